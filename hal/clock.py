@@ -1,0 +1,81 @@
+"""``rig.clock``: the same loop waits in real time and steps a lock-step simulation."""
+
+from __future__ import annotations
+
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator
+from typing import NamedTuple
+
+__all__ = ["Clock", "LockStepClock", "RealClock", "Tick"]
+
+
+class Tick(NamedTuple):
+    """One turn of a paced loop."""
+
+    t: float
+    """Time on the clock, s."""
+    dt: float
+    """Time since the turn before, s: a whole number of periods."""
+    missed: int
+    """Turns that were skipped because the loop's body took too long; they are never caught up."""
+
+
+class Clock(ABC):
+    """Seconds that only go forward."""
+
+    @abstractmethod
+    def now(self) -> float:
+        """Seconds: the host's monotonic clock, or simulated time."""
+
+    @abstractmethod
+    def sleep_until(self, t: float) -> None:
+        """Return when the clock shows ``t``. In lock-step this is what makes time go on."""
+
+    def sleep(self, seconds: float) -> None:
+        """Let ``seconds`` pass."""
+        self.sleep_until(self.now() + seconds)
+
+    def rate(self, hz: float) -> Iterator[Tick]:
+        """Turn for ever, ``hz`` times a second. The first turn comes at once.
+
+        Raises ValueError for a rate that is not positive.
+        """
+        if not hz > 0.0:
+            raise ValueError(f"a rate must be positive, not {hz}")
+        period = 1.0 / hz
+        start = self.now()
+        turn, missed = 0, 0
+        while True:
+            yield Tick(self.now(), period * (1 + missed), missed)
+            turn += 1
+            late = int((self.now() - start) / period + 1e-9) - turn
+            missed = max(0, late)
+            turn += missed
+            self.sleep_until(start + turn * period)
+
+
+class RealClock(Clock):
+    """The host's monotonic clock, the same in every process of this machine."""
+
+    def now(self) -> float:
+        return time.monotonic()
+
+    def sleep_until(self, t: float) -> None:
+        rest = t - time.monotonic()
+        if rest > 0.0:
+            time.sleep(rest)
+
+
+class LockStepClock(Clock):
+    """Simulated time: it stands still until somebody waits, and then runs as fast as the machine can."""
+
+    def __init__(self, now: Callable[[], float], advance_to: Callable[[float], None]) -> None:
+        self._now = now
+        self._advance_to = advance_to
+
+    def now(self) -> float:
+        return self._now()
+
+    def sleep_until(self, t: float) -> None:
+        self._advance_to(t)

@@ -1,0 +1,116 @@
+"""What can be asked of an arm. Frozen, checked when made, SI units; frames are the arm's base frame unless said."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import NamedTuple, Union
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from .errors import CommandError
+from .pose import Pose, frozen
+
+__all__ = ["CartesianTarget", "Command", "JointTarget", "JointTorque", "JointVelocity", "Kind", "Sent", "Twist"]
+
+Array = NDArray[np.float64]
+
+
+def _vector(name: str, values: ArrayLike, size: int | None = None) -> Array:
+    """A read-only vector of finite numbers, or a CommandError that says what was wrong."""
+    try:
+        array = frozen(values)
+    except (TypeError, ValueError) as error:
+        raise CommandError(f"{name} must be numbers: {error}") from None
+    if array.ndim != 1 or (size is not None and array.size != size):
+        raise CommandError(f"{name} must have shape ({size if size is not None else 'n'},), not {array.shape}")
+    if not np.isfinite(array).all():
+        raise CommandError(f"{name} holds a number that is not finite: {array.tolist()}")
+    return array
+
+
+class Kind(IntEnum):
+    """How a command travels to the servo."""
+
+    NONE = 0
+    JOINT_TARGET = 1
+    JOINT_VELOCITY = 2
+    JOINT_TORQUE = 3
+    CARTESIAN_TARGET = 4
+    TWIST = 5
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class JointTarget:
+    """Be at joint positions ``q`` (n,) in rad, moving at ``dq`` (n,) in rad/s (zero when left out).
+
+    Between two commands the servo extrapolates along ``dq``.
+    """
+
+    q: Array
+    dq: Array | None = None
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "q", _vector("q", self.q))
+        if self.dq is not None:
+            object.__setattr__(self, "dq", _vector("dq", self.dq, self.q.size))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class JointVelocity:
+    """Move the joints at ``dq`` (n,), rad/s."""
+
+    dq: Array
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "dq", _vector("dq", self.dq))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class JointTorque:
+    """Apply joint torques ``tau`` (n,), Nm, on top of the robot's own gravity compensation."""
+
+    tau: Array
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "tau", _vector("tau", self.tau))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CartesianTarget:
+    """Bring the tcp to ``pose``; inverse kinematics runs in the servo."""
+
+    pose: Pose
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.pose, Pose):
+            raise CommandError(f"pose must be a hal.Pose, not {type(self.pose).__name__}")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Twist:
+    """Move the tcp at ``linear`` (3,) m/s while it turns at ``angular`` (3,) rad/s.
+
+    Along the base's axes, or with ``frame="tcp"`` along the tcp's own.
+    """
+
+    linear: Array
+    angular: Array = (0.0, 0.0, 0.0)  # type: ignore[assignment]  # made an array below
+    frame: str = "base"
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "linear", _vector("linear", self.linear, 3))
+        object.__setattr__(self, "angular", _vector("angular", self.angular, 3))
+        if self.frame not in ("base", "tcp"):
+            raise CommandError(f"frame must be 'base' or 'tcp', not {self.frame!r}")
+
+
+Command = Union[JointTarget, JointVelocity, JointTorque, CartesianTarget, Twist]
+
+
+class Sent(NamedTuple):
+    """What ``Control.send`` really sent, and why it differs from what was asked, if it does."""
+
+    command: Command | None
+    reasons: tuple[str, ...] = ()

@@ -1,0 +1,349 @@
+"""One control session: what an arm follows, from when to when, and under whose thumb."""
+
+from __future__ import annotations
+
+import math
+from types import TracebackType
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from .commands import CartesianTarget, Command, JointTarget, JointTorque, JointVelocity, Kind, Sent, Twist
+from .errors import CommandError, ConnectionLost, HalError, MotionStopped, NotSupported, RobotFault
+from .inbox import CommandRecord, Session
+from .pose import Pose
+from .types import RobotState, RobotStatus, Trip
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from .deadman import Deadman
+    from .records import ServoRecord
+    from .robot import Robot
+
+__all__ = ["FIRST_STEP_ANGLE", "FIRST_STEP_DISTANCE", "Control", "StopLatch", "move_to"]
+
+FIRST_STEP_ANGLE = 0.1
+"""Farthest that a first joint target may be from the set-point, rad per joint."""
+FIRST_STEP_DISTANCE = 0.05
+"""Farthest that a first pose may be from the set-point, m."""
+_SHORTEST_DEADLINE = 0.1
+_PERIODS = 2.5
+_REST_LIMIT = 5.0
+
+_TRIPS = {
+    Trip.COMMAND_LATE: "the commands stopped coming",
+    Trip.DEADMAN_SILENT: "the dead-man's pad gave no sign of life",
+    Trip.DEADMAN_LOST: "the dead-man's pad was disconnected",
+    Trip.STOP: "rig.stop() was called",
+    Trip.APP_SILENT: "the app did not answer",
+    Trip.FAULT: "the robot reported a fault",
+    Trip.DEVICE_LOST: "the robot does not answer",
+    Trip.BAD_READING: "the robot reported numbers that cannot be",
+}
+
+
+class StopLatch:
+    """Remembers that ``rig.stop()`` was called until somebody acknowledges it."""
+
+    def __init__(self) -> None:
+        self.stopped = False
+
+    def check(self) -> None:
+        """Raise MotionStopped while the stop is not acknowledged."""
+        if self.stopped:
+            raise MotionStopped("rig.stop() was called", "call rig.rearm() when it is safe to move again")
+
+
+def trip_text(trip: Trip) -> str:
+    """A trip in words."""
+    return _TRIPS.get(trip, trip.name.lower())
+
+
+class Control:
+    """A session in which one arm follows commands. Made by :meth:`hal.robot.Robot.control`.
+
+    Leaving it, for whatever reason, brings the arm to rest; the first exception is the one that is raised.
+    """
+
+    def __init__(
+        self,
+        robot: Robot,
+        *,
+        deadman: Deadman | None,
+        rate_hz: float,
+        speed: float | None,
+        tcp_speed: float | None,
+        unattended: bool,
+        goal: tuple[float, ...] | None = None,
+    ) -> None:
+        spec = robot.spec
+        if spec.attended and deadman is None and not unattended:
+            raise CommandError(
+                f"{robot.name} really moves: pass deadman=pad.hold('l2'), or unattended=True when nobody is near it"
+            )
+        if deadman is not None and spec.attended:
+            deadman.check_trust()
+        if not (math.isfinite(rate_hz) and rate_hz > 0.0):
+            raise CommandError(f"rate_hz must be positive, not {rate_hz}")
+        self._deadline = max(_SHORTEST_DEADLINE, _PERIODS / rate_hz)
+        if goal is None and self._deadline > spec.deadline_max:
+            slowest = _PERIODS / spec.deadline_max
+            raise CommandError(f"{rate_hz:g} Hz is too slow for {robot.name}: send at {slowest:.1f} Hz or more")
+        self.robot = robot
+        self.deadman = deadman
+        self.speed = _share("speed", speed, spec.speed if goal is None else spec.move_speed, spec.speed, goal)
+        self.tcp_speed = _share("tcp_speed", tcp_speed, spec.tcp_speed, spec.tcp_speed, None)
+        self._goal = goal
+        self._mail = robot._mail
+        self._host = robot._host
+        self._id = 0
+        self._rearms = self._mail.get_rearms()
+        self._rearmed_at = -math.inf
+        self._detach: Callable[[], None] | None = None
+        self._grip: float | None = None
+
+    # Opening and leaving.
+
+    def __enter__(self) -> Control:
+        robot = self.robot
+        if self.deadman is None:
+            robot._latch.check()
+        else:
+            self._detach = self.deadman.attach(self._mail.put_deadman)
+        robot._sessions += 1
+        self._id = robot._sessions
+        session = Session(self._id, self.speed, self.tcp_speed, self.deadman is not None, self._goal)
+        try:
+            self._host.request("begin", {"robot": robot.name, "session": list(session)})
+        except BaseException:
+            self._id = 0
+            self._let_go()
+            raise
+        robot._open = self
+        if self.deadman is not None:
+            robot._latch.stopped = False
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        try:
+            self.close()
+        except (HalError, OSError):
+            if error is None:
+                raise
+
+    def close(self) -> None:
+        """Bring the arm to rest and end the session. Idempotent."""
+        if not self._id:
+            return
+        try:
+            self._host.request("end", {"robot": self.robot.name, "session": self._id})
+            self._wait_for_rest()
+        finally:
+            self._id = 0
+            self.robot._open = None
+            self._let_go()
+
+    def _let_go(self) -> None:
+        if self._detach is not None:
+            self._detach()
+            self._detach = None
+
+    def _wait_for_rest(self) -> None:
+        clock = self.robot.clock
+        deadline = clock.now() + _REST_LIMIT
+        while (found := self._peek()).session == self._id:
+            if clock.now() > deadline:
+                raise ConnectionLost(f"{self.robot.name} did not come to rest within {_REST_LIMIT:g} s: {found.status}")
+            clock.sleep(1.0 / self._host.spec.rate_hz)
+
+    # Driving.
+
+    @property
+    def status(self) -> RobotStatus:
+        """What the arm is doing."""
+        return self._peek().status
+
+    @property
+    def trip(self) -> Trip:
+        """Why a stop is latched; ``Trip.NONE`` when none is."""
+        return self._peek().trip
+
+    def _peek(self) -> ServoRecord:
+        self._host.check()
+        found = self._mail.peek()
+        if found is None:
+            raise ConnectionLost(f"{self.robot.name} has not reported a state yet")
+        return found
+
+    def send(self, command: Command | None, *, gripper: float | None = None, t_event: float = 0.0) -> Sent:
+        """Send a command to the arm and, with ``gripper``, a grip from 0 (open) to 1 (closed).
+
+        Returns what was really sent and why it differs. ``t_event`` is the time of the pad event behind it, for
+        latency figures. Raises CommandError (nothing was sent), MotionStopped after a trip, RobotFault.
+        """
+        if not self._id:
+            raise CommandError("this control session is not open: use it in a 'with' statement")
+        servo = self._peek()
+        now = self.robot.clock.now()
+        self._check_trip(servo, now)
+        waiting = self.deadman is not None and not self.deadman.held
+        reasons: list[str] = []
+        if command is not None:
+            command = self._checked(command, reasons)
+            if waiting:
+                reasons.append("the dead-man is not held: the arm does not move")
+            elif servo.status is RobotStatus.HOLDING:
+                self._check_first(command, servo)
+            kind, values = _encode(command)
+            self.robot._commands += 1
+            deadline = now + self._deadline
+            self._mail.put_command(
+                CommandRecord(self.robot._commands, self._id, now, deadline, kind, values, t_event)
+            )
+        if gripper is not None:
+            self._send_grip(gripper, waiting, reasons)
+        return Sent(command, tuple(reasons))
+
+    def _check_trip(self, servo: ServoRecord, now: float) -> None:
+        if servo.status is RobotStatus.FAULT:
+            fault = self.robot.state(max_age=math.inf).fault
+            cause, remedy = (fault.cause, fault.remedy) if fault else ("the robot reports a fault", "")
+            raise RobotFault(cause, f"{remedy}; then robot.recover()" if remedy else "call robot.recover()")
+        if servo.trip is Trip.NONE:
+            return
+        if self._rearmed_at > -math.inf and self._mail.state.seq() <= self._rearmed_at:
+            return  # the servo has not seen the rearm yet
+        remedy = "release the dead-man and press it again" if self.deadman else "call control.rearm() to go on"
+        raise MotionStopped(trip_text(servo.trip), remedy)
+
+    def rearm(self) -> None:
+        """Acknowledge a trip in a session without a dead-man; the arm follows the next command.
+
+        With a dead-man, letting go of it and pressing it again is the acknowledgement: MotionStopped says so.
+        """
+        if self.deadman is not None:
+            raise MotionStopped("this session has a dead-man", "release it and press it again")
+        self.robot._latch.stopped = False
+        self._rearms += 1
+        self._mail.rearms.write(self._rearms)
+        self._rearmed_at = self._mail.state.seq() + 1
+
+    def _checked(self, command: Command, reasons: list[str]) -> Command:
+        robot, n = self.robot, self.robot.n
+        if self._goal is not None:
+            raise CommandError("this session moves to a goal; it takes no commands")
+        if isinstance(command, JointTorque):
+            raise NotSupported(f"{robot.name}: driver {robot.spec.driver} takes no torques")
+        size = {JointTarget: "q", JointVelocity: "dq"}.get(type(command))
+        if size is not None:
+            count = getattr(command, size).size
+            if count != n:
+                raise CommandError(f"{robot.name} has {n} joints; {type(command).__name__} has {count}")
+        elif not isinstance(command, (CartesianTarget, Twist)):
+            raise CommandError(f"{type(command).__name__} is no command")
+        if isinstance(command, JointTarget):
+            limits = robot.limits
+            clipped = np.clip(command.q, limits.lower, limits.upper)
+            if not np.array_equal(clipped, command.q):
+                over = [robot.joints[k] for k in np.flatnonzero(clipped != command.q)]
+                reasons.append(f"position limit of {', '.join(over)}")
+                return JointTarget(clipped, command.dq)
+        return command
+
+    def _check_first(self, command: Command, servo: ServoRecord) -> None:
+        """A first target far from where the arm stands would make it leap."""
+        if isinstance(command, JointTarget):
+            step = np.abs(command.q - np.asarray(servo.q_set))
+            worst = int(np.argmax(step))
+            if step[worst] > FIRST_STEP_ANGLE:
+                raise CommandError(
+                    f"the first target is {step[worst]:.3f} rad from the set-point at {self.robot.joints[worst]}, more "
+                    f"than {FIRST_STEP_ANGLE} rad: use move_to first"
+                )
+        elif isinstance(command, CartesianTarget):
+            distance, _ = self.robot.fk(servo.q_set).distance(command.pose)
+            if distance > FIRST_STEP_DISTANCE:
+                raise CommandError(
+                    f"the first pose is {distance:.3f} m from the set-point, more than {FIRST_STEP_DISTANCE} m: use "
+                    "move_to first"
+                )
+
+    def _send_grip(self, fraction: float, waiting: bool, reasons: list[str]) -> None:
+        gripper = self.robot.gripper
+        if gripper is None:
+            raise NotSupported(f"{self.robot.name} has no gripper")
+        width = gripper.width_of(fraction)
+        if waiting:
+            reasons.append("the dead-man is not held: the gripper does not move")
+        elif self._grip is None or abs(width - self._grip) > gripper.spec.width_max * 0.005:
+            gripper.start(width)
+            self._grip = width
+
+
+def _share(name: str, asked: float | None, default: float, most: float, goal: object) -> float:
+    """``asked`` or the default, checked against the most that the rig allows."""
+    value = default if asked is None else asked
+    most = 1.0 if goal is not None else most
+    if not (math.isfinite(value) and 0.0 < value <= most):
+        raise CommandError(f"{name} must be above 0 and at most {most:g} (the rig's own), not {value}")
+    return value
+
+
+def _encode(command: Command) -> tuple[Kind, tuple[float, ...]]:
+    """A command as it travels; see :class:`hal.inbox.CommandRecord`."""
+    if isinstance(command, JointTarget):
+        q = command.q.tolist()
+        return Kind.JOINT_TARGET, (*q, *(command.dq.tolist() if command.dq is not None else [0.0] * len(q)))
+    if isinstance(command, JointVelocity):
+        return Kind.JOINT_VELOCITY, tuple(command.dq.tolist())
+    if isinstance(command, CartesianTarget):
+        return Kind.CARTESIAN_TARGET, (*command.pose.position.tolist(), *command.pose.orientation.tolist())
+    assert isinstance(command, Twist)
+    return Kind.TWIST, (*command.linear.tolist(), *command.angular.tolist(), 1.0 if command.frame == "tcp" else 0.0)
+
+
+def move_to(
+    robot: Robot,
+    target: ArrayLike | Pose,
+    *,
+    deadman: Deadman | None,
+    unattended: bool,
+    speed: float | None,
+    tcp_speed: float | None,
+    timeout: float | None,
+) -> RobotState:
+    """See :meth:`hal.robot.Robot.move_to`."""
+    goal = robot.ik(target) if isinstance(target, Pose) else JointTarget(target).q  # type: ignore[arg-type]
+    if goal.size != robot.n:
+        raise CommandError(f"{robot.name} has {robot.n} joints; the target has {goal.size}")
+    limits = robot.limits
+    outside = np.flatnonzero((goal < limits.lower) | (goal > limits.upper))
+    if outside.size:
+        names = ", ".join(robot.joints[k] for k in outside)
+        raise CommandError(f"the target is outside the position limits of {names}")
+    session = Control(
+        robot,
+        deadman=deadman,
+        rate_hz=50.0,
+        speed=speed,
+        tcp_speed=tcp_speed,
+        unattended=unattended,
+        goal=tuple(goal.tolist()),
+    )
+    clock = robot.clock
+    start = clock.now()
+    with session:
+        for _ in clock.rate(50.0):
+            servo = session._peek()
+            session._check_trip(servo, clock.now())
+            if servo.refused:
+                raise CommandError(f"the way to the target leaves the workspace of {robot.name}")
+            if servo.arrived and servo.session == session._id:
+                break
+            if timeout is not None and clock.now() - start > timeout:
+                raise TimeoutError(f"{robot.name} did not reach the target within {timeout:g} s")
+    return robot.state()

@@ -1,0 +1,125 @@
+"""Every error that the hal raises, in one tree.
+
+    HalError
+    ├── ConfigError (ValueError)            a rig, a model or an argument file is wrong; lists every problem
+    ├── CommandError (ValueError)           a command was malformed; nothing was sent
+    ├── Unreachable (ValueError)            no joint position reaches the pose; carries the residual
+    ├── DriverMissing (ImportError)         a library is not installed; names the command that installs it
+    ├── DeviceNotFound (LookupError)        no such device; lists those that are there
+    ├── ConnectionLost (ConnectionError)    the device, or the process that owned it, is gone
+    ├── StaleStateError (TimeoutError)      the newest state or frame is too old to act on
+    ├── MotionStopped (RuntimeError)        a stop is latched; says what tripped it and how to go on
+    ├── RobotFault (RuntimeError)           the robot reports a fault; carries cause and remedy
+    ├── ControlTaken (RuntimeError)         somebody else controls this arm
+    └── NotSupported (NotImplementedError)  this driver, or this rig, cannot do that
+
+Each one is also the builtin in brackets, so callers may catch either.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+__all__ = [
+    "CommandError",
+    "ConfigError",
+    "ConnectionLost",
+    "ControlTaken",
+    "DeviceNotFound",
+    "DriverMissing",
+    "HalError",
+    "MotionStopped",
+    "NotSupported",
+    "Problem",
+    "RobotFault",
+    "StaleStateError",
+    "Unreachable",
+]
+
+
+class HalError(Exception):
+    """The root: whatever the hal raises on purpose."""
+
+
+@dataclass(frozen=True, slots=True)
+class Problem:
+    """One thing that is wrong in a configuration file."""
+
+    file: str
+    """The file, or a description such as ``<dict>`` or ``--set``."""
+    key: str
+    """Dotted path of the key, for example ``robots.panda.base.position``."""
+    message: str
+    """What is wrong and what would be right."""
+
+    def __str__(self) -> str:
+        place = f"{self.file}: {self.key}" if self.key else self.file
+        return f"{place}: {self.message}"
+
+
+class ConfigError(HalError, ValueError):
+    """A configuration is wrong. ``problems`` holds every problem, not only the first."""
+
+    def __init__(self, problems: Sequence[Problem]) -> None:
+        self.problems = tuple(problems)
+        count = len(self.problems)
+        head = "1 problem" if count == 1 else f"{count} problems"
+        super().__init__(f"{head} in the configuration:\n" + "\n".join(f"  - {problem}" for problem in self.problems))
+
+
+class CommandError(HalError, ValueError):
+    """A command has the wrong shape, a non-finite number or an impossible value. Nothing was sent."""
+
+
+class Unreachable(HalError, ValueError):
+    """No joint position inside the limits reaches the pose."""
+
+    def __init__(self, message: str, *, position_error: float, rotation_error: float) -> None:
+        super().__init__(f"{message} (closest found: {position_error:.4f} m, {rotation_error:.4f} rad away)")
+        self.position_error = position_error
+        """Distance of the closest position found, in m."""
+        self.rotation_error = rotation_error
+        """Angle to the closest orientation found, in rad."""
+
+
+class DriverMissing(HalError, ImportError):
+    """A driver's library is not installed. The message names the command that installs it."""
+
+
+class DeviceNotFound(HalError, LookupError):
+    """No such device. The message lists those that are there."""
+
+
+class ConnectionLost(HalError, ConnectionError):
+    """A device, or the process that owned it, does not answer any more."""
+
+
+class StaleStateError(HalError, TimeoutError):
+    """The newest state or frame is older than the caller allows."""
+
+
+class MotionStopped(HalError, RuntimeError):
+    """A stop is latched: nothing moves until it is acknowledged (see ``Control.rearm``)."""
+
+    def __init__(self, reason: str, remedy: str = "") -> None:
+        super().__init__(f"{reason}; {remedy}" if remedy else reason)
+        self.reason = reason
+        self.remedy = remedy
+
+
+class RobotFault(HalError, RuntimeError):
+    """The robot reports a fault. ``recover()`` is the user's own act."""
+
+    def __init__(self, cause: str, remedy: str) -> None:
+        super().__init__(f"{cause}; {remedy}" if remedy else cause)
+        self.cause = cause
+        self.remedy = remedy
+
+
+class ControlTaken(HalError, RuntimeError):
+    """Another control session owns this arm."""
+
+
+class NotSupported(HalError, NotImplementedError):
+    """This driver, or this rig, cannot do that. The message says what can."""

@@ -1,0 +1,151 @@
+"""The newest record of one writer for any number of readers, in memory that processes share.
+
+A mailbox holds two slots. The writer fills the one that is not announced, then announces it by one aligned 8-byte
+store, so a writer that is killed in the middle of a write leaves the last whole record in place and no reader ever
+waits. Each slot carries its number and a checksum: a reader that was overtaken, or that runs on a processor which
+reorders stores, notices and tries again, a bounded number of times.
+"""
+
+from __future__ import annotations
+
+import struct
+from array import array
+from collections.abc import Sequence
+from typing import Any
+from zlib import crc32
+
+__all__ = ["Mailbox", "SeriesBox"]
+
+_HEADER = struct.Struct("<Q")
+_SLOT = struct.Struct("<QQ")  # number, checksum
+_TRIES = 16
+
+
+class _Slots:
+    """Two slots of ``capacity`` payload bytes and the number of the announced one."""
+
+    __slots__ = ("_buffer", "_payloads", "_seen", "_seq", "_starts")
+
+    def __init__(self, buffer: memoryview, capacity: int) -> None:
+        stride = self._stride(capacity)
+        self._buffer = buffer[: _HEADER.size + 2 * stride]
+        self._starts = (_HEADER.size, _HEADER.size + stride)
+        self._payloads = tuple(self._buffer[s + _SLOT.size : s + _SLOT.size + capacity] for s in self._starts)
+        self._seq: int = _HEADER.unpack_from(self._buffer, 0)[0]
+        self._seen = 0
+
+    @staticmethod
+    def _stride(capacity: int) -> int:
+        return (_SLOT.size + capacity + 7) // 8 * 8
+
+    @classmethod
+    def _size(cls, capacity: int) -> int:
+        return _HEADER.size + 2 * cls._stride(capacity)
+
+    def _announce(self, length: int) -> int:
+        """Publish what was filled into the free slot, ``length`` bytes of it."""
+        seq = self._seq + 1
+        which = seq & 1
+        _SLOT.pack_into(self._buffer, self._starts[which], seq, crc32(self._payloads[which][:length]))
+        _HEADER.pack_into(self._buffer, 0, seq)
+        self._seq = seq
+        return seq
+
+    def seq(self) -> int:
+        """Number of the newest record; 0 before the first."""
+        return _HEADER.unpack_from(self._buffer, 0)[0]  # type: ignore[no-any-return]
+
+    def release(self) -> None:
+        """Let go of the buffer, so that the memory behind it can be unmapped."""
+        for view in self._payloads:
+            view.release()
+        self._buffer.release()
+
+
+class Mailbox(_Slots):
+    """Records of one fixed ``layout``, a :mod:`struct` format without a byte-order mark.
+
+    One process writes, in one thread; everyone may read, each reader through a Mailbox of its own.
+    """
+
+    __slots__ = ("_layout", "_values")
+
+    def __init__(self, buffer: memoryview, layout: str) -> None:
+        self._layout = struct.Struct("<" + layout)
+        self._values: tuple[Any, ...] = ()
+        super().__init__(buffer, self._layout.size)
+
+    @classmethod
+    def size(cls, layout: str) -> int:
+        """Bytes that a mailbox of this layout takes; a multiple of 8."""
+        return cls._size(struct.calcsize("<" + layout))
+
+    def write(self, *values: Any) -> int:
+        """Announce a record; returns its number. ``struct.error`` when the values do not fit the layout."""
+        self._layout.pack_into(self._payloads[(self._seq + 1) & 1], 0, *values)
+        return self._announce(self._layout.size)
+
+    def read(self) -> tuple[int, tuple[Any, ...]] | None:
+        """The newest whole record as (number, values); None before the first one.
+
+        When every try meets a writer in the act: the last record that this reader has seen.
+        """
+        for _ in range(_TRIES):
+            seq = _HEADER.unpack_from(self._buffer, 0)[0]
+            if seq == self._seen:
+                break
+            which = seq & 1
+            number, check = _SLOT.unpack_from(self._buffer, self._starts[which])
+            payload = bytes(self._payloads[which])
+            if number == seq and crc32(payload) == check:
+                self._seen, self._values = seq, self._layout.unpack(payload)
+                break
+        return (self._seen, self._values) if self._seen else None
+
+
+_SERIES = struct.Struct("<dQQ")  # time, revision, count
+
+
+class SeriesBox(_Slots):
+    """A time, a revision and a series of numbers whose length may change from record to record, up to ``capacity``."""
+
+    __slots__ = ("_capacity", "_record")
+
+    def __init__(self, buffer: memoryview, capacity: int) -> None:
+        self._capacity = capacity
+        self._record: tuple[float, int, array[float]] = (0.0, 0, array("d"))
+        super().__init__(buffer, _SERIES.size + 8 * capacity)
+
+    @classmethod
+    def size(cls, capacity: int) -> int:
+        """Bytes that it takes."""
+        return cls._size(_SERIES.size + 8 * capacity)
+
+    def write(self, t: float, revision: int, values: Sequence[float]) -> int:
+        """Announce a record; returns its number. ValueError when there are more numbers than ``capacity``."""
+        count = len(values)
+        if count > self._capacity:
+            raise ValueError(f"{count} numbers do not fit into {self._capacity}")
+        payload = self._payloads[(self._seq + 1) & 1]
+        _SERIES.pack_into(payload, 0, t, revision, count)
+        end = _SERIES.size + 8 * count
+        payload[_SERIES.size : end] = array("d", values).tobytes()
+        return self._announce(end)
+
+    def read(self) -> tuple[int, float, int, array[float]] | None:
+        """The newest whole record as (number, time, revision, values); None before the first one."""
+        for _ in range(_TRIES):
+            seq = _HEADER.unpack_from(self._buffer, 0)[0]
+            if seq == self._seen:
+                break
+            which = seq & 1
+            number, check = _SLOT.unpack_from(self._buffer, self._starts[which])
+            t, revision, count = _SERIES.unpack_from(self._payloads[which], 0)
+            if count > self._capacity:
+                continue  # torn
+            payload = bytes(self._payloads[which][: _SERIES.size + 8 * count])
+            if number == seq and crc32(payload) == check:
+                self._seen = seq
+                self._record = (t, revision, array("d", payload[_SERIES.size :]))
+                break
+        return (self._seen, *self._record) if self._seen else None

@@ -1,0 +1,137 @@
+"""Rigid transforms: one small immutable class, positions in m, quaternions xyzw."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+__all__ = ["Pose", "frozen", "matrix_to_quaternion", "quaternion_to_matrix", "rpy_to_matrix"]
+
+Array = NDArray[np.float64]
+
+
+def frozen(values: ArrayLike, dtype: Any = np.float64) -> NDArray[Any]:
+    """A read-only copy of ``values`` as an array."""
+    array = np.array(values, dtype=dtype)
+    array.flags.writeable = False
+    return array
+
+
+def quaternion_to_matrix(quaternion: ArrayLike) -> Array:
+    """Rotation matrix (3, 3) of a quaternion (x, y, z, w); normalised first."""
+    x, y, z, w = np.asarray(quaternion, float) / np.linalg.norm(quaternion)
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
+def matrix_to_quaternion(matrix: ArrayLike) -> Array:
+    """Quaternion (x, y, z, w) with w >= 0 of a rotation matrix (3, 3).
+
+    The branch on the largest component (Shepperd, 1978) stays accurate near half turns.
+    """
+    m = np.asarray(matrix, float)
+    squares = np.array(
+        [
+            1 + m[0, 0] - m[1, 1] - m[2, 2],
+            1 - m[0, 0] + m[1, 1] - m[2, 2],
+            1 - m[0, 0] - m[1, 1] + m[2, 2],
+            1 + m[0, 0] + m[1, 1] + m[2, 2],
+        ]
+    )
+    largest = int(np.argmax(squares))
+    s = 2.0 * np.sqrt(squares[largest])
+    if largest == 3:
+        q = [(m[2, 1] - m[1, 2]) / s, (m[0, 2] - m[2, 0]) / s, (m[1, 0] - m[0, 1]) / s, s / 4]
+    elif largest == 0:
+        q = [s / 4, (m[0, 1] + m[1, 0]) / s, (m[0, 2] + m[2, 0]) / s, (m[2, 1] - m[1, 2]) / s]
+    elif largest == 1:
+        q = [(m[0, 1] + m[1, 0]) / s, s / 4, (m[1, 2] + m[2, 1]) / s, (m[0, 2] - m[2, 0]) / s]
+    else:
+        q = [(m[0, 2] + m[2, 0]) / s, (m[1, 2] + m[2, 1]) / s, s / 4, (m[1, 0] - m[0, 1]) / s]
+    quaternion = np.array(q)
+    return quaternion if quaternion[3] >= 0 else -quaternion
+
+
+def rpy_to_matrix(roll: float, pitch: float, yaw: float) -> Array:
+    """Rotation matrix of fixed-axis roll, pitch, yaw in rad, as URDF means them: Rz(yaw) Ry(pitch) Rx(roll)."""
+    cr, sr, cp, sp, cy, sy = np.cos(roll), np.sin(roll), np.cos(pitch), np.sin(pitch), np.cos(yaw), np.sin(yaw)
+    return np.array(
+        [
+            [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
+            [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
+            [-sp, cp * sr, cp * cr],
+        ]
+    )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Pose:
+    """A position (3,) in m and an orientation (4,) as a unit quaternion x, y, z, w. Arrays are read-only."""
+
+    position: Array
+    orientation: Array
+
+    def __init__(self, position: ArrayLike = (0.0, 0.0, 0.0), orientation: ArrayLike = (0.0, 0.0, 0.0, 1.0)) -> None:
+        p, q = frozen(position), np.array(orientation, float)
+        if p.shape != (3,) or q.shape != (4,):
+            raise ValueError(f"a pose is a position (3,) and a quaternion (4,), not {p.shape} and {q.shape}")
+        norm = float(np.linalg.norm(q))
+        if not np.isfinite(p).all() or not np.isfinite(norm) or norm < 1e-9:
+            raise ValueError("a pose needs finite numbers and a quaternion that is not zero")
+        object.__setattr__(self, "position", p)
+        object.__setattr__(self, "orientation", frozen(q / norm))
+
+    @classmethod
+    def from_matrix(cls, matrix: ArrayLike) -> Pose:
+        """From a homogeneous matrix (4, 4)."""
+        m = np.asarray(matrix, float)
+        return cls(m[:3, 3], matrix_to_quaternion(m[:3, :3]))
+
+    @classmethod
+    def from_rpy(cls, position: ArrayLike, rpy: Sequence[float]) -> Pose:
+        """From a position in m and roll, pitch, yaw in rad (URDF's convention)."""
+        return cls(position, matrix_to_quaternion(rpy_to_matrix(*rpy)))
+
+    def matrix(self) -> Array:
+        """The homogeneous matrix (4, 4)."""
+        m = np.eye(4)
+        m[:3, :3] = quaternion_to_matrix(self.orientation)
+        m[:3, 3] = self.position
+        return m
+
+    def inverse(self) -> Pose:
+        """The pose of the parent in this frame."""
+        return Pose.from_matrix(np.linalg.inv(self.matrix()))
+
+    def __matmul__(self, other: Pose) -> Pose:
+        """``a @ b``: b, given in a's frame, in the frame that a is given in."""
+        return Pose.from_matrix(self.matrix() @ other.matrix())
+
+    def distance(self, other: Pose) -> tuple[float, float]:
+        """Distance in m and angle in rad between two poses."""
+        dot = min(1.0, abs(float(self.orientation @ other.orientation)))
+        return float(np.linalg.norm(self.position - other.position)), 2.0 * float(np.arccos(dot))
+
+    def __eq__(self, other: object) -> bool:
+        if not isinstance(other, Pose):
+            return NotImplemented
+        same = np.array_equal(self.orientation, other.orientation) or np.array_equal(self.orientation, -other.orientation)
+        return np.array_equal(self.position, other.position) and same
+
+    def __hash__(self) -> int:
+        return hash(self.position.tobytes())
+
+    def __repr__(self) -> str:
+        def text(values: Array) -> str:
+            return "[" + ", ".join(f"{value:.4g}" for value in values) + "]"
+
+        return f"Pose({text(self.position)}, {text(self.orientation)})"

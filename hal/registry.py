@@ -1,0 +1,155 @@
+"""Drivers by name: a table of the built-in ones, and the entry-point group ``hal.drivers`` for everybody else's.
+
+Nothing here imports a driver before it is asked for, and nothing else in ``hal`` imports one at all.
+
+A driver is three things: a folder, a class per kind of device in it (:class:`~hal.robot.RobotDriver` and its
+siblings), and one :class:`DriverSpec` that names those classes. A package of your own announces its spec in its
+``pyproject.toml``, and then rigs may say ``driver: my_arm``::
+
+    [project.entry-points."hal.drivers"]
+    my_arm = "my_lab.my_arm:DRIVER"
+
+Without a package, a rig may name the spec itself: ``driver: my_lab.my_arm:DRIVER``.
+"""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields
+from difflib import get_close_matches
+from types import MappingProxyType
+from typing import Any
+
+from .errors import DeviceNotFound, DriverMissing, NotSupported
+
+__all__ = ["BUILT_IN", "GROUP", "DriverSpec", "driver", "load", "missing", "names"]
+
+GROUP = "hal.drivers"
+"""The entry-point group."""
+
+BUILT_IN: Mapping[str, str] = MappingProxyType(
+    {
+        "evdev": "hal.drivers.evdev:DRIVER",
+        "mock": "hal.drivers.mock:DRIVER",
+        "playback": "hal.drivers.playback:DRIVER",
+        "pybullet": "hal.drivers.pybullet:DRIVER",
+    }
+)
+"""Name of a driver that comes with the hal -> where its :class:`DriverSpec` is, as "module:ATTRIBUTE"."""
+
+
+@dataclass(frozen=True)
+class DriverSpec:
+    """What one driver offers. Every class is named as ``"module:Class"`` and imported when it is first used."""
+
+    name: str
+    robot: str | None = None
+    """A :class:`~hal.robot.RobotDriver`."""
+    gripper: str | None = None
+    """A :class:`~hal.gripper.GripperDriver`."""
+    camera: str | None = None
+    """A :class:`~hal.camera.CameraDriver`."""
+    gamepad: str | None = None
+    """A :class:`~hal.gamepad.GamepadDriver`."""
+    world: str | None = None
+    """The simulated world that this driver's arms, grippers and cameras stand in."""
+    mirror: str | None = None
+    """A copy of that world that shows published states and is never stepped."""
+    viewer: str | None = None
+    """A window onto a mirror."""
+    render_worker: str | None = None
+    """The process that draws the pictures of simulated cameras."""
+    requires: Mapping[str, str] = field(default_factory=dict)
+    """Import name of each library that the driver needs -> the command that installs it."""
+
+    @property
+    def kinds(self) -> tuple[str, ...]:
+        """The kinds of device that this driver has."""
+        return tuple(kind for kind in _KINDS if getattr(self, kind) is not None)
+
+
+_KINDS = tuple(f.name for f in fields(DriverSpec) if f.name not in ("name", "requires"))
+
+
+def names() -> tuple[str, ...]:
+    """Names of all drivers, built in and installed, in alphabetical order. Imports none of them."""
+    return tuple(sorted({*BUILT_IN, *_entry_points()}))
+
+
+def driver(name: str) -> DriverSpec:
+    """The spec of the driver called ``name``, or named as "module:ATTRIBUTE".
+
+    Raises DeviceNotFound (lists the drivers that there are) and DriverMissing (it is announced, but its package does
+    not import).
+    """
+    place = BUILT_IN.get(name)
+    if place is None and ":" in name:
+        place = name
+    if place is None:
+        place = _entry_points().get(name)
+    if place is None:
+        raise DeviceNotFound(f"there is no driver {name!r}{_nearest(name, names())}; drivers: {', '.join(names())}")
+    spec = _resolve(place, name, {})
+    if not isinstance(spec, DriverSpec):
+        raise DriverMissing(f"driver {name!r}: {place} is a {type(spec).__name__}, not a hal.registry.DriverSpec")
+    return spec
+
+
+def load(name: str, kind: str) -> Any:
+    """The class that the driver ``name`` has for ``kind`` (``robot``, ``gripper``, ``camera``, ``gamepad``, ...).
+
+    Raises what :func:`driver` raises, NotSupported (the driver has no such kind; lists what it has), and
+    DriverMissing (a library that it needs is not installed; names the command that installs it).
+    """
+    spec = driver(name)
+    if kind not in _KINDS:
+        raise NotSupported(f"there is no kind of driver {kind!r}{_nearest(kind, _KINDS)}; kinds: {', '.join(_KINDS)}")
+    place = getattr(spec, kind)
+    if place is None:
+        raise NotSupported(f"driver {name!r} has no {kind}; it has: {', '.join(spec.kinds) or 'nothing'}")
+    return _resolve(place, name, spec.requires)
+
+
+def missing(name: str) -> dict[str, str]:
+    """Libraries that the driver ``name`` needs and that are not installed -> the command that installs each.
+
+    Looks for them without importing them, so a program can say what is missing before it opens anything.
+    """
+    return {
+        library: command
+        for library, command in driver(name).requires.items()
+        if importlib.util.find_spec(library) is None
+    }
+
+
+def _resolve(place: str, name: str, requires: Mapping[str, str]) -> Any:
+    """The attribute named by "module:ATTRIBUTE"; trouble is reported as that of the driver ``name``."""
+    module_name, _, attribute = place.partition(":")
+    try:
+        module = importlib.import_module(module_name)
+    except ImportError as error:
+        library = (error.name or "").partition(".")[0]
+        if library == "hal" and not isinstance(error, ModuleNotFoundError):
+            raise  # a mistake inside the hal itself; a traceback serves whoever mends it
+        remedy = requires.get(library)
+        hints = [remedy] if remedy else [f"{command} (for {wanted})" for wanted, command in requires.items()]
+        advice = f"; install it with: {', '.join(hints)}" if hints else ""
+        raise DriverMissing(f"driver {name!r} does not import: {error}{advice}", name=error.name) from error
+    try:
+        return getattr(module, attribute)
+    except AttributeError:
+        raise DriverMissing(f"driver {name!r}: module {module_name} has no {attribute!r}") from None
+
+
+def _entry_points() -> dict[str, str]:
+    """Drivers that installed packages announce, name -> "module:ATTRIBUTE"."""
+    from importlib.metadata import entry_points  # 25 ms, so only when it is needed
+
+    return {point.name: point.value for point in entry_points(group=GROUP)}
+
+
+def _nearest(word: str, choices: tuple[str, ...]) -> str:
+    close = get_close_matches(word, choices, n=1)
+    return f" (did you mean {close[0]!r}?)" if close else ""

@@ -1,0 +1,253 @@
+"""An arm: the driver's abstract class (small, talks to one device) and the public class (see below)."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, ClassVar, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from .errors import ConnectionLost, StaleStateError
+from .pose import Pose, frozen
+from .types import Fault, RobotState, RobotStatus
+
+if TYPE_CHECKING:
+    from .clock import Clock
+    from .control import Control, StopLatch
+    from .deadman import Deadman
+    from .gripper import Gripper
+    from .host import Host
+    from .kinematics import Kinematics
+    from .specs import LimitsSpec, RobotSpec
+
+__all__ = ["Reading", "Robot", "RobotDriver", "Setpoint"]
+
+Floats = Sequence[float]
+
+
+class Reading(NamedTuple):
+    """What a robot driver reports once per cycle. Plain floats: this is the hot path."""
+
+    t: float
+    """When it was measured, on the host's clock, s."""
+    t_device: float
+    """The same on the device's own clock, s."""
+    seq: int
+    """Counts the device's samples; gaps are lost samples."""
+    q: Floats
+    """Joint positions, rad."""
+    dq: Floats
+    """Joint velocities, rad/s."""
+    tau: Floats | None = None
+    """Joint torques, Nm."""
+    q_commanded: Floats | None = None
+    """The set-point that the device says it took last; the servo re-anchors to it when it is not what was sent."""
+    dq_commanded: Floats | None = None
+    tau_ext: Floats | None = None
+    wrench_ext: Floats | None = None
+    fault: Fault | None = None
+    """A fault stops and latches the arm."""
+
+
+class Setpoint(NamedTuple):
+    """What the servo writes to a driver once per cycle; every value lies inside the limits, continuously."""
+
+    q: Floats
+    """rad"""
+    dq: Floats
+    """rad/s"""
+    ddq: Floats
+    """rad/s2"""
+
+
+class RobotDriver(ABC):
+    """One arm. It only talks to its device: limits, smoothing, time-outs and stopping stand above it.
+
+    Made by the registry with the arm's :class:`~hal.specs.RobotSpec` and, for a simulated arm, the world it stands
+    in. The calls come from one thread. ``open`` connects and reads; it never moves anything. ``close`` is idempotent
+    and stops safely first. A device that does not answer raises :class:`~hal.errors.ConnectionLost`.
+    """
+
+    modes: ClassVar[frozenset[str]] = frozenset({"position"})
+    """Kinds of set-point the device takes: ``position``, ``velocity``, ``torque``."""
+    paces_itself: ClassVar[bool] = False
+    """True where ``read`` blocks until the device's next cycle (a Franka's state packets)."""
+    simulated: ClassVar[bool] = False
+    """True where nothing real can move."""
+
+    def __init__(self, spec: RobotSpec, world: object | None = None) -> None:
+        self.spec = spec
+        self.world = world
+
+    @abstractmethod
+    def open(self) -> None:
+        """Connect. Nothing moves."""
+
+    @abstractmethod
+    def read(self, now: float) -> Reading:
+        """The newest state; ``now`` is the host's clock, for devices without one."""
+
+    @abstractmethod
+    def write(self, setpoint: Setpoint) -> None:
+        """Hand over the next set-point."""
+
+    @abstractmethod
+    def halt(self) -> None:
+        """End streaming: the device stops and holds by its own means. Idempotent."""
+
+    def recover(self) -> None:
+        """Clear a fault, as the user's own act. A driver without faults has nothing to do."""
+
+    def inject(self, **knobs: object) -> None:
+        """Switch faults on or off, for tests. Only drivers that simulate have any."""
+        from .errors import NotSupported
+
+        raise NotSupported(f"driver {type(self).__name__} has no faults to inject; the mock and pybullet drivers have")
+
+    @abstractmethod
+    def close(self) -> None:
+        """Stop safely and let go of the device. Idempotent."""
+
+
+class Robot:
+    """One arm of a rig, the same whatever driver it ends in. Made by :func:`hal.open`."""
+
+    def __init__(self, spec: RobotSpec, host: Host, clock: Clock, latch: StopLatch) -> None:
+        self.spec = spec
+        self.name = spec.name
+        self.clock = clock
+        self._host = host
+        self._mail = host.memory.robots[spec.name]
+        self._latch = latch
+        self._sessions = 0
+        self._commands = 0
+        self._open: Control | None = None
+        self._kinematics: Kinematics | None = None
+        self.gripper: Gripper | None = None
+        """The gripper on this arm, if the model has one."""
+        if spec.gripper is not None:
+            from .gripper import Gripper
+
+            self.gripper = Gripper(spec.gripper, spec.name, host, clock)
+
+    # What it is.
+
+    @property
+    def n(self) -> int:
+        """Number of joints."""
+        return len(self.spec.joints)
+
+    @property
+    def joints(self) -> tuple[str, ...]:
+        """Names of the joints, from base to tip."""
+        return self.spec.joints
+
+    @property
+    def home(self) -> NDArray[np.float64]:
+        """The model's home position (n,), rad."""
+        return frozen(self.spec.home)
+
+    @property
+    def limits(self) -> LimitsSpec:
+        """Joint limits that the servo keeps."""
+        return self.spec.limits
+
+    @property
+    def kinematics(self) -> Kinematics:
+        """Forward and inverse kinematics of this arm."""
+        if self._kinematics is None:
+            from .kinematics import Kinematics
+
+            self._kinematics = Kinematics(self.spec.kinematics)
+        return self._kinematics
+
+    # What it does.
+
+    def state(self, max_age: float = 0.1) -> RobotState:
+        """The newest state.
+
+        Raises StaleStateError when it is older than ``max_age`` s, ConnectionLost when the arm, or the process that
+        owns it, is gone.
+        """
+        self._host.check()
+        found = self._mail.get_state()
+        if found is None:
+            raise StaleStateError(f"{self.name} has not reported a state yet")
+        state = found[0]
+        if state.status is RobotStatus.LOST:
+            raise ConnectionLost(f"{self.name} does not answer; its last state is {self._age(state):.3f} s old")
+        age = self._age(state)
+        if age > max_age:
+            raise StaleStateError(f"the newest state of {self.name} is {age:.3f} s old, more than {max_age:g} s")
+        return state
+
+    def _age(self, state: RobotState) -> float:
+        return self.clock.now() - state.stamp.t
+
+    def fk(self, q: ArrayLike) -> Pose:
+        """Pose of the tcp in the base frame at joint positions ``q`` (n,), rad."""
+        return self.kinematics.pose(np.asarray(q, float))
+
+    def ik(self, pose: Pose, q_seed: ArrayLike | None = None) -> NDArray[np.float64]:
+        """Joint positions (n,) in rad that bring the tcp to ``pose`` (base frame), near ``q_seed`` or the present.
+
+        Raises Unreachable, with the residual in m and rad, where there are none.
+        """
+        seed = self.state().q if q_seed is None else np.asarray(q_seed, float)
+        return self.kinematics.solve(pose, seed)
+
+    def control(
+        self,
+        *,
+        deadman: Deadman | None = None,
+        rate_hz: float = 50.0,
+        speed: float | None = None,
+        tcp_speed: float | None = None,
+        unattended: bool = False,
+    ) -> Control:
+        """A session in which this arm follows commands; use it in a ``with`` statement.
+
+        ``deadman`` lets it move only while held, ``rate_hz`` says how often commands will come (and so, when they
+        are late), ``speed`` is a share of the joint speed limits (the rig's own by default, which it cannot exceed),
+        ``tcp_speed`` a speed in m/s. An arm that really moves needs a dead-man or ``unattended=True``.
+        """
+        from .control import Control
+
+        return Control(
+            self, deadman=deadman, rate_hz=rate_hz, speed=speed, tcp_speed=tcp_speed, unattended=unattended
+        )
+
+    def move_to(
+        self,
+        target: ArrayLike | Pose,
+        *,
+        deadman: Deadman | None = None,
+        unattended: bool = False,
+        speed: float | None = None,
+        tcp_speed: float | None = None,
+        timeout: float | None = None,
+    ) -> RobotState:
+        """Move to joint positions (n,) or to a tcp pose in the base frame, straight in joint space; blocks.
+
+        ``speed`` is a share of the joint speed limits (``move_speed`` of the rig, 0.1, by default); the tcp stays
+        below the rig's ``tcp_speed`` as well. With a dead-man it waits until that is held, and pauses while it is
+        not. Raises CommandError, Unreachable, MotionStopped after a trip, and TimeoutError after ``timeout`` s.
+        """
+        from .control import move_to
+
+        return move_to(
+            self, target, deadman=deadman, unattended=unattended, speed=speed, tcp_speed=tcp_speed, timeout=timeout
+        )
+
+    def recover(self) -> None:
+        """Clear a fault of the device. It is always the user's own act."""
+        self._host.request("recover", {"robot": self.name})
+
+    def inject(self, **knobs: object) -> None:
+        """Switch faults of a simulated driver on or off, for tests; the driver's ``inject`` lists its knobs."""
+        self._host.request("inject", {"robot": self.name, "device": "robot", "knobs": knobs})
+
+    def __repr__(self) -> str:
+        return f"<Robot {self.name}: {self.spec.model}, {self.n} joints, driver {self.spec.driver}>"

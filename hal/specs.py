@@ -1,0 +1,254 @@
+"""What a driver is made from: plain, checked, resolved records, with no configuration file behind them.
+
+The rig's configuration (:mod:`hal.config`) is resolved into these once. They travel as JSON to the process that owns
+a device (:func:`to_json`, :func:`from_json`), so they hold only numbers, texts, tuples and each other.
+"""
+
+from __future__ import annotations
+
+import types as _types
+import typing
+from dataclasses import asdict, dataclass, field, fields, is_dataclass
+from typing import Any, TypeVar
+
+__all__ = [
+    "BodySpec",
+    "CameraSpec",
+    "GripperSpec",
+    "GroupSpec",
+    "KinematicsSpec",
+    "LimitsSpec",
+    "PadSpec",
+    "RobotSpec",
+    "ViewSpec",
+    "WorkspaceSpec",
+    "WorldSpec",
+    "from_json",
+    "to_json",
+]
+
+Floats = tuple[float, ...]
+Vector3 = tuple[float, float, float]
+Quaternion = tuple[float, float, float, float]
+
+
+@dataclass(frozen=True)
+class LimitsSpec:
+    """Limits per joint, each (n,): rad, rad/s, rad/s2, rad/s3, Nm."""
+
+    lower: Floats
+    upper: Floats
+    velocity: Floats
+    acceleration: Floats
+    jerk: Floats
+    torque: Floats | None = None
+
+
+@dataclass(frozen=True)
+class KinematicsSpec:
+    """What forward and inverse kinematics need."""
+
+    urdf: str
+    """Absolute path."""
+    joints: tuple[str, ...]
+    """Names of the arm's joints, from base to tip; all others are held at zero."""
+    lower: Floats
+    upper: Floats
+    home: Floats
+    """Null-space posture, rad."""
+    base_link: str | None
+    """Link whose frame is the arm's base frame; the URDF's root when None."""
+    tcp_link: str
+    tcp_position: Vector3
+    """Tool centre point in the frame of ``tcp_link``, m."""
+    tcp_orientation: Quaternion
+
+
+@dataclass(frozen=True)
+class WorkspaceSpec:
+    """Where the tcp may be, in the arm's base frame, m."""
+
+    lower: Vector3
+    upper: Vector3
+
+
+@dataclass(frozen=True)
+class GripperSpec:
+    """A parallel gripper."""
+
+    name: str
+    driver: str
+    width_max: float
+    """m"""
+    speed: float
+    """Default and greatest speed of the width, m/s."""
+    force: float
+    """Default grip force, N."""
+    joints: tuple[str, ...] = ()
+    """Finger joints in the arm's URDF; each moves half the width."""
+    options: dict[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class RobotSpec:
+    """One arm on a rig."""
+
+    name: str
+    model: str
+    driver: str
+    rate_hz: float
+    """Rate of the servo and of the driver's cycle."""
+    urdf: str
+    joints: tuple[str, ...]
+    home: Floats
+    initial: Floats
+    """Joint positions at the start of a simulation, rad."""
+    limits: LimitsSpec
+    kinematics: KinematicsSpec
+    base_position: Vector3
+    base_orientation: Quaternion
+    """Pose of the base link in the world."""
+    gripper: GripperSpec | None = None
+    workspace: WorkspaceSpec | None = None
+    speed: float = 0.3
+    """Greatest share of the joint speed limits in a control session."""
+    move_speed: float = 0.1
+    """Share of the joint speed limits in ``move_to`` unless told otherwise."""
+    tcp_speed: float = 0.25
+    """Greatest speed of the tcp, m/s."""
+    attended: bool = False
+    """True where something real moves: a person must be there (a dead-man, or ``unattended=True``)."""
+    deadline_max: float = 1.0
+    """Longest deadline that a command may have, s (0.3 where something real moves)."""
+    options: dict[str, Any] = field(default_factory=dict)
+    """What only this driver needs (``real:`` or ``simulated:`` of the rig's file)."""
+
+
+@dataclass(frozen=True)
+class BodySpec:
+    """A thing in the simulated world that is not a robot."""
+
+    name: str
+    position: Vector3
+    orientation: Quaternion
+    shape: str
+    """``box``, ``sphere``, ``cylinder``, ``capsule``, ``plane`` or ``urdf``."""
+    half_extents: Vector3 | None = None
+    """Box, m."""
+    radius: float | None = None
+    length: float | None = None
+    """Of a cylinder, and of a capsule without its caps, m."""
+    urdf: str | None = None
+    scale: float = 1.0
+    mass: float = 0.0
+    """kg; 0 stands still. A URDF brings its own."""
+    fixed: bool = False
+    rgba: tuple[float, float, float, float] = (0.7, 0.7, 0.7, 1.0)
+    collision: bool = True
+    visible: bool = True
+
+
+@dataclass(frozen=True)
+class ViewSpec:
+    """Where a camera is: fixed in the world, or attached to a link of a robot.
+
+    The pose is that of the camera's optical frame (OpenCV's axes: x right, y down, z forward) in the world, or in
+    the frame of the link.
+    """
+
+    position: Vector3
+    orientation: Quaternion
+    robot: str | None = None
+    link: str | None = None
+
+
+@dataclass(frozen=True)
+class CameraSpec:
+    """One camera on a rig."""
+
+    name: str
+    model: str
+    driver: str
+    capture_width: int
+    capture_height: int
+    width: int
+    """Of the frames handed out, after the centre crop and the scaling, pixels."""
+    height: int
+    rate_hz: float
+    K: tuple[Vector3, Vector3, Vector3]
+    """Of the frames handed out; the centre of the upper left pixel is (0, 0)."""
+    distortion: Floats
+    depth_min: float
+    """Nearest and farthest depth that the camera measures, m; outside it reports 0."""
+    depth_max: float
+    streams: tuple[str, ...]
+    """Some of ``color``, ``depth``, ``infrared``, ``segmentation``."""
+    view: ViewSpec | None
+    options: dict[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class PadSpec:
+    """One gamepad on a rig."""
+
+    name: str
+    driver: str
+    model: dict[str, Any] | None
+    """A pad model as in ``sensors/gamepads``, or None to choose one by the device that is found."""
+    models: tuple[dict[str, Any], ...] = ()
+    """All known pad models, to choose from."""
+    dead_zone: float = 0.08
+    options: dict[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class GroupSpec:
+    """What shares one clock and one process: all simulated devices of a rig, or one real arm."""
+
+    name: str
+    clock: str
+    """``real_time`` or ``lock_step``."""
+    rate_hz: float
+    robots: tuple[RobotSpec, ...]
+    world: WorldSpec | None = None
+
+
+@dataclass(frozen=True)
+class WorldSpec:
+    """The simulated world of a rig."""
+
+    driver: str
+    physics_hz: float
+    gravity: Vector3
+    bodies: tuple[BodySpec, ...]
+    robots: tuple[RobotSpec, ...]
+    """Every arm that stands in the world."""
+
+
+_T = TypeVar("_T")
+
+
+def to_json(spec: Any) -> dict[str, Any]:
+    """A spec as plain lists, dicts and numbers."""
+    return asdict(spec)
+
+
+def from_json(cls: type[_T], data: dict[str, Any]) -> _T:
+    """The inverse of :func:`to_json`."""
+    hints = typing.get_type_hints(cls)
+    return cls(**{f.name: _revive(hints[f.name], data[f.name]) for f in fields(cls) if f.name in data})  # type: ignore[arg-type]
+
+
+def _revive(hint: Any, value: Any) -> Any:
+    if value is None:
+        return None
+    origin = typing.get_origin(hint)
+    if origin in (typing.Union, _types.UnionType):
+        return _revive(next(a for a in typing.get_args(hint) if a is not type(None)), value)
+    if is_dataclass(hint) and isinstance(hint, type):
+        return from_json(hint, value)
+    if origin is tuple:
+        args = typing.get_args(hint)
+        inner = args[0] if len(args) == 2 and args[1] is Ellipsis else None
+        return tuple(_revive(inner or args[k], item) for k, item in enumerate(value))
+    return value
