@@ -59,8 +59,8 @@ class DriverSpec:
     """A copy of that world that shows published states and is never stepped."""
     viewer: str | None = None
     """A window onto a mirror."""
-    render_worker: str | None = None
-    """The process that draws the pictures of simulated cameras."""
+    pictures: str | None = None
+    """What draws the pictures of all simulated cameras of a rig."""
     requires: Mapping[str, str] = field(default_factory=dict)
     """Import name of each library that the driver needs -> the command that installs it."""
 

@@ -1,0 +1,146 @@
+"""Drivers by name: built in, installed by somebody else, named directly, missing."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from hal import registry
+from hal.errors import DeviceNotFound, DriverMissing, NotSupported
+from hal.registry import DriverSpec
+from hal.robot import RobotDriver
+
+DRIVERS = Path(__file__).parents[2] / "drivers"
+
+
+@pytest.fixture
+def lab(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """A folder on sys.path, as site-packages is, whose modules are forgotten afterwards."""
+    before = set(sys.modules)
+    monkeypatch.syspath_prepend(tmp_path)
+    yield tmp_path
+    for name in set(sys.modules) - before:
+        if name.startswith("lab_"):
+            del sys.modules[name]
+
+
+def install(folder: Path, name: str, module: str, text: str) -> None:
+    """What pip leaves behind for a package with one entry point and one module."""
+    (folder / f"{module}.py").write_text(text)
+    info = folder / f"{module}-1.0.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {module}\nVersion: 1.0\n")
+    (info / "entry_points.txt").write_text(f"[hal.drivers]\n{name} = {module}:DRIVER\n")
+
+
+def test_every_driver_folder_is_in_the_table_and_resolves() -> None:
+    folders = {path.parent.name for path in DRIVERS.glob("*/__init__.py")}
+    assert set(registry.BUILT_IN) == folders
+    for name in folders:
+        spec = registry.driver(name)
+        assert spec.name == name
+        assert spec.kinds
+
+
+def test_the_mock_robot_is_a_robot_driver() -> None:
+    assert issubclass(registry.load("mock", "robot"), RobotDriver)
+
+
+def test_nothing_is_imported_before_it_is_asked_for() -> None:
+    code = (
+        "import sys, hal.registry as r; r.driver('mock');"
+        "print([m for m in sys.modules if m.startswith(('hal.drivers.mock.', 'importlib.metadata', 'pybullet'))])"
+    )
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=60)
+    assert result.stdout.strip() == "[]"
+
+
+def test_an_unknown_driver_lists_the_drivers_and_the_nearest_spelling() -> None:
+    with pytest.raises(DeviceNotFound, match=r"did you mean 'pybullet'\?.*evdev, mock, playback, pybullet"):
+        registry.load("pybulet", "robot")
+
+
+def test_a_kind_that_a_driver_lacks_lists_what_it_has() -> None:
+    with pytest.raises(NotSupported, match="'mock' has no world; it has: robot, gripper, camera, gamepad"):
+        registry.load("mock", "world")
+    with pytest.raises(NotSupported, match="did you mean 'gripper'"):
+        registry.load("mock", "griper")
+
+
+def test_a_third_partys_driver_through_its_entry_point(lab: Path) -> None:
+    install(
+        lab,
+        "lab_arm",
+        "lab_arm_driver",
+        "from hal.registry import DriverSpec\n"
+        "DRIVER = DriverSpec('lab_arm', robot='lab_arm_driver:Arm')\n"
+        "class Arm: pass\n",
+    )
+    assert "lab_arm" in registry.names()
+    assert "lab_arm_driver" not in sys.modules, "names() must not import drivers"
+    assert registry.driver("lab_arm").kinds == ("robot",)
+    assert registry.load("lab_arm", "robot").__name__ == "Arm"
+
+
+def test_a_third_party_cannot_replace_a_built_in_driver(lab: Path) -> None:
+    install(lab, "mock", "lab_impostor", "raise RuntimeError('imported')\n")
+    assert registry.load("mock", "robot").__module__ == "hal.drivers.mock.robot"
+
+
+def test_a_driver_named_directly(lab: Path) -> None:
+    (lab / "lab_direct.py").write_text(
+        "from hal.registry import DriverSpec\n"
+        "DRIVER = DriverSpec('direct', camera='lab_direct:Camera')\n"
+        "class Camera: pass\n"
+    )
+    assert registry.load("lab_direct:DRIVER", "camera").__name__ == "Camera"
+
+
+def test_a_missing_vendor_library_names_the_command(lab: Path) -> None:
+    (lab / "lab_vendor.py").write_text(
+        "from hal.registry import DriverSpec\n"
+        "DRIVER = DriverSpec('v', robot='lab_vendor_arm:Arm', requires={'no_such_vendor': 'pip install vendor-sdk'})\n"
+    )
+    (lab / "lab_vendor_arm.py").write_text("import no_such_vendor.core\nclass Arm: pass\n")
+    assert registry.missing("lab_vendor:DRIVER") == {"no_such_vendor": "pip install vendor-sdk"}
+    with pytest.raises(DriverMissing, match="no_such_vendor.*pip install vendor-sdk") as caught:
+        registry.load("lab_vendor:DRIVER", "robot")
+    assert isinstance(caught.value, ImportError)
+    assert isinstance(caught.value.__cause__, ModuleNotFoundError)
+
+
+def test_a_library_that_is_installed_is_not_missing(lab: Path) -> None:
+    (lab / "lab_fine.py").write_text(
+        "from hal.registry import DriverSpec\n"
+        "DRIVER = DriverSpec('f', robot='x:Y', requires={'numpy': 'pip install numpy'})\n"
+    )
+    assert registry.missing("lab_fine:DRIVER") == {}
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("DRIVER = 'lab'", "is a str, not a hal.registry.DriverSpec"),
+        ("", "has no 'DRIVER'"),
+        ("import no_such_thing", "no_such_thing"),
+    ],
+)
+def test_a_package_that_announces_nonsense(lab: Path, text: str, message: str) -> None:
+    install(lab, "lab_broken", "lab_broken_driver", text)
+    with pytest.raises(DriverMissing, match=message):
+        registry.driver("lab_broken")
+
+
+def test_an_error_in_a_drivers_own_code_is_not_hidden(lab: Path) -> None:
+    (lab / "lab_bug.py").write_text("1 / 0\n")
+    with pytest.raises(ZeroDivisionError):
+        registry.driver("lab_bug:DRIVER")
+
+
+def test_a_spec_knows_its_kinds() -> None:
+    assert DriverSpec("x", camera="a:B", viewer="a:C").kinds == ("camera", "viewer")
+    assert DriverSpec("x").kinds == ()
