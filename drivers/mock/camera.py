@@ -1,0 +1,169 @@
+"""A camera in memory, whose pictures say which frame they are."""
+
+from __future__ import annotations
+
+import math
+import time
+from typing import ClassVar, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hal.camera import CameraDriver, RawFrame
+from hal.clock import Clock, RealClock
+from hal.errors import CommandError, ConnectionLost
+from hal.pose import Pose
+from hal.specs import CameraSpec
+
+from .knobs import CameraKnobs, turned
+
+__all__ = ["PLANE", "SQUARE", "STEP", "MockCamera", "Written", "read_picture"]
+
+PLANE = 1.0
+"""Distance of the background from the camera, m (or the camera's farthest depth, where that is nearer)."""
+SQUARE = 16
+"""Edge of the square that moves over the picture, pixels; it is 0.1 m nearer than the background."""
+STEP = 4
+"""How far the square moves from frame to frame, pixels."""
+_HEAD = 12  # bytes of a picture that hold its number and its time
+
+
+class Written(NamedTuple):
+    """What a mock picture says about itself."""
+
+    seq: int
+    t: float
+    """s, to a microsecond."""
+
+
+def read_picture(color: NDArray[np.uint8]) -> Written:
+    """Which frame a mock picture is: its number and its time, written into its first four pixels.
+
+    Lets a test prove that a picture went unharmed, and unmixed, through whatever handles it (no lossy compression).
+    """
+    head = np.ascontiguousarray(color).reshape(-1)[:_HEAD].tobytes()
+    return Written(int.from_bytes(head[:4], "little"), int.from_bytes(head[4:], "little", signed=True) / 1e6)
+
+
+class MockCamera(CameraDriver):
+    """A camera in memory that looks at a plane, with a bright square moving to the right before it.
+
+    ``source`` is the rig's clock. In real time, frames come at the camera's rate, counted from ``open``. In lock-step
+    each ``grab`` is a new frame of the present time, at once; without a clock, one of a period later than the last.
+    The frame's number and time stand in the colour picture, see :func:`read_picture`. In the segmentation the square
+    is body 0. Faults: :class:`~hal.drivers.mock.knobs.CameraKnobs`.
+    """
+
+    simulated: ClassVar[bool] = True
+
+    def __init__(self, spec: CameraSpec, source: object | None = None) -> None:
+        super().__init__(spec, source)
+        if spec.width * spec.height * 3 < _HEAD:
+            raise CommandError(f"camera {spec.name!r}: a mock picture needs 4 pixels, not {spec.width}x{spec.height}")
+        self.knobs = CameraKnobs()
+        self.is_open = False
+        self._clock = source if isinstance(source, Clock) else None
+        self._waits = isinstance(source, RealClock)
+        self._t_open = 0.0
+        self._last = 0  # number of the newest frame handed out
+        self._view = None
+        if spec.view is not None and spec.view.robot is None:  # an attached camera goes where its arm goes
+            self._view = Pose(spec.view.position, spec.view.orientation)
+
+    def open(self) -> None:
+        self._answer()
+        if self.is_open:
+            return
+        self.is_open = True
+        self._last = 0
+        self._t_open = self._clock.now() if self._clock else 0.0
+
+    def grab(self, timeout: float) -> RawFrame | None:
+        if not self.is_open:
+            raise ConnectionLost(f"camera {self.spec.name!r} is not open")
+        deadline = time.monotonic() + (timeout if self._waits else 0.0)
+        while True:
+            self._answer()
+            seq = self._newest()
+            if seq > self._last:
+                return self._take(seq)
+            rest = deadline - time.monotonic()
+            if rest <= 0.0:
+                return None
+            time.sleep(min(rest, 0.25 / self.spec.rate_hz))
+
+    def _newest(self) -> int:
+        """Number of the newest frame that may be handed out; the first is 1."""
+        if self.knobs.freeze:
+            return self._last
+        if self._clock is None or not self._waits:
+            seq = self._last + 1
+            if self._lost(seq):
+                seq += 1
+        else:
+            age = self._clock.now() - self._t_open - self.knobs.delay_s
+            seq = max(0, math.floor(age * self.spec.rate_hz + 1e-6) + 1)  # the 1e-6 absorbs the rounding of a period
+        return self._last if self._lost(seq) else seq
+
+    def _lost(self, seq: int) -> bool:
+        return self.knobs.drop > 0 and seq % self.knobs.drop == 0
+
+    def _take(self, seq: int) -> RawFrame:
+        t = self._t_open + (seq - 1) / self.spec.rate_hz
+        if self._clock is not None and not self._waits:
+            t = self._clock.now() - self.knobs.delay_s
+        self._last = seq
+        color, depth, infrared, segmentation = self._draw(seq, t)
+        wanted = self.spec.streams
+        if self.knobs.garbage == "shape":
+            color, depth, infrared, segmentation = color[:-1], depth[:-1], infrared[:-1], segmentation[:-1]
+        elif self.knobs.garbage == "nan":
+            depth = np.full_like(depth, np.nan)
+        return RawFrame(
+            t=t,
+            t_device=t - self._t_open,
+            seq=seq,
+            color=color if "color" in wanted else None,
+            depth=depth if "depth" in wanted else None,
+            infrared=infrared if "infrared" in wanted else None,
+            segmentation=segmentation if "segmentation" in wanted else None,
+            T_world_camera=self._view,
+        )
+
+    def _draw(
+        self, seq: int, t: float
+    ) -> tuple[NDArray[np.uint8], NDArray[np.float32], NDArray[np.uint8], NDArray[np.int32]]:
+        spec, width, height = self.spec, self.spec.width, self.spec.height
+        plane = min(PLANE, spec.depth_max)
+        near = max(plane - 0.1, spec.depth_min)
+        color = np.empty((height, width, 3), np.uint8)
+        color[..., 0] = np.linspace(0, 200, width, dtype=np.uint8)
+        color[..., 1] = np.linspace(0, 200, height, dtype=np.uint8)[:, None]
+        color[..., 2] = 40
+        depth = np.full((height, width), plane, np.float32)
+        segmentation = np.full((height, width), -1, np.int32)
+        top, left = (height - min(SQUARE, height)) // 2, (seq * STEP) % width
+        square = (slice(top, top + SQUARE), slice(left, left + SQUARE))
+        color[square], depth[square], segmentation[square] = 255, near, 0
+        infrared = color.mean(axis=2).astype(np.uint8)
+        head = seq.to_bytes(4, "little") + round(t * 1e6).to_bytes(8, "little", signed=True)
+        color.reshape(-1)[:_HEAD] = np.frombuffer(head, np.uint8)
+        return color, depth, infrared, segmentation
+
+    def inject(self, **knobs: object) -> None:
+        """Turn knobs (:class:`~hal.drivers.mock.knobs.CameraKnobs`); those not named stay as they are.
+
+        Raises CommandError for a knob that does not exist, or a value that it cannot have.
+        """
+        self.knobs = turned(self.knobs, knobs)
+
+    def clear(self) -> None:
+        """Turn every knob back to harmless."""
+        self.knobs = CameraKnobs()
+
+    def close(self) -> None:
+        self.is_open = False
+
+    def _answer(self) -> None:
+        if self.knobs.disconnect:
+            raise ConnectionLost(f"camera {self.spec.name!r} does not answer (the mock's knob 'disconnect')")

@@ -1,0 +1,145 @@
+"""A gamepad in memory, held by a test instead of a hand."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterable, Mapping
+from types import MappingProxyType
+from typing import ClassVar
+
+from hal.errors import CommandError
+from hal.gamepad import GamepadDriver, PadReading
+from hal.specs import PadSpec
+from hal.types import AXES, BUTTONS
+
+from .knobs import PadKnobs, turned
+
+__all__ = ["MockPad"]
+
+_TRIGGERS = ("l2", "r2")
+_TRIGGER_PRESSED = 0.1  # a trigger is also a button; it counts as pressed from this travel on
+
+
+class MockPad(GamepadDriver):
+    """A pad whose sticks and buttons a test moves: ``press``, ``release``, ``stick``, ``set``.
+
+    A change becomes an event at the next ``poll``, with that poll's time. The triggers are axis and button in one, as
+    on a real pad: pressing ``l2`` pulls its axis to 1, and pulling its axis presses it. They may be moved from
+    another thread than that of ``poll``. Faults: :class:`~hal.drivers.mock.knobs.PadKnobs`.
+    """
+
+    simulated: ClassVar[bool] = True
+    proves_liveness: bool = True
+
+    def __init__(self, spec: PadSpec, source: object | None = None) -> None:
+        super().__init__(spec, source)
+        self.knobs = PadKnobs()
+        self.is_open = False
+        self._axes = dict.fromkeys(AXES, 0.0)
+        self._buttons: frozenset[str] = frozenset()
+        self._lock = threading.Lock()
+        self._news = threading.Event()
+        self._t_first: float | None = None
+        self._reading: PadReading | None = None
+
+    # What the hand does.
+
+    def press(self, *buttons: str) -> None:
+        """Press buttons (of ``hal.types.BUTTONS``) and keep them pressed. CommandError for a name that no pad has."""
+        self._hold(buttons, True)
+
+    def release(self, *buttons: str) -> None:
+        """Let go of buttons. CommandError for a name that no pad has."""
+        self._hold(buttons, False)
+
+    def stick(self, axis: str, value: float) -> None:
+        """Move one axis (of ``hal.types.AXES``): -1..1, triggers 0..1. CommandError for anything else."""
+        self.set(axes={axis: value})
+
+    def set(self, axes: Mapping[str, float] | None = None, buttons: Iterable[str] | None = None) -> None:
+        """Move the named axes, and press exactly these buttons; what is None stays as it is.
+
+        Raises CommandError for a name that no pad has or a value out of range; then nothing changes.
+        """
+        wanted = None if buttons is None else frozenset(buttons)
+        _check(axes or {}, wanted or frozenset())
+        with self._lock:
+            if wanted is not None:
+                self._buttons = wanted
+                self._axes.update({name: float(name in wanted) for name in _TRIGGERS})
+            for name, value in (axes or {}).items():
+                self._axes[name] = float(value)
+                if name in _TRIGGERS:
+                    pressed = value >= _TRIGGER_PRESSED
+                    self._buttons = self._buttons | {name} if pressed else self._buttons - {name}
+        self._news.set()
+
+    def _hold(self, buttons: tuple[str, ...], pressed: bool) -> None:
+        _check({}, buttons)
+        with self._lock:
+            self._buttons = self._buttons.union(buttons) if pressed else self._buttons.difference(buttons)
+            self._axes.update({name: float(pressed) for name in _TRIGGERS if name in buttons})
+        self._news.set()
+
+    # The driver.
+
+    def open(self) -> None:
+        self.is_open = True
+
+    def poll(self, now: float, timeout: float) -> PadReading:
+        if timeout > 0.0:
+            self._news.wait(timeout)
+        self._news.clear()
+        if self._t_first is None:
+            self._t_first = now
+        last = self._reading
+        if self.knobs.freeze and last is not None:
+            return last
+        with self._lock:
+            axes, buttons = dict(self._axes), self._buttons
+        connected = self.is_open and not self.knobs.disconnect
+        if not connected:
+            axes, buttons = dict.fromkeys(AXES, 0.0), frozenset()
+        changed = last is None or (last.axes, last.buttons, last.connected) != (axes, buttons, connected)
+        t = now if changed or last is None else last.t
+        self._reading = PadReading(
+            t=t,
+            t_alive=now if connected else (last.t_alive if last is not None else float("-inf")),
+            t_device=t - self._t_first,
+            seq=(last.seq if last is not None else 0) + int(changed),
+            axes=MappingProxyType(axes),
+            buttons=buttons,
+            connected=connected,
+        )
+        return self._reading
+
+    def describe(self) -> str:
+        return "a mock pad"
+
+    def inject(self, **knobs: object) -> None:
+        """Turn knobs (:class:`~hal.drivers.mock.knobs.PadKnobs`); those not named stay as they are.
+
+        Raises CommandError for a knob that does not exist, or a value that it cannot have.
+        """
+        self.knobs = turned(self.knobs, knobs)
+        self._news.set()
+
+    def clear(self) -> None:
+        """Turn every knob back to harmless: the pad is plugged in and speaks."""
+        self.knobs = PadKnobs()
+        self._news.set()
+
+    def close(self) -> None:
+        self.is_open = False
+
+
+def _check(axes: Mapping[str, float], buttons: Iterable[str]) -> None:
+    for name in buttons:
+        if name not in BUTTONS:
+            raise CommandError(f"{name!r} is no button; buttons: {', '.join(BUTTONS)}")
+    for name, value in axes.items():
+        if name not in AXES:
+            raise CommandError(f"{name!r} is no axis; axes: {', '.join(AXES)}")
+        lowest = 0.0 if name in _TRIGGERS else -1.0
+        if not lowest <= value <= 1.0:
+            raise CommandError(f"{name} goes from {lowest:g} to 1, not {value!r}")

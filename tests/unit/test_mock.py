@@ -1,0 +1,459 @@
+"""The mock devices: ideal without a knob turned, and wrong in exactly the way that a knob says."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from hal.clock import LockStepClock, RealClock
+from hal.drivers.mock.camera import STEP, MockCamera, read_picture
+from hal.drivers.mock.gamepad import MockPad
+from hal.drivers.mock.gripper import MockGripper
+from hal.drivers.mock.robot import MockRobot
+from hal.errors import CommandError, ConnectionLost
+from hal.robot import Setpoint
+from hal.specs import CameraSpec, GripperSpec, PadSpec, RobotSpec
+
+HERE = (0.1, -0.2, 0.3)  # robot_spec.initial
+ZERO = (0.0, 0.0, 0.0)
+
+
+def at(x: float) -> Setpoint:
+    """All joints at x rad, moving at 0.5 rad/s."""
+    return Setpoint((x,) * 3, (0.5,) * 3, ZERO)
+
+
+@pytest.fixture
+def arm(robot_spec: RobotSpec) -> MockRobot:
+    arm = MockRobot(robot_spec)
+    arm.open()
+    return arm
+
+
+@pytest.fixture
+def hand(gripper_spec: GripperSpec) -> MockGripper:
+    hand = MockGripper(gripper_spec)
+    hand.open()
+    hand.read(0.0)
+    return hand
+
+
+@pytest.fixture
+def camera(camera_spec: CameraSpec) -> MockCamera:
+    camera = MockCamera(camera_spec)
+    camera.open()
+    return camera
+
+
+@pytest.fixture
+def pad(pad_spec: PadSpec) -> MockPad:
+    pad = MockPad(pad_spec)
+    pad.open()
+    pad.poll(0.0, 0.0)
+    return pad
+
+
+# Robot.
+
+
+def test_robot_is_where_the_last_set_point_was(arm: MockRobot) -> None:
+    first = arm.read(5.0)
+    assert (first.q, first.dq, first.t, first.t_device) == (HERE, ZERO, 5.0, 0.0)
+    arm.write(at(0.4))
+    second = arm.read(5.01)
+    assert second.q == second.q_commanded == (0.4,) * 3
+    assert second.dq == (0.5,) * 3
+    assert second.seq == first.seq + 1
+    assert second.t_device == pytest.approx(0.01)
+    third = arm.read(5.02)
+    assert (third.q, third.dq) == ((0.4,) * 3, ZERO), "an arm that gets no new set-point rests at the last one"
+
+
+def test_robot_logs_every_set_point(arm: MockRobot) -> None:
+    arm.inject(drop=2)
+    arm.read(0.0)
+    for x in (0.1, 0.2, 0.3):
+        arm.write(at(x))
+    assert [setpoint.q[0] for setpoint in arm.log] == [0.1, 0.2, 0.3]
+
+
+def test_robot_delay(arm: MockRobot) -> None:
+    arm.inject(delay_s=0.025)
+    qs = []
+    for k in range(6):
+        reading = arm.read(0.01 * k)
+        qs.append(reading.q[0])
+        arm.write(at(float(k + 1)))
+    # Written after the reading at 0.00 s, due at 0.025 s: seen first at 0.03 s.
+    assert qs == [0.1, 0.1, 0.1, 1.0, 2.0, 3.0]
+    assert arm.read(0.06).q_commanded == (6.0,) * 3, "what the arm took is not delayed"
+
+
+def test_robot_drop(arm: MockRobot) -> None:
+    arm.inject(drop=3)
+    taken = []
+    for k in range(6):
+        arm.write(at(float(k)))
+        taken.append(arm.read(0.01 * k).q_commanded[0])  # type: ignore[index]
+    assert taken == [0.0, 1.0, 1.0, 3.0, 4.0, 4.0]
+
+
+def test_robot_freeze(arm: MockRobot) -> None:
+    before = arm.read(0.0)
+    arm.inject(freeze=True)
+    arm.write(at(0.4))
+    assert arm.read(0.01) is before
+    arm.inject(freeze=False)
+    after = arm.read(0.02)
+    assert after.q == (0.4,) * 3, "the arm went on while its readings stood still"
+    assert after.seq == before.seq + 1
+
+
+@pytest.mark.parametrize(
+    ("error", "expected"),
+    [(0.02, (0.42, 0.42, 0.42)), ((0.0, 0.1, -0.1), (0.4, 0.5, 0.3)), (np.array([0.0, 0.1, -0.1]), (0.4, 0.5, 0.3))],
+)
+def test_robot_following_error(arm: MockRobot, error: object, expected: tuple[float, ...]) -> None:
+    arm.inject(following_error=error)
+    arm.read(0.0)
+    arm.write(at(0.4))
+    reading = arm.read(0.01)
+    assert reading.q == pytest.approx(expected)
+    assert reading.q_commanded == (0.4,) * 3
+
+
+def test_robot_disconnect(arm: MockRobot) -> None:
+    arm.inject(delay_s=0.1)
+    arm.read(0.0)
+    arm.write(at(0.4))
+    arm.inject(disconnect=True)
+    calls: list[Callable[[], object]] = [arm.open, lambda: arm.read(0.1), lambda: arm.write(at(1.0)), arm.halt]
+    for call in calls:
+        with pytest.raises(ConnectionLost, match="'arm' does not answer"):
+            call()
+    arm.close()
+    arm.inject(disconnect=False)
+    arm.open()
+    assert arm.read(1.0).q == HERE, "it stopped where it was when the connection broke"
+
+
+@pytest.mark.parametrize("kind", ["nan", "inf", "short"])
+def test_robot_garbage(arm: MockRobot, kind: str) -> None:
+    arm.inject(garbage=kind)
+    q = arm.read(0.0).q
+    assert len(q) == (2 if kind == "short" else 3)
+    assert all(math.isfinite(x) for x in q) == (kind == "short")
+    arm.clear()
+    assert arm.read(0.1).q == HERE
+
+
+def test_robot_fault(arm: MockRobot) -> None:
+    arm.read(0.0)
+    arm.write(at(0.4))
+    arm.read(0.01)
+    arm.inject(fault="joint 2 is too hot")
+    arm.write(at(0.5))
+    reading = arm.read(0.02)
+    assert reading.fault is not None
+    assert reading.fault.cause == "joint 2 is too hot"
+    assert "recover" in reading.fault.remedy
+    assert reading.q == reading.q_commanded == (0.4,) * 3, "a faulted arm takes no set-points"
+    arm.recover()
+    arm.write(at(0.5))
+    reading = arm.read(0.03)
+    assert (reading.fault, reading.q) == (None, (0.5,) * 3)
+
+
+def test_robot_reports_the_forces_it_is_told(arm: MockRobot) -> None:
+    assert arm.read(0.0).tau_ext is None
+    arm.inject(tau_ext=(1.0, 2.0, 3.0), wrench_ext=(0.0, 0.0, -5.0, 0.0, 0.0, 0.0))
+    reading = arm.read(0.1)
+    assert reading.tau_ext == (1.0, 2.0, 3.0)
+    assert reading.wrench_ext == (0.0, 0.0, -5.0, 0.0, 0.0, 0.0)
+
+
+def test_robot_halt_drops_what_was_still_due(arm: MockRobot) -> None:
+    arm.inject(delay_s=0.1)
+    arm.read(0.0)
+    arm.write(at(0.4))
+    arm.halt()
+    assert arm.read(1.0).q == HERE
+    assert arm.read(1.1).q_commanded == HERE
+
+
+# Knobs.
+
+
+@pytest.mark.parametrize(
+    ("knobs", "message"),
+    [
+        ({"frezee": True}, "did you mean 'freeze'.*knobs: delay_s, drop"),
+        ({"freeze": 1}, "freeze must be True or False"),
+        ({"drop": -1}, "drop must be a count"),
+        ({"drop": 1.5}, "drop must be a count"),
+        ({"delay_s": -0.1}, "delay_s must be seconds"),
+        ({"garbage": "noise"}, "garbage must be one of nan, inf, short"),
+        ({"following_error": (0.1, 0.1)}, "following_error must have 3 numbers, not 2"),
+        ({"wrench_ext": (0.1, 0.1)}, "wrench_ext must have 6 numbers, not 2"),
+    ],
+)
+def test_a_wrong_knob_is_refused_and_changes_nothing(arm: MockRobot, knobs: dict[str, object], message: str) -> None:
+    before = arm.knobs
+    with pytest.raises(CommandError, match=message):
+        arm.inject(delay_s=0.5, **knobs) if "delay_s" not in knobs else arm.inject(**knobs)
+    assert arm.knobs == before
+
+
+def test_knobs_that_are_not_named_stay(arm: MockRobot) -> None:
+    arm.inject(drop=3)
+    arm.inject(delay_s=0.1)
+    assert (arm.knobs.drop, arm.knobs.delay_s) == (3, 0.1)
+
+
+# Gripper.
+
+
+def test_gripper_moves_at_its_speed(hand: MockGripper) -> None:
+    assert hand.read(0.0).width == 0.08
+    hand.move(0.02, 0.1, 10.0)
+    half_way = hand.read(0.3)
+    assert (half_way.width, half_way.moving, half_way.width_target) == (pytest.approx(0.05), True, 0.02)
+    there = hand.read(0.7)
+    assert (there.width, there.moving, there.grasped) == (0.02, False, False)
+    hand.move(0.04, 0.1, 10.0)
+    assert hand.read(0.8).width == pytest.approx(0.03)
+
+
+def test_gripper_brings_commands_into_its_range(hand: MockGripper) -> None:
+    hand.move(-1.0, 99.0, 10.0)
+    assert hand.read(0.1).width == pytest.approx(0.07), "no faster than its greatest speed"
+    assert hand.read(10.0).width == 0.0
+    hand.move(1.0, 0.1, 10.0)
+    assert hand.read(20.0).width == 0.08
+
+
+def test_gripper_the_newest_command_wins(hand: MockGripper) -> None:
+    hand.move(0.0, 0.1, 10.0)
+    hand.read(0.1)
+    hand.move(0.08, 0.1, 10.0)
+    assert hand.read(0.2).width == 0.08
+
+
+def test_gripper_holds_an_object_and_keeps_it_through_stop_and_close(hand: MockGripper) -> None:
+    hand.inject(object_width=0.03)
+    hand.move(0.0, 0.1, 15.0)
+    assert hand.read(0.1).grasped is False
+    held = hand.read(1.0)
+    assert (held.width, held.moving, held.grasped, held.force) == (0.03, False, True, 15.0)
+    hand.stop()
+    assert hand.read(2.0).grasped is True
+    hand.close()
+    hand.open()
+    assert (hand.read(3.0).width, hand.read(3.1).grasped) == (0.03, True)
+    hand.move(0.08, 0.1, 15.0)
+    assert hand.read(4.0)[3:7] == (0.08, 0.08, False, False)
+
+
+def test_gripper_closes_on_when_the_object_slips_out(hand: MockGripper) -> None:
+    hand.inject(object_width=0.03)
+    hand.move(0.0, 0.1, 15.0)
+    assert hand.read(1.0).grasped is True
+    hand.inject(object_width=None)
+    assert hand.read(1.1).width == pytest.approx(0.02)
+    assert hand.read(1.1).grasped is False
+
+
+def test_gripper_stop_stays(hand: MockGripper) -> None:
+    hand.move(0.0, 0.1, 10.0)
+    hand.read(0.2)
+    hand.stop()
+    still = hand.read(9.0)
+    assert (still.width, still.moving) == (pytest.approx(0.06), False)
+
+
+def test_gripper_knobs(hand: MockGripper) -> None:
+    hand.inject(stuck=True)
+    hand.move(0.0, 0.1, 10.0)
+    assert hand.read(1.0).width == 0.08
+    hand.inject(stuck=False, freeze=True)
+    frozen = hand.read(1.2)
+    assert frozen is hand.read(1.3)
+    hand.inject(freeze=False)
+    assert hand.read(1.4).width == pytest.approx(0.04)
+    hand.inject(garbage="nan")
+    assert math.isnan(hand.read(1.5).width)
+    hand.inject(disconnect=True)
+    with pytest.raises(ConnectionLost):
+        hand.move(0.0, 0.1, 10.0)
+    hand.close()
+
+
+# Camera.
+
+
+def test_camera_pictures_say_which_frame_they_are(camera: MockCamera) -> None:
+    frames = [camera.grab(0.0) for _ in range(3)]
+    for k, frame in enumerate(frames, start=1):
+        assert frame is not None
+        assert frame.color is not None
+        assert frame.seq == k
+        assert read_picture(frame.color) == (k, pytest.approx(frame.t, abs=1e-6))
+    assert frames[2].t - frames[0].t == pytest.approx(2 / 30)  # type: ignore[union-attr]
+
+
+def test_camera_streams_agree_and_the_square_moves(camera: MockCamera) -> None:
+    lefts = []
+    for _ in range(2):
+        frame = camera.grab(0.0)
+        assert frame is not None
+        assert frame.color is not None
+        assert frame.depth is not None
+        assert frame.infrared is not None
+        assert frame.segmentation is not None
+        assert frame.color.shape == (48, 64, 3)
+        assert frame.depth.shape == frame.infrared.shape == frame.segmentation.shape == (48, 64)
+        square = frame.segmentation == 0
+        assert (frame.color[square] == 255).all()
+        assert np.allclose(frame.depth[square], 0.9)
+        assert np.allclose(frame.depth[~square], 1.0)
+        lefts.append(int(np.argmax(square.any(axis=0))))
+    assert lefts[1] == lefts[0] + STEP
+
+
+def test_camera_gives_only_the_streams_asked_for(camera_spec: CameraSpec) -> None:
+    camera = MockCamera(replace(camera_spec, streams=("depth",)))
+    camera.open()
+    frame = camera.grab(0.0)
+    assert frame is not None
+    assert frame.depth is not None
+    assert (frame.color, frame.infrared, frame.segmentation) == (None, None, None)
+
+
+def test_camera_in_lock_step_shows_the_present(camera_spec: CameraSpec) -> None:
+    time = [2.0]
+    camera = MockCamera(camera_spec, LockStepClock(lambda: time[0], lambda t: None))
+    camera.open()
+    times = []
+    for now in (2.0, 2.5, 2.5):
+        time[0] = now
+        frame = camera.grab(1.0)
+        assert frame is not None
+        times.append((frame.seq, frame.t, frame.t_device))
+    assert times == [(1, 2.0, 0.0), (2, 2.5, 0.5), (3, 2.5, 0.5)]
+
+
+class ClockAt(RealClock):
+    """A real clock that a test moves."""
+
+    t = 100.0
+
+    def now(self) -> float:
+        return self.t
+
+
+def test_camera_in_real_time_keeps_its_rate(camera_spec: CameraSpec) -> None:
+    clock = ClockAt()
+    camera = MockCamera(camera_spec, clock)
+    camera.open()
+    seen = []
+    for k in range(200):  # 2 s in steps of 10 ms
+        clock.t = 100.0 + 0.01 * k
+        frame = camera.grab(0.0)
+        if frame is not None:
+            assert 0.0 <= clock.t - frame.t < 1 / 30 + 1e-9
+            seen.append(frame.seq)
+    assert seen == list(range(1, 61))
+
+
+def test_camera_knobs(camera: MockCamera) -> None:
+    camera.inject(drop=3)
+    assert [camera.grab(0.0).seq for _ in range(4)] == [1, 2, 4, 5]  # type: ignore[union-attr]
+    camera.inject(drop=0, freeze=True)
+    assert camera.grab(1.0) is None
+    camera.inject(freeze=False, garbage="shape")
+    frame = camera.grab(0.0)
+    assert frame is not None
+    assert frame.color is not None
+    assert frame.color.shape == (47, 64, 3)
+    camera.inject(garbage="nan")
+    frame = camera.grab(0.0)
+    assert frame is not None
+    assert frame.depth is not None
+    assert np.isnan(frame.depth).all()
+    camera.inject(garbage=None, disconnect=True)
+    with pytest.raises(ConnectionLost):
+        camera.grab(0.0)
+    camera.inject(disconnect=False)
+    assert camera.grab(0.0) is not None
+
+
+# Pad.
+
+
+def test_pad_events_get_the_time_of_the_poll_that_sees_them(pad: MockPad) -> None:
+    rest = pad.poll(1.0, 0.0)
+    assert (rest.connected, rest.buttons, rest.t, rest.t_alive) == (True, frozenset(), 0.0, 1.0)
+    pad.press("south", "l1")
+    pad.stick("left_x", -0.5)
+    pressed = pad.poll(2.0, 0.0)
+    assert pressed.buttons == {"south", "l1"}
+    assert pressed.axes["left_x"] == -0.5
+    assert (pressed.t, pressed.t_alive, pressed.seq) == (2.0, 2.0, rest.seq + 1)
+    pad.release("l1")
+    released = pad.poll(3.0, 0.0)
+    assert (released.buttons, released.seq) == ({"south"}, rest.seq + 2)
+    assert pad.poll(4.0, 0.0)[:2] == (3.0, 4.0), "no news: the event keeps its time, the pad is still alive"
+
+
+def test_pad_triggers_are_axis_and_button_in_one(pad: MockPad) -> None:
+    pad.press("l2")
+    assert pad.poll(1.0, 0.0).axes["l2"] == 1.0
+    pad.stick("l2", 0.0)
+    assert pad.poll(2.0, 0.0).buttons == frozenset()
+    pad.stick("r2", 0.6)
+    assert pad.poll(3.0, 0.0).buttons == {"r2"}
+    pad.set(axes={"left_y": 1.0}, buttons=["east"])
+    reading = pad.poll(4.0, 0.0)
+    assert (reading.buttons, reading.axes["left_y"], reading.axes["r2"]) == ({"east"}, 1.0, 0.0)
+
+
+def test_pad_freeze_keeps_what_was_pressed_and_shows_no_life(pad: MockPad) -> None:
+    pad.press("l2")
+    pad.poll(1.0, 0.0)
+    pad.inject(freeze=True)
+    pad.release("l2")
+    frozen = pad.poll(2.0, 0.0)
+    assert (frozen.buttons, frozen.t_alive, frozen.connected) == ({"l2"}, 1.0, True)
+    pad.clear()
+    assert pad.poll(3.0, 0.0).buttons == frozenset()
+
+
+def test_pad_disconnect_and_replug(pad: MockPad) -> None:
+    pad.press("l2")
+    pad.poll(1.0, 0.0)
+    pad.inject(disconnect=True)
+    gone = pad.poll(2.0, 0.0)
+    assert (gone.connected, gone.buttons, gone.axes["l2"], gone.t_alive) == (False, frozenset(), 0.0, 1.0)
+    pad.inject(disconnect=False)
+    back = pad.poll(3.0, 0.0)
+    assert (back.connected, back.buttons, back.t_alive) == (True, {"l2"}, 3.0)
+
+
+@pytest.mark.parametrize(
+    "move",
+    [
+        lambda pad: pad.press("cross"),
+        lambda pad: pad.stick("left", 0.5),
+        lambda pad: pad.stick("left_x", 1.5),
+        lambda pad: pad.stick("l2", -0.5),
+        lambda pad: pad.stick("left_x", float("nan")),
+    ],
+)
+def test_pad_refuses_what_no_pad_can_do(pad: MockPad, move: Callable[[MockPad], None]) -> None:
+    with pytest.raises(CommandError):
+        move(pad)
+    assert pad.poll(1.0, 0.0).buttons == frozenset()
