@@ -1,0 +1,159 @@
+"""The room that a session leaves the arm: joint speeds, the tcp's speed, the workspace."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from math import sqrt
+
+from .inbox import Session
+from .kinematics import Kinematics
+from .limits import speed_for
+from .smoothing import JointSmoother
+from .specs import WorkspaceSpec
+from .types import Limited
+
+__all__ = ["Envelope"]
+
+Floats = Sequence[float]
+
+_SAME_JACOBIAN = 2e-3
+"""The tcp's Jacobian is computed anew when a joint has moved this far, rad: an arm of 1 m errs by 2 mm/s per rad/s."""
+
+_TCP_SHARE = 0.97
+"""Share of the tcp speed that goals use, for what the stale Jacobian and joints that change speed one by one add."""
+
+_UNLIMITED = 100.0
+"""From this tcp speed on nothing is looked at, m/s."""
+
+_FACE_GAIN = 4.0
+"""Speed towards a face of the workspace per distance to it, 1/s: 0.25 m/s slows down from 6 cm, at 1 m/s2."""
+
+_BRAKE = 0.8
+_BRAKE_JERK = 0.5
+"""Shares of acceleration and jerk that goals count on for braking; what is left makes the braking smooth."""
+
+
+class Envelope:
+    """Cuts goals to a session's terms; ``limited`` collects what was held back since it was last cleared."""
+
+    def __init__(self, smoother: JointSmoother, kinematics: Kinematics, workspace: WorkspaceSpec | None) -> None:
+        self.smoother = smoother
+        self.kinematics = kinematics
+        self.workspace = workspace
+        self.velocity = list(smoother.velocity)
+        """Greatest joint speeds of the session (n,), rad/s."""
+        self.tcp_speed = float("inf")
+        """Greatest speed of the tcp, m/s."""
+        self.goal_tcp_speed = float("inf")
+        """The same for goals: a little less, for what the smoothing adds."""
+        self.limited = Limited.NONE
+        self._jacobian: list[list[float]] = []
+        self._jacobian_at: list[float] = []
+
+    def open(self, session: Session) -> None:
+        """Take over the terms of a session."""
+        self.velocity = [session.speed * v for v in self.smoother.velocity]
+        self.tcp_speed = session.tcp_speed
+        self.goal_tcp_speed = _TCP_SHARE * session.tcp_speed
+
+    # Goals: smooth caps, so that the hard checks below seldom have to act.
+
+    def cap_joints(self, dq: list[float]) -> list[float]:
+        """Each joint by itself: the session's speed, and what can still brake before a position limit."""
+        return [self._clip(i, v) for i, v in enumerate(dq)]
+
+    def cap_together(self, dq: list[float]) -> list[float]:
+        """The same caps, but the whole vector is scaled, so that the tcp keeps its direction."""
+        scale = 1.0
+        for i, v in enumerate(dq):
+            capped = self._clip(i, v)
+            if capped != v:
+                scale = min(scale, capped / v)
+        return dq if scale == 1.0 else [scale * v for v in dq]
+
+    def cap_tcp(self, dq: list[float]) -> list[float]:
+        """Scale a goal velocity so that the tcp keeps its speed limit, and slows down before the workspace's faces."""
+        if self.tcp_speed >= _UNLIMITED and self.workspace is None:
+            return dq
+        tcp = self.tcp_velocity(dq)
+        speed = sqrt(tcp[0] * tcp[0] + tcp[1] * tcp[1] + tcp[2] * tcp[2])
+        scale = 1.0
+        if speed > self.goal_tcp_speed:
+            scale = self.goal_tcp_speed / speed
+            self.limited |= Limited.TCP_SPEED
+        if self.workspace is not None and speed > 0.0:
+            for v, cap in zip(tcp, self.face_speeds(tcp), strict=True):
+                if abs(v) * scale > cap:
+                    scale = cap / abs(v)
+                    self.limited |= Limited.WORKSPACE
+        return dq if scale == 1.0 else [scale * v for v in dq]
+
+    def face_speeds(self, tcp_velocity: Floats) -> list[float]:
+        """Greatest speed (3,) in m/s along each base axis, given which way the tcp goes."""
+        if self.workspace is None:
+            return [float("inf")] * 3
+        at = self.kinematics.fk(self.smoother.q)
+        faces = zip(at, tcp_velocity, self.workspace.lower, self.workspace.upper, strict=False)
+        return [_FACE_GAIN * max(0.0, (high - x) if v > 0.0 else (x - low)) for x, v, low, high in faces]
+
+    def tcp_velocity(self, dq: Floats) -> list[float]:
+        """Linear velocity (3,) in m/s, along the base's axes, of the tcp when the joints of the set-point move so."""
+        q = self.smoother.q
+        at = self._jacobian_at
+        if not at or any(abs(x - y) > _SAME_JACOBIAN for x, y in zip(q, at, strict=True)):
+            self._jacobian = self.kinematics.jacobian(q)[:3].tolist()
+            self._jacobian_at = list(q)
+        return [sum([j * v for j, v in zip(row, dq, strict=True)]) for row in self._jacobian]
+
+    def _clip(self, i: int, v: float) -> float:
+        cap = self.velocity[i]
+        if not -cap <= v <= cap:
+            self.limited |= Limited.SPEED
+            v = cap if v > 0.0 else -cap
+        smoother = self.smoother
+        q, lower, upper, room = smoother.q[i], smoother.lower[i], smoother.upper[i], smoother.room[i]
+        if lower + room <= q <= upper - room:
+            return v
+        # Two ticks ahead: the cap must not fall faster than the joint can brake.
+        ahead = 2.0 * smoother.dt * smoother.dq[i]
+        left = upper - q - max(0.0, ahead) if v > 0.0 else q - lower + min(0.0, ahead)
+        cap = speed_for(left, _BRAKE * smoother.acceleration[i], _BRAKE_JERK * smoother.jerk[i])
+        if abs(v) > cap:
+            self.limited |= Limited.POSITION
+            return cap if v > 0.0 else -cap
+        return v
+
+    # Hard checks of a proposed step.
+
+    def stays_inside(self, smoother: JointSmoother) -> bool:
+        """Would a stop after the proposed step end inside the workspace, or no farther outside than one from now?"""
+        box = self.workspace
+        if box is None:
+            return True
+        end = self.kinematics.fk(smoother.stop_end_next())
+        if all(low <= x <= high for x, low, high in zip(end, box.lower, box.upper, strict=False)):
+            return True
+        now = self.kinematics.fk(smoother.stop_end())
+        for x, x_now, low, high in zip(end, now, box.lower, box.upper, strict=False):
+            if x > max(high, x_now) + 1e-9 or x < min(low, x_now) - 1e-9:
+                return False
+        return True
+
+    def allows(self, smoother: JointSmoother) -> bool:
+        """`stays_inside`, and the proposed step keeps the tcp's speed limit, or at least slows the tcp down."""
+        if self.tcp_speed < _UNLIMITED:
+            cap = self.goal_tcp_speed**2
+            x, y, z = self.tcp_velocity(smoother.dq_next)
+            speed = x * x + y * y + z * z
+            if speed > cap:
+                x, y, z = self.tcp_velocity(smoother.dq)
+                if speed > x * x + y * y + z * z:
+                    return False
+        return self.stays_inside(smoother)
+
+    def note(self, smoother: JointSmoother) -> None:
+        """Collect what the last step held back."""
+        if smoother.held_back:
+            self.limited |= Limited.POSITION
+        if smoother.guarded:
+            self.limited |= Limited.WORKSPACE

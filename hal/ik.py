@@ -1,0 +1,129 @@
+"""Inverse kinematics of a pose: bounded damped least squares from several starts."""
+
+from __future__ import annotations
+
+import math
+import random
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .errors import Unreachable
+from .pose import Pose
+
+if TYPE_CHECKING:
+    from .kinematics import Kinematics
+
+__all__ = ["solve"]
+
+Array = NDArray[np.float64]
+
+ITERATIONS = 80
+"""Steps from one start; a start that converges needs about ten."""
+RADIAN_IN_METRES = 0.3
+"""What one rad of orientation counts as, when two positions that both miss the pose are compared."""
+STEP_MAX = 0.5
+"""Longest step of a joint, rad: the Jacobian says nothing farther away."""
+CANDIDATES = 4
+"""Solutions to choose the nearest from, when the seed itself leads to none."""
+
+
+class _Result(NamedTuple):
+    q: Array
+    position_error: float
+    rotation_error: float
+
+    def miss(self) -> float:
+        return self.position_error + RADIAN_IN_METRES * self.rotation_error
+
+
+def solve(
+    kinematics: Kinematics, pose: Pose, seed: Array, position_tolerance: float, rotation_tolerance: float, starts: int
+) -> Array:
+    """See :meth:`hal.kinematics.Kinematics.solve`."""
+    target = np.concatenate([pose.position, pose.orientation])
+    closest: _Result | None = None
+    found: list[Array] = []
+    for number, start in enumerate(_starts(kinematics, seed, starts)):
+        result = _descend(kinematics, target, start, position_tolerance, rotation_tolerance)
+        if result.position_error <= position_tolerance and result.rotation_error <= rotation_tolerance:
+            if number == 0:
+                return result.q
+            found.append(result.q)
+            if len(found) == CANDIDATES:
+                break
+        elif closest is None or result.miss() < closest.miss():
+            closest = result
+    if found:
+        return min(found, key=lambda q: float(np.abs(q - seed).max()))
+    assert closest is not None
+    # Not what the descent believed, but where the forward kinematics of its answer really are.
+    position_error, rotation_error = _errors(kinematics.pose_error(closest.q, target))
+    raise Unreachable(
+        f"no joint position inside the limits brings the tcp to {pose!r}",
+        position_error=position_error,
+        rotation_error=rotation_error,
+        q=tuple(closest.q.tolist()),
+    )
+
+
+def _starts(kinematics: Kinematics, seed: Array, count: int) -> Iterator[Array]:
+    """The seed, home, then points between the seed and random ones, ever farther from the seed."""
+    lower, upper = _search_range(kinematics, seed)
+    yield np.clip(seed, lower, upper)
+    if count > 1:
+        yield np.clip(kinematics.home, lower, upper)
+    numbers = random.Random(0)  # the same starts for the same question, always
+    for k in range(2, count):
+        anywhere = np.array([numbers.uniform(a, b) for a, b in zip(lower, upper, strict=True)])
+        share = min(1.0, 2.0 * k / count)
+        yield np.clip((1.0 - share) * seed + share * anywhere, lower, upper)
+
+
+def _search_range(kinematics: Kinematics, seed: Array) -> tuple[Array, Array]:
+    """The limits, or a turn either way of the seed for a joint that turns without end."""
+    return np.maximum(kinematics.lower, seed - 2 * math.pi), np.minimum(kinematics.upper, seed + 2 * math.pi)
+
+
+def _descend(
+    kinematics: Kinematics, target: Array, start: Array, position_tolerance: float, rotation_tolerance: float
+) -> _Result:
+    """Levenberg-Marquardt with the damping that Sugihara (IEEE T-RO 27(5), 2011) gives for unreachable targets:
+    half the squared error and a small bias. Joints that press against a limit are left out of the step.
+    """
+    q = start.copy()
+    lower, upper = kinematics.lower, kinematics.upper
+    error = kinematics.pose_error(q, target)
+    best = _Result(q, *_errors(error))
+    stalled = 0
+    for _ in range(ITERATIONS):
+        if best.position_error <= 0.1 * position_tolerance and best.rotation_error <= 0.1 * rotation_tolerance:
+            break
+        jacobian = kinematics.jacobian(q)
+        gradient = error @ jacobian
+        free = ~(((q <= lower) & (gradient < 0.0)) | ((q >= upper) & (gradient > 0.0)))
+        if not free.any():
+            break
+        columns = jacobian[:, free]
+        normal = columns.T @ columns
+        normal.flat[:: len(normal) + 1] += 0.5 * float(error @ error) + 1e-9
+        step = np.zeros_like(q)
+        step[free] = np.linalg.solve(normal, gradient[free])
+        longest = float(np.abs(step).max())
+        if longest > STEP_MAX:
+            step *= STEP_MAX / longest
+        q = np.clip(q + step, lower, upper)
+        error = kinematics.pose_error(q, target)
+        result = _Result(q, *_errors(error))
+        stalled = 0 if result.miss() < 0.999 * best.miss() else stalled + 1
+        if result.miss() < best.miss():
+            best = result
+        if stalled == 8:
+            break
+    return best
+
+
+def _errors(twist: Array) -> tuple[float, float]:
+    return math.sqrt(float(twist[:3] @ twist[:3])), math.sqrt(float(twist[3:] @ twist[3:]))

@@ -1,0 +1,255 @@
+"""Kinematics of one arm: forward, differential and inverse, by pinocchio. Poses are in the arm's base frame.
+
+The model is reduced to the arm's joints, in the order of the spec; every other joint (fingers, a second arm) stands
+at zero. Continuous joints are treated as revolute joints without an end, so that a configuration is always n angles.
+"""
+
+from __future__ import annotations
+
+import difflib
+import math
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from .errors import CommandError
+from .pose import Pose
+
+if TYPE_CHECKING:
+    from .specs import KinematicsSpec
+
+__all__ = ["Kinematics", "Pose7"]
+
+Array = NDArray[np.float64]
+Pose7 = tuple[float, float, float, float, float, float, float]
+"""x, y, z in m, then a unit quaternion x, y, z, w."""
+
+NEAR_SINGULAR = 0.05
+"""Smallest singular value of the Jacobian (m and rad mixed) down to which twists are tracked exactly."""
+POSTURE_SPEED = 0.5
+"""Bound of the fastest joint in the pull towards the home posture, rad/s."""
+
+
+class Kinematics:
+    """Forward, differential and inverse kinematics of one arm with ``n`` joints.
+
+    Holds scratch memory: one object per thread. Joint positions are n numbers in rad, in the order of
+    ``spec.joints``; angles of continuous joints may take any value. Raises ValueError when the URDF does not have
+    what the spec names.
+    """
+
+    def __init__(self, spec: KinematicsSpec) -> None:
+        import eigenpy
+        import pinocchio as pin
+
+        self.spec = spec
+        self.n = len(spec.joints)
+        self.lower: Array = np.array(spec.lower, float)
+        self.upper: Array = np.array(spec.upper, float)
+        self.home: Array = np.array(spec.home, float)
+        self._home = self.home.tolist()
+        for name, values in (("lower", self.lower), ("upper", self.upper), ("home", self.home)):
+            if values.shape != (self.n,):
+                raise ValueError(f"{name} has {values.size} numbers for {self.n} joints")
+        self._pin: Any = pin
+        self._model: Any = _reduced_model(spec, pin)
+        self._tcp: int = _tcp_frame(self._model, spec, pin)
+        self._data: Any = self._model.createData()
+        # These are views: they show whatever was computed last.
+        self._tcp_placement: Any = self._data.oMf[self._tcp]
+        self._axes: Any = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
+        self._eigen: Any = eigenpy.SelfAdjointEigenSolver(np.eye(6))
+        self._llt: Any = eigenpy.LLT(np.eye(6))
+        self._gram: Array = np.empty((6, 6))
+        # Column of pinocchio's model for each joint of the spec; None where the orders agree, which is usual.
+        columns = [int(self._model.joints[self._model.getJointId(name)].idx_q) for name in spec.joints]
+        self._columns: NDArray[np.intp] | None = None
+        self._inverse_columns: NDArray[np.intp] | None = None
+        if columns != list(range(self.n)):
+            self._columns, self._inverse_columns = np.array(columns), np.argsort(columns)
+
+    def fk(self, q: Sequence[float] | Array) -> Pose7:
+        """Pose of the tcp as seven plain floats."""
+        self._forward(q)
+        self._pin.updateFramePlacement(self._model, self._data, self._tcp)
+        pose: Pose7 = self._pin.SE3ToXYZQUATtuple(self._tcp_placement)
+        return pose
+
+    def pose(self, q: Sequence[float] | Array) -> Pose:
+        """Pose of the tcp."""
+        values = self.fk(q)
+        return Pose(values[:3], values[3:])
+
+    def link_pose(self, link: str, q: Sequence[float] | Array) -> Pose:
+        """Pose of any link of the URDF (its own frame, not its centre of mass). KeyError for an unknown link."""
+        frame = self._model.getFrameId(link)
+        if frame >= self._model.nframes or self._model.frames[frame].type != self._pin.FrameType.BODY:
+            links = [f.name for f in self._model.frames if f.type == self._pin.FrameType.BODY]
+            near = difflib.get_close_matches(link, links, 3) or links
+            raise KeyError(f"no link {link!r} in {Path(self.spec.urdf).name}; did you mean {', '.join(near)}?")
+        self._forward(q)
+        self._pin.updateFramePlacement(self._model, self._data, frame)
+        values = self._pin.SE3ToXYZQUATtuple(self._data.oMf[frame])
+        return Pose(values[:3], values[3:])
+
+    def jacobian(self, q: Sequence[float] | Array) -> Array:
+        """(6, n): joint speeds to the tcp's velocity in m/s and rad/s, along the base's axes, linear rows first."""
+        jacobian: Array = self._pin.computeFrameJacobian(
+            self._model, self._data, self._ordered(q), self._tcp, self._axes
+        )
+        return jacobian if self._columns is None else jacobian[:, self._columns]
+
+    def velocity(
+        self, q: Sequence[float] | Array, twist: Sequence[float] | Array, posture_gain: float = 0.5
+    ) -> tuple[list[float], bool]:
+        """Joint speeds (n,) in rad/s for a twist (6,) of the tcp; and whether the arm is near a singularity.
+
+        Far from singularities the twist is met exactly. Near one, the component along each direction whose singular
+        value s is below :data:`NEAR_SINGULAR` (e) is met to the share (s/e)^2, so that joint speeds stay below
+        |twist| / e: damped least squares with numerical filtering (Maciejewski and Klein, J. Robotic Systems 5(6),
+        1988) with the damping s^2 + l^2 = max(s, e)^2. All other directions stay exact.
+
+        What the twist leaves free moves towards home at ``posture_gain`` (1/s) times the distance, at most
+        :data:`POSTURE_SPEED`; that motion is in the null space and does not move the tcp.
+        """
+        jacobian = self.jacobian(q)
+        gram = np.dot(jacobian, jacobian.T, self._gram)
+        self._eigen.compute(gram)
+        squares = self._eigen.eigenvalues()  # of the singular values, in ascending order
+        near = bool(squares[0] < NEAR_SINGULAR**2)
+        posture = self._posture(q, posture_gain)
+        if not near:
+            # posture + J^+ (twist - J posture): the posture, corrected to what the twist demands.
+            error = twist if posture is None else twist - jacobian.dot(posture)
+            self._llt.compute(gram)
+            speeds = self._llt.solve(np.asarray(error, float)).dot(jacobian)
+        else:
+            vectors = self._eigen.eigenvectors()
+            task = vectors.T.dot(twist) / np.maximum(squares, NEAR_SINGULAR**2)
+            if posture is not None:
+                # The null space is taken undamped, or the posture would creep along the singular direction.
+                regular = squares > 1e-12
+                drift = vectors.T.dot(jacobian.dot(posture))
+                task[regular] -= drift[regular] / squares[regular]
+            speeds = vectors.dot(task).dot(jacobian)
+        if posture is not None:
+            speeds += posture
+        result: list[float] = speeds.tolist()
+        return result, near
+
+    def _posture(self, q: Sequence[float] | Array, gain: float) -> Array | None:
+        """Joint speeds towards home; None where there is no freedom left for a posture."""
+        if gain == 0.0 or self.n <= 6:
+            return None
+        speeds = [gain * (home - value) for home, value in zip(self._home, q, strict=True)]
+        fastest = max(map(abs, speeds))
+        posture = np.array(speeds)
+        return posture if fastest <= POSTURE_SPEED else posture * (POSTURE_SPEED / fastest)
+
+    def pose_error(self, q: Sequence[float] | Array, pose: Sequence[float] | Array) -> Array:
+        """(6,) the constant twist along the base's axes that takes the tcp from ``fk(q)`` to ``pose`` in 1 s.
+
+        Linear part: the difference of the positions, m. Angular part: the rotation vector (the logarithm) of the
+        rotation between them, rad, never longer than pi.
+        """
+        return np.array(_difference(self.fk(q), pose))
+
+    def solve(
+        self,
+        pose: Pose,
+        q_seed: ArrayLike | None = None,
+        *,
+        position_tolerance: float = 1e-5,
+        rotation_tolerance: float = 1e-5,
+        starts: int = 24,
+    ) -> Array:
+        """Joint positions (n,) inside the limits that bring the tcp to ``pose``, near ``q_seed`` (home when None).
+
+        Searches from the seed, then from points ever farther from it, at most ``starts`` of them, the same ones every
+        time. Raises :class:`~hal.errors.Unreachable` with the distance of the closest position found, computed from
+        its forward kinematics, and CommandError for a seed of the wrong shape.
+        """
+        from .ik import solve
+
+        seed = self.home if q_seed is None else np.asarray(q_seed, float)
+        if seed.shape != (self.n,) or not np.isfinite(seed).all():
+            raise CommandError(f"q_seed must be {self.n} finite numbers, not {np.asarray(q_seed).tolist()}")
+        return solve(self, pose, seed, position_tolerance, rotation_tolerance, starts)
+
+    def _ordered(self, q: Sequence[float] | Array) -> Array:
+        values = np.array(q, float)
+        return values if self._inverse_columns is None else values[self._inverse_columns]
+
+    def _forward(self, q: Sequence[float] | Array) -> None:
+        self._pin.forwardKinematics(self._model, self._data, self._ordered(q))
+
+
+def _difference(start: Sequence[float], end: Sequence[float] | Array) -> tuple[float, ...]:
+    """Linear and angular difference of two poses of seven numbers; see :meth:`Kinematics.pose_error`."""
+    x1, y1, z1, ax, ay, az, aw = start
+    x2, y2, z2, bx, by, bz, bw = (float(value) for value in end)
+    # Quaternion of the rotation from start to end along the base's axes: end * conjugate(start).
+    w = bw * aw + bx * ax + by * ay + bz * az
+    x = -bw * ax + bx * aw - by * az + bz * ay
+    y = -bw * ay + bx * az + by * aw - bz * ax
+    z = -bw * az - bx * ay + by * ax + bz * aw
+    sine = math.sqrt(x * x + y * y + z * z)
+    if w < 0.0:  # the shorter way round
+        w, x, y, z = -w, -x, -y, -z
+    scale = 2.0 * math.atan2(sine, w) / sine if sine > 1e-12 else 2.0
+    return x2 - x1, y2 - y1, z2 - z1, scale * x, scale * y, scale * z
+
+
+def _reduced_model(spec: KinematicsSpec, pin: Any) -> Any:
+    """Pinocchio's model of the arm's joints alone, its world frame moved into the base link."""
+    full = pin.buildModelFromXML(_bounded_joints(spec.urdf))
+    missing = [name for name in spec.joints if not full.existJointName(name)]
+    if missing:
+        raise ValueError(f"{spec.urdf} has no movable joint {', '.join(missing)}")
+    locked = [k for k in range(1, full.njoints) if full.names[k] not in spec.joints]
+    model = pin.buildReducedModel(full, locked, pin.neutral(full))
+    if model.nq != len(spec.joints) or model.nv != len(spec.joints):
+        raise ValueError(f"an arm's joints must turn or slide about one axis each: {', '.join(spec.joints)}")
+    if spec.base_link is not None:
+        base = model.frames[_frame(model, spec.base_link, spec)]
+        if base.parentJoint != 0:
+            raise ValueError(f"base link {spec.base_link} moves with the arm's joints")
+        to_base = base.placement.inverse()
+        for k in range(1, model.njoints):
+            if model.parents[k] == 0:
+                model.jointPlacements[k] = to_base * model.jointPlacements[k]
+        for frame in model.frames:
+            if frame.parentJoint == 0:
+                frame.placement = to_base * frame.placement
+    return model
+
+
+def _bounded_joints(urdf: str) -> str:
+    """The URDF's text with continuous joints made revolute: pinocchio gives the former two numbers each."""
+    tree = ElementTree.parse(urdf)
+    for joint in tree.iter("joint"):
+        if joint.get("type") == "continuous":
+            joint.set("type", "revolute")
+            for old in joint.findall("limit"):
+                joint.remove(old)
+            ElementTree.SubElement(joint, "limit", lower="-1e9", upper="1e9", effort="1e9", velocity="1e9")
+    return ElementTree.tostring(tree.getroot(), encoding="unicode")
+
+
+def _frame(model: Any, link: str, spec: KinematicsSpec) -> int:
+    frame = int(model.getFrameId(link))
+    if frame >= model.nframes:
+        raise ValueError(f"{spec.urdf} has no link {link}")
+    return frame
+
+
+def _tcp_frame(model: Any, spec: KinematicsSpec, pin: Any) -> int:
+    """Add the tool centre point to the model as a frame of its own."""
+    link = model.frames[_frame(model, spec.tcp_link, spec)]
+    offset = pin.XYZQUATToSE3(np.array([*spec.tcp_position, *Pose((0, 0, 0), spec.tcp_orientation).orientation]))
+    frame = pin.Frame("hal_tcp", link.parentJoint, 0, link.placement * offset, pin.FrameType.OP_FRAME)
+    return int(model.addFrame(frame))

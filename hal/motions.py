@@ -1,0 +1,174 @@
+"""Commands in joint space, made into one tick of motion each: targets, velocities, and the path of ``move_to``.
+
+A motion is told its newest command (``accept``) and asked once per tick to move the smoother (``step``). It keeps no
+set-point of its own: after a stop or a re-anchoring it is made to forget (``start``) and goes on from where the arm is.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from math import isfinite
+
+from .envelope import Envelope
+from .inbox import CommandRecord
+from .limits import speed_for
+from .smoothing import JointSmoother
+from .types import Limited
+
+__all__ = ["JointTargetMotion", "JointVelocityMotion", "Motion"]
+
+Floats = Sequence[float]
+
+
+class Motion(ABC):
+    """How one kind of command moves the arm."""
+
+    size: int
+    """Number of values that a command of this kind has."""
+
+    def __init__(self, smoother: JointSmoother, envelope: Envelope) -> None:
+        self.smoother = smoother
+        self.envelope = envelope
+
+    @abstractmethod
+    def start(self) -> None:
+        """Forget every command; the next one is the first."""
+
+    def usable(self, values: Floats) -> bool:
+        """Can this command be followed at all? (As many values as ``size``, all finite.)"""
+        return len(values) == self.size and isfinite(sum(map(abs, values)))
+
+    def reanchored(self) -> None:
+        """The set-point is elsewhere than the last step left it; the newest command stays."""
+        return
+
+    def too_far(self, values: Floats) -> bool:
+        """Is this first target farther from the set-point than a stream may begin?"""
+        return False
+
+    @abstractmethod
+    def accept(self, command: CommandRecord) -> None:
+        """Follow this command from now on; it is ``usable``."""
+
+    @abstractmethod
+    def step(self, now: float) -> None:
+        """Advance the smoother by one tick."""
+
+
+class JointVelocityMotion(Motion):
+    """Move the joints at given velocities; each is capped by itself."""
+
+    def __init__(self, smoother: JointSmoother, envelope: Envelope) -> None:
+        super().__init__(smoother, envelope)
+        self.size = smoother.n
+        self._dq: list[float] = []
+
+    def start(self) -> None:
+        self._dq = [0.0] * self.size
+
+    def accept(self, command: CommandRecord) -> None:
+        self._dq = list(command.values)
+
+    def step(self, now: float) -> None:
+        envelope = self.envelope
+        goal = envelope.cap_tcp(envelope.cap_joints(self._dq))
+        self.smoother.follow(goal, envelope.stays_inside)
+
+
+class JointTargetMotion(Motion):
+    """Follow a stream of joint targets, or go to one that is held.
+
+    A moving target is followed at its own speed plus a correction of the error: smooth, since the speed changes little
+    from tick to tick. That would creep into a target that stands still, so a target that is repeated, or is the first
+    one after rest, or is too far for any arm to follow as a stream, is reached by Ruckig's time-optimal motion instead.
+    """
+
+    def __init__(self, smoother: JointSmoother, envelope: Envelope) -> None:
+        super().__init__(smoother, envelope)
+        self.size = 2 * smoother.n
+        self._command: CommandRecord | None = None
+        self._q: list[float] = []
+        self._dq: list[float] = []
+        self._direct = False
+        """Go there directly (True), or follow as a stream."""
+        self._still = True
+        """Did the target stand still before the newest command?"""
+
+    def start(self) -> None:
+        self._command = None
+        self._still = True
+        self._direct = False
+
+    def too_far(self, values: Floats) -> bool:
+        return any(abs(x - y) > FIRST_JOINT_STEP for x, y in zip(values, self.smoother.q, strict=False))
+
+    def accept(self, command: CommandRecord) -> None:
+        n = self.smoother.n
+        q, dq = list(command.values[:n]), list(command.values[n:])
+        before = self._command
+        moving = any(dq)
+        same = before is not None and q == self._q
+        self._direct = not moving and (same or self._still or self._is_jump(command.t, q))
+        self._still = not moving and (same or before is None)
+        self._command, self._q, self._dq = command, q, dq
+
+    def step(self, now: float) -> None:
+        assert self._command is not None
+        age = max(0.0, min(now, self._command.deadline) - self._command.t)
+        smoother, envelope = self.smoother, self.envelope
+        q, dq = self._q, self._dq
+        if not self._direct:
+            q = [x + v * age for x, v in zip(q, dq, strict=True)]
+        q, dq = self._into_limits(q, dq)
+        if self._direct and smoother.reach(q, envelope.velocity, envelope.allows):
+            return
+        brake, brake_jerk = _DIRECT if self._direct else _STREAM
+        goal = [
+            v + self._correction(i, x - smoother.q[i], v, brake, brake_jerk)
+            for i, (x, v) in enumerate(zip(q, dq, strict=True))
+        ]
+        smoother.follow(envelope.cap_tcp(envelope.cap_joints(goal)), envelope.stays_inside)
+
+    def _correction(self, i: int, error: float, dq: float, brake: float, brake_jerk: float) -> float:
+        """Speed (rad/s) that closes an error and can still brake before it is closed."""
+        smoother = self.smoother
+        distance = abs(error)
+        approach = smoother.dq[i] - dq if error > 0.0 else dq - smoother.dq[i]
+        ahead = 2.0 * smoother.dt * max(0.0, approach)
+        speed = speed_for(distance - ahead, brake * smoother.acceleration[i], brake_jerk * smoother.jerk[i])
+        speed = min(speed, _GAIN * distance)
+        return speed if error > 0.0 else -speed
+
+    def _into_limits(self, q: list[float], dq: list[float]) -> tuple[list[float], list[float]]:
+        """The target, and its speed, cut to the position limits."""
+        lower, upper = self.smoother.lower, self.smoother.upper
+        if all(low <= x <= high for x, low, high in zip(q, lower, upper, strict=True)):
+            return q, dq
+        inside = [max(low, min(high, x)) for x, low, high in zip(q, lower, upper, strict=True)]
+        if any(abs(x - y) > 1e-6 for x, y in zip(q, inside, strict=True)):
+            self.envelope.limited |= Limited.POSITION
+        return inside, [v if x == y else 0.0 for x, y, v in zip(q, inside, dq, strict=True)]
+
+    def _is_jump(self, t: float, q: list[float]) -> bool:
+        """Is the new target farther from the last one than the joints could have followed meanwhile?"""
+        before = self._command
+        if before is None:
+            return True
+        period = max(0.0, t - before.t)
+        state = zip(q, self._q, self._dq, self.envelope.velocity, strict=True)
+        return any(abs(x - x0 - v0 * period) > _JUMP + limit * period for x, x0, v0, limit in state)
+
+
+FIRST_JOINT_STEP = 0.1
+"""A first joint target farther than this from the set-point is refused, rad."""
+
+_GAIN = 8.0
+"""Speed per error of a followed target, 1/s. Measured at 50 Hz targets: rms error 0.8 mrad, no chatter."""
+
+_JUMP = 0.05
+"""A step of a stream beyond what the joint speed allows counts as a jump from here on, rad."""
+
+_STREAM = (0.8, 0.5)
+_DIRECT = (0.9, 0.7)
+"""Shares of acceleration and jerk with which a target's approach brakes."""
