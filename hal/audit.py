@@ -20,7 +20,6 @@ class SetpointAudit:
     """
 
     def __init__(self, limits: LimitsSpec, dt: float) -> None:
-        self._dt = dt
         ranges = list(zip(limits.lower, limits.upper, strict=True))
         self._middle = [0.5 * (low + high) for low, high in ranges]
         # One factor per joint and derivative turns a plain difference into a ratio of its limit.
@@ -29,7 +28,9 @@ class SetpointAudit:
             for (low, high), v, a, j in zip(ranges, limits.velocity, limits.acceleration, limits.jerk, strict=True)
         ]
         self._peaks = [0.0] * 4
+        self._count = 0
         self._before: list[tuple[float, float, float]] = []
+        """The last sample of each joint, and its first and second difference."""
         self.reset()
 
     def reset(self) -> None:
@@ -39,7 +40,8 @@ class SetpointAudit:
 
     def add(self, q: Sequence[float]) -> None:
         """One set-point (n,), rad, as it was handed to the driver."""
-        count = self._count
+        settled = self._count >= _SETTLE
+        self._count += 1
         top_p, top_v, top_a, top_j = self._peaks
         now = []
         for x, (x1, d1, dd1), middle, (p, v, a, j) in zip(q, self._before, self._middle, self._factors, strict=True):
@@ -49,7 +51,7 @@ class SetpointAudit:
             ratio = abs(x - middle) * p
             if ratio > top_p:
                 top_p = ratio
-            if count >= _SETTLE:
+            if settled:
                 ratio = abs(d) * v
                 if ratio > top_v:
                     top_v = ratio
@@ -60,7 +62,6 @@ class SetpointAudit:
                 if ratio > top_j:
                     top_j = ratio
         self._before = now
-        self._count = count + 1
         self._peaks = [top_p, top_v, top_a, top_j]
 
     def peaks(self) -> dict[str, float]:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, ClassVar, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from .errors import ConnectionLost, StaleStateError
+from .errors import ConnectionLost, NotSupported, StaleStateError
 from .histogram import Histogram
 from .pose import Pose, frozen
 from .types import Frame, Stamp
@@ -43,7 +43,7 @@ class CameraDriver(ABC):
     def __init__(self, spec: CameraSpec, source: object | None = None) -> None:
         self.spec = spec
         self.source = source
-        """Where a simulated camera gets its pictures from."""
+        """Where a simulated camera gets its pictures from; the rig's clock where nothing draws for it."""
 
     @abstractmethod
     def open(self) -> None:
@@ -55,6 +55,10 @@ class CameraDriver(ABC):
 
         Raises :class:`~hal.errors.ConnectionLost` when the device is gone.
         """
+
+    def inject(self, **knobs: object) -> None:
+        """Switch faults on or off, for tests. Only drivers that simulate have any."""
+        raise NotSupported(f"driver {type(self).__name__} has no faults to inject")
 
     @abstractmethod
     def close(self) -> None:

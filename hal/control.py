@@ -111,6 +111,8 @@ class Control:
         if self.deadman is None:
             robot._latch.check()
         else:
+            if robot._latch.stopped and self.deadman.held:
+                raise MotionStopped("rig.stop() was called", "release the dead-man first")
             self._detach = self.deadman.attach(self._mail.put_deadman)
         robot._sessions += 1
         self._id = robot._sessions
@@ -201,9 +203,7 @@ class Control:
             kind, values = _encode(command)
             self.robot._commands += 1
             deadline = now + self._deadline
-            self._mail.put_command(
-                CommandRecord(self.robot._commands, self._id, now, deadline, kind, values, t_event)
-            )
+            self._mail.put_command(CommandRecord(self.robot._commands, self._id, now, deadline, kind, values, t_event))
         if gripper is not None:
             self._send_grip(gripper, waiting, reasons)
         return Sent(command, tuple(reasons))
@@ -340,7 +340,7 @@ def move_to(
         for _ in clock.rate(50.0):
             servo = session._peek()
             session._check_trip(servo, clock.now())
-            if servo.refused:
+            if servo.refused and servo.session == session._id:
                 raise CommandError(f"the way to the target leaves the workspace of {robot.name}")
             if servo.arrived and servo.session == session._id:
                 break

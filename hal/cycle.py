@@ -38,15 +38,21 @@ class ArmUnit:
             self.gripper = registry.load(spec.gripper.driver, "gripper")(spec.gripper, world)
         self.kinematics = Kinematics(spec.kinematics)
         self.servo = Servo(spec, dt, self.kinematics)
-        self.audit = SetpointAudit(spec.limits, dt)
-        self.latency = Histogram(1e-4, 5000)
+        self.reset_statistics()
         self.reading: Reading | None = None
         self.error: ConnectionLost | None = None
+        self.gripper_error: ConnectionLost | None = None
+        self._sound: Reading | None = None
         self._setpoint: Any = None
         self._gripper_seq = 0
         self._latest_target = 0
         self._t_written = 0.0
         self._session = 0
+
+    def reset_statistics(self) -> None:
+        """Measure from now on: peaks of the set-points, latencies."""
+        self.audit = SetpointAudit(self.spec.limits, self.dt)
+        self.latency = Histogram(1e-4, 5000)
 
     def open(self, now: float) -> None:
         """Connect to the arm and its gripper, and read them once. Nothing moves."""
@@ -78,9 +84,11 @@ class ArmUnit:
         if self.error is not None or self.reading is None:
             self._setpoint = self.servo.lost(now)
             return
+        self._setpoint = self.servo.tick(now, self.reading, self._inbox(app))
+
+    def _inbox(self, app: AppRecord) -> Inbox:
         mail = self.mail
-        inbox = Inbox(mail.get_command(), mail.get_deadman(), app.stops, mail.get_rearms(), app.t)
-        self._setpoint = self.servo.tick(now, self.reading, inbox)
+        return Inbox(mail.get_command(), mail.get_deadman(), app.stops, mail.get_rearms(), app.t)
 
     def write(self, now: float) -> None:
         """Hand it to the device."""
@@ -112,7 +120,10 @@ class ArmUnit:
         command = self.mail.get_gripper_command()
         if command is not None and command.seq != self._gripper_seq:
             self._gripper_seq = command.seq
-            self.gripper.move(command.width, command.speed, command.force)
+            try:
+                self.gripper.move(command.width, command.speed, command.force)
+            except ConnectionLost as error:
+                self.gripper_error = error
 
     def note_latency(self, clock_now: float) -> None:
         """Time from a pad's event to the set-point that follows it, once per command."""
@@ -125,47 +136,54 @@ class ArmUnit:
             self.latency.add(clock_now - command.t_event)
 
     def publish(self, now: float) -> None:
-        """Tell the app."""
+        """Tell the app: what the servo does, with the newest reading that makes sense."""
+        self._publish_gripper(now)
         reading, report = self.reading, self.servo.report
+        if reading is not None and self._makes_sense(reading):
+            self._sound = reading
+        reading = self._sound
         if reading is None:
             return
-        q, dq = reading.q, reading.dq
-        usable = len(q) == len(dq) == self.spec.limits.upper.__len__() and all(map(math.isfinite, (*q, *dq)))
-        if usable:
-            tcp = self.kinematics.fk(q)
-            twist = (self.kinematics.jacobian(q) @ dq).tolist()
-            self.mail.put_state(
-                reading,
-                ServoRecord(
-                    RobotStatus.LOST if self.error is not None else report.status,
-                    report.trip,
-                    report.limited,
-                    report.target_seq,
-                    self._session,
-                    report.arrived,
-                    report.refused,
-                    self._t_written,
-                    report.t_stop,
-                    report.q_set,
-                    report.dq_set,
-                ),
-                tcp,
-                self.kinematics.fk(report.q_set),
-                twist,
-            )
-        if self.gripper is not None:
+        kinematics = self.kinematics
+        twist = (kinematics.jacobian(reading.q) @ reading.dq).tolist()
+        servo = ServoRecord(
+            RobotStatus.LOST if self.error is not None else report.status,
+            report.trip,
+            report.limited,
+            report.target_seq,
+            self._session,
+            report.arrived,
+            report.refused,
+            self._t_written,
+            report.t_stop,
+            report.q_set,
+            report.dq_set,
+        )
+        self.mail.put_state(reading, servo, kinematics.fk(reading.q), kinematics.fk(report.q_set), twist)
+
+    def _makes_sense(self, reading: Reading) -> bool:
+        n = len(self.spec.joints)
+        return len(reading.q) == len(reading.dq) == n and all(map(math.isfinite, (*reading.q, *reading.dq)))
+
+    def _publish_gripper(self, now: float) -> None:
+        if self.gripper is None:
+            return
+        try:
             self.mail.put_gripper(self.gripper.read(now))
+            self.gripper_error = None
+        except ConnectionLost as error:
+            self.gripper_error = error
 
     # Requests.
 
-    def begin(self, session: Session) -> None:
+    def begin(self, session: Session, app: AppRecord) -> None:
         """Open a control session. Raises ControlTaken while another one is open, ConnectionLost without an arm."""
         if self._session:
             raise ControlTaken(f"{self.spec.name} is under the control of session {self._session}")
         if self.error is not None:
             raise self.error
         self._anchor()
-        self.servo.begin(session)
+        self.servo.begin(session, self._inbox(app))
         self._session = session.id
 
     def end(self, session: int) -> None:
@@ -203,6 +221,7 @@ class Cycle:
         self.memory = memory
         self.dt = 1.0 / spec.rate_hz
         self.ticks = 0
+        self._counted_from = 0
         self.world: Any = None
         if spec.world is not None:
             self.world = registry.load(spec.world.driver, "world")(spec.world)
@@ -264,7 +283,7 @@ class Cycle:
     def _do_begin(self, robot: str, session: list[Any]) -> None:
         fields = Session(*session)
         goal = tuple(fields.move_to) if fields.move_to is not None else None
-        self._arm(robot).begin(fields._replace(move_to=goal))
+        self._arm(robot).begin(fields._replace(move_to=goal), self.memory.get_app())
 
     def _do_end(self, robot: str, session: int) -> None:
         self._arm(robot).end(session)
@@ -287,20 +306,27 @@ class Cycle:
 
     def _do_statistics(self) -> dict[str, Any]:
         return {
-            "ticks": self.ticks,
+            "ticks": self.ticks - self._counted_from,
             "robots": {
                 name: {"peak": unit.audit.peaks(), "latency_s": unit.latency.summary()}
                 for name, unit in self.arms.items()
             },
         }
 
+    def _do_reset_statistics(self) -> None:
+        self._counted_from = self.ticks
+        for unit in self._units:
+            unit.reset_statistics()
+
     def _world_request(self, method: str, params: dict[str, Any]) -> Any:
         if self.world is None:
             raise NotSupported("this rig has no simulated world; rig.world exists in simulation only")
         result = self.world.request(method, params)
-        if method in ("reset", "restore"):
+        if method == "reset":
+            name = params.get("name")
             for unit in self._units:
-                unit.moved()
+                if name is None or name == unit.spec.name:
+                    unit.moved()
         return result
 
     def close(self) -> None:

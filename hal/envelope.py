@@ -60,13 +60,16 @@ class Envelope:
 
     def cap_joints(self, dq: list[float]) -> list[float]:
         """Each joint by itself: the session's speed, and what can still brake before a position limit."""
-        return [self._clip(i, v) for i, v in enumerate(dq)]
+        state = zip(dq, self.velocity, self.smoother.q, self.smoother.free, strict=True)
+        return [
+            v if low <= q <= high and -cap <= v <= cap else self._clip(i, v)
+            for i, (v, cap, q, (low, high, _)) in enumerate(state)
+        ]
 
     def cap_together(self, dq: list[float]) -> list[float]:
         """The same caps, but the whole vector is scaled, so that the tcp keeps its direction."""
         scale = 1.0
-        for i, v in enumerate(dq):
-            capped = self._clip(i, v)
+        for v, capped in zip(dq, self.cap_joints(dq), strict=True):
             if capped != v:
                 scale = min(scale, capped / v)
         return dq if scale == 1.0 else [scale * v for v in dq]
@@ -111,9 +114,7 @@ class Envelope:
             self.limited |= Limited.SPEED
             v = cap if v > 0.0 else -cap
         smoother = self.smoother
-        q, lower, upper, room = smoother.q[i], smoother.lower[i], smoother.upper[i], smoother.room[i]
-        if lower + room <= q <= upper - room:
-            return v
+        q, lower, upper = smoother.q[i], smoother.lower[i], smoother.upper[i]
         # Two ticks ahead: the cap must not fall faster than the joint can brake.
         ahead = 2.0 * smoother.dt * smoother.dq[i]
         left = upper - q - max(0.0, ahead) if v > 0.0 else q - lower + min(0.0, ahead)

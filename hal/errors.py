@@ -75,12 +75,16 @@ class CommandError(HalError, ValueError):
 class Unreachable(HalError, ValueError):
     """No joint position inside the limits reaches the pose."""
 
-    def __init__(self, message: str, *, position_error: float, rotation_error: float) -> None:
+    def __init__(
+        self, message: str, *, position_error: float, rotation_error: float, q: tuple[float, ...] | None = None
+    ) -> None:
         super().__init__(f"{message} (closest found: {position_error:.4f} m, {rotation_error:.4f} rad away)")
         self.position_error = position_error
         """Distance of the closest position found, in m."""
         self.rotation_error = rotation_error
         """Angle to the closest orientation found, in rad."""
+        self.q = q
+        """The closest joint positions found, in rad, where there are any."""
 
 
 class DriverMissing(HalError, ImportError):

@@ -6,7 +6,7 @@ import math
 from abc import ABC, abstractmethod
 from typing import TYPE_CHECKING, ClassVar, NamedTuple
 
-from .errors import CommandError, StaleStateError
+from .errors import CommandError, NotSupported, StaleStateError
 from .types import GripperState
 
 if TYPE_CHECKING:
@@ -61,6 +61,10 @@ class GripperDriver(ABC):
     def stop(self) -> None:
         """Stay where the fingers are, keep the grip force."""
 
+    def inject(self, **knobs: object) -> None:
+        """Switch faults on or off, for tests. Only drivers that simulate have any."""
+        raise NotSupported(f"driver {type(self).__name__} has no faults to inject")
+
     @abstractmethod
     def close(self) -> None:
         """Let go of the device, not of the object. Idempotent."""
@@ -83,12 +87,19 @@ class Gripper:
         """Greatest distance between the fingers, m."""
         return self.spec.width_max
 
-    def state(self) -> GripperState:
-        """The newest state. ConnectionLost when the process that owns the gripper is gone."""
+    def state(self, max_age: float = 0.5) -> GripperState:
+        """The newest state.
+
+        Raises StaleStateError when it is older than ``max_age`` s, ConnectionLost when the process that owns the
+        gripper is gone.
+        """
         self._host.check()
         found = self._mail.get_gripper()
         if found is None:
             raise StaleStateError(f"the gripper of {self._robot} has not reported a state yet")
+        age = self.clock.now() - found.stamp.t
+        if age > max_age:
+            raise StaleStateError(f"the gripper of {self._robot} has been silent for {age:.3f} s")
         return found
 
     def width_of(self, fraction: float) -> float:

@@ -12,7 +12,7 @@ from collections.abc import Callable
 from typing import Any
 
 from .cycle import Cycle
-from .errors import NotSupported
+from .errors import HalError
 from .process import Child, SharedMemory
 from .records import AppRecord, GroupMemory
 from .specs import GroupSpec, to_json
@@ -97,7 +97,7 @@ class LocalHost(Host):
 
     def check(self) -> None:
         if self._closed:
-            raise NotSupported("the rig is closed")
+            raise HalError("the rig is closed")
 
     def stop(self) -> None:
         with self._stopping:
@@ -152,7 +152,7 @@ class RemoteHost(Host):
 
     def check(self) -> None:
         if self._closed.is_set():
-            raise NotSupported("the rig is closed")
+            raise HalError("the rig is closed")
         self.child.check()
 
     def stop(self) -> None:

@@ -96,20 +96,21 @@ class HostProcess:
             self.closing = True
             return
         try:
-            answer = {"result": self._statistics() if method == "statistics" else self._ask(message)}
+            answer = {"result": self._ask(method, message["params"])}
         except Exception as error:
             answer = {"error": pack_error(error)}
         self.channel.send({"id": message["id"], **answer})
         if not self.cycle.paces_itself:
             self.pacer.restart()
 
-    def _ask(self, message: dict[str, Any]) -> Any:
-        return self.cycle.request(message["method"], message["params"])
-
-    def _statistics(self) -> dict[str, Any]:
-        statistics: dict[str, Any] = self.cycle.request("statistics", {})
+    def _ask(self, method: str, params: dict[str, Any]) -> Any:
+        result = self.cycle.request(method, params)
         pacer = self.pacer
-        return statistics | {"missed": pacer.missed, "period_s": pacer.periods.summary()}
+        if method == "statistics":
+            result = result | {"missed": pacer.missed, "period_s": pacer.periods.summary()}
+        elif method == "reset_statistics":
+            pacer.reset_statistics()
+        return result
 
     def _app_gone(self) -> bool:
         if os.getppid() != self.parent:

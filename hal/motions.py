@@ -120,31 +120,39 @@ class JointTargetMotion(Motion):
         q, dq = self._q, self._dq
         if not self._direct:
             q = [x + v * age for x, v in zip(q, dq, strict=True)]
-        q, dq = self._into_limits(q, dq)
+        for x, low, high in zip(q, smoother.lower, smoother.upper, strict=True):
+            if not low <= x <= high:
+                q, dq = self._into_limits(q, dq)
+                break
         if self._direct and smoother.reach(q, envelope.velocity, envelope.allows):
             return
-        brake, brake_jerk = _DIRECT if self._direct else _STREAM
-        goal = [
-            v + self._correction(i, x - smoother.q[i], v, brake, brake_jerk)
-            for i, (x, v) in enumerate(zip(q, dq, strict=True))
-        ]
+        goal = self._approach(q, dq)
         smoother.follow(envelope.cap_tcp(envelope.cap_joints(goal)), envelope.stays_inside)
 
-    def _correction(self, i: int, error: float, dq: float, brake: float, brake_jerk: float) -> float:
-        """Speed (rad/s) that closes an error and can still brake before it is closed."""
+    def _approach(self, q: list[float], dq: list[float]) -> list[float]:
+        """The target's speed, plus what closes the error and can still brake before it is closed."""
         smoother = self.smoother
-        distance = abs(error)
-        approach = smoother.dq[i] - dq if error > 0.0 else dq - smoother.dq[i]
-        ahead = 2.0 * smoother.dt * max(0.0, approach)
-        speed = speed_for(distance - ahead, brake * smoother.acceleration[i], brake_jerk * smoother.jerk[i])
-        speed = min(speed, _GAIN * distance)
-        return speed if error > 0.0 else -speed
+        brake, brake_jerk = _DIRECT if self._direct else _STREAM
+        ahead = 2.0 * smoother.dt
+        goal = []
+        for x, v, x_set, v_set, A, J in zip(
+            q, dq, smoother.q, smoother.dq, smoother.acceleration, smoother.jerk, strict=True
+        ):
+            error = x - x_set
+            closing = v_set - v
+            if error < 0.0:
+                closing = -closing
+            distance = abs(error)
+            left = distance - ahead * closing if closing > 0.0 else distance
+            speed = speed_for(left, brake * A, brake_jerk * J)
+            if speed > _GAIN * distance:
+                speed = _GAIN * distance
+            goal.append(v + speed if error > 0.0 else v - speed)
+        return goal
 
     def _into_limits(self, q: list[float], dq: list[float]) -> tuple[list[float], list[float]]:
         """The target, and its speed, cut to the position limits."""
         lower, upper = self.smoother.lower, self.smoother.upper
-        if all(low <= x <= high for x, low, high in zip(q, lower, upper, strict=True)):
-            return q, dq
         inside = [max(low, min(high, x)) for x, low, high in zip(q, lower, upper, strict=True)]
         if any(abs(x - y) > 1e-6 for x, y in zip(q, inside, strict=True)):
             self.envelope.limited |= Limited.POSITION

@@ -124,7 +124,9 @@ class Pose:
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, Pose):
             return NotImplemented
-        same = np.array_equal(self.orientation, other.orientation) or np.array_equal(self.orientation, -other.orientation)
+        same = np.array_equal(self.orientation, other.orientation) or np.array_equal(
+            self.orientation, -other.orientation
+        )
         return np.array_equal(self.position, other.position) and same
 
     def __hash__(self) -> int:

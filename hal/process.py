@@ -150,7 +150,7 @@ class Child:
         fds = [theirs.fileno(), *(memory.fd for memory in memories)]
         path = [os.path.abspath(entry) for entry in sys.path]
         self.process = subprocess.Popen(
-            [sys.executable, "-I", "-c", _BOOT, json.dumps([fds, path, target])],
+            [sys.executable, "-I", "-u", "-c", _BOOT, json.dumps([fds, path, target])],
             pass_fds=fds,
             stdin=subprocess.DEVNULL,
             stdout=self._log,
@@ -210,6 +210,8 @@ class Child:
         return True
 
     def _tail(self) -> str:
+        if self._log.closed:
+            return ""
         self._log.seek(0, os.SEEK_END)
         self._log.seek(max(0, self._log.tell() - 2000))
         lines = self._log.read().decode(errors="replace").strip().splitlines()[-8:]

@@ -106,7 +106,7 @@ class RobotMail:
         """Formats, in the order in which the boxes lie."""
         width = max(2 * n, 7)
         state = f"ddQ{n}d{n}d{n}d{n}d{n}d7d7d6d{n}d6diiiQQ?Qdd?" + "".join(f"{size}s" for size in _TEXTS)
-        return (f"QddiddI{width}d", _DEADMAN, "Q", state, _GRIPPER_COMMAND, _GRIPPER_STATE)
+        return (f"QddidQH{width}d", _DEADMAN, "Q", state, _GRIPPER_COMMAND, _GRIPPER_STATE)
 
     @classmethod
     def size(cls, n: int) -> int:
@@ -120,7 +120,14 @@ class RobotMail:
         width = max(2 * self.n, 7)
         values = tuple(record.values) + (0.0,) * (width - len(record.values))
         self.command.write(
-            record.seq, record.t, record.deadline, record.kind, record.t_event, 0.0, record.session, *values
+            record.seq,
+            record.t,
+            record.deadline,
+            record.kind,
+            record.t_event,
+            record.session,
+            len(record.values),
+            *values,
         )
 
     def get_command(self) -> CommandRecord | None:
@@ -128,8 +135,8 @@ class RobotMail:
         found = self.command.read()
         if found is None:
             return None
-        seq, t, deadline, kind, t_event, _, session, *values = found[1]
-        return CommandRecord(seq, session, t, deadline, Kind(kind), tuple(values), t_event)
+        seq, t, deadline, kind, t_event, session, count, *values = found[1]
+        return CommandRecord(seq, session, t, deadline, Kind(kind), tuple(values[:count]), t_event)
 
     def put_deadman(self, record: DeadmanRecord) -> None:
         """Say how the dead-man stands."""
@@ -163,9 +170,7 @@ class RobotMail:
         """Publish an arm's state."""
         nothing = self._nothing
         fault = reading.fault
-        texts = (
-            (_text(fault.code, 48), _text(fault.cause, 160), _text(fault.remedy, 240)) if fault else (b"", b"", b"")
-        )
+        texts = (_text(fault.code, 48), _text(fault.cause, 160), _text(fault.remedy, 240)) if fault else (b"", b"", b"")
         self.state.write(
             reading.t,
             reading.t_device,
@@ -247,7 +252,14 @@ class RobotMail:
         grasped = _UNKNOWN if reading.grasped is None else (_YES if reading.grasped else _NO)
         force = math.nan if reading.force is None else reading.force
         self.gripper.write(
-            reading.t, reading.t_device, reading.seq, reading.width, reading.width_target, reading.moving, grasped, force
+            reading.t,
+            reading.t_device,
+            reading.seq,
+            reading.width,
+            reading.width_target,
+            reading.moving,
+            grasped,
+            force,
         )
 
     def get_gripper(self) -> GripperState | None:

@@ -62,7 +62,7 @@ def open_rig(
     ``sim=True`` makes everything simulated, ``sim=False`` sets the rig's flag to real, None leaves the file's flags.
     ``driver="mock"`` puts a mock in the place of every device. ``clock`` is ``real_time`` or ``lock_step``.
     ``overrides`` are ``KEY=VALUE`` for any key of the rig. ``pad`` says what a pad of ``model: auto`` is: ``auto``,
-    ``evdev``, ``keyboard`` or the path of a recording. ``viewer="gui"`` opens a window onto the simulated world.
+    ``evdev``, ``keyboard``, the path of a recording, or ``none`` to open no pad. ``viewer="gui"`` opens a window onto the simulated world.
     ``realtime`` asks for SCHED_FIFO and locked memory in the processes that run servos, where the user may.
 
     Nothing moves. Raises ConfigError (every problem at once), DriverMissing, DeviceNotFound, ConnectionLost.
@@ -142,6 +142,8 @@ class Rig:
                 self.robots[spec.name] = Robot(spec, host, self.clock, self._latch)
         self._open_cameras()
         self._open_pads(pad)
+        for host in self._hosts:
+            host.request("reset_statistics")  # starting up is not what anybody wants to measure
 
     def _open_pictures(self, host: Host, viewer: str) -> None:
         """Whatever shows the world: the renderer of its cameras, a window."""
@@ -160,7 +162,8 @@ class Rig:
 
     def _open_cameras(self) -> None:
         for spec in self.plan.cameras:
-            source = self._pictures.source(spec.name) if self._pictures and spec.name in self._pictures else None
+            drawn = self._pictures is not None and spec.name in self._pictures
+            source: object = self._pictures.source(spec.name) if self._pictures and drawn else self.clock
             driver = registry.load(spec.driver, "camera")(spec, source)
             camera = Camera(driver, self.clock, threaded=not self.lock_step)
             self._devices[spec.name] = driver
@@ -168,8 +171,9 @@ class Rig:
             camera.open()
 
     def _open_pads(self, pad: str | None) -> None:
-        for spec in self.plan.pads:
-            chosen, source, notes = choose_pad(spec, pad, self._viewer, attended=self.attended)
+        window = self.plan.world.driver if self.plan.world is not None else None
+        for spec in self.plan.pads if pad != "none" else ():
+            chosen, source, notes = choose_pad(spec, pad, self._viewer, window=window, attended=self.attended)
             self.notes.extend(notes)
             driver = registry.load(chosen.driver, "gamepad")(chosen, source)
             gamepad = Gamepad(driver)
@@ -192,7 +196,9 @@ class Rig:
     def _local(self) -> LocalHost:
         host = self._hosts[0]
         if not isinstance(host, LocalHost):
-            raise NotSupported("drivers live in processes of their own in real time; open the rig with clock='lock_step'")
+            raise NotSupported(
+                "drivers live in processes of their own in real time; open the rig with clock='lock_step'"
+            )
         return host
 
     def driver(self, name: str) -> Any:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, ClassVar, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .errors import ConnectionLost, StaleStateError
+from .errors import ConnectionLost, NotSupported, StaleStateError
 from .pose import Pose, frozen
 from .types import Fault, RobotState, RobotStatus
 
@@ -102,9 +102,7 @@ class RobotDriver(ABC):
 
     def inject(self, **knobs: object) -> None:
         """Switch faults on or off, for tests. Only drivers that simulate have any."""
-        from .errors import NotSupported
-
-        raise NotSupported(f"driver {type(self).__name__} has no faults to inject; the mock and pybullet drivers have")
+        raise NotSupported(f"driver {type(self).__name__} has no faults to inject")
 
     @abstractmethod
     def close(self) -> None:
@@ -215,9 +213,7 @@ class Robot:
         """
         from .control import Control
 
-        return Control(
-            self, deadman=deadman, rate_hz=rate_hz, speed=speed, tcp_speed=tcp_speed, unattended=unattended
-        )
+        return Control(self, deadman=deadman, rate_hz=rate_hz, speed=speed, tcp_speed=tcp_speed, unattended=unattended)
 
     def move_to(
         self,

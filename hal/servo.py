@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from math import isfinite, isnan
+from math import isfinite
 
 from .anchoring import Anchoring
 from .cartesian import PoseMotion, TwistMotion
@@ -25,7 +25,7 @@ from .robot import Reading, Setpoint
 from .smoothing import JointSmoother
 from .specs import RobotSpec
 from .types import Limited, RobotStatus, Trip
-from .watchdog import Watchdog, is_alive
+from .watchdog import Watchdog, is_alive, is_timely
 
 __all__ = ["Servo", "ServoReport"]
 
@@ -103,8 +103,8 @@ class Servo:
         self._forget_goals()
         self._publish()
 
-    def begin(self, session: Session) -> None:
-        """Open a session. The set-point must have been anchored.
+    def begin(self, session: Session, inbox: Inbox) -> None:
+        """Open a session. The set-point must have been anchored; ``inbox`` is what it holds at the moment.
 
         Raises ControlTaken while another one is open, CommandError when its terms cannot be met.
         """
@@ -123,7 +123,7 @@ class Servo:
         self.report.target_seq = self.report.refused = 0
         self.report.arrived = False
         self._forget_goals()
-        self._watchdog.begin(session)
+        self._watchdog.begin(session, inbox)
         self.report.status = RobotStatus.HOLDING
         self.report.trip = Trip.NONE
 
@@ -147,7 +147,7 @@ class Servo:
         if session is None or self._finished():
             self._idle(RobotStatus.FAULT if reading.fault is not None else RobotStatus.IDLE)
             return None
-        self._listen(session, inbox.command)
+        self._listen(now, session, inbox.command)
         return self._move(now, RobotStatus.FAULT if reading.fault is not None else None)
 
     def lost(self, now: float) -> Setpoint | None:
@@ -173,7 +173,7 @@ class Servo:
             return Trip.DEVICE_LOST  # it repeats an old reading
         return Trip.NONE
 
-    def _listen(self, session: Session, command: CommandRecord | None) -> None:
+    def _listen(self, now: float, session: Session, command: CommandRecord | None) -> None:
         """Take over the newest command, if it counts."""
         watchdog = self._watchdog
         mine = command is not None and command.session == session.id
@@ -191,7 +191,7 @@ class Servo:
             return
         self._seq = command.seq
         motion = self._motions.get(command.kind)
-        if motion is None or isnan(command.deadline) or not isfinite(command.t) or not motion.usable(command.values):
+        if motion is None or not is_timely(now, command) or not motion.usable(command.values):
             self.report.refused = command.seq
             return
         if motion is not self._motion:

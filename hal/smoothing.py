@@ -61,10 +61,13 @@ class JointSmoother:
         self.acceleration = [x * _INSIDE for x in limits.acceleration]
         self.jerk = [x * _INSIDE for x in limits.jerk]
         # No stop from within the limits is longer than the one from full speed at full acceleration.
-        self.room = [
+        room = [
             stop_displacement(v, a, a, j) for v, a, j in zip(self.velocity, self.acceleration, self.jerk, strict=True)
         ]
-        """Distance from a limit at which nothing can happen yet, rad."""
+        self.free = [
+            (low + r, high - r, v) for low, high, r, v in zip(self.lower, self.upper, room, self.velocity, strict=True)
+        ]
+        """Per joint: no slower than the third number (rad/s) and between the first two (rad), no limit can matter."""
         self._zeros = [0.0] * n
         self.q = list(self._zeros)
         """Set-point, rad."""
@@ -107,7 +110,7 @@ class JointSmoother:
 
     def at_rest(self) -> bool:
         """Does nothing move? (1e-6 rad/s, 1e-4 rad/s2: Ruckig's numbers at the end of a profile.)"""
-        return all(-1e-6 < v < 1e-6 for v in self.dq) and all(-1e-4 < a < 1e-4 for a in self.ddq)
+        return all(-1e-6 < v < 1e-6 and -1e-4 < a < 1e-4 for v, a in zip(self.dq, self.ddq, strict=True))
 
     def follow(self, dq: Floats, guard: Guard | None = None, together: bool = False) -> None:
         """One tick towards the velocities ``dq``, which are cut to the limits.
@@ -190,23 +193,22 @@ class JointSmoother:
 
     def _violations(self) -> frozenset[int]:
         """Joints whose stop after the proposed step would end beyond a limit, and farther than a stop from now."""
-        found = None
-        for i, q in enumerate(self.q_next):
-            v, room, lower, upper = self.dq_next[i], self.room[i], self._lower[i], self._upper[i]
-            speed = self.velocity[i]
-            if lower + room <= q <= upper - room and -speed <= v <= speed:
-                continue
-            a, A, J = self.ddq_next[i], self.acceleration[i], self.jerk[i]
-            peak = q + stop_peak(v, a, A, J)
-            trough = q - stop_peak(-v, -a, A, J)
-            if peak <= upper and trough >= lower:
-                continue
-            now, v_now, a_now = self.q[i], self.dq[i], self.ddq[i]
-            over = peak > upper and peak > now + stop_peak(v_now, a_now, A, J) + _ROUNDING
-            under = trough < lower and trough < now - stop_peak(-v_now, -a_now, A, J) - _ROUNDING
-            if over or under:
-                found = (found or set()) | {i}
-        return frozenset(found) if found else self._none
+        found = self._none
+        for i, (q, v, (low, high, speed)) in enumerate(zip(self.q_next, self.dq_next, self.free, strict=True)):
+            if not (low <= q <= high and -speed <= v <= speed) and self._violates(i):
+                found |= {i}
+        return found
+
+    def _violates(self, i: int) -> bool:
+        A, J, lower, upper = self.acceleration[i], self.jerk[i], self._lower[i], self._upper[i]
+        q, v, a = self.q_next[i], self.dq_next[i], self.ddq_next[i]
+        peak = q + stop_peak(v, a, A, J)
+        trough = q - stop_peak(-v, -a, A, J)
+        if peak <= upper and trough >= lower:
+            return False
+        q, v, a = self.q[i], self.dq[i], self.ddq[i]
+        over = peak > upper and peak > q + stop_peak(v, a, A, J) + _ROUNDING
+        return over or (trough < lower and trough < q - stop_peak(-v, -a, A, J) - _ROUNDING)
 
     def _commit(self) -> None:
         self.q, self.dq, self.ddq = self.q_next, self.dq_next, self.ddq_next

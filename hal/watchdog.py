@@ -8,7 +8,7 @@ from __future__ import annotations
 from .inbox import CommandRecord, DeadmanRecord, Inbox, Session
 from .types import Trip
 
-__all__ = ["SILENCE", "Watchdog", "is_alive"]
+__all__ = ["SILENCE", "Watchdog", "is_alive", "is_timely"]
 
 SILENCE = 0.150
 """Longest silence of the dead-man's pad, of the app and of the device, s."""
@@ -38,7 +38,6 @@ class Watchdog:
         self.renewed = False
         """Was the permission given anew in this tick? Commands sent before do not count any more."""
         self._stops: int | None = None
-        self._new_session = False
         self._presses = 0
         self._rearms = 0
         self._rebase = False
@@ -46,13 +45,17 @@ class Watchdog:
         self._command: CommandRecord | None = None
         """The command that the arm follows."""
 
-    def begin(self, session: Session) -> None:
-        """A session opens; `rig.stop()` counts from the last tick on."""
+    def begin(self, session: Session, inbox: Inbox) -> None:
+        """A session opens; presses and rearms count from what ``inbox`` says now, `rig.stop()` from the last tick."""
         self.session = session
         self.trip = Trip.NONE
         self.allowed = self.renewed = self._rebase = False
-        self._new_session = True
         self._command = None
+        self._rearms = inbox.rearms
+        deadman = inbox.deadman
+        # For move_to, a dead-man that is held already is as good as pressed now.
+        known = session.move_to is not None and deadman is not None and deadman.held
+        self._presses = (deadman.presses if deadman is not None else 0) - int(known)
 
     def end(self) -> None:
         """The session is over."""
@@ -80,8 +83,6 @@ class Watchdog:
         if session is None:
             return False
         deadman = inbox.deadman
-        if self._new_session:
-            self._first_tick(session, inbox)
         cause = self._cause(now, session, inbox, stopped, device)
         if cause is not Trip.NONE:
             self._latch(cause, now)
@@ -93,14 +94,6 @@ class Watchdog:
         elif not self.allowed and at_rest:
             self.allowed = self.renewed = True
         return self.allowed
-
-    def _first_tick(self, session: Session, inbox: Inbox) -> None:
-        self._new_session = False
-        self._rearms = inbox.rearms
-        deadman = inbox.deadman
-        if deadman is not None:
-            # For move_to, a dead-man that is held already is as good as pressed now.
-            self._presses = deadman.presses - (1 if session.move_to is not None and deadman.held else 0)
 
     def _cause(self, now: float, session: Session, inbox: Inbox, stopped: bool, device: Trip) -> Trip:
         """What forbids motion in this tick, the gravest first."""
@@ -123,10 +116,11 @@ class Watchdog:
     def _is_late(self, now: float, session: Session, newest: CommandRecord | None) -> bool:
         """Is a command due, and neither it nor the one that came meanwhile still in time?"""
         followed = self._command
-        if followed is None or now <= followed.deadline:
+        if followed is None or is_timely(now, followed):
             return False
-        came = newest is not None and newest.session == session.id and newest.seq > followed.seq
-        return not (came and newest is not None and now <= newest.deadline)
+        if newest is None or newest.session != session.id or newest.seq <= followed.seq:
+            return True
+        return not is_timely(now, newest)
 
     def _latch(self, cause: Trip, now: float) -> None:
         if self.trip is Trip.NONE or cause is Trip.FAULT:
@@ -165,6 +159,11 @@ class Watchdog:
         self._presses = presses
         self._command = None
         self.allowed = self.renewed = True
+
+
+def is_timely(now: float, command: CommandRecord) -> bool:
+    """Is this command still to be followed, and not from the future?"""
+    return command.t - _AHEAD <= now <= command.deadline
 
 
 def is_alive(now: float, sign: float) -> bool:

@@ -116,6 +116,11 @@ class World:
             for contact in found
         )
 
+    def aabb(self, name: str) -> tuple[Array, Array]:
+        """Lower and upper corner (3,) of the box along the world's axes around a body, m."""
+        found = self._ask("aabb", name=name)
+        return frozen(found["lower"]), frozen(found["upper"])
+
     def reset(self, name: str | None = None, *, pose: Pose | None = None, q: ArrayLike | None = None) -> None:
         """Put one thing, or everything, back: at rest, to its configured pose and joints or to those given here.
 

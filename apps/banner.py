@@ -1,0 +1,47 @@
+"""What drives what: printed before anything moves."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from hal.plan import Plan
+    from hal.rig import Rig
+
+__all__ = ["banner", "listing"]
+
+
+def listing(plan: Plan) -> list[str]:
+    """The devices of a rig that is not open, one a line."""
+    lines = []
+    for robot in plan.robots:
+        gripper = f", gripper 0..{robot.gripper.width_max:g} m" if robot.gripper else ""
+        where = "REAL" if robot.attended else "simulated"
+        lines.append(f"robot    {robot.name:10s} {robot.model}, {where} ({robot.driver}), {robot.rate_hz:g} Hz{gripper}")
+    for camera in plan.cameras:
+        streams = "+".join(camera.streams)
+        lines.append(
+            f"camera   {camera.name:10s} {camera.model} ({camera.driver}), {camera.width}x{camera.height} {streams} "
+            f"at {camera.rate_hz:g} Hz"
+        )
+    lines.extend(f"gamepad  {pad.name:10s} {pad.driver}" for pad in plan.pads)
+    if plan.world is not None:
+        things = ", ".join(body.name for body in plan.world.bodies) or "nothing else"
+        lines.append(f"world    {plan.world.driver}, {plan.world.physics_hz:g} Hz: {things}")
+    lines.append(f"clock    {plan.clock.replace('_', ' ')}")
+    return lines
+
+
+def banner(rig: Rig) -> str:
+    """The same for an open rig, with what was found."""
+    plan = rig.plan
+    lines = [f"rig      {plan.source}"]
+    for line in listing(plan):
+        if line.startswith("gamepad"):
+            continue
+        lines.append(line)
+        if line.startswith("world") and rig.renderer:
+            lines.append(f"renderer {rig.renderer}")
+    lines.extend(f"gamepad  {pad.name:10s} {pad.describe()}" for pad in rig.gamepads.values())
+    lines.extend(f"note     {note}" for note in rig.notes)
+    return "\n".join(f"  {line}" for line in lines)

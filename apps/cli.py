@@ -1,0 +1,87 @@
+"""What every app's command line shares: the rig's options, and errors that a person can read."""
+
+from __future__ import annotations
+
+import argparse
+import signal
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+__all__ = ["ACTION_NEEDED", "add_rig_options", "interruptible", "rig_options", "run_app"]
+
+ACTION_NEEDED = 2
+"""Exit status when a person must mend something first."""
+
+
+def add_rig_options(parser: argparse.ArgumentParser) -> None:
+    """Options that choose and change a rig; the same in every app."""
+    rig = parser.add_argument_group("rig")
+    rig.add_argument(
+        "--config", default="panda_table", metavar="FILE", help="a rig's file, or the name of a built-in one (%(default)s)"
+    )
+    flag = rig.add_mutually_exclusive_group()
+    flag.add_argument("--sim", dest="sim", action="store_true", default=None, help="simulate every device")
+    flag.add_argument("--real", dest="sim", action="store_false", help="use the real devices")
+    rig.add_argument(
+        "--set",
+        dest="overrides",
+        action="append",
+        default=[],
+        metavar="KEY=VALUE",
+        help="change any key of the rig, for example --set cameras.wrist.output.width=320; may be repeated",
+    )
+    rig.add_argument(
+        "--pad",
+        default="auto",
+        metavar="auto|evdev|keyboard|FILE",
+        help="what drives: a plugged-in pad, the viewer's keyboard, or a recording (%(default)s: the first that is there)",
+    )
+    rig.add_argument("--viewer", choices=["gui", "none"], default="none", help="a window onto the simulated world")
+    rig.add_argument(
+        "--realtime", action="store_true", help="ask for real-time scheduling and locked memory for the servos"
+    )
+    rig.add_argument("--dry-run", action="store_true", help="check everything, list what would be opened, touch nothing")
+
+
+def rig_options(args: argparse.Namespace) -> dict[str, Any]:
+    """The arguments of :func:`hal.open` that the options stand for."""
+    return {
+        "config": args.config,
+        "sim": args.sim,
+        "overrides": args.overrides,
+        "pad": args.pad,
+        "viewer": args.viewer,
+        "realtime": args.realtime,
+    }
+
+
+@contextmanager
+def interruptible() -> Iterator[None]:
+    """A closed terminal or a polite kill is like Ctrl-C: everything stops and closes before the program ends."""
+
+    def interrupt(signum: int, frame: object) -> None:
+        raise KeyboardInterrupt
+
+    names = [name for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]
+    before = {name: signal.signal(getattr(signal, name), interrupt) for name in names}
+    try:
+        yield
+    finally:
+        for name, handler in before.items():
+            signal.signal(getattr(signal, name), handler)
+
+
+def run_app(main: Any, args: argparse.Namespace) -> int:
+    """Run ``main(args)``; an error that a person can mend becomes a message, not a traceback."""
+    from hal.errors import HalError
+
+    try:
+        with interruptible():
+            return int(main(args))
+    except HalError as error:
+        print(f"{type(error).__name__}: {error}", file=sys.stderr)
+        return ACTION_NEEDED
+    except KeyboardInterrupt:
+        return 130

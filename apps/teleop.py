@@ -1,0 +1,185 @@
+"""Drive an arm with a gamepad: in simulation and on the real arm, the same program.
+
+    python apps/teleop.py --sim
+    python apps/teleop.py --real --config my_rig.yaml
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from typing import TYPE_CHECKING
+
+from hal.apps.cli import add_rig_options, rig_options, run_app
+
+if TYPE_CHECKING:
+    from hal.control import Control
+    from hal.gamepad import Gamepad
+    from hal.rig import Rig
+    from hal.robot import Robot
+    from hal.teleop import Teleop
+
+RATE_HZ = 50.0
+
+
+def parser() -> argparse.ArgumentParser:
+    """The command line."""
+    made = argparse.ArgumentParser(
+        prog="teleop", description="Drive an arm with a gamepad, in simulation or for real.", epilog="Ctrl-C stops the arm."
+    )
+    add_rig_options(made)
+    drive = made.add_argument_group("driving")
+    drive.add_argument("--robot", metavar="NAME", help="which arm, where the rig has several (the first)")
+    drive.add_argument("--mapping", default="default", metavar="FILE", help="what the pad's controls do (%(default)s)")
+    drive.add_argument("--speed", type=float, metavar="SHARE", help="share of the mapping's speeds, above 0, at most 1")
+    drive.add_argument("--duration", type=float, metavar="S", help="end after so many seconds")
+    drive.add_argument("--report", metavar="FILE", help="write how the run went, as JSON")
+    return made
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Entry point."""
+    return run_app(_main, parser().parse_args(argv))
+
+
+def _main(args: argparse.Namespace) -> int:
+    import hal
+    from hal.apps.banner import banner, listing
+    from hal.errors import CommandError
+
+    if args.speed is not None and not 0.0 < args.speed <= 1.0:
+        raise CommandError(f"--speed must be above 0 and at most 1, not {args.speed:g}")
+    if args.duration is not None and not args.duration > 0.0:
+        raise CommandError(f"--duration must be positive, not {args.duration:g}")
+    if args.dry_run:
+        from hal.config import load
+        from hal.mapping import load_mapping
+
+        plan = load(args.config, sim=args.sim, overrides=args.overrides).resolve()
+        load_mapping(args.mapping)
+        print(f"{plan.source} is in order; it would open:")
+        print("\n".join(f"  {line}" for line in [*listing(plan), *plan.warnings]))
+        return 0
+    with hal.open(**rig_options(args)) as rig:
+        print(banner(rig), flush=True)
+        name = args.robot or next(iter(rig.robots), None)
+        if name is None:
+            raise CommandError(f"{rig.plan.source} has no robot to drive")
+        if not rig.gamepads:
+            raise CommandError(f"{rig.plan.source} has no gamepad; add 'gamepads: {{pad: {{model: auto}}}}'")
+        robot, pad = rig.robots[name], next(iter(rig.gamepads.values()))
+        teleop = hal.Teleop(robot, mapping=args.mapping, speed=args.speed or 1.0)
+        print("\n".join(f"  {line}" for line in teleop.help(pad)), flush=True)
+        return Session(rig, robot, pad, teleop, args).run()
+
+
+class Session:
+    """One run of the app."""
+
+    def __init__(self, rig: Rig, robot: Robot, pad: Gamepad, teleop: Teleop, args: argparse.Namespace) -> None:
+        from hal.apps.report import RunReport
+        from hal.apps.status import StatusLine
+
+        self.rig, self.robot, self.pad, self.teleop, self.args = rig, robot, pad, teleop, args
+        self.deadman = pad.hold(teleop.mapping.deadman)
+        self.report = RunReport(rig, robot)
+        self.line = StatusLine()
+        self.end = rig.clock.now() + args.duration if args.duration else None
+        self.stopped: str | None = None
+
+    def run(self) -> int:
+        """Drive until the time is over, the recording ends or Ctrl-C; then stop, report, close."""
+        clean = False
+        try:
+            while self._drive():
+                self._go_home()
+            clean = True
+        except KeyboardInterrupt:
+            clean = True  # the session's end brought the arm to rest
+        finally:
+            self.line.clear()
+            if self.args.report:
+                self.report.write(self.args.report, self.report.collect(clean))
+        self.line.event(f"stopped after {self.rig.clock.now() - self.report.start:.1f} s")
+        return 0
+
+    def _drive(self) -> bool:
+        """Follow the pad. True when the home button was pressed, False when the run is over."""
+        from hal.errors import MotionStopped, RobotFault
+
+        seen = -1
+        with self.robot.control(deadman=self.deadman, rate_hz=RATE_HZ) as control:
+            self.teleop.reset()
+            for tick in self.rig.clock.rate(RATE_HZ):
+                state = self.pad.state()
+                fresh, seen = state.stamp.seq != seen, state.stamp.seq
+                motion, grip = self.teleop.step(state, tick.dt)
+                try:
+                    control.send(motion, gripper=grip, t_event=state.stamp.t if fresh else 0.0)
+                    self._resumed()
+                except MotionStopped as stop:
+                    self._tripped(stop)
+                except RobotFault as fault:
+                    self._faulted(fault)
+                self._show(control)
+                if self._over():
+                    return False
+                if self.teleop.home_pressed(state) and self.deadman.held:
+                    return True
+        return False
+
+    def _go_home(self) -> None:
+        from hal.errors import MotionStopped
+
+        self.line.event("home: hold the dead-man until the arm is there")
+        try:
+            self.robot.move_to(self.robot.home, deadman=self.deadman)
+        except MotionStopped as stop:
+            self._tripped(stop)
+
+    def _over(self) -> bool:
+        return self.pad.finished or (self.end is not None and self.rig.clock.now() >= self.end)
+
+    def _tripped(self, stop: Exception) -> None:
+        if self.stopped != str(stop):
+            self.stopped = str(stop)
+            self.report.tripped(getattr(stop, "reason", str(stop)))
+            self.line.event(f"STOPPED: {stop}")
+
+    def _faulted(self, fault: Exception) -> None:
+        if self.stopped != str(fault):
+            self.stopped = str(fault)
+            self.report.faulted(getattr(fault, "cause", str(fault)))
+            self.line.event(f"FAULT: {fault}")
+
+    def _resumed(self) -> None:
+        if self.stopped is not None:
+            self.stopped = None
+            self.line.event("going on")
+
+    def _show(self, control: Control) -> None:
+        state = self.robot.state()
+        self.report.saw(state)
+
+        def text() -> str:
+            x, y, z = state.tcp.position
+            held = "held" if self.deadman.held else "released"
+            gripper = self.robot.gripper
+            width = f"gripper {1e3 * gripper.state().width:4.0f} mm  " if gripper else ""
+            trips = f"  trips {len(self.report.trips)}" if self.report.trips else ""
+            limited = f"  held back: {state.limited.name}" if state.limited else ""
+            frames = "  ".join(
+                f"{name} {counts.fps:.0f}/s"
+                for name, camera in self.rig.cameras.items()
+                if (counts := camera.counts()).fps is not None
+            )
+            return (
+                f"  dead-man {held:8s}  {state.status.name.lower():9s}  tcp {x:6.3f} {y:6.3f} {z:6.3f} m  {width}"
+                f"{frames}{trips}{limited}"
+            )
+
+        self.line.update(text)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,87 @@
+"""Real time: missed servo ticks, frame rates, ages of states and frames, with both cameras of the built-in rig.
+
+    python benchmarks/real_time.py [--seconds 20] [--rates 240 1000]
+
+The reference in the same run is the same rig without cameras, and a bare pacer at the same rate that does nothing.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from typing import Any
+
+import numpy as np
+
+import hal
+from hal.histogram import Histogram
+from hal.pacer import Pacer
+
+
+def bare(rate_hz: float, seconds: float) -> float:
+    """Share of ticks that a loop with nothing to do misses in this process."""
+    pacer, end = Pacer(1.0 / rate_hz), time.monotonic() + seconds
+    turns = 0
+    while time.monotonic() < end:
+        pacer.wait()
+        turns += 1
+    return pacer.missed / (turns + pacer.missed)
+
+
+def run(rate_hz: float, seconds: float, cameras: bool) -> dict[str, Any]:
+    """Drive the arm at 50 Hz and look at its state and every frame."""
+    overrides = [f"simulation.physics_hz={rate_hz:g}"] + ([] if cameras else ["cameras={}"])
+    with hal.open("panda_table", sim=True, clock="real_time", overrides=overrides, pad="none") as rig:
+        arm = rig.robots["panda"]
+        before = next(iter(rig.statistics().values()))
+        ages = Histogram(1e-4, 5000)
+        start = rig.clock.now()
+        with arm.control(rate_hz=50) as control:
+            for tick in rig.clock.rate(50):
+                turn = tick.t - start
+                control.send(hal.Twist([0.05 * np.sin(turn), 0.05 * np.cos(turn), 0.0]))
+                state = arm.state()
+                ages.add(rig.clock.now() - state.stamp.t)
+                for camera in rig.cameras.values():
+                    camera.latest(max_age=5.0)
+                if turn > seconds:
+                    break
+        after = next(iter(rig.statistics().values()))
+        ticks = after["ticks"] - before["ticks"]
+        missed = after["missed"] - before["missed"]
+        return {
+            "missed": missed / (ticks + missed),
+            "period": after["period_s"],
+            "age": ages.summary(),
+            "cameras": {name: camera.counts() for name, camera in rig.cameras.items()},
+            "renderer": rig.renderer,
+        }
+
+
+def main() -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description="missed ticks, frame rates and ages in real time")
+    parser.add_argument("--seconds", type=float, default=20.0, help="length of each run (%(default)s)")
+    parser.add_argument("--rates", type=float, nargs="+", default=[240.0, 1000.0], help="servo rates, Hz")
+    args = parser.parse_args()
+    for rate_hz in args.rates:
+        print(f"\nservo {rate_hz:g} Hz, {args.seconds:g} s each")
+        print(f"  bare pacer            missed {100 * bare(rate_hz, args.seconds / 2):.2f} %")
+        for cameras in (False, True):
+            found = run(rate_hz, args.seconds, cameras)
+            name = "with both cameras" if cameras else "without cameras"
+            period, age = found["period"], found["age"]
+            print(
+                f"  {name:20s}  missed {100 * found['missed']:.2f} %, period ms p50 {1e3 * period['p50']:.2f} "
+                f"p99 {1e3 * period['p99']:.2f} max {1e3 * period['max']:.1f}, state age ms p50 {1e3 * age['p50']:.1f} "
+                f"p99 {1e3 * age['p99']:.1f}"
+            )
+            for camera, counts in found["cameras"].items():
+                print(
+                    f"    {camera:18s}  {counts.fps:.1f} frames/s, {counts.dropped} dropped, "
+                    f"age ms p50 {1e3 * counts.age_p50:.1f}  ({found['renderer']})"
+                )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,162 @@
+"""Median time of one servo tick per kind of command, beside a bare Ruckig update in the same run.
+
+    python benchmarks/servo_tick.py [ticks]
+
+Times differ from machine to machine and from minute to minute; the last column, the ratio to the reference measured in
+turn with it, is what to compare.
+"""
+
+from __future__ import annotations
+
+import argparse
+import gc
+import math
+import os
+import statistics
+import time
+from collections.abc import Callable
+from dataclasses import replace
+
+from ruckig import ControlInterface, InputParameter, OutputParameter, Ruckig, Synchronization
+from servo_streams import PANDA, robot_spec
+
+from hal.audit import SetpointAudit
+from hal.commands import Kind
+from hal.inbox import NO_INBOX, CommandRecord, Inbox, Session
+from hal.robot import Reading
+from hal.servo import Servo
+from hal.specs import RobotSpec, WorkspaceSpec
+
+RATE_HZ = 1000.0
+STILL = [0.0] * 7
+Values = Callable[[float, list[float]], list[float]]
+
+
+def panda() -> RobotSpec:
+    """The Panda that comes with PyBullet's data."""
+    import pybullet_data
+
+    spec = robot_spec(PANDA, RATE_HZ)
+    kinematics = replace(
+        spec.kinematics,
+        urdf=os.path.join(pybullet_data.getDataPath(), "franka_panda", "panda.urdf"),
+        joints=tuple(f"panda_joint{i}" for i in range(1, 8)),
+        tcp_link="panda_hand",
+        tcp_position=(0.0, 0.0, 0.1034),
+    )
+    return replace(spec, kinematics=kinematics)
+
+
+class Bare:
+    """The reference: a velocity target of seven joints, changed every tick, and the result read back."""
+
+    def __init__(self) -> None:
+        self.ruckig, self.inputs, self.output = Ruckig(7, 1 / RATE_HZ), InputParameter(7), OutputParameter(7)
+        self.inputs.control_interface = ControlInterface.Velocity
+        self.inputs.synchronization = Synchronization.No
+        self.inputs.max_velocity = list(PANDA.velocity)
+        self.inputs.max_acceleration, self.inputs.max_jerk = list(PANDA.acceleration), list(PANDA.jerk)
+        self.q = self.dq = self.ddq = STILL
+
+    def tick(self, t: float) -> None:
+        inputs = self.inputs
+        inputs.current_position, inputs.current_velocity, inputs.current_acceleration = self.q, self.dq, self.ddq
+        inputs.target_velocity = [math.sin(t)] * 7
+        self.ruckig.update(inputs, self.output)
+        output = self.output
+        self.q, self.dq, self.ddq = output.new_position, output.new_velocity, output.new_acceleration
+
+
+def measure(spec: RobotSpec, kind: Kind | None, values: Values, tcp_speed: float, ticks: int) -> tuple[float, ...]:
+    """Median and 99th percentile of a tick, and the median of the reference, in us. Without a kind: move_to."""
+    servo = Servo(spec, 1 / RATE_HZ)
+    servo.anchor(spec.home)
+    goal = tuple(x + 0.3 * math.cos(k) for k, x in enumerate(spec.home)) if kind is None else None
+    servo.begin(Session(1, 0.3, tcp_speed, False, goal), NO_INBOX)
+    bare = Bare()
+    now, q = 10.0, list(spec.home)
+    start = list(q)
+    command = None
+    times, references = [], []
+    for k in range(ticks):
+        now += 1 / RATE_HZ
+        t = k / RATE_HZ
+        if kind is not None and k % 20 == 0:  # 50 Hz
+            command = CommandRecord(k + 1, 1, now, now + 0.1, kind, tuple(values(t, start)))
+        reading = Reading(now, now, k, q, STILL)
+        inbox = Inbox(command, None, 0, 0, now)
+        begun = time.perf_counter_ns()
+        setpoint = servo.tick(now, reading, inbox)
+        ended = time.perf_counter_ns()
+        bare.tick(t)
+        references.append(time.perf_counter_ns() - ended)
+        times.append(ended - begun)
+        assert setpoint is not None
+        q = list(setpoint.q)
+    if servo.report.trip or max(abs(a - b) for a, b in zip(q, start, strict=True)) < 1e-3:
+        raise RuntimeError(f"{kind}: the arm did not move as it should: {servo.report}")
+    times.sort()
+    return statistics.median(times) / 1e3, times[int(0.99 * ticks)] / 1e3, statistics.median(references) / 1e3
+
+
+def audit_time(ticks: int) -> float:
+    """Median time of one sample of the audit, us."""
+    audit = SetpointAudit(PANDA, 1 / RATE_HZ)
+    times = []
+    for k in range(ticks):
+        q = [0.1 * math.sin(0.001 * k + i) for i in range(7)]
+        begun = time.perf_counter_ns()
+        audit.add(q)
+        times.append(time.perf_counter_ns() - begun)
+    return statistics.median(times) / 1e3
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("ticks", type=int, nargs="?", default=5000)
+    ticks = parser.parse_args().ticks
+    free, capped = 1e9, 0.25
+    box = WorkspaceSpec((0.1, -0.8, 0.0), (0.9, 0.8, 1.2))
+
+    def sine(t: float, start: list[float]) -> list[float]:
+        q = [x + 0.2 * (1 - math.cos(t + k)) - 0.2 * (1 - math.cos(k)) for k, x in enumerate(start)]
+        return q + [0.2 * math.sin(t + k) for k in range(7)]
+
+    def held(t: float, start: list[float]) -> list[float]:
+        return [x + 0.09 for x in start] + STILL
+
+    def velocity(t: float, start: list[float]) -> list[float]:
+        return [0.2 * math.sin(t + k) for k in range(7)]
+
+    def twist(t: float, start: list[float]) -> list[float]:
+        return [0.1 * math.cos(t), 0.1 * math.sin(t), -0.05 * math.cos(t), 0.0, 0.0, 0.2 * math.cos(t), 0.0]
+
+    spec = panda()
+    servo = Servo(spec, 1 / RATE_HZ)
+    pose = list(servo.kinematics.fk(spec.home))
+
+    def target(t: float, start: list[float]) -> list[float]:
+        return [pose[0] + 0.04 * math.sin(t), pose[1] + 0.04 * math.sin(2 * t), *pose[2:]]
+
+    walled = replace(spec, workspace=box)
+    cases: list[tuple[str, RobotSpec, Kind | None, Values, float]] = [
+        ("joint targets, moving", spec, Kind.JOINT_TARGET, sine, free),
+        ("joint targets, held", spec, Kind.JOINT_TARGET, held, free),
+        ("joint targets, tcp speed capped", spec, Kind.JOINT_TARGET, sine, capped),
+        ("joint targets, capped, workspace", walled, Kind.JOINT_TARGET, sine, capped),
+        ("joint velocities, capped", spec, Kind.JOINT_VELOCITY, velocity, capped),
+        ("poses", spec, Kind.CARTESIAN_TARGET, target, capped),
+        ("twists", spec, Kind.TWIST, twist, capped),
+        ("twists, workspace", walled, Kind.TWIST, twist, capped),
+        ("move_to", spec, None, held, capped),
+    ]
+    gc.disable()
+    print(f"{'kind of command':34s} {'median':>8s} {'p99':>8s} {'reference':>10s} {'ratio':>7s}   (us)")
+    for name, case, kind, values, tcp_speed in cases:
+        median, p99, reference = measure(case, kind, values, tcp_speed, ticks)
+        print(f"{name:34s} {median:8.1f} {p99:8.1f} {reference:10.1f} {median / reference:7.1f}")
+    print(f"{'audit, one sample':34s} {audit_time(ticks):8.1f}")
+
+
+if __name__ == "__main__":
+    main()

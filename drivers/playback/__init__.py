@@ -1,0 +1,9 @@
+"""A gamepad replayed from a recording."""
+
+from __future__ import annotations
+
+from hal.registry import DriverSpec
+
+__all__ = ["DRIVER"]
+
+DRIVER = DriverSpec(name="playback", gamepad="hal.drivers.playback.pad:PlaybackPad")

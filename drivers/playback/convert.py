@@ -1,0 +1,105 @@
+"""Turn an evemu recording (``.events``) of a pad into a file for playback.
+
+    python -m hal.drivers.playback.convert ds4.events --ioctl ds4.ioctl --model dualshock4 --output ds4.jsonl
+
+The axes' ranges come from ``A:`` lines, where the recording has its device's description, or from umockdev's
+``.ioctl`` file, where ``umockdev-record`` made it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import re
+import struct
+import sys
+from collections.abc import Iterable
+from pathlib import Path
+
+from hal.errors import ConfigError, HalError, Problem
+from hal.padcodes import ABS_NAME, EV_ABS, EV_KEY, KEY_NAME
+from hal.padmapper import AxisRange
+
+from .recording import RecordedEvent, Recording, dump
+
+__all__ = ["convert", "main"]
+
+_EVENT = re.compile(r"E: (\d+\.\d+) ([0-9a-fA-F]{4}) ([0-9a-fA-F]{4}) (-?\d+)")
+_RANGE = re.compile(r"A: ([0-9a-fA-F]{2}) (-?\d+) (-?\d+) (-?\d+) (-?\d+)")
+_IOCTL = re.compile(r"EVIOCGABS(?:\((\d+)\))? 0 ([0-9a-fA-F]{48})")
+
+
+def convert(events: Path, ioctl: Path | None = None, *, model: str, about: str = "") -> Recording:
+    """Read a recording of evemu. Events that no pad model can mean (SYN, MSC) are left out.
+
+    Raises ConfigError for lines that are no events, and where nothing says what the axes' numbers mean.
+    """
+    found: list[tuple[float, int, int, int]] = []
+    ranges: dict[int, AxisRange] = {}
+    problems: list[Problem] = []
+    for number, line in enumerate(_lines(events), 1):
+        if line.startswith("E: "):
+            match = _EVENT.match(line)
+            if match:
+                found.append((float(match[1]), int(match[2], 16), int(match[3], 16), int(match[4])))
+            else:
+                problems.append(Problem(str(events), f"line {number}", f"is no event: {line}"))
+        elif match := _RANGE.match(line):
+            ranges[int(match[1], 16)] = AxisRange(int(match[2]), int(match[3]), int(match[5]))
+    if ioctl is not None:
+        ranges.update(_ioctl_ranges(_lines(ioctl)))
+    wanted = [
+        (t, kind, code, value)
+        for t, kind, code, value in found
+        if (kind == EV_KEY and code in KEY_NAME) or (kind == EV_ABS and code in ABS_NAME)
+    ]
+    for code in sorted({code for _, kind, code, _ in wanted if kind == EV_ABS} - set(ranges)):
+        problems.append(Problem(str(events), ABS_NAME[code], "nothing says its range; name the .ioctl file too"))
+    if not wanted and not problems:
+        problems.append(Problem(str(events), "", "holds no event of a pad"))
+    if problems:
+        raise ConfigError(problems)
+    start = wanted[0][0]
+    known = {code: span for code, span in ranges.items() if code in ABS_NAME}
+    return Recording(model, known, tuple(RecordedEvent(t - start, *rest) for t, *rest in wanted), about)
+
+
+def _lines(path: Path) -> list[str]:
+    try:
+        return path.read_text(encoding="utf-8", errors="replace").splitlines()
+    except OSError as error:
+        raise ConfigError([Problem(str(path), "", f"cannot be read: {error.strerror}")]) from None
+
+
+def _ioctl_ranges(lines: Iterable[str]) -> dict[int, AxisRange]:
+    """Ranges from the answers to EVIOCGABS: struct input_absinfo of linux/input.h, six 32-bit numbers."""
+    ranges = {}
+    for line in lines:
+        if match := _IOCTL.match(line):
+            _, minimum, maximum, _, flat, _ = struct.unpack("<6i", bytes.fromhex(match[2]))
+            ranges[int(match[1] or 0)] = AxisRange(minimum, maximum, flat)
+    return ranges
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """The command line. Returns the exit status."""
+    parser = argparse.ArgumentParser(prog="hal.drivers.playback.convert", description="evemu -> playback")
+    parser.add_argument("events", type=Path, help="the recording")
+    parser.add_argument("--ioctl", type=Path, help="umockdev's .ioctl file of the same device")
+    parser.add_argument("--model", required=True, help="name of the pad's model, for example dualshock4")
+    parser.add_argument("--about", default="", help="where the recording comes from")
+    parser.add_argument("--output", type=Path, help="file to write; standard output when left out")
+    given = parser.parse_args(arguments)
+    try:
+        text = dump(convert(given.events, given.ioctl, model=given.model, about=given.about))
+    except HalError as error:
+        print(error, file=sys.stderr)
+        return 2
+    if given.output is None:
+        print(text, end="")
+    else:
+        given.output.write_text(text, encoding="utf-8")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

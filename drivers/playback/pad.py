@@ -1,0 +1,164 @@
+"""A pad that plays a recording on the rig's clock, with faults on request."""
+
+from __future__ import annotations
+
+import math
+import time
+from pathlib import Path
+from types import MappingProxyType
+from typing import Annotated, Any, ClassVar
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from hal.errors import ConfigError, Problem
+from hal.gamepad import GamepadDriver, PadReading
+from hal.padmapper import PadMapper
+from hal.padmodel import PadModel, pad_model, validated
+from hal.specs import PadSpec
+
+from .recording import Recording, load
+
+__all__ = ["PlaybackPad"]
+
+Seconds = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
+
+
+class Options(BaseModel):
+    """What a rig may say under ``options:`` of a recorded pad. Times are seconds from the first poll."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    file: Path
+    """The recording; :mod:`.recording` describes the format."""
+    loop: bool = False
+    """Begin again at the end, with everything released in between."""
+    freeze_at: Seconds | None = None
+    """From then on the pad says nothing more and stays connected: what is held stays held, ``t_alive`` stops."""
+    disconnect_at: Seconds | None = None
+    """Then it is unplugged,"""
+    reconnect_at: Seconds | None = None
+    """and then plugged in again, with whatever the recording holds at that time."""
+
+
+class PlaybackPad(GamepadDriver):
+    """Plays ``options.file`` from the first poll on. After the end the pad is released, connected and alive.
+
+    Nobody holds a recording, so it never counts as the dead-man of a real arm.
+    """
+
+    simulated: ClassVar[bool] = True
+
+    def __init__(self, spec: PadSpec, source: object | None = None) -> None:
+        """Raises ConfigError for wrong options."""
+        super().__init__(spec, source)
+        self._options = validated(Options, spec.options, f"gamepads.{spec.name}")
+        self._recording = Recording("", {}, ())
+        self._mapper: PadMapper | None = None
+        self._t0: float | None = None
+        self._next = 0
+        self._round = 0
+        self._played = 0
+        self._t_event = 0.0
+        self._last: PadReading | None = None
+
+    def open(self) -> None:
+        """Raises ConfigError, which lists every bad line of the file."""
+        self._recording = load(self._options.file)
+        self._mapper = PadMapper(self._model(), self._recording.ranges)
+        self.flat = self._mapper.flat
+        self._t0 = None
+        self._next = self._round = 0
+        self._begin()
+
+    def _model(self) -> PadModel:
+        file, wanted = str(self._options.file), self._recording.model
+        if not isinstance(wanted, str):
+            return pad_model(wanted, f"{file}, line 1: model")
+        known: list[dict[str, Any]] = [*self.spec.models, *([self.spec.model] if self.spec.model else [])]
+        for data in known:
+            if data.get("name") == wanted:
+                return pad_model(data, f"model {wanted}")
+        names = ", ".join(str(data.get("name")) for data in known)
+        raise ConfigError([Problem(file, "line 1", f"there is no pad model {wanted!r}; models: {names or 'none'}")])
+
+    def poll(self, now: float, timeout: float) -> PadReading:
+        if self._mapper is None:
+            raise RuntimeError("open the pad before polling it")
+        if self._t0 is None:
+            self._t0 = self._t_event = now
+        if timeout > 0.0:
+            now += self._wait(timeout if self._frozen(now) else min(timeout, self._due() - now))
+        if self._frozen(now) and self._last is not None:
+            return self._last
+        self._play(now)
+        connected = self._connected(now)
+        last_alive = self._last.t_alive if self._last is not None else -math.inf
+        self._last = PadReading(
+            t=self._t_event,
+            t_alive=now if connected else last_alive,
+            t_device=self._t_event - self._t0,
+            seq=self._played,
+            axes=MappingProxyType(dict(self._mapper.axes if connected else dict.fromkeys(self._mapper.axes, 0.0))),
+            buttons=self._mapper.buttons if connected else frozenset(),
+            connected=connected,
+        )
+        return self._last
+
+    @staticmethod
+    def _wait(seconds: float) -> float:
+        """Sleep, and say how long it took, s."""
+        start = time.monotonic()
+        if seconds > 0.0:
+            time.sleep(seconds)
+        return time.monotonic() - start
+
+    def _start(self) -> float:
+        """When the present round began, on the rig's clock, s."""
+        assert self._t0 is not None
+        return self._t0 + self._round * self._recording.duration
+
+    def _due(self) -> float:
+        """When the next event is due, on the rig's clock, s."""
+        events = self._recording.events
+        return self._start() + events[self._next].t if self._next < len(events) else math.inf
+
+    def _play(self, now: float) -> None:
+        """Feed every event that is due."""
+        assert self._mapper is not None
+        events = self._recording.events
+        while (due := self._due()) <= now:
+            event = events[self._next]
+            self._mapper.feed(event.kind, event.code, event.value)
+            self._next += 1
+            self._played += 1
+            self._t_event = due
+            if self._next == len(events):
+                self._begin()
+                if self._options.loop and self._recording.duration > 0.0:
+                    self._round += 1
+                    self._next = 0
+
+    def _begin(self) -> None:
+        """Everything released, as at the start and after the end."""
+        assert self._mapper is not None
+        self._mapper.release()
+
+    def _frozen(self, now: float) -> bool:
+        at = self._options.freeze_at
+        return at is not None and self._t0 is not None and now - self._t0 >= at
+
+    def _connected(self, now: float) -> bool:
+        off, on = self._options.disconnect_at, self._options.reconnect_at
+        if off is None or self._t0 is None or now - self._t0 < off:
+            return True
+        return on is not None and now - self._t0 >= max(on, off)
+
+    @property
+    def finished(self) -> bool:
+        return self._mapper is not None and not self._options.loop and self._next >= len(self._recording.events)
+
+    def describe(self) -> str:
+        return f"the recording {self._options.file.name}"
+
+    def close(self) -> None:
+        self._mapper = None

@@ -1,0 +1,16 @@
+"""The simulation: one PyBullet world per rig; arms, grippers and cameras are views of it."""
+
+from hal.registry import DriverSpec
+
+DRIVER = DriverSpec(
+    name="pybullet",
+    world="hal.drivers.pybullet.world:World",
+    mirror="hal.drivers.pybullet.mirror:Mirror",
+    robot="hal.drivers.pybullet.robot:PyBulletRobot",
+    gripper="hal.drivers.pybullet.gripper:PyBulletGripper",
+    camera="hal.drivers.pybullet.camera:PyBulletCamera",
+    gamepad="hal.drivers.pybullet.keyboard:KeyboardPad",
+    pictures="hal.drivers.pybullet.pictures:PyBulletPictures",
+    viewer="hal.drivers.pybullet.viewer:PyBulletViewer",
+    requires={"pybullet": "pip install 'robot-hal[sim]'"},
+)

@@ -1,0 +1,70 @@
+"""One thing that stands in the world: its PyBullet number, its names, and the frame that its pose is given in."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from hal.specs import BodySpec, RobotSpec
+
+from .library import Client
+from .transforms import Transform, compose, inverse
+
+__all__ = ["Body"]
+
+
+@dataclass
+class Body:
+    """A robot or an object.
+
+    PyBullet keeps a body's pose in the frame of its base link's *centre of mass* (its "inertial frame"); everybody
+    else means the base link's own frame. ``inertial`` is the constant transform between the two.
+    """
+
+    name: str
+    id: int
+    """PyBullet's number."""
+    spec: BodySpec | RobotSpec
+    links: dict[str, int]
+    """Link indices by name; the base link is -1."""
+    joints: dict[str, int]
+    """Indices of all joints by name, the fixed ones too."""
+    movable: tuple[int, ...]
+    """Indices of the joints that move."""
+    floating: bool
+    """Can physics move its base?"""
+    inertial: Transform
+    """The centre of mass's frame in the frame of the base link."""
+    index: int = -1
+    """Its place among the world's bodies: what segmentation images show."""
+    home: dict[int, float] = field(default_factory=dict)
+    """Where each movable joint starts: rad, or m."""
+    efforts: dict[int, float] = field(default_factory=dict)
+    """Greatest torque or force of each driven joint: Nm, or N."""
+    speeds: dict[int, float] = field(default_factory=dict)
+    """Greatest speed of each driven joint: rad/s, or m/s."""
+    base: Transform = ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
+    """Where the base link starts, in the world."""
+    damping: tuple[float, float] = (0.04, 0.04)
+    """Linear and angular damping. PyBullet does not give them back; 0.04 is what it starts with."""
+    hardened: set[int] = field(default_factory=set)
+    """Links whose contacts were made soft and then hard again (see :mod:`.dynamics`)."""
+
+    def __post_init__(self) -> None:
+        self.link_names = {index: name for name, index in self.links.items()}
+
+    @property
+    def is_robot(self) -> bool:
+        return isinstance(self.spec, RobotSpec)
+
+    @property
+    def moves(self) -> bool:
+        """Can physics move any of it?"""
+        return self.floating or bool(self.movable)
+
+    def base_pose(self, client: Client) -> Transform:
+        """The pose of the base link in the world."""
+        return compose(client.getBasePositionAndOrientation(self.id), inverse(self.inertial))
+
+    def set_base_pose(self, client: Client, pose: Transform) -> None:
+        """Put the base link there. Velocities stay."""
+        client.resetBasePositionAndOrientation(self.id, *compose(pose, self.inertial))

@@ -1,0 +1,137 @@
+"""A simulated parallel gripper: two coupled fingers, each with a motor of limited speed and force."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+from hal.errors import CommandError, ConfigError, Problem
+from hal.gripper import GripperDriver, GripperReading
+from hal.specs import GripperSpec, RobotSpec
+
+from .body import Body
+from .motors import position_gain
+from .world import World
+
+__all__ = ["PyBulletGripper"]
+
+AT_TARGET = 0.001
+"""m: a width this close to the target is there."""
+AT_REST = 0.002
+"""m/s: slower than this is standing still."""
+SETTLE = 0.1
+"""s of standing still after which a motion has ended, wherever it is."""
+PRESSING = 0.5
+"""Share of the commanded force from which on the fingers press on something."""
+
+
+class PyBulletGripper(GripperDriver):
+    """A view of the fingers of one robot in a :class:`~hal.drivers.pybullet.world.World`.
+
+    Each finger is driven by a position motor whose force is the grip force, so a grasp needs no code per step: on an
+    object the motors press with that force, from both sides, until the next command. Positive joint positions open.
+
+    To hold a thing of mass m, friction needs ``2 mu force >= m (g + a)``, with ``mu`` the product of the frictions of
+    finger and thing (PyBullet's rule): 20 N for the 2 kg cube on the Panda's fingers (1.0 and 0.5) at rest.
+    """
+
+    simulated: ClassVar[bool] = True
+
+    def __init__(self, spec: GripperSpec, world: object | None = None) -> None:
+        super().__init__(spec, world)
+        if not isinstance(world, World):
+            raise CommandError(f"{spec.name}: a simulated gripper needs the world that it stands in, not {world!r}")
+        self._world = world
+        self._open = False
+        self._target = spec.width_max
+        self._force = spec.force
+        self._moving = False
+        self._moved_at = 0.0
+
+    def open(self) -> None:
+        """Find the fingers in the world."""
+        self._body = _owner(self.spec, self._world)
+        self._joints = [self._body.joints[name] for name in self.spec.joints]
+        self._read = self._world.client.getJointStates
+        self._target = self._width()[0]
+        if not self._open:
+            self._world.on_reset(self._body.name, self._was_reset)
+        self._open = True
+
+    def read(self, now: float) -> GripperReading:
+        """The fingers as the last physics step left them; ``force`` is what the weaker motor pressed with, N."""
+        width, speed, force = self._width()
+        t = self._world.t
+        short = abs(width - self._target) > AT_TARGET
+        if abs(speed) > AT_REST:
+            self._moved_at = t
+        if self._moving and not (short and t - self._moved_at < SETTLE) and abs(speed) <= AT_REST:
+            self._moving = False
+        moving = self._moving or abs(speed) > AT_REST
+        pressing = force >= PRESSING * self._force
+        return GripperReading(
+            t=now,
+            t_device=t,
+            seq=self._world.steps,
+            width=width,
+            width_target=self._target,
+            moving=moving,
+            grasped=not moving and pressing and width > self._target + AT_TARGET,
+            force=force,
+        )
+
+    def move(self, width: float, speed: float, force: float) -> None:
+        """Start towards ``width``, cut to what the gripper can do; the newest command wins."""
+        self._target = min(max(width, 0.0), self.spec.width_max)
+        self._force = force
+        self._moving, self._moved_at = True, self._world.t
+        self._drive(min(speed, self.spec.speed))
+
+    def stop(self) -> None:
+        """Stay where the fingers are. On an object, they go on pressing."""
+        width, speed, force = self._width()
+        self._moving = False
+        if abs(speed) <= AT_REST and force >= PRESSING * self._force:
+            return
+        self._target = width
+        self._drive(self.spec.speed)
+
+    def close(self) -> None:
+        """The motors hold, or press, for as long as the world lasts."""
+        if self._open:
+            self._world.off_reset(self._body.name, self._was_reset)
+        self._open = False
+
+    def _drive(self, speed: float) -> None:
+        client = self._world.client
+        for joint in self._joints:
+            client.setJointMotorControl2(
+                self._body.id,
+                joint,
+                client.POSITION_CONTROL,
+                targetPosition=self._target / 2.0,
+                force=self._force,
+                positionGain=position_gain(self._world.dt),
+                velocityGain=1.0,
+                maxVelocity=speed / 2.0,
+            )
+
+    def _width(self) -> tuple[float, float, float]:
+        """Width in m, its speed in m/s (positive opens), and the force of the weaker motor in N (positive closes)."""
+        states = self._read(self._body.id, self._joints)
+        share = 2.0 / len(states)
+        width = share * sum(state[0] for state in states)
+        return width, share * sum(state[1] for state in states), min(-state[3] for state in states)
+
+    def _was_reset(self) -> None:
+        self._target = self._width()[0]
+        self._force = self.spec.force
+        self._moving = False
+
+
+def _owner(spec: GripperSpec, world: World) -> Body:
+    """The one robot in the world that has this gripper."""
+    owners = [body for body in world.bodies.values() if isinstance(body.spec, RobotSpec) and body.spec.gripper == spec]
+    if len(owners) != 1 or not spec.joints:
+        message = f"{len(owners)} robots have it" if spec.joints else "names no finger joints"
+        raise ConfigError([Problem("grippers", spec.name, f"{message}; it needs one robot and its finger joints")])
+    return owners[0]

@@ -1,0 +1,220 @@
+"""From the records of a rig to bodies in PyBullet."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from hal.errors import ConfigError, Problem
+from hal.specs import BodySpec, RobotSpec
+
+from .body import Body
+from .inertias import mend_inertias
+from .library import Client, silenced
+from .transforms import Transform, compose, inverse
+from .urdf import Mimic, UrdfFacts, read_urdf
+
+__all__ = ["load_object", "load_robot"]
+
+PLANE = (5.0, 5.0)
+"""Half extents of the part of an endless plane that is drawn, m."""
+UNKNOWN_EFFORT = 200.0
+"""Nm or N for a joint whose limit is given nowhere (a URDF's effort of 0 means unknown, not powerless)."""
+UNKNOWN_SPEED = 2.0
+"""rad/s or m/s, likewise."""
+GEAR_SHARE = 0.8
+"""Share of the error between coupled joints that one physics step takes away."""
+GEAR_FORCE = 10.0
+"""Strength of the coupling, as a multiple of the effort of the joints that it couples."""
+CONSTRAINT_ERP = 0.2
+"""PyBullet's own share, which it multiplies a gear's by."""
+
+
+def load_object(client: Client, spec: BodySpec) -> tuple[Body, list[str]]:
+    """Make an object.
+
+    Returns:
+        The body, and warnings for a person.
+
+    Raises:
+        ConfigError: its file is missing or broken, or a size that its shape needs.
+    """
+    key = f"objects.{spec.name}"
+    if spec.shape != "urdf":
+        number = _make_shape(client, spec, key)
+        body = _describe(client, spec, number, key)
+        return body, []
+    if spec.urdf is None:
+        raise ConfigError([Problem("objects", f"{key}.urdf", "is missing, and the shape is urdf")])
+    facts = read_urdf(spec.urdf, f"{key}.urdf")
+    number = _load_urdf(client, spec.urdf, f"{key}.urdf", fixed=spec.fixed, scale=spec.scale)
+    body = _describe(client, spec, number, f"{key}.urdf")
+    _couple(client, body, facts.mimics)
+    return body, _mass_warnings(spec.urdf, facts) + mend_inertias(client, body, spec.urdf, facts.massless)
+
+
+def load_robot(client: Client, spec: RobotSpec) -> tuple[Body, list[str]]:
+    """Make an arm with its base fixed in the world.
+
+    Returns and raises as :func:`load_object`; a joint or link that the URDF lacks is a ConfigError too.
+    """
+    key = f"robots.{spec.name}"
+    facts = read_urdf(spec.urdf, f"{key}.urdf")
+    number = _load_urdf(client, spec.urdf, f"{key}.urdf", fixed=True, scale=1.0)
+    body = _describe(client, spec, number, f"{key}.urdf")
+    fingers = spec.gripper.joints if spec.gripper else ()
+    _check_names(body, spec, fingers, key)
+
+    warnings = _mass_warnings(spec.urdf, facts) + mend_inertias(client, body, spec.urdf, facts.massless)
+    limits = spec.limits
+    for joint in body.movable:
+        info = client.getJointInfo(number, joint)
+        name, effort, speed = info[1].decode(), float(info[10]), float(info[11])
+        body.home[joint] = 0.0
+        if name in spec.joints:
+            place = spec.joints.index(name)
+            body.home[joint] = spec.initial[place]
+            speed = limits.velocity[place]
+            effort = limits.torque[place] if limits.torque else effort
+        elif name in fingers and spec.gripper:
+            body.home[joint] = spec.gripper.width_max / 2.0
+        if effort <= 0.0:
+            warnings.append(f"{spec.urdf}: joint {name!r} has no effort limit; {UNKNOWN_EFFORT:g} is used")
+        body.efforts[joint] = effort if effort > 0.0 else UNKNOWN_EFFORT
+        body.speeds[joint] = speed if speed > 0.0 else UNKNOWN_SPEED
+    body.base = _root_pose(client, body, spec)
+    mimics = facts.mimics or tuple(Mimic(finger, fingers[0], 1.0, 0.0) for finger in fingers[1:])
+    _couple(client, body, mimics)
+    return body, warnings
+
+
+def _load_urdf(client: Client, path: str, key: str, *, fixed: bool, scale: float) -> int:
+    number = -1
+    with silenced() as chatter:
+        try:
+            flags = client.URDF_USE_INERTIA_FROM_FILE  # else PyBullet invents inertias from the collision shapes
+            number = client.loadURDF(path, useFixedBase=fixed, globalScaling=scale, flags=flags)
+        except client.error:
+            pass  # said below, with what it printed
+    if number < 0:
+        said = " ".join(chatter.text.split())
+        raise ConfigError([Problem(path, key, f"PyBullet cannot load it. {said}".strip())])
+    return number
+
+
+def _make_shape(client: Client, spec: BodySpec, key: str) -> int:
+    def need(name: str) -> float:
+        value = getattr(spec, name)
+        if value is None:
+            raise ConfigError([Problem("objects", f"{key}.{name}", f"is missing, and a {spec.shape} needs it")])
+        return float(value)
+
+    drawn_at: Sequence[float] = (0.0, 0.0, 0.0)
+    if spec.shape == "box":
+        if spec.half_extents is None:
+            raise ConfigError([Problem("objects", f"{key}.half_extents", "is missing, and a box needs it")])
+        solid = drawn = {"shapeType": client.GEOM_BOX, "halfExtents": spec.half_extents}
+    elif spec.shape == "sphere":
+        solid = drawn = {"shapeType": client.GEOM_SPHERE, "radius": need("radius")}
+    elif spec.shape in ("cylinder", "capsule"):
+        kind = client.GEOM_CYLINDER if spec.shape == "cylinder" else client.GEOM_CAPSULE
+        solid = {"shapeType": kind, "radius": need("radius"), "height": need("length")}
+        drawn = {"shapeType": kind, "radius": need("radius"), "length": need("length")}
+    elif spec.shape == "plane":  # endless to touch; drawn as a thin box whose upper face is the plane
+        x, y = (spec.half_extents or (*PLANE, 0.0))[:2]
+        solid = {"shapeType": client.GEOM_PLANE, "planeNormal": (0.0, 0.0, 1.0)}
+        drawn = {"shapeType": client.GEOM_BOX, "halfExtents": (x, y, 0.005)}
+        drawn_at = (0.0, 0.0, -0.005)
+    else:
+        shapes = "box, sphere, cylinder, capsule, plane, urdf"
+        raise ConfigError([Problem("objects", f"{key}.shape", f"is {spec.shape!r}; shapes: {shapes}")])
+    shape = client.createCollisionShape(**solid) if spec.collision else -1
+    visual = (
+        client.createVisualShape(**drawn, rgbaColor=spec.rgba, visualFramePosition=drawn_at) if spec.visible else -1
+    )
+    mass = 0.0 if spec.fixed or spec.shape == "plane" else spec.mass
+    number: int = client.createMultiBody(mass, shape, visual)
+    return number
+
+
+def _describe(client: Client, spec: BodySpec | RobotSpec, number: int, key: str) -> Body:
+    """Names, indices and frames as PyBullet loaded them."""
+    links = {client.getBodyInfo(number)[0].decode(): -1}
+    joints: dict[str, int] = {}
+    movable: list[int] = []
+    for joint in range(client.getNumJoints(number)):
+        info = client.getJointInfo(number, joint)
+        joints[info[1].decode()] = joint
+        links[info[12].decode()] = joint
+        if info[2] in (client.JOINT_REVOLUTE, client.JOINT_PRISMATIC):
+            movable.append(joint)
+        elif info[2] != client.JOINT_FIXED:
+            message = f"joint {info[1].decode()!r} is neither fixed, revolute, continuous nor prismatic"
+            raise ConfigError([Problem(str(spec.urdf), key, message)])
+    dynamics = client.getDynamicsInfo(number, -1)
+    fixed = isinstance(spec, RobotSpec) or spec.fixed or spec.shape == "plane"
+    base: Transform = ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
+    if isinstance(spec, BodySpec):
+        base = (tuple(spec.position), tuple(spec.orientation))
+    return Body(
+        name=spec.name,
+        id=number,
+        spec=spec,
+        links=links,
+        joints=joints,
+        movable=tuple(movable),
+        floating=not fixed and dynamics[0] > 0.0,
+        inertial=(tuple(dynamics[3]), tuple(dynamics[4])),
+        home=dict.fromkeys(movable, 0.0),
+        base=base,
+    )
+
+
+def _check_names(body: Body, spec: RobotSpec, fingers: Sequence[str], key: str) -> None:
+    """Every joint and link that the record names must be there, and move where it has to."""
+    moving = {name for name, joint in body.joints.items() if joint in body.movable}
+    problems = [
+        Problem(spec.urdf, f"{key}.{where}", f"has no movable joint {name!r}; movable: {', '.join(sorted(moving))}")
+        for where, names in (("joints", spec.joints), ("gripper.joints", fingers))
+        for name in names
+        if name not in moving
+    ]
+    base_link = spec.kinematics.base_link
+    if base_link is not None and base_link not in body.links:
+        message = f"has no link {base_link!r}; links: {', '.join(body.links)}"
+        problems.append(Problem(spec.urdf, f"{key}.base_link", message))
+    if problems:
+        raise ConfigError(problems)
+
+
+def _root_pose(client: Client, body: Body, spec: RobotSpec) -> Transform:
+    """Where the URDF's root must stand for the arm's base link to stand where the rig says."""
+    link = body.links[spec.kinematics.base_link] if spec.kinematics.base_link else -1
+    if link == -1:
+        return (tuple(spec.base_position), tuple(spec.base_orientation))
+    body.set_base_pose(client, ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0)))
+    state = client.getLinkState(body.id, link, computeForwardKinematics=True)
+    return compose((spec.base_position, spec.base_orientation), inverse((state[4], state[5])))
+
+
+def _couple(client: Client, body: Body, mimics: Sequence[Mimic]) -> None:
+    """Make joints follow each other as ``<mimic>`` says, which PyBullet reads and ignores.
+
+    The gear acts between the two joints, so a finger that is blocked holds back the other one too.
+    """
+    for mimic in mimics:
+        if mimic.joint not in body.joints or mimic.of not in body.joints or mimic.multiplier == 0.0:
+            continue
+        follower, leader = body.joints[mimic.joint], body.joints[mimic.of]
+        gear = client.createConstraint(
+            body.id, leader, body.id, follower, client.JOINT_GEAR, (1, 0, 0), (0, 0, 0), (0, 0, 0)
+        )
+        force = GEAR_FORCE * max(body.efforts.get(leader, 0.0), body.efforts.get(follower, 0.0), 100.0)
+        client.changeConstraint(
+            gear, gearRatio=-1.0 / mimic.multiplier, erp=GEAR_SHARE / CONSTRAINT_ERP, maxForce=force
+        )
+
+
+def _mass_warnings(urdf: str, facts: UrdfFacts) -> list[str]:
+    if not facts.massless:
+        return []
+    return [f"{urdf}: no <inertial> in {', '.join(facts.massless)}; PyBullet takes 1 kg for each"]

@@ -1,0 +1,147 @@
+"""A simulated arm: joint motors that follow set-points closely, one call to read and one to write."""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar
+
+from hal.errors import CommandError, ConnectionLost
+from hal.robot import Reading, RobotDriver, Setpoint
+from hal.specs import RobotSpec
+from hal.types import Fault
+
+from .motors import hold, position_gain
+from .world import World
+
+__all__ = ["PyBulletRobot"]
+
+
+class PyBulletRobot(RobotDriver):
+    """A view of one robot in a :class:`~hal.drivers.pybullet.world.World`.
+
+    Each motor is a velocity constraint with a torque limit: in a physics step it brings its joint to the speed
+    ``dq + gain (p - q) / dt``, as far as its torque allows. With ``p = q_set - dq_set dt`` the joint is at the
+    set-point at the end of the step in which it was written, so the next reading lags by nothing. Gravity is
+    carried by the constraint, so that nothing sags. The torque limits are the rig's, or the URDF's where it has
+    none; the speed limits stand in each motor, so that a set-point that jumps cannot move a joint faster.
+    """
+
+    modes: ClassVar[frozenset[str]] = frozenset({"position", "velocity"})
+    simulated: ClassVar[bool] = True
+
+    def __init__(self, spec: RobotSpec, world: object | None = None) -> None:
+        super().__init__(spec, world)
+        self._world = _world_of(spec.name, world)
+        self._open = False
+        self._connected = True
+        self._frozen: Reading | None = None
+        self._freeze = False
+        self._fault: Fault | None = None
+        self._q: list[float] | None = None
+        self._dq: list[float] | None = None
+
+    def open(self) -> None:
+        """Find the robot in the world."""
+        world = self._world
+        self._body = world.body(self.spec.name)
+        self._joints = [self._body.joints[name] for name in self.spec.joints]
+        self._efforts = [self._body.efforts[joint] for joint in self._joints]
+        self._position_gains = [position_gain(world.dt)] * len(self._joints)
+        self._velocity_gains = [1.0] * len(self._joints)
+        self._read = world.client.getJointStates
+        self._write = world.client.setJointMotorControlArray
+        self._mode = world.client.POSITION_CONTROL
+        if not self._open:
+            world.on_reset(self.spec.name, self._was_reset)
+        self._open = True
+
+    def read(self, now: float) -> Reading:
+        """The joints as the last physics step left them; ``tau`` is what the motors applied in it."""
+        if not self._connected:
+            raise ConnectionLost(f"{self.spec.name} does not answer (injected)")
+        if self._freeze and self._frozen is not None:
+            return self._frozen
+        world = self._world
+        states = self._read(self._body.id, self._joints)
+        reading = Reading(
+            t=now,
+            t_device=world.t,
+            seq=world.steps,
+            q=[state[0] for state in states],
+            dq=[state[1] for state in states],
+            tau=[state[3] for state in states],
+            q_commanded=self._q,
+            dq_commanded=self._dq,
+            fault=self._fault,
+        )
+        self._frozen = reading
+        return reading
+
+    def write(self, setpoint: Setpoint) -> None:
+        """Hand over a set-point; a robot with a fault does not take it, which its ``q_commanded`` shows."""
+        if not self._connected:
+            raise ConnectionLost(f"{self.spec.name} does not answer (injected)")
+        if self._fault is not None:
+            return
+        q, dq = list(setpoint.q), list(setpoint.dq)
+        dt = self._world.dt
+        self._write(
+            self._body.id,
+            self._joints,
+            self._mode,
+            targetPositions=[a - b * dt for a, b in zip(q, dq, strict=True)],
+            targetVelocities=dq,
+            forces=self._efforts,
+            positionGains=self._position_gains,
+            velocityGains=self._velocity_gains,
+        )
+        self._q, self._dq = q, dq
+
+    def halt(self) -> None:
+        """The motors hold the last set-point."""
+        if self._open and self._q is not None:
+            self._hold(self._q)
+
+    def recover(self) -> None:
+        """Clear every injected fault."""
+        self._connected, self._freeze, self._fault = True, False, None
+
+    def inject(self, **knobs: object) -> None:
+        """Switch faults on or off.
+
+        Args:
+            **knobs: ``freeze=True``: every reading repeats the last one, stamps and all. ``lost=True``: the robot
+                does not answer. ``fault="text"``: the robot reports that fault, holds where it is and takes no
+                set-points; ``fault=None`` ends it.
+        """
+        known = {"freeze", "lost", "fault"}
+        if not set(knobs) <= known:
+            raise CommandError(f"{', '.join(sorted(set(knobs) - known))}: no such fault; faults: freeze, lost, fault")
+        self._freeze = bool(knobs.get("freeze", self._freeze))
+        self._connected = not knobs.get("lost", not self._connected)
+        if "fault" not in knobs:
+            return
+        cause = knobs["fault"]
+        self._fault = Fault("injected", str(cause), "call recover() on the arm") if cause else None
+        if self._fault is not None and self._open:
+            self._hold([state[0] for state in self._read(self._body.id, self._joints)])
+
+    def close(self) -> None:
+        """The motors hold the last set-point for as long as the world lasts."""
+        self.halt()
+        if self._open:
+            self._world.off_reset(self.spec.name, self._was_reset)
+        self._open = False
+
+    def _hold(self, q: list[float]) -> None:
+        hold(self._world.client, self._body, dict(zip(self._joints, q, strict=True)), self._world.dt)
+        self._q, self._dq = list(q), [0.0] * len(q)
+
+    def _was_reset(self) -> None:
+        self._q = [state[0] for state in self._read(self._body.id, self._joints)]
+        self._dq = [0.0] * len(self._joints)
+
+
+def _world_of(name: str, world: Any) -> World:
+    if not isinstance(world, World):
+        raise CommandError(f"{name}: a simulated device needs the simulated world that it stands in, not {world!r}")
+    return world

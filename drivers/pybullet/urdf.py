@@ -1,0 +1,81 @@
+"""What a URDF file says that PyBullet ignores, or reports with no more than a failure: read as plain XML."""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ElementTree
+from dataclasses import dataclass
+from pathlib import Path
+
+from hal.errors import ConfigError, Problem
+
+__all__ = ["Mimic", "UrdfFacts", "read_urdf"]
+
+
+@dataclass(frozen=True)
+class Mimic:
+    """A joint that follows another: ``q[joint] = multiplier * q[of] + offset``."""
+
+    joint: str
+    of: str
+    multiplier: float
+    offset: float
+
+
+@dataclass(frozen=True)
+class UrdfFacts:
+    """What this driver needs to know beside what PyBullet loads."""
+
+    mimics: tuple[Mimic, ...]
+    massless: tuple[str, ...]
+    """Links that have geometry but no ``<inertial>``: PyBullet gives them a mass of 1 kg."""
+
+
+def read_urdf(path: str, key: str) -> UrdfFacts:
+    """Read and check a URDF.
+
+    Args:
+        path: the file.
+        key: the configuration key that names it, for the error.
+
+    Raises:
+        ConfigError: no such file, no URDF, or meshes that are not there; every one is listed.
+    """
+    try:
+        root = ElementTree.parse(path).getroot()
+    except OSError as error:
+        raise ConfigError([Problem(path, key, f"cannot be read: {error.strerror}")]) from None
+    except ElementTree.ParseError as error:
+        raise ConfigError([Problem(path, key, f"is not a URDF: {error}")]) from None
+    if root.tag != "robot":
+        raise ConfigError([Problem(path, key, f"is not a URDF: its root is <{root.tag}>, not <robot>")])
+    missing = [name for name in _mesh_names(root) if not _mesh_is_there(name, Path(path).resolve().parent)]
+    if missing:
+        raise ConfigError([Problem(path, key, f"names a mesh that is not there: {name}") for name in missing])
+    mimics = tuple(
+        Mimic(
+            joint.get("name", ""),
+            mimic.get("joint", ""),
+            float(mimic.get("multiplier", 1.0)),
+            float(mimic.get("offset", 0.0)),
+        )
+        for joint in root.iter("joint")
+        if (mimic := joint.find("mimic")) is not None
+    )
+    massless = tuple(
+        link.get("name", "")
+        for link in root.iter("link")
+        if link.find("inertial") is None and (link.find("visual") is not None or link.find("collision") is not None)
+    )
+    return UrdfFacts(mimics, massless)
+
+
+def _mesh_names(root: ElementTree.Element) -> list[str]:
+    names = (mesh.get("filename", "") for mesh in root.iter("mesh"))
+    return list(dict.fromkeys(names))
+
+
+def _mesh_is_there(name: str, folder: Path) -> bool:
+    """PyBullet looks beside the URDF, then in each folder above it, whatever package a URI names."""
+    for scheme in ("package://", "model://", "file://"):
+        name = name.removeprefix(scheme)
+    return any((place / name).is_file() for place in (folder, *folder.parents))

@@ -1,0 +1,332 @@
+"""The simulated world of a rig: one PyBullet client that simulated arms, grippers and cameras are views of.
+
+The same class is the world that is stepped and each of its mirrors (the renderer's, the viewer's). A mirror is made
+from the same record and never stepped: it replays the edits of :data:`World.MIRRORED` in their order, which keeps the
+order of the bodies the same, and :meth:`World.show` poses it by a :meth:`World.snapshot` of that revision.
+"""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any, ClassVar
+
+from hal.errors import CommandError, ConfigError, DeviceNotFound, NotSupported, Problem
+from hal.specs import BodySpec, RobotSpec, WorldSpec
+
+from .body import Body
+from .contacts import bounding_box, find_contacts, forget_contacts
+from .dynamics import read_dynamics, write_dynamics
+from .library import Client
+from .loading import load_object, load_robot
+from .motors import hold
+from .picture import Picture
+from .transforms import Transform
+from .values import body_spec, joint_positions, nearest, numbers, pose_json, transform
+
+__all__ = ["World"]
+
+ITERATIONS = 100
+"""Of the solver, at most; it ends sooner where nothing is left to solve. With PyBullet's 50, fingers that grasp with
+70 N reach half of it, and fast arms are 0.2 % over their speed limits."""
+
+
+class World:
+    """Everything that stands in one simulation.
+
+    Public methods whose names are in :attr:`REQUESTS` are the questions and edits of ``rig.world``; they take and give
+    plain numbers, lists and dicts, so that they can travel (:meth:`request`). Poses are dicts of ``position`` (3,) m
+    and ``orientation`` (4,) xyzw, of a link's own frame, in the world.
+
+    Raises:
+        ConfigError: something in the record cannot be loaded; lists every such thing.
+        DriverMissing: PyBullet is not installed, or its window cannot open.
+    """
+
+    REQUESTS: ClassVar[frozenset[str]] = frozenset(
+        {
+            *("names", "describe", "pose", "velocity", "dynamics", "contacts", "aabb"),
+            *("add", "remove", "set_color", "set_pose", "set_velocity", "set_dynamics", "reset"),
+        }
+    )
+    MIRRORED: ClassVar[frozenset[str]] = frozenset({"add", "remove", "set_color"})
+    """Edits that change what is drawn beyond poses. Each one that succeeds adds one to :attr:`revision`; mirrors
+    replay them (``mirror.request(method, params)``) before they show a snapshot of that revision."""
+
+    def __init__(self, spec: WorldSpec, *, mirror: bool = False, gui: bool = False) -> None:
+        self.spec = spec
+        self.mirror = mirror
+        self.dt = 1.0 / spec.physics_hz
+        """One physics step, s."""
+        self.steps = 0
+        self.revision = 0
+        self.bodies: dict[str, Body] = {}
+        self.warnings: list[str] = []
+        """What a person should know about the files that were loaded."""
+        self.client = Client(gui=gui)
+        self._on_reset: dict[str, list[Callable[[], None]]] = {}
+        try:
+            self.client.setTimeStep(self.dt)
+            self.client.setGravity(*spec.gravity)
+            self.client.setPhysicsEngineParameter(deterministicOverlappingPairs=1, numSolverIterations=ITERATIONS)
+            self._load((*spec.bodies, *spec.robots))
+        except BaseException:
+            self.close()
+            raise
+        self._step = self.client.stepSimulation
+
+    def _load(self, specs: Iterable[BodySpec | RobotSpec]) -> None:
+        problems: list[Problem] = []
+        for spec in specs:
+            try:
+                self._place(spec)
+            except ConfigError as error:
+                problems.extend(error.problems)
+        if problems:
+            raise ConfigError(problems)
+        self._arrange()
+
+    def _place(self, spec: BodySpec | RobotSpec) -> Body:
+        if spec.name in self.bodies:
+            raise ConfigError([Problem("world", spec.name, "is the name of two things; names are unique in the world")])
+        if isinstance(spec, RobotSpec):
+            body, warnings = load_robot(self.client, spec)
+        else:
+            body, warnings = load_object(self.client, spec)
+        self.bodies[spec.name] = body
+        self.warnings += warnings
+        self._put_home(body)
+        return body
+
+    @property
+    def client_id(self) -> int:
+        """PyBullet's ``physicsClientId``."""
+        return self.client.id
+
+    @property
+    def t(self) -> float:
+        """Simulated time, s."""
+        return self.steps * self.dt
+
+    def step(self) -> None:
+        """One physics step."""
+        if self.mirror:
+            raise NotSupported("a mirror is posed by show(), never stepped")
+        self._step()
+        self.steps += 1
+
+    def close(self) -> None:
+        """Let go of PyBullet. Idempotent."""
+        self.bodies = {}
+        self.client.close()
+
+    # --- requests: rig.world -------------------------------------------------------------------------------------
+
+    def request(self, method: str, params: Mapping[str, Any]) -> Any:
+        """Call one of :attr:`REQUESTS` by name: JSON in, JSON out.
+
+        Raises:
+            DeviceNotFound: no body or link of that name; lists those that are there.
+            CommandError: no such method, arguments that it does not take, or impossible numbers.
+        """
+        if method not in self.REQUESTS:
+            raise CommandError(f"the world has no request {method!r}; requests: {', '.join(sorted(self.REQUESTS))}")
+        function = getattr(self, method)
+        try:
+            inspect.signature(function).bind(**params)
+        except TypeError as error:
+            raise CommandError(f"world.{method}: {error}") from None
+        return function(**params)
+
+    def names(self) -> list[str]:
+        """Names of everything, objects first, in the order in which they came."""
+        return list(self.bodies)
+
+    def describe(self, name: str) -> dict[str, Any]:
+        """``index`` (its number in segmentation images), ``robot`` (is it one?), ``links`` and ``joints`` by name."""
+        body = self.body(name)
+        return {"index": body.index, "robot": body.is_robot, "links": list(body.links), "joints": list(body.joints)}
+
+    def pose(self, name: str, link: str | None = None) -> dict[str, list[float]]:
+        """The pose of a link's frame in the world; of the base link when none is named."""
+        body = self.body(name)
+        index = self.link(body, link)
+        if index == -1:
+            return pose_json(body.base_pose(self.client))
+        state = self.client.getLinkState(body.id, index, computeForwardKinematics=True)
+        return pose_json((state[4], state[5]))
+
+    def set_pose(self, name: str, pose: Mapping[str, Sequence[float]]) -> None:
+        """Put an object's base link there, at rest, whatever is in the way; its joints keep their positions."""
+        body = self.body(name)
+        if body.is_robot:
+            raise CommandError(f"{name!r} is a robot: its servo moves it, and reset() puts it back")
+        self._set_base(body, transform(pose))
+
+    def velocity(self, name: str) -> list[list[float]]:
+        """Linear (3,) m/s of the base link's centre of mass and angular (3,) rad/s, along the world's axes."""
+        return [list(part) for part in self.client.getBaseVelocity(self.body(name).id)]
+
+    def set_velocity(
+        self, name: str, linear: Sequence[float] = (0.0, 0.0, 0.0), angular: Sequence[float] = (0.0, 0.0, 0.0)
+    ) -> None:
+        """Give a body that moves freely a velocity, as :meth:`velocity` means it."""
+        body = self.body(name)
+        if not body.floating:
+            raise CommandError(f"the base of {name!r} is fixed: it has no velocity to set")
+        self.client.resetBaseVelocity(body.id, numbers("linear", linear, 3), numbers("angular", angular, 3))
+
+    def dynamics(self, name: str, link: str | None = None) -> dict[str, Any]:
+        """Mass, inertia, frictions, restitution, contact stiffness and damping, damping (:func:`read_dynamics`)."""
+        body = self.body(name)
+        return read_dynamics(self.client, body, self.link(body, link))
+
+    def set_dynamics(self, name: str, link: str | None = None, **values: Any) -> dict[str, Any]:
+        """Set some of :meth:`dynamics`; returns what to pass here to put it all back (:func:`write_dynamics`)."""
+        body = self.body(name)
+        before = write_dynamics(self.client, body, self.link(body, link), values, self.dt)
+        forget_contacts(self.client, [body])
+        return before
+
+    def contacts(self, a: str | None = None, b: str | None = None) -> list[dict[str, Any]]:
+        """Where bodies touched in the last step: all, those of ``a``, or those between ``a`` and ``b``.
+
+        Each a dict of ``a``, ``b``, ``link_a``, ``link_b``, ``position`` (3,) m on ``b``, ``normal`` (3,) from ``b``
+        towards ``a``, ``distance`` m, negative where they overlap, and ``force`` N along the normal.
+        """
+        if a is None:
+            a, b = b, None
+        first, second = (None if name is None else self.body(name) for name in (a, b))
+        return find_contacts(self.client, self.bodies.values(), first, second)
+
+    def aabb(self, name: str) -> dict[str, list[float]]:
+        """``lower`` and ``upper`` (3,) m: the box along the world's axes that holds the whole body.
+
+        It is PyBullet's, so it may be larger by a collision margin (mm).
+        """
+        lower, upper = bounding_box(self.client, self.body(name))
+        return {"lower": lower, "upper": upper}
+
+    def add(self, spec: Mapping[str, Any] | BodySpec) -> int:
+        """Put an object into the world; returns the new revision."""
+        record = spec if isinstance(spec, BodySpec) else body_spec(spec)
+        self._load([record])
+        return self._edited()
+
+    def remove(self, name: str) -> int:
+        """Take an object out of the world; returns the new revision. Robots stay."""
+        body = self.body(name)
+        if body.is_robot:
+            raise CommandError(f"{name!r} is a robot: robots stay in the world")
+        self.client.removeBody(body.id)
+        del self.bodies[name]
+        self._arrange()
+        return self._edited()
+
+    def set_color(self, name: str, rgba: Sequence[float]) -> int:
+        """Paint all links of a body (red, green, blue, alpha in 0..1); returns the new revision."""
+        body = self.body(name)
+        color = numbers("rgba", rgba, 4)
+        if not all(0.0 <= value <= 1.0 for value in color):
+            raise CommandError(f"rgba of {name!r} must be numbers in 0..1, not {color}")
+        for link in {shape[1] for shape in self.client.getVisualShapeData(body.id)}:
+            self.client.changeVisualShape(body.id, link, rgbaColor=color)
+        return self._edited()
+
+    def _edited(self) -> int:
+        self.revision += 1
+        return self.revision
+
+    def reset(
+        self,
+        name: str | None = None,
+        pose: Mapping[str, Sequence[float]] | None = None,
+        q: Sequence[float] | None = None,
+    ) -> None:
+        """Put one thing, or everything, back: at rest, where the rig says it starts, or where these arguments say.
+
+        An arm holds there and its gripper is open. What was added or removed, painted or given other dynamics
+        stays so, and simulated time goes on.
+
+        Args:
+            name: of the body; None means all.
+            pose: an object's base link in the world; only with a name.
+            q: joint positions in rad or m; only with a name. Of an arm: those of its joints, or of its joints and
+                fingers; of an object: those of all its movable joints.
+        """
+        if name is None:
+            if pose is not None or q is not None:
+                raise CommandError("reset with a pose or with q needs the name of what they are for")
+            everything = list(self.bodies.values())
+            forget_contacts(self.client, everything)
+            for body in everything:
+                self._put_home(body)
+            return
+        body = self.body(name)
+        if pose is not None and body.is_robot:
+            raise CommandError(f"{name!r} is a robot: its base stays where the rig says")
+        base = body.base if pose is None else transform(pose)
+        joints = body.home if q is None else {**body.home, **joint_positions(body, q)}
+        forget_contacts(self.client, [body])
+        self._put(body, base, joints)
+
+    # --- for drivers, the renderer and the viewer ----------------------------------------------------------------
+
+    def body(self, name: str) -> Body:
+        """The body of that name, or a DeviceNotFound that lists all."""
+        if name not in self.bodies:
+            raise DeviceNotFound(f"the world has no body {name!r}{nearest(name, self.bodies)}")
+        return self.bodies[name]
+
+    def link(self, body: Body, name: str | None) -> int:
+        """Index of a link by name; of the base link for None."""
+        if name is None:
+            return -1
+        if name not in body.links:
+            raise DeviceNotFound(f"{body.name!r} has no link {name!r}{nearest(name, body.links)}")
+        return body.links[name]
+
+    def on_reset(self, name: str, callback: Callable[[], None]) -> None:
+        """Have ``callback`` called whenever the robot of that name was put somewhere by a reset."""
+        self._on_reset.setdefault(name, []).append(callback)
+
+    def off_reset(self, name: str, callback: Callable[[], None]) -> None:
+        """The end of :meth:`on_reset`."""
+        self._on_reset[name].remove(callback)
+
+    def snapshot(self) -> list[float]:
+        """Where everything is now: what :meth:`show` of a mirror at the same :attr:`revision` takes."""
+        return self._picture.take()
+
+    def show(self, snapshot: Sequence[float]) -> None:
+        """Put every body where a snapshot of the same revision says.
+
+        Raises:
+            ValueError: it was taken from a world with other bodies.
+        """
+        self._picture.show(snapshot)
+
+    def _arrange(self) -> None:
+        """Number the bodies and look again at what stands still, after bodies came, went or were moved by hand."""
+        for index, body in enumerate(self.bodies.values()):
+            body.index = index
+        self._picture = Picture(self.client, self.bodies.values())
+
+    def _put_home(self, body: Body) -> None:
+        self._put(body, body.base, body.home)
+
+    def _put(self, body: Body, base: Transform, joints: Mapping[int, float]) -> None:
+        self._set_base(body, base)
+        for joint, position in joints.items():
+            self.client.resetJointState(body.id, joint, position, 0.0)
+        if body.is_robot:
+            hold(self.client, body, joints, self.dt)
+        for callback in self._on_reset.get(body.name, ()):
+            callback()
+
+    def _set_base(self, body: Body, base: Transform) -> None:
+        body.set_base_pose(self.client, base)
+        if body.floating:
+            self.client.resetBaseVelocity(body.id, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+        else:
+            self._arrange()

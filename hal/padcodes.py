@@ -1,0 +1,58 @@
+"""Names and numbers of the input events that gamepads send.
+
+Source: the Linux kernel's ``include/uapi/linux/input-event-codes.h``. They stand here as well, though python-evdev has
+them too, because pad models and recordings name them on machines that have no evdev.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from types import MappingProxyType
+
+__all__ = [
+    "ABS",
+    "ABS_NAME",
+    "BUS_BLUETOOTH",
+    "BUS_USB",
+    "EV_ABS",
+    "EV_KEY",
+    "EV_MSC",
+    "EV_SYN",
+    "KEY",
+    "KEY_NAME",
+    "SYN_DROPPED",
+    "SYN_REPORT",
+]
+
+EV_SYN, EV_KEY, EV_ABS, EV_MSC = 0x00, 0x01, 0x03, 0x04
+SYN_REPORT, SYN_DROPPED = 0, 3
+BUS_USB, BUS_BLUETOOTH = 0x03, 0x05
+
+
+def _abs() -> dict[str, int]:
+    names = ("X", "Y", "Z", "RX", "RY", "RZ", "THROTTLE", "RUDDER", "WHEEL", "GAS", "BRAKE")
+    codes = {f"ABS_{name}": code for code, name in enumerate(names)}
+    for hat in range(4):
+        codes[f"ABS_HAT{hat}X"] = 0x10 + 2 * hat
+        codes[f"ABS_HAT{hat}Y"] = 0x11 + 2 * hat
+    return codes
+
+
+def _key() -> dict[str, int]:
+    codes = {f"BTN_{number}": 0x100 + number for number in range(10)}
+    joystick = ("TRIGGER", "THUMB", "THUMB2", "TOP", "TOP2", "PINKIE", "BASE", "BASE2", "BASE3", "BASE4", "BASE5")
+    codes.update({f"BTN_{name}": 0x120 + place for place, name in enumerate((*joystick, "BASE6"))})
+    gamepad = ("SOUTH", "EAST", "C", "NORTH", "WEST", "Z", "TL", "TR", "TL2", "TR2", "SELECT", "START", "MODE")
+    codes.update({f"BTN_{name}": 0x130 + place for place, name in enumerate((*gamepad, "THUMBL", "THUMBR"))})
+    codes.update({f"BTN_DPAD_{name}": 0x220 + place for place, name in enumerate(("UP", "DOWN", "LEFT", "RIGHT"))})
+    codes.update({f"BTN_TRIGGER_HAPPY{number}": 0x2C0 + number - 1 for number in range(1, 41)})
+    codes["KEY_RECORD"] = 167
+    return codes
+
+
+ABS: Mapping[str, int] = MappingProxyType(_abs())
+"""Axes: name -> code."""
+KEY: Mapping[str, int] = MappingProxyType(_key())
+"""Buttons: name -> code."""
+ABS_NAME: Mapping[int, str] = MappingProxyType({code: name for name, code in ABS.items()})
+KEY_NAME: Mapping[int, str] = MappingProxyType({code: name for name, code in KEY.items()})

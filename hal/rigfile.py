@@ -1,0 +1,225 @@
+"""The keys of a rig's file. Units stand beside them; what is left out has a good default.
+
+.. code-block:: yaml
+
+    robots:
+      panda: {model: panda}
+    cameras:
+      wrist:
+        model: realsense_d435
+        attached: {robot: panda, link: panda_hand, translation: [0.09, 0, 0.02], target: [-0.45, 0, 0.9]}
+    gamepads:
+      pad: {model: auto}
+    objects: [table, cube]
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal
+
+from pydantic import BeforeValidator, Field, model_validator
+
+from .models import Capture, Depth, Drivers, FieldOfView
+from .schema import (
+    Flag,
+    Name,
+    Number,
+    Numbers,
+    PerJoint,
+    Pixels,
+    PoseConfig,
+    Positive,
+    Share,
+    Strict,
+    Vector,
+    describe,
+)
+from .views import Attached, LookAt
+
+__all__ = [
+    "CameraConfig",
+    "GripperConfig",
+    "PadConfig",
+    "RigFile",
+    "RobotConfig",
+    "SimulationConfig",
+    "WorkspaceConfig",
+]
+
+
+class Device(Strict):
+    """What robots, grippers and cameras share."""
+
+    sim: Flag | None = None
+    """This device's own flag; the rig's when left out."""
+    drivers: Drivers | None = None
+    """Other drivers than the model's."""
+    real: dict[str, Any] = Field(default_factory=dict)
+    """What only the real driver needs."""
+    simulated: dict[str, Any] = Field(default_factory=dict)
+    """What only the simulated driver needs."""
+
+
+class LimitsConfig(Strict):
+    """Tighter limits than the model's, per joint or one number for all; rad, rad/s, rad/s2, rad/s3, Nm."""
+
+    lower: PerJoint | None = None
+    upper: PerJoint | None = None
+    velocity: PerJoint | None = None
+    acceleration: PerJoint | None = None
+    jerk: PerJoint | None = None
+    torque: PerJoint | None = None
+    allow_looser_limits: Flag = False
+    """Without it a limit may only be tighter than the model's."""
+
+
+class WorkspaceConfig(Strict):
+    """Where the tcp may be, in the arm's base frame, m."""
+
+    lower: Vector | None = None
+    upper: Vector | None = None
+    table_height: Number | None = None
+    """Of a plane that the tcp stays above."""
+
+
+class GripperConfig(Device):
+    """The model's gripper on this arm."""
+
+    enabled: Flag = True
+    speed: Positive | None = None
+    """Of the width, m/s; at most the model's."""
+    force: Positive | None = None
+    """N"""
+
+
+class RobotConfig(Device):
+    """An arm."""
+
+    model: str
+    """A name in ``robots/``, or the path of a file of your own."""
+    base: PoseConfig = PoseConfig()
+    """Of the base link in the world."""
+    initial: Numbers | None = None
+    """Joint positions at the start of a simulation, rad; home when left out."""
+    rate_hz: Positive | None = None
+    """Of a real arm's control cycle; the model's when left out."""
+    gripper: GripperConfig = GripperConfig()
+    speed: Share = 0.3
+    """Greatest share of the joint speed limits in a control session."""
+    move_speed: Share = 0.1
+    """Share of the joint speed limits in ``move_to`` unless told otherwise."""
+    tcp_speed: Positive = 0.25
+    """Greatest speed of the tcp, m/s (ISO 10218's reduced speed)."""
+    limits: LimitsConfig = LimitsConfig()
+    workspace: WorkspaceConfig | None = None
+
+
+class Output(Strict):
+    """Size of the frames handed out, pixels."""
+
+    width: Pixels
+    height: Pixels
+
+
+class StreamConfig(Strict):
+    """One kind of picture."""
+
+    format: str | None = None
+    """Of the real camera (``bgr8``, ``z16``, ...). Frames are RGB and metres whatever it is."""
+
+
+def _streams(value: Any) -> Any:
+    if isinstance(value, (list, tuple)):
+        return {str(name): {} for name in value}
+    if isinstance(value, dict):
+        return {name: {} if item is None else item for name, item in value.items()}
+    return value
+
+
+Stream = Literal["color", "depth", "infrared", "segmentation"]
+
+
+def _color_and_depth() -> dict[Stream, StreamConfig]:
+    return {"color": StreamConfig(), "depth": StreamConfig()}
+
+
+class CameraConfig(Device):
+    """A camera. It stands where ``look_at``, ``pose`` or ``attached`` says."""
+
+    model: str
+    """A name in ``sensors/cameras/``, or the path of a file of your own."""
+    capture: Capture | None = None
+    """One of the model's modes."""
+    output: Output | None = None
+    """Centre crop and scaling of what was captured; none when left out."""
+    streams: Annotated[dict[Stream, StreamConfig], BeforeValidator(_streams)] = Field(default_factory=_color_and_depth)
+    """``{color: {format: bgr8}, ...}`` or just ``[color, depth]``."""
+    look_at: LookAt | None = None
+    pose: PoseConfig | None = None
+    """Of the optical frame (x right, y down, z forward) in the world, as calibration writes it."""
+    attached: Attached | None = None
+    field_of_view: FieldOfView | None = None
+    """Only for models that leave it to the rig (``pinhole``)."""
+    depth: Depth | None = None
+    """Nearest and farthest depth, m; only for models that leave it to the rig."""
+
+    @model_validator(mode="after")
+    def _one_place(self) -> CameraConfig:
+        given = [key for key in ("look_at", "pose", "attached") if getattr(self, key) is not None]
+        if len(given) > 1:
+            raise ValueError(f"stands in one place: give one of {', '.join(given)}")
+        return self
+
+
+class PadConfig(Strict):
+    """A gamepad."""
+
+    model: str = "auto"
+    """``auto``, a name in ``sensors/gamepads/``, or the path of a file of your own."""
+    driver: str = "auto"
+    """``auto``, ``evdev``, ``keyboard``, ``playback`` or another driver."""
+    file: str | None = None
+    """The recording that ``playback`` plays."""
+    dead_zone: float = Field(default=0.08, ge=0.0, lt=1.0, strict=True)
+    """Share of a stick's way that counts as its rest."""
+    options: dict[str, Any] = Field(default_factory=dict)
+    """What only this driver needs."""
+
+
+class SimulationConfig(Strict):
+    """The simulated world."""
+
+    physics_hz: Positive = 240.0
+    gravity: Vector = (0.0, 0.0, -9.81)
+    """m/s2"""
+    clock: Literal["real_time", "lock_step"] | None = None
+    """``lock_step``: time stands still until somebody waits. Left out: real time, and lock-step for the mock."""
+    renderer: Literal["auto", "gl", "tiny"] = "auto"
+    """``gl`` is moderngl, ``tiny`` PyBullet's own; ``auto`` takes the first that works."""
+
+
+def _objects(value: Any) -> Any:
+    if value is None:  # "objects:" with nothing after it
+        return []
+    if not isinstance(value, (list, tuple)):
+        raise ValueError(f"must be a list of files, names or {{name, shape, ...}}, not {describe(value)}")
+    return value
+
+
+def _section(value: Any) -> Any:
+    """A key with nothing after it is an empty section."""
+    return {} if value is None else value
+
+
+class RigFile(Strict):
+    """A rig as written."""
+
+    description: str = ""
+    sim: Flag = True
+    """The one flag: is everything simulated that does not say otherwise?"""
+    robots: Annotated[dict[Name, RobotConfig], BeforeValidator(_section)] = Field(default_factory=dict)
+    cameras: Annotated[dict[Name, CameraConfig], BeforeValidator(_section)] = Field(default_factory=dict)
+    gamepads: Annotated[dict[Name, PadConfig], BeforeValidator(_section)] = Field(default_factory=dict)
+    objects: Annotated[list[Any], BeforeValidator(_objects)] = Field(default_factory=list)
+    """Of the simulated world: names in ``config/objects/``, paths, or ``{name, shape, ...}``."""
+    simulation: Annotated[SimulationConfig, BeforeValidator(_section)] = SimulationConfig()

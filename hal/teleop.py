@@ -1,0 +1,107 @@
+"""Teleoperation: from what a person does with a pad to what is asked of an arm and its gripper."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from .commands import Twist
+from .errors import CommandError
+from .mapping import AxisMapping, TeleopMapping, load_mapping
+from .types import PadState
+
+if TYPE_CHECKING:
+    from .gamepad import Gamepad
+    from .robot import Robot
+
+__all__ = ["Teleop"]
+
+_CROSSED = 0.05
+"""A trigger this close to the present grip has reached it (share of the travel)."""
+_DIRECTIONS = ("x", "y", "z", "roll", "pitch", "yaw")
+
+
+class Teleop:
+    """Turns pad states into commands by a mapping (``config/teleop``).
+
+    A trigger that closes the gripper takes it over only after it has crossed the present grip, so that neither the
+    start of a session, nor a new press of the dead-man, nor a pad that comes back ever drops what the fingers hold.
+    """
+
+    def __init__(
+        self, robot: Robot, mapping: str | Path | Mapping[str, Any] | TeleopMapping = "default", speed: float = 1.0
+    ) -> None:
+        """``speed`` scales the mapping's speeds, above 0, at most 1. Raises ConfigError for a bad mapping."""
+        if not (math.isfinite(speed) and 0.0 < speed <= 1.0):
+            raise CommandError(f"speed must be above 0 and at most 1, not {speed}")
+        self.robot = robot
+        self.mapping = load_mapping(mapping)
+        self.speed = speed
+        self._has_grip = False
+        self._side = 0.0
+        self._was_home = True
+
+    def reset(self) -> None:
+        """A new session: the gripper's trigger must cross the present grip again before it counts."""
+        self._has_grip = False
+        self._side = 0.0
+
+    def step(self, pad: PadState, dt: float) -> tuple[Twist, float | None]:
+        """The command for the arm, and for the gripper: a grip from 0 (open) to 1 (closed), or None for none.
+
+        ``dt`` is the time since the last step, s; the command is a speed, so nothing here depends on it.
+        """
+        twist = self.mapping.twist(pad)
+        linear, angular = ([self.speed * value for value in part] for part in (twist[:3], twist[3:]))
+        return Twist(linear, angular, frame=self.mapping.frame), self._grip(pad)
+
+    def home_pressed(self, pad: PadState) -> bool:
+        """Was the button that drives the arm home pressed since the last call?"""
+        button = self.mapping.go_home
+        pressed = button is not None and pad.pressed(button)
+        fresh, self._was_home = pressed and not self._was_home, pressed
+        return fresh
+
+    def _grip(self, pad: PadState) -> float | None:
+        mapping, gripper = self.mapping.gripper, self.robot.gripper
+        if mapping is None or gripper is None:
+            return None
+        if not (pad.connected and pad.pressed(self.mapping.deadman)):
+            self.reset()
+            return None
+        if mapping.axis is None:
+            if pad.pressed(str(mapping.close)):
+                return 1.0
+            return 0.0 if pad.pressed(str(mapping.open)) else None
+        wanted = min(1.0, max(0.0, pad.axis(mapping.axis)))
+        if not self._has_grip:
+            state = gripper.state()
+            difference = wanted - (1.0 - state.width / gripper.width_max)
+            crossed = self._side * difference < 0.0
+            self._has_grip = crossed or abs(difference) < _CROSSED
+            self._side = difference
+        return wanted if self._has_grip else None
+
+    def help(self, pad: Gamepad) -> list[str]:
+        """What the controls do, a line each, for people."""
+        mapping = self.mapping
+        lines = [f"hold {mapping.deadman} to move ({pad.name}: {pad.describe()}); let go of it to stop"]
+        moves = [
+            f"{name} {_control(axis)} ({self.speed * axis.scale:g} {'m/s' if k < 3 else 'rad/s'})"
+            for k, (name, axis) in enumerate(zip(_DIRECTIONS, mapping.axes(), strict=True))
+            if axis is not None
+        ]
+        lines.append("move: " + ", ".join(moves[:3]))
+        if moves[3:]:
+            lines.append("turn: " + ", ".join(moves[3:]))
+        if mapping.gripper is not None and self.robot.gripper is not None:
+            lines.append("gripper: " + ", ".join(mapping.gripper.controls))
+        if mapping.go_home is not None:
+            lines.append(f"home: {mapping.go_home}, with {mapping.deadman} held")
+        return lines
+
+
+def _control(axis: AxisMapping) -> str:
+    return "/".join(axis.controls)

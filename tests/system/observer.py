@@ -1,0 +1,158 @@
+"""Watches an app and its host from outside: whatever happens to the app, the arm's set-points can still be read.
+
+The app runs under a terminal of its own, so that Ctrl-C, Ctrl-Z and a closed window are the real things. It tells the
+descriptor of the memory that it shares with its host; mapping that through /proc keeps it readable after the app's end.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import json
+import os
+import pty
+import signal
+import subprocess
+import sys
+import termios
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from hal.process import SharedMemory
+from hal.records import GroupMemory, ServoRecord
+
+APP = """
+import json, os, sys, time
+import hal
+
+rig = hal.open({config!r}, sim=True, clock="real_time", overrides={overrides!r}, pad="none")
+arm = rig.robots["panda"]
+host = rig._hosts[0]
+children = [host.child.process.pid] + ([rig._pictures.child.process.pid] if rig._pictures else [])
+velocity = [0.4, 0.0, 0.0, 0.0, 0.4, 0.0, 0.4]
+with rig, arm.control(rate_hz=50) as control:
+    for turn, tick in enumerate(rig.clock.rate(50)):
+        control.send(hal.JointVelocity(velocity))
+        if turn == 20:
+            names = [[r.name, len(r.joints)] for r in host.spec.robots]
+            told = {{"pid": os.getpid(), "children": children, "fd": host.shared.fd, "joints": names}}
+            print(json.dumps(told), flush=True)
+        if {ending!r} == "exception" and turn == 40:
+            raise RuntimeError("a mistake in user code")
+        if {ending!r} == "commands stop" and turn == 40:
+            time.sleep(60)
+        if {ending!r} == "interpreter blocked" and turn == 40:
+            while True:
+                pass
+"""
+
+
+SHELL = """
+import os, signal, subprocess, sys
+
+signal.signal(signal.SIGTTOU, signal.SIG_IGN)
+app = subprocess.Popen([sys.executable, sys.argv[1]], preexec_fn=lambda: os.setpgid(0, 0))
+os.tcsetpgrp(0, app.pid)
+sys.exit(app.wait())
+"""
+# An interactive shell in short: a process group that is not orphaned, without which Ctrl-Z does nothing.
+
+
+class Watched:
+    """An app in motion."""
+
+    def __init__(self, folder: Path, ending: str = "", config: str = "panda_table", overrides: list[str] | None = None):
+        program = APP.format(config=config, overrides=overrides or ["cameras={}"], ending=ending)
+        script = folder / "app.py"
+        script.write_text(program)
+        self.terminal, slave = pty.openpty()
+
+        def own_terminal() -> None:
+            fcntl.ioctl(slave, termios.TIOCSCTTY, 0)
+
+        self.process = subprocess.Popen(
+            [sys.executable, "-c", SHELL, str(script)],
+            stdin=slave,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,
+            start_new_session=True,
+            preexec_fn=own_terminal,
+            text=True,
+        )
+        os.close(slave)
+        assert self.process.stdout is not None
+        line = self.process.stdout.readline()
+        if not line:
+            raise RuntimeError(f"the app ended with {self.process.wait(5)} before it moved")
+        told: dict[str, Any] = json.loads(line)
+        self.pid: int = told["pid"]
+        self.children: list[int] = told["children"]
+        descriptor = os.open(f"/proc/{told['pid']}/fd/{told['fd']}", os.O_RDWR)
+        joints = [(name, n) for name, n in told["joints"]]
+        self.memory = GroupMemory(SharedMemory(fd=descriptor).buffer, joints)
+
+    def servo(self) -> ServoRecord:
+        """What the servo says now."""
+        found = self.memory.robots["panda"].peek()
+        assert found is not None
+        return found
+
+    def speed(self) -> float:
+        """Greatest joint speed of the set-point, rad/s."""
+        return max(abs(value) for value in self.servo().dq_set)
+
+    def end(self, how: str) -> float:
+        """Do that to the app; returns when, on the monotonic clock."""
+        when = time.monotonic()
+        if how == "kill -9":
+            os.kill(self.pid, signal.SIGKILL)
+        elif how == "SIGSTOP":
+            os.kill(self.pid, signal.SIGSTOP)
+        elif how == "SIGTERM":
+            os.kill(self.pid, signal.SIGTERM)
+        elif how == "Ctrl-C":
+            os.write(self.terminal, b"\x03")
+        elif how == "Ctrl-Z":
+            os.write(self.terminal, b"\x1a")
+        elif how == "closed terminal":
+            os.close(self.terminal)
+            self.terminal = -1
+        return when
+
+    def wait_for(self, condition: Callable[[], bool], timeout: float = 10.0) -> float:
+        """When the condition first held; TimeoutError when it did not within ``timeout`` s."""
+        deadline = time.monotonic() + timeout
+        while not condition():
+            if time.monotonic() > deadline:
+                raise TimeoutError(f"did not happen within {timeout:g} s; servo: {self.servo()}")
+            time.sleep(0.0005)
+        return time.monotonic()
+
+    def at_rest(self) -> bool:
+        """Does the set-point stand still?"""
+        return self.speed() < 1e-9
+
+    def nobody_left(self) -> bool:
+        """Have all processes of the rig ended?"""
+        self.process.poll()
+        return not any(_runs(pid) for pid in self.children)
+
+    def close(self) -> None:
+        """End what is left of it."""
+        if self.process.poll() is None:
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(self.pid, signal.SIGKILL)
+            self.process.wait(5)
+        if self.terminal >= 0:
+            os.close(self.terminal)
+        with contextlib.suppress(TimeoutError):
+            self.wait_for(self.nobody_left, 5.0)
+
+
+def _runs(pid: int) -> bool:
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0] != "Z"
+    except (FileNotFoundError, ProcessLookupError):
+        return False

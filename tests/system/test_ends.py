@@ -1,0 +1,66 @@
+"""However an app ends, its arm is brought to rest by the arm's own process, and nothing is left behind."""
+
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parent))
+from observer import Watched
+
+from hal.types import RobotStatus, Trip
+
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(not sys.platform.startswith("linux"), reason="reads /proc"),
+]
+
+
+@pytest.fixture
+def watch(tmp_path: Path) -> Iterator[object]:
+    watched: list[Watched] = []
+
+    def start(ending: str = "") -> Watched:
+        watched.append(Watched(tmp_path, ending))
+        return watched[-1]
+
+    yield start
+    for app in watched:
+        app.close()
+
+
+@pytest.mark.parametrize("how", ["kill -9", "SIGTERM", "Ctrl-C", "closed terminal"])
+def test_an_app_that_ends(watch, how: str) -> None:
+    app = watch()
+    assert app.speed() > 0.1, "the arm moves before"
+    app.end(how)
+    app.wait_for(app.at_rest)
+    app.wait_for(app.nobody_left)
+
+
+@pytest.mark.parametrize("how", ["SIGSTOP", "Ctrl-Z"])
+def test_an_app_that_is_stopped_but_still_there(watch, how: str) -> None:
+    app = watch()
+    assert app.speed() > 0.1
+    app.end(how)
+    app.wait_for(app.at_rest)
+    servo = app.servo()
+    assert servo.status is RobotStatus.TRIPPED
+    assert servo.trip in (Trip.APP_SILENT, Trip.COMMAND_LATE)
+    assert not app.nobody_left(), "the host keeps holding: the app may come back"
+
+
+@pytest.mark.parametrize(
+    ("ending", "trip"),
+    [("commands stop", Trip.COMMAND_LATE), ("interpreter blocked", Trip.COMMAND_LATE), ("exception", Trip.NONE)],
+)
+def test_user_code_that_goes_wrong(watch, ending: str, trip: Trip) -> None:
+    app = watch(ending)
+    assert app.speed() > 0.1
+    app.wait_for(app.at_rest)
+    if trip is Trip.NONE:
+        app.wait_for(app.nobody_left)
+        assert app.process.wait(5) == 1, "the user's own exception ends the program"
+    else:
+        assert app.servo().trip is trip

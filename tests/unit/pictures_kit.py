@@ -1,0 +1,90 @@
+"""Worlds, cameras and a snapshot box for the tests of the simulated camera."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from specs import data
+
+from hal.drivers.pybullet.rendering import Renderer
+from hal.drivers.pybullet.world import World
+from hal.errors import DriverMissing
+from hal.pose import Pose
+from hal.specs import BodySpec, CameraSpec, RobotSpec, ViewSpec, WorldSpec
+
+STREAMS = ("color", "depth", "segmentation")
+
+
+def world(*bodies: BodySpec, robots: tuple[RobotSpec, ...] = (), **changes: Any) -> World:
+    """A world that the caller closes."""
+    data("plane.urdf")  # skips where PyBullet is not installed
+    return World(WorldSpec("pybullet", 240.0, (0.0, 0.0, -9.81), bodies, robots), **changes)
+
+
+def box(
+    name: str, half_extents: tuple[float, float, float], position: tuple[float, float, float], **more: Any
+) -> BodySpec:
+    """A box that stands still."""
+    values: dict[str, Any] = {"orientation": (0.0, 0.0, 0.0, 1.0), "fixed": True, **more}
+    return BodySpec(name=name, position=position, shape="box", half_extents=half_extents, **values)
+
+
+def camera(
+    width: int = 160, height: int = 120, *, name: str = "camera", focal: float | None = None, **more: Any
+) -> CameraSpec:
+    """A pinhole camera in the world's origin, looking along +z, unless ``view`` says otherwise."""
+    fx = focal or 0.9 * width
+    centre = more.pop("centre", ((width - 1) / 2, (height - 1) / 2))
+    fy = more.pop("fy", fx)
+    values: dict[str, Any] = {
+        "depth_min": 0.1,
+        "depth_max": 10.0,
+        "streams": STREAMS,
+        "rate_hz": 30.0,
+        "view": ViewSpec((0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0)),
+        **more,
+    }
+    return CameraSpec(
+        name=name,
+        model="test",
+        driver="pybullet",
+        capture_width=width,
+        capture_height=height,
+        width=width,
+        height=height,
+        K=((fx, 0.0, centre[0]), (0.0, fy, centre[1]), (0.0, 0.0, 1.0)),
+        distortion=(0.0,) * 5,
+        **values,
+    )
+
+
+def look_at(eye: tuple[float, ...], target: tuple[float, ...], up: tuple[float, ...] = (0.0, 0.0, 1.0)) -> Pose:
+    """The pose of an optical frame (x right, y down, z forward)."""
+    z = np.subtract(target, eye) / np.linalg.norm(np.subtract(target, eye))
+    x = np.cross(z, up) / np.linalg.norm(np.cross(z, up))
+    matrix = np.eye(4)
+    matrix[:3, :3] = np.stack([x, np.cross(z, x), z], axis=1)
+    matrix[:3, 3] = eye
+    return Pose.from_matrix(matrix)
+
+
+def renderer(name: str, scene: World) -> Renderer:
+    """A renderer by name; skips the test where there is no OpenGL."""
+    if name == "tiny":
+        from hal.drivers.pybullet.tiny import TinyRenderer
+
+        return TinyRenderer(scene)
+    from hal.drivers.pybullet.gl import GLRenderer
+
+    try:
+        return GLRenderer(scene)
+    except DriverMissing as error:
+        pytest.skip(f"no OpenGL here: libegl1 libgl1-mesa-dri ({error})")
+
+
+def rays(spec: CameraSpec) -> np.ndarray:
+    """(H, W, 3) directions with z = 1 through the centres of the pixels, in the camera's frame."""
+    v, u = np.mgrid[: spec.height, : spec.width]
+    return np.stack([u, v, np.ones_like(u)], axis=-1) @ np.linalg.inv(np.array(spec.K)).T

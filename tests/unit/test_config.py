@@ -1,0 +1,413 @@
+"""What a rig's file comes to: drivers by flag, clocks, limits, camera matrices and places."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+
+from hal.config import load
+from hal.data_files import find_data, list_data
+from hal.errors import ConfigError
+from hal.intrinsics import centre_crop
+from hal.plan import Plan
+from hal.pose import Pose
+from hal.specs import WorldSpec, from_json, to_json
+
+MIXED: dict[str, Any] = {
+    "robots": {"one": {"model": "panda"}, "two": {"model": "panda", "sim": True, "base": {"position": [0, 1, 0]}}},
+    "cameras": {"eye": {"model": "pinhole", "look_at": {"target": [0, 0, 0], "distance": 1.0}}},
+}
+MINE = {"sim": "mock", "real": "mock"}
+"""A stand-in for a real driver that is always there."""
+
+
+def plan(config: Any, **arguments: Any) -> Plan:
+    return load(config, **arguments).resolve()
+
+
+def with_real_drivers(config: dict[str, Any]) -> dict[str, Any]:
+    copy: dict[str, Any] = json.loads(json.dumps(config))
+    for section in ("robots", "cameras"):
+        for device in copy[section].values():
+            device["drivers"] = {"real": "mock"}
+            if section == "robots":
+                device["gripper"] = {"drivers": {"real": "mock"}}
+    return copy
+
+
+@pytest.mark.parametrize("name", list_data("config"))
+def test_every_rig_that_comes_with_the_hal_is_in_order(name: str) -> None:
+    rig = plan(name)
+    assert rig.robots
+    assert rig.world is not None
+    assert rig.warnings == ()
+    # What the hosts are given travels as JSON.
+    assert from_json(WorldSpec, json.loads(json.dumps(to_json(rig.world)))) == rig.world
+
+
+def test_the_tutorials_scene() -> None:
+    rig = plan("panda_table")
+    (panda,) = rig.robots
+    assert panda.base_position == (-0.55, 0.0, 0.6)
+    assert panda.home == panda.initial == (0.0, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785)
+    assert panda.gripper is not None
+    assert (panda.gripper.name, panda.gripper.width_max) == ("panda.gripper", 0.08)
+    assert rig.world is not None
+    bodies = {body.name: body for body in rig.world.bodies}
+    cube = bodies["cube"]
+    assert (cube.shape, cube.half_extents, cube.mass, cube.position) == (
+        "box",
+        (0.03, 0.015, 0.03),
+        2.0,
+        (0.0, -0.2, 0.7),
+    )
+    assert any(body.shape == "urdf" and not body.fixed for body in bodies.values())
+    cameras = {camera.name: camera for camera in rig.cameras}
+    assert {(c.width, c.height, c.rate_hz) for c in cameras.values()} == {(256, 256, 30.0)}
+    assert cameras["scene"].view is not None
+    assert cameras["scene"].view.robot is None
+    assert cameras["wrist"].view is not None
+    assert (cameras["wrist"].view.robot, cameras["wrist"].view.link) == ("panda", "panda_hand")
+
+
+def test_the_pandas_limits_are_the_published_ones() -> None:
+    limits = plan("panda_table").robots[0].limits
+    assert limits.lower[3] == -3.0718
+    assert limits.upper[1] == 1.7628
+    assert limits.velocity == (2.175,) * 4 + (2.61,) * 3
+    assert limits.acceleration == (15.0, 7.5, 10.0, 12.5, 15.0, 20.0, 20.0)
+    assert limits.jerk == tuple(500 * a for a in limits.acceleration)
+    assert limits.torque == (87.0,) * 4 + (12.0,) * 3
+
+
+def test_a_rig_in_one_line_has_good_defaults() -> None:
+    rig = plan({"robots": {"arm": {"model": "panda"}}})
+    assert rig.sim
+    assert (rig.clock, rig.source) == ("real_time", "<dict>")
+    arm = rig.robots[0]
+    assert (arm.driver, arm.speed, arm.move_speed, arm.tcp_speed) == ("pybullet", 0.3, 0.1, 0.25)
+    assert (arm.rate_hz, arm.attended, arm.deadline_max) == (240.0, False, 1.0)
+    assert rig.world is not None
+    assert rig.world.robots == rig.robots
+    assert rig.world.bodies == ()
+
+
+def test_missing_flag_means_simulation_and_sim_true_overrules_all() -> None:
+    config = with_real_drivers(MIXED) | {"sim": False}
+    rig = plan(config)
+    assert [(r.name, r.attended) for r in rig.robots] == [("one", True), ("two", False)]
+    assert not rig.sim
+    everything = plan(config, sim=True)
+    assert everything.sim
+    assert [r.attended for r in everything.robots] == [False, False]
+    assert {r.driver for r in everything.robots} | {c.driver for c in everything.cameras} == {"pybullet"}
+    config["robots"]["one"]["sim"] = False
+    assert not plan(config, sim=True).robots[0].attended
+
+
+def test_sim_false_sets_the_rigs_flag_and_leaves_each_device_its_own() -> None:
+    rig = plan(with_real_drivers(MIXED), sim=False)
+    assert not rig.sim
+    one, two = rig.robots
+    assert (one.driver, one.attended, one.rate_hz, one.deadline_max) == ("mock", True, 1000.0, 0.3)
+    assert (two.driver, two.attended, two.rate_hz, two.deadline_max) == ("pybullet", False, 240.0, 1.0)
+    assert one.gripper is not None
+    assert two.gripper is not None
+    assert (one.gripper.driver, two.gripper.driver) == ("mock", "pybullet")
+    assert rig.cameras[0].driver == "mock"
+    # The real arm stands in the world too, as a copy that simulated cameras see.
+    assert rig.world is not None
+    assert [r.name for r in rig.world.robots] == ["one", "two"]
+
+
+def test_without_simulated_devices_there_is_no_world() -> None:
+    config = with_real_drivers({**MIXED, "robots": {"one": {"model": "panda"}}})
+    assert plan(config, sim=False).world is None
+    assert plan(config).world is not None
+
+
+def test_only_the_chosen_kind_of_options_reaches_the_driver() -> None:
+    robot = {"model": "panda", "real": {"host": "1.2.3.4"}, "simulated": {"lag": 0.01}, "drivers": MINE}
+    robot["gripper"] = {"drivers": MINE}
+    assert plan({"robots": {"arm": robot}}).robots[0].options == {"lag": 0.01}
+    assert plan({"robots": {"arm": robot}}, sim=False).robots[0].options == {"host": "1.2.3.4"}
+
+
+def test_mock_stands_in_for_every_device_and_steps() -> None:
+    rig = plan("panda_table", driver="mock", sim=False)
+    robot = rig.robots[0]
+    assert robot.gripper is not None
+    drivers = {robot.driver, robot.gripper.driver, *(c.driver for c in rig.cameras), *(p.driver for p in rig.pads)}
+    assert drivers == {"mock"}
+    assert not robot.attended
+    assert rig.world is None
+    assert rig.clock == "lock_step"
+    assert plan("panda_table", driver="mock", clock="real_time").clock == "real_time"
+
+
+def test_clock_of_the_file_and_of_the_caller() -> None:
+    config = {**MIXED, "simulation": {"clock": "lock_step"}}
+    assert plan(config).clock == "lock_step"
+    assert plan(config, clock="real_time").clock == "real_time"
+    with pytest.raises(ConfigError, match=r"robots\.one: is real"):
+        load(with_real_drivers(config), sim=False)
+
+
+def test_physics_rate_is_the_rate_of_simulated_arms() -> None:
+    rig = plan(MIXED, overrides=["simulation.physics_hz=1000"])
+    assert {r.rate_hz for r in rig.robots} == {1000.0}
+    assert rig.world is not None
+    assert rig.world.physics_hz == 1000.0
+
+
+def test_overrides_set_any_key() -> None:
+    rig = load(
+        "panda_table",
+        overrides=[
+            "cameras.wrist.output.width=320",
+            "robots.panda.limits.acceleration=2",
+            "objects=[table]",
+            "sim=true",
+        ],
+    )
+    assert rig.resolve().cameras[1].width == 320
+    assert rig.resolve().robots[0].limits.acceleration == (2.0,) * 7
+    assert rig.cameras["wrist"].output is not None  # the file as written, with the override
+    assert rig.cameras["wrist"].output.width == 320
+    by_mapping = plan("panda_table", overrides={"cameras": {}, "simulation.renderer": "tiny"})
+    assert by_mapping.cameras == ()
+    assert by_mapping.renderer == "tiny"
+    assert (
+        plan("panda_table", overrides=["robots.panda.limits.acceleration=1e-1"]).robots[0].limits.acceleration[0] == 0.1
+    )
+
+
+def test_overrides_do_not_change_the_callers_dict() -> None:
+    before = json.dumps(MIXED)
+    plan(MIXED, overrides={"robots.one.base.position": [1, 2, 3], "robots.one.speed": 0.5})
+    assert json.dumps(MIXED) == before
+
+
+def test_a_rig_of_the_users_own_names_files_beside_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    model = yaml.safe_load(find_data("robots", "panda.yaml").read_text())
+    source = Path(plan("panda_table").robots[0].urdf)
+    (tmp_path / "my").mkdir()
+    (tmp_path / "my" / "arm.urdf").write_text(source.read_text())
+    model["urdf"] = "arm.urdf"
+    (tmp_path / "my" / "arm.yaml").write_text(yaml.safe_dump(model))
+    (tmp_path / "my" / "brick.yaml").write_text(
+        "{name: brick, shape: box, half_extents: [1, 1, 1], position: [3, 0, 0]}"
+    )
+    (tmp_path / "rig.yaml").write_text(
+        "robots: {arm: {model: my/arm.yaml}}\nobjects: [my/brick.yaml, {file: my/brick.yaml, name: other, mass: 2}]\n"
+    )
+    elsewhere = tmp_path / "elsewhere"
+    elsewhere.mkdir()
+    monkeypatch.chdir(elsewhere)
+    rig = plan(tmp_path / "rig.yaml")
+    assert rig.robots[0].urdf == str(tmp_path / "my" / "arm.urdf")
+    assert rig.source == str(tmp_path / "rig.yaml")
+    assert rig.world is not None
+    assert [(b.name, b.mass, b.position) for b in rig.world.bodies] == [
+        ("brick", 0.0, (3.0, 0.0, 0.0)),
+        ("other", 2.0, (3.0, 0.0, 0.0)),
+    ]
+
+
+def test_limits_may_be_tightened_by_the_rig() -> None:
+    limits = {"velocity": 1.0, "upper": [2.0, 1.0, 2.0, -1.0, 2.0, 3.0, 2.0]}
+    arm = plan({"robots": {"arm": {"model": "panda", "limits": limits}}}).robots[0]
+    assert arm.limits.velocity == (1.0,) * 7
+    assert arm.limits.upper == arm.kinematics.upper == (2.0, 1.0, 2.0, -1.0, 2.0, 3.0, 2.0)
+    looser = {"jerk": 20000, "allow_looser_limits": True}
+    assert plan({"robots": {"arm": {"model": "panda", "limits": looser}}}).robots[0].limits.jerk == (20000.0,) * 7
+
+
+def test_position_and_speed_limits_may_come_from_the_urdf() -> None:
+    limits = plan("iiwa_table").robots[0].limits
+    assert limits.lower[0] == pytest.approx(-math.radians(170))
+    assert limits.upper[6] == pytest.approx(math.radians(175))
+
+
+def test_workspace_and_table() -> None:
+    robot = {"model": "panda", "workspace": {"upper": [0.8, 0.5, 1.0], "table_height": 0.02}}
+    workspace = plan({"robots": {"arm": robot}}).robots[0].workspace
+    assert workspace is not None
+    assert workspace.upper == (0.8, 0.5, 1.0)
+    assert workspace.lower[2] == 0.02
+    assert workspace.lower[0] < -1.0
+
+
+def test_initial_positions_with_fingers_are_taken_with_a_warning() -> None:
+    q = [0.0, -0.5, 0.0, -2.0, 0.0, 1.5, 0.5]
+    assert plan({"robots": {"arm": {"model": "panda", "initial": q}}}).robots[0].initial == tuple(q)
+    rig = plan({"robots": {"arm": {"model": "panda", "initial": [*q, 0.04, 0.04]}}})
+    assert rig.robots[0].initial == tuple(q)
+    assert len(rig.warnings) == 1
+    assert "fingers" in rig.warnings[0]
+
+
+def test_gripper_can_be_left_out_and_slowed() -> None:
+    assert plan({"robots": {"arm": {"model": "panda", "gripper": {"enabled": False}}}}).robots[0].gripper is None
+    slow = plan({"robots": {"arm": {"model": "panda", "gripper": {"speed": 0.05}}}}).robots[0].gripper
+    assert slow is not None
+    assert slow.speed == 0.05
+
+
+def test_pads() -> None:
+    (pad,) = plan("panda_table").pads
+    assert (pad.driver, pad.model) == ("auto", None)
+    assert len(pad.models) == len(list_data("sensors", "gamepads"))
+    named = plan({"gamepads": {"pad": {"model": "dualshock4", "driver": "evdev", "dead_zone": 0.1}}}).pads[0]
+    assert named.model is not None
+    assert named.dead_zone == 0.1
+
+
+def test_playback_files_are_relative_to_the_rig(tmp_path: Path) -> None:
+    (tmp_path / "tour.jsonl").write_text("")
+    (tmp_path / "rig.yaml").write_text("gamepads: {pad: {driver: playback, file: tour.jsonl}}")
+    assert plan(tmp_path / "rig.yaml").pads[0].options == {"file": str(tmp_path / "tour.jsonl")}
+
+
+# Cameras.
+
+
+def camera(**keys: Any) -> Any:
+    keys = {"model": "pinhole", "look_at": {"target": [0, 0, 0], "distance": 1.0}} | keys
+    return plan({"robots": {"arm": {"model": "panda"}}, "cameras": {"eye": keys}}).cameras[0]
+
+
+def project(K: Any, direction: tuple[float, float, float]) -> tuple[float, float]:
+    u, v, w = np.array(K) @ np.array(direction)
+    return u / w, v / w
+
+
+def test_the_edges_of_the_picture_are_at_the_angles_of_view() -> None:
+    eye = camera(
+        capture={"width": 200, "height": 100, "rate_hz": 10}, field_of_view={"horizontal_deg": 90, "vertical_deg": 60}
+    )
+    assert project(eye.K, (1.0, 0.0, 1.0))[0] == pytest.approx(199.5)  # pixel centres are whole numbers
+    assert project(eye.K, (-1.0, 0.0, 1.0))[0] == pytest.approx(-0.5)
+    assert project(eye.K, (0.0, math.tan(math.radians(30)), 1.0))[1] == pytest.approx(99.5)
+    assert project(eye.K, (0.0, 0.0, 1.0)) == pytest.approx((99.5, 49.5))
+    square = camera(field_of_view={"vertical_deg": 60})
+    assert square.K[0][0] == square.K[1][1]
+
+
+def test_output_is_the_captures_centre_scaled() -> None:
+    capture = {"width": 640, "height": 480, "rate_hz": 30}
+    whole = camera(model="realsense_d435", capture=capture)
+    cut = camera(model="realsense_d435", capture=capture, output={"width": 256, "height": 256})
+    assert (cut.width, cut.height, cut.capture_width) == (256, 256, 640)
+    # A direction lands at the same place of the picture, measured in shares of the crop.
+    for direction in ((0.2, -0.1, 1.0), (-0.3, 0.3, 1.0), (0.0, 0.0, 1.0)):
+        u, v = project(whole.K, direction)
+        x, y = project(cut.K, direction)
+        assert (x + 0.5) / 256 == pytest.approx((u + 0.5 - 80) / 480)
+        assert (y + 0.5) / 256 == pytest.approx((v + 0.5) / 480)
+
+
+def test_a_4_to_3_mode_of_the_d435_is_the_middle_of_its_sensor() -> None:
+    wide = camera(model="realsense_d435", capture={"width": 1280, "height": 720, "rate_hz": 30})
+    narrow = camera(model="realsense_d435", capture={"width": 640, "height": 480, "rate_hz": 30})
+    assert wide.K[0][0] == pytest.approx(640 / math.tan(math.radians(69.4 / 2)))
+    assert narrow.K[0][0] == pytest.approx(wide.K[0][0] * 480 / 720)
+    assert (wide.depth_min, narrow.depth_min) == (0.28, 0.175)
+
+
+@pytest.mark.parametrize(
+    ("size", "out", "crop"),
+    [
+        ((640, 480), (256, 256), (80, 0, 480, 480)),
+        ((480, 640), (256, 256), (0, 80, 480, 480)),
+        ((640, 480), (320, 240), (0, 0, 640, 480)),
+        ((640, 480), (160, 90), (0, 60, 640, 360)),
+    ],
+)
+def test_centre_crop(size: tuple[int, int], out: tuple[int, int], crop: tuple[int, ...]) -> None:
+    assert centre_crop(*size, *out) == crop
+
+
+@pytest.mark.parametrize("up_axis", ["y", "z"])
+@pytest.mark.parametrize("angles", [(0, 0, 0), (30, -40, 20), (-90, 215, 0), (170, -89, -75), (90, -25, 0)])
+def test_look_at_is_pybullets(up_axis: str, angles: tuple[float, float, float]) -> None:
+    pybullet = pytest.importorskip("pybullet", reason="needs pybullet (pip install pybullet)")
+    target, distance = [0.1, -0.2, 0.3], 1.5
+    yaw, pitch, roll = angles
+    look_at = {"target": target, "distance": distance, "yaw_deg": yaw, "pitch_deg": pitch, "roll_deg": roll}
+    view = camera(look_at=look_at | {"up_axis": up_axis}).view
+    axis = {"y": 1, "z": 2}[up_axis]
+    gl = np.array(pybullet.computeViewMatrixFromYawPitchRoll(target, distance, yaw, pitch, roll, axis)).reshape(4, 4).T
+    expected = np.linalg.inv(gl) @ np.diag([1.0, -1.0, -1.0, 1.0])  # OpenGL looks along -z, y up
+    np.testing.assert_allclose(Pose(view.position, view.orientation).matrix(), expected, atol=1e-6)
+
+
+def test_pose_is_given_either_way() -> None:
+    half = math.sqrt(0.5)
+    long = camera(look_at=None, pose={"position": [1, 2, 3], "orientation": [half, 0, 0, half]}).view
+    assert camera(look_at=None, pose=[1, 2, 3, half, 0, 0, half]).view == long
+    assert long.position == (1.0, 2.0, 3.0)
+
+
+def axes(view: Any) -> np.ndarray:
+    return Pose(view.position, view.orientation).matrix()[:3, :3]
+
+
+def test_attached_looks_along_its_target_the_right_way_up() -> None:
+    place = {"robot": "arm", "link": "panda_hand", "translation": [0.1, 0, 0.2]}
+    forward = camera(look_at=None, attached=place | {"target": [0, 2, 0]}).view
+    assert (forward.robot, forward.link, forward.position) == ("arm", "panda_hand", (0.1, 0.0, 0.2))
+    x, y, z = axes(forward).T
+    np.testing.assert_allclose(z, [0, 1, 0], atol=1e-12)
+    np.testing.assert_allclose(y, [0, 0, -1], atol=1e-12)  # the picture's down is the link's -z
+    np.testing.assert_allclose(x, [1, 0, 0], atol=1e-12)
+    along_z = axes(camera(look_at=None, attached=place).view).T
+    np.testing.assert_allclose(along_z[2], [0, 0, 1], atol=1e-12)
+    np.testing.assert_allclose(along_z[1], [-1, 0, 0], atol=1e-12)  # x is up
+    tilted = axes(camera(look_at=None, attached=place | {"target": [0, 1, 0], "up": [1, 0, 0]}).view).T
+    np.testing.assert_allclose(tilted[1], [-1, 0, 0], atol=1e-12)
+
+
+def test_attached_rotation_turns_the_target_by_angles_or_quaternion() -> None:
+    place = {"robot": "arm", "link": "panda_hand", "target": [0, 1, 0]}
+    turned = camera(look_at=None, attached=place | {"rotation": [0, 0, math.pi / 2]}).view
+    np.testing.assert_allclose(axes(turned)[:, 2], [-1, 0, 0], atol=1e-12)
+    half = math.sqrt(0.5)
+    same = camera(look_at=None, attached=place | {"rotation": [0, 0, half, half]}).view
+    np.testing.assert_allclose(axes(same), axes(turned), atol=1e-12)
+
+
+def test_streams_as_list_or_with_formats() -> None:
+    assert camera(streams=["depth", "segmentation"]).streams == ("depth", "segmentation")
+    assert camera().streams == ("color", "depth")
+    real = {"model": "realsense_d435", "sim": False, "drivers": {"real": "mock"}}
+    real["streams"] = {"color": {"format": "bgr8"}, "depth": None}
+    assert plan({"cameras": {"eye": real}}).cameras[0].options == {"formats": {"color": "bgr8"}}
+    assert plan({"cameras": {"eye": real}}).cameras[0].view is None  # a real one may stand anywhere
+
+
+def test_yaml_numbers_with_exponents_are_numbers(tmp_path: Path) -> None:
+    (tmp_path / "rig.yaml").write_text(
+        "simulation: {physics_hz: 1e3, gravity: [0, 0, -1e-3]}\nrobots: {a: {model: panda}}"
+    )
+    world = plan(tmp_path / "rig.yaml").world
+    assert world is not None
+    assert (world.physics_hz, world.gravity) == (1000.0, (0.0, 0.0, -0.001))
+
+
+def test_missing_inertials_are_a_warning(tmp_path: Path) -> None:
+    text = Path(plan("panda_table").robots[0].urdf).read_text()
+    start = text.index("<inertial>", text.index('name="panda_link3"'))
+    (tmp_path / "arm.urdf").write_text(text[:start] + text[text.index("</inertial>", start) + len("</inertial>") :])
+    model = yaml.safe_load(find_data("robots", "panda.yaml").read_text()) | {"urdf": "arm.urdf"}
+    (tmp_path / "arm.yaml").write_text(yaml.safe_dump(model))
+    (tmp_path / "rig.yaml").write_text("robots: {arm: {model: ./arm.yaml}}")
+    (warning,) = plan(tmp_path / "rig.yaml").warnings
+    assert "panda_link3" in warning
+    assert "inertial" in warning

@@ -1,0 +1,405 @@
+"""Mistakes in configuration files: all of them at once, each with file, key, what is right and the nearest spelling."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+from hal.config import load
+from hal.data_files import find_data
+from hal.errors import ConfigError, Problem
+
+ROBOT = {"model": "panda"}
+LOOK = {"target": [0, 0, 0], "distance": 1.0}
+CAMERA = {"model": "realsense_d435", "look_at": LOOK}
+
+
+def problems(config: Any, **arguments: Any) -> list[Problem]:
+    """What is wrong; fails where nothing is."""
+    with pytest.raises(ConfigError) as caught:
+        load(config, **arguments)
+    return list(caught.value.problems)
+
+
+def only(config: Any, **arguments: Any) -> Problem:
+    """The one thing that is wrong."""
+    found = problems(config, **arguments)
+    assert len(found) == 1, "\n".join(map(str, found))
+    return found[0]
+
+
+def robot(**keys: Any) -> dict[str, Any]:
+    return {"robots": {"arm": {**ROBOT, **keys}}}
+
+
+def camera(**keys: Any) -> dict[str, Any]:
+    return {"robots": {"arm": ROBOT}, "cameras": {"eye": {**CAMERA, **keys}}}
+
+
+def thing(**keys: Any) -> dict[str, Any]:
+    return {"objects": [{"name": "brick", "shape": "box", "half_extents": [1, 1, 1], **keys}]}
+
+
+@pytest.mark.parametrize(
+    ("config", "key", "words"),
+    [
+        # Unknown keys, with the nearest right one.
+        ({"robtos": {}}, "robtos", ["did you mean 'robots'"]),
+        (robot(sped=0.2), "robots.arm.sped", ["did you mean 'speed'", "tcp_speed"]),
+        (robot(base={"positon": [0, 0, 0]}), "robots.arm.base.positon", ["did you mean 'position'"]),
+        (robot(gripper={"sped": 1}), "robots.arm.gripper.sped", ["did you mean 'speed'"]),
+        (camera(look_at={**LOOK, "yaw": 3}), "cameras.eye.look_at.yaw", ["did you mean 'yaw_deg'"]),
+        (camera(streams={"colour": {}}), "cameras.eye.streams.colour", ["did you mean 'color'"]),
+        (camera(streams={"color": {"fromat": "bgr8"}}), "cameras.eye.streams.color.fromat", ["'format'"]),
+        ({"simulation": {"physics_rate": 1}}, "simulation.physics_rate", ["physics_hz"]),
+        (thing(half_extent=[1, 1, 1]), "objects.0.half_extent", ["did you mean 'half_extents'"]),
+        # Unknown names, with the nearest right one.
+        ({"robots": {"arm": {"model": "pnada"}}}, "robots.arm.model", ["did you mean 'panda'", "iiwa"]),
+        ({"cameras": {"e": {**CAMERA, "model": "realsense_d453"}}}, "cameras.e.model", ["'realsense_d435'", "pinhole"]),
+        ({"gamepads": {"p": {"model": "dualshok4"}}}, "gamepads.p.model", ["did you mean 'dualshock4'", "auto"]),
+        ({"gamepads": {"p": {"driver": "evdve"}}}, "gamepads.p.driver", ["did you mean 'evdev'"]),
+        ({"objects": ["cub"]}, "objects.0", ["did you mean 'cube'", "table"]),
+        (robot(drivers={"sim": "pybulet"}), "robots.arm", ["did you mean 'pybullet'"]),
+        (robot(drivers={"sim": "evdev"}), "robots.arm", ["'evdev' has no robot", "gamepad"]),
+        ({"simulation": {"clock": "lockstep"}}, "simulation.clock", ["did you mean 'lock_step'"]),
+        ({"simulation": {"renderer": "opengl"}}, "simulation.renderer", ["auto", "gl", "tiny"]),
+        # A camera on a robot or a link that is not there.
+        (
+            camera(look_at=None, attached={"robot": "arn", "link": "panda_hand"}),
+            "cameras.eye.attached.robot",
+            ["no robot 'arn'", "did you mean 'arm'"],
+        ),
+        (
+            camera(look_at=None, attached={"robot": "arm", "link": "panda_hnad"}),
+            "cameras.eye.attached.link",
+            ["did you mean 'panda_hand'"],
+        ),
+        # A mode or a stream that the model lacks.
+        (
+            camera(capture={"width": 640, "height": 480, "rate_hz": 31}),
+            "cameras.eye.capture",
+            ["no mode 640x480 at 31 Hz", "640x480 at 6, 15, 30, 60 Hz", "1280x720"],
+        ),
+        (
+            camera(capture={"width": 641, "height": 480, "rate_hz": 30}),
+            "cameras.eye.capture",
+            ["641x480", "848x480"],
+        ),
+        (camera(depth={"min": 0.1, "max": 1.0}), "cameras.eye.depth", ["realsense_d435", "adjustable"]),
+        (camera(streams=[]), "cameras.eye.streams", ["at least one"]),
+        # Wrong types and wrong counts.
+        ({"sim": "yes"}, "sim", ["true or false", "'yes'"]),
+        ({"robots": ["panda"]}, "robots", ["keys and values"]),
+        ({"robots": {"arm": "panda"}}, "robots.arm", ["keys and values", "'panda'"]),
+        ({"objects": {"cube": 1}}, "objects", ["a list"]),
+        ({"objects": [7]}, "objects.0", ["a file, a name"]),
+        (robot(speed="fast"), "robots.arm.speed", ["a number", "'fast'"]),
+        (robot(speed=1.5), "robots.arm.speed", ["less than or equal to 1", "1.5"]),
+        (robot(speed=True), "robots.arm.speed", ["a number"]),
+        (robot(model=5), "robots.arm.model", ["text"]),
+        ({"robots": {"arm": {}}}, "robots.arm.model", ["is missing"]),
+        ({"robots": {"my arm": ROBOT}}, "robots.my arm", ["match pattern"]),
+        (camera(output={"width": 256.5, "height": 256}), "cameras.eye.output.width", ["whole number"]),
+        (camera(output={"width": "256", "height": 256}), "cameras.eye.output.width", ["whole number"]),
+        (camera(output={"width": 0, "height": 256}), "cameras.eye.output.width", ["greater than 0"]),
+        ({"simulation": {"physics_hz": float("nan")}}, "simulation.physics_hz", ["number"]),
+        ({"simulation": {"gravity": -9.81}}, "simulation.gravity", ["3 numbers"]),
+        ({"simulation": {"gravity": [0, 0, "down"]}}, "simulation.gravity", ["item 3 is 'down'"]),
+        # Wrong units: a pose of 3 numbers where 7 are due, degrees, a quaternion that is none.
+        (camera(look_at=None, pose=[0, 0, 1]), "cameras.eye.pose", ["7 numbers", "not 3", "quaternion"]),
+        (robot(base=[0, 0, 0]), "robots.arm.base", ["7 numbers", "not 3"]),
+        (robot(base={"position": [0, 0]}), "robots.arm.base.position", ["3 numbers", "in m", "not 2"]),
+        (robot(base={"orientation": [0, 0, 90]}), "robots.arm.base.orientation", ["4 numbers", "not 3"]),
+        (robot(base={"orientation": [0, 0, 90, 1]}), "robots.arm.base.orientation", ["unit quaternion", "90"]),
+        (robot(initial=[0, -45, 0, -135, 0, 90, 45]), "robots.arm.initial", ["panda_joint2", "-45", "rad"]),
+        (robot(initial=[0, 0, 0]), "robots.arm.initial", ["7 numbers", "panda_joint7", "not 3"]),
+        (
+            camera(look_at=None, attached={"robot": "arm", "link": "panda_hand", "rotation": [1, 2]}),
+            "cameras.eye.attached.rotation",
+            ["roll, pitch, yaw in rad", "quaternion"],
+        ),
+        (
+            camera(look_at=None, attached={"robot": "arm", "link": "panda_hand", "target": [0, 0, 0]}),
+            "cameras.eye.attached",
+            ["direction"],
+        ),
+        # A simulated camera must stand somewhere, and in one place.
+        (camera(look_at=None), "cameras.eye", ["look_at, pose or attached"]),
+        (camera(pose={}), "cameras.eye", ["one place", "look_at", "pose"]),
+        # Limits.
+        (robot(limits={"velocity": [1, 1]}), "robots.arm.limits.velocity", ["7 numbers", "rad/s", "not 2"]),
+        (robot(limits={"velocity": 3.0}), "robots.arm.limits.velocity", ["looser", "allow_looser_limits", "2.175"]),
+        (robot(limits={"lower": -3.0}), "robots.arm.limits.lower", ["looser"]),
+        (robot(limits={"velocity": -1.0}), "robots.arm.limits.velocity", ["above 0"]),
+        (robot(gripper={"speed": 9.0}), "robots.arm.gripper.speed", ["at most 0.1"]),
+        ({"robots": {"a": {"model": "iiwa", "gripper": {"speed": 0.1}}}}, "robots.a.gripper", ["no gripper"]),
+        (
+            robot(workspace={"upper": [1, 1, 0.1], "table_height": 0.2}),
+            "robots.arm.workspace",
+            ["empty"],
+        ),
+        # Objects.
+        (thing(half_extents=None), "objects.0", ["a box has half_extents", "missing"]),
+        (thing(radius=1), "objects.0", ["radius has no meaning"]),
+        (thing(shape="cone"), "objects.0.shape", ["'cone'", "cylinder"]),
+        (thing(mass=-1), "objects.0", ["must not be negative"]),
+        (thing(rgba=[255, 0, 0, 1]), "objects.0.rgba", ["0..1"]),
+        ({"objects": ["cube", "cube"]}, "name", ["'cube' is also the name of objects.0", "differ"]),
+        ({"robots": {"cube": ROBOT}, "objects": ["cube"]}, "name", ["robots.cube"]),
+        ({"objects": ["cubes/brick.yaml"]}, "objects.0", ["there is no file"]),
+        # Pads.
+        ({"gamepads": {"p": {"driver": "playback"}}}, "gamepads.p.file", ["is missing", "recording"]),
+        ({"gamepads": {"p": {"driver": "playback", "file": "no.jsonl"}}}, "gamepads.p.file", ["there is no file"]),
+        ({"gamepads": {"p": {"file": "a.jsonl"}}}, "gamepads.p.file", ["playback"]),
+        # Names of devices.
+        ({"robots": {"a": ROBOT}, "cameras": {"a": CAMERA}}, "cameras.a", ["robots.a has the same name"]),
+    ],
+)
+def test_one_mistake_is_one_problem_with_its_key(config: dict[str, Any], key: str, words: list[str]) -> None:
+    problem = only(config)
+    assert problem.key == key
+    for word in words:
+        assert word in problem.message
+
+
+def test_every_mistake_in_every_file_is_listed(tmp_path: Path) -> None:
+    (tmp_path / "bad_arm.yaml").write_text("urdf: arm.urdf\njoints: [j1]\ntcp: {lnk: hand}\nhome: [0]\n")
+    (tmp_path / "bad_brick.yaml").write_text("name: brick\nshape: box\n")
+    (tmp_path / "rig.yaml").write_text(
+        """
+sim: maybe
+robots:
+  good: {model: panda, initial: [1]}
+  bad: {model: panda, sped: 1}
+  ugly: {model: bad_arm.yaml}
+cameras:
+  eye: {model: realsense_d435, attached: {robot: bad, link: anything}}
+  ear: {model: realsense_d435, attached: {robot: god, link: panda_hand}}
+  nose: {model: realsense_d435, attached: {robot: good, link: panda_hadn}}
+objects: [bad_brick.yaml, missing.yaml, cub]
+"""
+    )
+    found = problems(tmp_path / "rig.yaml", overrides=["cameras.wrsit.output.width=3", "robots.good.colour=red"])
+    rig, arm, brick = (str(tmp_path / name) for name in ("rig.yaml", "bad_arm.yaml", "bad_brick.yaml"))
+    assert {(problem.file, problem.key) for problem in found} == {
+        (rig, "sim"),
+        (rig, "robots.bad.sped"),
+        ("--set", "robots.good.colour"),
+        ("--set", "cameras.wrsit.output.width"),
+        (arm, "tcp.link"),
+        (arm, "tcp.lnk"),
+        (brick, ""),
+        (rig, "objects.1"),
+        (rig, "objects.2"),
+        (rig, "cameras.ear.attached.robot"),
+    }
+    text = str(ConfigError(found))
+    assert text.startswith("10 problems")
+    assert f"{rig}: robots.bad.sped: " in text
+
+
+def test_with_the_schema_in_order_names_are_checked_across_files(tmp_path: Path) -> None:
+    (tmp_path / "rig.yaml").write_text(
+        "robots: {good: {model: panda, initial: [1]}, other: {model: pnada}}\n"
+        "cameras: {nose: {model: realsense_d435, attached: {robot: good, link: panda_hadn}}}\n"
+    )
+    assert {problem.key for problem in problems(tmp_path / "rig.yaml")} == {
+        "robots.good.initial",
+        "robots.other.model",
+        "cameras.nose.attached.link",
+    }
+
+
+# Files.
+
+
+def test_missing_file_and_unknown_rig(tmp_path: Path) -> None:
+    (tmp_path / "panda_bench.yaml").write_text("{}")
+    problem = only(tmp_path / "panda_bnech.yaml")
+    assert problem.file == str(tmp_path / "panda_bnech.yaml")
+    assert "there is no such file" in problem.message
+    assert "'panda_bench.yaml'" in problem.message
+    assert "did you mean 'panda_table'" in only("panda_tabel").message
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("robots: {arm: [", ["not valid YAML", "line"]),
+        ("- a\n- b\n", ["keys and values", "a list of 2"]),
+        ("", ["is empty"]),
+        ("robots: !!python/object/apply:os.system ['true']", ["not valid YAML"]),
+        ("a: 1\n---\nb: 2\n", ["not valid YAML"]),
+    ],
+)
+def test_files_that_are_no_rig(tmp_path: Path, text: str, words: list[str]) -> None:
+    (tmp_path / "rig.yaml").write_text(text)
+    problem = only(tmp_path / "rig.yaml")
+    for word in words:
+        assert word in problem.message
+
+
+def test_keys_that_are_given_twice(tmp_path: Path) -> None:
+    (tmp_path / "rig.yaml").write_text("robots:\n  arm: {model: panda}\n  arm: {model: iiwa, speed: 0.1, speed: 0.2}\n")
+    found = {problem.key: problem.message for problem in problems(tmp_path / "rig.yaml")}
+    assert set(found) == {"robots.arm", "robots.arm.speed"}
+    assert "given twice, in lines 2 and 3" in found["robots.arm"]
+
+
+def test_a_folder_in_place_of_a_file(tmp_path: Path) -> None:
+    (tmp_path / "rig.yaml").mkdir()
+    assert "cannot be read" in only(tmp_path / "rig.yaml").message
+
+
+# Overrides and arguments.
+
+
+@pytest.mark.parametrize(
+    ("override", "key", "words"),
+    [
+        ("cameras.wrist.output.widht=320", "cameras.wrist.output.widht", ["did you mean 'width'"]),
+        ("cameras.wrsit.output.width=320", "cameras.wrsit.output.width", ["no camera 'wrsit'", "did you mean 'wrist'"]),
+        ("cameras.wrist.output.width=wide", "cameras.wrist.output.width", ["whole number", "'wide'"]),
+        ("cameras.wrist.output.width=[", "cameras.wrist.output.width", ["not valid YAML"]),
+        ("simulaton.physics_hz=1000", "simulaton", ["did you mean 'simulation'"]),
+        ("sim", "", ["KEY=VALUE"]),
+        ("sim.deep=1", "sim.deep", ["sim holds no keys"]),
+        ("objects.9=cube", "objects.9", ["list of 4"]),
+        ("robots..speed=1", "robots..speed", ["empty part"]),
+    ],
+)
+def test_overrides_are_to_blame_for_their_own_mistakes(override: str, key: str, words: list[str]) -> None:
+    problem = only("panda_table", overrides=[override])
+    assert (problem.file, problem.key) == ("--set", key)
+    for word in words:
+        assert word in problem.message
+
+
+def test_arguments() -> None:
+    found = problems("panda_table", clock="lockstep", driver="mok")
+    assert {problem.key for problem in found} >= {"clock", "driver"}
+    assert any("did you mean 'lock_step'" in problem.message for problem in found)
+
+
+def test_a_real_arm_without_a_driver_for_it() -> None:
+    found = problems({"robots": {"arm": {"model": "iiwa"}}}, sim=False)
+    assert [problem.key for problem in found] == ["robots.arm"]
+    assert "no driver for a real robot" in found[0].message
+    assert "robots.arm.drivers.real" in found[0].message
+
+
+# Models and URDFs.
+
+
+@pytest.fixture
+def own_model(tmp_path: Path) -> Callable[..., Path]:
+    """Writes a rig with a changed copy of the Panda's model, and a changed copy of its URDF."""
+    original = yaml.safe_load(find_data("robots", "panda.yaml").read_text())
+    text = Path(load("panda_table").resolve().robots[0].urdf).read_text()
+
+    def write(change: Callable[[dict[str, Any]], object] = lambda model: None, urdf: str | None = None) -> Path:
+        model = copy.deepcopy(original) | {"urdf": "arm.urdf"}
+        change(model)
+        (tmp_path / "arm.urdf").write_text(text if urdf is None else urdf)
+        (tmp_path / "arm.yaml").write_text(yaml.safe_dump(model))
+        (tmp_path / "rig.yaml").write_text("robots: {arm: {model: arm.yaml}}")
+        return tmp_path / "rig.yaml"
+
+    return write
+
+
+def test_the_copied_model_is_in_order(own_model: Callable[..., Path]) -> None:
+    load(own_model())
+
+
+@pytest.mark.parametrize(
+    ("change", "key", "words"),
+    [
+        (lambda m: m["joints"].__setitem__(2, "panda_jiont3"), "joints.2", ["did you mean 'panda_joint"]),
+        (lambda m: m["joints"].__setitem__(6, "panda_joint8"), "joints.6", ["is fixed", "panda_joint7"]),
+        (lambda m: m["joints"].__setitem__(6, "panda_joint1"), "joints.6", ["given twice"]),
+        (lambda m: m["joints"].__setitem__(6, "panda_finger_joint1"), "joints.6", ["does not move the tcp's link"]),
+        (lambda m: m["gripper"]["joints"].__setitem__(0, "finger"), "gripper.joints.0", ["panda_finger_joint1"]),
+        (lambda m: m["tcp"].update(link="panda_hnad"), "tcp.link", ["did you mean 'panda_hand'"]),
+        (lambda m: m.update(base_link="base"), "base_link", ["no link 'base'", "panda_link0"]),
+        (lambda m: m["limits"].pop("acceleration"), "limits.acceleration", ["is missing", "rad/s2"]),
+        (lambda m: m["limits"].pop("jerk"), "limits.jerk", ["is missing", "rad/s3"]),
+        (lambda m: m["limits"].update(jerk=0), "limits.jerk", ["above 0"]),
+        (lambda m: m["limits"]["upper"].pop(), "limits.upper", ["7 numbers", "not 6"]),
+        (lambda m: m["limits"]["lower"].__setitem__(0, 3.0), "limits", ["lower must be below upper", "panda_joint1"]),
+        (lambda m: m["home"].pop(), "home", ["7 numbers", "not 6"]),
+        (lambda m: m["home"].__setitem__(3, 0.5), "home", ["panda_joint4", "outside its limits", "rad"]),
+        (lambda m: m.update(urdf={"package": "no_such_robots", "path": "a.urdf"}), "urdf.package", ["pip install"]),
+        (lambda m: m.update(urdf="amr.urdf"), "urdf", ["there is no file", "did you mean 'arm.urdf'"]),
+        (lambda m: m.update(urdf={"package": "yaml", "path": "a.urdf"}), "urdf", ["there is no file"]),
+        (lambda m: m.pop("tcp"), "tcp", ["is missing"]),
+        (lambda m: m.update(joints=[]), "joints", ["at least 1"]),
+        (lambda m: m["gripper"].update(width=0.08), "gripper.width", ["did you mean 'width_max'"]),
+    ],
+)
+def test_mistakes_in_a_robot_model(
+    own_model: Callable[..., Path], change: Callable[[dict[str, Any]], object], key: str, words: list[str]
+) -> None:
+    rig = own_model(change)
+    found = problems(rig)
+    matching = [problem for problem in found if problem.key == key]
+    assert matching, "\n".join(map(str, found))
+    assert matching[0].file == str(rig.parent / "arm.yaml")
+    for word in words:
+        assert word in matching[0].message
+
+
+@pytest.mark.parametrize(
+    ("urdf", "words"),
+    [
+        ("<robot name='x'><link name='a'></robot>", ["not valid XML"]),
+        ("<sdf/>", ["not a URDF", "<sdf>"]),
+        ("<robot/>", ["no links"]),
+        ("<robot><link name='a'/><joint name='j' type='fixed'><parent link='a'/></joint></robot>", ["'j' lacks"]),
+        (
+            "<robot><link name='a'/><joint name='j' type='fixed'><parent link='a'/><child link='b'/></joint></robot>",
+            ["'j' names link 'b'"],
+        ),
+        (
+            "<robot><link name='a'/><link name='b'/><joint name='j' type='revolute'><parent link='a'/><child link='b'/>"
+            "<limit lower='low'/></joint></robot>",
+            ["lower='low' is no number"],
+        ),
+    ],
+)
+def test_a_urdf_that_does_not_parse(own_model: Callable[..., Path], urdf: str, words: list[str]) -> None:
+    rig = own_model(urdf=urdf)
+    problem = only(rig)
+    assert problem.file == str(rig.parent / "arm.urdf")
+    for word in words:
+        assert word in problem.message
+
+
+def test_a_model_and_a_urdf_without_speed_limits(own_model: Callable[..., Path], tmp_path: Path) -> None:
+    rig = own_model(lambda model: model["limits"].pop("velocity"))
+    load(rig)  # the URDF has them
+    text = (tmp_path / "arm.urdf").read_text().replace('velocity="2.1750"', 'velocity="0"')
+    problem = only(own_model(lambda model: model["limits"].pop("velocity"), text))
+    assert problem.key == "limits.velocity"
+    assert "panda_joint1" in problem.message
+
+
+def test_an_object_whose_urdf_is_broken(tmp_path: Path) -> None:
+    (tmp_path / "cup.urdf").write_text("<robot>")
+    (tmp_path / "rig.yaml").write_text("objects: [{name: cup, urdf: cup.urdf}, {name: mug, urdf: mug.urdf}]")
+    found = problems(tmp_path / "rig.yaml")
+    assert [(Path(problem.file).name, problem.key) for problem in found] == [
+        ("cup.urdf", ""),
+        ("rig.yaml", "objects.1.urdf"),
+    ]
+
+
+def test_a_driver_whose_package_does_not_import() -> None:
+    problem = only(robot(drivers={"sim": "no_such_lab.arm:DRIVER"}))
+    assert problem.key == "robots.arm"
+    assert "no_such_lab" in problem.message

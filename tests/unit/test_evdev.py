@@ -1,0 +1,569 @@
+"""The evdev driver: real recordings under umockdev, and a fake input system that can be unplugged."""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+from hal.errors import ConfigError, DriverMissing, NotSupported
+from hal.gamepad import Gamepad, PadReading
+from hal.padcodes import (
+    ABS,
+    BUS_BLUETOOTH,
+    BUS_USB,
+    EV_ABS,
+    EV_KEY,
+    EV_MSC,
+    EV_SYN,
+    KEY,
+    SYN_DROPPED,
+    SYN_REPORT,
+)
+from hal.padmapper import AxisRange
+from hal.padmodel import Identity
+from hal.specs import PadSpec
+
+if sys.platform != "linux":
+    pytest.skip("evdev is Linux only", allow_module_level=True)
+
+from hal.drivers.evdev.node import Event
+from hal.drivers.evdev.pad import EvdevPad
+from hal.drivers.evdev.system import LinuxInput, NodeInfo
+
+ROOT = Path(__file__).parents[2]
+PADS = ROOT / "tests" / "data" / "pads"
+MODELS = tuple(
+    yaml.safe_load(path.read_text(encoding="utf-8")) for path in sorted((ROOT / "sensors" / "gamepads").glob("*.yaml"))
+)
+STICKS = ("ABS_X", "ABS_Y", "ABS_RX", "ABS_RY")
+AXES = {ABS[name]: AxisRange(0, 255, 15) for name in (*STICKS, "ABS_Z", "ABS_RZ")}
+AXES |= {ABS[name]: AxisRange(-1, 1) for name in ("ABS_HAT0X", "ABS_HAT0Y")}
+DS4 = Identity("Wireless Controller", 0x054C, 0x09CC, BUS_USB, "playstation")
+
+
+# Recordings of the real kernel drivers.
+
+
+def replay(name: str, node: str, events: int, folder: Path) -> list[dict[str, Any]]:
+    """What the driver reports while umockdev plays a recording."""
+    if shutil.which("umockdev-run") is None:
+        pytest.skip("needs umockdev: sudo apt install umockdev")
+    pytest.importorskip("evdev", reason="needs python-evdev: pip install evdev-binary")
+    for ending in ("umockdev", "ioctl", "events"):  # umockdev looks for its files beside each other
+        shutil.copy(PADS / f"{name}.{ending}", folder)
+    command = ["umockdev-run", "-d", f"{name}.umockdev", "-i", f"{node}={name}.ioctl", "-e", f"{node}={name}.events"]
+    done = subprocess.run(
+        [*command, "--", *reader], cwd=folder, capture_output=True, text=True, timeout=60, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    return [json.loads(line) for line in done.stdout.splitlines()]
+
+
+BUTTONS = ["west", "south", "east", "north", "l1", "r1", "l2", "r2", "select", "start", "l3", "r3"]
+
+
+@pytest.mark.parametrize(
+    ("name", "node", "events", "title", "unknown", "flat"),
+    [
+        # hid-sony shows 0 for its sticks before the first report, which would be full left and up.
+        ("ds4", "/dev/input/event3", 93, "DualShock 4", ["left_x", "left_y", "right_x", "right_y"], 15 / 127.5),
+        ("dualsense", "/dev/input/event4", 64, "DualSense", [], 0.0),
+    ],
+)
+def test_a_recorded_pad_comes_through_whole(
+    name: str, node: str, events: int, title: str, unknown: list[str], flat: float, tmp_path: Path
+) -> None:
+    found, *readings, end = replay(name, node, events, tmp_path)
+    assert found["describe"] == f"{title} (USB, {node})"
+    assert len(found["plugged"]) == 1
+    assert (found["notes"], found["trusted"], found["unknown"]) == ([], True, unknown)
+    assert found["flat"]["left_x"] == pytest.approx(flat)
+    assert end == {"events": events, "connected": True, "unknown": []}
+
+    # Every button once, in the order in which they were pressed.
+    pressed = [reading["buttons"] for reading in readings if reading["buttons"]]
+    assert [names for k, names in enumerate(pressed) if k == 0 or pressed[k - 1] != names] == [[b] for b in BUTTONS]
+    # The left stick went to the right while the right one went up, and both came back.
+    pushed = [reading["axes"] for reading in readings if reading["axes"]["left_x"] > 0.1]
+    assert [axes["left_x"] for axes in pushed] == sorted(axes["left_x"] for axes in pushed)
+    assert (pushed[-1]["left_x"], pushed[-1]["right_y"]) == (1.0, 1.0)
+    assert all(abs(axes["left_y"]) < 0.01 and abs(axes["right_x"]) < 0.01 for axes in pushed)
+    assert [reading["axes"]["dpad_x"] for reading in readings[-2:]] == [1.0, 0.0]
+    assert all(abs(value) < 0.01 for value in readings[-1]["axes"].values())
+
+
+# A fake input system.
+
+
+class FakeNode:
+    """An input device on a pipe, so that waiting for it and losing it are real."""
+
+    def __init__(self, path: str, axes: dict[int, AxisRange], keys: Sequence[int]) -> None:
+        self.path = path
+        self.axes = axes
+        self.keys = frozenset(keys)
+        self.shown: dict[int, int] = dict.fromkeys(axes, 0)
+        self.down: list[int] = []
+        self.gone = False
+        self.open_ends = 0
+        self._waiting: list[Event] = []
+        self._reader, self._writer = os.pipe()
+
+    def send(self, *events: tuple[int, int, int], t: float | None = None) -> None:
+        t = time.monotonic() if t is None else t
+        self._waiting += [Event(*event, t, t) for event in (*events, (EV_SYN, SYN_REPORT, 0))]
+        os.write(self._writer, b".")
+
+    def unplug(self, *, hang_up: bool) -> None:
+        """The kernel hangs up; a reader that comes before it looked sees ENODEV."""
+        self.gone = True
+        if hang_up:
+            os.close(self._writer)
+        else:
+            os.write(self._writer, b".")
+
+    def fileno(self) -> int:
+        return self._reader
+
+    def read(self) -> Sequence[Event]:
+        if self.gone:
+            raise OSError(errno.ENODEV, "No such device")
+        events, self._waiting = self._waiting, []
+        if events:
+            os.read(self._reader, 4096)
+        return events
+
+    def snapshot(self) -> tuple[dict[int, int], list[int]]:
+        return dict(self.shown), list(self.down)
+
+    def close(self) -> None:
+        self.open_ends -= 1
+
+
+class FakeInput:
+    """An input system with a hand on the plugs."""
+
+    def __init__(self) -> None:
+        self.plugged: dict[str, tuple[NodeInfo, FakeNode]] = {}
+        self.forbidden: set[str] = set()
+        self.changes = 0
+        self.opened: list[str] = []
+
+    def plug(self, identity: Identity, *, number: int = 3, uniq: str = "aa:bb", pad: bool = True) -> FakeNode:
+        path = f"/dev/input/event{number}"
+        axes = AXES if pad else {ABS["ABS_RX"]: AxisRange(-32768, 32767)}
+        node = FakeNode(path, axes, [KEY["BTN_SOUTH"]] if pad else [])
+        self.plugged[path] = NodeInfo(path, identity, uniq, f"/sys/{uniq}", pad), node
+        self.changes += 1
+        return node
+
+    def unplug(self, node: FakeNode, *, hang_up: bool = True) -> None:
+        del self.plugged[node.path]
+        self.changes += 1
+        node.unplug(hang_up=hang_up)
+
+    def allow(self, path: str) -> None:
+        self.forbidden.discard(path)
+        self.changes += 1
+
+    def nodes(self) -> list[NodeInfo]:
+        return [info for info, _ in self.plugged.values()]
+
+    def fingerprint(self) -> object:
+        return self.changes
+
+    def open(self, path: str) -> FakeNode:
+        if path in self.forbidden:
+            raise PermissionError(errno.EACCES, "Permission denied", path)
+        self.opened.append(path)
+        node = self.plugged[path][1]
+        node.open_ends += 1
+        return node
+
+
+@pytest.fixture
+def system() -> FakeInput:
+    return FakeInput()
+
+
+MakePad = Callable[..., EvdevPad]
+
+
+@pytest.fixture
+def make_pad(system: FakeInput) -> Iterator[MakePad]:
+    made: list[EvdevPad] = []
+
+    def make(model: dict[str, Any] | None = None, **options: object) -> EvdevPad:
+        pad = EvdevPad(PadSpec("pad", "evdev", model, MODELS, options=options), system=system)
+        made.append(pad)
+        pad.open()
+        return pad
+
+    yield make
+    for pad in made:
+        pad.close()
+
+
+def poll(pad: EvdevPad) -> PadReading:
+    return pad.poll(time.monotonic(), 0.0)
+
+
+def poll_until(pad: EvdevPad, true: Callable[[PadReading], bool], limit: float = 10.0) -> PadReading:
+    """Poll until a reading is as it should be; the driver looks for pads only a few times a second."""
+    end = time.monotonic() + limit
+    while not true(reading := pad.poll(time.monotonic(), 0.01)):
+        assert time.monotonic() < end, f"it did not happen; the last reading is {reading}"
+    return reading
+
+
+REST = [(EV_ABS, ABS[name], 128) for name in STICKS]
+
+
+def test_without_a_pad_it_is_disconnected_and_says_so(make_pad: MakePad) -> None:
+    pad = make_pad()
+    assert not poll(pad).connected
+    assert pad.describe() == "no gamepad"
+    assert not pad.proves_liveness
+
+
+def test_events_become_readings(system: FakeInput, make_pad: MakePad) -> None:
+    node = system.plug(DS4)
+    pad = make_pad()
+    assert pad.describe() == "DualShock 4 (USB, /dev/input/event3)"
+    node.send(*REST, (EV_ABS, ABS["ABS_Y"], 0), (EV_KEY, KEY["BTN_WEST"], 1))
+    reading = poll(pad)
+    assert reading.connected
+    assert reading.axes["left_y"] == 1.0
+    assert reading.buttons == {"west"}
+    assert reading.seq == 7
+    assert not reading.unknown
+
+
+def test_no_axis_counts_before_its_first_event(system: FakeInput, make_pad: MakePad) -> None:
+    node = system.plug(DS4)  # shows 0 everywhere: full left and up
+    reading = poll(make_pad())
+    assert set(reading.unknown) == {"left_x", "left_y", "right_x", "right_y"}
+    assert not any(reading.axes.values())
+    assert node.shown[ABS["ABS_X"]] == 0
+
+
+def test_times_are_on_the_rigs_clock(system: FakeInput, make_pad: MakePad) -> None:
+    node = system.plug(DS4)
+    pad = make_pad()
+    node.send(*REST, t=time.monotonic() - 0.05)
+    reading = pad.poll(1000.0, 0.0)  # a simulated time
+    assert 999.0 < reading.t <= 999.951
+    assert 999.9 < reading.t_alive <= 1000.1
+
+
+@pytest.mark.parametrize("hang_up", [True, False])
+def test_unplugging_releases_everything_and_replugging_brings_it_back(
+    system: FakeInput, make_pad: MakePad, hang_up: bool
+) -> None:
+    node = system.plug(DS4)
+    pad = make_pad()
+    node.send(*REST, (EV_ABS, ABS["ABS_X"], 255), (EV_KEY, KEY["BTN_TL"], 1))
+    held = poll(pad)
+    assert (held.axes["left_x"], held.buttons, pad.proves_liveness) == (1.0, {"l1"}, True)
+    system.unplug(node, hang_up=hang_up)
+    gone = poll(pad)
+    assert (gone.connected, any(gone.axes.values()), gone.buttons) == (False, False, frozenset())
+    assert gone.seq > held.seq
+    assert gone.t_alive == held.t_alive
+    assert node.open_ends == 0
+    assert not pad.proves_liveness
+
+    again = system.plug(DS4, number=5)
+    back = poll_until(pad, lambda reading: reading.connected)
+    assert not any(back.axes.values())
+    assert pad.describe().endswith("event5)")
+    again.send(*REST, (EV_ABS, ABS["ABS_X"], 0))
+    news = poll(pad)
+    assert (news.axes["left_x"], news.connected) == (-1.0, True)
+    assert news.seq > gone.seq
+
+
+def test_unplugged_with_the_stick_held_the_public_pad_stops_and_wants_a_new_press(
+    system: FakeInput, make_pad: MakePad
+) -> None:
+    node = system.plug(DS4)
+    pad = Gamepad(make_pad())
+    pad.open(time.monotonic())
+    deadman = pad.hold("l2")
+    held = [(EV_ABS, ABS["ABS_X"], 255), (EV_ABS, ABS["ABS_Z"], 255)]
+    node.send(*REST)
+    pad.poll_once(time.monotonic())
+    node.send(*held)
+    pad.poll_once(time.monotonic())
+    assert (pad.state().axis("left_x"), deadman.held) == (1.0, True)
+    system.unplug(node)
+    pad.poll_once(time.monotonic())
+    assert (pad.state().connected, pad.state().axis("left_x"), deadman.held) == (False, 0.0, False)
+    again = system.plug(DS4)
+    again.shown |= {ABS["ABS_X"]: 255, ABS["ABS_Z"]: 255}
+    poll_until(pad.driver, lambda reading: reading.connected)  # type: ignore[arg-type]
+    again.send(*REST, *held)
+    pad.poll_once(time.monotonic())
+    assert (pad.state().connected, pad.state().axis("left_x"), deadman.held) == (True, 0.0, False)
+    again.send(*REST, (EV_ABS, ABS["ABS_Z"], 0))
+    pad.poll_once(time.monotonic())
+    again.send(*held)
+    pad.poll_once(time.monotonic())
+    assert (pad.state().axis("left_x"), deadman.held) == (1.0, True)
+
+
+def test_waiting_for_news_ends_with_news_or_with_the_plug(system: FakeInput, make_pad: MakePad) -> None:
+    node = system.plug(DS4)
+    pad = make_pad()
+    node.send(*REST)
+    assert pad.poll(time.monotonic(), 60.0).seq == 5
+    system.unplug(node)
+    assert not pad.poll(time.monotonic(), 60.0).connected
+
+
+def test_after_dropped_events_the_state_is_read_anew(system: FakeInput, make_pad: MakePad) -> None:
+    node = system.plug(DS4)
+    pad = make_pad()
+    node.send(*REST, (EV_KEY, KEY["BTN_SOUTH"], 1))
+    assert poll(pad).buttons == {"south"}
+    node.shown = {**dict.fromkeys(AXES, 128), ABS["ABS_Y"]: 0, ABS["ABS_HAT0X"]: 1, ABS["ABS_HAT0Y"]: 0}
+    node.down = [KEY["BTN_EAST"]]
+    # What comes between the mark and the next report is worthless.
+    node.send((EV_SYN, SYN_DROPPED, 0), (EV_ABS, ABS["ABS_X"], 255), (EV_KEY, KEY["BTN_NORTH"], 1))
+    reading = poll(pad)
+    assert reading.buttons == {"east"}
+    assert abs(reading.axes["left_x"]) < 0.01
+    assert (reading.axes["left_y"], reading.axes["dpad_x"]) == (1.0, 1.0)
+    node.send((EV_ABS, ABS["ABS_X"], 255))
+    assert poll(pad).axes["left_x"] == 1.0
+
+
+def test_a_pad_that_may_not_be_read_is_reported_and_taken_once_it_may(system: FakeInput, make_pad: MakePad) -> None:
+    system.plug(DS4)
+    system.forbidden.add("/dev/input/event3")
+    pad = make_pad()
+    assert not poll(pad).connected
+    assert "sudo usermod -aG input $USER" in pad.describe()
+    assert len(pad.notes) == 1
+    system.allow("/dev/input/event3")  # udev, a moment later
+    poll_until(pad, lambda reading: reading.connected)
+    assert pad.notes == ()
+
+
+def test_it_is_looked_for_only_when_something_changed(
+    system: FakeInput, make_pad: MakePad, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    system.plug(DS4)
+    system.forbidden.add("/dev/input/event3")
+    looks: list[int] = []
+    nodes = system.nodes
+
+    def looked() -> list[NodeInfo]:
+        looks.append(1)
+        return nodes()
+
+    monkeypatch.setattr(system, "nodes", looked)
+    pad = make_pad()
+    end = time.monotonic() + 0.5
+    while time.monotonic() < end:
+        pad.poll(time.monotonic(), 0.01)
+    assert len(looks) == 1
+
+
+# Proof of life.
+
+
+MOTION = DS4._replace(name="Wireless Controller Motion Sensors")
+TOUCH = DS4._replace(name="Wireless Controller Touchpad")
+BEAT = (EV_MSC, 5, 1)
+
+
+def test_with_a_cable_every_poll_proves_that_the_pad_is_there(system: FakeInput, make_pad: MakePad) -> None:
+    system.plug(DS4)
+    pad = make_pad()
+    times = [pad.poll(100.0 + k, 0.0).t_alive for k in range(3)]
+    assert times == pytest.approx([100.0, 101.0, 102.0], abs=0.05)
+    assert pad.proves_liveness
+
+
+@pytest.mark.parametrize("bus", [BUS_USB, BUS_BLUETOOTH])
+def test_once_the_motion_sensor_was_heard_its_silence_lets_the_proof_age(
+    system: FakeInput, make_pad: MakePad, bus: int
+) -> None:
+    node = system.plug(DS4._replace(bus=bus))
+    motion = system.plug(MOTION._replace(bus=bus), number=4, pad=False)
+    system.plug(TOUCH._replace(bus=bus), number=5, pad=False)
+    pad = make_pad()
+    node.send(*REST)
+    poll(pad)
+    assert pad.proves_liveness is (bus == BUS_USB)
+    assert system.opened == ["/dev/input/event3", "/dev/input/event4"]
+    alive = [pad.poll(now, 0.0).t_alive for now in (100.0, 101.0)]
+    assert alive == pytest.approx([100.0, 101.0], abs=0.05)  # not heard yet: every poll counts
+    motion.send(BEAT)
+    assert pad.poll(102.0, 0.0).t_alive == pytest.approx(102.0, abs=0.05)
+    assert pad.proves_liveness
+    silent = [pad.poll(now, 0.0) for now in (103.0, 104.0)]
+    assert all(reading.connected for reading in silent)
+    assert [reading.t_alive for reading in silent] == pytest.approx([102.0, 102.0], abs=0.05)
+    motion.send(BEAT)
+    assert pad.poll(105.0, 0.0).t_alive == pytest.approx(105.0, abs=0.05)
+
+
+def test_the_motion_sensor_is_the_one_of_the_same_pad_and_may_appear_later(
+    system: FakeInput, make_pad: MakePad
+) -> None:
+    system.plug(MOTION._replace(bus=BUS_BLUETOOTH), number=2, uniq="cc:dd", pad=False)
+    system.plug(DS4._replace(bus=BUS_BLUETOOTH), number=3)
+    pad = make_pad()
+    poll(pad)
+    assert system.opened == ["/dev/input/event3"]
+    motion = system.plug(MOTION._replace(bus=BUS_BLUETOOTH), number=4, pad=False)
+    motion.send(BEAT)
+    poll_until(pad, lambda _: pad.proves_liveness)
+    assert system.opened == ["/dev/input/event3", "/dev/input/event4"]
+
+
+def test_losing_the_motion_sensor_is_losing_the_pad(system: FakeInput, make_pad: MakePad) -> None:
+    node = system.plug(DS4)
+    motion = system.plug(MOTION, number=4, pad=False)
+    pad = make_pad()
+    motion.send(BEAT)
+    assert poll(pad).connected
+    system.unplug(motion)
+    assert not poll(pad).connected
+    assert (node.open_ends, motion.open_ends) == (0, 0)
+
+
+@pytest.mark.parametrize(
+    "identity",
+    [
+        Identity("Xbox Wireless Controller", 0x045E, 0x02EA, BUS_BLUETOOTH, "microsoft"),
+        Identity("Xbox 360 Wireless Receiver", 0x045E, 0x0719, BUS_USB, "xpad"),
+        Identity("Nobody's pad", 0x1234, 0x5678, BUS_USB, "hid-generic"),
+    ],
+)
+def test_a_pad_whose_silence_tells_nothing_proves_nothing(
+    system: FakeInput, make_pad: MakePad, identity: Identity
+) -> None:
+    system.plug(identity)
+    pad = make_pad()
+    assert poll(pad).connected
+    assert not pad.proves_liveness
+    public = Gamepad(pad)
+    with pytest.raises(NotSupported, match="accept_silent_pad"):
+        public.hold("l2").check_trust()
+
+
+# Which pad.
+
+
+def test_devices_that_are_no_pads_are_left_alone(system: FakeInput, make_pad: MakePad) -> None:
+    system.plug(Identity("Keyboard", 1, 2, BUS_USB, "usbhid"), pad=False)
+    assert not poll(make_pad()).connected
+    assert system.opened == []
+
+
+def test_the_options_name_the_pad(system: FakeInput, make_pad: MakePad) -> None:
+    system.plug(DS4, number=3)
+    system.plug(DS4._replace(name="The other one"), number=7, uniq="cc:dd")
+    assert make_pad().describe().endswith("event3)")
+    assert make_pad(name="OTHER").describe().endswith("event7)")
+    assert make_pad(device="/dev/input/event7").describe().endswith("event7)")
+    missing = make_pad(device="/dev/input/event9")
+    assert not poll(missing).connected
+    assert "event3" in missing.describe()
+
+
+def test_a_fixed_model_takes_only_pads_that_it_matches(system: FakeInput, make_pad: MakePad) -> None:
+    system.plug(DS4)
+    (xbox,) = (model for model in MODELS if model["name"] == "xbox_one")
+    assert not poll(make_pad(model=xbox)).connected
+    system.plug(Identity("Microsoft X-Box One S pad", 0x045E, 0x02EA, BUS_USB, "xpad"), number=8, uniq="")
+    assert make_pad(model=xbox).describe() == "Xbox One pad (USB, /dev/input/event8)"
+
+
+def test_an_unknown_pad_is_guessed_with_a_warning(system: FakeInput, make_pad: MakePad) -> None:
+    node = system.plug(Identity("ACME Pad", 0x1234, 0x5678, BUS_USB, "hid-generic"))
+    pad = make_pad()
+    assert "unknown gamepad" in pad.notes[0]
+    assert "ABS_X: left_x" in pad.notes[0]
+    node.send(*REST, (EV_ABS, ABS["ABS_RX"], 255), (EV_KEY, KEY["BTN_SOUTH"], 1))
+    reading = poll(pad)
+    assert (reading.axes["right_x"], reading.buttons) == (1.0, {"south"})
+
+
+def test_unknown_options_are_refused(make_pad: MakePad) -> None:
+    with pytest.raises(ConfigError, match="gamepads.pad: devise"):
+        make_pad(devise="/dev/input/event3")
+
+
+def test_closing_lets_go_and_may_be_repeated(system: FakeInput, make_pad: MakePad) -> None:
+    node = system.plug(DS4)
+    pad = make_pad()
+    assert node.open_ends == 1
+    pad.close()
+    pad.close()
+    assert node.open_ends == 0
+    assert not poll(pad).connected
+
+
+# This machine.
+
+
+def test_a_machine_without_input_devices_has_no_pad(tmp_path: Path) -> None:
+    nothing = LinuxInput(tmp_path / "none", tmp_path / "none")
+    assert nothing.nodes() == []
+    assert nothing.fingerprint() == ()
+    assert isinstance(EvdevPad.plugged().pads, tuple)
+
+
+def test_devices_are_read_from_sysfs(tmp_path: Path) -> None:
+    hardware = tmp_path / "hardware"
+    (tmp_path / "bus" / "xpad").mkdir(parents=True)
+    for number, keys in ((12, "7cdb000000000000 0 0 0 0"), (2, "10000 0 0 0 0")):
+        device = tmp_path / "sys" / f"event{number}" / "device"
+        files = {"name": f"Pad {number}\n", "uniq": "\n", "id/vendor": "045e\n", "id/product": "028e\n"}
+        files |= {"id/bustype": "0003\n", "capabilities/key": f"{keys}\n", "capabilities/abs": "3003f\n"}
+        for name, text in files.items():
+            (device / name).parent.mkdir(parents=True, exist_ok=True)
+            (device / name).write_text(text)
+        hardware.mkdir(exist_ok=True)
+        (device / "device").symlink_to(hardware)
+    (hardware / "driver").symlink_to(tmp_path / "bus" / "xpad")
+    (tmp_path / "sys" / "mouse0").mkdir()
+    mouse, pad = LinuxInput(tmp_path / "sys", tmp_path / "dev").nodes()
+    assert pad.identity == Identity("Pad 12", 0x045E, 0x028E, BUS_USB, "xpad")
+    assert pad.path == str(tmp_path / "dev" / "event12")
+    assert (mouse.is_pad, pad.is_pad) == (False, True)
+    assert pad.belongs_to(mouse)  # the same hardware, where there is no serial number
+
+
+def test_the_fingerprint_sees_devices_and_permissions(tmp_path: Path) -> None:
+    system = LinuxInput(tmp_path, tmp_path)
+    marks = [system.fingerprint()]
+    (tmp_path / "event0").touch()
+    marks.append(system.fingerprint())
+    (tmp_path / "event0").chmod(0o600)
+    marks.append(system.fingerprint())
+    (tmp_path / "event0").unlink()
+    marks.append(system.fingerprint())
+    assert all(before != after for before, after in pairwise(marks))
+
+
+def test_a_missing_library_is_named_with_its_remedy(monkeypatch: pytest.MonkeyPatch, pad_spec: PadSpec) -> None:
+    monkeypatch.setitem(sys.modules, "evdev", None)
+    with pytest.raises(DriverMissing, match="pip install evdev-binary"):
+        EvdevPad(pad_spec).open()

@@ -1,0 +1,314 @@
+"""The public gamepad, around a driver that a test plays."""
+
+from __future__ import annotations
+
+import math
+import threading
+from collections.abc import Callable, Iterator
+
+import pytest
+
+from hal.errors import DeviceNotFound, NotSupported
+from hal.gamepad import Gamepad, GamepadDriver, PadReading
+from hal.specs import PadSpec
+from hal.types import AXES, PadState
+
+RESTING = dict.fromkeys(AXES, 0.0)
+
+
+class Played(GamepadDriver):
+    """Reports what the test says."""
+
+    proves_liveness = True
+
+    def __init__(self, spec: PadSpec) -> None:
+        super().__init__(spec)
+        self.reading = PadReading(0.0, 0.0, 0.0, 0, RESTING, frozenset(), connected=True)
+        self.failure: Exception | None = None
+        self.news = threading.Event()
+        self.closed = 0
+
+    def open(self) -> None:
+        pass
+
+    def poll(self, now: float, timeout: float) -> PadReading:
+        if timeout:
+            self.news.wait(timeout)
+            self.news.clear()
+        if self.failure is not None:
+            raise self.failure
+        return self.reading
+
+    def shows(self, *buttons: str, connected: bool = True, unknown: tuple[str, ...] = (), **axes: float) -> None:
+        old = self.reading
+        t = old.t + 0.01
+        self.reading = PadReading(
+            t, t, t, old.seq + 1, {**RESTING, **axes}, frozenset(buttons), connected=connected, unknown=unknown
+        )
+        self.news.set()
+
+    def close(self) -> None:
+        self.closed += 1
+
+
+@pytest.fixture
+def driver(pad_spec: PadSpec) -> Played:
+    return Played(pad_spec)
+
+
+@pytest.fixture
+def pad(driver: Played) -> Iterator[Gamepad]:
+    pad = Gamepad(driver)
+    pad.open(0.0)
+    yield pad
+    pad.close()
+
+
+@pytest.fixture
+def see(pad: Gamepad, driver: Played) -> Callable[..., PadState]:
+    """Let the driver report something, poll once, and look."""
+
+    def see(*buttons: str, connected: bool = True, unknown: tuple[str, ...] = (), **axes: float) -> PadState:
+        driver.shows(*buttons, connected=connected, unknown=unknown, **axes)
+        pad.poll_once(driver.reading.t)
+        return pad.state()
+
+    return see
+
+
+See = Callable[..., PadState]
+
+
+def test_before_it_is_opened_it_is_disconnected(driver: Played) -> None:
+    state = Gamepad(driver).state()
+    assert not state.connected
+    assert state.axis("left_x") == 0.0
+
+
+def test_the_state_bears_axes_buttons_and_stamps(see: See, driver: Played) -> None:
+    state = see("south", left_x=1.0, right_y=-1.0, l2=1.0, dpad_y=1.0)
+    assert state.connected
+    assert state.pressed("south")
+    assert [state.axis(name) for name in ("left_x", "right_y", "l2", "dpad_y", "left_y")] == [1.0, -1.0, 1.0, 1.0, 0.0]
+    assert (state.stamp.t, state.stamp.t_device, state.stamp.seq) == (driver.reading.t, driver.reading.t_device, 1)
+    with pytest.raises(TypeError):
+        state.axes["left_x"] = 0.0  # type: ignore[index]
+
+
+def test_a_stick_starts_from_zero_at_the_edge_of_its_dead_zone(see: See, pad: Gamepad) -> None:
+    zone = pad.driver.spec.dead_zone
+    assert see(left_x=zone).axis("left_x") == 0.0
+    assert 0.0 < see(left_x=zone + 1e-6).axis("left_x") < 2e-6
+    assert see(left_x=-(zone + 0.5 * (1.0 - zone))).axis("left_x") == pytest.approx(-0.5)
+    assert see(left_x=-1.0).axis("left_x") == -1.0
+    assert see(dpad_x=-1.0).axis("dpad_x") == -1.0
+
+
+def test_the_larger_of_the_rigs_dead_zone_and_the_pads_own_counts(see: See, driver: Played) -> None:
+    driver.flat = {"left_x": 0.2, "left_y": 0.01}
+    assert see(left_x=0.2).axis("left_x") == 0.0
+    assert see(left_y=0.5).axis("left_y") == pytest.approx((0.5 - 0.08) / 0.92)
+
+
+def test_a_reading_that_is_not_a_number_moves_nothing(see: See, pad: Gamepad) -> None:
+    deadman = pad.hold("l2")
+    see()
+    assert see(left_x=math.nan, l2=math.nan).axis("left_x") == 0.0
+    assert not deadman.held
+
+
+def test_nothing_counts_until_every_stick_was_at_rest(driver: Played) -> None:
+    driver.shows("south", left_x=1.0)
+    pad = Gamepad(driver)
+    pad.open(0.0)
+    assert pad.state().connected
+    assert pad.state().axis("left_x") == 0.0
+    assert pad.waiting_for == ("left_x",)
+    driver.shows("south", right_x=1.0)
+    pad.poll_once(0.1)
+    assert pad.state().axis("right_x") == 0.0
+    driver.shows("south", right_x=0.2)  # near enough to rest
+    pad.poll_once(0.2)
+    driver.shows("south", right_x=1.0)
+    pad.poll_once(0.3)
+    assert pad.state().axis("right_x") == 1.0
+    assert not pad.state().pressed("south")  # it was never seen up
+    assert pad.waiting_for == ("south",)
+
+
+def test_a_button_that_was_down_counts_once_it_was_let_go_of(see: See, driver: Played) -> None:
+    see(connected=False)
+    assert not see("south").pressed("south")
+    assert see("east").buttons == {"east"}
+    assert see("south", "east").buttons == {"south", "east"}
+
+
+def test_an_axis_that_the_pad_has_not_spoken_of_keeps_everything_shut(driver: Played) -> None:
+    driver.shows(unknown=("left_x",))
+    pad = Gamepad(driver)
+    pad.open(0.0)
+    driver.shows(unknown=("left_x",), right_x=1.0)
+    pad.poll_once(0.1)
+    assert pad.waiting_for == ("left_x", "right_x")
+    assert pad.state().axis("right_x") == 0.0
+
+
+def test_after_a_reconnection_sticks_and_dead_man_must_be_let_go_of_first(see: See, pad: Gamepad) -> None:
+    deadman = pad.hold("l2")
+    see()
+    assert see(left_y=1.0, l2=1.0).axis("left_y") == 1.0
+    assert deadman.held
+    state = see(connected=False, left_y=1.0, l2=1.0)  # a driver that forgets to release everything
+    assert (state.connected, state.axis("left_y"), deadman.held, deadman.connected) == (False, 0.0, False, False)
+    state = see(left_y=1.0, l2=1.0)
+    assert (state.connected, state.axis("left_y"), deadman.held, deadman.connected) == (True, 0.0, False, True)
+    see(left_y=1.0)
+    assert not see(left_y=1.0, l2=1.0).axis("left_y")
+    assert not deadman.held
+    see()
+    assert see(left_y=1.0, l2=1.0).axis("left_y") == 1.0
+    assert deadman.held
+    assert deadman.record.presses == 2
+
+
+def test_a_dead_man_on_a_trigger_has_hysteresis_and_one_on_a_button_has_not(see: See, pad: Gamepad) -> None:
+    trigger, button = pad.hold("l2"), pad.hold("l1")
+    see()
+    held = [(see(l2=value), trigger.held)[1] for value in (0.4, 0.6, 0.4, 0.2)]
+    assert held == [False, True, True, False]
+    see("l1")
+    assert (button.held, trigger.held) == (True, False)
+
+
+def test_a_trigger_that_is_only_a_button_is_a_dead_man_too(driver: Played, pad: Gamepad) -> None:
+    deadman = pad.hold("l2")
+    pad.poll_once(0.0)
+    driver.reading = driver.reading._replace(seq=1, axes={"left_x": 0.0}, buttons=frozenset({"l2"}))
+    pad.poll_once(0.1)
+    assert deadman.held
+
+
+def test_the_dead_man_of_a_control_is_one_object_and_knows_the_pad_at_once(pad: Gamepad) -> None:
+    assert pad.hold("l2") is pad.hold("l2")
+    assert pad.hold("l1") is not pad.hold("l2")
+    assert pad.hold("r1").connected
+    with pytest.raises(DeviceNotFound, match="l1"):
+        pad.hold("L1")
+
+
+def test_one_that_is_asked_for_while_it_is_pressed_must_be_let_go_of(see: See, pad: Gamepad) -> None:
+    see("l1")
+    deadman = pad.hold("l1")
+    assert not deadman.held
+    see("l1")
+    assert not deadman.held
+    see()
+    see("l1")
+    assert deadman.held
+
+
+def test_the_heartbeat_reaches_the_servo_with_every_poll(see: See, pad: Gamepad, driver: Played) -> None:
+    heard: list[float] = []
+    pad.hold("l2").attach(lambda record: heard.append(record.t_alive))
+    heard.clear()
+    for _ in range(3):
+        see()
+    pad.poll_once(99.0)  # the pad said nothing: the record is passed on all the same, with the old time
+    assert heard == pytest.approx([0.01, 0.02, 0.03, 0.03])
+
+
+def test_a_driver_that_fails_is_a_pad_that_is_gone(see: See, pad: Gamepad, driver: Played) -> None:
+    deadman = pad.hold("l2")
+    see()
+    see(l2=1.0)
+    assert deadman.held
+    driver.failure = ValueError("garbage on the wire")
+    pad.poll_once(1.0)
+    assert not pad.state().connected
+    assert not deadman.held
+    assert pad.error is driver.failure
+    driver.failure = None
+    state = see(l2=1.0)
+    assert state.connected
+    assert pad.error is None
+    assert not deadman.held
+
+
+def test_changes_are_told_and_only_changes(see: See, pad: Gamepad) -> None:
+    told: list[PadState] = []
+    detach = pad.on_change(told.append)
+    see("south")
+    pad.poll_once(5.0)  # the same reading again
+    see()
+    detach()
+    see("south")
+    assert [state.buttons for state in told] == [{"south"}, frozenset()]
+
+
+def test_a_callback_that_fails_ends_and_the_pad_goes_on(see: See, pad: Gamepad) -> None:
+    calls: list[PadState] = []
+
+    def broken(state: PadState) -> None:
+        calls.append(state)
+        raise KeyError("a mistake in the callback")
+
+    pad.on_change(broken)
+    see("south")
+    state = see("east")
+    assert len(calls) == 1
+    assert state.pressed("east")
+    assert isinstance(pad.error, KeyError)
+
+
+def test_only_a_pad_whose_silence_is_noticed_may_guard_a_real_arm(pad_spec: PadSpec, driver: Played) -> None:
+    pad = Gamepad(driver)
+    pad.hold("l2").check_trust()
+    driver.proves_liveness = False
+    with pytest.raises(NotSupported, match="accept_silent_pad"):
+        pad.hold("l2").check_trust()
+    pad_spec.options["accept_silent_pad"] = True
+    pad.hold("l2").check_trust()
+
+
+def test_its_own_thread_polls_it_and_close_ends_the_thread(driver: Played) -> None:
+    pad = Gamepad(driver)
+    pad.open(0.0)
+    pad.start_thread(lambda: driver.reading.t)
+    pressed = threading.Event()
+    pad.on_change(lambda state: pressed.set() if "south" in state.buttons else None)
+    driver.shows("south")
+    assert pressed.wait(5.0)
+    assert pad.state().pressed("south")
+    deadman = pad.hold("l2")
+    before = {thread for thread in threading.enumerate() if thread.name == "hal pad pad"}
+    assert len(before) == 1
+    pad.close()
+    pad.close()
+    assert not any(thread.is_alive() for thread in before)
+    assert driver.closed == 1
+    assert not pad.state().connected
+    assert not deadman.connected
+
+
+def test_waiting_returns_with_the_next_state_or_after_the_time_out(driver: Played) -> None:
+    pad = Gamepad(driver)
+    pad.open(0.0)
+    pad.start_thread(lambda: 0.0)
+    before = pad.state()
+    assert pad.wait(0.0) is before
+    seen: list[PadState] = []
+    waiter = threading.Thread(target=lambda: seen.append(pad.wait(60.0)))
+    waiter.start()
+    while waiter.is_alive():  # it may have missed the first changes
+        driver.shows("south")
+        waiter.join(0.02)
+    pad.close()
+    assert seen[0] is not before
+    assert seen[0].pressed("south")
+
+
+def test_a_closed_pad_is_not_polled(driver: Played, pad: Gamepad) -> None:
+    pad.close()
+    driver.shows("south")
+    pad.poll_once(1.0)
+    assert not pad.state().connected

@@ -1,0 +1,265 @@
+"""The recorded pad: the file's format, its clock, its faults, and the conversion of evemu recordings."""
+
+from __future__ import annotations
+
+import json
+import runpy
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+from hal.drivers.playback import convert as converter
+from hal.drivers.playback.pad import PlaybackPad
+from hal.drivers.playback.recording import dump, load
+from hal.errors import ConfigError, NotSupported
+from hal.gamepad import Gamepad, PadReading
+from hal.specs import PadSpec
+
+ROOT = Path(__file__).parents[2]
+PADS = ROOT / "tests" / "data" / "pads"
+TOUR = PADS / "tour.jsonl"
+MODELS = tuple(
+    yaml.safe_load(path.read_text(encoding="utf-8")) for path in sorted((ROOT / "sensors" / "gamepads").glob("*.yaml"))
+)
+HEADER: dict[str, Any] = {
+    "format": "hal-pad-events",
+    "version": 1,
+    "model": "dualshock4",
+    "ranges": {"ABS_X": [0, 255], "ABS_Z": [0, 255]},
+}
+
+Write = Callable[..., Path]
+
+
+@pytest.fixture
+def write(tmp_path: Path) -> Write:
+    """A recording of (t, code, value)."""
+
+    def write(*events: tuple[float, str, int], **header: object) -> Path:
+        lines = [json.dumps({**HEADER, **header})]
+        for t, code, value in events:
+            kind = "abs" if code.startswith("ABS") else "key"
+            lines.append(json.dumps({"t": t, "type": kind, "code": code, "value": value}))
+        path = tmp_path / "pad.jsonl"
+        path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+        return path
+
+    return write
+
+
+def player(path: Path, **options: object) -> PlaybackPad:
+    pad = PlaybackPad(PadSpec("pad", "playback", None, MODELS, options={"file": str(path), **options}))
+    pad.open()
+    return pad
+
+
+def test_events_come_when_they_are_due_on_the_rigs_clock(write: Write) -> None:
+    pad = player(write((0.0, "ABS_X", 255), (0.5, "BTN_SOUTH", 1), (1.0, "BTN_SOUTH", 0), (1.5, "ABS_X", 128)))
+    first = pad.poll(100.0, 0.0)
+    assert (first.axes["left_x"], first.buttons, first.t) == (1.0, frozenset(), 100.0)
+    assert pad.poll(100.499, 0.0).buttons == frozenset()
+    pressed = pad.poll(100.75, 0.0)
+    assert pressed.buttons == {"south"}
+    assert (pressed.t, pressed.t_device, pressed.seq, pressed.t_alive) == (100.5, 0.5, 2, 100.75)
+    assert pad.poll(101.0, 0.0).buttons == frozenset()
+
+
+def test_after_the_end_the_pad_is_released_connected_and_alive(write: Write) -> None:
+    pad = player(write((0.0, "ABS_X", 255), (0.1, "BTN_SOUTH", 1)))
+    assert pad.poll(0.0, 0.0).axes["left_x"] == 1.0
+    end = pad.poll(5.0, 0.0)
+    assert (end.axes["left_x"], end.buttons, end.connected, end.t_alive, end.seq) == (0.0, frozenset(), True, 5.0, 2)
+
+
+def test_a_loop_begins_again(write: Write) -> None:
+    pad = player(write((0.0, "BTN_SOUTH", 1), (0.4, "BTN_SOUTH", 0), (1.0, "ABS_X", 128)), loop=True)
+    seen = [bool(pad.poll(k * 0.3, 0.0).buttons) for k in range(8)]  # 0, 0.3, 0.6, 0.9, 0.2, 0.5, 0.8, 0.1
+    assert seen == [True, True, False, False, True, False, False, True]
+
+
+def test_a_loop_of_events_at_one_instant_ends(write: Write) -> None:
+    pad = player(write((0.0, "BTN_SOUTH", 1)), loop=True)
+    assert pad.poll(0.0, 0.0).seq == 1
+
+
+def test_waiting_ends_with_the_next_event(write: Write) -> None:
+    pad = player(write((0.0, "ABS_X", 128), (0.01, "BTN_SOUTH", 1), (0.5, "BTN_SOUTH", 0)))
+    pad.poll(0.0, 0.0)
+    reading = pad.poll(0.0, 60.0)
+    assert reading.buttons == {"south"}
+
+
+def test_a_frozen_pad_repeats_itself_and_gives_no_sign_of_life(write: Write) -> None:
+    pad = player(write((0.0, "ABS_X", 255), (2.0, "ABS_X", 128)), freeze_at=1.0)
+    pad.poll(0.0, 0.0)
+    before = pad.poll(0.99, 0.0)
+    after = [pad.poll(t, 0.0) for t in (1.0, 2.5, 9.0)]
+    assert all(reading == before for reading in after)
+    assert (before.connected, before.axes["left_x"], before.t_alive) == (True, 1.0, 0.99)
+
+
+def test_a_pad_is_unplugged_and_comes_back_with_what_is_held_by_then(write: Write) -> None:
+    events = ((0.0, "BTN_SOUTH", 1), (0.5, "ABS_X", 255), (9.0, "BTN_SOUTH", 0))
+    pad = player(write(*events), disconnect_at=1.0, reconnect_at=2.0)
+    pad.poll(0.0, 0.0)
+    assert pad.poll(0.9, 0.0).buttons == {"south"}
+    gone = pad.poll(1.5, 0.0)
+    assert (gone.connected, gone.buttons, gone.axes["left_x"], gone.t_alive) == (False, frozenset(), 0.0, 0.9)
+    back = pad.poll(2.0, 0.0)
+    assert (back.connected, back.buttons, back.axes["left_x"], back.t_alive) == (True, {"south"}, 1.0, 2.0)
+
+
+def test_a_recording_is_no_dead_man_for_a_real_arm(write: Write) -> None:
+    pad = Gamepad(player(write((0.0, "ABS_X", 128))))
+    with pytest.raises(NotSupported, match="nobody holds it"):
+        pad.hold("l2").check_trust()
+
+
+def test_it_may_bring_its_own_model(write: Write) -> None:
+    model = {"name": "own", "title": "Own", "axes": {"ABS_X": "-right_y"}, "buttons": {}}
+    pad = player(write((0.0, "ABS_X", 0), (1.0, "ABS_X", 0), model=model))
+    assert pad.poll(0.0, 0.0).axes["right_y"] == 1.0
+
+
+def test_every_bad_line_is_reported_with_its_number(tmp_path: Path) -> None:
+    path = tmp_path / "bad.jsonl"
+    lines = [
+        json.dumps({**HEADER, "version": 2, "ranges": {"ABS_X": [5, 5], "ABS_Q": [0, 1]}}),
+        '{"t": 0.0, "type": "abs", "code": "ABS_X", "value": ',
+        "[]",
+        json.dumps({"t": -1, "type": "key", "code": "BTN_SOUTH", "value": 1}),
+        json.dumps({"t": 1, "type": "rel", "code": "REL_X", "value": 1}),
+        json.dumps({"t": 1, "type": "key", "code": "BTN_NOSE", "value": 1}),
+        json.dumps({"t": 1, "type": "key", "code": "BTN_SOUTH", "value": 0.5}),
+        json.dumps({"t": 2, "type": "key", "code": "BTN_SOUTH", "value": 1}),
+        json.dumps({"t": 1, "type": "key", "code": "BTN_SOUTH", "value": 1}),
+        "",
+        json.dumps({"t": 3, "type": "key", "code": ["BTN_SOUTH"], "value": 1}),
+    ]
+    path.write_text("\n".join(lines), encoding="utf-8")
+    with pytest.raises(ConfigError) as caught:
+        load(path)
+    keys = [problem.key for problem in caught.value.problems]
+    assert sorted(keys) == sorted(["line 1"] * 3 + [f"line {number}" for number in (2, 3, 4, 5, 6, 7, 9, 11)])
+    assert {problem.file for problem in caught.value.problems} == {str(path)}
+
+
+@pytest.mark.parametrize("text", ["", "\n\n", "hello", '{"format": "else"}', "\x00\xff"])
+def test_a_file_that_is_no_recording_is_refused(tmp_path: Path, text: str) -> None:
+    path = tmp_path / "bad.jsonl"
+    path.write_text(text, encoding="latin-1")
+    with pytest.raises(ConfigError, match="bad.jsonl"):
+        load(path)
+
+
+def test_what_is_missing_or_unknown_is_named(write: Write, tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="cannot be read"):
+        player(tmp_path / "nowhere.jsonl")
+    with pytest.raises(ConfigError, match="no pad model 'wheel'; models: dualsense, dualshock4"):
+        player(write(model="wheel"))
+    with pytest.raises(ConfigError, match="freez_at"):
+        player(write(), freez_at=1.0)
+    with pytest.raises(ConfigError, match="file"):
+        PlaybackPad(PadSpec("pad", "playback", None, MODELS))
+
+
+@pytest.mark.parametrize(("name", "model", "events"), [("ds4", "dualshock4", 38), ("dualsense", "dualsense", 34)])
+def test_an_evemu_recording_converts_and_reads_back(name: str, model: str, events: int) -> None:
+    recording = converter.convert(PADS / f"{name}.events", PADS / f"{name}.ioctl", model=model)
+    assert len(recording.events) == events
+    assert recording.events[0].t == 0.0
+    stored = load(PADS / f"{name}.jsonl")
+    assert dump(recording._replace(about=stored.about)) == (PADS / f"{name}.jsonl").read_text()
+
+
+def test_evemus_own_description_gives_the_ranges_too(tmp_path: Path) -> None:
+    path = tmp_path / "own.events"
+    path.write_text(
+        "# EVEMU 1.3\nN: pad\nA: 00 -512 511 0 16 0\nE: 10.5 0003 0000 511\nE: 10.6 0000 0000 0\n", encoding="utf-8"
+    )
+    recording = converter.convert(path, model="dualshock4")
+    assert [*recording.ranges[0]] == [-512, 511, 16]
+    assert len(recording.events) == 1
+
+
+def test_the_converters_mistakes_are_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "bad.events"
+    path.write_text("E: nonsense\nE: 1.0 0003 0000 1\n", encoding="utf-8")
+    assert converter.main([str(path), "--model", "dualshock4"]) == 2
+    printed = capsys.readouterr().err
+    assert "line 1" in printed
+    assert "ABS_X: nothing says its range" in printed
+
+
+def test_the_converter_writes_a_file_that_plays(tmp_path: Path) -> None:
+    out = tmp_path / "out.jsonl"
+    given = [
+        str(PADS / "ds4.events"),
+        "--ioctl",
+        str(PADS / "ds4.ioctl"),
+        "--model",
+        "dualshock4",
+        "--output",
+        str(out),
+    ]
+    assert converter.main(given) == 0
+    pad = player(out)
+    pressed: set[str] = set()
+    for k in range(400):
+        pressed |= pad.poll(k * 0.01, 0.0).buttons
+    assert pressed >= {"south", "east", "west", "north", "l1", "r1", "l2", "r2", "select", "start", "l3", "r3"}
+
+
+# The tour.
+
+
+def test_the_tour_is_what_its_script_writes() -> None:
+    script = runpy.run_path(str(PADS / "make_tour.py"))
+    assert TOUR.read_text(encoding="utf-8") == "\n".join(script["lines"]()) + "\n"
+
+
+@pytest.fixture(scope="module")
+def tour() -> list[tuple[float, PadReading]]:
+    pad = player(TOUR)
+    return [(k * 0.01, pad.poll(k * 0.01, 0.0)) for k in range(1400)]
+
+
+def test_the_tour_drives_far_enough_and_turns_the_wrist(tour: list[tuple[float, PadReading]]) -> None:
+    """With the default mapping, at 0.1 m/s and 0.3 rad/s, counted only while the dead-man is squeezed."""
+    driven = turned = 0.0
+    for _, reading in tour:
+        if reading.axes["l2"] > 0.5:
+            up = ("l1" in reading.buttons) - ("r1" in reading.buttons)
+            driven += 0.001 * (reading.axes["dpad_y"] ** 2 + reading.axes["dpad_x"] ** 2 + up**2) ** 0.5
+            turned += 0.003 * sum(abs(v) for k, v in reading.axes.items() if k.endswith("_x") and abs(v) > 0.1)
+    assert driven > 0.5
+    assert turned > 0.5
+
+
+def test_the_tour_lets_go_of_the_dead_man_in_mid_motion_closes_the_hand_and_ends_released(
+    tour: list[tuple[float, PadReading]],
+) -> None:
+    pad = Gamepad(player(TOUR))
+    pad.open(0.0)
+    deadman = pad.hold("l2")
+    released_in_motion = False
+    was_held = False
+    grips = []
+    for k in range(1400):
+        pad.poll_once(k * 0.01)
+        moving = pad.state().axis("dpad_y") != 0.0
+        released_in_motion |= was_held and not deadman.held and moving
+        was_held = deadman.held
+        grips.append(pad.state().axis("r2"))
+    assert released_in_motion
+    assert deadman.record.presses == 2
+    assert max(grips) == 1.0
+    assert grips[0] == grips[-1] == 0.0
+    last = tour[-1][1]
+    assert last.connected
+    assert not last.buttons
+    assert not any(last.axes.values())
+    assert not deadman.held

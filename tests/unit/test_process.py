@@ -1,0 +1,147 @@
+"""Child processes: start from anywhere, answer, pass errors on, end without leaving anything."""
+
+import os
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from hal.errors import ConfigError, ConnectionLost
+from hal.process import Child, SharedMemory
+
+HERE = Path(__file__).parent
+
+
+@pytest.fixture(autouse=True)
+def targets_on_path(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    monkeypatch.syspath_prepend(str(HERE))
+    yield
+
+
+def start(**config: object) -> Child:
+    child = Child("echo", "child_targets:echo", config)
+    child.wait_ready(20.0)
+    return child
+
+
+def test_answers_and_memory() -> None:
+    memory = SharedMemory(64)
+    child = Child("echo", "child_targets:echo", {"x": "ä" * 100_000}, [memory])
+    ready = child.wait_ready(20.0)
+    assert ready["path"] == "ä" * 100_000
+    assert bytes(memory.buffer[:5]) == b"hello"
+    assert child.request("say", {"a": [1, 2.5]}) == {"a": [1, 2.5]}
+    child.close()
+    child.close()
+    assert child.process.returncode == 0
+    with pytest.raises(ConnectionLost, match="echo process ended"):
+        child.request("say")
+
+
+def test_an_error_while_it_starts_is_the_same_error_here() -> None:
+    child = Child("echo", "child_targets:echo", {"start": "fail"})
+    with pytest.raises(ConfigError, match=r"rig.yaml: robots.panda: is missing") as caught:
+        child.wait_ready(20.0)
+    assert caught.value.problems[0].key == "robots.panda"
+    child.close()
+
+
+def test_an_error_in_a_request_is_raised_here_and_the_child_goes_on() -> None:
+    child = start()
+    with pytest.raises(ConnectionLost, match="the arm is gone"):
+        child.request("fail")
+    assert child.request("say", {"b": 1}) == {"b": 1}
+    child.close()
+
+
+def test_a_death_is_told_with_the_last_words() -> None:
+    child = start()
+    with pytest.raises(ConnectionLost, match=r"status 3\); it said:\s+these are my last words"):
+        child.request("die")
+    child.close()
+
+
+def test_one_that_never_gets_ready_is_ended() -> None:
+    child = Child("echo", "child_targets:echo", {"start": "never"})
+    with pytest.raises(ConnectionLost, match=r"did not get ready within 0.3 s"):
+        child.wait_ready(0.3)
+    child.close(timeout=0.2)
+    assert child.process.returncode is not None
+
+
+def test_requests_from_many_threads_get_their_own_answers() -> None:
+    child = start()
+    wrong: list[object] = []
+
+    def ask(who: int) -> None:
+        for k in range(50):
+            if child.request("say", {"who": who, "k": k}) != {"who": who, "k": k}:
+                wrong.append((who, k))
+
+    threads = [threading.Thread(target=ask, args=(who,)) for who in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    child.close()
+    assert wrong == []
+
+
+PROGRAM = """
+import sys
+sys.path.insert(0, {here!r})
+from hal.process import Child
+child = Child("echo", "child_targets:echo", {{}})
+child.wait_ready(20.0)
+assert child.request("say", {{"a": 1}}) == {{"a": 1}}
+print("fine")
+child.close()
+"""
+
+
+@pytest.mark.parametrize("how", ["script", "stdin", "-c", "thread"])
+def test_starts_from_anywhere_also_beside_files_that_shadow_the_library(tmp_path: Path, how: str) -> None:
+    """No main guard, and a folder with its own json.py: what breaks multiprocessing and ``python -m``."""
+    (tmp_path / "json.py").write_text("raise RuntimeError('the wrong json')")
+    (tmp_path / "drivers").mkdir()
+    (tmp_path / "drivers" / "__init__.py").write_text("raise RuntimeError('the wrong drivers')")
+    program = PROGRAM.format(here=str(HERE))
+    if how == "thread":
+        body = "\n    ".join(program.strip().splitlines())
+        program = f"import threading\ndef run():\n    {body}\nt = threading.Thread(target=run)\nt.start()\nt.join()\n"
+    (tmp_path / "program").mkdir()
+    script = tmp_path / "program" / "unguarded.py"
+    script.write_text(program)
+    arguments = {"stdin": ["-"], "-c": ["-c", program]}.get(how, [str(script)])
+    # A shadowed json breaks `python -` and `-c` themselves (the folder is on their path), so only children see it.
+    folder = tmp_path if how in ("script", "thread") else tmp_path / "program"
+    done = subprocess.run(
+        [sys.executable, *arguments],
+        input=program if how == "stdin" else None,
+        cwd=folder,
+        capture_output=True,
+        text=True,
+        timeout=60,
+    )
+    assert done.stdout.strip() == "fine", done.stderr
+
+
+def test_ends_when_its_parent_is_killed(tmp_path: Path) -> None:
+    """Nothing is left, though nobody could clean up."""
+    program = PROGRAM.format(here=str(HERE)).replace("child.close()", "print(child.process.pid, flush=True); input()")
+    parent = subprocess.Popen(
+        [sys.executable, "-c", program], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, cwd=tmp_path
+    )
+    assert parent.stdout is not None
+    assert parent.stdout.readline().strip() == "fine"
+    pid = int(parent.stdout.readline())
+    parent.kill()
+    parent.wait()
+    deadline = time.monotonic() + 10.0
+    while os.path.exists(f"/proc/{pid}") and time.monotonic() < deadline:
+        time.sleep(0.01)
+    assert not os.path.exists(f"/proc/{pid}")

@@ -1,0 +1,224 @@
+"""The simulated hand: width, speed and force, both fingers together, and a grasp that holds."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from specs import PANDA_HOME, box, cube, floor, iiwa, panda, world_spec
+
+from hal.drivers.pybullet.gripper import PyBulletGripper
+from hal.drivers.pybullet.robot import PyBulletRobot
+from hal.drivers.pybullet.world import World
+from hal.errors import CommandError, ConfigError
+from hal.gripper import GripperReading
+from hal.robot import Setpoint
+from hal.specs import GripperSpec
+
+FINGERS = ("panda_finger_joint1", "panda_finger_joint2")
+
+
+class Bench:
+    """A Panda over a floor, with its hand open."""
+
+    def __init__(self, hz: float = 240.0) -> None:
+        spec = panda()
+        assert spec.gripper is not None
+        self.world = World(world_spec(floor(), spec, physics_hz=hz))
+        self.arm = PyBulletRobot(spec, self.world)
+        self.hand = PyBulletGripper(spec.gripper, self.world)
+        self.arm.open()
+        self.hand.open()
+        hand = self.world.pose("panda", "panda_hand")["position"]
+        self.tcp = np.array(hand) - [0.0, 0.0, 0.1034]
+
+    def run(self, seconds: float, each: Callable[[float], None] | None = None) -> list[GripperReading]:
+        """Step; ``each`` is called before every step with the seconds since the start."""
+        readings = []
+        for tick in range(round(seconds / self.world.dt)):
+            if each is not None:
+                each(tick * self.world.dt)
+            self.world.step()
+            readings.append(self.hand.read(self.world.t))
+        return readings
+
+    def fingers(self) -> tuple[float, float]:
+        body = self.world.body("panda")
+        left, right = self.world.client.getJointStates(body.id, [body.joints[name] for name in FINGERS])
+        return left[0], right[0]
+
+    def put_cube(self) -> None:
+        """The 2 kg cube between the fingers, on a stand."""
+        x, y, z = self.tcp
+        half = (z - 0.03) / 2.0
+        self.world.add(box("stand", (x, y, half), (0.1, 0.1, half)))
+        self.world.add(cube((x, y, z)))
+
+    def lift(self, t: float) -> None:
+        """Turn the shoulder back by 0.35 rad within a second, with no jerk at either end."""
+        s = min(t, 1.0)
+        share, rate = s**3 * (10.0 - 15.0 * s + 6.0 * s * s), 30.0 * s * s * (1.0 - s) ** 2
+        q, dq = np.array(PANDA_HOME), np.zeros(7)
+        q[1] -= 0.35 * share
+        dq[1] -= 0.35 * rate
+        self.arm.write(Setpoint(q.tolist(), dq.tolist(), [0.0] * 7))
+
+
+class TestMoving:
+    def test_it_starts_open_and_opening_the_driver_moves_nothing(self) -> None:
+        bench = Bench()
+        reading = bench.run(0.5)[-1]
+        assert reading.width == pytest.approx(0.08, abs=1e-4)
+        assert reading.width_target == pytest.approx(0.08)
+        assert not reading.moving
+        assert not reading.grasped
+
+    @pytest.mark.parametrize("speed", [0.02, 0.1])
+    def test_the_width_arrives_at_the_speed_that_was_asked(self, speed: float) -> None:
+        bench = Bench()
+        bench.run(0.1)
+        bench.hand.move(0.03, speed, 20.0)
+        assert bench.hand.read(0.0).moving
+        readings = bench.run(0.05 / speed + 0.5)
+        widths = np.array([reading.width for reading in readings])
+        assert widths[-1] == pytest.approx(0.03, abs=5e-4)
+        assert not readings[-1].moving
+        assert not readings[-1].grasped
+        assert np.abs(np.diff(widths)).max() / bench.world.dt == pytest.approx(speed, rel=0.02)
+        arrived = next(k for k, reading in enumerate(readings) if not reading.moving) * bench.world.dt
+        assert arrived >= 0.045 / speed
+
+    def test_the_newest_command_wins_and_stop_stays_there(self) -> None:
+        bench = Bench()
+        bench.hand.move(0.0, 0.1, 20.0)
+        bench.run(0.2)
+        bench.hand.move(0.08, 0.1, 20.0)
+        turned = bench.run(0.2)[-1]
+        assert turned.width_target == 0.08
+        bench.hand.move(0.0, 0.1, 20.0)
+        bench.run(0.4)
+        before = bench.hand.read(0.0).width
+        bench.hand.stop()
+        after = bench.run(0.5)[-1]
+        assert 0.01 < before < 0.07
+        assert after.width == pytest.approx(before, abs=1e-3)
+        assert not after.moving
+        assert not after.grasped
+
+    def test_impossible_widths_and_speeds_are_cut(self) -> None:
+        bench = Bench()
+        bench.hand.move(-1.0, 99.0, 20.0)
+        readings = bench.run(1.5)
+        widths = np.array([reading.width for reading in readings])
+        assert readings[-1].width_target == 0.0
+        assert widths[-1] == pytest.approx(0.0, abs=1e-4)
+        assert np.abs(np.diff(widths)).max() / bench.world.dt <= 0.1 * 1.02
+        bench.hand.move(1.0, 0.1, 20.0)
+        assert bench.run(1.5)[-1].width == pytest.approx(0.08, abs=1e-4)
+
+    def test_reset_opens_it(self) -> None:
+        bench = Bench()
+        bench.hand.move(0.0, 0.1, 20.0)
+        assert bench.run(1.0)[-1].width < 0.01
+        bench.world.reset()
+        reading = bench.run(0.5)[-1]
+        assert reading.width == pytest.approx(0.08, abs=1e-4)
+        assert reading.width_target == pytest.approx(0.08)
+        assert not reading.moving
+
+
+class TestCoupling:
+    @pytest.mark.parametrize("speed", [0.02, 0.1])
+    def test_a_finger_that_is_blocked_holds_back_the_other(self, speed: float) -> None:
+        bench = Bench()
+        hand = bench.world.pose("panda", "panda_hand")["position"]
+        bench.world.add(box("block", (hand[0], hand[1] - 0.01, hand[2] - 0.1), (0.008, 0.008, 0.008)))
+        bench.hand.move(0.0, speed, 20.0)
+        apart: list[float] = []
+        bench.run(0.06 / speed + 0.5, lambda t: apart.append(abs(np.subtract(*bench.fingers()))))
+        touching = {
+            link for contact in bench.world.contacts("panda", "block") if (link := contact["link_a"]) is not None
+        }
+        assert touching == {"panda_leftfinger"}  # the right one touches nothing
+        assert 0.005 < min(bench.fingers()) < 0.03  # both moved, and neither closed
+        assert max(apart) < 5e-4
+
+    def test_fingers_move_together(self) -> None:
+        bench = Bench()
+        bench.hand.move(0.0, 0.1, 20.0)
+        apart: list[float] = []
+        readings = bench.run(1.5, lambda t: apart.append(abs(np.subtract(*bench.fingers()))))
+        assert readings[-1].width < 1e-3
+        assert max(apart) < 1e-5
+
+
+class TestGrasping:
+    @pytest.mark.parametrize("hz", [240.0, 1000.0])
+    @pytest.mark.parametrize("force", [30.0, 70.0])
+    def test_the_cube_is_lifted_and_held(self, force: float, hz: float) -> None:
+        bench = Bench(hz)
+        bench.put_cube()
+        bench.hand.move(0.0, 0.1, force)
+        gripped = bench.run(1.0)[-1]
+        assert gripped.grasped
+        assert gripped.width == pytest.approx(0.03, abs=0.003)
+        assert gripped.force == pytest.approx(force, rel=0.2)
+        before = np.array(bench.world.pose("cube")["position"])
+        offset = distance(bench.world)
+        assert bench.run(2.0, bench.lift)[-1].grasped
+        after = np.array(bench.world.pose("cube")["position"])
+        assert after[2] - before[2] > 0.08
+        assert abs(distance(bench.world) - offset) < 1e-3
+        bench.hand.stop()  # neither stop nor close lets go
+        held = bench.run(0.5)[-1]
+        assert held.grasped
+        assert held.force == pytest.approx(force, rel=0.2)
+        bench.hand.close()
+        bench.run(0.5)
+        assert abs(bench.world.pose("cube")["position"][2] - after[2]) < 1e-3
+
+    def test_too_little_force_loses_it_and_says_so(self) -> None:
+        bench = Bench()
+        bench.put_cube()
+        bench.hand.move(0.0, 0.1, 10.0)  # friction needs 20 N
+        assert bench.run(1.0)[-1].grasped
+        before = bench.world.pose("cube")["position"][2]
+        lifted = bench.run(2.0, bench.lift)[-1]
+        assert not lifted.grasped
+        assert bench.world.pose("cube")["position"][2] - before < 0.01
+
+    def test_open_lets_go(self) -> None:
+        bench = Bench()
+        bench.put_cube()
+        bench.hand.move(0.0, 0.1, 40.0)
+        bench.run(1.0)
+        bench.run(1.5, bench.lift)
+        held = bench.world.pose("cube")["position"][2]
+        bench.hand.move(0.08, 0.1, 40.0)
+        reading = bench.run(1.5)[-1]
+        assert not reading.grasped
+        assert held - bench.world.pose("cube")["position"][2] > 0.05
+
+
+def distance(world: World) -> float:
+    """From the hand to the cube, m."""
+    hand, thing = world.pose("panda", "panda_hand")["position"], world.pose("cube")["position"]
+    return float(np.linalg.norm(np.subtract(hand, thing)))
+
+
+class TestBadInput:
+    def test_a_world_is_needed(self) -> None:
+        with pytest.raises(CommandError, match="world"):
+            PyBulletGripper(GripperSpec("hand", "pybullet", 0.08, 0.1, 20.0), None)
+
+    def test_a_gripper_of_no_robot(self) -> None:
+        world = World(world_spec(iiwa()))
+        gripper = PyBulletGripper(GripperSpec("hand", "pybullet", 0.08, 0.1, 20.0, FINGERS), world)
+        with pytest.raises(ConfigError, match="0 robots"):
+            gripper.open()
+
+    def test_a_finger_that_the_urdf_lacks(self) -> None:
+        wrong = GripperSpec("hand", "pybullet", 0.08, 0.1, 20.0, ("panda_finger_joint1", "panda_finger_joint9"))
+        with pytest.raises(ConfigError, match="panda_finger_joint9"):
+            World(world_spec(panda(gripper=wrong)))

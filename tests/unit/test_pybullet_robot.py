@@ -1,0 +1,301 @@
+"""The simulated arm: it follows set-points closely, keeps its speed and torque, holds, and fails when told to."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from specs import IIWA_HOME, PANDA_HOME, box, cube, floor, iiwa, panda, world_spec
+
+from hal.drivers.pybullet.robot import PyBulletRobot
+from hal.drivers.pybullet.world import World
+from hal.errors import CommandError, ConfigError, ConnectionLost
+from hal.robot import Reading, Setpoint
+from hal.specs import BodySpec, RobotSpec
+
+ZERO = (0.0,) * 7
+DIRECTION = np.array([1.0, 0.5, -1.0, 0.5, 1.0, 0.5, 1.0])
+
+
+def opened(spec: RobotSpec | None = None, *others: BodySpec, hz: float = 240.0) -> tuple[World, PyBulletRobot]:
+    arm = spec or panda()
+    world = World(world_spec(*others, arm, physics_hz=hz))
+    driver = PyBulletRobot(arm, world)
+    driver.open()
+    return world, driver
+
+
+def swing(t: float, home: NDArray[np.float64]) -> Setpoint:
+    """A smooth motion from rest at home, at 1 rad/s at its fastest, t seconds after its start."""
+    amplitude, rate = 0.5, 2.0
+    q = home + amplitude * (1.0 - math.cos(rate * t)) * DIRECTION
+    dq = amplitude * rate * math.sin(rate * t) * DIRECTION
+    return Setpoint(q.tolist(), dq.tolist(), ZERO)
+
+
+def follow(world: World, driver: PyBulletRobot, seconds: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Swing; the errors (ticks, 7) of the readings against the set-points before them, and the speeds."""
+    home = np.array(driver.spec.initial)
+    errors, speeds = [], []
+    for tick in range(round(seconds / world.dt)):
+        setpoint = swing(tick * world.dt, home)
+        driver.write(setpoint)
+        world.step()
+        reading = driver.read(world.t)
+        errors.append(np.subtract(reading.q, setpoint.q))
+        speeds.append(reading.dq)
+    return np.array(errors), np.array(speeds)
+
+
+class TestFollowing:
+    @pytest.mark.parametrize("hz", [240.0, 1000.0])
+    @pytest.mark.parametrize(("spec", "home"), [(panda, PANDA_HOME), (iiwa, IIWA_HOME)])
+    def test_smooth_motion_is_followed_within_a_tenth_of_a_millirad(self, spec, home, hz: float) -> None:  # type: ignore[no-untyped-def]
+        world, driver = opened(spec(), hz=hz)
+        errors, speeds = follow(world, driver, 1.5)
+        assert np.abs(speeds).max() == pytest.approx(1.0, abs=0.02)  # it did move
+        assert np.abs(errors).max() < 1e-4
+
+    def test_with_two_kilograms_in_the_hand(self) -> None:
+        world, driver = opened()
+        weld_weight(world)
+        for _ in range(120):
+            world.step()
+        errors, speeds = follow(world, driver, 1.5)
+        assert np.abs(speeds).max() > 0.9
+        assert np.abs(errors).max() < 2e-3
+
+    @pytest.mark.parametrize("joint", range(7))
+    def test_a_joint_whose_set_point_jumps_moves_no_faster_than_its_limit(self, joint: int) -> None:
+        world, driver = opened()
+        target = list(PANDA_HOME)
+        target[joint] += 1.5
+        speeds = []
+        for _ in range(480):
+            driver.write(Setpoint(target, ZERO, ZERO))
+            world.step()
+            speeds.append(abs(driver.read(0.0).dq[joint]))
+        assert driver.read(0.0).q == pytest.approx(target, abs=1e-3)
+        assert 1.5 < max(speeds) <= driver.spec.limits.velocity[joint] * 1.001
+
+    def test_set_points_at_the_speed_limit_are_followed_and_not_overtaken(self) -> None:
+        world, driver = opened()
+        limit, home, rate = np.array(driver.spec.limits.velocity), np.array(PANDA_HOME), 3.0
+        speeds, errors = [], []
+        for tick in range(480):
+            t = tick * world.dt
+            q, dq = home + limit / rate * (1.0 - math.cos(rate * t)), limit * math.sin(rate * t)
+            driver.write(Setpoint(q.tolist(), dq.tolist(), ZERO))
+            world.step()
+            reading = driver.read(0.0)
+            speeds.append(np.abs(reading.dq))
+            errors.append(np.subtract(reading.q, q))
+        peak = np.max(speeds, axis=0) / limit
+        assert peak.min() > 0.99
+        assert peak.max() < 1.001
+        assert np.abs(errors).max() < 1e-3
+
+    def test_the_torque_limit_holds(self) -> None:
+        weak = panda()
+        weak = replace(weak, limits=replace(weak.limits, torque=(87.0, 5.0, 87.0, 87.0, 12.0, 12.0, 12.0)))
+        world, driver = opened(replace(weak, initial=(0.0, 0.9, 0.0, -0.8, 0.0, 1.6, 0.785)))
+        torques = []
+        for _ in range(60):
+            world.step()
+            torques.append(driver.read(0.0).tau)
+        assert np.abs(torques).max(axis=0)[1] == pytest.approx(5.0)
+        assert driver.read(0.0).q[1] > 1.0  # 5 Nm do not carry the arm
+
+    def test_a_joint_without_an_effort_limit_is_told_and_still_driven(self, tmp_path: Path) -> None:
+        urdf = tmp_path / "arm.urdf"
+        urdf.write_text(ONE_JOINT)
+        limits = replace(panda().limits, torque=None)
+        one = {name: (getattr(limits, name)[0],) for name in ("lower", "upper", "velocity", "acceleration", "jerk")}
+        spec = panda(
+            urdf=str(urdf), joints=("j",), initial=(0.5,), home=(0.0,), gripper=None, limits=replace(limits, **one)
+        )
+        world, driver = opened(spec)
+        for _ in range(240):
+            world.step()
+        assert any("'j'" in warning and "effort" in warning for warning in world.warnings)
+        assert driver.read(0.0).q == pytest.approx([0.5], abs=1e-3)
+
+
+ONE_JOINT = """<robot name="arm">
+<link name="base"><inertial>
+<mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial></link>
+<link name="bar"><inertial><origin xyz="0.3 0 0"/><mass value="1"/>
+<inertia ixx="0.01" iyy="0.01" izz="0.01" ixy="0" ixz="0" iyz="0"/></inertial></link>
+<joint name="j" type="revolute"><parent link="base"/><child link="bar"/><axis xyz="0 1 0"/>
+<limit lower="-2" upper="2" effort="0" velocity="0"/></joint></robot>"""
+
+
+def weld_weight(world: World) -> None:
+    """2 kg, as the cube has, fixed below the hand."""
+    hand = world.pose("panda", "panda_hand")
+    x, y, z = hand["position"]
+    world.add(cube((x, y, z - 0.15)))
+    world.set_pose("cube", {"position": [x, y, z - 0.15], "orientation": hand["orientation"]})
+    body, weight = world.body("panda"), world.body("cube")
+    joint = world.client.JOINT_FIXED
+    world.client.createConstraint(
+        body.id, body.links["panda_hand"], weight.id, -1, joint, (0, 0, 0), (0, 0, 0.15), (0, 0, 0)
+    )
+
+
+class TestHolding:
+    def test_it_does_not_sag(self) -> None:
+        for weight in (False, True):
+            world, driver = opened()
+            if weight:
+                weld_weight(world)
+            for _ in range(960):
+                world.step()
+            assert np.abs(np.subtract(driver.read(0.0).q, PANDA_HOME)).max() < 2e-3
+            assert np.abs(driver.read(0.0).tau or ZERO).max() > 10.0  # it carries its own weight
+
+    def test_halt_holds_the_last_set_point(self) -> None:
+        world, driver = opened()
+        follow(world, driver, 0.5)
+        last = driver.read(0.0).q_commanded
+        driver.halt()
+        driver.halt()
+        for _ in range(240):
+            world.step()
+        reading = driver.read(0.0)
+        assert last is not None
+        assert reading.q == pytest.approx(last, abs=1e-4)
+        assert reading.q_commanded == last
+        assert np.abs(reading.dq).max() < 1e-4
+
+    def test_close_holds_too_and_is_idempotent(self) -> None:
+        world, driver = opened()
+        follow(world, driver, 0.5)
+        last = driver.read(0.0).q_commanded
+        driver.close()
+        driver.close()
+        for _ in range(240):
+            world.step()
+        again = PyBulletRobot(driver.spec, world)
+        again.open()
+        assert again.read(0.0).q == pytest.approx(last, abs=1e-4)
+
+    def test_it_gives_way_to_a_wall_within_its_torques(self) -> None:
+        world, driver = opened(None, box("wall", (0.5, 0.2, 0.5), (0.3, 0.02, 0.5)))
+        home, torques, deepest = np.array(PANDA_HOME), [], 0.0
+        for tick in range(480):
+            angle = min(0.5 * tick * world.dt, 1.0)
+            driver.write(Setpoint([angle, *home[1:]], [0.5 if angle < 1.0 else 0.0, *ZERO[1:]], ZERO))
+            world.step()
+            torques.append(driver.read(0.0).tau)
+            deepest = min([deepest, *(contact["distance"] for contact in world.contacts("panda", "wall"))])
+        assert world.contacts("panda", "wall")
+        assert deepest > -0.003
+        assert world.pose("panda", "panda_hand")["position"][1] < 0.18
+        away = np.abs(np.subtract(driver.read(0.0).q, driver.read(0.0).q_commanded or ZERO))
+        assert away.max() > 0.1
+        assert (np.abs(torques).max(axis=0) <= np.array(driver.spec.limits.torque) + 1e-9).all()
+
+
+class TestReadings:
+    def test_stamps_and_units(self) -> None:
+        world, driver = opened()
+        first = driver.read(5.0)
+        world.step()
+        second = driver.read(6.0)
+        assert (first.t, first.t_device, first.seq) == (5.0, 0.0, 0)
+        assert (second.t, second.t_device, second.seq) == (6.0, world.dt, 1)
+        assert second.q == pytest.approx(PANDA_HOME, abs=1e-4)
+        assert second.tau_ext is None
+
+    def test_what_was_commanded_is_known_once_something_was(self) -> None:
+        world, driver = opened()
+        assert driver.read(0.0).q_commanded is None
+        setpoint = swing(0.3, np.array(PANDA_HOME))
+        driver.write(setpoint)
+        reading = driver.read(0.0)
+        assert (reading.q_commanded, reading.dq_commanded) == (setpoint.q, setpoint.dq)
+        world.reset("panda", q=[0.1, *PANDA_HOME[1:]])
+        reading = driver.read(0.0)
+        assert reading.q_commanded == pytest.approx([0.1, *PANDA_HOME[1:]])
+        assert reading.dq_commanded == [0.0] * 7
+
+    def test_opening_moves_nothing(self) -> None:
+        world = World(world_spec(panda()))
+        before = world.snapshot()
+        driver = PyBulletRobot(panda(), world)
+        driver.open()
+        driver.read(0.0)
+        assert world.snapshot() == before
+
+    def test_two_arms_do_not_disturb_each_other(self) -> None:
+        left, right = panda("left"), iiwa("right", base_position=(0.0, 1.5, 0.0))
+        world = World(world_spec(floor(), left, right))
+        one, other = PyBulletRobot(left, world), PyBulletRobot(right, world)
+        one.open()
+        other.open()
+        errors, _ = follow(world, one, 1.0)
+        assert np.abs(errors).max() < 1e-4
+        assert other.read(0.0).q == pytest.approx(IIWA_HOME, abs=1e-3)
+
+
+class TestFaults:
+    def test_freeze_repeats_the_reading_while_the_arm_moves_on(self) -> None:
+        world, driver = opened()
+        frozen = driver.read(1.0)
+        driver.inject(freeze=True)
+        follow(world, driver, 0.5)
+        assert driver.read(2.0) is frozen
+        driver.recover()
+        assert moved(driver.read(3.0), frozen)
+
+    def test_lost_raises_until_recovered(self) -> None:
+        _, driver = opened()
+        driver.inject(lost=True)
+        with pytest.raises(ConnectionLost):
+            driver.read(0.0)
+        with pytest.raises(ConnectionLost):
+            driver.write(Setpoint(PANDA_HOME, ZERO, ZERO))
+        driver.recover()
+        assert driver.read(0.0).q == pytest.approx(PANDA_HOME)
+
+    def test_a_fault_is_reported_and_holds_the_arm(self) -> None:
+        world, driver = opened()
+        follow(world, driver, 0.5)
+        driver.inject(fault="collision")
+        at_fault = driver.read(0.0)
+        assert at_fault.fault is not None
+        assert at_fault.fault.cause == "collision"
+        for tick in range(240):
+            driver.write(swing(0.5 + tick * world.dt, np.array(PANDA_HOME)))
+            world.step()
+        assert driver.read(0.0).q == pytest.approx(at_fault.q, abs=0.02)
+        assert driver.read(0.0).q_commanded == at_fault.q
+        driver.recover()
+        assert driver.read(0.0).fault is None
+        here = driver.read(0.0).q
+        driver.write(Setpoint([here[0] + 0.01, *here[1:]], ZERO, ZERO))
+        assert driver.read(0.0).q_commanded == [here[0] + 0.01, *here[1:]]
+
+    def test_an_unknown_fault_is_refused(self) -> None:
+        _, driver = opened()
+        with pytest.raises(CommandError, match="freeze"):
+            driver.inject(explode=True)
+
+
+def moved(one: Reading, other: Reading) -> bool:
+    return float(np.abs(np.subtract(one.q, other.q)).max()) > 0.1
+
+
+def test_a_world_is_needed() -> None:
+    with pytest.raises(CommandError, match="world"):
+        PyBulletRobot(panda(), None)
+
+
+def test_a_joint_that_the_urdf_lacks() -> None:
+    with pytest.raises(ConfigError, match="panda_jiont7"):
+        World(world_spec(panda(joints=(*panda().joints[:6], "panda_jiont7"))))

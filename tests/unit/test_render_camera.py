@@ -1,0 +1,269 @@
+"""The simulated camera: where it is, what it stamps, and how the process that draws follows the world's edits."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+from pictures_kit import box, camera, look_at, renderer, world
+from specs import panda
+
+from hal.drivers.pybullet import rendering
+from hal.drivers.pybullet.camera import DirectSource, PyBulletCamera, SharedSource, camera_pose
+from hal.drivers.pybullet.frames import FrameRing
+from hal.drivers.pybullet.gl_target import create_context
+from hal.drivers.pybullet.mirror import Mirror
+from hal.drivers.pybullet.render_worker import RenderWorker
+from hal.drivers.pybullet.rendering import choose_renderer
+from hal.drivers.pybullet.tiny import TinyRenderer
+from hal.drivers.pybullet.world import World
+from hal.errors import ConfigError, ConnectionLost, DriverMissing, NotSupported
+from hal.mailbox import SeriesBox
+from hal.specs import BodySpec, ViewSpec, to_json
+
+STILL = (0.0, 0.0, 0.0, 1.0)
+ABOVE = look_at((0.0, 0.0, 1.2), (0.0, 0.0, 0.0), (1.0, 0.0, 0.0))
+FROM_ABOVE = ViewSpec(tuple(ABOVE.position), tuple(ABOVE.orientation))
+
+
+def ball(name: str, x: float, **more: object) -> BodySpec:
+    return BodySpec(name, (x, 0.0, 0.1), STILL, "sphere", radius=0.1, **{"mass": 1.0, **more})  # type: ignore[arg-type]
+
+
+def direct(scene: World, spec: object) -> PyBulletCamera:
+    source = DirectSource(scene, TinyRenderer(scene), spec, lambda: 10.0 + scene.t)  # type: ignore[arg-type]
+    driver = PyBulletCamera(spec, source)  # type: ignore[arg-type]
+    driver.open()
+    return driver
+
+
+class TestDirect:
+    """Lock-step."""
+
+    def test_draws_the_present_state_and_stamps_it(self) -> None:
+        scene = world(ball("ball", 0.0))
+        driver = direct(scene, camera(view=FROM_ABOVE))
+        first = driver.grab(0.0)
+        again = driver.grab(0.0)
+        for _ in range(48):
+            scene.step()
+        later = driver.grab(0.0)
+        assert first is not None
+        assert again is not None
+        assert later is not None
+        assert (first.t, first.t_device) == (10.0, 0.0)
+        assert (again.t, again.seq) == (first.t, first.seq + 1)
+        assert np.array_equal(first.depth, again.depth)
+        assert later.t_device == pytest.approx(0.2)
+        assert later.t == pytest.approx(10.2)
+        assert later.depth is not None
+        assert first.depth is not None
+        middle = (60, 80)
+        fall = later.depth[middle] - first.depth[middle]
+        assert fall == pytest.approx(0.5 * 9.81 * 0.2**2, rel=0.1)
+        scene.close()
+
+    def test_an_attached_camera_follows_its_link(self) -> None:
+        view = ViewSpec((0.02, -0.05, 0.1), (0.0, 0.38268343, 0.0, 0.92387953), "panda", "panda_hand")
+        scene = world(robots=(panda(),))
+        spec = camera(40, 30, view=view)
+        driver = direct(scene, spec)
+        before = driver.grab(0.0)
+        scene.reset("panda", q=[0.5, -0.3, 0.2, -1.8, 0.1, 1.4, 0.2])
+        after = driver.grab(0.0)
+        assert before is not None
+        assert after is not None
+        assert before.T_world_camera is not None
+        assert after.T_world_camera is not None
+        distance, angle = before.T_world_camera.distance(after.T_world_camera)
+        assert distance > 0.1
+        assert angle > 0.1
+        state = scene.client.getLinkState(scene.bodies["panda"].id, 8, computeForwardKinematics=1)
+        expected = scene.client.multiplyTransforms(state[4], state[5], view.position, view.orientation)
+        assert np.allclose(after.T_world_camera.position, expected[0], atol=1e-9)
+        assert abs(np.dot(after.T_world_camera.orientation, expected[1])) == pytest.approx(1.0)
+        scene.close()
+
+    def test_a_camera_needs_a_place(self) -> None:
+        scene = world(robots=(panda(),))
+        draws = TinyRenderer(scene)
+        with pytest.raises(ConfigError, match="look_at, pose or attached"):
+            DirectSource(scene, draws, camera(view=None), lambda: 0.0)
+        nowhere = ViewSpec((0.0, 0.0, 0.0), STILL, "panda", "panda_hnad")
+        with pytest.raises(ConfigError, match="panda_hand"):
+            DirectSource(scene, draws, camera(view=nowhere), lambda: 0.0)
+        scene.close()
+
+    def test_without_a_world_it_says_so(self) -> None:
+        with pytest.raises(NotSupported, match="needs a simulated world"):
+            PyBulletCamera(camera()).open()
+
+
+class Bench:
+    """A stepped world that publishes, and a worker that draws, in one process."""
+
+    def __init__(self, *bodies: BodySpec) -> None:
+        self.world = world(*bodies)
+        self.box = SeriesBox(memoryview(bytearray(SeriesBox.size(256))), 256)
+        self.spec = camera(80, 60, view=FROM_ABOVE, rate_hz=10000.0)
+        specs = [self.spec]
+        buffer = memoryview(bytearray(FrameRing.size(specs)))
+        mirror_world = World(self.world.spec, mirror=True)
+        self.mirror = Mirror(mirror_world, self.box)
+        self.worker = RenderWorker(self.mirror, TinyRenderer(mirror_world), specs, FrameRing(buffer, specs))
+        self.source = SharedSource(FrameRing(buffer, specs), self.spec, lambda: None)
+        self.t = 0.0
+
+    def publish(self) -> None:
+        self.t += 0.01
+        self.box.write(self.t, self.world.revision, self.world.snapshot())
+
+    def edit(self, method: str, **params: object) -> tuple[str, dict[str, object], int]:
+        return method, params, self.world.request(method, params)
+
+    def close(self) -> None:
+        self.world.close()
+        self.mirror.world.close()
+
+
+@pytest.fixture
+def bench() -> Iterator[Bench]:
+    made = Bench(box("floor", (2.0, 2.0, 0.05), (0.0, 0.0, -0.05)), ball("ball", 0.0))
+    yield made
+    made.close()
+
+
+class TestWorker:
+    """Real time."""
+
+    def test_shows_what_was_published(self, bench: Bench) -> None:
+        bench.worker.warm_up()
+        bench.worker.run_once()
+        assert bench.source.grab(0.0) is None  # nothing was published yet
+        bench.publish()
+        bench.worker.run_once()
+        first = bench.source.grab(0.0)
+        assert first is not None
+        assert first.t == bench.t
+        bench.worker.run_once()
+        assert bench.source.grab(0.0) is None  # the world stands still: no new picture of the same moment
+        bench.world.set_pose("ball", {"position": [0.3, 0.0, 0.1], "orientation": list(STILL)})
+        bench.publish()
+        bench.worker.run_once()
+        second = bench.source.grab(0.0)
+        assert second is not None
+        assert second.t == bench.t
+        assert first.segmentation is not None
+        assert second.segmentation is not None
+        assert (first.segmentation == 1).any()
+        rows = [np.flatnonzero((image == 1).any(axis=1)).mean() for image in (first.segmentation, second.segmentation)]
+        assert rows[0] - rows[1] > 5  # +x is up in this picture
+
+    def test_an_edit_is_done_before_its_snapshot_is_shown(self, bench: Bench) -> None:
+        bench.publish()
+        bench.worker.run_once()
+        assert bench.source.grab(0.0) is not None
+        add = bench.edit("add", spec=to_json(ball("second", 0.3, rgba=(1.0, 0.0, 0.0, 1.0))))
+        paint = bench.edit("set_color", name="second", rgba=[0.0, 0.0, 1.0, 1.0])
+        bench.publish()
+        bench.worker.run_once()
+        assert bench.source.grab(0.0) is None  # the snapshot overtook the edits
+        bench.mirror.edited(*paint)  # and these overtook each other
+        bench.worker.run_once()
+        assert bench.source.grab(0.0) is None
+        bench.mirror.edited(*add)
+        bench.worker.run_once()
+        frame = bench.source.grab(0.0)
+        assert frame is not None
+        assert frame.segmentation is not None
+        assert frame.color is not None
+        seen = frame.segmentation == 2
+        assert seen.sum() > 20
+        red, _, blue = frame.color[seen].mean(axis=0)
+        assert blue > red + 50
+
+    def test_an_edit_waits_for_its_snapshot(self, bench: Bench) -> None:
+        bench.publish()
+        remove = bench.edit("remove", name="ball")
+        bench.mirror.edited(*remove)
+        bench.worker.run_once()  # the snapshot still has the ball
+        frame = bench.source.grab(0.0)
+        assert frame is not None
+        assert 1 in np.unique(frame.segmentation)
+        bench.publish()
+        bench.worker.run_once()
+        frame = bench.source.grab(0.0)
+        assert frame is not None
+        assert 1 not in np.unique(frame.segmentation)
+        assert 0 in np.unique(frame.segmentation)
+
+    def test_a_source_says_when_its_process_is_gone(self, bench: Bench) -> None:
+        def gone() -> None:
+            raise ConnectionLost("the renderer process ended")
+
+        specs = [bench.spec]
+        ring = FrameRing(memoryview(bytearray(FrameRing.size(specs))), specs)
+        with pytest.raises(ConnectionLost):
+            SharedSource(ring, bench.spec, gone).grab(0.0)
+
+
+class TestChoice:
+    """Which renderer is taken, and what is said of it."""
+
+    def no_gl(self) -> object:
+        raise DriverMissing("no EGL; apt install libegl1 libgl1-mesa-dri")
+
+    def test_without_gl_pybullet_draws_and_says_why(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        scene = world(box("wall", (1.0, 1.0, 0.1), (0.0, 0.0, 1.0)))
+        monkeypatch.setattr("hal.drivers.pybullet.gl.create_context", self.no_gl)
+        chosen = choose_renderer(scene)
+        assert isinstance(chosen, TinyRenderer)
+        assert "apt install libegl1" in chosen.description
+        images = chosen.render(camera(16, 12), camera_pose(scene, camera(16, 12)))
+        assert images.depth is not None
+        assert (images.depth > 0).all()
+        with pytest.raises(DriverMissing, match="apt install"):
+            choose_renderer(scene, "gl")
+        assert "apt install" not in choose_renderer(scene, "tiny").description
+        with pytest.raises(ConfigError, match="auto, gl, tiny"):
+            choose_renderer(scene, "opengl")
+        scene.close()
+
+    def test_a_missing_library_names_its_command(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setitem(__import__("sys").modules, "moderngl", None)
+        with pytest.raises(DriverMissing, match="pip install moderngl"):
+            create_context()
+
+    def test_gl_is_the_first_choice(self) -> None:
+        scene = world(box("wall", (1.0, 1.0, 0.1), (0.0, 0.0, 1.0)))
+        renderer("gl", scene).close()  # or skip
+        chosen = choose_renderer(scene)
+        assert "OpenGL on " in chosen.description
+        assert rendering.Renderer in type(chosen).__mro__
+        chosen.close()
+        chosen.close()
+        scene.close()
+
+
+def test_gl_draws_from_any_thread() -> None:
+    import threading
+
+    scene = world(box("wall", (0.2, 0.2, 0.1), (0.0, 0.0, 1.0)))
+    draws = renderer("gl", scene)
+    spec = camera(40, 30)
+    found = []
+
+    def draw() -> None:
+        found.append(draws.render(spec, camera_pose(scene, spec)))
+
+    for _ in range(2):
+        thread = threading.Thread(target=draw)
+        thread.start()
+        thread.join()
+    draw()
+    assert len(found) == 3
+    assert np.ptp(found[0].depth) > 0.5
+    assert all(np.array_equal(found[0].depth, images.depth) for images in found)
+    draws.close()
+    scene.close()

@@ -1,0 +1,161 @@
+"""The smoother keeps every limit, whatever it is asked, judged by the positions it hands out."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from ruckig import RuckigError
+from servo_kit import tightened
+
+from hal.audit import SetpointAudit
+from hal.smoothing import JointSmoother
+from hal.specs import LimitsSpec
+
+LIMITS = LimitsSpec((-1.0, -2.0), (1.0, 0.5), (2.0, 1.0), (10.0, 5.0), (1000.0, 100.0))
+SHARES = st.tuples(st.floats(0.1, 1.0), st.floats(0.02, 1.0))
+# One thing to ask for, and for how many ticks: velocities, a position, or a stop.
+REQUEST = st.tuples(
+    st.sampled_from(("follow", "reach", "stop")),
+    st.tuples(st.floats(-4.0, 4.0), st.floats(-4.0, 4.0)),
+    st.integers(1, 80),
+)
+QUICK = settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+
+
+def clamp(q: Sequence[float], smoother: JointSmoother) -> list[float]:
+    return [max(low, min(high, x)) for x, low, high in zip(q, smoother.lower, smoother.upper, strict=True)]
+
+
+def play(smoother: JointSmoother, requests: Sequence[tuple[str, tuple[float, float], int]]) -> list[list[float]]:
+    path = []
+    for what, values, ticks in requests:
+        for _ in range(ticks):
+            if what == "follow":
+                smoother.follow(values)
+            elif what == "stop" or not smoother.reach(clamp(values, smoother), smoother.velocity):
+                smoother.stop()
+            path.append(list(smoother.q))
+    return path
+
+
+@QUICK
+@given(SHARES, st.sampled_from((240.0, 1000.0)), st.lists(REQUEST, min_size=1, max_size=12))
+def test_every_limit_is_kept(shares: tuple[float, float], rate: float, requests: list) -> None:
+    limits = tightened(LIMITS, *shares)
+    smoother = JointSmoother(limits, 1.0 / rate)
+    audit = SetpointAudit(limits, 1.0 / rate)
+    for q in play(smoother, requests):
+        audit.add(q)
+    assert all(peak <= 1.0 for peak in audit.peaks().values()), audit.peaks()
+
+
+@QUICK
+@given(
+    SHARES,
+    st.tuples(st.floats(-1.2, 1.2), st.floats(-2.2, 0.7)),
+    st.tuples(st.floats(-2.0, 2.0), st.floats(-1.0, 1.0)),
+    st.lists(REQUEST, min_size=1, max_size=8),
+)
+def test_from_outside_and_in_motion_no_farther_than_a_stop(
+    shares: tuple[float, float], q: tuple[float, float], dq: tuple[float, float], requests: list
+) -> None:
+    smoother = JointSmoother(tightened(LIMITS, *shares), 1 / 240)
+    smoother.anchor(q, dq)
+    stop = JointSmoother(tightened(LIMITS, *shares), 1 / 240)
+    stop.anchor(q, dq)
+    ends = stop.stop_end()
+    highest = [max(high, x, end) for high, x, end in zip(LIMITS.upper, q, ends, strict=True)]
+    lowest = [min(low, x, end) for low, x, end in zip(LIMITS.lower, q, ends, strict=True)]
+    for at in play(smoother, requests):
+        assert all(low - 1e-9 <= x <= high + 1e-9 for x, low, high in zip(at, lowest, highest, strict=True))
+
+
+def test_an_arm_outside_comes_back_in_and_stays() -> None:
+    smoother = JointSmoother(LIMITS, 1 / 240)
+    smoother.anchor((1.1, 0.0))
+    for _ in range(50):
+        smoother.follow((1.0, 0.0))
+    assert smoother.q[0] == pytest.approx(1.1)
+    for _ in range(100):
+        smoother.follow((-0.5, 0.0))
+    assert smoother.q[0] < 1.0
+    for _ in range(400):
+        smoother.follow((1.0, 0.0))
+    assert 0.99 < smoother.q[0] <= 1.0
+
+
+def test_velocity_is_reached_and_the_stop_ends_where_it_was_foretold() -> None:
+    smoother = JointSmoother(LIMITS, 1 / 240)
+    for _ in range(60):
+        smoother.follow((0.7, -0.3))
+    assert smoother.dq == pytest.approx([0.7, -0.3])
+    foretold = smoother.stop_end()
+    while not smoother.at_rest():
+        smoother.stop()
+    assert smoother.q == pytest.approx(foretold, abs=1e-9)
+    assert foretold[0] > 0.1
+
+
+def test_reach_arrives_exactly_and_keeps_its_speed() -> None:
+    smoother = JointSmoother(LIMITS, 1 / 240)
+    fastest = 0.0
+    for _ in range(1000):
+        assert smoother.reach((0.8, -1.0), (0.5, 0.5))
+        fastest = max(fastest, *map(abs, smoother.dq))
+    assert smoother.q == pytest.approx([0.8, -1.0], abs=1e-12)
+    assert fastest == pytest.approx(0.5)
+    assert smoother.at_rest()
+
+
+def test_a_guard_turns_the_step_into_a_stop() -> None:
+    smoother = JointSmoother(LIMITS, 1 / 240)
+    for _ in range(60):
+        smoother.follow((0.7, 0.0))
+    end = smoother.stop_end()[0]
+    for _ in range(200):
+        smoother.follow((0.7, 0.0), guard=lambda s: s.stop_end_next()[0] <= end + 1e-9)
+    assert smoother.q[0] == pytest.approx(end)
+    assert smoother.guarded
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
+def test_a_goal_that_is_no_number_stops_the_arm(bad: float) -> None:
+    smoother = JointSmoother(LIMITS, 1 / 240)
+    for _ in range(60):
+        smoother.follow((0.7, -0.3))
+    for _ in range(120):
+        smoother.follow((bad, -0.3))
+    assert smoother.at_rest()
+
+
+class BrokenRuckig:
+    """Refuses everything, as Ruckig does with input that it cannot plan."""
+
+    def update(self, *_: object) -> None:
+        raise RuckigError("refused")
+
+    def reset(self) -> None:
+        pass
+
+
+def test_without_ruckig_the_arm_still_stops_inside_the_limits() -> None:
+    dt = 1 / 240
+    smoother = JointSmoother(LIMITS, dt)
+    audit = SetpointAudit(LIMITS, dt)
+    for _ in range(40):
+        smoother.follow((2.0, -1.0))
+        audit.add(smoother.q)
+    assert smoother.dq[0] > 1.0
+    foretold = smoother.stop_end()
+    smoother._ruckig = BrokenRuckig()
+    assert not smoother.reach((0.9, -0.9), (1.0, 1.0))
+    for _ in range(200):
+        smoother.follow((2.0, -1.0))
+        audit.add(smoother.q)
+    assert smoother.at_rest()
+    assert smoother.q == pytest.approx(foretold, abs=1e-6)
+    assert all(peak <= 1.0 for peak in audit.peaks().values()), audit.peaks()
