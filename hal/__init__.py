@@ -6,7 +6,7 @@
         arm = rig.robots["panda"]
         arm.move_to(arm.home)
 
-Importing this package costs numpy and little else; whatever is heavier loads when it is first used.
+Importing this package costs nothing to speak of: every name loads when it is first used.
 """
 
 from __future__ import annotations
@@ -14,31 +14,48 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from .commands import CartesianTarget, Command, JointTarget, JointTorque, JointVelocity, Sent, Twist
-from .errors import (
-    CommandError,
-    ConfigError,
-    ConnectionLost,
-    ControlTaken,
-    DeviceNotFound,
-    DriverMissing,
-    HalError,
-    MotionStopped,
-    NotSupported,
-    RobotFault,
-    StaleStateError,
-    Unreachable,
-)
-from .pose import Pose
-from .types import Fault, Frame, GripperState, Limited, PadState, RobotState, RobotStatus, Stamp, Trip
-
 if TYPE_CHECKING:
+    from .commands import (
+        CartesianTarget,
+        Command,
+        JointTarget,
+        JointTorque,
+        JointVelocity,
+        Sent,
+        Twist,
+    )
     from .control import Control
+    from .errors import (
+        CommandError,
+        ConfigError,
+        ConnectionLost,
+        ControlTaken,
+        DeviceNotFound,
+        DriverMissing,
+        HalError,
+        MotionStopped,
+        NotSupported,
+        RobotFault,
+        StaleStateError,
+        Unreachable,
+    )
+    from .pose import Pose
     from .rig import Rig
     from .rig import open_rig as open
     from .robot import Robot
     from .specs import BodySpec
     from .teleop import Teleop
+    from .types import (
+        Fault,
+        Frame,
+        GripperState,
+        Limited,
+        PadState,
+        RobotState,
+        RobotStatus,
+        Stamp,
+        Trip,
+    )
 
 __all__ = [
     "BodySpec",
@@ -76,17 +93,34 @@ __all__ = [
     "Twist",
     "Unreachable",
     "__version__",
-    "open",
 ]
+# Without `open`: a star import must not shadow the builtin.
 
-_LAZY = {
-    "BodySpec": ("specs", "BodySpec"),
-    "Control": ("control", "Control"),
-    "Rig": ("rig", "Rig"),
-    "Robot": ("robot", "Robot"),
-    "Teleop": ("teleop", "Teleop"),
-    "open": ("rig", "open_rig"),
+_MODULES = {
+    "commands": ("CartesianTarget", "Command", "JointTarget", "JointTorque", "JointVelocity", "Sent", "Twist"),
+    "control": ("Control",),
+    "errors": (
+        "CommandError",
+        "ConfigError",
+        "ConnectionLost",
+        "ControlTaken",
+        "DeviceNotFound",
+        "DriverMissing",
+        "HalError",
+        "MotionStopped",
+        "NotSupported",
+        "RobotFault",
+        "StaleStateError",
+        "Unreachable",
+    ),
+    "pose": ("Pose",),
+    "rig": ("Rig",),
+    "robot": ("Robot",),
+    "specs": ("BodySpec",),
+    "teleop": ("Teleop",),
+    "types": ("Fault", "Frame", "GripperState", "Limited", "PadState", "RobotState", "RobotStatus", "Stamp", "Trip"),
 }
+_HOME = {name: module for module, names in _MODULES.items() for name in names}
 
 
 def __getattr__(name: str) -> Any:
@@ -94,11 +128,15 @@ def __getattr__(name: str) -> Any:
         from importlib.metadata import version
 
         return version("robot-hal")
-    if name in _LAZY:
-        module, attribute = _LAZY[name]
-        return getattr(import_module(f".{module}", __name__), attribute)
-    raise AttributeError(f"module 'hal' has no attribute {name!r}")
+    if name == "open":
+        value = import_module(".rig", __name__).open_rig
+    elif name in _HOME:
+        value = getattr(import_module(f".{_HOME[name]}", __name__), name)
+    else:
+        raise AttributeError(f"module 'hal' has no attribute {name!r}")
+    globals()[name] = value
+    return value
 
 
 def __dir__() -> list[str]:
-    return sorted(__all__)
+    return sorted([*__all__, "open"])

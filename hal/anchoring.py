@@ -45,7 +45,6 @@ class Anchoring:
         self._written = False
         self._taken = None
         self._before = None
-        self._seq = None
         self._silent = False
 
     def wrote(self) -> None:
@@ -61,9 +60,10 @@ class Anchoring:
         if not sound:
             self._silent = True
             return False
-        if not self._written or reading.seq == self._seq:  # an old reading knows nothing of the last set-point
-            return False
+        old = reading.seq == self._seq  # it knows nothing of the last set-point
         self._seq = reading.seq
+        if old or not self._written:
+            return False
         if self._silent:
             self._silent = False
             return self._resume(reading)

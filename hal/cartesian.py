@@ -42,9 +42,6 @@ _POSTURE = 0.5
 _POSTURE_FULL = 0.05
 """Speed (m/s, or rad/s) of the tcp from which on the posture is pulled in full."""
 
-_RAMP = 0.9
-"""Share of the acceleration with which goals change speed; the rest lets the joints catch up with them."""
-
 _BRAKE = (0.8, 0.5)
 """Shares of acceleration and jerk with which a pose's approach brakes."""
 
@@ -52,18 +49,7 @@ _BRAKE = (0.8, 0.5)
 class _CartesianMotion(Motion):
     """What twists and poses share."""
 
-    def __init__(self, smoother: JointSmoother, envelope: Envelope) -> None:
-        super().__init__(smoother, envelope)
-        self._wanted: list[float] = []
-        """Joint speeds of the last tick's goal (n,), rad/s."""
-
-    def start(self) -> None:
-        self._wanted = list(self.smoother.dq)
-
-    def reanchored(self) -> None:
-        self._wanted = list(self.smoother.dq)
-
-    def _follow(self, twist: list[float]) -> None:
+    def _follow_twist(self, twist: list[float]) -> None:
         """One tick towards this twist (6,) of the tcp, along the base's axes."""
         envelope, smoother = self.envelope, self.smoother
         speed = max(_norm(twist[:3]), _norm(twist[3:]))
@@ -73,26 +59,7 @@ class _CartesianMotion(Motion):
             envelope.limited |= Limited.SINGULAR
         if not isfinite(sum(dq)):
             dq = [0.0] * smoother.n
-        dq = envelope.cap_tcp(envelope.cap_together(self._brake(dq)))
-        self._wanted = dq = self._ramp(dq)
-        smoother.follow(dq, envelope.stays_inside, together=True)
-        if smoother.held_back or smoother.guarded:
-            self._wanted = list(smoother.dq)
-
-    def _ramp(self, dq: list[float]) -> list[float]:
-        """Go from the last goal to this one no faster than the slowest joint can, all in proportion.
-
-        Left to themselves, joints with more acceleration to spare would run ahead, and the tcp off its line.
-        """
-        smoother = self.smoother
-        share = 1.0
-        for v, v0, A in zip(dq, self._wanted, smoother.acceleration, strict=True):
-            step = _RAMP * A * smoother.dt
-            if abs(v - v0) > step:
-                share = min(share, step / abs(v - v0))
-        if share == 1.0:
-            return dq
-        return [v0 + share * (v - v0) for v, v0 in zip(dq, self._wanted, strict=True)]
+        self._follow(envelope.cap_together(self._brake(dq)), together=True)
 
     def _brake(self, dq: list[float]) -> list[float]:
         """Slow the joint speeds (n,) down where the goal is near."""
@@ -156,7 +123,7 @@ class TwistMotion(_CartesianMotion):
         self._advance(pose, twist)
         error = difference(pose, self._goal)
         error = self._shorten_lead(pose, error)
-        self._follow(self._cap([v + _TWIST_GAIN * e for v, e in zip(twist, error, strict=True)]))
+        self._follow_twist(self._cap([v + _TWIST_GAIN * e for v, e in zip(twist, error, strict=True)]))
 
     def _advance(self, pose: Floats, twist: list[float]) -> None:
         """Move the goal by one tick, part by part."""
@@ -219,7 +186,7 @@ class PoseMotion(_CartesianMotion):
         twist = self._cap([_POSE_GAIN * scale * x for x in error])
         distance = _norm(error)
         self._rate = _norm(twist) / distance if distance > 0.0 else _POSE_GAIN
-        self._follow(twist)
+        self._follow_twist(twist)
 
     def _brake(self, dq: list[float]) -> list[float]:
         """Slow the whole motion to what the joint with the least reserve can still brake.

@@ -28,6 +28,9 @@ _UNLIMITED = 100.0
 _FACE_GAIN = 4.0
 """Speed towards a face of the workspace per distance to it, 1/s: 0.25 m/s slows down from 6 cm, at 1 m/s2."""
 
+_CHANGE = 0.9
+"""Share of the acceleration with which goals change speed in proportion; the rest lets the joints catch up."""
+
 _BRAKE = 0.8
 _BRAKE_JERK = 0.5
 """Shares of acceleration and jerk that goals count on for braking; what is left makes the braking smooth."""
@@ -74,14 +77,18 @@ class Envelope:
                 scale = min(scale, capped / v)
         return dq if scale == 1.0 else [scale * v for v in dq]
 
-    def cap_tcp(self, dq: list[float]) -> list[float]:
-        """Scale a goal velocity so that the tcp keeps its speed limit, and slows down before the workspace's faces."""
+    def cap_tcp(self, dq: list[float]) -> tuple[list[float], bool]:
+        """Scale a goal velocity so that the tcp keeps its speed limit, and slows down before the workspace's faces.
+
+        Also says whether the tcp's speed was what limited it.
+        """
         if self.tcp_speed >= _UNLIMITED and self.workspace is None:
-            return dq
+            return dq, False
         tcp = self.tcp_velocity(dq)
         speed = sqrt(tcp[0] * tcp[0] + tcp[1] * tcp[1] + tcp[2] * tcp[2])
         scale = 1.0
-        if speed > self.goal_tcp_speed:
+        slowed = speed > self.goal_tcp_speed
+        if slowed:
             scale = self.goal_tcp_speed / speed
             self.limited |= Limited.TCP_SPEED
         if self.workspace is not None and speed > 0.0:
@@ -89,7 +96,17 @@ class Envelope:
                 if abs(v) * scale > cap:
                     scale = cap / abs(v)
                     self.limited |= Limited.WORKSPACE
-        return dq if scale == 1.0 else [scale * v for v in dq]
+        return (dq if scale == 1.0 else [scale * v for v in dq]), slowed
+
+    def in_proportion(self, dq: list[float], before: Floats) -> list[float]:
+        """From the goal velocity of the last tick towards ``dq``, no faster than the slowest joint can, all alike."""
+        smoother = self.smoother
+        share = 1.0
+        for v, v0, A in zip(dq, before, smoother.acceleration, strict=True):
+            step = _CHANGE * A * smoother.dt
+            if abs(v - v0) > step:
+                share = min(share, step / abs(v - v0))
+        return dq if share == 1.0 else [v0 + share * (v - v0) for v, v0 in zip(dq, before, strict=True)]
 
     def face_speeds(self, tcp_velocity: Floats) -> list[float]:
         """Greatest speed (3,) in m/s along each base axis, given which way the tcp goes."""

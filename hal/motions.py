@@ -30,10 +30,12 @@ class Motion(ABC):
     def __init__(self, smoother: JointSmoother, envelope: Envelope) -> None:
         self.smoother = smoother
         self.envelope = envelope
+        self._wanted: list[float] | None = None
+        """Joint speeds of the last tick's goal (n,), rad/s, while goals change in proportion."""
 
-    @abstractmethod
     def start(self) -> None:
         """Forget every command; the next one is the first."""
+        self._wanted = None
 
     def usable(self, values: Floats) -> bool:
         """Can this command be followed at all? (As many values as ``size``, all finite.)"""
@@ -41,7 +43,7 @@ class Motion(ABC):
 
     def reanchored(self) -> None:
         """The set-point is elsewhere than the last step left it; the newest command stays."""
-        return
+        self._wanted = None
 
     def too_far(self, values: Floats) -> bool:
         """Is this first target farther from the set-point than a stream may begin?"""
@@ -55,6 +57,23 @@ class Motion(ABC):
     def step(self, now: float) -> None:
         """Advance the smoother by one tick."""
 
+    def _follow(self, dq: list[float], together: bool = False) -> None:
+        """One tick towards these joint speeds (n,), no faster than the tcp may go.
+
+        With ``together``, and where the tcp's speed is what limits them, all joints change speed in proportion. Left to
+        themselves, those with acceleration to spare would run ahead: the tcp would leave its line, and on the way from
+        one permitted speed to another it could be too fast.
+        """
+        smoother, envelope = self.smoother, self.envelope
+        dq, slowed = envelope.cap_tcp(dq)
+        if together or slowed:
+            self._wanted = dq = envelope.in_proportion(dq, smoother.dq if self._wanted is None else self._wanted)
+        else:
+            self._wanted = None
+        smoother.follow(dq, envelope.stays_inside, together)
+        if smoother.held_back or smoother.guarded:
+            self._wanted = None
+
 
 class JointVelocityMotion(Motion):
     """Move the joints at given velocities; each is capped by itself."""
@@ -65,23 +84,24 @@ class JointVelocityMotion(Motion):
         self._dq: list[float] = []
 
     def start(self) -> None:
+        super().start()
         self._dq = [0.0] * self.size
 
     def accept(self, command: CommandRecord) -> None:
         self._dq = list(command.values)
 
     def step(self, now: float) -> None:
-        envelope = self.envelope
-        goal = envelope.cap_tcp(envelope.cap_joints(self._dq))
-        self.smoother.follow(goal, envelope.stays_inside)
+        self._follow(self.envelope.cap_joints(self._dq))
 
 
 class JointTargetMotion(Motion):
     """Follow a stream of joint targets, or go to one that is held.
 
     A moving target is followed at its own speed plus a correction of the error: smooth, since the speed changes little
-    from tick to tick. That would creep into a target that stands still, so a target that is repeated, or is the first
-    one after rest, or is too far for any arm to follow as a stream, is reached by Ruckig's time-optimal motion instead.
+    from tick to tick. That would creep into a target that stands still, so one that is held is reached by Ruckig's
+    time-optimal motion instead. A target without speed counts as held when it is repeated, when the one before had a
+    speed or was held itself, and when it is too far for any arm to follow as a stream. So a stream of bare positions,
+    even at 10 Hz, is smoothed and not reached one by one.
     """
 
     def __init__(self, smoother: JointSmoother, envelope: Envelope) -> None:
@@ -96,7 +116,9 @@ class JointTargetMotion(Motion):
         """Did the target stand still before the newest command?"""
 
     def start(self) -> None:
+        super().start()
         self._command = None
+        self._q, self._dq = [], []
         self._still = True
         self._direct = False
 
@@ -109,7 +131,8 @@ class JointTargetMotion(Motion):
         before = self._command
         moving = any(dq)
         same = before is not None and q == self._q
-        self._direct = not moving and (same or self._still or self._is_jump(command.t, q))
+        halts = any(self._dq) or self._still
+        self._direct = not moving and (same or halts or self._is_jump(command.t, q))
         self._still = not moving and (same or before is None)
         self._command, self._q, self._dq = command, q, dq
 
@@ -125,9 +148,9 @@ class JointTargetMotion(Motion):
                 q, dq = self._into_limits(q, dq)
                 break
         if self._direct and smoother.reach(q, envelope.velocity, envelope.allows):
-            return
-        goal = self._approach(q, dq)
-        smoother.follow(envelope.cap_tcp(envelope.cap_joints(goal)), envelope.stays_inside)
+            self._wanted = None
+        else:
+            self._follow(envelope.cap_joints(self._approach(q, dq)))
 
     def _approach(self, q: list[float], dq: list[float]) -> list[float]:
         """The target's speed, plus what closes the error and can still brake before it is closed."""

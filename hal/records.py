@@ -100,6 +100,10 @@ class RobotMail:
             boxes.append(Mailbox(buffer[offset:], layout))
             offset += Mailbox.size(layout)
         self.command, self.deadman, self.rearms, self.state, self.gripper_command, self.gripper = boxes
+        # What was decoded last, with its number: most ticks find nothing new.
+        self._command: tuple[int, CommandRecord] | None = None
+        self._deadman: tuple[int, DeadmanRecord] | None = None
+        self._grip: tuple[int, GripperCommand] | None = None
 
     @staticmethod
     def layouts(n: int) -> tuple[str, ...]:
@@ -135,8 +139,11 @@ class RobotMail:
         found = self.command.read()
         if found is None:
             return None
-        seq, t, deadline, kind, t_event, session, count, *values = found[1]
-        return CommandRecord(seq, session, t, deadline, Kind(kind), tuple(values[:count]), t_event)
+        if self._command is None or self._command[0] != found[0]:
+            seq, t, deadline, kind, t_event, session, count, *values = found[1]
+            record = CommandRecord(seq, session, t, deadline, Kind(kind), tuple(values[:count]), t_event)
+            self._command = found[0], record
+        return self._command[1]
 
     def put_deadman(self, record: DeadmanRecord) -> None:
         """Say how the dead-man stands."""
@@ -145,7 +152,11 @@ class RobotMail:
     def get_deadman(self) -> DeadmanRecord | None:
         """How the dead-man stood last."""
         found = self.deadman.read()
-        return DeadmanRecord(*found[1]) if found else None
+        if found is None:
+            return None
+        if self._deadman is None or self._deadman[0] != found[0]:
+            self._deadman = found[0], DeadmanRecord(*found[1])
+        return self._deadman[1]
 
     def get_rearms(self) -> int:
         """How often ``control.rearm()`` was called."""
@@ -155,7 +166,11 @@ class RobotMail:
     def get_gripper_command(self) -> GripperCommand | None:
         """The newest command to the gripper."""
         found = self.gripper_command.read()
-        return GripperCommand(*found[1]) if found else None
+        if found is None:
+            return None
+        if self._grip is None or self._grip[0] != found[0]:
+            self._grip = found[0], GripperCommand(*found[1])
+        return self._grip[1]
 
     # From the servo to the app.
 

@@ -189,7 +189,8 @@ class PadConfig(Strict):
 class SimulationConfig(Strict):
     """The simulated world."""
 
-    physics_hz: Positive = 240.0
+    physics_hz: float = Field(default=240.0, ge=50.0, le=10000.0, strict=True)
+    """Steps of the simulation, and of the servos in it, per second."""
     gravity: Vector = (0.0, 0.0, -9.81)
     """m/s2"""
     clock: Literal["real_time", "lock_step"] | None = None

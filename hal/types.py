@@ -53,7 +53,14 @@ class Stamp:
     """Counts samples; a gap is a sample that was lost."""
 
 
-class RobotStatus(IntEnum):
+class _Named(IntEnum):
+    """A number on the wire, a name for people."""
+
+    def __str__(self) -> str:
+        return self.name.lower()
+
+
+class RobotStatus(_Named):
     """What the arm is doing."""
 
     IDLE = 0
@@ -72,7 +79,7 @@ class RobotStatus(IntEnum):
     """The device does not answer."""
 
 
-class Trip(IntEnum):
+class Trip(_Named):
     """Why a stop was latched."""
 
     NONE = 0

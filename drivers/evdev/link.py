@@ -35,7 +35,7 @@ class Link:
         self.events = 0
         """Events so far; one that the kernel dropped counts too."""
         self.t = self.t_alive = -math.inf
-        """Time of the newest event, at first that of the first poll, and of the newest proof of life; rig's clock, s."""
+        """Time of the newest event, at first that of the first poll, and of the last proof of life; s, rig's clock."""
         self.t_device = 0.0
         self._node = node
         self._motion: Node | None = None
@@ -58,6 +58,7 @@ class Link:
     def listen_to(self, motion: Node) -> None:
         """Take the pad's motion sensor as its heartbeat, as soon as it is heard."""
         self._motion = motion
+        self._poller.register(motion.fileno(), 0)  # wakes nobody with its news, only when it is unplugged
 
     def poll(self, now: float, timeout: float) -> None:
         """Take every event; wait for the first one for up to ``timeout`` s. Raises OSError when the pad is gone.

@@ -109,15 +109,15 @@ class PyBulletRobot(RobotDriver):
         """Switch faults on or off.
 
         Args:
-            **knobs: ``freeze=True``: every reading repeats the last one, stamps and all. ``lost=True``: the robot
+            **knobs: ``freeze=True``: every reading repeats the last one, stamps and all. ``disconnect=True``: the robot
                 does not answer. ``fault="text"``: the robot reports that fault, holds where it is and takes no
                 set-points; ``fault=None`` ends it.
         """
-        known = {"freeze", "lost", "fault"}
+        known = {"freeze", "disconnect", "fault"}
         if not set(knobs) <= known:
-            raise CommandError(f"{', '.join(sorted(set(knobs) - known))}: no such fault; faults: freeze, lost, fault")
+            raise CommandError(f"{', '.join(sorted(set(knobs) - known))}: no such fault; faults: freeze, disconnect, fault")
         self._freeze = bool(knobs.get("freeze", self._freeze))
-        self._connected = not knobs.get("lost", not self._connected)
+        self._connected = not knobs.get("disconnect", not self._connected)
         if "fault" not in knobs:
             return
         cause = knobs["fault"]

@@ -15,6 +15,7 @@ from hal.process import Child, SharedMemory
 from hal.specs import to_json
 
 from .keyboard import LAYOUT, KeyboardSource
+from .viewer_process import HEARTBEAT
 
 __all__ = ["PyBulletViewer"]
 
@@ -33,9 +34,10 @@ class PyBulletViewer(Viewer):
                 "the window needs a display, and DISPLAY is not set: run it on a desktop, through `ssh -X`, or under "
                 "`xvfb-run`; or use --viewer none"
             )
+        self._beat = SharedMemory(Mailbox.size(HEARTBEAT))
         self._keys = SharedMemory(Mailbox.size(LAYOUT))
         self._mailbox = Mailbox(self._keys.buffer, LAYOUT)
-        self._has_keyboard = False
+        self._watch: Child | None = None
         self._closed = False
         if isinstance(host, RemoteHost):
             snapshots, offset = host.shared, host.snapshot_offset
@@ -49,7 +51,7 @@ class PyBulletViewer(Viewer):
             "snapshot_capacity": SNAPSHOT_CAPACITY,
         }
         target = "hal.drivers.pybullet.viewer_process:main"
-        self._child = Child("viewer", target, config, [snapshots, self._keys])
+        self._child = Child("viewer", target, config, [snapshots, self._beat])
 
     def _published(self, host: LocalHost) -> SharedMemory:
         """Lock-step: this process publishes the world while simulated time goes on."""
@@ -67,20 +69,35 @@ class PyBulletViewer(Viewer):
 
     def wait_ready(self) -> None:
         ready = self._child.wait_ready()
-        self._has_keyboard = bool(ready["keyboard"])
-        self.notes = tuple(ready["notes"])
+        if ready["window"] is None:
+            self.notes = ("the viewer's window was not found on the display, so its keyboard is not used",)
+            return
+        target = "hal.drivers.pybullet.keyboard_process:main"
+        self._watch = Child("keyboard", target, ready, [self._beat, self._keys])
+        self._watch.wait_ready()
 
     def edited(self, method: str, params: dict[str, Any], revision: int) -> None:
         with suppress(ConnectionLost):  # a window that was closed needs no news
             self._child.channel.send({"method": method, "params": params, "revision": revision})
 
     def keyboard(self) -> KeyboardSource | None:
-        return KeyboardSource(self._mailbox, time.monotonic, self._child.check) if self._has_keyboard else None
+        if self._watch is None:
+            return None
+        return KeyboardSource(self._mailbox, time.monotonic, self._check)
+
+    def _check(self) -> None:
+        """Raise ConnectionLost when the window is gone."""
+        assert self._watch is not None
+        self._watch.check()
+        self._child.check()
 
     def describe(self) -> str:
         return "PyBullet's window"
 
     def close(self) -> None:
         self._closed = True
-        self._child.close()
+        for child in (self._watch, self._child):
+            if child is not None:
+                child.close()
+        self._beat.close()
         self._keys.close()

@@ -1,4 +1,8 @@
-"""The process behind the viewer's window."""
+"""The process behind the viewer's window.
+
+PyBullet's window answers each call only between two of its pictures, so this process is often busy for a tenth of a
+second; that is why the keys are watched by another one (:mod:`.keyboard_process`).
+"""
 
 from __future__ import annotations
 
@@ -12,43 +16,24 @@ from hal.mailbox import Mailbox, SeriesBox
 from hal.process import Channel, SharedMemory
 from hal.specs import WorldSpec, from_json
 
-from .keyboard import KEYS, LAYOUT, KeyboardRecord, grip
 from .mirror import Mirror
 from .world import World
-from .x11 import Keyboard, NoDisplay, windows
+from .x11 import NoDisplay, windows
 
-__all__ = ["KeyWatch", "main"]
+__all__ = ["HEARTBEAT", "main"]
 
-_NICE = 5
-_PERIOD = 0.01
-"""How often the keys are looked at, s."""
+HEARTBEAT = "d"
+"""Layout of the mailbox in which it says when it was last alive, s."""
+_NICE = 10
+"""It comes after everything else."""
 _FRAME = 1 / 30
 """How often the world is shown, s."""
 _TITLE = "Bullet Physics"
 """What the title of PyBullet's window contains."""
 
 
-class KeyWatch:
-    """Writes what the keyboard does into the record that the app reads."""
-
-    def __init__(self, mailbox: Mailbox) -> None:
-        self._mailbox = mailbox
-        self._record = KeyboardRecord(0.0, 0.0, 0, 0, 0.0)
-
-    def look(self, held: frozenset[str], now: float) -> None:
-        """Note that these keys are down now."""
-        last = self._record
-        mask = sum(1 << bit for bit, key in enumerate(KEYS) if key in held)
-        dt = min(now - last.t_alive, 0.1)
-        opening = grip(last.grip, held, dt)
-        changed = (mask, opening) != (last.mask, last.grip)
-        t_event = now if changed else last.t_event
-        self._record = KeyboardRecord(now, t_event, last.events + changed, mask, opening)
-        self._mailbox.write(*self._record)
-
-
 def main(channel: Channel, memories: Sequence[SharedMemory], config: dict[str, Any]) -> None:
-    """Entry point of the child process; ``memories`` are the world's snapshots and the keyboard's record."""
+    """Entry point of the child process; ``memories`` are the world's snapshots and the heartbeat."""
     os.nice(_NICE)
     os.environ.setdefault("LP_NUM_THREADS", "1")
     parent = os.getppid()
@@ -59,30 +44,23 @@ def main(channel: Channel, memories: Sequence[SharedMemory], config: dict[str, A
     world = World(from_json(WorldSpec, config["world"]), mirror=True, gui=True)
     _arrange(world)
     ours = windows(_TITLE) - before
-    keyboard = Keyboard(KEYS, next(iter(ours))) if len(ours) == 1 else None
-    notes = [] if keyboard else ["the viewer's window was not found on the display, so its keyboard is not used"]
-    channel.send({"ready": {"keyboard": keyboard is not None, "notes": notes}})
     box = SeriesBox(memories[0].buffer[config["snapshot_offset"] :], config["snapshot_capacity"])
+    heartbeat = Mailbox(memories[1].buffer, HEARTBEAT)
+    heartbeat.write(time.monotonic())
+    channel.send({"ready": {"window": next(iter(ours)) if len(ours) == 1 else None, "pid": os.getpid()}})
     mirror = Mirror(world, box)
-    watch = KeyWatch(Mailbox(memories[1].buffer, LAYOUT))
-    due = 0.0
     while os.getppid() == parent and world.client.isConnected():
-        now = time.monotonic()
-        if keyboard is not None:
-            if not keyboard.present():
-                return
-            watch.look(keyboard.held(), now)
+        due = time.monotonic() + _FRAME
         try:
             while (message := channel.poll()) is not None:
                 if message["method"] == "close":
                     return
                 mirror.edited(message["method"], message["params"], message["revision"])
-            if now >= due:
-                mirror.update()
-                due = now + _FRAME
+            mirror.update()
         except (ConnectionLost, world.client.error):
             return  # the app or the window is gone
-        time.sleep(max(0.0, now + _PERIOD - time.monotonic()))
+        heartbeat.write(time.monotonic())
+        time.sleep(max(0.0, due - time.monotonic()))
 
 
 def _arrange(world: World) -> None:

@@ -94,7 +94,7 @@ def pybullet_robot() -> Iterator[RobotBench]:
     spec = _panda("pybullet")
     world = World(WorldSpec("pybullet", 240.0, (0.0, 0.0, -9.81), (), (spec,)))
     driver = PyBulletRobot(spec, world)
-    yield RobotBench(dt=1 / 240, advance=world.step, driver=driver, lose=lambda: driver.inject(lost=True))
+    yield RobotBench(dt=1 / 240, advance=world.step, driver=driver, lose=lambda: driver.inject(disconnect=True))
     driver.close()
     world.close()
 

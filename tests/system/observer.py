@@ -30,7 +30,7 @@ import hal
 rig = hal.open({config!r}, sim=True, clock="real_time", overrides={overrides!r}, pad="none")
 arm = rig.robots["panda"]
 host = rig._hosts[0]
-children = [host.child.process.pid] + ([rig._pictures.child.process.pid] if rig._pictures else [])
+children = [host.child.process.pid] + ([rig._pictures._child.process.pid] if rig._pictures else [])
 velocity = [0.4, 0.0, 0.0, 0.0, 0.4, 0.0, 0.4]
 with rig, arm.control(rate_hz=50) as control:
     for turn, tick in enumerate(rig.clock.rate(50)):

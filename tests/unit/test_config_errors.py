@@ -280,6 +280,32 @@ def test_overrides_are_to_blame_for_their_own_mistakes(override: str, key: str, 
         assert word in problem.message
 
 
+def places(value: Any, path: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
+    """Every key and item in nested data."""
+    items = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
+    return [path] * bool(path) + [deeper for key, item in items for deeper in places(item, (*path, key))]
+
+
+def test_nonsense_anywhere_is_a_config_error_or_nothing_worse() -> None:
+    """Never a traceback for a person's mistake: nonsense in every place of a rig."""
+    rig = yaml.safe_load(find_data("config", "panda_table.yaml").read_text())
+    nonsense = [None, -1, 2.5, "x", [], {}, [1, 2], True, float("nan"), float("inf"), 10**400, {1: 2}, [None] * 7]
+    refused: list[Problem] = []
+    for k, place in enumerate(places(rig)):
+        broken = copy.deepcopy(rig)
+        target = broken
+        for part in place[:-1]:
+            target = target[part]
+        for value in (nonsense[k % len(nonsense)], nonsense[(5 * k + 3) % len(nonsense)]):
+            target[place[-1]] = value
+            try:
+                load(broken)
+            except ConfigError as error:
+                refused.extend(error.problems)
+    assert len(refused) > 50
+    assert all(problem.key and problem.message for problem in refused)
+
+
 def test_arguments() -> None:
     found = problems("panda_table", clock="lockstep", driver="mok")
     assert {problem.key for problem in found} >= {"clock", "driver"}

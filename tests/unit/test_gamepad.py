@@ -207,6 +207,17 @@ def test_one_that_is_asked_for_while_it_is_pressed_must_be_let_go_of(see: See, p
     assert deadman.held
 
 
+def test_a_release_before_anything_counts_does_not_arm_the_dead_man(driver: Played) -> None:
+    driver.shows(left_x=1.0)
+    pad = Gamepad(driver)
+    pad.open(0.0)
+    deadman = pad.hold("l1")
+    for buttons, left_x, held in (((), 1.0, False), (("l1",), 0.0, False), ((), 0.0, False), (("l1",), 0.0, True)):
+        driver.shows(*buttons, left_x=left_x)
+        pad.poll_once(driver.reading.t)
+        assert deadman.held is held
+
+
 def test_the_heartbeat_reaches_the_servo_with_every_poll(see: See, pad: Gamepad, driver: Played) -> None:
     heard: list[float] = []
     pad.hold("l2").attach(lambda record: heard.append(record.t_alive))

@@ -255,7 +255,7 @@ class TestFaults:
 
     def test_lost_raises_until_recovered(self) -> None:
         _, driver = opened()
-        driver.inject(lost=True)
+        driver.inject(disconnect=True)
         with pytest.raises(ConnectionLost):
             driver.read(0.0)
         with pytest.raises(ConnectionLost):

@@ -9,7 +9,6 @@ import pytest
 from pictures_kit import box, camera, look_at, renderer, world
 from specs import panda
 
-from hal.drivers.pybullet import rendering
 from hal.drivers.pybullet.camera import DirectSource, PyBulletCamera, SharedSource, camera_pose
 from hal.drivers.pybullet.frames import FrameRing
 from hal.drivers.pybullet.gl_target import create_context
@@ -240,7 +239,7 @@ class TestChoice:
         renderer("gl", scene).close()  # or skip
         chosen = choose_renderer(scene)
         assert "OpenGL on " in chosen.description
-        assert rendering.Renderer in type(chosen).__mro__
+    XXX
         chosen.close()
         chosen.close()
         scene.close()

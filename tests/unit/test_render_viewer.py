@@ -15,8 +15,8 @@ from pictures_kit import world
 from specs import box, data, world_spec
 
 from hal.drivers.pybullet.keyboard import HELP, KEYS, LAYOUT, KeyboardPad, KeyboardSource
+from hal.drivers.pybullet.keyboard_process import KeyWatch
 from hal.drivers.pybullet.viewer import PyBulletViewer
-from hal.drivers.pybullet.viewer_process import KeyWatch
 from hal.drivers.pybullet.x11 import windows
 from hal.errors import ConnectionLost, NotSupported
 from hal.gamepad import PadReading
@@ -35,6 +35,7 @@ class Desk:
         self.watch = KeyWatch(mailbox)
         self.t = 50.0
         self.gone = False
+        self.shown: Callable[[float], float] = lambda t: t
         self.pad = KeyboardPad(PAD, KeyboardSource(mailbox, lambda: self.t, self.check))
         self.pad.open()
 
@@ -46,7 +47,7 @@ class Desk:
         assert set(keys) <= set(KEYS)
         for _ in range(max(1, round(seconds / 0.01))):
             self.t += 0.01
-            self.watch.look(frozenset(keys), self.t)
+            self.watch.look(frozenset(keys), self.t, self.shown(self.t))
         return self.pad.poll(self.t + 1000.0, 0.0)  # the rig's clock is another one
 
 
@@ -88,6 +89,14 @@ class TestKeys:
         desk.t += 0.5  # the window hangs
         frozen = desk.pad.poll(desk.t + 1000.0, 0.0)
         assert frozen.t_alive == pytest.approx(1000.0 + desk.t - 0.5)
+
+    def test_a_window_that_hangs_is_silence(self) -> None:
+        desk = Desk()
+        desk.press("space")
+        hung = desk.t
+        desk.shown = lambda t: hung
+        assert desk.press("space", seconds=0.3).t_alive == pytest.approx(1000.0 + desk.t)  # a busy graphics card
+        assert desk.press("space", seconds=0.4).t_alive == pytest.approx(1000.0 + hung)
 
     def test_a_closed_window_is_a_pad_that_is_gone(self) -> None:
         desk = Desk()
@@ -215,9 +224,16 @@ def test_the_window_its_keys_its_focus_and_its_end(display: str) -> None:
         until(lambda: time.monotonic() - reading().t_alive > 0.3)
         os.kill(process.pid, signal.SIGCONT)
         until(lambda: time.monotonic() - reading().t_alive < 0.2)
+        assert viewer._watch is not None
+        watch = viewer._watch.process
+        os.kill(watch.pid, signal.SIGSTOP)
+        until(lambda: time.monotonic() - reading().t_alive > 0.3)
+        os.kill(watch.pid, signal.SIGCONT)
+        until(lambda: time.monotonic() - reading().t_alive < 0.2)
 
         xdotool("windowclose", str(ours))
         until(lambda: not reading().connected)
+        until(lambda: process.poll() is not None)
         viewer.edited("set_color", {"name": "block", "rgba": [1, 0, 0, 1]}, 1)  # nobody is there; no error
     finally:
         viewer.close()

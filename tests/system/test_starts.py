@@ -1,0 +1,95 @@
+"""A rig opens, moves and closes wherever Python runs, and leaves no process behind."""
+
+import os
+import re
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+pytestmark = pytest.mark.slow
+
+BODY = """
+import hal
+rig = hal.open("panda_table", sim=True, pad="none")
+arm = rig.robots["panda"]
+goal = arm.home.copy()
+goal[0] += 0.05
+arm.move_to(goal, speed=0.5)
+frame = rig.cameras["scene"].read()
+print("moved", round(float(arm.state().q[0]), 3), "saw", frame.color.shape)
+print("children", *[h.child.process.pid for h in rig._hosts], rig._pictures._child.process.pid)
+"""
+WITH = BODY + "rig.close()\n"
+
+
+def expect(output: str) -> None:
+    """It moved, it saw, and its processes are gone."""
+    assert "moved 0.05 saw (256, 256, 3)" in output, output
+    pids = [int(pid) for pid in re.search(r"children (\d+) (\d+)", output).groups()]
+    deadline = time.monotonic() + 10.0
+    while any(os.path.exists(f"/proc/{pid}") for pid in pids):
+        assert time.monotonic() < deadline, f"still there: {pids}"
+        time.sleep(0.02)
+
+
+def run(arguments: list[str], program: str | None, folder: Path) -> str:
+    done = subprocess.run(
+        [sys.executable, *arguments], input=program, cwd=folder, capture_output=True, text=True, timeout=90
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def test_an_unguarded_script(tmp_path: Path) -> None:
+    script = tmp_path / "experiment.py"
+    script.write_text(WITH)
+    expect(run([str(script)], None, tmp_path))
+
+
+def test_standard_input_without_closing(tmp_path: Path) -> None:
+    expect(run(["-"], BODY, tmp_path))
+
+
+def test_the_interactive_prompt_without_closing(tmp_path: Path) -> None:
+    expect(run(["-i", "-q"], BODY, tmp_path))
+
+
+def test_a_thread(tmp_path: Path) -> None:
+    body = "\n    ".join(WITH.strip().splitlines())
+    program = f"import threading\ndef run():\n    {body}\nt = threading.Thread(target=run)\nt.start()\nt.join()\n"
+    expect(run(["-c", program], None, tmp_path))
+
+
+def test_a_notebook_kernel(tmp_path: Path) -> None:
+    try:
+        from jupyter_client.manager import start_new_kernel
+    except ImportError:
+        pytest.skip("ipykernel is not installed")
+    manager, client = start_new_kernel(kernel_name="python3", cwd=str(tmp_path), startup_timeout=60)
+    printed: list[str] = []
+
+    def collect(message: dict) -> None:
+        if message["msg_type"] == "stream":
+            printed.append(message["content"]["text"])
+
+    try:
+        reply = client.execute_interactive(BODY, timeout=90, output_hook=collect)
+        assert reply["content"]["status"] == "ok", reply["content"]
+    finally:
+        client.stop_channels()
+        manager.shutdown_kernel()
+    expect("".join(printed))
+
+
+def test_two_rigs_at_once_and_one_after_the_other(tmp_path: Path) -> None:
+    program = """
+import hal
+for _ in range(2):
+    with hal.open("panda_table", driver="mock") as a, hal.open("iiwa_table", driver="mock") as b:
+        a.clock.sleep(0.1); b.clock.sleep(0.2)
+        print(a.clock.now() < b.clock.now(), a.robots["panda"].n)
+"""
+    assert run(["-c", program], None, tmp_path).split() == ["True", "7"] * 2
