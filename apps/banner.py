@@ -17,7 +17,9 @@ def listing(plan: Plan) -> list[str]:
     for robot in plan.robots:
         gripper = f", gripper 0..{robot.gripper.width_max:g} m" if robot.gripper else ""
         where = "REAL" if robot.attended else "simulated"
-        lines.append(f"robot    {robot.name:10s} {robot.model}, {where} ({robot.driver}), {robot.rate_hz:g} Hz{gripper}")
+        lines.append(
+            f"robot    {robot.name:10s} {robot.model}, {where} ({robot.driver}), {robot.rate_hz:g} Hz{gripper}"
+        )
     for camera in plan.cameras:
         streams = "+".join(camera.streams)
         lines.append(

@@ -19,7 +19,10 @@ def add_rig_options(parser: argparse.ArgumentParser) -> None:
     """Options that choose and change a rig; the same in every app."""
     rig = parser.add_argument_group("rig")
     rig.add_argument(
-        "--config", default="panda_table", metavar="FILE", help="a rig's file, or the name of a built-in one (%(default)s)"
+        "--config",
+        default="panda_table",
+        metavar="FILE",
+        help="a rig's file, or the name of a built-in one (%(default)s)",
     )
     flag = rig.add_mutually_exclusive_group()
     flag.add_argument("--sim", dest="sim", action="store_true", default=None, help="simulate every device")
@@ -36,13 +39,15 @@ def add_rig_options(parser: argparse.ArgumentParser) -> None:
         "--pad",
         default="auto",
         metavar="auto|evdev|keyboard|FILE",
-        help="what drives: a plugged-in pad, the viewer's keyboard, or a recording (%(default)s: the first that is there)",
+        help="what drives: a plugged-in pad, the viewer's keyboard, a recording; %(default)s: the first that is there",
     )
     rig.add_argument("--viewer", choices=["gui", "none"], default="none", help="a window onto the simulated world")
     rig.add_argument(
         "--realtime", action="store_true", help="ask for real-time scheduling and locked memory for the servos"
     )
-    rig.add_argument("--dry-run", action="store_true", help="check everything, list what would be opened, touch nothing")
+    rig.add_argument(
+        "--dry-run", action="store_true", help="check everything, list what would be opened, touch nothing"
+    )
 
 
 def rig_options(args: argparse.Namespace) -> dict[str, Any]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,7 +12,7 @@ if TYPE_CHECKING:
     from hal.robot import Robot
     from hal.types import RobotState
 
-__all__ = ["RunReport"]
+__all__ = ["RunReport", "check_writable"]
 
 
 class RunReport:
@@ -85,6 +86,15 @@ class RunReport:
     def write(path: str, report: dict[str, Any]) -> None:
         """Write a report that :meth:`collect` made."""
         Path(path).write_text(json.dumps(report, indent=2) + "\n")
+
+
+def check_writable(path: str) -> None:
+    """Raise CommandError now rather than after the run when no file can be written there."""
+    from hal.errors import CommandError
+
+    folder = Path(path).resolve().parent
+    if not folder.is_dir() or not os.access(folder, os.W_OK):
+        raise CommandError(f"--report {path}: the folder {folder} does not exist or cannot be written to")
 
 
 def _ms(seconds: float | None) -> float | None:

@@ -1,7 +1,7 @@
 """Drive an arm with a gamepad: in simulation and on the real arm, the same program.
 
-    python apps/teleop.py --sim
-    python apps/teleop.py --real --config my_rig.yaml
+python apps/teleop.py --sim
+python apps/teleop.py --real --config my_rig.yaml
 """
 
 from __future__ import annotations
@@ -25,7 +25,9 @@ RATE_HZ = 50.0
 def parser() -> argparse.ArgumentParser:
     """The command line."""
     made = argparse.ArgumentParser(
-        prog="teleop", description="Drive an arm with a gamepad, in simulation or for real.", epilog="Ctrl-C stops the arm."
+        prog="teleop",
+        description="Drive an arm with a gamepad, in simulation or for real.",
+        epilog="Ctrl-C stops the arm.",
     )
     add_rig_options(made)
     drive = made.add_argument_group("driving")
@@ -51,6 +53,10 @@ def _main(args: argparse.Namespace) -> int:
         raise CommandError(f"--speed must be above 0 and at most 1, not {args.speed:g}")
     if args.duration is not None and not args.duration > 0.0:
         raise CommandError(f"--duration must be positive, not {args.duration:g}")
+    if args.report:
+        from hal.apps.report import check_writable
+
+        check_writable(args.report)
     if args.dry_run:
         from hal.config import load
         from hal.mapping import load_mapping
@@ -69,7 +75,6 @@ def _main(args: argparse.Namespace) -> int:
             raise CommandError(f"{rig.plan.source} has no gamepad; add 'gamepads: {{pad: {{model: auto}}}}'")
         robot, pad = rig.robots[name], next(iter(rig.gamepads.values()))
         teleop = hal.Teleop(robot, mapping=args.mapping, speed=args.speed or 1.0)
-        print("\n".join(f"  {line}" for line in teleop.help(pad)), flush=True)
         return Session(rig, robot, pad, teleop, args).run()
 
 
@@ -91,6 +96,7 @@ class Session:
         """Drive until the time is over, the recording ends or Ctrl-C; then stop, report, close."""
         clean = False
         try:
+            print("\n".join(f"  {line}" for line in self.teleop.help(self.pad)), flush=True)
             while self._drive():
                 self._go_home()
             clean = True

@@ -40,8 +40,7 @@ if TYPE_CHECKING:
         Unreachable,
     )
     from .pose import Pose
-    from .rig import Rig
-    from .rig import open_rig as open
+    from .rig import Rig, open_rig
     from .robot import Robot
     from .specs import BodySpec
     from .teleop import Teleop
@@ -56,6 +55,8 @@ if TYPE_CHECKING:
         Stamp,
         Trip,
     )
+
+    open = open_rig
 
 __all__ = [
     "BodySpec",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import NamedTuple, Union
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -30,6 +30,9 @@ def _vector(name: str, values: ArrayLike, size: int | None = None) -> Array:
     return array
 
 
+_set = object.__setattr__  # the commands are frozen, also for their own constructors
+
+
 class Kind(IntEnum):
     """How a command travels to the servo."""
 
@@ -41,7 +44,7 @@ class Kind(IntEnum):
     TWIST = 5
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, init=False)
 class JointTarget:
     """Be at joint positions ``q`` (n,) in rad, moving at ``dq`` (n,) in rad/s (zero when left out).
 
@@ -49,46 +52,46 @@ class JointTarget:
     """
 
     q: Array
-    dq: Array | None = None
+    dq: Array | None
 
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "q", _vector("q", self.q))
-        if self.dq is not None:
-            object.__setattr__(self, "dq", _vector("dq", self.dq, self.q.size))
+    def __init__(self, q: ArrayLike, dq: ArrayLike | None = None) -> None:
+        _set(self, "q", _vector("q", q))
+        _set(self, "dq", None if dq is None else _vector("dq", dq, self.q.size))
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, init=False)
 class JointVelocity:
     """Move the joints at ``dq`` (n,), rad/s."""
 
     dq: Array
 
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "dq", _vector("dq", self.dq))
+    def __init__(self, dq: ArrayLike) -> None:
+        _set(self, "dq", _vector("dq", dq))
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, init=False)
 class JointTorque:
     """Apply joint torques ``tau`` (n,), Nm, on top of the robot's own gravity compensation."""
 
     tau: Array
 
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "tau", _vector("tau", self.tau))
+    def __init__(self, tau: ArrayLike) -> None:
+        _set(self, "tau", _vector("tau", tau))
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, init=False)
 class CartesianTarget:
     """Bring the tcp to ``pose``; inverse kinematics runs in the servo."""
 
     pose: Pose
 
-    def __post_init__(self) -> None:
-        if not isinstance(self.pose, Pose):
-            raise CommandError(f"pose must be a hal.Pose, not {type(self.pose).__name__}")
+    def __init__(self, pose: Pose) -> None:
+        if not isinstance(pose, Pose):
+            raise CommandError(f"pose must be a hal.Pose, not {type(pose).__name__}")
+        _set(self, "pose", pose)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, init=False)
 class Twist:
     """Move the tcp at ``linear`` (3,) m/s while it turns at ``angular`` (3,) rad/s.
 
@@ -96,17 +99,18 @@ class Twist:
     """
 
     linear: Array
-    angular: Array = (0.0, 0.0, 0.0)  # type: ignore[assignment]  # made an array below
-    frame: str = "base"
+    angular: Array
+    frame: str
 
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "linear", _vector("linear", self.linear, 3))
-        object.__setattr__(self, "angular", _vector("angular", self.angular, 3))
-        if self.frame not in ("base", "tcp"):
-            raise CommandError(f"frame must be 'base' or 'tcp', not {self.frame!r}")
+    def __init__(self, linear: ArrayLike, angular: ArrayLike = (0.0, 0.0, 0.0), frame: str = "base") -> None:
+        if frame not in ("base", "tcp"):
+            raise CommandError(f"frame must be 'base' or 'tcp', not {frame!r}")
+        _set(self, "linear", _vector("linear", linear, 3))
+        _set(self, "angular", _vector("angular", angular, 3))
+        _set(self, "frame", frame)
 
 
-Command = Union[JointTarget, JointVelocity, JointTorque, CartesianTarget, Twist]
+Command: TypeAlias = JointTarget | JointVelocity | JointTorque | CartesianTarget | Twist
 
 
 class Sent(NamedTuple):

@@ -317,7 +317,7 @@ def move_to(
     timeout: float | None,
 ) -> RobotState:
     """See :meth:`hal.robot.Robot.move_to`."""
-    goal = robot.ik(target) if isinstance(target, Pose) else JointTarget(target).q  # type: ignore[arg-type]
+    goal = robot.ik(target) if isinstance(target, Pose) else JointTarget(target).q
     if goal.size != robot.n:
         raise CommandError(f"{robot.name} has {robot.n} joints; the target has {goal.size}")
     limits = robot.limits

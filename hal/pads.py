@@ -27,7 +27,7 @@ def choose_pad(
     """The pad to open, where it gets its record from, and what a person should know.
 
     ``wanted`` is what the program asked for: ``evdev``, ``keyboard``, the path of a recording, or ``auto`` (None means
-    the same). It only matters for a pad whose driver is ``auto`` in the rig. ``window`` names the driver behind the viewer.
+    the same). It only matters for a pad whose driver is ``auto`` in the rig. ``window`` names the viewer's driver.
     ``auto`` is a pad that is plugged in, else the viewer's keyboard, else, where nothing real moves, the recorded
     tour.
 

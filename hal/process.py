@@ -7,6 +7,7 @@ passed by descriptor: nothing can be left behind, whoever is killed.
 
 from __future__ import annotations
 
+import contextlib
 import json
 import mmap
 import os
@@ -146,7 +147,7 @@ class Child:
         self._number = 0
         ours, theirs = socket.socketpair()
         self.channel = Channel(ours)
-        self._log = tempfile.TemporaryFile()
+        self._log = tempfile.TemporaryFile()  # noqa: SIM115  # closed by close()
         fds = [theirs.fileno(), *(memory.fd for memory in memories)]
         path = [os.path.abspath(entry) for entry in sys.path]
         self.process = subprocess.Popen(
@@ -246,10 +247,8 @@ def child_main(target: str, fds: Sequence[int]) -> None:
     except BaseException as error:
         status = 1
         traceback.print_exc()
-        try:
+        with contextlib.suppress(ConnectionLost):
             channel.send({"error": pack_error(error)})
-        except ConnectionLost:
-            pass
     finally:
         sys.stdout.flush()
         sys.stderr.flush()

@@ -55,8 +55,6 @@ class DriverSpec:
     """A :class:`~hal.gamepad.GamepadDriver`."""
     world: str | None = None
     """The simulated world that this driver's arms, grippers and cameras stand in."""
-    mirror: str | None = None
-    """A copy of that world that shows published states and is never stepped."""
     viewer: str | None = None
     """A window onto a mirror."""
     pictures: str | None = None

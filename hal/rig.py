@@ -62,8 +62,9 @@ def open_rig(
     ``sim=True`` makes everything simulated, ``sim=False`` sets the rig's flag to real, None leaves the file's flags.
     ``driver="mock"`` puts a mock in the place of every device. ``clock`` is ``real_time`` or ``lock_step``.
     ``overrides`` are ``KEY=VALUE`` for any key of the rig. ``pad`` says what a pad of ``model: auto`` is: ``auto``,
-    ``evdev``, ``keyboard``, the path of a recording, or ``none`` to open no pad. ``viewer="gui"`` opens a window onto the simulated world.
-    ``realtime`` asks for SCHED_FIFO and locked memory in the processes that run servos, where the user may.
+    ``evdev``, ``keyboard``, the path of a recording, or ``none`` to open no pad. ``viewer="gui"`` opens a window onto
+    the simulated world. ``realtime`` asks for SCHED_FIFO and locked memory in the processes that run servos, where the
+    user may.
 
     Nothing moves. Raises ConfigError (every problem at once), DriverMissing, DeviceNotFound, ConnectionLost.
     """
@@ -124,10 +125,10 @@ class Rig:
             world_host = local if group.world is not None else None
         else:
             for group in groups:
-                host = RemoteHost(group, realtime=realtime)
-                self._hosts.append(host)
+                remote = RemoteHost(group, realtime=realtime)
+                self._hosts.append(remote)
                 if group.world is not None:
-                    world_host = host
+                    world_host = remote
         if world_host is not None:
             self._open_pictures(world_host, viewer)
         elif viewer != "none":
@@ -157,8 +158,7 @@ class Rig:
         for shown in (self._pictures, self._viewer):
             if shown is not None:
                 shown.wait_ready()
-        if self._pictures is not None:
-            self.notes.extend(self._pictures.notes)
+                self.notes.extend(shown.notes)
 
     def _open_cameras(self) -> None:
         for spec in self.plan.cameras:

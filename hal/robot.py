@@ -97,7 +97,7 @@ class RobotDriver(ABC):
     def halt(self) -> None:
         """End streaming: the device stops and holds by its own means. Idempotent."""
 
-    def recover(self) -> None:
+    def recover(self) -> None:  # noqa: B027  # most have nothing to do
         """Clear a fault, as the user's own act. A driver without faults has nothing to do."""
 
     def inject(self, **knobs: object) -> None:

@@ -165,13 +165,20 @@ class Servo:
         """What is wrong with the device."""
         if reading.fault is not None:
             return Trip.FAULT
-        n = self._smoother.n
-        for values in (reading.q, reading.dq, reading.q_commanded, reading.dq_commanded):
-            if values is not None and not (len(values) == n and sum(map(abs, values)) < _ABSURD):
-                return Trip.BAD_READING
+        sound = self._is_sound(reading.q) and self._is_sound(reading.dq)
+        if sound and reading.q_commanded is not None:
+            sound = self._is_sound(reading.q_commanded)
+        if sound and reading.dq_commanded is not None:
+            sound = self._is_sound(reading.dq_commanded)
+        if not sound:
+            return Trip.BAD_READING
         if not is_alive(now, reading.t):
             return Trip.DEVICE_LOST  # it repeats an old reading
         return Trip.NONE
+
+    def _is_sound(self, values: Floats) -> bool:
+        """As many numbers as joints, finite and not absurd."""
+        return len(values) == self._smoother.n and sum(map(abs, values)) < _ABSURD
 
     def _listen(self, now: float, session: Session, command: CommandRecord | None) -> None:
         """Take over the newest command, if it counts."""

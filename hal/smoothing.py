@@ -124,7 +124,9 @@ class JointSmoother:
         """
         if not isfinite(sum(dq)):  # a goal that is no number is no goal
             dq = self._zeros
-        target = [max(-limit, min(limit, v)) for v, limit in zip(dq, self.velocity, strict=True)]
+        target = [
+            v if -cap <= v <= cap else (cap if v > 0.0 else -cap) for v, cap in zip(dq, self.velocity, strict=True)
+        ]
         self.guarded = False
         self._propose_velocity(target)
         self.held_back = self._violations()

@@ -5,7 +5,6 @@ from hal.registry import DriverSpec
 DRIVER = DriverSpec(
     name="pybullet",
     world="hal.drivers.pybullet.world:World",
-    mirror="hal.drivers.pybullet.mirror:Mirror",
     robot="hal.drivers.pybullet.robot:PyBulletRobot",
     gripper="hal.drivers.pybullet.gripper:PyBulletGripper",
     camera="hal.drivers.pybullet.camera:PyBulletCamera",

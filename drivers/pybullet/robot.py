@@ -115,7 +115,9 @@ class PyBulletRobot(RobotDriver):
         """
         known = {"freeze", "disconnect", "fault"}
         if not set(knobs) <= known:
-            raise CommandError(f"{', '.join(sorted(set(knobs) - known))}: no such fault; faults: freeze, disconnect, fault")
+            raise CommandError(
+                f"{', '.join(sorted(set(knobs) - known))}: no such fault; faults: freeze, disconnect, fault"
+            )
         self._freeze = bool(knobs.get("freeze", self._freeze))
         self._connected = not knobs.get("disconnect", not self._connected)
         if "fault" not in knobs:

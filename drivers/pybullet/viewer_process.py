@@ -70,6 +70,7 @@ def _arrange(world: World) -> None:
         client.configureDebugVisualizer(getattr(client, option), 0)
     bases = [robot.base_position for robot in world.spec.robots]
     x, y, z = (sum(axis) / len(bases) for axis in zip(*bases, strict=True)) if bases else (0.0, 0.0, 0.0)
+    client.configureDebugVisualizer(lightPosition=(x + 1.5, y - 1.5, z + 3.0))
     client.resetDebugVisualizerCamera(
-        cameraDistance=1.9, cameraYaw=60.0, cameraPitch=-28.0, cameraTargetPosition=(x + 0.35, y, z + 0.2)
+        cameraDistance=1.3, cameraYaw=60.0, cameraPitch=-26.0, cameraTargetPosition=(x + 0.3, y, z + 0.25)
     )

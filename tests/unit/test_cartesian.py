@@ -200,3 +200,16 @@ def test_quaternions(
     assert rotate(start, vector) == pytest.approx(list(matrix @ vector), abs=1e-12)
     end = after_rotation(start, turn)
     assert difference([0.0, 0.0, 0.0, *start], [1.0, 2.0, 3.0, *end]) == pytest.approx([1, 2, 3, *turn], abs=1e-7)
+
+
+@pytest.mark.parametrize("values", [[1.5, 0, 0, 0, 0, 0, 0], [0, 1.5, 0, 1.0, 0, 0, 0]])
+def test_an_arm_that_brakes_badly_keeps_the_workspace_too(values: list[float]) -> None:
+    """The slow-down before the faces does not suffice here; the check of where the stop would end must act."""
+    spec = panda(workspace=WorkspaceSpec((0.0, -0.3, 0.2), (0.5, 0.3, 0.7)))
+    bench = Bench(replace(spec, limits=tightened(spec.limits, 0.1, 0.02)))
+    bench.stream(3.0, Kind.JOINT_VELOCITY, values)
+    path = tcp(bench)
+    assert np.abs(path[:, 1]).max() <= 0.3 + 1e-6
+    assert path[:, 0].max() <= 0.5 + 1e-6
+    assert max(abs(path[-1][1]) - 0.3, path[-1][0] - 0.5) == pytest.approx(0.0, abs=1e-3)
+    bench.assert_within_limits()

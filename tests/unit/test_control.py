@@ -124,7 +124,7 @@ def test_a_first_target_far_away_is_refused(rig: hal.Rig, arm: hal.Robot) -> Non
         with pytest.raises(CommandError, match=r"0\.200 rad from the set-point at .*use move_to"):
             control.send(JointTarget(far))
         with pytest.raises(CommandError, match=r"0\.100 m from the set-point, .*use move_to"):
-            control.send(hal.CartesianTarget(hal.Pose(pose.position + [0.1, 0, 0], pose.orientation)))
+            control.send(hal.CartesianTarget(hal.Pose(pose.position + np.array([0.1, 0, 0]), pose.orientation)))
         let_pass(rig, 0.1)
     assert np.array_equal(arm.state().q, arm.home)
 
@@ -231,7 +231,7 @@ def test_one_arm_one_session(arm: hal.Robot) -> None:
 
 
 def test_the_users_exception_is_the_one_that_is_raised(rig: hal.Rig, arm: hal.Robot) -> None:
-    with pytest.raises(ZeroDivisionError), arm.control() as control:  # noqa: PT012
+    with pytest.raises(ZeroDivisionError), arm.control() as control:
         for _ in turns(rig, 10):
             control.send(JointVelocity([0.2] * 7))
         raise ZeroDivisionError

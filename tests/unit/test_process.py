@@ -19,7 +19,7 @@ HERE = Path(__file__).parent
 @pytest.fixture(autouse=True)
 def targets_on_path(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     monkeypatch.syspath_prepend(str(HERE))
-    yield
+    return
 
 
 def start(**config: object) -> Child:

@@ -239,7 +239,6 @@ class TestChoice:
         renderer("gl", scene).close()  # or skip
         chosen = choose_renderer(scene)
         assert "OpenGL on " in chosen.description
-    XXX
         chosen.close()
         chosen.close()
         scene.close()
