@@ -114,6 +114,8 @@ class JointTargetMotion(Motion):
         """Go there directly (True), or follow as a stream."""
         self._still = True
         """Did the target stand still before the newest command?"""
+        self._stream_braking = _braking(smoother, *_STREAM)
+        self._direct_braking = _braking(smoother, *_DIRECT)
 
     def start(self) -> None:
         super().start()
@@ -155,21 +157,20 @@ class JointTargetMotion(Motion):
     def _approach(self, q: list[float], dq: list[float]) -> list[float]:
         """The target's speed, plus what closes the error and can still brake before it is closed."""
         smoother = self.smoother
-        brake, brake_jerk = _DIRECT if self._direct else _STREAM
+        braking = self._direct_braking if self._direct else self._stream_braking
         ahead = 2.0 * smoother.dt
         goal = []
-        for x, v, x_set, v_set, A, J in zip(
-            q, dq, smoother.q, smoother.dq, smoother.acceleration, smoother.jerk, strict=True
-        ):
+        for x, v, x_set, v_set, (A, J, short) in zip(q, dq, smoother.q, smoother.dq, braking, strict=True):
             error = x - x_set
             closing = v_set - v
             if error < 0.0:
                 closing = -closing
             distance = abs(error)
             left = distance - ahead * closing if closing > 0.0 else distance
-            speed = speed_for(left, brake * A, brake_jerk * J)
-            if speed > _GAIN * distance:
-                speed = _GAIN * distance
+            speed = _GAIN * distance
+            # Over a short way speed_for is a cube root; a small error, the usual case, can be judged without it.
+            if not (0.0 < left <= short and speed * speed * speed <= left * left * J):
+                speed = min(speed, speed_for(left, A, J))
             goal.append(v + speed if error > 0.0 else v - speed)
         return goal
 
@@ -203,3 +204,9 @@ _JUMP = 0.05
 _STREAM = (0.8, 0.5)
 _DIRECT = (0.9, 0.7)
 """Shares of acceleration and jerk with which a target's approach brakes."""
+
+
+def _braking(smoother: JointSmoother, share: float, jerk_share: float) -> list[tuple[float, float, float]]:
+    """Per joint: these shares of acceleration and jerk, and the longest way on which a stop keeps below the former."""
+    limits = [(share * a, jerk_share * j) for a, j in zip(smoother.acceleration, smoother.jerk, strict=True)]
+    return [(a, j, a * a * a / (j * j)) for a, j in limits]

@@ -144,5 +144,5 @@ def test_ctrl_c_stops_reports_and_ends(tmp_path: Path) -> None:
 def test_help_names_every_option() -> None:
     done = teleop("--help")
     assert done.returncode == 0
-    for option in "config sim real pad viewer duration speed set report dry-run".split():
+    for option in ["config", "sim", "real", "pad", "viewer", "duration", "speed", "set", "report", "dry-run"]:
         assert f"--{option}" in done.stdout

@@ -1,0 +1,119 @@
+"""A simulation in lock-step, through the public interface: deterministic, and time stands still between waits."""
+
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+
+import hal
+from hal import JointTarget, Pose, Twist
+
+
+@pytest.fixture
+def rig() -> Iterator[hal.Rig]:
+    with hal.open("panda_table", sim=True, clock="lock_step", pad="none") as opened:
+        yield opened
+
+
+def drive(steps: int) -> tuple[bytes, bytes]:
+    """Arm and cube after some steps that touch both, as bytes."""
+    with hal.open("panda_table", sim=True, clock="lock_step", pad="none", overrides=["cameras={}"]) as rig:
+        arm = rig.robots["panda"]
+        start = arm.state().q
+        trace, cube = [], []
+        with arm.control(rate_hz=50) as control:
+            for k, tick in enumerate(rig.clock.rate(50)):
+                control.send(JointTarget(start + 0.2 * np.sin(0.3 * tick.t * np.arange(1, 8))), gripper=(k // 50) % 2)
+                state = arm.state()
+                trace.append(np.concatenate([state.q, state.dq, state.q_set, state.tcp.position]))
+                cube.append(rig.world.pose("cube").position)
+                if k == steps:
+                    break
+        assert np.ptp(np.array(trace)[:, 0]) > 0.1, "it moved"
+        return np.array(trace).tobytes(), np.array(cube).tobytes()
+
+
+def test_two_runs_are_equal_to_the_bit() -> None:
+    assert drive(1000) == drive(1000)
+
+
+def test_time_stands_still_between_waits(rig: hal.Rig) -> None:
+    arm = rig.robots["panda"]
+    before = arm.state()
+    assert arm.state().stamp == before.stamp
+    rig.clock.sleep(0.1)
+    after = arm.state()
+    assert after.stamp.t == pytest.approx(before.stamp.t + 0.1, abs=1 / 240)
+    frame = rig.cameras["scene"].read()
+    assert frame.stamp.t == after.stamp.t, "a frame shows the present"
+
+
+def test_a_frame_shows_what_the_world_knows(rig: hal.Rig) -> None:
+    """The cube's true corner projects onto its picture: pose, K, depth and T_world_camera agree."""
+    rig.clock.sleep(0.5)
+    frame = rig.cameras["scene"].read()
+    top = rig.world.pose("cube").position + [0, 0, 0.03]
+    x, y, z = frame.T_world_camera.inverse().matrix()[:3] @ [*top, 1.0]
+    u, v, _ = frame.K @ [x / z, y / z, 1.0]
+    row, column = round(v + 1.0), round(u)  # just below the top edge
+    assert frame.depth[row, column] == pytest.approx(z, abs=0.03)
+    red, green, blue = (int(value) for value in frame.color[row, column])
+    assert red > green
+    assert blue > green
+
+
+def test_the_arm_pushes_the_cube(rig: hal.Rig) -> None:
+    """Robot and objects share one world: contacts, forces, motion."""
+    arm = rig.robots["panda"]
+    base = Pose([-0.55, 0, 0.6]).inverse()
+    rig.clock.sleep(0.5)  # the cube falls onto the table
+    beside = base @ Pose(rig.world.pose("cube").position + [-0.1, 0, 0.03], [1, 0, 0, 0])
+    arm.gripper.grip(1.0)
+    arm.move_to(beside, speed=0.3)
+    start = rig.world.pose("cube").position
+    with arm.control(rate_hz=50) as control:
+        for tick in rig.clock.rate(50):
+            control.send(Twist([0.1, 0, 0]))
+            if rig.world.contacts("panda", "cube"):
+                touched = tick.t
+                break
+            assert tick.t < 60.0
+        for tick in rig.clock.rate(50):
+            control.send(Twist([0.1, 0, 0]))
+            if tick.t > touched + 0.5:
+                break
+    assert rig.world.pose("cube").position[0] > start[0] + 0.02
+
+
+def test_reset_puts_an_arm_somewhere_and_a_session_goes_on_from_there(rig: hal.Rig) -> None:
+    arm = rig.robots["panda"]
+    q = arm.home.copy()
+    q[0] = 0.7
+    rig.world.reset("panda", q=q)
+    assert arm.state().q == pytest.approx(q, abs=1e-6)
+    assert arm.state().q_set == pytest.approx(q, abs=1e-6)
+    with arm.control() as control:
+        rig.world.reset("panda")
+        control.send(JointTarget(arm.home))
+        rig.clock.sleep(0.05)
+        assert arm.state().q == pytest.approx(arm.home, abs=2e-3)
+
+
+def test_dynamics_are_read_back_and_restored(rig: hal.Rig) -> None:
+    before = rig.world.dynamics("cube")
+    with rig.world.changed_dynamics("cube", lateral_friction=0.05, spinning_friction=0.02, mass=1.0):
+        now = rig.world.dynamics("cube")
+        assert now["lateral_friction"] == pytest.approx(0.05)
+        assert now["spinning_friction"] == pytest.approx(0.02)
+        assert now["mass"] == pytest.approx(1.0)
+    assert rig.world.dynamics("cube") == before
+
+
+def test_a_second_arm_is_only_data() -> None:
+    with hal.open("iiwa_table", sim=True, clock="lock_step", pad="none", overrides=["cameras={}"]) as rig:
+        arm = next(iter(rig.robots.values()))
+        assert arm.spec.model == "iiwa"
+        assert arm.gripper is None
+        goal = arm.home.copy()
+        goal[0] += 0.2
+        assert arm.move_to(goal, speed=0.3).q == pytest.approx(goal, abs=2e-3)

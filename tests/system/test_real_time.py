@@ -1,0 +1,125 @@
+"""A rig in real time: processes that are lost, edits of the world that reach the pictures, faults at run time."""
+
+import itertools
+import os
+import signal
+import time
+from collections.abc import Callable, Iterator
+
+import numpy as np
+import pytest
+
+import hal
+from hal import BodySpec, ConnectionLost, JointVelocity, MotionStopped, Pose, RobotStatus, Trip
+
+pytestmark = pytest.mark.slow
+
+
+@pytest.fixture(scope="module")
+def rig() -> Iterator[hal.Rig]:
+    with hal.open("panda_table", sim=True, clock="real_time", pad="none") as opened:
+        yield opened
+
+
+def wait_for(condition: Callable[[], bool], timeout: float = 10.0) -> None:
+    deadline = time.monotonic() + timeout
+    while not condition():
+        assert time.monotonic() < deadline, "did not happen in time"
+        time.sleep(0.005)
+
+
+def pixels_of(rig: hal.Rig, color: tuple[int, int, int]) -> int:
+    image = rig.cameras["scene"].read(timeout=5.0).color.astype(int)
+    target = np.array(color)
+    hue = image / np.maximum(1, image.max(axis=2, keepdims=True))
+    return int((np.abs(hue - target / target.max()).max(axis=2) < 0.15).sum())
+
+
+def test_edits_of_the_world_are_seen_by_the_cameras(rig: hal.Rig) -> None:
+    green = (0.0, 1.0, 0.0, 1.0)
+    assert pixels_of(rig, (0, 255, 0)) == 0
+    ball = BodySpec("ball", (0.0, 0.0, 0.75), (0, 0, 0, 1), "sphere", radius=0.1, fixed=True, rgba=green)
+    rig.world.add(ball)
+    assert rig.world.bodies[-1] == "ball" or "ball" in rig.world.bodies
+    wait_for(lambda: pixels_of(rig, (0, 255, 0)) > 50)
+    rig.world.set_color("ball", (0.0, 0.0, 1.0, 1.0))
+    wait_for(lambda: pixels_of(rig, (0, 255, 0)) == 0 and pixels_of(rig, (0, 0, 255)) > 50)
+    rig.world.remove("ball")
+    wait_for(lambda: pixels_of(rig, (0, 0, 255)) == 0)
+
+
+def test_poses_and_reset(rig: hal.Rig) -> None:
+    start = rig.world.pose("cube")
+    rig.world.set_pose("cube", Pose([0.1, 0.1, 0.9]))
+    wait_for(lambda: rig.world.pose("cube").position[2] < 0.7)  # it fell onto the table
+    rig.world.reset("cube")
+    assert rig.world.pose("cube").distance(start)[0] < 0.15
+    with pytest.raises(hal.DeviceNotFound, match="cube"):
+        rig.world.pose("cubes")
+
+
+def test_states_and_frames_go_on_and_their_stamps_increase(rig: hal.Rig) -> None:
+    arm, camera = rig.robots["panda"], rig.cameras["wrist"]
+    frames = [camera.read(timeout=5.0) for _ in range(5)]
+    assert all(b.stamp.t > a.stamp.t and b.stamp.seq > a.stamp.seq for a, b in itertools.pairwise(frames))
+    states = []
+    while len(states) < 5:
+        state = arm.state()
+        if not states or state.stamp.seq != states[-1].stamp.seq:
+            states.append(state)
+    assert all(b.stamp.t > a.stamp.t for a, b in itertools.pairwise(states))
+
+
+def test_a_fault_in_motion_is_told_and_recovered(rig: hal.Rig) -> None:
+    arm = rig.robots["panda"]
+    velocity = JointVelocity([0.2, 0, 0, 0, 0, 0, 0])
+    with arm.control() as control:
+        for k, _ in enumerate(rig.clock.rate(50)):
+            control.send(velocity)
+            if k == 15:
+                break
+        assert arm.state().dq_set[0] > 0.1
+        arm.inject(fault="collision")
+        wait_for(lambda: arm.state().status is RobotStatus.FAULT)
+        with pytest.raises(hal.RobotFault, match="collision"):
+            control.send(velocity)
+        arm.recover()
+        wait_for(lambda: control.trip is Trip.FAULT and arm.state().status is RobotStatus.TRIPPED)
+        with pytest.raises(MotionStopped):
+            control.send(velocity)
+        control.rearm()
+        wait_for(lambda: control.trip is Trip.NONE)
+
+
+def test_a_renderer_that_is_killed_takes_only_the_cameras() -> None:
+    with hal.open("panda_table", sim=True, clock="real_time", pad="none") as rig:
+        arm, camera = rig.robots["panda"], rig.cameras["scene"]
+        camera.read(timeout=5.0)
+        os.kill(rig._pictures._child.process.pid, signal.SIGKILL)
+
+        def lost() -> bool:
+            try:
+                camera.latest(max_age=10.0)
+            except ConnectionLost:
+                return True
+            return False
+
+        wait_for(lost)
+        goal = arm.home.copy()
+        goal[0] += 0.05
+        arm.move_to(goal, speed=0.5)
+        assert arm.state().q[0] == pytest.approx(0.05, abs=2e-3)
+
+
+def test_a_host_that_is_killed_is_told_by_the_next_call() -> None:
+    rig = hal.open("panda_table", sim=True, clock="real_time", pad="none", overrides=["cameras={}"])
+    arm = rig.robots["panda"]
+    with pytest.raises(ConnectionLost, match="simulation process ended"), arm.control() as control:
+        for k, _ in enumerate(rig.clock.rate(50)):
+            control.send(JointVelocity([0.1] * 7))
+            if k == 10:
+                os.kill(rig._hosts[0].child.process.pid, signal.SIGKILL)
+            assert k < 200
+    with pytest.raises(ConnectionLost):
+        rig.world.pose("cube")
+    rig.close()
