@@ -114,7 +114,7 @@ class JointSmoother:
 
     def at_rest(self) -> bool:
         """Does nothing move? (1e-6 rad/s, 1e-4 rad/s2: Ruckig's numbers at the end of a profile.)"""
-        return all(-1e-6 < v < 1e-6 and -1e-4 < a < 1e-4 for v, a in zip(self.dq, self.ddq, strict=True))
+        return max(map(abs, self.dq)) < 1e-6 and max(map(abs, self.ddq)) < 1e-4
 
     def follow(self, dq: Floats, guard: Guard | None = None, together: bool = False) -> None:
         """One tick towards the velocities ``dq``, which are cut to the limits.

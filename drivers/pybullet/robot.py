@@ -61,18 +61,8 @@ class PyBulletRobot(RobotDriver):
         if self._freeze and self._frozen is not None:
             return self._frozen
         world = self._world
-        states = self._read(self._body.id, self._joints)
-        reading = Reading(
-            t=now,
-            t_device=world.t,
-            seq=world.steps,
-            q=[state[0] for state in states],
-            dq=[state[1] for state in states],
-            tau=[state[3] for state in states],
-            q_commanded=self._q,
-            dq_commanded=self._dq,
-            fault=self._fault,
-        )
+        q, dq, _, tau = zip(*self._read(self._body.id, self._joints), strict=True)
+        reading = Reading(now, world.t, world.steps, q, dq, tau, self._q, self._dq, None, None, self._fault)
         self._frozen = reading
         return reading
 
