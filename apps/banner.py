@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from hal.plan import Plan
+    from hal.config.plan import Plan
     from hal.rig import Rig
 
 __all__ = ["banner", "listing"]

@@ -59,7 +59,7 @@ def _main(args: argparse.Namespace) -> int:
         check_writable(args.report)
     if args.dry_run:
         from hal.config import load
-        from hal.mapping import load_mapping
+        from hal.config.mapping import load_mapping
 
         plan = load(args.config, sim=args.sim, overrides=args.overrides).resolve()
         load_mapping(args.mapping)

@@ -15,7 +15,7 @@ import numpy as np
 
 import hal
 from hal.histogram import Histogram
-from hal.pacer import Pacer
+from hal.host.pacer import Pacer
 
 
 def bare(rate_hz: float, seconds: float) -> float:

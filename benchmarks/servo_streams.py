@@ -22,11 +22,11 @@ from dataclasses import dataclass, field
 
 from ruckig import InputParameter, Ruckig, Synchronization, Trajectory
 
-from hal.audit import SetpointAudit
 from hal.commands import Kind
 from hal.inbox import NO_INBOX, CommandRecord, Inbox, Session
 from hal.robot import Reading
-from hal.servo import Servo
+from hal.servo.audit import SetpointAudit
+from hal.servo.servo import Servo
 from hal.specs import KinematicsSpec, LimitsSpec, RobotSpec
 
 N = 7

@@ -20,11 +20,11 @@ from dataclasses import replace
 from ruckig import ControlInterface, InputParameter, OutputParameter, Ruckig, Synchronization
 from servo_streams import PANDA, robot_spec
 
-from hal.audit import SetpointAudit
 from hal.commands import Kind
 from hal.inbox import NO_INBOX, CommandRecord, Inbox, Session
 from hal.robot import Reading
-from hal.servo import Servo
+from hal.servo.audit import SetpointAudit
+from hal.servo.servo import Servo
 from hal.specs import RobotSpec, WorkspaceSpec
 
 RATE_HZ = 1000.0

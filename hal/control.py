@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from .deadman import Deadman
-    from .records import ServoRecord
+    from .host.records import ServoRecord
     from .robot import Robot
 
 __all__ = ["FIRST_STEP_ANGLE", "FIRST_STEP_DISTANCE", "Control", "StopLatch", "move_to"]
@@ -247,11 +247,11 @@ class Control:
             raise CommandError(f"{type(command).__name__} is no command")
         if isinstance(command, JointTarget):
             limits = robot.limits
-            clipped = np.clip(command.q, limits.lower, limits.upper)
-            if not np.array_equal(clipped, command.q):
-                over = [robot.joints[k] for k in np.flatnonzero(clipped != command.q)]
+            wanted = zip(limits.lower, command.q.tolist(), limits.upper, robot.joints, strict=True)
+            over = [name for low, x, high, name in wanted if not low <= x <= high]
+            if over:
                 reasons.append(f"position limit of {', '.join(over)}")
-                return JointTarget(clipped, command.dq)
+                return JointTarget(np.clip(command.q, limits.lower, limits.upper), command.dq)
         return command
 
     def _check_first(self, command: Command, servo: ServoRecord) -> None:

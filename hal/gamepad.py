@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, ClassVar, NamedTuple
 
 from .deadman import Deadman
 from .errors import DeviceNotFound
-from .neutral import NeutralGate
-from .padcontrols import HeldControl, without_dead_zone
+from .pads.controls import HeldControl, without_dead_zone
+from .pads.neutral import NeutralGate
 from .types import AXES, BUTTONS, PadState, Stamp
 
 if TYPE_CHECKING:

@@ -11,7 +11,7 @@ from .types import GripperState
 
 if TYPE_CHECKING:
     from .clock import Clock
-    from .host import Host
+    from .host.hosts import Host
     from .specs import GripperSpec
 
 __all__ = ["Gripper", "GripperDriver", "GripperReading"]

@@ -7,7 +7,6 @@ at zero. Continuous joints are treated as revolute joints without an end, so tha
 from __future__ import annotations
 
 import difflib
-import math
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Sequence
 from pathlib import Path
@@ -18,6 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from .errors import CommandError
 from .pose import Pose
+from .quaternion import difference
 
 if TYPE_CHECKING:
     from .specs import KinematicsSpec
@@ -156,7 +156,7 @@ class Kinematics:
         Linear part: the difference of the positions, m. Angular part: the rotation vector (the logarithm) of the
         rotation between them, rad, never longer than pi.
         """
-        return np.array(_difference(self.fk(q), pose))
+        return np.array(difference(self.fk(q), [float(value) for value in pose]))
 
     def solve(
         self,
@@ -180,28 +180,34 @@ class Kinematics:
             raise CommandError(f"q_seed must be {self.n} finite numbers, not {np.asarray(q_seed).tolist()}")
         return solve(self, pose, seed, position_tolerance, rotation_tolerance, starts)
 
+    def reach(self) -> tuple[float, ...]:
+        """Per joint, a speed of the tcp (m/s) that 1 rad/s (or 1 m/s) of it never exceeds, wherever the arm is.
+
+        The way from a joint's axis to the tcp along the links is at least as long as any lever arm. The numbers do not
+        grow from base to tip, and bound the change of the Jacobian as well: turning joint j by x rad turns or shifts
+        every column of the linear part by at most ``reach[j] * x``.
+        """
+        model = self._model
+        frame = model.frames[self._tcp]
+        joint, distance, least = int(frame.parentJoint), float(np.linalg.norm(frame.placement.translation)), 0.0
+        reach = dict.fromkeys(self.spec.joints, 0.0)
+        while joint > 0:
+            name = str(model.names[joint])
+            if "JointModelP" in model.joints[joint].shortname():  # it slides: 1 m/m, and it makes the way longer
+                least = 1.0
+                k = self.spec.joints.index(name)
+                distance += max(abs(self.spec.lower[k]), abs(self.spec.upper[k]))
+            reach[name] = max(distance, least)
+            distance += float(np.linalg.norm(model.jointPlacements[joint].translation))
+            joint = int(model.parents[joint])
+        return tuple(reach[name] for name in self.spec.joints)
+
     def _ordered(self, q: Sequence[float] | Array) -> Array:
         values = np.array(q, float)
         return values if self._inverse_columns is None else values[self._inverse_columns]
 
     def _forward(self, q: Sequence[float] | Array) -> None:
         self._pin.forwardKinematics(self._model, self._data, self._ordered(q))
-
-
-def _difference(start: Sequence[float], end: Sequence[float] | Array) -> tuple[float, ...]:
-    """Linear and angular difference of two poses of seven numbers; see :meth:`Kinematics.pose_error`."""
-    x1, y1, z1, ax, ay, az, aw = start
-    x2, y2, z2, bx, by, bz, bw = (float(value) for value in end)
-    # Quaternion of the rotation from start to end along the base's axes: end * conjugate(start).
-    w = bw * aw + bx * ax + by * ay + bz * az
-    x = -bw * ax + bx * aw - by * az + bz * ay
-    y = -bw * ay + bx * az + by * aw - bz * ax
-    z = -bw * az - bx * ay + by * ax + bz * aw
-    sine = math.sqrt(x * x + y * y + z * z)
-    if w < 0.0:  # the shorter way round
-        w, x, y, z = -w, -x, -y, -z
-    scale = 2.0 * math.atan2(sine, w) / sine if sine > 1e-12 else 2.0
-    return x2 - x1, y2 - y1, z2 - z1, scale * x, scale * y, scale * z
 
 
 def _reduced_model(spec: KinematicsSpec, pin: Any) -> Any:

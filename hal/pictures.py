@@ -6,7 +6,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from typing import Any
 
-from .host import Host
+from .host.hosts import Host
 from .specs import CameraSpec
 
 __all__ = ["Pictures", "Shown", "Viewer"]

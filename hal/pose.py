@@ -91,6 +91,14 @@ class Pose:
         object.__setattr__(self, "orientation", frozen(q / norm))
 
     @classmethod
+    def trusted(cls, position: Array, orientation: Array) -> Pose:
+        """From read-only arrays (3,) and (4,) that are known to be finite and normalised; nothing is checked."""
+        pose = cls.__new__(cls)
+        object.__setattr__(pose, "position", position)
+        object.__setattr__(pose, "orientation", orientation)
+        return pose
+
+    @classmethod
     def from_matrix(cls, matrix: ArrayLike) -> Pose:
         """From a homogeneous matrix (4, 4)."""
         m = np.asarray(matrix, float)

@@ -17,15 +17,15 @@ from .clock import Clock, LockStepClock, RealClock
 from .control import StopLatch
 from .errors import DeviceNotFound, HalError, NotSupported
 from .gamepad import Gamepad
-from .host import Host, LocalHost, RemoteHost
-from .pads import choose_pad
+from .host.hosts import Host, LocalHost, RemoteHost
+from .pads.choice import choose_pad
 from .robot import Robot
 from .specs import GroupSpec
 from .world import NoWorld, World
 
 if TYPE_CHECKING:
+    from .config.plan import Plan
     from .pictures import Pictures, Viewer
-    from .plan import Plan
 
 __all__ = ["Devices", "Rig", "open_rig"]
 

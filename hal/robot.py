@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from .control import Control, StopLatch
     from .deadman import Deadman
     from .gripper import Gripper
-    from .host import Host
+    from .host.hosts import Host
     from .kinematics import Kinematics
     from .specs import LimitsSpec, RobotSpec
 
@@ -52,7 +52,10 @@ class Reading(NamedTuple):
 
 
 class Setpoint(NamedTuple):
-    """What the servo writes to a driver once per cycle; every value lies inside the limits, continuously."""
+    """What the servo writes to a driver once per cycle; every value lies inside the limits, continuously.
+
+    A driver may keep the numbers, and report them as ``q_commanded``, but must not change them.
+    """
 
     q: Floats
     """rad"""

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from .commands import Twist
+from .config.mapping import AxisMapping, TeleopMapping, load_mapping
 from .errors import CommandError
-from .mapping import AxisMapping, TeleopMapping, load_mapping
 from .types import PadState
 
 if TYPE_CHECKING:

@@ -7,9 +7,9 @@ import math
 import select
 import time
 
-from hal.padcodes import BUS_USB, EV_SYN, SYN_DROPPED, SYN_REPORT
-from hal.padmapper import PadMapper
-from hal.padmodel import MatchRule, PadModel
+from hal.pads.codes import BUS_USB, EV_SYN, SYN_DROPPED, SYN_REPORT
+from hal.pads.mapper import PadMapper
+from hal.pads.model import MatchRule, PadModel
 
 from .node import Node
 from .system import NodeInfo

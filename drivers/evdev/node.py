@@ -9,8 +9,8 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple, Protocol
 
 from hal.errors import DriverMissing
-from hal.padcodes import EV_ABS, EV_KEY
-from hal.padmapper import AxisRange
+from hal.pads.codes import EV_ABS, EV_KEY
+from hal.pads.mapper import AxisRange
 
 __all__ = ["Event", "EvdevNode", "Node", "evdev_module"]
 

@@ -13,8 +13,8 @@ from pydantic import BaseModel, ConfigDict
 
 from hal.errors import NotSupported
 from hal.gamepad import GamepadDriver, PadReading, Plugged
-from hal.padguess import guess_model, guess_warning
-from hal.padmodel import choose_model, pad_model, validated
+from hal.pads.guess import guess_model, guess_warning
+from hal.pads.model import choose_model, pad_model, validated
 from hal.specs import PadSpec
 from hal.types import AXES
 

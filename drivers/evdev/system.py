@@ -7,8 +7,8 @@ import struct
 from pathlib import Path
 from typing import NamedTuple, Protocol
 
-from hal.padcodes import ABS, KEY
-from hal.padmodel import Identity
+from hal.pads.codes import ABS, KEY
+from hal.pads.model import Identity
 
 from .node import EvdevNode, Node
 

@@ -16,8 +16,8 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from hal.errors import ConfigError, HalError, Problem
-from hal.padcodes import ABS_NAME, EV_ABS, EV_KEY, KEY_NAME
-from hal.padmapper import AxisRange
+from hal.pads.codes import ABS_NAME, EV_ABS, EV_KEY, KEY_NAME
+from hal.pads.mapper import AxisRange
 
 from .recording import RecordedEvent, Recording, dump
 

@@ -12,8 +12,8 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from hal.errors import ConfigError, Problem
 from hal.gamepad import GamepadDriver, PadReading
-from hal.padmapper import PadMapper
-from hal.padmodel import PadModel, pad_model, validated
+from hal.pads.mapper import PadMapper
+from hal.pads.model import PadModel, pad_model, validated
 from hal.specs import PadSpec
 
 from .recording import Recording, load

@@ -18,8 +18,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from hal.errors import ConfigError, Problem
-from hal.padcodes import ABS, ABS_NAME, EV_ABS, EV_KEY, KEY, KEY_NAME
-from hal.padmapper import AxisRange
+from hal.pads.codes import ABS, ABS_NAME, EV_ABS, EV_KEY, KEY, KEY_NAME
+from hal.pads.mapper import AxisRange
 
 __all__ = ["RecordedEvent", "Recording", "dump", "load"]
 

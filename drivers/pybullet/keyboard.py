@@ -7,7 +7,7 @@ from typing import ClassVar, NamedTuple
 
 from hal.errors import ConnectionLost, NotSupported
 from hal.gamepad import GamepadDriver, PadReading
-from hal.mailbox import Mailbox
+from hal.host.mailbox import Mailbox
 
 __all__ = [
     "AXIS_KEYS",

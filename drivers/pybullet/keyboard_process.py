@@ -10,8 +10,8 @@ from contextlib import suppress
 from typing import Any
 
 from hal.errors import ConnectionLost
-from hal.mailbox import Mailbox
-from hal.process import Channel, SharedMemory
+from hal.host.mailbox import Mailbox
+from hal.host.process import Channel, SharedMemory
 
 from .keyboard import KEYS, LAYOUT, KeyboardRecord, grip
 from .viewer_process import HEARTBEAT

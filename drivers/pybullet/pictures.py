@@ -6,9 +6,9 @@ from collections.abc import Sequence
 from typing import Any
 
 from hal.errors import NotSupported
-from hal.host import SNAPSHOT_CAPACITY, Host, LocalHost, RemoteHost
+from hal.host.hosts import SNAPSHOT_CAPACITY, Host, LocalHost, RemoteHost
+from hal.host.process import Child, SharedMemory
 from hal.pictures import Pictures
-from hal.process import Child, SharedMemory
 from hal.specs import CameraSpec, to_json
 
 from .camera import DirectSource, FrameSource, SharedSource

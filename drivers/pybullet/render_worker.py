@@ -13,8 +13,8 @@ from collections.abc import Sequence
 from typing import Any
 
 from hal.errors import ConnectionLost
-from hal.mailbox import SeriesBox
-from hal.process import Channel, SharedMemory
+from hal.host.mailbox import SeriesBox
+from hal.host.process import Channel, SharedMemory
 from hal.specs import CameraSpec, WorldSpec, from_json
 
 from .camera import check_view, draw

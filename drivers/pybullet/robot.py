@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, ClassVar
 
 from hal.errors import CommandError, ConnectionLost
@@ -36,8 +37,8 @@ class PyBulletRobot(RobotDriver):
         self._frozen: Reading | None = None
         self._freeze = False
         self._fault: Fault | None = None
-        self._q: list[float] | None = None
-        self._dq: list[float] | None = None
+        self._q: Sequence[float] | None = None
+        self._dq: Sequence[float] | None = None
 
     def open(self) -> None:
         """Find the robot in the world."""
@@ -72,7 +73,7 @@ class PyBulletRobot(RobotDriver):
             raise ConnectionLost(f"{self.spec.name} does not answer (injected)")
         if self._fault is not None:
             return
-        q, dq = list(setpoint.q), list(setpoint.dq)
+        q, dq = setpoint.q, setpoint.dq
         dt = self._world.dt
         self._write(
             self._body.id,

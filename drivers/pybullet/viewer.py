@@ -8,10 +8,10 @@ from contextlib import suppress
 from typing import Any
 
 from hal.errors import ConnectionLost, NotSupported
-from hal.host import SNAPSHOT_CAPACITY, Host, LocalHost, RemoteHost
-from hal.mailbox import Mailbox, SeriesBox
+from hal.host.hosts import SNAPSHOT_CAPACITY, Host, LocalHost, RemoteHost
+from hal.host.mailbox import Mailbox, SeriesBox
+from hal.host.process import Child, SharedMemory
 from hal.pictures import Viewer
-from hal.process import Child, SharedMemory
 from hal.specs import to_json
 
 from .keyboard import LAYOUT, KeyboardSource

@@ -12,8 +12,8 @@ from collections.abc import Sequence
 from typing import Any
 
 from hal.errors import ConnectionLost, NotSupported
-from hal.mailbox import Mailbox, SeriesBox
-from hal.process import Channel, SharedMemory
+from hal.host.mailbox import Mailbox, SeriesBox
+from hal.host.process import Channel, SharedMemory
 from hal.specs import WorldSpec, from_json
 
 from .mirror import Mirror

@@ -20,8 +20,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from hal.process import SharedMemory
-from hal.records import GroupMemory, ServoRecord
+from hal.host.process import SharedMemory
+from hal.host.records import GroupMemory, ServoRecord
 
 APP = """
 import json, os, sys, time

@@ -4,7 +4,7 @@ import os
 import time
 
 from hal.errors import ConfigError, ConnectionLost, Problem
-from hal.process import pack_error
+from hal.host.process import pack_error
 
 
 def echo(channel, memories, config):

@@ -11,11 +11,11 @@ from typing import Any
 
 from specs import panda
 
-from hal.audit import SetpointAudit
 from hal.commands import Kind
 from hal.inbox import CommandRecord, DeadmanRecord, Inbox, Session
 from hal.robot import Reading, Setpoint
-from hal.servo import Servo
+from hal.servo.audit import SetpointAudit
+from hal.servo.servo import Servo
 from hal.specs import LimitsSpec, RobotSpec
 from hal.types import Fault, Limited, RobotStatus, Trip
 

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 from servo_kit import STILL, Bench, N
 
-from hal.audit import SetpointAudit
+from hal.servo.audit import SetpointAudit
 from hal.types import Fault, Limited, RobotStatus
 
 

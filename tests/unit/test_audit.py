@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from hal.audit import SetpointAudit
+from hal.servo.audit import SetpointAudit
 from hal.specs import LimitsSpec
 
 LIMITS = LimitsSpec((-1.0, 0.0), (1.0, 4.0), (2.0, 1.0), (10.0, 5.0), (100.0, 50.0))

@@ -12,10 +12,10 @@ import pytest
 import yaml
 
 from hal.config import load
-from hal.data_files import find_data, list_data
+from hal.config.data_files import find_data, list_data
+from hal.config.intrinsics import centre_crop
+from hal.config.plan import Plan
 from hal.errors import ConfigError
-from hal.intrinsics import centre_crop
-from hal.plan import Plan
 from hal.pose import Pose
 from hal.specs import WorldSpec, from_json, to_json
 

@@ -11,7 +11,7 @@ import pytest
 import yaml
 
 from hal.config import load
-from hal.data_files import find_data
+from hal.config.data_files import find_data
 from hal.errors import ConfigError, Problem
 
 ROBOT = {"model": "panda"}

@@ -21,7 +21,7 @@ from hal import (
     Trip,
     Twist,
 )
-from hal.audit import SetpointAudit
+from hal.servo.audit import SetpointAudit
 
 
 @pytest.fixture

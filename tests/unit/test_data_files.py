@@ -10,8 +10,8 @@ from pathlib import Path
 
 import pytest
 
-import hal.data_files
-from hal.data_files import data_folder, find_data, is_path, list_data
+import hal.config.data_files
+from hal.config.data_files import data_folder, find_data, is_path, list_data
 
 
 def test_finds_what_comes_with_the_hal() -> None:
@@ -46,8 +46,10 @@ def test_an_installed_copy_finds_its_own_data(tmp_path: Path) -> None:
     package = tmp_path / "site" / "hal"
     (package / "data" / "robots").mkdir(parents=True)
     (package / "data" / "robots" / "only_here.yaml").write_text("x: 1")
-    shutil.copy(hal.data_files.__file__, package / "data_files.py")
-    spec = importlib.util.spec_from_file_location("installed_data_files", package / "data_files.py")
+    (package / "config").mkdir()
+    copy = package / "config" / "data_files.py"
+    shutil.copy(hal.config.data_files.__file__, copy)
+    spec = importlib.util.spec_from_file_location("installed_data_files", copy)
     assert spec is not None
     assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)

@@ -19,7 +19,7 @@ import yaml
 
 from hal.errors import ConfigError, DriverMissing, NotSupported
 from hal.gamepad import Gamepad, PadReading
-from hal.padcodes import (
+from hal.pads.codes import (
     ABS,
     BUS_BLUETOOTH,
     BUS_USB,
@@ -31,8 +31,8 @@ from hal.padcodes import (
     SYN_DROPPED,
     SYN_REPORT,
 )
-from hal.padmapper import AxisRange
-from hal.padmodel import Identity
+from hal.pads.mapper import AxisRange
+from hal.pads.model import Identity
 from hal.specs import PadSpec
 
 if sys.platform != "linux":

@@ -5,8 +5,8 @@ import threading
 
 import pytest
 
-from hal.mailbox import Mailbox, SeriesBox
-from hal.process import SharedMemory
+from hal.host.mailbox import Mailbox, SeriesBox
+from hal.host.process import SharedMemory
 
 
 def pair(layout: str) -> tuple[Mailbox, Mailbox, bytearray]:

@@ -7,8 +7,8 @@ from typing import Any
 
 import pytest
 
+from hal.config.mapping import TeleopMapping, load_mapping
 from hal.errors import ConfigError
-from hal.mapping import TeleopMapping, load_mapping
 from hal.types import PadState, Stamp
 
 STAMP = Stamp(0.0, 0.0, 1)

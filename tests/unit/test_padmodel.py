@@ -9,10 +9,10 @@ import pytest
 import yaml
 
 from hal.errors import ConfigError
-from hal.padcodes import ABS, BUS_BLUETOOTH, BUS_USB, EV_ABS, EV_KEY, EV_MSC, KEY
-from hal.padguess import guess_model, guess_warning
-from hal.padmapper import AxisRange, PadMapper
-from hal.padmodel import Identity, PadModel, choose_model, pad_model
+from hal.pads.codes import ABS, BUS_BLUETOOTH, BUS_USB, EV_ABS, EV_KEY, EV_MSC, KEY
+from hal.pads.guess import guess_model, guess_warning
+from hal.pads.mapper import AxisRange, PadMapper
+from hal.pads.model import Identity, PadModel, choose_model, pad_model
 from hal.types import AXES, BUTTONS
 
 FOLDER = Path(__file__).parents[2] / "sensors" / "gamepads"

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from hal.errors import ConfigError, ConnectionLost
-from hal.process import Child, SharedMemory
+from hal.host.process import Child, SharedMemory
 
 HERE = Path(__file__).parent
 
@@ -94,7 +94,7 @@ def test_requests_from_many_threads_get_their_own_answers() -> None:
 PROGRAM = """
 import sys
 sys.path.insert(0, {here!r})
-from hal.process import Child
+from hal.host.process import Child
 child = Child("echo", "child_targets:echo", {{}})
 child.wait_ready(20.0)
 assert child.request("say", {{"a": 1}}) == {{"a": 1}}

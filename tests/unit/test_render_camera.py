@@ -18,7 +18,7 @@ from hal.drivers.pybullet.rendering import choose_renderer
 from hal.drivers.pybullet.tiny import TinyRenderer
 from hal.drivers.pybullet.world import World
 from hal.errors import ConfigError, ConnectionLost, DriverMissing, NotSupported
-from hal.mailbox import SeriesBox
+from hal.host.mailbox import SeriesBox
 from hal.specs import BodySpec, ViewSpec, to_json
 
 STILL = (0.0, 0.0, 0.0, 1.0)

@@ -15,7 +15,7 @@ from hal.camera import RawFrame
 from hal.drivers.pybullet.camera import PyBulletCamera
 from hal.drivers.pybullet.pictures import PyBulletPictures
 from hal.errors import ConnectionLost
-from hal.host import RemoteHost
+from hal.host.hosts import RemoteHost
 from hal.specs import GroupSpec, ViewSpec
 
 ABOVE = look_at((0.0, 0.0, 1.2), (0.0, 0.0, 0.0), (1.0, 0.0, 0.0))

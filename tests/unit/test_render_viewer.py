@@ -20,8 +20,8 @@ from hal.drivers.pybullet.viewer import PyBulletViewer
 from hal.drivers.pybullet.x11 import windows
 from hal.errors import ConnectionLost, NotSupported
 from hal.gamepad import PadReading
-from hal.host import LocalHost
-from hal.mailbox import Mailbox
+from hal.host.hosts import LocalHost
+from hal.host.mailbox import Mailbox
 from hal.specs import BodySpec, GroupSpec, PadSpec, to_json
 
 PAD = PadSpec("pad", "pybullet", None)

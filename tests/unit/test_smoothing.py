@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 from ruckig import RuckigError
 from servo_kit import tightened
 
-from hal.audit import SetpointAudit
-from hal.smoothing import JointSmoother
+from hal.servo.audit import SetpointAudit
+from hal.servo.smoothing import JointSmoother
 from hal.specs import LimitsSpec
 
 LIMITS = LimitsSpec((-1.0, -2.0), (1.0, 0.5), (2.0, 1.0), (10.0, 5.0), (1000.0, 100.0))

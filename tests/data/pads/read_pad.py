@@ -19,7 +19,7 @@ import yaml
 from hal.drivers.evdev.node import EvdevNode, Event
 from hal.drivers.evdev.pad import EvdevPad
 from hal.drivers.evdev.system import LinuxInput
-from hal.padcodes import EV_SYN
+from hal.pads.codes import EV_SYN
 from hal.specs import PadSpec
 
 

@@ -1,0 +1,45 @@
+"""Where the data that come with the hal are: robot and sensor models, rigs, objects, mappings.
+
+They are found by path. In a checkout the folders ``robots/``, ``sensors/`` and ``config/`` stand beside ``hal/``;
+in an installed wheel they are in ``hal/data/``. Nothing of the user's is looked at, so no folder of theirs can shadow
+ours.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+__all__ = ["FOLDERS", "data_folder", "find_data", "is_path", "list_data"]
+
+FOLDERS = ("robots", "sensors", "config")
+
+
+def data_folder(name: str) -> Path:
+    """The folder ``robots``, ``sensors`` or ``config``. LookupError for another name."""
+    if name not in FOLDERS:
+        raise LookupError(f"there is no data folder {name!r}; folders: {', '.join(FOLDERS)}")
+    package = Path(__file__).resolve().parents[1]
+    installed = package / "data" / name
+    return installed if installed.is_dir() else package.parent / name
+
+
+def find_data(folder: str, *parts: str) -> Path:
+    """Path of a data file, for example ``find_data("robots", "panda.yaml")``.
+
+    Raises FileNotFoundError, which lists what there is.
+    """
+    path = data_folder(folder).joinpath(*parts)
+    if not path.is_file():
+        there = ", ".join(list_data(folder, *parts[:-1])) or "none"
+        raise FileNotFoundError(f"{'/'.join((folder, *parts))} does not come with the hal; there are: {there}")
+    return path
+
+
+def list_data(folder: str, *parts: str) -> tuple[str, ...]:
+    """Names of the YAML files in a data folder, without their ending, in alphabetical order."""
+    return tuple(sorted(path.stem for path in data_folder(folder).joinpath(*parts).glob("*.yaml")))
+
+
+def is_path(name: str) -> bool:
+    """Does ``name`` mean a file of the user's, rather than the name of something that comes with the hal?"""
+    return "/" in name or "\\" in name or name.endswith((".yaml", ".yml"))

@@ -1,0 +1,113 @@
+"""A rig's configuration: read, checked as a whole, and resolved into a plan.
+
+One :class:`~hal.errors.ConfigError` tells everything that is wrong in the rig's file, the models and objects that it
+names, their URDFs and the caller's overrides.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from pydantic import PrivateAttr, ValidationError
+
+from .data_files import data_folder, is_path, list_data
+from .files import Problems, explain, nearest, read_yaml
+from .overrides import apply_overrides
+from .plan import Plan
+from .resolve import Context, resolve
+from .rigfile import RigFile
+
+__all__ = ["RigConfig", "load"]
+
+DEVICES = ("robots", "cameras", "gamepads")
+CLOCKS = ("real_time", "lock_step")
+
+
+class RigConfig(RigFile):
+    """A rig's file, checked. :meth:`resolve` gives what is opened."""
+
+    _plan: Plan = PrivateAttr()
+
+    def resolve(self) -> Plan:
+        """Every device with its driver."""
+        return self._plan
+
+
+def load(
+    config: str | Path | Mapping[str, Any],
+    *,
+    sim: bool | None = None,
+    driver: str | None = None,
+    clock: str | None = None,
+    overrides: Sequence[str] | Mapping[str, Any] = (),
+) -> RigConfig:
+    """Read a rig: a file (its path has a slash or ends in .yaml), the name of a built-in one, or a dict.
+
+    ``sim=True`` makes every arm, gripper and camera simulated, whatever its own flag; ``sim=False`` sets the rig's
+    flag and leaves each device its own; None leaves all of them. ``driver`` replaces every driver (``"mock"``), and
+    then lock-step is the default clock. ``overrides`` are ``"KEY=VALUE"`` with the value in YAML, or a mapping.
+    Paths in a dict are relative to the working directory.
+
+    Raises ConfigError with every problem.
+    """
+    problems = Problems()
+    _check_arguments(sim, driver, clock, problems)
+    data, source, base = _read(config, problems)
+    if data is None:
+        problems.raise_any()
+        raise AssertionError("no data and no problem")
+    data = apply_overrides(data, overrides, problems)
+    rig, broken = _validate(data, source, problems)
+    context = Context(source, base, rig, sim, driver, clock, broken, problems)
+    plan = resolve(context)
+    problems.raise_any()
+    rig._plan = plan
+    return rig
+
+
+def _check_arguments(sim: object, driver: str | None, clock: str | None, problems: Problems) -> None:
+    if sim is not None and not isinstance(sim, bool):
+        problems.add("<arguments>", "sim", f"must be true, false or nothing, not {sim!r}")
+    if clock is not None and clock not in CLOCKS:
+        problems.add("<arguments>", "clock", f"{clock!r} is not possible{nearest(clock, CLOCKS)}")
+    if driver is not None and driver != "mock":
+        problems.add("<arguments>", "driver", f"only 'mock' can stand in for every device, not {driver!r}")
+
+
+def _read(config: str | Path | Mapping[str, Any], problems: Problems) -> tuple[dict[str, Any] | None, str, Path]:
+    if isinstance(config, Mapping):
+        return dict(config), "<dict>", Path.cwd()
+    name = str(config)
+    if isinstance(config, Path) or is_path(name):
+        path = Path(config).expanduser().resolve()
+        return read_yaml(path, problems), str(path), path.parent
+    rigs = list_data("config")
+    if name not in rigs:
+        problems.add("<arguments>", "config", f"there is no rig {name!r}{nearest(name, rigs)}, or a path to your own")
+        return None, name, Path.cwd()
+    path = data_folder("config") / f"{name}.yaml"
+    return read_yaml(path, problems), str(path), path.parent
+
+
+def _validate(data: dict[str, Any], source: str, problems: Problems) -> tuple[RigConfig, set[str]]:
+    """The rig without what is wrong in it, so that the rest can be checked too; and the devices left out."""
+    broken: set[str] = set()
+    for _ in range(10):  # each round takes out what the last one found; two are enough for any one mistake
+        try:
+            return RigConfig.model_validate(data), broken
+        except ValidationError as error:
+            for key, message in explain(RigConfig, error):
+                problems.add(source, key, message)
+            for found in error.errors(include_url=False, include_context=False, include_input=False):
+                data = _without(data, found["loc"], broken)
+    return RigConfig(), broken
+
+
+def _without(data: dict[str, Any], loc: tuple[int | str, ...], broken: set[str]) -> dict[str, Any]:
+    section = loc[0] if loc else None
+    if len(loc) > 1 and section in DEVICES and isinstance(data.get(section), Mapping):
+        broken.add(f"{section}.{loc[1]}")
+        return {**data, section: {k: v for k, v in data[section].items() if k != loc[1]}}
+    return {key: value for key, value in data.items() if key != section}

@@ -1,0 +1,222 @@
+"""Robot and camera models: what is the same for every one of its kind. YAML files in ``robots/`` and ``sensors/``.
+
+A model of your own is a file of the same shape; a rig names it by its path.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from pydantic import Field, model_validator
+
+from .data_files import data_folder, is_path, list_data
+from .files import Problems, nearest, read_yaml
+from .schema import (
+    Flag,
+    Name,
+    Numbers,
+    PerJoint,
+    Pixels,
+    PoseConfig,
+    Positive,
+    QuaternionConfig,
+    Strict,
+    Vector,
+)
+
+__all__ = [
+    "CameraModel",
+    "Drivers",
+    "FieldOfView",
+    "GripperModel",
+    "Mode",
+    "PoseConfig",
+    "RobotModel",
+    "UrdfSource",
+    "find_model",
+    "load_pad_models",
+]
+
+
+class Drivers(Strict):
+    """Which driver does the work, in simulation and for real; None where there is none."""
+
+    sim: str | None = None
+    real: str | None = None
+
+
+class UrdfSource(Strict):
+    """A URDF: a path relative to the file that names it, or a path inside an installed Python package."""
+
+    path: str
+    package: str | None = None
+
+    @model_validator(mode="before")
+    @classmethod
+    def _plain_path(cls, data: Any) -> Any:
+        return {"path": data} if isinstance(data, str) else data
+
+
+class LimitsModel(Strict):
+    """Per joint, or one number for all: rad, rad/s, rad/s2, rad/s3, Nm (m and N for joints that slide).
+
+    Position, speed and torque come from the URDF where they are left out; acceleration and jerk must be given.
+    """
+
+    lower: PerJoint | None = None
+    upper: PerJoint | None = None
+    velocity: PerJoint | None = None
+    acceleration: PerJoint | None = None
+    jerk: PerJoint | None = None
+    torque: PerJoint | None = None
+
+
+class TcpModel(Strict):
+    """The tool centre point in the frame of a link."""
+
+    link: str
+    position: Vector = (0.0, 0.0, 0.0)
+    orientation: QuaternionConfig = (0.0, 0.0, 0.0, 1.0)
+
+
+class GripperModel(Strict):
+    """A parallel gripper: fingers that move together, each half the width."""
+
+    joints: tuple[str, ...] = ()
+    drivers: Drivers = Drivers()
+    width_max: Positive
+    """m"""
+    speed: Positive
+    """Of the width, m/s."""
+    force: Positive
+    """N"""
+    real: dict[str, Any] = Field(default_factory=dict)
+    simulated: dict[str, Any] = Field(default_factory=dict)
+
+
+class RobotModel(Strict):
+    """An arm, and its gripper if it has one."""
+
+    description: str = ""
+    urdf: UrdfSource
+    drivers: Drivers = Drivers()
+    rate_hz: Positive = 1000.0
+    """Of the real arm's control cycle. A simulated one runs at the rig's ``physics_hz``."""
+    joints: tuple[Name, ...] = Field(min_length=1)
+    """Of the arm, from base to tip; the fingers are the gripper's."""
+    base_link: str | None = None
+    """The URDF's root when left out."""
+    tcp: TcpModel
+    home: Numbers
+    """rad"""
+    limits: LimitsModel = LimitsModel()
+    gripper: GripperModel | None = None
+    real: dict[str, Any] = Field(default_factory=dict)
+    """What only the real driver needs; a rig adds to it."""
+    simulated: dict[str, Any] = Field(default_factory=dict)
+
+
+class Mode(Strict):
+    """A size of picture and the rates that it comes at."""
+
+    width: Pixels
+    height: Pixels
+    rates_hz: tuple[Positive, ...] = Field(min_length=1)
+    depth_min: Positive | None = None
+    """Nearest depth in this mode, m; the model's when left out."""
+
+    def __str__(self) -> str:
+        return f"{self.width}x{self.height} at {', '.join(f'{rate:g}' for rate in self.rates_hz)} Hz"
+
+
+class FieldOfView(Strict):
+    """Angles of view of the whole sensor, from edge to edge of its outermost pixels, deg.
+
+    ``width`` and ``height`` are those of the picture that shows the whole sensor; a mode of another shape is its
+    centre. Left out, every mode shows the same angles. One angle alone means square pixels.
+    """
+
+    horizontal_deg: float | None = Field(default=None, gt=0.0, lt=180.0, strict=True)
+    vertical_deg: float | None = Field(default=None, gt=0.0, lt=180.0, strict=True)
+    width: Pixels | None = None
+    height: Pixels | None = None
+
+    @model_validator(mode="after")
+    def _complete(self) -> FieldOfView:
+        if self.horizontal_deg is None and self.vertical_deg is None:
+            raise ValueError("needs horizontal_deg, vertical_deg or both")
+        if (self.width is None) != (self.height is None):
+            raise ValueError("needs width and height of the whole sensor's picture, or neither")
+        return self
+
+
+class Depth(Strict):
+    """What can be measured, m."""
+
+    min: Positive
+    max: Positive
+
+    @model_validator(mode="after")
+    def _ordered(self) -> Depth:
+        if self.min >= self.max:
+            raise ValueError(f"min must be less than max, not {self.min:g} and {self.max:g}")
+        return self
+
+
+class Capture(Strict):
+    """What a camera takes."""
+
+    width: Pixels
+    height: Pixels
+    rate_hz: Positive
+
+
+class CameraModel(Strict):
+    """A camera."""
+
+    description: str = ""
+    drivers: Drivers = Drivers()
+    modes: tuple[Mode, ...] | None = None
+    """What it can take; None where anything goes."""
+    capture: Capture
+    """What it takes unless a rig says otherwise."""
+    field_of_view: FieldOfView
+    distortion: Numbers = (0.0, 0.0, 0.0, 0.0, 0.0)
+    """k1, k2, p1, p2, k3 (OpenCV's order)."""
+    depth: Depth
+    streams: tuple[str, ...] = ("color", "depth", "infrared")
+    """What it can give."""
+    adjustable: Flag = False
+    """May a rig choose the field of view and the range of depth? (A real camera's are what they are.)"""
+    real: dict[str, Any] = Field(default_factory=dict)
+    simulated: dict[str, Any] = Field(default_factory=dict)
+
+    @model_validator(mode="after")
+    def _five(self) -> CameraModel:
+        if len(self.distortion) != 5:
+            raise ValueError(f"distortion must be 5 numbers k1, k2, p1, p2, k3, not {len(self.distortion)}")
+        return self
+
+
+def find_model(name: str, folder: str, parts: tuple[str, ...], base: Path) -> Path | str:
+    """Path of a model: the user's when ``name`` is a path (relative to ``base``), else one that comes with the hal.
+
+    Returns a sentence where there is none.
+    """
+    if is_path(name):
+        return (base / Path(name).expanduser()).resolve()
+    there = list_data(folder, *parts)
+    if name not in there:
+        return f"there is no {'/'.join((folder, *parts))} model {name!r}{nearest(name, there)}, or a path to your own"
+    return data_folder(folder).joinpath(*parts, f"{name}.yaml")
+
+
+def load_pad_models(problems: Problems) -> dict[str, dict[str, Any]]:
+    """All pad models that come with the hal, by name, as plain data. The pads' driver knows what is in them."""
+    models = {}
+    for name in list_data("sensors", "gamepads"):
+        data = read_yaml(data_folder("sensors") / "gamepads" / f"{name}.yaml", problems)
+        if data is not None:
+            models[name] = data
+    return models

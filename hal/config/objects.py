@@ -1,0 +1,179 @@
+"""Things in the simulated world: primitives and URDFs, in files of their own or in the rig's."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, Literal
+
+from pydantic import model_validator
+
+from ..specs import BodySpec
+from .data_files import data_folder, is_path, list_data
+from .files import Problems, nearest, read_yaml, validate
+from .models import UrdfSource
+from .schema import Flag, Name, Number, PoseConfig, Positive, QuaternionConfig, Rgba, Strict, Vector, describe
+from .sources import locate_urdf
+from .urdf import read_urdf
+
+__all__ = ["ObjectConfig", "load_objects"]
+
+SIZES = {
+    "box": ("half_extents",),
+    "sphere": ("radius",),
+    "cylinder": ("radius", "length"),
+    "capsule": ("radius", "length"),
+    "plane": (),
+    "urdf": ("urdf",),
+}
+"""What each shape needs, and what no other shape may have."""
+
+
+class ObjectConfig(Strict):
+    """One thing. Lengths in m."""
+
+    name: Name
+    shape: Literal["box", "sphere", "cylinder", "capsule", "plane", "urdf"]
+    """May be left out where ``urdf`` is given."""
+    half_extents: Vector | None = None
+    """Of a box."""
+    radius: Positive | None = None
+    """Of a sphere, a cylinder or a capsule."""
+    length: Positive | None = None
+    """Of a cylinder, or of a capsule without its caps."""
+    urdf: UrdfSource | None = None
+    scale: Positive | None = None
+    """Of a URDF."""
+    mass: Number | None = None
+    """kg; 0, or left out, stands still. A URDF brings its own."""
+    fixed: Flag = False
+    position: Vector = (0.0, 0.0, 0.0)
+    orientation: QuaternionConfig = (0.0, 0.0, 0.0, 1.0)
+    rgba: Rgba = (0.7, 0.7, 0.7, 1.0)
+    collision: Flag = True
+    visible: Flag = True
+
+    @model_validator(mode="before")
+    @classmethod
+    def _shorthands(cls, data: Any) -> Any:
+        if not isinstance(data, dict):
+            return data
+        data = dict(data)
+        if "urdf" in data:
+            data.setdefault("shape", "urdf")
+        if "pose" in data:
+            pose = PoseConfig.model_validate(data.pop("pose"))
+            data.setdefault("position", pose.position)
+            data.setdefault("orientation", pose.orientation)
+        return data
+
+    @model_validator(mode="after")
+    def _sizes(self) -> ObjectConfig:
+        needed = SIZES[self.shape]
+        given = [key for key in ("half_extents", "radius", "length", "urdf") if getattr(self, key) is not None]
+        missing, extra = [k for k in needed if k not in given], [k for k in given if k not in needed]
+        if missing or extra:
+            wants = ", ".join(needed) or "no size"
+            wrong = [*(f"{key} is missing" for key in missing), *(f"{key} has no meaning" for key in extra)]
+            raise ValueError(f"a {self.shape} has {wants}: {', '.join(wrong)}")
+        if self.half_extents is not None and min(self.half_extents) <= 0.0:
+            raise ValueError("half_extents must be above 0")
+        if self.mass is not None and (self.mass < 0.0 or self.shape == "urdf"):
+            raise ValueError("mass must not be negative" if self.mass < 0.0 else "a urdf brings its own mass")
+        if self.scale is not None and self.shape != "urdf":
+            raise ValueError(f"scale is for a urdf; a {self.shape} has its size in m")
+        return self
+
+
+def load_objects(
+    entries: list[Any], source: str, base: Path, taken: dict[str, str], problems: Problems, warnings: list[str]
+) -> tuple[BodySpec, ...]:
+    """The bodies of a rig. ``taken`` are the names of its robots, with the key where each stands."""
+    bodies = []
+    for k, entry in enumerate(entries):
+        key = f"objects.{k}"
+        loaded = _load(entry, source, base, key, problems)
+        if loaded is None:
+            continue
+        config, file, prefix = loaded
+        name_key = f"{prefix}.name" if prefix else "name"
+        if config.name in taken:
+            problems.add(file, name_key, f"{config.name!r} is also the name of {taken[config.name]}; names must differ")
+            continue
+        taken[config.name] = f"{key} in {source}"
+        body = _body(config, file, prefix, base if file == source else Path(file).parent, problems, warnings)
+        if body is not None:
+            bodies.append(body)
+    return tuple(bodies)
+
+
+def _load(entry: Any, source: str, base: Path, key: str, problems: Problems) -> tuple[ObjectConfig, str, str] | None:
+    """The object, the file that it is in, and the key that it has there."""
+    changes: dict[str, Any] = {}
+    if isinstance(entry, dict) and "file" in entry:
+        changes = {name: value for name, value in entry.items() if name != "file"}
+        entry = entry["file"]
+    if isinstance(entry, dict):
+        config = validate(ObjectConfig, entry, source, problems, key)
+        return (config, source, key) if config is not None else None
+    if not isinstance(entry, str):
+        problems.add(source, key, f"must be a file, a name or keys and values, not {describe(entry)}")
+        return None
+    if is_path(entry):
+        path = (base / Path(entry).expanduser()).resolve()
+        if not path.is_file():
+            there = [f"{path.parent.name}/{p.name}" for p in path.parent.glob("*.yaml")] if path.parent.is_dir() else []
+            problems.add(source, key, f"there is no file {path}{nearest(f'{path.parent.name}/{path.name}', there)}")
+            return None
+    else:
+        there = list(list_data("config", "objects"))
+        if entry not in there:
+            problems.add(source, key, f"there is no object {entry!r}{nearest(entry, there)}, or a path to your own")
+            return None
+        path = data_folder("config") / "objects" / f"{entry}.yaml"
+    data = read_yaml(path, problems)
+    if data is None:
+        return None
+    if changes:
+        # The file stands on its own first, so that a mistake is reported where it is.
+        if validate(ObjectConfig, data, path, problems) is None:
+            return None
+        config = validate(ObjectConfig, {**data, **changes}, source, problems, key)
+        return (config, str(path), "") if config is not None else None
+    config = validate(ObjectConfig, data, path, problems)
+    return (config, str(path), "") if config is not None else None
+
+
+def _body(
+    config: ObjectConfig, file: str, prefix: str, base: Path, problems: Problems, warnings: list[str]
+) -> BodySpec | None:
+    urdf: str | None = None
+    if config.urdf is not None:
+        key = f"{prefix}.urdf" if prefix else "urdf"
+        path = locate_urdf(config.urdf, base, file, key, problems)
+        if path is None:
+            return None
+        try:
+            model = read_urdf(path)
+        except (ValueError, OSError) as error:
+            problems.add(path, "", str(error))
+            return None
+        if model.without_mass():
+            links = ", ".join(model.without_mass())
+            warnings.append(f"{path}: no <inertial> in {links}; the simulator makes up a mass")
+        urdf = str(path)
+    return BodySpec(
+        name=config.name,
+        position=config.position,
+        orientation=config.orientation,
+        shape=config.shape,
+        half_extents=config.half_extents,
+        radius=config.radius,
+        length=config.length,
+        urdf=urdf,
+        scale=config.scale or 1.0,
+        mass=config.mass or 0.0,
+        fixed=config.fixed,
+        rgba=config.rgba,
+        collision=config.collision,
+        visible=config.visible,
+    )

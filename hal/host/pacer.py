@@ -1,0 +1,77 @@
+"""A periodic loop against absolute deadlines: what came too late is skipped and counted, never caught up."""
+
+from __future__ import annotations
+
+import ctypes
+import gc
+import os
+import sys
+import time
+
+from ..histogram import Histogram
+
+__all__ = ["Pacer", "prepare_process"]
+
+_PR_SET_TIMERSLACK = 29
+
+
+class Pacer:
+    """Wakes its caller every ``period`` s."""
+
+    def __init__(self, period: float) -> None:
+        self.period = period
+        self.missed = 0
+        """Periods that were skipped."""
+        self.periods = Histogram(2e-5, 5000)
+        """Time between two wake-ups, s."""
+        self._next = time.monotonic() + period
+        self._last = 0.0
+
+    def wait(self) -> float:
+        """Sleep until the next deadline; returns the time of waking, s."""
+        now = time.monotonic()
+        if now < self._next:
+            time.sleep(self._next - now)
+            now = time.monotonic()
+        late = int((now - self._next) / self.period)
+        if late > 0:
+            self.missed += late
+            self._next += late * self.period
+        self._next += self.period
+        if self._last:
+            self.periods.add(now - self._last)
+        self._last = now
+        return now
+
+    def restart(self) -> None:
+        """Go on from now, counting nothing as missed: after work for which the group's time was paused."""
+        self._next = time.monotonic() + self.period
+        self._last = 0.0
+
+    def reset_statistics(self) -> None:
+        """Count from zero."""
+        self.missed = 0
+        self.periods = Histogram(2e-5, 5000)
+
+
+def prepare_process(realtime: bool = False) -> str:
+    """Make this process wake up on time; returns what was done, in words.
+
+    Needs no privilege: a timer slack of 1 ns (prctl), and no garbage collection. With ``realtime``: SCHED_FIFO and
+    locked memory as well, where the user may; without them it goes on all the same.
+    """
+    gc.collect()
+    gc.freeze()
+    gc.disable()
+    if not sys.platform.startswith("linux"):
+        return "default scheduling"
+    libc = ctypes.CDLL(None, use_errno=True)
+    libc.prctl(_PR_SET_TIMERSLACK, 1, 0, 0, 0)
+    if not realtime:
+        return "default scheduling"
+    try:
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(50))
+    except OSError:
+        return "default scheduling (no right to SCHED_FIFO: see 'ulimit -r')"
+    locked = libc.mlockall(3) == 0
+    return "SCHED_FIFO, memory locked" if locked else "SCHED_FIFO"

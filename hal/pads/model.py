@@ -1,0 +1,146 @@
+"""What a gamepad's event codes mean: the model of ``sensors/gamepads/*.yaml``, and how to choose one.
+
+A model is data only; :class:`~hal.pads.mapper.PadMapper` applies it.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Collection, Iterable, Mapping
+from typing import Annotated, Any, NamedTuple, TypeVar
+
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
+
+from ..errors import ConfigError, Problem
+from ..types import AXES, BUTTONS
+from .codes import ABS, BUS_BLUETOOTH, BUS_USB, KEY
+
+__all__ = ["Identity", "MatchRule", "PadModel", "choose_model", "pad_model", "validated"]
+
+_M = TypeVar("_M", bound=BaseModel)
+_BUSES = {BUS_USB: "usb", BUS_BLUETOOTH: "bluetooth"}
+
+
+class Identity(NamedTuple):
+    """What the system says about a pad that is plugged in."""
+
+    name: str
+    vendor: int
+    product: int
+    bus: int
+    """``BUS_USB``, ``BUS_BLUETOOTH`` or another of the kernel's bus numbers."""
+    driver: str
+    """The kernel's driver, for example ``xpad``; empty where it is not known."""
+
+    @property
+    def bus_name(self) -> str:
+        """``usb``, ``bluetooth`` or ``other``."""
+        return _BUSES.get(self.bus, "other")
+
+
+def _known(kind: str, names: Collection[str]) -> AfterValidator:
+    def check(name: str) -> str:
+        if name not in names:
+            raise ValueError(f"{name!r} is no {kind}; there are: {', '.join(names)}")
+        return name
+
+    return AfterValidator(check)
+
+
+def _axis(text: str) -> str:
+    name = text.removeprefix("-")
+    if name not in AXES:
+        raise ValueError(f"{name!r} is no axis; axes: {', '.join(AXES)}; with '-' in front where it is reversed")
+    return text
+
+
+def _button(text: str) -> str:
+    if text in BUTTONS or text in ("+dpad_x", "-dpad_x", "+dpad_y", "-dpad_y"):
+        return text
+    raise ValueError(f"{text!r} is no button; buttons: {', '.join(BUTTONS)}, or a d-pad's +dpad_x, -dpad_x ...")
+
+
+class _Strict(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class MatchRule(_Strict):
+    """A pad matches when everything that the rule names is right."""
+
+    vendor: Annotated[int, Field(ge=0, le=0xFFFF)] | None = None
+    product: Annotated[int, Field(ge=0, le=0xFFFF)] | None = None
+    name: str | None = None
+    """Part of the device's name, in any case of letters."""
+    driver: str | None = None
+    """The kernel's driver: pads with the same buttons report them differently through different drivers."""
+    bus: Annotated[str, _known("bus", ("usb", "bluetooth"))] | None = None
+    wireless: bool = False
+    """What is plugged in is only the receiver of a wireless pad, so unplugging says nothing about the pad."""
+
+    def fits(self, pad: Identity) -> int:
+        """How many of the pad's properties the rule names, all of them right; 0 when it does not match."""
+        wanted = (self.vendor, self.product, self.driver, self.bus)
+        found = (pad.vendor, pad.product, pad.driver, pad.bus_name)
+        if any(w is not None and w != f for w, f in zip(wanted, found, strict=True)):
+            return 0
+        if self.name is not None and self.name.lower() not in pad.name.lower():
+            return 0
+        return sum(w is not None for w in (*wanted, self.name))
+
+
+class PadModel(_Strict):
+    """One kind of gamepad, as in ``sensors/gamepads/<name>.yaml``."""
+
+    name: str
+    """The file's name without ``.yaml``."""
+    title: str
+    """For people."""
+    match: tuple[MatchRule, ...] = ()
+    axes: dict[Annotated[str, _known("event code of an axis", ABS)], Annotated[str, AfterValidator(_axis)]]
+    """Event code -> axis, ``-axis`` where the kernel's value grows to the left or downwards."""
+    buttons: dict[Annotated[str, _known("event code of a button", KEY)], Annotated[str, AfterValidator(_button)]]
+    """Event code -> button; ``+dpad_y`` and its like where the d-pad's directions are buttons."""
+    ranges: dict[Annotated[str, _known("event code of an axis", ABS)], tuple[int, int]] = {}
+    """Event code -> (minimum, maximum), only for a pad whose own answer is wrong."""
+    motion_node: str | None = None
+    """End of the name of the pad's motion sensor, which speaks all the time and so shows that the pad is alive."""
+
+    def rule_for(self, pad: Identity) -> MatchRule | None:
+        """The rule that describes ``pad`` best; None when the model does not match."""
+        best = max(self.match, key=lambda rule: rule.fits(pad), default=None)
+        return best if best is not None and best.fits(pad) else None
+
+    def to_yaml(self) -> str:
+        """The model as a file to put into ``sensors/gamepads`` or into a rig."""
+        import yaml
+
+        text: str = yaml.safe_dump(self.model_dump(exclude_defaults=True, mode="json"), sort_keys=False)
+        return re.sub(r"(vendor|product): (\d+)$", lambda m: f"{m[1]}: 0x{int(m[2]):04x}", text, flags=re.MULTILINE)
+
+
+def validated(cls: type[_M], data: Mapping[str, Any], file: str) -> _M:
+    """``data`` as a ``cls``. Raises ConfigError, which lists every problem; ``file`` is what it calls the place."""
+    try:
+        return cls.model_validate(dict(data))
+    except ValidationError as error:
+        raise ConfigError(
+            [
+                Problem(file, ".".join(str(part) for part in found["loc"]), found["msg"].removeprefix("Value error, "))
+                for found in error.errors()
+            ]
+        ) from None
+
+
+def pad_model(data: Mapping[str, Any], file: str = "<gamepad model>") -> PadModel:
+    """A checked model. Raises ConfigError, which lists every problem; ``file`` is what it calls the place."""
+    return validated(PadModel, data, file)
+
+
+def choose_model(models: Iterable[PadModel], pad: Identity) -> tuple[PadModel, MatchRule] | None:
+    """The model with the most exact rule for ``pad``, and that rule; the first of equals, None for an unknown pad."""
+    best: tuple[PadModel, MatchRule] | None = None
+    for model in models:
+        rule = model.rule_for(pad)
+        if rule is not None and (best is None or rule.fits(pad) > best[1].fits(pad)):
+            best = model, rule
+    return best

@@ -1,0 +1,72 @@
+"""What a driver was really given, judged by backward differences, whoever computed it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..specs import LimitsSpec
+
+__all__ = ["SetpointAudit"]
+
+_HISTORY = 3
+"""Differences up to the third need three samples before the one that they belong to."""
+_BATCH = 64
+"""Samples are judged so many at a time: one by one they would cost the servo's loop ten times as much."""
+
+
+class SetpointAudit:
+    """Peaks of a stream of joint set-points, as ratios of the limits; constant memory.
+
+    Velocity, acceleration and jerk are backward differences over ``dt``: at 1 or below the limit was kept. Position is
+    the distance from the middle of the range as a share of half the range: at 1 or below the joint was inside.
+    """
+
+    def __init__(self, limits: LimitsSpec, dt: float) -> None:
+        lower, upper = np.array(limits.lower), np.array(limits.upper)
+        self._middle = 0.5 * (lower + upper)
+        # Each turns a plain difference of positions into a ratio of its limit.
+        self._half_range = 0.5 * (upper - lower)
+        self._limits = [
+            dt * np.array(limits.velocity),
+            dt * dt * np.array(limits.acceleration),
+            dt * dt * dt * np.array(limits.jerk),
+        ]
+        self._peaks = [0.0] * 4
+        self._history: NDArray[np.float64] = np.empty((0, len(lower)))
+        self._pending: list[Sequence[float]] = []
+
+    def reset(self) -> None:
+        """Forget the history, not the peaks: the next sample begins a new stream (a reset of the world)."""
+        self._judge()
+        self._history = self._history[:0]
+
+    def add(self, q: Sequence[float]) -> None:
+        """One set-point (n,), rad, as it was handed to the driver. It must not be changed afterwards."""
+        self._pending.append(q)
+        if len(self._pending) >= _BATCH:
+            self._judge()
+
+    def _judge(self) -> None:
+        if not self._pending:
+            return
+        samples = np.concatenate([self._history, np.array(self._pending, float)])
+        self._pending = []
+        self._raise_to(0, np.abs(samples[len(self._history) :] - self._middle) / self._half_range)
+        # The first samples of a stream have no past: a leap to where it begins is not a motion.
+        new = len(samples) - max(len(self._history), _HISTORY)
+        if new > 0:
+            for order, limit in enumerate(self._limits, start=1):
+                self._raise_to(order, np.abs(np.diff(samples, order, axis=0)[-new:]) / limit)
+        self._history = samples[-_HISTORY:]
+
+    def _raise_to(self, which: int, ratios: NDArray[np.float64]) -> None:
+        self._peaks[which] = max(self._peaks[which], float(ratios.max()))
+
+    def peaks(self) -> dict[str, float]:
+        """The greatest ratios so far: ``velocity``, ``acceleration``, ``jerk``, ``position``."""
+        self._judge()
+        position, velocity, acceleration, jerk = self._peaks
+        return {"velocity": velocity, "acceleration": acceleration, "jerk": jerk, "position": position}

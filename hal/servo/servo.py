@@ -1,0 +1,260 @@
+"""One arm's servo: the only place where set-points are made. Pure: no clock, device or process inside.
+
+    newest command ─► watchdog ─► motion (goal in joint space) ─► envelope (speed caps) ─► smoother ─► set-point
+
+The host calls :meth:`Servo.tick` once per cycle between reading the device and writing to it. Whatever happens, an arm
+that must not follow is brought to rest by the smoother's time-optimal stop and held where that ends.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from math import isfinite
+
+from ..commands import Kind
+from ..errors import CommandError, ControlTaken
+from ..inbox import CommandRecord, Inbox, Session
+from ..kinematics import Kinematics
+from ..robot import Reading, Setpoint
+from ..specs import RobotSpec
+from ..types import Limited, RobotStatus, Trip
+from .anchoring import Anchoring
+from .cartesian import PoseMotion, TwistMotion
+from .envelope import Envelope
+from .motions import JointTargetMotion, JointVelocityMotion, Motion
+from .path import PathMotion
+from .smoothing import JointSmoother
+from .watchdog import Watchdog, is_alive, is_timely
+
+__all__ = ["Servo", "ServoReport"]
+
+Floats = Sequence[float]
+
+_ABSURD = 1e3
+"""Joint positions (rad) and speeds (rad/s) beyond this are a broken reading."""
+
+
+@dataclass(slots=True)
+class ServoReport:
+    """What the servo did in its last tick."""
+
+    status: RobotStatus = RobotStatus.IDLE
+    trip: Trip = Trip.NONE
+    limited: Limited = Limited.NONE
+    target_seq: int = 0
+    """Number of the command that the set-point follows; 0 before the first one of a session."""
+    refused: int = 0
+    """Number of the newest command of this session that was refused; 0 for none."""
+    q_set: Floats = ()
+    """rad"""
+    dq_set: Floats = ()
+    ddq_set: Floats = ()
+    arrived: bool = False
+    """Is ``move_to`` done?"""
+    t_trip: float = 0.0
+    """When the stop was latched, s."""
+    t_stop: float = 0.0
+    """When the last braking began, s."""
+
+
+class Servo:
+    """Set-points for one arm, once per ``dt`` seconds."""
+
+    def __init__(self, spec: RobotSpec, dt: float, kinematics: Kinematics | None = None) -> None:
+        self.spec = spec
+        self.kinematics = Kinematics(spec.kinematics) if kinematics is None else kinematics
+        self.report = ServoReport()
+        self._smoother = smoother = JointSmoother(spec.limits, dt)
+        self._envelope = envelope = Envelope(smoother, self.kinematics, spec.workspace)
+        self._watchdog = Watchdog()
+        self._anchoring = Anchoring(smoother)
+        self._motions: dict[Kind, Motion] = {
+            Kind.JOINT_TARGET: JointTargetMotion(smoother, envelope),
+            Kind.JOINT_VELOCITY: JointVelocityMotion(smoother, envelope),
+            Kind.CARTESIAN_TARGET: PoseMotion(smoother, envelope),
+            Kind.TWIST: TwistMotion(smoother, envelope),
+        }
+        self._path = PathMotion(smoother, envelope)
+        self._session: Session | None = None
+        self._motion: Motion | None = None
+        """What moves the arm now; None until the first command."""
+        self._anchored = False
+        self._ending = False
+        self._followed = False
+        """Did a motion move the arm in the last tick?"""
+        self._seq = 0
+        """Newest command that was looked at, or that does not count any more."""
+
+    @property
+    def active(self) -> bool:
+        """Is a session open, or still braking?"""
+        return self._session is not None
+
+    def anchor(self, q: Floats, dq: Floats | None = None) -> None:
+        """The set-point is here now: ``q`` (n,) rad, ``dq`` (n,) rad/s. Every goal is forgotten."""
+        n = self._smoother.n
+        for name, values in (("q", q), ("dq", dq)):
+            if values is not None and not (len(values) == n and isfinite(sum(map(abs, values)))):
+                raise CommandError(f"cannot anchor to {name} = {list(values)}: {n} finite numbers are due")
+        self._smoother.anchor(q, dq)
+        self._anchoring.forget()
+        self._anchored = True
+        self._forget_goals()
+        self._publish()
+
+    def begin(self, session: Session, inbox: Inbox) -> None:
+        """Open a session. The set-point must have been anchored; ``inbox`` is what it holds at the moment.
+
+        Raises ControlTaken while another one is open, CommandError when its terms cannot be met.
+        """
+        if self._session is not None:
+            raise ControlTaken(f"session {self._session.id} controls this arm")
+        if not self._anchored:
+            raise CommandError("anchor the servo before a session begins")
+        if not (0.0 < session.speed <= 1.0 and session.tcp_speed > 0.0):
+            raise CommandError(f"a session needs 0 < speed <= 1 and tcp_speed > 0, not {session}")
+        self._envelope.open(session)
+        if session.move_to is not None:
+            self._path.aim(session.move_to)
+        self._session = session
+        self._ending = False
+        self._seq = 0
+        self.report.target_seq = self.report.refused = 0
+        self.report.arrived = False
+        self._forget_goals()
+        self._watchdog.begin(session, inbox)
+        self.report.status = RobotStatus.HOLDING
+        self.report.trip = Trip.NONE
+
+    def end(self) -> None:
+        """Close the session: brake, then be idle."""
+        if self._session is not None and not self._ending:
+            self._ending = True
+            self._watchdog.end()
+            self._forget_goals()
+
+    def tick(self, now: float, reading: Reading, inbox: Inbox) -> Setpoint | None:
+        """The next set-point, or None when no session is open and there is nothing to write."""
+        self._envelope.limited = Limited.NONE
+        device = self._judge(now, reading)
+        if self._session is not None and self._anchoring.look(reading, sound=device is Trip.NONE):
+            self._envelope.limited |= Limited.REANCHORED
+            if self._motion is not None:
+                self._motion.reanchored()
+        self._watchdog.update(now, inbox, self._smoother.at_rest(), device)
+        session = self._session
+        if session is None or self._finished():
+            self._idle(RobotStatus.FAULT if reading.fault is not None else RobotStatus.IDLE)
+            return None
+        self._listen(now, session, inbox.command)
+        return self._move(now, RobotStatus.FAULT if reading.fault is not None else None)
+
+    def lost(self, now: float) -> Setpoint | None:
+        """The device did not answer in this cycle: trip, and go on braking."""
+        self._envelope.limited = Limited.NONE
+        self._watchdog.device_lost(now)
+        self._anchoring.lose()
+        if self._session is None or self._finished():
+            self._idle(RobotStatus.LOST)
+            return None
+        self._forget_goals()
+        return self._move(now, RobotStatus.LOST)
+
+    def _judge(self, now: float, reading: Reading) -> Trip:
+        """What is wrong with the device."""
+        if reading.fault is not None:
+            return Trip.FAULT
+        if not (self._is_sound(reading.q) and self._is_sound(reading.dq)):
+            return Trip.BAD_READING
+        q, dq = reading.q_commanded, reading.dq_commanded
+        # A device that reports the very numbers that it was given needs no second look.
+        if q is not None and q is not self._smoother.q and not self._is_sound(q):
+            return Trip.BAD_READING
+        if dq is not None and dq is not self._smoother.dq and not self._is_sound(dq):
+            return Trip.BAD_READING
+        if not is_alive(now, reading.t):
+            return Trip.DEVICE_LOST  # it repeats an old reading
+        return Trip.NONE
+
+    def _is_sound(self, values: Floats) -> bool:
+        """As many numbers as joints, finite and not absurd."""
+        return len(values) == self._smoother.n and sum(map(abs, values)) < _ABSURD
+
+    def _listen(self, now: float, session: Session, command: CommandRecord | None) -> None:
+        """Take over the newest command, if it counts."""
+        watchdog = self._watchdog
+        mine = command is not None and command.session == session.id
+        if not watchdog.allowed or watchdog.renewed:
+            self._forget_goals()
+        if session.move_to is not None:
+            if watchdog.allowed and self._motion is None:
+                self._path.start()
+                self._motion = self._path
+            return
+        stale = not watchdog.allowed or (watchdog.renewed and session.deadman)
+        if stale and command is not None and mine:  # what was sent before the press is not resumed after it
+            self._seq = max(self._seq, command.seq)
+        if not watchdog.allowed or command is None or not mine or command.seq <= self._seq:
+            return
+        self._seq = command.seq
+        motion = self._motions.get(command.kind)
+        if motion is None or not is_timely(now, command) or not motion.usable(command.values):
+            self.report.refused = command.seq
+            return
+        if motion is not self._motion:
+            if motion.too_far(command.values):
+                self.report.refused = command.seq
+                return
+            motion.start()
+            self._motion = motion
+        motion.accept(command)
+        watchdog.expect(command)
+        self.report.target_seq = command.seq
+
+    def _move(self, now: float, status: RobotStatus | None) -> Setpoint:
+        """One tick of motion or of the stop; ``status`` overrides the usual one."""
+        smoother, watchdog = self._smoother, self._watchdog
+        follows = watchdog.allowed and self._motion is not None
+        if self._followed and not follows:
+            self.report.t_stop = now
+        self._followed = follows
+        if watchdog.allowed and self._motion is not None:
+            self._motion.step(now)
+            self._envelope.note(smoother)
+            self.report.arrived = self._motion is self._path and self._path.arrived
+            usual = RobotStatus.FOLLOWING
+        else:
+            smoother.stop()
+            usual = RobotStatus.HOLDING if smoother.at_rest() else RobotStatus.STOPPING
+            if watchdog.trip is not Trip.NONE:
+                usual = RobotStatus.TRIPPED
+        self.report.status = usual if status is None else status
+        self.report.trip = watchdog.trip
+        self.report.t_trip = watchdog.t_trip
+        self._publish()
+        self._anchoring.wrote()
+        return Setpoint(smoother.q, smoother.dq, smoother.ddq)
+
+    def _finished(self) -> bool:
+        """Has a session that ends come to rest? Then it is closed."""
+        if self._ending and self._smoother.at_rest():
+            self._session = None
+            self._ending = False
+            self._anchoring.forget()
+            return True
+        return False
+
+    def _idle(self, status: RobotStatus) -> None:
+        self.report.status = status
+        self.report.trip = Trip.NONE
+        self.report.limited = Limited.NONE
+
+    def _forget_goals(self) -> None:
+        self._motion = None
+        self._watchdog.expect(None)
+
+    def _publish(self) -> None:
+        report, smoother = self.report, self._smoother
+        report.q_set, report.dq_set, report.ddq_set = smoother.q, smoother.dq, smoother.ddq
+        report.limited = self._envelope.limited

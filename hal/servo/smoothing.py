@@ -1,0 +1,226 @@
+"""From a wanted motion to set-points that keep every limit: Ruckig, and a check that the arm could still stop.
+
+The free Ruckig knows no position limits, and clipping a position breaks the limits of acceleration and jerk. So the
+smoother keeps an invariant instead: **after every tick the time-optimal stop still ends inside every limit**. A step
+that would break it is replaced by the first tick of that stop, which keeps it by construction. An arm that starts
+outside a limit may only come back in: what counts is max(limit, where the stop would end now).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from math import isfinite
+
+from ruckig import (
+    ControlInterface,
+    InputParameter,
+    OutputParameter,
+    Ruckig,
+    RuckigError,
+    Synchronization,
+)
+
+from ..specs import LimitsSpec
+from .limits import stop_displacement, stop_peak, stop_step
+
+__all__ = ["Guard", "JointSmoother"]
+
+Floats = Sequence[float]
+
+Guard = Callable[["JointSmoother"], bool]
+"""Looks at the step that is proposed (``q_next``, ``dq_next``, ``ddq_next``) and answers whether it may be taken."""
+
+_INSIDE = 1.0 - 1e-5
+"""Share of the limits used, so that rounding in third differences of positions never shows as a violation."""
+
+_ABOVE = 1.0 + 1e-6
+"""Ruckig's position interface gets this much more speed: from exactly its greatest speed it may plan to brake all the
+way (seen: 20 s instead of 13)."""
+
+_EDGE = 1e-9
+"""The same for positions, rad."""
+
+_STILL = 1e-12
+"""Speeds and accelerations below this are rounding errors, rad/s and rad/s2."""
+
+_ROUNDING = 1e-12
+"""By how much two stops along the same profile may seem to end apart, rad."""
+
+
+class JointSmoother:
+    """The set-point of all joints, and the only thing that moves it. ``n`` joints, SI units, plain floats.
+
+    Each of :meth:`follow`, :meth:`reach` and :meth:`stop` advances the set-point by exactly one tick.
+    """
+
+    def __init__(self, limits: LimitsSpec, dt: float) -> None:
+        self.n = n = len(limits.lower)
+        self.dt = dt
+        self.lower = [x + 2.0 * _EDGE for x in limits.lower]
+        """Where goals may be, rad: a little inside of where the check begins, or rounding would make it refuse them."""
+        self.upper = [x - 2.0 * _EDGE for x in limits.upper]
+        self._lower = [x + _EDGE for x in limits.lower]
+        self._upper = [x - _EDGE for x in limits.upper]
+        self.velocity = [x * _INSIDE for x in limits.velocity]
+        self.acceleration = [x * _INSIDE for x in limits.acceleration]
+        self.jerk = [x * _INSIDE for x in limits.jerk]
+        # No stop from within the limits is longer than the one from full speed at full acceleration.
+        room = [
+            stop_displacement(v, a, a, j) for v, a, j in zip(self.velocity, self.acceleration, self.jerk, strict=True)
+        ]
+        self.free = [
+            (low + r, high - r, v) for low, high, r, v in zip(self.lower, self.upper, room, self.velocity, strict=True)
+        ]
+        """Per joint: no slower than the third number (rad/s) and between the first two (rad), no limit can matter."""
+        self._zeros = [0.0] * n
+        self.q = list(self._zeros)
+        """Set-point, rad."""
+        self.dq = list(self._zeros)
+        self.ddq = list(self._zeros)
+        self.q_next = self.q
+        """What the step in progress proposes."""
+        self.dq_next = self.dq
+        self.ddq_next = self.ddq
+        self._none: frozenset[int] = frozenset()
+        self._all = frozenset(range(n))
+        self.held_back = self._none
+        """Joints that the last step stopped because a position limit was near."""
+        self.guarded = False
+        """Did the guard turn the last step into a stop?"""
+        self._ruckig = Ruckig(n, dt)
+        self._output = OutputParameter(n)
+        self._input = InputParameter(n)
+        # Each joint by itself: synchronised stops are longer than the shortest one, on which the check relies.
+        self._input.synchronization = Synchronization.No
+        self._input.max_acceleration = self.acceleration
+        self._input.max_jerk = self.jerk
+
+    def anchor(self, q: Floats, dq: Floats | None = None, ddq: Floats | None = None) -> None:
+        """Start from here. Accelerations beyond the limits are cut, since no stop could be computed from them."""
+        self.q = list(q)
+        self.dq = list(self._zeros if dq is None else dq)
+        self.ddq = [
+            max(-limit, min(limit, a))
+            for a, limit in zip(self._zeros if ddq is None else ddq, self.acceleration, strict=True)
+        ]
+        self.held_back = self._none
+        self.guarded = False
+
+    def adopt(self, q: Floats, dq: Floats, ddq: Floats) -> None:
+        """Take a set-point that somebody else computed inside the limits (a planned path)."""
+        self.q, self.dq, self.ddq = list(q), list(dq), list(ddq)
+        self.held_back = self._none
+        self.guarded = False
+
+    def at_rest(self) -> bool:
+        """Does nothing move? (1e-6 rad/s, 1e-4 rad/s2: Ruckig's numbers at the end of a profile.)"""
+        return max(map(abs, self.dq)) < 1e-6 and max(map(abs, self.ddq)) < 1e-4
+
+    def follow(self, dq: Floats, guard: Guard | None = None, together: bool = False) -> None:
+        """One tick towards the velocities ``dq``, which are cut to the limits.
+
+        A joint that would break the invariant is stopped; with ``together`` all are. A step that the guard refuses
+        becomes a stop of all.
+        """
+        if not isfinite(sum(dq)):  # a goal that is no number is no goal
+            dq = self._zeros
+        target = [
+            v if -cap <= v <= cap else (cap if v > 0.0 else -cap) for v, cap in zip(dq, self.velocity, strict=True)
+        ]
+        self.guarded = False
+        self._propose_velocity(target)
+        self.held_back = self._violations()
+        if self.held_back:
+            stopped = self._all if together else self.held_back
+            self._propose_velocity([0.0 if i in stopped else v for i, v in enumerate(target)])
+        if guard is not None and not guard(self):
+            self.guarded = True
+            self._propose_velocity(self._zeros)
+        self._commit()
+
+    def reach(self, q: Floats, velocity: Floats, guard: Guard | None = None) -> bool:
+        """One tick of the time-optimal motion to rest at ``q``, no faster than ``velocity`` (each > 0).
+
+        False, and nothing has moved, when that would break the invariant, when the guard refuses, or when Ruckig
+        cannot plan it.
+        """
+        inputs = self._input
+        inputs.control_interface = ControlInterface.Position
+        inputs.max_velocity = [v * _ABOVE for v in velocity]
+        inputs.target_position = q
+        inputs.target_velocity = self._zeros
+        if not self._propose() or self._violations() or (guard is not None and not guard(self)):
+            return False
+        self.held_back = self._none
+        self.guarded = False
+        self._commit()
+        return True
+
+    def stop(self) -> None:
+        """One tick of the time-optimal stop."""
+        self.held_back = self._none
+        self.guarded = False
+        self._propose_velocity(self._zeros)
+        self._commit()
+        if max(map(abs, self.dq)) < _STILL and max(map(abs, self.ddq)) < _STILL:
+            self.dq, self.ddq = list(self._zeros), list(self._zeros)  # Ruckig leaves 1e-17 here and there
+
+    def stop_end(self) -> list[float]:
+        """Where a stop that begins now ends, rad."""
+        return self._ends(self.q, self.dq, self.ddq)
+
+    def stop_end_next(self) -> list[float]:
+        """Where a stop after the proposed step would end, rad."""
+        return self._ends(self.q_next, self.dq_next, self.ddq_next)
+
+    def _propose_velocity(self, dq: Floats) -> None:
+        inputs = self._input
+        inputs.control_interface = ControlInterface.Velocity
+        inputs.target_velocity = dq
+        if not self._propose():  # never seen, but an arm that moves must not depend on it: stop by hand
+            state = zip(self.q, self.dq, self.ddq, self.acceleration, self.jerk, strict=True)
+            steps = [stop_step(q, v, a, A, J, self.dt) for q, v, a, A, J in state]
+            self.q_next, self.dq_next, self.ddq_next = (list(column) for column in zip(*steps, strict=True))
+
+    def _propose(self) -> bool:
+        inputs, output = self._input, self._output
+        inputs.current_position = self.q
+        inputs.current_velocity = self.dq
+        inputs.current_acceleration = self.ddq
+        try:
+            self._ruckig.update(inputs, output)
+        except RuckigError:
+            self._ruckig.reset()
+            return False
+        self.q_next = output.new_position
+        self.dq_next = output.new_velocity
+        self.ddq_next = output.new_acceleration
+        return isfinite(sum(self.q_next) + sum(self.dq_next) + sum(self.ddq_next))
+
+    def _violations(self) -> frozenset[int]:
+        """Joints whose stop after the proposed step would end beyond a limit, and farther than a stop from now."""
+        found = self._none
+        for i, (q, v, (low, high, speed)) in enumerate(zip(self.q_next, self.dq_next, self.free, strict=True)):
+            if not (low <= q <= high and -speed <= v <= speed) and self._violates(i):
+                found |= {i}
+        return found
+
+    def _violates(self, i: int) -> bool:
+        A, J, lower, upper = self.acceleration[i], self.jerk[i], self._lower[i], self._upper[i]
+        q, v, a = self.q_next[i], self.dq_next[i], self.ddq_next[i]
+        peak = q + stop_peak(v, a, A, J)
+        trough = q - stop_peak(-v, -a, A, J)
+        if peak <= upper and trough >= lower:
+            return False
+        q, v, a = self.q[i], self.dq[i], self.ddq[i]
+        over = peak > upper and peak > q + stop_peak(v, a, A, J) + _ROUNDING
+        return over or (trough < lower and trough < q - stop_peak(-v, -a, A, J) - _ROUNDING)
+
+    def _commit(self) -> None:
+        self.q, self.dq, self.ddq = self.q_next, self.dq_next, self.ddq_next
+
+    def _ends(self, q: Floats, dq: Floats, ddq: Floats) -> list[float]:
+        return [
+            x + (stop_displacement(v, a, A, J) if v or a else 0.0)
+            for x, v, a, A, J in zip(q, dq, ddq, self.acceleration, self.jerk, strict=True)
+        ]

@@ -1,0 +1,171 @@
+"""May the arm move? The dead-man, the heartbeats, the deadline of a command, stops and faults of one control session.
+
+Every comparison is written so that a number that is not finite counts as the bad case.
+"""
+
+from __future__ import annotations
+
+from ..inbox import CommandRecord, DeadmanRecord, Inbox, Session
+from ..types import Trip
+
+__all__ = ["SILENCE", "Watchdog", "is_alive", "is_timely"]
+
+SILENCE = 0.150
+"""Longest silence of the dead-man's pad, of the app and of the device, s."""
+
+_AHEAD = 1.0
+"""A sign of life may be this far in the future before it is taken for garbage, s."""
+
+
+class Watchdog:
+    """The permission to move, once per tick.
+
+    With a dead-man, motion is allowed from a press until its release, and a trip is left by a release and a new press.
+    A dead-man that is already held when the session opens does not count (someone may have taped it down, or hold it
+    from before) except for ``move_to``, whose goal is known. Without a dead-man, motion is allowed from the start and
+    a trip is left by ``control.rearm()``. The cause of the trip must be gone first: a press or a rearm that came while
+    it lasted does not count.
+    """
+
+    def __init__(self) -> None:
+        self.session: Session | None = None
+        self.trip = Trip.NONE
+        """Why the stop is latched."""
+        self.t_trip = 0.0
+        """When it was."""
+        self.allowed = False
+        """May the arm move in this tick?"""
+        self.renewed = False
+        """Was the permission given anew in this tick? Commands sent before do not count any more."""
+        self._stops: int | None = None
+        self._presses = 0
+        self._rearms = 0
+        self._rebase = False
+        """Presses and rearms of ticks without a reading do not count; the next tick says how many there were."""
+        self._command: CommandRecord | None = None
+        """The command that the arm follows."""
+
+    def begin(self, session: Session, inbox: Inbox) -> None:
+        """A session opens; presses and rearms count from what ``inbox`` says now, `rig.stop()` from the last tick."""
+        self.session = session
+        self.trip = Trip.NONE
+        self.allowed = self.renewed = self._rebase = False
+        self._command = None
+        self._rearms = inbox.rearms
+        deadman = inbox.deadman
+        # For move_to, a dead-man that is held already is as good as pressed now.
+        known = session.move_to is not None and deadman is not None and deadman.held
+        self._presses = (deadman.presses if deadman is not None else 0) - int(known)
+
+    def end(self) -> None:
+        """The session is over."""
+        self.session = None
+        self.allowed = False
+        self.trip = Trip.NONE
+
+    def expect(self, command: CommandRecord | None) -> None:
+        """The next command must come before the deadline of this one; None: none is due."""
+        self._command = command
+
+    def device_lost(self, now: float) -> None:
+        """The device did not answer in this cycle."""
+        if self.session is not None:
+            self._latch(Trip.DEVICE_LOST, now)
+            self._rebase = True
+            self.renewed = False
+
+    def update(self, now: float, inbox: Inbox, at_rest: bool, device: Trip = Trip.NONE) -> bool:
+        """One tick; ``device`` is what is wrong with the reading. Returns ``allowed``."""
+        stopped = self._stops is not None and inbox.stops != self._stops
+        self._stops = inbox.stops
+        self.renewed = False
+        session = self.session
+        if session is None:
+            return False
+        deadman = inbox.deadman
+        cause = self._cause(now, session, inbox, stopped, device)
+        if cause is not Trip.NONE:
+            self._latch(cause, now)
+        if self.trip is not Trip.NONE:
+            self._try_to_leave(session, inbox, at_rest, cause)
+        elif session.deadman:
+            assert deadman is not None
+            self._follow_deadman(deadman, at_rest)
+        elif not self.allowed and at_rest:
+            self.allowed = self.renewed = True
+        return self.allowed
+
+    def _cause(self, now: float, session: Session, inbox: Inbox, stopped: bool, device: Trip) -> Trip:
+        """What forbids motion in this tick, the gravest first."""
+        if device is not Trip.NONE:
+            return device
+        if stopped:
+            return Trip.STOP
+        if session.deadman:
+            if inbox.deadman is None or not inbox.deadman.connected:
+                return Trip.DEADMAN_LOST
+            if not is_alive(now, inbox.deadman.t_alive):
+                return Trip.DEADMAN_SILENT
+        if not is_alive(now, inbox.t_app):
+            return Trip.APP_SILENT
+        released = session.deadman and inbox.deadman is not None and not inbox.deadman.held
+        if self.allowed and not released and self._is_late(now, session, inbox.command):
+            return Trip.COMMAND_LATE
+        return Trip.NONE
+
+    def _is_late(self, now: float, session: Session, newest: CommandRecord | None) -> bool:
+        """Is a command due, and neither it nor the one that came meanwhile still in time?"""
+        followed = self._command
+        if followed is None or is_timely(now, followed):
+            return False
+        if newest is None or newest.session != session.id or newest.seq <= followed.seq:
+            return True
+        return not is_timely(now, newest)
+
+    def _latch(self, cause: Trip, now: float) -> None:
+        if self.trip is Trip.NONE or cause is Trip.FAULT:
+            self.t_trip = now if self.trip is Trip.NONE else self.t_trip
+            self.trip = cause
+        self.allowed = False
+        self._command = None
+
+    def _try_to_leave(self, session: Session, inbox: Inbox, at_rest: bool, cause: Trip) -> None:
+        self.allowed = False
+        deadman = inbox.deadman
+        presses = self._presses if deadman is None else deadman.presses
+        if cause is not Trip.NONE or self._rebase:
+            self._presses, self._rearms = presses, inbox.rearms
+            self._rebase = False
+            return
+        if not at_rest:
+            return
+        if session.deadman:
+            if deadman is not None and deadman.held and presses != self._presses:
+                self._grant(presses)
+        elif inbox.rearms != self._rearms:
+            self._rearms = inbox.rearms
+            self._grant(presses)
+
+    def _follow_deadman(self, deadman: DeadmanRecord, at_rest: bool) -> None:
+        if self.allowed and not (deadman.held and deadman.presses == self._presses):
+            # Released, or released and pressed again between two ticks: stop first in both cases.
+            self.allowed = False
+            self._command = None
+        elif not self.allowed and deadman.held and deadman.presses != self._presses and at_rest:
+            self._grant(deadman.presses)
+
+    def _grant(self, presses: int) -> None:
+        self.trip = Trip.NONE
+        self._presses = presses
+        self._command = None
+        self.allowed = self.renewed = True
+
+
+def is_timely(now: float, command: CommandRecord) -> bool:
+    """Is this command still to be followed, and not from the future?"""
+    return command.t - _AHEAD <= now <= command.deadline
+
+
+def is_alive(now: float, sign: float) -> bool:
+    """Is the last sign of life (s) young enough, and not from the future?"""
+    return -_AHEAD <= now - sign <= SILENCE
