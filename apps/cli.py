@@ -88,5 +88,8 @@ def run_app(main: Any, args: argparse.Namespace) -> int:
     except HalError as error:
         print(f"{type(error).__name__}: {error}", file=sys.stderr)
         return ACTION_NEEDED
+    except OSError as error:  # a device or a file that cannot be opened
+        print(f"{type(error).__name__}: {error}", file=sys.stderr)
+        return ACTION_NEEDED
     except KeyboardInterrupt:
         return 130

@@ -27,7 +27,8 @@ __all__ = ["FIRST_STEP_ANGLE", "FIRST_STEP_DISTANCE", "Control", "StopLatch", "m
 FIRST_STEP_ANGLE = 0.1
 """Farthest that a first joint target may be from the set-point, rad per joint."""
 FIRST_STEP_DISTANCE = 0.05
-"""Farthest that a first pose may be from the set-point, m."""
+FIRST_STEP_TURN = 0.2
+"""Farthest that a first pose may be from the set-point, m and rad. The servo keeps the same bounds by itself."""
 _SHORTEST_DEADLINE = 0.1
 _PERIODS = 2.5
 _REST_LIMIT = 5.0
@@ -103,6 +104,7 @@ class Control:
         self._rearmed_at = -math.inf
         self._detach: Callable[[], None] | None = None
         self._grip: float | None = None
+        self._refused = 0
 
     # Opening and leaving.
 
@@ -194,6 +196,9 @@ class Control:
         self._check_trip(servo, now)
         waiting = self.deadman is not None and not self.deadman.held
         reasons: list[str] = []
+        if servo.session == self._id and servo.refused > self._refused:
+            self._refused = servo.refused
+            reasons.append("the servo refused an earlier command: too far for a first one, or too late")
         if command is not None:
             command = self._checked(command, reasons)
             if waiting:
@@ -265,11 +270,11 @@ class Control:
                     f"than {FIRST_STEP_ANGLE} rad: use move_to first"
                 )
         elif isinstance(command, CartesianTarget):
-            distance, _ = self.robot.fk(servo.q_set).distance(command.pose)
-            if distance > FIRST_STEP_DISTANCE:
+            distance, turn = self.robot.fk(servo.q_set).distance(command.pose)
+            if distance > FIRST_STEP_DISTANCE or turn > FIRST_STEP_TURN:
                 raise CommandError(
-                    f"the first pose is {distance:.3f} m from the set-point, more than {FIRST_STEP_DISTANCE} m: use "
-                    "move_to first"
+                    f"the first pose is {distance:.3f} m and {turn:.3f} rad from the set-point, more than "
+                    f"{FIRST_STEP_DISTANCE} m or {FIRST_STEP_TURN} rad: use move_to first"
                 )
 
     def _send_grip(self, fraction: float, waiting: bool, reasons: list[str]) -> None:
@@ -280,7 +285,7 @@ class Control:
         if waiting:
             reasons.append("the dead-man is not held: the gripper does not move")
         elif self._grip is None or abs(width - self._grip) > gripper.spec.width_max * 0.005:
-            gripper.start(width)
+            gripper._send(width, gripper.spec.speed, gripper.spec.force)
             self._grip = width
 
 

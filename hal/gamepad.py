@@ -197,11 +197,10 @@ class Gamepad:
 
     def _distrust(self) -> str | None:
         driver = self.driver
-        accepted = driver.spec.options.get("accept_silent_pad") is True and not driver.simulated
-        if driver.proves_liveness or accepted:
-            return None
         if driver.simulated:
             return f"{driver.describe()} cannot be the dead-man of a real arm: nobody holds it; plug a gamepad in"
+        if driver.proves_liveness or driver.spec.options.get("accept_silent_pad") is True:
+            return None
         return (
             f"{driver.describe()} cannot be the dead-man of a real arm: when it falls silent, nothing tells whether "
             "it is still held; plug the pad in with its cable, or accept that risk with "

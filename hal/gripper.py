@@ -11,6 +11,7 @@ from .types import GripperState
 
 if TYPE_CHECKING:
     from .clock import Clock
+    from .control import StopLatch
     from .host.hosts import Host
     from .specs import GripperSpec
 
@@ -73,12 +74,13 @@ class GripperDriver(ABC):
 class Gripper:
     """The gripper of an arm. The newest command wins; fingers keep what they hold when a session ends or trips."""
 
-    def __init__(self, spec: GripperSpec, robot: str, host: Host, clock: Clock) -> None:
+    def __init__(self, spec: GripperSpec, robot: str, host: Host, clock: Clock, latch: StopLatch) -> None:
         self.spec = spec
         self.name = spec.name
         self.clock = clock
         self._robot = robot
         self._host = host
+        self._latch = latch
         self._mail = host.memory.robots[robot]
         self._commands = 0
 
@@ -111,7 +113,7 @@ class Gripper:
     def start(self, width: float, speed: float | None = None, force: float | None = None) -> None:
         """Start towards ``width`` (m) at ``speed`` (m/s) with at most ``force`` (N); returns at once.
 
-        Raises CommandError for numbers that the gripper cannot do.
+        Raises CommandError for numbers that the gripper cannot do, MotionStopped while ``rig.stop()`` is latched.
         """
         speed = self.spec.speed if speed is None else speed
         force = self.spec.force if force is None else force
@@ -121,7 +123,11 @@ class Gripper:
             raise CommandError(f"speed must be above 0 and at most {self.spec.speed:g} m/s, not {speed}")
         if not 0.0 < force < math.inf:
             raise CommandError(f"force must be positive, not {force}")
+        self._latch.check()
         self._host.check()
+        self._send(width, speed, force)
+
+    def _send(self, width: float, speed: float, force: float) -> None:
         self._commands += 1
         self._mail.gripper_command.write(self._commands, width, speed, force)
 

@@ -116,6 +116,10 @@ class Pose:
         m[:3, 3] = self.position
         return m
 
+    def transform(self, points: ArrayLike) -> Array:
+        """Points (3,) or (n, 3), given in this frame, in the frame that the pose is given in."""
+        return np.asarray(points, float) @ quaternion_to_matrix(self.orientation).T + self.position
+
     def inverse(self) -> Pose:
         """The pose of the parent in this frame."""
         return Pose.from_matrix(np.linalg.inv(self.matrix()))

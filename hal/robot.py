@@ -131,7 +131,7 @@ class Robot:
         if spec.gripper is not None:
             from .gripper import Gripper
 
-            self.gripper = Gripper(spec.gripper, spec.name, host, clock)
+            self.gripper = Gripper(spec.gripper, spec.name, host, clock, latch)
 
     # What it is.
 
@@ -230,8 +230,8 @@ class Robot:
     ) -> RobotState:
         """Move to joint positions (n,) or to a tcp pose in the base frame, straight in joint space; blocks.
 
-        ``speed`` is a share of the joint speed limits (``move_speed`` of the rig, 0.1, by default); the tcp stays
-        below the rig's ``tcp_speed`` as well. With a dead-man it waits until that is held, and pauses while it is
+        ``speed`` is a share of the joint speed limits, up to 1 (``move_speed`` of the rig, 0.1, by default); the tcp
+        stays below the rig's ``tcp_speed`` all the same. With a dead-man it waits until that is held, and pauses while it is
         not. Raises CommandError, Unreachable, MotionStopped after a trip, and TimeoutError after ``timeout`` s.
         """
         from .control import move_to

@@ -123,7 +123,9 @@ def test_a_first_target_far_away_is_refused(rig: hal.Rig, arm: hal.Robot) -> Non
     with arm.control() as control:
         with pytest.raises(CommandError, match=r"0\.200 rad from the set-point at .*use move_to"):
             control.send(JointTarget(far))
-        with pytest.raises(CommandError, match=r"0\.100 m from the set-point, .*use move_to"):
+        with pytest.raises(CommandError, match=r"0\.000 m and \d\.\d+ rad from the set-point, .*use move_to"):
+            control.send(hal.CartesianTarget(hal.Pose(pose.position, [0, 1, 0, 0])))
+        with pytest.raises(CommandError, match=r"0\.100 m and 0\.000 rad from the set-point, .*use move_to"):
             control.send(hal.CartesianTarget(hal.Pose(pose.position + np.array([0.1, 0, 0]), pose.orientation)))
         let_pass(rig, 0.1)
     assert np.array_equal(arm.state().q, arm.home)
@@ -343,6 +345,14 @@ def test_the_gripper_takes_metres_and_fractions(rig: hal.Rig, arm: hal.Robot) ->
             gripper.start(bad)
     with pytest.raises(CommandError, match="from 0 .open. to 1"):
         gripper.grip(1.5)
+
+
+def test_the_gripper_rests_while_a_stop_is_latched(rig: hal.Rig, arm: hal.Robot) -> None:
+    rig.stop()
+    with pytest.raises(MotionStopped, match=r"rig\.rearm"):
+        arm.gripper.grip(1.0)
+    rig.rearm()
+    assert arm.gripper.grip(1.0).width < 1e-3
 
 
 def test_a_trip_and_the_end_of_a_session_leave_the_grip_alone(rig: hal.Rig, arm: hal.Robot) -> None:
