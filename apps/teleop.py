@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from hal.teleop import Teleop
 
 RATE_HZ = 50.0
+STALE = 2.0
 
 
 def parser() -> argparse.ArgumentParser:
@@ -164,7 +165,7 @@ class Session:
             self.line.event("going on")
 
     def _show(self, control: Control) -> None:
-        state = self.robot.state()
+        state = self.robot.state(max_age=STALE)  # what is only shown may be older than what is acted on
         self.report.saw(state)
 
         def text() -> str:
