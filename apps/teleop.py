@@ -98,8 +98,8 @@ class Session:
         clean = False
         try:
             print("\n".join(f"  {line}" for line in self.teleop.help(self.pad)), flush=True)
-            while self._drive():
-                self._go_home()
+            while self._turn():
+                pass
             clean = True
         except KeyboardInterrupt:
             clean = True  # the session's end brought the arm to rest
@@ -109,6 +109,20 @@ class Session:
                 self.report.write(self.args.report, self.report.collect(clean))
         self.line.event(f"stopped after {self.rig.clock.now() - self.report.start:.1f} s")
         return 0
+
+    def _turn(self) -> bool:
+        """Drive, and go home when that was asked for. False when the run is over."""
+        from hal.errors import MotionStopped
+
+        try:
+            go_on = self._drive()
+            if go_on:
+                self._go_home()
+        except MotionStopped as stop:  # a new session wants the stop to be acknowledged first
+            self._tripped(stop)
+            self.rig.clock.sleep(0.1)
+            return not self._over()
+        return go_on
 
     def _drive(self) -> bool:
         """Follow the pad. True when the home button was pressed, False when the run is over."""
@@ -136,13 +150,8 @@ class Session:
         return False
 
     def _go_home(self) -> None:
-        from hal.errors import MotionStopped
-
         self.line.event("home: hold the dead-man until the arm is there")
-        try:
-            self.robot.move_to(self.robot.home, deadman=self.deadman)
-        except MotionStopped as stop:
-            self._tripped(stop)
+        self.robot.move_to(self.robot.home, deadman=self.deadman)
 
     def _over(self) -> bool:
         return self.pad.finished or (self.end is not None and self.rig.clock.now() >= self.end)

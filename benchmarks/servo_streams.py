@@ -42,7 +42,11 @@ NEAR = 1e-3
 
 
 class NoKinematics:
-    """Joint streams with an unlimited tcp speed need none; any use is an error."""
+    """Joint streams with an unlimited tcp speed need none; any use beyond the servo's making is an error."""
+
+    def reach(self) -> tuple[float, ...]:
+        """No lever arms."""
+        return (0.0,) * N
 
 
 @dataclass

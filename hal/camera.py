@@ -173,15 +173,16 @@ class Camera:
         while not self._closing.is_set():
             try:
                 raw = self._driver.grab(0.1)
-            except ConnectionLost as error:
+                if raw is None:
+                    continue
+                frame = self._frame(raw)
+            except Exception as error:
+                lost = error if isinstance(error, ConnectionLost) else ConnectionLost(f"camera {self.name}: {error!r}")
                 with self._news:
-                    self._error = error
+                    self._error = lost
                     self._news.notify_all()
                 self._closing.wait(0.2)
                 continue
-            if raw is None:
-                continue
-            frame = self._frame(raw)
             with self._news:
                 self._error = None
                 self._newest = frame

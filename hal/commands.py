@@ -12,7 +12,17 @@ from numpy.typing import ArrayLike, NDArray
 from .errors import CommandError
 from .pose import Pose, frozen
 
-__all__ = ["CartesianTarget", "Command", "JointTarget", "JointTorque", "JointVelocity", "Kind", "Sent", "Twist"]
+__all__ = [
+    "CartesianTarget",
+    "Command",
+    "JointTarget",
+    "JointTorque",
+    "JointVelocity",
+    "Kind",
+    "Sent",
+    "Twist",
+    "encode",
+]
 
 Array = NDArray[np.float64]
 
@@ -111,6 +121,19 @@ class Twist:
 
 
 Command: TypeAlias = JointTarget | JointVelocity | JointTorque | CartesianTarget | Twist
+
+
+def encode(command: Command) -> tuple[Kind, tuple[float, ...]]:
+    """A command as it travels; see :class:`hal.inbox.CommandRecord`."""
+    if isinstance(command, JointTarget):
+        q = command.q.tolist()
+        return Kind.JOINT_TARGET, (*q, *(command.dq.tolist() if command.dq is not None else [0.0] * len(q)))
+    if isinstance(command, JointVelocity):
+        return Kind.JOINT_VELOCITY, tuple(command.dq.tolist())
+    if isinstance(command, CartesianTarget):
+        return Kind.CARTESIAN_TARGET, (*command.pose.position.tolist(), *command.pose.orientation.tolist())
+    assert isinstance(command, Twist)
+    return Kind.TWIST, (*command.linear.tolist(), *command.angular.tolist(), 1.0 if command.frame == "tcp" else 0.0)
 
 
 class Sent(NamedTuple):

@@ -7,13 +7,12 @@ from types import TracebackType
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import ArrayLike
 
-from .commands import CartesianTarget, Command, JointTarget, JointTorque, JointVelocity, Kind, Sent, Twist
-from .errors import CommandError, ConnectionLost, HalError, MotionStopped, NotSupported, RobotFault
+from .commands import CartesianTarget, Command, JointTarget, JointTorque, JointVelocity, Sent, Twist, encode
+from .errors import CommandError, ConnectionLost, ControlTaken, HalError, MotionStopped, NotSupported, RobotFault
 from .inbox import CommandRecord, Session
-from .pose import Pose
-from .types import RobotState, RobotStatus, Trip
+from .stops import trip_text
+from .types import RobotStatus, Trip
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -22,7 +21,7 @@ if TYPE_CHECKING:
     from .host.records import ServoRecord
     from .robot import Robot
 
-__all__ = ["FIRST_STEP_ANGLE", "FIRST_STEP_DISTANCE", "Control", "StopLatch", "move_to"]
+__all__ = ["FIRST_STEP_ANGLE", "FIRST_STEP_DISTANCE", "FIRST_STEP_TURN", "Control"]
 
 FIRST_STEP_ANGLE = 0.1
 """Farthest that a first joint target may be from the set-point, rad per joint."""
@@ -32,34 +31,6 @@ FIRST_STEP_TURN = 0.2
 _SHORTEST_DEADLINE = 0.1
 _PERIODS = 2.5
 _REST_LIMIT = 5.0
-
-_TRIPS = {
-    Trip.COMMAND_LATE: "the commands stopped coming",
-    Trip.DEADMAN_SILENT: "the dead-man's pad gave no sign of life",
-    Trip.DEADMAN_LOST: "the dead-man's pad was disconnected",
-    Trip.STOP: "rig.stop() was called",
-    Trip.APP_SILENT: "the app did not answer",
-    Trip.FAULT: "the robot reported a fault",
-    Trip.DEVICE_LOST: "the robot does not answer",
-    Trip.BAD_READING: "the robot reported numbers that cannot be",
-}
-
-
-class StopLatch:
-    """Remembers that ``rig.stop()`` was called until somebody acknowledges it."""
-
-    def __init__(self) -> None:
-        self.stopped = False
-
-    def check(self) -> None:
-        """Raise MotionStopped while the stop is not acknowledged."""
-        if self.stopped:
-            raise MotionStopped("rig.stop() was called", "call rig.rearm() when it is safe to move again")
-
-
-def trip_text(trip: Trip) -> str:
-    """A trip in words."""
-    return _TRIPS.get(trip, trip.name.lower())
 
 
 class Control:
@@ -100,7 +71,7 @@ class Control:
         self._mail = robot._mail
         self._host = robot._host
         self._id = 0
-        self._rearms = self._mail.get_rearms()
+        self._stopped = False
         self._rearmed_at = -math.inf
         self._detach: Callable[[], None] | None = None
         self._grip: float | None = None
@@ -110,25 +81,34 @@ class Control:
 
     def __enter__(self) -> Control:
         robot = self.robot
-        if self.deadman is None:
-            robot._latch.check()
-        else:
-            if robot._latch.stopped and self.deadman.held:
-                raise MotionStopped("rig.stop() was called", "release the dead-man first")
-            self._detach = self.deadman.attach(self._mail.put_deadman)
+        if self._id:
+            raise ControlTaken("this control session is open already")
+        if robot._open is not None:
+            raise ControlTaken(f"{robot.name} is under the control of another session of this program")
+        # The count first: a stop that comes after this line trips the session in its first tick.
+        stops = self._host.stops
+        self._check_latch()
         robot._sessions += 1
         self._id = robot._sessions
-        session = Session(self._id, self.speed, self.tcp_speed, self.deadman is not None, self._goal)
+        session = Session(self._id, self.speed, self.tcp_speed, self.deadman is not None, self._goal, stops)
         try:
+            robot._open = self
+            if self.deadman is not None:
+                self._detach = self.deadman.attach(self._mail.put_deadman)
             self._host.request("begin", {"robot": robot.name, "session": list(session)})
-        except BaseException:
-            self._id = 0
-            self._let_go()
+        except BaseException:  # Ctrl-C too: the host may have it already, or get it later
+            self._forget()
             raise
-        robot._open = self
-        if self.deadman is not None:
+        if self.deadman is not None and self._host.stops == stops:
             robot._latch.stopped = False
         return self
+
+    def _check_latch(self) -> None:
+        latch = self.robot._latch
+        if self.deadman is None:
+            latch.check()
+        elif latch.stopped and self.deadman.held:
+            raise MotionStopped("rig.stop() was called", "release the dead-man first")
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
@@ -143,15 +123,17 @@ class Control:
         """Bring the arm to rest and end the session. Idempotent."""
         if not self._id:
             return
+        self._mail.end(self._id)  # needs no answer: from here on the arm brakes, whatever happens to this program
         try:
-            self._host.request("end", {"robot": self.robot.name, "session": self._id})
             self._wait_for_rest()
         finally:
-            self._id = 0
-            self.robot._open = None
-            self._let_go()
+            self._forget()
 
-    def _let_go(self) -> None:
+    def _forget(self) -> None:
+        """The session is over for this program; the host is told, should it not know."""
+        self._mail.end(self._id)
+        self._id = 0
+        self.robot._open = None
         if self._detach is not None:
             self._detach()
             self._detach = None
@@ -205,7 +187,7 @@ class Control:
                 reasons.append("the dead-man is not held: the arm does not move")
             elif servo.status is RobotStatus.HOLDING:
                 self._check_first(command, servo)
-            kind, values = _encode(command)
+            kind, values = encode(command)
             self.robot._commands += 1
             deadline = now + self._deadline
             self._mail.put_command(CommandRecord(self.robot._commands, self._id, now, deadline, kind, values, t_event))
@@ -219,9 +201,12 @@ class Control:
             cause, remedy = (fault.cause, fault.remedy) if fault else ("the robot reports a fault", "")
             raise RobotFault(cause, f"{remedy}; then robot.recover()" if remedy else "call robot.recover()")
         if servo.trip is Trip.NONE:
+            if self._stopped:  # a press of the dead-man acknowledged the stop
+                self._stopped = self.robot._latch.stopped = False
             return
         if self._rearmed_at > -math.inf and self._mail.state.seq() <= self._rearmed_at:
             return  # the servo has not seen the rearm yet
+        self._stopped = servo.trip is Trip.STOP
         remedy = "release the dead-man and press it again" if self.deadman else "call control.rearm() to go on"
         raise MotionStopped(trip_text(servo.trip), remedy)
 
@@ -233,8 +218,7 @@ class Control:
         if self.deadman is not None:
             raise MotionStopped("this session has a dead-man", "release it and press it again")
         self.robot._latch.stopped = False
-        self._rearms += 1
-        self._mail.rearms.write(self._rearms)
+        self._mail.rearm()
         self._rearmed_at = self._mail.state.seq() + 1
 
     def _checked(self, command: Command, reasons: list[str]) -> Command:
@@ -296,59 +280,3 @@ def _share(name: str, asked: float | None, default: float, most: float, goal: ob
     if not (math.isfinite(value) and 0.0 < value <= most):
         raise CommandError(f"{name} must be above 0 and at most {most:g} (the rig's own), not {value}")
     return value
-
-
-def _encode(command: Command) -> tuple[Kind, tuple[float, ...]]:
-    """A command as it travels; see :class:`hal.inbox.CommandRecord`."""
-    if isinstance(command, JointTarget):
-        q = command.q.tolist()
-        return Kind.JOINT_TARGET, (*q, *(command.dq.tolist() if command.dq is not None else [0.0] * len(q)))
-    if isinstance(command, JointVelocity):
-        return Kind.JOINT_VELOCITY, tuple(command.dq.tolist())
-    if isinstance(command, CartesianTarget):
-        return Kind.CARTESIAN_TARGET, (*command.pose.position.tolist(), *command.pose.orientation.tolist())
-    assert isinstance(command, Twist)
-    return Kind.TWIST, (*command.linear.tolist(), *command.angular.tolist(), 1.0 if command.frame == "tcp" else 0.0)
-
-
-def move_to(
-    robot: Robot,
-    target: ArrayLike | Pose,
-    *,
-    deadman: Deadman | None,
-    unattended: bool,
-    speed: float | None,
-    tcp_speed: float | None,
-    timeout: float | None,
-) -> RobotState:
-    """See :meth:`hal.robot.Robot.move_to`."""
-    goal = robot.ik(target) if isinstance(target, Pose) else JointTarget(target).q
-    if goal.size != robot.n:
-        raise CommandError(f"{robot.name} has {robot.n} joints; the target has {goal.size}")
-    limits = robot.limits
-    outside = np.flatnonzero((goal < limits.lower) | (goal > limits.upper))
-    if outside.size:
-        names = ", ".join(robot.joints[k] for k in outside)
-        raise CommandError(f"the target is outside the position limits of {names}")
-    session = Control(
-        robot,
-        deadman=deadman,
-        rate_hz=50.0,
-        speed=speed,
-        tcp_speed=tcp_speed,
-        unattended=unattended,
-        goal=tuple(goal.tolist()),
-    )
-    clock = robot.clock
-    start = clock.now()
-    with session:
-        for _ in clock.rate(50.0):
-            servo = session._peek()
-            session._check_trip(servo, clock.now())
-            if servo.refused and servo.session == session._id:
-                raise CommandError(f"the way to the target leaves the workspace of {robot.name}")
-            if servo.arrived and servo.session == session._id:
-                break
-            if timeout is not None and clock.now() - start > timeout:
-                raise TimeoutError(f"{robot.name} did not reach the target within {timeout:g} s")
-    return robot.state()

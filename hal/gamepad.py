@@ -235,13 +235,12 @@ class Gamepad:
         if not self._open:
             return False
         try:
-            reading = self.driver.poll(now, timeout)
+            self._take(self.driver.poll(now, timeout))
         except Exception as error:
             self._error = error
             self._lose(now)
             return False
         self._error = None
-        self._take(reading)
         return True
 
     def _lose(self, now: float) -> None:

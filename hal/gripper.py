@@ -11,9 +11,9 @@ from .types import GripperState
 
 if TYPE_CHECKING:
     from .clock import Clock
-    from .control import StopLatch
     from .host.hosts import Host
     from .specs import GripperSpec
+    from .stops import StopLatch
 
 __all__ = ["Gripper", "GripperDriver", "GripperReading"]
 

@@ -21,6 +21,8 @@ class Session(NamedTuple):
     """Motion only while a dead-man is held."""
     move_to: tuple[float, ...] | None = None
     """Go to these joint positions (rad) and stay; None for a session that follows streamed commands."""
+    stops: int = 0
+    """Calls of ``rig.stop()`` that the app knew of, and had acknowledged, when it opened the session."""
 
 
 class CommandRecord(NamedTuple):

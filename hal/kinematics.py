@@ -9,6 +9,7 @@ from __future__ import annotations
 import difflib
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Sequence
+from math import dist, hypot, inf, sqrt
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -51,7 +52,6 @@ class Kinematics:
         self.lower: Array = np.array(spec.lower, float)
         self.upper: Array = np.array(spec.upper, float)
         self.home: Array = np.array(spec.home, float)
-        self._home = self.home.tolist()
         for name, values in (("lower", self.lower), ("upper", self.upper), ("home", self.home)):
             if values.shape != (self.n,):
                 raise ValueError(f"{name} has {values.size} numbers for {self.n} joints")
@@ -65,12 +65,16 @@ class Kinematics:
         self._eigen: Any = eigenpy.SelfAdjointEigenSolver(np.eye(6))
         self._llt: Any = eigenpy.LLT(np.eye(6))
         self._gram: Array = np.empty((6, 6))
+        self._regular_at: Sequence[float] = (inf,) * self.n
+        self._regular_room = 0.0
         # Column of pinocchio's model for each joint of the spec; None where the orders agree, which is usual.
         columns = [int(self._model.joints[self._model.getJointId(name)].idx_q) for name in spec.joints]
         self._columns: NDArray[np.intp] | None = None
         self._inverse_columns: NDArray[np.intp] | None = None
         if columns != list(range(self.n)):
             self._columns, self._inverse_columns = np.array(columns), np.argsort(columns)
+        # Greatest change of the Jacobian (Frobenius norm) for a turn of the joints of length 1.
+        self._change = sqrt(self.n) * hypot(*self.reach(), sqrt(self.n))
 
     def fk(self, q: Sequence[float] | Array) -> Pose7:
         """Pose of the tcp as seven plain floats."""
@@ -103,8 +107,19 @@ class Kinematics:
         )
         return jacobian if self._columns is None else jacobian[:, self._columns]
 
+    def fk_and_jacobian(self, q: Sequence[float] | Array) -> tuple[Pose7, Array]:
+        """:meth:`fk` and :meth:`jacobian` together, for little more than one of them."""
+        jacobian = self.jacobian(q)  # has done the forward kinematics of the joints
+        self._pin.updateFramePlacement(self._model, self._data, self._tcp)
+        pose: Pose7 = self._pin.SE3ToXYZQUATtuple(self._tcp_placement)
+        return pose, jacobian
+
     def velocity(
-        self, q: Sequence[float] | Array, twist: Sequence[float] | Array, posture_gain: float = 0.5
+        self,
+        q: Sequence[float] | Array,
+        twist: Sequence[float] | Array,
+        posture_gain: float = 0.5,
+        jacobian: Array | None = None,
     ) -> tuple[list[float], bool]:
         """Joint speeds (n,) in rad/s for a twist (6,) of the tcp; and whether the arm is near a singularity.
 
@@ -114,20 +129,23 @@ class Kinematics:
         1988) with the damping s^2 + l^2 = max(s, e)^2. All other directions stay exact.
 
         What the twist leaves free moves towards home at ``posture_gain`` (1/s) times the distance, at most
-        :data:`POSTURE_SPEED`; that motion is in the null space and does not move the tcp.
+        :data:`POSTURE_SPEED`; that motion is in the null space and does not move the tcp. Who has the Jacobian at
+        ``q`` already can pass it.
         """
-        jacobian = self.jacobian(q)
+        if jacobian is None:
+            jacobian = self.jacobian(q)
         gram = np.dot(jacobian, jacobian.T, self._gram)
-        self._eigen.compute(gram)
-        squares = self._eigen.eigenvalues()  # of the singular values, in ascending order
-        near = bool(squares[0] < NEAR_SINGULAR**2)
+        near = not self._is_surely_regular(q) and self._is_near_singular(q, gram)
         posture = self._posture(q, posture_gain)
         if not near:
             # posture + J^+ (twist - J posture): the posture, corrected to what the twist demands.
-            error = twist if posture is None else twist - jacobian.dot(posture)
+            error = np.array(twist, float)
+            if posture is not None:
+                error -= jacobian.dot(posture)
             self._llt.compute(gram)
-            speeds = self._llt.solve(np.asarray(error, float)).dot(jacobian)
+            speeds = self._llt.solve(error).dot(jacobian)
         else:
+            squares = self._eigen.eigenvalues()  # of the singular values, in ascending order
             vectors = self._eigen.eigenvectors()
             task = vectors.T.dot(twist) / np.maximum(squares, NEAR_SINGULAR**2)
             if posture is not None:
@@ -145,10 +163,27 @@ class Kinematics:
         """Joint speeds towards home; None where there is no freedom left for a posture."""
         if gain == 0.0 or self.n <= 6:
             return None
-        speeds = [gain * (home - value) for home, value in zip(self._home, q, strict=True)]
-        fastest = max(map(abs, speeds))
-        posture = np.array(speeds)
+        posture: Array = gain * (self.home - q)
+        if posture.dot(posture) <= POSTURE_SPEED**2:  # then its fastest is no faster either
+            return posture
+        fastest = float(np.abs(posture).max())
         return posture if fastest <= POSTURE_SPEED else posture * (POSTURE_SPEED / fastest)
+
+    def _is_near_singular(self, q: Sequence[float] | Array, gram: Array) -> bool:
+        """Is a singular value of the Jacobian at ``q`` below :data:`NEAR_SINGULAR`? Its ``gram`` matrix is J J^T."""
+        self._eigen.compute(gram)
+        square = float(self._eigen.eigenvalues()[0])
+        self._regular_at, self._regular_room = tuple(q), sqrt(max(0.0, square)) - NEAR_SINGULAR
+        return square < NEAR_SINGULAR**2
+
+    def _is_surely_regular(self, q: Sequence[float] | Array) -> bool:
+        """Is the arm surely not near a singularity, because it was not when one was looked for last? False: not proven.
+
+        No singular value of J changes by more than the Frobenius norm of the change of J (Weyl). A turn of the joints
+        by d changes the linear part of each of its n columns by at most |reach| |d| (see :meth:`reach`), the angular
+        part by at most sum |d_i| <= sqrt(n) |d|.
+        """
+        return dist(q, self._regular_at) * self._change <= self._regular_room
 
     def pose_error(self, q: Sequence[float] | Array, pose: Sequence[float] | Array) -> Array:
         """(6,) the constant twist along the base's axes that takes the tcp from ``fk(q)`` to ``pose`` in 1 s.

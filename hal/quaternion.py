@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from math import atan2, cos, sin, sqrt
+from math import atan2, cos, hypot, sin
 
 __all__ = ["after_rotation", "difference", "rotate"]
 
@@ -21,34 +21,30 @@ def rotate(quaternion: Floats, vector: Floats) -> list[float]:
 
 def after_rotation(quaternion: Floats, vector: Floats) -> list[float]:
     """The orientation (4,) after a turn by the rotation vector (3,) in rad, both along the parent's axes."""
-    angle = sqrt(sum([x * x for x in vector]))
+    x, y, z = vector
+    angle = hypot(x, y, z)
     scale = 0.5 if angle < 1e-9 else sin(0.5 * angle) / angle
-    x, y, z = (scale * v for v in vector)
-    w = cos(0.5 * angle)
+    x, y, z, w = scale * x, scale * y, scale * z, cos(0.5 * angle)
     qx, qy, qz, qw = quaternion
-    product = [
-        w * qx + x * qw + y * qz - z * qy,
-        w * qy - x * qz + y * qw + z * qx,
-        w * qz + x * qy - y * qx + z * qw,
-        w * qw - x * qx - y * qy - z * qz,
-    ]
-    norm = sqrt(sum([c * c for c in product]))
-    return [c / norm for c in product]
+    a = w * qx + x * qw + y * qz - z * qy
+    b = w * qy - x * qz + y * qw + z * qx
+    c = w * qz + x * qy - y * qx + z * qw
+    d = w * qw - x * qx - y * qy - z * qz
+    norm = hypot(a, b, c, d)
+    return [a / norm, b / norm, c / norm, d / norm]
 
 
 def difference(start: Floats, end: Floats) -> list[float]:
     """The twist (6,) along the parent's axes that takes a pose (7,) to another in 1 s, turning the shorter way."""
-    ax, ay, az, aw = start[3:]
-    bx, by, bz, bw = end[3:]
+    x0, y0, z0, ax, ay, az, aw = start
+    x1, y1, z1, bx, by, bz, bw = end
     # The rotation from start to end along the parent's axes is end * conjugate(start).
     w = bw * aw + bx * ax + by * ay + bz * az
-    turn = [
-        -bw * ax + bx * aw - by * az + bz * ay,
-        -bw * ay + bx * az + by * aw - bz * ax,
-        -bw * az - bx * ay + by * ax + bz * aw,
-    ]
-    sine = sqrt(sum([x * x for x in turn]))
+    x = -bw * ax + bx * aw - by * az + bz * ay
+    y = -bw * ay + bx * az + by * aw - bz * ax
+    z = -bw * az - bx * ay + by * ax + bz * aw
+    sine = hypot(x, y, z)
     scale = 2.0 * atan2(sine, abs(w)) / sine if sine > 1e-12 else 2.0
     if w < 0.0:
         scale = -scale
-    return [b - a for a, b in zip(start[:3], end[:3], strict=True)] + [scale * x for x in turn]
+    return [x1 - x0, y1 - y0, z1 - z0, scale * x, scale * y, scale * z]

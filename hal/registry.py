@@ -4,12 +4,13 @@ Nothing here imports a driver before it is asked for, and nothing else in ``hal`
 
 A driver is three things: a folder, a class per kind of device in it (:class:`~hal.robot.RobotDriver` and its
 siblings), and one :class:`DriverSpec` that names those classes. A package of your own announces its spec in its
-``pyproject.toml``, and then rigs may say ``driver: my_arm``::
+``pyproject.toml``, and then the model of an arm or a camera, or its entry in a rig, may say
+``drivers: {real: my_arm}``, and that of a gamepad ``driver: my_pad``::
 
     [project.entry-points."hal.drivers"]
     my_arm = "my_lab.my_arm:DRIVER"
 
-Without a package, a rig may name the spec itself: ``driver: my_lab.my_arm:DRIVER``.
+Without a package, they may name the spec itself: ``drivers: {real: "my_lab.my_arm:DRIVER"}``.
 """
 
 from __future__ import annotations

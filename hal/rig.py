@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import atexit
 import contextlib
-import weakref
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from difflib import get_close_matches
 from pathlib import Path
 from types import TracebackType
@@ -14,13 +13,13 @@ from typing import TYPE_CHECKING, Any, TypeVar
 from . import registry
 from .camera import Camera
 from .clock import Clock, LockStepClock, RealClock
-from .control import StopLatch
-from .errors import DeviceNotFound, HalError, NotSupported
+from .errors import ConnectionLost, DeviceNotFound, HalError, NotSupported
 from .gamepad import Gamepad
 from .host.hosts import Host, LocalHost, RemoteHost
 from .pads.choice import choose_pad
 from .robot import Robot
 from .specs import GroupSpec
+from .stops import StopLatch
 from .world import NoWorld, World
 
 if TYPE_CHECKING:
@@ -102,9 +101,7 @@ class Rig:
         self._viewer: Viewer | None = None
         self._devices: dict[str, Any] = {}
         self._closed = False
-        reference = weakref.ref(self)
-        self._at_exit: Callable[[], None] = lambda: _close_at_exit(reference)
-        atexit.register(self._at_exit)
+        atexit.register(self._close_at_exit)
 
     # Opening.
 
@@ -245,24 +242,29 @@ class Rig:
     def _world_edited(self, method: str, params: dict[str, Any], revision: int) -> None:
         for shown in (self._pictures, self._viewer):
             if shown is not None:
-                shown.edited(method, params, revision)
+                with contextlib.suppress(ConnectionLost):  # its own next use says that it is gone
+                    shown.edited(method, params, revision)
 
     def close(self) -> None:
         """Bring the arms to rest and let go of every device. Idempotent; the first error is raised at the end."""
         if self._closed:
             return
-        self._closed = True
-        atexit.unregister(self._at_exit)
-        errors: list[Exception] = []
+        errors: list[BaseException] = []
         sessions = [robot._open for robot in self.robots.values() if robot._open is not None]
         shown = [item for item in (self._viewer, self._pictures) if item is not None]
         for device in (*sessions, *self.gamepads.values(), *self.cameras.values(), *shown, *self._hosts):
             try:
                 device.close()
-            except Exception as error:
+            except BaseException as error:  # a second Ctrl-C must not leave the rest open
                 errors.append(error)
+        self._closed = True
+        atexit.unregister(self._close_at_exit)
         if errors:
             raise errors[0]
+
+    def _close_at_exit(self) -> None:
+        with contextlib.suppress(Exception):
+            self.close()
 
     def __enter__(self) -> Rig:
         return self
@@ -291,10 +293,3 @@ def _groups(plan: Plan) -> list[GroupSpec]:
         return [GroupSpec("simulation", plan.clock, rate, inside + outside, world)]
     groups = [GroupSpec("simulation", plan.clock, world.physics_hz, inside, world)] if world else []
     return groups + [GroupSpec(r.name, plan.clock, r.rate_hz, (r,)) for r in outside]
-
-
-def _close_at_exit(reference: weakref.ref[Rig]) -> None:
-    rig = reference()
-    if rig is not None:
-        with contextlib.suppress(Exception):
-            rig.close()

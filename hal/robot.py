@@ -15,12 +15,13 @@ from .types import Fault, RobotState, RobotStatus
 
 if TYPE_CHECKING:
     from .clock import Clock
-    from .control import Control, StopLatch
+    from .control import Control
     from .deadman import Deadman
     from .gripper import Gripper
     from .host.hosts import Host
     from .kinematics import Kinematics
     from .specs import LimitsSpec, RobotSpec
+    from .stops import StopLatch
 
 __all__ = ["Reading", "Robot", "RobotDriver", "Setpoint"]
 
@@ -173,19 +174,16 @@ class Robot:
         owns it, is gone.
         """
         self._host.check()
-        found = self._mail.get_state()
-        if found is None:
+        state = self._mail.get_state()
+        if state is None:
             raise StaleStateError(f"{self.name} has not reported a state yet")
-        state = found[0]
+        age = self.clock.now() - state.stamp.t
         if state.status is RobotStatus.LOST:
-            raise ConnectionLost(f"{self.name} does not answer; its last state is {self._age(state):.3f} s old")
-        age = self._age(state)
+            reason = f": {state.fault.cause}" if state.fault is not None else ""
+            raise ConnectionLost(f"{self.name} does not answer{reason} (its last state is {age:.3f} s old)")
         if age > max_age:
             raise StaleStateError(f"the newest state of {self.name} is {age:.3f} s old, more than {max_age:g} s")
         return state
-
-    def _age(self, state: RobotState) -> float:
-        return self.clock.now() - state.stamp.t
 
     def fk(self, q: ArrayLike) -> Pose:
         """Pose of the tcp in the base frame at joint positions ``q`` (n,), rad."""
@@ -231,10 +229,10 @@ class Robot:
         """Move to joint positions (n,) or to a tcp pose in the base frame, straight in joint space; blocks.
 
         ``speed`` is a share of the joint speed limits, up to 1 (``move_speed`` of the rig, 0.1, by default); the tcp
-        stays below the rig's ``tcp_speed`` all the same. With a dead-man it waits until that is held, and pauses while it is
-        not. Raises CommandError, Unreachable, MotionStopped after a trip, and TimeoutError after ``timeout`` s.
+        stays below the rig's ``tcp_speed`` all the same. With a dead-man it waits until that is held, and pauses while
+        it is not. Raises CommandError, Unreachable, MotionStopped after a trip, and TimeoutError after ``timeout`` s.
         """
-        from .control import move_to
+        from .moving import move_to
 
         return move_to(
             self, target, deadman=deadman, unattended=unattended, speed=speed, tcp_speed=tcp_speed, timeout=timeout

@@ -79,11 +79,11 @@ class PyBulletRobot(RobotDriver):
             self._body.id,
             self._joints,
             self._mode,
-            targetPositions=[a - b * dt for a, b in zip(q, dq, strict=True)],
-            targetVelocities=dq,
-            forces=self._efforts,
-            positionGains=self._position_gains,
-            velocityGains=self._velocity_gains,
+            [a - b * dt for a, b in zip(q, dq, strict=True)],  # and their velocities, forces and gains, by position:
+            dq,  # names would double the time of the call
+            self._efforts,
+            self._position_gains,
+            self._velocity_gains,
         )
         self._q, self._dq = q, dq
 
@@ -125,7 +125,7 @@ class PyBulletRobot(RobotDriver):
             self._world.off_reset(self.spec.name, self._was_reset)
         self._open = False
 
-    def _hold(self, q: list[float]) -> None:
+    def _hold(self, q: Sequence[float]) -> None:
         hold(self._world.client, self._body, dict(zip(self._joints, q, strict=True)), self._world.dt)
         self._q, self._dq = list(q), [0.0] * len(q)
 

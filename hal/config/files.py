@@ -1,22 +1,19 @@
-"""YAML files into checked records, gathering every problem on the way instead of stopping at the first."""
+"""YAML files into plain data, gathering every problem on the way instead of stopping at the first."""
 
 from __future__ import annotations
 
 import difflib
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import yaml
-from pydantic import BaseModel, ValidationError
 
 from ..errors import ConfigError, Problem
-from .schema import describe, keys_at
+from .schema import describe
 
-__all__ = ["Problems", "nearest", "read_yaml", "validate"]
-
-M = TypeVar("M", bound=BaseModel)
+__all__ = ["Problems", "closest", "nearest", "parse_yaml", "plain_copy", "read_yaml"]
 
 
 class Problems:
@@ -26,9 +23,13 @@ class Problems:
         self.found: list[Problem] = []
         self.overridden: set[str] = set()
         """Dotted keys that the caller set on top of the file."""
+        self.written: dict[tuple[str, str], str] = {}
+        """File and dotted key as it should be spelt -> the last part of that key as the file spells it."""
 
     def add(self, file: Path | str, key: str, message: str) -> None:
         """Note a problem. One in a key that an override set is the override's, not the file's."""
+        right = key.split(".")
+        key = ".".join(self.written.get((str(file), ".".join(right[: k + 1])), part) for k, part in enumerate(right))
         by_override = any(key == path or key.startswith(path + ".") for path in self.overridden)
         problem = Problem("--set" if by_override else str(file), key, message)
         if problem not in self.found:
@@ -40,12 +41,24 @@ class Problems:
             raise ConfigError(self.found)
 
 
+def closest(word: str, choices: Iterable[str]) -> str | None:
+    """The one of ``choices`` that was probably meant by ``word``."""
+    return next(iter(difflib.get_close_matches(word, sorted(choices), n=1)), None)
+
+
 def nearest(word: str, choices: Iterable[str]) -> str:
-    """``"; did you mean ...? known: ..."`` for a name that is not among ``choices``."""
+    """``"; did you mean ...? there are: ..."`` for a name that is not among ``choices``."""
     known = sorted(choices)
-    close = difflib.get_close_matches(word, known, n=1)
-    hint = f"; did you mean {close[0]!r}?" if close else ";"
+    close = closest(word, known)
+    hint = f"; did you mean {close!r}?" if close else ";"
     return f"{hint} there are: {', '.join(known)}" if known else "; there are none"
+
+
+def plain_copy(value: Any) -> Any:
+    """A copy of nested dicts and lists, down to the values in them."""
+    if isinstance(value, Mapping):
+        return {key: plain_copy(item) for key, item in value.items()}
+    return [plain_copy(item) for item in value] if isinstance(value, (list, tuple)) else value
 
 
 # The one in C is ten times as fast; PyYAML can be built without it.
@@ -86,7 +99,10 @@ def read_yaml(path: Path, problems: Problems) -> dict[str, Any] | None:
             problems.add(path, "", "is empty")
             return None
         _find_duplicates(node, (), path, problems, set())
-        data = loader.construct_document(node)
+        data = plain_copy(loader.construct_document(node))
+    except RecursionError:
+        problems.add(path, "", "holds an alias (*) of something that the alias is in, or is nested too deeply")
+        return None
     except yaml.YAMLError as error:
         problems.add(path, "", f"is not valid YAML: {' '.join(str(error).split())}")
         return None
@@ -114,55 +130,3 @@ def _find_duplicates(node: yaml.Node, place: tuple[str, ...], path: Path, proble
     elif isinstance(node, yaml.SequenceNode):
         for k, item in enumerate(node.value):
             _find_duplicates(item, (*place, str(k)), path, problems, seen)
-
-
-def validate(model: type[M], data: Any, file: Path | str, problems: Problems, prefix: str = "") -> M | None:
-    """A record from plain data; None, and every problem noted, where that cannot be."""
-    try:
-        return model.model_validate(data)
-    except ValidationError as error:
-        for key, message in explain(model, error):
-            problems.add(file, ".".join(part for part in (prefix, key) if part), message)
-        return None
-
-
-def explain(model: type[BaseModel], error: ValidationError) -> list[tuple[str, str]]:
-    """Dotted key and a sentence for each thing that pydantic found."""
-    return [
-        (".".join(str(part) for part in found["loc"] if part != "[key]"), _sentence(model, found))
-        for found in error.errors(include_url=False)
-    ]
-
-
-def _sentence(model: type[BaseModel], found: Any) -> str:
-    kind, loc, given = found["type"], found["loc"], found["input"]
-    if kind == "missing":
-        return "is missing"
-    if kind == "extra_forbidden":
-        return f"is no key here{nearest(str(loc[-1]), keys_at(model, loc[:-1]))}"
-    if kind == "value_error":
-        return str(found["ctx"]["error"])
-    if kind == "literal_error":
-        choices = _choices(found["ctx"]["expected"])
-        return f"{describe(given)} is not possible{nearest(str(given), choices)}"
-    if kind in ("model_type", "dict_type", "model_attributes_type"):
-        keys = keys_at(model, loc)
-        return f"must hold keys and values, not {describe(given)}" + (f"; keys: {', '.join(keys)}" if keys else "")
-    wanted = _WANTED.get(kind) or found["msg"].replace("Input should be", "must be").replace("String should", "must")
-    return f"{wanted}, not {describe(given)}"
-
-
-_WANTED = {
-    "bool_type": "must be true or false",
-    "float_type": "must be a number",
-    "int_type": "must be a whole number",
-    "int_from_float": "must be a whole number",
-    "finite_number": "must be a finite number",
-    "string_type": "must be text",
-    "list_type": "must be a list",
-    "tuple_type": "must be a list",
-}
-
-
-def _choices(expected: str) -> Sequence[str]:
-    return [part.strip("' ") for part in expected.replace(" or ", ", ").split(",")]

@@ -10,18 +10,19 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from pydantic import PrivateAttr, ValidationError
+from pydantic import PrivateAttr
 
+from .context import Context
 from .data_files import data_folder, is_path, list_data
-from .files import Problems, explain, nearest, read_yaml
+from .files import Problems, nearest, read_yaml
 from .overrides import apply_overrides
 from .plan import Plan
-from .resolve import Context, resolve
+from .resolve import resolve
 from .rigfile import RigFile
+from .validation import validate
 
 __all__ = ["RigConfig", "load"]
 
-DEVICES = ("robots", "cameras", "gamepads")
 CLOCKS = ("real_time", "lock_step")
 
 
@@ -59,11 +60,9 @@ def load(
         problems.raise_any()
         raise AssertionError("no data and no problem")
     data = apply_overrides(data, overrides, problems)
-    rig, broken = _validate(data, source, problems)
-    context = Context(source, base, rig, sim, driver, clock, broken, problems)
-    plan = resolve(context)
-    problems.raise_any()
-    rig._plan = plan
+    rig = validate(RigConfig, data, source, problems)
+    stand_in = "mock" if driver is not None else None  # another one was noted above
+    rig._plan = resolve(Context(source, base, rig, sim, stand_in, clock, problems))
     return rig
 
 
@@ -89,25 +88,3 @@ def _read(config: str | Path | Mapping[str, Any], problems: Problems) -> tuple[d
         return None, name, Path.cwd()
     path = data_folder("config") / f"{name}.yaml"
     return read_yaml(path, problems), str(path), path.parent
-
-
-def _validate(data: dict[str, Any], source: str, problems: Problems) -> tuple[RigConfig, set[str]]:
-    """The rig without what is wrong in it, so that the rest can be checked too; and the devices left out."""
-    broken: set[str] = set()
-    for _ in range(10):  # each round takes out what the last one found; two are enough for any one mistake
-        try:
-            return RigConfig.model_validate(data), broken
-        except ValidationError as error:
-            for key, message in explain(RigConfig, error):
-                problems.add(source, key, message)
-            for found in error.errors(include_url=False, include_context=False, include_input=False):
-                data = _without(data, found["loc"], broken)
-    return RigConfig(), broken
-
-
-def _without(data: dict[str, Any], loc: tuple[int | str, ...], broken: set[str]) -> dict[str, Any]:
-    section = loc[0] if loc else None
-    if len(loc) > 1 and section in DEVICES and isinstance(data.get(section), Mapping):
-        broken.add(f"{section}.{loc[1]}")
-        return {**data, section: {k: v for k, v in data[section].items() if k != loc[1]}}
-    return {key: value for key, value in data.items() if key != section}

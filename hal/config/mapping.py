@@ -10,12 +10,13 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal
 
-from pydantic import Field, model_validator
+from pydantic import Field, field_validator, model_validator
 
 from ..types import AXES, BUTTONS, PadState
 from .data_files import data_folder, is_path, list_data
-from .files import Problems, nearest, read_yaml, validate
+from .files import Problems, nearest, read_yaml
 from .schema import Flag, Positive, Strict
+from .validation import validate
 
 __all__ = ["AxisMapping", "DirectionsMapping", "GripperMapping", "TeleopMapping", "TurnsMapping", "load_mapping"]
 
@@ -117,13 +118,22 @@ class TeleopMapping(Strict):
     actions: dict[str, str] = Field(default_factory=dict)
     """What an app does when a button is pressed, for example ``record: south``; the app says which it knows."""
 
+    @field_validator("deadman", "go_home")
+    @classmethod
+    def _is_button(cls, name: str | None) -> str | None:
+        if name is not None:
+            _known(name, BUTTONS, "button")
+        return name
+
+    @field_validator("actions")
+    @classmethod
+    def _are_buttons(cls, actions: dict[str, str]) -> dict[str, str]:
+        for name in actions.values():
+            _known(name, BUTTONS, "button")
+        return actions
+
     @model_validator(mode="after")
     def _controls(self) -> TeleopMapping:
-        _known(self.deadman, (*BUTTONS, "l2", "r2"), "button")
-        if self.go_home is not None:
-            _known(self.go_home, BUTTONS, "button")
-        for button in self.actions.values():
-            _known(button, BUTTONS, "button")
         moving = {control for mapping in self.axes() if mapping is not None for control in mapping.controls}
         moving |= set(self.gripper.controls) if self.gripper else set()
         alone = [self.deadman, *self.actions.values()] + ([self.go_home] if self.go_home else [])

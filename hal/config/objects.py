@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, Literal
 
@@ -9,11 +10,24 @@ from pydantic import model_validator
 
 from ..specs import BodySpec
 from .data_files import data_folder, is_path, list_data
-from .files import Problems, nearest, read_yaml, validate
+from .files import Problems, nearest, read_yaml
 from .models import UrdfSource
-from .schema import Flag, Name, Number, PoseConfig, Positive, QuaternionConfig, Rgba, Strict, Vector, describe
+from .schema import (
+    Flag,
+    Name,
+    Number,
+    PoseConfig,
+    Positive,
+    QuaternionConfig,
+    Rgba,
+    Strict,
+    Unknown,
+    Vector,
+    describe,
+)
 from .sources import locate_urdf
 from .urdf import read_urdf
+from .validation import validate
 
 __all__ = ["ObjectConfig", "load_objects"]
 
@@ -48,6 +62,8 @@ class ObjectConfig(Strict):
     fixed: Flag = False
     position: Vector = (0.0, 0.0, 0.0)
     orientation: QuaternionConfig = (0.0, 0.0, 0.0, 1.0)
+    pose: PoseConfig | None = None
+    """Both in one."""
     rgba: Rgba = (0.7, 0.7, 0.7, 1.0)
     collision: Flag = True
     visible: Flag = True
@@ -55,16 +71,7 @@ class ObjectConfig(Strict):
     @model_validator(mode="before")
     @classmethod
     def _shorthands(cls, data: Any) -> Any:
-        if not isinstance(data, dict):
-            return data
-        data = dict(data)
-        if "urdf" in data:
-            data.setdefault("shape", "urdf")
-        if "pose" in data:
-            pose = PoseConfig.model_validate(data.pop("pose"))
-            data.setdefault("position", pose.position)
-            data.setdefault("orientation", pose.orientation)
-        return data
+        return {"shape": "urdf", **data} if isinstance(data, dict) and "urdf" in data else data
 
     @model_validator(mode="after")
     def _sizes(self) -> ObjectConfig:
@@ -95,14 +102,17 @@ def load_objects(
         if loaded is None:
             continue
         config, file, prefix = loaded
-        name_key = f"{prefix}.name" if prefix else "name"
-        if config.name in taken:
-            problems.add(file, name_key, f"{config.name!r} is also the name of {taken[config.name]}; names must differ")
-            continue
-        taken[config.name] = f"{key} in {source}"
-        body = _body(config, file, prefix, base if file == source else Path(file).parent, problems, warnings)
-        if body is not None:
-            bodies.append(body)
+        with suppress(Unknown):
+            if config.name in taken:
+                text = f"{config.name!r} is also the name of {taken[config.name]}; names must differ"
+                problems.add(file, f"{prefix}.name" if prefix else "name", text)
+            taken.setdefault(config.name, f"{key} in {source}")
+        folder = base if file == source else Path(file).parent
+        urdf: Path | None = None
+        with suppress(Unknown):
+            urdf = _urdf(config, folder, file, f"{prefix}.urdf" if prefix else "urdf", problems, warnings)
+        if not problems.found:
+            bodies.append(_body(config, urdf))
     return tuple(bodies)
 
 
@@ -113,8 +123,7 @@ def _load(entry: Any, source: str, base: Path, key: str, problems: Problems) -> 
         changes = {name: value for name, value in entry.items() if name != "file"}
         entry = entry["file"]
     if isinstance(entry, dict):
-        config = validate(ObjectConfig, entry, source, problems, key)
-        return (config, source, key) if config is not None else None
+        return validate(ObjectConfig, entry, source, problems, key), source, key
     if not isinstance(entry, str):
         problems.add(source, key, f"must be a file, a name or keys and values, not {describe(entry)}")
         return None
@@ -133,43 +142,48 @@ def _load(entry: Any, source: str, base: Path, key: str, problems: Problems) -> 
     data = read_yaml(path, problems)
     if data is None:
         return None
-    if changes:
-        # The file stands on its own first, so that a mistake is reported where it is.
-        if validate(ObjectConfig, data, path, problems) is None:
-            return None
-        config = validate(ObjectConfig, {**data, **changes}, source, problems, key)
-        return (config, str(path), "") if config is not None else None
     config = validate(ObjectConfig, data, path, problems)
-    return (config, str(path), "") if config is not None else None
+    if not changes:
+        return config, str(path), ""
+    # The file stood on its own first, so that a mistake is reported where it is, and here not again.
+    in_order = all(problem.file != str(path) for problem in problems.found)
+    noted = Problems()
+    changed = validate(ObjectConfig, {**data, **changes}, source, noted, key)
+    for problem in noted.found:
+        if in_order or problem.key.removeprefix(f"{key}.").partition(".")[0] in changes:
+            problems.add(source, problem.key, problem.message)
+    return changed, str(path), ""
 
 
-def _body(
-    config: ObjectConfig, file: str, prefix: str, base: Path, problems: Problems, warnings: list[str]
-) -> BodySpec | None:
-    urdf: str | None = None
-    if config.urdf is not None:
-        key = f"{prefix}.urdf" if prefix else "urdf"
-        path = locate_urdf(config.urdf, base, file, key, problems)
-        if path is None:
-            return None
-        try:
-            model = read_urdf(path)
-        except (ValueError, OSError) as error:
-            problems.add(path, "", str(error))
-            return None
-        if model.without_mass():
-            links = ", ".join(model.without_mass())
-            warnings.append(f"{path}: no <inertial> in {links}; the simulator makes up a mass")
-        urdf = str(path)
+def _urdf(
+    config: ObjectConfig, base: Path, file: str, key: str, problems: Problems, warnings: list[str]
+) -> Path | None:
+    """Path of the object's URDF, if it has one and that can be read."""
+    path = locate_urdf(config.urdf, base, file, key, problems) if config.urdf is not None else None
+    if path is None:
+        return None
+    try:
+        model = read_urdf(path)
+    except (ValueError, OSError) as error:
+        problems.add(path, "", str(error))
+        return None
+    if model.without_mass():
+        links = ", ".join(model.without_mass())
+        warnings.append(f"{path}: no <inertial> in {links}; the simulator makes up a mass")
+    return path
+
+
+def _body(config: ObjectConfig, urdf: Path | None) -> BodySpec:
+    pose, given = config.pose or PoseConfig(), config.model_fields_set
     return BodySpec(
         name=config.name,
-        position=config.position,
-        orientation=config.orientation,
+        position=config.position if "position" in given else pose.position,
+        orientation=config.orientation if "orientation" in given else pose.orientation,
         shape=config.shape,
         half_extents=config.half_extents,
         radius=config.radius,
         length=config.length,
-        urdf=urdf,
+        urdf=str(urdf) if urdf is not None else None,
         scale=config.scale or 1.0,
         mass=config.mass or 0.0,
         fixed=config.fixed,

@@ -7,7 +7,7 @@ from typing import Any
 
 import yaml
 
-from .files import Problems, nearest, parse_yaml
+from .files import Problems, nearest, parse_yaml, plain_copy
 
 __all__ = ["apply_overrides"]
 
@@ -19,16 +19,10 @@ def apply_overrides(
     data: dict[str, Any], overrides: Sequence[str] | Mapping[str, Any], problems: Problems
 ) -> dict[str, Any]:
     """A copy of the rig's data with the overrides in it; what is wrong with their form is noted."""
-    result = _copy(data)
+    result = plain_copy(data)
     for key, value in _pairs(overrides, problems):
         _put(result, key, value, problems)
     return dict(result)
-
-
-def _copy(value: Any) -> Any:
-    if isinstance(value, Mapping):
-        return {key: _copy(item) for key, item in value.items()}
-    return [_copy(item) for item in value] if isinstance(value, (list, tuple)) else value
 
 
 def _pairs(overrides: Sequence[str] | Mapping[str, Any], problems: Problems) -> list[tuple[str, Any]]:

@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from contextlib import suppress
+from typing import get_args
 
 from ..pose import Pose
 from ..specs import CameraSpec, ViewSpec
-from .files import nearest, read_yaml, validate
+from .context import Context
+from .files import nearest
 from .intrinsics import Intrinsics, centre_crop, from_field_of_view
-from .models import CameraModel, Capture, find_model
-from .rigfile import CameraConfig
+from .models import CameraModel, Capture, Mode
+from .rigfile import CameraConfig, Stream
+from .schema import Unknown
 from .views import view_of
-
-if TYPE_CHECKING:
-    from .resolve import Context
 
 __all__ = ["resolve_camera"]
 
@@ -21,36 +21,25 @@ __all__ = ["resolve_camera"]
 def resolve_camera(context: Context, name: str, config: CameraConfig) -> CameraSpec | None:
     """The camera, or None with the problems noted."""
     key = f"cameras.{name}"
+    model, _ = context.read_model(CameraModel, key, config, "sensors", "cameras")
+    for check in (_check_attached, _check_place):
+        with suppress(Unknown):
+            check(context, key, config)
+    for check_with_model in (_check_mode, _check_adjustable, _check_streams):
+        with suppress(Unknown):
+            check_with_model(context, key, config, model)
+    driver = context.choose_driver("camera", key, config, model)
+    return None if context.problems.found else _spec(context, name, config, model, driver)
+
+
+def _spec(context: Context, name: str, config: CameraConfig, model: CameraModel, driver: str) -> CameraSpec:
     simulated = context.simulated(config)
-    view = _view(context, key, config)
-    if view is None and simulated and context.driver is None:
-        context.problem(key, "is simulated and stands nowhere: give look_at, pose or attached")
-    found = find_model(config.model, "sensors", ("cameras",), context.base)
-    if isinstance(found, str):
-        context.problem(f"{key}.model", found)
-        return None
-    data = read_yaml(found, context.problems)
-    model = validate(CameraModel, data, found, context.problems) if data is not None else None
-    if model is None:
-        return None
-    capture, mode_depth = _capture(context, key, config, model)
-    if not model.adjustable:
-        for part in ("field_of_view", "depth"):
-            if getattr(config, part) is not None:
-                context.problem(
-                    f"{key}.{part}", f"belongs to model {config.model!r}; only adjustable models leave it open"
-                )
-    for stream in config.streams:
-        allowed = (*model.streams, "segmentation") if simulated else model.streams
-        if stream not in allowed:
-            hint = "; only simulated cameras have it" if stream == "segmentation" else ""
-            context.problem(f"{key}.streams.{stream}", f"model {config.model!r} has {', '.join(allowed)}{hint}")
-    if not config.streams:
-        context.problem(f"{key}.streams", f"must name at least one of {', '.join(model.streams)}")
+    capture = config.capture or model.capture
     output = config.output or capture
     K = _intrinsics(config, model, capture).through(
         centre_crop(capture.width, capture.height, output.width, output.height), output.width, output.height
     )
+    mode = _mode(model, capture)
     depth = config.depth or model.depth
     options = {**model.simulated, **config.simulated} if simulated else {**model.real, **config.real}
     formats = {stream: kind.format for stream, kind in config.streams.items() if kind.format is not None}
@@ -59,7 +48,7 @@ def resolve_camera(context: Context, name: str, config: CameraConfig) -> CameraS
     return CameraSpec(
         name=name,
         model=config.model,
-        driver=context.choose_driver("camera", key, simulated, config.drivers, model.drivers),
+        driver=driver,
         capture_width=capture.width,
         capture_height=capture.height,
         width=output.width,
@@ -67,26 +56,66 @@ def resolve_camera(context: Context, name: str, config: CameraConfig) -> CameraS
         rate_hz=capture.rate_hz,
         K=K.matrix(),
         distortion=(0.0,) * 5 if simulated else model.distortion,  # what is drawn has none
-        depth_min=depth.min if config.depth else mode_depth or depth.min,
+        depth_min=(mode.depth_min if mode and not config.depth else None) or depth.min,
         depth_max=depth.max,
         streams=tuple(config.streams),
-        view=view,
+        view=_view(config),
         options=options,
     )
 
 
-def _capture(context: Context, key: str, config: CameraConfig, model: CameraModel) -> tuple[Capture, float | None]:
-    """What it takes, and the nearest depth in that mode where the model tells it."""
-    capture = config.capture or model.capture
-    if model.modes is None:
-        return capture, None
-    for mode in model.modes:
+def _check_place(context: Context, key: str, config: CameraConfig) -> None:
+    somewhere = config.look_at or config.pose or config.attached
+    if somewhere is None and context.driver is None and context.simulated(config):
+        context.problem(key, "is simulated and stands nowhere: give look_at, pose or attached")
+
+
+def _check_attached(context: Context, key: str, config: CameraConfig) -> None:
+    if config.attached is None:
+        return
+    robot, robots = config.attached.robot, context.rig.robots
+    if robot not in robots:
+        context.problem(f"{key}.attached.robot", f"this rig has no robot {robot!r}{nearest(robot, robots)}")
+    urdf = context.urdfs.get(robot)  # None where the robot itself is wrong
+    if urdf is not None and config.attached.link not in urdf.links:
+        link = config.attached.link
+        text = f"robot {robot!r} has no link {link!r}{nearest(link, urdf.links)}"
+        context.problem(f"{key}.attached.link", text)
+
+
+def _mode(model: CameraModel, capture: Capture) -> Mode | None:
+    """The model's mode that takes this, where the model has modes and this is one of them."""
+    for mode in model.modes or ():
         if (mode.width, mode.height) == (capture.width, capture.height) and capture.rate_hz in mode.rates_hz:
-            return capture, mode.depth_min
+            return mode
+    return None
+
+
+def _check_mode(context: Context, key: str, config: CameraConfig, model: CameraModel) -> None:
+    capture = config.capture or model.capture
+    if model.modes is None or _mode(model, capture) is not None:
+        return
     asked = f"{capture.width}x{capture.height} at {capture.rate_hz:g} Hz"
     modes = "; ".join(str(mode) for mode in model.modes)
     context.problem(f"{key}.capture", f"model {config.model!r} has no mode {asked}; it has: {modes}")
-    return capture, None
+
+
+def _check_adjustable(context: Context, key: str, config: CameraConfig, model: CameraModel) -> None:
+    for part in ("field_of_view", "depth"):
+        if not model.adjustable and getattr(config, part, None) is not None:
+            text = f"belongs to model {config.model!r}; only adjustable models leave it open"
+            context.problem(f"{key}.{part}", text)
+
+
+def _check_streams(context: Context, key: str, config: CameraConfig, model: CameraModel) -> None:
+    if not config.streams:
+        context.problem(f"{key}.streams", f"must name at least one of {', '.join(model.streams)}")
+    simulated = context.simulated(config)
+    allowed = (*model.streams, "segmentation") if simulated else model.streams
+    for stream in config.streams:
+        if stream not in allowed and stream in get_args(Stream):  # others are noted already
+            hint = "; only simulated cameras have it" if stream == "segmentation" else ""
+            context.problem(f"{key}.streams.{stream}", f"model {config.model!r} has {', '.join(allowed)}{hint}")
 
 
 def _intrinsics(config: CameraConfig, model: CameraModel, capture: Capture) -> Intrinsics:
@@ -95,21 +124,10 @@ def _intrinsics(config: CameraConfig, model: CameraModel, capture: Capture) -> I
     return from_field_of_view(capture.width, capture.height, angles.horizontal_deg, angles.vertical_deg, sensor)
 
 
-def _view(context: Context, key: str, config: CameraConfig) -> ViewSpec | None:
+def _view(config: CameraConfig) -> ViewSpec | None:
     if config.look_at is not None:
         return view_of(config.look_at.pose())
     if config.pose is not None:
         return view_of(Pose(config.pose.position, config.pose.orientation))
     attached = config.attached
-    if attached is None:
-        return None
-    known = {*context.rig.robots, *(k.removeprefix("robots.") for k in context.broken if k.startswith("robots."))}
-    if attached.robot not in known:
-        context.problem(
-            f"{key}.attached.robot", f"this rig has no robot {attached.robot!r}{nearest(attached.robot, known)}"
-        )
-    urdf = context.urdfs.get(attached.robot)  # None where the robot itself is wrong
-    if urdf is not None and attached.link not in urdf.links:
-        text = f"robot {attached.robot!r} has no link {attached.link!r}{nearest(attached.link, urdf.links)}"
-        context.problem(f"{key}.attached.link", text)
-    return view_of(attached.pose(), attached.robot, attached.link)
+    return view_of(attached.pose(), attached.robot, attached.link) if attached is not None else None

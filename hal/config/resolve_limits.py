@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
+from contextlib import suppress
 from pathlib import Path
 
 from ..specs import Floats, LimitsSpec
 from .files import Problems
 from .models import RobotModel
 from .rigfile import RobotConfig
+from .schema import Unknown
 from .urdf import UrdfModel
 
 __all__ = ["resolve_limits", "spread"]
@@ -39,68 +41,104 @@ def spread(
 
 def resolve_limits(
     model: RobotModel,
-    urdf: UrdfModel,
+    urdf: UrdfModel | None,
     file: Path,
     config: RobotConfig,
     source: str,
     key: str,
     problems: Problems,
-) -> LimitsSpec | None:
-    """The limits that the servo keeps; None, and problems noted, where they are not whole."""
-    n, found = len(model.joints), len(problems.found)
-    limits: dict[str, Floats | None] = {}
-    for name, unit in UNITS.items():
-        own: Floats | None = getattr(model.limits, name)
-        if own is not None:
-            limits[name] = spread(own, n, file, f"limits.{name}", unit, problems, one_for_all=True)
-        else:
-            limits[name] = _from_urdf(model, urdf, name, file, problems)
-    if len(problems.found) > found:
-        return None
-    for name in UNITS:
-        changed: Floats | None = getattr(config.limits, name)
-        if changed is None:
-            continue
-        values = spread(changed, n, source, f"{key}.{name}", UNITS[name], problems, one_for_all=True)
-        if values is not None:
-            _check_tighter(values, limits[name], model, name, config.limits.allow_looser_limits, source, key, problems)
-            limits[name] = values
-    changed_keys = config.limits.model_fields_set
-    for name in ("velocity", "acceleration", "jerk", "torque"):
-        place, where = (source, f"{key}.{name}") if name in changed_keys else (file, f"limits.{name}")
-        if any(value <= 0.0 for value in limits[name] or ()):
-            problems.add(place, where, f"must be above 0 ({UNITS[name]}) for every joint")
-    lower, upper, joints = limits["lower"] or (), limits["upper"] or (), model.joints
-    for low, high, joint in zip(lower, upper, joints, strict=False):
-        if low >= high:
-            place, where = (source, key) if changed_keys & {"lower", "upper"} else (file, "limits")
-            problems.add(place, where, f"lower must be below upper: joint {joint!r} has {low:g} and {high:g}")
-    if len(problems.found) > found:
-        return None
+) -> LimitsSpec:
+    """The limits that the servo keeps. Numbers that nobody knows are NaN, which is neither too large nor too small.
+
+    They are noted as missing here, or what keeps them from being known was noted before. Raises Unknown where the
+    number of joints is not known.
+    """
+    with suppress(Unknown):
+        for name in ("acceleration", "jerk"):
+            if getattr(model.limits, name, ()) is None:
+                text = f"is missing: {UNITS[name]}, one number for each joint or one for all; a URDF does not hold it"
+                problems.add(file, f"limits.{name}", text)
+    _check_positive(model, file, "limits", problems)
+    _check_positive(config, source, key, problems)
+    limits = {name: _of_model(model, urdf, name, file, problems) for name in UNITS}
+    with suppress(Unknown):
+        for name in UNITS:
+            changed: Floats | None = getattr(config.limits, name, None)
+            if changed is None:
+                continue
+            unit, n = UNITS[name], len(model.joints)
+            values = spread(changed, n, source, f"{key}.{name}", unit, problems, one_for_all=True)
+            if values is not None:
+                _check_tighter(values, limits[name], model, name, config, source, key, problems)
+                limits[name] = values
+    _check_order(limits, model, file, config, source, key, problems)
     return LimitsSpec(**limits)  # type: ignore[arg-type]  # None only for torque, which may be
 
 
+def _check_positive(owner: RobotModel | RobotConfig, file: Path | str, key: str, problems: Problems) -> None:
+    with suppress(Unknown):
+        for name in ("velocity", "acceleration", "jerk", "torque"):
+            if any(value <= 0.0 for value in getattr(owner.limits, name, None) or ()):
+                problems.add(file, f"{key}.{name}", f"must be above 0 ({UNITS[name]}) for every joint")
+
+
+def _check_order(
+    limits: dict[str, Floats | None],
+    model: RobotModel,
+    file: Path,
+    config: RobotConfig,
+    source: str,
+    key: str,
+    problems: Problems,
+) -> None:
+    """Lower below upper. Where they are not, nobody knows what is between them, so they are NaN afterwards."""
+    lower, upper = list(limits["lower"] or ()), list(limits["upper"] or ())
+    empty: list[str] = []
+    for k, joint in enumerate(model.joints):
+        if lower[k] >= upper[k]:
+            empty.append(f"joint {joint!r} has {lower[k]:g} and {upper[k]:g}")
+            lower[k] = upper[k] = math.nan
+    if empty:
+        by_rig = not {"lower", "upper"}.isdisjoint(config.limits.model_fields_set)
+        place, where = (source, key) if by_rig else (file, "limits")
+        problems.add(place, where, f"lower must be below upper: {'; '.join(empty)}")
+    limits["lower"], limits["upper"] = tuple(lower), tuple(upper)
+
+
+def _of_model(model: RobotModel, urdf: UrdfModel | None, name: str, file: Path, problems: Problems) -> Floats | None:
+    n = len(model.joints)
+    unknown = (math.nan,) * n
+    with suppress(Unknown):
+        own: Floats | None = getattr(model.limits, name)
+        if own is not None:
+            values = spread(own, n, file, f"limits.{name}", UNITS[name], problems, one_for_all=True) or unknown
+            return tuple(value if name in ("lower", "upper") or value > 0.0 else math.nan for value in values)
+        if urdf is not None and name not in ("acceleration", "jerk"):
+            return _from_urdf(model, urdf, name, file, problems)
+    return unknown
+
+
 def _from_urdf(model: RobotModel, urdf: UrdfModel, name: str, file: Path, problems: Problems) -> Floats | None:
-    unit = UNITS[name]
-    if name in ("acceleration", "jerk"):
-        text = f"is missing: {unit}, one number for each joint or one for all; a URDF does not hold it"
-        problems.add(file, f"limits.{name}", text)
-        return None
-    joints = [urdf.joints[joint] for joint in model.joints]
+    joints = [urdf.joints.get(joint) for joint in model.joints]
     if name == "torque":
-        efforts = [joint.effort for joint in joints]
+        efforts = [joint.effort for joint in joints if joint is not None and joint.effort and joint.effort > 0.0]
         # An effort of 0 stands in many files for "unknown".
-        return tuple(effort for effort in efforts if effort) if all(efforts) else None
+        return tuple(efforts) if len(efforts) == len(joints) else None
     values: list[float] = []
+    lacking: list[str] = []
     for joint in joints:
-        value: float | None = getattr(joint, name)
-        if value is None and joint.kind == "continuous" and name in ("lower", "upper"):
+        value: float | None = getattr(joint, name, None)
+        if joint is None or not joint.movable:  # noted where joints are looked up
+            value = math.nan
+        elif value is None and joint.kind == "continuous" and name in ("lower", "upper"):
             value = math.copysign(ENDLESS, -1.0 if name == "lower" else 1.0)
-        if value is None or (name == "velocity" and value <= 0.0):
-            text = f"is missing ({unit}), and {urdf.path.name} gives none for joint {joint.name!r}"
-            problems.add(file, f"limits.{name}", text)
-            return None
+        elif value is None or (name == "velocity" and value <= 0.0):
+            lacking.append(joint.name)
+            value = math.nan
         values.append(value)
+    if lacking:
+        text = f"is missing ({UNITS[name]}), and {urdf.path.name} gives none for {', '.join(map(repr, lacking))}"
+        problems.add(file, f"limits.{name}", text)
     return tuple(values)
 
 
@@ -109,12 +147,12 @@ def _check_tighter(
     limits: Floats | None,
     model: RobotModel,
     name: str,
-    allowed: bool,
+    config: RobotConfig,
     source: str,
     key: str,
     problems: Problems,
 ) -> None:
-    if allowed or limits is None:
+    if config.limits.allow_looser_limits or limits is None:
         return
     looser = [
         f"{value:g} is looser than the model's {limit:g} for joint {joint!r}"

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from ..specs import PadSpec
+from .context import Context
 from .files import read_yaml
 from .models import find_model, load_pad_models
 from .rigfile import PadConfig
-
-if TYPE_CHECKING:
-    from .resolve import Context
+from .schema import Unknown
 
 __all__ = ["resolve_pad"]
 
@@ -23,35 +23,49 @@ def resolve_pad(context: Context, name: str, config: PadConfig) -> PadSpec | Non
     """The pad, or None with the problems noted."""
     key = f"gamepads.{name}"
     model: dict[str, Any] | None = None
-    if config.model != "auto":
-        found = find_model(config.model, "sensors", ("gamepads",), context.base)
-        if isinstance(found, str):
-            context.problem(f"{key}.model", f"{found}, or auto")
-        else:
-            model = read_yaml(found, context.problems)
-    options = dict(config.options)
-    driver = context.driver or config.driver
-    if config.file is not None:
-        options["file"] = str((context.base / Path(config.file).expanduser()).resolve())
+    with suppress(Unknown):
+        model = _model(context, key, config)
     if context.driver is None:
-        _check_recording(context, f"{key}.file", config, options.get("file"))
-    if driver not in CHOSEN_LATER:
-        context.check_driver(driver, "gamepad", f"{key}.driver")
+        with suppress(Unknown):
+            _check_recording(context, f"{key}.file", config)
+        with suppress(Unknown):
+            if config.driver not in CHOSEN_LATER:
+                context.check_driver(config.driver, "gamepad", f"{key}.driver")
+    models = tuple(load_pad_models(context.problems).values())
+    if context.problems.found:
+        return None
+    options = dict(config.options)
+    if config.file is not None:
+        options["file"] = str(_recording(context, config.file))
     return PadSpec(
         name=name,
-        driver=driver,
+        driver=context.driver or config.driver,
         model=model,
-        models=tuple(load_pad_models(context.problems).values()),
+        models=models,
         dead_zone=config.dead_zone,
         options=options,
     )
 
 
-def _check_recording(context: Context, key: str, config: PadConfig, file: str | None) -> None:
+def _model(context: Context, key: str, config: PadConfig) -> dict[str, Any] | None:
+    if config.model == "auto":
+        return None
+    found = find_model(config.model, "sensors", ("gamepads",), context.base)
+    if isinstance(found, str):
+        context.problem(f"{key}.model", f"{found}, or auto")
+        return None
+    return read_yaml(found, context.problems)
+
+
+def _recording(context: Context, file: str) -> Path:
+    return (context.base / Path(file).expanduser()).resolve()
+
+
+def _check_recording(context: Context, key: str, config: PadConfig) -> None:
     if config.driver != "playback":
-        if file is not None:
+        if config.file is not None:
             context.problem(key, f"is for the driver playback, not {config.driver!r}")
-    elif file is None:
+    elif config.file is None:
         context.problem(key, "is missing: the recording that is to be played")
-    elif not Path(file).is_file():
-        context.problem(key, f"there is no file {file}")
+    elif not _recording(context, config.file).is_file():
+        context.problem(key, f"there is no file {_recording(context, config.file)}")

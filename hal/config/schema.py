@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import typing
 from collections.abc import Callable, Sequence
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 
@@ -22,17 +22,31 @@ __all__ = [
     "Rgba",
     "Share",
     "Strict",
+    "Unknown",
     "Vector",
     "describe",
     "is_number",
     "keys_at",
+    "kind_inside",
+    "record_in",
 ]
 
 
+class Unknown(AttributeError):
+    """A key was asked for whose value is wrong or missing, which has been noted: leave out what needs it."""
+
+
 class Strict(BaseModel):
-    """A record that knows all its keys."""
+    """A record that knows all its keys. One from a file with mistakes can have holes, which raise :class:`Unknown`."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    if not TYPE_CHECKING:  # so that mypy still finds misspelt attributes
+
+        def __getattr__(self, name: str) -> Any:
+            if name in type(self).model_fields:
+                raise Unknown(name)
+            return super().__getattr__(name)
 
 
 def describe(value: Any) -> str:
@@ -125,24 +139,26 @@ def keys_at(model: type[BaseModel], loc: Sequence[Any]) -> tuple[str, ...]:
     """The keys that are allowed at a place in a record: what an unknown key is compared with."""
     kind: Any = model
     for part in loc:
-        kind = _inside(kind, part)
-    kind = _record(kind)
+        kind = kind_inside(kind, part)
+    kind = record_in(kind)
     return tuple(kind.model_fields) if kind is not None else ()
 
 
-def _inside(kind: Any, part: Any) -> Any:
-    record = _record(kind)
+def kind_inside(kind: Any, part: Any) -> Any:
+    """The type of what stands at ``part`` in a record, a dict or a list of the type ``kind``; None where unknown."""
+    record = record_in(kind)
     if record is not None:
         found = record.model_fields.get(str(part))
         return found.annotation if found is not None else None
     for option in _options(kind):
         arguments = typing.get_args(option)
-        if typing.get_origin(option) in (dict, list) and arguments:
-            return arguments[-1]
+        if typing.get_origin(option) in (dict, list, tuple) and arguments:
+            return arguments[1] if typing.get_origin(option) is dict else arguments[0]
     return None
 
 
-def _record(kind: Any) -> type[BaseModel] | None:
+def record_in(kind: Any) -> type[BaseModel] | None:
+    """The record that a value of the type ``kind`` is, where it is one."""
     return next((k for k in _options(kind) if isinstance(k, type) and issubclass(k, BaseModel)), None)
 
 

@@ -11,7 +11,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable
 from typing import Any
 
-from ..errors import HalError
+from ..errors import ConnectionLost, HalError
 from ..specs import GroupSpec, to_json
 from .cycle import Cycle
 from .process import Child, SharedMemory
@@ -21,10 +21,14 @@ __all__ = ["Host", "LocalHost", "RemoteHost"]
 
 HEARTBEAT = 0.02
 """Period of the app's heartbeat, s."""
-SNAPSHOT_CAPACITY = 1024
+SNAPSHOT_CAPACITY = 8192
 """Most numbers in a picture of the world: seven a body, one a joint."""
+SILENT = 1.0
+"""A host that has published nothing for so long does not answer any more, s."""
 PAD_PERIOD = 0.01
 """How often pads are polled in lock-step, simulated s."""
+_STOP_LIMIT = 5.0
+"""Longest time for bringing the arms to rest before the devices are closed all the same, s."""
 
 
 class Host(ABC):
@@ -32,6 +36,11 @@ class Host(ABC):
 
     spec: GroupSpec
     memory: GroupMemory
+
+    @property
+    @abstractmethod
+    def stops(self) -> int:
+        """How often :meth:`stop` was called."""
 
     @abstractmethod
     def request(self, method: str, params: dict[str, Any] | None = None) -> Any:
@@ -61,7 +70,8 @@ class LocalHost(Host):
         self.pollers: list[Callable[[float], object]] = []
         """Called every :data:`PAD_PERIOD` of simulated time: pads."""
         self._stops = 0
-        self._stopping = threading.Lock()
+        self._busy = threading.RLock()
+        """Time goes on in one thread only."""
         self._next_poll = 0.0
         self._closed = False
         self.cycle.open(0.0)
@@ -72,17 +82,22 @@ class LocalHost(Host):
         return self.cycle.ticks * self.cycle.dt
 
     def advance_to(self, t: float) -> None:
-        """Step until simulated time is ``t``, to within half a step."""
-        cycle, dt = self.cycle, self.cycle.dt
-        steps = round((t - self.now()) / dt)
-        for _ in range(steps):
-            now = (cycle.ticks + 1) * dt
-            if now >= self._next_poll:
-                for poll in self.pollers:
-                    poll(now)
-                self._next_poll = now + PAD_PERIOD
-            cycle.step(now, AppRecord(now, self._stops))
-        self.publish()
+        """Step until simulated time is ``t``, to within half a step; at least once where ``t`` lies ahead."""
+        with self._busy:
+            ahead = (t - self.now()) / self.cycle.dt
+            if ahead > 1e-6:
+                for _ in range(max(1, round(ahead))):
+                    self._step()
+                self.publish()
+
+    def _step(self) -> None:
+        cycle = self.cycle
+        now = (cycle.ticks + 1) * cycle.dt
+        if now >= self._next_poll:
+            for poll in self.pollers:
+                poll(now)
+            self._next_poll = now + PAD_PERIOD
+        cycle.step(now, AppRecord(now, self._stops))
 
     def publish(self) -> None:
         """Make the present state visible."""
@@ -91,27 +106,34 @@ class LocalHost(Host):
         self.memory.host.write(now, self.cycle.ticks, 0, True)
 
     def request(self, method: str, params: dict[str, Any] | None = None) -> Any:
-        result = self.cycle.request(method, params or {})
-        self.publish()
-        return result
+        with self._busy:
+            result = self.cycle.request(method, params or {})
+            self.publish()
+            return result
+
+    @property
+    def stops(self) -> int:
+        return self._stops
 
     def check(self) -> None:
         if self._closed:
             raise HalError("the rig is closed")
 
     def stop(self) -> None:
-        with self._stopping:
-            self._stops += 1
+        self._stops += 1  # not under the lock: whoever holds it may be the one to be stopped
 
     def close(self) -> None:
-        if self._closed:
-            return
-        self._closed = True
-        for _ in range(round(5.0 / self.cycle.dt)):
-            if self.cycle.stop_sessions():
-                break
-            self.cycle.step(self.now() + self.cycle.dt, AppRecord(self.now(), self._stops))
-        self.cycle.close()
+        with self._busy:
+            if self._closed:
+                return
+            self._closed = True
+            try:
+                for _ in range(round(_STOP_LIMIT / self.cycle.dt)):
+                    if self.cycle.stop_sessions():
+                        break
+                    self._step()
+            finally:
+                self.cycle.close()
 
 
 class RemoteHost(Host):
@@ -129,7 +151,7 @@ class RemoteHost(Host):
         config = {"group": to_json(spec), "snapshot_capacity": SNAPSHOT_CAPACITY, "realtime": realtime}
         self.child = Child(spec.name, "hal.host.main:main", config, [self.shared])
         self._stops = 0
-        self._writing = threading.Lock()
+        self._writing = threading.RLock()  # a signal handler may call stop() in the middle of stop()
         self._closed = threading.Event()
         self._beat()
         self._thread = threading.Thread(target=self._heartbeat, name=f"hal-heartbeat-{spec.name}", daemon=True)
@@ -150,10 +172,22 @@ class RemoteHost(Host):
     def request(self, method: str, params: dict[str, Any] | None = None) -> Any:
         return self.child.request(method, params)
 
+    @property
+    def stops(self) -> int:
+        return self._stops
+
     def check(self) -> None:
         if self._closed.is_set():
             raise HalError("the rig is closed")
         self.child.check()
+        silence = self._silence()
+        if silence > SILENT:
+            raise ConnectionLost(f"the {self.spec.name} process has not answered for {silence:.1f} s")
+
+    def _silence(self) -> float:
+        """How long the host has published nothing although no request keeps it busy, s."""
+        host = self.memory.get_host()
+        return time.monotonic() - host.t if host.ready and not self.child.busy else 0.0
 
     def stop(self) -> None:
         with self._writing:
@@ -163,7 +197,7 @@ class RemoteHost(Host):
     def close(self) -> None:
         if self._closed.is_set():
             return
-        self.child.close(timeout=8.0)
+        self.child.close(timeout=1.0 if self._silence() > SILENT else _STOP_LIMIT + 3.0)
         self._closed.set()
         self._thread.join(timeout=1.0)
         self.shared.close()

@@ -16,7 +16,7 @@ from zlib import crc32
 
 __all__ = ["Mailbox", "SeriesBox"]
 
-_HEADER = struct.Struct("<Q")
+_HEADER = 8  # bytes: the announced number, in the machine's own order; nobody else reads this memory
 _SLOT = struct.Struct("<QQ")  # number, checksum
 _TRIES = 16
 
@@ -24,14 +24,15 @@ _TRIES = 16
 class _Slots:
     """Two slots of ``capacity`` payload bytes and the number of the announced one."""
 
-    __slots__ = ("_buffer", "_payloads", "_seen", "_seq", "_starts")
+    __slots__ = ("_announced", "_buffer", "_payloads", "_seen", "_seq", "_starts")
 
     def __init__(self, buffer: memoryview, capacity: int) -> None:
         stride = self._stride(capacity)
-        self._buffer = buffer[: _HEADER.size + 2 * stride]
-        self._starts = (_HEADER.size, _HEADER.size + stride)
+        self._buffer = buffer[: _HEADER + 2 * stride]
+        self._announced = self._buffer[:_HEADER].cast("Q")
+        self._starts = (_HEADER, _HEADER + stride)
         self._payloads = tuple(self._buffer[s + _SLOT.size : s + _SLOT.size + capacity] for s in self._starts)
-        self._seq: int = _HEADER.unpack_from(self._buffer, 0)[0]
+        self._seq: int = self._announced[0]
         self._seen = 0
 
     @staticmethod
@@ -40,24 +41,24 @@ class _Slots:
 
     @classmethod
     def _size(cls, capacity: int) -> int:
-        return _HEADER.size + 2 * cls._stride(capacity)
+        return _HEADER + 2 * cls._stride(capacity)
 
     def _announce(self, length: int) -> int:
         """Publish what was filled into the free slot, ``length`` bytes of it."""
         seq = self._seq + 1
         which = seq & 1
         _SLOT.pack_into(self._buffer, self._starts[which], seq, crc32(self._payloads[which][:length]))
-        _HEADER.pack_into(self._buffer, 0, seq)
+        self._announced[0] = seq
         self._seq = seq
         return seq
 
     def seq(self) -> int:
         """Number of the newest record; 0 before the first."""
-        return _HEADER.unpack_from(self._buffer, 0)[0]  # type: ignore[no-any-return]
+        return self._announced[0]
 
     def release(self) -> None:
         """Let go of the buffer, so that the memory behind it can be unmapped."""
-        for view in self._payloads:
+        for view in (*self._payloads, self._announced):
             view.release()
         self._buffer.release()
 
@@ -68,11 +69,11 @@ class Mailbox(_Slots):
     One process writes, in one thread; everyone may read, each reader through a Mailbox of its own.
     """
 
-    __slots__ = ("_layout", "_values")
+    __slots__ = ("_layout", "_record")
 
     def __init__(self, buffer: memoryview, layout: str) -> None:
         self._layout = struct.Struct("<" + layout)
-        self._values: tuple[Any, ...] = ()
+        self._record = b""
         super().__init__(buffer, self._layout.size)
 
     @classmethod
@@ -90,17 +91,22 @@ class Mailbox(_Slots):
 
         When every try meets a writer in the act: the last record that this reader has seen.
         """
+        found = self.read_bytes()
+        return None if found is None else (found[0], self._layout.unpack(found[1]))
+
+    def read_bytes(self) -> tuple[int, bytes] | None:
+        """The same, not unpacked."""
         for _ in range(_TRIES):
-            seq = _HEADER.unpack_from(self._buffer, 0)[0]
+            seq = self._announced[0]
             if seq == self._seen:
                 break
             which = seq & 1
             number, check = _SLOT.unpack_from(self._buffer, self._starts[which])
-            payload = bytes(self._payloads[which])
-            if number == seq and crc32(payload) == check:
-                self._seen, self._values = seq, self._layout.unpack(payload)
+            record = bytes(self._payloads[which])
+            if number == seq and crc32(record) == check:
+                self._seen, self._record = seq, record
                 break
-        return (self._seen, self._values) if self._seen else None
+        return (self._seen, self._record) if self._seen else None
 
 
 _SERIES = struct.Struct("<dQQ")  # time, revision, count
@@ -135,7 +141,7 @@ class SeriesBox(_Slots):
     def read(self) -> tuple[int, float, int, array[float]] | None:
         """The newest whole record as (number, time, revision, values); None before the first one."""
         for _ in range(_TRIES):
-            seq = _HEADER.unpack_from(self._buffer, 0)[0]
+            seq = self._announced[0]
             if seq == self._seen:
                 break
             which = seq & 1

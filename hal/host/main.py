@@ -6,6 +6,7 @@ terminal's signals.
 
 from __future__ import annotations
 
+import contextlib
 import os
 import signal
 import time
@@ -61,6 +62,10 @@ class HostProcess:
                 if self._app_gone():
                     self.closing = True
             self._stop()
+        except BaseException:
+            with contextlib.suppress(Exception):
+                self._stop()  # whatever went wrong, the arms are brought to rest if that can still be done
+            raise
         finally:
             cycle.close()
 
@@ -99,7 +104,10 @@ class HostProcess:
             answer = {"result": self._ask(method, message["params"])}
         except Exception as error:
             answer = {"error": pack_error(error)}
-        self.channel.send({"id": message["id"], **answer})
+        try:
+            self.channel.send({"id": message["id"], **answer})
+        except ConnectionLost:
+            self.closing = True  # the app is gone: come to rest first
         if not self.cycle.paces_itself:
             self.pacer.restart()
 

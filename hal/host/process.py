@@ -24,7 +24,7 @@ from typing import Any
 from .. import errors
 from ..errors import ConnectionLost, HalError, Problem
 
-__all__ = ["Channel", "Child", "SharedMemory", "child_main"]
+__all__ = ["Channel", "ChannelClosed", "Child", "SharedMemory", "child_main"]
 
 _BOOT = (
     "import sys, json; fds, path, target = json.loads(sys.argv[1]); "
@@ -34,6 +34,10 @@ _BOOT = (
 START_TIMEOUT = 60.0
 """Longest time that a child may take to get ready, s: reading a large mesh for the first time takes a while."""
 REQUEST_TIMEOUT = 30.0
+
+
+class ChannelClosed(ConnectionLost):
+    """The other process hung up: for a child, the end of its work."""
 
 
 class SharedMemory:
@@ -78,7 +82,7 @@ class Channel:
                 self.sock.settimeout(REQUEST_TIMEOUT)
                 self.sock.sendall(data)
         except OSError as error:
-            raise ConnectionLost(f"the other process is gone: {error}") from None
+            raise ChannelClosed(f"the other process is gone: {error}") from None
 
     def poll(self) -> Any | None:
         """A message if one is there; never waits. ConnectionLost when the other side is gone."""
@@ -100,9 +104,9 @@ class Channel:
             except (BlockingIOError, TimeoutError):
                 return None
             except OSError as error:
-                raise ConnectionLost(f"the other process is gone: {error}") from None
+                raise ChannelClosed(f"the other process is gone: {error}") from None
             if not data:
-                raise ConnectionLost("the other process closed the connection")
+                raise ChannelClosed("the other process closed the connection")
             self._pending += data
             if b"\n" not in self._pending:
                 return None
@@ -165,6 +169,11 @@ class Child:
         except ConnectionLost:
             self.check()
             raise
+
+    @property
+    def busy(self) -> bool:
+        """Is a request of this process on its way?"""
+        return self._asking.locked()
 
     def wait_ready(self, timeout: float = START_TIMEOUT) -> Any:
         """Wait until the child is ready; raises the error that it met while it started."""
@@ -242,8 +251,8 @@ def child_main(target: str, fds: Sequence[int]) -> None:
         module, _, function = target.partition(":")
         main: Callable[..., None] = getattr(__import__(module, fromlist=[function]), function)
         main(channel, memories, config)
-    except ConnectionLost as error:
-        status = 0 if "closed the connection" in str(error) else 1
+    except ChannelClosed:
+        pass
     except BaseException as error:
         status = 1
         traceback.print_exc()

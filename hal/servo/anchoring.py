@@ -60,23 +60,25 @@ class Anchoring:
         if not sound:
             self._silent = True
             return False
-        old = reading.seq == self._seq  # it knows nothing of the last set-point
-        self._seq = reading.seq
+        seq = reading.seq
+        old = seq == self._seq  # it knows nothing of the last set-point
+        self._seq = seq
         if old or not self._written:
             return False
         if self._silent:
             self._silent = False
             return self._resume(reading)
-        if reading.q_commanded is None:
+        q = reading.q_commanded
+        if q is None:
             return False
         smoother = self._smoother
-        corrected = reading.q_commanded is not smoother.q and _apart(reading.q_commanded, smoother.q) > _SAME
+        corrected = q is not smoother.q and _apart(q, smoother.q) > _SAME
         if corrected:
             dq, ddq = self._device_motion(reading)
-            smoother.anchor(reading.q_commanded, dq, ddq)
+            smoother.anchor(q, dq, ddq)
         else:
             self._taken = (smoother.dq, smoother.ddq, reading.dq_commanded)
-        self._before = (reading.q_commanded, reading.dq_commanded)
+        self._before = (q, reading.dq_commanded)
         return corrected
 
     def _resume(self, reading: Reading) -> bool:

@@ -7,7 +7,7 @@ behind that has run away. Saturation scales the whole motion: the tcp keeps its 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from math import isfinite, sqrt
+from math import hypot, isfinite
 
 from ..inbox import CommandRecord
 from ..quaternion import after_rotation, difference, rotate
@@ -36,6 +36,9 @@ _TWIST_GAIN = 3.0
 _QUIET = (0.005, 0.02)
 """Below these speeds (m/s, rad/s) a part of the motion that is not commanded any more counts as stopped."""
 
+_ABSURD = 1e3
+"""Twists are cut to this, m/s and rad/s, so that their squares stay finite."""
+
 _POSTURE = 0.5
 """Pull of the posture while the tcp moves, 1/s; it fades with the tcp's speed, so that a still tcp is a still arm."""
 
@@ -52,9 +55,10 @@ class _CartesianMotion(Motion):
     def _follow_twist(self, twist: list[float]) -> None:
         """One tick towards this twist (6,) of the tcp, along the base's axes."""
         envelope, smoother = self.envelope, self.smoother
-        speed = max(_norm(twist[:3]), _norm(twist[3:]))
+        speed = max(hypot(*twist[:3]), hypot(*twist[3:]))
         posture = _POSTURE * min(1.0, speed / _POSTURE_FULL)
-        dq, singular = envelope.kinematics.velocity(smoother.q, twist, posture)
+        _, jacobian = envelope.here()
+        dq, singular = envelope.kinematics.velocity(smoother.q, twist, posture, jacobian)
         if singular:
             envelope.limited |= Limited.SINGULAR
         if not isfinite(sum(dq)):
@@ -68,12 +72,12 @@ class _CartesianMotion(Motion):
     def _cap(self, twist: list[float]) -> list[float]:
         """A twist (6,) cut to the tcp speed as a whole, and its linear part to what the workspace leaves."""
         envelope = self.envelope
-        speed = _norm(twist[:3])
+        speed = hypot(*twist[:3])
         cap = envelope.goal_tcp_speed
         if speed > cap:
             envelope.limited |= Limited.TCP_SPEED
             twist = [x * cap / speed for x in twist]
-        if envelope.workspace is not None:
+        if not envelope.far_from_faces():
             faces = envelope.face_speeds(twist[:3])
             linear = [max(-face, min(face, x)) for x, face in zip(twist[:3], faces, strict=True)]
             if linear != twist[:3]:
@@ -110,13 +114,15 @@ class TwistMotion(_CartesianMotion):
     def step(self, now: float) -> None:
         smoother, envelope = self.smoother, self.envelope
         if not any(self._values[:6]):
-            smoother.follow([0.0] * smoother.n, envelope.stays_inside)
+            smoother.follow([0.0] * smoother.n, envelope.guard)
             self.start()
             return
-        pose = envelope.kinematics.fk(smoother.q)
+        pose, _ = envelope.here()
         if not self._goal:
             self._goal = list(pose)
-        twist = [max(-1e3, min(1e3, x)) for x in self._values[:6]]
+        twist = list(self._values[:6])
+        if hypot(*twist) > _ABSURD:
+            twist = [max(-_ABSURD, min(_ABSURD, x)) for x in twist]
         if self._values[6]:
             twist = rotate(pose[3:], twist[:3]) + rotate(pose[3:], twist[3:])
         twist = self._cap(twist)
@@ -128,29 +134,33 @@ class TwistMotion(_CartesianMotion):
     def _advance(self, pose: Floats, twist: list[float]) -> None:
         """Move the goal by one tick, part by part."""
         dt, goal = self.smoother.dt, self._goal
-        linear, angular = twist[:3], twist[3:]
-        for part, rate in enumerate((linear, angular)):
+        angular = twist[3:]
+        for part, rate in enumerate((twist[:3], angular)):
             if any(rate):
                 self._held[part] = False
             elif not self._held[part]:  # still braking: wherever it comes to rest is the goal
                 goal[3 * part : 3 + 4 * part] = pose[3 * part : 3 + 4 * part]
                 self._held[part] = self._at_rest(part)
-        goal[:3] = [x + dt * v for x, v in zip(goal[:3], linear, strict=True)]
-        goal[3:] = after_rotation(goal[3:], [dt * w for w in angular])
+        x, y, z, *orientation = goal
+        vx, vy, vz, wx, wy, wz = twist
+        self._goal = [x + dt * vx, y + dt * vy, z + dt * vz, *after_rotation(orientation, (dt * wx, dt * wy, dt * wz))]
 
     def _at_rest(self, part: int) -> bool:
-        rows = self.envelope.kinematics.jacobian(self.smoother.q)[3 * part : 3 * part + 3]
-        return _norm((rows @ self.smoother.dq).tolist()) < _QUIET[part]
+        _, jacobian = self.envelope.here()
+        return hypot(*jacobian[3 * part : 3 * part + 3].dot(self.smoother.dq).tolist()) < _QUIET[part]
 
     def _shorten_lead(self, pose: Floats, error: list[float]) -> list[float]:
         linear, angular = error[:3], error[3:]
+        shortened = False
         for part, lead in ((linear, _LEAD[0]), (angular, _LEAD[1])):
-            distance = _norm(part)
+            distance = hypot(*part)
             if distance > lead:
                 part[:] = [x * lead / distance for x in part]
-                self.envelope.limited |= Limited.LEAD
-        if self.envelope.limited & Limited.LEAD:
-            self._goal = [x + e for x, e in zip(pose, linear, strict=False)] + after_rotation(pose[3:], angular)
+                shortened = True
+        if not shortened:
+            return error
+        self.envelope.limited |= Limited.LEAD
+        self._goal = [x + e for x, e in zip(pose, linear, strict=False)] + after_rotation(pose[3:], angular)
         return linear + angular
 
 
@@ -166,26 +176,27 @@ class PoseMotion(_CartesianMotion):
         """Speed per error in this tick, 1/s."""
 
     def usable(self, values: Floats) -> bool:
-        return super().usable(values) and abs(_norm(values[3:]) - 1.0) < 1e-3
+        return super().usable(values) and abs(hypot(*values[3:]) - 1.0) < 1e-3
 
     def too_far(self, values: Floats) -> bool:
         error = difference(self.envelope.kinematics.fk(self.smoother.q), values)
-        return _norm(error[:3]) > FIRST_STEP[0] or _norm(error[3:]) > FIRST_STEP[1]
+        return hypot(*error[:3]) > FIRST_STEP[0] or hypot(*error[3:]) > FIRST_STEP[1]
 
     def accept(self, command: CommandRecord) -> None:
         self._pose = command.values
 
     def step(self, now: float) -> None:
-        error = difference(self.envelope.kinematics.fk(self.smoother.q), self._pose)
+        at, _ = self.envelope.here()
+        error = difference(at, self._pose)
         scale = 1.0
         for part, lead in ((error[:3], _LEAD[0]), (error[3:], _LEAD[1])):
-            distance = _norm(part)
+            distance = hypot(*part)
             if scale * distance > lead:
                 scale = lead / distance
                 self.envelope.limited |= Limited.LEAD
         twist = self._cap([_POSE_GAIN * scale * x for x in error])
-        distance = _norm(error)
-        self._rate = _norm(twist) / distance if distance > 0.0 else _POSE_GAIN
+        distance = hypot(*error)
+        self._rate = hypot(*twist) / distance if distance > 0.0 else _POSE_GAIN
         self._follow_twist(twist)
 
     def _brake(self, dq: list[float]) -> list[float]:
@@ -200,7 +211,3 @@ class PoseMotion(_CartesianMotion):
                 cap = speed_for(abs(v) / self._rate, _BRAKE[0] * A, _BRAKE[1] * J)
                 slowest = min(slowest, cap / abs(v))
         return dq if slowest == 1.0 else [slowest * v for v in dq]
-
-
-def _norm(values: Floats) -> float:
-    return sqrt(sum([x * x for x in values]))

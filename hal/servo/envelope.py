@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from math import sqrt
+from math import hypot
+from typing import TYPE_CHECKING
 
 from ..inbox import Session
-from ..kinematics import Kinematics
+from ..kinematics import Kinematics, Pose7
 from ..specs import WorkspaceSpec
 from ..types import Limited
 from .limits import speed_for
-from .smoothing import JointSmoother
+from .smoothing import Guard, JointSmoother
 from .tcp import TcpReference
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
 
 __all__ = ["Envelope"]
 
@@ -43,25 +48,41 @@ class Envelope:
         self.workspace = workspace
         self.velocity = list(smoother.velocity)
         """Greatest joint speeds of the session (n,), rad/s."""
+        self._slowest = smoother.slowest
+        """A vector of joint speeds no longer than this is within every joint's, rad/s."""
         self.tcp_speed = float("inf")
         """Greatest speed of the tcp, m/s."""
         self.goal_tcp_speed = float("inf")
         """The same for goals: a little less, for what the smoothing adds."""
         self.limited = Limited.NONE
+        self.guard: Guard | None = None if workspace is None else self.stays_inside
+        """What a proposed step must satisfy beyond joint limits."""
         self._tcp = TcpReference(smoother, kinematics, workspace)
 
     def open(self, session: Session) -> None:
         """Take over the terms of a session."""
         self.velocity = [session.speed * v for v in self.smoother.velocity]
+        self._slowest = min(self.velocity)
         self._tcp.open(self.velocity)
-        self._tcp.forget()
         self.tcp_speed = session.tcp_speed
         self.goal_tcp_speed = _TCP_SHARE * session.tcp_speed
 
     # Goals: smooth caps, so that the hard checks below seldom have to act.
 
+    def lets_pass(self, dq: list[float]) -> bool:
+        """Is this goal velocity surely within every cap below? False: not proven."""
+        smoother = self.smoother
+        speed = hypot(*dq)
+        if not (speed <= self._slowest and smoother.is_free(smoother.q)):
+            return False
+        if self.tcp_speed < _UNLIMITED and not self._tcp.lets_pass(speed, self.goal_tcp_speed):
+            return False
+        return self.far_from_faces()
+
     def cap_joints(self, dq: list[float]) -> list[float]:
         """Each joint by itself: the session's speed, and what can still brake before a position limit."""
+        if hypot(*dq) <= self._slowest and self.smoother.is_free(self.smoother.q):
+            return dq
         state = zip(dq, self.velocity, self.smoother.q, self.smoother.free, strict=True)
         return [
             v if low <= q <= high and -cap <= v <= cap else self._clip(i, v)
@@ -70,8 +91,11 @@ class Envelope:
 
     def cap_together(self, dq: list[float]) -> list[float]:
         """The same caps, but the whole vector is scaled, so that the tcp keeps its direction."""
+        each = self.cap_joints(dq)
+        if each is dq:
+            return dq
         scale = 1.0
-        for v, capped in zip(dq, self.cap_joints(dq), strict=True):
+        for v, capped in zip(dq, each, strict=True):
             if capped != v:
                 scale = min(scale, capped / v)
         return dq if scale == 1.0 else [scale * v for v in dq]
@@ -83,10 +107,10 @@ class Envelope:
         """
         if self.tcp_speed >= _UNLIMITED and self.workspace is None:
             return dq, False
-        if self._tcp.surely_slower(dq, self.goal_tcp_speed) and self._far_from_faces():
+        if self._tcp.surely_slower(dq, self.goal_tcp_speed) and self.far_from_faces():
             return dq, False
         tcp = self._tcp.velocity(dq)
-        speed = sqrt(tcp[0] * tcp[0] + tcp[1] * tcp[1] + tcp[2] * tcp[2])
+        speed = hypot(*tcp)
         scale = 1.0
         slowed = speed > self.goal_tcp_speed
         if slowed:
@@ -113,11 +137,15 @@ class Envelope:
         """Greatest speed (3,) in m/s along each base axis, given which way the tcp goes."""
         if self.workspace is None:
             return [float("inf")] * 3
-        at = self.kinematics.fk(self.smoother.q)
+        at, _ = self.here()
         faces = zip(at, tcp_velocity, self.workspace.lower, self.workspace.upper, strict=False)
         return [_FACE_GAIN * max(0.0, (high - x) if v > 0.0 else (x - low)) for x, v, low, high in faces]
 
-    def _far_from_faces(self) -> bool:
+    def here(self) -> tuple[Pose7, NDArray[np.float64]]:
+        """Pose of the tcp and its Jacobian (6, n) at the set-point; computed once a tick, whoever asks."""
+        return self._tcp.here()
+
+    def far_from_faces(self) -> bool:
         """Is the tcp surely where no face of the workspace slows it down?"""
         return self.workspace is None or self._tcp.surely_inside(self.goal_tcp_speed / _FACE_GAIN)
 
@@ -156,12 +184,9 @@ class Envelope:
     def allows(self, smoother: JointSmoother) -> bool:
         """`stays_inside`, and the proposed step keeps the tcp's speed limit, or at least slows the tcp down."""
         if self.tcp_speed < _UNLIMITED and not self._tcp.surely_slower(smoother.dq_next, self.goal_tcp_speed):
-            x, y, z = self._tcp.velocity(smoother.dq_next)
-            speed = x * x + y * y + z * z
-            if speed > self.goal_tcp_speed**2:
-                x, y, z = self._tcp.velocity(smoother.dq)
-                if speed > x * x + y * y + z * z:
-                    return False
+            speed = hypot(*self._tcp.velocity(smoother.dq_next))
+            if speed > self.goal_tcp_speed and speed > hypot(*self._tcp.velocity(smoother.dq)):
+                return False
         return self.stays_inside(smoother)
 
     def note(self, smoother: JointSmoother) -> None:

@@ -70,9 +70,18 @@ class Motion(ABC):
             self._wanted = dq = envelope.in_proportion(dq, smoother.dq if self._wanted is None else self._wanted)
         else:
             self._wanted = None
-        smoother.follow(dq, envelope.stays_inside, together)
+        smoother.follow(dq, envelope.guard, together)
         if smoother.held_back or smoother.guarded:
             self._wanted = None
+
+    def _follow_each(self, dq: list[float]) -> None:
+        """The same, but first each joint is capped by itself."""
+        envelope = self.envelope
+        if envelope.lets_pass(dq):
+            self._wanted = None
+            self.smoother.follow(dq, envelope.guard)
+        else:
+            self._follow(envelope.cap_joints(dq))
 
 
 class JointVelocityMotion(Motion):
@@ -91,7 +100,7 @@ class JointVelocityMotion(Motion):
         self._dq = list(command.values)
 
     def step(self, now: float) -> None:
-        self._follow(self.envelope.cap_joints(self._dq))
+        self._follow_each(self._dq)
 
 
 class JointTargetMotion(Motion):
@@ -114,6 +123,8 @@ class JointTargetMotion(Motion):
         """Go there directly (True), or follow as a stream."""
         self._still = True
         """Did the target stand still before the newest command?"""
+        self._inside = True
+        """Is the target inside the position limits, now and until the deadline?"""
         self._stream_braking = _braking(smoother, *_STREAM)
         self._direct_braking = _braking(smoother, *_DIRECT)
 
@@ -137,42 +148,48 @@ class JointTargetMotion(Motion):
         self._direct = not moving and (same or halts or self._is_jump(command.t, q))
         self._still = not moving and (same or before is None)
         self._command, self._q, self._dq = command, q, dq
+        # It moves along a straight line: inside at both ends is inside.
+        self._inside = self._is_inside(q, dq, 0.0) and (
+            not moving or self._is_inside(q, dq, command.deadline - command.t)
+        )
 
     def step(self, now: float) -> None:
         assert self._command is not None
         age = max(0.0, min(now, self._command.deadline) - self._command.t)
         smoother, envelope = self.smoother, self.envelope
         q, dq = self._q, self._dq
-        if not self._direct:
-            q = [x + v * age for x, v in zip(q, dq, strict=True)]
-        for x, low, high in zip(q, smoother.lower, smoother.upper, strict=True):
-            if not low <= x <= high:
-                q, dq = self._into_limits(q, dq)
-                break
+        if not self._inside:
+            q, dq = self._into_limits([x + v * age for x, v in zip(q, dq, strict=True)], dq)
+            age = 0.0
         if self._direct and smoother.reach(q, envelope.velocity, envelope.allows):
             self._wanted = None
-        else:
-            self._follow(envelope.cap_joints(self._approach(q, dq)))
+            return
+        self._follow_each(self._approach(q, dq, age))
 
-    def _approach(self, q: list[float], dq: list[float]) -> list[float]:
-        """The target's speed, plus what closes the error and can still brake before it is closed."""
+    def _approach(self, q: list[float], dq: list[float], age: float) -> list[float]:
+        """The speed of the target, ``age`` s on, plus what closes the error and can still brake before it is closed."""
         smoother = self.smoother
         braking = self._direct_braking if self._direct else self._stream_braking
         ahead = 2.0 * smoother.dt
+        twice_ahead = ahead + ahead
         goal = []
-        for x, v, x_set, v_set, (A, J, short) in zip(q, dq, smoother.q, smoother.dq, braking, strict=True):
-            error = x - x_set
-            closing = v_set - v
-            if error < 0.0:
-                closing = -closing
+        for x, v, x_set, v_set, (A, J, b, c) in zip(q, dq, smoother.q, smoother.dq, braking, strict=True):
+            error = x + v * age - x_set
             distance = abs(error)
-            left = distance - ahead * closing if closing > 0.0 else distance
-            speed = _GAIN * distance
-            # Over a short way speed_for is a cube root; a small error, the usual case, can be judged without it.
-            if not (0.0 < left <= short and speed * speed * speed <= left * left * J):
-                speed = min(speed, speed_for(left, A, J))
-            goal.append(v + speed if error > 0.0 else v - speed)
+            speed = _GAIN * error
+            # Not always can that be braked on the way; mostly it can, with room to spare (see _braking).
+            if distance * (b * distance + c) + twice_ahead * abs(v_set - v) > 0.0:
+                closing = v_set - v if error > 0.0 else v - v_set
+                most = speed_for(distance - ahead * max(0.0, closing), A, J)
+                if abs(speed) > most:
+                    speed = most if error > 0.0 else -most
+            goal.append(v + speed)
         return goal
+
+    def _is_inside(self, q: list[float], dq: list[float], age: float) -> bool:
+        """Is the target, ``age`` s on, inside the position limits?"""
+        limits = zip(q, dq, self.smoother.lower, self.smoother.upper, strict=True)
+        return all(low <= x + v * age <= high for x, v, low, high in limits)
 
     def _into_limits(self, q: list[float], dq: list[float]) -> tuple[list[float], list[float]]:
         """The target, and its speed, cut to the position limits."""
@@ -206,7 +223,12 @@ _DIRECT = (0.9, 0.7)
 """Shares of acceleration and jerk with which a target's approach brakes."""
 
 
-def _braking(smoother: JointSmoother, share: float, jerk_share: float) -> list[tuple[float, float, float]]:
-    """Per joint: these shares of acceleration and jerk, and the longest way on which a stop keeps below the former."""
+def _braking(smoother: JointSmoother, share: float, jerk_share: float) -> list[tuple[float, float, float, float]]:
+    """Per joint: A and J, these shares of acceleration and jerk, then b and c of a quick test.
+
+    A stop from speed s is no longer than s (s/A + A/J) / 2, whether its braking reaches A or not (`stop_distance`, and
+    the inequality of the means). So a joint that approaches over the distance d at s = _GAIN d stops within a way w of
+    it when s (s/A + A/J) <= 2 w, that is d (b d + c) + 2 (d - w) <= 0.
+    """
     limits = [(share * a, jerk_share * j) for a, j in zip(smoother.acceleration, smoother.jerk, strict=True)]
-    return [(a, j, a * a * a / (j * j)) for a, j in limits]
+    return [(A, J, _GAIN * _GAIN / A, _GAIN * A / J - 2.0) for A, J in limits]

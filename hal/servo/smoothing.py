@@ -9,7 +9,7 @@ outside a limit may only come back in: what counts is max(limit, where the stop 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from math import isfinite
+from math import dist, hypot, inf, isfinite
 
 from ruckig import (
     ControlInterface,
@@ -71,7 +71,12 @@ class JointSmoother:
         self.free = [
             (low + r, high - r, v) for low, high, r, v in zip(self.lower, self.upper, room, self.velocity, strict=True)
         ]
-        """Per joint: no slower than the third number (rad/s) and between the first two (rad), no limit can matter."""
+        """Per joint: no faster than the third number (rad/s) and between the first two (rad), no limit can matter."""
+        self.slowest = min(self.velocity)
+        """A vector of joint speeds no longer than this is within every joint's limit, rad/s."""
+        # Where all joints were free last, and how far around it they stay so, rad.
+        self._free_at: Floats = [inf] * n
+        self._free_room = 0.0
         self._zeros = [0.0] * n
         self.q = list(self._zeros)
         """Set-point, rad."""
@@ -94,6 +99,8 @@ class JointSmoother:
         self._input.synchronization = Synchronization.No
         self._input.max_acceleration = self.acceleration
         self._input.max_jerk = self.jerk
+        self._speeds: Floats = ()
+        """The speeds that Ruckig's position interface keeps; the velocity interface has no need of any."""
 
     def anchor(self, q: Floats, dq: Floats | None = None, ddq: Floats | None = None) -> None:
         """Start from here. Accelerations beyond the limits are cut, since no stop could be computed from them."""
@@ -114,7 +121,7 @@ class JointSmoother:
 
     def at_rest(self) -> bool:
         """Does nothing move? (1e-6 rad/s, 1e-4 rad/s2: Ruckig's numbers at the end of a profile.)"""
-        return max(map(abs, self.dq)) < 1e-6 and max(map(abs, self.ddq)) < 1e-4
+        return hypot(*self.dq) < 1e-6 and hypot(*self.ddq) < 1e-4
 
     def follow(self, dq: Floats, guard: Guard | None = None, together: bool = False) -> None:
         """One tick towards the velocities ``dq``, which are cut to the limits.
@@ -122,17 +129,14 @@ class JointSmoother:
         A joint that would break the invariant is stopped; with ``together`` all are. A step that the guard refuses
         becomes a stop of all.
         """
-        if not isfinite(sum(dq)):  # a goal that is no number is no goal
-            dq = self._zeros
-        target = [
-            v if -cap <= v <= cap else (cap if v > 0.0 else -cap) for v, cap in zip(dq, self.velocity, strict=True)
-        ]
+        if not hypot(*dq) <= self.slowest:
+            dq = self._within_speed(dq)
         self.guarded = False
-        self._propose_velocity(target)
+        self._propose_velocity(dq)
         self.held_back = self._violations()
         if self.held_back:
             stopped = self._all if together else self.held_back
-            self._propose_velocity([0.0 if i in stopped else v for i, v in enumerate(target)])
+            self._propose_velocity([0.0 if i in stopped else v for i, v in enumerate(dq)])
         if guard is not None and not guard(self):
             self.guarded = True
             self._propose_velocity(self._zeros)
@@ -146,7 +150,9 @@ class JointSmoother:
         """
         inputs = self._input
         inputs.control_interface = ControlInterface.Position
-        inputs.max_velocity = [v * _ABOVE for v in velocity]
+        if velocity is not self._speeds:
+            self._speeds = velocity
+            inputs.max_velocity = [v * _ABOVE for v in velocity]
         inputs.target_position = q
         inputs.target_velocity = self._zeros
         if not self._propose() or self._violations() or (guard is not None and not guard(self)):
@@ -162,7 +168,7 @@ class JointSmoother:
         self.guarded = False
         self._propose_velocity(self._zeros)
         self._commit()
-        if max(map(abs, self.dq)) < _STILL and max(map(abs, self.ddq)) < _STILL:
+        if hypot(*self.dq) < _STILL and hypot(*self.ddq) < _STILL:
             self.dq, self.ddq = list(self._zeros), list(self._zeros)  # Ruckig leaves 1e-17 here and there
 
     def stop_end(self) -> list[float]:
@@ -195,14 +201,32 @@ class JointSmoother:
         self.q_next = output.new_position
         self.dq_next = output.new_velocity
         self.ddq_next = output.new_acceleration
-        return isfinite(sum(self.q_next) + sum(self.dq_next) + sum(self.ddq_next))
+        return isfinite(hypot(*self.q_next, *self.dq_next, *self.ddq_next))
+
+    def _within_speed(self, dq: Floats) -> Floats:
+        if not isfinite(sum(dq)):  # a goal that is no number is no goal
+            return self._zeros
+        return [v if -cap <= v <= cap else (cap if v > 0.0 else -cap) for v, cap in zip(dq, self.velocity, strict=True)]
+
+    def is_free(self, q: Floats) -> bool:
+        """Are these positions (n,), rad, surely where no limit can matter to joints within their speed limits?
+
+        One distance instead of two comparisons a joint: none has moved farther than all of them together.
+        """
+        return dist(q, self._free_at) <= self._free_room
 
     def _violations(self) -> frozenset[int]:
         """Joints whose stop after the proposed step would end beyond a limit, and farther than a stop from now."""
+        q_next, dq_next = self.q_next, self.dq_next
+        if hypot(*dq_next) <= self.slowest and self.is_free(q_next):
+            return self._none
         found = self._none
-        for i, (q, v, (low, high, speed)) in enumerate(zip(self.q_next, self.dq_next, self.free, strict=True)):
+        room = inf
+        for i, (q, v, (low, high, speed)) in enumerate(zip(q_next, dq_next, self.free, strict=True)):
+            room = min(room, q - low, high - q)
             if not (low <= q <= high and -speed <= v <= speed) and self._violates(i):
                 found |= {i}
+        self._free_at, self._free_room = q_next, room  # negative: not free here
         return found
 
     def _violates(self, i: int) -> bool:

@@ -13,6 +13,11 @@ __all__ = ["SILENCE", "Watchdog", "is_alive", "is_timely"]
 SILENCE = 0.150
 """Longest silence of the dead-man's pad, of the app and of the device, s."""
 
+_HARMLESS_AT_REST = (Trip.DEADMAN_LOST, Trip.DEADMAN_SILENT, Trip.APP_SILENT)
+"""With a dead-man that is released these are no reason to latch anything."""
+
+_NONE = Trip.NONE  # the one that is named in every tick; it is zero, and so false (Python 3.11 takes 0.1 us to find it)
+
 _AHEAD = 1.0
 """A sign of life may be this far in the future before it is taken for garbage, s."""
 
@@ -27,7 +32,9 @@ class Watchdog:
     it lasted does not count.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, dt: float = 0.0) -> None:
+        """``dt`` is the time between two looks, s: the limit of silence is kept although nobody looks in between."""
+        self._silence = SILENCE - dt
         self.session: Session | None = None
         self.trip = Trip.NONE
         """Why the stop is latched."""
@@ -46,12 +53,13 @@ class Watchdog:
         """The command that the arm follows."""
 
     def begin(self, session: Session, inbox: Inbox) -> None:
-        """A session opens; presses and rearms count from what ``inbox`` says now, `rig.stop()` from the last tick."""
+        """A session opens. Presses and rearms count from what ``inbox`` says now, stops from what the app knew of."""
         self.session = session
         self.trip = Trip.NONE
         self.allowed = self.renewed = self._rebase = False
         self._command = None
         self._rearms = inbox.rearms
+        self._stops = session.stops
         deadman = inbox.deadman
         # For move_to, a dead-man that is held already is as good as pressed now.
         known = session.move_to is not None and deadman is not None and deadman.held
@@ -84,9 +92,13 @@ class Watchdog:
             return False
         deadman = inbox.deadman
         cause = self._cause(now, session, inbox, stopped, device)
-        if cause is not Trip.NONE:
+        if cause and cause in _HARMLESS_AT_REST and session.deadman and not self.allowed and not self.trip:
+            # Nothing moves, and nothing will before a new press: no trip. A press during the silence is not one.
+            self._presses = self._presses if deadman is None else deadman.presses
+            return False
+        if cause:
             self._latch(cause, now)
-        if self.trip is not Trip.NONE:
+        if self.trip:
             self._try_to_leave(session, inbox, at_rest, cause)
         elif session.deadman:
             assert deadman is not None
@@ -97,21 +109,22 @@ class Watchdog:
 
     def _cause(self, now: float, session: Session, inbox: Inbox, stopped: bool, device: Trip) -> Trip:
         """What forbids motion in this tick, the gravest first."""
-        if device is not Trip.NONE:
+        if device:
             return device
         if stopped:
             return Trip.STOP
         if session.deadman:
             if inbox.deadman is None or not inbox.deadman.connected:
                 return Trip.DEADMAN_LOST
-            if not is_alive(now, inbox.deadman.t_alive):
+            if not is_alive(now, inbox.deadman.t_alive, self._silence):
                 return Trip.DEADMAN_SILENT
-        if not is_alive(now, inbox.t_app):
+        if not is_alive(now, inbox.t_app, self._silence):
             return Trip.APP_SILENT
-        released = session.deadman and inbox.deadman is not None and not inbox.deadman.held
-        if self.allowed and not released and self._is_late(now, session, inbox.command):
-            return Trip.COMMAND_LATE
-        return Trip.NONE
+        if self.allowed and self._is_late(now, session, inbox.command):
+            released = session.deadman and inbox.deadman is not None and not inbox.deadman.held
+            if not released:
+                return Trip.COMMAND_LATE
+        return _NONE
 
     def _is_late(self, now: float, session: Session, newest: CommandRecord | None) -> bool:
         """Is a command due, and neither it nor the one that came meanwhile still in time?"""
@@ -166,6 +179,6 @@ def is_timely(now: float, command: CommandRecord) -> bool:
     return command.t - _AHEAD <= now <= command.deadline
 
 
-def is_alive(now: float, sign: float) -> bool:
+def is_alive(now: float, sign: float, silence: float = SILENCE) -> bool:
     """Is the last sign of life (s) young enough, and not from the future?"""
-    return -_AHEAD <= now - sign <= SILENCE
+    return -_AHEAD <= now - sign <= silence

@@ -82,7 +82,9 @@ class Bench:
         if begin:
             self.begin()
 
-    def begin(self) -> None:
+    def begin(self, known_stops: int | None = None) -> None:
+        """Open the session; the app knew of so many stops then (all of them)."""
+        self.session = self.session._replace(stops=self.stops if known_stops is None else known_stops)
         self.servo.begin(self.session, self.inbox())
 
     @property

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import random
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -52,7 +53,7 @@ def thing(**keys: Any) -> dict[str, Any]:
         ({"robtos": {}}, "robtos", ["did you mean 'robots'"]),
         (robot(sped=0.2), "robots.arm.sped", ["did you mean 'speed'", "tcp_speed"]),
         (robot(base={"positon": [0, 0, 0]}), "robots.arm.base.positon", ["did you mean 'position'"]),
-        (robot(gripper={"sped": 1}), "robots.arm.gripper.sped", ["did you mean 'speed'"]),
+        (robot(gripper={"sped": 0.05}), "robots.arm.gripper.sped", ["did you mean 'speed'"]),
         (camera(look_at={**LOOK, "yaw": 3}), "cameras.eye.look_at.yaw", ["did you mean 'yaw_deg'"]),
         (camera(streams={"colour": {}}), "cameras.eye.streams.colour", ["did you mean 'color'"]),
         (camera(streams={"color": {"fromat": "bgr8"}}), "cameras.eye.streams.color.fromat", ["'format'"]),
@@ -191,28 +192,21 @@ objects: [bad_brick.yaml, missing.yaml, cub]
         (rig, "robots.bad.sped"),
         ("--set", "robots.good.colour"),
         ("--set", "cameras.wrsit.output.width"),
-        (arm, "tcp.link"),
+        (rig, "robots.good.initial"),
         (arm, "tcp.lnk"),
+        (arm, "urdf"),
+        (arm, "limits.acceleration"),
+        (arm, "limits.jerk"),
         (brick, ""),
         (rig, "objects.1"),
         (rig, "objects.2"),
+        (rig, "cameras.eye.attached.link"),
         (rig, "cameras.ear.attached.robot"),
+        (rig, "cameras.nose.attached.link"),
     }
     text = str(ConfigError(found))
-    assert text.startswith("10 problems")
+    assert text.startswith("15 problems")
     assert f"{rig}: robots.bad.sped: " in text
-
-
-def test_with_the_schema_in_order_names_are_checked_across_files(tmp_path: Path) -> None:
-    (tmp_path / "rig.yaml").write_text(
-        "robots: {good: {model: panda, initial: [1]}, other: {model: pnada}}\n"
-        "cameras: {nose: {model: realsense_d435, attached: {robot: good, link: panda_hadn}}}\n"
-    )
-    assert {problem.key for problem in problems(tmp_path / "rig.yaml")} == {
-        "robots.good.initial",
-        "robots.other.model",
-        "cameras.nose.attached.link",
-    }
 
 
 # Files.
@@ -235,6 +229,7 @@ def test_missing_file_and_unknown_rig(tmp_path: Path) -> None:
         ("", ["is empty"]),
         ("robots: !!python/object/apply:os.system ['true']", ["not valid YAML"]),
         ("a: 1\n---\nb: 2\n", ["not valid YAML"]),
+        ("objects: &all [*all]", ["an alias"]),
     ],
 )
 def test_files_that_are_no_rig(tmp_path: Path, text: str, words: list[str]) -> None:
@@ -280,6 +275,9 @@ def test_overrides_are_to_blame_for_their_own_mistakes(override: str, key: str, 
         assert word in problem.message
 
 
+NONSENSE = [None, -1, 2.5, "x", [], {}, [1, 2], True, float("nan"), float("inf"), 10**400, {1: 2}, [None] * 7]
+
+
 def places(value: Any, path: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
     """Every key and item in nested data."""
     items = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
@@ -289,14 +287,13 @@ def places(value: Any, path: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
 def test_nonsense_anywhere_is_a_config_error_or_nothing_worse() -> None:
     """Never a traceback for a person's mistake: nonsense in every place of a rig."""
     rig = yaml.safe_load(find_data("config", "panda_table.yaml").read_text())
-    nonsense = [None, -1, 2.5, "x", [], {}, [1, 2], True, float("nan"), float("inf"), 10**400, {1: 2}, [None] * 7]
     refused: list[Problem] = []
     for k, place in enumerate(places(rig)):
         broken = copy.deepcopy(rig)
         target = broken
         for part in place[:-1]:
             target = target[part]
-        for value in (nonsense[k % len(nonsense)], nonsense[(5 * k + 3) % len(nonsense)]):
+        for value in (NONSENSE[k % len(NONSENSE)], NONSENSE[(5 * k + 3) % len(NONSENSE)]):
             target[place[-1]] = value
             try:
                 load(broken)
@@ -308,7 +305,7 @@ def test_nonsense_anywhere_is_a_config_error_or_nothing_worse() -> None:
 
 def test_arguments() -> None:
     found = problems("panda_table", clock="lockstep", driver="mok")
-    assert {problem.key for problem in found} >= {"clock", "driver"}
+    assert {problem.key for problem in found} == {"clock", "driver"}
     assert any("did you mean 'lock_step'" in problem.message for problem in found)
 
 
@@ -366,18 +363,17 @@ def test_the_copied_model_is_in_order(own_model: Callable[..., Path]) -> None:
         (lambda m: m.pop("tcp"), "tcp", ["is missing"]),
         (lambda m: m.update(joints=[]), "joints", ["at least 1"]),
         (lambda m: m["gripper"].update(width=0.08), "gripper.width", ["did you mean 'width_max'"]),
+        (lambda m: m.update(driver="franka"), "driver", ["did you mean 'drivers'"]),
     ],
 )
 def test_mistakes_in_a_robot_model(
     own_model: Callable[..., Path], change: Callable[[dict[str, Any]], object], key: str, words: list[str]
 ) -> None:
     rig = own_model(change)
-    found = problems(rig)
-    matching = [problem for problem in found if problem.key == key]
-    assert matching, "\n".join(map(str, found))
-    assert matching[0].file == str(rig.parent / "arm.yaml")
+    problem = only(rig)
+    assert (problem.file, problem.key) == (str(rig.parent / "arm.yaml"), key)
     for word in words:
-        assert word in matching[0].message
+        assert word in problem.message
 
 
 @pytest.mark.parametrize(
@@ -406,6 +402,12 @@ def test_a_urdf_that_does_not_parse(own_model: Callable[..., Path], urdf: str, w
         assert word in problem.message
 
 
+def test_one_of_the_arms_own_joints_is_no_finger(own_model: Callable[..., Path]) -> None:
+    problem = only(own_model(lambda model: model["gripper"]["joints"].__setitem__(0, "panda_joint7")))
+    assert problem.key == "gripper.joints"
+    assert "one of the arm's joints" in problem.message
+
+
 def test_a_model_and_a_urdf_without_speed_limits(own_model: Callable[..., Path], tmp_path: Path) -> None:
     rig = own_model(lambda model: model["limits"].pop("velocity"))
     load(rig)  # the URDF has them
@@ -429,3 +431,178 @@ def test_a_driver_whose_package_does_not_import() -> None:
     problem = only(robot(drivers={"sim": "no_such_lab.arm:DRIVER"}))
     assert problem.key == "robots.arm"
     assert "no_such_lab" in problem.message
+
+
+# Many mistakes at once: what each one alone is told, all together are told, and nothing else.
+
+
+class Bench:
+    """A rig in order, in files that mistakes can be made in."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.rig = yaml.safe_load(find_data("config", "panda_table.yaml").read_text())
+        self.arm = yaml.safe_load(find_data("robots", "panda.yaml").read_text()) | {"urdf": "arm.urdf"}
+        self.camera = yaml.safe_load(find_data("sensors", "cameras", "realsense_d435.yaml").read_text())
+        self.cup = {"name": "cup", "urdf": "cup.urdf"}
+        self.urdf = Path(load("panda_table").resolve().robots[0].urdf).read_text()
+        self.overrides: list[str] = []
+        self.panda: dict[str, Any] = self.rig["robots"]["panda"]
+        self.panda["model"] = "arm.yaml"
+        self.wrist: dict[str, Any] = self.rig["cameras"]["wrist"]
+        self.wrist["model"] = "camera.yaml"
+        self.rig["gamepads"]["pad"] = {"model": "dualshock4", "driver": "evdev"}
+        self.pad: dict[str, Any] = self.rig["gamepads"]["pad"]
+        self.rig["robots"]["other"] = {"model": "iiwa", "base": [2, 0, 0, 0, 0, 0, 1]}
+        self.objects: list[Any] = self.rig["objects"]
+        self.objects += ["cup.yaml", {"file": "cube", "name": "brick"}]
+
+    def found(self) -> set[tuple[str, str]]:
+        """File and key of each problem; every one is told once."""
+        for name in ("rig", "arm", "camera", "cup"):
+            (self.folder / f"{name}.yaml").write_text(yaml.safe_dump(getattr(self, name)))
+        (self.folder / "arm.urdf").write_text(self.urdf)
+        (self.folder / "cup.urdf").write_text("<robot name='cup'><link name='cup'/></robot>")
+        try:
+            load(self.folder / "rig.yaml", overrides=self.overrides)
+            found: tuple[Problem, ...] = ()
+        except ConfigError as error:
+            found = error.problems
+        places = [(Path(problem.file).name, problem.key) for problem in found]
+        assert len(places) == len(set(places)), "\n".join(map(str, found))
+        return set(places)
+
+
+def _hide_speed_limit(bench: Bench) -> None:
+    del bench.arm["limits"]["velocity"]
+    bench.urdf = bench.urdf.replace('velocity="2.1750"', 'velocity="0"')
+
+
+MISTAKES: dict[tuple[str, str], Callable[[Bench], object]] = {
+    # The arm's entry in the rig: a key, a type, a unit, and what only its model or its URDF can tell.
+    ("rig.yaml", "robots.panda.colour"): lambda b: b.panda.update(colour="red"),
+    ("rig.yaml", "robots.panda.move_sped"): lambda b: b.panda.update(move_sped=0.2),
+    ("rig.yaml", "robots.panda.speed"): lambda b: b.panda.update(speed="fast"),
+    ("rig.yaml", "robots.panda.base"): lambda b: b.panda.update(base=[0, 0, 1]),
+    ("rig.yaml", "robots.panda.initial"): lambda b: b.panda.update(initial=[0, -45, 0, -135, 0, 90, 45]),
+    ("rig.yaml", "robots.panda.limits.torque"): lambda b: b.panda.update(limits={"torque": 1000}),
+    ("rig.yaml", "robots.panda.gripper.speed"): lambda b: b.panda.update(gripper={"speed": 9.0}),
+    ("rig.yaml", "robots.panda.drivers.rael"): lambda b: b.panda.update(drivers={"rael": "franka"}),
+    ("rig.yaml", "robots.panda.workspace"): lambda b: b.panda.update(workspace={"upper": [1, 1, 0], "table_height": 1}),
+    ("rig.yaml", "robots.other.model"): lambda b: b.rig["robots"]["other"].update(model="iwia"),
+    # Its model.
+    ("arm.yaml", "driver"): lambda b: b.arm.update(driver=b.arm.pop("drivers")),
+    ("arm.yaml", "description"): lambda b: b.arm.update(description=7),
+    ("arm.yaml", "joints.2"): lambda b: b.arm["joints"].__setitem__(2, "panda_jiont3"),
+    ("arm.yaml", "tcp.lnk"): lambda b: b.arm["tcp"].update(lnk=b.arm["tcp"].pop("link")),
+    ("arm.yaml", "base_link"): lambda b: b.arm.update(base_link="panda_lnik0"),
+    ("arm.yaml", "home"): lambda b: b.arm["home"].__setitem__(3, 0.5),
+    ("arm.yaml", "limits.jerk"): lambda b: b.arm["limits"].pop("jerk"),
+    ("arm.yaml", "limits.acceleration"): lambda b: b.arm["limits"].update(acceleration=0),
+    ("arm.yaml", "limits.velocity"): _hide_speed_limit,
+    ("arm.yaml", "limits"): lambda b: b.arm["limits"]["lower"].__setitem__(0, 3.0),
+    ("arm.yaml", "limits.effort"): lambda b: b.arm["limits"].update(effort=9),
+    ("arm.yaml", "gripper.joints.0"): lambda b: b.arm["gripper"]["joints"].__setitem__(0, "finger"),
+    # Cameras and their model.
+    ("rig.yaml", "cameras.wrist.attached.lnk"): lambda b: b.wrist["attached"].update(
+        lnk=b.wrist["attached"].pop("link")
+    ),
+    ("rig.yaml", "cameras.wrist.output.width"): lambda b: b.wrist["output"].update(width="wide"),
+    ("rig.yaml", "cameras.wrist.capture"): lambda b: b.wrist.update(capture={"width": 9, "height": 9, "rate_hz": 9}),
+    ("rig.yaml", "cameras.wrist.drivers.sim"): lambda b: b.wrist.update(drivers={"sim": 3}),
+    ("rig.yaml", "cameras.scene.model"): lambda b: b.rig["cameras"]["scene"].update(model="realsense_d453"),
+    ("rig.yaml", "cameras.scene.look_at.yaw"): lambda b: b.rig["cameras"]["scene"]["look_at"].update(yaw=3),
+    ("rig.yaml", "cameras.eye"): lambda b: b.rig["cameras"].update(eye={"model": "realsense_d435"}),
+    ("camera.yaml", "mode"): lambda b: b.camera.update(mode=[]),
+    ("camera.yaml", ""): lambda b: b.camera.update(distortion=[0, 0]),
+    # Objects: in files, in the rig, changed.
+    ("cup.yaml", "colour"): lambda b: b.cup.update(colour="red"),
+    ("cup.yaml", "urdf"): lambda b: b.cup.update(urdf="cpu.urdf"),
+    ("rig.yaml", "objects.5.mas"): lambda b: b.objects[5].update(mas=1),
+    ("rig.yaml", "objects.6"): lambda b: b.objects.append({"file": "cube", "name": "ball", "radius": 0.1}),
+    # The pad, the simulation, the caller.
+    ("rig.yaml", "gamepads.pad.driver"): lambda b: b.pad.update(driver="evdve"),
+    ("rig.yaml", "gamepads.pad.model"): lambda b: b.pad.update(model="dualshok4"),
+    ("rig.yaml", "gamepads.pad.dead_zone"): lambda b: b.pad.update(dead_zone=2),
+    ("rig.yaml", "simulation.physics_rate"): lambda b: b.rig["simulation"].update(physics_rate=1000),
+    ("rig.yaml", "simulation.clock"): lambda b: b.rig["simulation"].update(clock="lockstep"),
+    ("--set", "cameras.wrsit.output.width"): lambda b: b.overrides.append("cameras.wrsit.output.width=3"),
+    ("--set", "robots.panda.tcp_speed"): lambda b: b.overrides.append("robots.panda.tcp_speed=-1"),
+}
+
+
+def test_the_bench_is_in_order(tmp_path: Path) -> None:
+    bench = Bench(tmp_path)
+    assert bench.found() == set()
+    assert len(load(tmp_path / "rig.yaml").resolve().robots) == 2
+
+
+@pytest.mark.parametrize("place", MISTAKES, ids=" ".join)
+def test_each_mistake_alone_is_one_problem(tmp_path: Path, place: tuple[str, str]) -> None:
+    bench = Bench(tmp_path)
+    MISTAKES[place](bench)
+    assert bench.found() == {place}
+
+
+def test_all_mistakes_on_all_levels_are_told_at_once(tmp_path: Path) -> None:
+    bench = Bench(tmp_path)
+    for make in MISTAKES.values():
+        make(bench)
+    assert bench.found() == set(MISTAKES)
+
+
+@pytest.mark.parametrize("seed", range(15))
+def test_no_mistake_hides_another_and_none_invents_one(tmp_path: Path, seed: int) -> None:
+    bench = Bench(tmp_path)
+    some = random.Random(seed).sample(list(MISTAKES), 2 + seed % 6)
+    for place in some:
+        MISTAKES[place](bench)
+    assert bench.found() == set(some)
+
+
+def test_what_stands_under_a_misspelt_key_is_checked_too_and_told_under_that_key(tmp_path: Path) -> None:
+    bench = Bench(tmp_path)
+    bench.arm["limts"] = bench.arm.pop("limits") | {"jerk": 0, "velocity": "fast"}
+    bench.overrides = ["robots.other.wrokspace.table_height=high"]
+    assert bench.found() == {
+        ("arm.yaml", "limts"),
+        ("arm.yaml", "limts.jerk"),
+        ("arm.yaml", "limts.velocity"),
+        ("--set", "robots.other.wrokspace"),
+        ("--set", "robots.other.wrokspace.table_height"),
+    }
+
+
+def test_a_key_that_only_looks_like_another_is_one_problem(tmp_path: Path) -> None:
+    bench = Bench(tmp_path)
+    bench.wrist["depth_min"] = 0.1  # nearest: depth, which holds min and max
+    assert bench.found() == {("rig.yaml", "cameras.wrist.depth_min")}
+
+
+@pytest.mark.parametrize("name", ["arm", "camera", "cup"])
+def test_nonsense_in_a_model_or_an_object_is_a_config_error_or_nothing_worse(tmp_path: Path, name: str) -> None:
+    bench, refused = Bench(tmp_path), 0
+    good = getattr(bench, name)
+    for k, place in enumerate(places(good)[::2]):
+        setattr(bench, name, copy.deepcopy(good))
+        target = getattr(bench, name)
+        for part in place[:-1]:
+            target = target[part]
+        target[place[-1]] = NONSENSE[k % len(NONSENSE)]
+        refused += bool(bench.found())
+    assert refused > len(places(good)) / 4
+
+
+def test_a_joint_that_does_not_move_lacks_no_limits(tmp_path: Path) -> None:
+    bench = Bench(tmp_path)
+    bench.arm["limits"] = {"acceleration": 10, "jerk": 500}  # the rest is the URDF's, which has none for this joint
+    assert bench.found() == set()
+    bench.arm["joints"][6] = "panda_joint8"
+    assert bench.found() == {("arm.yaml", "joints.6")}
+
+
+def test_a_mistake_in_an_objects_file_is_not_told_again_of_who_changes_it(tmp_path: Path) -> None:
+    bench = Bench(tmp_path)
+    bench.cup["rgba"] = [255, 0, 0, 1]
+    bench.objects.append({"file": "cup.yaml", "name": "mug", "fixd": True})
+    assert bench.found() == {("cup.yaml", "rgba"), ("rig.yaml", "objects.6.fixd")}

@@ -66,7 +66,7 @@ def test_a_mapping_of_ones_own(tmp_path: Path) -> None:
         ({"linear": {"x": {"axis": "dpad_x", "scale": 0.0}}}, "linear.x.scale", ["greater than 0"]),
         ({"linear": {"roll": {}}}, "linear.roll", ["no key here", "x, y, z"]),
         ({"frame": "tool"}, "frame", ["'tool'", "base, tcp"]),
-        ({"deadman": "l4"}, "", ["no button 'l4'"]),
+        ({"deadman": "l4"}, "deadman", ["no button 'l4'"]),
         ({"gripper": {"open": "east"}}, "gripper", ["open and close"]),
         ({"linear": {"x": {"axis": "l2", "scale": 1.0}}}, "", ["'l2' has two meanings"]),
         ({"go_home": "north", "actions": {"record": "north"}}, "", ["'north' has two meanings"]),

@@ -1,0 +1,63 @@
+"""``move_to``: a session that goes to one place and ends there."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from .commands import JointTarget
+from .control import Control
+from .errors import CommandError
+from .pose import Pose
+from .types import RobotState
+
+if TYPE_CHECKING:
+    from .deadman import Deadman
+    from .robot import Robot
+
+__all__ = ["move_to"]
+
+
+def move_to(
+    robot: Robot,
+    target: ArrayLike | Pose,
+    *,
+    deadman: Deadman | None,
+    unattended: bool,
+    speed: float | None,
+    tcp_speed: float | None,
+    timeout: float | None,
+) -> RobotState:
+    """See :meth:`hal.robot.Robot.move_to`."""
+    goal = robot.ik(target) if isinstance(target, Pose) else JointTarget(target).q
+    if goal.size != robot.n:
+        raise CommandError(f"{robot.name} has {robot.n} joints; the target has {goal.size}")
+    limits = robot.limits
+    outside = np.flatnonzero((goal < limits.lower) | (goal > limits.upper))
+    if outside.size:
+        names = ", ".join(robot.joints[k] for k in outside)
+        raise CommandError(f"the target is outside the position limits of {names}")
+    session = Control(
+        robot,
+        deadman=deadman,
+        rate_hz=50.0,
+        speed=speed,
+        tcp_speed=tcp_speed,
+        unattended=unattended,
+        goal=tuple(goal.tolist()),
+    )
+    clock = robot.clock
+    start = clock.now()
+    with session:
+        for _ in clock.rate(50.0):
+            servo = session._peek()
+            session._check_trip(servo, clock.now())
+            if servo.refused and servo.session == session._id:
+                raise CommandError(f"the way to the target leaves the workspace of {robot.name}")
+            if servo.arrived and servo.session == session._id:
+                break
+            if timeout is not None and clock.now() - start > timeout:
+                raise TimeoutError(f"{robot.name} did not reach the target within {timeout:g} s")
+    return robot.state()

@@ -1,0 +1,286 @@
+"""Bounds that spare the servo its kinematics: never a wrong "surely", and "surely" most of the time."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from servo_kit import Bench
+from specs import PANDA_HOME, data, panda
+
+from hal.commands import Kind
+from hal.kinematics import NEAR_SINGULAR, Kinematics
+from hal.servo.servo import Servo
+from hal.servo.smoothing import JointSmoother
+from hal.servo.tcp import TcpReference
+from hal.specs import KinematicsSpec, LimitsSpec, WorkspaceSpec
+
+Array = np.ndarray[Any, np.dtype[np.float64]]
+DT = 1 / 240
+
+
+def iiwa() -> tuple[KinematicsSpec, LimitsSpec]:
+    """KUKA's arm with a tool that points aside, and slow, weak joints."""
+    upper = (2.96, 2.09, 2.96, 2.09, 2.96, 2.09, 3.05)
+    lower = tuple(-x for x in upper)
+    joints = tuple(f"lbr_iiwa_joint_{k}" for k in range(1, 8))
+    kinematics = KinematicsSpec(
+        urdf=data("kuka_iiwa/model.urdf"),
+        joints=joints,
+        lower=lower,
+        upper=upper,
+        home=(0.0, 0.5, 0.0, -1.3, 0.0, 1.2, 0.0),
+        base_link=None,
+        tcp_link="lbr_iiwa_link_7",
+        tcp_position=(0.2, 0.03, 0.1),
+        tcp_orientation=(0.0, 0.0, 0.6, 0.8),
+    )
+    return kinematics, LimitsSpec(lower, upper, (1.7,) * 7, (4.0,) * 7, (40.0,) * 7)
+
+
+class Arm:
+    """One arm with everything that the bounds are about."""
+
+    def __init__(self, spec: KinematicsSpec, limits: LimitsSpec) -> None:
+        self.limits = limits
+        self.kinematics = Kinematics(spec)
+        self.smoother = JointSmoother(limits, DT)
+        self.random = np.random.default_rng(3)
+        self.cap = [0.3 * v for v in limits.velocity]
+
+    def reference(self, box: WorkspaceSpec | None = None) -> TcpReference:
+        reference = TcpReference(self.smoother, self.kinematics, box)
+        reference.open(self.cap)
+        return reference
+
+    def somewhere(self) -> Array:
+        return self.random.uniform(self.limits.lower, self.limits.upper)
+
+    def aside(self) -> Array:
+        """A way of the joints, rad: from a tenth of a mrad to a whole one."""
+        return self.random.normal(size=7) * 10.0 ** self.random.uniform(-4.0, 0.0)
+
+    def speeds(self) -> Array:
+        """Joint speeds within the session's, often at it."""
+        return np.clip(self.random.normal(size=7), -1.0, 1.0) * self.cap
+
+    def tcp_speed(self, q: Sequence[float], dq: Array) -> float:
+        return float(np.linalg.norm(self.kinematics.jacobian(q)[:3] @ dq))
+
+
+@pytest.fixture(params=["panda", "iiwa"])
+def arm(request: pytest.FixtureRequest) -> Arm:
+    if request.param == "panda":
+        spec = panda()
+        return Arm(spec.kinematics, spec.limits)
+    return Arm(*iiwa())
+
+
+def test_reach_bounds_the_jacobian_its_change_and_the_way_of_the_tcp(arm: Arm) -> None:
+    reach = np.array(arm.kinematics.reach())
+    greatest = np.zeros(7)
+    for _ in range(1000):
+        q, d = arm.somewhere(), arm.aside()
+        before, after = arm.kinematics.jacobian(q), arm.kinematics.jacobian(q + d)
+        greatest = np.maximum(greatest, np.linalg.norm(before[:3], axis=0))
+        way = reach @ np.abs(d) + 1e-12
+        assert np.linalg.norm(after[:3] - before[:3], axis=0).max() <= way
+        assert np.linalg.norm(np.subtract(arm.kinematics.fk(q + d)[:3], arm.kinematics.fk(q)[:3])) <= way
+    assert (greatest <= reach + 1e-12).all()
+    assert (greatest[:6] > 0.5 * reach[:6]).all(), "a bound that is far too great proves nothing"
+    assert (np.diff(reach) <= 0.0).all()
+
+
+def test_surely_slower_is_never_wrong(arm: Arm) -> None:
+    """References near and far, caps just above and below the true speed."""
+    proven = missed = 0
+    for _ in range(1500):
+        q, dq = arm.somewhere(), arm.speeds()
+        if arm.random.random() < 0.5:  # the direction in which the tcp is fastest
+            dq = 0.1 * np.linalg.svd(arm.kinematics.jacobian(q)[:3])[2][0]
+        reference = arm.reference()
+        arm.smoother.anchor((q + arm.aside()).tolist())
+        reference.here()
+        arm.smoother.anchor(q.tolist())
+        exact = arm.tcp_speed(q, dq)
+        cap = exact * arm.random.choice([0.5, 0.9, 0.999, 1.001, 1.1, 2.0])
+        if reference.lets_pass(float(np.linalg.norm(dq)), cap):
+            assert exact <= cap
+        if reference.surely_slower(dq.tolist(), cap):
+            proven += 1
+            assert exact <= cap
+        elif cap > exact:
+            missed += 1
+    assert proven > 600
+    assert missed < 150
+
+
+def test_it_knows_the_speed_where_it_has_looked(arm: Arm) -> None:
+    for _ in range(50):
+        q, dq = arm.somewhere(), arm.speeds()
+        arm.smoother.anchor(q.tolist())
+        reference = arm.reference()
+        exact = arm.tcp_speed(q, dq)
+        assert reference.surely_slower(dq.tolist(), exact * (1 + 1e-9))
+        assert not reference.surely_slower(dq.tolist(), exact * (1 - 1e-9))
+        assert np.linalg.norm(reference.velocity(dq.tolist())) == pytest.approx(exact)
+
+
+def test_surely_inside_is_never_wrong(arm: Arm) -> None:
+    """Neither for a stop that begins now nor for one after any step that the smoother can take."""
+    proven = outside = 0
+    smoother = arm.smoother
+    for _ in range(1500):
+        q, dq = arm.somewhere(), arm.speeds() * arm.random.choice([0.1, 1.0])
+        ddq = arm.random.uniform(-1.0, 1.0, 7) * smoother.acceleration * arm.random.choice([0.0, 0.1, 1.0])
+        at = np.array(arm.kinematics.fk(q)[:3])
+        half = 10.0 ** arm.random.uniform(-2.0, 0.3)
+        box = WorkspaceSpec(tuple(at - half), tuple(at + half * arm.random.uniform(0.2, 1.0, 3)))
+        reference = arm.reference(box)
+        smoother.anchor((q + arm.aside()).tolist())
+        reference.here()
+        smoother.anchor(q.tolist(), dq.tolist(), ddq.tolist())
+        end = arm.kinematics.fk(smoother.stop_end())
+        inside = is_inside(end, box)
+        outside += not inside
+        if reference.surely_stays_inside():
+            proven += 1
+            assert inside
+            smoother.follow((arm.random.choice([-1.0, 0.0, 1.0], 7) * smoother.velocity).tolist())
+            assert is_inside(arm.kinematics.fk(smoother.stop_end()), box)
+    assert proven > 200
+    assert outside > 50
+
+
+def test_a_stop_that_begins_at_rest_may_still_go_far() -> None:
+    """A weak joint that has just begun to speed up needs long to take the acceleration back."""
+    spec, limits = iiwa()
+    kinematics, smoother = Kinematics(spec), JointSmoother(limits, 1e-4)
+    smoother.anchor(spec.home, None, [4.0] + [0.0] * 6)
+    at = np.array(kinematics.fk(spec.home)[:3])
+    way = float(np.linalg.norm(np.subtract(kinematics.fk(smoother.stop_end())[:3], at)))
+    assert way > 0.01
+    for share, expected in ((0.9, False), (8.0, True)):
+        reference = TcpReference(smoother, kinematics, WorkspaceSpec(tuple(at - share * way), tuple(at + share * way)))
+        reference.open([0.5] * 7)
+        assert reference.surely_inside(0.0) is expected
+
+
+def test_a_margin_is_kept(arm: Arm) -> None:
+    proven = 0
+    for _ in range(300):
+        q = arm.somewhere()
+        arm.smoother.anchor(q.tolist(), (0.3 * arm.speeds()).tolist())
+        at = np.array(arm.kinematics.fk(q)[:3])
+        margin = float(arm.random.uniform(0.0, 0.3))
+        box = WorkspaceSpec(tuple(at - 0.3), tuple(at + 0.3))
+        reference = arm.reference(box)
+        reference.surely_inside(0.0)  # what is known then must not answer for the greater margin
+        if reference.surely_inside(margin):
+            proven += 1
+            end = arm.kinematics.fk(arm.smoother.stop_end())
+            assert is_inside(end, WorkspaceSpec(tuple(at - 0.3 + margin), tuple(at + 0.3 - margin)))
+    assert 20 < proven < 290
+
+
+def test_a_joint_faster_than_the_session_proves_nothing(arm: Arm) -> None:
+    q = list(arm.kinematics.home)
+    box = WorkspaceSpec((-9.0,) * 3, (9.0,) * 3)
+    arm.smoother.anchor(q, [1.0 * c for c in arm.cap])
+    assert arm.reference(box).surely_stays_inside()
+    arm.smoother.anchor(q, [1.01 * c for c in arm.cap])
+    assert not arm.reference(box).surely_stays_inside()
+
+
+def test_singularities_are_seen_although_they_are_not_always_looked_for(arm: Arm) -> None:
+    """A slow walk through the whole range, with one object that remembers and the definition beside it."""
+    kinematics = arm.kinematics
+    seen = {True: 0, False: 0}
+    looked = 0
+    look = kinematics._is_near_singular
+
+    def counted(*arguments: Any) -> bool:
+        nonlocal looked
+        looked += 1
+        return look(*arguments)
+
+    kinematics._is_near_singular = counted  # type: ignore[method-assign]
+    for _ in range(20):
+        a, b = arm.somewhere(), arm.somewhere()
+        for share in np.arange(0.0, 1.0, 0.002):
+            q = (a + share * (b - a)).tolist()
+            smallest = np.linalg.svd(kinematics.jacobian(q), compute_uv=False)[-1]
+            near = kinematics.velocity(q, [0.1, 0.0, 0.0, 0.0, 0.0, 0.0])[1]
+            assert near == (smallest < NEAR_SINGULAR) or abs(smallest - NEAR_SINGULAR) < 1e-9
+            seen[near] += 1
+    assert min(seen.values()) > 300
+    assert looked < sum(seen.values())
+
+
+class Counted(Kinematics):
+    """Counts how often the arm's kinematics are computed."""
+
+    computed = 0
+
+    def fk(self, q: Any) -> Any:
+        self.computed += 1
+        return super().fk(q)
+
+    def jacobian(self, q: Any) -> Any:
+        self.computed += 1
+        return super().jacobian(q)
+
+
+def counted_bench(tcp_speed: float) -> tuple[Bench, Counted]:
+    spec = replace(panda(), workspace=WorkspaceSpec((0.1, -0.8, 0.0), (0.9, 0.8, 1.2)))
+    bench = Bench(spec, speed=0.3, tcp_speed=tcp_speed, begin=False)
+    kinematics = Counted(spec.kinematics)
+    bench.servo = Servo(spec, bench.dt, kinematics)
+    bench.servo.anchor(bench.q)
+    bench.begin()
+    return bench, kinematics
+
+
+@pytest.mark.parametrize("kind", [Kind.JOINT_VELOCITY, Kind.JOINT_TARGET])
+def test_joint_streams_need_hardly_any_kinematics(kind: Kind) -> None:
+    bench, kinematics = counted_bench(0.25)
+    ticks = 480
+    for k in range(ticks):
+        dq = [0.15 * np.sin(k * DT + i) for i in range(7)]
+        if kind is Kind.JOINT_VELOCITY:
+            bench.send(kind, dq)
+        else:
+            bench.target([x + v * DT for x, v in zip(bench.q, dq, strict=True)], dq)
+        bench.tick()
+    assert np.abs(np.subtract(bench.q, PANDA_HOME)).max() > 0.1
+    assert bench.limited == 0
+    assert 0 < kinematics.computed < ticks / 20
+
+
+def test_near_the_greatest_speed_they_are_computed_and_the_speed_is_kept() -> None:
+    bench, kinematics = counted_bench(0.1)
+    fastest = 0.0
+    for _ in range(240):
+        bench.send(Kind.JOINT_VELOCITY, [0.3, 0.2, 0.0, 0.2, 0.0, 0.0, 0.0])
+        bench.tick()
+        report = bench.servo.report
+        linear = kinematics.jacobian(report.q_set)[:3] @ report.dq_set
+        fastest = max(fastest, float(np.linalg.norm(linear)))
+    assert 0.09 < fastest <= 0.1
+    assert kinematics.computed > 300  # of which 240 are this test's own
+
+
+def test_a_twist_computes_the_kinematics_once_a_tick() -> None:
+    bench, kinematics = counted_bench(0.25)
+    for k in range(240):
+        bench.send(Kind.TWIST, [0.05 * np.cos(k * DT), 0.05, 0.0, 0.0, 0.0, 0.1, 0.0])
+        bench.tick()
+    assert np.linalg.norm(np.subtract(kinematics.fk(bench.q)[:3], kinematics.fk(PANDA_HOME)[:3])) > 0.04
+    assert kinematics.computed <= 240 + 2
+
+
+def is_inside(pose: Sequence[float], box: WorkspaceSpec) -> bool:
+    return all(low <= x <= high for x, low, high in zip(pose, box.lower, box.upper, strict=False))
