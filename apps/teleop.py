@@ -58,12 +58,16 @@ def _main(args: argparse.Namespace) -> int:
         from hal.apps.report import check_writable
 
         check_writable(args.report)
-    if args.dry_run:
-        from hal.config import load
-        from hal.config.mapping import load_mapping
+    from hal.config import load
+    from hal.config.mapping import load_mapping
+    from hal.pads.choice import check_wanted
 
+    load_mapping(args.mapping)
+    check_wanted(args.pad)
+    if args.dry_run:
         plan = load(args.config, sim=args.sim, overrides=args.overrides).resolve()
-        load_mapping(args.mapping)
+        if args.robot and args.robot not in {robot.name for robot in plan.robots}:
+            raise CommandError(f"--robot {args.robot}: the rig has {', '.join(r.name for r in plan.robots) or 'none'}")
         print(f"{plan.source} is in order; it would open:")
         print("\n".join(f"  {line}" for line in [*listing(plan), *plan.warnings]))
         return 0
@@ -107,7 +111,7 @@ class Session:
             self.line.clear()
             if self.args.report:
                 self.report.write(self.args.report, self.report.collect(clean))
-        self.line.event(f"stopped after {self.rig.clock.now() - self.report.start:.1f} s")
+        self.line.event(f"{self._ending()} after {self.rig.clock.now() - self.report.start:.1f} s; the arm is at rest")
         return 0
 
     def _turn(self) -> bool:
@@ -153,6 +157,11 @@ class Session:
         self.line.event("home: hold the dead-man until the arm is there")
         self.robot.move_to(self.robot.home, deadman=self.deadman)
 
+    def _ending(self) -> str:
+        if self.pad.finished:
+            return f"{self.pad.describe()} was played to its end"
+        return "stopped, as --duration says," if self.end and self.rig.clock.now() >= self.end else "stopped"
+
     def _over(self) -> bool:
         return self.pad.finished or (self.end is not None and self.rig.clock.now() >= self.end)
 
@@ -180,18 +189,19 @@ class Session:
         def text() -> str:
             x, y, z = state.tcp.position
             held = "held" if self.deadman.held else "released"
+            status = state.status.name.lower()
             gripper = self.robot.gripper
             width = f"gripper {1e3 * gripper.state().width:4.0f} mm  " if gripper else ""
             trips = f"  trips {len(self.report.trips)}" if self.report.trips else ""
-            limited = f"  held back: {state.limited.name}" if state.limited else ""
+            limited = f"  held back: {state.limited}" if state.limited else ""
             frames = "  ".join(
                 f"{name} {counts.fps:.0f}/s"
                 for name, camera in self.rig.cameras.items()
                 if (counts := camera.counts()).fps is not None
             )
             return (
-                f"  dead-man {held:8s}  {state.status.name.lower():9s}  tcp {x:6.3f} {y:6.3f} {z:6.3f} m  {width}"
-                f"{frames}{trips}{limited}"
+                f"  dead-man {held:8s}  {status:9s}{trips}  tcp {x:6.3f} {y:6.3f} {z:6.3f} m  {width}"
+                f"{limited}  {frames}"
             )
 
         self.line.update(text)

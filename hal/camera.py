@@ -114,15 +114,17 @@ class Camera:
         """Camera matrix (3, 3), pixels."""
         return self._K
 
-    def read(self, timeout: float = 1.0) -> Frame:
-        """The next frame that was not handed out yet.
+    def read(self, timeout: float = 1.0, after: float | None = None) -> Frame:
+        """The next frame that was not handed out yet; with ``after``, the first one taken at that time or later.
+
+        In real time a frame shows what was some ms ago: after a motion, ``read(after=rig.clock.now())`` shows its end.
 
         Raises StaleStateError when none came within ``timeout`` s, ConnectionLost when the camera is gone.
         """
         if not self._threaded:
             return self._grab(timeout)
         with self._news:
-            fresh = self._news.wait_for(lambda: self._error is not None or self._unseen(), timeout)
+            fresh = self._news.wait_for(lambda: self._error is not None or self._unseen(after), timeout)
             if self._error is not None:
                 raise self._error
             if not fresh:
@@ -154,8 +156,18 @@ class Camera:
             fps = (self._frames - 1) / span if self._frames > 1 and span > 0.0 else None
             return CameraCounts(self._frames, self._dropped, fps, self._ages.percentile(0.5))
 
-    def _unseen(self) -> bool:
-        return self._newest is not None and self._newest.stamp.seq != self._handed_out
+    def _unseen(self, after: float | None) -> bool:
+        newest = self._newest
+        if newest is None or newest.stamp.seq == self._handed_out:
+            return False
+        return after is None or newest.stamp.t >= after
+
+    def wait_for_first(self, timeout: float) -> bool:
+        """Is there a frame to hand out, now or within ``timeout`` s?"""
+        if not self._threaded:
+            return True
+        with self._news:
+            return self._news.wait_for(lambda: self._error is not None or self._newest is not None, timeout)
 
     def _hand_out(self) -> Frame:
         assert self._newest is not None

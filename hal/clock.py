@@ -19,6 +19,8 @@ class Tick(NamedTuple):
     """Time since the turn before, s: a whole number of periods."""
     missed: int
     """Turns that were skipped because the loop's body took too long; they are never caught up."""
+    elapsed: float = 0.0
+    """Time since the loop's first turn, s: the same in real time and in lock-step."""
 
 
 class Clock(ABC):
@@ -47,7 +49,8 @@ class Clock(ABC):
         start = self.now()
         turn, missed = 0, 0
         while True:
-            yield Tick(self.now(), period * (1 + missed), missed)
+            now = self.now()
+            yield Tick(now, period * (1 + missed), missed, now - start)
             turn += 1
             late = int((self.now() - start) / period + 1e-9) - turn
             missed = max(0, late)

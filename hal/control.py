@@ -3,13 +3,23 @@
 from __future__ import annotations
 
 import math
+import warnings
 from types import TracebackType
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from .commands import CartesianTarget, Command, JointTarget, JointTorque, JointVelocity, Sent, Twist, encode
-from .errors import CommandError, ConnectionLost, ControlTaken, HalError, MotionStopped, NotSupported, RobotFault
+from .errors import (
+    CommandError,
+    ConnectionLost,
+    ControlTaken,
+    HalError,
+    MotionStopped,
+    NotSupported,
+    RobotFault,
+    Unreachable,
+)
 from .inbox import CommandRecord, Session
 from .stops import trip_text
 from .types import RobotStatus, Trip
@@ -72,6 +82,7 @@ class Control:
         self._host = robot._host
         self._id = 0
         self._stopped = False
+        self._told = False
         self._rearmed_at = -math.inf
         self._detach: Callable[[], None] | None = None
         self._grip: float | None = None
@@ -84,7 +95,9 @@ class Control:
         if self._id:
             raise ControlTaken("this control session is open already")
         if robot._open is not None:
-            raise ControlTaken(f"{robot.name} is under the control of another session of this program")
+            raise ControlTaken(
+                f"{robot.name} is under the control of another session of this program: leave its 'with' block first"
+            )
         # The count first: a stop that comes after this line trips the session in its first tick.
         stops = self._host.stops
         self._check_latch()
@@ -123,11 +136,19 @@ class Control:
         """Bring the arm to rest and end the session. Idempotent."""
         if not self._id:
             return
+        self._warn_of_trip()
         self._mail.end(self._id)  # needs no answer: from here on the arm brakes, whatever happens to this program
         try:
             self._wait_for_rest()
         finally:
             self._forget()
+
+    def _warn_of_trip(self) -> None:
+        """A stop that nobody was told of, because nothing was sent after it, must not pass in silence."""
+        found = self._mail.peek()
+        if found is not None and found.session == self._id and found.trip is not Trip.NONE and not self._told:
+            text = f"{self.robot.name} was stopped in this session: {trip_text(found.trip)}"
+            warnings.warn(text, RuntimeWarning, stacklevel=4)
 
     def _forget(self) -> None:
         """The session is over for this program; the host is told, should it not know."""
@@ -178,6 +199,8 @@ class Control:
         self._check_trip(servo, now)
         waiting = self.deadman is not None and not self.deadman.held
         reasons: list[str] = []
+        if servo.limited and servo.status is RobotStatus.FOLLOWING:
+            reasons.append(f"the servo holds the motion back: {servo.limited}")
         if servo.session == self._id and servo.refused > self._refused:
             self._refused = servo.refused
             reasons.append("the servo refused an earlier command: too far for a first one, or too late")
@@ -207,6 +230,7 @@ class Control:
         if self._rearmed_at > -math.inf and self._mail.state.seq() <= self._rearmed_at:
             return  # the servo has not seen the rearm yet
         self._stopped = servo.trip is Trip.STOP
+        self._told = True
         remedy = "release the dead-man and press it again" if self.deadman else "call control.rearm() to go on"
         raise MotionStopped(trip_text(servo.trip), remedy)
 
@@ -233,7 +257,15 @@ class Control:
             if count != n:
                 raise CommandError(f"{robot.name} has {n} joints; {type(command).__name__} has {count}")
         elif not isinstance(command, (CartesianTarget, Twist)):
-            raise CommandError(f"{type(command).__name__} is no command")
+            hint = "; did you mean hal.JointTarget(q)?" if isinstance(command, (np.ndarray, list, tuple)) else ""
+            raise CommandError(f"{type(command).__name__} is no command{hint}")
+        if isinstance(command, CartesianTarget):
+            farthest = robot.kinematics.farthest()
+            away = float(np.linalg.norm(command.pose.position)) - farthest
+            if away > 0.0:
+                raise Unreachable(
+                    f"{robot.name} reaches {farthest:.2f} m from its base", position_error=away, rotation_error=0.0
+                )
         if isinstance(command, JointTarget):
             limits = robot.limits
             wanted = zip(limits.lower, command.q.tolist(), limits.upper, robot.joints, strict=True)

@@ -222,6 +222,14 @@ class Kinematics:
         grow from base to tip, and bound the change of the Jacobian as well: turning joint j by x rad turns or shifts
         every column of the linear part by at most ``reach[j] * x``.
         """
+        return self._levers()[0]
+
+    def farthest(self) -> float:
+        """A distance of the tcp from the base frame's origin that no joint position exceeds, m."""
+        return self._levers()[1]
+
+    def _levers(self) -> tuple[tuple[float, ...], float]:
+        """The way along the links from each joint, and from the base, to the tcp, at most."""
         model = self._model
         frame = model.frames[self._tcp]
         joint, distance, least = int(frame.parentJoint), float(np.linalg.norm(frame.placement.translation)), 0.0
@@ -235,7 +243,7 @@ class Kinematics:
             reach[name] = max(distance, least)
             distance += float(np.linalg.norm(model.jointPlacements[joint].translation))
             joint = int(model.parents[joint])
-        return tuple(reach[name] for name in self.spec.joints)
+        return tuple(reach[name] for name in self.spec.joints), distance
 
     def _ordered(self, q: Sequence[float] | Array) -> Array:
         values = np.array(q, float)

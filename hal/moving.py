@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 
 from .commands import JointTarget
 from .control import Control
-from .errors import CommandError
+from .errors import CommandError, MotionStopped
 from .pose import Pose
 from .types import RobotState
 
@@ -17,7 +17,10 @@ if TYPE_CHECKING:
     from .deadman import Deadman
     from .robot import Robot
 
-__all__ = ["move_to"]
+__all__ = ["PATIENCE", "move_to"]
+
+PATIENCE = 60.0
+"""How long ``move_to`` waits for somebody to hold the dead-man, s."""
 
 
 def move_to(
@@ -49,7 +52,7 @@ def move_to(
         goal=tuple(goal.tolist()),
     )
     clock = robot.clock
-    start = clock.now()
+    start = held = clock.now()
     with session:
         for _ in clock.rate(50.0):
             servo = session._peek()
@@ -58,6 +61,10 @@ def move_to(
                 raise CommandError(f"the way to the target leaves the workspace of {robot.name}")
             if servo.arrived and servo.session == session._id:
                 break
+            if deadman is None or deadman.held:
+                held = clock.now()
+            elif clock.now() - held > PATIENCE:
+                raise MotionStopped(f"nobody held the dead-man for {PATIENCE:g} s", "call move_to again")
             if timeout is not None and clock.now() - start > timeout:
                 raise TimeoutError(f"{robot.name} did not reach the target within {timeout:g} s")
     return robot.state()

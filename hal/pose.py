@@ -106,7 +106,9 @@ class Pose:
 
     @classmethod
     def from_rpy(cls, position: ArrayLike, rpy: Sequence[float]) -> Pose:
-        """From a position in m and roll, pitch, yaw in rad (URDF's convention)."""
+        """From a position in m and roll, pitch, yaw in rad (URDF's convention). ValueError beyond two turns."""
+        if max(map(abs, rpy)) > 4.0 * np.pi:
+            raise ValueError(f"roll, pitch and yaw are in rad, not degrees: {list(rpy)}")
         return cls(position, matrix_to_quaternion(rpy_to_matrix(*rpy)))
 
     def matrix(self) -> Array:
@@ -118,7 +120,8 @@ class Pose:
 
     def transform(self, points: ArrayLike) -> Array:
         """Points (3,) or (n, 3), given in this frame, in the frame that the pose is given in."""
-        return np.asarray(points, float) @ quaternion_to_matrix(self.orientation).T + self.position
+        moved: Array = np.asarray(points, float) @ quaternion_to_matrix(self.orientation).T + self.position
+        return moved
 
     def inverse(self) -> Pose:
         """The pose of the parent in this frame."""

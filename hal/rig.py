@@ -29,6 +29,7 @@ if TYPE_CHECKING:
 __all__ = ["Devices", "Rig", "open_rig"]
 
 T = TypeVar("T")
+_FIRST_FRAME = 5.0
 
 
 class Devices(dict[str, T]):
@@ -132,7 +133,9 @@ class Rig:
             raise NotSupported("there is no simulated world to look at; leave the viewer out")
         for host in self._hosts:
             if isinstance(host, RemoteHost):
-                host.wait_ready()
+                scheduling = host.wait_ready()["scheduling"]
+                if realtime:
+                    self.notes.append(f"servo process {host.spec.name}: {scheduling}")
         if world_host is not None:
             self.world = World(world_host.request, self._world_edited)
         for host in self._hosts:
@@ -166,6 +169,9 @@ class Rig:
             self._devices[spec.name] = driver
             self.cameras[spec.name] = camera
             camera.open()
+        for camera in self.cameras.values():
+            if not camera.wait_for_first(_FIRST_FRAME):
+                self.notes.append(f"camera {camera.name} has sent no frame in its first {_FIRST_FRAME:g} s")
 
     def _open_pads(self, pad: str | None) -> None:
         window = self.plan.world.driver if self.plan.world is not None else None

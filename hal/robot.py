@@ -152,6 +152,11 @@ class Robot:
         return frozen(self.spec.home)
 
     @property
+    def base(self) -> Pose:
+        """Where the arm's base frame stands in the world, as the rig's file says."""
+        return Pose(self.spec.base_position, self.spec.base_orientation)
+
+    @property
     def limits(self) -> LimitsSpec:
         """Joint limits that the servo keeps."""
         return self.spec.limits

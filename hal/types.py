@@ -104,6 +104,10 @@ class Trip(_Named):
 class Limited(IntFlag):
     """What the servo held back in this tick."""
 
+    def __str__(self) -> str:
+        names = [flag.name or "" for flag in type(self) if flag and flag in self]
+        return ", ".join(names).lower().replace("_", " ") or "nothing"
+
     NONE = 0
     SPEED = 1
     """The commanded motion was slowed to the session's joint speed."""
@@ -238,7 +242,9 @@ def as_dict(record: Any) -> dict[str, Any]:
             return {f.name: plain(getattr(value, f.name)) for f in fields(value)}
         if isinstance(value, np.ndarray):
             return value.tolist()
-        if isinstance(value, (IntEnum, IntFlag)):
+        if isinstance(value, IntFlag):
+            return str(value)
+        if isinstance(value, IntEnum):
             return value.name
         if isinstance(value, Mapping):
             return {key: plain(item) for key, item in value.items()}

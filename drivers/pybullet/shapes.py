@@ -141,7 +141,8 @@ def _revolved(profile: NDArray[np.float64], normals: NDArray[np.float64]) -> Mes
     def around(points: NDArray[np.float64]) -> NDArray[np.float64]:
         ring = points[:, None, :1] * circle[None]
         height = np.broadcast_to(points[:, None, 1:], (*ring.shape[:2], 1))
-        return np.concatenate([ring, height], axis=2).reshape(-1, 3)
+        rows: NDArray[np.float64] = np.concatenate([ring, height], axis=2).reshape(-1, 3)
+        return rows
 
     row = _SEGMENTS + 1
     lower = (np.arange(len(profile) - 1)[:, None] * row + np.arange(_SEGMENTS)).reshape(-1)

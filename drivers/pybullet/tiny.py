@@ -76,7 +76,8 @@ def _projection(camera: CameraSpec) -> NDArray[np.float64]:
     matrix[1] *= -1
     matrix[2, 2:] = (_FAR + _NEAR) / (_FAR - _NEAR), -2 * _FAR * _NEAR / (_FAR - _NEAR)
     matrix[3, 2] = 1
-    return matrix @ np.diag([1.0, -1.0, -1.0, 1.0])
+    projection: NDArray[np.float64] = matrix @ np.diag([1.0, -1.0, -1.0, 1.0])
+    return projection
 
 
 def _column_major(matrix: NDArray[np.float64]) -> list[float]:

@@ -14,7 +14,7 @@ from ..specs import PadSpec
 if TYPE_CHECKING:
     from ..pictures import Viewer
 
-__all__ = ["TOUR", "choose_pad"]
+__all__ = ["TOUR", "check_wanted", "choose_pad"]
 
 TOUR = ("config", "teleop/tour.jsonl")
 """The recorded tour, among the data files."""
@@ -40,16 +40,23 @@ def choose_pad(
     if wanted in (None, _AUTO):
         return _first(spec, viewer, window, attended)
     if wanted == "evdev":
-        return replace(spec, driver="evdev"), None, ()
+        pads, notes = _plugged()
+        missing = () if pads else ("no gamepad is plugged in yet: plug one in at any time",)
+        return replace(spec, driver="evdev"), None, (*notes, *missing)
     if wanted == "keyboard":
         return _keyboard(spec, viewer, window)
     assert wanted is not None
+    check_wanted(wanted)
     path = Path(wanted)
-    if not path.is_file():
-        raise DeviceNotFound(f"there is no pad {wanted!r}: auto, evdev, keyboard, or the path of a recording (.jsonl)")
     if attended:
         raise NotSupported("a recording cannot hold the dead-man of a real arm; plug in a pad")
     return _recording(spec, path), None, ()
+
+
+def check_wanted(wanted: str | None) -> None:
+    """Raise DeviceNotFound when ``wanted`` is neither a kind of pad nor a recording that is there."""
+    if wanted not in (None, _AUTO, "evdev", "keyboard", "none") and not Path(str(wanted)).is_file():
+        raise DeviceNotFound(f"there is no pad {wanted!r}: auto, evdev, keyboard, or the path of a recording (.jsonl)")
 
 
 def _first(

@@ -31,8 +31,10 @@ def test_simulated_time_stands_still_until_somebody_waits() -> None:
 
 def test_a_rate_turns_at_once_and_then_every_period() -> None:
     clock, _ = lock_step()
-    times = [tick.t for tick in itertools.islice(clock.rate(50.0), 4)]
-    assert times == pytest.approx([0.0, 0.02, 0.04, 0.06])
+    clock.sleep(1.0)
+    ticks = list(itertools.islice(clock.rate(50.0), 4))
+    assert [tick.t for tick in ticks] == pytest.approx([1.0, 1.02, 1.04, 1.06])
+    assert [tick.elapsed for tick in ticks] == pytest.approx([0.0, 0.02, 0.04, 0.06])
 
 
 def test_turns_that_came_too_late_are_skipped_and_told() -> None:

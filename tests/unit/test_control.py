@@ -385,3 +385,82 @@ def test_closing_is_idempotent_and_ends_an_open_session() -> None:
     rig.close()
     with pytest.raises(hal.HalError):
         arm.state()
+
+
+def test_a_pose_beyond_reach_is_refused_in_mid_session_too(rig: hal.Rig, arm: hal.Robot) -> None:
+    pose = arm.state().tcp
+    with arm.control() as control:
+        for _ in turns(rig, 5):
+            control.send(hal.CartesianTarget(pose))
+        with pytest.raises(hal.Unreachable, match="reaches"):
+            control.send(hal.CartesianTarget(hal.Pose(pose.position * 1000.0, pose.orientation)))  # mm
+
+
+def test_what_the_servo_holds_back_is_told(rig: hal.Rig, arm: hal.Robot) -> None:
+    with arm.control() as control:
+        told = [control.send(Twist([0, 0, 50.0])).reasons for _ in turns(rig, 5)]
+    assert "tcp speed" in str(told[-1])
+
+
+def test_a_stop_that_nobody_was_told_of_is_a_warning(rig: hal.Rig, arm: hal.Robot) -> None:
+    with pytest.warns(RuntimeWarning, match="commands stopped coming"), arm.control() as control:
+        control.send(JointTarget(arm.state().q))
+        let_pass(rig, 1.0)
+
+
+def test_ctrl_c_while_a_session_opens_leaves_nothing_moving(
+    rig: hal.Rig, arm: hal.Robot, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    request = rig._local.request
+
+    def interrupted(method: str, params: dict[str, object] | None = None) -> object:
+        request(method, params)
+        if method == "begin":
+            raise KeyboardInterrupt
+        return None
+
+    monkeypatch.setattr(rig._local, "request", interrupted)
+    goal = arm.home + 0.2
+    with pytest.raises(KeyboardInterrupt):
+        arm.move_to(goal)
+    monkeypatch.undo()
+    let_pass(rig, 1.0)
+    assert arm.state().status is RobotStatus.IDLE
+    assert np.abs(arm.state().q - arm.home).max() < 0.01
+    arm.move_to(goal)  # and the arm is free
+
+
+def test_a_device_that_takes_no_setpoints_is_lost_and_does_not_leap(rig: hal.Rig, arm: hal.Robot) -> None:
+    driver = rig.driver("panda")
+    write, broken = driver.write, []
+
+    def failing(setpoint: object) -> None:
+        if broken:
+            raise OSError("cable")
+        write(setpoint)
+
+    driver.write = failing
+    velocity = JointVelocity([0.2] * 7)
+    with arm.control() as control:
+        for _ in turns(rig, 20):
+            control.send(velocity)
+        broken.append(True)
+        let_pass(rig, 0.06)
+        with pytest.raises(ConnectionLost, match="cable"):
+            arm.state()
+        broken.clear()
+        let_pass(rig, 0.3)
+        assert control.trip is Trip.DEVICE_LOST
+        with pytest.raises(MotionStopped):
+            control.send(velocity)
+    audit = SetpointAudit(arm.limits, 1.0 / arm.spec.rate_hz)
+    for setpoint in driver.log:
+        audit.add(setpoint.q)
+    assert audit.peaks()["velocity"] <= 1.0
+
+
+def test_short_sleeps_add_up(rig: hal.Rig) -> None:
+    before = rig.clock.now()
+    for _ in range(100):
+        rig.clock.sleep(0.001)
+    assert rig.clock.now() > before + 0.09
