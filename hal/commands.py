@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import IntEnum
+from math import isfinite
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
@@ -35,7 +36,8 @@ def _vector(name: str, values: ArrayLike, size: int | None = None) -> Array:
         raise CommandError(f"{name} must be numbers: {error}") from None
     if array.ndim != 1 or (size is not None and array.size != size):
         raise CommandError(f"{name} must have shape ({size if size is not None else 'n'},), not {array.shape}")
-    if not np.isfinite(array).all():
+    # The sum of the squares is finite when all are; where it is not, it may only be too great.
+    if not isfinite(array.dot(array)) and not np.isfinite(array).all():
         raise CommandError(f"{name} holds a number that is not finite: {array.tolist()}")
     return array
 

@@ -464,3 +464,14 @@ def test_short_sleeps_add_up(rig: hal.Rig) -> None:
     for _ in range(100):
         rig.clock.sleep(0.001)
     assert rig.clock.now() > before + 0.09
+
+
+def test_a_stop_keeps_the_fingers_where_it_finds_them(rig: hal.Rig, arm: hal.Robot) -> None:
+    arm.gripper.start(0.0)
+    let_pass(rig, 0.2)
+    moving = arm.gripper.state()
+    assert moving.moving
+    rig.stop()
+    let_pass(rig, 1.0)
+    assert arm.gripper.state().width == pytest.approx(moving.width, abs=2e-3)
+    assert not arm.gripper.state().moving

@@ -169,6 +169,19 @@ def test_a_stop_that_begins_at_rest_may_still_go_far() -> None:
         assert reference.surely_inside(0.0) == expected
 
 
+def test_the_next_step_is_foreseen(arm: Arm) -> None:
+    """An arm at rest right before a face is inside, but the stop after its next step need not be."""
+    home = arm.kinematics.home.tolist()
+    at = np.array(arm.kinematics.fk(home)[:3])
+    for half, expected in ((1e-6, False), (0.5, True)):
+        box = WorkspaceSpec(tuple((at - half).tolist()), tuple((at + half).tolist()))
+        arm.smoother.anchor(home)
+        reference = arm.reference(box)
+        assert reference.surely_stays_inside() == expected
+        arm.smoother.follow(arm.cap)
+        assert is_inside(arm.kinematics.fk(arm.smoother.stop_end()), box) == expected
+
+
 def test_a_margin_is_kept(arm: Arm) -> None:
     proven = 0
     for _ in range(300):
