@@ -25,6 +25,10 @@ __all__ = ["main"]
 
 APP_GONE = 30.0
 """An app that is there but has given no sign of life for so long is taken for gone, s. Its arms stopped long before."""
+STATES_HZ = 500.0
+"""States are published at about this rate at most."""
+SNAPSHOTS_HZ = 250.0
+"""The same for the world's poses, from which pictures are drawn."""
 STOP_LIMIT = 5.0
 """Longest time for bringing the arms to rest before the devices are closed all the same, s."""
 
@@ -44,6 +48,9 @@ class HostProcess:
             self.snapshots = SeriesBox(buffer[GroupMemory.size(joints) :], config["snapshot_capacity"])
         self.cycle = Cycle(spec, self.memory)
         self.realtime = bool(config.get("realtime", False))
+        # A fast servo tells the app and the renderer less often than it ticks: nobody could look that often.
+        self._state_every = max(1, round(spec.rate_hz / STATES_HZ))
+        self._snapshot_every = max(1, round(spec.rate_hz / SNAPSHOTS_HZ))
         self.closing = False
         self.pacer = Pacer(self.cycle.dt)
 
@@ -86,8 +93,9 @@ class HostProcess:
 
     def _publish(self, now: float) -> None:
         cycle = self.cycle
-        cycle.publish(now)
-        if self.snapshots is not None:
+        if cycle.ticks % self._state_every == 0:
+            cycle.publish(now)
+        if self.snapshots is not None and cycle.ticks % self._snapshot_every == 0:
             self.snapshots.write(now, cycle.world.revision, cycle.world.snapshot())
         clock_now = time.monotonic()
         for unit in cycle.arms.values():

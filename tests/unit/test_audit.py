@@ -48,3 +48,12 @@ def test_an_excursion_shows_in_the_position() -> None:
     audit = SetpointAudit(LIMITS, DT)
     audit.add((0.0, 4.2))
     assert audit.peaks()["position"] == pytest.approx(2.2 / 2.0)
+
+
+def test_a_set_point_that_is_no_number_breaks_every_limit() -> None:
+    audit = SetpointAudit(LIMITS, DT)
+    for k in range(10):
+        audit.add((math.nan if k == 5 else 0.0, 2.0))
+    assert set(audit.peaks().values()) == {math.inf}
+    audit.add((0.0, 2.0))
+    assert set(audit.peaks().values()) == {math.inf}, "and is not forgotten"
