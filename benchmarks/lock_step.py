@@ -4,7 +4,8 @@
 
 Without cameras the reference is PyBullet alone: the same bodies, the same number of physics steps, one motor command
 and one reading a policy step. With two 256x256 RGB-D cameras it is the same with PyBullet's own renderer
-(TinyRenderer, no shadows). Rounds of both alternate; the medians are printed.
+(TinyRenderer, no shadows). The row between them compares with PyBullet whose motors are written and whose joints are read
+at every physics step, as any servo must. Rounds of both alternate; the medians are printed.
 """
 
 from __future__ import annotations
@@ -43,8 +44,8 @@ def ours(cameras: bool) -> tuple[Callable[[], None], hal.Rig]:
     return step, rig
 
 
-def raw(rig: hal.Rig, cameras: bool) -> tuple[Callable[[], None], Any]:
-    """The same with bare PyBullet calls."""
+def raw(rig: hal.Rig, cameras: bool, every_tick: bool = False) -> tuple[Callable[[], None], Any]:
+    """The same with bare PyBullet calls; with ``every_tick``, motors written and joints read at each physics step."""
     import pybullet
 
     from hal.drivers.pybullet.world import World
@@ -68,18 +69,20 @@ def raw(rig: hal.Rig, cameras: bool) -> tuple[Callable[[], None], Any]:
     def step() -> None:
         nonlocal turn
         turn += 1
-        target = start + 0.05 * np.sin(turn / POLICY_HZ + phases)
-        pybullet.setJointMotorControlArray(
-            body.id,
-            joints,
-            pybullet.POSITION_CONTROL,
-            targetPositions=target.tolist(),
-            forces=forces,
-            physicsClientId=client,
-        )
-        for _ in range(substeps):
+        target = (start + 0.05 * np.sin(turn / POLICY_HZ + phases)).tolist()
+        for k in range(substeps):
+            if k == 0 or every_tick:
+                pybullet.setJointMotorControlArray(
+                    body.id,
+                    joints,
+                    pybullet.POSITION_CONTROL,
+                    targetPositions=target,
+                    forces=forces,
+                    physicsClientId=client,
+                )
             pybullet.stepSimulation(physicsClientId=client)
-        pybullet.getJointStates(body.id, joints, physicsClientId=client)
+            if k == substeps - 1 or every_tick:
+                pybullet.getJointStates(body.id, joints, physicsClientId=client)
         if cameras:
             for view in views:
                 pybullet.getCameraImage(
@@ -114,9 +117,13 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=3, help="rounds of each (%(default)s)")
     args = parser.parse_args()
     print(f"{'':34s}{'hal':>12s}{'raw PyBullet':>14s}{'ratio':>8s}   policy steps/s, medians of {args.rounds}")
-    for cameras, name in ((False, "no camera"), (True, "two 256x256 RGB-D cameras")):
+    for cameras, every_tick, name in (
+        (False, False, "no camera"),
+        (False, True, "... motors written every tick"),
+        (True, False, "two 256x256 RGB-D cameras"),
+    ):
         step, rig = ours(cameras)
-        reference, world = raw(rig, cameras)
+        reference, world = raw(rig, cameras, every_tick)
         rounds = [(rate(step, args.seconds), rate(reference, args.seconds)) for _ in range(args.rounds)]
         mine, theirs = (statistics.median(values) for values in zip(*rounds, strict=True))
         ratio = statistics.median(a / b for a, b in rounds)
