@@ -4,7 +4,7 @@
 
 Without cameras the reference is PyBullet alone: the same bodies, the same number of physics steps, one motor command
 and one reading a policy step. With two 256x256 RGB-D cameras it is the same with PyBullet's own renderer
-(TinyRenderer, no shadows). The row between them compares with PyBullet whose motors are written and whose joints are read
+(TinyRenderer, no shadows). The row between them is for PyBullet whose motors are written and whose joints are read
 at every physics step, as any servo must. Rounds of both alternate; the medians are printed.
 """
 
