@@ -15,6 +15,7 @@ import json
 import statistics
 import tempfile
 import time
+import warnings
 from pathlib import Path
 
 import hal
@@ -96,6 +97,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description="time from silence to braking")
     parser.add_argument("--runs", type=int, default=5, help="of each way (%(default)s)")
     runs = parser.parse_args().runs
+    warnings.simplefilter("ignore", RuntimeWarning)  # that a session was stopped is what is measured
     print(f"{'ms after the event: median (max)':34s}{'braking begins':>20s}{'at rest':>20s}")
     for way in WAYS:
         with tempfile.TemporaryDirectory() as folder:
