@@ -136,19 +136,20 @@ class Control:
         """Bring the arm to rest and end the session. Idempotent."""
         if not self._id:
             return
-        self._warn_of_trip()
+        untold = self._untold_trip()
         self._mail.end(self._id)  # needs no answer: from here on the arm brakes, whatever happens to this program
         try:
             self._wait_for_rest()
         finally:
             self._forget()
+        if untold is not Trip.NONE:
+            text = f"{self.robot.name} was stopped in this session: {trip_text(untold)}"
+            warnings.warn(text, RuntimeWarning, stacklevel=3)
 
-    def _warn_of_trip(self) -> None:
-        """A stop that nobody was told of, because nothing was sent after it, must not pass in silence."""
+    def _untold_trip(self) -> Trip:
+        """A stop that nobody was told of, because nothing was sent after it: it must not pass in silence."""
         found = self._mail.peek()
-        if found is not None and found.session == self._id and found.trip is not Trip.NONE and not self._told:
-            text = f"{self.robot.name} was stopped in this session: {trip_text(found.trip)}"
-            warnings.warn(text, RuntimeWarning, stacklevel=4)
+        return Trip.NONE if found is None or found.session != self._id or self._told else found.trip
 
     def _forget(self) -> None:
         """The session is over for this program; the host is told, should it not know."""
@@ -224,6 +225,7 @@ class Control:
             cause, remedy = (fault.cause, fault.remedy) if fault else ("the robot reports a fault", "")
             raise RobotFault(cause, f"{remedy}; then robot.recover()" if remedy else "call robot.recover()")
         if servo.trip is Trip.NONE:
+            self._told = False
             if self._stopped:  # a press of the dead-man acknowledged the stop
                 self._stopped = self.robot._latch.stopped = False
             return

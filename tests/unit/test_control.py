@@ -2,6 +2,7 @@
 
 import itertools
 import threading
+import warnings
 from collections.abc import Iterator
 
 import numpy as np
@@ -475,3 +476,14 @@ def test_a_stop_keeps_the_fingers_where_it_finds_them(rig: hal.Rig, arm: hal.Rob
     let_pass(rig, 1.0)
     assert arm.gripper.state().width == pytest.approx(moving.width, abs=2e-3)
     assert not arm.gripper.state().moving
+
+
+def test_a_warning_that_is_an_error_does_not_keep_the_arm_from_stopping(rig: hal.Rig, arm: hal.Robot) -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        with pytest.raises(RuntimeWarning, match="commands stopped coming"), arm.control() as control:
+            control.send(JointVelocity([0.2] * 7))
+            let_pass(rig, 1.0)
+    assert arm.state().status is RobotStatus.IDLE
+    with arm.control():
+        pass
