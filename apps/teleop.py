@@ -110,9 +110,18 @@ class Session:
         finally:
             self.line.clear()
             if self.args.report:
-                self.report.write(self.args.report, self.report.collect(clean))
+                self._write_report(clean)
         self.line.event(f"{self._ending()} after {self.rig.clock.now() - self.report.start:.1f} s; the arm is at rest")
         return 0
+
+    def _write_report(self, clean: bool) -> None:
+        """A rig that is gone cannot be asked; what ended the run must be told all the same."""
+        from hal.errors import HalError
+
+        try:
+            self.report.write(self.args.report, self.report.collect(clean))
+        except (HalError, OSError) as error:
+            self.line.event(f"no report: {error}")
 
     def _turn(self) -> bool:
         """Drive, and go home when that was asked for. False when the run is over."""

@@ -40,6 +40,7 @@ class ArmUnit:
         self.error: ConnectionLost | None = None
         """Why the device counts as lost."""
         self._write_failed = False
+        self._gripper_reason = ""
         self._stops: int | None = None
         self._sound: Reading | None = None
         self._setpoint: Any = None
@@ -157,10 +158,11 @@ class ArmUnit:
         if command is not None:
             self._gripper_seq = command.seq
 
-    @staticmethod
-    def _note_gripper(error: Exception) -> None:
-        """The arm goes on without its gripper, whose state grows old."""
-        if not isinstance(error, ConnectionLost):
+    def _note_gripper(self, error: Exception) -> None:
+        """The arm goes on without its gripper, whose state grows old. Each new reason is written down once."""
+        reason = f"{type(error).__name__}: {error}"
+        if reason != self._gripper_reason:
+            self._gripper_reason = reason
             traceback.print_exception(error)
 
     def note_latency(self, clock_now: float) -> None:

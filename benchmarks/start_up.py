@@ -1,0 +1,44 @@
+"""Time of `import hal` and of `apps/teleop.py --help`, beside an interpreter that does nothing and `import numpy`.
+
+python benchmarks/start_up.py [--runs 7]
+"""
+
+from __future__ import annotations
+
+import argparse
+import statistics
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+APP = Path(__file__).resolve().parents[1] / "apps" / "teleop.py"
+WAYS = {
+    "nothing (reference)": ["-c", "pass"],
+    "import numpy (reference)": ["-c", "import numpy"],
+    "import hal": ["-c", "import hal"],
+    "import hal; hal.open": ["-c", "import hal; hal.open"],
+    "apps/teleop.py --help": [str(APP), "--help"],
+}
+
+
+def seconds(arguments: list[str]) -> float:
+    """Wall time of a fresh interpreter."""
+    start = time.perf_counter()
+    subprocess.run([sys.executable, *arguments], check=True, stdout=subprocess.DEVNULL)
+    return time.perf_counter() - start
+
+
+def main() -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description="time until something can be used")
+    parser.add_argument("--runs", type=int, default=7, help="of each (%(default)s)")
+    runs = parser.parse_args().runs
+    found = {name: [seconds(arguments) for _ in range(runs)] for name, arguments in WAYS.items()}
+    print(f"{'whole process, s':28s}{'median':>10s}{'min':>10s}{'max':>10s}")
+    for name, values in found.items():
+        print(f"{name:28s}{statistics.median(values):10.3f}{min(values):10.3f}{max(values):10.3f}")
+
+
+if __name__ == "__main__":
+    main()
