@@ -7,10 +7,10 @@ from typing import ClassVar, Protocol
 
 from hal.camera import CameraDriver, RawFrame
 from hal.errors import ConfigError, DeviceNotFound, NotSupported, Problem
+from hal.host.frames import FrameRing
 from hal.pose import Pose
 from hal.specs import CameraSpec
 
-from .frames import FrameRing
 from .rendering import Renderer
 from .world import World
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from typing import ClassVar, NamedTuple
 
@@ -64,6 +65,8 @@ HELP = (
 )
 
 LAYOUT = "ddQQd"
+_LOOK = 0.005
+"""s between two looks at a record that has not changed."""
 
 
 class KeyboardRecord(NamedTuple):
@@ -103,6 +106,7 @@ class KeyboardPad(GamepadDriver):
     """
 
     simulated: ClassVar[bool] = True
+    _seen = 0
 
     def open(self) -> None:
         if not isinstance(self.source, KeyboardSource):
@@ -111,6 +115,7 @@ class KeyboardPad(GamepadDriver):
     def poll(self, now: float, timeout: float) -> PadReading:
         source = self.source
         assert isinstance(source, KeyboardSource)
+        self._wait(source, timeout)
         found = source.mailbox.read()
         connected = found is not None and self._there(source)
         if found is None or not connected:
@@ -120,6 +125,12 @@ class KeyboardPad(GamepadDriver):
         axes, buttons = _controls(record)
         t_event, t_alive = record.t_event + shift, record.t_alive + shift
         return PadReading(t_event, t_alive, record.t_event, record.events, axes, buttons, connected=True)
+
+    def _wait(self, source: KeyboardSource, timeout: float) -> None:
+        """The record has news of its own life every few ms; without a wait the poller would spin."""
+        if timeout > 0.0 and source.mailbox.seq() == self._seen:
+            time.sleep(min(timeout, _LOOK))
+        self._seen = source.mailbox.seq()
 
     @staticmethod
     def _there(source: KeyboardSource) -> bool:

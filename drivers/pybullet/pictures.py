@@ -6,13 +6,13 @@ from collections.abc import Sequence
 from typing import Any
 
 from hal.errors import NotSupported
+from hal.host.frames import FrameRing
 from hal.host.hosts import SNAPSHOT_CAPACITY, Host, LocalHost, RemoteHost
 from hal.host.process import Child, SharedMemory
 from hal.pictures import Pictures
 from hal.specs import CameraSpec, to_json
 
 from .camera import DirectSource, FrameSource, SharedSource
-from .frames import FrameRing
 from .rendering import Renderer, choose_renderer
 
 __all__ = ["PyBulletPictures"]

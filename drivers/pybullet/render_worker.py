@@ -14,12 +14,12 @@ from collections.abc import Sequence
 from typing import Any
 
 from hal.errors import ConnectionLost
+from hal.host.frames import FrameRing
 from hal.host.mailbox import SeriesBox
 from hal.host.process import Channel, SharedMemory
 from hal.specs import CameraSpec, WorldSpec, from_json
 
 from .camera import check_view, draw
-from .frames import FrameRing
 from .mirror import Mirror
 from .rendering import Renderer, choose_renderer
 from .world import World

@@ -10,7 +10,6 @@ from pictures_kit import box, camera, look_at, renderer, world
 from specs import panda
 
 from hal.drivers.pybullet.camera import DirectSource, PyBulletCamera, SharedSource, camera_pose
-from hal.drivers.pybullet.frames import FrameRing
 from hal.drivers.pybullet.gl_target import create_context
 from hal.drivers.pybullet.mirror import Mirror
 from hal.drivers.pybullet.render_worker import RenderWorker
@@ -18,6 +17,7 @@ from hal.drivers.pybullet.rendering import choose_renderer
 from hal.drivers.pybullet.tiny import TinyRenderer
 from hal.drivers.pybullet.world import World
 from hal.errors import ConfigError, ConnectionLost, DriverMissing, NotSupported
+from hal.host.frames import FrameRing
 from hal.host.mailbox import SeriesBox
 from hal.specs import BodySpec, ViewSpec, to_json
 

@@ -11,7 +11,7 @@ import pytest
 from pictures_kit import STREAMS, camera
 
 from hal.camera import RawFrame
-from hal.drivers.pybullet.frames import FrameRing
+from hal.host.frames import FrameRing
 from hal.pose import Pose
 from hal.specs import CameraSpec
 

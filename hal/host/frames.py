@@ -16,9 +16,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from hal.camera import RawFrame
-from hal.pose import Pose
-from hal.specs import CameraSpec
+from ..camera import RawFrame
+from ..pose import Pose
+from ..specs import CameraSpec
 
 __all__ = ["FrameRing"]
 
