@@ -8,7 +8,7 @@ if TYPE_CHECKING:
     from hal.config.plan import Plan
     from hal.rig import Rig
 
-__all__ = ["banner", "listing"]
+__all__ = ["banner", "invitation", "listing"]
 
 
 def listing(plan: Plan) -> list[str]:
@@ -47,3 +47,24 @@ def banner(rig: Rig) -> str:
     lines.extend(f"gamepad  {pad.name:10s} {pad.describe()}" for pad in rig.gamepads.values())
     lines.extend(f"note     {note}" for note in rig.notes)
     return "\n".join(f"  {line}" for line in lines)
+
+
+def invitation(rig: Rig) -> str:
+    """What a person should open in a browser; nothing where there is nothing to open."""
+    lines = []
+    if rig.console is not None:
+        does = "drive, watch and stop" if rig.console.driven_by is None else "watch and stop"
+        lines += [
+            "",
+            f"  Open this in a browser to {does}:",
+            "",
+            f"      {rig.console.link}",
+            "",
+        ]
+        if rig.console.tunnel:
+            lines += ["  From another computer, type this there first:", "", f"      {rig.console.tunnel}", ""]
+    if rig.viewer3d is not None:
+        if not lines:
+            lines.append("")
+        lines += ["  The arms in three dimensions, on this machine:", "", f"      {rig.viewer3d.link}", ""]
+    return "\n".join(lines)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import logging
 import signal
 import sys
 from collections.abc import Iterator
@@ -38,10 +39,22 @@ def add_rig_options(parser: argparse.ArgumentParser) -> None:
     rig.add_argument(
         "--pad",
         default="auto",
-        metavar="auto|evdev|keyboard|FILE",
-        help="what drives: a plugged-in pad, the viewer's keyboard, a recording; %(default)s: the first that is there",
+        metavar="auto|web|evdev|terminal|keyboard|demo|none|FILE",
+        help="what drives: a page in a browser, a plugged-in pad, the keys of this terminal or of the viewer's window, "
+        "the recorded tour, a recording; %(default)s: a plugged-in pad, else the page",
     )
-    rig.add_argument("--viewer", choices=["gui", "none"], default="none", help="a window onto the simulated world")
+    rig.add_argument(
+        "--viewer",
+        choices=["gui", "3d", "none"],
+        default="none",
+        help="a window onto the simulated world, or a page with the arms in three dimensions",
+    )
+    rig.add_argument("--console", action="store_true", help="serve the page also when another pad drives")
+    rig.add_argument(
+        "--listen",
+        metavar="ADDRESS[:PORT]",
+        help="where the page is served; only this machine can open it unless you say otherwise",
+    )
     rig.add_argument(
         "--realtime", action="store_true", help="ask for real-time scheduling and locked memory for the servos"
     )
@@ -58,6 +71,8 @@ def rig_options(args: argparse.Namespace) -> dict[str, Any]:
         "overrides": args.overrides,
         "pad": args.pad,
         "viewer": args.viewer,
+        "console": args.console or args.listen is not None,
+        "listen": args.listen,
         "realtime": args.realtime,
     }
 
@@ -82,6 +97,7 @@ def run_app(main: Any, args: argparse.Namespace) -> int:
     """Run ``main(args)``; an error that a person can mend becomes a message, not a traceback."""
     from hal.errors import HalError
 
+    logging.getLogger("hal.console").disabled = True  # the banner says it
     try:
         with interruptible():
             return int(main(args))

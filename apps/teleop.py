@@ -1,4 +1,4 @@
-"""Drive an arm with a gamepad: in simulation and on the real arm, the same program.
+"""Drive an arm from a browser or with a gamepad: in simulation and on the real arm, the same program.
 
 python apps/teleop.py --sim
 python apps/teleop.py --real --config my_rig.yaml
@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 from hal.apps.cli import add_rig_options, rig_options, run_app
 
 if TYPE_CHECKING:
+    from hal.commands import Twist
     from hal.control import Control
     from hal.gamepad import Gamepad
     from hal.rig import Rig
@@ -27,7 +28,7 @@ def parser() -> argparse.ArgumentParser:
     """The command line."""
     made = argparse.ArgumentParser(
         prog="teleop",
-        description="Drive an arm with a gamepad, in simulation or for real.",
+        description="Drive an arm from a browser or with a gamepad, in simulation or for real.",
         epilog="Ctrl-C stops the arm.",
     )
     add_rig_options(made)
@@ -96,12 +97,17 @@ class Session:
         self.line = StatusLine()
         self.end = rig.clock.now() + args.duration if args.duration else None
         self.stopped: str | None = None
+        if rig.console is not None:
+            rig.console.explain(teleop.labels())
 
     def run(self) -> int:
         """Drive until the time is over, the recording ends or Ctrl-C; then stop, report, close."""
+        from hal.apps.banner import invitation
+
         clean = False
         try:
-            print("\n".join(f"  {line}" for line in self.teleop.help(self.pad)), flush=True)
+            print("\n".join(f"  {line}" for line in self.teleop.help(self.pad)))
+            print(invitation(self.rig), flush=True)
             while self._turn():
                 pass
             clean = True
@@ -113,6 +119,11 @@ class Session:
                 self._write_report(clean)
         self.line.event(f"{self._ending()} after {self.rig.clock.now() - self.report.start:.1f} s; the arm is at rest")
         return 0
+
+    def _event(self, text: str) -> None:
+        """Tell it here and on the console's pages."""
+        self.line.event(text)
+        self.rig.say(text)
 
     def _write_report(self, clean: bool) -> None:
         """A rig that is gone cannot be asked; what ended the run must be told all the same."""
@@ -144,10 +155,13 @@ class Session:
         seen = -1
         with self.robot.control(deadman=self.deadman, rate_hz=RATE_HZ) as control:
             self.teleop.reset()
+            if self.rig.viewer3d is not None:
+                self.rig.viewer3d.clear_goal(self.robot.name)
             for tick in self.rig.clock.rate(RATE_HZ):
                 state = self.pad.state()
                 fresh, seen = state.stamp.seq != seen, state.stamp.seq
                 motion, grip = self.teleop.step(state, tick.dt)
+                motion = self._towards_goal(motion)
                 try:
                     control.send(motion, gripper=grip, t_event=state.stamp.t if fresh else 0.0)
                     self._resumed()
@@ -162,8 +176,24 @@ class Session:
                     return True
         return False
 
+    def _towards_goal(self, motion: Twist) -> Twist:
+        """Sticks at rest and the handle of the 3D view dragged: there. It moves only while the dead-man is held."""
+        from hal.following import towards
+
+        view, name = self.rig.viewer3d, self.robot.name
+        goal = view.goal(name) if view is not None else None
+        if view is None or goal is None:
+            return motion
+        if motion.linear.any() or motion.angular.any():
+            view.clear_goal(name)  # the sticks come first
+            return motion
+        mapping = self.teleop.mapping
+        linear, angular = mapping.speeds()
+        speed = self.teleop.speed
+        return towards(goal, self.robot.state(max_age=STALE).tcp_set, speed * linear, speed * angular)
+
     def _go_home(self) -> None:
-        self.line.event("home: hold the dead-man until the arm is there")
+        self._event("home: hold the dead-man until the arm is there")
         self.robot.move_to(self.robot.home, deadman=self.deadman)
 
     def _ending(self) -> str:
@@ -178,18 +208,18 @@ class Session:
         if self.stopped != str(stop):
             self.stopped = str(stop)
             self.report.tripped(getattr(stop, "reason", str(stop)))
-            self.line.event(f"STOPPED: {stop}")
+            self._event(f"STOPPED: {stop}")
 
     def _faulted(self, fault: Exception) -> None:
         if self.stopped != str(fault):
             self.stopped = str(fault)
             self.report.faulted(getattr(fault, "cause", str(fault)))
-            self.line.event(f"FAULT: {fault}")
+            self._event(f"FAULT: {fault}")
 
     def _resumed(self) -> None:
         if self.stopped is not None:
             self.stopped = None
-            self.line.event("going on")
+            self._event("going on")
 
     def _show(self, control: Control) -> None:
         state = self.robot.state(max_age=STALE)  # what is only shown may be older than what is acted on

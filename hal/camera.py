@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from typing import TYPE_CHECKING, ClassVar, NamedTuple
 
 import numpy as np
@@ -96,6 +97,7 @@ class Camera:
         self._error: ConnectionLost | None = None
         self._closing = threading.Event()
         self._thread: threading.Thread | None = None
+        self._listeners: dict[object, Callable[[Frame], None]] = {}
         self._ages = Histogram(5e-4, 2000)
         self._first = self._last = 0.0
         self._frames = self._dropped = 0
@@ -149,6 +151,21 @@ class Camera:
                 raise StaleStateError(f"the newest frame of camera {self.name} is {age:.3f} s old")
             return self._hand_out()
 
+    def on_frame(self, callback: Callable[[Frame], None]) -> Callable[[], None]:
+        """In real time, call ``callback`` with every frame, from the camera's thread; what comes back ends that.
+
+        It delays the next frame for as long as it takes. An exception in it ends it.
+        """
+        token = object()
+        with self._news:
+            self._listeners[token] = callback
+
+        def detach() -> None:
+            with self._news:
+                self._listeners.pop(token, None)
+
+        return detach
+
     def counts(self) -> CameraCounts:
         """Frames, gaps, rate and age so far."""
         with self._news:
@@ -199,6 +216,13 @@ class Camera:
                 self._error = None
                 self._newest = frame
                 self._news.notify_all()
+                listeners = tuple(self._listeners.items())
+            for token, callback in listeners:
+                try:
+                    callback(frame)
+                except Exception:
+                    with self._news:
+                        self._listeners.pop(token, None)
 
     def _frame(self, raw: RawFrame) -> Frame:
         for image in (raw.color, raw.depth, raw.infrared, raw.segmentation):

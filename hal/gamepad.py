@@ -92,6 +92,11 @@ class GamepadDriver(ABC):
         return type(self).__name__
 
     @property
+    def can_hold(self) -> bool:
+        """Can a control be held down? Where not (a terminal's keys), each press is one small step."""
+        return True
+
+    @property
     def finished(self) -> bool:
         """Has it nothing more to say? Only a recording ends."""
         return False
@@ -180,6 +185,11 @@ class Gamepad:
     def waiting_for(self) -> tuple[str, ...]:
         """Controls that must be let go of before the pad counts. A pad that never reported an axis wants it moved."""
         return self._gate.waiting_for
+
+    @property
+    def can_hold(self) -> bool:
+        """Can a control be held down? Where not (a terminal's keys), each press is one small step."""
+        return self.driver.can_hold
 
     @property
     def finished(self) -> bool:

@@ -4,12 +4,16 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from .host.hosts import Host
+from .pose import Pose
 from .specs import CameraSpec
 
-__all__ = ["Pictures", "Shown", "Viewer"]
+if TYPE_CHECKING:
+    from .rig import Rig
+
+__all__ = ["Pictures", "Shown", "Viewer", "Viewer3D"]
 
 
 class Shown(ABC):
@@ -60,3 +64,26 @@ class Viewer(Shown):
     @abstractmethod
     def keyboard(self) -> object | None:
         """Where the driver of the keyboard's gamepad gets its record from; None when the window has none."""
+
+
+class Viewer3D(Shown):
+    """A page with a rig's arms in three dimensions, and a handle on each tcp that a person may drag."""
+
+    def __init__(self, rig: Rig) -> None:
+        self.rig = rig
+
+    @property
+    @abstractmethod
+    def link(self) -> str:
+        """What a person opens."""
+
+    @abstractmethod
+    def goal(self, robot: str) -> Pose | None:
+        """Where a person has dragged the handle of this arm: a pose of the tcp in the arm's base frame, or None.
+
+        A wish, not a permission: whoever moves the arm there asks its dead-man.
+        """
+
+    @abstractmethod
+    def clear_goal(self, robot: str) -> None:
+        """Put the handle back onto the tcp."""

@@ -36,6 +36,9 @@ BUILT_IN: Mapping[str, str] = MappingProxyType(
         "mock": "hal.drivers.mock:DRIVER",
         "playback": "hal.drivers.playback:DRIVER",
         "pybullet": "hal.drivers.pybullet:DRIVER",
+        "terminal": "hal.drivers.terminal:DRIVER",
+        "viser": "hal.drivers.viser:DRIVER",
+        "web": "hal.drivers.web:DRIVER",
     }
 )
 """Name of a driver that comes with the hal -> where its :class:`DriverSpec` is, as "module:ATTRIBUTE"."""
@@ -58,8 +61,12 @@ class DriverSpec:
     """The simulated world that this driver's arms, grippers and cameras stand in."""
     viewer: str | None = None
     """A window onto a mirror."""
+    viewer3d: str | None = None
+    """A page with the arms in three dimensions."""
     pictures: str | None = None
     """What draws the pictures of all simulated cameras of a rig."""
+    console: str | None = None
+    """A page in a browser that shows a rig and drives it."""
     requires: Mapping[str, str] = field(default_factory=dict)
     """Import name of each library that the driver needs -> the command that installs it."""
 

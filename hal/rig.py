@@ -4,46 +4,36 @@ from __future__ import annotations
 
 import atexit
 import contextlib
+import logging
 from collections.abc import Mapping, Sequence
-from difflib import get_close_matches
+from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any
 
 from . import registry
 from .camera import Camera
 from .clock import Clock, LockStepClock, RealClock
+from .console import Console, Listen
+from .devices import Devices
 from .errors import ConnectionLost, DeviceNotFound, HalError, NotSupported
 from .gamepad import Gamepad
+from .host.groups import groups_of
 from .host.hosts import Host, LocalHost, RemoteHost
-from .pads.choice import choose_pad
+from .pads.choice import Chosen, choose_pad, in_words, tour
 from .robot import Robot
-from .specs import GroupSpec
+from .specs import PadSpec
 from .stops import StopLatch
 from .world import NoWorld, World
 
 if TYPE_CHECKING:
     from .config.plan import Plan
-    from .pictures import Pictures, Viewer
+    from .pictures import Pictures, Viewer, Viewer3D
 
-__all__ = ["Devices", "Rig", "open_rig"]
+__all__ = ["Rig", "open_rig"]
 
-T = TypeVar("T")
 _FIRST_FRAME = 5.0
-
-
-class Devices(dict[str, T]):
-    """Devices by name. A name that is not there raises DeviceNotFound, which lists those that are."""
-
-    def __init__(self, kind: str) -> None:
-        super().__init__()
-        self._kind = kind
-
-    def __missing__(self, name: str) -> T:
-        close = get_close_matches(name, self, n=1)
-        hint = f" (did you mean {close[0]!r}?)" if close else ""
-        there = ", ".join(self) if self else "none"
-        raise DeviceNotFound(f"this rig has no {self._kind} {name!r}{hint}; it has: {there}")
+_CONSOLE = "web"
 
 
 def open_rig(
@@ -55,6 +45,8 @@ def open_rig(
     overrides: Sequence[str] | Mapping[str, Any] = (),
     pad: str | None = None,
     viewer: str = "none",
+    console: bool = False,
+    listen: str | None = None,
     realtime: bool = False,
 ) -> Rig:
     """Open a rig: a file, the name of a built-in one, or a dict of the same shape.
@@ -62,18 +54,21 @@ def open_rig(
     ``sim=True`` makes everything simulated, ``sim=False`` sets the rig's flag to real, None leaves the file's flags.
     ``driver="mock"`` puts a mock in the place of every device. ``clock`` is ``real_time`` or ``lock_step``.
     ``overrides`` are ``KEY=VALUE`` for any key of the rig. ``pad`` says what a pad of ``model: auto`` is: ``auto``,
-    ``evdev``, ``keyboard``, the path of a recording, or ``none`` to open no pad. ``viewer="gui"`` opens a window onto
-    the simulated world. ``realtime`` asks for SCHED_FIFO and locked memory in the processes that run servos, where the
-    user may.
+    ``evdev``, ``web`` (the console), ``terminal``, ``keyboard``, ``demo`` (the recorded tour), the path of a recording,
+    or ``none`` to open no pad. ``viewer="gui"`` opens a window onto the simulated world, ``viewer="3d"`` a page with
+    the arms in three dimensions. ``console=True`` serves the console also where another pad drives; ``listen`` is the
+    address, and the port, at which it listens: loopback unless told otherwise. ``realtime`` asks for SCHED_FIFO and
+    locked memory in the processes that run servos, where the user may.
 
     Nothing moves. Raises ConfigError (every problem at once), DriverMissing, DeviceNotFound, ConnectionLost.
     """
     from .config import load
 
+    where = Listen.parse(listen)
     plan = load(config, sim=sim, driver=driver, clock=clock, overrides=overrides).resolve()
     rig = Rig(plan)
     try:
-        rig._open(pad=pad, viewer=viewer, realtime=realtime)
+        rig._open(pad=pad, viewer=viewer, console=console, listen=where, realtime=realtime)
     except BaseException:
         with contextlib.suppress(Exception):
             rig.close()
@@ -98,6 +93,10 @@ class Rig:
         """What a person should know: what was not found, and the command that mends it."""
         self._hosts: list[Host] = []
         self._latch = StopLatch()
+        self.console: Console | None = None
+        """The page in a browser, where there is one."""
+        self.viewer3d: Viewer3D | None = None
+        """The page with the arms in three dimensions, where there is one."""
         self._pictures: Pictures | None = None
         self._viewer: Viewer | None = None
         self._devices: dict[str, Any] = {}
@@ -111,9 +110,10 @@ class Rig:
         """Does this rig's time stand still until somebody waits?"""
         return self.plan.clock == "lock_step"
 
-    def _open(self, *, pad: str | None, viewer: str, realtime: bool) -> None:
+    def _open(self, *, pad: str | None, viewer: str, console: bool, listen: Listen, realtime: bool) -> None:
         plan = self.plan
-        groups = _groups(plan)
+        pads = self._choose_pads(pad, viewer)
+        groups = groups_of(plan)
         world_host: Host | None = None
         if self.lock_step:
             (group,) = groups
@@ -127,10 +127,14 @@ class Rig:
                 self._hosts.append(remote)
                 if group.world is not None:
                     world_host = remote
+        if console or any(chosen.spec.driver == _CONSOLE for chosen in pads):
+            self._start_console(listen, pads)
         if world_host is not None:
             self._open_pictures(world_host, viewer)
-        elif viewer != "none":
+        elif viewer == "gui":
             raise NotSupported("there is no simulated world to look at; leave the viewer out")
+        if viewer == "3d":
+            self.viewer3d = registry.load("viser", "viewer3d")(self)
         for host in self._hosts:
             if isinstance(host, RemoteHost):
                 scheduling = host.wait_ready()["scheduling"]
@@ -141,8 +145,15 @@ class Rig:
         for host in self._hosts:
             for spec in host.spec.robots:
                 self.robots[spec.name] = Robot(spec, host, self.clock, self._latch)
+        for opened in (self.console, self.viewer3d):
+            if opened is not None:
+                opened.wait_ready()
+                self.notes.extend(opened.notes)
         self._open_cameras()
-        self._open_pads(pad)
+        if self.console is not None:
+            for camera in self.cameras.values():
+                self.console.show(camera)
+        self._open_pads(pads)
         for host in self._hosts:
             host.request("reset_statistics")  # starting up is not what anybody wants to measure
 
@@ -153,7 +164,7 @@ class Rig:
         cameras = [camera for camera in self.plan.cameras if camera.driver == world.driver]
         if cameras:
             self._pictures = registry.load(world.driver, "pictures")(host, cameras, self.plan.renderer)
-        if viewer != "none":
+        if viewer == "gui":
             self._viewer = registry.load(world.driver, "viewer")(host)
         for shown in (self._pictures, self._viewer):
             if shown is not None:
@@ -173,20 +184,53 @@ class Rig:
             if not camera.wait_for_first(_FIRST_FRAME):
                 self.notes.append(f"camera {camera.name} has sent no frame in its first {_FIRST_FRAME:g} s")
 
-    def _open_pads(self, pad: str | None) -> None:
-        window = self.plan.world.driver if self.plan.world is not None else None
-        for spec in self.plan.pads if pad != "none" else ():
-            chosen, source, notes = choose_pad(spec, pad, self._viewer, window=window, attended=self.attended)
-            self.notes.extend(notes)
-            driver = registry.load(chosen.driver, "gamepad")(chosen, source)
+    def _choose_pads(self, pad: str | None, viewer: str) -> list[Chosen]:
+        if pad == "none":
+            return []
+        window, lock_step = viewer == "gui", self.lock_step
+        return [choose_pad(s, pad, window=window, attended=self.attended, lock_step=lock_step) for s in self.plan.pads]
+
+    def _start_console(self, listen: Listen, pads: Sequence[Chosen]) -> None:
+        if self.lock_step:
+            raise NotSupported("the console is for real time; in lock-step, time runs as fast as the program lets it")
+        drives = any(chosen.spec.driver == _CONSOLE for chosen in pads)
+        others = ", ".join(in_words(chosen.spec.driver) for chosen in pads) or "the program itself"
+        self.console = registry.load(_CONSOLE, "console")(self, listen, driven_by=None if drives else others)
+
+    def _open_pads(self, pads: Sequence[Chosen]) -> None:
+        for chosen in pads:
+            self.notes.extend(chosen.notes)
+            spec, source = self._pad_source(chosen.spec)
+            driver = registry.load(spec.driver, "gamepad")(spec, source)
             gamepad = Gamepad(driver)
             self._devices[spec.name] = driver
             self.gamepads[spec.name] = gamepad
             gamepad.open(self.clock.now())
+            self.notes.extend(gamepad.notes)
             if self.lock_step:
                 self._local.pollers.append(gamepad.poll_once)
             else:
                 gamepad.start_thread(self.clock.now)
+            if spec.driver == _CONSOLE and self.console is not None:
+                # Without a word a program that waits for a dead-man would just hang. Apps print a banner instead.
+                logging.getLogger("hal.console").warning("drive from a browser: %s", self.console.link)
+
+    def _pad_source(self, spec: PadSpec) -> tuple[PadSpec, object | None]:
+        """The pad with its driver's final name, and where that gets its record from."""
+        if spec.driver == _CONSOLE:
+            return spec, self.console
+        if spec.driver == "terminal":
+            return spec, self.stop
+        if spec.driver != "keyboard":
+            return spec, None
+        keyboard = self._viewer.keyboard() if self._viewer is not None else None
+        world = self.plan.world
+        if keyboard is not None and world is not None:
+            return replace(spec, driver=world.driver), keyboard
+        if self._viewer is None or self.attended:
+            raise DeviceNotFound("the keyboard is that of the viewer's window: add --viewer gui")
+        self.notes.append("the window's keyboard cannot be used: playing the recorded tour")
+        return tour(spec), None
 
     # What it is.
 
@@ -241,12 +285,17 @@ class Rig:
         for host in self._hosts:
             host.stop()
 
+    def say(self, text: str) -> None:
+        """Show a line to whoever watches: on the console's pages, where there are some."""
+        if self.console is not None:
+            self.console.say(text)
+
     def rearm(self) -> None:
         """Acknowledge :meth:`stop`, so that sessions without a dead-man can be opened again."""
         self._latch.stopped = False
 
     def _world_edited(self, method: str, params: dict[str, Any], revision: int) -> None:
-        for shown in (self._pictures, self._viewer):
+        for shown in (self._pictures, self._viewer, self.viewer3d):
             if shown is not None:
                 with contextlib.suppress(ConnectionLost):  # its own next use says that it is gone
                     shown.edited(method, params, revision)
@@ -257,7 +306,7 @@ class Rig:
             return
         errors: list[BaseException] = []
         sessions = [robot._open for robot in self.robots.values() if robot._open is not None]
-        shown = [item for item in (self._viewer, self._pictures) if item is not None]
+        shown = [item for item in (self.viewer3d, self.console, self._viewer, self._pictures) if item is not None]
         for device in (*sessions, *self.gamepads.values(), *self.cameras.values(), *shown, *self._hosts):
             try:
                 device.close()
@@ -287,15 +336,3 @@ class Rig:
     def __repr__(self) -> str:
         devices = ", ".join([*self.robots, *self.cameras, *self.gamepads])
         return f"<Rig {self.plan.source}: {devices}; {self.plan.clock}>"
-
-
-def _groups(plan: Plan) -> list[GroupSpec]:
-    """Which devices share a clock and a process: the simulated world's, and each other arm alone."""
-    world = plan.world
-    inside = tuple(r for r in plan.robots if world is not None and r.driver == world.driver)
-    outside = tuple(r for r in plan.robots if r not in inside)
-    if plan.clock == "lock_step":
-        rate = world.physics_hz if world else max((r.rate_hz for r in outside), default=240.0)
-        return [GroupSpec("simulation", plan.clock, rate, inside + outside, world)]
-    groups = [GroupSpec("simulation", plan.clock, world.physics_hz, inside, world)] if world else []
-    return groups + [GroupSpec(r.name, plan.clock, r.rate_hz, (r,)) for r in outside]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,6 +21,15 @@ __all__ = ["Teleop"]
 _CROSSED = 0.05
 """A trigger this close to the present grip has reached it (share of the travel)."""
 _DIRECTIONS = ("x", "y", "z", "roll", "pitch", "yaw")
+_WORDS = (
+    ("back", "forward"),
+    ("right", "left"),
+    ("down", "up"),
+    ("tilt left", "tilt right"),
+    ("tip up", "tip down"),
+    ("turn right", "turn left"),
+)
+"""The six directions in the arm's base frame (x forward, y left, z up), the negative end first."""
 
 
 class Teleop:
@@ -84,10 +93,46 @@ class Teleop:
             self._side = difference
         return wanted if self._has_grip else None
 
+    def labels(self, actions: Collection[str] = ()) -> dict[str, Any]:
+        """What the controls do, for a page that draws them. ``actions`` are those of the mapping that the app knows.
+
+        ``controls`` has the meanings of an axis at its two ends (-1 and 1, or released and pressed), and of a button.
+        """
+        mapping = self.mapping
+        controls: dict[str, list[str]] = {}
+        for name, words, axis in zip(_DIRECTIONS, _WORDS, mapping.axes(), strict=True):
+            if axis is None:
+                continue
+            low, high = words if mapping.frame == "base" else (f"tool {name} -", f"tool {name} +")
+            if axis.invert:
+                low, high = high, low
+            if axis.buttons is not None:
+                controls.update(zip(axis.buttons, ([low], [high]), strict=True))
+            else:
+                controls[str(axis.axis)] = [low, high]
+        grip = mapping.gripper if self.robot.gripper is not None else None
+        if grip is not None and grip.axis is not None:
+            controls[grip.axis] = ["gripper: open", "gripper: closed"]
+        elif grip is not None:
+            controls |= {str(grip.open): ["open the gripper"], str(grip.close): ["close the gripper"]}
+        controls |= {button: [action] for action, button in mapping.actions.items() if action in actions}
+        if mapping.go_home is not None:
+            controls[mapping.go_home] = ["home"]
+        return {
+            "deadman": mapping.deadman,
+            "home": mapping.go_home,
+            "frame": mapping.frame,
+            "robot": self.robot.name,
+            "controls": controls,
+        }
+
     def help(self, pad: Gamepad) -> list[str]:
         """What the controls do, a line each, for people."""
         mapping = self.mapping
-        lines = [f"hold {mapping.deadman} to move ({pad.name}: {pad.describe()}); let go of it to stop"]
+        if pad.can_hold:
+            lines = [f"hold {mapping.deadman} to move; let go of it to stop"]
+        else:
+            lines = [f"each key is one small step, with {mapping.deadman} in it"]
         moves = [
             f"{name} {_control(axis)} ({self.speed * axis.scale:g} {'m/s' if k < 3 else 'rad/s'})"
             for k, (name, axis) in enumerate(zip(_DIRECTIONS, mapping.axes(), strict=True))
@@ -98,7 +143,7 @@ class Teleop:
             lines.append("turn: " + ", ".join(moves[3:]))
         if mapping.gripper is not None and self.robot.gripper is not None:
             lines.append("gripper: " + ", ".join(mapping.gripper.controls))
-        if mapping.go_home is not None:
+        if mapping.go_home is not None and pad.can_hold:
             lines.append(f"home: {mapping.go_home}, with {mapping.deadman} held")
         return lines
 

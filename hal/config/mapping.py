@@ -147,6 +147,11 @@ class TeleopMapping(Strict):
         linear, angular = self.linear, self.angular
         return (linear.x, linear.y, linear.z, angular.roll, angular.pitch, angular.yaw)
 
+    def speeds(self) -> tuple[float, float]:
+        """The greatest speed along an axis, m/s, and about one, rad/s; 0 where nothing moves."""
+        scales = [0.0 if axis is None else axis.scale for axis in self.axes()]
+        return max(scales[:3]), max(scales[3:])
+
     def twist(self, pad: PadState) -> tuple[float, ...]:
         """The commanded twist (6,): m/s, then rad/s."""
         return tuple(0.0 if mapping is None else mapping.value(pad) for mapping in self.axes())

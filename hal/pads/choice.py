@@ -4,75 +4,91 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import NamedTuple
 
 from .. import registry
 from ..config.data_files import find_data
 from ..errors import DeviceNotFound, DriverMissing, NotSupported
 from ..specs import PadSpec
 
-if TYPE_CHECKING:
-    from ..pictures import Viewer
-
-__all__ = ["TOUR", "check_wanted", "choose_pad"]
+__all__ = ["KINDS", "TOUR", "Chosen", "check_wanted", "choose_pad", "in_words", "tour"]
 
 TOUR = ("config", "teleop/tour.jsonl")
 """The recorded tour, among the data files."""
+KINDS = ("auto", "evdev", "web", "terminal", "keyboard", "demo", "none")
+"""What may be asked for, besides the path of a recording."""
 _AUTO = "auto"
+_WORDS = {
+    "evdev": "a gamepad at the program's computer",
+    "terminal": "the terminal of the program",
+    "keyboard": "the keyboard of the viewer's window",
+    "playback": "a recording",
+}
 
 
-def choose_pad(
-    spec: PadSpec, wanted: str | None, viewer: Viewer | None, *, window: str | None, attended: bool
-) -> tuple[PadSpec, object | None, tuple[str, ...]]:
-    """The pad to open, where it gets its record from, and what a person should know.
+class Chosen(NamedTuple):
+    """A pad that is going to be opened."""
 
-    ``wanted`` is what the program asked for: ``evdev``, ``keyboard``, the path of a recording, or ``auto`` (None means
-    the same). It only matters for a pad whose driver is ``auto`` in the rig. ``window`` names the viewer's driver.
-    ``auto`` is a pad that is plugged in, else the viewer's keyboard, else, where nothing real moves, the recorded
-    tour.
+    spec: PadSpec
+    """Its driver is that of a gamepad, or ``keyboard`` for the viewer's window."""
+    notes: tuple[str, ...] = ()
+    """What a person should know."""
 
-    Raises DeviceNotFound, with what to do, where there is nothing to drive with.
+
+def choose_pad(spec: PadSpec, wanted: str | None, *, window: bool, attended: bool, lock_step: bool) -> Chosen:
+    """The pad to open. ``wanted`` is one of :data:`KINDS`, the path of a recording, or None, which means ``auto``.
+
+    It only matters for a pad whose driver is ``auto`` in the rig. ``auto`` is a pad that is plugged in, else the
+    console, which anybody with a browser can drive from. In lock-step, where nobody could, it is the keyboard of the
+    viewer's ``window``, or the recorded tour. ``attended``: something real moves.
+
+    Raises DeviceNotFound and NotSupported, with what to do instead.
     """
-    if spec.driver == "keyboard":
-        return _keyboard(spec, viewer, window)
     if spec.driver != _AUTO:
-        return spec, None, ()
+        return Chosen(spec)
+    check_wanted(wanted)
     if wanted in (None, _AUTO):
-        return _first(spec, viewer, window, attended)
+        return _first(spec, window, attended, lock_step)
     if wanted == "evdev":
         pads, notes = _plugged()
         missing = () if pads else ("no gamepad is plugged in yet: plug one in at any time",)
-        return replace(spec, driver="evdev"), None, (*notes, *missing)
-    if wanted == "keyboard":
-        return _keyboard(spec, viewer, window)
-    assert wanted is not None
-    check_wanted(wanted)
-    path = Path(wanted)
+        return Chosen(replace(spec, driver="evdev"), (*notes, *missing))
+    if wanted in ("keyboard", "web", "terminal"):
+        return Chosen(replace(spec, driver=wanted))
     if attended:
-        raise NotSupported("a recording cannot hold the dead-man of a real arm; plug in a pad")
-    return _recording(spec, path), None, ()
+        raise NotSupported("a recording cannot hold the dead-man of a real arm; plug a pad in, or use --pad web")
+    return Chosen(tour(spec) if wanted == "demo" else _recording(spec, Path(str(wanted))))
 
 
 def check_wanted(wanted: str | None) -> None:
     """Raise DeviceNotFound when ``wanted`` is neither a kind of pad nor a recording that is there."""
-    if wanted not in (None, _AUTO, "evdev", "keyboard", "none") and not Path(str(wanted)).is_file():
-        raise DeviceNotFound(f"there is no pad {wanted!r}: auto, evdev, keyboard, or the path of a recording (.jsonl)")
+    if wanted is not None and wanted not in KINDS and not Path(wanted).is_file():
+        kinds = ", ".join(KINDS)
+        raise DeviceNotFound(f"there is no pad {wanted!r}: {kinds}, or the path of a recording (.jsonl)")
 
 
-def _first(
-    spec: PadSpec, viewer: Viewer | None, window: str | None, attended: bool
-) -> tuple[PadSpec, object | None, tuple[str, ...]]:
+def in_words(driver: str) -> str:
+    """What drives, for people who look on."""
+    return _WORDS.get(driver, f"the pad of driver {driver}")
+
+
+def tour(spec: PadSpec) -> PadSpec:
+    """The recorded tour in the place of this pad."""
+    return _recording(spec, find_data(*TOUR))
+
+
+def _first(spec: PadSpec, window: bool, attended: bool, lock_step: bool) -> Chosen:
     pads, notes = _plugged()
     if pads:
-        return replace(spec, driver="evdev"), None, notes
-    if viewer is not None and viewer.keyboard() is not None:
-        return _keyboard(spec, viewer, window)
+        return Chosen(replace(spec, driver="evdev"), notes)
+    if not lock_step:
+        return Chosen(replace(spec, driver="web"), notes)
+    if window:
+        return Chosen(replace(spec, driver="keyboard"), notes)
     if attended:
-        raise DeviceNotFound(
-            "; ".join(["no gamepad is plugged in, and a real arm does not move without one: plug one in", *notes])
-        )
-    note = "no gamepad is plugged in: playing the recorded tour (plug one in, or use --viewer gui and its keyboard)"
-    return _recording(spec, find_data(*TOUR)), None, (*notes, note)
+        text = "no gamepad is plugged in, and a real arm does not move without one: plug one in"
+        raise DeviceNotFound("; ".join([text, *notes]))
+    return Chosen(tour(spec), (*notes, "in lock-step nobody can drive by hand: playing the recorded tour"))
 
 
 def _plugged() -> tuple[tuple[str, ...], tuple[str, ...]]:
@@ -81,15 +97,6 @@ def _plugged() -> tuple[tuple[str, ...], tuple[str, ...]]:
     except (DriverMissing, NotSupported) as error:
         return (), (str(error),)
     return found.pads, found.notes
-
-
-def _keyboard(
-    spec: PadSpec, viewer: Viewer | None, window: str | None
-) -> tuple[PadSpec, object | None, tuple[str, ...]]:
-    keyboard = viewer.keyboard() if viewer is not None else None
-    if keyboard is None or window is None:
-        raise DeviceNotFound("the keyboard is that of the viewer's window: add --viewer gui")
-    return replace(spec, driver=window), keyboard, ()
 
 
 def _recording(spec: PadSpec, path: Path) -> PadSpec:

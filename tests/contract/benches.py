@@ -187,7 +187,52 @@ def playback_pad() -> Iterator[PadBench]:
         driver.close()
 
 
+@contextmanager
+def web_pad() -> Iterator[PadBench]:
+    """The page of the console; every 10 ms it says how its pad stands."""
+    from hal.drivers.web.pad import PadMail, WebPad, reading
+    from hal.types import AXES
+
+    class Page:
+        mail = PadMail()
+        driver = "page 1"
+        there, mask = True, 0
+
+        def show_playing(self, on: bool) -> None:
+            """No recording is played here."""
+
+    page = Page()
+    driver = WebPad(PadSpec(name="pad", driver="web", model=None), page)
+    bench = PadBench(dt=0.01, driver=driver)
+
+    def speak() -> None:
+        now, axes = bench.now, [0.0] * len(AXES)
+        message = {"connected": page.there, "t": now, "t_alive": now, "axes": axes, "buttons": page.mask}
+        page.mail.put(reading(message, 0))
+
+    bench.advance = speak
+    bench.press_south = lambda: setattr(page, "mask", 1)
+    bench.unplug = lambda: setattr(page, "there", False)
+    bench.replug = lambda: setattr(page, "there", True)
+    yield bench
+    driver.close()
+
+
+@contextmanager
+def terminal_pad() -> Iterator[PadBench]:
+    """The keys of a terminal, which a test plays."""
+    from terminal_kit import FarEnd
+
+    from hal.drivers.terminal.pad import TerminalPad
+
+    with FarEnd() as far:
+        options = {"tty": far.path, "mode": "step"}
+        driver = TerminalPad(PadSpec(name="pad", driver="terminal", model=None, options=options))
+        yield PadBench(dt=0.01, driver=driver, press_south=lambda: far.put("1"))
+        driver.close()
+
+
 ROBOTS = {"mock": mock_robot, "pybullet": pybullet_robot}
 GRIPPERS = {"mock": mock_gripper, "pybullet": pybullet_gripper}
 CAMERAS = {"mock": mock_camera}
-PADS = {"mock": mock_pad, "playback": playback_pad}
+PADS = {"mock": mock_pad, "playback": playback_pad, "terminal": terminal_pad, "web": web_pad}

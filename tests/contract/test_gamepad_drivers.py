@@ -77,7 +77,7 @@ def test_nothing_is_pressed_on_a_pad_that_is_unplugged(bench: PadBench) -> None:
     assert not any(gone.axes.values())
     assert gone.t_alive <= pressed.t_alive + 2 * bench.dt
     bench.replug()
-    assert poll(bench).connected
+    assert any(poll(bench).connected for _ in range(20)), "it comes back by itself"
 
 
 def test_close_may_be_repeated_or_come_first(bench: PadBench) -> None:

@@ -1,4 +1,4 @@
-"""Which pad drives: a plugged-in one, the viewer's keyboard, or the recorded tour."""
+"""Which pad drives: a plugged-in one, the console, the viewer's keyboard, or a recording."""
 
 from pathlib import Path
 
@@ -6,20 +6,10 @@ import pytest
 
 from hal.errors import DeviceNotFound, NotSupported
 from hal.gamepad import Plugged
-from hal.pads.choice import choose_pad
+from hal.pads.choice import Chosen, choose_pad
 from hal.specs import PadSpec
 
 AUTO = PadSpec("pad", "auto", None)
-
-
-class Window:
-    """A viewer with a keyboard, or without."""
-
-    def __init__(self, record: object | None) -> None:
-        self.record = record
-
-    def keyboard(self) -> object | None:
-        return self.record
 
 
 @pytest.fixture
@@ -33,56 +23,71 @@ def plug(monkeypatch: pytest.MonkeyPatch):
     return say
 
 
-def choose(wanted: str | None = None, viewer: object | None = None, attended: bool = False, spec: PadSpec = AUTO):
-    return choose_pad(spec, wanted, viewer, window="pybullet", attended=attended)
+def choose(
+    wanted: str | None = None,
+    window: bool = False,
+    attended: bool = False,
+    lock_step: bool = False,
+    spec: PadSpec = AUTO,
+) -> Chosen:
+    return choose_pad(spec, wanted, window=window, attended=attended, lock_step=lock_step)
 
 
-def test_a_plugged_in_pad_comes_first(plug) -> None:
+@pytest.mark.parametrize("lock_step", [False, True])
+def test_a_plugged_in_pad_comes_first(plug, lock_step: bool) -> None:
     plug("DualShock 4")
-    spec, source, _ = choose(viewer=Window("record"))
-    assert (spec.driver, source) == ("evdev", None)
+    assert choose(window=True, lock_step=lock_step).spec.driver == "evdev"
 
 
-def test_then_the_keyboard_of_the_window(plug) -> None:
-    plug()
-    spec, source, _ = choose(viewer=Window("record"))
-    assert (spec.driver, source) == ("pybullet", "record")
-
-
-def test_then_the_recorded_tour_and_it_says_so(plug) -> None:
+@pytest.mark.parametrize("attended", [False, True])
+def test_then_the_console_in_simulation_and_for_real(plug, attended: bool) -> None:
     plug(notes=("no permission: sudo usermod -aG input me",))
-    spec, _, notes = choose(viewer=Window(None))
-    assert spec.driver == "playback"
-    assert Path(spec.options["file"]).name == "tour.jsonl"
-    assert "usermod" in notes[0]
-    assert "recorded tour" in notes[-1]
+    chosen = choose(window=True, attended=attended)
+    assert chosen.spec.driver == "web"
+    assert "usermod" in chosen.notes[0]
+
+
+def test_in_lock_step_the_keyboard_of_the_window_or_the_recorded_tour(plug) -> None:
+    plug()
+    assert choose(window=True, lock_step=True).spec.driver == "keyboard"
+    chosen = choose(lock_step=True)
+    assert chosen.spec.driver == "playback"
+    assert Path(chosen.spec.options["file"]).name == "tour.jsonl"
+    assert "recorded tour" in chosen.notes[-1]
 
 
 def test_a_real_arm_is_not_driven_by_a_recording(plug, tmp_path: Path) -> None:
     plug(notes=("no permission: sudo usermod -aG input me",))
     with pytest.raises(DeviceNotFound, match=r"plug one in; no permission: sudo usermod"):
-        choose(attended=True)
+        choose(attended=True, lock_step=True)
     recording = tmp_path / "pad.jsonl"
     recording.touch()
-    with pytest.raises(NotSupported, match="recording cannot hold"):
-        choose(str(recording), attended=True)
+    for wanted in (str(recording), "demo"):
+        with pytest.raises(NotSupported, match="recording cannot hold"):
+            choose(wanted, attended=True)
 
 
 def test_what_was_asked_for(plug, tmp_path: Path) -> None:
     plug("DualShock 4")
     recording = tmp_path / "pad.jsonl"
     recording.touch()
-    assert choose(str(recording))[0].driver == "playback"
-    assert choose("evdev")[0].driver == "evdev"
-    assert choose("keyboard", Window("record"))[0].driver == "pybullet"
-    with pytest.raises(DeviceNotFound, match="add --viewer gui"):
-        choose("keyboard")
-    with pytest.raises(DeviceNotFound, match=r"there is no pad 'nothing'"):
+    assert choose(str(recording)).spec.options["file"] == str(recording)
+    for kind in ("evdev", "web", "terminal", "keyboard"):
+        assert choose(kind).spec.driver == kind
+    assert Path(choose("demo").spec.options["file"]).name == "tour.jsonl"
+    with pytest.raises(DeviceNotFound, match=r"there is no pad 'nothing': auto, evdev, web"):
         choose("nothing")
+
+
+def test_a_pad_that_may_come_later_is_told(plug) -> None:
+    plug()
+    chosen = choose("evdev")
+    assert chosen.spec.driver == "evdev"
+    assert "plug one in at any time" in chosen.notes[-1]
 
 
 def test_a_rig_that_names_its_pad_is_obeyed(plug) -> None:
     plug("DualShock 4")
     named = PadSpec("pad", "playback", None, options={"file": "x.jsonl"})
-    assert choose("evdev", spec=named)[0] is named
-    assert choose("auto", Window("record"), spec=PadSpec("pad", "keyboard", None))[0].driver == "pybullet"
+    assert choose("evdev", spec=named).spec is named
+    assert choose("auto", window=True, spec=PadSpec("pad", "keyboard", None)).spec.driver == "keyboard"

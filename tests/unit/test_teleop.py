@@ -110,3 +110,17 @@ def test_help_names_the_controls(rig: hal.Rig, arm: hal.Robot) -> None:
     assert "hold l2 to move" in text
     assert "dpad_y (0.2 m/s)" in text
     assert "gripper: r2" in text
+
+
+def test_labels_say_what_each_control_does() -> None:
+    with hal.open("panda_table", driver="mock", overrides=["cameras={}"]) as rig:
+        labels = hal.Teleop(rig.robots["panda"]).labels(actions=("record",))
+    assert (labels["deadman"], labels["home"], labels["robot"]) == ("l2", "north", "panda")
+    controls = labels["controls"]
+    assert controls["dpad_y"] == ["back", "forward"]
+    assert controls["dpad_x"] == ["left", "right"], "the mapping inverts y, which points to the left"
+    assert (controls["l1"], controls["r1"]) == (["up"], ["down"])
+    assert controls["left_x"] == ["turn left", "turn right"]
+    assert controls["r2"] == ["gripper: open", "gripper: closed"]
+    assert controls["south"] == ["record"]
+    assert "home" not in controls, "of the mapping's actions only those that the app knows"

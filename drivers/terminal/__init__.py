@@ -1,0 +1,9 @@
+"""The keys of the terminal that a program runs in as a gamepad, also over ssh."""
+
+from __future__ import annotations
+
+from hal.registry import DriverSpec
+
+__all__ = ["DRIVER"]
+
+DRIVER = DriverSpec(name="terminal", gamepad="hal.drivers.terminal.pad:TerminalPad")

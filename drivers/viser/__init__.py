@@ -1,0 +1,13 @@
+"""A page with a rig's arms in three dimensions, and a handle on each tcp to drag: viser, in a process of its own."""
+
+from __future__ import annotations
+
+from hal.registry import DriverSpec
+
+__all__ = ["DRIVER"]
+
+DRIVER = DriverSpec(
+    name="viser",
+    viewer3d="hal.drivers.viser.viewer:ViserViewer",
+    requires={"viser": "pip install 'robot-hal[viewer]'"},
+)

@@ -1,0 +1,190 @@
+"""What a URDF looks like: its links in a tree, the joints between them, and what is drawn on each link."""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from hal.pose import Pose
+from hal.quaternion import after_rotation, rotate
+
+__all__ = ["Joint", "UrdfTree", "Visual", "read_tree"]
+
+_TURNS = ("revolute", "continuous")
+_SLIDES = "prismatic"
+_SCHEMES = ("package://", "model://", "file://")
+
+
+@dataclass(frozen=True)
+class Visual:
+    """One thing to draw, with its pose in the frame that it belongs to."""
+
+    pose: Pose
+    shape: str
+    """``mesh``, ``box``, ``sphere``, ``cylinder`` or ``capsule``."""
+    size: tuple[float, ...]
+    """Scale of a mesh along x, y, z; sides of a box; radius; radius and length; m."""
+    rgba: tuple[float, ...] | None = None
+    """None: as the file says."""
+    file: str = ""
+    """Of a mesh; a path that may not be there."""
+
+
+@dataclass(frozen=True)
+class Joint:
+    """A joint, and how it moves its child. A driven one has a ``source``, whose value counts: itself, or a mimic's."""
+
+    name: str
+    kind: str
+    parent: str
+    child: str
+    origin: Pose
+    """Of the child in the parent's frame, at zero."""
+    axis: tuple[float, ...]
+    """(3,) along the parent's axes."""
+    source: str
+    multiplier: float = 1.0
+    offset: float = 0.0
+
+    @property
+    def moves(self) -> bool:
+        """Does the child move with a value?"""
+        return self.kind in _TURNS or self.kind == _SLIDES
+
+    def placement(self, values: Mapping[str, float]) -> tuple[list[float], list[float]]:
+        """Position (3,) and quaternion (4,) of the child in the parent's frame; a joint without a value is at zero."""
+        position, orientation = self.origin.position.tolist(), self.origin.orientation.tolist()
+        value = self.multiplier * values.get(self.source, 0.0) + self.offset
+        along = [value * part for part in self.axis]
+        if self.kind in _TURNS:
+            orientation = after_rotation(orientation, along)
+        elif self.kind == _SLIDES:
+            position = [a + b for a, b in zip(position, along, strict=True)]
+        return position, orientation
+
+
+@dataclass(frozen=True)
+class UrdfTree:
+    """A URDF as a tree."""
+
+    root: str
+    joints: tuple[Joint, ...]
+    """From the root outwards: a parent comes before its children."""
+    visuals: Mapping[str, tuple[Visual, ...]]
+    """Of each link."""
+
+    def poses(self, values: Mapping[str, float]) -> dict[str, Pose]:
+        """The pose of each link in the root's frame."""
+        found = {self.root: Pose()}
+        for joint in self.joints:
+            found[joint.child] = found[joint.parent] @ Pose(*joint.placement(values))
+        return found
+
+
+def read_tree(path: str) -> UrdfTree:
+    """Read a URDF. Raises ValueError with what is wrong in it, and OSError."""
+    try:
+        robot = ElementTree.parse(path).getroot()
+    except ElementTree.ParseError as error:
+        raise ValueError(f"{path} is not valid XML: {error}") from None
+    colors: dict[str, tuple[float, ...]] = {}  # materials may be named after their first use
+    for material in robot.iter("material"):
+        color = material.find("color")
+        if color is not None:
+            colors.setdefault(material.get("name", ""), _numbers(color, "rgba", 4, 1.0))
+    folder = Path(path).resolve().parent
+    visuals = {
+        link.get("name", ""): tuple(
+            shown for visual in link.findall("visual") if (shown := _visual(visual, colors, folder)) is not None
+        )
+        for link in robot.findall("link")
+    }
+    joints = [_joint(element) for element in robot.findall("joint")]
+    return _tree(path, joints, visuals)
+
+
+def _tree(path: str, joints: list[Joint], visuals: dict[str, tuple[Visual, ...]]) -> UrdfTree:
+    """The joints in order. ValueError where they are no tree."""
+    children = {joint.child for joint in joints}
+    roots = [link for link in visuals if link not in children]
+    if len(roots) != 1:
+        raise ValueError(f"{path} has {len(roots)} links that hang on nothing, not one")
+    placed, ordered, waiting = {roots[0]}, [], joints
+    while waiting:
+        ready = [joint for joint in waiting if joint.parent in placed]
+        if not ready:
+            raise ValueError(f"{path}: joint {waiting[0].name} does not hang on the root")
+        ordered += ready
+        waiting = [joint for joint in waiting if joint.parent not in placed]
+        placed |= {joint.child for joint in ready}
+    return UrdfTree(roots[0], tuple(ordered), visuals)
+
+
+def _joint(element: ElementTree.Element) -> Joint:
+    name, mimic = element.get("name", ""), element.find("mimic")
+    parent, child = element.find("parent"), element.find("child")
+    if parent is None or child is None:
+        raise ValueError(f"joint {name} lacks its parent or its child")
+    origin = _origin(element)
+    axis = _numbers(element.find("axis"), "xyz", 3, 0.0) if element.find("axis") is not None else (1.0, 0.0, 0.0)
+    length = sum(part * part for part in axis) ** 0.5
+    if length == 0.0 and element.get("type") in (*_TURNS, _SLIDES):
+        raise ValueError(f"joint {name} has an axis of no length")
+    return Joint(
+        name=name,
+        kind=element.get("type", ""),
+        parent=parent.get("link", ""),
+        child=child.get("link", ""),
+        origin=origin,
+        axis=tuple(rotate(origin.orientation.tolist(), [part / (length or 1.0) for part in axis])),
+        source=name if mimic is None else mimic.get("joint", ""),
+        multiplier=1.0 if mimic is None else float(mimic.get("multiplier", 1.0)),
+        offset=0.0 if mimic is None else float(mimic.get("offset", 0.0)),
+    )
+
+
+def _visual(element: ElementTree.Element, colors: Mapping[str, tuple[float, ...]], folder: Path) -> Visual | None:
+    material, geometry = element.find("material"), element.find("geometry")
+    rgba = colors.get(material.get("name", "")) if material is not None else None
+    if material is not None and (own := material.find("color")) is not None:
+        rgba = _numbers(own, "rgba", 4, 1.0)
+    shape = next(iter(geometry), None) if geometry is not None else None
+    if shape is None:
+        return None
+    pose = _origin(element)
+    if shape.tag == "mesh":
+        file = _find(shape.get("filename", ""), folder)
+        return Visual(pose, "mesh", _numbers(shape, "scale", 3, 1.0), rgba, file)
+    if shape.tag == "box":
+        return Visual(pose, "box", _numbers(shape, "size", 3, 0.0), rgba)
+    if shape.tag == "sphere":
+        return Visual(pose, "sphere", _numbers(shape, "radius", 1, 0.0), rgba)
+    if shape.tag in ("cylinder", "capsule"):
+        return Visual(pose, shape.tag, _numbers(shape, "radius", 1, 0.0) + _numbers(shape, "length", 1, 0.0), rgba)
+    return None
+
+
+def _origin(element: ElementTree.Element) -> Pose:
+    origin = element.find("origin")
+    if origin is None:
+        return Pose()
+    return Pose.from_rpy(_numbers(origin, "xyz", 3, 0.0), _numbers(origin, "rpy", 3, 0.0))
+
+
+def _numbers(element: ElementTree.Element | None, attribute: str, count: int, default: float) -> tuple[float, ...]:
+    text = element.get(attribute) if element is not None else None
+    if text is None:
+        return (default,) * count
+    values = tuple(float(word) for word in text.split())
+    if len(values) != count:
+        raise ValueError(f"{attribute}={text!r} has {len(values)} numbers, not {count}")
+    return values
+
+
+def _find(name: str, folder: Path) -> str:
+    """Beside the URDF, or in a folder above it; where it would be beside the URDF when it is nowhere."""
+    for scheme in _SCHEMES:
+        name = name.removeprefix(scheme)
+    return str(next((place / name for place in (folder, *folder.parents) if (place / name).is_file()), folder / name))

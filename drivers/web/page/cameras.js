@@ -1,0 +1,132 @@
+// What the cameras see: one large, the others small beside it.
+
+import { byId, choose, make, segments, setData, setText, show } from "./dom.js";
+import { Pictures } from "./pictures.js";
+
+const SILENT = 500; // ms without a new picture, at least, until a camera counts as silent
+const PERIODS = 5; // and this many of its own periods
+const WINDOW = 2000; // ms over which the rate is counted
+
+/** One camera on the page. */
+class View {
+  /** @param {any} camera of the rig's list @param {(name: string) => void} choose */
+  constructor(camera, choose) {
+    this.name = camera.name;
+    this.patience = Math.max(SILENT, (PERIODS * 1000) / (camera.rate_hz || 30));
+    this.figure = make("figure", "camera");
+    this.canvas = make("canvas");
+    this.canvas.dataset.camera = camera.name;
+    this.canvas.width = camera.width;
+    this.canvas.height = camera.height;
+    this.canvas.setAttribute("role", "img");
+    this.canvas.setAttribute("aria-label", `Camera ${camera.name}`);
+    this.context = this.canvas.getContext("2d", { alpha: false });
+    this.numbers = make("span", "numbers");
+    this.old = make("div", "old");
+    const caption = make("figcaption");
+    const kind = camera.shows === "color" ? "" : ` (${camera.shows})`;
+    caption.append(make("b", "", camera.name + kind), this.numbers);
+    this.figure.append(this.canvas, this.old, caption);
+    this.figure.addEventListener("click", () => choose(camera.name));
+    this.visible = false;
+    this.mark(performance.now());
+  }
+
+  /** When the newest picture was taken, and when the newest ones were drawn, ms. */
+  #taken = -Infinity;
+  #latency = 0;
+  /** @type {number[]} */ #drawn = [];
+
+  /** @param {import("./pictures.js").Picture} picture */
+  draw({ bitmap, taken }) {
+    if (this.canvas.width !== bitmap.width || this.canvas.height !== bitmap.height) {
+      this.canvas.width = bitmap.width;
+      this.canvas.height = bitmap.height;
+    }
+    this.context.drawImage(bitmap, 0, 0);
+    const now = performance.now();
+    this.#taken = taken;
+    this.#latency = now - taken;
+    this.#drawn.push(now);
+    this.mark(now);
+  }
+
+  /** Say how fresh the picture is; one that is old must not look live. @param {number} now */
+  mark(now) {
+    while (this.#drawn.length && now - this.#drawn[0] > WINDOW) this.#drawn.shift();
+    const age = now - this.#taken;
+    const state = age === Infinity ? "none" : age > this.patience ? "stale" : "live";
+    setData(this.figure, "state", state);
+    if (state === "live") {
+      const rate = this.#drawn.length > 1 ? (1000 * (this.#drawn.length - 1)) / (now - this.#drawn[0]) : 0;
+      setText(this.numbers, `${rate.toFixed(0)}/s  ${Math.round(this.#latency)} ms`);
+    } else {
+      const seconds = (age / 1000).toFixed(age < 10000 ? 1 : 0);
+      setText(this.numbers, "");
+      setText(this.old, state === "none" ? "no picture yet" : `not live: ${seconds} s old`);
+    }
+  }
+}
+
+export class Cameras {
+  constructor() {
+    this.pictures = new Pictures();
+    this.pictures.came = (picture) => this.views[picture.camera]?.draw(picture);
+    /** @type {View[]} */
+    this.views = [];
+    this.large = "";
+    this.seen = new IntersectionObserver((entries) => this.#moved(entries));
+    document.addEventListener("visibilitychange", () => this.#watch());
+  }
+
+  /** Show these cameras. @param {any[]} cameras of hello */
+  open(cameras) {
+    const names = cameras.map((camera) => camera.name);
+    if (names.join("\n") !== this.views.map((view) => view.name).join("\n")) this.#build(cameras, names);
+    this.pictures.open(names);
+  }
+
+  close() {
+    this.pictures.close();
+  }
+
+  /** Ten times a second. */
+  paint() {
+    const now = performance.now();
+    for (const view of this.views) if (view.visible) view.mark(now);
+  }
+
+  /** @param {any[]} cameras @param {string[]} names */
+  #build(cameras, names) {
+    this.seen.disconnect();
+    this.views = cameras.map((camera) => new View(camera, (name) => this.#enlarge(name)));
+    byId("cameras").replaceChildren(...this.views.map((view) => view.figure));
+    segments(byId("tabs"), names, (name) => this.#enlarge(name));
+    if (names.length) this.#enlarge(names[0]);
+    else byId("cameras").append(make("p", "hint", "This rig has no cameras."));
+    setData(byId("view"), "count", String(names.length));
+    for (const view of this.views) this.seen.observe(view.figure);
+    show(byId("tabs"), names.length > 1);
+  }
+
+  /** @param {string} name */
+  #enlarge(name) {
+    this.large = name;
+    for (const view of this.views) view.figure.classList.toggle("large", view.name === name);
+    choose(byId("tabs"), name);
+  }
+
+  /** @param {IntersectionObserverEntry[]} entries */
+  #moved(entries) {
+    for (const entry of entries) {
+      const view = this.views.find((one) => one.figure === entry.target);
+      if (view) view.visible = entry.isIntersecting;
+    }
+    this.#watch();
+  }
+
+  #watch() {
+    const visible = document.visibilityState === "visible";
+    this.pictures.watch(this.views.filter((view) => visible && view.visible).map((view) => view.name));
+  }
+}

@@ -1,0 +1,125 @@
+// The panel of an arm: joints, tcp, gripper, how its servo keeps time, and how old all that is.
+
+import { byId, choose, segments, setData, setText } from "./dom.js";
+import { Joints, signed } from "./joints.js";
+import { Plot } from "./plot.js";
+
+const WINDOW = 2; // s over which the servo's rate is counted
+const OLD = 500; // ms
+
+/** Counts a host's ticks. */
+class Rate {
+  /** @type {[number, number][]} */ #seen = [];
+
+  /** @param {number} t s @param {number} ticks @returns {number | null} ticks/s */
+  add(t, ticks) {
+    const seen = this.#seen;
+    if (seen.length && ticks < seen[seen.length - 1][1]) seen.length = 0;
+    seen.push([t, ticks]);
+    while (t - seen[0][0] > WINDOW) seen.shift();
+    const [[t0, first]] = seen;
+    return t - t0 > WINDOW / 4 ? (ticks - first) / (t - t0) : null;
+  }
+}
+
+export class Facts {
+  constructor() {
+    this.plot = new Plot();
+    this.joints = new Joints((joint) => this.plot.choose(joint));
+    /** @type {any[]} */
+    this.robots = [];
+    this.name = "";
+    /** @type {Map<string, Rate>} */
+    this.rates = new Map();
+    /** @type {Map<string, number | null>} */
+    this.measured = new Map();
+  }
+
+  #gripMax = /** @type {number | null} */ (null);
+
+  /** @param {any[]} robots of hello */
+  open(robots) {
+    this.robots = robots;
+    segments(byId("robots"), robots.map((robot) => robot.name), (name) => this.#choose(name));
+    const names = robots.map((robot) => robot.name);
+    if (names.length) this.#choose(names.includes(this.name) ? this.name : names[0]);
+  }
+
+  /** @param {string} name */
+  #choose(name) {
+    const robot = this.robots.find((one) => one.name === name);
+    this.name = name;
+    this.#gripMax = robot.width_max;
+    choose(byId("robots"), name);
+    setText(byId("model"), this.robots.length > 1 ? robot.model : robot.name);
+    byId("model").title = `${robot.name}: ${robot.model}, ${robot.driver}, ${robot.real ? "a real arm" : "simulated"}`;
+    this.joints.open(robot);
+    this.plot.open(robot.joints);
+  }
+
+  /** Remember what the plot and the rates need, of every state. @param {any} state */
+  take(state) {
+    const robot = state.robots[this.name];
+    if (robot && !robot.lost) this.plot.add(state.t, robot.q, robot.q_set);
+    for (const [name, host] of Object.entries(state.hosts ?? {})) {
+      const rate = this.rates.get(name) ?? new Rate();
+      this.rates.set(name, rate);
+      this.measured.set(name, rate.add(state.t, host.ticks));
+    }
+  }
+
+  /** How far the gripper is closed, 0..1, or null. @param {any} state */
+  closed(state) {
+    const gripper = state?.robots[this.name]?.gripper;
+    if (!gripper || !this.#gripMax || typeof gripper.width !== "number") return null;
+    return Math.min(1, Math.max(0, 1 - gripper.width / this.#gripMax));
+  }
+
+  /** Ten times a second. @param {any} state @param {number} silent ms since it came */
+  paint(state, silent) {
+    const robot = state.robots[this.name];
+    const there = robot && !robot.lost;
+    setData(byId("facts"), "old", there && silent < OLD ? null : "");
+    if (there) {
+      this.joints.show(robot);
+      const [x, y, z, ...turn] = robot.tcp;
+      setText(byId("tcp"), `x ${signed(x, 3)}  y ${signed(y, 3)}  z ${signed(z, 3)} m`);
+      const [roll, pitch, yaw] = angles(turn).map((angle) => signed(angle, 1));
+      setText(byId("turned"), `${roll}  ${pitch}  ${yaw} °`);
+      setText(byId("width"), gripperWords(robot.gripper));
+    }
+    const known = there && Number.isFinite(silent);
+    setText(byId("age"), known ? `${Math.round(1000 * robot.age + silent)} ms old` : (robot?.lost ?? "none"));
+    setText(byId("servo"), this.#hosts(state.hosts ?? {}));
+    this.plot.paint();
+  }
+
+  /** @param {any} hosts */
+  #hosts(hosts) {
+    const names = Object.keys(hosts);
+    return names.map((name) => {
+      const host = hosts[name];
+      const rate = (this.measured.get(name) ?? host.rate_hz).toFixed(0);
+      const silent = host.silent > 0.1 ? `, silent ${host.silent.toFixed(1)} s` : "";
+      const called = names.length > 1 ? `${name} ` : "";
+      return `${called}${rate} of ${host.rate_hz.toFixed(0)} Hz, ${host.missed} missed${silent}`;
+    }).join("\n");
+  }
+}
+
+/** Roll, pitch and yaw in degrees. @param {number[]} quaternion x, y, z, w */
+export function angles([x, y, z, w]) {
+  const roll = Math.atan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y));
+  const pitch = Math.asin(Math.min(1, Math.max(-1, 2 * (w * y - z * x))));
+  const yaw = Math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z));
+  return [roll, pitch, yaw].map((angle) => (180 * angle) / Math.PI);
+}
+
+/** @param {any} gripper of a robot's state */
+function gripperWords(gripper) {
+  if (!gripper) return "none";
+  const mm = (/** @type {number} */ width) => (1000 * width).toFixed(1);
+  const target = Math.abs(gripper.width - gripper.width_target) > 5e-4 ? ` to ${mm(gripper.width_target)}` : "";
+  const does = gripper.grasped ? ", holds something" : gripper.moving ? ", moves" : "";
+  return `${mm(gripper.width)}${target} mm${does}`;
+}

@@ -1,0 +1,113 @@
+// A gamepad that the browser knows (its Gamepad API).
+
+import { byId, setText } from "./dom.js";
+import { AXIS, BIT } from "./names.js";
+
+const NEAR = 0.25; // what counts as let go of, share of the travel
+const BUTTON_ORDER = [
+  "south", "east", "west", "north", "l1", "r1", "l2", "r2", "select", "start", "l3", "r3", null, null, null, null,
+  "home", "touchpad",
+];
+const [UP, DOWN, LEFT, RIGHT] = [12, 13, 14, 15];
+
+/**
+ * Only pads with the standard mapping: of others nobody knows which button is which. A pad counts after all of it was
+ * let go of once, for browsers show a pad only when a button on it is pressed.
+ */
+export class BrowserGamepad {
+  /** @param {import("./pad.js").Pad} pad @param {(text: string) => void} lost */
+  constructor(pad, lost) {
+    this.pad = pad;
+    this.lost = lost;
+    this.source = pad.source();
+    /** May its dead-man count by itself? Not on a real arm: a wireless pad that dies keeps its last state here. */
+    this.mayHold = true;
+    pad.released.push(() => (this.#free = false));
+    addEventListener("gamepadconnected", () => this.describe());
+    addEventListener("gamepaddisconnected", () => this.look());
+    setInterval(() => this.describe(), 1000);
+  }
+
+  /** @type {number | null} */ #index = null;
+  #free = false;
+
+  /** Take the present state. */
+  look() {
+    const found = this.#admit();
+    if (!found) {
+      if (this.#index !== null) this.#lose();
+      return;
+    }
+    this.source.clear();
+    this.source.mayHold = this.mayHold;
+    if (this.#free) read(found, this.source);
+    this.pad.update();
+  }
+
+  /** Tell a person what there is. */
+  describe() {
+    setText(byId("gamepad"), this.#words());
+  }
+
+  #words() {
+    if (!navigator.getGamepads) return "This browser offers no gamepads at this address.";
+    const found = this.#admit();
+    if (found) {
+      const name = found.id.replace(/\s*\(.*\)\s*$/, "") || found.id;
+      if (!this.#free) return `${name}: let go of all its sticks and buttons first.`;
+      if (!this.mayHold) return `${name}. Its dead-man is not enough on a real arm: hold Space or the button as well.`;
+      return `${name}: ${this.pad.deadman.toUpperCase()} is the dead-man.`;
+    }
+    const other = navigator.getGamepads().find((one) => one?.connected);
+    if (other) return `${other.id} is not used: this browser does not know which of its buttons is which.`;
+    return "No gamepad yet: plug one in and press a button on it.";
+  }
+
+  /** The pad, if there is one; whether it counts by now stands in #free. @returns {Gamepad | null} */
+  #admit() {
+    const found = this.#find();
+    if (!found) return null;
+    if (found.index !== this.#index) {
+      this.#index = found.index;
+      this.#free = false;
+    }
+    this.#free ||= atRest(found);
+    return found;
+  }
+
+  /** @returns {Gamepad | null} */
+  #find() {
+    const pads = (navigator.getGamepads?.() ?? []).filter((one) => one?.connected && one.mapping === "standard");
+    return pads.find((one) => one?.index === this.#index) ?? (this.#index === null ? pads[0] : null) ?? null;
+  }
+
+  #lose() {
+    this.#index = null;
+    this.pad.reset();
+    this.lost("the gamepad was disconnected: everything counts as let go of");
+  }
+}
+
+/** @param {Gamepad} found */
+function atRest(found) {
+  const centred = found.axes.slice(0, 4).every((value) => Math.abs(value) <= NEAR);
+  return centred && found.buttons.every((one) => one.value <= NEAR && !one.pressed);
+}
+
+/** @param {Gamepad} found @param {import("./pad.js").Source} source */
+function read(found, source) {
+  const [leftX = 0, leftY = 0, rightX = 0, rightY = 0] = found.axes;
+  const value = (/** @type {number} */ place) => found.buttons[place]?.value ?? 0;
+  const { axes } = source;
+  axes[AXIS.left_x] = leftX;
+  axes[AXIS.left_y] = -leftY; // the browser's point down
+  axes[AXIS.right_x] = rightX;
+  axes[AXIS.right_y] = -rightY;
+  axes[AXIS.l2] = value(6);
+  axes[AXIS.r2] = value(7);
+  axes[AXIS.dpad_x] = value(RIGHT) - value(LEFT);
+  axes[AXIS.dpad_y] = value(UP) - value(DOWN);
+  BUTTON_ORDER.forEach((name, place) => {
+    if (name && found.buttons[place]?.pressed && name !== "l2" && name !== "r2") source.mask |= BIT[name];
+  });
+}

@@ -1,0 +1,206 @@
+// The console's page: opens the parts and passes messages between them.
+
+import { Cameras } from "./cameras.js";
+import { Connection } from "./connection.js";
+import { byId, setAttribute, setData, setText, show } from "./dom.js";
+import { Drive } from "./drive.js";
+import { Facts } from "./facts.js";
+import { BrowserGamepad } from "./gamepad.js";
+import { Heartbeat } from "./heartbeat.js";
+import { Keyboard } from "./keyboard.js";
+import { Lease } from "./lease.js";
+import { Log } from "./log.js";
+import { Overlay } from "./overlay.js";
+import { Pad } from "./pad.js";
+import { Presence } from "./presence.js";
+import { Status } from "./status.js";
+import { openTheme } from "./theme.js";
+
+const REPAINT = 100; // ms
+
+const connection = new Connection();
+const pad = new Pad();
+const presence = new Presence();
+const lease = new Lease(connection);
+const heartbeat = new Heartbeat(pad, connection, () => lease.mine && connection.connected && presence.check());
+const log = new Log();
+const status = new Status(connection, lease);
+const facts = new Facts();
+const cameras = new Cameras();
+const overlay = new Overlay(() => connection.open());
+const mayDrive = () => lease.mine && presence.present;
+const drive = new Drive(pad, mayDrive);
+const keyboard = new Keyboard(pad, mayDrive, stop);
+const gamepad = new BrowserGamepad(pad, (text) => log.add(text));
+
+/** @type {any} */
+let hello = null;
+/** @type {any} */
+let state = null;
+let stateAt = -Infinity;
+let told = false;
+
+const silence = () => performance.now() - stateAt;
+const isReal = () => hello !== null && (!hello.rig.sim || hello.rig.robots.some((/** @type {any} */ one) => one.real));
+
+/** A rig's name: that of its file. @param {string} source */
+const called = (source) => source.replace(/^.*[/\\]/, "").replace(/\.ya?ml$/, "");
+
+function stop() {
+  const sent = connection.send({ type: "stop" });
+  log.add(sent ? "STOP was sent" : "STOP could not be sent: there is no connection");
+  setData(byId("stop"), "sent", "");
+  setTimeout(() => setData(byId("stop"), "sent", null), 400);
+}
+
+/** Message type -> what to do with it. @type {Record<string, (message: any) => void>} */
+const HEARD = {
+  hello(message) {
+    hello = message;
+    const { rig } = hello;
+    log.clear();
+    setText(byId("rig"), called(rig.source));
+    byId("rig").title = rig.source;
+    setText(byId("kind"), isReal() ? "REAL ARM" : "SIMULATION");
+    show(byId("kind"), true);
+    setData(document.documentElement, "real", isReal() ? "" : null);
+    setData(document.documentElement, "connected", "");
+    show(byId("demo"), rig.demo);
+    gamepad.mayHold = drive.padHolds = rig.pad_may_hold ?? !rig.attended;
+    drive.paint();
+    status.waiting = [];
+    lease.hello(hello);
+    facts.open(rig.robots);
+    cameras.open(rig.cameras);
+    gamepad.describe();
+  },
+  lease(message) {
+    log.synchronise(message.t);
+    lease.heard(message);
+    retitle();
+    advise();
+  },
+  labels(message) {
+    drive.explain(message);
+  },
+  beat(message) {
+    heartbeat.answered(message.t);
+  },
+  state(message) {
+    state = message;
+    stateAt = performance.now();
+    connection.proved();
+    overlay.hide();
+    log.synchronise(state.t);
+    facts.take(state);
+    status.show(state.robots, facts.name, 0);
+    setText(byId("demo"), state.playing ? "End the tour" : "Play the tour");
+    advise();
+  },
+  pad(message) {
+    status.waiting = message.waiting;
+    if (status.waiting.includes("r2")) drive.letGoOfGrip();
+    advise();
+  },
+  say(message) {
+    log.add(message.text, message.t);
+  },
+  refused(message) {
+    log.add(message.why);
+    status.notice(message.why);
+  },
+};
+
+function advise() {
+  status.advise(presence.present, pad.held, state?.playing ?? false);
+}
+
+function retitle() {
+  document.title = `${lease.mine ? "driving " : ""}${hello ? called(hello.rig.source) : "console"}`;
+  setAttribute(byId("demo"), "aria-disabled", String(!lease.mine));
+  byId("demo").title = lease.mine ? "" : "Only the page that drives can do that";
+}
+
+connection.heard = (message) => HEARD[message.type]?.(message);
+
+connection.lost = (code, reason, retry) => {
+  const watched = document.documentElement.dataset.connected !== undefined;
+  if (watched || code >= 4400 || !told) { // a further try that fails must not hide that the arm was stopped
+    overlay.show(code, reason, retry, { drove: lease.mine, watched, real: isReal() });
+  }
+  told = true;
+  setData(document.documentElement, "connected", null);
+  stateAt = -Infinity;
+  lease.disconnected();
+  cameras.close();
+  retitle();
+};
+
+lease.granted = (t) => {
+  pad.reset();
+  heartbeat.granted(t);
+};
+lease.ended = () => pad.reset();
+
+presence.left = (why) => {
+  if (lease.mine) heartbeat.away(why);
+  pad.reset();
+  advise();
+};
+presence.came = () => {
+  pad.reset();
+  advise();
+};
+
+heartbeat.before.push((dt) => keyboard.look(dt), () => gamepad.look());
+heartbeat.stalled = (ms) => log.add(`this page stood still for ${Math.round(ms)} ms`);
+pad.changed.push(() => advise());
+
+// A finger on STOP counts at once; a click without a pointer comes from the keyboard or an aid.
+byId("stop").addEventListener("pointerdown", stop);
+byId("stop").addEventListener("click", (/** @type {MouseEvent} */ event) => event.detail === 0 && stop());
+byId("demo").addEventListener("click", () => {
+  if (lease.mine) connection.send({ type: "demo", play: !state?.playing });
+});
+// A click leaves the focus alone, or Enter, which is the pad's start, would click the button once more.
+addEventListener("mousedown", (event) => {
+  if (!(event.target instanceof Element) || !event.target.closest("button, summary")) return;
+  event.preventDefault();
+  if (document.activeElement instanceof HTMLElement) document.activeElement.blur();
+});
+addEventListener("hashchange", () => connection.open());
+
+/** The link to the program: how quick it is, and whether it speaks at all. */
+function paintLink() {
+  const quick = lease.mine && heartbeat.roundTrip !== null ? ` ${heartbeat.roundTrip.toFixed(0)} ms` : "";
+  const alive = connection.connected && silence() < 500;
+  setText(byId("link"), alive ? `connected${quick}` : connection.connected ? "no news" : "not connected");
+  setData(byId("link-lamp"), "tone", alive ? "on" : "alarm");
+}
+
+setInterval(() => {
+  paintLink();
+  cameras.paint();
+  if (!state) return;
+  const pages = state.pages;
+  setText(byId("pages"), `${pages} page${pages === 1 ? "" : "s"}`);
+  status.show(state.robots, facts.name, silence());
+  drive.mark(facts.closed(state));
+  facts.paint(state, silence());
+}, REPAINT);
+
+byId("legend").open = matchMedia("(min-width: 1100px) and (min-height: 1000px)").matches;
+openTheme(() => facts.plot.restyle());
+heartbeat.start();
+connection.open();
+
+/** For tests: how the page stands. */
+Object.defineProperty(window, "halConsole", {
+  value: Object.freeze({
+    get connected() { return connection.connected; },
+    get driving() { return lease.mine; },
+    get lastState() { return state; },
+    get beats() { return heartbeat.beats; },
+    get page() { return hello?.page ?? null; },
+  }),
+});

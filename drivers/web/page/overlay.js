@@ -1,0 +1,57 @@
+// What covers the page while there is no connection: nothing on it is live then.
+
+import { ENDED, REFUSED, TOO_MANY } from "./connection.js";
+import { byId, setText, show } from "./dom.js";
+
+/** Close code -> what it means, and what to do. @type {Record<number, [string, string]>} */
+const ENDINGS = {
+  [REFUSED]: [
+    "this link is not valid",
+    "Use the link that the program printed last: it ends in # and a long word, and is a new one each time.",
+  ],
+  [TOO_MANY]: ["too many pages are open", "Close one of the others, then try again."],
+  [ENDED]: [
+    "the program has ended",
+    "When it is started again it prints a new link: open that one. This page goes on looking for the old one.",
+  ],
+};
+
+export class Overlay {
+  /** @param {() => void} again */
+  constructor(again) {
+    byId("again").addEventListener("click", again);
+  }
+
+  hide() {
+    show(byId("overlay"), false);
+  }
+
+  /**
+   * @param {number} code the socket's close code @param {string} reason
+   * @param {number | null} retry ms until the next try
+   * @param {{drove: boolean, watched: boolean, real: boolean}} before what this page did until now
+   */
+  show(code, reason, retry, { drove, watched, real }) {
+    const [title, text] = ENDINGS[code] ?? [lostTitle(drove, watched), lostText(drove, watched, real)];
+    setText(byId("overlay-title"), title);
+    setText(byId("overlay-text"), text);
+    const told = code >= 4400 && !(code in ENDINGS) && reason ? `The program closed it: ${reason}. ` : "";
+    setText(byId("overlay-next"), told + (retry === null ? "" : "Connecting again by itself."));
+    show(byId("again"), code === TOO_MANY);
+    show(byId("overlay"), true);
+  }
+}
+
+/** @param {boolean} drove @param {boolean} watched */
+function lostTitle(drove, watched) {
+  if (drove) return "no connection to the program: the arm has been stopped";
+  return watched ? "no connection to the program: nothing here is live" : "no connection to the program";
+}
+
+/** @param {boolean} drove @param {boolean} watched @param {boolean} real */
+function lostText(drove, watched, real) {
+  const own = real ? " Use the robot's own stop if it moves." : "";
+  if (drove) return `An arm whose page falls silent stops by itself.${own}`;
+  if (watched) return `STOP does not reach the arm from here.${own}`;
+  return "Is it still running, and is this the link that it printed last?";
+}

@@ -1,0 +1,172 @@
+// Target against measured, over the last seconds: one joint large, or all of them one below the other.
+
+import { byId, setText } from "./dom.js";
+import { shortened, signed } from "./joints.js";
+
+const SPAN = 20; // s
+const CAPACITY = 512; // samples; 20 a second come
+const GAP = 0.3; // s between two samples from which on no line joins them
+const SMALLEST = 0.02; // rad; what is smaller than this is not blown up to the full height
+
+export class Plot {
+  constructor() {
+    this.canvas = byId("plot");
+    this.context = this.canvas.getContext("2d");
+    /** @type {string[]} */
+    this.names = [];
+    /** @type {number | null} */
+    this.joint = null;
+    this.visible = true;
+    const seen = new IntersectionObserver((entries) => (this.visible = entries[entries.length - 1].isIntersecting));
+    seen.observe(this.canvas);
+    new ResizeObserver(() => this.#resize()).observe(this.canvas);
+    matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => this.restyle());
+    this.restyle();
+  }
+
+  #times = new Float64Array(CAPACITY);
+  /** @type {Float32Array[]} */ #q = [];
+  /** @type {Float32Array[]} */ #set = [];
+  #count = 0;
+  #ratio = 1;
+  #colours = { measured: "", target: "", quiet: "" };
+  #font = "";
+
+  /** Start anew with these joints. @param {string[]} names */
+  open(names) {
+    this.names = names.map((name) => shortened(name, names));
+    this.#q = names.map(() => new Float32Array(CAPACITY));
+    this.#set = names.map(() => new Float32Array(CAPACITY));
+    this.#count = 0;
+    this.choose(null);
+  }
+
+  /** @param {number | null} joint null: all of them */
+  choose(joint) {
+    this.joint = joint;
+    setText(byId("plotted"), joint === null ? "all" : this.names[joint]);
+    this.paint();
+  }
+
+  /** @param {number} t s @param {number[]} q @param {number[]} set rad */
+  add(t, q, set) {
+    const last = (this.#count - 1) % CAPACITY;
+    if (this.#count && t <= this.#times[last]) {
+      if (t === this.#times[last]) return;
+      this.#count = 0; // another clock: the program was started again
+    }
+    const place = this.#count % CAPACITY;
+    this.#times[place] = t;
+    this.#q.forEach((series, k) => (series[place] = q[k]));
+    this.#set.forEach((series, k) => (series[place] = set[k]));
+    this.#count += 1;
+  }
+
+  /** Take the colours of the page as it looks now. */
+  restyle() {
+    const panel = byId("plotting");
+    const colour = (/** @type {string} */ part) => getComputedStyle(panel.querySelector(part)).color;
+    this.#colours = { measured: colour(".measured"), target: colour(".target"), quiet: colour(".keys") };
+    this.#font = `11px ${getComputedStyle(document.body).fontFamily}`;
+  }
+
+  #resize() {
+    this.#ratio = devicePixelRatio || 1;
+    this.canvas.width = Math.round(this.canvas.clientWidth * this.#ratio);
+    this.canvas.height = Math.round(this.canvas.clientHeight * this.#ratio);
+    this.paint();
+  }
+
+  paint() {
+    const { context, canvas } = this;
+    const [width, height] = [canvas.width / this.#ratio, canvas.height / this.#ratio];
+    if (!this.visible || width < 40 || height < 20) return;
+    context.setTransform(this.#ratio, 0, 0, this.#ratio, 0, 0);
+    context.clearRect(0, 0, width, height);
+    context.font = this.#font;
+    context.textBaseline = "middle";
+    const shown = this.joint === null ? this.names.map((_, k) => k) : [this.joint];
+    const floor = height - 14;
+    const strip = floor / shown.length;
+    shown.forEach((joint, k) => this.#strip(joint, k * strip, strip, width));
+    this.#ruler(floor, width);
+  }
+
+  /** Samples from the left edge on. */
+  *#places() {
+    const newest = this.#times[(this.#count - 1) % CAPACITY];
+    for (let k = Math.max(0, this.#count - CAPACITY); k < this.#count; k += 1) {
+      const place = k % CAPACITY;
+      if (this.#times[place] >= newest - SPAN) yield place;
+    }
+  }
+
+  /** @param {number} joint @param {number} top @param {number} height @param {number} width */
+  #strip(joint, top, height, width) {
+    const { context } = this;
+    const alone = this.joint !== null;
+    const left = alone ? 46 : 26;
+    const [q, set] = [this.#q[joint], this.#set[joint]];
+    let [low, high] = [Infinity, -Infinity];
+    for (const place of this.#places()) {
+      low = Math.min(low, q[place], set[place]);
+      high = Math.max(high, q[place], set[place]);
+    }
+    const middle = (low + high) / 2;
+    const half = Math.max(SMALLEST, high - low) / 2;
+    const pad = alone ? 8 : 3;
+    const y = (/** @type {number} */ value) => top + height / 2 - ((value - middle) / half) * (height / 2 - pad);
+    context.fillStyle = context.strokeStyle = this.#colours.quiet;
+    context.textAlign = "left";
+    if (!alone) context.fillText(this.names[joint], 0, top + height / 2, left - 4);
+    context.lineWidth = 1;
+    context.globalAlpha = 0.25;
+    context.strokeRect(left + 0.5, Math.round(top) + 0.5, width - left - 1, Math.round(height) - 1);
+    context.globalAlpha = 1;
+    if (!(high >= low)) return;
+    if (alone) this.#scale(middle, half, left, y);
+    this.#line(set, left, width, y, this.#colours.target, alone ? 2.5 : 2, [4, 3]);
+    this.#line(q, left, width, y, this.#colours.measured, 1.5, []);
+  }
+
+  /** @param {number} middle @param {number} half @param {number} left @param {(value: number) => number} y */
+  #scale(middle, half, left, y) {
+    const { context } = this;
+    context.textAlign = "right";
+    for (const value of [middle - half, middle, middle + half]) context.fillText(signed(value, 3), left - 5, y(value));
+  }
+
+  /**
+   * @param {Float32Array} series @param {number} left @param {number} width @param {(value: number) => number} y
+   * @param {string} colour @param {number} thick @param {number[]} dash
+   */
+  #line(series, left, width, y, colour, thick, dash) {
+    const { context } = this;
+    const newest = this.#times[(this.#count - 1) % CAPACITY];
+    let before = -Infinity;
+    context.beginPath();
+    for (const place of this.#places()) {
+      const t = this.#times[place];
+      const x = width - 1 - ((newest - t) / SPAN) * (width - left - 2);
+      if (t - before > GAP) context.moveTo(x, y(series[place]));
+      else context.lineTo(x, y(series[place]));
+      before = t;
+    }
+    context.strokeStyle = colour;
+    context.lineWidth = thick;
+    context.setLineDash(dash);
+    context.stroke();
+    context.setLineDash([]);
+  }
+
+  /** @param {number} floor @param {number} width */
+  #ruler(floor, width) {
+    const left = this.joint === null ? 26 : 46;
+    this.context.fillStyle = this.#colours.quiet;
+    for (const seconds of [SPAN, SPAN / 2, 0]) {
+      this.context.textAlign = seconds === SPAN ? "left" : seconds ? "center" : "right";
+      const x = width - (seconds / SPAN) * (width - left);
+      this.context.fillText(seconds ? `−${seconds} s` : "now", x, floor + 8);
+    }
+  }
+}

@@ -1,0 +1,33 @@
+"""The process that serves the page: between any number of browsers and one app.
+
+It only ever reads the memory that the hosts write, and asks the app for everything else, over a channel on which
+neither waits for the other. When it is killed, stopped or too busy, the pad's proof of life grows old, as with a cable
+that is pulled.
+
+It takes 3 % of a processor with two small cameras and a page that drives, and keeps the app's priority: a stop from a
+page is as urgent as the app itself.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Sequence
+from typing import Any
+
+from hal.errors import DriverMissing
+from hal.host.process import Channel, SharedMemory
+
+__all__ = ["main"]
+
+
+def main(channel: Channel, memories: Sequence[SharedMemory], config: dict[str, Any]) -> None:
+    """Entry point of the child process; ``memories`` are that of the pictures, and one for each host.
+
+    Raises NotSupported where it cannot listen, DriverMissing without its libraries.
+    """
+    try:
+        from .service import Service
+    except ImportError as error:
+        remedy = "install what it needs with: pip install aiohttp simplejpeg"
+        raise DriverMissing(f"the console does not import ({error}); {remedy}") from error
+    asyncio.run(Service(channel, memories, config).run())

@@ -1,0 +1,107 @@
+"""How the rig is, for the pages: out of the memory that the hosts write, without asking anybody."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+from hal.host.records import GroupMemory, RobotMail
+from hal.inbox import DeadmanRecord
+from hal.stops import trip_text
+from hal.types import Fault, GripperState, RobotState, RobotStatus, Trip
+
+__all__ = ["Telemetry", "plain"]
+
+_MAX_AGE = 0.1
+"""A state older than this is not shown as one, s: as ``robot.state()``."""
+_DIGITS = 5
+
+
+def plain(value: float) -> float | None:
+    """A number for a page: 10 um, 10 urad; None for what is not finite."""
+    return round(value, _DIGITS) if math.isfinite(value) else None
+
+
+class Telemetry:
+    """Reads the mailboxes of every group."""
+
+    def __init__(self, hosts: Sequence[Mapping[str, Any]], memories: Sequence[memoryview]) -> None:
+        """``hosts`` as in the process's configuration, and the memory of each."""
+        self._hosts = hosts
+        joints = [[(str(name), int(n)) for name, n in host["joints"]] for host in hosts]
+        self._groups = [GroupMemory(memory, names) for memory, names in zip(memories, joints, strict=True)]
+
+    def snapshot(self, now: float) -> dict[str, Any]:
+        """All robots and hosts as JSON; ``now`` in s, on the hosts' clock."""
+        robots: dict[str, Any] = {}
+        hosts: dict[str, Any] = {}
+        for host, group in zip(self._hosts, self._groups, strict=True):
+            record = group.get_host()
+            hosts[host["name"]] = {
+                "rate_hz": host["rate_hz"],
+                "ticks": record.ticks,
+                "missed": record.missed,
+                "silent": plain(now - record.t) if record.ticks or record.ready else None,
+            }
+            for name, mail in group.robots.items():
+                robots[name] = _robot(mail, name in host["grippers"], now)
+        return {"robots": robots, "hosts": hosts}
+
+
+def _robot(mail: RobotMail, has_gripper: bool, now: float) -> dict[str, Any]:
+    state = mail.get_state()
+    if state is None:
+        return {"lost": "it has not reported a state yet"}
+    age = now - state.stamp.t
+    if state.status is RobotStatus.LOST:
+        reason = f": {state.fault.cause}" if state.fault is not None else ""
+        return {"lost": f"it does not answer{reason} (its last state is {age:.1f} s old)"}
+    if not age <= _MAX_AGE:
+        return {"lost": f"its newest state is {age:.1f} s old"}
+    gripper = mail.get_gripper() if has_gripper else None
+    return {
+        "t": state.stamp.t,
+        "age": plain(age),
+        "status": str(state.status),
+        "trip": str(state.trip),
+        "trip_text": trip_text(state.trip) if state.trip is not Trip.NONE else "",
+        "limited": str(state.limited),
+        "fault": _fault(state.fault),
+        "q": _list(state.q),
+        "q_set": _list(state.q_set),
+        "dq": _list(state.dq),
+        "tcp": _tcp(state),
+        "gripper": _gripper(gripper),
+        "deadman": _deadman(mail.get_deadman(), now),
+    }
+
+
+def _tcp(state: RobotState) -> list[float | None]:
+    return _list(state.tcp.position) + _list(state.tcp.orientation)
+
+
+def _fault(fault: Fault | None) -> dict[str, str] | None:
+    return None if fault is None else {"code": fault.code, "cause": fault.cause, "remedy": fault.remedy}
+
+
+def _gripper(state: GripperState | None) -> dict[str, Any] | None:
+    if state is None:
+        return None
+    return {
+        "width": plain(state.width),
+        "width_target": plain(state.width_target),
+        "moving": state.moving,
+        "grasped": state.grasped,
+    }
+
+
+def _deadman(record: DeadmanRecord | None, now: float) -> dict[str, Any] | None:
+    if record is None:
+        return None
+    return {"held": record.held, "connected": record.connected, "age": plain(now - record.t_alive)}
+
+
+def _list(values: Any) -> list[float | None]:
+    numbers: Iterable[float] = values.tolist()
+    return [plain(value) for value in numbers]

@@ -1,0 +1,39 @@
+"""One rig and one browser for a whole module: both take seconds to start."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import pytest
+
+from .kit import Bench, Browser, need_browser, wait_for
+
+
+@pytest.fixture(scope="module")
+def bench() -> Iterator[Bench]:
+    """A rig without cameras that its console drives."""
+    need_browser()
+    bench = Bench()
+    yield bench
+    bench.close()
+
+
+@pytest.fixture(scope="module")
+def browser(bench: Bench) -> Iterator[Browser]:
+    """A browser that may do as it likes."""
+    browser = Browser()
+    yield browser
+    browser.close()
+
+
+@pytest.fixture
+def page(bench: Bench, browser: Browser) -> Iterator[Browser]:
+    """The console, opened anew; it drives, and nothing is held."""
+    browser.open(bench.link)
+    browser.wait_driving()
+    wait_for(lambda: bench.session.pad.state().connected and not bench.session.pad.waiting_for, "the pad to be at rest")
+    yield browser
+    complaints = browser.complaints()
+    browser.chrome.get("about:blank")
+    wait_for(bench.rests, "the arm to rest")
+    assert complaints == []

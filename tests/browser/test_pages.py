@@ -1,0 +1,139 @@
+"""Several pages, strangers, cameras, and how the page looks on a desk and on a phone."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import pytest
+
+from .kit import Bench, Browser, need_browser, wait_for
+
+
+@pytest.fixture
+def second(bench: Bench, page: Browser) -> Iterator[Browser]:
+    """Another person's browser, which came later."""
+    other = Browser()
+    other.open(bench.link)
+    wait_for(lambda: other.facts.get("connected") and other.facts.get("lastState"), "the second page")
+    yield other
+    other.close()
+
+
+@pytest.mark.slow
+def test_one_page_drives_and_another_watches_stops_and_takes_over(bench: Bench, page: Browser, second: Browser) -> None:
+    assert second.facts["driving"] is False, "who comes later watches"
+    second.hold()
+    with second.drag("dpad", 0.0, 1.0):
+        page.hold()
+        wait_for(lambda: bench.session.deadman.held, "the driver's dead-man")
+        with page.drag("dpad", -1.0, 0.0):
+            wait_for(lambda: bench.tcp_speed[1] > 0.1, "the driver's motion")
+            assert abs(bench.tcp_speed[0]) < 0.02, "a watcher moves nothing"
+            second.click("#stop")
+            wait_for(lambda: bench.trip == "stop" and bench.rests(), "a watcher's stop")
+        page.let_go()
+    second.let_go()
+    wait_for(lambda: not bench.session.deadman.held, "the release")
+    page.hold()
+    with page.drag("dpad", 1.0, 0.0):
+        wait_for(lambda: bench.tcp_speed[1] < -0.1, "motion again")
+        second.click("#lease")
+        wait_for(lambda: second.facts["driving"] and not page.facts["driving"], "the lease to change hands")
+        wait_for(lambda: bench.trip == "deadman_lost" and bench.rests(), "the arm to stop")
+    page.let_go()
+    wait_for(lambda: bench.session.pad.state().connected and not bench.session.pad.waiting_for, "the new driver's pad")
+    second.hold()
+    with second.drag("dpad", -1.0, 0.0):
+        wait_for(lambda: bench.tcp_speed[1] > 0.1, "the new driver to drive")
+    second.let_go()
+
+
+def test_a_link_with_another_token_shows_nothing(bench: Bench, page: Browser) -> None:
+    address = bench.link.partition("#")[0]
+    page.open(f"{address}#not-the-token")
+    wait_for(lambda: "link" in page.text("body").lower() and not page.facts.get("connected"), "the page to refuse")
+    assert not page.facts.get("lastState")
+    page.complaints()  # the browser may log the closed socket
+
+
+@pytest.mark.slow
+def test_the_cameras_show_what_happens() -> None:
+    need_browser()
+    bench, browser = Bench(cameras=True), Browser()
+    picture = """const c = document.querySelector('[data-camera="scene"]');
+        const data = c.getContext('2d').getImageData(0, 0, c.width, c.height).data;
+        let sum = 0; for (let k = 0; k < data.length; k += 1) sum = (sum * 31 + data[k]) >>> 0;
+        const values = new Set(); for (let k = 0; k < data.length; k += 4) values.add(data[k]);
+        return [sum, values.size]"""
+    try:
+        browser.open(bench.link)
+        browser.wait_driving()
+        wait_for(lambda: browser.run(picture)[1] > 50, "a picture with something in it")
+        still = browser.run(picture)[0]
+        browser.hold()
+        with browser.drag("dpad", -1.0, 0.0):
+            wait_for(lambda: bench.tcp_speed[1] > 0.1, "motion")
+            wait_for(lambda: browser.run(picture)[0] != still, "another picture")
+        browser.let_go()
+        wait_for(lambda: browser.facts["lastState"]["cameras"]["scene"]["fps"] > 5, "a rate")
+        assert browser.facts["lastState"]["cameras"]["scene"]["age"] < 1.0
+        assert browser.complaints() == []
+    finally:
+        browser.close()
+        bench.close()
+
+
+SIZES = [(1280, 800, False), (1920, 1080, False), (844, 390, True), (667, 375, True), (1024, 768, True)]
+NEEDED = ["#stop", "#hold", '[data-disc="dpad"]', '[data-disc="right"]', "#deadman"]
+
+
+@pytest.mark.parametrize(("width", "height", "touch"), SIZES)
+def test_what_one_needs_is_in_view_and_apart(page: Browser, width: int, height: int, touch: bool) -> None:
+    page.size(width, height, touch)
+    try:
+        places = {name: page.place(name) for name in NEEDED}
+        for name, at in places.items():
+            assert at["width"] >= 24, name
+            assert at["height"] >= 16, name
+            assert at["left"] >= -0.5, name
+            assert at["top"] >= -0.5, name
+            assert at["right"] <= width + 0.5, f"{name} is cut off on the right"
+            assert at["bottom"] <= height + 0.5, f"{name} is below the fold"
+        for one in ("#stop", "#hold"):
+            for other, at in places.items():
+                apart = (
+                    places[one]["right"] <= at["left"] + 0.5
+                    or at["right"] <= places[one]["left"] + 0.5
+                    or places[one]["bottom"] <= at["top"] + 0.5
+                    or at["bottom"] <= places[one]["top"] + 0.5
+                )
+                assert one == other or apart, f"{one} and {other} overlap"
+        assert page.run("return document.documentElement.scrollWidth") <= width
+        assert places["#stop"]["width"] * places["#stop"]["height"] > 44 * 36, "large enough for a thumb"
+        top = page.run(
+            "const r = arguments[0]; return document.elementFromPoint(r.x, r.y).closest('#stop') !== null",
+            places["#stop"],
+        )
+        assert top, "something covers the stop button"
+    finally:
+        page.size(1280, 800)
+
+
+def test_two_thumbs(bench: Bench, page: Browser) -> None:
+    """One on the dead-man, the other one on a disc; lifting the first stops the arm."""
+    page.size(844, 390, touch=True)
+    try:
+        hold, disc = page.place("#hold"), page.place('[data-disc="dpad"]')
+        left = {"x": hold["x"], "y": hold["y"], "id": 1}
+        right = {"x": disc["x"], "y": disc["y"], "id": 2}
+        page.cdp("Input.dispatchTouchEvent", type="touchStart", touchPoints=[left])
+        wait_for(lambda: bench.session.deadman.held, "the thumb to hold")
+        page.cdp("Input.dispatchTouchEvent", type="touchStart", touchPoints=[left, right])
+        right["x"] -= 0.5 * disc["width"]
+        page.cdp("Input.dispatchTouchEvent", type="touchMove", touchPoints=[left, right])
+        wait_for(lambda: bench.tcp_speed[1] > 0.1, "motion")
+        page.cdp("Input.dispatchTouchEvent", type="touchEnd", touchPoints=[left])
+        wait_for(lambda: not bench.session.deadman.held and bench.rests(), "the arm to rest")
+        page.cdp("Input.dispatchTouchEvent", type="touchEnd", touchPoints=[])
+    finally:
+        page.size(1280, 800)

@@ -1,0 +1,240 @@
+"""Whatever happens to the browser while the arm moves: it stops, it is latched, and only a new press goes on."""
+
+from __future__ import annotations
+
+import asyncio
+import socket
+import threading
+import time
+from collections.abc import Iterator
+from urllib.parse import urlsplit
+
+import pytest
+
+from .kit import Bench, Browser, wait_for
+
+
+@pytest.fixture
+def moving(bench: Bench, page: Browser) -> Iterator[Browser]:
+    """The arm goes to the left, by real keys that stay down."""
+    move(bench, page)
+    yield page
+    page.key("ArrowLeft", "ArrowLeft", False)
+    page.let_go()
+    bring_home(bench)
+
+
+def move(bench: Bench, page: Browser) -> None:
+    page.hold()
+    page.key("ArrowLeft", "ArrowLeft", True)
+    wait_for(lambda: bench.tcp_speed[1] > 0.15, "full speed")
+
+
+def bring_home(bench: Bench) -> None:
+    """Far from where the test left it, so that no limit is near in the next one."""
+    bench.rig.world.reset("panda")
+
+
+def stopped(bench: Bench) -> bool:
+    return bench.trip != "none" and bench.rests()
+
+
+def goes_on_after_release_and_press(bench: Bench, page: Browser) -> None:
+    """Still latched, also while the key is down; then it goes on."""
+    assert bench.trip != "none"
+    page.key("ArrowLeft", "ArrowLeft", False)
+    page.let_go()
+    wait_for(lambda: bench.session.pad.state().connected, "the pad to be back")
+    wait_for(lambda: not bench.session.deadman.held and not bench.session.pad.waiting_for, "everything to be released")
+    move(bench, page)
+    assert bench.trip == "none"
+
+
+def braking_after(bench: Bench, event: float) -> float:
+    """Seconds from the event until the servo began to brake."""
+    wait_for(lambda: stopped(bench), "the arm to be stopped")
+    return bench.servo.t_stop - event
+
+
+def test_a_frozen_browser(bench: Bench, moving: Browser) -> None:
+    event = moving.freeze()
+    late = braking_after(bench, event)
+    assert bench.trip in ("deadman_silent", "deadman_lost"), "the servo and the console notice at about the same time"
+    assert 0.05 < late < 1.0  # how late exactly is for benchmarks/console.py
+    before = bench.tcp.copy()
+    moving.thaw()
+    wait_for(lambda: moving.facts.get("connected"), "the page to answer")
+    time.sleep(0.5)
+    assert stopped(bench), "what the browser still had to say moves nothing"
+    assert abs(bench.tcp - before).max() < 1e-3
+    goes_on_after_release_and_press(bench, moving)
+
+
+def test_a_reloaded_page(bench: Bench, moving: Browser) -> None:
+    moving.chrome.refresh()
+    braking_after(bench, time.monotonic())
+    assert bench.trip == "deadman_lost"
+    moving.wait_driving()
+    goes_on_after_release_and_press(bench, moving)
+
+
+def test_a_hidden_tab(bench: Bench, moving: Browser) -> None:
+    console = moving.chrome.current_window_handle
+    moving.chrome.switch_to.new_window("tab")
+    try:
+        braking_after(bench, time.monotonic())
+        assert bench.trip in ("deadman_lost", "deadman_silent")
+    finally:
+        moving.chrome.close()
+        moving.chrome.switch_to.window(console)
+    goes_on_after_release_and_press(bench, moving)
+
+
+def test_a_window_that_lost_the_focus(bench: Bench, moving: Browser) -> None:
+    moving.run("window.dispatchEvent(new Event('blur'))")
+    braking_after(bench, time.monotonic())
+    assert bench.trip == "deadman_lost"
+    moving.run("window.dispatchEvent(new Event('focus'))")
+    goes_on_after_release_and_press(bench, moving)
+
+
+def test_stop_by_the_person_who_drives(bench: Bench, moving: Browser) -> None:
+    moving.key("Escape", "Escape", True)
+    moving.key("Escape", "Escape", False)
+    braking_after(bench, time.monotonic())
+    assert bench.trip == "stop"
+    assert "rig.stop" in moving.text("#trip") or "stop" in moving.text("#trip").lower()
+    goes_on_after_release_and_press(bench, moving)
+
+
+def test_the_stop_button(bench: Bench, moving: Browser) -> None:
+    moving.click("#stop")
+    braking_after(bench, time.monotonic())
+    assert bench.trip == "stop"
+    goes_on_after_release_and_press(bench, moving)
+
+
+def test_a_closed_tab(bench: Bench, moving: Browser) -> None:
+    console = moving.chrome.current_window_handle
+    moving.chrome.switch_to.new_window("window")
+    other = moving.chrome.current_window_handle
+    moving.chrome.switch_to.window(console)
+    if bench.trip != "none":  # the new window took the focus away: that was the other test
+        goes_on_after_release_and_press(bench, moving)
+    moving.chrome.close()
+    moving.chrome.switch_to.window(other)
+    moving.size(1280, 800)
+    braking_after(bench, time.monotonic())
+    assert bench.trip == "deadman_lost"
+    assert bench.session.pad.state().connected is False
+    moving.open(bench.link)
+    moving.wait_driving()
+    goes_on_after_release_and_press(bench, moving)
+
+
+class Cable:
+    """A way to the console that can be cut like a cable: nothing is closed, nothing arrives any more."""
+
+    def __init__(self, port: int) -> None:
+        self._target = port
+        self._cut = threading.Event()
+        self._loop = asyncio.new_event_loop()
+        self._ready = threading.Event()
+        self.port = 0
+        self._thread = threading.Thread(target=self._run)
+        self._thread.start()
+        assert self._ready.wait(5.0)
+
+    def _run(self) -> None:
+        async def serve() -> None:
+            server = await asyncio.start_server(self._forward, "127.0.0.1", 0, family=socket.AF_INET)
+            self.port = server.sockets[0].getsockname()[1]
+            self._ready.set()
+
+        self._loop.run_until_complete(serve())
+        self._loop.run_forever()
+
+    async def _forward(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        there_reader, there_writer = await asyncio.open_connection("127.0.0.1", self._target)
+
+        async def pump(source: asyncio.StreamReader, sink: asyncio.StreamWriter) -> None:
+            while data := await source.read(65536):
+                while self._cut.is_set():  # held back, as by a network that may yet come back
+                    await asyncio.sleep(0.005)
+                sink.write(data)
+                await sink.drain()
+            sink.close()
+
+        await asyncio.gather(pump(reader, there_writer), pump(there_reader, writer), return_exceptions=True)
+
+    def cut(self) -> float:
+        self._cut.set()
+        return time.monotonic()
+
+    def mend(self) -> None:
+        self._cut.clear()
+
+    def close(self) -> None:
+        self._cut.clear()
+        self._loop.call_soon_threadsafe(self._loop.stop)
+        self._thread.join(5.0)
+
+
+@pytest.mark.slow
+def test_a_network_that_is_cut_and_comes_back(bench: Bench, browser: Browser) -> None:
+    """All that the page sent meanwhile arrives at once then, and moves nothing."""
+    parts = urlsplit(bench.link)
+    assert parts.port is not None
+    cable = Cable(parts.port)
+    try:
+        browser.open(f"http://127.0.0.1:{cable.port}/#{parts.fragment}")
+        browser.wait_driving()
+        wait_for(lambda: bench.session.pad.state().connected and not bench.session.pad.waiting_for, "the pad at rest")
+        move(bench, browser)
+        event = cable.cut()
+        late = braking_after(bench, event)
+        how = bench.trip
+        assert how in ("deadman_silent", "deadman_lost"), "the servo and the console notice at about the same time"
+        assert late < 1.0
+        before = bench.tcp.copy()
+        browser.key("ArrowLeft", "ArrowLeft", False)
+        browser.let_go()
+        browser.hold()  # pressed anew while nobody heard it
+        browser.key("ArrowLeft", "ArrowLeft", True)
+        time.sleep(0.5)
+        cable.mend()
+        time.sleep(0.5)
+        assert bench.trip == how, "a press of which nothing was heard does not count"
+        assert abs(bench.tcp - before).max() < 1e-3
+        browser.wait_driving()
+        goes_on_after_release_and_press(bench, browser)
+        browser.key("ArrowLeft", "ArrowLeft", False)
+        browser.let_go()
+        bring_home(bench)
+        browser.chrome.get("about:blank")
+    finally:
+        cable.close()
+
+
+def test_a_fault_is_told_and_recovered_from(bench: Bench, moving: Browser) -> None:
+    bench.arm.inject(fault="joint 3 is too warm")
+    wait_for(lambda: "joint 3 is too warm" in moving.text("#fault"), "the page to tell the fault")
+    assert "recover" in moving.text("#fault").lower()
+    moving.key("ArrowLeft", "ArrowLeft", False)
+    moving.let_go()
+    moving.click("#recover")
+    wait_for(lambda: bench.arm.state().fault is None, "the fault to be cleared")
+    move(bench, moving)
+    assert not moving.text("#fault")
+
+
+def test_the_app_that_ends_is_told(page: Browser) -> None:
+    """Of another rig than the other tests'."""
+    other = Bench()
+    try:
+        page.open(other.link)
+        page.wait_driving()
+    finally:
+        other.close()
+    wait_for(lambda: not page.facts.get("connected"), "the page to notice")
+    wait_for(lambda: "ended" in page.text("body").lower(), "the page to say so")

@@ -1,0 +1,308 @@
+"""The 3D viewer of a rig in real time: who gets in, what is shown, what a drag comes to, and when it ends."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import subprocess
+import sys
+import time
+import warnings
+from collections.abc import Iterator
+from pathlib import Path
+from urllib.parse import urlsplit
+
+import numpy as np
+import pytest
+
+pytest.importorskip("viser", reason="needs viser (pip install 'robot-hal[viewer]')")
+pytest.importorskip("pybullet", reason="needs pybullet (pip install pybullet)")
+
+import viser
+from viser_kit import PlainPage, get, until
+from websockets.exceptions import InvalidStatus
+from websockets.sync.client import connect
+
+import hal
+from hal import BodySpec, CartesianTarget, JointVelocity, MotionStopped, NotSupported, Pose, registry
+from hal.drivers.viser.urdf import read_tree
+from hal.drivers.viser.viewer import ViserViewer
+
+pytestmark = pytest.mark.slow
+
+HANDLE = "/arms/panda/handle"
+
+
+def open_rig() -> hal.Rig:
+    return hal.open("panda_table", sim=True, clock="real_time", pad="none", overrides=["cameras={}"])
+
+
+@pytest.fixture(scope="module")
+def rig() -> Iterator[hal.Rig]:
+    with open_rig() as opened:
+        yield opened
+
+
+@pytest.fixture(scope="module")
+def viewer(rig: hal.Rig) -> Iterator[ViserViewer]:
+    made = registry.load("viser", "viewer3d")(rig)
+    try:
+        made.wait_ready()
+        yield made
+    finally:
+        made.close()
+        made.close()
+
+
+@pytest.fixture
+def page(viewer: ViserViewer) -> Iterator[PlainPage]:
+    opened = PlainPage(viewer.link)
+    try:
+        until(lambda: opened.hear() or HANDLE in opened.nodes)
+        yield opened
+    finally:
+        opened.close()
+        until(lambda: viewer.goal("panda") is None)
+
+
+def wxyz(pose: Pose) -> tuple[float, ...]:
+    x, y, z, w = pose.orientation.tolist()
+    return w, x, y, z
+
+
+def beside(pose: Pose, x: float = 0.03) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    """A place ``x`` m farther along the base's x, as a page says it."""
+    return (float(pose.position[0]) + x, *pose.position[1:].tolist()), wxyz(pose)
+
+
+def listening(pid: int) -> list[str]:
+    """Addresses on which a process listens, as the kernel writes them."""
+    inodes = set()
+    for descriptor in Path(f"/proc/{pid}/fd").iterdir():
+        target = os.readlink(descriptor)
+        if target.startswith("socket:"):
+            inodes.add(target[len("socket:[") : -1])
+    found = []
+    for table in ("tcp", "tcp6"):
+        for line in Path(f"/proc/{pid}/net/{table}").read_text().splitlines()[1:]:
+            fields = line.split()
+            if fields[3] == "0A" and fields[9] in inodes:
+                found.append(fields[1].rpartition(":")[0])
+    return found
+
+
+def test_it_listens_on_loopback_only(viewer: ViserViewer) -> None:
+    assert urlsplit(viewer.link).hostname == "127.0.0.1"
+    assert listening(viewer._child.process.pid) == ["0100007F"]
+    assert viewer.notes == ()
+    assert "viser" in viewer.describe()
+
+
+def test_nobody_gets_in_without_the_link(viewer: ViserViewer) -> None:
+    parts = urlsplit(viewer.link)
+    bare = f"http://{parts.netloc}/"
+    assert get(bare)[0] == 403
+    assert get(f"{bare}?token=wrong")[0] == 403
+    assert get(viewer.link, Host="evil.example:8080")[0] == 403
+    status, cookie = get(viewer.link)
+    assert status == 200
+    assert get(bare, Cookie=cookie)[0] == 200  # a page that is loaded again
+    ours = f"http://{parts.netloc}"
+    for origin, crumbs in ((ours, {}), ("http://evil.example", {"Cookie": cookie}), (ours, {"Cookie": "a=b; c"})):
+        with pytest.raises(InvalidStatus, match="403"):
+            connect(
+                f"ws://{parts.netloc}",
+                subprotocols=[f"viser-v{viser.__version__}"],  # type: ignore[list-item]
+                origin=origin,  # type: ignore[arg-type]
+                additional_headers=crumbs,
+            )
+
+
+def test_links_fingers_and_handle_follow_the_arm(rig: hal.Rig, viewer: ViserViewer, page: PlainPage) -> None:
+    arm = rig.robots["panda"]
+    q = np.array(arm.home)
+    q[[0, 3]] += (0.2, -0.15)
+    arm.move_to(q, speed=0.3)
+    arm.gripper.move(0.02)
+    tree = read_tree(arm.spec.urdf)
+
+    def shown() -> bool:
+        page.hear()
+        state = arm.state()
+        values = dict(zip(arm.spec.joints, state.q.tolist(), strict=True))
+        width = arm.gripper.state().width
+        values |= {"panda_finger_joint1": width / 2, "panda_finger_joint2": width / 2}
+        for joint in (joint for joint in tree.joints if joint.moves):
+            (path,) = [name for name in page.nodes if name.endswith(f"/{joint.child}")]
+            node = page.nodes[path]
+            position, (x, y, z, w) = joint.placement(values)
+            if np.abs(np.array(node.get("position", (0, 0, 0))) - position).max() > 1e-3:
+                return False
+            if abs(np.dot(node.get("wxyz", (1, 0, 0, 0)), (w, x, y, z))) < 1 - 1e-5:
+                return False
+        handle = Pose(page.nodes[HANDLE]["position"], [*page.nodes[HANDLE]["wxyz"][1:], page.nodes[HANDLE]["wxyz"][0]])
+        distance, angle = handle.distance(state.tcp)
+        return distance < 1e-3 and angle < 1e-2
+
+    until(shown)
+    assert viewer.goal("panda") is None
+    until(lambda: page.hear() or any("panda" in text and "dead-man" in text for text in page.texts.values()))
+
+
+def test_a_drag_is_a_goal_until_it_is_cleared(rig: hal.Rig, viewer: ViserViewer, page: PlainPage) -> None:
+    tcp = rig.robots["panda"].state().tcp
+    wanted = beside(tcp)
+    page.drag(HANDLE, wanted)
+    goal = until(lambda: viewer.goal("panda"))
+    assert goal.position == pytest.approx(wanted[0])
+    assert goal.distance(tcp)[1] < 1e-3
+    assert rig.robots["panda"].state().tcp.distance(tcp)[0] < 2e-3  # a goal moves nothing
+    nowhere = time.monotonic()
+    page.drag(HANDLE, ((float("nan"), 0.0, 0.5), (1, 0, 0, 0)), ((9.0, 0.0, 0.5), (1, 0, 0, 0)), ((0.4,), (1, 0, 0, 0)))
+    until(lambda: viewer._goals["panda"].t > nowhere + 0.2)  # it was said again since
+    kept = viewer.goal("panda")
+    assert kept is not None
+    assert kept.position == pytest.approx(wanted[0])
+    viewer.clear_goal("panda")
+    assert viewer.goal("panda") is None
+    until(lambda: page.hear() or np.abs(np.subtract(page.nodes[HANDLE]["position"], tcp.position)).max() < 2e-3)
+    assert viewer.goal("panda") is None
+
+    page.drag(HANDLE, wanted)
+    until(lambda: viewer.goal("panda"))
+    page.press("Put the handle back")
+    until(lambda: viewer.goal("panda") is None)
+    with pytest.raises(hal.DeviceNotFound, match="panda"):
+        viewer.goal("pandas")
+
+
+def test_a_page_that_is_closed_takes_its_goal_along(rig: hal.Rig, viewer: ViserViewer) -> None:
+    page = PlainPage(viewer.link)
+    page.drag(HANDLE, beside(rig.robots["panda"].state().tcp), let_go=False)
+    until(lambda: viewer.goal("panda"))
+    page.close()
+    until(lambda: viewer.goal("panda") is None)
+
+
+def test_a_viewer_that_hangs_has_no_goals(rig: hal.Rig, viewer: ViserViewer, page: PlainPage) -> None:
+    page.drag(HANDLE, beside(rig.robots["panda"].state().tcp))
+    until(lambda: viewer.goal("panda"))
+    pid = viewer._child.process.pid
+    os.kill(pid, signal.SIGSTOP)
+    try:
+        until(lambda: viewer.goal("panda") is None)
+        begun = time.monotonic()
+        for _ in range(1000):
+            viewer.clear_goal("panda")
+        assert time.monotonic() - begun < 1.0  # and nobody waits for it
+    finally:
+        os.kill(pid, signal.SIGCONT)
+
+
+def test_an_arm_that_comes_there_ends_the_goal(rig: hal.Rig, viewer: ViserViewer, page: PlainPage) -> None:
+    arm = rig.robots["panda"]
+
+    def comes() -> bool:
+        page.drag(HANDLE, beside(arm.state().tcp, 0.02))
+        goal = until(lambda: viewer.goal("panda"))
+        with arm.control(rate_hz=50) as control:
+            for tick in rig.clock.rate(50):
+                if viewer.goal("panda") is None:
+                    break
+                control.send(CartesianTarget(goal))
+                assert tick.elapsed < 20.0
+        return arm.state().tcp_set.distance(goal)[0] < 3e-3
+
+    for _ in range(5):
+        with contextlib.suppress(MotionStopped), warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            if comes():
+                return
+        # A machine that is too busy trips the arm, which ends the goal as well.
+        until(lambda: viewer.goal("panda") is None)
+    pytest.fail("it never came there")
+
+
+def test_its_stop_stops_and_a_trip_ends_goals(rig: hal.Rig, viewer: ViserViewer, page: PlainPage) -> None:
+    arm = rig.robots["panda"]
+    page.drag(HANDLE, beside(arm.state().tcp, 0.1))
+    until(lambda: viewer.goal("panda"))
+    until(lambda: page.hear() or "Stop" in page.buttons)
+    with pytest.raises(MotionStopped, match="stop"), arm.control(rate_hz=50) as control:
+        for tick in rig.clock.rate(50):
+            control.send(JointVelocity([0.05, 0, 0, 0, 0, 0, 0]))
+            if tick.elapsed > 0.2 and "Stop" in page.buttons:
+                page.press("Stop")
+                del page.buttons["Stop"]
+            assert tick.elapsed < 20.0
+    until(lambda: viewer.goal("panda") is None)
+    rig.rearm()
+
+
+def test_edits_of_the_world_are_drawn(rig: hal.Rig, viewer: ViserViewer, page: PlainPage) -> None:
+    def told(method: str, **params: object) -> None:
+        viewer.edited(method, params, int(rig._hosts[0].request(f"world.{method}", params)))
+
+    cube = "/bodies/cube/0"
+    until(lambda: page.hear() or np.abs(np.subtract(page.nodes[cube]["position"], (0.0, -0.2, 0.7))).max() < 0.1)
+    ball = BodySpec("ball", (0.2, 0.0, 0.9), (0, 0, 0, 1), "sphere", radius=0.03, mass=0.1, rgba=(0, 1, 0, 1))
+    told("add", spec=hal.specs.to_json(ball))
+    told("set_color", name="ball", rgba=[1.0, 0.0, 0.0, 1.0])
+    until(lambda: page.hear() or page.nodes.get("/bodies/ball/0", {}).get("position", (0, 0, 9))[2] < 0.7)  # it fell
+    told("remove", name="ball")
+    rig.world.set_pose("cube", Pose([0.1, 0.1, 0.9]))
+    until(lambda: page.hear() or np.abs(np.subtract(page.nodes[cube]["position"][:2], (0.1, 0.1))).max() < 0.05)
+
+
+def test_it_does_without_the_others_and_the_rig_without_it() -> None:
+    """A second viewer takes the next port; killing it leaves the rig alone."""
+    with open_rig() as rig:
+        first, second = (registry.load("viser", "viewer3d")(rig) for _ in range(2))
+        try:
+            for one in (first, second):
+                one.wait_ready()
+            assert urlsplit(first.link).port != urlsplit(second.link).port
+            first._child.process.kill()
+            until(lambda: first._thread is not None and not first._thread.is_alive())
+            assert first.goal("panda") is None
+            first.clear_goal("panda")
+            assert rig.robots["panda"].state().q is not None
+        finally:
+            first.close()
+            second.close()
+        assert first._child.process.poll() is not None
+        assert second._child.process.poll() == 0
+
+
+APP = """
+import hal, time
+from hal import registry
+rig = hal.open("panda_table", driver="mock", clock="real_time", pad="none", overrides=["cameras={}"])
+viewer = registry.load("viser", "viewer3d")(rig)
+viewer.wait_ready()
+print(viewer._child.process.pid, flush=True)
+time.sleep(60)
+"""
+
+
+def test_it_ends_with_an_app_that_is_killed() -> None:
+    app = subprocess.Popen([sys.executable, "-c", APP], stdout=subprocess.PIPE, text=True)
+    try:
+        assert app.stdout is not None
+        pid = int(app.stdout.readline())
+        assert Path(f"/proc/{pid}").exists()
+        app.kill()
+        app.wait(10)
+        until(lambda: not Path(f"/proc/{pid}").exists() or "Z" in Path(f"/proc/{pid}/stat").read_text().split()[2])
+    finally:
+        app.kill()
+        app.wait(10)
+
+
+def test_lock_step_has_no_3d_view() -> None:
+    with (
+        hal.open("panda_table", driver="mock", clock="lock_step", pad="none") as rig,
+        pytest.raises(NotSupported, match="real time"),
+    ):
+        registry.load("viser", "viewer3d")(rig)

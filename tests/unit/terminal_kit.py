@@ -1,0 +1,209 @@
+"""The other end of a pseudo-terminal: what a terminal's program and the person in front of it do."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import pty
+import re
+import select
+import struct
+import subprocess
+import termios
+import threading
+import time
+from collections.abc import Callable
+from fcntl import ioctl
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+__all__ = ["FarEnd", "InTerminal", "wait_for"]
+
+_QUERY = re.compile(rb"\x1b\[([<>=?]?)([0-9;]*)(\$p|[uhlc])")
+
+
+def wait_for(condition: Callable[[], bool], what: str, timeout: float = 20.0) -> None:
+    """Until it holds; AssertionError when it does not within ``timeout`` s."""
+    deadline = time.monotonic() + timeout
+    while not condition():
+        assert time.monotonic() < deadline, f"{what} did not happen within {timeout:g} s"
+        time.sleep(0.002)
+
+
+class FarEnd:
+    """A terminal. ``kitty`` ones speak the Kitty keyboard protocol; all answer what they are.
+
+    It answers from a thread of its own. ``silent`` makes it answer nothing any more, as a link does that was cut.
+    """
+
+    def __init__(self, *, kitty: bool = False, reports_focus: bool = True, answers: bool = True, delay: float = 0.0):
+        self.master, self.slave = pty.openpty()
+        self.path = os.ttyname(self.slave)
+        self.kitty, self.reports_focus, self.delay = kitty, reports_focus, delay
+        self.silent = not answers
+        self.flags = [0]
+        """The stack of keyboard modes."""
+        self.focus = False
+        """Is the focus reported?"""
+        self.screen = b""
+        """Everything that was written to it."""
+        self._seen = 0
+        self._ending = threading.Event()
+        self._thread = threading.Thread(target=self._run, daemon=True)
+        self._thread.start()
+
+    def type(self, text: str | bytes) -> None:
+        """Press keys."""
+        os.write(self.master, text.encode() if isinstance(text, str) else text)
+
+    def put(self, text: str | bytes) -> None:
+        """Press keys where nobody reads meanwhile: they have reached the near end when this returns."""
+        before = self.unread()
+        self.type(text)
+        wait_for(lambda: self.unread() > before, "typing")
+
+    def unread(self) -> int:
+        """How many bytes wait for a reader."""
+        return int(struct.unpack("i", ioctl(self.slave, termios.FIONREAD, b"\0" * 4))[0])
+
+    @property
+    def settings(self) -> list[Any]:
+        return termios.tcgetattr(self.slave)
+
+    @settings.setter
+    def settings(self, attributes: list[Any]) -> None:
+        termios.tcsetattr(self.slave, termios.TCSANOW, attributes)
+
+    @property
+    def raw(self) -> bool:
+        """Key by key, no echo?"""
+        return not termios.tcgetattr(self.slave)[3] & (termios.ICANON | termios.ECHO)
+
+    def _run(self) -> None:
+        while not self._ending.is_set():
+            if not select.select((self.master,), (), (), 0.05)[0]:
+                continue
+            try:
+                self.screen += os.read(self.master, 65536)
+            except OSError:
+                return
+            self._answer()
+
+    def _answer(self) -> None:
+        for found in _QUERY.finditer(self.screen, self._seen):
+            self._seen = found.end()
+            mark, digits, final = (part.decode() for part in found.groups())
+            numbers = [int(number) for number in digits.split(";") if number] or [0]
+            answer = self._obey(mark, numbers, final)
+            if answer and not self.silent:
+                if self.delay:
+                    time.sleep(self.delay)
+                os.write(self.master, answer.encode())
+
+    def _obey(self, mark: str, numbers: list[int], final: str) -> str:
+        if final == "c" and not mark:
+            return "\x1b[?62;22c"
+        if final == "u" and self.kitty:
+            if mark == ">":
+                self.flags.append(numbers[0])
+            elif mark == "<" and len(self.flags) > 1:
+                self.flags.pop()
+            elif mark == "?":
+                return f"\x1b[?{self.flags[-1]}u"
+        if final in "hl" and mark == "?" and numbers == [1004] and self.reports_focus:
+            self.focus = final == "h"
+        if final == "$p" and mark == "?" and self.kitty:
+            known = numbers == [1004] and self.reports_focus
+            return f"\x1b[?{numbers[0]};{(1 if self.focus else 2) if known else 0}$y"
+        return ""
+
+    def hang_up(self) -> None:
+        """The window is closed."""
+        self._ending.set()
+        self._thread.join(2.0)
+        os.close(self.master)
+        self.master = -1
+
+    def close(self) -> None:
+        self._ending.set()
+        self._thread.join(2.0)
+        for fd in (self.master, self.slave):
+            if fd >= 0:
+                os.close(fd)
+        self.master = self.slave = -1
+
+    def __enter__(self) -> FarEnd:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None):
+        self.close()
+
+
+class InTerminal:
+    """A program that runs in a terminal of its own, as a shell starts it: in the foreground, in control."""
+
+    def __init__(self, far: FarEnd, command: list[str]) -> None:
+        self.far = far
+        self.before = far.settings
+
+        def take_control() -> None:
+            ioctl(far.slave, termios.TIOCSCTTY, 0)
+
+        self.process = subprocess.Popen(
+            command,
+            stdin=far.slave,
+            stdout=far.slave,
+            stderr=far.slave,
+            start_new_session=True,
+            preexec_fn=take_control,
+            env={**os.environ, "TERM": "xterm-256color", "PS1": "$ "},
+        )
+
+    def shows(self, text: str, timeout: float = 30.0) -> None:
+        """Wait until the screen shows it."""
+
+        def condition() -> bool:
+            return text.encode() in self.far.screen
+
+        try:
+            wait_for(condition, f"{text!r} on the screen", timeout)
+        except AssertionError as error:
+            raise AssertionError(f"{error}; it shows {self.far.screen[-2000:]!r}") from None
+
+    def tells(self, pattern: str, timeout: float = 30.0) -> str:
+        """What the pattern's group is, as soon as the screen shows it."""
+        wait_for(
+            lambda: re.search(pattern, self.far.screen.decode()) is not None, f"{pattern!r} on the screen", timeout
+        )
+        found = re.search(pattern, self.far.screen.decode())
+        assert found is not None
+        return found[1]
+
+    def holders(self) -> list[str]:
+        """Command lines of the processes that hold this terminal, except for the test's own."""
+        found = []
+        for process in Path("/proc").iterdir():
+            if process.name.isdigit() and int(process.name) != os.getpid():
+                with contextlib.suppress(OSError):
+                    if any(os.readlink(link) == self.far.path for link in (process / "fd").iterdir()):
+                        found.append((process / "cmdline").read_text().replace("\0", " "))
+        return found
+
+    def is_put_back(self) -> None:
+        """Wait until nobody holds the terminal any more, and it is as it was before."""
+        wait_for(lambda: not self.holders(), "letting go of the terminal")
+        wait_for(lambda: self.far.flags == [0] and not self.far.focus, "taking back what was asked of the terminal")
+        assert self.far.settings == self.before
+        assert self.far.unread() == 0, "nothing is left for the shell to read"
+
+    def close(self) -> None:
+        if self.process.poll() is None:
+            self.process.kill()
+        self.process.wait(10)
+
+    def __enter__(self) -> InTerminal:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None):
+        self.close()

@@ -1,0 +1,179 @@
+"""The page as a gamepad, seen from the app: nothing is missed, nothing is made up, an interruption lets go."""
+
+from __future__ import annotations
+
+import math
+import threading
+
+import pytest
+
+from hal.config.files import Problems
+from hal.config.models import load_pad_models
+from hal.drivers.web.pad import PadMail, WebPad, gone, reading
+from hal.errors import NotSupported
+from hal.gamepad import Gamepad, PadReading
+from hal.specs import PadSpec
+from hal.types import AXES, BUTTONS
+
+L2 = 1 << BUTTONS.index("l2")
+SOUTH = 1 << BUTTONS.index("south")
+
+
+class Page:
+    """The console as a pad sees it, with a page that does what a test says."""
+
+    def __init__(self) -> None:
+        self.mail = PadMail()
+        self.driver: str | None = "page 1"
+        self.playing: list[bool] = []
+
+    def show_playing(self, on: bool) -> None:
+        self.playing.append(on)
+
+    def send(self, t: float, mask: int = 0, **axes: float) -> None:
+        values = [axes.get(name, 1.0 if name == "l2" and mask & L2 else 0.0) for name in AXES]
+        message = {"connected": True, "t": t, "t_alive": t - 0.001, "axes": values, "buttons": mask}
+        self.mail.put(reading(message, 0))
+
+    def leave(self, t: float) -> None:
+        self.mail.put(reading({"connected": False, "t": t, "why": "hidden"}, 0))
+
+
+@pytest.fixture
+def page() -> Page:
+    return Page()
+
+
+@pytest.fixture
+def pad(page: Page) -> WebPad:
+    models = tuple(load_pad_models(Problems()).values())
+    pad = WebPad(PadSpec("pad", "web", None, models), page)
+    pad.open()
+    return pad
+
+
+def test_axes_and_buttons_have_their_names(page: Page, pad: WebPad) -> None:
+    page.send(1.0, SOUTH, left_x=0.5, dpad_y=-1.0)
+    found = pad.poll(1.0, 0.0)
+    assert found.connected
+    assert found.buttons == {"south"}
+    assert {name: value for name, value in found.axes.items() if value} == {"left_x": 0.5, "dpad_y": -1.0}
+    assert (found.t, found.t_alive) == (0.999, 0.999)
+
+
+def test_what_the_page_repeats_proves_life_and_is_no_event(page: Page, pad: WebPad) -> None:
+    page.send(1.0, left_x=0.5)
+    first = pad.poll(1.0, 0.0)
+    page.send(1.02, left_x=0.5)
+    second = pad.poll(1.02, 0.0)
+    assert (second.seq, second.t) == (first.seq, first.t)
+    assert second.t_alive == pytest.approx(1.019)
+    assert pad.poll(1.1, 0.0) == second, "silence proves nothing"
+    silent = pad.poll(1.2, 0.0)
+    assert (silent.connected, silent.axes["left_x"]) == (False, 0.0), "nor does it push a stick for ever"
+
+
+def test_no_page_no_pad(page: Page, pad: WebPad) -> None:
+    assert not pad.poll(1.0, 0.0).connected
+
+
+def test_every_message_is_handed_out_in_order(page: Page, pad: WebPad) -> None:
+    for t, mask in ((1.0, 0), (1.01, SOUTH), (1.02, 0), (1.03, SOUTH)):
+        page.send(t, mask)
+    pressed = [bool(pad.poll(1.04, 0.0).buttons) for _ in range(4)]
+    assert pressed == [False, True, False, True]
+
+
+def test_an_app_that_is_too_late_sees_an_interruption_and_the_newest(page: Page, pad: WebPad) -> None:
+    for k in range(65):
+        page.send(1.0 + 0.02 * k, L2)
+    found = [pad.poll(2.3, 0.0) for _ in range(2)]
+    assert [reading.connected for reading in found] == [False, True]
+    assert found[1].t_alive == pytest.approx(1.0 + 0.02 * 64 - 0.001)
+
+
+def test_a_poll_waits_for_news_and_no_longer(page: Page, pad: WebPad) -> None:
+    answers: list[PadReading] = []
+    poller = threading.Thread(target=lambda: answers.append(pad.poll(1.0, 30.0)))
+    poller.start()
+    page.send(1.0, SOUTH)
+    poller.join(10.0)
+    assert answers[0].buttons == {"south"}
+
+
+def test_a_page_that_left_while_it_held_must_let_go_before_it_holds_again(page: Page, pad: WebPad) -> None:
+    gamepad = Gamepad(pad)
+    gamepad.open(0.0)
+    deadman = gamepad.hold("l2")
+
+    def after(t: float) -> bool:
+        gamepad.poll_once(t)
+        return deadman.held
+
+    page.send(1.0)
+    assert not after(1.0)
+    page.send(1.02, L2)
+    assert after(1.02)
+    page.leave(1.04)
+    page.send(1.05, L2)
+    assert not after(1.04)
+    assert not deadman.connected
+    assert not after(1.05)
+    assert not deadman.connected, "every servo must have the time to see that it was lost"
+    page.send(1.10, L2)
+    assert not after(1.10), "held all through the interruption"
+    page.send(1.12)
+    assert not after(1.12)
+    page.send(1.14, L2)
+    assert after(1.14)
+    assert deadman.record.presses == 2
+
+
+def test_it_may_guard_a_real_arm(pad: WebPad) -> None:
+    Gamepad(pad).hold("l2").check_trust()
+
+
+def test_the_tour_plays_and_gives_way(page: Page, pad: WebPad) -> None:
+    page.send(1.0)
+    assert pad.poll(1.0, 0.0).connected
+    pad.play(True)
+    assert not pad.poll(1.0, 0.0).connected, "what is held on the page does not hold on in the tour"
+    held = [pad.poll(1.0 + 0.05 * k, 0.0).axes["l2"] > 0.5 for k in range(60)]
+    assert any(held)
+    page.send(4.1, SOUTH)
+    assert not pad.poll(4.1, 0.0).connected
+    assert page.playing == [True, False]
+    assert pad.poll(4.2, 0.0).buttons == {"south"}
+    assert not pad.finished
+
+
+def test_the_tour_ends_when_its_page_goes_and_when_it_is_over(page: Page, pad: WebPad) -> None:
+    for end in (lambda: page.leave(1.1), lambda: pad.play(False)):
+        page.send(1.0)
+        pad.poll(1.0, 0.0)
+        pad.play(True)
+        pad.poll(1.0, 0.0)
+        pad.poll(1.05, 0.0)
+        end()
+        assert not pad.poll(1.1, 0.0).connected
+        assert page.playing[-1] is False
+    page.send(2.0)
+    pad.poll(2.0, 0.0)
+    pad.play(True)
+    pad.poll(2.0, 0.0)
+    for t in range(2, 600):
+        pad.poll(float(t), 0.0)
+        if not page.playing[-1]:
+            break
+    assert page.playing[-1] is False, "the recording has an end"
+
+
+def test_a_rig_without_a_console_says_so() -> None:
+    with pytest.raises(NotSupported, match="console"):
+        WebPad(PadSpec("pad", "web", None)).open()
+
+
+def test_a_lost_pad_has_nothing_pressed() -> None:
+    lost = gone(3.0, 7)
+    assert (lost.connected, lost.buttons, set(lost.axes.values())) == (False, frozenset(), {0.0})
+    assert lost.t_alive == -math.inf

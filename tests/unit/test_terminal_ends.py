@@ -1,0 +1,172 @@
+"""However a program ends or is stopped, its terminal is as it was before."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+import sys
+from pathlib import Path
+
+import pytest
+from terminal_kit import FarEnd, InTerminal, wait_for
+
+pytestmark = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="reads /proc")
+
+PROGRAM = """
+import os, signal, sys, time
+from hal.drivers.terminal.pad import TerminalPad
+from hal.gamepad import Gamepad
+from hal.specs import PadSpec
+
+pad = Gamepad(TerminalPad(PadSpec(name="pad", driver="terminal", model=None)))
+try:
+    pad.open(time.monotonic())
+    pad.start_thread(time.monotonic)
+    print("ready", flush=True)
+    {ending}
+    for _ in range(6000):
+        time.sleep(0.01)
+finally:
+    pad.close()
+"""
+
+
+QUESTION = b"\x1b[?u\x1b[c"
+"""What every terminal is asked first."""
+
+
+def program(far: FarEnd, folder: Path, ending: str = "") -> InTerminal:
+    script = folder / "program.py"
+    script.write_text(PROGRAM.format(ending=ending))
+    return InTerminal(far, [sys.executable, str(script)])
+
+
+@pytest.mark.parametrize("kitty", [False, True])
+@pytest.mark.parametrize(
+    "ending",
+    [
+        "pad.close()",
+        "raise RuntimeError('a mistake')",
+        "sys.exit(3)",
+        "os._exit(4)",
+        "os.abort()",
+        "os.kill(os.getpid(), signal.SIGTERM)",
+        "os.kill(os.getpid(), signal.SIGKILL)",
+    ],
+)
+def test_a_program_that_ends(tmp_path: Path, kitty: bool, ending: str) -> None:
+    with FarEnd(kitty=kitty) as far, program(far, tmp_path, f"{ending}; sys.exit()") as it:
+        it.shows("ready")
+        it.process.wait(20)
+        it.is_put_back()
+
+
+@pytest.mark.parametrize("kitty", [False, True])
+def test_ctrl_c(tmp_path: Path, kitty: bool) -> None:
+    with FarEnd(kitty=kitty) as far, program(far, tmp_path) as it:
+        it.shows("ready")
+        far.type("\x1b[99;5u" if kitty else "\x03")
+        it.process.wait(20)
+        it.shows("KeyboardInterrupt")
+        it.is_put_back()
+
+
+def test_ctrl_c_counts_also_while_the_terminal_is_being_asked_what_it_can(tmp_path: Path) -> None:
+    with FarEnd(kitty=True, delay=0.2) as far, program(far, tmp_path) as it:
+        wait_for(lambda: far.flags[-1] == 15, "reporting keys")
+        far.type("\x1b[99;5u")
+        it.process.wait(20)
+        assert b"ready" not in far.screen
+        it.is_put_back()
+
+
+@pytest.mark.parametrize("kitty", [False, True])
+def test_a_program_that_is_killed_while_it_stands_still(tmp_path: Path, kitty: bool) -> None:
+    with FarEnd(kitty=kitty) as far, program(far, tmp_path) as it:
+        it.shows("ready")
+        it.process.send_signal(signal.SIGSTOP)
+        it.process.kill()
+        it.process.wait(20)
+        it.is_put_back()
+
+
+def test_settings_that_a_shell_has_changed_since_are_left_alone(tmp_path: Path) -> None:
+    with FarEnd() as far, program(far, tmp_path) as it:
+        it.shows("ready")
+        it.process.send_signal(signal.SIGSTOP)
+        wait_for(lambda: far.raw, "being raw")
+        attributes = far.settings
+        attributes[0] |= 1  # IGNBRK: any change will do
+        far.settings = attributes
+        it.process.kill()
+        it.process.wait(20)
+        wait_for(lambda: not it.holders(), "letting go of the terminal")
+        assert far.settings == attributes
+
+
+def test_a_closed_window_leaves_nobody_behind(tmp_path: Path) -> None:
+    with FarEnd(kitty=True) as far, program(far, tmp_path) as it:
+        it.shows("ready")
+        far.hang_up()
+        it.process.wait(20)
+        wait_for(lambda: not it.holders(), "letting go of the terminal")
+
+
+@pytest.mark.parametrize("kitty", [False, True])
+@pytest.mark.parametrize("shell", ["bash --norc -i", "dash -i"])
+def test_ctrl_z_and_fg(tmp_path: Path, kitty: bool, shell: str) -> None:
+    name = shell.split()[0]
+    if shutil.which(name) is None:
+        pytest.skip(f"needs {name}: sudo apt install {name}")
+    script = tmp_path / "program.py"
+    script.write_text(PROGRAM.format(ending="print('pid', os.getpid(), flush=True)"))
+    with FarEnd(kitty=kitty) as far, InTerminal(far, shell.split()) as it:
+        it.shows("$ ")
+        far.type("stty -g | sed s/^/settings=/\n")
+        settings = it.tells(r"settings=([0-9a-f:]{20,})\r")
+        far.type(f"{sys.executable} {script}\n")
+        pid = int(it.tells(r"pid (\d+)\D"))
+        for turn in (1, 2, 3):
+            wait_for(lambda turn=turn: far.screen.count(QUESTION) == turn, "taking the terminal over")
+            wait_for(lambda: far.flags[-1] == (15 if kitty else 0), "reporting keys")
+            assert far.raw
+            if turn == 3:
+                break
+            far.type("\x1b[122;5u" if kitty else "\x1a")
+            wait_for(lambda: state(pid) == "T", "standing still")
+            assert far.flags == [0]
+            assert not far.focus
+            far.type(f"stty -g | sed s/^/now{turn}=/\n")
+            it.shows(f"now{turn}={settings}")
+            far.type("fg\n")
+        far.type("\x1b[99;5u" if kitty else "\x03")
+        it.shows("KeyboardInterrupt")
+        wait_for(lambda: far.flags == [0], "giving the terminal back")
+        far.type("echo $((20 + 3))\n")
+        it.shows("23")
+
+
+def state(pid: int) -> str:
+    """R, S, T and so on."""
+    return Path(f"/proc/{pid}/stat").read_text().rpartition(") ")[2][0]
+
+
+def test_in_the_background_it_neither_reads_nor_stops_nor_touches_the_terminal(tmp_path: Path) -> None:
+    if shutil.which("bash") is None:
+        pytest.skip("needs bash: sudo apt install bash")
+    script = tmp_path / "program.py"
+    script.write_text(PROGRAM.format(ending="print('pid', os.getpid(), pad.describe(), flush=True)"))
+    with FarEnd(kitty=True) as far, InTerminal(far, ["bash", "--norc", "-i"]) as it:
+        it.shows("$ ")
+        far.type(f"{sys.executable} {script} &\n")
+        it.shows("once the program is in the foreground")
+        assert far.flags == [0]
+        far.type("echo $((20 + 3))\n")
+        it.shows("23")
+        far.type("fg\n")
+        wait_for(lambda: far.flags[-1] == 15, "taking the terminal over")
+        os.kill(int(it.tells(r"pid (\d+)\D")), signal.SIGKILL)
+        wait_for(lambda: far.flags == [0], "giving the terminal back")
+        far.type("\x15echo $((20 + 4))\n")  # an answer that was on its way may have reached the shell: Ctrl-U
+        it.shows("24")

@@ -1,0 +1,68 @@
+"""Bytes from a terminal, made into keys and answers: whatever comes, in whatever pieces."""
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from hal.drivers.terminal.keys import ALT, CTRL, PRESS, RELEASE, REPEAT, SHIFT, Answer, Key, KeyParser
+
+
+def parsed(*pieces: bytes) -> list[Key | Answer]:
+    parser = KeyParser()
+    return [event for k, piece in enumerate(pieces) for event in parser.feed(piece, 0.001 * k)]
+
+
+@pytest.mark.parametrize(
+    ("data", "events"),
+    [
+        # A plain terminal.
+        (b"w", [Key("w")]),
+        (b"W", [Key("w", PRESS, SHIFT)]),
+        (b" \t\r\n", [Key("space"), Key("tab"), Key("enter"), Key("enter")]),
+        (b"\x00", [Key("space")]),
+        (b"\x1b[A\x1bOB\x1b[1;2C", [Key("up"), Key("down"), Key("right", PRESS, SHIFT)]),
+        (b"\x1b[5~\x1b[6~\x1b[1~\x1b[H", [Key("pageup"), Key("pagedown"), Key("home"), Key("home")]),
+        (b"\x1b[1;5D\x1b[1;3D", [Key("left", PRESS, CTRL), Key("left", PRESS, ALT)]),
+        # The Kitty protocol.
+        (b"\x1b[119u\x1b[119;1:2u\x1b[119;1:3u", [Key("w"), Key("w", REPEAT), Key("w", RELEASE)]),
+        (b"\x1b[32;1:1u\x1b[27u", [Key("space"), Key("escape")]),
+        (b"\x1b[1;1:3A\x1b[5;1:3~", [Key("up", RELEASE), Key("pageup", RELEASE)]),
+        (b"\x1b[57419;129u", [Key("up")]),  # of the keypad, with Num Lock
+        (b"\x1b[99;5u\x1b[99;69u", [Key("c", PRESS, CTRL), Key("c", PRESS, CTRL)]),  # the second with Caps Lock
+        (b"\x1b[1089::99;5u", [Key("c", PRESS, CTRL)]),  # on a Cyrillic keyboard
+        (b"\x1b[119:87;2u", [Key("w", PRESS, SHIFT)]),
+        (b"\x1b[57441;2u\x1b[57441;1:3u", [Key("shift", PRESS, SHIFT), Key("shift", RELEASE)]),
+        (b"\x1b[119;9u", [Key("w", PRESS, ALT)]),  # super
+        # Answers.
+        (b"\x1b[?15u\x1b[?62;22c", [Answer("?u", (15,)), Answer("?c", (62, 22))]),
+        (b"\x1b[?1004;1$y\x1b[I\x1b[O", [Answer("?$y", (1004, 1)), Answer("I"), Answer("O")]),
+        # What means nothing.
+        (b"\x1b[12;40R\x1b[99~\x1b[>1;2c\x1b[<0;3;5M\x1b[3;1:9u\x7f\x01\xc3\xa4", []),
+        (b"\x1b[" + b"1" * 1000 + b"uw", [Key("1")] * 953 + [Key("u"), Key("w")]),
+        # Esc: alone in front of another key it is a stop, and so is Alt with a key, which looks the same.
+        (b"\x1bw", [Key("escape")]),
+        (b"\x1b\x1b\x1b[A", [Key("escape"), Key("escape"), Key("up")]),
+    ],
+)
+def test_what_is_typed(data: bytes, events: list[Key | Answer]) -> None:
+    assert parsed(data) == events
+    assert parsed(*(bytes([byte]) for byte in data)) == events, "byte by byte"
+
+
+@pytest.mark.parametrize("begun", [b"\x1b", b"\x1b[", b"\x1b[1;"])
+def test_what_is_not_finished_in_time_is_esc(begun: bytes) -> None:
+    parser = KeyParser()
+    assert parser.feed(begun, 5.0) == []
+    assert parser.feed(b"", 5.05) == [], "the rest may still come"
+    assert parser.feed(b"", 5.2) == [Key("escape")]
+    assert parser.feed(b"w", 5.3) == [Key("w")]
+
+
+@given(st.lists(st.binary(max_size=40) | st.sampled_from([b"\x1b", b"\x1b[", b"\x1b[?", b"\x1bO", b"u"]), max_size=30))
+def test_nothing_makes_it_fail_or_grow(pieces: list[bytes]) -> None:
+    parser = KeyParser()
+    for piece in pieces:
+        parser.feed(piece, 0.0)
+        assert len(parser._pending) < 64
+    parser.feed(b"", 1.0)
+    assert parser.feed(b"w", 1.0)[-1:] == [Key("w")]

@@ -1,0 +1,105 @@
+"""What the 3D viewer sends to a browser: GLB files, and the lines of a workspace."""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import trimesh
+from specs import data, panda
+
+from hal.drivers.viser.meshes import glb
+from hal.drivers.viser.urdf import Visual, read_tree
+from hal.pose import Pose
+from hal.specs import WorkspaceSpec
+
+
+def loaded(visual: Visual) -> Any:
+    """What a browser would find."""
+    return trimesh.load(io.BytesIO(glb(visual)), file_type="glb", process=False)
+
+
+def colors(scene: Any) -> np.ndarray:
+    return np.concatenate([np.asarray(part.visual.vertex_colors)[:, :3] for part in scene.geometry.values()])
+
+
+@pytest.mark.parametrize(
+    ("shape", "size", "extents"),
+    [
+        ("box", (0.1, 0.2, 0.3), (0.1, 0.2, 0.3)),
+        ("sphere", (0.1,), (0.2, 0.2, 0.2)),
+        ("cylinder", (0.1, 0.4), (0.2, 0.2, 0.4)),
+        ("capsule", (0.1, 0.4), (0.2, 0.2, 0.6)),
+    ],
+)
+def test_primitives_have_their_size_and_colour(shape: str, size: tuple[float, ...], extents: tuple[float, ...]) -> None:
+    scene = loaded(Visual(Pose(), shape, size, (1.0, 0.0, 0.0, 1.0)))
+    assert scene.extents == pytest.approx(extents, abs=2e-3)
+    assert scene.bounds.mean(axis=0) == pytest.approx((0, 0, 0), abs=1e-3)
+    assert (colors(scene) == (255, 0, 0)).all()
+
+
+def test_an_arms_meshes_keep_their_place_and_their_colours() -> None:
+    tree = read_tree(panda().urdf)
+    (link,) = tree.visuals["panda_link1"]
+    scene = loaded(link)
+    assert scene.bounds == pytest.approx(trimesh.load(link.file, process=False).bounds, abs=1e-5)
+    (finger,) = tree.visuals["panda_leftfinger"]
+    shades = colors(loaded(finger)).astype(int)
+    assert (np.ptp(shades, axis=1) < 20).all()  # greys
+    assert shades.min() < 70  # the dark pad, in linear numbers
+    assert shades.max() > 180  # the white rest
+
+
+def test_few_large_triangles_keep_their_picture() -> None:
+    tree = read_tree(data("table/table.urdf"))
+    scene = loaded(tree.visuals[tree.root][0])
+    pictures = [part.visual.material.baseColorTexture for part in scene.geometry.values()]
+    assert len(pictures) == 1
+    assert max(pictures[0].size) <= 512
+
+
+def test_a_mirrored_mesh_is_not_inside_out(tmp_path: Path) -> None:
+    file = tmp_path / "ball.stl"
+    trimesh.creation.icosphere(2, 0.1).export(file)
+    for scale in ((1.0, 1.0, 1.0), (1.0, -2.0, 1.0)):
+        (part,) = loaded(Visual(Pose(), "mesh", scale, None, str(file))).geometry.values()
+        assert part.volume > 0
+        outwards = np.einsum("ni,ni->n", part.vertex_normals, part.vertices)
+        assert (outwards > 0).all()
+
+
+def test_a_heavy_mesh_gets_lighter_and_keeps_its_shape(tmp_path: Path) -> None:
+    file = tmp_path / "ball.ply"
+    trimesh.creation.icosphere(7, 0.1).export(file)  # 327 680 triangles
+    (part,) = loaded(Visual(Pose(), "mesh", (1.0, 1.0, 1.0), (0.0, 1.0, 0.0, 1.0), str(file))).geometry.values()
+    assert 10_000 < len(part.faces) < 200_000
+    radius = np.linalg.norm(part.vertices, axis=1)
+    assert radius == pytest.approx(np.full(len(radius), 0.1), abs=1e-3)
+    assert (part.visual.vertex_colors[:, :3] == (0, 255, 0)).all()
+
+
+@pytest.mark.parametrize("content", [None, "solid nothing\nendsolid nothing\n", "\0\1\2"])
+def test_what_cannot_be_drawn_is_said(tmp_path: Path, content: str | None) -> None:
+    file = tmp_path / "odd.stl"
+    if content is not None:
+        file.write_text(content)
+    with pytest.raises(ValueError, match=r"odd\.stl"):
+        glb(Visual(Pose(), "mesh", (1.0, 1.0, 1.0), None, str(file)))
+
+
+def test_a_workspace_is_drawn_where_it_ends() -> None:
+    pytest.importorskip("viser", reason="needs viser (pip install 'robot-hal[viewer]')")
+    from hal.drivers.viser.arm import workspace_lines
+
+    box = workspace_lines(WorkspaceSpec((0.1, -0.2, 0.0), (0.6, 0.2, 0.5)))
+    assert box.shape == (24, 2, 3)  # each edge belongs to two sides
+    assert box.reshape(-1, 3).min(axis=0) == pytest.approx((0.1, -0.2, 0.0))
+    assert box.reshape(-1, 3).max(axis=0) == pytest.approx((0.6, 0.2, 0.5))
+    table = workspace_lines(WorkspaceSpec((-10.0, -10.0, 0.01), (10.0, 10.0, 10.0)))
+    assert table.shape == (4, 2, 3)
+    assert (table[..., 2] == np.float32(0.01)).all()
+    assert len(workspace_lines(WorkspaceSpec((-10.0,) * 3, (10.0,) * 3))) == 0

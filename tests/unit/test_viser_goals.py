@@ -1,0 +1,137 @@
+"""Goals of the 3D viewer: whose drag counts, and when a goal ends."""
+
+from __future__ import annotations
+
+from math import inf, nan
+
+import numpy as np
+import pytest
+
+from hal.drivers.viser.goals import FARTHEST, UNUSED, Drag, checked_pose
+from hal.pose import Pose
+
+LEVEL = (0.0, 0.0, 0.0, 1.0)
+HERE, THERE = (0.3, 0.0, 0.5), (0.4, 0.0, 0.5)
+AT = [Pose(HERE), Pose(HERE)]
+
+
+def dragged(let_go: bool = True) -> Drag:
+    drag = Drag()
+    drag.grab(1)
+    assert drag.move(1, THERE, LEVEL, 10.0)
+    if let_go:
+        drag.release(1)
+    return drag
+
+
+@pytest.mark.parametrize(
+    ("position", "orientation"),
+    [
+        ((nan, 0.0, 0.5), LEVEL),
+        ((0.0, inf, 0.5), LEVEL),
+        ((0.0, 0.0, FARTHEST + 0.01), LEVEL),
+        ((0.0, 0.5), LEVEL),
+        (HERE, (0.0, 0.0, 0.0, 0.0)),
+        (HERE, (0.0, nan, 0.0, 1.0)),
+        (HERE, (0.0, 0.0, 1.0)),
+        (HERE, (0.0, 0.0, 0.0, 30.0)),
+    ],
+)
+def test_numbers_that_make_no_sense_are_no_goal(position: tuple[float, ...], orientation: tuple[float, ...]) -> None:
+    assert checked_pose(position, orientation) is None
+    drag = Drag()
+    drag.grab(1)
+    assert not drag.move(1, position, orientation, 0.0)
+    assert drag.goal is None
+
+
+def test_a_goal_is_a_unit_quaternion_and_has_a_number_of_its_own() -> None:
+    drag = dragged(let_go=False)
+    first = drag.goal
+    assert drag.move(1, THERE, (0.0, 0.0, 0.9, 0.9), 11.0)
+    second = drag.goal
+    assert first is not None
+    assert second is not None
+    assert second.seq > first.seq
+    assert np.linalg.norm(second.orientation) == pytest.approx(1.0)
+    drag.clear()
+    drag.grab(1)
+    drag.move(1, THERE, LEVEL, 12.0)
+    assert drag.goal is not None
+    assert drag.goal.seq > second.seq
+
+
+def test_nobody_drags_what_another_page_holds() -> None:
+    drag = Drag()
+    assert not drag.move(2, THERE, LEVEL, 0.0)  # never grabbed
+    drag.grab(1)
+    assert not drag.free
+    drag.grab(2)
+    assert not drag.move(2, THERE, LEVEL, 0.0)
+    drag.release(2)
+    drag.leave(2)
+    assert drag.move(1, THERE, LEVEL, 0.0)
+    drag.release(1)
+    drag.grab(2)  # it was let go of
+    assert drag.move(2, HERE, LEVEL, 0.0)
+
+
+def test_grabbing_alone_is_no_goal() -> None:
+    drag = Drag()
+    drag.grab(1)
+    assert drag.goal is None
+    assert not drag.free
+    drag.release(1)
+    assert drag.free
+
+
+def test_a_goal_is_reached_when_it_is_let_go_of() -> None:
+    drag = dragged(let_go=False)
+    near = [Pose(HERE), Pose((0.4, 0.0015, 0.5))]
+    drag.update(10.1, near, tripped=False)
+    assert drag.goal is not None
+    drag.release(1)
+    turned = [Pose(THERE, (0.0, 0.0, np.sin(0.01), np.cos(0.01)))]  # by 0.02 rad
+    drag.update(10.2, turned, tripped=False)
+    assert drag.goal is not None
+    drag.update(10.3, near, tripped=False)
+    assert drag.goal is None
+    assert drag.free
+
+
+def test_a_goal_that_nobody_goes_to_lapses() -> None:
+    for drag in (dragged(), dragged(let_go=False)):  # also when a page froze in the middle of a drag
+        drag.update(10.0, AT, tripped=False)
+        drag.update(10.0 + UNUSED - 0.1, AT, tripped=False)
+        assert drag.goal is not None
+        drag.update(10.0 + UNUSED + 0.1, AT, tripped=False)
+        assert drag.goal is None
+        assert not drag.move(1, THERE, LEVEL, 21.0)  # until it is grabbed anew
+
+
+def test_a_goal_that_is_approached_stays() -> None:
+    drag = dragged()
+    for step in range(40):
+        drag.update(10.0 + step, [Pose((0.3 + 0.002 * step, 0.0, 0.5))], tripped=False)
+        assert drag.goal is not None
+    drag.update(50.0 + UNUSED, [Pose((0.3, 0.0, 0.5))], tripped=False)
+    assert drag.goal is None
+
+
+def test_a_trip_ends_a_goal_and_the_drag_behind_it() -> None:
+    drag = dragged(let_go=False)
+    drag.update(10.1, AT, tripped=True)
+    assert drag.goal is None
+    assert not drag.move(1, THERE, LEVEL, 10.2)
+    drag.grab(1)
+    assert drag.move(1, THERE, LEVEL, 10.3)  # a new wish
+    drag.update(10.4, AT, tripped=True)
+    assert drag.goal is not None
+
+
+def test_a_page_that_leaves_takes_its_goal_along() -> None:
+    drag = dragged()
+    drag.leave(2)
+    assert drag.goal is not None
+    drag.leave(1)
+    assert drag.goal is None

@@ -1,0 +1,110 @@
+"""What a URDF looks like: the viewer's own reader against the kinematics that move the arm."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from specs import PANDA_HOME, data, panda
+
+from hal.drivers.viser.urdf import read_tree
+from hal.kinematics import Kinematics
+from hal.pose import Pose
+from hal.specs import KinematicsSpec
+
+SMALL = """
+<robot name="small">
+  <joint name="second" type="prismatic">
+    <parent link="arm"/><child link="tip"/><origin xyz="0 0 1" rpy="0 1.5707963267948966 0"/><axis xyz="0 0 2"/>
+    <mimic joint="first" multiplier="-2" offset="0.5"/>
+  </joint>
+  <joint name="first" type="continuous"><parent link="base"/><child link="arm"/><axis xyz="0 0 1"/></joint>
+  <link name="base"/>
+  <link name="arm">
+    <visual><geometry><box size="1 2 3"/></geometry><material name="red"/></visual>
+    <visual><geometry><mesh filename="package://nowhere/a.stl" scale="1 1 -1"/></geometry></visual>
+  </link>
+  <link name="tip">
+    <visual>
+      <origin xyz="0 0 0.1"/><geometry><cylinder radius="0.1" length="0.2"/></geometry>
+      <material name="red"><color rgba="1 0 0 1"/></material>
+    </visual>
+  </link>
+</robot>
+"""
+
+
+def iiwa() -> KinematicsSpec:
+    joints = tuple(f"lbr_iiwa_joint_{k}" for k in range(1, 8))
+    nothing = (0.0,) * 7
+    return KinematicsSpec(
+        urdf=data("kuka_iiwa/model.urdf"),
+        joints=joints,
+        lower=(-2.9,) * 7,
+        upper=(2.9,) * 7,
+        home=nothing,
+        base_link=None,
+        tcp_link="lbr_iiwa_link_7",
+        tcp_position=(0.0, 0.0, 0.0),
+        tcp_orientation=(0.0, 0.0, 0.0, 1.0),
+    )
+
+
+@pytest.mark.parametrize("arm", ["panda", "iiwa"])
+def test_links_are_where_the_kinematics_say(arm: str) -> None:
+    spec = panda().kinematics if arm == "panda" else iiwa()
+    kinematics, tree = Kinematics(spec), read_tree(spec.urdf)
+    tcp = Pose(spec.tcp_position, spec.tcp_orientation)
+    random = np.random.default_rng(3)
+    for q in [np.array(PANDA_HOME), *random.uniform(spec.lower, spec.upper, (20, 7))]:
+        poses = tree.poses(dict(zip(spec.joints, q.tolist(), strict=True)))
+        base = poses[spec.base_link or tree.root].inverse()
+        for found, wanted in (
+            (base @ poses[spec.tcp_link] @ tcp, kinematics.pose(q)),
+            (base @ poses[tree.joints[3].child], kinematics.link_pose(tree.joints[3].child, q)),
+        ):
+            assert np.abs(found.position - wanted.position).max() < 1e-6
+            assert found.distance(wanted)[1] < 1e-6
+
+
+def test_fingers_move_apart_by_the_width() -> None:
+    tree = read_tree(panda().urdf)
+    poses = tree.poses({"panda_finger_joint1": 0.03, "panda_finger_joint2": 0.03})
+    assert poses["panda_leftfinger"].distance(poses["panda_rightfinger"])[0] == pytest.approx(0.06)
+
+
+def test_joints_in_any_order_mimics_and_materials(tmp_path: Path) -> None:
+    file = tmp_path / "small.urdf"
+    file.write_text(SMALL)
+    tree = read_tree(str(file))
+    assert [joint.name for joint in tree.joints] == ["first", "second"]
+    poses = tree.poses({"first": 0.25})  # the second slides by 0 along its own z, which is the arm's x
+    assert poses["tip"].position == pytest.approx([0.0, 0.0, 1.0])
+    poses = tree.poses({"first": 0.0})
+    assert poses["tip"].position == pytest.approx([0.5, 0.0, 1.0])
+    box, mesh = tree.visuals["arm"]
+    assert (box.shape, box.size, box.rgba) == ("box", (1.0, 2.0, 3.0), (1.0, 0.0, 0.0, 1.0))
+    assert (mesh.size, mesh.rgba) == ((1.0, 1.0, -1.0), None)
+    assert mesh.file == str(tmp_path / "nowhere/a.stl")
+    (cylinder,) = tree.visuals["tip"]
+    assert cylinder.size == (0.1, 0.2)
+    assert cylinder.pose.position == pytest.approx([0.0, 0.0, 0.1])
+
+
+@pytest.mark.parametrize(
+    ("change", "complaint"),
+    [
+        (("</robot>", ""), "not valid XML"),
+        (('<parent link="arm"/>', ""), "lacks its parent"),
+        (('<parent link="base"/>', '<parent link="tip"/>'), "hang"),
+        (('<axis xyz="0 0 2"/>', '<axis xyz="0 0 0"/>'), "no length"),
+        (('size="1 2 3"', 'size="1 2"'), "2 numbers"),
+    ],
+)
+def test_what_is_wrong_is_said(tmp_path: Path, change: tuple[str, str], complaint: str) -> None:
+    assert change[0] in SMALL
+    file = tmp_path / "small.urdf"
+    file.write_text(SMALL.replace(*change))
+    with pytest.raises(ValueError, match=complaint):
+        read_tree(str(file))

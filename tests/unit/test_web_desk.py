@@ -1,0 +1,355 @@
+"""The console's rules, without a socket: whose pad counts, what the app is told, what pages are told."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import pytest
+
+from hal.drivers.web.applink import Waiting
+from hal.drivers.web.desk import Desk, Page
+from hal.drivers.web.outbox import Outbox
+from hal.drivers.web.padmessage import Malformed
+
+RIG: dict[str, Any] = {
+    "drivable": True,
+    "driven_by": None,
+    "demo": True,
+    "robots": [{"name": "panda"}, {"name": "ur5"}],
+    "cameras": [],
+}
+
+
+class App:
+    """Reads at once, unless told not to."""
+
+    def __init__(self) -> None:
+        self.waiting = Waiting()
+        self.told: list[dict[str, Any]] = []
+        self.reads = True
+
+    def flush(self) -> None:
+        while self.reads and (message := self.waiting.take()) is not None:
+            self.told.append(message)
+
+    def news(self) -> list[dict[str, Any]]:
+        """What it was told since it was asked last."""
+        told, self.told = self.told, []
+        return told
+
+    def pads(self) -> list[object]:
+        """The same, of the pad only: the page that it is of, or why it is gone."""
+        pads = [message["pad"] for message in self.news() if "pad" in message]
+        return [pad["from"] if pad["connected"] else (pad["why"],) for pad in pads]
+
+
+class Room:
+    """A desk, the app behind it, and a clock."""
+
+    def __init__(self, **rig: Any) -> None:
+        self.now = 100.0
+        self.app = App()
+        self.desk = Desk({**RIG, **rig}, self.app, lambda: self.now)
+        self.cut: list[int] = []
+
+    def page(self) -> Page:
+        """A page that opens."""
+        number = len(self.desk.pages) + 1
+        return self.desk.open(lambda: self.cut.append(number))
+
+    def driver(self) -> Page:
+        """A page that opens and drives, with its pad there."""
+        page = self.page()
+        self.say(page, type="lease", take=True)
+        self.pad(page, self.now)
+        self.app.news()
+        inbox(page)
+        return page
+
+    def say(self, page: Page, **message: Any) -> None:
+        self.desk.received(page, json.dumps(message))
+
+    def pad(self, page: Page, seen: float, since: float = 0.0, axes: list[float] | None = None) -> None:
+        axes = [0.0] * 8 if axes is None else axes
+        self.say(page, type="pad", seen=seen, since=since, axes=axes, buttons=0)
+
+
+def inbox(page: Page) -> list[dict[str, Any]]:
+    """Everything that waits for a page."""
+    return [json.loads(text) for text in iter(page.outbox.take, None)]
+
+
+def test_a_page_that_opens_is_told_everything_in_order() -> None:
+    room = Room()
+    room.driver()
+    room.desk.heard({"method": "labels", "labels": {"deadman": "l2", "controls": {}}})
+    for k in range(60):
+        room.desk.heard({"method": "say", "t": float(k), "text": f"word {k}"})
+    room.desk.heard({"method": "waiting", "controls": ["r2"]})
+    told = inbox(room.page())
+    hello, labels, lease, pad, *says = told
+    assert (hello["type"], hello["page"], hello["name"], hello["rig"]) == ("hello", 2, "page 2", RIG)
+    assert (hello["axes"][0], hello["buttons"][0]) == ("left_x", "south")
+    assert labels == {"type": "labels", "deadman": "l2", "controls": {}}
+    assert lease == {"type": "lease", "driver": "page 1", "you": False, "t": 100.0, "why": ""}
+    assert pad == {"type": "pad", "waiting": ["r2"]}
+    assert [say["text"] for say in says] == [f"word {k}" for k in range(10, 60)]
+
+
+def test_only_the_pad_of_the_page_that_drives_counts() -> None:
+    room = Room()
+    driver, other = room.driver(), room.page()
+    inbox(other)
+    room.pad(other, 100.0)
+    assert room.app.news() == []
+    assert inbox(other) == []
+    room.now = 100.02
+    room.pad(driver, 100.0, 20.0, [0.5, 0, 0, 0, 1, 0, 0, -1])
+    axes = (0.5, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, -1.0)
+    pad = {"connected": True, "t": 100.02, "t_alive": 100.02, "axes": axes, "buttons": 0, "from": "page 1"}
+    assert room.app.news() == [{"pad": pad}]
+    assert inbox(driver) == [{"type": "beat", "t": 100.02}]
+
+
+def test_a_late_message_is_no_pad_but_is_answered() -> None:
+    room = Room()
+    driver = room.driver()
+    room.now = 100.3
+    room.pad(driver, 100.0, 20.0, [1.0] * 8)
+    room.pad(driver, 100.0, 40.0, [1.0] * 8)
+    assert room.app.pads() == [("its messages came late",)]
+    beat, complaint, *more = inbox(driver)
+    assert beat == {"type": "beat", "t": 100.3}
+    assert complaint["type"] == "refused"
+    assert "150 ms" in complaint["why"]
+    assert more == [], "it is told once, not fifty times a second"
+    room.pad(driver, 100.3)
+    assert room.app.pads() == ["page 1"]
+
+
+def test_a_gap_is_told_before_the_message_that_ends_it() -> None:
+    room = Room()
+    driver = room.driver()
+    room.now = 100.5
+    room.pad(driver, 100.0, 500.0)
+    assert room.app.pads() == [("its page gave no sign of life",), "page 1"]
+
+
+def test_silence_is_told_when_somebody_looks() -> None:
+    room = Room()
+    room.driver()
+    room.desk.look(100.1)
+    assert room.app.news() == []
+    room.desk.look(100.2)
+    room.desk.look(100.25)
+    assert room.app.pads() == [("its page gave no sign of life",)]
+
+
+@pytest.mark.parametrize("why", ["hidden", "blur", "closing"])
+def test_away_is_away_until_the_next_message(why: str) -> None:
+    room = Room()
+    driver = room.driver()
+    room.say(driver, type="away", why=why)
+    room.say(driver, type="away", why=why)
+    (gone,) = room.app.pads()
+    assert "page" in gone[0]  # type: ignore[index]
+    room.now = 100.02
+    room.pad(driver, 100.0, 20.0)
+    assert room.app.pads() == ["page 1"]
+
+
+def test_away_of_a_watcher_is_nobodys_business() -> None:
+    room = Room()
+    room.driver()
+    room.say(room.page(), type="away", why="hidden")
+    assert room.app.news() == []
+
+
+def test_the_lease_goes_to_whoever_takes_it_and_the_pad_is_gone_in_between() -> None:
+    room = Room()
+    first, second = room.driver(), room.page()
+    inbox(second)
+    room.now = 100.01
+    room.say(second, type="lease", take=True)
+    told = room.app.news()
+    assert told[0]["pad"]["why"] == "page 2 took it"
+    assert not told[0]["pad"]["connected"]
+    assert told[1:] == [{"driver": "page 2"}]
+    assert inbox(first) == [
+        {"type": "lease", "driver": "page 2", "you": False, "t": 100.01, "why": "page 2 took it"},
+    ]
+    assert inbox(second)[0]["you"]
+    room.pad(first, 100.0, 10.0, [1.0] * 8)
+    assert room.app.news() == [], "what was on its way counts no more"
+    assert inbox(first) == [], "and is not answered"
+    room.pad(second, 100.01)
+    assert room.app.pads() == ["page 2"]
+
+
+def test_a_page_that_takes_it_back_is_not_heard_with_what_it_said_before() -> None:
+    room = Room()
+    first, second = room.driver(), room.page()
+    room.now = 100.01
+    room.say(second, type="lease", take=True)
+    room.now = 100.02
+    room.say(first, type="lease", take=True)
+    room.app.news()
+    room.pad(first, 100.0, 20.0, [1.0] * 8)
+    assert room.app.news() == []
+    room.pad(first, 100.02)
+    assert room.app.pads() == ["page 1"]
+
+
+@pytest.mark.parametrize("how", ["let go", "leave"])
+def test_nobody_drives_after_the_driver_let_go_or_left(how: str) -> None:
+    room = Room()
+    driver, other = room.driver(), room.page()
+    inbox(other)
+    if how == "let go":
+        room.say(driver, type="lease", take=False)
+    else:
+        room.desk.leave(driver)
+        room.desk.leave(driver)
+    gone, free = room.app.news()
+    assert not gone["pad"]["connected"]
+    assert gone["pad"]["why"].startswith("page 1")
+    assert free == {"driver": None}
+    (lease,) = inbox(other)
+    assert (lease["driver"], lease["you"]) == (None, False)
+    room.pad(driver, 100.0, 0.0, [1.0] * 8)
+    assert room.app.news() == []
+
+
+def test_taking_what_one_has_changes_nothing() -> None:
+    room = Room()
+    driver = room.driver()
+    room.say(driver, type="lease", take=True)
+    assert (room.app.news(), inbox(driver)) == ([], [])
+
+
+def test_where_another_pad_drives_pages_only_watch_and_stop() -> None:
+    room = Room(drivable=False, driven_by="DualShock 4", demo=False)
+    page = room.page()
+    inbox(page)
+    room.say(page, type="lease", take=True)
+    room.say(page, type="recover", robot="panda")
+    room.say(page, type="demo", play=True)
+    assert room.app.news() == []
+    refused = inbox(page)
+    assert [message["type"] for message in refused] == ["refused"] * 3
+    assert "DualShock 4" in refused[0]["why"]
+    room.say(page, type="stop")
+    assert room.app.news() == [{"stop": "page 1"}]
+
+
+def test_anybody_stops_only_the_driver_recovers_and_plays() -> None:
+    room = Room()
+    driver, other = room.driver(), room.page()
+    inbox(other)
+    room.say(other, type="stop")
+    room.say(other, type="recover", robot="panda")
+    room.say(other, type="demo", play=True)
+    assert room.app.news() == [{"stop": "page 2"}]
+    assert len(inbox(other)) == 2
+    room.say(driver, type="recover", robot="ur5")
+    room.say(driver, type="demo", play=False)
+    assert room.app.news() == [{"recover": "ur5", "page": "page 1"}, {"demo": False, "page": "page 1"}]
+
+
+@pytest.mark.parametrize(
+    "message",
+    [
+        {"type": "recover", "robot": "iiwa"},
+        {"type": "watch", "cameras": []},
+        {"type": "drawn", "camera": "scene"},
+        {"type": "pad", "seen": 100.5, "since": 0, "axes": [0] * 8, "buttons": 0},
+    ],
+)
+def test_malformed_here(message: dict[str, Any]) -> None:
+    room = Room()
+    driver = room.driver()
+    with pytest.raises(Malformed):
+        room.say(driver, **message)
+    assert (room.app.news(), inbox(driver)) == ([], [])
+
+
+def test_what_the_app_says_reaches_the_pages_that_it_is_for() -> None:
+    room = Room()
+    first, second = room.page(), room.page()
+    inbox(first), inbox(second)
+    room.desk.heard({"method": "refused", "page": "page 2", "why": "it is too late"})
+    room.desk.heard({"method": "refused", "page": "page 9", "why": "gone"})
+    room.desk.heard({"method": "playing", "on": True})
+    room.desk.heard({"method": "say", "t": 1.0, "text": "home"})
+    room.desk.show({"t": 100.0})
+    say, state = {"type": "say", "t": 1.0, "text": "home"}, {"type": "state", "t": 100.0, "pages": 2, "playing": True}
+    assert inbox(first) == [say, state]
+    assert inbox(second) == [{"type": "refused", "why": "it is too late"}, say, state]
+
+
+# What waits for an app that does not read.
+
+
+def test_an_app_that_reads_again_hears_of_every_loss_and_the_newest_pad() -> None:
+    room = Room()
+    driver = room.driver()
+    room.app.reads = False
+    for k in range(1, 200):
+        room.now = 100.0 + 0.02 * k
+        room.pad(driver, 100.0, 20.0 * k, [k / 200.0] * 8)
+        if k == 50:
+            room.say(driver, type="away", why="hidden")
+        if k % 40 == 0:
+            room.say(driver, type="stop")
+    room.app.reads = True
+    room.app.flush()
+    stop, gone, pad = room.app.news()
+    assert stop == {"stop": "page 1"}
+    assert gone["pad"]["why"] == "the page was hidden"
+    assert pad["pad"]["axes"][0] == 199 / 200.0
+
+
+def test_a_loss_outdates_the_pad_before_it() -> None:
+    waiting = Waiting()
+    waiting.pad(1.0, 1.0, (1.0,), 0, "page 1")
+    waiting.gone(2.0, "it was hidden")
+    assert waiting.take() == {"pad": {"connected": False, "t": 2.0, "why": "it was hidden"}}
+    assert waiting.take() is None
+
+
+def test_wishes_that_nobody_hears_are_refused() -> None:
+    room = Room()
+    driver = room.driver()
+    room.app.reads = False
+    for _ in range(100):
+        room.say(driver, type="recover", robot="panda")
+    assert inbox(driver)[-1] == {"type": "refused", "why": "the app does not answer"}
+    room.say(driver, type="stop")
+    room.app.reads = True
+    room.app.flush()
+    told = room.app.news()
+    assert told[0] == {"stop": "page 1"}
+    assert 1 < len(told) < 20
+
+
+# What waits for a page that does not read.
+
+
+def test_beats_first_then_notes_in_order_then_the_newest_state() -> None:
+    outbox = Outbox(lambda: None)
+    for k in range(3):
+        outbox.state(f"state {k}")
+        outbox.note(f"note {k}")
+        outbox.beat(f"beat {k}")
+    assert list(iter(outbox.take, None)) == ["beat 2", "note 0", "note 1", "note 2", "state 2"]
+
+
+def test_a_page_that_misses_a_note_is_cut_off() -> None:
+    room = Room()
+    slow, other = room.page(), room.page()
+    for k in range(300):
+        room.desk.heard({"method": "say", "t": 0.0, "text": f"word {k}"})
+        inbox(other)
+    assert set(room.cut) == {1}
+    assert len(inbox(slow)) <= 256

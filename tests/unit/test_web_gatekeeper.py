@@ -1,0 +1,88 @@
+"""Who may come in."""
+
+from __future__ import annotations
+
+import pytest
+
+from hal.drivers.web.gatekeeper import Gatekeeper
+
+TOKEN = "Zm9v-Y_mFy"
+
+
+@pytest.mark.parametrize(
+    ("host", "on_loopback", "outside"),
+    [
+        ("127.0.0.1:8470", True, True),
+        ("127.0.0.1", True, True),
+        ("127.0.0.2:8470", True, True),
+        ("[::1]:8470", True, True),
+        ("localhost:9000", True, True),
+        ("LocalHost", True, True),
+        ("192.168.1.5:8470", False, True),
+        ("[fe80::1]:8470", False, True),
+        ("bench:8470", False, True),
+        ("BENCH.local", False, True),
+        ("attacker.example:8470", False, False),
+        ("127.0.0.1.attacker.example", False, False),
+        ("localhost.attacker.example", False, False),
+        ("localhost.", False, False),
+        ("localhost:", False, False),
+        ("localhost:84a0", False, False),
+        ("localhost@attacker.example", False, False),
+        ("2130706433", False, False),
+        ("127.1", False, False),
+        ("0x7f.1", False, False),
+        ("[localhost]", False, False),
+        ("::1", False, False),
+        ("127.0.0.1 ; script-src *", False, False),
+        ("127.0.0.1\n", False, False),
+        ("", False, False),
+        (None, False, False),
+    ],
+)
+def test_hosts(host: str | None, on_loopback: bool, outside: bool) -> None:
+    names = ["Bench", "bench.local"]
+    assert Gatekeeper(TOKEN, "127.0.0.1", names).knows_host(host) is on_loopback
+    assert Gatekeeper(TOKEN, "0.0.0.0", names).knows_host(host) is outside
+
+
+@pytest.mark.parametrize(
+    ("origin", "own"),
+    [
+        ("http://127.0.0.1:8470", True),
+        ("HTTP://127.0.0.1:8470", True),
+        ("https://127.0.0.1:8470", False),
+        ("http://127.0.0.1", False),
+        ("http://127.0.0.1:8471", False),
+        ("http://localhost:8470", False),
+        ("http://attacker.example", False),
+        ("null", False),
+        ("", False),
+        (None, False),
+    ],
+)
+def test_origins(origin: str | None, own: bool) -> None:
+    assert Gatekeeper(TOKEN, "127.0.0.1", []).is_own_page(origin, "127.0.0.1:8470") is own
+    assert not Gatekeeper(TOKEN, "127.0.0.1", []).is_own_page(origin, None)
+
+
+@pytest.mark.parametrize(
+    ("offered", "admitted"),
+    [
+        (f"hal.v1, {TOKEN}", True),
+        (f"hal.v1,{TOKEN}", True),
+        (f"hal.v1, {TOKEN[:-1]}", False),
+        (f"hal.v1, {TOKEN}x", False),
+        (f"hal.v1, {TOKEN.lower()}", False),
+        ("hal.v1, \udcff\u00e9", False),
+        ("hal.v1, ", False),
+        ("hal.v1", False),
+        (TOKEN, False),
+        (f"{TOKEN}, hal.v1", False),
+        (f"hal.v1, wrong, {TOKEN}", False),
+        ("", False),
+        (None, False),
+    ],
+)
+def test_tokens(offered: str | None, admitted: bool) -> None:
+    assert Gatekeeper(TOKEN, "127.0.0.1", []).admits(offered) is admitted

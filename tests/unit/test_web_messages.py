@@ -1,0 +1,172 @@
+"""What a page may say: everything else is malformed, and nothing else ever comes of it."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from hal.drivers.web.allowance import MALFORMED, MESSAGES, Allowance
+from hal.drivers.web.messages import (
+    LONGEST,
+    Away,
+    Demo,
+    Drawn,
+    Malformed,
+    Recover,
+    Stop,
+    Take,
+    Watch,
+    encode,
+    parse,
+)
+from hal.drivers.web.padmessage import PadMessage
+
+PAD = {"type": "pad", "seen": 12.5, "since": 20.0, "axes": [0.0, -1, 0.25, 1, 1, 0.0, -1.0, 1], "buttons": 64}
+
+
+def take(text: str) -> object:
+    return parse(text, robots=["panda"], cameras=["scene", "wrist"])
+
+
+@pytest.mark.parametrize(
+    ("message", "record"),
+    [
+        (PAD, PadMessage(12.5, 0.02, (0.0, -1.0, 0.25, 1.0, 1.0, 0.0, -1.0, 1.0), 64)),
+        ({"type": "away", "why": "hidden"}, Away("the page was hidden")),
+        ({"type": "lease", "take": True}, Take(True)),
+        ({"type": "lease", "take": False}, Take(False)),
+        ({"type": "stop"}, Stop()),
+        ({"type": "recover", "robot": "panda"}, Recover("panda")),
+        ({"type": "demo", "play": True}, Demo(True)),
+        ({"type": "watch", "cameras": ["wrist", "wrist", "scene"]}, Watch(("wrist", "scene"))),
+        ({"type": "watch", "cameras": []}, Watch(())),
+        ({"type": "drawn", "camera": "scene"}, Drawn("scene")),
+    ],
+)
+def test_what_a_page_may_say(message: dict[str, Any], record: object) -> None:
+    assert take(json.dumps(message)) == record
+
+
+def with_axis(value: str) -> str:
+    return json.dumps(PAD).replace("0.25", value)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        with_axis("NaN"),
+        with_axis("Infinity"),
+        with_axis("-Infinity"),
+        with_axis("1e999"),
+        with_axis("1.001"),
+        with_axis("-1.001"),
+        with_axis("true"),
+        with_axis("null"),
+        with_axis('"0"'),
+        with_axis("[0]"),
+        with_axis("9" * 3000),
+        with_axis("0.25, 0.25"),
+        *(
+            json.dumps({**PAD, **wrong})
+            for wrong in (
+                {"axes": PAD["axes"][:7]},  # type: ignore[index]
+                {"axes": []},
+                {"axes": {}},
+                {"axes": [0, 0, 0, 0, -0.5, 0, 0, 0]},  # a trigger has no other side
+                {"buttons": 1 << 14},
+                {"buttons": -1},
+                {"buttons": 1.0},
+                {"buttons": True},
+                {"buttons": 10**400},
+                {"buttons": ["l2"]},
+                {"seen": -1.0},
+                {"seen": None},
+                {"seen": False},
+                {"seen": 10**400},
+                {"since": -0.001},
+                {"since": 1e10},
+                {"since": "20"},
+                {"extra": 1},
+            )
+        ),
+        '{"type":"pad"}',
+        '{"type":"stop","now":true}',
+        '{"type":"stopp"}',
+        '{"type":["stop"]}',
+        '{"type":null}',
+        '{"stop":true}',
+        '["stop"]',
+        '"stop"',
+        "stop",
+        "1",
+        "",
+        '{"type":"stop"',
+        '{"type":"lease","take":1}',
+        '{"type":"lease","take":"true"}',
+        '{"type":"away","why":"asleep"}',
+        '{"type":"away","why":["hidden"]}',
+        '{"type":"recover","robot":"\\ud800"}',
+        '{"type":"recover","robot":"ur5"}',
+        '{"type":"recover","robot":{}}',
+        '{"type":"watch","cameras":"scene"}',
+        '{"type":"watch","cameras":["scene","attic"]}',
+        '{"type":"watch","cameras":[["scene"]]}',
+        '{"type":"drawn","camera":0}',
+        "[" * LONGEST,
+        '{"a":' * (LONGEST // 5),
+    ],
+)
+def test_what_it_may_not(text: str) -> None:
+    with pytest.raises(Malformed):
+        take(text)
+
+
+JSON = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(),
+    lambda inner: st.lists(inner, max_size=9) | st.dictionaries(st.sampled_from([*PAD, "take", "why"]), inner),
+    max_leaves=20,
+)
+
+
+@given(st.one_of(st.text(), JSON.map(json.dumps), st.fixed_dictionaries(dict.fromkeys(PAD, JSON)).map(json.dumps)))
+def test_whatever_comes_it_is_a_record_or_malformed(text: str) -> None:
+    try:
+        record = take(text)
+    except Malformed:
+        return
+    assert record is not None
+
+
+@given(JSON, st.sampled_from([*PAD]))
+def test_a_pad_with_one_field_of_anything_is_sound_or_malformed(value: object, key: str) -> None:
+    try:
+        record = take(json.dumps({**PAD, key: value}))
+    except Malformed:
+        return
+    if isinstance(record, PadMessage):
+        assert len(record.axes) == 8
+        assert all(-1.0 <= axis <= 1.0 for axis in record.axes)
+        assert 0 <= record.buttons < 1 << 14
+
+
+def test_nothing_that_is_no_number_is_ever_sent() -> None:
+    with pytest.raises(ValueError, match="JSON"):
+        encode({"t": float("nan")})
+
+
+def test_an_allowance_is_one_of_a_second() -> None:
+    allowance = Allowance()
+    assert all(allowance.may_go_on(5.0 + k * 1e-3) for k in range(MESSAGES))
+    assert not allowance.may_go_on(5.5)
+    assert allowance.may_go_on(6.0)
+    assert all(Allowance().may_go_on(7.0 + 0.02 * k) for k in range(10 * MESSAGES))
+
+
+def test_mistakes_are_counted_for_ever() -> None:
+    allowance = Allowance()
+    assert all(allowance.may_err() for _ in range(MALFORMED))
+    assert not allowance.may_err()

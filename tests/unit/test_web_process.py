@@ -1,0 +1,401 @@
+"""The console's process with real sockets: whose pad arrives, what pages are told, how it ends."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import os
+import signal
+import socket
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from web_kit import REST, TOKEN, WAIT, App, Page, run
+
+from hal.errors import NotSupported
+from hal.servo.watchdog import SILENCE
+from hal.types import Fault, RobotStatus
+
+
+@pytest.fixture
+def app() -> Iterator[App]:
+    with App() as found:
+        yield found
+
+
+def gone(message: dict[str, Any]) -> bool:
+    return "pad" in message and not message["pad"]["connected"]
+
+
+# What they say.
+
+
+def test_nonsense_is_survived_until_there_is_too_much_of_it(app: App) -> None:
+    async def test() -> None:
+        async with Page(app) as page:
+            for k in range(98):
+                await page.ws.send_str('{"type":"pad","seen":NaN}' if k % 2 else "[" * 4000)
+            await page.ws.send_bytes(b'{"type":"stop"}')
+            await page.ws.send_str("{" + " " * 4094 + "}")
+            await page.take()
+            await page.drive()
+            assert (await app.pad())["connected"]
+            await page.ws.send_str("nonsense")
+            assert await page.closed() == 4400
+            assert (await app.pad())["why"] == "page 1 is gone"
+        async with Page(app) as page:
+            await page.next("hello")
+
+    run(test)
+
+
+def test_a_message_that_is_too_long_ends_the_page(app: App) -> None:
+    async def test() -> None:
+        async with Page(app) as page:
+            await page.ws.send_str(" " * 4097)
+            assert await page.closed() == 1009
+        async with Page(app) as page:
+            await page.next("hello")
+
+    run(test)
+
+
+def test_too_many_messages_end_the_page_and_a_stop_among_them_is_heard(app: App) -> None:
+    async def test() -> None:
+        async with Page(app) as page:
+            await page.take()
+            for _ in range(900):
+                await page.ws.send_json(page.pad([1.0] * 8))
+            await page.say(type="stop")
+            missing = [{"stop": "page 1"}, {"driver": None}]  # in either order
+            told = await app.all_until(lambda message: message in missing and (missing.remove(message) or not missing))
+            assert sum("pad" in message and message["pad"]["connected"] for message in told) <= 400
+            assert any(gone(message) for message in told), "it drives no more"
+            assert await page.closed() == 4408
+
+    run(test)
+
+
+def test_a_watcher_stops_the_arm(app: App) -> None:
+    async def test() -> None:
+        async with Page(app) as driver, Page(app) as watcher:
+            await driver.take()
+            await watcher.next("hello")
+            await watcher.say(type="stop")
+            assert await app.next(lambda message: "stop" in message) == {"stop": "page 2"}
+            await watcher.say(type="recover", robot="arm")
+            assert "only the page that drives" in (await watcher.next("refused"))["why"]
+            await driver.say(type="recover", robot="arm")
+            assert await app.next() == {"recover": "arm", "page": "page 1"}
+
+    run(test)
+
+
+def test_the_lease_between_two_pages(app: App) -> None:
+    async def test() -> None:
+        async with Page(app) as first:
+            await first.take()
+            assert await app.next() == {"driver": "page 1"}
+            await first.drive([0.5, 0, 0, 0, 1, 0, 0, 0], 64)
+            pad = await app.pad()
+            assert (pad["connected"], pad["from"], pad["buttons"]) == (True, "page 1", 64)
+            assert pad["axes"] == [0.5, 0, 0, 0, 1, 0, 0, 0]
+            assert pad["t"] - SILENCE <= pad["t_alive"] <= pad["t"] <= time.monotonic()
+            async with Page(app) as second:
+                await second.take()
+                assert (await app.pad())["why"] == "page 2 took it"
+                assert await app.next() == {"driver": "page 2"}
+                lost = await first.next("lease")
+                assert (lost["driver"], lost["you"], lost["why"]) == ("page 2", False, "page 2 took it")
+                await first.ws.send_json(first.pad([1.0] * 8))
+                await second.drive()
+                assert (await app.pad())["from"] == "page 2"
+            assert (await app.pad())["why"] == "page 2 is gone"
+            assert await app.next() == {"driver": None}
+            assert (await first.next("lease"))["driver"] is None
+
+    run(test)
+
+
+@pytest.mark.parametrize("how", ["hidden", "closed", "cut"])
+def test_a_page_that_goes_away_is_a_pad_that_is_gone_at_once(app: App, how: str) -> None:
+    async def test() -> None:
+        async with Page(app) as page:
+            await page.take()
+            await page.drive([0.0] * 4 + [1.0] + [0.0] * 3, 64)
+            assert (await app.pad())["connected"]
+            if how == "hidden":
+                await page.say(type="away", why="hidden")
+            elif how == "closed":
+                await page.ws.close()
+            else:
+                page.ws._response.connection.transport.abort()  # type: ignore[union-attr]
+            pad = await app.pad()
+            assert not pad["connected"]
+            assert pad["why"] == ("the page was hidden" if how == "hidden" else "page 1 is gone")
+
+    run(test)
+
+
+def test_a_page_that_falls_silent_is_a_pad_that_is_gone(app: App) -> None:
+    async def test() -> None:
+        async with Page(app) as page:
+            await page.take()
+            await page.drive()
+            pad = await app.pad()
+            lost = await app.pad()
+            assert (lost["connected"], lost["why"]) == (False, "its page gave no sign of life")
+            assert lost["t"] - pad["t_alive"] > SILENCE
+
+    run(test)
+
+
+def test_late_messages_move_nothing(app: App) -> None:
+    async def test() -> None:
+        async with Page(app) as page:
+            await page.take()
+            await asyncio.sleep(0.5)
+            for age in (0.4, 0.3, 0.2):
+                await page.ws.send_json(page.pad([1.0] * 8, age=age))
+            await page.drive()
+            told = await app.all_until(lambda message: "pad" in message)
+            assert told[-1]["pad"]["axes"] == REST
+
+    run(test)
+
+
+def test_what_came_while_the_server_stood_still_moves_nothing(app: App) -> None:
+    """The page goes on, held at full deflection; the console's process is stopped, as by a machine that swaps."""
+
+    async def test() -> None:
+        async with Page(app) as page:
+            await page.take()
+            await page.drive()
+            assert (await app.pad())["connected"]
+            os.kill(app.child.process.pid, signal.SIGSTOP)
+            try:
+                until = time.monotonic() + 0.8
+                while time.monotonic() < until:
+                    await page.ws.send_json(page.pad([1.0] * 8, 64))
+                    await asyncio.sleep(0.02)
+            finally:
+                os.kill(app.child.process.pid, signal.SIGCONT)
+            assert not (await app.pad())["connected"]
+            await page.drive([0.125] * 8)
+            while True:
+                pad = await app.pad()
+                if pad["connected"]:
+                    assert pad["t"] - pad["t_alive"] <= SILENCE
+                    if pad["axes"][0] == 0.125:
+                        return
+
+    run(test)
+
+
+def test_an_app_that_does_not_read_costs_nobody_anything(app: App) -> None:
+    """It is stopped for a while. Pages are answered, and what it then finds is a handful of messages, stop included."""
+
+    async def test() -> None:
+        async with Page(app) as page, Page(app) as watcher:
+            await page.take()
+            for k in range(200):
+                await page.drive([k / 200.0] * 8)
+                if k == 150:
+                    await watcher.say(type="stop")
+                await asyncio.sleep(0.005)
+            await page.next("state")
+            told = await app.all_until(lambda message: "pad" in message and message["pad"]["axes"][0] == 199 / 200.0)
+            assert {"stop": "page 2"} in told
+            assert len(told) < 60
+
+    run(test)
+
+
+# What they are told.
+
+
+def test_states(app: App) -> None:
+    async def test() -> None:
+        async with Page(app) as page:
+            arm = (await page.next("state"))["robots"]["arm"]
+            assert arm == {"lost": "it has not reported a state yet"}
+            app.put_state(time.monotonic(), q=0.123456789, fault=Fault("e1", "the button is pressed", "release it"))
+            state = await page.next("state")
+            while "lost" in state["robots"]["arm"]:
+                state = await page.next("state")
+            arm = state["robots"]["arm"]
+            assert (arm["q"], arm["q_set"], arm["dq"]) == ([0.12346] * 3, [0.25] * 3, [0.0] * 3)
+            assert arm["tcp"] == [0.1, 0.2, 0.3, 0.0, 0.0, 0.0, 1.0]
+            assert (arm["status"], arm["trip"], arm["trip_text"], arm["limited"]) == ("following", "none", "", "speed")
+            assert arm["fault"] == {"code": "e1", "cause": "the button is pressed", "remedy": "release it"}
+            assert arm["gripper"] == {"width": 0.04, "width_target": 0.08, "moving": True, "grasped": None}
+            assert arm["deadman"]["held"]
+            assert 0.0 <= arm["age"] < 0.1
+            host = state["hosts"]["group"]
+            assert (host["rate_hz"], host["ticks"], host["missed"]) == (240.0, 1000, 3)
+            assert (state["pages"], state["playing"]) == (1, False)
+            while "lost" not in state["robots"]["arm"]:
+                state = await page.next("state")
+            assert "old" in state["robots"]["arm"]["lost"]
+            app.put_state(time.monotonic(), status=RobotStatus.LOST, fault=Fault("lost", "no packets", ""))
+            while "no packets" not in state["robots"]["arm"]["lost"]:
+                state = await page.next("state")
+
+    run(test)
+
+
+def test_numbers_that_are_none_reach_no_page(app: App) -> None:
+    async def test() -> None:
+        async with Page(app) as page:
+            await page.next("hello")
+            app.put_state(time.monotonic(), q=float("nan"))
+            state = await page.next("state")
+            while "q" not in state["robots"]["arm"]:
+                app.put_state(time.monotonic(), q=float("nan"))
+                state = await page.next("state")
+            assert state["robots"]["arm"]["q"] == [None] * 3
+
+    run(test)
+
+
+def test_words_of_the_app(app: App) -> None:
+    async def test() -> None:
+        async with Page(app) as page:
+            await page.next("hello")
+            app.send("labels", labels={"deadman": "l2", "home": None})
+            assert await page.next("labels") == {"type": "labels", "deadman": "l2", "home": None}
+            app.send("say", t=1.5, text="grüß Gott")
+            assert await page.next("say") == {"type": "say", "t": 1.5, "text": "grüß Gott"}
+            app.send("waiting", controls=["r2"])
+            assert await page.next("pad") == {"type": "pad", "waiting": ["r2"]}
+            app.send("playing", on=True)
+            while not (await page.next("state"))["playing"]:
+                pass
+            app.send("refused", page="page 1", why="not now")
+            assert (await page.next("refused"))["why"] == "not now"
+
+    run(test)
+
+
+# A page that reads nothing.
+
+
+def handshake(app: App, path: str) -> socket.socket:
+    """A page's socket by hand, with a small window, of which nothing more is ever read."""
+    sock = socket.socket()
+    sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+    sock.settimeout(WAIT)
+    sock.connect(("127.0.0.1", app.port))
+    lines = [
+        f"GET {path} HTTP/1.1",
+        f"Host: 127.0.0.1:{app.port}",
+        f"Origin: {app.url}",
+        "Connection: Upgrade",
+        "Upgrade: websocket",
+        "Sec-WebSocket-Version: 13",
+        "Sec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==",
+        f"Sec-WebSocket-Protocol: hal.v1, {TOKEN}",
+    ]
+    sock.sendall("\r\n".join([*lines, "", ""]).encode())
+    assert sock.recv(12) == b"HTTP/1.1 101"
+    return sock
+
+
+def resident(pid: int) -> int:
+    """Memory of a process, bytes."""
+    return int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+
+
+@pytest.mark.slow
+def test_a_page_that_reads_nothing_delays_nobody_and_is_cut_off(app: App) -> None:
+    async def test() -> None:
+        frozen = handshake(app, "/live")
+        async with Page(app) as page:
+            await page.take()
+            start, memory = time.monotonic(), resident(app.child.process.pid)
+            pages, longest = 2, 0.0
+            while pages == 2 and time.monotonic() < start + 30.0:
+                app.put_state(time.monotonic())
+                sent = time.monotonic()
+                await page.drive()
+                longest = max(longest, time.monotonic() - sent)
+                pages = (await page.next("state"))["pages"]
+            assert pages == 1
+            assert time.monotonic() - start > 9.0, "it is given some time"
+            assert longest < 1.0
+            assert resident(app.child.process.pid) - memory < 8 << 20
+        frozen.close()
+
+    run(test)
+
+
+# How it ends.
+
+
+def test_the_app_closes(app: App) -> None:
+    async def test() -> None:
+        async with Page(app) as live, Page(app, "/pictures") as pictures:
+            await live.take()
+            app.child.channel.send({"id": 0, "method": "close", "params": {}})
+            assert await live.closed() == 4410
+            assert await pictures.closed() == 4410
+            assert app.child.process.wait(WAIT) == 0
+
+    run(test)
+
+
+def test_it_closes_at_once_though_a_page_does_not_answer(app: App) -> None:
+    frozen = handshake(app, "/live")
+    start = time.monotonic()
+    app.child.close()
+    assert app.child.process.returncode == 0
+    assert time.monotonic() - start < 4.0
+    frozen.close()
+
+
+def test_the_app_is_gone(app: App) -> None:
+    app.child.channel.sock.shutdown(socket.SHUT_RDWR)
+    assert app.child.process.wait(WAIT) == 0
+
+
+def test_a_port_that_is_taken() -> None:
+    with App() as first, App(listen=["127.0.0.1", first.port]) as second:
+        assert first.port < second.port <= first.port + 20
+        with pytest.raises(NotSupported, match=rf"port {first.port} of 127.0.0.1: Address already in use"):
+            App(listen=["127.0.0.1", first.port], port_fixed=True)
+
+
+def test_an_address_of_another_machine() -> None:
+    with pytest.raises(NotSupported, match=r"is 192.0.2.1 an address of this machine\?"):
+        App(listen=["192.0.2.1", 0])
+
+
+def test_ipv6() -> None:
+    if not Path("/proc/net/if_inet6").exists() or "lo" not in Path("/proc/net/if_inet6").read_text():
+        pytest.skip("this machine has no IPv6")
+    with App(listen=["::1", 0]) as app:
+        app.url = f"http://[::1]:{app.port}"
+
+        async def test() -> None:
+            async with Page(app) as page:
+                await page.next("hello")
+
+        run(test)
+
+
+def test_nothing_that_a_page_sends_appears_in_its_words(app: App) -> None:
+    """What a page writes is never passed on, neither to the app nor to other pages."""
+
+    async def test() -> None:
+        async with Page(app) as page, Page(app) as other:
+            await page.take()
+            for message in ({"type": "away", "why": "<b>x</b>"}, {"type": "recover", "robot": "<b>x</b>"}):
+                await page.ws.send_str(json.dumps(message))
+            await page.say(type="stop")
+            assert "<b>" not in json.dumps(await app.all_until(lambda message: "stop" in message))
+            assert "<b>" not in json.dumps(await other.next("state"))
+
+    run(test)

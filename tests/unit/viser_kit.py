@@ -1,0 +1,114 @@
+"""A page of the 3D viewer without a browser: it speaks viser's protocol over a plain WebSocket."""
+
+from __future__ import annotations
+
+import http.client
+import time
+from collections.abc import Callable
+from typing import Any
+from urllib.parse import urlsplit
+
+import msgspec
+import viser
+import zstandard
+from websockets.sync.client import connect
+
+
+def until(condition: Callable[[], Any], limit: float = 20.0) -> Any:
+    """What the condition became, once it is true."""
+    deadline = time.monotonic() + limit
+    while not (value := condition()):
+        assert time.monotonic() < deadline, "it did not come to that"
+        time.sleep(0.01)
+    return value
+
+
+def get(link: str, **headers: str) -> tuple[int, str]:
+    """Status of a GET request, and the cookie that came with it."""
+    parts = urlsplit(link)
+    connection = http.client.HTTPConnection(parts.netloc, timeout=10.0)
+    try:
+        connection.request("GET", f"{parts.path or '/'}?{parts.query}", headers=headers)
+        answer = connection.getresponse()
+        return answer.status, (answer.getheader("Set-Cookie") or "").split(";")[0]
+    finally:
+        connection.close()
+
+
+class PlainPage:
+    """Opens a link as a browser would, and remembers what it was told."""
+
+    def __init__(self, link: str) -> None:
+        status, cookie = get(link)
+        assert status == 200
+        self.address = urlsplit(link).netloc
+        self.socket = connect(
+            f"ws://{self.address}",
+            subprotocols=[f"viser-v{viser.__version__}"],  # type: ignore[list-item]
+            additional_headers={"Cookie": cookie},
+            origin=f"http://{self.address}",  # type: ignore[arg-type]
+            max_size=None,
+            compression=None,
+        )
+        self.nodes: dict[str, dict[str, Any]] = {}
+        """Newest ``position`` and ``wxyz`` of each node, by name."""
+        self.texts: dict[str, str] = {}
+        self.buttons: dict[str, str] = {}
+        self.say(
+            "ViewerCameraMessage",
+            wxyz=(1, 0, 0, 0),
+            position=(1, 1, 1),
+            fov=1.0,
+            near=0.1,
+            far=10.0,
+            image_height=10,
+            image_width=10,
+            look_at=(0, 0, 0),
+            up_direction=(0, 0, 1),
+        )
+
+    def say(self, kind: str, **fields: Any) -> None:
+        """Send one message."""
+        self.socket.send(msgspec.msgpack.encode({"type": kind, **fields}))
+
+    def drag(self, name: str, *poses: tuple[tuple[float, ...], tuple[float, ...]], let_go: bool = True) -> None:
+        """Grab a handle, drag it through poses of position and wxyz, and let go of it."""
+        self.say("TransformControlsDragStartMessage", name=name)
+        for position, wxyz in poses:
+            self.say("TransformControlsUpdateMessage", name=name, position=position, wxyz=wxyz)
+        if let_go:
+            self.say("TransformControlsDragEndMessage", name=name)
+
+    def press(self, label: str) -> None:
+        """Press a button of the panel."""
+        self.say("GuiUpdateMessage", uuid=self.buttons[label], updates={"value": True})
+
+    def hear(self) -> None:
+        """Take in what has come."""
+        while True:
+            try:
+                frame = self.socket.recv(timeout=0.0)
+            except TimeoutError:
+                return
+            assert isinstance(frame, bytes)
+            size = int.from_bytes(frame[8:16], "little")
+            inner = zstandard.ZstdDecompressor().decompress(frame[16 : 16 + size])
+            for message in msgspec.msgpack.decode(inner)["messages"]:
+                self._take(message)
+
+    def _take(self, message: dict[str, Any]) -> None:
+        kind, name = message["type"], message.get("name", "")
+        if kind == "SetPositionMessage":
+            self.nodes.setdefault(name, {})["position"] = message["position"]
+        elif kind == "SetOrientationMessage":
+            self.nodes.setdefault(name, {})["wxyz"] = message["wxyz"]
+        elif kind == "GuiMarkdownMessage":
+            self.texts[message["uuid"]] = message["props"]["_markdown"]
+        elif kind == "GuiButtonMessage":
+            self.buttons[message["props"]["label"]] = message["uuid"]
+        elif kind == "GuiUpdateMessage" and message["uuid"] in self.texts:
+            self.texts[message["uuid"]] = message["updates"].get("_markdown", self.texts[message["uuid"]])
+
+    def close(self) -> None:
+        """Hang up."""
+        self.socket.close()

@@ -1,0 +1,218 @@
+"""The console's process with everything around it, for tests: an app and pages that are played by hand."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import struct
+import time
+from collections.abc import Awaitable, Callable
+from typing import Any
+
+import aiohttp
+import numpy as np
+
+from hal.camera import RawFrame
+from hal.gripper import GripperReading
+from hal.host.frames import FrameRing
+from hal.host.process import Child, SharedMemory
+from hal.host.records import GroupMemory, ServoRecord
+from hal.inbox import DeadmanRecord
+from hal.robot import Reading
+from hal.specs import CameraSpec, to_json
+from hal.types import Limited, RobotStatus, Trip
+
+TOKEN = "a-token-of-the-test_0123456789"
+JOINTS = [("arm", 3)]
+REST = [0.0] * 8
+WAIT = 10.0
+"""s after which something that never comes is missed."""
+HEADER = struct.Struct("<BBHIdf")
+
+
+def camera(name: str, width: int = 64, height: int = 48, stream: str = "color", rate_hz: float = 30.0) -> CameraSpec:
+    """A camera whose ring holds one stream."""
+    return CameraSpec(
+        name=name,
+        model="test",
+        driver="mock",
+        capture_width=width,
+        capture_height=height,
+        width=width,
+        height=height,
+        rate_hz=rate_hz,
+        K=((60.0, 0.0, 31.5), (0.0, 60.0, 23.5), (0.0, 0.0, 1.0)),
+        distortion=(0.0,) * 5,
+        depth_min=0.2,
+        depth_max=2.2,
+        streams=(stream,),
+        view=None,
+    )
+
+
+def frame(spec: CameraSpec, value: float, t: float | None = None) -> RawFrame:
+    """A picture of one colour, or depth."""
+    flat = (spec.height, spec.width)
+    images: dict[str, Any] = dict.fromkeys(("color", "depth", "infrared", "segmentation"))
+    (stream,) = spec.streams
+    shape, kind = ((*flat, 3), np.uint8) if stream == "color" else (flat, np.float32 if stream == "depth" else np.uint8)
+    images[stream] = np.full(shape, value, kind)
+    now = time.monotonic() if t is None else t
+    return RawFrame(now, now, 0, **images, T_world_camera=None)
+
+
+def run(test: Callable[[], Awaitable[None]]) -> None:
+    """Run a test that talks to the process."""
+    asyncio.run(asyncio.wait_for(test(), 60.0))
+
+
+class App:
+    """The app's side of the channel, and of the memory."""
+
+    def __init__(self, *cameras: CameraSpec, rig: dict[str, Any] | None = None, **config: Any) -> None:
+        self.cameras = {spec.name: spec for spec in cameras}
+        self.ring_memory = SharedMemory(FrameRing.size(cameras))
+        self.ring = FrameRing(self.ring_memory.buffer, cameras)
+        self.host_memory = SharedMemory(GroupMemory.size(JOINTS))
+        self.group = GroupMemory(self.host_memory.buffer, JOINTS)
+        known = {"source": "test", "sim": True, "attended": False, "drivable": True, "driven_by": None, "demo": True}
+        settings = {
+            "rig": {**known, "robots": [{"name": "arm"}], "cameras": [], **(rig or {})},
+            "listen": ["127.0.0.1", 0],
+            "port_fixed": False,
+            "token": TOKEN,
+            "names": ["testbench"],
+            "hosts": [{"name": "group", "rate_hz": 240.0, "joints": JOINTS, "grippers": ["arm"]}],
+            "cameras": [to_json(spec) for spec in cameras],
+            **config,
+        }
+        memories = [self.ring_memory, self.host_memory]
+        self.child = Child("console", "hal.drivers.web.process:main", settings, memories)
+        ready = self.child.wait_ready(30.0)
+        self._log = os.dup(self.child._log.fileno())
+        self.port = int(ready["port"])
+        self.url = f"http://127.0.0.1:{self.port}"
+
+    def __enter__(self) -> App:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.child.close()
+        self.ring_memory.close()
+        self.host_memory.close()
+        with os.fdopen(self._log, "rb") as log:
+            log.seek(0)
+            said = log.read().decode()
+        assert said == "", f"the console's process complained: {said}"
+
+    def send(self, method: str, **more: Any) -> None:
+        """Say something to the console."""
+        self.child.channel.send({"method": method, **more})
+
+    def show(self, camera: str, value: float, t: float | None = None) -> None:
+        """A new picture of one colour."""
+        self.ring.put(camera, frame(self.cameras[camera], value, t))
+        self.send("frame", camera=camera)
+
+    async def next(self, wanted: Callable[[dict[str, Any]], bool] = lambda message: True) -> dict[str, Any]:
+        """The next message that is wanted; those before it are dropped."""
+        deadline = time.monotonic() + WAIT
+        while time.monotonic() < deadline:
+            message = self.child.channel.poll()
+            if message is not None and wanted(message):
+                return message
+            if message is None:
+                await asyncio.sleep(0.001)
+        raise AssertionError("the app was never told")
+
+    async def all_until(self, wanted: Callable[[dict[str, Any]], bool]) -> list[dict[str, Any]]:
+        """Every message up to the one that is wanted, in order."""
+        seen: list[dict[str, Any]] = []
+
+        def note(message: dict[str, Any]) -> bool:
+            seen.append(message)
+            return wanted(message)
+
+        await self.next(note)
+        return seen
+
+    async def pad(self) -> dict[str, Any]:
+        """The next word on the pad."""
+        return dict((await self.next(lambda message: "pad" in message))["pad"])
+
+    def put_state(self, t: float, q: float = 0.5, status: RobotStatus = RobotStatus.FOLLOWING, **reading: Any) -> None:
+        """The arm's state as its host would write it."""
+        n = JOINTS[0][1]
+        mail = self.group.robots["arm"]
+        servo = ServoRecord(status, Trip.NONE, Limited.SPEED, 0, 1, False, 0, t, t, (0.25,) * n, (0.0,) * n)
+        tcp = (0.1, 0.2, 0.3, 0.0, 0.0, 0.0, 1.0)
+        mail.put_state(Reading(t, t, 1, (q,) * n, (0.0,) * n, **reading), servo, tcp, tcp, (0.0,) * 6)
+        mail.put_gripper(GripperReading(t, t, 1, 0.04, 0.08, True, None))
+        mail.put_deadman(DeadmanRecord(True, True, 1, t))
+        self.group.host.write(t, 1000, 3, True)
+
+
+class Page:
+    """A page, as far as the server can tell. ``async with`` opens its socket."""
+
+    def __init__(self, app: App, path: str = "/live", token: str = TOKEN, **headers: str) -> None:
+        self.app = app
+        self._path = path
+        self._protocols = ("hal.v1", token)
+        self._headers = {"Origin": app.url, **headers}
+        self.seen = 0.0
+        self.at = 0.0
+        self.name = ""
+
+    async def __aenter__(self) -> Page:
+        self._session = aiohttp.ClientSession()
+        try:
+            self.ws = await self._session.ws_connect(
+                self.app.url + self._path, protocols=self._protocols, headers=self._headers
+            )
+        except aiohttp.ClientError:
+            await self._session.close()
+            raise
+        return self
+
+    async def __aexit__(self, *error: object) -> None:
+        await self.ws.close()
+        await self._session.close()
+
+    async def say(self, **message: Any) -> None:
+        await self.ws.send_json(message)
+
+    async def next(self, kind: str) -> dict[str, Any]:
+        """The next message of this type."""
+        while True:
+            message = await self.ws.receive(WAIT)
+            assert message.type is aiohttp.WSMsgType.TEXT, f"{message.type}: {message.data}"
+            data = message.json()
+            if data["type"] == "beat" or (data["type"] == "lease" and data["you"]):
+                self.seen, self.at = data["t"], time.monotonic()
+            if data["type"] == kind:
+                return dict(data)
+
+    async def closed(self) -> int:
+        """Wait until the server closes; its code."""
+        while True:
+            message = await self.ws.receive(WAIT)
+            if message.type in (aiohttp.WSMsgType.CLOSE, aiohttp.WSMsgType.CLOSED, aiohttp.WSMsgType.ERROR):
+                assert self.ws.close_code is not None
+                return self.ws.close_code
+
+    async def take(self) -> None:
+        """Take the lease, and wait until it is there."""
+        await self.say(type="lease", take=True)
+        while not (await self.next("lease"))["you"]:
+            pass
+
+    def pad(self, axes: list[float] = REST, buttons: int = 0, age: float = 0.0) -> dict[str, Any]:
+        """A pad message that was sent ``age`` s ago, and was under way since."""
+        since = max(0.0, time.monotonic() - self.at - age) * 1000.0
+        return {"type": "pad", "seen": self.seen, "since": since, "axes": axes, "buttons": buttons}
+
+    async def drive(self, axes: list[float] = REST, buttons: int = 0) -> None:
+        """One pad message, and its beat."""
+        await self.ws.send_json(self.pad(axes, buttons))
+        await self.next("beat")
