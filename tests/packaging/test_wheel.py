@@ -18,6 +18,7 @@ else:
 ROOT = Path(__file__).parents[2]
 MAPPED = {"hal": "hal", "apps": "hal/apps", "drivers": "hal/drivers"}
 DATA = {name: f"hal/data/{name}" for name in ("config", "robots", "sensors")}
+SHIPPED_CODE = (".py", ".html", ".css", ".js")
 SHIPPED_DATA = {".yaml", ".jsonl"}
 
 pytestmark = pytest.mark.slow
@@ -68,7 +69,7 @@ def test_every_module_and_every_data_file_is_in_the_wheel(wheel: Path) -> None:
     expected = {"hal/py.typed"}
     for folder, place in (MAPPED | DATA).items():
         for path in (ROOT / folder).rglob("*"):
-            wanted = path.suffix == ".py" if folder in MAPPED else path.suffix in SHIPPED_DATA
+            wanted = path.suffix in (SHIPPED_CODE if folder in MAPPED else SHIPPED_DATA)
             if wanted and path.is_file():
                 expected.add(f"{place}/{path.relative_to(ROOT / folder).as_posix()}")
     shipped = {name for name in zipfile.ZipFile(wheel).namelist() if ".dist-info/" not in name}
