@@ -88,7 +88,7 @@ class Reader:
 
     def open(self, *arguments: Any, **options: Any) -> Any:
         """``hal.open`` without waiting: lock-step and the recorded tour, unless the document says otherwise."""
-        if options.get("driver") is None:
+        if options.get("driver") is None and options.get("pad") != "web":
             options.setdefault("clock", "lock_step")
             options.setdefault("pad", str(find_data(*TOUR)))
         rig = self._open(*arguments, **options)

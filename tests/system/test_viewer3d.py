@@ -129,7 +129,7 @@ def test_links_fingers_and_handle_follow_the_arm(rig: hal.Rig, viewer: ViserView
 
     def shown() -> bool:
         page.hear()
-        state = arm.state()
+        state = arm.state(max_age=2.0)
         values = dict(zip(arm.spec.joints, state.q.tolist(), strict=True))
         width = arm.gripper.state().width
         values |= {"panda_finger_joint1": width / 2, "panda_finger_joint2": width / 2}
@@ -204,7 +204,7 @@ def test_an_arm_that_comes_there_ends_the_goal(rig: hal.Rig, viewer: ViserViewer
     arm = rig.robots["panda"]
 
     def comes() -> bool:
-        page.drag(HANDLE, beside(arm.state().tcp, 0.02))
+        page.drag(HANDLE, beside(arm.state(max_age=2.0).tcp, 0.02))
         goal = until(lambda: viewer.goal("panda"))
         with arm.control(rate_hz=50) as control:
             for tick in rig.clock.rate(50):
@@ -212,7 +212,7 @@ def test_an_arm_that_comes_there_ends_the_goal(rig: hal.Rig, viewer: ViserViewer
                     break
                 control.send(CartesianTarget(goal))
                 assert tick.elapsed < 20.0
-        return arm.state().tcp_set.distance(goal)[0] < 3e-3
+        return arm.state(max_age=2.0).tcp_set.distance(goal)[0] < 3e-3
 
     for _ in range(5):
         with contextlib.suppress(MotionStopped), warnings.catch_warnings():
@@ -226,7 +226,7 @@ def test_an_arm_that_comes_there_ends_the_goal(rig: hal.Rig, viewer: ViserViewer
 
 def test_its_stop_stops_and_a_trip_ends_goals(rig: hal.Rig, viewer: ViserViewer, page: PlainPage) -> None:
     arm = rig.robots["panda"]
-    page.drag(HANDLE, beside(arm.state().tcp, 0.1))
+    page.drag(HANDLE, beside(arm.state(max_age=2.0).tcp, 0.1))
     until(lambda: viewer.goal("panda"))
     until(lambda: page.hear() or "Stop" in page.buttons)
     with pytest.raises(MotionStopped, match="stop"), arm.control(rate_hz=50) as control:
