@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 
 RATE_HZ = 50.0
 STALE = 2.0
+LET_GO = 0.2
+"""s without the dead-man after which somebody does not want to go home any more."""
 
 
 def parser() -> argparse.ArgumentParser:
@@ -193,8 +195,17 @@ class Session:
         return towards(goal, self.robot.state(max_age=STALE).tcp_set, speed * linear, speed * angular)
 
     def _go_home(self) -> None:
+        from hal.errors import MotionStopped
+
         self._event("home: hold the dead-man until the arm is there")
-        self.robot.move_to(self.robot.home, deadman=self.deadman)
+        try:
+            self.robot.move_to(self.robot.home, deadman=self.deadman, patience=LET_GO)
+        except MotionStopped:
+            if self.deadman.held or not self.deadman.connected:
+                raise
+            self._event("home: given up, the dead-man was let go of")
+        else:
+            self._event("home: there; let go of the dead-man and hold it again to drive")
 
     def _ending(self) -> str:
         if self.pad.finished:

@@ -72,12 +72,19 @@ def cost(seconds: float) -> None:
     try:
         pid = bench.console._child.process.pid  # type: ignore[attr-defined]
         _console(bench, pid, "console, no page", seconds)
+        page = subprocess.Popen([sys.executable, __file__, "--page", bench.link])
+        try:
+            wait_for(lambda: bench.status == "following", "the page without a browser to drive")
+            _console(bench, pid, "console, a page without a browser", seconds)
+        finally:
+            page.terminate()
+            page.wait()
         browser = Browser()
         try:
             browser.open(bench.link)
             browser.wait_driving()
             browser.hold()
-            _console(bench, pid, "console, page drives, two cameras", seconds)
+            _console(bench, pid, "console, Chromium drives, two cameras", seconds)
             state = browser.facts["lastState"]["cameras"]
             print(
                 "    "
@@ -105,6 +112,50 @@ def _console(bench: Bench, pid: int, name: str, seconds: float) -> None:
     missed = _missed(bench.rig, seconds)
     share = 100.0 * (cpu(pid) - before) / seconds
     print(f"{name:34s} {share:5.1f} % of a processor   missed {missed:.2f} %")
+
+
+async def be_a_page(link: str) -> None:
+    """Do what the page does, without a browser beside the servo: hold the dead-man, take every picture."""
+    import asyncio
+
+    import aiohttp
+
+    parts = urlsplit(link)
+    origin = f"http://{parts.netloc}"
+    options: dict[str, Any] = {"protocols": ("hal.v1", parts.fragment), "origin": origin}
+    seen, arrived = 0.0, time.monotonic()
+    async with aiohttp.ClientSession() as session:
+        live = await session.ws_connect(f"{origin}/live", **options)
+        pictures = await session.ws_connect(f"{origin}/pictures", **options)
+        await live.send_json({"type": "lease", "take": True})
+        names: list[str] = []
+
+        async def hear() -> None:
+            nonlocal seen, arrived, names
+            async for message in live:
+                said = message.json()
+                if said["type"] in ("beat", "lease"):
+                    seen, arrived = said["t"], time.monotonic()
+                elif said["type"] == "hello":
+                    names = [camera["name"] for camera in said["rig"]["cameras"]]
+                    await pictures.send_json({"type": "watch", "cameras": names})
+
+        async def draw() -> None:
+            async for message in pictures:
+                await pictures.send_json({"type": "drawn", "camera": names[message.data[0]]})
+
+        async def beat() -> None:
+            turn = 0
+            while True:
+                await asyncio.sleep(0.02)
+                turn += 1
+                held = turn > 50
+                since = 1e3 * (time.monotonic() - arrived)
+                axes = [0.0, 0.0, 0.0, 0.0, float(held), 0.0, 0.0, 0.0]
+                buttons = (1 << 6) * held
+                await live.send_json({"type": "pad", "seen": seen, "since": since, "axes": axes, "buttons": buttons})
+
+        await asyncio.gather(hear(), draw(), beat())
 
 
 def latency(runs: int) -> None:
@@ -219,7 +270,12 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=20.0, help="of each measurement of cost (%(default)s)")
     parser.add_argument("--runs", type=int, default=30, help="presses for the latency (%(default)s); a tenth for stops")
     parser.add_argument("--only", nargs="+", default=["start", "cost", "latency", "stops"], help="parts to run")
+    parser.add_argument("--page", metavar="LINK", help=argparse.SUPPRESS)
     args = parser.parse_args()
+    if args.page:
+        import asyncio
+
+        asyncio.run(be_a_page(args.page))
     few = max(3, args.runs // 10)
     parts = {
         "start": lambda: start(few),

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 __all__ = ["PATIENCE", "move_to"]
 
 PATIENCE = 60.0
-"""How long ``move_to`` waits for somebody to hold the dead-man, s."""
+"""How long ``move_to`` waits for somebody to hold the dead-man unless told otherwise, s."""
 
 
 def move_to(
@@ -32,6 +32,7 @@ def move_to(
     speed: float | None,
     tcp_speed: float | None,
     timeout: float | None,
+    patience: float = PATIENCE,
 ) -> RobotState:
     """See :meth:`hal.robot.Robot.move_to`."""
     goal = robot.ik(target) if isinstance(target, Pose) else JointTarget(target).q
@@ -63,8 +64,8 @@ def move_to(
                 break
             if deadman is None or deadman.held:
                 held = clock.now()
-            elif clock.now() - held > PATIENCE:
-                raise MotionStopped(f"nobody held the dead-man for {PATIENCE:g} s", "call move_to again")
+            elif clock.now() - held > patience:
+                raise MotionStopped(f"nobody held the dead-man for {patience:g} s", "call move_to again")
             if timeout is not None and clock.now() - start > timeout:
                 raise TimeoutError(f"{robot.name} did not reach the target within {timeout:g} s")
     return robot.state()

@@ -230,17 +230,26 @@ class Robot:
         speed: float | None = None,
         tcp_speed: float | None = None,
         timeout: float | None = None,
+        patience: float = 60.0,
     ) -> RobotState:
         """Move to joint positions (n,) or to a tcp pose in the base frame, straight in joint space; blocks.
 
         ``speed`` is a share of the joint speed limits, up to 1 (``move_speed`` of the rig, 0.1, by default); the tcp
         stays below the rig's ``tcp_speed`` all the same. With a dead-man it waits until that is held, and pauses while
-        it is not. Raises CommandError, Unreachable, MotionStopped after a trip, and TimeoutError after ``timeout`` s.
+        it is not, for up to ``patience`` s. Raises CommandError, Unreachable, MotionStopped after a trip or when nobody
+        held the dead-man for so long, and TimeoutError after ``timeout`` s.
         """
         from .moving import move_to
 
         return move_to(
-            self, target, deadman=deadman, unattended=unattended, speed=speed, tcp_speed=tcp_speed, timeout=timeout
+            self,
+            target,
+            deadman=deadman,
+            unattended=unattended,
+            speed=speed,
+            tcp_speed=tcp_speed,
+            timeout=timeout,
+            patience=patience,
         )
 
     def recover(self) -> None:

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 from hal.camera import Camera, RawFrame
 from hal.console import Console, Listen
 from hal.errors import ConnectionLost, HalError, NotSupported
-from hal.gamepad import Gamepad
+from hal.gamepad import Gamepad, PadReading
 from hal.host.frames import FrameRing
 from hal.host.hosts import RemoteHost
 from hal.host.process import Channel, Child, SharedMemory
@@ -47,8 +47,7 @@ class WebConsole(Console):
 
     def __init__(self, rig: Rig, listen: Listen, *, driven_by: str | None) -> None:
         super().__init__(rig, listen, driven_by=driven_by)
-        self.mail = PadMail()
-        """What the page does with its pad."""
+        self._mails: list[PadMail] = []
         self._driver: str | None = None
         self._token = secrets.token_urlsafe(_TOKEN_BYTES)
         self._address, self._port = listen.address, listen.port
@@ -108,6 +107,16 @@ class WebConsole(Console):
         """The page that drives, by its name; None where none does."""
         return self._driver
 
+    def subscribe(self) -> PadMail:
+        """What the page does with its pad, from now on."""
+        mail = PadMail()
+        self._mails.append(mail)
+        return mail
+
+    def _put(self, found: PadReading) -> None:
+        for mail in self._mails:
+            mail.put(found)
+
     # What it tells.
 
     def say(self, text: str) -> None:
@@ -161,14 +170,14 @@ class WebConsole(Console):
             pass
         finally:
             self._driver = None
-            self.mail.put(gone(time.monotonic(), 0))
+            self._put(gone(time.monotonic(), 0))
             if not self._closed.is_set():
                 print("the console's process is gone: no page can drive or stop any more", file=sys.stderr)
 
     def _take(self, message: dict[str, Any]) -> None:
         if "pad" in message:
             pad = message["pad"]
-            self.mail.put(reading(pad, 0))
+            self._put(reading(pad, 0))
             if not pad["connected"]:
                 self.say(f"the pad is gone: {pad['why']}")
             self._say_what_is_waited_for()

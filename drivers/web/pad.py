@@ -86,7 +86,8 @@ class PadMail:
 class PadSource(Protocol):
     """What :class:`WebPad` asks of the console."""
 
-    mail: PadMail
+    def subscribe(self) -> PadMail:
+        """What the page does with its pad, from now on; each pad of a rig that is the page's has a mail of its own."""
 
     @property
     def driver(self) -> str | None:
@@ -111,6 +112,7 @@ class WebPad(GamepadDriver):
 
     def __init__(self, spec: PadSpec, source: object | None = None) -> None:
         super().__init__(spec, source)
+        self._mail = PadMail()
         self._told = gone(-math.inf, 0)
         self._gone_until = -math.inf
         self._tour: GamepadDriver | None = None
@@ -124,8 +126,9 @@ class WebPad(GamepadDriver):
         return source
 
     def open(self) -> None:
-        if not hasattr(self.source, "mail"):
+        if not hasattr(self.source, "subscribe"):
             raise NotSupported("the page drives a rig that was opened with its console: pad='web'")
+        self._mail = self._console.subscribe()
         self._open = True
 
     def play(self, on: bool) -> None:
@@ -137,10 +140,10 @@ class WebPad(GamepadDriver):
         if wanted is not None and wanted != (self._tour is not None):
             return self._begin(now) if wanted else self._end(now)
         if self._tour is None:
-            found = self._console.mail.take(timeout)
+            found = self._mail.take(timeout)
             silent = now - found.t_alive > SILENCE  # the console's process hangs, or is stopped
             return self._tell(found if self._open and not silent else gone(found.t, 0), now)
-        page = self._console.mail.take(0.0)
+        page = self._mail.take(0.0)
         if page.buttons or not page.connected or self._tour.finished:
             return self._end(now)
         return self._tell(self._tour.poll(now, timeout), now)

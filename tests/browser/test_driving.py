@@ -106,6 +106,21 @@ def test_home_goes_while_the_dead_man_is_held(bench: Bench, page: Browser) -> No
     page.let_go()
 
 
+def test_letting_go_on_the_way_home_gives_it_up(bench: Bench, page: Browser) -> None:
+    page.hold()
+    with page.drag("dpad", 0.0, -0.8):
+        wait_for(lambda: abs(bench.arm.state(max_age=2.0).q - bench.arm.home).max() > 0.2, "the arm to leave home")
+    wait_for(bench.rests, "the arm to rest")
+    page.click("#home")
+    wait_for(lambda: "hold the dead-man until" in page.text("#log") and bench.speed() > 0.01, "the way home")
+    page.let_go()
+    wait_for(lambda: "given up" in page.text("#log"), "the app to give it up")
+    page.hold()
+    with page.drag("dpad", -0.8, 0.0):
+        wait_for(lambda: bench.tcp_speed[1] > 0.1, "the sticks to drive again")
+    page.let_go()
+
+
 def test_a_pad_of_the_browser_has_the_same_names(bench: Bench, page: Browser) -> None:
     """A pad as the Gamepad API shows it, standard layout: its L2 holds, its d-pad drives."""
     page.run(

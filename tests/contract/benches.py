@@ -198,6 +198,9 @@ def web_pad() -> Iterator[PadBench]:
         driver = "page 1"
         there, mask = True, 0
 
+        def subscribe(self) -> PadMail:
+            return self.mail
+
         def show_playing(self, on: bool) -> None:
             """No recording is played here."""
 

@@ -27,6 +27,9 @@ class Page:
         self.driver: str | None = "page 1"
         self.playing: list[bool] = []
 
+    def subscribe(self) -> PadMail:
+        return self.mail
+
     def show_playing(self, on: bool) -> None:
         self.playing.append(on)
 
