@@ -97,7 +97,8 @@ def run_app(main: Any, args: argparse.Namespace) -> int:
     """Run ``main(args)``; an error that a person can mend becomes a message, not a traceback."""
     from hal.errors import HalError
 
-    logging.getLogger("hal.console").disabled = True  # the banner says it
+    link = logging.getLogger("hal.console")
+    before, link.disabled = link.disabled, True  # the banner says it
     try:
         with interruptible():
             return int(main(args))
@@ -109,3 +110,5 @@ def run_app(main: Any, args: argparse.Namespace) -> int:
         return ACTION_NEEDED
     except KeyboardInterrupt:
         return 130
+    finally:
+        link.disabled = before

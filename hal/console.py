@@ -34,7 +34,10 @@ class Listen(NamedTuple):
         """``ADDRESS[:PORT]`` or ``:PORT``, IPv6 in brackets; None is loopback. CommandError for anything else."""
         if text is None:
             return cls()
-        wrong = CommandError(f"--listen takes an address and a port, for example 0.0.0.0:{PORT}, not {text!r}")
+        hint = f"; for a port alone write :{text}" if text.isdigit() else ""
+        wrong = CommandError(f"--listen takes an address and a port, for example 0.0.0.0:{PORT}, not {text!r}{hint}")
+        if hint:
+            raise wrong
         if text.startswith("["):
             address, bracket, rest = text[1:].partition("]")
             if not bracket or (rest and not rest.startswith(":")):

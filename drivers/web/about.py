@@ -62,4 +62,5 @@ def _about_robot(robot: RobotSpec) -> dict[str, Any]:
 
 
 def _accepts_silent_pads(rig: Rig) -> bool:
-    return any(pad.options.get("accept_silent_pad") is True for pad in rig.plan.pads)
+    ours = [pad for pad in rig.plan.pads if pad.driver in ("auto", "web")]
+    return any(pad.options.get("accept_silent_pad") is True for pad in ours)

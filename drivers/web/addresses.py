@@ -32,9 +32,10 @@ def link(address: str, port: int, token: str) -> str:
     return f"http://{host}:{port}/#{token}"
 
 
-def tunnel(port: int) -> str:
+def tunnel(address: str, port: int) -> str:
     """The ssh command that makes the link work on the computer where it is typed."""
-    return f"ssh -L {port}:127.0.0.1:{port} {_user()}@{socket.gethostname()}"
+    there = f"[{address}]" if ":" in address else address
+    return f"ssh -L {port}:{there}:{port} {_user()}@{socket.gethostname()}"
 
 
 def names() -> list[str]:

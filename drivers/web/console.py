@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
-import queue
 import secrets
 import sys
 import threading
@@ -14,16 +12,17 @@ from typing import TYPE_CHECKING, Any
 
 from hal.camera import Camera, RawFrame
 from hal.console import Console, Listen
-from hal.errors import ConnectionLost, HalError, NotSupported
+from hal.errors import HalError, NotSupported
 from hal.gamepad import Gamepad, PadReading
 from hal.host.frames import FrameRing
 from hal.host.hosts import RemoteHost
-from hal.host.process import Channel, Child, SharedMemory
+from hal.host.process import Child, SharedMemory
 from hal.specs import CameraSpec, to_json
 from hal.types import Frame
 
 from .about import about_rig, shown_stream
 from .addresses import is_loopback, link, names, tunnel
+from .conversation import Conversation
 from .pad import PadMail, WebPad, gone, reading
 
 if TYPE_CHECKING:
@@ -31,18 +30,13 @@ if TYPE_CHECKING:
 
 __all__ = ["WebConsole"]
 
-_LOOK = 0.5
-"""s between two looks whether the console's process is still there."""
-_OUTGOING = 256
-"""Messages that may wait for the console's process."""
 _TOKEN_BYTES = 18
 
 
 class WebConsole(Console):
-    """The page, its process, and the two threads that talk with that.
+    """What an app tells its pages, and what it does for them.
 
-    One thread hears the page's pad and its wishes. The other one tells: a console that does not listen (stopped,
-    swapped out) must never hold up a camera or the app.
+    A console that does not listen (stopped, swapped out) holds up neither a camera nor the app: :mod:`.conversation`.
     """
 
     def __init__(self, rig: Rig, listen: Listen, *, driven_by: str | None) -> None:
@@ -54,9 +48,8 @@ class WebConsole(Console):
         self._watched: frozenset[str] = frozenset()
         self._waiting: tuple[str, ...] = ()
         self._detach: list[Any] = []
-        self._closed = threading.Event()
-        self._outgoing: queue.Queue[dict[str, Any] | None] = queue.Queue(_OUTGOING)
-        self._threads: list[threading.Thread] = []
+        self._closed = False
+        self._recovering = threading.Lock()
         hosts = [host for host in rig._hosts if isinstance(host, RemoteHost)]
         if len(hosts) != len(rig._hosts):
             raise NotSupported("the console shows a rig in real time only")
@@ -74,16 +67,13 @@ class WebConsole(Console):
         }
         memories = [self._frames, *(host.shared for host in hosts)]
         self._child = Child("console", "hal.drivers.web.process:main", config, memories)
+        self._conversation = Conversation(self._child, self._take, self._is_lost)
 
     def wait_ready(self) -> None:
         ready = self._child.wait_ready()
         self._address, self._port = str(ready["address"]), int(ready["port"])
         self.notes = self._warnings()
-        hear = threading.Thread(target=self._hear, name="hal-console-hear", daemon=True)
-        tell = threading.Thread(target=self._tell, name="hal-console-tell", daemon=True)
-        self._threads = [hear, tell]
-        for thread in self._threads:
-            thread.start()
+        self._conversation.start()
 
     def _warnings(self) -> tuple[str, ...]:
         if is_loopback(self._address):
@@ -100,12 +90,17 @@ class WebConsole(Console):
 
     @property
     def tunnel(self) -> str:
-        return tunnel(self._port) if is_loopback(self._address) else ""
+        return tunnel(self._address, self._port) if is_loopback(self._address) else ""
 
     @property
     def driver(self) -> str | None:
         """The page that drives, by its name; None where none does."""
         return self._driver
+
+    @property
+    def stops(self) -> int:
+        """How often ``rig.stop()`` was called, by whomever."""
+        return sum(host.stops for host in self.rig._hosts)
 
     def subscribe(self) -> PadMail:
         """What the page does with its pad, from now on."""
@@ -120,14 +115,14 @@ class WebConsole(Console):
     # What it tells.
 
     def say(self, text: str) -> None:
-        self._send({"method": "say", "t": time.monotonic(), "text": text})
+        self._conversation.tell("say", t=time.monotonic(), text=text)
 
     def explain(self, labels: Mapping[str, Any]) -> None:
-        self._send({"method": "labels", "labels": dict(labels)})
+        self._conversation.tell("labels", labels=dict(labels))
 
     def show_playing(self, on: bool) -> None:
         """Tell the pages whether the recorded tour is being played."""
-        self._send({"method": "playing", "on": on})
+        self._conversation.tell("playing", on=on)
 
     def show(self, camera: Camera) -> None:
         """Show this camera's frames to whoever watches it."""
@@ -142,37 +137,14 @@ class WebConsole(Console):
         layers = {name: getattr(frame, name) for name in spec.streams}
         raw = RawFrame(stamp.t, stamp.t_device, stamp.seq, None, None, None, None, None)._replace(**layers)
         self._ring.put(spec.name, raw)
-        self._send({"method": "frame", "camera": spec.name})
-
-    def _send(self, message: dict[str, Any]) -> None:
-        with contextlib.suppress(queue.Full):  # it does not listen; what it missed is old by the time it does
-            self._outgoing.put_nowait(message)
-
-    def _tell(self) -> None:
-        channel = Channel(self._child.channel.sock.dup())
-        try:
-            while (message := self._outgoing.get()) is not None:
-                channel.send(message)
-        except ConnectionLost:
-            pass  # the hearing thread says so
-        finally:
-            channel.close()
+        self._conversation.show(spec.name)
 
     # What it hears.
 
-    def _hear(self) -> None:
-        try:
-            while not self._closed.is_set():
-                message = self._child.channel.receive(_LOOK)
-                if message is not None:
-                    self._take(message)
-        except (ConnectionLost, OSError, ValueError):
-            pass
-        finally:
-            self._driver = None
-            self._put(gone(time.monotonic(), 0))
-            if not self._closed.is_set():
-                print("the console's process is gone: no page can drive or stop any more", file=sys.stderr)
+    def _is_lost(self) -> None:
+        self._driver = None
+        self._put(gone(time.monotonic(), 0))
+        print("the console is gone: no page can drive or stop any more; start the program anew", file=sys.stderr)
 
     def _take(self, message: dict[str, Any]) -> None:
         if "pad" in message:
@@ -189,23 +161,35 @@ class WebConsole(Console):
         elif "watched" in message:
             self._watched = frozenset(message["watched"])
         elif "recover" in message:
-            # It may take long, and the pad must be heard meanwhile.
-            threading.Thread(target=self._recover, args=(message["recover"], message["page"]), daemon=True).start()
+            self._start_recovery(str(message["recover"]), str(message["page"]))
         elif "demo" in message:
             self._play(bool(message["demo"]), str(message["page"]))
+
+    def _start_recovery(self, robot: str, page: str) -> None:
+        """One at a time, in a thread of its own: it may take long, and the pad must be heard meanwhile."""
+        if not self._recovering.acquire(blocking=False):
+            self._conversation.tell("refused", page=page, why="a robot is being recovered already")
+            return
+        try:
+            threading.Thread(target=self._recover, args=(robot, page), name="hal-console-recover", daemon=True).start()
+        except RuntimeError:
+            self._recovering.release()
+            raise
 
     def _recover(self, robot: str, page: str) -> None:
         try:
             self.rig.robots[robot].recover()
         except (HalError, OSError) as error:
-            self._send({"method": "refused", "page": page, "why": str(error)})
+            self._conversation.tell("refused", page=page, why=str(error))
         else:
             self.say(f"{robot} recovered by {page}: release the dead-man and press it again")
+        finally:
+            self._recovering.release()
 
     def _play(self, on: bool, page: str) -> None:
         pad = self._pad()
         if pad is None or self.rig.attended:
-            self._send({"method": "refused", "page": page, "why": "the tour is played in simulation only"})
+            self._conversation.tell("refused", page=page, why="the tour is played in simulation only")
             return
         assert isinstance(pad.driver, WebPad)
         pad.driver.play(on)
@@ -218,19 +202,15 @@ class WebConsole(Console):
         waiting = pad.waiting_for if pad is not None else ()
         if waiting != self._waiting:
             self._waiting = waiting
-            self._send({"method": "waiting", "controls": list(waiting)})
+            self._conversation.tell("waiting", controls=list(waiting))
 
     def close(self) -> None:
-        if self._closed.is_set():
+        if self._closed:
             return
-        self._closed.set()
+        self._closed = True
         for detach in self._detach:
             detach()
-        with contextlib.suppress(queue.Full):
-            self._outgoing.put_nowait(None)
-        self._child.close()
-        for thread in self._threads:
-            thread.join(timeout=1.0)
+        self._conversation.close()
         self._frames.close()
 
 

@@ -93,6 +93,10 @@ class PadSource(Protocol):
     def driver(self) -> str | None:
         """The page that drives."""
 
+    @property
+    def stops(self) -> int:
+        """How often ``rig.stop()`` was called."""
+
     def show_playing(self, on: bool) -> None:
         """Tell the pages whether the recorded tour is being played."""
 
@@ -105,7 +109,7 @@ class WebPad(GamepadDriver):
     That the *person* is there is proven by a finger on the dead-man alone, as with every pad.
 
     In simulation, a page may ask for the recorded tour; it is played in the place of the page's pad until it ends, the
-    page is gone, or its person touches a button.
+    page is gone, its person touches a button, or somebody stops the arms.
     """
 
     proves_liveness = True
@@ -116,6 +120,8 @@ class WebPad(GamepadDriver):
         self._told = gone(-math.inf, 0)
         self._gone_until = -math.inf
         self._tour: GamepadDriver | None = None
+        self._stops = 0
+        """Calls of ``rig.stop()`` when the tour began: one more ends it, for nobody is there to acknowledge it."""
         self._wanted: bool | None = None
         """Somebody asked for the tour, or for its end."""
         self._open = False
@@ -144,13 +150,15 @@ class WebPad(GamepadDriver):
             silent = now - found.t_alive > SILENCE  # the console's process hangs, or is stopped
             return self._tell(found if self._open and not silent else gone(found.t, 0), now)
         page = self._mail.take(0.0)
-        if page.buttons or not page.connected or self._tour.finished:
+        watched = page.connected and now - page.t_alive <= SILENCE
+        if page.buttons or not watched or self._tour.finished or self._console.stops != self._stops:
             return self._end(now)
         return self._tell(self._tour.poll(now, timeout), now)
 
     def _begin(self, now: float) -> PadReading:
         self._tour = registry.load("playback", "gamepad")(replace(tour(self.spec), name=self.spec.name), None)
         self._tour.open()
+        self._stops = self._console.stops
         self._console.show_playing(True)
         return self._tell(gone(now, 0), now)
 

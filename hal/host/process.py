@@ -34,6 +34,8 @@ _BOOT = (
 START_TIMEOUT = 60.0
 """Longest time that a child may take to get ready, s: reading a large mesh for the first time takes a while."""
 REQUEST_TIMEOUT = 30.0
+GOODBYE = 0.5
+"""A child that does not take the word that it should end within so long, s, is stopped or hangs."""
 
 
 class ChannelClosed(ConnectionLost):
@@ -74,12 +76,12 @@ class Channel:
         self._pending = b""
         self._sending = threading.Lock()
 
-    def send(self, message: Any) -> None:
-        """Send one message. ConnectionLost when the other side is gone."""
+    def send(self, message: Any, timeout: float = REQUEST_TIMEOUT) -> None:
+        """Send one message. ConnectionLost when the other side is gone, or does not take it within ``timeout`` s."""
         data = json.dumps(message).encode() + b"\n"
         try:
             with self._sending:
-                self.sock.settimeout(REQUEST_TIMEOUT)
+                self.sock.settimeout(timeout)
                 self.sock.sendall(data)
         except OSError as error:
             raise ChannelClosed(f"the other process is gone: {error}") from None
@@ -231,7 +233,7 @@ class Child:
         """Ask the child to stop and end, and wait for it; end it by force when it does not. Idempotent."""
         try:
             if self.process.poll() is None:
-                self.channel.send({"id": 0, "method": "close", "params": {}})
+                self.channel.send({"id": 0, "method": "close", "params": {}}, GOODBYE)
         except ConnectionLost:
             pass
         if not self._wait_end(timeout):

@@ -196,6 +196,7 @@ def web_pad() -> Iterator[PadBench]:
     class Page:
         mail = PadMail()
         driver = "page 1"
+        stops = 0
         there, mask = True, 0
 
         def subscribe(self) -> PadMail:

@@ -29,7 +29,7 @@ def test_what_may_be_asked_for(text: str | None, expected: tuple[str, int, bool]
     assert Listen.parse(text) == expected
 
 
-@pytest.mark.parametrize("text", ["0.0.0.0:port", "[::1", "[::1]9000", "1.2.3.4:70000", "a:-1"])
+@pytest.mark.parametrize("text", ["0.0.0.0:port", "[::1", "[::1]9000", "1.2.3.4:70000", "a:-1", "8470"])
 def test_what_may_not(text: str) -> None:
     with pytest.raises(CommandError, match="--listen"):
         Listen.parse(text)
@@ -42,7 +42,8 @@ def test_the_token_stands_in_the_fragment() -> None:
 
 
 def test_a_tunnel_keeps_the_port_so_that_the_link_stays_the_same() -> None:
-    assert "-L 8470:127.0.0.1:8470 " in tunnel(8470)
+    assert "-L 8470:127.0.0.1:8470 " in tunnel("127.0.0.1", 8470)
+    assert "-L 8470:[::1]:8470 " in tunnel("::1", 8470)
 
 
 def test_loopback() -> None:

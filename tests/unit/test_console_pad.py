@@ -26,6 +26,7 @@ class Page:
         self.mail = PadMail()
         self.driver: str | None = "page 1"
         self.playing: list[bool] = []
+        self.stops = 0
 
     def subscribe(self) -> PadMail:
         return self.mail
@@ -141,13 +142,33 @@ def test_the_tour_plays_and_gives_way(page: Page, pad: WebPad) -> None:
     assert pad.poll(1.0, 0.0).connected
     pad.play(True)
     assert not pad.poll(1.0, 0.0).connected, "what is held on the page does not hold on in the tour"
-    held = [pad.poll(1.0 + 0.05 * k, 0.0).axes["l2"] > 0.5 for k in range(60)]
+    held = []
+    for k in range(60):
+        page.send(1.0 + 0.05 * k)
+        held.append(pad.poll(1.0 + 0.05 * k, 0.0).axes["l2"] > 0.5)
     assert any(held)
     page.send(4.1, SOUTH)
     assert not pad.poll(4.1, 0.0).connected
     assert page.playing == [True, False]
     assert pad.poll(4.2, 0.0).buttons == {"south"}
     assert not pad.finished
+
+
+@pytest.mark.parametrize("end", ["stop", "silence"])
+def test_a_stop_and_a_silent_page_end_the_tour(page: Page, pad: WebPad, end: str) -> None:
+    page.send(1.0)
+    pad.poll(1.0, 0.0)
+    pad.play(True)
+    pad.poll(1.0, 0.0)
+    page.send(1.1)
+    assert pad.poll(1.1, 0.0).connected
+    if end == "stop":
+        page.stops += 1
+        page.send(1.2)
+    assert pad.poll(1.2 if end == "stop" else 1.3, 0.0).connected is False
+    page.send(2.0)
+    assert pad.poll(2.0, 0.0).buttons == frozenset(), "it does not go on by itself"
+    assert page.playing == [True, False]
 
 
 def test_the_tour_ends_when_its_page_goes_and_when_it_is_over(page: Page, pad: WebPad) -> None:
@@ -165,6 +186,7 @@ def test_the_tour_ends_when_its_page_goes_and_when_it_is_over(page: Page, pad: W
     pad.play(True)
     pad.poll(2.0, 0.0)
     for t in range(2, 600):
+        page.send(float(t))
         pad.poll(float(t), 0.0)
         if not page.playing[-1]:
             break
