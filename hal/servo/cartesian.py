@@ -114,7 +114,7 @@ class TwistMotion(_CartesianMotion):
     def step(self, now: float) -> None:
         smoother, envelope = self.smoother, self.envelope
         if not any(self._values[:6]):
-            smoother.follow([0.0] * smoother.n, envelope.guard)
+            smoother.settle(envelope.guard)
             self.start()
             return
         pose, _ = envelope.here()

@@ -162,6 +162,20 @@ class JointSmoother:
         self._commit()
         return True
 
+    def settle(self, guard: Guard | None = None) -> None:
+        """One tick towards rest in which the joints keep their proportions, so that the tcp stays on its way.
+
+        It takes as long as the joint that needs longest; where a limit is near each joint stops by itself.
+        """
+        self._input.synchronization = Synchronization.Phase
+        self._propose_velocity(self._zeros)
+        self._input.synchronization = Synchronization.No
+        self.guarded = False
+        self.held_back = self._violations()
+        if self.held_back or (guard is not None and not guard(self)):
+            self._propose_velocity(self._zeros)
+        self._commit()
+
     def stop(self) -> None:
         """One tick of the time-optimal stop."""
         self.held_back = self._none

@@ -80,6 +80,18 @@ def test_letting_go_of_the_stick_stops_without_coming_back() -> None:
     bench.assert_within_limits()
 
 
+def test_pushes_and_stops_do_not_add_up_to_a_tilted_hand() -> None:
+    """Joints that brake each by itself lose 6 mm of height and turn the hand by a degree in every stop."""
+    bench = Bench(tcp_speed=0.25)
+    for k in range(6):
+        bench.stream(0.5, Kind.TWIST, [0.2 * (-1) ** k, 0, 0, 0, 0, 0, 0])
+        bench.stream(0.3, Kind.TWIST, [0.0] * 7)
+        assert not bench.moving
+    assert abs(tcp(bench)[-1, 2] - tcp(bench)[0, 2]) < 0.003
+    assert turned(bench) < math.radians(0.1)
+    bench.assert_within_limits()
+
+
 def test_the_tcp_speed_is_kept_through_reversals_and_turns() -> None:
     bench = Bench(tcp_speed=0.25, speed=0.5)
     for k in range(720):

@@ -19,7 +19,7 @@ LIMITS = LimitsSpec((-1.0, -2.0), (1.0, 0.5), (2.0, 1.0), (10.0, 5.0), (1000.0, 
 SHARES = st.tuples(st.floats(0.1, 1.0), st.floats(0.02, 1.0))
 # One thing to ask for, and for how many ticks: velocities, a position, or a stop.
 REQUEST = st.tuples(
-    st.sampled_from(("follow", "reach", "stop")),
+    st.sampled_from(("follow", "reach", "settle", "stop")),
     st.tuples(st.floats(-4.0, 4.0), st.floats(-4.0, 4.0)),
     st.integers(1, 80),
 )
@@ -36,6 +36,8 @@ def play(smoother: JointSmoother, requests: Sequence[tuple[str, tuple[float, flo
         for _ in range(ticks):
             if what == "follow":
                 smoother.follow(values)
+            elif what == "settle":
+                smoother.settle()
             elif what == "stop" or not smoother.reach(clamp(values, smoother), smoother.velocity):
                 smoother.stop()
             path.append(list(smoother.q))
@@ -98,6 +100,25 @@ def test_velocity_is_reached_and_the_stop_ends_where_it_was_foretold() -> None:
         smoother.stop()
     assert smoother.q == pytest.approx(foretold, abs=1e-9)
     assert foretold[0] > 0.1
+
+
+def test_settling_keeps_the_proportions_and_takes_no_longer_than_the_slowest_joint() -> None:
+    settling, stopping = JointSmoother(LIMITS, 1 / 240), JointSmoother(LIMITS, 1 / 240)
+    for smoother in (settling, stopping):
+        smoother.anchor([0.0, 0.0], [0.8, -0.4])
+    ratios = []
+    ticks = {"settle": 0, "stop": 0}
+    for smoother, way in ((settling, "settle"), (stopping, "stop")):
+        while not smoother.at_rest():
+            getattr(smoother, way)()
+            ticks[way] += 1
+            assert ticks[way] < 1000
+            if way == "settle" and abs(smoother.dq[0]) > 0.01:
+                ratios.append(smoother.dq[1] / smoother.dq[0])
+    assert ratios == pytest.approx([-0.5] * len(ratios), rel=1e-3)
+    assert len(ratios) > 5
+    assert ticks["settle"] <= ticks["stop"] + 2
+    assert settling.q[1] / settling.q[0] == pytest.approx(-0.5, rel=1e-3)
 
 
 def test_reach_arrives_exactly_and_keeps_its_speed() -> None:
