@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from typing import TYPE_CHECKING
+from urllib.parse import urlsplit
 
 if TYPE_CHECKING:
     from hal.config.plan import Plan
@@ -67,4 +68,7 @@ def invitation(rig: Rig) -> str:
         if not lines:
             lines.append("")
         lines += ["  The arms in three dimensions, on this machine:", "", f"      {rig.viewer3d.link}", ""]
+        if rig.console is not None and rig.console.tunnel:
+            port = urlsplit(rig.viewer3d.link).port
+            lines += [f"  (from another computer, add to the ssh line: -L {port}:127.0.0.1:{port})", ""]
     return "\n".join(lines)

@@ -79,6 +79,8 @@ def _main(args: argparse.Namespace) -> int:
         name = args.robot or next(iter(rig.robots), None)
         if name is None:
             raise CommandError(f"{rig.plan.source} has no robot to drive")
+        if args.pad == "none":
+            raise CommandError("--pad none: this program needs something that drives")
         if not rig.gamepads:
             raise CommandError(f"{rig.plan.source} has no gamepad; add 'gamepads: {{pad: {{model: auto}}}}'")
         robot, pad = rig.robots[name], next(iter(rig.gamepads.values()))
@@ -100,7 +102,7 @@ class Session:
         self.end = rig.clock.now() + args.duration if args.duration else None
         self.stopped: str | None = None
         if rig.console is not None:
-            rig.console.explain(teleop.labels())
+            rig.console.explain(teleop.labels(actions=("home",)))
 
     def run(self) -> int:
         """Drive until the time is over, the recording ends or Ctrl-C; then stop, report, close."""

@@ -94,7 +94,9 @@ class Teleop:
         return wanted if self._has_grip else None
 
     def labels(self, actions: Collection[str] = ()) -> dict[str, Any]:
-        """What the controls do, for a page that draws them. ``actions`` are those of the mapping that the app knows.
+        """What the controls do, for a page that draws them.
+
+        ``actions`` are those of the mapping that the app knows, and ``home`` where it looks at :meth:`home_pressed`.
 
         ``controls`` has the meanings of an axis at its two ends (-1 and 1, or released and pressed), and of a button.
         """
@@ -116,11 +118,12 @@ class Teleop:
         elif grip is not None:
             controls |= {str(grip.open): ["open the gripper"], str(grip.close): ["close the gripper"]}
         controls |= {button: [action] for action, button in mapping.actions.items() if action in actions}
-        if mapping.go_home is not None:
-            controls[mapping.go_home] = ["home"]
+        home = mapping.go_home if "home" in actions else None
+        if home is not None:
+            controls[home] = ["home"]
         return {
             "deadman": mapping.deadman,
-            "home": mapping.go_home,
+            "home": home,
             "frame": mapping.frame,
             "robot": self.robot.name,
             "controls": controls,

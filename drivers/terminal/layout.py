@@ -38,7 +38,7 @@ AXIS_KEYS: Mapping[str, tuple[str, float]] = MappingProxyType(
     }
 )
 """Key -> the axis that it pushes, and which way."""
-SHOULDER_KEYS: Mapping[str, str] = MappingProxyType({"pageup": "l1", "pagedown": "r1"})
+SHOULDER_KEYS: Mapping[str, str] = MappingProxyType({"pageup": "l1", "q": "l1", "pagedown": "r1", "e": "r1"})
 """Key -> the button that it is; these usually move something."""
 BUTTON_KEYS: Mapping[str, str] = MappingProxyType(
     {"1": "south", "2": "east", "3": "west", "4": "north", "enter": "start", "tab": "select", "home": "home"}
@@ -48,7 +48,7 @@ CLOSE, OPEN = "g", "h"
 """They pull r2, and let it go."""
 
 _KEYS = (
-    "    arrows: d-pad; Page Up/Down: l1/r1; WASD, IJKL: left, right stick; G/H: r2, close/open\n"
+    "    arrows: d-pad; Page Up/Down or Q/E: l1/r1; WASD, IJKL: left, right stick; G/H: r2, close/open\n"
     "    1 2 3 4: south east west north; Enter: start; Tab: select; Home: home; Ctrl-C ends"
 )
 STEP_HELP = (

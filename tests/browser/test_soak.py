@@ -1,6 +1,7 @@
 """Nothing stops the arm that should not: a minute of holding, with both cameras on the page.
 
-``HAL_SOAK_S=600`` makes it ten.
+``HAL_SOAK_S=600`` makes it ten. On a machine that is too busy for that the page's own main thread stands still for
+longer than the servo waits. Then the arm must stop, and the page says so in its log: such a try is repeated.
 """
 
 from __future__ import annotations
@@ -13,12 +14,24 @@ import pytest
 from .kit import Bench, Browser, need_browser, wait_for
 
 SECONDS = float(os.environ.get("HAL_SOAK_S", "60"))
+TRIES = 3
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(int(SECONDS) + 120)
+@pytest.mark.timeout(int(TRIES * SECONDS) + 180)
 def test_a_held_dead_man_stays_held() -> None:
     need_browser()
+    stalls = []
+    for _ in range(TRIES):
+        stall = hold_and_drive()
+        if stall is None:
+            return
+        stalls.append(stall)
+    pytest.fail(f"this machine is too busy: {stalls}")
+
+
+def hold_and_drive() -> str | None:
+    """Hold for so long, and drive to and fro. What the page says of its own standstill, if there was one."""
     bench, browser = Bench(cameras=True), Browser()
     try:
         browser.open(bench.link)
@@ -38,10 +51,13 @@ def test_a_held_dead_man_stays_held() -> None:
             turn += 1
             moved += abs(bench.tcp - last).max()
             last = bench.tcp
-            assert bench.trip == "none", f"stopped in turn {turn}: {bench.trip}"
-            assert bench.session.deadman.held
+            if bench.trip != "none" or not bench.session.deadman.held:
+                log = browser.text("#log")
+                assert "stood still" in log, f"stopped in turn {turn} without a reason: {bench.trip}\n{log}"
+                return log
         assert bench.session.report.trips == []
         assert moved > 0.03 * SECONDS, "the arm went to and fro"
+        return None
     finally:
         browser.close()
         bench.close()

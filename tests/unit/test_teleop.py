@@ -114,7 +114,7 @@ def test_help_names_the_controls(rig: hal.Rig, arm: hal.Robot) -> None:
 
 def test_labels_say_what_each_control_does() -> None:
     with hal.open("panda_table", driver="mock", overrides=["cameras={}"]) as rig:
-        labels = hal.Teleop(rig.robots["panda"]).labels(actions=("record",))
+        labels = hal.Teleop(rig.robots["panda"]).labels(actions=("record", "home"))
     assert (labels["deadman"], labels["home"], labels["robot"]) == ("l2", "north", "panda")
     controls = labels["controls"]
     assert controls["dpad_y"] == ["back", "forward"]
@@ -123,4 +123,5 @@ def test_labels_say_what_each_control_does() -> None:
     assert controls["left_x"] == ["turn left", "turn right"]
     assert controls["r2"] == ["gripper: open", "gripper: closed"]
     assert controls["south"] == ["record"]
+    assert controls["north"] == ["home"]
     assert "home" not in controls, "of the mapping's actions only those that the app knows"
