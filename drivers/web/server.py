@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 import errno
-import logging
 import socket
+import time
 from collections.abc import Awaitable, Callable
 from pathlib import Path
 
 from aiohttp import web
 
-from hal.errors import NotSupported
+from hal.errors import DriverMissing, NotSupported
 
 from .gatekeeper import Gatekeeper
 from .live import Live
 from .pictures import Pictures
+from .sockets import VISITORS
+from .visitors import Visitors
 
 __all__ = ["listening", "make_app", "read_page"]
 
@@ -24,8 +26,6 @@ _TYPES = {
     ".html": "text/html; charset=utf-8",
     ".css": "text/css; charset=utf-8",
     ".js": "text/javascript; charset=utf-8",
-    ".svg": "image/svg+xml",
-    ".png": "image/png",
 }
 _HEADERS = {
     "Cache-Control": "no-store",
@@ -46,9 +46,9 @@ Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 
 
 def read_page(folder: Path = _PAGE) -> dict[str, File]:
-    """The files of the page, by name: the only ones that are ever served."""
-    if not folder.is_dir():
-        return {}
+    """The files of the page, by name: the only ones that are ever served. DriverMissing where they are not."""
+    if not (folder / _INDEX).is_file():
+        raise DriverMissing(f"the console's page is not there: no {folder / _INDEX}; install the project again")
     return {
         path.name: (path.read_bytes(), _TYPES[path.suffix])
         for path in sorted(folder.iterdir())
@@ -56,12 +56,14 @@ def read_page(folder: Path = _PAGE) -> dict[str, File]:
     }
 
 
-def make_app(gatekeeper: Gatekeeper, live: Live, pictures: Pictures, files: dict[str, File]) -> web.Application:
+def make_app(
+    gatekeeper: Gatekeeper, visitors: Visitors, live: Live, pictures: Pictures, files: dict[str, File]
+) -> web.Application:
     """The server's application."""
-    logging.getLogger("aiohttp").setLevel(logging.ERROR)  # its warnings repeat headers, and so a mistyped token
 
     @web.middleware
     async def check(request: web.Request, handler: Handler) -> web.StreamResponse:
+        visitors.asked(request.transport, time.monotonic())
         host = request.headers.get("Host")
         if not gatekeeper.knows_host(host):
             raise web.HTTPMisdirectedRequest(text="this server has another name; open the link that it printed\n")
@@ -83,6 +85,7 @@ def make_app(gatekeeper: Gatekeeper, live: Live, pictures: Pictures, files: dict
         return web.Response(body=body, headers={"Content-Type": content_type})
 
     app = web.Application(middlewares=[check])
+    app[VISITORS] = visitors
     app.on_response_prepare.append(add_headers)
     app.router.add_get("/", serve_file)
     app.router.add_get("/page/{name}", serve_file)

@@ -22,13 +22,12 @@ from .live import Live
 from .pictures import Pictures
 from .server import listening, make_app, read_page
 from .telemetry import Telemetry
+from .visitors import Visitors
 
 __all__ = ["Service"]
 
 _PERIOD = 0.05
 """s between two states."""
-_KEEPALIVE = 15.0
-"""s for which an idle connection of plain HTTP stays open."""
 
 
 class Service:
@@ -48,24 +47,26 @@ class Service:
         self._desk = Desk(config["rig"], self._link)
         self._live = Live(gatekeeper, self._desk)
         self._pictures = Pictures(gatekeeper, self._gallery, self._tell_watched)
-        self._app = make_app(gatekeeper, self._live, self._pictures, read_page())
+        self._visitors = Visitors()
+        self._app = make_app(gatekeeper, self._visitors, self._live, self._pictures, read_page())
         self._parent = os.getppid()
 
     async def run(self) -> None:
         """Serve until the end."""
-        runner = web.AppRunner(self._app, access_log=None, handle_signals=False, keepalive_timeout=_KEEPALIVE)
+        runner = web.AppRunner(self._app, access_log=None, handle_signals=False)
         await runner.setup()
+        assert runner.server is not None
         self._channel.send({"ready": {"address": self._address, "port": self._socket.getsockname()[1]}})
         self._link.start()
-        site = web.SockSite(runner, self._socket)
-        await site.start()
+        receiving = asyncio.ensure_future(self._visitors.receive(self._socket, runner.server))
         telling = asyncio.ensure_future(self._tell_states())
         ended = asyncio.ensure_future(self._link.ended.wait())
-        await asyncio.wait((telling, ended), return_when=asyncio.FIRST_COMPLETED)
-        await site.stop()
+        done, _ = await asyncio.wait((receiving, telling, ended), return_when=asyncio.FIRST_COMPLETED)
+        receiving.cancel()
+        self._socket.close()
         await asyncio.gather(self._live.close(), self._pictures.close())
-        if telling.done():
-            telling.result()  # raises what made it end
+        for task in done:
+            task.result()  # raises what made it end
 
     def _heard(self, message: dict[str, Any]) -> None:
         """The app said something."""
@@ -89,6 +90,7 @@ class Service:
             self._desk.look(now)
             self._live.drop_the_stuck(now)
             self._pictures.drop_the_stuck(now)
+            self._visitors.show_out(now)
             if self._desk.pages:
                 self._desk.show({"t": now, **self._telemetry.snapshot(now), "cameras": self._gallery.report(now)})
             due = max(due + _PERIOD, now)

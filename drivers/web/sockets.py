@@ -14,8 +14,12 @@ from aiohttp import WSMsgType, web
 from .allowance import Allowance
 from .gatekeeper import PROTOCOL, Gatekeeper
 from .messages import LONGEST
+from .visitors import Visitors
 
-__all__ = ["Sockets", "Wire"]
+__all__ = ["VISITORS", "Sockets", "Wire"]
+
+VISITORS = web.AppKey("visitors", Visitors)
+"""Where the application keeps those that are no pages."""
 
 Reason = tuple[int, bytes]
 """Why a socket is closed: a code of RFC 6455's private range, and words."""
@@ -29,6 +33,8 @@ _TOO_MANY_PAGES = (4409, b"too many pages are open")
 _APP_CLOSES = (4410, b"the app has ended")
 
 _PAGES = 16
+_REFUSED = 16
+"""Sockets with a wrong token that are told so at the same time. More of them are not opened at all."""
 _PING = 10.0
 """s of silence after which a page is asked whether it is still there."""
 _GOODBYE = 1.0
@@ -113,6 +119,7 @@ class Sockets(ABC):
     def __init__(self, gatekeeper: Gatekeeper) -> None:
         self._gatekeeper = gatekeeper
         self._wires: set[Wire] = set()
+        self._refused = 0
 
     @abstractmethod
     async def serve(self, wire: Wire) -> None:
@@ -120,27 +127,32 @@ class Sockets(ABC):
 
     async def handle(self, request: web.Request) -> web.StreamResponse:
         """A page's request for a socket, from its opening to its end."""
-        ws = web.WebSocketResponse(
-            protocols=(PROTOCOL,),
-            heartbeat=_PING,
-            timeout=_GOODBYE,
-            compress=False,
-            max_msg_size=LONGEST + 1,  # it refuses this many
-            writer_limit=1,  # every send waits until the kernel has taken it
-        )
-        await ws.prepare(request)
-        transport = request.transport
         if not self._gatekeeper.admits(request.headers.get("Sec-WebSocket-Protocol")):
-            await _close(ws, _WRONG_TOKEN)
-        elif len(self._wires) >= _PAGES:
+            return await self._refuse(request)
+        ws = await _open(request, heartbeat=_PING)
+        transport = request.transport
+        if len(self._wires) >= _PAGES:
             await _close(ws, _TOO_MANY_PAGES)
         elif transport is not None:
             wire = Wire(ws, transport)
             self._wires.add(wire)
             try:
-                await self.serve(wire)
+                with request.app[VISITORS].staying(transport):
+                    await self.serve(wire)
             finally:
                 self._wires.discard(wire)
+        return ws
+
+    async def _refuse(self, request: web.Request) -> web.WebSocketResponse:
+        """Say why: a page learns it from the code of a socket's end only, not from the answer to its handshake."""
+        if self._refused >= _REFUSED:
+            raise web.HTTPForbidden(text="too many come with a wrong token\n")
+        self._refused += 1
+        try:
+            ws = await _open(request)
+            await _close(ws, _WRONG_TOKEN)
+        finally:
+            self._refused -= 1
         return ws
 
     def drop_the_stuck(self, now: float) -> None:
@@ -154,6 +166,22 @@ class Sockets(ABC):
         if self._wires:
             goodbyes = [asyncio.ensure_future(wire.close(_APP_CLOSES)) for wire in self._wires]
             await asyncio.wait(goodbyes, timeout=_GOODBYE)
+
+
+async def _open(request: web.Request, heartbeat: float | None = None) -> web.WebSocketResponse:
+    ws = web.WebSocketResponse(
+        protocols=(PROTOCOL,),
+        heartbeat=heartbeat,
+        timeout=_GOODBYE,
+        compress=False,
+        max_msg_size=LONGEST + 1,  # it refuses this many
+        writer_limit=1,  # every send waits until the kernel has taken it
+    )
+    try:
+        await ws.prepare(request)
+    except (ConnectionError, ValueError):  # it is gone again, or its key is no ASCII
+        raise web.HTTPBadRequest(text="this is no handshake of a WebSocket\n") from None
+    return ws
 
 
 async def _close(ws: web.WebSocketResponse, reason: Reason) -> None:

@@ -10,6 +10,7 @@ import pytest
 from web_kit import TOKEN, WAIT, App, Page, run
 
 from hal.drivers.web.server import read_page
+from hal.errors import DriverMissing
 
 
 @pytest.fixture(scope="module")
@@ -128,9 +129,15 @@ def test_only_files_of_a_page_are_read(tmp_path: Path) -> None:
         (tmp_path / name).write_text(name)
     (tmp_path / "folder.js").mkdir()
     files = read_page(tmp_path)
-    assert sorted(files) == ["icon.png", "icon.svg", "index.html", "pad.js", "page.css"]
+    assert sorted(files) == ["index.html", "pad.js", "page.css"]
     assert files["pad.js"] == (b"pad.js", "text/javascript; charset=utf-8")
-    assert read_page(tmp_path / "nowhere") == {}
+
+
+def test_without_its_page_it_does_not_start(tmp_path: Path) -> None:
+    (tmp_path / "pad.js").write_text("")
+    for folder in (tmp_path, tmp_path / "nowhere"):
+        with pytest.raises(DriverMissing, match=r"index\.html; install the project again"):
+            read_page(folder)
 
 
 def test_too_many_pages(app: App) -> None:
