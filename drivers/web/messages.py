@@ -29,6 +29,7 @@ _AWAY = {
     "hidden": "the page was hidden",
     "blur": "the page lost the keyboard's focus",
     "closing": "the page was closed",
+    "hands": "the page may have missed that somebody let go",
 }
 
 

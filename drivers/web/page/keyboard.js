@@ -16,7 +16,7 @@ function isTyping(target) {
 /** Enter belongs to what was reached with Tab. @param {KeyboardEvent} event */
 function isActivation(event) {
   const active = document.activeElement;
-  return event.code === "Enter" && active !== null && active.matches("button, summary, a");
+  return event.key === "Enter" && active !== null && active.matches("button, summary, a");
 }
 
 export class Keyboard {
@@ -40,6 +40,11 @@ export class Keyboard {
   /** Keys whose press was ours, so that their repetition scrolls nothing. @type {Set<string>} */
   #ours = new Set();
 
+  /** Is a key of the pad down? */
+  get holds() {
+    return this.#down.size > 0;
+  }
+
   /** Move the gripper's slider by as long as its keys are held. @param {number} dt s */
   look(dt) {
     let way = 0;
@@ -50,10 +55,8 @@ export class Keyboard {
   /** @param {KeyboardEvent} event */
   #pressed(event) {
     const key = event.code;
-    if (key === STOP_KEY) {
-      if (!event.repeat) this.stop();
-      return;
-    }
+    if (event.repeat && isActivation(event)) event.preventDefault(); // one press is one click
+    if (key === STOP_KEY || (key === HOLD_KEY && document.activeElement?.id === "stop")) return this.#stopped(event);
     if (event.key === "Meta") return this.#releaseAll(); // its system swallows the releases of other keys
     if (!USED.has(key) || event.ctrlKey || event.metaKey || event.altKey) return;
     if (event.repeat) {
@@ -65,6 +68,15 @@ export class Keyboard {
     this.#ours.add(key);
     this.#down.add(key);
     this.#apply();
+  }
+
+  /** Esc, or Space on the button that was reached with Tab. @param {KeyboardEvent} event */
+  #stopped(event) {
+    if (event.code === HOLD_KEY) {
+      event.preventDefault();
+      this.#ours.add(HOLD_KEY);
+    }
+    if (!event.repeat) this.stop();
   }
 
   /** @param {KeyboardEvent} event */

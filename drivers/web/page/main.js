@@ -6,6 +6,7 @@ import { byId, setAttribute, setData, setText, show } from "./dom.js";
 import { Drive } from "./drive.js";
 import { Facts } from "./facts.js";
 import { BrowserGamepad } from "./gamepad.js";
+import { Hands } from "./hands.js";
 import { Heartbeat } from "./heartbeat.js";
 import { Keyboard } from "./keyboard.js";
 import { Lease } from "./lease.js";
@@ -14,6 +15,7 @@ import { Overlay } from "./overlay.js";
 import { Pad } from "./pad.js";
 import { Presence } from "./presence.js";
 import { Status } from "./status.js";
+import { Stopping } from "./stopping.js";
 import { openTheme } from "./theme.js";
 
 const REPAINT = 100; // ms
@@ -30,7 +32,10 @@ const cameras = new Cameras();
 const overlay = new Overlay(() => connection.open());
 const mayDrive = () => lease.mine && presence.present;
 const drive = new Drive(pad, mayDrive);
+const stopping = new Stopping(connection, log);
+const stop = () => stopping.stop();
 const keyboard = new Keyboard(pad, mayDrive, stop);
+const hands = new Hands(pad, keyboard);
 const gamepad = new BrowserGamepad(pad, (text) => log.add(text));
 
 /** @type {any} */
@@ -46,13 +51,6 @@ const isReal = () => hello !== null && (!hello.rig.sim || hello.rig.robots.some(
 /** A rig's name: that of its file. @param {string} source */
 const called = (source) => source.replace(/^.*[/\\]/, "").replace(/\.ya?ml$/, "");
 
-function stop() {
-  const sent = connection.send({ type: "stop" });
-  log.add(sent ? "STOP was sent" : "STOP could not be sent: there is no connection");
-  setData(byId("stop"), "sent", "");
-  setTimeout(() => setData(byId("stop"), "sent", null), 400);
-}
-
 /** Message type -> what to do with it. @type {Record<string, (message: any) => void>} */
 const HEARD = {
   hello(message) {
@@ -66,7 +64,7 @@ const HEARD = {
     setData(document.documentElement, "real", isReal() ? "" : null);
     setData(document.documentElement, "connected", "");
     show(byId("demo"), rig.demo);
-    gamepad.mayHold = drive.padHolds = rig.pad_may_hold ?? !rig.attended;
+    gamepad.mayHold = drive.padHolds = rig.pad_may_hold;
     drive.paint();
     status.waiting = [];
     lease.hello(hello);
@@ -89,6 +87,7 @@ const HEARD = {
   state(message) {
     state = message;
     stateAt = performance.now();
+    stopping.heard(state);
     connection.proved();
     overlay.hide();
     log.synchronise(state.t);
@@ -152,7 +151,13 @@ presence.came = () => {
   advise();
 };
 
-heartbeat.before.push((dt) => keyboard.look(dt), () => gamepad.look());
+hands.lost = (why) => {
+  log.add(why);
+  heartbeat.away("blur");
+  pad.reset();
+};
+
+heartbeat.before.push((dt) => hands.look(dt), (dt) => keyboard.look(dt), () => gamepad.look());
 heartbeat.stalled = (ms) => log.add(`this page stood still for ${Math.round(ms)} ms`);
 pad.changed.push(() => advise());
 

@@ -7,9 +7,12 @@
  * @property {() => void} up the last finger has left, was taken away, or is forgotten
  */
 
+const LEFT = 1; // of PointerEvent.buttons
+
 /**
  * Follow the presses on an element. A control that drives holds on to the pointer, so that sliding off it neither
- * lets go nor presses its neighbour; a pointer that is cancelled or lost is let go of.
+ * lets go nor presses its neighbour; a pointer that is cancelled or lost is let go of. So is a mouse that has another
+ * button down as well: the last of its buttons alone is told of when it is let go of, and the press may be over by then.
  *
  * @param {HTMLElement} element
  * @param {Handlers} handlers
@@ -31,14 +34,14 @@ export function onPress(element, { down, move, up }) {
     element.setPointerCapture(event.pointerId);
   });
   element.addEventListener("pointermove", (event) => {
-    if (pointers.has(event.pointerId)) move?.(event);
+    if (event.pointerType === "mouse" && event.buttons !== LEFT) end(event.pointerId);
+    else if (pointers.has(event.pointerId)) move?.(event);
   });
   for (const type of /** @type {const} */ (["pointerup", "pointercancel", "lostpointercapture"])) {
     element.addEventListener(type, (event) => end(event.pointerId));
   }
   const noMagnifier = (/** @type {TouchEvent} */ event) => event.cancelable && event.preventDefault();
   element.addEventListener("touchstart", noMagnifier, { passive: false });
-  element.addEventListener("contextmenu", (event) => event.preventDefault());
 
   return () => {
     if (!pointers.size) return;

@@ -26,7 +26,10 @@ function remember(theme) {
 export function openTheme(changed) {
   const root = document.documentElement;
   const known = remembered();
-  if (known === "light" || known === "dark") root.dataset.theme = known;
+  if (known === "light" || known === "dark") {
+    root.dataset.theme = known;
+    changed(); // what was drawn before has the other one's colours
+  }
   byId("theme").addEventListener("click", () => {
     const dark = matchMedia("(prefers-color-scheme: dark)").matches;
     const now = root.dataset.theme ?? (dark ? "dark" : "light");
