@@ -1,4 +1,4 @@
-"""A hand that lets go is seen to, though something came between it and the page; and a STOP that fails says so."""
+"""A hand that lets go is seen to, though something came between it and the page."""
 
 from __future__ import annotations
 
@@ -8,15 +8,11 @@ import signal
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
-from urllib.parse import urlsplit
 
 import pytest
 
-import hal
-
 from .kit import Bench, Browser, wait_for
-from .test_trips import Cable
+from .moves import drive_left, let_go_of_all, lines
 
 ALARM = "#alarm"
 
@@ -50,17 +46,6 @@ def repeat_for(page: Browser, seconds: float, code: str = "ArrowLeft", key: str 
     while time.monotonic() < end:
         repeat(page, code, key)
         time.sleep(0.03)
-
-
-def drive_left(bench: Bench, page: Browser) -> None:
-    page.hold()
-    page.key("ArrowLeft", "ArrowLeft", True)
-    wait_for(lambda: bench.tcp_speed[1] > 0.1, "motion")
-
-
-def let_go_of_all(page: Browser) -> None:
-    page.key("ArrowLeft", "ArrowLeft", False)
-    page.let_go()
 
 
 def button(page: Browser, kind: str, at: dict[str, float], name: str, buttons: int, modifiers: int = 0) -> None:
@@ -265,10 +250,6 @@ def test_a_browser_that_hangs_though_its_page_does_not(bench: Bench, page: Brows
 # Keys on buttons that were reached with Tab.
 
 
-def lines(page: Browser, words: str) -> int:
-    return page.text("#log").count(words)
-
-
 def test_space_on_the_stop_button_stops(bench: Bench, page: Browser) -> None:
     page.run("document.querySelector('#stop').focus()")
     page.hold()
@@ -302,102 +283,3 @@ def test_a_held_enter_clicks_once(page: Browser) -> None:
     enter(page, False)
     wait_for(lambda: page.facts["driving"] is False, "the lease to be let go of")
     assert page.run("return window.clicks") == 1
-
-
-# A STOP that fails.
-
-
-def alarm(page: Browser) -> str:
-    return page.text(ALARM)
-
-
-def quiet(page: Browser, seconds: float = 0.8) -> bool:
-    """No alarm for longer than a stop may take to be confirmed."""
-    end = time.monotonic() + seconds
-    while time.monotonic() < end:
-        if alarm(page):
-            return False
-        time.sleep(0.02)
-    return True
-
-
-def test_a_stop_that_works_alarms_nobody(bench: Bench, page: Browser) -> None:
-    drive_left(bench, page)
-    page.click("#stop")
-    wait_for(lambda: bench.trip == "stop", "the stop")
-    assert quiet(page)
-    page.click("#stop")  # an arm that is stopped for this or another reason shows just that
-    assert quiet(page)
-    assert lines(page, "STOP was sent") == 2
-    let_go_of_all(page)
-
-
-def test_a_stop_with_nothing_to_stop(page: Browser) -> None:
-    """No program drives the arm: nothing is latched, and nothing moves."""
-    with hal.open("panda_table", sim=True, pad="web", listen=":0", overrides=["cameras={}"]) as rig:
-        assert rig.console is not None
-        page.open(rig.console.link)
-        wait_for(lambda: page.facts.get("lastState"), "a state")
-        assert page.facts["lastState"]["robots"]["panda"]["status"] == "idle"
-        page.click("#stop")
-        assert quiet(page)
-        assert lines(page, "STOP was sent") == 1
-
-
-def test_a_stop_that_nothing_follows(bench: Bench, page: Browser, monkeypatch: pytest.MonkeyPatch) -> None:
-    """It is heard, and the arm goes on."""
-    drive_left(bench, page)
-    with monkeypatch.context() as broken:
-        broken.setattr(bench.rig, "stop", lambda: None)
-        page.click("#stop")
-        wait_for(lambda: "STOP was not confirmed: use the robot's own stop" in alarm(page), "the alarm")
-        assert "panda is " in alarm(page)
-        page.click("#alarm-close")
-        wait_for(lambda: not alarm(page), "the alarm to be closed")
-        page.click("#stop")
-        wait_for(lambda: alarm(page), "the alarm")
-        time.sleep(0.3)
-        assert alarm(page), "it stays"
-    page.click("#stop")
-    wait_for(lambda: bench.trip == "stop", "the stop")
-    wait_for(lambda: not alarm(page), "the alarm to end with what it tells")
-    let_go_of_all(page)
-
-
-def on_top(page: Browser, selector: str) -> Any:
-    script = """const r = document.querySelector(arguments[0]).getBoundingClientRect();
-        return document.elementFromPoint(r.x + r.width / 2, r.y + r.height / 2).closest(arguments[0]) !== null"""
-    return page.run(script, selector)
-
-
-def test_a_stop_that_never_arrives(bench: Bench, page: Browser) -> None:
-    """The cable is pulled, and the page cannot know yet."""
-    parts = urlsplit(bench.link)
-    assert parts.port is not None
-    cable = Cable(parts.port)
-    try:
-        page.open(f"http://127.0.0.1:{cable.port}/#{parts.fragment}")
-        page.wait_driving()
-        cable.cut()
-        page.key("Escape", "Escape", True)
-        page.key("Escape", "Escape", False)
-        wait_for(lambda: "STOP was not confirmed" in alarm(page), "the alarm")
-        assert "does not answer" in alarm(page)
-        assert on_top(page, "#stop")
-        wait_for(lambda: page.text("#overlay"), "the page to give the connection up")
-        assert on_top(page, ALARM)
-        before = lines(page, "STOP was sent")
-        page.key("Escape", "Escape", True)
-        page.key("Escape", "Escape", False)
-        wait_for(lambda: "STOP does not reach the arm" in alarm(page), "the page to say so at once")
-        assert lines(page, "STOP was sent") == before, "nothing was sent"
-        cable.mend()
-        wait_for(lambda: page.facts.get("connected"), "the connection")
-        page.key("Escape", "Escape", True)
-        page.key("Escape", "Escape", False)
-        wait_for(lambda: bench.trip != "none", "the stop")
-        wait_for(lambda: not alarm(page), "the alarm to end with what it tells")
-        page.complaints()  # the browser may log the socket that it could not open
-        page.chrome.get("about:blank")
-    finally:
-        cable.close()

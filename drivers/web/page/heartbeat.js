@@ -59,7 +59,7 @@ export class Heartbeat {
     this.#probe = null;
   }
 
-  /** Tell that the pad is gone. @param {"hidden" | "blur" | "closing"} why */
+  /** Tell that the pad is gone. @param {"hidden" | "blur" | "closing" | "hands"} why */
   away(why) {
     this.#running = false;
     this.connection.send({ type: "away", why });

@@ -153,7 +153,7 @@ presence.came = () => {
 
 hands.lost = (why) => {
   log.add(why);
-  heartbeat.away("blur");
+  heartbeat.away("hands");
   pad.reset();
 };
 
