@@ -103,6 +103,7 @@ const HEARD = {
   },
   say(message) {
     log.add(message.text, message.t);
+    status.told(message.text);
   },
   refused(message) {
     log.add(message.why);

@@ -4,6 +4,7 @@ import { byId, setData, setText, show } from "./dom.js";
 
 const SILENT = 0.15; // s, as in the servo
 const OLD = 500; // ms without a state until the page says so
+const LOSS = "the pad is gone: ";
 
 /** The dead-man in one word. @param {any} deadman of a robot's state */
 export function deadmanWord(deadman) {
@@ -36,10 +37,17 @@ export class Status {
     this.deadman = "unknown";
     this.status = "unknown";
     this.trip = "none";
+    /** Why the pad was lost last. */
+    this.loss = "";
     byId("recover").addEventListener("click", () => connection.send({ type: "recover", robot: this.faulty }));
   }
 
   #noticeTimer = 0;
+
+  /** The program said something. @param {string} text */
+  told(text) {
+    if (text.startsWith(LOSS)) this.loss = text.slice(LOSS.length);
+  }
 
   /**
    * @param {any} robots of a state @param {string} name the robot that is shown
@@ -78,10 +86,10 @@ export class Status {
     }
     show(byId("fault"), faulty !== undefined);
     show(byId("recover"), this.lease.mine);
-    const stopped = names.find((one) => stopOf(robots[one]) !== "");
+    const stopped = names.find((one) => stopOf(robots[one], this.loss) !== "");
     const trip = stopped === undefined ? "none" : (robots[stopped].trip ?? "lost");
     if (stopped !== undefined) {
-      setText(byId("trip-text"), `${called(stopped)}${stopOf(robots[stopped])}`);
+      setText(byId("trip-text"), `${called(stopped)}${stopOf(robots[stopped], this.loss)}`);
       setText(byId("trip-remedy"), robots[stopped].lost ? "What the arm does is not known." : remedy(trip));
     }
     show(byId("trip"), stopped !== undefined);
@@ -125,10 +133,15 @@ export class Status {
   }
 }
 
-/** Why an arm stands, in words; "" for no reason, or for a fault, which has its own banner. @param {any} robot */
-function stopOf(robot) {
+/**
+ * Why an arm stands, in words; "" for no reason, or for a fault, which has its own banner.
+ * @param {any} robot @param {string} loss why the pad was lost last, as the program told
+ */
+function stopOf(robot, loss) {
   if (!robot) return "";
   if (robot.lost) return `No fresh state: ${robot.lost}`;
   if (robot.trip === "none" || robot.fault) return "";
+  if (robot.trip === "stop") return "Stopped: somebody pressed STOP, or the program did";
+  if (robot.trip === "deadman_lost" && loss) return `Stopped: ${loss}`;
   return `Stopped: ${robot.trip_text || robot.trip}`;
 }
