@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import threading
 from abc import ABC, abstractmethod
 from collections.abc import Callable
@@ -20,6 +21,8 @@ if TYPE_CHECKING:
     from .specs import CameraSpec
 
 __all__ = ["Camera", "CameraCounts", "CameraDriver", "RawFrame"]
+
+_LOG = logging.getLogger("hal.camera")
 
 
 class RawFrame(NamedTuple):
@@ -154,7 +157,8 @@ class Camera:
     def on_frame(self, callback: Callable[[Frame], None]) -> Callable[[], None]:
         """In real time, call ``callback`` with every frame, from the camera's thread; what comes back ends that.
 
-        It delays the next frame for as long as it takes. An exception in it ends it.
+        It delays the next frame for as long as it takes. An exception in it ends it,
+        and is logged.
         """
         token = object()
         with self._news:
@@ -221,6 +225,9 @@ class Camera:
                 try:
                     callback(frame)
                 except Exception:
+                    _LOG.exception(
+                        "camera %s: what was called with every frame failed, and is called no more", self.name
+                    )
                     with self._news:
                         self._listeners.pop(token, None)
 

@@ -17,10 +17,7 @@ if TYPE_CHECKING:
     from .deadman import Deadman
     from .robot import Robot
 
-__all__ = ["PATIENCE", "move_to"]
-
-PATIENCE = 60.0
-"""How long ``move_to`` waits for somebody to hold the dead-man unless told otherwise, s."""
+__all__ = ["move_to"]
 
 
 def move_to(
@@ -32,9 +29,11 @@ def move_to(
     speed: float | None,
     tcp_speed: float | None,
     timeout: float | None,
-    patience: float = PATIENCE,
+    patience: float,
 ) -> RobotState:
     """See :meth:`hal.robot.Robot.move_to`."""
+    if not patience >= 0.0:
+        raise CommandError(f"patience must be 0 or more, not {patience}")
     goal = robot.ik(target) if isinstance(target, Pose) else JointTarget(target).q
     if goal.size != robot.n:
         raise CommandError(f"{robot.name} has {robot.n} joints; the target has {goal.size}")

@@ -6,7 +6,6 @@ physics nor the app ever waits for a picture.
 
 from __future__ import annotations
 
-import contextlib
 import os
 import time
 import warnings
@@ -16,6 +15,7 @@ from typing import Any
 from hal.errors import ConnectionLost
 from hal.host.frames import FrameRing
 from hal.host.mailbox import SeriesBox
+from hal.host.pacer import yield_to_others
 from hal.host.process import Channel, SharedMemory
 from hal.specs import CameraSpec, WorldSpec, from_json
 
@@ -68,23 +68,9 @@ class RenderWorker:
         return min(self._due.values())
 
 
-def _yield_to_others() -> None:
-    """Pictures come after the servo: a lower priority, no claim to run at once, and one processor left alone.
-
-    The last of these matters most: a servo at 1 kHz beside two cameras on two cores missed 6 to 10 % of its ticks
-    without it, 0.3 to 0.4 % with it (benchmarks/real_time.py).
-    """
-    os.nice(_NICE)
-    with contextlib.suppress(AttributeError, OSError):  # Linux only
-        os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
-        processors = sorted(os.sched_getaffinity(0))
-        if len(processors) > 1:
-            os.sched_setaffinity(0, processors[1:])
-
-
 def main(channel: Channel, memories: Sequence[SharedMemory], config: dict[str, Any]) -> None:
     """Entry point of the child process; ``memories`` are that of the world's host and that of the pictures."""
-    _yield_to_others()
+    yield_to_others(_NICE)
     parent = os.getppid()
     world = World(from_json(WorldSpec, config["world"]), mirror=True)
     cameras = [from_json(CameraSpec, camera) for camera in config["cameras"]]

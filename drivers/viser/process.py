@@ -5,13 +5,13 @@ Nothing here writes into that memory, so nothing that a page does, or that goes 
 
 from __future__ import annotations
 
-import contextlib
 import os
 import time
 from collections.abc import Sequence
 from typing import Any
 
 from hal.errors import ConnectionLost
+from hal.host.pacer import yield_to_others
 from hal.host.process import Channel, SharedMemory
 from hal.specs import GroupSpec, from_json
 
@@ -34,7 +34,7 @@ _REPEAT = 0.1
 
 def main(channel: Channel, memories: Sequence[SharedMemory], config: dict[str, Any]) -> None:
     """Entry point of the child process; ``memories`` are those of the hosts, in the order of ``config["groups"]``."""
-    _yield_to_others()
+    yield_to_others(_NICE)
     parent = os.getppid()
     server = serve(PORT, config["label"], config["secret"])
     page = Page(server, [from_json(GroupSpec, group) for group in config["groups"]], memories)
@@ -52,16 +52,6 @@ def main(channel: Channel, memories: Sequence[SharedMemory], config: dict[str, A
         except ConnectionLost:
             return  # the app is gone
         time.sleep(max(0.0, due - time.monotonic()))
-
-
-def _yield_to_others() -> None:
-    """The servo comes first: a lower priority, no claim to run at once, and one processor left alone."""
-    os.nice(_NICE)
-    with contextlib.suppress(AttributeError, OSError):  # Linux only
-        os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
-        processors = sorted(os.sched_getaffinity(0))
-        if len(processors) > 1:
-            os.sched_setaffinity(0, processors[1:])
 
 
 class Teller:

@@ -314,6 +314,8 @@ def test_move_to_waits_for_the_deadman_as_long_as_it_was_told(rig: hal.Rig, arm:
     with pytest.raises(MotionStopped, match=r"nobody held the dead-man for 0.5 s"):
         arm.move_to(arm.home + 0.1, deadman=rig.gamepads["pad"].hold("l2"), patience=0.5)
     assert 0.5 <= rig.clock.now() - start < 0.7
+    with pytest.raises(CommandError, match="patience"):
+        arm.move_to(arm.home, patience=float("nan"))
 
 
 def test_move_to_pauses_while_the_deadman_is_released(rig: hal.Rig, arm: hal.Robot) -> None:
