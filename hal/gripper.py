@@ -7,7 +7,7 @@ from abc import ABC, abstractmethod
 from typing import TYPE_CHECKING, ClassVar, NamedTuple
 
 from .errors import CommandError, NotSupported, StaleStateError
-from .types import GripperState
+from .types import Fault, GripperOutcome, GripperState
 
 if TYPE_CHECKING:
     from .clock import Clock
@@ -31,13 +31,17 @@ class GripperReading(NamedTuple):
     moving: bool
     grasped: bool | None = None
     force: float | None = None
+    outcome: GripperOutcome | None = None
+    """How the newest command ended; None where the driver cannot know, and it is judged by the width."""
+    fault: Fault | None = None
+    """Why the last command failed, with what to do about it."""
 
 
 class GripperDriver(ABC):
-    """One gripper. ``move`` starts a motion and returns at once: a gripper never blocks the arm.
+    """One gripper. ``move``, ``grasp`` and ``home`` start a motion and return at once: a gripper never blocks the arm.
 
     The newest command wins; one motion is in flight. Neither ``stop`` nor ``close`` opens the fingers or lets go of
-    what they hold.
+    what they hold. All calls, ``read`` too, come from one thread and return within a few ms.
     """
 
     simulated: ClassVar[bool] = False
@@ -57,6 +61,16 @@ class GripperDriver(ABC):
     @abstractmethod
     def move(self, width: float, speed: float, force: float) -> None:
         """Start towards ``width`` (m) at ``speed`` (m/s), pressing with at most ``force`` (N)."""
+
+    def grasp(self, width: float, speed: float, force: float, inner: float, outer: float) -> None:
+        """Start to close on something of ``width`` (m) at ``speed`` (m/s) and hold it with ``force`` (N).
+
+        It is held when the fingers end between ``width - inner`` and ``width + outer`` (m).
+        """
+        self.move(width, speed, force)
+
+    def home(self) -> None:  # noqa: B027  # most have nothing to do
+        """Start to find out how far the fingers open. Only some grippers need it, once after they are switched on."""
 
     @abstractmethod
     def stop(self) -> None:

@@ -33,6 +33,7 @@ GROUP = "hal.drivers"
 BUILT_IN: Mapping[str, str] = MappingProxyType(
     {
         "evdev": "hal.drivers.evdev:DRIVER",
+        "franka": "hal.drivers.franka:DRIVER",
         "mock": "hal.drivers.mock:DRIVER",
         "playback": "hal.drivers.playback:DRIVER",
         "pybullet": "hal.drivers.pybullet:DRIVER",
@@ -67,6 +68,17 @@ class DriverSpec:
     """What draws the pictures of all simulated cameras of a rig."""
     console: str | None = None
     """A page in a browser that shows a rig and drives it."""
+    checks: Mapping[str, str] = field(default_factory=dict)
+    """Kind of device (``robot``, ``gripper``) -> "module:function", which looks at the resolved record of such a device
+    before anything is opened, and yields (key, message) for each thing that is wrong in it; keys are relative to the
+    device's entry in the rig, for example ``real.host``. It must not import the driver's libraries."""
+    emulated: str | None = None
+    """"module:function" that says of the options of a real device whether a program stands in for it, which may be
+    stepped by ``rig.clock`` (an address on this computer)."""
+    preflight: str | None = None
+    """"module:function" that looks at a real arm before it moves (see :mod:`hal.preflight`)."""
+    own_process: frozenset[str] = frozenset()
+    """Kinds of device that need a process of their own (``gripper``: the vendor's calls block)."""
     requires: Mapping[str, str] = field(default_factory=dict)
     """Import name of each library that the driver needs -> the command that installs it."""
 
@@ -76,7 +88,8 @@ class DriverSpec:
         return tuple(kind for kind in _KINDS if getattr(self, kind) is not None)
 
 
-_KINDS = tuple(f.name for f in fields(DriverSpec) if f.name not in ("name", "requires"))
+_NO_KINDS = ("name", "checks", "emulated", "preflight", "own_process", "requires")
+_KINDS = tuple(f.name for f in fields(DriverSpec) if f.name not in _NO_KINDS)
 
 
 def names() -> tuple[str, ...]:

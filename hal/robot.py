@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
-from typing import TYPE_CHECKING, ClassVar, NamedTuple
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -64,6 +64,9 @@ class Setpoint(NamedTuple):
     """rad/s"""
     ddq: Floats
     """rad/s2"""
+    tau: Floats | None = None
+    """Nm, in torque mode only: what to apply on top of what carries the arm's own weight. ``q`` and ``dq`` are then
+    what was measured."""
 
 
 class RobotDriver(ABC):
@@ -77,7 +80,7 @@ class RobotDriver(ABC):
     modes: ClassVar[frozenset[str]] = frozenset({"position"})
     """Kinds of set-point the device takes: ``position``, ``velocity``, ``torque``."""
     paces_itself: ClassVar[bool] = False
-    """True where ``read`` blocks until the device's next cycle (a Franka's state packets)."""
+    """True where the device sets the pace: :meth:`wait` blocks until its next cycle (a Franka's state packets)."""
     simulated: ClassVar[bool] = False
     """True where nothing real can move."""
 
@@ -89,9 +92,16 @@ class RobotDriver(ABC):
     def open(self) -> None:
         """Connect. Nothing moves."""
 
+    def wait(self) -> None:
+        """Block until the device's next cycle, for a bounded time. Only of drivers that pace themselves.
+
+        Raises nothing: what went wrong is for :meth:`read` to say.
+        """
+        raise NotSupported(f"driver {type(self).__name__} does not pace itself")
+
     @abstractmethod
     def read(self, now: float) -> Reading:
-        """The newest state; ``now`` is the host's clock, for devices without one."""
+        """The newest state; ``now`` is the host's clock, for devices without one. Does not block."""
 
     @abstractmethod
     def write(self, setpoint: Setpoint) -> None:
@@ -103,6 +113,23 @@ class RobotDriver(ABC):
 
     def recover(self) -> None:  # noqa: B027  # most have nothing to do
         """Clear a fault, as the user's own act. A driver without faults has nothing to do."""
+
+    @property
+    def wants_loop(self) -> bool:
+        """Does the device's library want to own the loop from now on (see :meth:`loop`)?"""
+        return False
+
+    def loop(self, turn: Callable[[], None]) -> None:
+        """Let the library call ``turn`` (one whole cycle of the group) until the motion is over.
+
+        For libraries that stream set-points only out of a callback of their own: inside a turn, ``wait`` does not
+        block, ``read`` gives the state that the callback was called with and ``write`` keeps what it is to return.
+        """
+        raise NotSupported(f"driver {type(self).__name__} does not own a loop")
+
+    def statistics(self) -> dict[str, Any]:
+        """What the driver knows of its connection, as plain numbers and texts, for reports."""
+        return {}
 
     def inject(self, **knobs: object) -> None:
         """Switch faults on or off, for tests. Only drivers that simulate have any."""

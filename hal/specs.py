@@ -118,6 +118,8 @@ class RobotSpec:
     """Greatest speed of the tcp, m/s."""
     attended: bool = False
     """True where something real moves: a person must be there (a dead-man, or ``unattended=True``)."""
+    emulated: bool = False
+    """True where the real driver talks to a program that stands in for the device."""
     deadline_max: float = 1.0
     """Longest deadline that a command may have, s (0.3 where something real moves)."""
     options: dict[str, Any] = field(default_factory=dict)
@@ -211,6 +213,8 @@ class GroupSpec:
     rate_hz: float
     robots: tuple[RobotSpec, ...]
     world: WorldSpec | None = None
+    grippers: tuple[GripperSpec, ...] = ()
+    """Grippers whose driver runs in this group: those of its arms, or one that has a process of its own."""
 
 
 @dataclass(frozen=True)

@@ -22,6 +22,7 @@ __all__ = [
     "BUTTONS",
     "Fault",
     "Frame",
+    "GripperOutcome",
     "GripperState",
     "Limited",
     "PadState",
@@ -99,6 +100,23 @@ class Trip(_Named):
     """The robot does not answer."""
     BAD_READING = 8
     """The robot reported numbers that cannot be."""
+
+
+class GripperOutcome(_Named):
+    """How a gripper's newest command went."""
+
+    NONE = 0
+    """There was none."""
+    RUNNING = 1
+    """The fingers are on their way."""
+    DONE = 2
+    """They are where they should be, or, after a grasp, hold something of the right width."""
+    MISSED = 3
+    """They rest somewhere else, or closed on nothing."""
+    STOPPED = 4
+    """``stop()`` or a newer command ended it."""
+    FAILED = 5
+    """The gripper refused it; its fault says why."""
 
 
 class Limited(IntFlag):

@@ -60,7 +60,7 @@ def test_nothing_is_imported_before_it_is_asked_for() -> None:
 
 
 def test_an_unknown_driver_lists_the_drivers_and_the_nearest_spelling() -> None:
-    with pytest.raises(DeviceNotFound, match=r"did you mean 'pybullet'\?.*evdev, mock, playback, pybullet"):
+    with pytest.raises(DeviceNotFound, match=r"did you mean 'pybullet'\?.*evdev, franka, mock, playback, pybullet"):
         registry.load("pybulet", "robot")
 
 

@@ -1,0 +1,24 @@
+"""A Franka arm and its hand over the network: FR3 by pylibfranka, Panda (FER) by panda-python. See docs/franka.md."""
+
+from __future__ import annotations
+
+from hal.registry import DriverSpec
+
+__all__ = ["DRIVER"]
+
+DRIVER = DriverSpec(
+    name="franka",
+    robot="hal.drivers.franka.arm:FrankaArm",
+    gripper="hal.drivers.franka.hand:FrankaHand",
+    checks={
+        "robot": "hal.drivers.franka.settings:check_arm",
+        "gripper": "hal.drivers.franka.settings:check_hand",
+    },
+    emulated="hal.drivers.franka.settings:is_emulated",
+    preflight="hal.drivers.franka.preflight:check",
+    own_process=frozenset({"gripper"}),
+    requires={
+        "pylibfranka": "pip install 'robot-hal[franka]'",
+        "panda_py": "pip install 'robot-hal[panda]'",
+    },
+)
