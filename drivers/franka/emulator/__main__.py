@@ -1,0 +1,149 @@
+"""``python -m hal.drivers.franka.emulator``: see ``--help``."""
+
+from __future__ import annotations
+
+import argparse
+import gc
+import ipaddress
+import signal
+import sys
+from contextlib import ExitStack
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from hal.config.data_files import find_data
+from hal.drivers.franka.limits import LIMITS
+
+from .arm import Arm
+from .console import CONTROL_PORT, Console
+from .executor import Executor
+from .faults import help_text
+from .journal import Journal
+from .model import RigidBody
+from .pacing import Pacing
+from .plant import IdealPlant, LaggingPlant, Plant
+from .protocol import PORT, PROTOCOLS
+from .requests import Files
+from .server import ArmServer
+from .urdf import arm_only
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+_ROBOTS = {"fr3": ("FR3", "fr3", 10), "panda": ("Panda", "fer", 5)}
+"""Choice -> name, model of its limits, protocol."""
+_HOME = (0.0, -0.785398163, 0.0, -2.35619449, 0.0, 1.57079633, 0.785398163)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """The program; returns its exit status."""
+    options = _parser().parse_args(arguments)
+    journal = Journal(options.quiet)
+    try:
+        with ExitStack() as stack:
+            server, greeting = _prepare(options, stack, journal)
+            for number in (signal.SIGTERM, signal.SIGINT):
+                signal.signal(number, lambda *_: server.stop())
+            gc.freeze()
+            journal.print(greeting)
+            server.run()
+    except (OSError, ValueError) as error:
+        text = error.strerror if isinstance(error, OSError) and error.strerror else error
+        print(f"error: {text}", file=sys.stderr)
+        return 1
+    except KeyboardInterrupt:  # before it was ready
+        return 130
+    journal.print("ended")
+    return 0
+
+
+def _prepare(options: argparse.Namespace, stack: ExitStack, journal: Journal) -> tuple[ArmServer, str]:
+    """Everything, ready to run, and the line that says so. Raises OSError and ValueError with what is wrong."""
+    title, model, version = _ROBOTS[options.robot]
+    urdf = options.urdf or find_data("robots", "fr3.urdf")
+    library = options.model_library
+    files = Files(
+        arm_only(urdf.read_text(encoding="utf-8")).encode(), library.read_bytes() if library is not None else None
+    )
+    plant = _plant(options, urdf)
+    stack.callback(plant.close)
+    with_hand = options.end_effector == "hand"
+    arm = Arm(PROTOCOLS[version], LIMITS[model], plant, journal, with_hand)
+    pacing = Pacing(options.lockstep, options.paced or not options.lockstep, options.patience)
+    server = ArmServer(options.host, arm, files, pacing, options.seed)
+    stack.callback(server.close)
+    hand = _hand(options)
+    if hand is not None:
+        hand.start()
+        stack.callback(hand.stop)
+    # Nobody on the network is to give fault commands.
+    control_host = options.host if ipaddress.ip_address(options.host).is_loopback else "127.0.0.1"
+    console = Console(control_host, server.poller, Executor(server, hand).execute)
+    stack.callback(console.close)
+    server.attach(console)
+    hands = "no hand" if hand is None else f"hand {PORT + 1}"
+    return server, (
+        f"ready: {title} at {options.host}, arm {PORT}, {hands}, control {control_host}:{CONTROL_PORT}; "
+        f"protocol {version}, {pacing.describe()}, plant {options.plant}"
+    )
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="python -m hal.drivers.franka.emulator",
+        description="Stands in for a Franka arm and its hand: the vendor's own client libraries talk to it as to the "
+        "robot. It checks limits and timing as documented; what is not documented is assumed. It proves nothing about "
+        "a real arm.",
+        epilog="commands, typed here or sent to the control port:\n" + help_text(),
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    add = parser.add_argument
+    add("--robot", choices=sorted(_ROBOTS), default="fr3", help="which arm (%(default)s)")
+    add("--host", default="127.0.0.2", type=_address, help="address to listen on; the ports are fixed (%(default)s)")
+    add("--plant", choices=("ideal", "lag", "pybullet"), default="ideal", help="what moves behind it (%(default)s)")
+    add("--lag", type=_positive, default=0.01, metavar="S", help="time constant of --plant lag, s (%(default)s)")
+    add("--lockstep", action="store_true", help="while a motion runs, wait for the answer to each state")
+    add("--paced", action="store_true", help="with --lockstep: never faster than real time")
+    add("--patience", type=_positive, default=5.0, metavar="S", help="with --lockstep: wait so long, s (%(default)s)")
+    add("--q", type=float, nargs=7, default=_HOME, metavar="RAD", help="joint positions at the start (home)")
+    add("--urdf", type=Path, help="the arm's URDF (the project's fr3.urdf)")
+    add("--model-library", type=Path, metavar="FILE", help="panda: shared object to send when asked for (none)")
+    add("--end-effector", choices=("hand", "none"), default="hand", help="what is on the flange (%(default)s)")
+    add("--no-hand", action="store_true", help="serve no hand, only the arm")
+    add("--seed", type=int, default=0, help="of what is lost by chance (%(default)s)")
+    add("--quiet", action="store_true", help="print no events")
+    return parser
+
+
+def _plant(options: argparse.Namespace, urdf: Path) -> Plant:
+    body = RigidBody(urdf)
+    if options.plant == "lag":
+        return LaggingPlant(body, options.q, options.lag)
+    if options.plant == "pybullet":
+        from .plant_pybullet import PyBulletPlant
+
+        return PyBulletPlant(body, urdf, options.q)
+    return IdealPlant(body, options.q)
+
+
+def _hand(options: argparse.Namespace) -> Any:
+    if options.no_hand:
+        return None
+    from .hand import HandServer
+
+    return HandServer(options.host)
+
+
+def _address(text: str) -> str:
+    return str(ipaddress.IPv4Address(text))
+
+
+def _positive(text: str) -> float:
+    value = float(text)
+    if not 0.0 < value <= 3600.0:
+        raise ValueError
+    return value
+
+
+if __name__ == "__main__":
+    sys.exit(main())

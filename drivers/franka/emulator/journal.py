@@ -1,0 +1,95 @@
+"""What the emulator tells: events with their times, for a person and for tests, and figures over a run."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections import deque
+from typing import Any
+
+from hal.histogram import Histogram
+
+__all__ = ["STALL", "Figures", "Journal"]
+
+STALL = 0.02
+"""s: a cycle that comes later than this is written down by its time and length."""
+_KEPT = 1000
+
+
+class Journal:
+    """The last thousand events; each is also a line on standard output."""
+
+    def __init__(self, quiet: bool = False) -> None:
+        self._quiet = quiet
+        self._events: deque[dict[str, Any]] = deque(maxlen=_KEPT)
+        self._number = 0
+
+    def say(self, kind: str, text: str, **details: object) -> None:
+        """Something happened. ``kind`` is one word for programs, ``details`` are plain values."""
+        self._number += 1
+        self._events.append({"n": self._number, "t": time.monotonic(), "kind": kind, "text": text, **details})
+        if not self._quiet:
+            self.print(text)
+
+    def print(self, text: str) -> None:
+        """A line with the time of day; into nothing once nobody reads any more."""
+        now = time.time()
+        clock = time.strftime("%H:%M:%S", time.localtime(now))
+        try:
+            print(f"{clock}.{int(now % 1 * 1000):03d}  {text}", flush=True)
+        except (OSError, ValueError):
+            self._quiet = True
+            sys.stdout = open("/dev/null", "w")  # noqa: SIM115  # or the interpreter complains at its end
+
+    def events(self, last: int = _KEPT) -> list[dict[str, Any]]:
+        """The last so many: n, t (monotonic clock, s), kind, text, and details."""
+        return list(self._events)[-last:]
+
+
+class Figures:
+    """Counters and times since the start or the last reset."""
+
+    def __init__(self) -> None:
+        self.since = time.monotonic()
+        self.cycles = 0
+        self.states = 0
+        """States that went out."""
+        self.states_lost = 0
+        """By the fault commands, or in silence."""
+        self.commands = 0
+        """Commands that came in, of any kind."""
+        self.accepted = 0
+        self.lost = 0
+        """Cycles of a motion without their command."""
+        self.lost_in_row = 0
+        """Greatest number of them in a row."""
+        self.thrown_away = 0
+        """Commands lost by the fault commands."""
+        self.stale = 0
+        """Commands that answered an older state than the last one sent."""
+        self.malformed = 0
+        self.motions = 0
+        self.reflexes = 0
+        self.lateness = Histogram(2e-5, 2000)
+        self.answers = Histogram(5e-6, 4000)
+        """From a state sent to its command received."""
+        self.stalls: deque[tuple[float, float]] = deque(maxlen=_KEPT)
+        """When (monotonic clock, s) a cycle should have been and how much later it was, s."""
+
+    def late(self, due: float, by: float) -> None:
+        """A cycle was due then and came so much later, s."""
+        self.lateness.add(by)
+        if by >= STALL:
+            self.stalls.append((due, by))
+
+    def report(self) -> dict[str, Any]:
+        """Everything as plain values; times in s."""
+        values: dict[str, Any] = {}
+        for name, value in vars(self).items():
+            if isinstance(value, Histogram):
+                values[name] = value.summary()
+            elif isinstance(value, deque):
+                values[name] = [{"t": t, "length": length} for t, length in value]
+            else:
+                values[name] = value
+        return values

@@ -1,0 +1,105 @@
+"""State and command packets of both protocols: sizes, places, what goes in comes out."""
+
+from __future__ import annotations
+
+import struct
+
+import pytest
+
+from hal.drivers.franka.emulator.layouts import COMMAND, STATE, StatePacket, read_command
+from hal.drivers.franka.emulator.protocol import PROTOCOLS, Outcome
+
+
+def test_sizes_are_those_that_clients_accept() -> None:
+    assert {version: layout.size for version, layout in STATE.items()} == {5: 2373, 10: 1377}
+    assert {version: layout.size for version, layout in COMMAND.items()} == {5: 370, 10: 371}
+
+
+@pytest.mark.parametrize(
+    ("version", "name", "offset"),
+    [
+        (5, "q", 1184),
+        (5, "ddq_d", 1408),
+        (5, "O_T_EE_c", 1944),
+        (5, "motion_generator_mode", 2280),
+        (5, "reflex_reason", 2323),
+        (5, "robot_mode", 2364),
+        (10, "q", 596),
+        (10, "ddq_d", 708),
+        (10, "O_T_EE_c", 976),
+        (10, "accelerometer_top", 1144),
+        (10, "motion_generator_mode", 1288),
+        (10, "reflex_reason", 1331),
+        (10, "robot_mode", 1372),
+    ],
+)
+def test_places_in_a_state(version: int, name: str, offset: int) -> None:
+    assert STATE[version].fields[name].offset == offset
+
+
+@pytest.mark.parametrize("version", [5, 10])
+def test_what_is_put_is_what_is_read_and_nothing_else_changes(version: int) -> None:
+    packet = StatePacket(version)
+    numbers = iter(range(1, 1000))
+    written = {}
+    for name, field in packet.layout.fields.items():
+        values = tuple(next(numbers) % 200 for _ in range(field.values))
+        packet.put(name, values)
+        written[name] = values
+    for name, values in written.items():
+        assert packet.get(name) == values, name
+
+
+@pytest.mark.parametrize("version", [5, 10])
+def test_the_quick_ways_write_the_same_places(version: int) -> None:
+    packet = StatePacket(version)
+    packet.put_joints(range(56))
+    packet.put_motors(range(56, 70))
+    packet.put_modes(3, 2)
+    names = ("tau_J", "tau_J_d", "dtau_J", "q", "q_d", "dq", "dq_d", "ddq_d", "theta", "dtheta")
+    for k, name in enumerate(names):
+        assert packet.get(name) == tuple(range(7 * k, 7 * k + 7)), name
+    assert packet.get("motion_generator_mode") == (3,)
+    assert packet.get("controller_mode") == (2,)
+    with pytest.raises(struct.error):
+        packet.put_joints(range(55))
+
+
+@pytest.mark.parametrize("version", [5, 10])
+def test_a_command_is_taken_apart(version: int) -> None:
+    values = [7, *(k / 10 for k in range(14)), *([0.0] * 24), 1, 0, *(k + 0.5 for k in range(7))]
+    kinds = "<Q14d24dBB7d"
+    data = struct.pack(kinds, *values) + (b"\0" if version == 10 else b"")
+    command = read_command(data, version)
+    assert command is not None
+    assert command.message_id == 7
+    assert command.q == tuple(k / 10 for k in range(7))
+    assert command.dq == tuple(k / 10 for k in range(7, 14))
+    assert command.tau == tuple(k + 0.5 for k in range(7))
+    assert not command.finished
+    assert read_command(data[:-1], version) is None
+    assert read_command(data + b"\0", version) is None
+    finished = bytearray(data)
+    finished[313] = 1
+    found = read_command(bytes(finished), version)
+    assert found is not None
+    assert found.finished
+
+
+def test_the_end_of_torque_control_has_a_byte_of_its_own_in_protocol_10() -> None:
+    found = read_command(bytes(370) + b"\1", 10)
+    assert found is not None
+    assert found.finished
+
+
+def test_codes_sizes_and_statuses_of_requests() -> None:
+    new, old = PROTOCOLS[10], PROTOCOLS[5]
+    assert (new.codes["AutomaticErrorRecovery"], old.codes["AutomaticErrorRecovery"]) == (10, 12)
+    assert (new.codes["GetRobotModel"], old.codes["LoadModelLibrary"]) == (11, 13)
+    assert (new.requests[new.codes["Move"]].size, old.requests[old.codes["Move"]].size) == (125, 68)
+    assert (new.status("Move", Outcome.REFLEX), old.status("Move", Outcome.REFLEX)) == (8, 6)
+    assert (new.status("Move", Outcome.EMERGENCY), old.status("Move", Outcome.EMERGENCY)) == (9, 7)
+    assert (new.status("Move", Outcome.ABORTED), old.status("Move", Outcome.ABORTED)) == (11, 9)
+    assert new.status("AutomaticErrorRecovery", Outcome.MANUAL) == 3
+    assert old.status("AutomaticErrorRecovery", Outcome.MANUAL) == 2
+    assert new.status("StopMove", Outcome.INVALID) == new.status("StopMove", Outcome.NOT_POSSIBLE) == 1

@@ -1,0 +1,80 @@
+"""An emulated arm without a network: requests and commands are handed to it, answers and states read off it."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Sequence
+from math import nan
+
+from hal.config.data_files import find_data
+from hal.drivers.franka.emulator.arm import Arm, Reply
+from hal.drivers.franka.emulator.journal import Journal
+from hal.drivers.franka.emulator.layouts import STATE, CommandPacket
+from hal.drivers.franka.emulator.model import RigidBody
+from hal.drivers.franka.emulator.plant import IdealPlant, Plant
+from hal.drivers.franka.emulator.protocol import PROTOCOLS, Controller, Generator
+from hal.drivers.franka.emulator.requests import Files, Requests
+from hal.drivers.franka.limits import LIMITS
+
+HOME = (0.0, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785)
+URDF = find_data("robots", "fr3.urdf")
+ZERO = (0.0,) * 7
+
+
+class Bench:
+    """An arm, and a client's end of it."""
+
+    def __init__(self, version: int = 10, plant: Plant | None = None, library: bytes | None = None) -> None:
+        self.version = version
+        self.journal = Journal(quiet=True)
+        self.replies: list[Reply] = []
+        self.plant = plant or IdealPlant(RigidBody(URDF), HOME)
+        limits = LIMITS["fr3" if version == 10 else "fer"]
+        self.arm = Arm(PROTOCOLS[version], limits, self.plant, self.journal, send=self.replies.append)
+        self.requests = Requests(self.arm, Files(b"<robot/>", library))
+
+    def ask(self, name: str, payload: bytes = b"") -> int:
+        """Request something; the status of the answer, after the next cycle if need be."""
+        before = len(self.replies)
+        self.requests.take(name, 7, payload)
+        if len(self.replies) == before:
+            self.idle()
+        return self.replies[before].body[0]
+
+    def move(self, generator: Generator = Generator.JOINT_POSITION, external: bool = False) -> int:
+        """Ask for a motion."""
+        controller = Controller.EXTERNAL if external else Controller.JOINT_IMPEDANCE
+        payload = struct.pack("<II6d", controller, generator, *[1.0] * 6)
+        return self.ask("Move", payload + (bytes(57) if self.version == 10 else b""))
+
+    def idle(self, cycles: int = 1) -> None:
+        """Cycles without a command."""
+        for _ in range(cycles):
+            self.arm.tick(None)
+
+    def command(
+        self,
+        q: Sequence[float] | None = None,
+        dq: Sequence[float] = ZERO,
+        tau: Sequence[float] = ZERO,
+        finished: bool = False,
+    ) -> None:
+        """One cycle with a command."""
+        position = tuple(q) if q is not None else (nan,) * 7 if finished else tuple(self.arm.sample.q)
+        self.arm.tick(CommandPacket(self.arm.message_id, position, tuple(dq), tuple(tau), finished))
+
+    def state(self, name: str) -> tuple[float, ...]:
+        """A field of the state packet, after another cycle."""
+        packet = bytes(self.arm.tick(None))
+        field = STATE[self.version].fields[name]
+        values: tuple[float, ...] = struct.unpack_from(f"<{field.values}{field.kind}", packet, field.offset)
+        return values
+
+    def speed_up(self, cycles: int = 50) -> None:
+        """Joint 1 from rest to 5 rad/s2 times so many milliseconds."""
+        acceleration = 0.0
+        speed = 0.0
+        for _ in range(cycles):
+            acceleration = min(5.0, acceleration + 4.0)
+            speed += acceleration * 1e-3
+            self.command(dq=(speed, *ZERO[1:]))

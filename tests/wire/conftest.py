@@ -1,0 +1,37 @@
+"""Emulators that the tests of a module share; each test gets them as if switched on anew."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import pytest
+
+from .franka_kit import Emulator, shared
+
+
+@pytest.fixture(scope="module")
+def _lockstep_fr3() -> Iterator[Emulator]:
+    pytest.importorskip("pylibfranka", reason="needs pylibfranka: pip install 'robot-hal[franka]'")
+    with shared("--lockstep", robot="fr3") as emulator:
+        yield emulator
+
+
+@pytest.fixture(scope="module")
+def _lockstep_panda() -> Iterator[Emulator]:
+    pytest.importorskip("panda_py", reason="needs panda-python: pip install 'robot-hal[panda]'")
+    with shared("--lockstep", robot="panda") as emulator:
+        yield emulator
+
+
+@pytest.fixture
+def fr3(_lockstep_fr3: Emulator) -> Emulator:
+    """An FR3 in lock-step."""
+    _lockstep_fr3.refresh()
+    return _lockstep_fr3
+
+
+@pytest.fixture
+def panda(_lockstep_panda: Emulator) -> Emulator:
+    """A Panda in lock-step."""
+    _lockstep_panda.refresh()
+    return _lockstep_panda

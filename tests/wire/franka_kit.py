@@ -1,0 +1,160 @@
+"""Emulated Frankas for tests: each a process of its own at a loopback address of its own.
+
+with Emulator("--lockstep", robot="fr3") as emulator:     # ready when the line is through
+    ...                                                   # connect anything to emulator.host
+    emulator.control.send("reflex joint_reflex")
+    emulator.wait_event("motion ended")
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from hal.drivers.franka.emulator.control import Control
+
+__all__ = ["FR3_CLIENT", "PANDA_CLIENT", "Emulator", "free_host", "run_client"]
+
+HERE = Path(__file__).parent
+FR3_CLIENT = HERE / "fr3_client.py"
+PANDA_CLIENT = HERE / "panda_client.py"
+PORTS = (1337, 1338, 1339)
+START_LIMIT = 20.0
+END_LIMIT = 5.0
+
+
+def free_host(block: int = 1) -> str:
+    """An address 127.0.block.x none of whose Franka ports is taken; different test processes begin elsewhere."""
+    for k in range(250):
+        host = f"127.0.{block}.{(os.getpid() + k) % 250 + 1}"
+        with contextlib.suppress(OSError), contextlib.ExitStack() as stack:
+            for port in PORTS:
+                listener = stack.enter_context(socket.socket())
+                listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+                listener.bind((host, port))
+            return host
+    raise RuntimeError(f"no free address in 127.0.{block}.x")
+
+
+class Emulator:
+    """A running emulator. ``options`` are those of its command line; without ``hand`` it serves the arm only."""
+
+    def __init__(self, *options: str, robot: str = "fr3", host: str | None = None, hand: bool = False) -> None:
+        """Returns when it is ready. Raises RuntimeError, with what it printed, when it does not get ready."""
+        self.host = host or free_host()
+        self.lines: list[str] = []
+        """What it printed so far."""
+        self._ready = threading.Event()
+        command = [sys.executable, "-m", "hal.drivers.franka.emulator", "--robot", robot, "--host", self.host, *options]
+        if not hand:
+            command.append("--no-hand")
+        began = time.monotonic()
+        self.process = subprocess.Popen(
+            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+        )
+        self._reader = threading.Thread(target=self._read, daemon=True)
+        self._reader.start()
+        if not self._ready.wait(START_LIMIT) or not any("ready:" in line for line in self.lines):
+            self.process.kill()
+            self.process.wait()
+            raise RuntimeError("the emulator did not get ready:\n" + "\n".join(self.lines))
+        self.start_time = time.monotonic() - began
+        """s from the start of the process to its "ready"."""
+        self.control = Control(self.host)
+
+    def _read(self) -> None:
+        assert self.process.stdout is not None
+        for line in self.process.stdout:
+            self.lines.append(line.rstrip("\n"))
+            if "ready:" in line:
+                self._ready.set()
+        self._ready.set()
+
+    def type(self, line: str) -> None:
+        """Type a line into its standard input."""
+        assert self.process.stdin is not None
+        self.process.stdin.write(line + "\n")
+        self.process.stdin.flush()
+
+    def events(self, kind: str | None = None) -> list[dict[str, Any]]:
+        """Its last events, of one kind or of any."""
+        events: list[dict[str, Any]] = self.control.send("log 1000")["events"]
+        return [event for event in events if kind in (None, event["kind"])]
+
+    def wait_event(self, kind: str, after: int = 0, timeout: float = 10.0) -> dict[str, Any]:
+        """The first event of that kind with a number above ``after``. TimeoutError when there is none in time."""
+        deadline = time.monotonic() + timeout
+        while True:
+            for event in self.events(kind):
+                if event["n"] > after:
+                    return event
+            if time.monotonic() > deadline:
+                raise TimeoutError(f"no event {kind!r}; there were: {[event['text'] for event in self.events()]}")
+            time.sleep(0.005)
+
+    def refresh(self) -> None:
+        """As if switched on anew, at home: for tests that share one."""
+        self.control.send("restart")
+        self.control.send("place")
+        self.control.send("reset-stats")
+
+    def end(self, number: int = signal.SIGTERM) -> int:
+        """Send it this signal; its exit status."""
+        with contextlib.suppress(ProcessLookupError):
+            self.process.send_signal(number)
+        return self.process.wait(END_LIMIT)
+
+    def close(self) -> None:
+        """End it, whatever state it is in."""
+        self.control.close()
+        if self.process.poll() is None:
+            self.process.terminate()
+            try:
+                self.process.wait(END_LIMIT)
+            except subprocess.TimeoutExpired:
+                self.process.kill()
+                self.process.wait()
+        self._reader.join(END_LIMIT)
+        for stream in (self.process.stdin, self.process.stdout):
+            if stream is not None:
+                with contextlib.suppress(OSError):
+                    stream.close()
+
+    def __enter__(self) -> Emulator:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+def run_client(script: Path, scenario: str, host: str, timeout: float = 30.0, **arguments: object) -> dict[str, Any]:
+    """Run one scenario of a client script in a process of its own, and give what it reports.
+
+    The vendor's libraries block without letting other Python threads run, and change the scheduling of the thread that
+    constructs a robot; so they are kept out of the tests' process. Raises subprocess.TimeoutExpired when it hangs, and
+    RuntimeError with what it printed when it fails.
+    """
+    command = [sys.executable, str(script), scenario, host, json.dumps(arguments)]
+    done = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=timeout)
+    if done.returncode != 0:
+        raise RuntimeError(f"{script.name} {scenario} ended with {done.returncode}:\n{done.stdout}{done.stderr}")
+    report: dict[str, Any] = json.loads(done.stdout.splitlines()[-1])
+    return report
+
+
+@contextlib.contextmanager
+def shared(*options: str, robot: str) -> Iterator[Emulator]:
+    """An emulator for a module; fails when it did not live to its end."""
+    with Emulator(*options, robot=robot) as emulator:
+        yield emulator
+        assert emulator.process.poll() is None, "\n".join(emulator.lines)

@@ -1,0 +1,268 @@
+"""The emulator as a program: how it starts, what it says, how it is told what to do, how it ends, and its pace."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import select
+import signal
+import socket
+import struct
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+
+import pytest
+
+from hal.drivers.franka.emulator.control import Control
+
+from .franka_kit import FR3_CLIENT, Emulator, run_client
+
+PROGRAM = [sys.executable, "-m", "hal.drivers.franka.emulator"]
+
+
+@pytest.fixture(scope="module")
+def _real_time() -> Iterator[Emulator]:
+    with Emulator("--q", "0.1", "-0.7", "0", "-2.3", "0", "1.6", "0.8") as emulator:
+        yield emulator
+
+
+@pytest.fixture
+def arm(_real_time: Emulator) -> Emulator:
+    """An FR3 in real time."""
+    _real_time.refresh()
+    return _real_time
+
+
+class Client:
+    """Speaks the protocol by hand."""
+
+    def __init__(self, host: str) -> None:
+        self.udp = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self.udp.bind(("127.0.0.1", 0))
+        self.udp.settimeout(2.0)
+        self.tcp = socket.create_connection((host, 1337), 2.0)
+        self.send(0, struct.pack("<HH", 10, self.udp.getsockname()[1]))
+
+    def send(self, code: int, payload: bytes) -> None:
+        self.tcp.sendall(struct.pack("<III", code, 1, 12 + len(payload)) + payload)
+
+    def reply(self) -> bytes:
+        """The next response, without its header."""
+        head = self.tcp.recv(12, socket.MSG_WAITALL)
+        return self.tcp.recv(struct.unpack("<III", head)[2] - 12, socket.MSG_WAITALL)
+
+    def close(self) -> None:
+        self.tcp.close()
+        self.udp.close()
+
+
+@pytest.fixture
+def client(arm: Emulator) -> Iterator[Client]:
+    client = Client(arm.host)
+    assert client.reply() == b"\0\x0a\0"
+    yield client
+    client.close()
+
+
+def test_it_says_when_it_is_ready_and_ends_when_it_is_told() -> None:
+    for number in (signal.SIGTERM, signal.SIGINT):
+        with Emulator() as emulator:
+            (ready,) = [line for line in emulator.lines if "ready:" in line]
+            for part in ("FR3", emulator.host, "1337", "no hand", "1339", "protocol 10", "real time", "plant ideal"):
+                assert part in ready
+            assert emulator.end(number) == 0
+            emulator.close()
+            assert emulator.lines[-1].endswith("ended")
+            assert not any("Traceback" in line for line in emulator.lines)
+
+
+def test_an_address_that_is_taken_or_nobodys_is_one_line(arm: Emulator) -> None:
+    for host, reason in ((arm.host, "Address already in use"), ("192.0.2.1", "Cannot assign requested address")):
+        done = subprocess.run([*PROGRAM, "--host", host, "--no-hand"], capture_output=True, text=True, timeout=20)
+        assert done.returncode == 1
+        assert done.stderr == f"error: cannot listen on {host}:1337: {reason}\n"
+
+
+def test_options_that_make_no_sense() -> None:
+    for options in (["--host", "here"], ["--patience", "0"], ["--robot", "ur5"], ["--urdf", "/nowhere.urdf"]):
+        done = subprocess.run([*PROGRAM, *options], capture_output=True, text=True, timeout=20)
+        assert done.returncode != 0
+        assert "Traceback" not in done.stderr
+
+
+def test_commands_from_the_shell(arm: Emulator) -> None:
+    shell = [sys.executable, "-m", "hal.drivers.franka.emulator.control", "--host", arm.host]
+    done = subprocess.run([*shell, "user-stop", "on"], capture_output=True, text=True, timeout=20)
+    assert (done.returncode, done.stdout) == (0, "{}\n")
+    assert arm.control.send("state")["mode"] == "user_stopped"
+    done = subprocess.run([*shell, "user-stop", "perhaps"], capture_output=True, text=True, timeout=20)
+    assert (done.returncode, done.stderr) == (1, "error: user-stop: takes on or off\n")
+    done = subprocess.run([*shell, "help"], capture_output=True, text=True, timeout=20)
+    assert "silence S" in done.stdout
+
+
+def test_commands_that_are_typed(arm: Emulator) -> None:
+    arm.type("reflex joint_reflex")
+    arm.wait_event("reflex", after=0)
+    arm.type("nonsense")
+    arm.type("help")
+    deadline = time.monotonic() + 5.0
+    while not any("silence S" in line for line in arm.lines) and time.monotonic() < deadline:
+        time.sleep(0.005)
+    assert any("no command 'nonsense'" in line for line in arm.lines)
+    assert any("silence S" in line for line in arm.lines)
+
+
+@pytest.mark.parametrize(
+    "line",
+    ["", "reflex", "reflex nothing", "silence", "silence -1", "silence x", "lose-states 2", "lose-states next", "log x",
+     "version 70000", "place 1 2", "place 9 0 0 0 0 0 0", "guiding", "hand object none", "restart soon", "stall 1e9"],
+)  # fmt: skip
+def test_commands_that_make_no_sense_are_refused_in_words(arm: Emulator, line: str) -> None:
+    with pytest.raises(ValueError, match=r"\w"):
+        arm.control.send(line)
+    assert arm.control.send("state")["mode"] == "idle"
+
+
+def test_lines_on_the_control_port_may_be_words_or_json(arm: Emulator) -> None:
+    with socket.create_connection((arm.host, 1339), 5.0) as connection:
+        answers = connection.makefile()
+        connection.sendall(b'user-stop on\n{"command": ["user-stop", "off"]}\n{"command": 5}\n{broken\n')
+        found = [answers.readline() for _ in range(4)]
+        assert found[:2] == ['{"ok": true}\n'] * 2
+        assert all('"ok": false' in answer for answer in found[2:])
+        connection.sendall(b"x" * 5000)  # a line without an end
+        with contextlib.suppress(ConnectionResetError):
+            assert answers.readline() == ""
+    assert arm.control.send("state")["mode"] == "idle"
+
+
+def test_states_come_every_millisecond_and_the_numbers_go_up(arm: Emulator, client: Client) -> None:
+    client.udp.recv(2000)
+    began = time.monotonic()
+    numbers = [struct.unpack_from("<Q", client.udp.recv(2000))[0] for _ in range(300)]
+    took = time.monotonic() - began
+    assert numbers == list(range(numbers[0], numbers[0] + 300))
+    assert took > 0.25
+    stats = arm.control.send("stats")
+    assert stats["states"] >= 300
+    assert stats["lateness"]["p50"] < 0.001
+
+
+def test_its_own_stalls_are_written_down(arm: Emulator, client: Client) -> None:
+    before = time.monotonic()
+    arm.control.send("stall 0.1")
+    after = time.monotonic()
+    client.udp.recv(2000)
+    stalls = [stall for stall in arm.control.send("stats")["stalls"] if before <= stall["t"] <= after]
+    assert any(stall["length"] > 0.09 for stall in stalls)
+
+
+def test_what_is_no_request_ends_the_connection_and_not_the_emulator(arm: Emulator) -> None:
+    for data in (
+        b"\xff" * 12,
+        struct.pack("<III", 0, 0, 5),
+        struct.pack("<III", 99, 0, 12),
+        struct.pack("<III", 1, 0, 12),
+    ):
+        with socket.create_connection((arm.host, 1337), 5.0) as connection:
+            connection.sendall(data)
+            assert connection.recv(100) == b""
+    assert arm.control.send("state")["connected"] is False
+
+
+def test_requests_in_pieces_of_the_wrong_size_and_commands_that_are_none(arm: Emulator, client: Client) -> None:
+    request = struct.pack("<III", 4, 1, 68) + struct.pack("<7d", *[1000.0] * 7)
+    for k in range(len(request)):
+        client.tcp.sendall(request[k : k + 1])
+    assert client.reply() == b"\0"
+    client.send(4, bytes(48))
+    assert client.reply() == b"\2"  # invalid argument
+    _, place = client.udp.recvfrom(2000)
+    for size in (0, 10, 370, 1000):
+        client.udp.sendto(bytes(size), place)
+    while arm.control.send("stats")["malformed"] < 4:
+        client.udp.recv(2000)
+    assert arm.control.send("state")["mode"] == "idle"
+
+
+def test_a_client_that_is_killed_makes_room_at_once(arm: Emulator, client: Client) -> None:
+    client.close()
+    again = Client(arm.host)
+    try:
+        assert again.reply()[0] == 0
+    finally:
+        again.close()
+
+
+def test_who_never_introduces_himself_keeps_nobody_away(arm: Emulator) -> None:
+    with socket.create_connection((arm.host, 1337), 5.0):
+        welcome = False
+        deadline = time.monotonic() + 5.0
+        while not welcome and time.monotonic() < deadline:
+            client = Client(arm.host)
+            with contextlib.suppress(OSError, struct.error):  # turned away
+                welcome = client.reply()[0] == 0
+            client.close()
+            time.sleep(0.05)
+        assert welcome
+
+
+def test_kill_is_sudden() -> None:
+    with Emulator() as emulator:
+        emulator.control.send("kill")
+        assert emulator.process.wait(5) == -signal.SIGKILL
+
+
+def test_nobody_reads_what_it_prints() -> None:
+    """A closed pipe is no reason to stop serving."""
+    reading, writing = os.pipe()
+    host = "127.0.1.251"
+    process = subprocess.Popen([*PROGRAM, "--host", host, "--no-hand"], stdin=subprocess.DEVNULL, stdout=writing)
+    os.close(writing)
+    try:
+        assert select.select([reading], [], [], 20.0)[0]
+        os.close(reading)
+        with Control(host) as control:
+            for _ in range(3):
+                control.send("user-stop on")
+            assert control.send("state")["mode"] == "user_stopped"
+    finally:
+        process.terminate()
+        assert process.wait(5) == 0
+
+
+def test_in_lock_step_a_client_that_does_not_answer_is_waited_for_and_then_given_up() -> None:
+    with Emulator("--lockstep", "--patience", "0.5") as emulator:
+        client = Client(emulator.host)
+        client.reply()
+        client.send(1, struct.pack("<II6d", 0, 0, *[1.0] * 6) + bytes(57))
+        assert client.reply() == b"\1"
+        while True:
+            state, place = client.udp.recvfrom(2000)
+            if state[1288] == 1:  # a joint position generator runs
+                break
+        number, q = struct.unpack_from("<Q", state)[0], struct.unpack_from("<7f", state, 596)
+        began = time.monotonic()
+        client.udp.sendto(struct.pack("<Q7d", number, *q) + bytes(307), place)
+        assert client.reply() == b"\x08"  # by a reflex
+        took = time.monotonic() - began
+        assert 0.5 <= took < 3.0
+        assert emulator.control.send("state")["errors"] == ["communication_constraints_violation"]
+        client.close()
+
+
+def test_a_motion_in_real_time(arm: Emulator) -> None:
+    pytest.importorskip("pylibfranka", reason="needs pylibfranka: pip install 'robot-hal[franka]'")
+    for _ in range(3):  # a loaded machine may lose twenty commands in a row
+        arm.refresh()
+        report = run_client(FR3_CLIENT, "motion", arm.host, way=0.004, duration=0.4)
+        if report["error"] == "":
+            break
+        assert "communication_constraints_violation" in report["error"]
+        assert arm.control.send("stats")["lost_in_row"] == 20
+    assert (report["error"], report["mode"]) == ("", "Idle")
+    assert report["wall"] >= 0.39
+    assert report["q"][0] == pytest.approx(0.104, abs=1e-4)
