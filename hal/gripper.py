@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import math
+import threading
 from abc import ABC, abstractmethod
 from typing import TYPE_CHECKING, ClassVar, NamedTuple
 
-from .errors import CommandError, NotSupported, StaleStateError
+from .errors import CommandError, ConnectionLost, MotionStopped, NotSupported, RobotFault, StaleStateError
+from .gripper_motion import GripperMotion, GripperResult
+from .host.gripper_mail import GripperAct, GripperCommand
 from .types import Fault, GripperOutcome, GripperState
 
 if TYPE_CHECKING:
@@ -15,7 +18,7 @@ if TYPE_CHECKING:
     from .specs import GripperSpec
     from .stops import StopLatch
 
-__all__ = ["Gripper", "GripperDriver", "GripperReading"]
+__all__ = ["Gripper", "GripperDriver", "GripperMotion", "GripperReading", "GripperResult"]
 
 
 class GripperReading(NamedTuple):
@@ -32,7 +35,8 @@ class GripperReading(NamedTuple):
     grasped: bool | None = None
     force: float | None = None
     outcome: GripperOutcome | None = None
-    """How the newest command ended; None where the driver cannot know, and it is judged by the width."""
+    """How the newest command goes, from the return of its call on; None where the driver cannot know, and it is judged
+    by ``moving`` and the width."""
     fault: Fault | None = None
     """Why the last command failed, with what to do about it."""
 
@@ -65,9 +69,10 @@ class GripperDriver(ABC):
     def grasp(self, width: float, speed: float, force: float, inner: float, outer: float) -> None:
         """Start to close on something of ``width`` (m) at ``speed`` (m/s) and hold it with ``force`` (N).
 
-        It is held when the fingers end between ``width - inner`` and ``width + outer`` (m).
+        It is held when the fingers end between ``width - inner`` and ``width + outer`` (m). A driver without a grasp of
+        its own closes as far as that, and so presses on what is there.
         """
-        self.move(width, speed, force)
+        self.move(max(0.0, width - inner), speed, force)
 
     def home(self) -> None:  # noqa: B027  # most have nothing to do
         """Start to find out how far the fingers open. Only some grippers need it, once after they are switched on."""
@@ -86,7 +91,14 @@ class GripperDriver(ABC):
 
 
 class Gripper:
-    """The gripper of an arm. The newest command wins; fingers keep what they hold when a session ends or trips."""
+    """The gripper of an arm. The newest command wins; fingers keep what they hold when a session ends or trips.
+
+    ``move``, ``grasp``, ``home``, ``open`` and ``grip`` wait until the fingers rest. They raise RobotFault, with cause
+    and remedy, when the gripper failed, MotionStopped when a stop or a newer command came first, TimeoutError, and
+    ConnectionLost. ``start``, ``start_grasp`` and ``start_home`` return at once, with a motion to ask or to wait for.
+    All of them raise CommandError for numbers that the gripper cannot do, and MotionStopped while ``rig.stop()`` is
+    latched.
+    """
 
     def __init__(self, spec: GripperSpec, robot: str, host: Host, clock: Clock, latch: StopLatch) -> None:
         self.spec = spec
@@ -95,28 +107,62 @@ class Gripper:
         self._robot = robot
         self._host = host
         self._latch = latch
-        self._mail = host.memory.robots[robot]
+        self._mail = host.memory.grippers[spec.name]
         self._commands = 0
+        self._motion: GripperMotion | None = None
+        self._sending = threading.RLock()  # a signal handler may call stop() in the middle of a command
+
+    # How it is.
 
     @property
     def width_max(self) -> float:
         """Greatest distance between the fingers, m."""
         return self.spec.width_max
 
+    @property
+    def period(self) -> float:
+        """New states come about this often, s."""
+        return 1.0 / self._host.spec.rate_hz
+
+    def check(self) -> None:
+        """Raise ConnectionLost when the process that owns the gripper is gone."""
+        self._host.check()
+
+    def newest(self) -> GripperState | None:
+        """The newest state, however old; None before the first one."""
+        found = self._mail.get()
+        return None if found is None else found.state
+
     def state(self, max_age: float = 0.5) -> GripperState:
         """The newest state.
 
-        Raises StaleStateError when it is older than ``max_age`` s, ConnectionLost when the process that owns the
-        gripper is gone.
+        When it is older than ``max_age`` s: StaleStateError, or ConnectionLost where it is known that the gripper does
+        not answer. ConnectionLost, too, when the process that owns it is gone.
         """
-        self._host.check()
-        found = self._mail.get_gripper()
+        self.check()
+        found = self._mail.get()
         if found is None:
             raise StaleStateError(f"the gripper of {self._robot} has not reported a state yet")
-        age = self.clock.now() - found.stamp.t
+        age = self.clock.now() - found.state.stamp.t
         if age > max_age:
+            if found.lost:
+                why = f": {found.state.fault}" if found.state.fault is not None else ""
+                raise ConnectionLost(f"the gripper of {self._robot} has not answered for {age:.3f} s{why}")
             raise StaleStateError(f"the gripper of {self._robot} has been silent for {age:.3f} s")
-        return found
+        return found.state
+
+    @property
+    def trouble(self) -> str:
+        """Why commands do not move the fingers: nobody answers, or the newest command failed. Empty when they do.
+
+        Never waits: for loops that go on without a gripper.
+        """
+        try:
+            state = self.state()
+        except (ConnectionLost, StaleStateError) as error:
+            return str(error)
+        failed = state.outcome is GripperOutcome.FAILED
+        return f"the gripper of {self._robot} failed: {state.fault}" if failed else ""
 
     def width_of(self, fraction: float) -> float:
         """Width in m of a grip from 0 (open) to 1 (closed). CommandError outside that."""
@@ -124,11 +170,43 @@ class Gripper:
             raise CommandError(f"a grip goes from 0 (open) to 1 (closed), not {fraction}")
         return (1.0 - fraction) * self.spec.width_max
 
-    def start(self, width: float, speed: float | None = None, force: float | None = None) -> None:
-        """Start towards ``width`` (m) at ``speed`` (m/s) with at most ``force`` (N); returns at once.
+    # Commands that return at once.
 
-        Raises CommandError for numbers that the gripper cannot do, MotionStopped while ``rig.stop()`` is latched.
+    def start(self, width: float, speed: float | None = None, force: float | None = None) -> GripperMotion:
+        """Start towards ``width`` (m) at ``speed`` (m/s) with at most ``force`` (N)."""
+        return self._begin(GripperAct.MOVE, *self._checked(width, speed, force))
+
+    def start_grasp(
+        self,
+        width: float,
+        force: float | None = None,
+        speed: float | None = None,
+        inner: float = 0.005,
+        outer: float = 0.005,
+    ) -> GripperMotion:
+        """Start to close on something of about ``width`` (m) and hold it with ``force`` (N).
+
+        It is held when the fingers end between ``width - inner`` and ``width + outer`` (m); what is narrower, wider or
+        not there at all is ``MISSED``.
         """
+        for name, value in (("inner", inner), ("outer", outer)):
+            if not 0.0 <= value < math.inf:
+                raise CommandError(f"{name} must be a distance in m, 0 or more, not {value}")
+        return self._begin(GripperAct.GRASP, *self._checked(width, speed, force), inner, outer)
+
+    def start_home(self) -> GripperMotion:
+        """Start to find out how far the fingers open. Some grippers need it once after they are switched on.
+
+        They open and close for it, and drop what they hold; grippers that need none do nothing.
+        """
+        return self._begin(GripperAct.HOME)
+
+    def stop(self) -> None:
+        """Stay where the fingers are, with the force that they have. Returns at once; any thread may call it."""
+        self.check()
+        self._put(self._host.stops, GripperAct.STOP)
+
+    def _checked(self, width: float, speed: float | None, force: float | None) -> tuple[float, float, float]:
         speed = self.spec.speed if speed is None else speed
         force = self.spec.force if force is None else force
         if not 0.0 <= width <= self.spec.width_max:
@@ -137,30 +215,56 @@ class Gripper:
             raise CommandError(f"speed must be above 0 and at most {self.spec.speed:g} m/s, not {speed}")
         if not 0.0 < force < math.inf:
             raise CommandError(f"force must be positive, not {force}")
+        return width, speed, force
+
+    def _begin(self, act: GripperAct, *numbers: float) -> GripperMotion:
+        stops = self._host.stops  # before the latch: a stop that comes after this line ends the motion
         self._latch.check()
-        self._host.check()
-        self._send(width, speed, force)
+        self.check()
+        with self._sending:
+            self._motion = GripperMotion(self, self._put(stops, act, *numbers))
+            return self._motion
 
     def _send(self, width: float, speed: float, force: float) -> None:
-        self._commands += 1
-        self._mail.gripper_command.write(self._commands, width, speed, force)
+        """Start a motion out of a loop that drives an arm: nobody has to be there, and nothing waits."""
+        stops = self._host.stops
+        if not self._latch.stopped:
+            self._put(stops, GripperAct.MOVE, width, speed, force)
+
+    def _put(self, stops: int, act: GripperAct, *numbers: float) -> int:
+        with self._sending:
+            if self._motion is not None:
+                self._motion._look()  # how it ended cannot be seen any more after the next command
+            self._commands += 1
+            self._mail.put_command(GripperCommand(self._commands, stops, act, *numbers))
+            return self._commands
+
+    # Commands that wait.
 
     def move(
         self, width: float, speed: float | None = None, force: float | None = None, timeout: float = 10.0
     ) -> GripperState:
-        """Move to ``width`` and wait until the fingers rest: there, or on what they hold. Raises TimeoutError."""
-        before = self.state().stamp
-        self.start(width, speed, force)
-        deadline = self.clock.now() + timeout
-        period = max(0.01, 1.0 / self._host.spec.rate_hz)
-        while True:
-            self.clock.sleep(period)
-            state = self.state()
-            taken = state.stamp.t > before.t and abs(state.width_target - width) < 1e-6
-            if taken and not state.moving:
-                return state
-            if self.clock.now() > deadline:
-                raise TimeoutError(f"the gripper of {self._robot} is still moving after {timeout:g} s: {state}")
+        """Move to ``width`` and wait until the fingers rest: there, or on what they hold."""
+        return self._finish(self.start(width, speed, force), timeout).state
+
+    def grasp(
+        self,
+        width: float,
+        force: float | None = None,
+        speed: float | None = None,
+        inner: float = 0.005,
+        outer: float = 0.005,
+        timeout: float = 10.0,
+    ) -> bool:
+        """Close on something of about ``width`` and wait: True when it is held. See :meth:`start_grasp`."""
+        return bool(self._finish(self.start_grasp(width, force, speed, inner, outer), timeout))
+
+    def home(self, timeout: float = 30.0) -> GripperState:
+        """Find out how far the fingers open, and wait: see :meth:`start_home`."""
+        result = self._finish(self.start_home(), timeout)
+        if not result:
+            raise RobotFault(f"{self.name} did not finish homing", "see that nothing is between its fingers; try again")
+        return result.state
 
     def grip(self, fraction: float, force: float | None = None) -> GripperState:
         """Close by a fraction from 0 (open) to 1 (closed) and wait: a helper on top of :meth:`move`."""
@@ -170,13 +274,19 @@ class Gripper:
         """Open all the way and wait."""
         return self.move(self.spec.width_max)
 
-    def stop(self) -> None:
-        """Stay where the fingers are, with the force that they have."""
-        self._host.request("gripper_stop", {"robot": self._robot})
+    def _finish(self, motion: GripperMotion, timeout: float) -> GripperResult:
+        result = motion.wait(timeout)
+        if result.outcome is GripperOutcome.FAILED:
+            fault = result.fault
+            raise RobotFault(*((fault.cause, fault.remedy) if fault else (f"{self.name} failed", "")))
+        if result.outcome is GripperOutcome.STOPPED:
+            self._latch.check()
+            raise MotionStopped(f"{self.name} was stopped, or got a newer command, before it was there")
+        return result
 
     def inject(self, **knobs: object) -> None:
         """Switch faults of a simulated driver on or off, for tests."""
-        self._host.request("inject", {"robot": self._robot, "device": "gripper", "knobs": knobs})
+        self._host.request("inject_gripper", {"gripper": self.name, "knobs": knobs})
 
     def __repr__(self) -> str:
         return f"<Gripper of {self._robot}: 0..{self.spec.width_max:g} m, driver {self.spec.driver}>"

@@ -7,6 +7,7 @@ from typing import ClassVar
 from hal.errors import ConnectionLost
 from hal.gripper import GripperDriver, GripperReading
 from hal.specs import GripperSpec
+from hal.types import Fault, GripperOutcome
 
 from .knobs import GripperKnobs, turned
 
@@ -26,12 +27,15 @@ class MockGripper(GripperDriver):
         super().__init__(spec, world)
         self.knobs = GripperKnobs()
         self.log: list[tuple[float, float, float]] = []
-        """Every ``move``: width in m, speed in m/s, force in N."""
+        """Every ``move`` and ``grasp``: width in m, speed in m/s, force in N."""
+        self.homed = 0
+        """Counts calls of ``home``."""
         self.is_open = False
-        self._width = self._target = spec.width_max
+        self._width = self._target = self._aim = spec.width_max
         self._speed = 0.0
         self._force = 0.0
         self._stopped = True
+        self._fault: Fault | None = None
         self._t: float | None = None
         self._t_first: float | None = None
         self._reading: GripperReading | None = None
@@ -60,16 +64,18 @@ class MockGripper(GripperDriver):
             moving=not self._stopped and self._width != self._goal() and not self.knobs.stuck,
             grasped=grasped,
             force=self._force if grasped else 0.0,
+            outcome=None if self._fault is None else GripperOutcome.FAILED,
+            fault=self._fault,
         )
         return self._reading
 
     def _goal(self) -> float:
-        """Where the fingers end: at the target, or before it on an object that they close on."""
+        """Where the fingers end: where they are driven to, or before it on an object that they close on."""
         thing = self.knobs.object_width
-        return max(self._target, thing) if thing is not None and self._width >= thing else self._target
+        return max(self._aim, thing) if thing is not None and self._width >= thing else self._aim
 
     def _pressing(self) -> bool:
-        return self.knobs.object_width is not None and self._target < self.knobs.object_width == self._width
+        return self.knobs.object_width is not None and self._aim < self.knobs.object_width == self._width
 
     def _advance(self, dt: float) -> None:
         if self._stopped or self.knobs.stuck:
@@ -81,7 +87,28 @@ class MockGripper(GripperDriver):
     def move(self, width: float, speed: float, force: float) -> None:
         self._expect_open()
         self.log.append((width, speed, force))
-        self._target = min(max(width, 0.0), self.spec.width_max)
+        width = min(max(width, 0.0), self.spec.width_max)
+        self._start(width, width, speed, force)
+
+    def grasp(self, width: float, speed: float, force: float, inner: float, outer: float) -> None:
+        """Close until something, or the other finger, stops the fingers."""
+        self._expect_open()
+        self.log.append((width, speed, force))
+        self._start(min(max(width, 0.0), self.spec.width_max), 0.0, speed, force)
+
+    def home(self) -> None:
+        """Open all the way."""
+        self._expect_open()
+        self.homed += 1
+        self._start(self.spec.width_max, self.spec.width_max, self.spec.speed, self.spec.force)
+
+    def _start(self, target: float, aim: float, speed: float, force: float) -> None:
+        failure = self.knobs.fail
+        self._fault = None if failure is None else Fault("mock", failure, "turn the knob 'fail' back to None")
+        if failure is not None:
+            self._stopped = True
+            return
+        self._target, self._aim = target, aim
         self._speed = min(speed, self.spec.speed)
         self._force = force
         self._stopped = False

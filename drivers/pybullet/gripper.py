@@ -42,7 +42,7 @@ class PyBulletGripper(GripperDriver):
             raise CommandError(f"{spec.name}: a simulated gripper needs the world that it stands in, not {world!r}")
         self._world = world
         self._open = False
-        self._target = spec.width_max
+        self._target = self._aim = spec.width_max
         self._force = spec.force
         self._moving = False
         self._moved_at = 0.0
@@ -52,7 +52,7 @@ class PyBulletGripper(GripperDriver):
         self._body = _owner(self.spec, self._world)
         self._joints = [self._body.joints[name] for name in self.spec.joints]
         self._read = self._world.client.getJointStates
-        self._target = self._width()[0]
+        self._target = self._aim = self._width()[0]
         if not self._open:
             self._world.on_reset(self._body.name, self._was_reset)
         self._open = True
@@ -61,7 +61,7 @@ class PyBulletGripper(GripperDriver):
         """The fingers as the last physics step left them; ``force`` is what the weaker motor pressed with, N."""
         width, speed, force = self._width()
         t = self._world.t
-        short = abs(width - self._target) > AT_TARGET
+        short = abs(width - self._aim) > AT_TARGET
         if abs(speed) > AT_REST:
             self._moved_at = t
         if self._moving and not (short and t - self._moved_at < SETTLE) and abs(speed) <= AT_REST:
@@ -75,13 +75,21 @@ class PyBulletGripper(GripperDriver):
             width=width,
             width_target=self._target,
             moving=moving,
-            grasped=not moving and pressing and width > self._target + AT_TARGET,
+            grasped=not moving and pressing and width > self._aim + AT_TARGET,
             force=force,
         )
 
     def move(self, width: float, speed: float, force: float) -> None:
         """Start towards ``width``, cut to what the gripper can do; the newest command wins."""
-        self._target = min(max(width, 0.0), self.spec.width_max)
+        self._target = self._aim = min(max(width, 0.0), self.spec.width_max)
+        self._start(speed, force)
+
+    def grasp(self, width: float, speed: float, force: float, inner: float, outer: float) -> None:
+        """Start to close until something, or the other finger, stops the fingers; they go on pressing."""
+        self._target, self._aim = min(max(width, 0.0), self.spec.width_max), 0.0
+        self._start(speed, force)
+
+    def _start(self, speed: float, force: float) -> None:
         self._force = force
         self._moving, self._moved_at = True, self._world.t
         self._drive(min(speed, self.spec.speed))
@@ -92,7 +100,7 @@ class PyBulletGripper(GripperDriver):
         self._moving = False
         if abs(speed) <= AT_REST and force >= PRESSING * self._force:
             return
-        self._target = width
+        self._target = self._aim = width
         self._drive(self.spec.speed)
 
     def close(self) -> None:
@@ -108,7 +116,7 @@ class PyBulletGripper(GripperDriver):
                 self._body.id,
                 joint,
                 client.POSITION_CONTROL,
-                targetPosition=self._target / 2.0,
+                targetPosition=self._aim / 2.0,
                 force=self._force,
                 positionGain=position_gain(self._world.dt),
                 velocityGain=1.0,
@@ -123,7 +131,7 @@ class PyBulletGripper(GripperDriver):
         return width, share * sum(state[1] for state in states), min(-state[3] for state in states)
 
     def _was_reset(self) -> None:
-        self._target = self._width()[0]
+        self._target = self._aim = self._width()[0]
         self._force = self.spec.force
         self._moving = False
 

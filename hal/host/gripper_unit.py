@@ -1,0 +1,164 @@
+"""One gripper in a group's cycle: its driver, its mailboxes, and how its newest command goes."""
+
+from __future__ import annotations
+
+import math
+import traceback
+
+from ..errors import CommandError, ConfigError, ConnectionLost, DriverMissing, HalError, NotSupported, RobotFault
+from ..gripper import GripperDriver, GripperReading
+from ..types import Fault, GripperOutcome
+from .gripper_mail import GripperAct, GripperCommand, GripperMail
+from .records import AppRecord
+
+__all__ = ["AT_WIDTH", "GripperUnit"]
+
+AT_WIDTH = 0.001
+"""Fingers that rest so close to where they should be are there, m."""
+_SWITCH_ON = "see that it is on and connected"
+
+
+class GripperUnit:
+    """A gripper with its mailboxes. Whatever goes wrong with it is told in its state, and stops nothing else."""
+
+    def __init__(self, driver: GripperDriver, mail: GripperMail) -> None:
+        self.driver = driver
+        self.spec = driver.spec
+        self.mail = mail
+        self._reading: GripperReading | None = None
+        self._command: GripperCommand | None = None
+        self._seq = 0
+        self._seq_before = 0
+        """Number of the last reading before the newest command."""
+        self._outcome = GripperOutcome.NONE
+        self._final = False
+        """Is the outcome no longer for the driver to say?"""
+        self._fault: Fault | None = None
+        """Why the newest command failed, where its call did."""
+        self._stops = 0
+        self._reason = ""
+
+    def open(self) -> None:
+        """Connect. Nothing moves. Raises ConnectionLost, which says how to do without it."""
+        try:
+            self.driver.open()
+        except (CommandError, ConfigError, DriverMissing, NotSupported):
+            raise
+        except Exception as error:
+            text = str(error) if isinstance(error, HalError) else f"{type(error).__name__}: {error}"
+            raise ConnectionLost(
+                f"{self.spec.name} cannot be opened: {text}; without this gripper, "
+                "`gripper: {enabled: false}` in the arm's entry of the rig switches it off"
+            ) from error
+
+    # Per cycle.
+
+    def serve(self, app: AppRecord) -> None:
+        """Keep the fingers where a stop finds them; start what the app asked for last.
+
+        A command that was sent before a stop, or that the gripper does not take, is forgotten: nothing moves later.
+        """
+        if app.stops != self._stops:
+            self._stops = app.stops
+            self._stop(self._outcome is GripperOutcome.RUNNING)
+        command = self.mail.get_command()
+        if command is None or command.seq <= self._seq:
+            return
+        self._seq = command.seq
+        if command.stops < app.stops:
+            self._end(GripperOutcome.STOPPED)
+        else:
+            self._take(command)
+
+    def _take(self, command: GripperCommand) -> None:
+        if command.act is GripperAct.STOP:
+            self._stop(True)
+            return
+        self._command = command
+        self._outcome, self._final, self._fault = GripperOutcome.RUNNING, False, None
+        self._seq_before = self._reading.seq if self._reading is not None else -1
+        try:
+            if command.act is GripperAct.MOVE:
+                self.driver.move(command.width, command.speed, command.force)
+            elif command.act is GripperAct.GRASP:
+                self.driver.grasp(command.width, command.speed, command.force, command.inner, command.outer)
+            else:
+                self.driver.home()
+        except Exception as error:
+            self._fail(error)
+
+    def _stop(self, ends: bool) -> None:
+        """``ends``: the newest command is not over yet."""
+        try:
+            self.driver.stop()
+        except Exception as error:
+            self._fail(error)
+        else:
+            if ends:
+                self._end(GripperOutcome.STOPPED)
+
+    def _fail(self, error: Exception) -> None:
+        self._note(error)
+        self._end(GripperOutcome.FAILED, _fault_of(error))
+
+    def _end(self, outcome: GripperOutcome, fault: Fault | None = None) -> None:
+        self._outcome, self._final, self._fault = outcome, True, fault
+
+    def _note(self, error: Exception) -> None:
+        """Each new reason is written down once, in the process's log."""
+        reason = f"{type(error).__name__}: {error}"
+        if reason != self._reason:
+            self._reason = reason
+            traceback.print_exception(error)
+
+    def publish(self, now: float) -> None:
+        """Tell the app the newest state. From a gripper that does not answer that is an old one, and why."""
+        lost: Fault | None = None
+        try:
+            reading = self.driver.read(now)
+            if not math.isfinite(reading.width):
+                raise ConnectionLost(f"{self.spec.name} reports a width of {reading.width}")
+        except Exception as error:
+            self._note(error)
+            lost = _fault_of(error)
+        else:
+            self._reading = reading
+            self._judge(reading)
+        if self._reading is not None:
+            fault = self._fault or lost or self._reading.fault
+            self.mail.put(self._reading, self._seq, self._outcome, fault, lost is not None)
+
+    def _judge(self, reading: GripperReading) -> None:
+        """How the newest command goes: the driver knows, or the width tells."""
+        command = self._command
+        if command is None or self._final:
+            return
+        if reading.outcome:
+            self._outcome = reading.outcome
+        elif not reading.moving and reading.seq != self._seq_before:
+            self._end(_outcome_at_rest(command, reading))
+
+    def close(self) -> None:
+        """Let go of the device, not of what it holds."""
+        self.driver.close()
+
+
+def _outcome_at_rest(command: GripperCommand, reading: GripperReading) -> GripperOutcome:
+    beyond = reading.width - command.width
+    if command.act is GripperAct.MOVE:
+        there = abs(beyond) <= AT_WIDTH
+    elif command.act is GripperAct.GRASP:
+        there = -command.inner <= beyond <= command.outer and reading.grasped is not False
+    else:
+        there = True
+    return GripperOutcome.DONE if there else GripperOutcome.MISSED
+
+
+def _fault_of(error: Exception) -> Fault:
+    if isinstance(error, RobotFault):
+        return Fault("gripper", error.cause, error.remedy)
+    if isinstance(error, ConnectionLost):
+        return Fault("lost", str(error), _SWITCH_ON)
+    if isinstance(error, HalError):
+        return Fault("refused", str(error), "")
+    return Fault("driver", f"{type(error).__name__}: {error}", "this is a mistake in the driver")
