@@ -8,6 +8,7 @@ from urllib.parse import urlsplit
 if TYPE_CHECKING:
     from hal.config.plan import Plan
     from hal.rig import Rig
+    from hal.specs import GripperSpec, RobotSpec
 
 __all__ = ["banner", "invitation", "listing"]
 
@@ -16,11 +17,13 @@ def listing(plan: Plan) -> list[str]:
     """The devices of a rig that is not open, one a line."""
     lines = []
     for robot in plan.robots:
-        gripper = f", gripper 0..{robot.gripper.width_max:g} m" if robot.gripper else ""
-        where = "REAL" if robot.attended else "simulated"
-        lines.append(
-            f"robot    {robot.name:10s} {robot.model}, {where} ({robot.driver}), {robot.rate_hz:g} Hz{gripper}"
-        )
+        simulated = not robot.attended or (plan.world is not None and robot.driver == plan.world.driver)
+        where = f"simulated ({robot.driver})" if simulated else _real(robot, robot)
+        gripper = robot.gripper
+        hand = f", gripper 0..{gripper.width_max:g} m" if gripper else ""
+        if gripper and robot.attended and simulated:
+            hand += f", {_real(robot, gripper)}"
+        lines.append(f"robot    {robot.name:10s} {robot.model}, {where}, {robot.rate_hz:g} Hz{hand}")
     for camera in plan.cameras:
         streams = "+".join(camera.streams)
         lines.append(
@@ -33,6 +36,12 @@ def listing(plan: Plan) -> list[str]:
         lines.append(f"world    {plan.world.driver}, {plan.world.physics_hz:g} Hz: {things}")
     lines.append(f"clock    {plan.clock.replace('_', ' ')}")
     return lines
+
+
+def _real(robot: RobotSpec, device: RobotSpec | GripperSpec) -> str:
+    """What drives a device that counts as real, and where: nobody may take a robot for its stand-in."""
+    host = f" at {device.options['host']}" if "host" in device.options else ""
+    return f"{'EMULATED' if robot.emulated else 'REAL'} ({device.driver}{host})"
 
 
 def banner(rig: Rig) -> str:

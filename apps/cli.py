@@ -10,14 +10,14 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
-__all__ = ["ACTION_NEEDED", "add_rig_options", "interruptible", "rig_options", "run_app"]
+__all__ = ["ACTION_NEEDED", "add_config_options", "add_rig_options", "interruptible", "rig_options", "run_app"]
 
 ACTION_NEEDED = 2
 """Exit status when a person must mend something first."""
 
 
-def add_rig_options(parser: argparse.ArgumentParser) -> None:
-    """Options that choose and change a rig; the same in every app."""
+def add_config_options(parser: argparse.ArgumentParser) -> argparse._ArgumentGroup:
+    """Options that choose and change a rig's configuration; the same in every app."""
     rig = parser.add_argument_group("rig")
     rig.add_argument(
         "--config",
@@ -36,6 +36,12 @@ def add_rig_options(parser: argparse.ArgumentParser) -> None:
         metavar="KEY=VALUE",
         help="change any key of the rig, for example --set cameras.wrist.output.width=320; may be repeated",
     )
+    return rig
+
+
+def add_rig_options(parser: argparse.ArgumentParser) -> None:
+    """Those, and what an open rig consists of besides its devices."""
+    rig = add_config_options(parser)
     rig.add_argument(
         "--pad",
         default="auto",

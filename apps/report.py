@@ -71,16 +71,24 @@ class RunReport:
                 "ticks": group["ticks"],
                 "missed": group.get("missed", 0),
                 "period_ms": _summary(group.get("period_s")),
+                "reanchored": own["reanchored"],
+                "driver": own["driver"],
             },
             "latency_ms": {"p50": _ms(latency["p50"]), "p99": _ms(latency["p99"])},
             "state_age_ms": _summary(self._ages.summary()),
             "tcp_travel_m": self._travel,
+            "tcp_end": self._end(),
             "peak": own["peak"],
             "cameras": cameras,
             "trips": self.trips,
             "faults": self.faults,
             "clean_exit": clean_exit,
         }
+
+    def _end(self) -> dict[str, list[float]]:
+        """Where the tcp is now, in the arm's base frame, m and xyzw."""
+        tcp = self._robot.state(max_age=float("inf")).tcp
+        return {"position": tcp.position.tolist(), "orientation": tcp.orientation.tolist()}
 
     @staticmethod
     def write(path: str, report: dict[str, Any]) -> None:

@@ -10,7 +10,7 @@ import argparse
 import sys
 from typing import TYPE_CHECKING
 
-from hal.apps.cli import add_rig_options, rig_options, run_app
+from hal.apps.cli import ACTION_NEEDED, add_rig_options, rig_options, run_app
 
 if TYPE_CHECKING:
     from hal.commands import Twist
@@ -51,6 +51,7 @@ def main(argv: list[str] | None = None) -> int:
 def _main(args: argparse.Namespace) -> int:
     import hal
     from hal.apps.banner import banner, listing
+    from hal.apps.check import may_open
     from hal.errors import CommandError
 
     if args.speed is not None and not 0.0 < args.speed <= 1.0:
@@ -67,13 +68,15 @@ def _main(args: argparse.Namespace) -> int:
 
     load_mapping(args.mapping)
     check_wanted(args.pad)
+    plan = load(args.config, sim=args.sim, overrides=args.overrides).resolve()
     if args.dry_run:
-        plan = load(args.config, sim=args.sim, overrides=args.overrides).resolve()
         if args.robot and args.robot not in {robot.name for robot in plan.robots}:
             raise CommandError(f"--robot {args.robot}: the rig has {', '.join(r.name for r in plan.robots) or 'none'}")
         print(f"{plan.source} is in order; it would open:")
         print("\n".join(f"  {line}" for line in [*listing(plan), *plan.warnings]))
         return 0
+    if not may_open(plan):
+        return ACTION_NEEDED
     with hal.open(**rig_options(args)) as rig:
         print(banner(rig), flush=True)
         name = args.robot or next(iter(rig.robots), None)

@@ -1,6 +1,10 @@
 """Median time of one servo tick per kind of command, beside a bare Ruckig update in the same run.
 
-    python benchmarks/servo_tick.py [ticks]
+    python benchmarks/servo_tick.py [ticks] [--idle]
+
+"Prepared" is the tick that a host sees: what depends on the set-point alone was computed after the last write, which
+takes the time in the next column. ``--idle`` waits for the rest of each millisecond, as a host does: what a processor
+has forgotten meanwhile is part of the truth.
 
 Times differ from machine to machine and from minute to minute; the last column, the ratio to the reference measured in
 turn with it, is what to compare.
@@ -15,13 +19,15 @@ import os
 import statistics
 import time
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
+import numpy as np
 from ruckig import ControlInterface, InputParameter, OutputParameter, Ruckig, Synchronization
 from servo_streams import PANDA, robot_spec
 
 from hal.commands import Kind
 from hal.inbox import NO_INBOX, CommandRecord, Inbox, Session
+from hal.kinematics import Kinematics
 from hal.robot import Reading
 from hal.servo.audit import SetpointAudit
 from hal.servo.servo import Servo
@@ -44,7 +50,7 @@ def panda() -> RobotSpec:
         tcp_link="panda_hand",
         tcp_position=(0.0, 0.0, 0.1034),
     )
-    return replace(spec, kinematics=kinematics)
+    return replace(spec, kinematics=kinematics, limits=replace(spec.limits, torque=(87.0,) * 4 + (12.0,) * 3))
 
 
 class Bare:
@@ -67,23 +73,39 @@ class Bare:
         self.q, self.dq, self.ddq = output.new_position, output.new_velocity, output.new_acceleration
 
 
-def measure(spec: RobotSpec, kind: Kind | None, values: Values, tcp_speed: float, ticks: int) -> tuple[float, ...]:
-    """Median and 99th percentile of a tick, and the median of the reference, in us. Without a kind: move_to."""
-    servo = Servo(spec, 1 / RATE_HZ)
+@dataclass
+class Times:
+    """Of one kind of command, us."""
+
+    median: float
+    p99: float
+    prepare: float
+    """Median of what is computed ahead."""
+    reference: float
+
+
+def measure(
+    spec: RobotSpec, kind: Kind | None, values: Values, tcp_speed: float, ticks: int, prepared: bool, idle: bool
+) -> Times:
+    """Times of a tick, with or without what is computed ahead of it. Without a kind: move_to."""
+    kinematics = Kinematics(spec.kinematics)
+    servo = Servo(spec, 1 / RATE_HZ, kinematics, kinematics.mass_matrix)
     servo.anchor(spec.home)
     goal = tuple(x + 0.3 * math.cos(k) for k, x in enumerate(spec.home)) if kind is None else None
     servo.begin(Session(1, 0.3, tcp_speed, False, goal), NO_INBOX)
     bare = Bare()
-    now, q = 10.0, list(spec.home)
+    now, q, dq = 10.0, list(spec.home), STILL
     start = list(q)
+    inverse = np.linalg.inv(kinematics.mass_matrix(start))
     command = None
-    times, references = [], []
+    times, ahead, references = [], [], []
     for k in range(ticks):
+        due = time.perf_counter() + 1 / RATE_HZ
         now += 1 / RATE_HZ
         t = k / RATE_HZ
         if kind is not None and k % 20 == 0:  # 50 Hz
             command = CommandRecord(k + 1, 1, now, now + 0.1, kind, tuple(values(t, start)))
-        reading = Reading(now, now, k, q, STILL)
+        reading = Reading(now, now, k, q, dq)
         inbox = Inbox(command, None, 0, 0, now)
         begun = time.perf_counter_ns()
         setpoint = servo.tick(now, reading, inbox)
@@ -92,11 +114,22 @@ def measure(spec: RobotSpec, kind: Kind | None, values: Values, tcp_speed: float
         references.append(time.perf_counter_ns() - ended)
         times.append(ended - begun)
         assert setpoint is not None
-        q = list(setpoint.q)
+        if setpoint.tau is None:
+            q = list(setpoint.q)
+        else:  # an arm without friction, whose inertia does not change
+            dq = [v + a / RATE_HZ for v, a in zip(dq, inverse.dot(setpoint.tau).tolist(), strict=True)]
+            q = [x + v / RATE_HZ for x, v in zip(q, dq, strict=True)]
+        if prepared:
+            begun = time.perf_counter_ns()
+            servo.prepare()
+            ahead.append(time.perf_counter_ns() - begun)
+        if idle:
+            time.sleep(max(0.0, due - time.perf_counter()))
     if servo.report.trip or max(abs(a - b) for a, b in zip(q, start, strict=True)) < 1e-3:
         raise RuntimeError(f"{kind}: the arm did not move as it should: {servo.report}")
     times.sort()
-    return statistics.median(times) / 1e3, times[int(0.99 * ticks)] / 1e3, statistics.median(references) / 1e3
+    median, p99 = statistics.median(times) / 1e3, times[int(0.99 * ticks)] / 1e3
+    return Times(median, p99, statistics.median(ahead or [0]) / 1e3, statistics.median(references) / 1e3)
 
 
 def audit_time(ticks: int) -> float:
@@ -114,7 +147,9 @@ def audit_time(ticks: int) -> float:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("ticks", type=int, nargs="?", default=5000)
-    ticks = parser.parse_args().ticks
+    parser.add_argument("--idle", action="store_true", help="wait for the rest of each millisecond between two ticks")
+    args = parser.parse_args()
+    ticks, idle = args.ticks, args.idle
     free, capped = 1e9, 0.25
     box = WorkspaceSpec((0.1, -0.8, 0.0), (0.9, 0.8, 1.2))
 
@@ -130,6 +165,9 @@ def main() -> None:
 
     def twist(t: float, start: list[float]) -> list[float]:
         return [0.1 * math.cos(t), 0.1 * math.sin(t), -0.05 * math.cos(t), 0.0, 0.0, 0.2 * math.cos(t), 0.0]
+
+    def torque(t: float, start: list[float]) -> list[float]:
+        return [(-1.0) ** k * math.cos(5.0 * t) for k in range(7)]
 
     spec = panda()
     servo = Servo(spec, 1 / RATE_HZ)
@@ -148,13 +186,17 @@ def main() -> None:
         ("poses", spec, Kind.CARTESIAN_TARGET, target, capped),
         ("twists", spec, Kind.TWIST, twist, capped),
         ("twists, workspace", walled, Kind.TWIST, twist, capped),
+        ("torques, capped", spec, Kind.JOINT_TORQUE, torque, capped),
+        ("torques, capped, workspace", walled, Kind.JOINT_TORQUE, torque, capped),
         ("move_to", spec, None, held, capped),
     ]
     gc.disable()
-    print(f"{'kind of command':34s} {'median':>8s} {'p99':>8s} {'reference':>10s} {'ratio':>7s}   (us)")
+    heads = ("median", "p99", "prepared", "p99", "ahead", "reference", "ratio")
+    print(f"{'kind of command':34s}" + "".join(f"{head:>10s}" for head in heads) + "   (us)")
     for name, case, kind, values, tcp_speed in cases:
-        median, p99, reference = measure(case, kind, values, tcp_speed, ticks)
-        print(f"{name:34s} {median:8.1f} {p99:8.1f} {reference:10.1f} {median / reference:7.1f}")
+        plain, ready = (measure(case, kind, values, tcp_speed, ticks, prepared, idle) for prepared in (False, True))
+        numbers = (plain.median, plain.p99, ready.median, ready.p99, ready.prepare, ready.reference)
+        print(f"{name:34s}" + "".join(f"{x:10.1f}" for x in (*numbers, ready.median / ready.reference)))
     print(f"{'audit, one sample':34s} {audit_time(ticks):8.1f}")
 
 

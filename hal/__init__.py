@@ -39,6 +39,7 @@ if TYPE_CHECKING:
         StaleStateError,
         Unreachable,
     )
+    from .gripper_motion import GripperMotion, GripperResult
     from .pose import Pose
     from .rig import Rig, open_rig
     from .robot import Robot
@@ -47,6 +48,7 @@ if TYPE_CHECKING:
     from .types import (
         Fault,
         Frame,
+        GripperOutcome,
         GripperState,
         Limited,
         PadState,
@@ -71,6 +73,9 @@ __all__ = [
     "DriverMissing",
     "Fault",
     "Frame",
+    "GripperMotion",
+    "GripperOutcome",
+    "GripperResult",
     "GripperState",
     "HalError",
     "JointTarget",
@@ -114,12 +119,24 @@ _MODULES = {
         "StaleStateError",
         "Unreachable",
     ),
+    "gripper_motion": ("GripperMotion", "GripperResult"),
     "pose": ("Pose",),
     "rig": ("Rig",),
     "robot": ("Robot",),
     "specs": ("BodySpec",),
     "teleop": ("Teleop",),
-    "types": ("Fault", "Frame", "GripperState", "Limited", "PadState", "RobotState", "RobotStatus", "Stamp", "Trip"),
+    "types": (
+        "Fault",
+        "Frame",
+        "GripperOutcome",
+        "GripperState",
+        "Limited",
+        "PadState",
+        "RobotState",
+        "RobotStatus",
+        "Stamp",
+        "Trip",
+    ),
 }
 _HOME = {name: module for module, names in _MODULES.items() for name in names}
 

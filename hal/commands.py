@@ -83,7 +83,12 @@ class JointVelocity:
 
 @dataclass(frozen=True, slots=True, eq=False, init=False)
 class JointTorque:
-    """Apply joint torques ``tau`` (n,), Nm, on top of the robot's own gravity compensation."""
+    """Apply joint torques ``tau`` (n,), Nm, on top of those with which the arm carries its own weight.
+
+    They are followed as fast as 990 Nm/s, and only as far as the arm could still be kept below the session's speeds
+    when what it presses against gives way. Commands of another kind must wait until the arm is at rest and no torque is
+    left, and torques until it rests.
+    """
 
     tau: Array
 
@@ -132,6 +137,8 @@ def encode(command: Command) -> tuple[Kind, tuple[float, ...]]:
         return Kind.JOINT_TARGET, (*q, *(command.dq.tolist() if command.dq is not None else [0.0] * len(q)))
     if isinstance(command, JointVelocity):
         return Kind.JOINT_VELOCITY, tuple(command.dq.tolist())
+    if isinstance(command, JointTorque):
+        return Kind.JOINT_TORQUE, tuple(command.tau.tolist())
     if isinstance(command, CartesianTarget):
         return Kind.CARTESIAN_TARGET, (*command.pose.position.tolist(), *command.pose.orientation.tolist())
     assert isinstance(command, Twist)

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from . import registry
 from .commands import CartesianTarget, Command, JointTarget, JointTorque, JointVelocity, Sent, Twist, encode
 from .errors import (
     CommandError,
@@ -65,7 +66,7 @@ class Control:
             raise CommandError(
                 f"{robot.name} really moves: pass deadman=pad.hold('l2'), or unattended=True when nobody is near it"
             )
-        if deadman is not None and spec.attended:
+        if deadman is not None and spec.attended and not spec.emulated:
             deadman.check_trust()
         if not (math.isfinite(rate_hz) and rate_hz > 0.0):
             raise CommandError(f"rate_hz must be positive, not {rate_hz}")
@@ -87,6 +88,8 @@ class Control:
         self._detach: Callable[[], None] | None = None
         self._grip: float | None = None
         self._refused = 0
+        self._takes_torques = False
+        """Is it known that the arm takes torques?"""
 
     # Opening and leaving.
 
@@ -204,7 +207,10 @@ class Control:
             reasons.append(f"the servo holds the motion back: {servo.limited}")
         if servo.session == self._id and servo.refused > self._refused:
             self._refused = servo.refused
-            reasons.append("the servo refused an earlier command: too far for a first one, or too late")
+            reasons.append(
+                "the servo refused an earlier command: too far for a first one, too late, or torques and another kind "
+                "of command without a rest in between"
+            )
         if command is not None:
             command = self._checked(command, reasons)
             if waiting:
@@ -234,7 +240,12 @@ class Control:
         self._stopped = servo.trip is Trip.STOP
         self._told = True
         remedy = "release the dead-man and press it again" if self.deadman else "call control.rearm() to go on"
-        raise MotionStopped(trip_text(servo.trip), remedy)
+        raise MotionStopped(trip_text(servo.trip) + self._why_lost(servo), remedy)
+
+    def _why_lost(self, servo: ServoRecord) -> str:
+        """What the driver says of a device that does not answer."""
+        state = self._mail.get_state() if servo.status is RobotStatus.LOST else None
+        return f" ({state.fault.cause})" if state is not None and state.fault is not None else ""
 
     def rearm(self) -> None:
         """Acknowledge a trip in a session without a dead-man; the arm follows the next command.
@@ -252,8 +263,8 @@ class Control:
         if self._goal is not None:
             raise CommandError("this session moves to a goal; it takes no commands")
         if isinstance(command, JointTorque):
-            raise NotSupported(f"{robot.name}: driver {robot.spec.driver} takes no torques")
-        size = {JointTarget: "q", JointVelocity: "dq"}.get(type(command))
+            self._check_torques()
+        size = {JointTarget: "q", JointVelocity: "dq", JointTorque: "tau"}.get(type(command))
         if size is not None:
             count = getattr(command, size).size
             if count != n:
@@ -275,7 +286,26 @@ class Control:
             if over:
                 reasons.append(f"position limit of {', '.join(over)}")
                 return JointTarget(np.clip(command.q, limits.lower, limits.upper), command.dq)
+        if isinstance(command, JointTorque) and (most := robot.limits.torque) is not None:
+            over = [
+                name for x, limit, name in zip(command.tau.tolist(), most, robot.joints, strict=True) if abs(x) > limit
+            ]
+            if over:
+                reasons.append(f"torque limit of {', '.join(over)}")
+                return JointTorque(np.clip(command.tau, np.negative(most), most))
         return command
+
+    def _check_torques(self) -> None:
+        """NotSupported for an arm that takes no torques. Its driver's class says so, and is looked at once."""
+        spec = self.robot.spec
+        if self._takes_torques:
+            return
+        modes: frozenset[str] = registry.load(spec.driver, "robot").modes
+        if "torque" not in modes:
+            raise NotSupported(f"{spec.name}: driver {spec.driver} takes no torques, only: {', '.join(sorted(modes))}")
+        if spec.limits.torque is None:
+            raise NotSupported(f"{spec.name}: model {spec.model} takes no torques without limits.torque, Nm per joint")
+        self._takes_torques = True
 
     def _check_first(self, command: Command, servo: ServoRecord) -> None:
         """A first target far from where the arm stands would make it leap."""
@@ -300,6 +330,8 @@ class Control:
         if gripper is None:
             raise NotSupported(f"{self.robot.name} has no gripper")
         width = gripper.width_of(fraction)
+        if gripper.trouble:
+            reasons.append(gripper.trouble)
         if waiting:
             reasons.append("the dead-man is not held: the gripper does not move")
         elif self._grip is None or abs(width - self._grip) > gripper.spec.width_max * 0.005:

@@ -20,6 +20,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from .types import Fault
 
 __all__ = [
     "CommandError",
@@ -97,6 +101,9 @@ class DeviceNotFound(HalError, LookupError):
 
 class ConnectionLost(HalError, ConnectionError):
     """A device, or the process that owned it, does not answer any more."""
+
+    fault: Fault | None = None
+    """Cause and remedy, where the driver knows them."""
 
 
 class StaleStateError(HalError, TimeoutError):

@@ -11,7 +11,7 @@ import xml.etree.ElementTree as ElementTree
 from collections.abc import Sequence
 from math import dist, hypot, inf, sqrt
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -23,7 +23,7 @@ from .quaternion import difference
 if TYPE_CHECKING:
     from .specs import KinematicsSpec
 
-__all__ = ["Kinematics", "Pose7"]
+__all__ = ["Inverse", "Kinematics", "Pose7"]
 
 Array = NDArray[np.float64]
 Pose7 = tuple[float, float, float, float, float, float, float]
@@ -33,6 +33,27 @@ NEAR_SINGULAR = 0.05
 """Smallest singular value of the Jacobian (m and rad mixed) down to which twists are tracked exactly."""
 POSTURE_SPEED = 0.5
 """Bound of the fastest joint in the pull towards the home posture, rad/s."""
+
+
+class Inverse(NamedTuple):
+    """From twists of the tcp to joint speeds, at one place: everything that does not depend on the twist."""
+
+    matrix: Array
+    """(6, n): what 1 m/s and 1 rad/s along each of the base's axes add to the joint speeds, rad/s."""
+    posture: Array | None
+    """(n,) the way home that does not move the tcp, rad; None where nothing is left free for it."""
+    posture_most: float
+    """The greatest gain for which no joint goes home faster than :data:`POSTURE_SPEED`, 1/s."""
+    near_singular: bool
+    """Is a singular value of the Jacobian below :data:`NEAR_SINGULAR`?"""
+
+    def speeds(self, twist: Sequence[float] | Array, posture_gain: float) -> list[float]:
+        """Joint speeds (n,) in rad/s for a twist (6,), and towards home at ``posture_gain`` (1/s)."""
+        speeds = np.dot(twist, self.matrix)
+        if self.posture is not None and posture_gain != 0.0:
+            speeds += min(posture_gain, self.posture_most) * self.posture
+        result: list[float] = speeds.tolist()
+        return result
 
 
 class Kinematics:
@@ -114,6 +135,11 @@ class Kinematics:
         pose: Pose7 = self._pin.SE3ToXYZQUATtuple(self._tcp_placement)
         return pose, jacobian
 
+    def mass_matrix(self, q: Sequence[float] | Array) -> Array:
+        """(n, n) joint-space inertia, kg m2, as the URDF says: some invent it, and then it is good for nothing."""
+        mass: Array = self._pin.crba(self._model, self._data, self._ordered(q))
+        return mass if self._columns is None else mass[np.ix_(self._columns, self._columns)]
+
     def velocity(
         self,
         q: Sequence[float] | Array,
@@ -123,51 +149,43 @@ class Kinematics:
     ) -> tuple[list[float], bool]:
         """Joint speeds (n,) in rad/s for a twist (6,) of the tcp; and whether the arm is near a singularity.
 
-        Far from singularities the twist is met exactly. Near one, the component along each direction whose singular
+        What the twist leaves free moves towards home at ``posture_gain`` (1/s) times the distance, at most
+        :data:`POSTURE_SPEED`; that motion is in the null space and does not move the tcp. Who has the Jacobian at
+        ``q`` already can pass it. For several twists at one place see :meth:`inverse`.
+        """
+        inverse = self.inverse(q, self.jacobian(q) if jacobian is None else jacobian)
+        return inverse.speeds(twist, posture_gain), inverse.near_singular
+
+    def inverse(self, q: Sequence[float] | Array, jacobian: Array) -> Inverse:
+        """From twists to joint speeds at ``q`` (n,), rad, whose Jacobian is known.
+
+        Far from singularities a twist is met exactly. Near one, the component along each direction whose singular
         value s is below :data:`NEAR_SINGULAR` (e) is met to the share (s/e)^2, so that joint speeds stay below
         |twist| / e: damped least squares with numerical filtering (Maciejewski and Klein, J. Robotic Systems 5(6),
         1988) with the damping s^2 + l^2 = max(s, e)^2. All other directions stay exact.
-
-        What the twist leaves free moves towards home at ``posture_gain`` (1/s) times the distance, at most
-        :data:`POSTURE_SPEED`; that motion is in the null space and does not move the tcp. Who has the Jacobian at
-        ``q`` already can pass it.
         """
-        if jacobian is None:
-            jacobian = self.jacobian(q)
         gram = np.dot(jacobian, jacobian.T, self._gram)
         near = not self._is_surely_regular(q) and self._is_near_singular(q, gram)
-        posture = self._posture(q, posture_gain)
+        home = self.home - q if self.n > 6 else None  # else nothing is left free for a posture
         if not near:
-            # posture + J^+ (twist - J posture): the posture, corrected to what the twist demands.
-            error = np.array(twist, float)
-            if posture is not None:
-                error -= jacobian.dot(posture)
             self._llt.compute(gram)
-            speeds = self._llt.solve(error).dot(jacobian)
+            matrix = self._llt.solve(jacobian)
+            drift = None if home is None else jacobian.dot(home).dot(matrix)
         else:
             squares = self._eigen.eigenvalues()  # of the singular values, in ascending order
             vectors = self._eigen.eigenvectors()
-            task = vectors.T.dot(twist) / np.maximum(squares, NEAR_SINGULAR**2)
-            if posture is not None:
+            along = vectors.T.dot(jacobian)
+            matrix = (vectors / np.maximum(squares, NEAR_SINGULAR**2)).dot(along)
+            drift = None
+            if home is not None:
                 # The null space is taken undamped, or the posture would creep along the singular direction.
                 regular = squares > 1e-12
-                drift = vectors.T.dot(jacobian.dot(posture))
-                task[regular] -= drift[regular] / squares[regular]
-            speeds = vectors.dot(task).dot(jacobian)
-        if posture is not None:
-            speeds += posture
-        result: list[float] = speeds.tolist()
-        return result, near
-
-    def _posture(self, q: Sequence[float] | Array, gain: float) -> Array | None:
-        """Joint speeds towards home; None where there is no freedom left for a posture."""
-        if gain == 0.0 or self.n <= 6:
-            return None
-        posture: Array = gain * (self.home - q)
-        if posture.dot(posture) <= POSTURE_SPEED**2:  # then its fastest is no faster either
-            return posture
-        fastest = float(np.abs(posture).max())
-        return posture if fastest <= POSTURE_SPEED else posture * (POSTURE_SPEED / fastest)
+                drift = (along[regular].dot(home) / squares[regular]).dot(along[regular])
+        if home is None or drift is None:
+            return Inverse(matrix, None, 0.0, near)
+        fastest = float(np.abs(home).max())
+        most = POSTURE_SPEED / fastest if fastest > 0.0 else inf
+        return Inverse(matrix, home - drift, most, near)
 
     def _is_near_singular(self, q: Sequence[float] | Array, gram: Array) -> bool:
         """Is a singular value of the Jacobian at ``q`` below :data:`NEAR_SINGULAR`? Its ``gram`` matrix is J J^T."""

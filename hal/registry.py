@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import importlib
 import importlib.util
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields
 from difflib import get_close_matches
 from types import MappingProxyType
@@ -25,7 +25,7 @@ from typing import Any
 
 from .errors import DeviceNotFound, DriverMissing, NotSupported
 
-__all__ = ["BUILT_IN", "GROUP", "DriverSpec", "driver", "load", "missing", "names"]
+__all__ = ["BUILT_IN", "GROUP", "DriverSpec", "driver", "function", "load", "missing", "names"]
 
 GROUP = "hal.drivers"
 """The entry-point group."""
@@ -129,6 +129,17 @@ def load(name: str, kind: str) -> Any:
     if place is None:
         raise NotSupported(f"driver {name!r} has no {kind}; it has: {', '.join(spec.kinds) or 'nothing'}")
     return _resolve(place, name, spec.requires)
+
+
+def function(name: str, place: str | None) -> Callable[..., Any] | None:
+    """The function that the driver ``name`` names as ``place`` in its spec (a check, ``emulated``, ``preflight``).
+
+    None where it names none. Raises DriverMissing.
+    """
+    if place is None:
+        return None
+    found: Callable[..., Any] = _resolve(place, name, driver(name).requires)
+    return found
 
 
 def missing(name: str) -> dict[str, str]:

@@ -18,11 +18,12 @@ from .console import Console, Listen
 from .devices import Devices
 from .errors import ConnectionLost, DeviceNotFound, HalError, NotSupported
 from .gamepad import Gamepad
+from .gripper import Gripper
 from .host.groups import groups_of
-from .host.hosts import Host, LocalHost, RemoteHost
+from .host.hosts import Host, LocalHost, RemoteHost, SteppedHost
 from .pads.choice import Chosen, choose_pad, in_words, tour
 from .robot import Robot
-from .specs import PadSpec
+from .specs import GroupSpec, PadSpec, RobotSpec
 from .stops import StopLatch
 from .world import NoWorld, World
 
@@ -114,19 +115,7 @@ class Rig:
         plan = self.plan
         pads = self._choose_pads(pad, viewer)
         groups = groups_of(plan)
-        world_host: Host | None = None
-        if self.lock_step:
-            (group,) = groups
-            local = LocalHost(group)
-            self._hosts.append(local)
-            self.clock = LockStepClock(local.now, local.advance_to)
-            world_host = local if group.world is not None else None
-        else:
-            for group in groups:
-                remote = RemoteHost(group, realtime=realtime)
-                self._hosts.append(remote)
-                if group.world is not None:
-                    world_host = remote
+        world_host = self._start_hosts(groups, realtime)
         if console or any(chosen.spec.driver == _CONSOLE for chosen in pads):
             self._start_console(listen, pads)
         if world_host is not None:
@@ -138,13 +127,13 @@ class Rig:
         for host in self._hosts:
             if isinstance(host, RemoteHost):
                 scheduling = host.wait_ready()["scheduling"]
-                if realtime:
+                if realtime and host.spec.robots:
                     self.notes.append(f"servo process {host.spec.name}: {scheduling}")
         if world_host is not None:
             self.world = World(world_host.request, self._world_edited)
         for host in self._hosts:
             for spec in host.spec.robots:
-                self.robots[spec.name] = Robot(spec, host, self.clock, self._latch)
+                self.robots[spec.name] = Robot(spec, host, self.clock, self._latch, self._gripper_of(spec))
         for opened in (self.console, self.viewer3d):
             if opened is not None:
                 opened.wait_ready()
@@ -156,6 +145,33 @@ class Rig:
         self._open_pads(pads)
         for host in self._hosts:
             host.request("reset_statistics")  # starting up is not what anybody wants to measure
+
+    def _start_hosts(self, groups: Sequence[GroupSpec], realtime: bool) -> Host | None:
+        """The processes of the groups; returns the one with the simulated world. Its copies of arms follow the rest."""
+        world_host: Host | None = None
+        if self.lock_step:
+            group, *others = groups
+            stepped = [SteppedHost(other) for other in others]
+            self._hosts.extend(stepped)
+            local = LocalHost(group, stepped)
+            self._hosts.insert(0, local)
+            self.clock = LockStepClock(local.now, local.advance_to)
+            return local if group.world is not None else None
+        remotes: list[RemoteHost] = []
+        for group in sorted(groups, key=lambda group: group.world is not None):
+            others_ = remotes if group.world is not None else ()
+            remotes.append(RemoteHost(group, realtime=realtime and bool(group.robots), others=others_))
+            self._hosts.append(remotes[-1])
+            if group.world is not None:
+                world_host = remotes[-1]
+        return world_host
+
+    def _gripper_of(self, robot: RobotSpec) -> Gripper | None:
+        spec = robot.gripper
+        if spec is None:
+            return None
+        host = next(host for host in self._hosts if spec in host.spec.grippers)
+        return Gripper(spec, robot.name, host, self.clock, self._latch)
 
     def _open_pictures(self, host: Host, viewer: str) -> None:
         """Whatever shows the world: the renderer of its cameras, a window."""
@@ -187,8 +203,8 @@ class Rig:
     def _choose_pads(self, pad: str | None, viewer: str) -> list[Chosen]:
         if pad == "none":
             return []
-        window, lock_step = viewer == "gui", self.lock_step
-        return [choose_pad(s, pad, window=window, attended=self.attended, lock_step=lock_step) for s in self.plan.pads]
+        known = {"window": viewer == "gui", "attended": self.attended, "lock_step": self.lock_step}
+        return [choose_pad(spec, pad, **known, emulated=self.emulated) for spec in self.plan.pads]
 
     def _start_console(self, listen: Listen, pads: Sequence[Chosen]) -> None:
         if self.lock_step:
@@ -240,6 +256,11 @@ class Rig:
         return any(robot.attended for robot in self.plan.robots)
 
     @property
+    def emulated(self) -> bool:
+        """Does a program stand in for everything that counts as real here, so that nothing can be hurt?"""
+        return self.attended and all(robot.emulated for robot in self.plan.robots if robot.attended)
+
+    @property
     def _local(self) -> LocalHost:
         host = self._hosts[0]
         if not isinstance(host, LocalHost):
@@ -253,15 +274,13 @@ class Rig:
 
         ``name`` is a robot's, a camera's or a pad's, or ``robot.gripper``.
         """
-        arms = self._local.cycle.arms
-        if name in arms:
-            return arms[name].driver
-        robot, _, part = name.partition(".")
-        if part == "gripper" and robot in arms and arms[robot].gripper is not None:
-            return arms[robot].gripper
-        if name in self._devices:
-            return self._devices[name]
-        there = ", ".join([*arms, *self._devices])
+        cycle = self._local.cycle
+        drivers: dict[str, Any] = {unit_name: unit.driver for unit_name, unit in cycle.arms.items()}
+        drivers |= {unit_name: unit.driver for unit_name, unit in cycle.grippers.items()}
+        drivers |= self._devices
+        if name in drivers:
+            return drivers[name]
+        there = ", ".join(drivers)
         raise DeviceNotFound(f"this rig has no device {name!r}; it has: {there}")
 
     @property

@@ -127,9 +127,19 @@ class RobotDriver(ABC):
         """
         raise NotSupported(f"driver {type(self).__name__} does not own a loop")
 
+    def own_tcp(self) -> Floats | None:
+        """Where the device itself says that its tcp was in the last reading: 4x4 by columns, in the base frame, m.
+
+        None where it does not know. It is compared with ours when the arm is opened, and a mismatch is refused.
+        """
+        return None
+
     def statistics(self) -> dict[str, Any]:
         """What the driver knows of its connection, as plain numbers and texts, for reports."""
         return {}
+
+    def reset_statistics(self) -> None:  # noqa: B027
+        """Count from zero."""
 
     def inject(self, **knobs: object) -> None:
         """Switch faults on or off, for tests. Only drivers that simulate have any."""
@@ -143,7 +153,9 @@ class RobotDriver(ABC):
 class Robot:
     """One arm of a rig, the same whatever driver it ends in. Made by :func:`hal.open`."""
 
-    def __init__(self, spec: RobotSpec, host: Host, clock: Clock, latch: StopLatch) -> None:
+    def __init__(
+        self, spec: RobotSpec, host: Host, clock: Clock, latch: StopLatch, gripper: Gripper | None = None
+    ) -> None:
         self.spec = spec
         self.name = spec.name
         self.clock = clock
@@ -154,12 +166,8 @@ class Robot:
         self._commands = 0
         self._open: Control | None = None
         self._kinematics: Kinematics | None = None
-        self.gripper: Gripper | None = None
+        self.gripper = gripper
         """The gripper on this arm, if the model has one."""
-        if spec.gripper is not None:
-            from .gripper import Gripper
-
-            self.gripper = Gripper(spec.gripper, spec.name, host, clock, latch)
 
     # What it is.
 
@@ -211,7 +219,7 @@ class Robot:
             raise StaleStateError(f"{self.name} has not reported a state yet")
         age = self.clock.now() - state.stamp.t
         if state.status is RobotStatus.LOST:
-            reason = f": {state.fault.cause}" if state.fault is not None else ""
+            reason = f": {state.fault.cause}; {state.fault.remedy}" if state.fault is not None else ""
             raise ConnectionLost(f"{self.name} does not answer{reason} (its last state is {age:.3f} s old)")
         if age > max_age:
             raise StaleStateError(f"the newest state of {self.name} is {age:.3f} s old, more than {max_age:g} s")
@@ -285,7 +293,7 @@ class Robot:
 
     def inject(self, **knobs: object) -> None:
         """Switch faults of a simulated driver on or off, for tests; the driver's ``inject`` lists its knobs."""
-        self._host.request("inject", {"robot": self.name, "device": "robot", "knobs": knobs})
+        self._host.request("inject", {"robot": self.name, "knobs": knobs})
 
     def __repr__(self) -> str:
         return f"<Robot {self.name}: {self.spec.model}, {self.n} joints, driver {self.spec.driver}>"

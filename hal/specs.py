@@ -117,9 +117,10 @@ class RobotSpec:
     tcp_speed: float = 0.25
     """Greatest speed of the tcp, m/s."""
     attended: bool = False
-    """True where something real moves: a person must be there (a dead-man, or ``unattended=True``)."""
+    """True where something real moves, the arm or its gripper: a person must be there (a dead-man, or
+    ``unattended=True``)."""
     emulated: bool = False
-    """True where the real driver talks to a program that stands in for the device."""
+    """True where a program stands in for all that counts as real, and nothing really moves."""
     deadline_max: float = 1.0
     """Longest deadline that a command may have, s (0.3 where something real moves)."""
     options: dict[str, Any] = field(default_factory=dict)

@@ -16,6 +16,8 @@ _TRIPS = {
     Trip.FAULT: "the robot reported a fault",
     Trip.DEVICE_LOST: "the robot does not answer",
     Trip.BAD_READING: "the robot reported numbers that cannot be",
+    Trip.HOST_LATE: "the servo's own process was stopped, or could not run, for too long",
+    Trip.LIMIT: "driven by torques, the arm came to a limit of speed, position or workspace, or did not come to rest",
 }
 
 

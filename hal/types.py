@@ -100,6 +100,10 @@ class Trip(_Named):
     """The robot does not answer."""
     BAD_READING = 8
     """The robot reported numbers that cannot be."""
+    HOST_LATE = 9
+    """The servo's own process was stopped, or could not run, for too long."""
+    LIMIT = 10
+    """Driven by torques, the arm came to a limit: of speed, of position, of the workspace, or of the time to brake."""
 
 
 class GripperOutcome(_Named):
@@ -141,6 +145,8 @@ class Limited(IntFlag):
     """The arm is close to a singularity and does not follow the commanded direction exactly."""
     REANCHORED = 64
     """The device had not taken the last set-point; the motion goes on from where it says it is."""
+    TORQUE = 128
+    """The commanded torques were cut to the torque limits."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -204,6 +210,12 @@ class GripperState:
     """True while the fingers press on something short of the target; None where the driver cannot know."""
     force: float | None
     """Grip force, N, where the driver knows it."""
+    outcome: GripperOutcome
+    """How the newest command went."""
+    fault: Fault | None
+    """Why it failed, or why the gripper does not answer, with what to do about it."""
+    target_seq: int
+    """Number of the newest command that the gripper took; 0 before the first one."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -46,6 +46,8 @@ class GripperKnobs:
     """Readings repeat while the fingers go on."""
     stuck: bool = False
     """The fingers do not move, whatever they are told."""
+    fail: str | None = None
+    """Commands are taken, move nothing, and end as ``FAILED`` with a fault of this cause."""
     disconnect: bool = False
     """Every call but ``close`` raises ConnectionLost."""
     garbage: str | None = None

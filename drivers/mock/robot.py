@@ -1,4 +1,4 @@
-"""An ideal arm: it is where the newest set-point says, unless a knob is turned."""
+"""An ideal arm: it is where the newest set-point says, unless a knob is turned. Torques drive it like seven wheels."""
 
 from __future__ import annotations
 
@@ -14,19 +14,29 @@ from hal.types import Fault
 
 from .knobs import RobotKnobs, turned
 
-__all__ = ["LOG_LENGTH", "MockRobot"]
+__all__ = ["FRICTION", "INERTIA", "LOG_LENGTH", "MockRobot"]
 
 LOG_LENGTH = 100_000
 """How many set-points ``MockRobot.log`` keeps: 100 s of the fastest arm."""
+INERTIA = 1.0
+"""Of every joint that is driven by torques, kg m2."""
+FRICTION = 1.0
+"""Of the same, Nm per rad/s."""
+KEEP_UP = 0.020
+"""For how long the last torques are kept up without new ones, s: as long as a Franka does."""
 
 
 class MockRobot(RobotDriver):
     """An arm in memory. A set-point written after ``read(t)`` is where the arm is at the next ``read``.
 
+    Set-points with torques drive every joint by itself: a wheel of ``INERTIA`` with ``FRICTION``, and no weight.
+    Without new ones for ``KEEP_UP`` seconds it stands still.
+
     Time is only the ``now`` of ``read``; the device's own clock starts with the first reading. Closing and opening
     again keeps the position, as a real arm's joints do. Faults: :class:`~hal.drivers.mock.knobs.RobotKnobs`.
     """
 
+    modes: ClassVar[frozenset[str]] = frozenset({"position", "torque"})
     simulated: ClassVar[bool] = True
 
     def __init__(self, spec: RobotSpec, world: object | None = None) -> None:
@@ -41,6 +51,8 @@ class MockRobot(RobotDriver):
         self._pending: deque[tuple[float, Setpoint]] = deque()  # what it took and does not follow yet, with its time
         self._written = 0
         self._now = -math.inf
+        self._t_driven = -math.inf
+        """When the torques came that drive it."""
         self._t_first: float | None = None
         self._reading: Reading | None = None
         self._seq = 0
@@ -53,22 +65,40 @@ class MockRobot(RobotDriver):
         self._expect_open()
         if self._t_first is None:
             self._t_first = now
+        moved = self._follow(now, now - self._now)
         self._now = now
-        moved = self._follow(now)
         if self.knobs.freeze and self._reading is not None:
             return self._reading
         self._seq += 1
         self._reading = self._report(now, now - self._t_first, moved)
         return self._reading
 
-    def _follow(self, now: float) -> bool:
-        """Go to the newest set-point that is due; False when there was none."""
+    def _follow(self, now: float, dt: float) -> bool:
+        """Go to the newest set-point that is due; False when there was none, so that it stands still."""
         due = None
         while self._pending and self._pending[0][0] <= now:
-            due = self._pending.popleft()[1]
+            self._t_driven, due = self._pending.popleft()
+        tau = self._follows.tau if due is None else due.tau
+        if tau is not None:
+            kept_up = now - self._t_driven <= KEEP_UP + dt
+            if kept_up:
+                self._follows = self._driven(tau, dt)
+            else:
+                self._hold()
+            return kept_up
         if due is not None:
             self._follows = due
         return due is not None
+
+    def _driven(self, tau: Sequence[float], dt: float) -> Setpoint:
+        """Where torques bring it in ``dt`` seconds, and how fast it is then."""
+        dq = [(INERTIA * v + dt * x) / (INERTIA + dt * FRICTION) for v, x in zip(self._follows.dq, tau, strict=True)]
+        q = [x + dt * v for x, v in zip(self._follows.q, dq, strict=True)]
+        return Setpoint(q, dq, (0.0,) * len(q), tau)
+
+    def mass_matrix(self, q: Sequence[float]) -> list[list[float]]:
+        """Joint-space inertia (n, n), kg m2."""
+        return [[INERTIA * float(i == k) for k in range(len(q))] for i in range(len(q))]
 
     def _report(self, t: float, t_device: float, moved: bool) -> Reading:
         knobs, n = self.knobs, len(self.spec.joints)

@@ -11,7 +11,7 @@ from .body import Body
 from .inertias import mend_inertias
 from .library import Client, silenced
 from .transforms import Transform, compose, inverse
-from .urdf import Mimic, UrdfFacts, read_urdf
+from .urdf import Mimic, UrdfFacts, loadable, read_urdf
 
 __all__ = ["load_object", "load_robot"]
 
@@ -25,6 +25,9 @@ GEAR_SHARE = 0.8
 """Share of the error between coupled joints that one physics step takes away."""
 GEAR_FORCE = 10.0
 """Strength of the coupling, as a multiple of the effort of the joints that it couples."""
+FINGER_MASS = 0.1
+"""kg, at least: the solver lets a finger of 29 g press with no more than 26 N. What drives it moves along, and is in no
+URDF."""
 CONSTRAINT_ERP = 0.2
 """PyBullet's own share, which it multiplies a gear's by."""
 
@@ -77,6 +80,8 @@ def load_robot(client: Client, spec: RobotSpec) -> tuple[Body, list[str]]:
             effort = limits.torque[place] if limits.torque else effort
         elif name in fingers and spec.gripper:
             body.home[joint] = spec.gripper.width_max / 2.0
+            if client.getDynamicsInfo(number, joint)[0] < FINGER_MASS:
+                client.changeDynamics(number, joint, mass=FINGER_MASS)
         if effort <= 0.0:
             warnings.append(f"{spec.urdf}: joint {name!r} has no effort limit; {UNKNOWN_EFFORT:g} is used")
         body.efforts[joint] = effort if effort > 0.0 else UNKNOWN_EFFORT
@@ -89,10 +94,10 @@ def load_robot(client: Client, spec: RobotSpec) -> tuple[Body, list[str]]:
 
 def _load_urdf(client: Client, path: str, key: str, *, fixed: bool, scale: float) -> int:
     number = -1
-    with silenced() as chatter:
+    with loadable(path) as file, silenced() as chatter:
         try:
             flags = client.URDF_USE_INERTIA_FROM_FILE  # else PyBullet invents inertias from the collision shapes
-            number = client.loadURDF(path, useFixedBase=fixed, globalScaling=scale, flags=flags)
+            number = client.loadURDF(file, useFixedBase=fixed, globalScaling=scale, flags=flags)
         except client.error:
             pass  # said below, with what it printed
     if number < 0:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 from .body import Body
 from .library import Client
 
-__all__ = ["hold", "position_gain"]
+Floats = Sequence[float]
+
+__all__ = ["Torques", "hold", "position_gain"]
 
 STIFFNESS = 72.0
 """1/s: a position error dies away at this rate. At 240 Hz that is a gain of 0.3 per step. A loaded arm follows best
@@ -36,3 +38,60 @@ def hold(client: Client, body: Body, targets: Mapping[int, float], dt: float) ->
             velocityGain=1.0,
             maxVelocity=body.speeds[joint],
         )
+
+
+class Torques:
+    """Some joints of a body, driven by torques on top of what carries their weight.
+
+    PyBullet takes a torque for one step, so they must be given anew for each. Everything that is moved by the joints is
+    carried, and what the motion itself asks for (Coriolis and centrifugal torques); what the gripper holds is not.
+    """
+
+    def __init__(self, client: Client, body: Body, joints: Sequence[int]) -> None:
+        self._client = client
+        self._body = body
+        self._joints = list(joints)
+        self._efforts = [body.efforts[joint] for joint in joints]
+        self._movable = list(body.movable)
+        self._places = [self._movable.index(joint) for joint in joints]
+        self._still = [0.0] * len(self._movable)
+        self._carry: Floats = ()
+        self._given: Floats = [0.0] * len(self._joints)
+        """What this step has got already, Nm: PyBullet adds up."""
+        self.applied: Floats = self._given
+        """What acted in the last step, Nm. PyBullet tells that of motors only."""
+
+    def begin(self) -> None:
+        """Switch the joints' own motors off."""
+        client, nothing = self._client, [0.0] * len(self._joints)
+        client.setJointMotorControlArray(self._body.id, self._joints, client.VELOCITY_CONTROL, forces=nothing)
+        self._given = nothing
+        self.next_step()
+
+    def next_step(self) -> None:
+        """A physics step is over; the next one has got nothing yet."""
+        client, body = self._client, self._body
+        q, dq, _, _ = zip(*client.getJointStates(body.id, self._movable), strict=True)
+        carry = client.calculateInverseDynamics(body.id, q, dq, self._still)
+        self._carry = [carry[place] for place in self._places]
+        self.applied, self._given = self._given, [0.0] * len(self._joints)
+
+    def give(self, tau: Floats) -> None:
+        """These torques (Nm) and what carries the arm, within the efforts, for the next step."""
+        wanted = [
+            max(-effort, min(effort, own + carry))
+            for own, carry, effort in zip(tau, self._carry, self._efforts, strict=True)
+        ]
+        more = [new - old for new, old in zip(wanted, self._given, strict=True)]
+        client = self._client
+        client.setJointMotorControlArray(self._body.id, self._joints, client.TORQUE_CONTROL, forces=more)
+        self._given = wanted
+
+    def mass_matrix(self, q: Floats) -> list[list[float]]:
+        """Joint-space inertia of the joints at ``q`` (rad), kg m2; the body's other joints stay where they are."""
+        client, body = self._client, self._body
+        everything = [state[0] for state in client.getJointStates(body.id, self._movable)]
+        for place, x in zip(self._places, q, strict=True):
+            everything[place] = x
+        rows = client.calculateMassMatrix(body.id, everything)
+        return [[rows[i][k] for k in self._places] for i in self._places]

@@ -10,10 +10,13 @@ from hal.robot import Reading, RobotDriver, Setpoint
 from hal.specs import RobotSpec
 from hal.types import Fault
 
-from .motors import hold, position_gain
+from .motors import Torques, hold, position_gain
 from .world import World
 
 __all__ = ["PyBulletRobot"]
+
+KEEP_UP = 0.020
+"""For how long torques are kept up without new ones, s: as long as a Franka does."""
 
 
 class PyBulletRobot(RobotDriver):
@@ -24,9 +27,12 @@ class PyBulletRobot(RobotDriver):
     set-point at the end of the step in which it was written, so the next reading lags by nothing. Gravity is
     carried by the constraint, so that nothing sags. The torque limits are the rig's, or the URDF's where it has
     none; the speed limits stand in each motor, so that a set-point that jumps cannot move a joint faster.
+
+    A set-point with torques switches these motors off, and adds its torques to those that carry the arm; one without
+    switches them on again. The last torques are kept up for 20 ms without new ones, then the motors hold the arm.
     """
 
-    modes: ClassVar[frozenset[str]] = frozenset({"position", "velocity"})
+    modes: ClassVar[frozenset[str]] = frozenset({"position", "velocity", "torque"})
     simulated: ClassVar[bool] = True
 
     def __init__(self, spec: RobotSpec, world: object | None = None) -> None:
@@ -39,6 +45,10 @@ class PyBulletRobot(RobotDriver):
         self._fault: Fault | None = None
         self._q: Sequence[float] | None = None
         self._dq: Sequence[float] | None = None
+        self._tau: Sequence[float] | None = None
+        """What drives it, Nm; None while the motors follow positions."""
+        self._t_taken = self._t_given = 0.0
+        """When the last torques came, and for which step the motors were given some, in simulated s."""
 
     def open(self) -> None:
         """Find the robot in the world."""
@@ -51,6 +61,7 @@ class PyBulletRobot(RobotDriver):
         self._read = world.client.getJointStates
         self._write = world.client.setJointMotorControlArray
         self._mode = world.client.POSITION_CONTROL
+        self._torques = Torques(world.client, self._body, self._joints)
         if not self._open:
             world.on_reset(self.spec.name, self._was_reset)
         self._open = True
@@ -59,10 +70,14 @@ class PyBulletRobot(RobotDriver):
         """The joints as the last physics step left them; ``tau`` is what the motors applied in it."""
         if not self._connected:
             raise ConnectionLost(f"{self.spec.name} does not answer (injected)")
+        if self._tau is not None:
+            self._keep_up(self._tau)
         if self._freeze and self._frozen is not None:
             return self._frozen
         world = self._world
         q, dq, _, tau = zip(*self._read(self._body.id, self._joints), strict=True)
+        if self._tau is not None:
+            tau = tuple(self._torques.applied)
         reading = Reading(now, world.t, world.steps, q, dq, tau, self._q, self._dq, None, None, self._fault)
         self._frozen = reading
         return reading
@@ -73,6 +88,11 @@ class PyBulletRobot(RobotDriver):
             raise ConnectionLost(f"{self.spec.name} does not answer (injected)")
         if self._fault is not None:
             return
+        if setpoint.tau is not None:
+            self._drive(setpoint, setpoint.tau)
+            return
+        if self._tau is not None:
+            self._hold(setpoint.q)  # puts the motors' speed limits back
         q, dq = setpoint.q, setpoint.dq
         dt = self._world.dt
         self._write(
@@ -87,10 +107,34 @@ class PyBulletRobot(RobotDriver):
         )
         self._q, self._dq = q, dq
 
+    def _drive(self, setpoint: Setpoint, tau: Sequence[float]) -> None:
+        """Torques for the next step, in the place of the motors."""
+        if self._tau is None:
+            self._torques.begin()
+            self._t_given = self._world.t
+        self._tau, self._t_taken = tau, self._world.t
+        self._keep_up(tau)
+        self._q, self._dq = setpoint.q, setpoint.dq
+
+    def _keep_up(self, tau: Sequence[float]) -> None:
+        """What the arm's own controller does for each step: carry the arm, whether new torques come or not."""
+        t = self._world.t
+        if t - self._t_taken > KEEP_UP:
+            self._hold(self._where())
+            return
+        if t != self._t_given:
+            self._torques.next_step()
+            self._t_given = t
+        self._torques.give(tau)
+
+    def mass_matrix(self, q: Sequence[float]) -> list[list[float]]:
+        """Joint-space inertia of the simulated arm (n, n) at ``q``, kg m2."""
+        return self._torques.mass_matrix(q)
+
     def halt(self) -> None:
-        """The motors hold the last set-point."""
+        """The motors hold the last set-point; an arm that is driven by torques, where it is."""
         if self._open and self._q is not None:
-            self._hold(self._q)
+            self._hold(self._q if self._tau is None else self._where())
 
     def recover(self) -> None:
         """Clear every injected fault."""
@@ -111,12 +155,14 @@ class PyBulletRobot(RobotDriver):
             )
         self._freeze = bool(knobs.get("freeze", self._freeze))
         self._connected = not knobs.get("disconnect", not self._connected)
+        if not self._connected and self._open and self._tau is not None:
+            self._hold(self._where())  # the arm's own controller notices, and it is not read any more
         if "fault" not in knobs:
             return
         cause = knobs["fault"]
         self._fault = Fault("injected", str(cause), "call recover() on the arm") if cause else None
         if self._fault is not None and self._open:
-            self._hold([state[0] for state in self._read(self._body.id, self._joints)])
+            self._hold(self._where())
 
     def close(self) -> None:
         """The motors hold the last set-point for as long as the world lasts."""
@@ -128,10 +174,14 @@ class PyBulletRobot(RobotDriver):
     def _hold(self, q: Sequence[float]) -> None:
         hold(self._world.client, self._body, dict(zip(self._joints, q, strict=True)), self._world.dt)
         self._q, self._dq = list(q), [0.0] * len(q)
+        self._tau = None
+
+    def _where(self) -> list[float]:
+        return [state[0] for state in self._read(self._body.id, self._joints)]
 
     def _was_reset(self) -> None:
-        self._q = [state[0] for state in self._read(self._body.id, self._joints)]
-        self._dq = [0.0] * len(self._joints)
+        self._q, self._dq = self._where(), [0.0] * len(self._joints)
+        self._tau = None
 
 
 def _world_of(name: str, world: Any) -> World:

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import tempfile
 import xml.etree.ElementTree as ElementTree
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
 from hal.errors import ConfigError, Problem
+from hal.packages import mesh_file, near
 
-__all__ = ["Mimic", "UrdfFacts", "read_urdf"]
+__all__ = ["Mimic", "UrdfFacts", "loadable", "read_urdf"]
 
 
 @dataclass(frozen=True)
@@ -48,7 +52,9 @@ def read_urdf(path: str, key: str) -> UrdfFacts:
         raise ConfigError([Problem(path, key, f"is not a URDF: {error}")]) from None
     if root.tag != "robot":
         raise ConfigError([Problem(path, key, f"is not a URDF: its root is <{root.tag}>, not <robot>")])
-    missing = [name for name in _mesh_names(root) if not _mesh_is_there(name, Path(path).resolve().parent)]
+    folder = Path(path).resolve().parent
+    names = dict.fromkeys(mesh.get("filename", "") for mesh in root.iter("mesh"))
+    missing = [name for name in names if not mesh_file(name, folder).is_file()]
     if missing:
         raise ConfigError([Problem(path, key, f"names a mesh that is not there: {name}") for name in missing])
     mimics = tuple(
@@ -69,13 +75,18 @@ def read_urdf(path: str, key: str) -> UrdfFacts:
     return UrdfFacts(mimics, massless)
 
 
-def _mesh_names(root: ElementTree.Element) -> list[str]:
-    names = (mesh.get("filename", "") for mesh in root.iter("mesh"))
-    return list(dict.fromkeys(names))
-
-
-def _mesh_is_there(name: str, folder: Path) -> bool:
-    """PyBullet looks beside the URDF, then in each folder above it, whatever package a URI names."""
-    for scheme in ("package://", "model://", "file://"):
-        name = name.removeprefix(scheme)
-    return any((place / name).is_file() for place in (folder, *folder.parents))
+@contextmanager
+def loadable(path: str) -> Iterator[str]:
+    """The path of a URDF as PyBullet can load it: a copy for a while where its meshes are in installed packages."""
+    folder = Path(path).resolve().parent
+    tree = ElementTree.parse(path)
+    files = [element for tag in ("mesh", "texture") for element in tree.iter(tag) if element.get("filename")]
+    if all(near(element.get("filename", ""), folder) for element in files):
+        yield path
+        return
+    for element in files:
+        element.set("filename", str(mesh_file(element.get("filename", ""), folder)))
+    with tempfile.TemporaryDirectory() as place:
+        copy = Path(place) / Path(path).name
+        tree.write(copy, encoding="unicode")
+        yield str(copy)

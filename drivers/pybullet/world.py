@@ -14,6 +14,7 @@ from typing import Any, ClassVar
 from hal.errors import CommandError, ConfigError, DeviceNotFound, NotSupported, Problem
 from hal.specs import BodySpec, RobotSpec, WorldSpec
 
+from .arm_copy import ArmCopy
 from .body import Body
 from .contacts import bounding_box, find_contacts, forget_contacts
 from .dynamics import read_dynamics, write_dynamics
@@ -65,6 +66,8 @@ class World:
         """What a person should know about the files that were loaded."""
         self.client = Client(gui=gui)
         self._on_reset: dict[str, list[Callable[[], None]]] = {}
+        self._copies: dict[str, ArmCopy] = {}
+        """Of arms that other drivers move."""
         try:
             self.client.setTimeStep(self.dt)
             self.client.setGravity(*spec.gravity)
@@ -96,6 +99,8 @@ class World:
         self.bodies[spec.name] = body
         self.warnings += warnings
         self._put_home(body)
+        if isinstance(spec, RobotSpec) and spec.driver != self.spec.driver:
+            self._copies[spec.name] = ArmCopy(self.client, body, self.dt)
         return body
 
     @property
@@ -112,12 +117,15 @@ class World:
         """One physics step."""
         if self.mirror:
             raise NotSupported("a mirror is posed by show(), never stepped")
+        for copy in self._copies.values():
+            copy.prepare_step()
         self._step()
         self.steps += 1
 
     def close(self) -> None:
         """Let go of PyBullet. Idempotent."""
         self.bodies = {}
+        self._copies = {}
         self.client.close()
 
     # --- requests: rig.world -------------------------------------------------------------------------------------
@@ -245,8 +253,8 @@ class World:
     ) -> None:
         """Put one thing, or everything, back: at rest, where the rig says it starts, or where these arguments say.
 
-        An arm holds there and its gripper is open. What was added or removed, painted or given other dynamics
-        stays so, and simulated time goes on.
+        An arm holds there and its gripper is open. The copy of a real arm stays where that arm is. What was added or
+        removed, painted or given other dynamics stays so, and simulated time goes on.
 
         Args:
             name: of the body; None means all.
@@ -260,9 +268,12 @@ class World:
             everything = list(self.bodies.values())
             forget_contacts(self.client, everything)
             for body in everything:
-                self._put_home(body)
+                if body.name not in self._copies:
+                    self._put_home(body)
             return
         body = self.body(name)
+        if name in self._copies:
+            raise CommandError(f"{name!r} stands where the real arm is; move that")
         if pose is not None and body.is_robot:
             raise CommandError(f"{name!r} is a robot: its base stays where the rig says")
         base = body.base if pose is None else transform(pose)
@@ -271,6 +282,25 @@ class World:
         self._put(body, base, joints)
 
     # --- for drivers, the renderer and the viewer ----------------------------------------------------------------
+
+    def follow(self, name: str, q: Sequence[float], dq: Sequence[float], width: float | None = None) -> None:
+        """Put the copy of a real arm where that arm is. For every step anew; one that is not told anything stays.
+
+        Args:
+            name: of an arm that another driver moves.
+            q: (n,) rad.
+            dq: (n,) rad/s, which it goes on with during the next step.
+            width: of its gripper, m; None where nobody knows.
+
+        Raises:
+            DeviceNotFound: no such body.
+            CommandError: the arm is a simulated one, or the numbers are not n finite ones. The copy stays.
+        """
+        copy = self._copies.get(name)
+        if copy is None:
+            self.body(name)
+            raise CommandError(f"{name!r} is not the copy of a real arm")
+        copy.follow(q, dq, width)
 
     def body(self, name: str) -> Body:
         """The body of that name, or a DeviceNotFound that lists all."""

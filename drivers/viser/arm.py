@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from viser import SceneApi, SceneNodeHandle, TransformControlsEvent, TransformControlsHandle
 
+from hal.host.gripper_mail import GripperMail
 from hal.host.records import RobotMail
 from hal.pose import Pose
 from hal.specs import RobotSpec, WorkspaceSpec
@@ -33,9 +34,12 @@ class ArmView:
     Raises ValueError and OSError when its URDF cannot be read.
     """
 
-    def __init__(self, scene: SceneApi, spec: RobotSpec, mail: RobotMail, notes: list[str]) -> None:
+    def __init__(
+        self, scene: SceneApi, spec: RobotSpec, mail: RobotMail, gripper: GripperMail | None, notes: list[str]
+    ) -> None:
         self.spec = spec
         self.mail = mail
+        self.gripper = gripper
         self.drag = Drag()
         self._tree = read_tree(spec.urdf)
         root = f"/arms/{spec.name}"
@@ -96,9 +100,9 @@ class ArmView:
         if state is None:
             return
         values = dict(zip(self.spec.joints, state.q.tolist(), strict=True))
-        gripper = self.mail.get_gripper()
-        if gripper is not None and self.spec.gripper is not None:
-            values |= dict.fromkeys(self.spec.gripper.joints, gripper.width / 2.0)
+        hand = self.gripper.get() if self.gripper is not None else None
+        if hand is not None and self.spec.gripper is not None:
+            values |= dict.fromkeys(self.spec.gripper.joints, hand.state.width / 2.0)
         for joint, node in self._links:
             place(node, *joint.placement(values))
         place(self._set, state.tcp_set.position.tolist(), state.tcp_set.orientation.tolist())

@@ -39,16 +39,17 @@ class Page:
         self._due = 0.0
         self.bodies: Bodies | None = None
         arms: list[tuple[ArmView, GroupMemory]] = []
-        for group, shared in zip(groups, memories, strict=True):
-            joints = [(robot.name, len(robot.joints)) for robot in group.robots]
-            memory = GroupMemory(shared.buffer, joints)
+        found = [GroupMemory.of(shared.buffer, group) for group, shared in zip(groups, memories, strict=True)]
+        grippers = {name: mail for memory in found for name, mail in memory.grippers.items()}
+        for group, shared, memory in zip(groups, memories, found, strict=True):
             for robot in group.robots:
+                mail, hand = memory.robots[robot.name], grippers[robot.gripper.name] if robot.gripper else None
                 try:
-                    arms.append((ArmView(server.scene, robot, memory.robots[robot.name], self.notes), memory))
+                    arms.append((ArmView(server.scene, robot, mail, hand, self.notes), memory))
                 except (OSError, ValueError) as error:
                     raise HalError(f"{robot.name} cannot be drawn: {error}") from error
             if group.world is not None:
-                snapshots = SeriesBox(shared.buffer[GroupMemory.size(joints) :], SNAPSHOT_CAPACITY)
+                snapshots = SeriesBox(shared.buffer[GroupMemory.size_of(group) :], SNAPSHOT_CAPACITY)
                 self.bodies = Bodies(server.scene, group.world, snapshots, self.notes)
         self.arms = [arm for arm, _ in arms]
         if not any(group.world is not None and _has_floor(group.world) for group in groups):

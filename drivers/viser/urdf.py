@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
+from hal.packages import mesh_file
 from hal.pose import Pose
 from hal.quaternion import after_rotation, rotate
 
@@ -14,7 +15,6 @@ __all__ = ["Joint", "UrdfTree", "Visual", "read_tree"]
 
 _TURNS = ("revolute", "continuous")
 _SLIDES = "prismatic"
-_SCHEMES = ("package://", "model://", "file://")
 
 
 @dataclass(frozen=True)
@@ -155,8 +155,8 @@ def _visual(element: ElementTree.Element, colors: Mapping[str, tuple[float, ...]
         return None
     pose = _origin(element)
     if shape.tag == "mesh":
-        file = _find(shape.get("filename", ""), folder)
-        return Visual(pose, "mesh", _numbers(shape, "scale", 3, 1.0), rgba, file)
+        file = mesh_file(shape.get("filename", ""), folder)
+        return Visual(pose, "mesh", _numbers(shape, "scale", 3, 1.0), rgba, str(file))
     if shape.tag == "box":
         return Visual(pose, "box", _numbers(shape, "size", 3, 0.0), rgba)
     if shape.tag == "sphere":
@@ -181,10 +181,3 @@ def _numbers(element: ElementTree.Element | None, attribute: str, count: int, de
     if len(values) != count:
         raise ValueError(f"{attribute}={text!r} has {len(values)} numbers, not {count}")
     return values
-
-
-def _find(name: str, folder: Path) -> str:
-    """Beside the URDF, or in a folder above it; where it would be beside the URDF when it is nowhere."""
-    for scheme in _SCHEMES:
-        name = name.removeprefix(scheme)
-    return str(next((place / name for place in (folder, *folder.parents) if (place / name).is_file()), folder / name))

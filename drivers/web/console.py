@@ -226,5 +226,6 @@ def _host(host: RemoteHost) -> dict[str, Any]:
         "name": spec.name,
         "rate_hz": spec.rate_hz,
         "joints": [[robot.name, len(robot.joints)] for robot in spec.robots],
-        "grippers": [robot.name for robot in spec.robots if robot.gripper is not None],
+        "grippers": [gripper.name for gripper in spec.grippers],
+        "gripper_of": {robot.name: robot.gripper.name for robot in spec.robots if robot.gripper is not None},
     }

@@ -6,15 +6,18 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
+from hal.host.gripper_mail import GripperMail
 from hal.host.records import GroupMemory, RobotMail
 from hal.inbox import DeadmanRecord
 from hal.stops import trip_text
-from hal.types import Fault, GripperState, RobotState, RobotStatus, Trip
+from hal.types import Fault, RobotState, RobotStatus, Trip
 
 __all__ = ["Telemetry", "plain"]
 
 _MAX_AGE = 0.1
 """A state older than this is not shown as one, s: as ``robot.state()``."""
+_GRIPPER_MAX_AGE = 0.5
+"""The same for a gripper, s: as ``gripper.state()``."""
 _DIGITS = 5
 
 
@@ -29,8 +32,12 @@ class Telemetry:
     def __init__(self, hosts: Sequence[Mapping[str, Any]], memories: Sequence[memoryview]) -> None:
         """``hosts`` as in the process's configuration, and the memory of each."""
         self._hosts = hosts
-        joints = [[(str(name), int(n)) for name, n in host["joints"]] for host in hosts]
-        self._groups = [GroupMemory(memory, names) for memory, names in zip(memories, joints, strict=True)]
+        self._groups = [
+            GroupMemory(memory, [(str(name), int(n)) for name, n in host["joints"]], host["grippers"])
+            for host, memory in zip(hosts, memories, strict=True)
+        ]
+        mails = {name: mail for group in self._groups for name, mail in group.grippers.items()}
+        self._grippers = {str(arm): mails[name] for host in hosts for arm, name in host["gripper_of"].items()}
 
     def snapshot(self, now: float) -> dict[str, Any]:
         """All robots and hosts as JSON; ``now`` in s, on the hosts' clock."""
@@ -45,11 +52,11 @@ class Telemetry:
                 "silent": plain(now - record.t) if record.ticks or record.ready else None,
             }
             for name, mail in group.robots.items():
-                robots[name] = _robot(mail, name in host["grippers"], now)
+                robots[name] = _robot(mail, self._grippers.get(name), now)
         return {"robots": robots, "hosts": hosts}
 
 
-def _robot(mail: RobotMail, has_gripper: bool, now: float) -> dict[str, Any]:
+def _robot(mail: RobotMail, gripper: GripperMail | None, now: float) -> dict[str, Any]:
     state = mail.get_state()
     if state is None:
         return {"lost": "it has not reported a state yet"}
@@ -59,7 +66,6 @@ def _robot(mail: RobotMail, has_gripper: bool, now: float) -> dict[str, Any]:
         return {"lost": f"it does not answer{reason} (its last state is {age:.1f} s old)"}
     if not age <= _MAX_AGE:
         return {"lost": f"its newest state is {age:.1f} s old"}
-    gripper = mail.get_gripper() if has_gripper else None
     return {
         "t": state.stamp.t,
         "age": plain(age),
@@ -72,7 +78,7 @@ def _robot(mail: RobotMail, has_gripper: bool, now: float) -> dict[str, Any]:
         "q_set": _list(state.q_set),
         "dq": _list(state.dq),
         "tcp": _tcp(state),
-        "gripper": _gripper(gripper),
+        "gripper": _gripper(gripper, now),
         "deadman": _deadman(mail.get_deadman(), now),
     }
 
@@ -85,9 +91,12 @@ def _fault(fault: Fault | None) -> dict[str, str] | None:
     return None if fault is None else {"code": fault.code, "cause": fault.cause, "remedy": fault.remedy}
 
 
-def _gripper(state: GripperState | None) -> dict[str, Any] | None:
-    if state is None:
+def _gripper(mail: GripperMail | None, now: float) -> dict[str, Any] | None:
+    """None where there is none, or where it says nothing: its process may be gone while the arm goes on."""
+    record = mail.get() if mail is not None else None
+    if record is None or not now - record.state.stamp.t <= _GRIPPER_MAX_AGE:
         return None
+    state = record.state
     return {
         "width": plain(state.width),
         "width_target": plain(state.width_target),

@@ -38,6 +38,10 @@ class Context:
     warnings: list[str] = field(default_factory=list)
     urdfs: dict[str, UrdfModel] = field(default_factory=dict)
     """URDFs of the robots, by the robot's name; those that could be read."""
+    links: dict[str, dict[str, str]] = field(default_factory=dict)
+    """Other names of links, by the robot's name; those that are known."""
+    emulated: set[str] = field(default_factory=set)
+    """Keys in the rig of the arms that count as real, but have programs in the place of all that is."""
     drivers: dict[str, str] = field(default_factory=dict)
     """Drivers of the arms, grippers and cameras, by their keys in the rig; those that are known."""
 

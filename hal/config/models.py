@@ -30,6 +30,7 @@ __all__ = [
     "Drivers",
     "FieldOfView",
     "GripperModel",
+    "LimitsModel",
     "Mode",
     "PoseConfig",
     "RobotModel",
@@ -110,7 +111,12 @@ class RobotModel(Strict):
     tcp: TcpModel
     home: Numbers
     """rad"""
+    links: dict[Name, str] = Field(default_factory=dict)
+    """Other names for links, which a rig can use in ``attached`` whatever the model: ``{hand: panda_hand}``."""
     limits: LimitsModel = LimitsModel()
+    """What the arm can do."""
+    real_limits: LimitsModel = LimitsModel()
+    """Tighter ones, kept where the arm is real; those that are left out are as above."""
     gripper: GripperModel | None = None
     real: dict[str, Any] = Field(default_factory=dict)
     """What only the real driver needs; a rig adds to it."""

@@ -82,9 +82,10 @@ def _check_clock(context: Context) -> None:
         devices: dict[str, Device] = getattr(context.rig, section, {})
         for name, config in devices.items():
             with suppress(Unknown):
-                if not context.simulated(config):
+                key = f"{section}.{name}"
+                if not context.simulated(config) and key not in context.emulated:
                     text = "is real, and a real device cannot be stepped: use the clock real_time, or simulate it"
-                    context.problem(f"{section}.{name}", text)
+                    context.problem(key, text)
 
 
 def _world_driver(context: Context) -> str | None:

@@ -59,7 +59,7 @@ def _spec(context: Context, name: str, config: CameraConfig, model: CameraModel,
         depth_min=(mode.depth_min if mode and not config.depth else None) or depth.min,
         depth_max=depth.max,
         streams=tuple(config.streams),
-        view=_view(config),
+        view=_view(context, config),
         options=options,
     )
 
@@ -77,9 +77,9 @@ def _check_attached(context: Context, key: str, config: CameraConfig) -> None:
     if robot not in robots:
         context.problem(f"{key}.attached.robot", f"this rig has no robot {robot!r}{nearest(robot, robots)}")
     urdf = context.urdfs.get(robot)  # None where the robot itself is wrong
-    if urdf is not None and config.attached.link not in urdf.links:
-        link = config.attached.link
-        text = f"robot {robot!r} has no link {link!r}{nearest(link, urdf.links)}"
+    link, aliases = config.attached.link, context.links.get(robot, {})
+    if urdf is not None and link not in urdf.links and link not in aliases:
+        text = f"robot {robot!r} has no link {link!r}{nearest(link, (*urdf.links, *aliases))}"
         context.problem(f"{key}.attached.link", text)
 
 
@@ -124,10 +124,13 @@ def _intrinsics(config: CameraConfig, model: CameraModel, capture: Capture) -> I
     return from_field_of_view(capture.width, capture.height, angles.horizontal_deg, angles.vertical_deg, sensor)
 
 
-def _view(config: CameraConfig) -> ViewSpec | None:
+def _view(context: Context, config: CameraConfig) -> ViewSpec | None:
     if config.look_at is not None:
         return view_of(config.look_at.pose())
     if config.pose is not None:
         return view_of(Pose(config.pose.position, config.pose.orientation))
     attached = config.attached
-    return view_of(attached.pose(), attached.robot, attached.link) if attached is not None else None
+    if attached is None:
+        return None
+    link = context.links.get(attached.robot, {}).get(attached.link, attached.link)
+    return view_of(attached.pose(), attached.robot, link)

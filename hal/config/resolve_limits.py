@@ -1,15 +1,16 @@
-"""An arm's limits: the model's, filled in from the URDF, tightened by the rig."""
+"""An arm's limits: the model's, filled in from the URDF, tightened where the arm is real, and by the rig."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 
 from ..specs import Floats, LimitsSpec
 from .files import Problems
-from .models import RobotModel
-from .rigfile import RobotConfig
+from .models import LimitsModel, RobotModel
+from .rigfile import LimitsConfig, RobotConfig
 from .schema import Unknown
 from .urdf import UrdfModel
 
@@ -46,62 +47,105 @@ def resolve_limits(
     config: RobotConfig,
     source: str,
     key: str,
+    real: bool,
     problems: Problems,
 ) -> LimitsSpec:
     """The limits that the servo keeps. Numbers that nobody knows are NaN, which is neither too large nor too small.
 
-    They are noted as missing here, or what keeps them from being known was noted before. Raises Unknown where the
-    number of joints is not known.
+    They are noted as missing here, or what keeps them from being known was noted before. ``real``: the model's
+    ``real_limits`` count. Raises Unknown where the number of joints is not known.
     """
     with suppress(Unknown):
         for name in ("acceleration", "jerk"):
             if getattr(model.limits, name, ()) is None:
                 text = f"is missing: {UNITS[name]}, one number for each joint or one for all; a URDF does not hold it"
                 problems.add(file, f"limits.{name}", text)
-    _check_positive(model, file, "limits", problems)
-    _check_positive(config, source, key, problems)
-    limits = {name: _of_model(model, urdf, name, file, problems) for name in UNITS}
     with suppress(Unknown):
-        for name in UNITS:
-            changed: Floats | None = getattr(config.limits, name, None)
-            if changed is None:
-                continue
-            unit, n = UNITS[name], len(model.joints)
-            values = spread(changed, n, source, f"{key}.{name}", unit, problems, one_for_all=True)
-            if values is not None:
-                _check_tighter(values, limits[name], model, name, config, source, key, problems)
-                limits[name] = values
-    _check_order(limits, model, file, config, source, key, problems)
+        _check_positive(model.limits, file, "limits", problems)
+    limits = {name: _of_model(model, urdf, name, file, problems) for name in UNITS}
+    _check_order(limits, model.joints, file, "limits", problems)
+    own = dict(limits)  # looked at in simulation, too, so that mistakes are found there
+    with suppress(Unknown):
+        _tighten(own, model.real_limits, model.joints, file, "real_limits", problems, _LOOSER_THAN_OWN)
+    if real:
+        limits = own
+    with suppress(Unknown):
+        rule = None if getattr(config.limits, "allow_looser_limits", True) else _LOOSER_THAN_MODEL
+        _tighten(limits, config.limits, model.joints, source, key, problems, rule)
     return LimitsSpec(**limits)  # type: ignore[arg-type]  # None only for torque, which may be
 
 
-def _check_positive(owner: RobotModel | RobotConfig, file: Path | str, key: str, problems: Problems) -> None:
-    with suppress(Unknown):
-        for name in ("velocity", "acceleration", "jerk", "torque"):
-            if any(value <= 0.0 for value in getattr(owner.limits, name, None) or ()):
-                problems.add(file, f"{key}.{name}", f"must be above 0 ({UNITS[name]}) for every joint")
+_LOOSER_THAN_OWN = "{value:g} is looser than limits.{name}, {limit:g}, for joint {joint!r}", ""
+_LOOSER_THAN_MODEL = (
+    "{value:g} is looser than the model's {limit:g} for joint {joint!r}",
+    "; only allow_looser_limits: true beside it permits that",
+)
+"""What is said of each number that is too loose, and after them."""
+
+
+def _tighten(
+    limits: dict[str, Floats | None],
+    changes: LimitsModel | LimitsConfig,
+    joints: Sequence[str],
+    file: Path | str,
+    key: str,
+    problems: Problems,
+    rule: tuple[str, str] | None,
+) -> None:
+    """Put ``changes`` in place of those of ``limits``, in place; where there is a ``rule``, looser ones are noted."""
+    _check_positive(changes, file, key, problems)
+    for name, unit in UNITS.items():
+        changed: Floats | None = getattr(changes, name, None)
+        if changed is None:
+            continue
+        values = spread(changed, len(joints), file, f"{key}.{name}", unit, problems, one_for_all=True)
+        if values is None:
+            continue
+        if rule is not None:
+            _check_tighter(values, limits[name], joints, name, file, f"{key}.{name}", problems, rule)
+        limits[name] = values
+    if not {"lower", "upper"}.isdisjoint(changes.model_fields_set):
+        _check_order(limits, joints, file, key, problems)
+
+
+def _check_positive(limits: LimitsModel | LimitsConfig, file: Path | str, key: str, problems: Problems) -> None:
+    for name in ("velocity", "acceleration", "jerk", "torque"):
+        if any(value <= 0.0 for value in getattr(limits, name, None) or ()):
+            problems.add(file, f"{key}.{name}", f"must be above 0 ({UNITS[name]}) for every joint")
+
+
+def _check_tighter(
+    values: Floats,
+    limits: Floats | None,
+    joints: Sequence[str],
+    name: str,
+    file: Path | str,
+    key: str,
+    problems: Problems,
+    rule: tuple[str, str],
+) -> None:
+    each, after = rule
+    looser = [
+        each.format(value=value, limit=limit, joint=joint, name=name)
+        for value, limit, joint in zip(values, limits or values, joints, strict=True)
+        if (value < limit if name == "lower" else value > limit)
+    ]
+    if looser:
+        problems.add(file, key, f"{'; '.join(looser)} ({UNITS[name]}){after}")
 
 
 def _check_order(
-    limits: dict[str, Floats | None],
-    model: RobotModel,
-    file: Path,
-    config: RobotConfig,
-    source: str,
-    key: str,
-    problems: Problems,
+    limits: dict[str, Floats | None], joints: Sequence[str], file: Path | str, key: str, problems: Problems
 ) -> None:
     """Lower below upper. Where they are not, nobody knows what is between them, so they are NaN afterwards."""
     lower, upper = list(limits["lower"] or ()), list(limits["upper"] or ())
     empty: list[str] = []
-    for k, joint in enumerate(model.joints):
+    for k, joint in enumerate(joints):
         if lower[k] >= upper[k]:
             empty.append(f"joint {joint!r} has {lower[k]:g} and {upper[k]:g}")
             lower[k] = upper[k] = math.nan
     if empty:
-        by_rig = not {"lower", "upper"}.isdisjoint(config.limits.model_fields_set)
-        place, where = (source, key) if by_rig else (file, "limits")
-        problems.add(place, where, f"lower must be below upper: {'; '.join(empty)}")
+        problems.add(file, key, f"lower must be below upper: {'; '.join(empty)}")
     limits["lower"], limits["upper"] = tuple(lower), tuple(upper)
 
 
@@ -140,25 +184,3 @@ def _from_urdf(model: RobotModel, urdf: UrdfModel, name: str, file: Path, proble
         text = f"is missing ({UNITS[name]}), and {urdf.path.name} gives none for {', '.join(map(repr, lacking))}"
         problems.add(file, f"limits.{name}", text)
     return tuple(values)
-
-
-def _check_tighter(
-    values: Floats,
-    limits: Floats | None,
-    model: RobotModel,
-    name: str,
-    config: RobotConfig,
-    source: str,
-    key: str,
-    problems: Problems,
-) -> None:
-    if config.limits.allow_looser_limits or limits is None:
-        return
-    looser = [
-        f"{value:g} is looser than the model's {limit:g} for joint {joint!r}"
-        for value, limit, joint in zip(values, limits, model.joints, strict=True)
-        if (value < limit if name == "lower" else value > limit)
-    ]
-    if looser:
-        text = f"{'; '.join(looser)} ({UNITS[name]}); only allow_looser_limits: true beside it permits that"
-        problems.add(source, f"{key}.{name}", text)

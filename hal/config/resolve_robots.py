@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 from ..specs import Floats, GripperSpec, KinematicsSpec, LimitsSpec, RobotSpec, Vector3, WorkspaceSpec
 from .context import Context
+from .driver_options import SHARED, ask_driver, is_emulated, options_of
 from .files import Problems, nearest
 from .models import RobotModel
 from .resolve_limits import resolve_limits, spread
@@ -34,56 +37,90 @@ def resolve_robot(context: Context, name: str, config: RobotConfig) -> RobotSpec
         if urdf.without_mass():
             links = ", ".join(urdf.without_mass())
             context.warnings.append(f"{urdf.path}: no <inertial> in {links}; the simulator makes up a mass")
+    with suppress(Unknown):
+        context.links[name] = model.links
+    simulated = True
+    with suppress(Unknown):
+        simulated = context.simulated(config)
+    limits, home, initial = _joint_numbers(context, key, config, model, file, urdf, simulated)
+    driver = context.choose_driver("robot", key, config, model)
+    gripper_driver = _check_gripper(context, f"{key}.gripper", config, model)
+    with suppress(Unknown):
+        _check_workspace(context, f"{key}.workspace", config)
+    with suppress(Unknown):
+        if urdf is not None and limits is not None and home is not None and driver:
+            options = options_of(config, model, simulated, driver)
+            shared = options if driver == gripper_driver else {}
+            gripper = _gripper(context, name, config, model, gripper_driver, shared)
+            real = [] if simulated else [(driver, options)]
+            if gripper is not None and not context.simulated(config.gripper, config):
+                real.append((gripper.driver, gripper.options))
+            spec = RobotSpec(
+                name=name,
+                model=config.model,
+                driver=driver,
+                rate_hz=context.rig.simulation.physics_hz if simulated else config.rate_hz or model.rate_hz,
+                urdf=str(urdf.path),
+                joints=model.joints,
+                home=home,
+                initial=initial or home,
+                limits=limits,
+                kinematics=_kinematics(model, urdf, limits, home),
+                base_position=config.base.position,
+                base_orientation=config.base.orientation,
+                gripper=gripper,
+                workspace=_workspace(config.workspace) if config.workspace is not None else None,
+                speed=config.speed,
+                move_speed=config.move_speed,
+                tcp_speed=config.tcp_speed,
+                attended=bool(real),
+                emulated=bool(real) and all(is_emulated(*device) for device in real),
+                deadline_max=DEADLINE_SIMULATED if simulated else DEADLINE_REAL,
+                options=options,
+            )
+            if spec.emulated:
+                context.emulated.add(key)
+            ask_driver(context, key, spec, config, model, file)
+            return spec
+    return None
+
+
+def _joint_numbers(
+    context: Context,
+    key: str,
+    config: RobotConfig,
+    model: RobotModel,
+    file: Path,
+    urdf: UrdfModel | None,
+    simulated: bool,
+) -> tuple[LimitsSpec | None, Floats | None, Floats | None]:
+    """Limits, home and initial positions; None for what is not known, or not given."""
     limits: LimitsSpec | None = None
     home: Floats | None = None
     initial: Floats | None = None
     with suppress(Unknown):
-        limits = resolve_limits(model, urdf, file, config, context.source, f"{key}.limits", context.problems)
+        where = context.source, f"{key}.limits"
+        limits = resolve_limits(model, urdf, file, config, *where, not simulated, context.problems)
     with suppress(Unknown):
         home = spread(model.home, len(model.joints), file, "home", "numbers", context.problems)
         _check_inside(home, limits, model.joints, file, "home", context.problems)
     with suppress(Unknown):
         initial = _initial(context, f"{key}.initial", model, config)
         _check_inside(initial, limits, model.joints, context.source, f"{key}.initial", context.problems)
-    driver = context.choose_driver("robot", key, config, model)
-    gripper_driver = _check_gripper(context, f"{key}.gripper", config, model)
-    with suppress(Unknown):
-        _check_workspace(context, f"{key}.workspace", config)
-    if context.problems.found or urdf is None or limits is None or home is None:
-        return None
-    simulated = context.simulated(config)
-    rate = context.rig.simulation.physics_hz if simulated else config.rate_hz or model.rate_hz
-    return RobotSpec(
-        name=name,
-        model=config.model,
-        driver=driver,
-        rate_hz=rate,
+    return limits, home, initial
+
+
+def _kinematics(model: RobotModel, urdf: UrdfModel, limits: LimitsSpec, home: Floats) -> KinematicsSpec:
+    return KinematicsSpec(
         urdf=str(urdf.path),
         joints=model.joints,
+        lower=limits.lower,
+        upper=limits.upper,
         home=home,
-        initial=initial or home,
-        limits=limits,
-        kinematics=KinematicsSpec(
-            urdf=str(urdf.path),
-            joints=model.joints,
-            lower=limits.lower,
-            upper=limits.upper,
-            home=home,
-            base_link=model.base_link,
-            tcp_link=model.tcp.link,
-            tcp_position=model.tcp.position,
-            tcp_orientation=model.tcp.orientation,
-        ),
-        base_position=config.base.position,
-        base_orientation=config.base.orientation,
-        gripper=_gripper(context, name, config, model, gripper_driver),
-        workspace=_workspace(config.workspace) if config.workspace is not None else None,
-        speed=config.speed,
-        move_speed=config.move_speed,
-        tcp_speed=config.tcp_speed,
-        attended=not simulated,
-        deadline_max=DEADLINE_SIMULATED if simulated else DEADLINE_REAL,
-        options={**model.simulated, **config.simulated} if simulated else {**model.real, **config.real},
+        base_link=model.base_link,
+        tcp_link=model.tcp.link,
+        tcp_position=model.tcp.position,
+        tcp_orientation=model.tcp.orientation,
     )
 
 
@@ -107,6 +144,11 @@ def _check_names(model: RobotModel, urdf: UrdfModel, file: Path, problems: Probl
     with suppress(Unknown):
         if model.base_link is not None:
             _check_link(model.base_link, "base_link", urdf, file, problems)
+    with suppress(Unknown):
+        for alias, link in model.links.items():
+            _check_link(link, f"links.{alias}", urdf, file, problems)
+            if alias in urdf.links and alias != link:
+                problems.add(file, f"links.{alias}", f"{urdf.path.name} has a link of that name; take another one")
     with suppress(Unknown):
         _check_link(model.tcp.link, "tcp.link", urdf, file, problems)
         if model.tcp.link in urdf.links:
@@ -179,15 +221,23 @@ def _check_gripper(context: Context, key: str, config: RobotConfig, model: Robot
             if own.enabled and own.speed is not None and own.speed > kind.speed:
                 context.problem(f"{key}.speed", f"must be at most {kind.speed:g} m/s, the model's, not {own.speed:g}")
         if own.enabled:
+            if context.simulated(own, config) and not context.simulated(config):
+                context.problem(key, "is simulated, and its arm is real: its fingers would stand in another world")
             return context.choose_driver("gripper", key, own, kind, config)
     return ""
 
 
-def _gripper(context: Context, name: str, config: RobotConfig, model: RobotModel, driver: str) -> GripperSpec | None:
+def _gripper(
+    context: Context, name: str, config: RobotConfig, model: RobotModel, driver: str, arm: Mapping[str, Any]
+) -> GripperSpec | None:
+    """``arm``: options of the arm, where the same driver drives both."""
     own, kind = config.gripper, model.gripper
-    if kind is None or not own.enabled:
+    if kind is None or not own.enabled or not driver:
         return None
     simulated = context.simulated(own, config)
+    options = options_of(own, kind, simulated, driver)
+    if not simulated:
+        options = {**{name: arm[name] for name in SHARED if name in arm}, **options}
     return GripperSpec(
         name=f"{name}.gripper",
         driver=driver,
@@ -195,7 +245,7 @@ def _gripper(context: Context, name: str, config: RobotConfig, model: RobotModel
         speed=own.speed or kind.speed,
         force=own.force or kind.force,
         joints=kind.joints,
-        options={**kind.simulated, **own.simulated} if simulated else {**kind.real, **own.real},
+        options=options,
     )
 
 

@@ -39,6 +39,7 @@ from .views import Attached, LookAt
 __all__ = [
     "CameraConfig",
     "GripperConfig",
+    "LimitsConfig",
     "PadConfig",
     "RigFile",
     "RobotConfig",

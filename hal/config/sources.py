@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import importlib.util
 from pathlib import Path
 
+from ..packages import package_folder
 from .files import Problems, nearest
 from .models import UrdfSource
 
@@ -23,7 +23,7 @@ def locate_urdf(source: UrdfSource, base: Path, file: Path | str, key: str, prob
     if source.package is None:
         path = (base / Path(source.path).expanduser()).resolve()
     else:
-        folder = _package_folder(source.package)
+        folder = package_folder(source.package)
         if folder is None:
             command = INSTALL.get(source.package, f"pip install {source.package.replace('_', '-')}")
             problems.add(file, f"{key}.package", f"package {source.package!r} is not installed; {command}")
@@ -34,15 +34,3 @@ def locate_urdf(source: UrdfSource, base: Path, file: Path | str, key: str, prob
         problems.add(file, key, f"there is no file {path}{nearest(path.name, there) if there else ''}")
         return None
     return path
-
-
-def _package_folder(package: str) -> Path | None:
-    try:
-        spec = importlib.util.find_spec(package)
-    except (ImportError, ValueError):
-        return None
-    if spec is None:
-        return None
-    if spec.submodule_search_locations:
-        return Path(next(iter(spec.submodule_search_locations)))
-    return Path(spec.origin).parent if spec.origin else None

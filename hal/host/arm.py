@@ -1,4 +1,4 @@
-"""One arm in a group's cycle: its driver, its gripper, its servo and its mailboxes."""
+"""One arm in a group's cycle: its driver, its servo and its mailboxes."""
 
 from __future__ import annotations
 
@@ -6,12 +6,14 @@ import math
 import traceback
 from typing import Any
 
+import numpy as np
+
 from .. import registry
-from ..errors import ConnectionLost, ControlTaken
-from ..gripper import GripperDriver
+from ..errors import ConnectionLost, ControlTaken, HalError
 from ..histogram import Histogram
 from ..inbox import Inbox, Session
 from ..kinematics import Kinematics
+from ..pose import Pose
 from ..robot import Reading, RobotDriver
 from ..servo.audit import SetpointAudit
 from ..servo.servo import Servo
@@ -21,18 +23,18 @@ from .records import AppRecord, RobotMail, ServoRecord
 
 __all__ = ["ArmUnit"]
 
+TCP_APART, TCP_TURNED = 0.002, 0.02
+"""By how much a device's own tcp may differ from the model's, m and rad."""
+
 
 class ArmUnit:
-    """An arm with everything that belongs to it: driver, gripper, servo, mailboxes."""
+    """An arm with everything that belongs to it: driver, servo, mailboxes."""
 
     def __init__(self, spec: RobotSpec, dt: float, mail: RobotMail, world: object | None) -> None:
         self.spec = spec
         self.dt = dt
         self.mail = mail
         self.driver: RobotDriver = registry.load(spec.driver, "robot")(spec, world)
-        self.gripper: GripperDriver | None = None
-        if spec.gripper is not None:
-            self.gripper = registry.load(spec.gripper.driver, "gripper")(spec.gripper, world)
         self.kinematics = Kinematics(spec.kinematics)
         self.servo = Servo(spec, dt, self.kinematics)
         self.reset_statistics()
@@ -40,12 +42,12 @@ class ArmUnit:
         self.error: ConnectionLost | None = None
         """Why the device counts as lost."""
         self._write_failed = False
-        self._gripper_reason = ""
-        self._stops: int | None = None
         self._sound: Reading | None = None
         self._setpoint: Any = None
-        self._gripper_seq = 0
         self._latest_target = 0
+        self._reanchored = 0
+        self._prepared: Inbox | None = None
+        """The inbox that the next set-point was computed from."""
         self._t_written = 0.0
         self._session = 0
 
@@ -53,14 +55,33 @@ class ArmUnit:
         """Measure from now on: peaks of the set-points, latencies."""
         self.audit = SetpointAudit(self.spec.limits, self.dt)
         self.latency = Histogram(1e-4, 5000)
+        self.lost_cycles = 0
+        """Samples of the device that were never seen."""
+        self.reanchored = 0
+        """How often the device had not taken a set-point."""
+        self.driver.reset_statistics()
 
     def open(self, now: float) -> None:
-        """Connect to the arm and its gripper, and read them once. Nothing moves."""
+        """Connect to the arm and read it once. Nothing moves."""
         self.driver.open()
-        if self.gripper is not None:
-            self.gripper.open()
+        if self.driver.paces_itself:
+            self.driver.wait()
         self.reading = self.driver.read(now)
+        self._compare_tcp()
         self._anchor()
+
+    def _compare_tcp(self) -> None:
+        """A device that knows where its tcp is must agree with the model, or every Cartesian motion would be wrong."""
+        theirs = self.driver.own_tcp()
+        if theirs is None or self.reading is None:
+            return
+        device = Pose.from_matrix(np.array(theirs, float).reshape(4, 4).T)
+        distance, angle = self.kinematics.pose(self.reading.q).distance(device)
+        if distance > TCP_APART or angle > TCP_TURNED:
+            raise HalError(
+                f"{self.spec.name}: the arm and model {self.spec.model!r} do not mean the same tool centre point: they "
+                f"are {1e3 * distance:.1f} mm and {angle:.3f} rad apart; mend the arm's end effector or the model's tcp"
+            )
 
     def _anchor(self) -> None:
         """The set-point is where the device holds."""
@@ -73,12 +94,16 @@ class ArmUnit:
 
     def read(self, now: float) -> None:
         """Ask the device. One that took no set-point stays lost for a whole cycle, though it answers again."""
+        before = self.reading
         try:
-            self.reading = self.driver.read(now)
+            self.reading = reading = self.driver.read(now)
             if not self._write_failed:
                 self.error = None
         except Exception as error:
             self._lose(error)
+            return
+        if self.driver.paces_itself and before is not None and reading.seq > before.seq + 1:
+            self.lost_cycles += reading.seq - before.seq - 1
 
     def _lose(self, error: Exception) -> None:
         """A driver that fails, in whatever way, is a device that does not answer."""
@@ -89,13 +114,25 @@ class ArmUnit:
             traceback.print_exception(error)  # into the process's log: this is a mistake in a driver
         self.error = ConnectionLost(f"{self.spec.name}: {type(error).__name__}: {error}")
 
-    def tick(self, now: float, app: AppRecord) -> None:
+    def tick(self, now: float, app: AppRecord, late: bool = False) -> None:
         """Compute the next set-point."""
         self._look_for_end()
         if self.error is not None or self.reading is None:
+            self._prepared = None
             self._setpoint = self.servo.lost(now)
             return
-        self._setpoint = self.servo.tick(now, self.reading, self._inbox(app))
+        inbox, self._prepared = self._prepared or self._inbox(app), None
+        self._setpoint = self.servo.tick(now, self.reading, inbox, late)
+        if self.servo.report.reanchored != self._reanchored:
+            self._reanchored = self.servo.report.reanchored
+            self.reanchored += 1
+            self.audit.reset()  # the device's own set-points lie in between
+
+    def prepare(self, app: AppRecord) -> None:
+        """A device that sets the pace waits for its answer: compute the next one before it asks."""
+        if self._setpoint is not None and self.driver.paces_itself:
+            self._prepared = self._inbox(app)
+            self.servo.prepare(self._prepared)
 
     def _inbox(self, app: AppRecord) -> Inbox:
         mail = self.mail
@@ -134,37 +171,6 @@ class ArmUnit:
         if self._session and self.mail.get_marks().ended == self._session:
             self.servo.end()
 
-    def serve_gripper(self, app: AppRecord) -> None:
-        """Start the newest motion that the app asked of the gripper; keep its fingers where a stop finds them.
-
-        A command that a gripper does not take is forgotten: it must not move when it comes back.
-        """
-        gripper = self.gripper
-        if gripper is None:
-            return
-        stopped = self._stops is not None and app.stops != self._stops
-        self._stops = app.stops
-        command = self.mail.get_gripper_command()
-        fresh = command is not None and command.seq > self._gripper_seq
-        if not (stopped or fresh):
-            return
-        try:
-            if stopped:
-                gripper.stop()
-            elif command is not None:
-                gripper.move(command.width, command.speed, command.force)
-        except Exception as error:
-            self._note_gripper(error)
-        if command is not None:
-            self._gripper_seq = command.seq
-
-    def _note_gripper(self, error: Exception) -> None:
-        """The arm goes on without its gripper, whose state grows old. Each new reason is written down once."""
-        reason = f"{type(error).__name__}: {error}"
-        if reason != self._gripper_reason:
-            self._gripper_reason = reason
-            traceback.print_exception(error)
-
     def note_latency(self, clock_now: float) -> None:
         """Time from a pad's event to the set-point that follows it, once per command."""
         target = self.servo.report.target_seq
@@ -173,11 +179,11 @@ class ArmUnit:
         self._latest_target = target
         command = self.mail.get_command()
         if command is not None and command.seq == target and command.t_event > 0.0:
-            self.latency.add(clock_now - command.t_event)
+            ahead = self.dt if self.driver.paces_itself else 0.0  # it is written in the next cycle
+            self.latency.add(clock_now + ahead - command.t_event)
 
     def publish(self, now: float) -> None:
         """Tell the app: what the servo does, with the newest reading that makes sense."""
-        self._publish_gripper(now)
         reading, report = self.reading, self.servo.report
         if reading is not None and self._makes_sense(reading):
             self._sound = reading
@@ -185,7 +191,8 @@ class ArmUnit:
         if reading is None:
             return
         if self.error is not None:
-            reading = reading._replace(fault=Fault("lost", str(self.error), "see that it is on and connected"))
+            lost = self.error.fault or Fault("lost", str(self.error), "see that it is on and connected")
+            reading = reading._replace(fault=lost)
         tcp, jacobian = self.kinematics.fk_and_jacobian(reading.q)
         servo = ServoRecord(
             RobotStatus.LOST if self.error is not None else report.status,
@@ -205,14 +212,6 @@ class ArmUnit:
     def _makes_sense(self, reading: Reading) -> bool:
         n = len(self.spec.joints)
         return len(reading.q) == len(reading.dq) == n and math.isfinite(math.hypot(*reading.q, *reading.dq))
-
-    def _publish_gripper(self, now: float) -> None:
-        if self.gripper is None:
-            return
-        try:
-            self.mail.put_gripper(self.gripper.read(now))
-        except Exception as error:
-            self._note_gripper(error)
 
     # Requests.
 
@@ -238,13 +237,5 @@ class ArmUnit:
         self._anchor()
 
     def close(self) -> None:
-        """Let go of the devices. Every close is tried; the first error is raised at the end."""
-        errors = []
-        for device in (self.driver, self.gripper):
-            try:
-                if device is not None:
-                    device.close()
-            except Exception as error:
-                errors.append(error)
-        if errors:
-            raise errors[0]
+        """Let go of the device."""
+        self.driver.close()

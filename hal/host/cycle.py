@@ -6,24 +6,30 @@ lock-step (:mod:`hal.host.hosts`).
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Any
 
 from .. import registry
 from ..errors import DeviceNotFound, NotSupported
 from ..inbox import Session
+from ..robot import RobotDriver
 from ..specs import GroupSpec
 from .arm import ArmUnit
+from .copies import copies_of
+from .gripper_unit import GripperUnit
 from .records import AppRecord, GroupMemory
 
 __all__ = ["Cycle"]
 
 
 class Cycle:
-    """A group: its world, if it has one, and its arms."""
+    """A group: its world, if it has one, its arms and its grippers."""
 
-    def __init__(self, spec: GroupSpec, memory: GroupMemory) -> None:
+    def __init__(self, spec: GroupSpec, memory: GroupMemory, others: Iterable[GroupMemory] = ()) -> None:
+        """``others``: memories of the rig's other groups, whose arms have copies in this group's world."""
         self.spec = spec
         self.memory = memory
+        self._copies = copies_of(spec, others)
         self.dt = 1.0 / spec.rate_hz
         self.ticks = 0
         self._counted_from = 0
@@ -32,38 +38,74 @@ class Cycle:
             self.world = registry.load(spec.world.driver, "world")(spec.world)
         self.arms = {r.name: ArmUnit(r, self.dt, memory.robots[r.name], self.world) for r in spec.robots}
         self._units = tuple(self.arms.values())
+        self.grippers: dict[str, GripperUnit] = {}
+        for gripper in spec.grippers:
+            driver = registry.load(gripper.driver, "gripper")(gripper, self.world)
+            self.grippers[gripper.name] = GripperUnit(driver, memory.grippers[gripper.name])
+        self._hands = tuple(self.grippers.values())
 
     @property
     def paces_itself(self) -> bool:
-        """Does a device's blocking read set the pace?"""
+        """Does a device set the pace?"""
         return any(unit.driver.paces_itself for unit in self._units)
+
+    @property
+    def lost_cycles(self) -> int:
+        """Cycles of the device that sets the pace of which this group saw nothing."""
+        return sum(unit.lost_cycles for unit in self._units)
+
+    @property
+    def attended(self) -> bool:
+        """Does something real move?"""
+        return any(unit.spec.attended for unit in self._units)
+
+    def looping_driver(self) -> RobotDriver | None:
+        """A driver whose library wants to own the loop now."""
+        return next((unit.driver for unit in self._units if unit.driver.wants_loop), None)
 
     def open(self, now: float) -> None:
         """Connect to every device and publish a first state. Nothing moves."""
         for unit in self._units:
             unit.open(now)
-            unit.publish(now)
+        for hand in self._hands:
+            hand.open()
+        self.publish(now)
 
-    def step(self, now: float, app: AppRecord) -> None:
-        """One cycle. ``now`` is the time on the group's clock."""
+    def wait(self) -> None:
+        """Block until the device that sets the pace has something new."""
+        for unit in self._units:
+            if unit.driver.paces_itself:
+                unit.driver.wait()
+
+    def step(self, now: float, app: AppRecord, late: bool = False) -> None:
+        """One cycle. ``now`` is the time on the group's clock; ``late``: this process could not run for a while."""
         self.ticks += 1
         if self.world is not None:
+            for copy in self._copies:
+                copy.follow(self.world)
             self.world.step()
         for unit in self._units:
             unit.read(now)
-            unit.tick(now, app)
+            unit.tick(now, app, late)
         for unit in self._units:
             unit.write(now)
-            unit.serve_gripper(app)
             unit.finish_session()
+            unit.prepare(app)
+        for hand in self._hands:
+            hand.serve(app)
 
     def publish(self, now: float) -> None:
         """Tell the app what every device reports."""
         for unit in self._units:
             unit.publish(now)
+        for hand in self._hands:
+            hand.publish(now)
 
     def stop_sessions(self) -> bool:
-        """Bring every arm to rest; True when all of them are. Call it between steps until it is."""
+        """Bring every arm to rest; True when all of them are. Call it between steps until it is.
+
+        Fingers are left alone: they keep what they hold.
+        """
         resting = True
         for unit in self._units:
             if not unit.finish_session():
@@ -93,24 +135,22 @@ class Cycle:
     def _do_recover(self, robot: str) -> None:
         self._arm(robot).recover()
 
-    def _do_inject(self, robot: str, device: str, knobs: dict[str, Any]) -> None:
-        unit = self._arm(robot)
-        target: Any = unit.gripper if device == "gripper" else unit.driver
-        if target is None:
-            raise DeviceNotFound(f"{robot} has no gripper")
-        target.inject(**knobs)
+    def _do_inject(self, robot: str, knobs: dict[str, Any]) -> None:
+        self._arm(robot).driver.inject(**knobs)
 
-    def _do_gripper_stop(self, robot: str) -> None:
-        gripper = self._arm(robot).gripper
-        if gripper is None:
-            raise DeviceNotFound(f"{robot} has no gripper")
-        gripper.stop()
+    def _do_inject_gripper(self, gripper: str, knobs: dict[str, Any]) -> None:
+        self.grippers[gripper].driver.inject(**knobs)
 
     def _do_statistics(self) -> dict[str, Any]:
         return {
             "ticks": self.ticks - self._counted_from,
             "robots": {
-                name: {"peak": unit.audit.peaks(), "latency_s": unit.latency.summary()}
+                name: {
+                    "peak": unit.audit.peaks(),
+                    "latency_s": unit.latency.summary(),
+                    "reanchored": unit.reanchored,
+                    "driver": unit.driver.statistics(),
+                }
                 for name, unit in self.arms.items()
             },
         }
@@ -134,9 +174,9 @@ class Cycle:
     def close(self) -> None:
         """Let go of every device. Idempotent."""
         errors = []
-        for unit in self._units:
+        for close in (*(unit.close for unit in self._units), *(hand.close for hand in self._hands)):
             try:
-                unit.close()
+                close()
             except Exception as error:
                 errors.append(error)
         if self.world is not None:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import threading
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from ..errors import ConnectionLost, HalError
@@ -17,14 +17,15 @@ from .cycle import Cycle
 from .process import Child, SharedMemory
 from .records import AppRecord, GroupMemory
 
-__all__ = ["Host", "LocalHost", "RemoteHost"]
+__all__ = ["Host", "LocalHost", "RemoteHost", "SteppedHost"]
 
 HEARTBEAT = 0.02
 """Period of the app's heartbeat, s."""
 SNAPSHOT_CAPACITY = 8192
 """Most numbers in a picture of the world: seven a body, one a joint."""
-SILENT = 1.0
-"""A host that has published nothing for so long does not answer any more, s."""
+SILENT = 1.5
+"""A host that has published nothing for so long does not answer any more, s. (A Franka's library waits 1 s for a
+state.)"""
 PAD_PERIOD = 0.01
 """How often pads are polled in lock-step, simulated s."""
 _STOP_LIMIT = 5.0
@@ -62,11 +63,12 @@ class Host(ABC):
 class LocalHost(Host):
     """Lock-step: the cycle runs here, whenever the clock is told to go on."""
 
-    def __init__(self, spec: GroupSpec) -> None:
+    def __init__(self, spec: GroupSpec, others: Sequence[SteppedHost] = ()) -> None:
+        """``others``: groups in processes of their own that keep in step with this one."""
         self.spec = spec
-        joints = [(robot.name, len(robot.joints)) for robot in spec.robots]
-        self.memory = GroupMemory(memoryview(bytearray(GroupMemory.size(joints))), joints)
-        self.cycle = Cycle(spec, self.memory)
+        self.memory = GroupMemory.of(memoryview(bytearray(GroupMemory.size_of(spec))), spec)
+        self._others = others
+        self.cycle = Cycle(spec, self.memory, [other.memory for other in others])
         self.pollers: list[Callable[[float], object]] = []
         """Called every :data:`PAD_PERIOD` of simulated time: pads."""
         self._stops = 0
@@ -97,6 +99,8 @@ class LocalHost(Host):
             for poll in self.pollers:
                 poll(now)
             self._next_poll = now + PAD_PERIOD
+        for other in self._others:
+            other.advance_to(now)
         cycle.step(now, AppRecord(now, self._stops))
 
     def publish(self) -> None:
@@ -139,17 +143,19 @@ class LocalHost(Host):
 class RemoteHost(Host):
     """Real time: the cycle runs in a process of its own."""
 
-    def __init__(self, spec: GroupSpec, *, realtime: bool = False) -> None:
+    def __init__(self, spec: GroupSpec, *, realtime: bool = False, others: Sequence[RemoteHost] = ()) -> None:
+        """``others``: groups whose arms have copies in this one's world."""
         self.spec = spec
-        joints = [(robot.name, len(robot.joints)) for robot in spec.robots]
-        size = GroupMemory.size(joints)
+        size = GroupMemory.size_of(spec)
         from .mailbox import SeriesBox
 
         self.snapshot_offset = size
         self.shared = SharedMemory(size + SeriesBox.size(SNAPSHOT_CAPACITY))
-        self.memory = GroupMemory(self.shared.buffer, joints)
+        self.memory = GroupMemory.of(self.shared.buffer, spec)
         config = {"group": to_json(spec), "snapshot_capacity": SNAPSHOT_CAPACITY, "realtime": realtime}
-        self.child = Child(spec.name, "hal.host.main:main", config, [self.shared])
+        config["others"] = [to_json(other.spec) for other in others]
+        memories = [self.shared, *(other.shared for other in others)]
+        self.child = Child(spec.name, "hal.host.main:main", config, memories)
         self._stops = 0
         self._writing = threading.RLock()  # a signal handler may call stop() in the middle of stop()
         self._closed = threading.Event()
@@ -201,3 +207,21 @@ class RemoteHost(Host):
         self._closed.set()
         self._thread.join(timeout=1.0)
         self.shared.close()
+
+
+class SteppedHost(RemoteHost):
+    """Lock-step with a process of its own, for a driver whose library cannot live in the app's."""
+
+    def __init__(self, spec: GroupSpec) -> None:
+        self._cycles = 0
+        super().__init__(spec)
+
+    def advance_to(self, t: float) -> None:
+        """Have it step until simulated time is ``t``, to within half a step."""
+        wanted = round(t * self.spec.rate_hz) - self._cycles
+        if wanted > 0:
+            self._cycles += wanted
+            self.request("advance", {"cycles": wanted})
+
+    def _silence(self) -> float:
+        return 0.0  # it is silent whenever nobody steps; a request that it does not answer says the rest

@@ -1,4 +1,4 @@
-"""The process around a group's servos in real time.
+"""The process around a group's servos and grippers in real time.
 
 It ends by itself when the app is gone, brakes its arms when the app does not answer, and is not reached by the
 terminal's signals.
@@ -7,6 +7,7 @@ terminal's signals.
 from __future__ import annotations
 
 import contextlib
+import math
 import os
 import signal
 import time
@@ -17,6 +18,7 @@ from ..errors import ConnectionLost
 from ..specs import GroupSpec, from_json
 from .cycle import Cycle
 from .mailbox import SeriesBox
+from .pace import DevicePace, Pace, Steps, Suspension
 from .pacer import Pacer, prepare_process
 from .process import Channel, SharedMemory, pack_error
 from .records import GroupMemory
@@ -40,67 +42,115 @@ class HostProcess:
         self.channel = channel
         self.parent = os.getppid()
         spec = from_json(GroupSpec, config["group"])
-        joints = [(robot.name, len(robot.joints)) for robot in spec.robots]
         buffer = memories[0].buffer
-        self.memory = GroupMemory(buffer, joints)
+        self.memory = GroupMemory.of(buffer, spec)
         self.snapshots: SeriesBox | None = None
         if spec.world is not None:
-            self.snapshots = SeriesBox(buffer[GroupMemory.size(joints) :], config["snapshot_capacity"])
-        self.cycle = Cycle(spec, self.memory)
+            self.snapshots = SeriesBox(buffer[GroupMemory.size_of(spec) :], config["snapshot_capacity"])
+        others = [from_json(GroupSpec, group) for group in config.get("others", ())]
+        pairs = zip(memories[1:], others, strict=True)
+        self.cycle = Cycle(spec, self.memory, [GroupMemory.of(memory.buffer, other) for memory, other in pairs])
         self.realtime = bool(config.get("realtime", False))
         # A fast servo tells the app and the renderer less often than it ticks: nobody could look that often.
         self._state_every = max(1, round(spec.rate_hz / STATES_HZ))
         self._snapshot_every = max(1, round(spec.rate_hz / SNAPSHOTS_HZ))
         self.closing = False
-        self.pacer = Pacer(self.cycle.dt)
+        self._resting = False
+        self._give_up_at = math.inf
+        self._owed: int | None = None
+        """Number of the request that is answered when time stands still again."""
+        self._suspension = Suspension() if self.cycle.attended else None
+        self.pace: Pace
+        if spec.clock == "lock_step":
+            self.pace = Steps(self.cycle, self._attend)
+        elif self.cycle.paces_itself:
+            self.pace = DevicePace(self.cycle)
+        else:
+            self.pace = Pacer(self.cycle.dt)
 
     def run(self) -> None:
         """Open, cycle, stop, close."""
         signal.signal(signal.SIGTERM, self._terminate)
         cycle = self.cycle
         try:
-            cycle.open(time.monotonic())
+            cycle.open(self.pace.now())
             scheduling = prepare_process(self.realtime)
-            self.pacer.restart()
-            self._publish(time.monotonic())
+            self.pace.restart()
+            self._publish(self.pace.now())
             self.channel.send({"ready": {"scheduling": scheduling, "rate_hz": cycle.spec.rate_hz}})
-            while not self.closing:
-                self._turn()
-                if self._app_gone():
-                    self.closing = True
-            self._stop()
+            self._cycle_until_closed()
         except BaseException:
+            self.closing = True
             with contextlib.suppress(Exception):
-                self._stop()  # whatever went wrong, the arms are brought to rest if that can still be done
+                self._cycle_until_closed()  # whatever went wrong, the arms are brought to rest if that can be done
             raise
         finally:
             cycle.close()
 
+    def _cycle_until_closed(self) -> None:
+        while not self._is_over():
+            self._turn()
+            driver = self.cycle.looping_driver()
+            if driver is not None:
+                driver.loop(self._turn)
+
+    def _is_over(self) -> bool:
+        """The app is done with this process, and its arms are at rest, or have had their time."""
+        if not self.closing:
+            return False
+        now = time.monotonic()
+        if self._give_up_at == math.inf:
+            self._give_up_at = now + STOP_LIMIT
+        return self._resting or now > self._give_up_at
+
     def _terminate(self, signum: int, frame: object) -> None:
         self.closing = True
+        self.pace.run_free()
 
     def _turn(self) -> None:
-        now = time.monotonic() if self.cycle.paces_itself else self.pacer.wait()
-        self.cycle.step(now, self.memory.get_app())
+        """One cycle; a driver's library may be the one who calls it."""
+        cycle = self.cycle
+        if self.closing:
+            self._resting = cycle.stop_sessions()
+            if self._is_over():
+                return
+        now = self.pace.wait()
+        late = self._suspension is not None and self._suspension.ended()
+        cycle.step(now, self.pace.heard(self.memory.get_app()), late)
         self._publish(now)
-        try:
-            message = self.channel.poll()
-        except ConnectionLost:
-            self.closing = True
-            return
-        if message is not None:
-            self._serve(message)
+        self._settle_up()
+        self._attend(0.0)
+
+    def _settle_up(self) -> None:
+        """Lock-step: the cycles that the app asked for are done."""
+        if self._owed is not None and self.pace.pausing:
+            number, self._owed = self._owed, None
+            self._answer(number, {"result": None})
 
     def _publish(self, now: float) -> None:
         cycle = self.cycle
-        if cycle.ticks % self._state_every == 0:
+        if cycle.ticks % self._state_every == 0 or self.pace.pausing:
             cycle.publish(now)
         if self.snapshots is not None and cycle.ticks % self._snapshot_every == 0:
             self.snapshots.write(now, cycle.world.revision, cycle.world.snapshot())
-        clock_now = time.monotonic()
+        clock_now = self.pace.now()
         for unit in cycle.arms.values():
             unit.note_latency(clock_now)
-        self.memory.host.write(now, cycle.ticks, self.pacer.missed, True)
+        self.memory.host.write(now, cycle.ticks, self.pace.missed, True)
+
+    def _attend(self, timeout: float) -> None:
+        """Serve a request, if there is one."""
+        try:
+            message = self.channel.receive(timeout) if timeout else self.channel.poll()
+        except ConnectionLost:
+            self.closing = True
+        else:
+            if message is not None:
+                self._serve(message)
+            if self._app_gone():
+                self.closing = True
+        if self.closing:
+            self.pace.run_free()
 
     def _serve(self, message: dict[str, Any]) -> None:
         """Answer a request between two ticks; simulated time stands still meanwhile."""
@@ -108,24 +158,33 @@ class HostProcess:
         if method == "close":
             self.closing = True
             return
+        if method == "advance" and isinstance(self.pace, Steps):
+            self.pace.grant(message["params"]["cycles"])
+            self._owed = message["id"]
+            return
         try:
             answer = {"result": self._ask(method, message["params"])}
         except Exception as error:
             answer = {"error": pack_error(error)}
+        if self.pace.pausing:
+            self.cycle.publish(self.pace.now())  # what was asked for may have changed what the app sees
+        self._answer(message["id"], answer)
+        self.pace.restart()
+
+    def _answer(self, number: int, answer: dict[str, Any]) -> None:
         try:
-            self.channel.send({"id": message["id"], **answer})
+            self.channel.send({"id": number, **answer})
         except ConnectionLost:
             self.closing = True  # the app is gone: come to rest first
-        if not self.cycle.paces_itself:
-            self.pacer.restart()
+            self.pace.run_free()
 
     def _ask(self, method: str, params: dict[str, Any]) -> Any:
         result = self.cycle.request(method, params)
-        pacer = self.pacer
+        pace = self.pace
         if method == "statistics":
-            result = result | {"missed": pacer.missed, "period_s": pacer.periods.summary()}
+            result = result | {"missed": pace.missed, "period_s": pace.periods.summary()}
         elif method == "reset_statistics":
-            pacer.reset_statistics()
+            pace.reset_statistics()
         return result
 
     def _app_gone(self) -> bool:
@@ -133,14 +192,6 @@ class HostProcess:
             return True
         heartbeat = self.memory.get_app().t
         return heartbeat > 0.0 and time.monotonic() - heartbeat > APP_GONE
-
-    def _stop(self) -> None:
-        """Bring every arm to rest before the devices are closed."""
-        deadline = time.monotonic() + STOP_LIMIT
-        while not self.cycle.stop_sessions() and time.monotonic() < deadline:
-            now = time.monotonic() if self.cycle.paces_itself else self.pacer.wait()
-            self.cycle.step(now, self.memory.get_app())
-            self._publish(now)
 
 
 def main(channel: Channel, memories: Sequence[SharedMemory], config: dict[str, Any]) -> None:

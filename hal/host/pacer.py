@@ -9,24 +9,26 @@ import os
 import sys
 import time
 
-from ..histogram import Histogram
+from .pace import Pace
 
 __all__ = ["Pacer", "prepare_process"]
 
 _PR_SET_TIMERSLACK = 29
 
 
-class Pacer:
+class Pacer(Pace):
     """Wakes its caller every ``period`` s."""
 
     def __init__(self, period: float) -> None:
+        super().__init__()
         self.period = period
-        self.missed = 0
-        """Periods that were skipped."""
-        self.periods = Histogram(2e-5, 5000)
-        """Time between two wake-ups, s."""
+        self._missed = 0
         self._next = time.monotonic() + period
-        self._last = 0.0
+
+    @property
+    def missed(self) -> int:
+        """Periods that were skipped."""
+        return self._missed
 
     def wait(self) -> float:
         """Sleep until the next deadline; returns the time of waking, s."""
@@ -36,23 +38,19 @@ class Pacer:
             now = time.monotonic()
         late = int((now - self._next) / self.period)
         if late > 0:
-            self.missed += late
+            self._missed += late
             self._next += late * self.period
         self._next += self.period
-        if self._last:
-            self.periods.add(now - self._last)
-        self._last = now
+        self._note(now)
         return now
 
     def restart(self) -> None:
-        """Go on from now, counting nothing as missed: after work for which the group's time was paused."""
+        super().restart()
         self._next = time.monotonic() + self.period
-        self._last = 0.0
 
     def reset_statistics(self) -> None:
-        """Count from zero."""
-        self.missed = 0
-        self.periods = Histogram(2e-5, 5000)
+        super().reset_statistics()
+        self._missed = 0
 
 
 def prepare_process(realtime: bool = False) -> str:

@@ -6,31 +6,30 @@ leaves this file: it becomes None in the public records.
 
 from __future__ import annotations
 
-import math
 import threading
-from collections.abc import Callable, Sequence
-from typing import Any, Generic, NamedTuple, TypeVar
+from collections.abc import Iterable, Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from ..commands import Kind
-from ..gripper import GripperReading
 from ..inbox import CommandRecord, DeadmanRecord
 from ..robot import Reading
-from ..types import GripperState, Stamp
+from .gripper_mail import GripperMail
 from .mailbox import Mailbox
+from .newest import Newest, newest
 from .state_layout import ServoRecord, StateLayout
 
-__all__ = ["AppRecord", "GripperCommand", "GroupMemory", "HostRecord", "RobotMail", "ServoRecord"]
+if TYPE_CHECKING:
+    from ..specs import GroupSpec
+
+__all__ = ["AppRecord", "GroupMemory", "HostRecord", "RobotMail", "ServoRecord"]
 
 _APP = "dQ"
 _HOST = "dQQ?"
 _DEADMAN = "??Qd"
-_GRIPPER_COMMAND = "Qddd"
-_GRIPPER_STATE = "ddQdd?bd"
-_UNKNOWN, _NO, _YES = -1, 0, 1
 
 
 class AppRecord(NamedTuple):
-    """What the app says to every servo of a group."""
+    """What the app says to every arm and gripper of a group."""
 
     t: float
     """Heartbeat, s."""
@@ -60,48 +59,8 @@ class Marks(NamedTuple):
 _NO_MARKS = Marks(0, 0)
 
 
-class GripperCommand(NamedTuple):
-    """A gripper's newest command."""
-
-    seq: int
-    width: float
-    speed: float
-    force: float
-
-
-Raw = TypeVar("Raw")
-Record = TypeVar("Record")
-
-
-class _Newest(Generic[Raw, Record]):
-    """The newest record of a mailbox, decoded once: most looks find nothing new."""
-
-    __slots__ = ("_decode", "_known", "_read", "_seq")
-
-    def __init__(
-        self, seq: Callable[[], int], read: Callable[[], tuple[int, Raw] | None], decode: Callable[[Raw], Record]
-    ) -> None:
-        self._seq = seq
-        self._read = read
-        self._decode = decode
-        self._known: tuple[int, Record | None] = (0, None)  # its number, and itself; replaced together
-
-    def get(self) -> Record | None:
-        """None before the first one."""
-        known = self._known
-        if self._seq() != known[0]:
-            found = self._read()
-            if found is not None and found[0] != known[0]:
-                self._known = known = (found[0], self._decode(found[1]))
-        return known[1]
-
-
-def _newest(box: Mailbox, decode: Callable[[tuple[Any, ...]], Record]) -> Callable[[], Record | None]:
-    return _Newest(box.seq, box.read, decode).get
-
-
 class RobotMail:
-    """The mailboxes of one arm with ``n`` joints and of its gripper."""
+    """The mailboxes of one arm with ``n`` joints."""
 
     def __init__(self, buffer: memoryview, n: int) -> None:
         self.n = n
@@ -111,28 +70,24 @@ class RobotMail:
         for layout in self.layouts(n):
             boxes.append(Mailbox(buffer[offset:], layout))
             offset += Mailbox.size(layout)
-        self.command, self.deadman, self.marks, self.state, self.gripper_command, self.gripper = boxes
+        self.command, self.deadman, self.marks, self.state = boxes
         state = self.state
-        self.get_command = _newest(self.command, _command)
+        self.get_command = newest(self.command, _command)
         """The newest command."""
-        self.get_deadman = _newest(self.deadman, DeadmanRecord._make)
+        self.get_deadman = newest(self.deadman, DeadmanRecord._make)
         """How the dead-man stood last."""
-        self.get_gripper_command = _newest(self.gripper_command, GripperCommand._make)
-        """The newest command to the gripper."""
-        self.get_state = _Newest(state.seq, state.read_bytes, self._layout.state).get
+        self.get_state = Newest(state.seq, state.read_bytes, self._layout.state).get
         """The newest state; None before the first one."""
-        self.peek = _Newest(state.seq, state.read_bytes, self._layout.servo).get
+        self.peek = Newest(state.seq, state.read_bytes, self._layout.servo).get
         """Only what the servo said: for every ``send``."""
-        self.get_gripper = _newest(self.gripper, _gripper)
-        """A gripper's newest state; None before the first one."""
-        self._newest_marks = _newest(self.marks, Marks._make)
+        self._newest_marks = newest(self.marks, Marks._make)
         self._marking = threading.Lock()
 
     @staticmethod
     def layouts(n: int) -> tuple[str, ...]:
         """Formats, in the order in which the boxes lie."""
         width = max(2 * n, 7)
-        return (f"QddidQH{width}d", _DEADMAN, "QQ", StateLayout(n).format, _GRIPPER_COMMAND, _GRIPPER_STATE)
+        return (f"QddidQH{width}d", _DEADMAN, "QQ", StateLayout(n).format)
 
     @classmethod
     def size(cls, n: int) -> int:
@@ -188,58 +143,47 @@ class RobotMail:
         """Publish an arm's state."""
         self.state.write(*self._layout.values(reading, servo, tcp, tcp_set, twist))
 
-    def put_gripper(self, reading: GripperReading) -> None:
-        """Publish a gripper's state."""
-        grasped = _UNKNOWN if reading.grasped is None else (_YES if reading.grasped else _NO)
-        force = math.nan if reading.force is None else reading.force
-        self.gripper.write(
-            reading.t,
-            reading.t_device,
-            reading.seq,
-            reading.width,
-            reading.width_target,
-            reading.moving,
-            grasped,
-            force,
-        )
-
 
 def _command(values: tuple[Any, ...]) -> CommandRecord:
     seq, t, deadline, kind, t_event, session, count, *rest = values
     return CommandRecord(seq, session, t, deadline, Kind(kind), tuple(rest[:count]), t_event)
 
 
-def _gripper(values: tuple[Any, ...]) -> GripperState:
-    t, t_device, seq, width, target, moving, grasped, force = values
-    return GripperState(
-        stamp=Stamp(t, t_device, seq),
-        width=width,
-        width_target=target,
-        moving=moving,
-        grasped=None if grasped == _UNKNOWN else grasped == _YES,
-        force=None if math.isnan(force) else force,
-    )
-
-
 class GroupMemory:
-    """All mailboxes of a group: the app's word to all servos, the host's word, then one :class:`RobotMail` an arm."""
+    """All mailboxes of a group: the app's word to all units, the host's word, then those of each arm and gripper."""
 
-    def __init__(self, buffer: memoryview, joints: Sequence[tuple[str, int]]) -> None:
+    def __init__(self, buffer: memoryview, robots: Iterable[tuple[str, int]], grippers: Iterable[str] = ()) -> None:
+        """``robots`` names each arm and its number of joints."""
         self.app = Mailbox(buffer, _APP)
         offset = Mailbox.size(_APP)
         self.host = Mailbox(buffer[offset:], _HOST)
         offset += Mailbox.size(_HOST)
-        self._newest_app = _newest(self.app, AppRecord._make)
-        self._newest_host = _newest(self.host, HostRecord._make)
+        self._newest_app = newest(self.app, AppRecord._make)
+        self._newest_host = newest(self.host, HostRecord._make)
         self.robots: dict[str, RobotMail] = {}
-        for name, n in joints:
+        for name, n in robots:
             self.robots[name] = RobotMail(buffer[offset:], n)
             offset += RobotMail.size(n)
+        self.grippers: dict[str, GripperMail] = {}
+        for name in grippers:
+            self.grippers[name] = GripperMail(buffer[offset:])
+            offset += GripperMail.size()
+
+    @classmethod
+    def of(cls, buffer: memoryview, spec: GroupSpec) -> GroupMemory:
+        """The mailboxes of this group."""
+        return cls(buffer, *_names(spec))
+
+    @classmethod
+    def size_of(cls, spec: GroupSpec) -> int:
+        """Bytes that the mailboxes of this group take."""
+        return cls.size(*_names(spec))
 
     @staticmethod
-    def size(joints: Sequence[tuple[str, int]]) -> int:
-        """Bytes that it takes; ``joints`` names each arm and its number of joints."""
-        return Mailbox.size(_APP) + Mailbox.size(_HOST) + sum(RobotMail.size(n) for _, n in joints)
+    def size(robots: Iterable[tuple[str, int]], grippers: Iterable[str] = ()) -> int:
+        """Bytes that it takes, for the same arguments as it is made from."""
+        arms = sum(RobotMail.size(n) for _, n in robots)
+        return Mailbox.size(_APP) + Mailbox.size(_HOST) + arms + GripperMail.size() * len(list(grippers))
 
     def get_app(self) -> AppRecord:
         """The app's newest word."""
@@ -248,3 +192,7 @@ class GroupMemory:
     def get_host(self) -> HostRecord:
         """The host's newest word."""
         return self._newest_host() or HostRecord(0.0, 0, 0, False)
+
+
+def _names(spec: GroupSpec) -> tuple[list[tuple[str, int]], list[str]]:
+    return [(robot.name, len(robot.joints)) for robot in spec.robots], [gripper.name for gripper in spec.grippers]

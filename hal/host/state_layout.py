@@ -16,15 +16,13 @@ from numpy.typing import NDArray
 
 from ..pose import Pose
 from ..robot import Reading
-from ..types import Fault, Limited, RobotState, RobotStatus, Stamp, Trip
+from ..types import Limited, RobotState, RobotStatus, Stamp, Trip
+from . import fault_layout
 
 __all__ = ["ServoRecord", "StateLayout"]
 
 _STAMP = struct.Struct("<ddQ")
 _SERVO = struct.Struct("<iiiQQ?Qdd")
-_TEXTS = (48, 160, 240)  # bytes for a fault's code, cause and remedy
-_FAULT = struct.Struct("<?" + "".join(f"{size}s" for size in _TEXTS))
-_NO_FAULT = (False, b"", b"", b"")
 _STATUSES = {int(status): status for status in RobotStatus}
 _TRIPS = {int(trip): trip for trip in Trip}
 
@@ -66,7 +64,7 @@ class StateLayout:
     @property
     def format(self) -> str:
         """Of the whole record, for :mod:`struct`."""
-        parts = (_STAMP.format, f"{self._count}d", _SERVO.format, _FAULT.format)
+        parts = (_STAMP.format, f"{self._count}d", _SERVO.format, fault_layout.FORMAT)
         return "".join(part.removeprefix("<") for part in parts)
 
     def values(
@@ -92,7 +90,7 @@ class StateLayout:
             *(reading.tau_ext or nothing),
             *(reading.wrench_ext or (nan,) * 6),
             *servo[:9],  # all but the set-points
-            *(_NO_FAULT if reading.fault is None else _fault_values(reading.fault)),
+            *fault_layout.fault_values(reading.fault),
         )
 
     def servo(self, record: bytes) -> ServoRecord:
@@ -124,7 +122,7 @@ class StateLayout:
             wrench_ext=_known(wrench_ext),
             status=_STATUSES[status],
             trip=_TRIPS[trip],
-            fault=_fault(record, end + _SERVO.size),
+            fault=fault_layout.fault_at(record, end + _SERVO.size),
             limited=_limited(limited),
             target_seq=target_seq,
         )
@@ -136,15 +134,3 @@ def _limited(bits: int) -> Limited:
 
 def _known(values: NDArray[np.float64]) -> NDArray[np.float64] | None:
     return None if isnan(values[0]) else values
-
-
-def _fault_values(fault: Fault) -> tuple[Any, ...]:
-    texts = (fault.code, fault.cause, fault.remedy)
-    return (True, *(text.encode()[:size] for text, size in zip(texts, _TEXTS, strict=True)))
-
-
-def _fault(record: bytes, offset: int) -> Fault | None:
-    if not record[offset]:
-        return None
-    texts = _FAULT.unpack_from(record, offset)[1:]
-    return Fault(*(text.rstrip(b"\0").decode(errors="ignore") for text in texts))

@@ -35,12 +35,15 @@ class Chosen(NamedTuple):
     """What a person should know."""
 
 
-def choose_pad(spec: PadSpec, wanted: str | None, *, window: bool, attended: bool, lock_step: bool) -> Chosen:
+def choose_pad(
+    spec: PadSpec, wanted: str | None, *, window: bool, attended: bool, lock_step: bool, emulated: bool = False
+) -> Chosen:
     """The pad to open. ``wanted`` is one of :data:`KINDS`, the path of a recording, or None, which means ``auto``.
 
     It only matters for a pad whose driver is ``auto`` in the rig. ``auto`` is a pad that is plugged in, else the
     console, which anybody with a browser can drive from. In lock-step, where nobody could, it is the keyboard of the
-    viewer's ``window``, or the recorded tour. ``attended``: something real moves.
+    viewer's ``window``, or the recorded tour. ``attended``: something real moves; ``emulated``: a program stands in for
+    all of that, so that a recording may drive it.
 
     Raises DeviceNotFound and NotSupported, with what to do instead.
     """
@@ -48,16 +51,17 @@ def choose_pad(spec: PadSpec, wanted: str | None, *, window: bool, attended: boo
         return Chosen(spec)
     check_wanted(wanted)
     if wanted in (None, _AUTO):
-        return _first(spec, window, attended, lock_step)
+        return _first(spec, window, attended and not emulated, lock_step)
     if wanted == "evdev":
         pads, notes = _plugged()
         missing = () if pads else ("no gamepad is plugged in yet: plug one in at any time",)
         return Chosen(replace(spec, driver="evdev"), (*notes, *missing))
     if wanted in ("keyboard", "web", "terminal"):
         return Chosen(replace(spec, driver=wanted))
-    if attended:
+    if attended and not emulated:
         raise NotSupported("a recording cannot hold the dead-man of a real arm; plug a pad in, or use --pad web")
-    return Chosen(tour(spec) if wanted == "demo" else _recording(spec, Path(str(wanted))))
+    notes = ("a recording holds the dead-man: what counts as real here is emulated",) if attended else ()
+    return Chosen(tour(spec) if wanted == "demo" else _recording(spec, Path(str(wanted))), notes)
 
 
 def check_wanted(wanted: str | None) -> None:

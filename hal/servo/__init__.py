@@ -2,9 +2,11 @@
 
 ``servo`` is one tick; ``watchdog`` says whether the arm may move, ``motions``, ``cartesian`` and ``path`` where to,
 ``envelope`` how fast at most, ``smoothing`` and ``limits`` what the next set-point is, ``anchoring`` whether the device
-took the last one, and ``audit`` recomputes from what the driver was given whether the limits were kept.
+took the last one, ``torque`` and ``torque_bounds`` drive an arm by torques, and ``audit`` recomputes from what the
+driver was given whether the limits were kept.
 """
 
-from .servo import Servo, ServoReport
+from .report import ServoReport
+from .servo import Servo
 
 __all__ = ["Servo", "ServoReport"]

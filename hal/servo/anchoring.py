@@ -14,9 +14,12 @@ from .smoothing import JointSmoother
 __all__ = ["Anchoring"]
 
 Floats = Sequence[float]
+Motion = tuple[Floats, Floats, Floats]
+"""Positions, speeds and accelerations, rad, s."""
 
-_SAME = 1e-6
-"""Set-points that differ less are the same, rad: a Franka reports them in single precision, 2.4e-7 near pi."""
+_SAME = 2e-7
+"""Set-points that differ less are the same, rad. An FR3 reports them in single precision, rounded by 1.2e-7 near pi;
+at 1 kHz what is overlooked looks like a jerk of up to three times this over dt^3, 600 rad/s3."""
 
 _AWAY = 1e-2
 """After a silence, an arm this far from its set-point is taken from where it is, rad (when it cannot say what it
@@ -55,43 +58,48 @@ class Anchoring:
         """The device does not answer, or makes no sense: it may have stopped anywhere."""
         self._silent = True
 
-    def look(self, reading: Reading, sound: bool) -> bool:
-        """Compare; True when the smoother was corrected. ``sound``: the reading can be trusted."""
+    def look(self, reading: Reading, sound: bool, sent: Motion | None = None) -> bool:
+        """Compare; True when the smoother was corrected. ``sound``: the reading can be trusted.
+
+        ``sent`` is the set-point that the device was given last; the smoother's own when it has not gone on since.
+        """
         if not sound:
             self._silent = True
             return False
         seq = reading.seq
         old = seq == self._seq  # it knows nothing of the last set-point
+        cycles = 1 if self._seq is None else max(1, seq - self._seq)  # more where samples were lost
         self._seq = seq
         if old or not self._written:
             return False
+        smoother = self._smoother
+        q_sent, dq_sent, ddq_sent = (smoother.q, smoother.dq, smoother.ddq) if sent is None else sent
         if self._silent:
             self._silent = False
-            return self._resume(reading)
+            return self._resume(reading, q_sent)
         q = reading.q_commanded
         if q is None:
             return False
-        smoother = self._smoother
-        corrected = q is not smoother.q and _apart(q, smoother.q) > _SAME
+        corrected = q is not q_sent and _apart(q, q_sent) > _SAME
         if corrected:
-            dq, ddq = self._device_motion(reading)
+            dq, ddq = self._device_motion(reading, cycles)
             smoother.anchor(q, dq, ddq)
         else:
-            self._taken = (smoother.dq, smoother.ddq, reading.dq_commanded)
+            self._taken = (dq_sent, ddq_sent, reading.dq_commanded)
         self._before = (q, reading.dq_commanded)
         return corrected
 
-    def _resume(self, reading: Reading) -> bool:
+    def _resume(self, reading: Reading, q_sent: Floats) -> bool:
         """The first reading after a silence: go on from where the arm is, at the speed that was measured, if any."""
         self._taken = self._before = None
         q, allowed = (reading.q, _AWAY) if reading.q_commanded is None else (reading.q_commanded, _SAME)
-        if _apart(q, self._smoother.q) <= allowed:
+        if _apart(q, q_sent) <= allowed:
             return False
         moves = max(map(abs, reading.dq)) > _MOVES
         self._smoother.anchor(q, reading.dq if moves else None)
         return True
 
-    def _device_motion(self, reading: Reading) -> tuple[Floats, Floats]:
+    def _device_motion(self, reading: Reading, cycles: int) -> tuple[Floats, Floats]:
         """Speed and acceleration to go on with, so that the *device's* sequence keeps the limits.
 
         A device that repeats its last set-point gets the missed one again, in effect. Otherwise the acceleration is
@@ -112,7 +120,7 @@ class Anchoring:
         if dq is None or dq_before is None or reported is None:
             return own, still
         limits = smoother.acceleration
-        ddq = [max(-A, min(A, (v - v0) / dt)) for v, v0, A in zip(dq, dq_before, limits, strict=True)]
+        ddq = [max(-A, min(A, (v - v0) / (cycles * dt))) for v, v0, A in zip(dq, dq_before, limits, strict=True)]
         at_point = sum(abs(v - v0) for v, v0 in zip(own, reported, strict=True))
         half_before = sum(abs(v - 0.5 * dt * a - v0) for v, a, v0 in zip(own, own_ddq, reported, strict=True))
         if half_before < at_point:

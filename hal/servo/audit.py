@@ -8,12 +8,15 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from ..robot import Setpoint
 from ..specs import LimitsSpec
 
 __all__ = ["SetpointAudit"]
 
 _HISTORY = 3
 """Differences up to the third need three samples before the one that they belong to."""
+_TORQUE_RATE = 1000.0
+"""Greatest rate of a torque, Nm/s: what a Franka's interface takes."""
 _BATCH = 128
 """Samples are judged so many at a time: one by one they would cost the servo's loop fifty times as much."""
 
@@ -23,6 +26,8 @@ class SetpointAudit:
 
     Velocity, acceleration and jerk are backward differences over ``dt``: at 1 or below the limit was kept. Position is
     the distance from the middle of the range as a share of half the range: at 1 or below the joint was inside.
+
+    An arm that is driven by torques has no such set-points: there the torques, and their rates, are what is judged.
     """
 
     def __init__(self, limits: LimitsSpec, dt: float) -> None:
@@ -36,6 +41,11 @@ class SetpointAudit:
             dt * dt * dt * np.array(limits.jerk),
         ]
         self._peaks = [0.0] * 4
+        self._torque_limits = limits.torque
+        self._torque_step = _TORQUE_RATE * dt
+        self._torque_peaks: list[float] = []
+        """Of torque and of its rate; empty before the first torques."""
+        self._tau: Sequence[float] | None = None
         self._history: NDArray[np.float64] = np.empty((0, len(lower)))
         self._pending: list[float] = []
         self._full = _BATCH * len(lower)
@@ -44,6 +54,27 @@ class SetpointAudit:
         """Forget the history, not the peaks: the next sample begins a new stream (a reset of the world)."""
         self._judge()
         self._history = self._history[:0]
+        self._tau = None
+
+    def take(self, setpoint: Setpoint) -> None:
+        """One set-point, of whatever kind, as it was handed to the driver."""
+        if setpoint.tau is not None:
+            self._add_torques(setpoint.tau)
+            return
+        if self._tau is not None:  # positions begin anew, where the torques have brought the arm
+            self.reset()
+        self.add(setpoint.q)
+
+    def _add_torques(self, tau: Sequence[float]) -> None:
+        before = [0.0] * len(tau) if self._tau is None else self._tau
+        self._tau = tau
+        limits = self._torque_limits
+        torque = rate = math.inf
+        if limits is not None and math.isfinite(sum(tau)):
+            torque = max([abs(x) / most for x, most in zip(tau, limits, strict=True)])
+            rate = max([abs(x - y) for x, y in zip(tau, before, strict=True)]) / self._torque_step
+        peaks = self._torque_peaks or [0.0, 0.0]
+        self._torque_peaks = [max(peaks[0], torque), max(peaks[1], rate)]
 
     def add(self, q: Sequence[float]) -> None:
         """One set-point (n,), rad, as it was handed to the driver."""
@@ -73,7 +104,11 @@ class SetpointAudit:
             self._peaks[which] = math.inf if math.isnan(ratio) else ratio
 
     def peaks(self) -> dict[str, float]:
-        """The greatest ratios so far: ``velocity``, ``acceleration``, ``jerk``, ``position``."""
+        """The greatest ratios so far: ``velocity``, ``acceleration``, ``jerk``, ``position``.
+
+        And ``torque`` and ``torque_rate`` where there were torques.
+        """
         self._judge()
         position, velocity, acceleration, jerk = self._peaks
-        return {"velocity": velocity, "acceleration": acceleration, "jerk": jerk, "position": position}
+        peaks = {"velocity": velocity, "acceleration": acceleration, "jerk": jerk, "position": position}
+        return peaks | dict(zip(("torque", "torque_rate"), self._torque_peaks, strict=False))

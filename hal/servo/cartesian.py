@@ -52,14 +52,17 @@ _BRAKE = (0.8, 0.5)
 class _CartesianMotion(Motion):
     """What twists and poses share."""
 
+    def prepare(self) -> None:
+        self.envelope.prepare()
+
     def _follow_twist(self, twist: list[float]) -> None:
         """One tick towards this twist (6,) of the tcp, along the base's axes."""
         envelope, smoother = self.envelope, self.smoother
         speed = max(hypot(*twist[:3]), hypot(*twist[3:]))
         posture = _POSTURE * min(1.0, speed / _POSTURE_FULL)
-        _, jacobian = envelope.here()
-        dq, singular = envelope.kinematics.velocity(smoother.q, twist, posture, jacobian)
-        if singular:
+        inverse = envelope.inverse()
+        dq = inverse.speeds(twist, posture)
+        if inverse.near_singular:
             envelope.limited |= Limited.SINGULAR
         if not isfinite(sum(dq)):
             dq = [0.0] * smoother.n

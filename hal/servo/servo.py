@@ -9,7 +9,6 @@ that must not follow is brought to rest by the smoother's time-optimal stop and 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from math import hypot, isfinite
 
 from ..commands import Kind
@@ -20,12 +19,15 @@ from ..robot import Reading, Setpoint
 from ..specs import RobotSpec
 from ..types import Limited, RobotStatus, Trip
 from .anchoring import Anchoring
+from .anchoring import Motion as Motion3
 from .cartesian import PoseMotion, TwistMotion
 from .envelope import Envelope
 from .motions import JointTargetMotion, JointVelocityMotion, Motion
 from .path import PathMotion
+from .report import ServoReport
 from .smoothing import JointSmoother
-from .watchdog import Watchdog, is_alive, is_timely
+from .torque import MassMatrix, TorqueMotion
+from .watchdog import SILENCE, Watchdog, is_alive, is_timely
 
 __all__ = ["Servo", "ServoReport"]
 
@@ -38,33 +40,17 @@ _ABSURD = 1e3
 """Joint positions (rad) and speeds (rad/s) beyond this are a broken reading."""
 
 
-@dataclass(slots=True)
-class ServoReport:
-    """What the servo did in its last tick."""
-
-    status: RobotStatus = RobotStatus.IDLE
-    trip: Trip = Trip.NONE
-    limited: Limited = Limited.NONE
-    target_seq: int = 0
-    """Number of the command that the set-point follows; 0 before the first one of a session."""
-    refused: int = 0
-    """Number of the newest command of this session that was refused; 0 for none."""
-    q_set: Floats = ()
-    """rad"""
-    dq_set: Floats = ()
-    ddq_set: Floats = ()
-    arrived: bool = False
-    """Is ``move_to`` done?"""
-    t_trip: float = 0.0
-    """When the stop was latched, s."""
-    t_stop: float = 0.0
-    """When the last braking began, s."""
-
-
 class Servo:
     """Set-points for one arm, once per ``dt`` seconds."""
 
-    def __init__(self, spec: RobotSpec, dt: float, kinematics: Kinematics | None = None) -> None:
+    def __init__(
+        self,
+        spec: RobotSpec,
+        dt: float,
+        kinematics: Kinematics | None = None,
+        mass_matrix: MassMatrix | None = None,
+    ) -> None:
+        """``mass_matrix`` is that of a device that takes torques; without it, torques are refused."""
         self.spec = spec
         self.kinematics = Kinematics(spec.kinematics) if kinematics is None else kinematics
         self.report = ServoReport()
@@ -72,9 +58,11 @@ class Servo:
         self._envelope = envelope = Envelope(smoother, self.kinematics, spec.workspace)
         self._watchdog = Watchdog(dt)
         self._anchoring = Anchoring(smoother)
+        self._torque = TorqueMotion(smoother, envelope, spec.limits, mass_matrix)
         self._motions: dict[Kind, Motion] = {
             Kind.JOINT_TARGET: JointTargetMotion(smoother, envelope),
             Kind.JOINT_VELOCITY: JointVelocityMotion(smoother, envelope),
+            Kind.JOINT_TORQUE: self._torque,
             Kind.CARTESIAN_TARGET: PoseMotion(smoother, envelope),
             Kind.TWIST: TwistMotion(smoother, envelope),
         }
@@ -86,8 +74,16 @@ class Servo:
         self._ending = False
         self._followed = False
         """Did a motion move the arm in the last tick?"""
+        self._t_tick: float | None = None
+        """When the last tick was."""
         self._seq = 0
         """Newest command that was looked at, or that does not count any more."""
+        self._ready: Setpoint | None = None
+        """What :meth:`prepare` computed for the next tick."""
+        self._sent: Motion3 | None = None
+        """What the device was given last, while something is ready."""
+        self._seen = (0.0, _NO_TRIP, False, False)
+        """What the last tick made of the reading: when, what is wrong, was the host late, is there a fault?"""
 
     @property
     def active(self) -> bool:
@@ -101,6 +97,8 @@ class Servo:
             if values is not None and not (len(values) == n and isfinite(sum(map(abs, values)))):
                 raise CommandError(f"cannot anchor to {name} = {list(values)}: {n} finite numbers are due")
         self._smoother.anchor(q, dq)
+        self._ready = None
+        self._torque.active = False
         self._anchoring.forget()
         self._anchored = True
         self._forget_goals()
@@ -118,10 +116,12 @@ class Servo:
         if not (0.0 < session.speed <= 1.0 and session.tcp_speed > 0.0):
             raise CommandError(f"a session needs 0 < speed <= 1 and tcp_speed > 0, not {session}")
         self._envelope.open(session)
+        self._torque.open()
         if session.move_to is not None:
             self._path.aim(session.move_to)
         self._session = session
         self._ending = False
+        self._ready = None
         self._seq = 0
         self.report.target_seq = self.report.refused = 0
         self.report.arrived = False
@@ -137,32 +137,77 @@ class Servo:
             self._watchdog.end()
             self._forget_goals()
 
-    def tick(self, now: float, reading: Reading, inbox: Inbox) -> Setpoint | None:
-        """The next set-point, or None when no session is open and there is nothing to write."""
+    def tick(self, now: float, reading: Reading, inbox: Inbox, late: bool = False) -> Setpoint | None:
+        """The next set-point, or None when there is nothing to write: no session is open.
+
+        ``late`` is for a pause that ``now`` does not show, because the clock stood still in it (a suspended computer).
+        """
         session = self._session
-        self._envelope.limited = _UNLIMITED
+        late = self._is_late(now) or late
+        ready, self._ready = self._ready, None
+        if ready is None:
+            self._envelope.limited = _UNLIMITED
         device = self._judge(now, reading)
-        if session is not None and self._anchoring.look(reading, not device):
-            self._envelope.limited |= Limited.REANCHORED
+        torque = self._torque
+        torque.see(reading if self._is_known(reading, device) else None)
+        if torque.active:
+            device = device or self._overruns()
+        elif session is not None and self._anchoring.look(reading, not device, self._sent if ready is not None else None):
+            ready = None
+            self.report.reanchored += 1
+            self._envelope.limited = Limited.REANCHORED
             if self._motion is not None:
                 self._motion.reanchored()
-        self._watchdog.update(now, inbox, self._smoother.at_rest(), device)
-        if session is None or (self._ending and self._finished()):
-            self._idle(RobotStatus.FAULT if reading.fault is not None else RobotStatus.IDLE)
+        self._seen = (now, device, late, reading.fault is not None)
+        # What was computed ahead goes out even when something is wrong: the stop begins where it ends.
+        return self._decide(inbox, *self._seen) if ready is None else ready
+
+    def _decide(self, inbox: Inbox, now: float, device: Trip, late: bool, faulty: bool) -> Setpoint | None:
+        """The next set-point, from what the device and the app said."""
+        self._watchdog.update(now, inbox, self._at_rest(), device, late)
+        if self._session is None or (self._ending and self._finished()):
+            self._idle(RobotStatus.FAULT if faulty else RobotStatus.IDLE)
             return None
-        self._listen(now, session, inbox.command)
-        return self._move(now, RobotStatus.FAULT if reading.fault is not None else None)
+        self._listen(now, self._session, inbox.command)
+        return self._move(now, RobotStatus.FAULT if faulty else None)
+
+    def _is_late(self, now: float) -> bool:
+        """Was the last tick too long ago for an arm that really moves? Nothing looked after it meanwhile."""
+        before, self._t_tick = self._t_tick, now
+        return self.spec.attended and before is not None and not now - before <= SILENCE
 
     def lost(self, now: float) -> Setpoint | None:
         """The device did not answer in this cycle: trip, and go on braking."""
+        self._t_tick = now
+        ready, self._ready = self._ready, None
         self._envelope.limited = Limited.NONE
         self._watchdog.device_lost(now)
         self._anchoring.lose()
+        self._torque.see(None)
         if self._session is None or (self._ending and self._finished()):
             self._idle(RobotStatus.LOST)
             return None
         self._forget_goals()
-        return self._move(now, RobotStatus.LOST)
+        return self._move(now, RobotStatus.LOST) if ready is None else ready
+
+    def prepare(self, inbox: Inbox | None = None) -> None:
+        """Compute the next set-point ahead, in the idle part of the cycle: after the write.
+
+        For a device that wants its answer quickly (a Franka: within 0.3 ms of its state). The next tick then only looks
+        whether the device took the last set-point, and hands over the one that is ready; it computes another one where
+        the device did not. What the app and the device say counts one cycle later than without.
+        """
+        if self._torque.active:
+            self._torque.prepare()
+        elif inbox is None:
+            if self._motion is not None:
+                self._motion.prepare()
+        elif self._session is not None and self._t_tick is not None:
+            now, device, late, faulty = self._seen
+            smoother = self._smoother
+            self._sent = (smoother.q, smoother.dq, smoother.ddq)
+            self._envelope.limited &= Limited.REANCHORED  # for whoever looks between two ticks
+            self._ready = self._decide(inbox, now + smoother.dt, device, late, faulty)
 
     def _judge(self, now: float, reading: Reading) -> Trip:
         """What is wrong with the device."""
@@ -177,9 +222,21 @@ class Servo:
             return Trip.BAD_READING
         if dq is not smoother.dq and dq is not None and not self._is_sound(dq):
             return Trip.BAD_READING
-        if not is_alive(now, reading.t):
+        if not is_alive(now, reading.t, self._torque.patience if self._torque.active else SILENCE):
             return Trip.DEVICE_LOST  # it repeats an old reading
         return _NO_TRIP
+
+    def _is_known(self, reading: Reading, device: Trip) -> bool:
+        """Does this reading, in which ``device`` is wrong, tell where the arm is and how fast?"""
+        return not device or (device is Trip.FAULT and self._is_sound(reading.q) and self._is_sound(reading.dq))
+
+    def _overruns(self) -> Trip:
+        """Does an arm that follows torques, or is braked by them, run into a limit?"""
+        limit = self._torque.overrun(driven=self._motion is self._torque)
+        if limit is None:
+            return _NO_TRIP
+        self._envelope.limited |= limit
+        return Trip.LIMIT
 
     def _is_sound(self, values: Floats) -> bool:
         """As many numbers as joints, finite and not absurd."""
@@ -207,7 +264,9 @@ class Servo:
             self.report.refused = command.seq
             return
         if motion is not self._motion:
-            if motion.too_far(command.values):
+            if self._torque.active and self._torque.resting:
+                self._leave_torques()
+            if self._torque.active or motion.too_far(command.values):
                 self.report.refused = command.seq
                 return
             motion.start()
@@ -216,7 +275,7 @@ class Servo:
         watchdog.expect(command)
         self.report.target_seq = command.seq
 
-    def _move(self, now: float, status: RobotStatus | None) -> Setpoint:
+    def _move(self, now: float, status: RobotStatus | None) -> Setpoint | None:
         """One tick of motion or of the stop; ``status`` overrides the usual one."""
         smoother, watchdog, report = self._smoother, self._watchdog, self.report
         motion = self._motion if watchdog.allowed else None
@@ -228,8 +287,11 @@ class Servo:
         else:
             if self._followed:
                 report.t_stop = now
-            smoother.stop()
-            usual = RobotStatus.HOLDING if smoother.at_rest() else RobotStatus.STOPPING
+            if self._torque.active and self._torque.brake():
+                self._leave_torques()
+            if not self._torque.active:
+                smoother.stop()
+            usual = RobotStatus.HOLDING if self._at_rest() else RobotStatus.STOPPING
             if watchdog.trip:
                 usual = RobotStatus.TRIPPED
         self._followed = motion is not None
@@ -237,12 +299,25 @@ class Servo:
         report.trip = watchdog.trip
         report.t_trip = watchdog.t_trip
         self._publish()
+        if self._torque.active:
+            return self._torque.setpoint()
         self._anchoring.wrote()
         return Setpoint(smoother.q, smoother.dq, smoother.ddq)
 
+    def _at_rest(self) -> bool:
+        """Does nothing move, and are positions what holds the arm?"""
+        return self._smoother.at_rest() and not self._torque.active
+
+    def _leave_torques(self) -> None:
+        """From here on positions hold the arm."""
+        self._torque.leave()
+        self._anchoring.forget()
+
     def _finished(self) -> bool:
         """Has the session, which ends, come to rest? Then it is closed."""
-        if self._smoother.at_rest():
+        if self._torque.active and self._torque.blind:  # the device was left alone: it holds by itself
+            self._leave_torques()
+        if self._at_rest():
             self._session = None
             self._ending = False
             self._anchoring.forget()
@@ -261,4 +336,6 @@ class Servo:
     def _publish(self) -> None:
         report, smoother = self.report, self._smoother
         report.q_set, report.dq_set, report.ddq_set = smoother.q, smoother.dq, smoother.ddq
+        if self._torque.active:
+            report.q_set, report.dq_set, report.ddq_set = self._torque.q, self._torque.dq, [0.0] * smoother.n
         report.limited = self._envelope.limited

@@ -82,8 +82,11 @@ class Watchdog:
             self._rebase = True
             self.renewed = False
 
-    def update(self, now: float, inbox: Inbox, at_rest: bool, device: Trip = Trip.NONE) -> bool:
-        """One tick; ``device`` is what is wrong with the reading. Returns ``allowed``."""
+    def update(self, now: float, inbox: Inbox, at_rest: bool, device: Trip = Trip.NONE, late: bool = False) -> bool:
+        """One tick; ``device`` is what is wrong with the arm, ``late`` says that the last tick was too long ago.
+
+        Returns ``allowed``.
+        """
         stopped = self._stops is not None and inbox.stops != self._stops
         self._stops = inbox.stops
         self.renewed = False
@@ -91,7 +94,7 @@ class Watchdog:
         if session is None:
             return False
         deadman = inbox.deadman
-        cause = self._cause(now, session, inbox, stopped, device)
+        cause = self._cause(now, session, inbox, stopped, device, late)
         if cause and cause in _HARMLESS_AT_REST and session.deadman and not self.allowed and not self.trip:
             # Nothing moves, and nothing will before a new press: no trip. A press during the silence is not one.
             self._presses = self._presses if deadman is None else deadman.presses
@@ -107,12 +110,14 @@ class Watchdog:
             self.allowed = self.renewed = True
         return self.allowed
 
-    def _cause(self, now: float, session: Session, inbox: Inbox, stopped: bool, device: Trip) -> Trip:
+    def _cause(self, now: float, session: Session, inbox: Inbox, stopped: bool, device: Trip, late: bool) -> Trip:
         """What forbids motion in this tick, the gravest first."""
         if device:
             return device
         if stopped:
             return Trip.STOP
+        if late and self.allowed:
+            return Trip.HOST_LATE
         if session.deadman:
             if inbox.deadman is None or not inbox.deadman.connected:
                 return Trip.DEADMAN_LOST

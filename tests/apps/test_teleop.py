@@ -113,11 +113,11 @@ def test_a_persons_mistake_is_a_message_not_a_traceback(arguments: list[str], te
         assert text in done.stderr
 
 
-def test_a_real_arm_without_its_driver_says_so() -> None:
+def test_a_real_device_without_its_driver_says_so() -> None:
     done = teleop("--real")
     assert done.returncode == 2
     assert "Traceback" not in done.stderr
-    assert "robots.panda" in done.stderr
+    assert "cameras.scene" in done.stderr
 
 
 @pytest.mark.slow

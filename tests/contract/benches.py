@@ -19,7 +19,7 @@ from hal.drivers.mock.robot import MockRobot
 from hal.gamepad import GamepadDriver
 from hal.gripper import GripperDriver
 from hal.robot import RobotDriver
-from hal.specs import CameraSpec, GripperSpec, PadSpec, RobotSpec, ViewSpec, WorldSpec
+from hal.specs import BodySpec, CameraSpec, GripperSpec, PadSpec, RobotSpec, ViewSpec, WorldSpec
 
 from ..unit.specs import panda
 
@@ -53,6 +53,8 @@ class RobotBench(Bench):
 @dataclass
 class GripperBench(Bench):
     driver: GripperDriver = None  # type: ignore[assignment]
+    put_object: Callable[[float], None] = lambda width: None
+    """Hold something rigid of this width (m) between the open fingers."""
 
 
 @dataclass
@@ -102,7 +104,7 @@ def pybullet_robot() -> Iterator[RobotBench]:
 @contextmanager
 def mock_gripper() -> Iterator[GripperBench]:
     driver = MockGripper(_hand("mock"))
-    yield GripperBench(dt=1 / 240, driver=driver)
+    yield GripperBench(dt=1 / 240, driver=driver, put_object=lambda width: driver.inject(object_width=width))
     driver.close()
 
 
@@ -118,7 +120,13 @@ def pybullet_gripper() -> Iterator[GripperBench]:
     arm = PyBulletRobot(spec, world)
     arm.open()
     driver = PyBulletGripper(spec.gripper, world)
-    yield GripperBench(dt=1 / 240, advance=world.step, driver=driver)
+    x, y, z = world.pose("panda", "panda_hand")["position"]
+
+    def put_object(width: float) -> None:
+        place = (x, y, z - 0.1034)  # its fingers point down
+        world.add(BodySpec("thing", place, NO_ROTATION, "sphere", radius=width / 2, fixed=True))
+
+    yield GripperBench(dt=1 / 240, advance=world.step, driver=driver, put_object=put_object)
     driver.close()
     arm.close()
     world.close()

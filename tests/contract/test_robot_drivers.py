@@ -155,3 +155,64 @@ def test_a_fault_has_a_cause_and_a_remedy_and_ends_with_recover(bench: RobotBenc
 def test_an_unknown_fault_is_refused(bench: RobotBench) -> None:
     with pytest.raises((CommandError, NotSupported)):
         bench.driver.inject(no_such_knob=True)
+
+
+# Of those that take torques.
+
+
+@pytest.fixture
+def torqued(bench: RobotBench) -> RobotBench:
+    if "torque" not in bench.driver.modes:
+        pytest.skip("takes no torques")
+    bench.driver.open()
+    cycles(bench, 2)
+    return bench
+
+
+def drive(bench: RobotBench, joint: int, tau: float, seconds: float) -> list[Reading]:
+    """One torque, and none on the other joints, with set-points that say what was measured, as a servo's do."""
+    readings = cycles(bench, 1)
+    still = (0.0,) * len(readings[0].q)
+    for _ in range(round(seconds / bench.dt)):
+        torques = tuple(tau if k == joint else 0.0 for k in range(len(still)))
+        bench.driver.write(Setpoint(readings[-1].q, readings[-1].dq, still, torques))
+        readings += cycles(bench, 1)
+    return readings
+
+
+def test_it_knows_its_inertia(torqued: RobotBench) -> None:
+    q = cycles(torqued, 1)[-1].q
+    mass = np.array(torqued.driver.mass_matrix(q), float)
+    assert mass.shape == (len(q), len(q))
+    assert mass == pytest.approx(mass.T, abs=1e-9)
+    assert (np.linalg.eigvalsh(mass) > 0.0).all()
+
+
+def test_without_torque_it_carries_itself(torqued: RobotBench) -> None:
+    first, *_, last = drive(torqued, 0, 0.0, 1.0)
+    assert np.abs(np.subtract(last.q, first.q)).max() < STILL
+
+
+def test_a_torque_turns_its_joint_as_the_inertia_says(torqued: RobotBench) -> None:
+    first, second, *_ = drive(torqued, JOINT, 1.0, 0.2)
+    mass = np.array(torqued.driver.mass_matrix(first.q), float)
+    expected = np.linalg.solve(mass, np.eye(len(first.q))[JOINT])[JOINT] * torqued.dt
+    assert second.dq[JOINT] - first.dq[JOINT] == pytest.approx(expected, rel=0.2)
+    assert second.fault is None
+    assert cycles(torqued, 1)[-1].q[JOINT] > first.q[JOINT]
+
+
+def test_without_new_torques_it_holds_by_itself(torqued: RobotBench) -> None:
+    drive(torqued, JOINT, 1.0, 0.1)
+    readings = cycles(torqued, round(0.5 / torqued.dt))
+    assert np.abs(readings[-1].dq).max() < 5e-3
+    assert np.abs(np.subtract(readings[-1].q, readings[-20].q)).max() < STILL
+
+
+def test_after_torques_halt_holds_and_set_points_are_followed_again(torqued: RobotBench) -> None:
+    drive(torqued, JOINT, 1.0, 0.1)
+    torqued.driver.halt()
+    at_halt = cycles(torqued, 1)[-1].q
+    rest = cycles(torqued, 60)[-1].q
+    assert rest == pytest.approx(at_halt, abs=0.01)
+    assert ramp(torqued, 0.2)[-1].q[JOINT] == pytest.approx(rest[JOINT] + 0.2, abs=0.01)

@@ -38,6 +38,7 @@ with rig, arm.control(rate_hz=50) as control:
         if turn == 20:
             names = [[r.name, len(r.joints)] for r in host.spec.robots]
             told = {{"pid": os.getpid(), "children": children, "fd": host.shared.fd, "joints": names}}
+            told["grippers"] = [g.name for g in host.spec.grippers]
             print(json.dumps(told), flush=True)
         if {ending!r} == "exception" and turn == 40:
             raise RuntimeError("a mistake in user code")
@@ -91,7 +92,7 @@ class Watched:
         self.children: list[int] = told["children"]
         descriptor = os.open(f"/proc/{told['pid']}/fd/{told['fd']}", os.O_RDWR)
         joints = [(name, n) for name, n in told["joints"]]
-        self.memory = GroupMemory(SharedMemory(fd=descriptor).buffer, joints)
+        self.memory = GroupMemory(SharedMemory(fd=descriptor).buffer, joints, told["grippers"])
 
     def servo(self) -> ServoRecord:
         """What the servo says now."""

@@ -72,6 +72,10 @@ class Bench:
         self.pad_alive = self.app_alive = True
         self.stops = self.rearms = 0
         self.t_app = self.now
+        self.late = False
+        """Was there a pause that the clock does not show?"""
+        self.prepares = False
+        """Does the host use the idle part of its cycle?"""
         self.fault: Fault | None = None
         self.reading: dict[str, Any] = {}
         """What the next readings say instead of the truth."""
@@ -127,7 +131,9 @@ class Bench:
         self.ticks += 1
         values = {"q": self.q, "dq": STILL, "fault": self.fault} | self.reading
         reading = Reading(values.pop("t", self.now), self.now, values.pop("seq", self.ticks), **values)
-        setpoint = self.servo.tick(self.now, reading, self.inbox())
+        setpoint = self.servo.tick(self.now, reading, self.inbox(), self.late)
+        if self.prepares:
+            self.servo.prepare()
         return self._take(setpoint)
 
     def lose(self) -> Setpoint | None:

@@ -1,13 +1,16 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import pytest
 
+from hal.robot import Setpoint
 from hal.servo.audit import SetpointAudit
 from hal.specs import LimitsSpec
 
 LIMITS = LimitsSpec((-1.0, 0.0), (1.0, 4.0), (2.0, 1.0), (10.0, 5.0), (100.0, 50.0))
+WITH_TORQUES = replace(LIMITS, torque=(20.0, 10.0))
 DT = 0.01
 
 
@@ -57,3 +60,40 @@ def test_a_set_point_that_is_no_number_breaks_every_limit() -> None:
     assert set(audit.peaks().values()) == {math.inf}
     audit.add((0.0, 2.0))
     assert set(audit.peaks().values()) == {math.inf}, "and is not forgotten"
+
+
+def torques(*tau: float) -> Setpoint:
+    return Setpoint((0.3, 2.0), (1.0, 1.0), (0.0, 0.0), tau)
+
+
+def at(x: float) -> Setpoint:
+    return Setpoint((x, 2.0), (0.0, 0.0), (0.0, 0.0))
+
+
+def test_torques_are_judged_by_their_limits_and_their_rate_from_none_on() -> None:
+    audit = SetpointAudit(WITH_TORQUES, DT)
+    audit.take(torques(0.0, 2.0))
+    audit.take(torques(5.0, -1.0))
+    audit.take(torques(10.0, -1.0))
+    peaks = audit.peaks()
+    assert peaks["torque"] == pytest.approx(0.5)
+    assert peaks["torque_rate"] == pytest.approx(5.0 / DT / 1000.0)
+    assert peaks["position"] == 0.0, "where such an arm goes was not commanded"
+
+
+def test_positions_after_torques_begin_a_new_stream() -> None:
+    audit = SetpointAudit(WITH_TORQUES, DT)
+    for _ in range(10):
+        audit.take(at(0.0))
+    audit.take(torques(1.0, 1.0))
+    for _ in range(10):
+        audit.take(at(0.5))
+    assert audit.peaks()["velocity"] == 0.0
+    assert "torque" not in SetpointAudit(LIMITS, DT).peaks()
+
+
+@pytest.mark.parametrize("tau", [(math.nan, 0.0), (0.0, math.inf)])
+def test_torques_that_are_no_numbers_break_their_limits(tau: tuple[float, float]) -> None:
+    audit = SetpointAudit(WITH_TORQUES, DT)
+    audit.take(torques(*tau))
+    assert audit.peaks()["torque"] == math.inf

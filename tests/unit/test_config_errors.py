@@ -596,6 +596,7 @@ def test_nonsense_in_a_model_or_an_object_is_a_config_error_or_nothing_worse(tmp
 def test_a_joint_that_does_not_move_lacks_no_limits(tmp_path: Path) -> None:
     bench = Bench(tmp_path)
     bench.arm["limits"] = {"acceleration": 10, "jerk": 500}  # the rest is the URDF's, which has none for this joint
+    bench.arm["real_limits"] = {}
     assert bench.found() == set()
     bench.arm["joints"][6] = "panda_joint8"
     assert bench.found() == {("arm.yaml", "joints.6")}

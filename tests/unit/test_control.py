@@ -4,6 +4,7 @@ import itertools
 import threading
 import warnings
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -22,6 +23,7 @@ from hal import (
     Trip,
     Twist,
 )
+from hal.drivers.mock.robot import MockRobot
 from hal.servo.audit import SetpointAudit
 
 
@@ -100,6 +102,8 @@ def test_sent_says_what_was_changed(rig: hal.Rig, arm: hal.Robot) -> None:
         (lambda: JointTarget([0.0] * 6), "has 7 joints; JointTarget has 6"),
         (lambda: JointVelocity([0.0] * 8), "has 7 joints; JointVelocity has 8"),
         (lambda: JointTarget([float("nan")] * 7), "not finite"),
+        (lambda: hal.JointTorque([0.0] * 6), "has 7 joints; JointTorque has 6"),
+        (lambda: hal.JointTorque([float("inf")] * 7), "not finite"),
         (lambda: Twist([0.1, 0.0]), r"shape \(3,\), not \(2,\)"),
         (lambda: Twist([0.1, 0.0, float("inf")]), "not finite"),
         (lambda: "up", "str is no command"),
@@ -113,9 +117,26 @@ def test_a_malformed_command_is_refused_and_nothing_moves(rig: hal.Rig, arm: hal
     assert np.array_equal(arm.state().q, arm.home)
 
 
-def test_torques_are_not_supported_and_say_so(arm: hal.Robot) -> None:
-    with arm.control() as control, pytest.raises(hal.NotSupported, match="takes no torques"):
+def test_a_driver_that_takes_no_torques_says_so(arm: hal.Robot, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(MockRobot, "modes", frozenset({"position"}))
+    with (
+        arm.control() as control,
+        pytest.raises(hal.NotSupported, match="driver mock takes no torques, only: position"),
+    ):
         control.send(hal.JointTorque([0.0] * 7))
+
+
+def test_a_model_without_limits_of_torque_says_so(arm: hal.Robot) -> None:
+    arm.spec = replace(arm.spec, limits=replace(arm.spec.limits, torque=None))
+    with arm.control() as control, pytest.raises(hal.NotSupported, match="without limits.torque"):
+        control.send(hal.JointTorque([0.0] * 7))
+
+
+def test_torques_are_cut_to_their_limits_and_that_is_told(arm: hal.Robot) -> None:
+    with arm.control() as control:
+        sent = control.send(hal.JointTorque([100.0, 0.0, 0.0, 0.0, 0.0, 0.0, -13.0]))
+        assert sent.command.tau.tolist() == [87.0, 0.0, 0.0, 0.0, 0.0, 0.0, -12.0]
+        assert sent.reasons == (f"torque limit of {arm.joints[0]}, {arm.joints[6]}",)
 
 
 def test_a_first_target_far_away_is_refused(rig: hal.Rig, arm: hal.Robot) -> None:

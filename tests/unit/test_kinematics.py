@@ -378,6 +378,16 @@ def test_joints_keep_the_order_of_the_spec(tmp_path: Path) -> None:
     assert np.isfinite(speeds).all()
 
 
+def test_the_inertia_keeps_the_order_of_the_spec() -> None:
+    backwards = {name: getattr(IIWA, name)[::-1] for name in ("joints", "lower", "upper", "home")}
+    plain, turned = Kinematics(IIWA), Kinematics(dataclasses.replace(IIWA, **backwards))
+    for q in configurations(IIWA, 5):
+        mass = plain.mass_matrix(q)
+        assert mass == pytest.approx(mass.T)
+        assert (np.linalg.eigvalsh(mass) > 0.0).all()
+        np.testing.assert_allclose(turned.mass_matrix(q[::-1]), mass[::-1, ::-1], atol=1e-12)
+
+
 @pytest.mark.parametrize(
     ("changes", "message"),
     [

@@ -17,6 +17,7 @@ from hal.drivers.mock.robot import MockRobot
 from hal.errors import CommandError, ConnectionLost
 from hal.robot import Setpoint
 from hal.specs import CameraSpec, GripperSpec, PadSpec, RobotSpec
+from hal.types import GripperOutcome
 
 HERE = (0.1, -0.2, 0.3)  # robot_spec.initial
 ZERO = (0.0, 0.0, 0.0)
@@ -273,6 +274,39 @@ def test_gripper_stop_stays(hand: MockGripper) -> None:
     hand.stop()
     still = hand.read(9.0)
     assert (still.width, still.moving) == (pytest.approx(0.06), False)
+
+
+def test_gripper_grasps_what_is_there_and_closes_where_nothing_is(hand: MockGripper) -> None:
+    hand.grasp(0.03, 0.1, 15.0, 0.005, 0.005)
+    closed = hand.read(2.0)
+    assert (closed.width, closed.width_target, closed.grasped) == (0.0, 0.03, False)
+    hand.move(0.08, 0.1, 15.0)
+    hand.read(4.0)
+    hand.inject(object_width=0.03)
+    hand.grasp(0.03, 0.1, 15.0, 0.005, 0.005)
+    held = hand.read(6.0)
+    assert (held.width, held.grasped, held.force) == (0.03, True, 15.0)
+    assert hand.log[-1] == (0.03, 0.1, 15.0)
+
+
+def test_gripper_homing_opens_it(hand: MockGripper) -> None:
+    hand.move(0.02, 0.1, 15.0)
+    hand.read(2.0)
+    hand.home()
+    assert hand.read(2.1).moving
+    assert (hand.read(4.0).width, hand.homed) == (0.08, 1)
+
+
+def test_gripper_that_fails_says_why_and_does_not_move(hand: MockGripper) -> None:
+    hand.inject(fail="it is too hot")
+    hand.move(0.02, 0.1, 15.0)
+    failed = hand.read(2.0)
+    assert (failed.width, failed.moving, failed.outcome) == (0.08, False, GripperOutcome.FAILED)
+    assert failed.fault is not None
+    assert failed.fault.cause == "it is too hot"
+    hand.inject(fail=None)
+    hand.move(0.02, 0.1, 15.0)
+    assert (hand.read(4.0).width, hand.read(4.1).outcome) == (0.02, None)
 
 
 def test_gripper_knobs(hand: MockGripper) -> None:

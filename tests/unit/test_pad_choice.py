@@ -28,9 +28,10 @@ def choose(
     window: bool = False,
     attended: bool = False,
     lock_step: bool = False,
+    emulated: bool = False,
     spec: PadSpec = AUTO,
 ) -> Chosen:
-    return choose_pad(spec, wanted, window=window, attended=attended, lock_step=lock_step)
+    return choose_pad(spec, wanted, window=window, attended=attended, lock_step=lock_step, emulated=emulated)
 
 
 @pytest.mark.parametrize("lock_step", [False, True])
@@ -65,6 +66,16 @@ def test_a_real_arm_is_not_driven_by_a_recording(plug, tmp_path: Path) -> None:
     for wanted in (str(recording), "demo"):
         with pytest.raises(NotSupported, match="recording cannot hold"):
             choose(wanted, attended=True)
+
+
+def test_an_emulated_arm_may_be_driven_by_a_recording_and_that_is_told(plug, tmp_path: Path) -> None:
+    plug()
+    assert choose(attended=True, emulated=True, lock_step=True).spec.driver == "playback"
+    chosen = choose("demo", attended=True, emulated=True)
+    assert Path(chosen.spec.options["file"]).name == "tour.jsonl"
+    assert "emulated" in chosen.notes[-1]
+    assert choose("demo").notes == ()
+    assert choose(attended=True, emulated=True).spec.driver == "web"
 
 
 def test_what_was_asked_for(plug, tmp_path: Path) -> None:

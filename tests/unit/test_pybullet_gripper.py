@@ -178,6 +178,23 @@ class TestGrasping:
         bench.run(0.5)
         assert abs(bench.world.pose("cube")["position"][2] - after[2]) < 1e-3
 
+    def test_a_grasp_of_the_right_width_presses_and_holds(self) -> None:
+        bench = Bench()
+        bench.put_cube()
+        bench.hand.grasp(0.03, 0.1, 40.0, 0.005, 0.005)
+        held = bench.run(1.0)[-1]
+        assert held.grasped, "a move to 30 mm would only touch it"
+        assert (held.width_target, held.force) == (0.03, pytest.approx(40.0, rel=0.2))
+        assert bench.run(2.0, bench.lift)[-1].grasped
+        assert bench.world.pose("cube")["position"][2] > 0.5
+
+    def test_a_grasp_of_nothing_closes(self) -> None:
+        bench = Bench()
+        bench.hand.grasp(0.03, 0.1, 40.0, 0.005, 0.005)
+        reading = bench.run(1.5)[-1]
+        assert (reading.moving, reading.grasped) == (False, False)
+        assert reading.width < 1e-3
+
     def test_too_little_force_loses_it_and_says_so(self) -> None:
         bench = Bench()
         bench.put_cube()

@@ -7,10 +7,12 @@ import math
 import pytest
 
 from hal.commands import Kind
-from hal.host.records import RobotMail, ServoRecord
+from hal.gripper import GripperReading
+from hal.host.gripper_mail import GripperAct, GripperCommand, GripperMail
+from hal.host.records import GroupMemory, RobotMail, ServoRecord
 from hal.inbox import CommandRecord, DeadmanRecord
 from hal.robot import Reading
-from hal.types import Fault, Limited, RobotStatus, Trip
+from hal.types import Fault, GripperOutcome, Limited, RobotStatus, Trip
 
 N = 6
 Q, DQ, Q_SET, DQ_SET = ([10.0 * k + i for i in range(N)] for k in range(4))
@@ -97,6 +99,54 @@ def test_a_command_a_deadman_and_marks_arrive(mails: tuple[RobotMail, RobotMail]
     app.end(6)
     assert host.get_deadman() == deadman
     assert host.get_marks() == (2, 6)
+
+
+def test_a_grippers_command_and_state_arrive() -> None:
+    memory = memoryview(bytearray(GripperMail.size()))
+    app, host = GripperMail(memory), GripperMail(memory)
+    assert (host.get_command(), app.get()) == (None, None)
+    command = GripperCommand(7, 2, GripperAct.GRASP, 0.03, 0.1, 40.0, 0.004, 0.006)
+    app.put_command(command)
+    assert host.get_command() == command
+    fault = Fault("hot", "it is too hot \u2717", "let it cool down")
+    reading = GripperReading(3.0, 4.0, 9, 0.031, 0.03, True, True, 12.5)
+    host.put(reading, 7, GripperOutcome.FAILED, fault, lost=True)
+    found = app.get()
+    assert found is not None
+    assert found.lost
+    state = found.state
+    assert (state.stamp.t, state.stamp.t_device, state.stamp.seq) == (3.0, 4.0, 9)
+    assert (state.width, state.width_target, state.moving, state.grasped, state.force) == (
+        0.031,
+        0.03,
+        True,
+        True,
+        12.5,
+    )
+    assert (state.outcome, state.fault, state.target_seq) == (GripperOutcome.FAILED, fault, 7)
+    host.put(GripperReading(3.1, 4.1, 10, 0.031, 0.03, False))
+    found = app.get()
+    assert found is not None
+    assert (found.lost, found.state.grasped, found.state.force, found.state.fault) == (False, None, None, None)
+
+
+def test_mailboxes_of_a_group_do_not_overlap() -> None:
+    robots, grippers = [("left", 6), ("right", 7)], ["left.gripper", "right.gripper"]
+    memory = memoryview(bytearray(GroupMemory.size(robots, grippers)))
+    app, host = (GroupMemory(memory, robots, grippers) for _ in range(2))
+    for k, name in enumerate(grippers):
+        app.grippers[name].put_command(GripperCommand(k + 1, 0, GripperAct.HOME))
+        host.grippers[name].put(GripperReading(k, k, k, 0.01 * k, 0.0, False))
+    app.robots["right"].rearm()
+    app.app.write(1.0, 5)
+    host.host.write(2.0, 3, 4, True)
+    for k, name in enumerate(grippers):
+        command, found = host.grippers[name].get_command(), app.grippers[name].get()
+        assert command is not None
+        assert found is not None
+        assert (command.seq, found.state.width) == (k + 1, 0.01 * k)
+    assert (host.robots["left"].get_marks().rearms, host.robots["right"].get_marks().rearms) == (0, 1)
+    assert (host.get_app(), app.get_host()) == ((1.0, 5), (2.0, 3, 4, True))
 
 
 def test_a_torn_record_is_not_taken_for_the_newest(mails: tuple[RobotMail, RobotMail]) -> None:

@@ -144,3 +144,13 @@ def test_an_error_in_a_drivers_own_code_is_not_hidden(lab: Path) -> None:
 def test_a_spec_knows_its_kinds() -> None:
     assert DriverSpec("x", camera="a:B", viewer="a:C").kinds == ("camera", "viewer")
     assert DriverSpec("x").kinds == ()
+
+
+def test_a_function_that_a_driver_names(lab: Path) -> None:
+    assert registry.function("mock", None) is None
+    (lab / "lab_checks.py").write_text("def check(spec):\n    return [('real.host', 'is missing')]\n")
+    check = registry.function("mock", "lab_checks:check")
+    assert check is not None
+    assert check(None) == [("real.host", "is missing")]
+    with pytest.raises(DriverMissing, match="module lab_checks has no 'chekc'"):
+        registry.function("mock", "lab_checks:chekc")

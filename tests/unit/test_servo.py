@@ -12,6 +12,7 @@ from specs import PANDA_HOME, panda
 from hal.commands import Kind
 from hal.errors import CommandError, ControlTaken
 from hal.inbox import Session
+from hal.specs import WorkspaceSpec
 from hal.types import Limited, RobotStatus, Trip
 
 streams = load_streams()
@@ -221,6 +222,39 @@ def test_a_start_outside_the_limits_only_comes_back_in() -> None:
     inside = [x - 0.09 * (k == 0) for k, x in enumerate(start)]
     bench.stream(0.5, Kind.JOINT_TARGET, [*inside, *STILL])
     assert bench.q == pytest.approx(inside)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_what_is_computed_ahead_changes_nothing(seed: int) -> None:
+    """Bit by bit: whatever is commanded, where the arm is re-anchored, near singularities, faces and limits."""
+
+    def history(prepares: bool) -> list[list[float]]:
+        rng = random.Random(seed)
+        box = WorkspaceSpec((0.2, -0.2, 0.2), (0.7, 0.2, 0.8))
+        bench = Bench(panda(workspace=box), tcp_speed=rng.choice((0.25, 9.0)), deadman=seed % 2 == 0)
+        bench.prepares = prepares
+        for _ in range(60):
+            if bench.deadman is not None and (not bench.deadman.held or rng.random() < 0.1):
+                bench.release() if bench.deadman.held else bench.press()
+            kind = rng.choice((Kind.TWIST, Kind.TWIST, Kind.CARTESIAN_TARGET, Kind.JOINT_TARGET, Kind.JOINT_VELOCITY))
+            if kind is Kind.CARTESIAN_TARGET:
+                x, y, z, *turn = bench.servo.kinematics.fk(bench.q)
+                values = [x + rng.uniform(-0.04, 0.04), y, z + rng.uniform(-0.04, 0.04), *turn]
+            elif kind is Kind.JOINT_TARGET:
+                values = [x + rng.uniform(-0.05, 0.05) for x in bench.q] + list(STILL)
+            elif kind is Kind.TWIST:
+                values = [rng.choice((0.0, 0.1, -0.4)) for _ in range(6)] + [rng.choice((0.0, 1.0))]
+            else:
+                values = [rng.uniform(-0.5, 0.5) for _ in range(N)]
+            bench.stream(0.04, kind, values, every=3)
+            if rng.random() < 0.2:  # the device took something else
+                bench.reading = {"q_commanded": [x + 1e-3 for x in bench.q], "dq_commanded": STILL}
+                bench.tick()
+                bench.reading = {}
+        assert bench.limited
+        return bench.history
+
+    assert history(True) == history(False)
 
 
 def test_the_same_input_gives_the_same_output() -> None:

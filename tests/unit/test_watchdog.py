@@ -6,6 +6,7 @@ import math
 
 import pytest
 from servo_kit import Bench
+from specs import panda
 
 from hal.commands import Kind
 from hal.types import Fault, RobotStatus, Trip
@@ -273,6 +274,70 @@ def test_what_happens_while_the_deadman_is_released_is_no_trip_and_moves_nothing
     bench.press()
     bench.drive(0.3)
     assert bench.moving
+
+
+def attended(**changes: object) -> Bench:
+    """An arm that really moves, driven as in `held`."""
+    bench = Bench(panda(attended=True, **changes), deadman=True)
+    bench.tick()
+    bench.press()
+    bench.drive()
+    assert bench.moving
+    return bench
+
+
+def test_a_servo_that_could_not_run_trips_an_arm_that_really_moves() -> None:
+    """The app, the pad and the device went on meanwhile: nothing but the pause itself tells."""
+    bench = attended()
+    bench.now += PATIENCE
+    bench.drive(bench.dt)
+    assert (bench.status, bench.trip) == (RobotStatus.TRIPPED, Trip.HOST_LATE)
+    bench.until_rest(0.5)
+    bench.drive(0.3)
+    assert bench.trip is Trip.HOST_LATE
+    assert not bench.moving
+    bench.release()
+    bench.tick()
+    bench.press()
+    bench.drive(0.3)
+    assert bench.trip is Trip.NONE
+    assert bench.moving
+    bench.assert_within_limits()
+
+
+def test_a_shorter_pause_and_one_in_which_nothing_may_move_are_no_trip() -> None:
+    bench = attended()
+    bench.now += PATIENCE - 2.5 * bench.dt
+    bench.drive(bench.dt)
+    assert bench.status is RobotStatus.FOLLOWING
+    bench.release()
+    bench.until_rest(0.5)
+    bench.now += 9.0
+    bench.tick()
+    assert (bench.status, bench.trip) == (RobotStatus.HOLDING, Trip.NONE)
+    bench.servo.end()
+    bench.run(0.1)
+    bench.now += 9.0
+    bench.begin()
+    bench.tick()
+    assert bench.trip is Trip.NONE
+
+
+def test_a_simulated_arm_waits_with_its_world() -> None:
+    bench = held()
+    bench.now += 9.0
+    bench.drive(bench.dt)
+    assert (bench.status, bench.trip) == (RobotStatus.FOLLOWING, Trip.NONE)
+
+
+@pytest.mark.parametrize("attended_arm", [True, False])
+def test_a_pause_that_the_clock_does_not_show_is_told_by_the_host(attended_arm: bool) -> None:
+    bench = attended() if attended_arm else held()
+    bench.late = True
+    bench.drive(bench.dt)
+    bench.late = False
+    assert bench.trip is Trip.HOST_LATE
+    bench.until_rest(0.5)
 
 
 def test_a_clock_that_runs_backwards_does_no_harm() -> None:

@@ -24,6 +24,7 @@ from hal.types import Limited, RobotStatus, Trip
 
 TOKEN = "a-token-of-the-test_0123456789"
 JOINTS = [("arm", 3)]
+GRIPPERS = ["arm.gripper"]
 REST = [0.0] * 8
 WAIT = 10.0
 """s after which something that never comes is missed."""
@@ -73,8 +74,8 @@ class App:
         self.cameras = {spec.name: spec for spec in cameras}
         self.ring_memory = SharedMemory(FrameRing.size(cameras))
         self.ring = FrameRing(self.ring_memory.buffer, cameras)
-        self.host_memory = SharedMemory(GroupMemory.size(JOINTS))
-        self.group = GroupMemory(self.host_memory.buffer, JOINTS)
+        self.host_memory = SharedMemory(GroupMemory.size(JOINTS, GRIPPERS))
+        self.group = GroupMemory(self.host_memory.buffer, JOINTS, GRIPPERS)
         known = {"source": "test", "sim": True, "attended": False, "drivable": True, "driven_by": None, "demo": True}
         settings = {
             "rig": {**known, "robots": [{"name": "arm"}], "cameras": [], **(rig or {})},
@@ -82,7 +83,15 @@ class App:
             "port_fixed": False,
             "token": TOKEN,
             "names": ["testbench"],
-            "hosts": [{"name": "group", "rate_hz": 240.0, "joints": JOINTS, "grippers": ["arm"]}],
+            "hosts": [
+                {
+                    "name": "group",
+                    "rate_hz": 240.0,
+                    "joints": JOINTS,
+                    "grippers": GRIPPERS,
+                    "gripper_of": {"arm": "arm.gripper"},
+                }
+            ],
             "cameras": [to_json(spec) for spec in cameras],
             **config,
         }
@@ -147,7 +156,7 @@ class App:
         servo = ServoRecord(status, Trip.NONE, Limited.SPEED, 0, 1, False, 0, t, t, (0.25,) * n, (0.0,) * n)
         tcp = (0.1, 0.2, 0.3, 0.0, 0.0, 0.0, 1.0)
         mail.put_state(Reading(t, t, 1, (q,) * n, (0.0,) * n, **reading), servo, tcp, tcp, (0.0,) * 6)
-        mail.put_gripper(GripperReading(t, t, 1, 0.04, 0.08, True, None))
+        self.group.grippers["arm.gripper"].put(GripperReading(t, t, 1, 0.04, 0.08, True, None))
         mail.put_deadman(DeadmanRecord(True, True, 1, t))
         self.group.host.write(t, 1000, 3, True)
 

@@ -1,0 +1,90 @@
+"""Look before a real arm moves: at this computer, at the arm, and at the network between them.
+
+python apps/check.py --real --config my_rig.yaml
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict
+from typing import TYPE_CHECKING
+
+from hal.apps.cli import ACTION_NEEDED, add_config_options, run_app
+
+if TYPE_CHECKING:
+    from hal.config.plan import Plan
+    from hal.verdict import Verdict
+
+__all__ = ["main", "may_open", "parser"]
+
+BRIEFLY = 0.5
+"""s of measuring before a program opens a rig."""
+_SHOWN = {"ok": "ok", "warn": "WARN", "fail": "FAIL", "unknown": "unknown"}
+_INDENT = " " * 10
+
+
+def parser() -> argparse.ArgumentParser:
+    """The command line."""
+    made = argparse.ArgumentParser(
+        prog="check",
+        description="Look before a real arm moves: at this computer, at the arm, and at the network between them.",
+        epilog="Nothing moves. The exit status is 2 when something fails, else 0.",
+    )
+    add_config_options(made)
+    made.add_argument("--duration", type=float, default=2.0, metavar="S", help="measure so long (%(default)s)")
+    made.add_argument("--json", action="store_true", help="print the findings as one JSON object")
+    return made
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Entry point."""
+    return run_app(_main, parser().parse_args(argv))
+
+
+def _main(args: argparse.Namespace) -> int:
+    from hal.config import load
+    from hal.errors import CommandError
+    from hal.preflight import preflight, real_arms
+
+    if not 0.0 < args.duration <= 60.0:
+        raise CommandError(f"--duration must be above 0 and at most 60, not {args.duration:g}")
+    plan = load(args.config, sim=args.sim, overrides=args.overrides).resolve()
+    verdicts = preflight(plan, args.duration)
+    if args.json:
+        found = list(verdicts)
+        print(json.dumps({"rig": plan.source, "fit": _fit(found), "verdicts": [asdict(v) for v in found]}, indent=2))
+    else:
+        found = _shown(verdicts)
+        if not real_arms(plan):
+            print(f"every arm of {plan.source} is simulated: there is nothing to check but this computer")
+    return 0 if _fit(found) else ACTION_NEEDED
+
+
+def may_open(plan: Plan) -> bool:
+    """The same, briefly and in print, for a program that is about to open a rig. True at once without a real arm."""
+    from hal.preflight import preflight, real_arms
+
+    return not real_arms(plan) or _fit(_shown(preflight(plan, BRIEFLY)))
+
+
+def _fit(verdicts: Sequence[Verdict]) -> bool:
+    return all(verdict.level != "fail" for verdict in verdicts)
+
+
+def _shown(verdicts: Iterable[Verdict]) -> list[Verdict]:
+    """Print each as soon as it is known, with what mends it below."""
+    found = []
+    for verdict in verdicts:
+        found.append(verdict)
+        print(f"{_SHOWN[verdict.level]:10s}{verdict.name:16s} {verdict.found}")
+        if verdict.level != "ok" and verdict.remedy:
+            print(f"{_INDENT}-> {verdict.remedy}")
+        sys.stdout.flush()
+    return found
+
+
+if __name__ == "__main__":
+    sys.exit(main())

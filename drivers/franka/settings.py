@@ -1,0 +1,246 @@
+"""What a rig may say of a Franka arm and of its hand under ``real:``, checked before anything is opened.
+
+Ranges are those of the comments in libfranka's ``robot.h``; where that gives none, a number only has to make sense.
+Nothing here imports the vendor's libraries.
+"""
+
+from __future__ import annotations
+
+import ipaddress
+import re
+from collections.abc import Iterator, Mapping
+from typing import Annotated, Any, Literal, TypeVar
+
+import numpy as np
+from pydantic import BaseModel, BeforeValidator, Field, model_validator
+
+from hal.config.files import Problems
+from hal.config.schema import Positive, Strict, Vector, describe, is_number
+from hal.config.validation import validate
+from hal.errors import ConfigError
+from hal.specs import Floats, GripperSpec, RobotSpec
+
+from .frames import Frame
+from .limits import LIMITS, ArmLimits
+
+__all__ = ["ArmSettings", "CollisionBehavior", "HandSettings", "Load", "check_arm", "check_hand", "is_emulated"]
+
+_LABEL = re.compile(r"(?!-)[A-Za-z0-9_-]{1,63}(?<!-)")
+
+
+def _host(value: Any) -> str:
+    """An IPv4 address or a host name."""
+    advice = "must be the robot's address, for example 172.16.0.2, without scheme and port"
+    if not isinstance(value, str):
+        raise ValueError(f"{advice}, not {describe(value)}")
+    text = value.strip()
+    labels = text.removesuffix(".").split(".")
+    if labels[-1].isdecimal():  # no host name ends in a number
+        try:
+            return str(ipaddress.IPv4Address(text))
+        except ValueError:
+            raise ValueError(f"{advice}, not {describe(value)}") from None
+    if not all(_LABEL.fullmatch(label) for label in labels):
+        raise ValueError(f"{advice}, not {describe(value)}")
+    return text
+
+
+def _each(what: str, *ranges: tuple[float, float]) -> BeforeValidator:
+    """Numbers with a lowest and a highest value each; they mean ``what``."""
+
+    def check(value: Any) -> tuple[float, ...]:
+        size = f"{len(ranges)} numbers ({what})"
+        if not isinstance(value, (list, tuple)) or len(value) != len(ranges):
+            raise ValueError(f"must be a list of {size}, not {describe(value)}")
+        for k, (item, (lowest, highest)) in enumerate(zip(value, ranges, strict=True)):
+            if not is_number(item) or not lowest <= item <= highest:
+                raise ValueError(f"must be {size}; item {k + 1} is {describe(item)}, outside {lowest:g} to {highest:g}")
+        return tuple(float(item) for item in value)
+
+    return BeforeValidator(check)
+
+
+_UNITS = {
+    "lower": "rad",
+    "upper": "rad",
+    "velocity": "rad/s",
+    "acceleration": "rad/s2",
+    "jerk": "rad/s3",
+    "torque": "Nm",
+}
+_ANY = 1e4
+"""Nm or N; a threshold beyond every force that the arm could exert switches the detection off."""
+Host = Annotated[str, BeforeValidator(_host)]
+Torques = Annotated[Floats, _each("Nm, one for each joint", *[(0.0, _ANY)] * 7)]
+Forces = Annotated[Floats, _each("x, y, z in N, then roll, pitch, yaw in Nm", *[(0.0, _ANY)] * 6)]
+JointStiffness = Annotated[Floats, _each("Nm/rad, one for each joint", *[(0.0, 14250.0)] * 7)]
+CartesianStiffness = Annotated[
+    Floats, _each("x, y, z in N/m, then roll, pitch, yaw in Nm/rad", *[(10.0, 3000.0)] * 3, *[(1.0, 300.0)] * 3)
+]
+
+
+class CollisionBehavior(Strict):
+    """External torques and forces: above the lower ones the arm reports a contact, above the upper ones it stops.
+
+    The defaults are those with which libfranka's own examples move the arm.
+    """
+
+    lower_torque: Torques = (20.0, 20.0, 18.0, 18.0, 16.0, 14.0, 12.0)
+    upper_torque: Torques = (20.0, 20.0, 18.0, 18.0, 16.0, 14.0, 12.0)
+    lower_force: Forces = (20.0, 20.0, 20.0, 25.0, 25.0, 25.0)
+    upper_force: Forces = (20.0, 20.0, 20.0, 25.0, 25.0, 25.0)
+
+    @model_validator(mode="after")
+    def _ordered(self) -> CollisionBehavior:
+        for kind in ("torque", "force"):
+            lower, upper = getattr(self, f"lower_{kind}"), getattr(self, f"upper_{kind}")
+            for k, (low, high) in enumerate(zip(lower, upper, strict=True)):
+                if low > high:
+                    raise ValueError(f"lower_{kind} must not be above upper_{kind}; item {k + 1}: {low:g} and {high:g}")
+        return self
+
+    def arguments(self) -> tuple[list[float], list[float], list[float], list[float]]:
+        """In the order of the library's call."""
+        return list(self.lower_torque), list(self.upper_torque), list(self.lower_force), list(self.upper_force)
+
+
+class Load(Strict):
+    """What the hand holds for good. (The hand itself is told to the robot in its own interface, Desk.)"""
+
+    mass: float = Field(ge=0.0, le=3.0, strict=True)
+    """kg; both arms' data sheets give a payload of 3 kg."""
+    com: Vector = (0.0, 0.0, 0.0)
+    """Centre of mass in the frame of the flange, m."""
+    inertia: Annotated[Floats, _each("xx, yy, zz, xy, xz, yz in kg m2", *[(0.0, 10.0)] * 3, *[(-10.0, 10.0)] * 3)] = (
+        0.0,
+    ) * 6
+    """About its centre of mass."""
+
+    @model_validator(mode="after")
+    def _possible(self) -> Load:
+        moments = np.linalg.eigvalsh(self._tensor())
+        if moments[0] < -1e-9 or moments[2] > moments[0] + moments[1] + 1e-9:
+            raise ValueError(f"inertia: no body has the moments {', '.join(f'{value:.3g}' for value in moments)} kg m2")
+        return self
+
+    def _tensor(self) -> np.ndarray[Any, np.dtype[np.float64]]:
+        xx, yy, zz, xy, xz, yz = self.inertia
+        return np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+
+    def arguments(self) -> tuple[float, list[float], list[float]]:
+        """In the order of the library's call; the inertia as (9,)."""
+        return self.mass, list(self.com), self._tensor().ravel().tolist()
+
+
+class ArmSettings(Strict):
+    """``real:`` of an arm."""
+
+    host: Host
+    arm: Literal["fr3", "fer"]
+    """FR3, or FER: the Panda. The model says which."""
+    stream: Literal["position", "velocity"] = "position"
+    """What the arm is told a thousand times a second."""
+    collision_behavior: CollisionBehavior = CollisionBehavior()
+    joint_impedance: JointStiffness = (3000.0, 3000.0, 3000.0, 2500.0, 2500.0, 2000.0, 2000.0)
+    """Stiffness of the arm's own controller. The default is that of libfranka's examples."""
+    cartesian_impedance: CartesianStiffness | None = None
+    """Of its Cartesian controller, which nothing here uses; left alone unless it is given."""
+    load: Load | None = None
+    """Left alone unless it is given, and so are the two frames."""
+    end_effector: Frame | None = None
+    """NE_T_EE: of the end effector in the frame that is set in Desk, m."""
+    stiffness_frame: Frame | None = None
+    """EE_T_K: of the stiffness frame in the end effector's, m."""
+
+    @classmethod
+    def of(cls, spec: RobotSpec) -> ArmSettings:
+        """Those of an arm's record. Raises ConfigError, which lists everything that is wrong."""
+        return _of(cls, spec.options, f"robots.{spec.name}.real")
+
+
+class HandSettings(Strict):
+    """``real:`` of a gripper. The arm's host is put in where none is given."""
+
+    host: Host
+    tolerance: Positive = 0.002
+    """How far from the width that was asked for the fingers may end and still be there, m."""
+
+    @classmethod
+    def of(cls, spec: GripperSpec) -> HandSettings:
+        """Those of a gripper's record. Raises ConfigError, which lists everything that is wrong."""
+        return _of(cls, spec.options, f"{spec.name}.real")
+
+
+_Settings = TypeVar("_Settings", bound=BaseModel)
+
+
+def _of(model: type[_Settings], options: Mapping[str, Any], where: str) -> _Settings:
+    problems = Problems()
+    settings = validate(model, options, where, problems)
+    if problems.found:
+        raise ConfigError(problems.found)
+    return settings
+
+
+def is_emulated(options: Mapping[str, Any]) -> bool:
+    """Is the host of these options this computer? No robot is: a program stands in for it."""
+    host = str(options.get("host", "")).strip().removesuffix(".").lower()
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"
+
+
+def check_arm(spec: RobotSpec) -> Iterator[tuple[str, str]]:
+    """What is wrong in an arm's record: (key in the arm's entry of the rig, sentence)."""
+    yield from _check_options(ArmSettings, spec.options)
+    limits = LIMITS.get(str(spec.options.get("arm")))
+    if len(spec.joints) != 7:
+        yield "model", f"must have 7 joints, as Franka's arms do, not {len(spec.joints)}"
+    elif limits is not None:
+        yield from _check_limits(spec, limits)
+    if spec.rate_hz != 1000.0:
+        yield "rate_hz", f"must be 1000 Hz, the arm's own rate, not {spec.rate_hz:g}"
+
+
+def check_hand(spec: GripperSpec) -> Iterator[tuple[str, str]]:
+    """What is wrong in a hand's record: (key in the gripper's entry, sentence)."""
+    yield from _check_options(HandSettings, spec.options)
+
+
+def _check_options(model: type[BaseModel], options: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
+    problems = Problems()
+    validate(model, options, "", problems, "real")
+    for problem in problems.found:
+        missing = problem.key == "real.host" and "host" not in options
+        yield problem.key, "is missing: the robot's address, for example 172.16.0.2" if missing else problem.message
+
+
+def _check_limits(spec: RobotSpec, official: ArmLimits) -> Iterator[tuple[str, str]]:
+    """No limit of the servo may lie beyond what Franka allows; not even ``allow_looser_limits`` changes that."""
+    name = official.model.upper()
+    for kind, unit in _UNITS.items():
+        ours: Floats | None = getattr(spec.limits, kind)
+        wrong = [
+            f"{joint} has {value:g}, beyond {limit:g}"
+            for joint, value, limit in zip(spec.joints, ours or (), getattr(official, kind), strict=bool(ours))
+            if (value < limit if kind == "lower" else value > limit)
+        ]
+        if wrong:
+            yield f"limits.{kind}", f"{'; '.join(wrong)} {unit}, the {name}'s own: the arm would stop with a reflex"
+    fast = list(_too_fast(spec, official))
+    if fast:
+        advice = "lower the speed, or keep farther from the stops"
+        yield "limits", f"{'; '.join(fast)} (towards its stops the {name} may only be slower); {advice}"
+
+
+def _too_fast(spec: RobotSpec, official: ArmLimits) -> Iterator[str]:
+    """Joints that may not be as fast at an end of their range as they may be elsewhere."""
+    ranges = zip(spec.limits.lower, spec.limits.upper, official.lower, official.upper, strict=True)
+    lower, upper = zip(*((max(a, low), min(b, high)) for a, b, low, high in ranges), strict=True)
+    down, up = official.velocity_range(lower)[0], official.velocity_range(upper)[1]
+    for k, joint in enumerate(spec.joints):
+        speed = spec.limits.velocity[k]
+        most, end = min((abs(down[k]), lower[k]), (up[k], upper[k]))
+        if most < speed <= official.velocity[k]:
+            yield f"{joint} has {speed:g} rad/s, but only {most:.4g} is allowed at {end:g} rad, an end of its range"

@@ -1,0 +1,78 @@
+"""What only one driver needs: its options in the rig and the model, and what that driver says of them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from .. import registry
+from ..specs import GripperSpec, RobotSpec
+from .context import Context
+from .models import GripperModel, RobotModel
+from .rigfile import GripperConfig, RobotConfig
+
+__all__ = ["SHARED", "ask_driver", "is_emulated", "options_of"]
+
+SHARED = ("host",)
+"""Options of a real arm that its gripper has too, unless it has its own."""
+
+
+def options_of(
+    config: RobotConfig | GripperConfig, model: RobotModel | GripperModel, simulated: bool, driver: str
+) -> dict[str, Any]:
+    """The rig's options for this driver, on top of the model's. The latter are for the model's own driver only."""
+    own = model.drivers.sim if simulated else model.drivers.real
+    of_model = (model.simulated if simulated else model.real) if driver == own else {}
+    return {**of_model, **(config.simulated if simulated else config.real)}
+
+
+def is_emulated(driver: str, options: Mapping[str, Any]) -> bool:
+    """Does the driver say that a program stands in for the real device with these options?"""
+    found = registry.function(driver, registry.driver(driver).emulated)
+    return found is not None and bool(found(options))
+
+
+def ask_driver(context: Context, key: str, spec: RobotSpec, config: RobotConfig, model: RobotModel, file: Path) -> None:
+    """Note what the drivers of an arm and of its gripper find wrong in their records."""
+    for relative, message in _found(spec.driver, "robot", spec):
+        _note(context, key, "", relative, message, config, model, file)
+    gripper, kind = spec.gripper, model.gripper
+    if gripper is None or kind is None:
+        return
+    arms = {f"real.{name}" for name in SHARED if name not in {**kind.real, **config.gripper.real}}
+    for relative, message in _found(gripper.driver, "gripper", gripper):
+        if gripper.driver != spec.driver or relative not in arms:  # what is the arm's was told there
+            _note(context, key, "gripper.", relative, message, config.gripper, kind, file)
+
+
+def _found(driver: str, kind: str, spec: RobotSpec | GripperSpec) -> list[tuple[str, str]]:
+    check = registry.function(driver, registry.driver(driver).checks.get(kind))
+    return list(check(spec)) if check is not None else []
+
+
+def _note(
+    context: Context,
+    key: str,
+    part: str,
+    relative: str,
+    message: str,
+    config: RobotConfig | GripperConfig,
+    model: RobotModel | GripperModel,
+    file: Path,
+) -> None:
+    """In the rig's file, unless what is wrong stands in the model's. ``relative`` is a key of the device's entry."""
+    section, _, rest = relative.partition(".")
+    name = rest.partition(".")[0]
+    in_model = False
+    if section in ("real", "simulated"):
+        in_model = name in getattr(model, section) and name not in getattr(config, section)
+    elif section == "limits" and isinstance(model, RobotModel) and isinstance(config, RobotConfig):
+        given = config.limits.model_fields_set
+        in_model = name not in given if name else not given
+        if in_model and name in model.real_limits.model_fields_set and not context.simulated(config):
+            relative = f"real_{relative}"
+    if in_model:
+        context.problems.add(file, f"{part}{relative}", message)
+    else:
+        context.problem(f"{key}.{part}{relative}", message)

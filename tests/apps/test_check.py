@@ -1,0 +1,92 @@
+"""The check as a person starts it, and before the teleoperation opens a rig."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from franka_at_home import address, emulator
+
+ROOT = Path(__file__).resolve().parents[2]
+HOST, EMPTY = address(4), address(5)
+needs_libraries = pytest.mark.skipif(
+    importlib.util.find_spec("pylibfranka") is None or importlib.util.find_spec("panda_py") is None,
+    reason="needs the Python packages pylibfranka and panda-python",
+)
+
+
+def run(app: str, *arguments: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, str(ROOT / "apps" / app), *arguments], capture_output=True, text=True, timeout=60
+    )
+
+
+def at(host: str) -> tuple[str, ...]:
+    return ("--config", "franka_emulator", "--set", f"robots.arm.real.host={host}")
+
+
+def test_a_simulated_rig_has_nothing_to_check_but_the_computer() -> None:
+    done = run("check.py", "--sim")
+    assert done.returncode == 0, done.stderr
+    assert "nothing to check but this computer" in done.stdout
+    assert [word for word in ("kernel", "processor", "scheduling", "memory") if word not in done.stdout] == []
+
+
+def test_what_fails_is_shown_with_its_remedy_and_is_the_exit_status() -> None:
+    done = run("check.py", *at(EMPTY), "--duration", "0.1")
+    assert done.returncode == 2
+    assert done.stderr == ""
+    lines = done.stdout.splitlines()
+    (at_line,) = [k for k, line in enumerate(lines) if line.startswith("FAIL")]
+    assert "arm: robot" in lines[at_line]
+    assert (
+        lines[at_line + 1].strip().startswith("-> start it in another terminal: python -m hal.drivers.franka.emulator")
+    )
+
+
+@needs_libraries
+def test_json_has_every_finding() -> None:
+    with emulator(HOST, "--robot", "panda"):
+        done = run("check.py", *at(HOST), "--set", "robots.arm.model=panda", "--duration", "0.1", "--json")
+    assert done.returncode == 0, done.stdout + done.stderr
+    report = json.loads(done.stdout)
+    assert report["fit"] is True
+    assert report["rig"].endswith("franka_emulator.yaml")
+    found = {v["name"]: v for v in report["verdicts"]}
+    assert found["arm: robot"]["level"] == "ok"
+    assert "protocol 5" in found["arm: robot"]["found"]
+    assert {"kernel", "processor", "scheduling", "memory", "arm: network"} <= set(found)
+    assert all(set(v) == {"name", "level", "found", "remedy"} for v in report["verdicts"])
+
+
+@pytest.mark.parametrize(
+    ("arguments", "text"),
+    [
+        (["--duration", "0"], "--duration must be above 0"),
+        (["--config", "panda_tabel"], "did you mean 'panda_table'"),
+    ],
+)
+def test_a_persons_mistake_is_a_message_not_a_traceback(arguments: list[str], text: str) -> None:
+    done = run("check.py", *arguments)
+    assert done.returncode == 2
+    assert text in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+def test_teleoperation_of_an_arm_that_is_not_there_ends_before_anything_is_opened() -> None:
+    done = run("teleop.py", *at(EMPTY), "--duration", "1")
+    assert done.returncode == 2
+    assert "Traceback" not in done.stderr
+    assert "FAIL" in done.stdout
+    assert f"{EMPTY}:1337 refuses" in done.stdout
+    assert "Open this in a browser" not in done.stdout
+
+
+def test_teleoperation_of_a_simulation_is_not_checked() -> None:
+    done = run("teleop.py", "--sim", "--pad", "demo", "--duration", "0.2", "--set", "cameras={}")
+    assert done.returncode == 0, done.stderr
+    assert "kernel" not in done.stdout

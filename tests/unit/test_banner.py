@@ -1,0 +1,34 @@
+"""What is printed before anything moves: nobody may take a robot for its stand-in, or the other way round."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from hal.apps.banner import listing
+from hal.config import load
+
+
+def robot_line(config: Any, **arguments: Any) -> str:
+    (line,) = (line for line in listing(load(config, **arguments).resolve()) if line.startswith("robot"))
+    return line
+
+
+@pytest.mark.parametrize(
+    ("config", "sim", "words"),
+    [
+        ("franka", True, "fr3, simulated (pybullet), 240 Hz, gripper 0..0.08 m"),
+        ("franka", False, "fr3, REAL (franka at 172.16.0.2), 1000 Hz, gripper 0..0.08 m"),
+        ("franka_emulator", None, "fr3, EMULATED (franka at 127.0.0.2), 1000 Hz, gripper 0..0.08 m"),
+        ("franka_emulator", True, "fr3, simulated (pybullet), 240 Hz"),
+    ],
+)
+def test_an_arm_is_called_what_it_is(config: str, sim: bool | None, words: str) -> None:
+    assert words in robot_line(config, sim=sim)
+
+
+def test_a_real_hand_on_a_simulated_arm_is_called_real() -> None:
+    hand = {"sim": False, "real": {"host": "172.16.0.2"}}
+    line = robot_line({"robots": {"arm": {"model": "fr3", "gripper": hand}}})
+    assert "simulated (pybullet), 240 Hz, gripper 0..0.08 m, REAL (franka at 172.16.0.2)" in line

@@ -1,0 +1,64 @@
+"""An arm that counts as real, with a program in its place: stepped by the clock, and driven by a recording."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import hal
+from hal.errors import CommandError, NotSupported
+
+LAB = """
+from hal.registry import DriverSpec
+
+DRIVER = DriverSpec(name="lab", robot="hal.drivers.mock.robot:MockRobot", emulated="lab_arm:emulated")
+
+def emulated(options):
+    return options.get("host") == "here"
+"""
+
+
+@pytest.fixture(autouse=True)
+def lab(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    (tmp_path / "lab_arm.py").write_text(LAB)
+    monkeypatch.syspath_prepend(tmp_path)
+    yield
+    sys.modules.pop("lab_arm", None)
+
+
+def rig(**hosts: str) -> dict[str, Any]:
+    """Arms without hands, by name, each at its host."""
+    drivers, hand = {"real": "lab_arm:DRIVER"}, {"enabled": False}
+    robots = {n: {"model": "panda", "drivers": drivers, "gripper": hand, "real": {"host": h}} for n, h in hosts.items()}
+    return {"sim": False, "robots": robots, "gamepads": {"pad": {}}}
+
+
+def test_the_tour_drives_it_in_lock_step() -> None:
+    with hal.open(rig(arm="here"), clock="lock_step", pad="demo") as bench:
+        assert bench.attended
+        assert bench.emulated
+        assert any("emulated" in note for note in bench.notes)
+        arm, pad = bench.robots["arm"], bench.gamepads["pad"]
+        teleop = hal.Teleop(arm, mapping="default")
+        start = arm.state().q.copy()
+        with arm.control(deadman=pad.hold("l2"), rate_hz=50) as control:
+            for tick in bench.clock.rate(50):
+                motion, grip = teleop.step(pad.state(), tick.dt)
+                control.send(motion, gripper=grip)
+                if tick.elapsed > 6.0:
+                    break
+        assert abs(arm.state().q - start).max() > 0.01
+
+
+def test_it_still_needs_a_dead_man() -> None:
+    with hal.open(rig(arm="here"), clock="lock_step", pad="none") as bench, pytest.raises(CommandError, match="dead"):
+        bench.robots["arm"].control(rate_hz=50)
+
+
+def test_one_arm_that_really_moves_forbids_it() -> None:
+    with pytest.raises(NotSupported, match="recording cannot hold the dead-man"):
+        hal.open(rig(arm="here", other="there"), pad="demo")

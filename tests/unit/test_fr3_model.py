@@ -1,0 +1,187 @@
+"""The FR3's files: the URDF says what Franka publishes and loads everywhere; its limits hold in all its range."""
+
+from __future__ import annotations
+
+import math
+import xml.etree.ElementTree as ElementTree
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from specs import cube, data, world_spec
+
+from hal.config import load
+from hal.config.data_files import find_data
+from hal.drivers.franka.limits import FR3
+from hal.drivers.franka.settings import check_arm
+from hal.kinematics import Kinematics
+from hal.specs import RobotSpec
+
+URDF = find_data("robots", "fr3.urdf")
+JOINTS = [f"fr3_joint{k}" for k in range(1, 8)]
+# a, d, alpha of the modified Denavit-Hartenberg parameters in Franka's documents; the last row is the flange.
+DH = [
+    (0.0, 0.333, 0.0),
+    (0.0, 0.0, -math.pi / 2),
+    (0.0, 0.316, math.pi / 2),
+    (0.0825, 0.0, math.pi / 2),
+    (-0.0825, 0.384, -math.pi / 2),
+    (0.0, 0.0, math.pi / 2),
+    (0.088, 0.0, math.pi / 2),
+    (0.0, 0.107, 0.0),
+]
+
+
+def fr3(**arguments: bool) -> RobotSpec:
+    return load("franka", **arguments).resolve().robots[0]
+
+
+def turn_z(angle: float) -> np.ndarray:
+    c, s = math.cos(angle), math.sin(angle)
+    return np.array([[c, -s, 0, 0], [s, c, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1.0]])
+
+
+def flange(q: np.ndarray) -> np.ndarray:
+    """(4, 4) by the table."""
+    pose = np.eye(4)
+    for (a, d, alpha), theta in zip(DH, [*q, 0.0], strict=True):
+        c, s = math.cos(alpha), math.sin(alpha)
+        pose = pose @ np.array([[1, 0, 0, a], [0, c, -s, 0], [0, s, c, 0], [0, 0, 0, 1.0]]) @ turn_z(theta)
+        pose = pose @ np.array([[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, d], [0, 0, 0, 1.0]])
+    return pose
+
+
+def random_positions(count: int) -> np.ndarray:
+    return np.random.default_rng(1).uniform(FR3.lower, FR3.upper, (count, 7))
+
+
+def test_the_kinematics_are_those_of_the_table() -> None:
+    spec = fr3()
+    kinematics = Kinematics(spec.kinematics)
+    to_hand = turn_z(-math.pi / 4)
+    to_hand[2, 3] = 0.1034
+    for q in random_positions(50):
+        assert kinematics.pose(q).matrix() == pytest.approx(flange(q) @ to_hand, abs=1e-9)
+        assert kinematics.link_pose("fr3_hand_tcp", q).matrix() == pytest.approx(flange(q) @ to_hand, abs=1e-9)
+
+
+def test_every_link_stands_where_that_of_pybullets_panda_does() -> None:
+    from hal.drivers.pybullet.world import World
+
+    panda = load("franka", overrides=["robots.arm.model=panda"]).resolve().robots[0]
+    world = World(world_spec(replace(fr3(), name="fr3"), replace(panda, name="panda")))
+    assert not [warning for warning in world.warnings if "fr3" in warning]
+    links = [*(f"link{k}" for k in range(9)), "hand", "leftfinger", "rightfinger"]
+    for q in random_positions(20):
+        world.reset("fr3", q=[*q, 0.01, 0.01])
+        world.reset("panda", q=[*q, 0.01, 0.01])
+        for link in links:
+            ours, theirs = world.pose("fr3", f"fr3_{link}"), world.pose("panda", f"panda_{link}")
+            assert ours["position"] == pytest.approx(theirs["position"], abs=1e-6), link
+            if link != "rightfinger":  # ours is turned about z, so that both fingers are alike
+                same = abs(np.dot(ours["orientation"], theirs["orientation"]))
+                assert same == pytest.approx(1.0, abs=1e-6), link
+    world.close()
+
+
+def test_pybullet_says_nothing_about_it() -> None:
+    from hal.drivers.pybullet.library import Client, silenced
+    from hal.drivers.pybullet.urdf import loadable
+
+    data("")
+    client = Client()
+    with loadable(str(URDF)) as file, silenced() as chatter:
+        body = client.loadURDF(file, useFixedBase=True, flags=client.URDF_USE_INERTIA_FROM_FILE)
+    assert chatter.text == ""
+    drawn = [Path(shape[4].decode()) for shape in client.getVisualShapeData(body)]
+    assert len(drawn) == 11
+    assert all(file.is_file() for file in drawn)
+    client.close()
+
+
+def test_the_other_views_find_its_meshes() -> None:
+    from hal.drivers.viser.urdf import read_tree
+
+    data("")
+    visuals = [visual for link in read_tree(str(URDF)).visuals.values() for visual in link]
+    assert len(visuals) == 11
+    assert all(Path(visual.file).is_file() for visual in visuals)
+
+
+def test_the_urdf_holds_the_official_limits() -> None:
+    root = ElementTree.parse(URDF).getroot()
+    joints = {joint.get("name"): joint for joint in root.iter("joint")}
+    for k, name in enumerate(JOINTS):
+        limit, slower = joints[name].find("limit"), joints[name].find("position_based_velocity_limits")
+        assert limit is not None
+        assert slower is not None
+        said = [float(limit.get(key, "nan")) for key in ("lower", "upper", "velocity", "effort")]
+        assert said == [FR3.lower[k], FR3.upper[k], FR3.velocity[k], FR3.torque[k]]
+        assert FR3.velocity_offset is not None
+        assert FR3.deceleration is not None
+        assert float(slower.get("velocity_offset", "nan")) == FR3.velocity_offset[k]
+        assert float(slower.get("deceleration_limit", "nan")) == FR3.deceleration[k]
+
+
+def test_no_other_joint_can_be_taken_for_one_of_the_arms() -> None:
+    """The vendor's client looks for joints whose names contain joint1 to joint7."""
+    names = [joint.get("name", "") for joint in ElementTree.parse(URDF).getroot().iter("joint")]
+    for k in range(1, 8):
+        assert [name for name in names if f"joint{k}" in name] == [f"fr3_joint{k}"]
+
+
+def test_it_weighs_what_an_fr3_with_a_hand_does() -> None:
+    masses = [float(mass.get("value", "nan")) for mass in ElementTree.parse(URDF).getroot().iter("mass")]
+    assert 17.0 < sum(masses) < 20.0
+
+
+def test_every_speed_holds_everywhere_in_the_range() -> None:
+    limits = fr3(sim=False).limits
+    assert FR3.rectangle is not None
+    assert (limits.lower, limits.upper) == (FR3.rectangle.lower, FR3.rectangle.upper)
+    for q in np.linspace(limits.lower, limits.upper, 101):
+        down, up = FR3.velocity_range(q)
+        for k, speed in enumerate(limits.velocity):
+            assert -down[k] >= speed <= up[k]
+    # And they are not slower than they must be: less than 1 % below.
+    edge = FR3.velocity_range(limits.upper)[1]
+    assert all(
+        min(most, official) < 1.01 * speed
+        for most, official, speed in zip(edge, FR3.rectangle.velocity, limits.velocity, strict=True)
+    )
+    assert list(check_arm(fr3(sim=False))) == []
+
+
+@pytest.mark.parametrize("model", ["fr3", "panda"])
+def test_where_the_arm_is_real_one_lost_setpoint_keeps_the_jerk_below_the_arms_own(model: str) -> None:
+    overrides = [f"robots.arm.model={model}"]
+    simulated = load("franka", overrides=overrides).resolve().robots[0].limits
+    real = load("franka", overrides=overrides, sim=False).resolve().robots[0].limits
+    assert set(real.acceleration) == {4.0}
+    assert all(4.0 * ours <= official for ours, official in zip(real.jerk, simulated.jerk, strict=True))
+    assert (real.lower, real.upper, real.velocity) == (simulated.lower, simulated.upper, simulated.velocity)
+
+
+def test_the_simulated_hand_presses_as_hard_as_it_is_told() -> None:
+    from hal.drivers.pybullet.gripper import PyBulletGripper
+    from hal.drivers.pybullet.world import World
+
+    arm = replace(fr3(), base_position=(0.0, 0.0, 0.0))
+    here = tuple(Kinematics(arm.kinematics).fk(arm.home)[:3])
+    world = World(world_spec(cube(here), arm))
+    assert arm.gripper is not None
+    hand = PyBulletGripper(arm.gripper, world)
+    hand.open()
+    hand.move(0.031, 0.1, 60.0)
+    for _ in range(150):
+        world.step()
+        world.set_pose("cube", {"position": here})
+    hand.move(0.0, 0.1, 60.0)
+    for _ in range(240):
+        world.step()
+    reading = hand.read(1.0)
+    assert reading.grasped
+    assert reading.force == pytest.approx(60.0, rel=0.05)
+    assert world.pose("cube")["position"][2] == pytest.approx(here[2], abs=0.005)
+    world.close()

@@ -1,0 +1,242 @@
+"""What a rig may say of a Franka arm and its hand, and what is refused before anything is opened."""
+
+from __future__ import annotations
+
+import math
+import subprocess
+import sys
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from hal.config import load
+from hal.drivers.franka.limits import FER, FR3
+from hal.drivers.franka.settings import ArmSettings, HandSettings, check_arm, check_hand, is_emulated
+from hal.errors import ConfigError
+from hal.specs import GripperSpec, LimitsSpec, RobotSpec
+
+
+def arm(model: str = "fr3", **options: Any) -> RobotSpec:
+    """A real arm that is in order but for these options."""
+    spec = load("franka", sim=False, overrides=[f"robots.arm.model={model}"]).resolve().robots[0]
+    return replace(spec, options={**spec.options, **options})
+
+
+def hand(**options: Any) -> GripperSpec:
+    spec = arm().gripper
+    assert spec is not None
+    return replace(spec, options={**spec.options, **options})
+
+
+def limited(model: str = "fr3", **limits: Any) -> RobotSpec:
+    """The same arm with other limits."""
+    spec = arm(model)
+    return replace(spec, limits=replace(spec.limits, **limits))
+
+
+def other(values: tuple[float, ...], joint: int, value: float) -> tuple[float, ...]:
+    """``values`` with another one for one joint, counted from 1."""
+    return (*values[: joint - 1], value, *values[joint:])
+
+
+@pytest.mark.parametrize("model", ["fr3", "panda"])
+def test_the_labs_rig_is_in_order(model: str) -> None:
+    assert list(check_arm(arm(model))) == []
+    settings = ArmSettings.of(arm(model))
+    assert (settings.host, settings.arm) == ("172.16.0.2", {"fr3": "fr3", "panda": "fer"}[model])
+    assert settings.stream == "position"
+    assert list(check_hand(hand())) == []
+    assert HandSettings.of(hand()).host == "172.16.0.2"
+
+
+def test_what_is_left_out_is_as_in_the_vendors_examples_or_left_alone() -> None:
+    settings = ArmSettings.of(arm())
+    lower, upper, force, _ = settings.collision_behavior.arguments()
+    assert lower == upper == [20, 20, 18, 18, 16, 14, 12]
+    assert force == [20, 20, 20, 25, 25, 25]
+    assert settings.joint_impedance == (3000, 3000, 3000, 2500, 2500, 2000, 2000)
+    alone = (settings.cartesian_impedance, settings.load, settings.end_effector, settings.stiffness_frame)
+    assert alone == (None,) * 4
+
+
+def test_everything_that_may_be_said() -> None:
+    spec = arm(
+        stream="velocity",
+        collision_behavior={"upper_torque": [30] * 7, "upper_force": [40] * 6},
+        joint_impedance=[0, 14250, 1, 2, 3, 4, 5],
+        cartesian_impedance=[10, 3000, 100, 1, 300, 10],
+        load={"mass": 0.5, "com": [0, 0, 0.1], "inertia": [1e-3, 2e-3, 2.5e-3, 1e-5, 2e-5, 3e-5]},
+        end_effector={"position": [0, 0, 0.1]},
+        stiffness_frame=[[0, -1, 0, 0.1], [1, 0, 0, 0.2], [0, 0, 1, 0.3], [0, 0, 0, 1]],
+    )
+    assert list(check_arm(spec)) == []
+    settings = ArmSettings.of(spec)
+    mass, com, inertia = settings.load.arguments() if settings.load else (0, [], [])
+    assert (mass, com) == (0.5, [0, 0, 0.1])
+    assert inertia == [1e-3, 1e-5, 2e-5, 1e-5, 2e-3, 3e-5, 2e-5, 3e-5, 2.5e-3]
+    assert settings.end_effector is not None
+    assert settings.stiffness_frame is not None
+    assert settings.end_effector.matrix() == pytest.approx([1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0.1, 1])
+    columns = np.reshape(settings.stiffness_frame.matrix(), (4, 4)).T
+    assert columns == pytest.approx(np.array([[0, -1, 0, 0.1], [1, 0, 0, 0.2], [0, 0, 1, 0.3], [0, 0, 0, 1]]))
+
+
+@pytest.mark.parametrize(
+    ("options", "key", "words"),
+    [
+        ({"hst": "172.16.0.2"}, "real.hst", "did you mean 'host'"),
+        ({"host": "172.16.0.256"}, "real.host", "for example 172.16.0.2"),
+        ({"host": "172.16.0.2:1337"}, "real.host", "without scheme and port"),
+        ({"host": "https://robot.local"}, "real.host", "without scheme and port"),
+        ({"host": ""}, "real.host", "must be the robot's address"),
+        ({"host": 172}, "real.host", "not 172"),
+        ({"host": "::1"}, "real.host", "must be the robot's address"),
+        ({"arm": "fr4"}, "real.arm", "did you mean 'fr3'"),
+        ({"stream": "torques"}, "real.stream", "position, velocity"),
+        ({"joint_impedance": [3000] * 6}, "real.joint_impedance", "7 numbers (Nm/rad"),
+        ({"joint_impedance": [3000] * 6 + [14251]}, "real.joint_impedance", "item 7 is 14251, outside 0 to 14250"),
+        ({"joint_impedance": [math.nan] * 7}, "real.joint_impedance", "item 1"),
+        ({"cartesian_impedance": [5] * 6}, "real.cartesian_impedance", "outside 10 to 3000"),
+        ({"cartesian_impedance": [10] * 3 + [301] * 3}, "real.cartesian_impedance", "item 4 is 301, outside 1 to 300"),
+        ({"collision_behavior": {"upper_torqe": []}}, "real.collision_behavior.upper_torqe", "'upper_torque'"),
+        ({"collision_behavior": {"upper_force": [-1] * 6}}, "real.collision_behavior.upper_force", "item 1 is -1"),
+        ({"collision_behavior": {"upper_torque": [10] * 7}}, "real.collision_behavior", "item 1: 20 and 10"),
+        ({"collision_behavior": {"lower_force": [30] * 6}}, "real.collision_behavior", "lower_force must not be above"),
+        ({"load": {"mass": 3.1}}, "real.load.mass", "less than or equal to 3"),
+        ({"load": {"com": [0, 0, 0]}}, "real.load.mass", "is missing"),
+        ({"load": {"mass": 1, "inertia": [1, 1, 3, 0, 0, 0]}}, "real.load", "no body has the moments"),
+        ({"load": {"mass": 1, "inertia": [1, 1, 1, 2, 0, 0]}}, "real.load", "no body has the moments"),
+        ({"end_effector": [0, 0, 0.1]}, "real.end_effector", "7 numbers"),
+        ({"end_effector": [[1, 0, 0]] * 4}, "real.end_effector", "four rows of four numbers"),
+        ({"end_effector": [[1, 0, 0, 0]] * 3 + [[0, 0, 0, 1]]}, "real.end_effector", "right-handed"),
+        ({"end_effector": np.diag([-1.0, 1, 1, 1]).tolist()}, "real.end_effector", "right-handed"),
+        ({"end_effector": np.diag([1.0, 1, 1, 2]).tolist()}, "real.end_effector", "0, 0, 0, 1"),
+        ({"stiffness_frame": {"orientation": [0, 0, 0, 2]}}, "real.stiffness_frame.orientation", "unit quaternion"),
+    ],
+)
+def test_what_makes_no_sense_is_told_by_its_key(options: dict[str, Any], key: str, words: str) -> None:
+    spec = arm(**options)
+    said = dict(check_arm(spec))
+    assert words in said[key]
+    with pytest.raises(ConfigError, match="robots.arm.real"):
+        ArmSettings.of(spec)
+
+
+@pytest.mark.parametrize("host", ["robot.local", "franka", "127.0.0.2", "my-arm.lab.example."])
+def test_hosts_that_may_be(host: str) -> None:
+    assert ArmSettings.of(arm(host=host)).host == host
+    assert HandSettings.of(hand(host=host)).host == host
+
+
+def test_a_host_must_be_given() -> None:
+    nowhere = replace(arm(), options={"arm": "fr3"})
+    assert list(check_arm(nowhere)) == [("real.host", "is missing: the robot's address, for example 172.16.0.2")]
+    assert [key for key, _ in check_hand(replace(hand(), options={}))] == ["real.host"]
+
+
+def test_what_a_hand_may_not_be_told() -> None:
+    assert "did you mean 'tolerance'" in dict(check_hand(hand(tolerence=0.01)))["real.tolerence"]
+    assert "greater than 0" in dict(check_hand(hand(tolerance=0)))["real.tolerance"]
+
+
+@pytest.mark.parametrize(
+    ("options", "emulated"),
+    [
+        ({"host": "127.0.0.1"}, True),
+        ({"host": "127.3.2.1"}, True),
+        ({"host": "::1"}, True),
+        ({"host": "localhost"}, True),
+        ({"host": " LOCALHOST. "}, True),
+        ({"host": "172.16.0.2"}, False),
+        ({"host": "localhost.lab.example"}, False),
+        ({"host": "127.0.0.1.lab.example"}, False),
+        ({"host": 127}, False),
+        ({"host": None}, False),
+        ({}, False),
+    ],
+)
+def test_this_computer_is_no_robot(options: dict[str, Any], emulated: bool) -> None:
+    assert is_emulated(options) is emulated
+
+
+def test_the_rehearsals_rig_is_emulated_and_the_labs_is_not() -> None:
+    (rehearsal,) = load("franka_emulator").resolve().robots
+    assert (rehearsal.driver, rehearsal.attended, rehearsal.emulated) == ("franka", True, True)
+    assert load("franka_emulator", clock="lock_step").resolve().clock == "lock_step"
+    assert not arm().emulated
+
+
+@pytest.mark.parametrize(
+    ("model", "limit", "joint", "value", "official"),
+    [
+        ("fr3", "lower", 4, -3.1, -3.077),
+        ("fr3", "upper", 1, 2.95, 2.9007),
+        ("fr3", "velocity", 5, 5.3, 5.26),
+        ("fr3", "acceleration", 2, 10.5, 10),
+        ("fr3", "jerk", 7, 5001, 5000),
+        ("fr3", "torque", 6, 13, 12),
+        ("panda", "lower", 6, -0.02, -0.0175),
+        ("panda", "upper", 4, -0.06, -0.0698),
+        ("panda", "velocity", 1, 2.2, 2.175),
+        ("panda", "acceleration", 2, 8, 7.5),
+        ("panda", "jerk", 2, 3800, 3750),
+        ("panda", "torque", 1, 88, 87),
+    ],
+)
+def test_no_limit_lies_beyond_the_arms_own(model: str, limit: str, joint: int, value: float, official: float) -> None:
+    good = getattr(arm(model).limits, limit)
+    said = dict(check_arm(limited(model, **{limit: other(good, joint, value)})))
+    name = f"{'fr3' if model == 'fr3' else 'panda'}_joint{joint}"
+    assert f"{name} has {value:g}, beyond {official:g}" in said[f"limits.{limit}"]
+
+
+def test_the_arms_own_limits_are_allowed() -> None:
+    own = {"acceleration": FR3.acceleration, "jerk": FR3.jerk, "torque": FR3.torque}
+    assert list(check_arm(limited(**own))) == []
+    names = ("lower", "upper", "velocity", "acceleration", "jerk", "torque")
+    assert list(check_arm(limited("panda", **{name: getattr(FER, name) for name in names}))) == []
+
+
+def test_an_fr3_may_not_be_fast_where_its_range_ends() -> None:
+    """At each end by itself: what is wrong is told with the joint, its speed and the speed that is allowed there."""
+    good = arm().limits
+    for end, k in (("lower", 0), ("upper", 1)):
+        near = FR3.lower[0] + 0.1 if end == "lower" else FR3.upper[0] - 0.1
+        ((key, text),) = check_arm(limited(**{end: other(getattr(good, end), 1, near)}))
+        allowed = abs(FR3.velocity_range([near] * 7)[k][0])
+        assert key == "limits"
+        assert f"fr3_joint1 has 1.91 rad/s, but only {allowed:.4g} is allowed at {near:g} rad" in text
+        assert "fr3_joint2" not in text
+        slower = other(good.velocity, 1, math.floor(100 * allowed) / 100)
+        assert list(check_arm(limited(velocity=slower, **{end: other(getattr(good, end), 1, near)}))) == []
+
+
+def test_franka_s_own_rectangular_speeds_are_a_little_too_fast() -> None:
+    assert FR3.rectangle is not None
+    ((key, text),) = check_arm(limited(velocity=FR3.rectangle.velocity))
+    assert key == "limits"
+    assert all(f"fr3_joint{k}" in text for k in range(1, 8))
+
+
+def test_numbers_that_are_not_known_do_not_confuse_the_check() -> None:
+    """Where a file has mistakes, limits are NaN; whoever wrote it was told of those already."""
+    unknown = (math.nan,) * 7
+    assert list(check_arm(replace(arm(), limits=LimitsSpec(*[unknown] * 5)))) == []
+
+
+def test_other_arms_and_rates_are_refused() -> None:
+    assert "must be 1000 Hz" in dict(check_arm(replace(arm(), rate_hz=500.0)))["rate_hz"]
+    six = replace(arm(), joints=arm().joints[:6])
+    assert "must have 7 joints" in dict(check_arm(six))["model"]
+    assert "real.arm" in dict(check_arm(replace(arm(), options={"host": "172.16.0.2"})))
+
+
+def test_nothing_of_the_vendor_is_imported_to_check_a_rig() -> None:
+    code = (
+        "import sys; from hal.config import load; load('franka', sim=False).resolve();"
+        "print([m for m in ('pylibfranka', 'panda_py', 'pinocchio', 'pybullet') if m in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True)
+    assert done.stdout.strip() == "[]"

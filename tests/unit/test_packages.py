@@ -1,0 +1,92 @@
+"""Files that URDFs name: beside them, above them, or in an installed Python package."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import pytest
+from specs import data, world_spec
+
+from hal.drivers.pybullet.world import World
+from hal.errors import ConfigError
+from hal.packages import mesh_file, package_folder
+from hal.specs import BodySpec
+
+CUBE = """
+v -1 -1 -1
+v 1 -1 -1
+v 0 1 -1
+v 0 0 1
+f 1 3 2
+f 1 2 4
+f 2 3 4
+f 3 1 4
+"""
+
+
+def thing(folder: Path, mesh: str) -> BodySpec:
+    """A body whose URDF, in ``folder``, draws ``mesh``."""
+    urdf = folder / "thing.urdf"
+    urdf.write_text(
+        '<robot name="thing"><link name="base"><inertial><mass value="1"/><inertia ixx="1" ixy="0" ixz="0" iyy="1" '
+        f'iyz="0" izz="1"/></inertial><visual><geometry><mesh filename="{mesh}"/></geometry></visual></link></robot>'
+    )
+    return BodySpec("thing", (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0), "urdf", urdf=str(urdf))
+
+
+@pytest.fixture
+def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """An installed package with a mesh in it; importing it fails."""
+    folder = tmp_path / "site" / "lab_meshes"
+    (folder / "parts").mkdir(parents=True)
+    (folder / "__init__.py").write_text("raise RuntimeError('nobody needs to import this')")
+    (folder / "parts" / "cube.obj").write_text(CUBE)
+    monkeypatch.syspath_prepend(tmp_path / "site")
+    return folder
+
+
+def test_a_package_is_found_and_not_imported(package: Path) -> None:
+    assert package_folder("lab_meshes") == package
+    assert package_folder("lab_meshez") is None
+    assert package_folder("") is None
+    assert "lab_meshes" not in sys.modules
+
+
+def test_what_lies_beside_a_urdf_or_above_it_comes_first(package: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "robot" / "urdf"
+    folder.mkdir(parents=True)
+    name = "package://lab_meshes/parts/cube.obj"
+    assert mesh_file(name, folder) == package / "parts" / "cube.obj"
+    for place in (tmp_path / "robot", folder):
+        (place / "lab_meshes" / "parts").mkdir(parents=True)
+        (place / "lab_meshes" / "parts" / "cube.obj").touch()
+        assert mesh_file(name, folder) == place / "lab_meshes" / "parts" / "cube.obj"
+
+
+@pytest.mark.parametrize("name", ["lab_meshes/parts/cube.obj", "package://lab_meshes/parts/ball.obj", ""])
+def test_what_is_nowhere_should_be_beside_the_urdf(package: Path, tmp_path: Path, name: str) -> None:
+    """Only ``package://`` means a package: a plain path that happens to look like one does not."""
+    found = mesh_file(name, tmp_path)
+    assert found.is_relative_to(tmp_path)
+    assert not found.is_file()
+
+
+def test_an_absolute_path_stays_one(tmp_path: Path) -> None:
+    mesh = tmp_path / "cube.obj"
+    mesh.write_text(CUBE)
+    assert mesh_file(f"file://{mesh}", Path("/nowhere")) == mesh
+
+
+def test_the_simulation_draws_a_mesh_out_of_a_package(package: Path, tmp_path: Path) -> None:
+    data("")
+    world = World(world_spec(thing(tmp_path, "package://lab_meshes/parts/cube.obj")))
+    (shape,) = world.client.getVisualShapeData(world.body("thing").id)
+    assert Path(shape[4].decode()) == package / "parts" / "cube.obj"
+    world.close()
+
+
+def test_a_mesh_that_is_in_no_package_is_told(package: Path, tmp_path: Path) -> None:
+    data("")
+    with pytest.raises(ConfigError, match=r"thing.urdf.*names a mesh that is not there: package://lab_meshes/ball.obj"):
+        World(world_spec(thing(tmp_path, "package://lab_meshes/ball.obj")))

@@ -1,0 +1,182 @@
+"""The copy of a real arm in the simulated world: where the arm is, whatever is in its way."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from specs import PANDA_HOME, box, cube, floor, panda, world_spec
+
+from hal.drivers.pybullet.world import World
+from hal.errors import CommandError, DeviceNotFound, NotSupported
+from hal.kinematics import Kinematics
+
+REST = [0.0] * 7
+JOINTS = tuple(f"panda_joint{k}" for k in range(1, 8))
+FINGERS = ("panda_finger_joint1", "panda_finger_joint2")
+
+
+def copied(*things: object) -> World:
+    """A world with the copy of a real arm."""
+    arm = panda("arm", driver="franka")
+    return World(world_spec(*things, arm))  # type: ignore[arg-type]
+
+
+@pytest.fixture
+def world() -> Iterator[World]:
+    world = copied(floor())
+    yield world
+    world.close()
+
+
+def joints(world: World, names: tuple[str, ...] = JOINTS) -> np.ndarray:
+    body = world.body("arm")
+    return np.array([state[0] for state in world.client.getJointStates(body.id, [body.joints[n] for n in names])])
+
+
+def run(world: World, seconds: float) -> None:
+    for _ in range(round(seconds / world.dt)):
+        world.step()
+
+
+def test_it_is_a_robot_and_stands_where_the_rig_says_until_it_is_told_more(world: World) -> None:
+    assert world.describe("arm")["robot"]
+    run(world, 1.0)
+    assert joints(world) == pytest.approx(PANDA_HOME, abs=1e-4)
+
+
+def test_it_is_at_once_where_the_arm_is_and_its_links_with_it(world: World) -> None:
+    q = [0.3, -0.2, 0.4, -1.5, 0.2, 1.2, -0.6]
+    world.follow("arm", q, REST, 0.03)
+    assert joints(world) == pytest.approx(q)
+    assert joints(world, FINGERS) == pytest.approx(0.015)
+    hand = Kinematics(replace(panda().kinematics, tcp_position=(0.0, 0.0, 0.0))).pose(q)
+    assert world.pose("arm", "panda_hand")["position"] == pytest.approx(hand.position, abs=1e-5)
+
+
+def test_it_neither_sags_nor_lags(world: World) -> None:
+    """After a step it is where the arm will be then."""
+    q, dq = list(PANDA_HOME), [0.0] * 7
+    for k in range(480):
+        t = k * world.dt
+        q[0], dq[0] = 0.5 * math.sin(2 * t), math.cos(2 * t)
+        world.follow("arm", q, dq, 0.04)
+        world.step()
+        wanted = [0.5 * math.sin(2 * (t + world.dt)), *PANDA_HOME[1:]]
+        assert joints(world) == pytest.approx(wanted, abs=5e-5)
+
+
+@pytest.mark.parametrize("dq", [0.0, 1.0])
+def test_when_nobody_says_where_the_arm_is_it_stays(world: World, dq: float) -> None:
+    world.follow("arm", PANDA_HOME, [dq] * 7, 0.04)
+    world.step()
+    stopped = joints(world)
+    assert np.abs(stopped - PANDA_HOME).max() == pytest.approx(dq * world.dt, abs=1e-4)
+    run(world, 1.0)
+    assert joints(world) == pytest.approx(stopped, abs=1e-4)
+
+
+def test_it_pushes_what_it_meets_and_is_not_held_up() -> None:
+    """A cube of 50 kg in the way of the forearm, which swings about the first joint."""
+    world = copied(floor(), box("block", (0.33, 0.35, 0.3), (0.1, 0.1, 0.3), mass=50.0))
+    q = [0.0, 0.6, 0.0, -2.2, 0.0, 2.0, 0.785]
+    run_into = 0.9
+    for k in range(round(run_into / 0.5 / world.dt)):
+        q[0] = 0.5 * k * world.dt
+        world.follow("arm", q, [0.5, *REST[1:]], 0.04)
+        world.step()
+    assert joints(world)[0] == pytest.approx(run_into, abs=2e-3)
+    assert joints(world)[1:] == pytest.approx(q[1:], abs=1e-3)
+    assert world.pose("block")["position"][1] > 0.40
+    world.close()
+
+
+def test_its_fingers_hold_a_thing_that_only_the_simulation_has() -> None:
+    """The real fingers close on nothing; the copy's close as far as the cube, and carry it."""
+    kinematics = Kinematics(panda().kinematics)
+    here = tuple(kinematics.fk(PANDA_HOME)[:3])
+    world = copied(floor(), cube(here))
+    world.set_dynamics("cube", mass=0.2)
+    q = list(PANDA_HOME)
+    for k in range(60):
+        world.set_pose("cube", {"position": here})
+        world.follow("arm", q, REST, 0.04 - 0.0005 * k)
+        world.step()
+    for k in range(240):
+        q[0] = 0.5 * k * world.dt
+        world.follow("arm", q, [0.5, *REST[1:]], 0.0)
+        world.step()
+    assert joints(world, FINGERS) == pytest.approx(0.015, abs=1e-3)
+    tcp = kinematics.fk(q)[:3]
+    assert world.pose("cube")["position"] == pytest.approx(tcp, abs=0.01)
+    assert math.dist(tcp, here) > 0.1
+    world.close()
+
+
+def test_a_width_that_nobody_knows_leaves_the_fingers_alone(world: World) -> None:
+    world.follow("arm", PANDA_HOME, REST, 0.02)
+    run(world, 0.1)
+    world.follow("arm", PANDA_HOME, REST, None)
+    run(world, 0.1)
+    assert joints(world, FINGERS) == pytest.approx(0.01, abs=1e-4)
+
+
+def test_a_reset_leaves_it_where_the_real_arm_is(world: World) -> None:
+    q = [0.5, *PANDA_HOME[1:]]
+    world.follow("arm", q, REST, 0.04)
+    world.reset()
+    assert joints(world) == pytest.approx(q)
+    with pytest.raises(CommandError, match="where the real arm is"):
+        world.reset("arm")
+    with pytest.raises(CommandError, match="is a robot"):
+        world.set_pose("arm", {"position": [0, 0, 1]})
+
+
+def test_a_mirror_shows_it() -> None:
+    world = copied(floor())
+    mirror = World(world.spec, mirror=True)
+    world.follow("arm", [0.5, *PANDA_HOME[1:]], REST, 0.01)
+    world.step()
+    mirror.show(world.snapshot())
+    for link in ("panda_hand", "panda_leftfinger"):
+        shown, there = mirror.pose("arm", link), world.pose("arm", link)
+        assert shown["position"] == pytest.approx(there["position"], abs=1e-6)
+    with pytest.raises(NotSupported):
+        mirror.step()
+    world.close()
+    mirror.close()
+
+
+@pytest.mark.parametrize(
+    ("q", "dq", "width"),
+    [
+        ([0.0] * 6, REST, 0.04),
+        (REST, [0.0] * 8, 0.04),
+        ([math.nan, *REST[1:]], REST, 0.04),
+        (REST, [math.inf, *REST[1:]], 0.04),
+        (REST, REST, math.nan),
+        (None, REST, 0.04),
+    ],
+)
+def test_impossible_numbers_are_refused_and_it_stays(
+    world: World, q: list[float], dq: list[float], width: float
+) -> None:
+    with pytest.raises(CommandError):
+        world.follow("arm", q, dq, width)
+    world.step()
+    assert joints(world) == pytest.approx(PANDA_HOME, abs=1e-4)
+    assert joints(world, FINGERS) == pytest.approx(0.04, abs=1e-4)
+
+
+def test_only_a_copy_can_be_told(world: World) -> None:
+    with pytest.raises(DeviceNotFound, match="did you mean 'arm'"):
+        world.follow("arn", PANDA_HOME, REST, None)
+    with pytest.raises(CommandError, match="not the copy of a real arm"):
+        world.follow("floor", PANDA_HOME, REST, None)
+    simulated = World(world_spec(panda("arm")))
+    with pytest.raises(CommandError, match="not the copy of a real arm"):
+        simulated.follow("arm", PANDA_HOME, REST, None)
+    simulated.close()

@@ -1,0 +1,276 @@
+"""Torques in real physics: PyBullet's Panda floats, turns, is stopped, and keeps every bound."""
+
+from __future__ import annotations
+
+import random
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from specs import PANDA_HOME, box, iiwa, panda, world_spec
+from torque_kit import NOTHING, N, one, simulated
+
+from hal.drivers.pybullet.robot import PyBulletRobot
+from hal.drivers.pybullet.world import World
+from hal.kinematics import Kinematics
+from hal.robot import Setpoint
+from hal.specs import BodySpec
+from hal.types import Limited, RobotStatus, Trip
+
+STIFFNESS = np.array([0.0, 200.0, 200.0, 200.0, 20.0, 20.0, 2.0])  # Nm per rad, of an arm that keeps its posture
+RATES = pytest.mark.parametrize("rate_hz", [240.0, 1000.0])
+
+
+def opened(*others: BodySpec, torque: tuple[float, ...] | None = None) -> tuple[World, PyBulletRobot]:
+    """An arm that follows set-points by itself, without a servo."""
+    spec = panda()
+    if torque is not None:
+        spec = replace(spec, limits=replace(spec.limits, torque=torque))
+    world = World(world_spec(spec, *others))
+    driver = PyBulletRobot(spec, world)
+    driver.open()
+    for _ in range(60):
+        world.step()
+    return world, driver
+
+
+def torques(driver: PyBulletRobot, tau: tuple[float, ...] | list[float] = NOTHING) -> Setpoint:
+    reading = driver.read(0.0)
+    return Setpoint(reading.q, reading.dq, NOTHING, tau)
+
+
+class TestServed:
+    """With the servo above it."""
+
+    @RATES
+    def test_without_torques_it_floats_where_it_is(self, rate_hz: float) -> None:
+        arm = simulated(rate_hz=rate_hz)
+        start = arm.q
+        arm.drive(2.0)
+        assert arm.by_torques
+        assert np.abs(arm.q - start).max() < 2e-3
+        assert np.abs(arm.dq).max() < 2e-3
+
+    @RATES
+    def test_a_small_torque_turns_the_wrist_and_a_release_stops_and_holds_it(self, rate_hz: float) -> None:
+        arm = simulated(rate_hz=rate_hz)
+        start = arm.q
+        arm.drive(0.5, one(6, 0.3))
+        assert arm.q[6] - start[6] > 0.1
+        assert arm.dq[6] == pytest.approx(0.9 * 0.3 * 2.61, rel=0.02)
+        arm.release()
+        let_go = arm.q
+        assert arm.until_held() < 0.2
+        assert np.abs(arm.q - let_go).max() < 0.05
+        rest = arm.q
+        arm.run(1.0)
+        assert arm.state == (RobotStatus.HOLDING, Trip.NONE)
+        assert arm.q == pytest.approx(rest, abs=1e-3)
+        arm.assert_within_limits()
+
+    @RATES
+    def test_at_full_speed_it_brakes_along_its_way(self, rate_hz: float) -> None:
+        arm = simulated(rate_hz=rate_hz, speed=1.0, tcp_speed=99.0)
+        arm.drive(0.3, [20.0, 5.0, -5.0, 5.0, 1.0, -1.0, 0.3])
+        assert np.abs(arm.dq / arm.spec.limits.velocity).max() > 0.7
+        arm.stops += 1
+        before, direction = arm.q, arm.dq / np.linalg.norm(arm.dq)
+        assert arm.until_held() < 0.35
+        way = arm.q - before
+        assert np.linalg.norm(way) < 0.35
+        assert way @ direction / np.linalg.norm(way) > 0.95
+        assert arm.servo.report.trip is Trip.STOP
+        arm.assert_within_limits()
+
+    def test_the_torque_limit_holds_at_the_motors_too(self) -> None:
+        arm = simulated(speed=1.0, tcp_speed=99.0)
+        arm.drive(0.3, [500.0, -500.0, 500.0, -500.0, 50.0, 50.0, -50.0])
+        applied = np.abs([reading.tau for reading in arm.readings if reading.tau is not None]).max(axis=0)
+        assert (applied <= np.array(arm.spec.limits.torque) + 1e-9).all()
+        arm.assert_within_limits()
+
+    def test_a_hand_that_pushes_too_fast_trips_it(self) -> None:
+        arm = simulated()
+        assert arm.world is not None
+        client, body = arm.world.client, arm.world.body("panda")
+        for _ in range(240):
+            arm.send(NOTHING)
+            place = client.getLinkState(body.id, body.links["panda_hand"])[0]
+            client.applyExternalForce(body.id, body.links["panda_hand"], (0.0, 30.0, 0.0), place, client.WORLD_FRAME)
+            arm.tick()
+            if arm.servo.report.trip:
+                break
+        assert arm.servo.report.trip is Trip.LIMIT
+        assert arm.limited & (Limited.SPEED | Limited.TCP_SPEED)
+        assert arm.tcp_speed < 0.35
+        assert arm.until_held() < 0.3
+
+    def test_against_a_wall_it_pushes_and_relaxes_before_positions_take_over(self) -> None:
+        arm = simulated()
+        assert arm.world is not None
+        arm.world.add(box("wall", (0.3, 0.22, 0.5), (0.3, 0.02, 0.5)))
+        for _ in range(720):
+            hold = -STIFFNESS * (arm.q - PANDA_HOME) - 0.1 * STIFFNESS * arm.dq
+            arm.drive(arm.dt, [6.0, *hold[1:]])
+        assert arm.by_torques
+        assert arm.world.contacts("panda", "wall")
+        assert np.abs(arm.dq).max() < 0.05
+        assert arm.tau[0] == pytest.approx(6.0)
+        arm.release()
+        arm.until_held()
+        arm.run(0.5)
+        assert sum(contact["force"] for contact in arm.world.contacts("panda", "wall")) < 20.0
+        arm.assert_within_limits()
+
+    def test_a_load_that_nobody_told_of_sinks_slowly_and_is_held_in_the_end(self) -> None:
+        arm = simulated()
+        assert arm.world is not None
+        client, body = arm.world.client, arm.world.body("panda")
+        hand = body.links["panda_hand"]
+        start = arm.q
+        for turn in range(480):
+            if turn < 24:
+                arm.send(NOTHING)
+            elif turn == 24:
+                arm.release()
+            place = client.getLinkState(body.id, hand)[0]
+            client.applyExternalForce(body.id, hand, (0.0, 0.0, -20.0), place, client.WORLD_FRAME)
+            arm.tick()
+            if turn > 24 and not arm.by_torques:
+                break
+        assert arm.servo.report.trip is Trip.LIMIT
+        assert np.abs(arm.q - start).max() < 0.2
+
+    @pytest.mark.slow
+    @pytest.mark.parametrize("seed", range(12))
+    def test_random_torques_keep_every_bound(self, seed: int) -> None:
+        rng = random.Random(seed)
+        limits = panda().limits
+        start = [
+            low + (high - low) * rng.uniform(0.2, 0.8) for low, high in zip(limits.lower, limits.upper, strict=True)
+        ]
+        speed = rng.choice((0.3, 1.0))
+        arm = simulated(start, speed=speed, deadman=False)
+        size = [rng.choice((2.0, 10.0, 50.0)) * (1.0 if joint < 4 else 0.15) for joint in range(N)]
+        for turn in range(480):
+            if turn % 24 == 0:
+                tau = [rng.uniform(-x, x) for x in size]
+                if rng.random() < 0.2:
+                    arm.stops += 1
+            arm.drive(arm.dt, tau)
+            if arm.servo._at_rest() and arm.servo.report.trip:
+                arm.rearms += 1
+            assert (arm.q <= limits.upper).all()
+            assert (arm.q >= limits.lower).all()
+            assert np.abs(arm.dq / limits.velocity).max() <= 1.3 * speed
+            assert arm.tcp_speed <= 0.28
+        assert any(setpoint.tau for setpoint in arm.given)
+        assert arm.audit.peaks()["torque"] <= 1.0
+        assert arm.audit.peaks()["torque_rate"] <= 1.0
+
+
+class TestDriver:
+    """The simulated device alone."""
+
+    def test_torques_are_on_top_of_what_carries_the_arm(self) -> None:
+        world, driver = opened()
+        for _ in range(480):
+            driver.write(torques(driver))
+            world.step()
+        assert driver.read(0.0).q == pytest.approx(PANDA_HOME, abs=2e-3)
+        for _ in range(24):
+            driver.write(torques(driver, one(5, 0.5)))
+            world.step()
+        reading = driver.read(0.0)
+        assert reading.dq[5] > 0.5
+        assert reading.tau is not None
+        carried = driver.read(0.0).tau[5] - 0.5  # type: ignore[index]
+        assert abs(carried) < 3.0
+
+    def test_the_inertia_is_the_one_that_is_simulated(self) -> None:
+        world, driver = opened()
+        mass = np.array(driver.mass_matrix(PANDA_HOME))
+        assert mass == pytest.approx(mass.T)
+        assert (np.linalg.eigvalsh(mass) > 0.0).all()
+        tau = np.array([2.0, 1.0, -1.0, 1.0, 0.1, -0.1, 0.02])
+        driver.write(torques(driver, tau.tolist()))
+        world.step()
+        assert mass @ driver.read(0.0).dq == pytest.approx(tau * world.dt, rel=0.05, abs=1e-4)
+
+    def test_where_the_urdf_is_right_it_says_the_same(self) -> None:
+        spec = iiwa()
+        world = World(world_spec(spec))
+        driver = PyBulletRobot(spec, world)
+        driver.open()
+        rng = np.random.default_rng(0)
+        kinematics = Kinematics(spec.kinematics)
+        for _ in range(10):
+            q = rng.uniform(spec.limits.lower, spec.limits.upper).tolist()
+            assert np.array(driver.mass_matrix(q)) == pytest.approx(kinematics.mass_matrix(q), rel=1e-3, abs=1e-4)
+
+    def test_reading_twice_does_not_carry_it_twice(self) -> None:
+        world, driver = opened()
+        for _ in range(240):
+            driver.write(torques(driver))
+            driver.read(0.0)
+            driver.read(0.0)
+            world.step()
+        assert driver.read(0.0).q == pytest.approx(PANDA_HOME, abs=2e-3)
+
+    def test_torques_that_stop_coming_are_kept_up_for_20_ms_and_then_it_holds(self) -> None:
+        world, driver = opened()
+        driver.write(torques(driver, one(0, 5.0)))
+        speeds = []
+        for _ in range(100):
+            world.step()
+            speeds.append(driver.read(0.0).dq[0])
+        assert speeds[:5] == sorted(speeds[:5])
+        assert speeds[4] > 0.1
+        assert abs(speeds[8]) < 0.02
+        assert np.abs(driver.read(0.0).dq).max() < 2e-3
+        assert driver.read(0.0).q[1:] == pytest.approx(PANDA_HOME[1:], abs=0.02)
+
+    @pytest.mark.parametrize("how", ["halt", "close", "fault", "disconnect", "position"])
+    def test_whatever_ends_them_the_motors_hold_it_with_their_speed_limit(self, how: str) -> None:
+        world, driver = opened()
+        for _ in range(12):
+            driver.write(torques(driver, one(0, 5.0)))
+            world.step()
+        q = driver.read(0.0).q
+        if how in ("halt", "close"):
+            getattr(driver, how)()
+        elif how == "position":
+            driver.write(Setpoint(q, NOTHING, NOTHING))
+        else:
+            driver.inject(**{how: "too hot"})
+        for _ in range(120):
+            world.step()
+        if how == "close":
+            driver.open()
+        driver.recover()
+        assert driver.read(0.0).q == pytest.approx(q, abs=0.02)
+        speeds = []
+        for _ in range(120):
+            driver.write(Setpoint([q[0] + 1.0, *q[1:]], NOTHING, NOTHING))
+            world.step()
+            speeds.append(driver.read(0.0).dq[0])
+        assert driver.read(0.0).q[0] > q[0] + 0.5
+        assert max(speeds) <= driver.spec.limits.velocity[0] * 1.001
+
+    def test_a_reset_ends_them(self) -> None:
+        world, driver = opened()
+        driver.write(torques(driver, one(0, 5.0)))
+        world.reset("panda")
+        for _ in range(120):
+            world.step()
+            driver.read(0.0)
+        assert driver.read(0.0).q == pytest.approx(PANDA_HOME, abs=2e-3)
+
+    def test_the_effort_bounds_torque_and_carrying_together(self) -> None:
+        world, driver = opened(torque=(87.0, 5.0, 87.0, 87.0, 12.0, 12.0, 12.0))
+        applied = []
+        for _ in range(60):
+            driver.write(torques(driver, one(1, -4.5)))
+            world.step()
+            applied.append(driver.read(0.0).tau)
+        assert np.abs(applied).max(axis=0)[1] == pytest.approx(5.0)

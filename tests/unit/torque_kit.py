@@ -1,0 +1,183 @@
+"""An arm that is driven by torques, for tests: a servo and the driver under it, ticked by hand."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from specs import panda, world_spec
+
+from hal.commands import Kind
+from hal.drivers.mock.robot import MockRobot
+from hal.drivers.pybullet.robot import PyBulletRobot
+from hal.drivers.pybullet.world import World
+from hal.inbox import CommandRecord, DeadmanRecord, Inbox, Session
+from hal.robot import Reading, Setpoint
+from hal.servo.audit import SetpointAudit
+from hal.servo.servo import Servo
+from hal.specs import RobotSpec, WorkspaceSpec
+from hal.types import Limited, RobotStatus, Trip
+
+N = 7
+NOTHING = (0.0,) * N
+
+
+class Driven:
+    """One arm under its servo. Its dead-man is held, unless it has none; the app and the pad are alive."""
+
+    def __init__(
+        self,
+        driver: Any,
+        world: World | None = None,
+        *,
+        rate_hz: float = 240.0,
+        speed: float = 0.3,
+        tcp_speed: float = 0.25,
+        deadman: bool = True,
+        mass_matrix: Callable[[Sequence[float]], Any] | None = None,
+    ) -> None:
+        self.driver, self.world = driver, world
+        self.spec: RobotSpec = driver.spec
+        self.dt = 1.0 / rate_hz
+        self.servo = Servo(self.spec, self.dt, None, mass_matrix or driver.mass_matrix)
+        self.audit = SetpointAudit(self.spec.limits, self.dt)
+        self.now = 20.0
+        self.seq = 0
+        self.command: CommandRecord | None = None
+        self.deadman = DeadmanRecord(False, True, 0, 0.0) if deadman else None
+        self.stops = self.rearms = 0
+        self.t_app = self.now
+        self.app_alive = True
+        self.limited = Limited.NONE
+        self.silent = False
+        """Does the device not answer?"""
+        self.tamper: Callable[[Reading], Reading] = lambda reading: reading
+        """What becomes of a reading on its way."""
+        self.prepared = True
+        self.setpoint: Setpoint | None = None
+        self.given: list[Setpoint] = []
+        """What the driver was given."""
+        self.readings: list[Reading] = []
+        driver.open()
+        self.reading: Reading = driver.read(self.now)
+        self.servo.anchor(self.reading.q)
+        self.servo.begin(Session(1, speed, tcp_speed, deadman), self.inbox())
+        self.tick()
+        if deadman:
+            self.press()
+
+    @property
+    def tau(self) -> Sequence[float]:
+        """What the driver was given last, Nm."""
+        assert self.setpoint is not None
+        assert self.setpoint.tau is not None
+        return self.setpoint.tau
+
+    @property
+    def by_torques(self) -> bool:
+        return self.setpoint is not None and self.setpoint.tau is not None
+
+    @property
+    def state(self) -> tuple[RobotStatus, Trip]:
+        return self.servo.report.status, self.servo.report.trip
+
+    @property
+    def q(self) -> NDArray[np.float64]:
+        return np.array(self.reading.q)
+
+    @property
+    def dq(self) -> NDArray[np.float64]:
+        return np.array(self.reading.dq)
+
+    @property
+    def tcp_speed(self) -> float:
+        """m/s"""
+        return float(np.linalg.norm((self.servo.kinematics.jacobian(self.q) @ self.dq)[:3]))
+
+    def press(self) -> None:
+        assert self.deadman is not None
+        self.deadman = self.deadman._replace(held=True, presses=self.deadman.presses + 1)
+
+    def release(self) -> None:
+        assert self.deadman is not None
+        self.deadman = self.deadman._replace(held=False)
+
+    def inbox(self) -> Inbox:
+        if self.app_alive:
+            self.t_app = self.now
+        if self.deadman is not None:
+            self.deadman = self.deadman._replace(t_alive=self.now)
+        return Inbox(self.command, self.deadman, self.stops, self.rearms, self.t_app)
+
+    def send(self, values: Sequence[float], kind: Kind = Kind.JOINT_TORQUE, deadline: float = 0.1) -> int:
+        self.seq += 1
+        self.command = CommandRecord(self.seq, 1, self.now, self.now + deadline, kind, tuple(values))
+        return self.seq
+
+    def tick(self) -> Setpoint | None:
+        self.now += self.dt
+        if self.world is not None:
+            self.world.step()
+        self.reading = self.driver.read(self.now)
+        self.readings.append(self.reading)
+        if self.silent:
+            self.setpoint = self.servo.lost(self.now)
+        else:
+            self.setpoint = self.servo.tick(self.now, self.tamper(self.reading), self.inbox())
+        self.limited |= self.servo.report.limited
+        if self.setpoint is not None and not self.silent:
+            self.driver.write(self.setpoint)
+            self.given.append(self.setpoint)
+            self.audit.take(self.setpoint)
+        if self.prepared:
+            self.servo.prepare()
+        return self.setpoint
+
+    def run(self, seconds: float) -> None:
+        """Ticks without new commands."""
+        for _ in range(round(seconds / self.dt)):
+            self.tick()
+
+    def drive(self, seconds: float, tau: Sequence[float] = NOTHING) -> None:
+        """The same torques again and again."""
+        for _ in range(round(seconds / self.dt)):
+            self.send(tau)
+            self.tick()
+
+    def until_held(self, most: float = 1.0) -> float:
+        """Tick until positions hold the arm; returns how long that took, s."""
+        begun = self.now
+        while self.by_torques or not self.servo._at_rest():
+            self.tick()
+            assert self.now < begun + most, "positions did not take over"
+        return self.now - begun
+
+    def assert_within_limits(self) -> None:
+        for name, peak in self.audit.peaks().items():
+            assert peak <= 1.0, f"{name} reached {peak} of its limit"
+
+
+def one(joint: int, tau: float) -> list[float]:
+    """A torque on one joint, none on the others."""
+    return [tau if k == joint else 0.0 for k in range(N)]
+
+
+def wheels(box: WorkspaceSpec | None = None, **how: Any) -> Driven:
+    """The mock: seven wheels, which nothing couples, on the Panda's model."""
+    rate_hz = how.get("rate_hz", 240.0)
+    return Driven(MockRobot(replace(panda(driver="mock"), rate_hz=rate_hz, workspace=box)), **how)
+
+
+def simulated(initial: Sequence[float] | None = None, box: WorkspaceSpec | None = None, **how: Any) -> Driven:
+    """PyBullet's Panda, which has had the time to settle."""
+    rate_hz = how.get("rate_hz", 240.0)
+    spec = replace(panda(), rate_hz=rate_hz, workspace=box)
+    if initial is not None:
+        spec = replace(spec, initial=tuple(initial))
+    world = World(world_spec(spec, physics_hz=rate_hz))
+    for _ in range(60):
+        world.step()
+    return Driven(PyBulletRobot(spec, world), world, **how)

@@ -1,0 +1,76 @@
+"""A whole rig whose arm is an emulated Franka: the same that a user opens, without cameras and pads."""
+
+from __future__ import annotations
+
+import contextlib
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import hal
+from hal.rig import Rig
+from hal.robot import Robot
+from hal.types import RobotState, RobotStatus
+
+__all__ = ["Drive", "arm_of", "rig_of", "settled", "wait_until"]
+
+
+def rig_of(host: str, robot: str = "fr3", *more: str, lock_step: bool = False, sim: bool = False) -> Rig:
+    """The rehearsal's rig without cameras and, unless ``more`` says otherwise, without its hand."""
+    model = "panda" if robot == "panda" else "fr3"
+    overrides = [f"robots.arm.model={model}", "cameras={}", f"robots.arm.real.host={host}"]
+    overrides += [] if sim else ["robots.arm.gripper.enabled=false"]
+    clock = "lock_step" if lock_step else "real_time"
+    return hal.open("franka_emulator", sim=sim, pad="none", clock=clock, overrides=[*overrides, *more])
+
+
+def arm_of(rig: Rig) -> Robot:
+    """Its arm."""
+    return rig.robots["arm"]
+
+
+def wait_until(condition: Callable[[], bool], what: str, timeout: float = 10.0) -> float:
+    """Poll until it holds; s that it took. TimeoutError, which names it, when it does not in time."""
+    began = time.monotonic()
+    while not condition():
+        if time.monotonic() - began > timeout:
+            raise TimeoutError(f"after {timeout:g} s still not {what}")
+        time.sleep(0.002)
+    return time.monotonic() - began
+
+
+@dataclass
+class Drive:
+    """An arm in motion: twists to and fro at 50 Hz, and the first error that the app got."""
+
+    arm: Robot
+    error: Exception | None = None
+    t_error: float = 0.0
+    """When, on the monotonic clock, s."""
+    t_stale: float = 0.0
+    """When its state was first found to be too old, s; 0 for never."""
+
+    def go(self, rig: Rig, seconds: float, until: Callable[[], bool] = lambda: False) -> None:
+        """Send for so long, or until something, or until the first error."""
+        with contextlib.suppress(hal.HalError), self.arm.control(rate_hz=50, unattended=True) as control:
+            start = rig.clock.now()
+            for tick in rig.clock.rate(50):
+                forth = int((tick.t - start) / 1.0) % 2 == 0
+                try:
+                    control.send(hal.Twist([0.0, 0.05 if forth else -0.05, 0.0]))
+                    self.arm.state()
+                except hal.StaleStateError:
+                    self.t_stale = self.t_stale or time.monotonic()
+                except hal.HalError as error:
+                    self.error, self.t_error = error, time.monotonic()
+                    return
+                if until() or tick.t - start > seconds:
+                    return
+
+
+def settled(arm: Robot) -> RobotState:
+    """Its state once nothing is going on."""
+    wait_until(
+        lambda: arm.state(max_age=5.0).status in (RobotStatus.IDLE, RobotStatus.FAULT, RobotStatus.LOST), "settled"
+    )
+    return arm.state(max_age=5.0)

@@ -1,0 +1,218 @@
+"""However an app ends, the arm's own process ends the motion in order; what goes wrong at opening is said at once."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import hal
+from hal.drivers.franka.links import link_to
+
+from .franka_kit import Emulator, free_host
+from .rig_kit import arm_of, rig_of, wait_until
+
+pytest.importorskip("pylibfranka", reason="needs pylibfranka: pip install 'robot-hal[franka]'")
+pytest.importorskip("panda_py", reason="needs panda-python: pip install 'robot-hal[panda]'")
+
+ROOT = Path(__file__).parents[2]
+APP = """
+import json, os, sys
+sys.path.insert(0, sys.argv[2])
+import hal
+overrides = ["cameras={}", "robots.arm.real.host=" + sys.argv[1], "robots.arm.model=" + sys.argv[3]]
+with hal.open("franka_emulator", pad="none", overrides=[*overrides, "robots.arm.gripper.enabled=false"]) as rig:
+    arm = rig.robots["arm"]
+    with arm.control(rate_hz=50, unattended=True) as control:
+        for turn, tick in enumerate(rig.clock.rate(50)):
+            control.send(hal.JointVelocity([0.2, 0, 0, 0, 0.2, 0, 0.2]))
+            if turn == 25:
+                children = [host.child.process.pid for host in rig._hosts]
+                print(json.dumps({"pid": os.getpid(), "children": children}), flush=True)
+"""
+
+
+@pytest.fixture(params=["fr3", "panda"])
+def emulator(request: pytest.FixtureRequest) -> Iterator[Emulator]:
+    with Emulator(robot=request.param) as started:
+        yield started
+
+
+class App:
+    """A program that moves the arm."""
+
+    def __init__(self, emulator: Emulator, model: str) -> None:
+        self.process = subprocess.Popen(
+            [sys.executable, "-c", APP, emulator.host, str(ROOT), model],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        assert self.process.stdout is not None
+        assert self.process.stderr is not None
+        line = self.process.stdout.readline()
+        assert line, self.process.stderr.read()
+        self.children: list[int] = json.loads(line)["children"]
+
+    def nobody_left(self) -> bool:
+        self.process.poll()
+        return not any(os.path.exists(f"/proc/{pid}") for pid in [self.process.pid, *self.children])
+
+    def close(self) -> None:
+        if self.process.poll() is None:
+            self.process.kill()
+        self.process.wait(10.0)
+        for stream in (self.process.stdout, self.process.stderr):
+            if stream is not None:
+                stream.close()
+
+
+def model_of(emulator: Emulator) -> str:
+    return "panda" if "Panda" in "".join(emulator.lines[:2]) else "fr3"
+
+
+@pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGINT])
+def test_an_app_that_ends_leaves_an_arm_at_rest(emulator: Emulator, how: signal.Signals) -> None:
+    app = App(emulator, model_of(emulator))
+    try:
+        assert max(map(abs, emulator.control.send("state")["dq"])) > 0.1, "it moves"
+        app.process.send_signal(how)
+        ended = emulator.wait_event("motion ended")
+        assert "success (finished)" in ended["text"], "in order, not cut off"
+        wait_until(app.nobody_left, "gone")
+        assert max(map(abs, emulator.control.send("state")["dq"])) < 1e-9
+        assert not emulator.events("reflex")
+    finally:
+        app.close()
+
+
+def test_an_app_that_is_stopped_leaves_an_arm_at_rest(emulator: Emulator) -> None:
+    app = App(emulator, model_of(emulator))
+    try:
+        app.process.send_signal(signal.SIGSTOP)
+        wait_until(lambda: max(map(abs, emulator.control.send("state")["dq"])) < 1e-9, "at rest")
+        assert not emulator.events("reflex")
+        assert emulator.control.send("state")["mode"] == "move", "it holds, and the session may go on"
+    finally:
+        app.process.send_signal(signal.SIGCONT)
+        app.close()
+
+
+def test_the_arms_own_process_is_killed(emulator: Emulator) -> None:
+    """Then nobody can end the motion in order: the robot does, and the app hears of it."""
+    app = App(emulator, model_of(emulator))
+    try:
+        os.kill(app.children[0], signal.SIGKILL)
+        emulator.wait_event("motion ended")
+        app.process.wait(10.0)
+        assert app.process.stderr is not None
+        said = app.process.stderr.read()
+        assert "ConnectionLost" in said
+        assert "arm process ended" in said
+        wait_until(lambda: max(map(abs, emulator.control.send("state")["dq"])) < 1e-9, "at rest")
+    finally:
+        app.close()
+
+
+def opening(host: str, robot: str = "fr3", *more: str) -> str:
+    """What is said when a rig cannot be opened."""
+    with pytest.raises(hal.HalError) as caught:
+        rig_of(host, robot, *more).close()
+    text = f"{type(caught.value).__name__}: {caught.value}"
+    assert "\n" not in text, text
+    return text
+
+
+@pytest.mark.parametrize("robot", ["fr3", "panda"])
+def test_nobody_is_there(robot: str) -> None:
+    host = free_host()
+    said = opening(host, robot)
+    assert said.startswith("ConnectionLost: arm: ")
+    assert host in said
+
+
+def test_the_wrong_model_is_named(emulator: Emulator) -> None:
+    right = model_of(emulator)
+    said = opening(emulator.host, "fr3" if right == "panda" else "panda")
+    assert f"say model: {right}" in said
+
+
+def test_another_version_is_named(emulator: Emulator) -> None:
+    emulator.control.send("version 7")
+    said = opening(emulator.host, model_of(emulator))
+    assert "protocol 7" in said
+
+
+def test_a_second_program_is_told_who_the_first_one_is(emulator: Emulator) -> None:
+    app = App(emulator, model_of(emulator))
+    try:
+        said = opening(emulator.host, model_of(emulator))
+        assert said.startswith("ControlTaken")
+        assert f"process {app.process.pid}" in said
+    finally:
+        app.close()
+
+
+def test_somebody_elses_client_holds_the_arm(emulator: Emulator) -> None:
+    """Another computer's: there is no process here that could be named."""
+    with socket.create_connection((emulator.host, 1337)):
+        said = opening(emulator.host, model_of(emulator))
+    assert said.startswith("ConnectionLost: arm: ")
+
+
+def test_another_tool_at_the_flange_is_refused() -> None:
+    with Emulator("--end-effector", "none") as emulator:
+        said = opening(emulator.host)
+    assert "do not mean the same tool centre point" in said
+    assert "103.4 mm" in said
+
+
+@pytest.mark.parametrize(("arm", "library", "extra"), [("fr3", "pylibfranka", "franka"), ("fer", "panda_py", "panda")])
+def test_a_missing_library_names_the_extra(monkeypatch: pytest.MonkeyPatch, arm: str, library: str, extra: str) -> None:
+    for name in list(sys.modules):
+        if name.startswith(("hal.drivers.franka.fr3", "hal.drivers.franka.panda")):
+            monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, library, None)
+    with pytest.raises(hal.DriverMissing, match=f"pip install 'robot-hal.{extra}.'"):
+        link_to(arm)
+
+
+def test_settings_reach_the_robot(emulator: Emulator) -> None:
+    more = ["robots.arm.real.load={mass: 0.5, com: [0, 0, 0.05]}"]
+    with rig_of(emulator.host, model_of(emulator), *more):
+        pass
+    settings: dict[str, Any] = emulator.control.send("settings")
+    assert "0.5" in json.dumps(settings)
+
+
+def test_an_arm_is_ready_while_another_thread_works(emulator: Emulator) -> None:
+    """A busy thread in the app has nothing to do with the arm's process: no motion is lost."""
+    done = threading.Event()
+
+    def busy() -> None:
+        value = 0
+        while not done.is_set():
+            value = (value * 31 + 7) % 1000003
+
+    thread = threading.Thread(target=busy)
+    with rig_of(emulator.host, model_of(emulator)) as rig:
+        arm = arm_of(rig)
+        thread.start()
+        try:
+            goal = arm.home.copy()
+            goal[0] += 0.1
+            arm.move_to(goal, unattended=True)
+        finally:
+            done.set()
+            thread.join()
+    assert not emulator.events("reflex")
+    assert "success" in emulator.events("motion ended")[-1]["text"]

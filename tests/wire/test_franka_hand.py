@@ -1,0 +1,399 @@
+"""The driver of the Franka Hand, through Franka's own client library, against the emulated hand."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("panda_py", reason="needs panda-python: pip install 'robot-hal[panda]'")
+
+from hal.drivers.franka import hand, hand_calls, hand_link, hand_pilot
+from hal.drivers.franka.hand import FrankaHand
+from hal.errors import CommandError, ConnectionLost, NotSupported
+from hal.specs import GripperSpec
+from hal.types import GripperOutcome
+
+from .franka_kit import free_host
+from .hand_kit import LIMIT, HandBench
+
+DONE, MISSED, STOPPED, FAILED = (GripperOutcome[name] for name in ("DONE", "MISSED", "STOPPED", "FAILED"))
+
+
+@pytest.fixture
+def bench() -> Iterator[HandBench]:
+    """A homed hand, half open."""
+    with HandBench() as bench:
+        yield bench
+
+
+@pytest.fixture
+def brisk(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nobody has to wait as long as a real hand may need."""
+    monkeypatch.setattr(hand_calls, "_SLACK", 0.3)
+    monkeypatch.setattr(hand_pilot, "_STOP_ANSWER", 0.3)
+    monkeypatch.setattr(hand_pilot, "_REST", 0.3)
+    monkeypatch.setattr(hand_link, "_PAUSE", 0.1)
+
+
+def client_of(bench: HandBench) -> int:
+    """Number of the process in which the client library lives."""
+    child = bench.hand._link._child
+    assert child is not None
+    return child.process.pid
+
+
+def test_opening_reads_and_moves_nothing(bench):
+    reading = bench.read()
+    assert (reading.width, reading.width_target, reading.moving, reading.grasped) == (0.04, 0.04, False, False)
+    assert (reading.outcome, reading.fault) == (GripperOutcome.NONE, None)
+    assert 0.0 <= time.monotonic() - reading.t < 1.0
+    later = bench.wait(lambda r: r.seq > reading.seq + 2)
+    assert later.t_device > reading.t_device
+    assert later.t > reading.t
+    bench.hand.open()
+    assert bench.requests == {"connect": 1, "homing": 0, "grasp": 0, "move": 0, "stop": 0}
+
+
+@pytest.mark.parametrize("ends_at_width", ["on", "off"])
+def test_widths_are_reached_whatever_a_grasp_of_nothing_does(ends_at_width):
+    with HandBench() as bench:
+        bench.command(f"grasp-ends-at-width {ends_at_width}")
+        for width in (0.06, 0.03):
+            bench.hand.move(width, 0.1, 40.0)
+            assert bench.read().outcome is GripperOutcome.RUNNING
+            reading = bench.finish()
+            assert (reading.outcome, reading.moving, reading.grasped) == (DONE, False, False)
+            assert (reading.width, reading.width_target) == (pytest.approx(width, abs=0.002), width)
+        newest = bench.command("state")["newest"]
+        assert newest["grasp"] == [0.03, 0.0, 0.08, 0.1, 40.0]
+
+
+def test_what_a_move_closes_on_is_held_until_it_opens(bench):
+    bench.command("object 0.03")
+    bench.hand.move(0.0, 0.1, 35.0)
+    reading = bench.finish()
+    assert (reading.outcome, reading.grasped, reading.width, reading.fault) == (MISSED, True, 0.03, None)
+    assert bench.command("state")["force"] == 35.0
+    before = bench.requests
+    bench.hand.move(0.01, 0.1, 35.0)
+    bench.hand.stop()
+    assert bench.finish().grasped
+    assert bench.requests == before
+    assert bench.command("state")["is_grasped"]
+    bench.hand.move(0.05, 0.1, 35.0)
+    reading = bench.finish()
+    assert (reading.outcome, reading.grasped) == (DONE, False)
+
+
+def test_a_trigger_that_is_pulled_onto_something_ends_with_a_hold():
+    with HandBench(object_width=0.02) as bench:
+        for k in range(25):
+            bench.hand.move(0.04 * (1.0 - k / 24), 0.1, 40.0)
+            seq = bench.read().seq
+            bench.wait(lambda r, seq=seq: r.seq > seq)
+        reading = bench.finish()
+        assert (reading.outcome, reading.grasped, reading.width) == (MISSED, True, 0.02)
+        assert bench.requests["stop"] <= 5
+        assert bench.requests["move"] <= 5
+
+
+def test_a_grasp_holds_what_has_the_right_width_only(bench):
+    bench.command("object 0.03")
+    bench.hand.grasp(0.02, 0.1, 40.0, 0.005, 0.005)
+    assert (bench.finish().outcome, bench.read().grasped) == (MISSED, False)
+    bench.hand.move(0.04, 0.1, 40.0)
+    bench.finish()
+    bench.hand.grasp(0.03, 0.1, 50.0, 0.005, 0.005)
+    assert (bench.finish().outcome, bench.read().grasped) == (DONE, True)
+    assert bench.command("state")["newest"]["grasp"] == [0.03, 0.005, 0.005, 0.1, 50.0]
+    before = bench.requests
+    bench.hand.grasp(0.03, 0.1, 50.0, 0.005, 0.005)
+    assert bench.finish().outcome is DONE
+    bench.hand.grasp(0.03, 0.1, 60.0, 0.005, 0.005)
+    reading = bench.finish()
+    assert reading.outcome is FAILED
+    assert reading.fault is not None
+    assert reading.fault.code == "holding"
+    bench.hand.home()
+    assert bench.finish().outcome is FAILED
+    assert bench.requests == before
+    assert bench.command("state")["is_grasped"]
+
+
+def test_a_hand_that_is_not_homed_says_so_and_is_homed():
+    with HandBench(homed=False) as bench:
+        bench.server.fingers.width = 0.01
+        fault = bench.read().fault
+        assert fault is not None
+        assert fault.code == "not_homed"
+        assert "home" in fault.remedy
+        bench.hand.move(0.08, 0.1, 40.0)
+        assert (bench.finish().outcome, bench.read().fault) == (FAILED, fault)
+        assert bench.requests["move"] == 0
+        bench.hand.home()
+        reading = bench.finish()
+        assert (reading.outcome, reading.fault, reading.width) == (DONE, None, 0.08)
+        assert bench.slowest < 0.3  # the library's own call takes more than a second
+
+
+def test_a_stop_leaves_the_fingers_where_they_are(bench, brisk):
+    bench.hand.move(0.08, 0.02, 40.0)
+    bench.wait(lambda r: r.width > 0.041)
+    bench.hand.stop()
+    assert bench.read().outcome is STOPPED
+    width = bench.wait_server(lambda state: state["motion"] is None)["width"]
+    assert width < 0.08
+    reading = bench.wait(lambda r: not r.moving)
+    assert reading.width == width
+    bench.hand.stop()
+    bench.wait(lambda r: r.seq > reading.seq + 25)
+    assert (bench.read().width, bench.read().fault, bench.requests["stop"]) == (width, None, 1)
+
+
+def test_the_newest_command_wins_and_those_that_had_not_begun_are_dropped(bench):
+    bench.hand.move(0.08, 0.02, 40.0)
+    bench.wait(lambda r: r.width > 0.041)
+    bench.hand.grasp(0.01, 0.1, 40.0, 0.005, 0.005)
+    bench.hand.move(0.03, 0.1, 40.0)
+    reading = bench.finish()
+    assert (reading.outcome, reading.width_target) == (DONE, 0.03)
+    assert reading.width == pytest.approx(0.03, abs=0.002)
+    assert bench.command("state")["newest"]["grasp"][0] == 0.03
+    assert bench.requests["grasp"] == 1
+
+
+def test_a_stop_that_is_ignored_is_told_and_the_next_command_waits(bench, brisk):
+    bench.command("stop-ignored on")
+    bench.hand.move(0.06, 0.02, 40.0)
+    bench.wait(lambda r: r.width > 0.041)
+    bench.hand.stop()
+    reading = bench.wait(lambda r: r.fault is not None)
+    assert reading.fault is not None
+    assert (reading.outcome, reading.fault.code, reading.moving) == (STOPPED, "stop_ignored", True)
+    bench.hand.move(0.07, 0.1, 40.0)
+    assert bench.finish().outcome is DONE
+    assert bench.read().width == pytest.approx(0.07, abs=0.002)
+
+
+def test_a_stop_that_lets_go_is_told(bench, brisk):
+    """States and answers are late, so nobody can know that the fingers hold something when they are told to stop."""
+    for words in ("stop-releases on", "object 0.03", "slow-reply 0.8"):
+        bench.command(words)
+    bench.hand.grasp(0.03, 0.04, 40.0, 0.005, 0.005)
+    bench.wait_server(lambda state: state["motion"] == "grasp")
+    bench.command("silence 0.5")
+    bench.wait_server(lambda state: state["is_grasped"])
+    bench.hand.stop()
+    reading = bench.wait(lambda r: r.fault is not None)
+    assert reading.fault is not None
+    assert (reading.outcome, reading.fault.code, reading.grasped) == (STOPPED, "stop_released", False)
+
+
+def test_a_motion_that_the_hand_refuses_has_failed(bench):
+    bench.command("fail")
+    bench.hand.move(0.08, 0.1, 40.0)
+    reading = bench.finish()
+    assert reading.outcome is FAILED
+    assert reading.fault is not None
+    assert reading.fault.code == "hand_failed"
+    bench.hand.move(0.05, 0.1, 40.0)
+    assert (bench.finish().outcome, bench.read().fault) == (DONE, None)
+
+
+def test_a_motion_that_is_never_answered_is_given_up(bench, brisk):
+    client = client_of(bench)
+    bench.command("slow-reply 1000")
+    bench.hand.move(0.045, 0.1, 40.0)
+    reading = bench.finish()
+    assert reading.outcome is FAILED
+    assert reading.fault is not None
+    assert reading.fault.code == "no_answer"
+    bench.wait_server(lambda state: not state["client"])
+    bench.command("slow-reply 0")
+    bench.wait_back(2)
+    assert client_of(bench) != client
+    bench.hand.move(0.05, 0.1, 40.0)
+    assert bench.finish().outcome is DONE
+
+
+def test_silence_is_a_lost_hand_and_nothing_waits_for_it(bench):
+    bench.command("silence 1.3")
+    assert "silent" in bench.wait_lost()
+    with pytest.raises(ConnectionLost):
+        bench.hand.move(0.08, 0.1, 40.0)
+    bench.wait_back(1)
+    assert bench.slowest < 0.5  # the library waits for a second
+    bench.hand.move(0.05, 0.1, 40.0)
+    assert bench.finish().outcome is DONE
+
+
+@pytest.mark.parametrize("how", ["the hand hangs up", "the client library dies", "the hand restarts"])
+def test_a_connection_comes_back_but_not_the_command_that_it_cost(bench, brisk, monkeypatch, how):
+    """The library itself would wait for ever here, and take a whole core."""
+    monkeypatch.setattr(hand_link, "_SILENT", 0.5)
+    client = client_of(bench)
+    bench.hand.move(0.08, 0.01, 40.0)
+    bench.wait(lambda r: r.width > 0.041)
+    if how == "the hand hangs up":
+        bench.command("drop")
+    elif how == "the client library dies":
+        os.kill(client, signal.SIGKILL)
+    else:
+        bench.command("restart 0.2")
+    reading = bench.wait_back(2)
+    assert reading.outcome is FAILED
+    assert reading.fault is not None
+    assert reading.fault.code == "lost"
+    assert bench.requests["move"] == 1
+    with pytest.raises(ProcessLookupError):
+        os.kill(client, 0)
+    if how == "the hand restarts":
+        bench.hand.move(0.05, 0.1, 40.0)
+        fault = bench.finish().fault
+        assert fault is not None
+        assert fault.code == "not_homed"
+
+
+def test_closing_leaves_alone_what_is_held(bench):
+    bench.command("object 0.03")
+    bench.hand.move(0.0, 0.1, 40.0)
+    bench.finish()
+    client = client_of(bench)
+    before = bench.requests
+    bench.hand.close()
+    bench.hand.close()
+    state = bench.command("state")
+    assert (state["is_grasped"], state["force"], state["requests"]) == (True, 40.0, before)
+    with pytest.raises(ProcessLookupError):
+        os.kill(client, 0)
+    with pytest.raises(ConnectionLost):
+        bench.read()
+
+
+def test_closing_stops_fingers_that_are_on_their_way(bench):
+    bench.hand.move(0.08, 0.01, 40.0)
+    bench.wait(lambda r: r.width > 0.041)
+    bench.hand.close()
+    state = bench.command("state")
+    assert (state["motion"], state["requests"]["stop"]) == (None, 1)
+    assert state["width"] < 0.06
+
+
+def test_nobody_there_is_told_in_one_line():
+    spec = GripperSpec("panda.gripper", "franka", 0.08, 0.1, 40.0, options={"host": "127.0.2.255"})
+    with pytest.raises(ConnectionLost, match="panda.gripper: .*127.0.2.255") as caught:
+        FrankaHand(spec).open()
+    assert "\n" not in str(caught.value)
+
+
+def test_another_protocol_is_told():
+    with HandBench(connect=False, version=4) as bench, pytest.raises(NotSupported, match="protocol 4, .* 3"):
+        bench.hand.open()
+
+
+def test_a_hand_that_another_program_uses_is_told(bench):
+    other = FrankaHand(bench.hand.spec)
+    with pytest.raises(ConnectionLost, match=bench.host):
+        other.open()
+    bench.hand.move(0.05, 0.1, 40.0)
+    assert bench.finish().outcome is DONE
+
+
+def test_a_hand_that_takes_the_connection_and_says_nothing_is_told(monkeypatch):
+    monkeypatch.setattr(hand_link, "_OPEN", 1.0)
+    with HandBench(connect=False) as bench:
+        bench.command("slow-reply 1000")
+        with pytest.raises(ConnectionLost, match="says nothing"):
+            bench.hand.open()
+
+
+def test_numbers_that_cannot_be_are_never_sent(bench):
+    for numbers in ((math.nan, 0.1, 40.0), (0.04, 0.0, 40.0), (0.04, 0.1, -1.0), (0.04, math.inf, 40.0)):
+        with pytest.raises(CommandError):
+            bench.hand.move(*numbers)
+        with pytest.raises(CommandError):
+            bench.hand.grasp(*numbers, 0.005, 0.005)
+    assert bench.requests["move"] == bench.requests["grasp"] == 0
+
+
+def test_numbers_beyond_the_hand_are_brought_into_its_range(bench):
+    bench.hand.move(0.2, 5.0, 40.0)
+    assert bench.finish().outcome is DONE
+    assert bench.command("state")["newest"]["move"] == [0.08, 0.1]
+
+
+def test_a_hand_that_sends_no_states_is_told(monkeypatch):
+    monkeypatch.setattr(hand, "_FIRST_STATE", 0.3)
+    with HandBench(connect=False) as bench:
+        bench.command("silence 1000")
+        with pytest.raises(ConnectionLost, match="no state"):
+            bench.hand.open()
+
+
+def test_the_client_library_ends_with_its_driver(bench):
+    """Also when that is killed."""
+    bench.hand.close()
+    program = (
+        "import sys, time; from hal.drivers.franka.hand import FrankaHand; from hal.specs import GripperSpec; "
+        "hand = FrankaHand(GripperSpec('hand', 'franka', 0.08, 0.1, 40.0, options={'host': sys.argv[1]})); "
+        "hand.open(); print(hand._link._child.process.pid, flush=True); time.sleep(100)"
+    )
+    driver = subprocess.Popen([sys.executable, "-c", program, bench.host], stdout=subprocess.PIPE, text=True)
+    assert driver.stdout is not None
+    client = int(driver.stdout.readline())
+    driver.kill()
+    driver.communicate()
+    deadline = time.monotonic() + LIMIT
+    while Path(f"/proc/{client}").exists():
+        assert time.monotonic() < deadline, "it lives on"
+        time.sleep(0.01)
+    assert not bench.command("state")["client"]
+
+
+def test_the_emulated_hand_is_a_program_too():
+    host = free_host(2)
+    program = [sys.executable, "-m", "hal.drivers.franka.emulator.hand", "--host", host, "--object", "0.03"]
+    with subprocess.Popen(program, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdin is not None
+        assert process.stdout is not None
+        assert host in process.stdout.readline()
+        process.stdin.write("state\nstop-ignored perhaps\n")
+        process.stdin.flush()
+        assert json.loads(process.stdout.readline())["object"] == 0.03
+        assert not json.loads(process.stdout.readline())["ok"]
+        with socket.create_connection((host, 1340), timeout=LIMIT) as control, control.makefile("rw") as lines:
+            for line in ('{"command": ["object", "none"]}', "state", "[1"):
+                lines.write(line + "\n")
+            lines.flush()
+            answers = [json.loads(lines.readline()) for _ in range(3)]
+        assert [answer["ok"] for answer in answers] == [True, True, False]
+        assert answers[1]["object"] is None
+        process.stdin.close()
+        assert process.wait(LIMIT) == 0
+
+
+def test_words_of_the_emulated_hand_that_make_no_sense_are_refused(bench):
+    for words in ("", "help"):
+        assert "object W|none" in bench.command(words)["text"]
+    for words in ("dance", "object", "object wide", "stop-ignored maybe", "silence -1", "drop it"):
+        with pytest.raises(ValueError, match=words.split()[0]):
+            bench.command(words)
+
+
+def test_whoever_is_no_client_is_hung_up_on():
+    with HandBench(connect=False) as bench:
+        with socket.create_connection((bench.host, 1338), timeout=5.0) as stranger:
+            stranger.sendall(b"GET / HTTP/1.1\r\n\r\n")
+            assert stranger.recv(10) == b""
+        bench.hand.open()
+        assert bench.read().width == 0.04

@@ -1,0 +1,99 @@
+"""One recorded drive, four arms: simulated and emulated FR3 and Panda end at the same pose, through the same app."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import hal
+from hal.pose import Pose
+
+from .calm_tour import write_tour
+from .franka_kit import Emulator
+from .rig_kit import arm_of, rig_of
+
+pytest.importorskip("pylibfranka", reason="needs pylibfranka: pip install 'robot-hal[franka]'")
+pytest.importorskip("panda_py", reason="needs panda-python: pip install 'robot-hal[panda]'")
+pytestmark = pytest.mark.slow
+
+APP = Path(__file__).parents[2] / "apps" / "teleop.py"
+RUNS = 20 if os.environ.get("HAL_SOAK") == "1" else 2
+APART, TURNED = 0.002, 0.02
+"""By how much the ends may differ, m and rad."""
+
+
+def teleop(tour: Path, report: Path, *arguments: str) -> dict[str, Any]:
+    """Run the app through the tour; its report."""
+    command = [sys.executable, str(APP), "--config", "franka_emulator", "--pad", str(tour), "--speed", "0.3"]
+    command += ["--set", "cameras={}", "--set", "simulation.clock=lock_step", "--report", str(report), *arguments]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=100)
+    assert done.returncode == 0, done.stdout + done.stderr
+    found: dict[str, Any] = json.loads(report.read_text())
+    return found
+
+
+def end_of(report: dict[str, Any]) -> Pose:
+    end = report["tcp_end"]
+    return Pose(end["position"], end["orientation"])
+
+
+def test_the_same_drive_ends_at_the_same_pose(fr3: Emulator, panda: Emulator, tmp_path: Path) -> None:
+    tour = write_tour(tmp_path / "calm.jsonl")
+    reports = {
+        "simulated": teleop(tour, tmp_path / "sim.json", "--sim"),
+        "FR3": teleop(tour, tmp_path / "fr3.json", "--real", *at(fr3, "fr3")),
+        "Panda": teleop(tour, tmp_path / "panda.json", "--real", *at(panda, "panda")),
+    }
+    for name, report in reports.items():
+        assert report["tcp_travel_m"] >= 0.3, name
+        assert report["trips"] == report["faults"] == [], name
+        assert report["clean_exit"], name
+    for emulator in (fr3, panda):
+        assert not emulator.events("reflex")
+        assert "success" in emulator.events("motion ended")[-1]["text"]
+    for one in reports:
+        for other in reports:
+            distance, angle = end_of(reports[one]).distance(end_of(reports[other]))
+            assert distance <= APART, (one, other)
+            assert angle <= TURNED, (one, other)
+
+
+def at(emulator: Emulator, model: str) -> list[str]:
+    options = [f"robots.arm.real.host={emulator.host}", f"robots.arm.model={model}", "robots.arm.gripper.enabled=false"]
+    return [word for option in options for word in ("--set", option)]
+
+
+@pytest.mark.parametrize("losses", ["lose-commands 0.05", "lose-commands 0.2", "lose-states 0.05"])
+@pytest.mark.parametrize("robot", ["fr3", "panda"])
+def test_packets_that_are_lost_end_no_motion(request: pytest.FixtureRequest, robot: str, losses: str) -> None:
+    """The share of lost packets is far beyond what a cable does; 20 runs each with HAL_SOAK=1, else 2."""
+    emulator: Emulator = request.getfixturevalue(robot)
+    for _ in range(RUNS):
+        emulator.refresh()
+        with rig_of(emulator.host, robot, lock_step=True) as rig:
+            arm = arm_of(rig)
+            emulator.control.send(losses)
+            start = rig.clock.now()
+            with arm.control(rate_hz=50, unattended=True) as control:
+                for tick in rig.clock.rate(50):
+                    t = tick.t - start
+                    turn = np.array([0.06 * np.sin(2 * t), 0.05 * np.cos(3 * t), 0.04 * np.sin(t)])
+                    control.send(hal.Twist(turn, [0.0, 0.0, 0.2 * np.sin(2 * t)]))
+                    if t > 3.0:
+                        break
+            statistics = rig.statistics()["arm"]["robots"]["arm"]
+            emulator.control.send("lose-commands 0")
+            emulator.control.send("lose-states 0")
+        assert not emulator.events("reflex")
+        assert "success" in emulator.events("motion ended")[-1]["text"]
+        if losses.startswith("lose-commands"):
+            assert statistics["reanchored"] > 10, "nothing was lost: the test shows nothing"
+        else:
+            assert statistics["driver"]["lost_states"] > 50
