@@ -50,6 +50,9 @@ class Reading(NamedTuple):
     wrench_ext: Floats | None = None
     fault: Fault | None = None
     """A fault stops and latches the arm."""
+    tau_commanded: Floats | None = None
+    """In torque mode: the torques that the device says it took last, Nm; none at all before it has changed its mode.
+    The servo goes on from these, as it does from ``q_commanded``."""
 
 
 class Setpoint(NamedTuple):
@@ -126,6 +129,14 @@ class RobotDriver(ABC):
         block, ``read`` gives the state that the callback was called with and ``write`` keeps what it is to return.
         """
         raise NotSupported(f"driver {type(self).__name__} does not own a loop")
+
+    def mass_matrix(self, q: Floats) -> Any:
+        """Joint-space inertia (n, n), kg m2, at joint positions ``q``, rad: numbers in rows, or an array.
+
+        Of drivers that take torques: the servo brakes by it, and bounds what it lets through. Three times too much or
+        too little is still good enough; that of a URDF whose inertias are invented is not.
+        """
+        raise NotSupported(f"driver {type(self).__name__} does not know the arm's inertia")
 
     def own_tcp(self) -> Floats | None:
         """Where the device itself says that its tcp was in the last reading: 4x4 by columns, in the base frame, m.

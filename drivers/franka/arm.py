@@ -9,12 +9,15 @@ from __future__ import annotations
 
 import contextlib
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from math import inf
 from typing import Any, ClassVar
 
+from hal.config.data_files import find_data
 from hal.errors import ConnectionLost, HalError, RobotFault
 from hal.histogram import Histogram
+from hal.kinematics import Kinematics
 from hal.machine import has_realtime_kernel
 from hal.robot import Reading, RobotDriver, Setpoint
 from hal.specs import RobotSpec
@@ -68,6 +71,7 @@ class FrankaArm(RobotDriver):
         self._lost: Fault | None = None
         """Why there is no connection."""
         self._configured = False
+        self._inertias: Kinematics | None = None
         self._retry_at = 0.0
         self.success_min = inf
         """Lowest success rate so far."""
@@ -177,7 +181,9 @@ class FrankaArm(RobotDriver):
         if s.mode not in _CALM:
             fault = self._present_fault(s)
         seq = round(1e3 * s.t)
-        return Reading(now, s.t, seq, s.q, s.dq, s.tau, s.q_d, s.dq_d, s.tau_ext, s.wrench_ext, fault)
+        driven = self._link is not None and self._link.motion is Kind.TORQUE
+        taken = s.tau_d if driven else (0.0,) * 7  # else it is what its own controller wants
+        return Reading(now, s.t, seq, s.q, s.dq, s.tau, s.q_d, s.dq_d, s.tau_ext, s.wrench_ext, fault, taken)
 
     def write(self, setpoint: Setpoint) -> None:
         link = self._link
@@ -220,6 +226,20 @@ class FrankaArm(RobotDriver):
         if link.motion is None:  # a library with a loop of its own ends a motion when the cycle returns to it
             self._configure()
             link.start(kind)
+
+    def mass_matrix(self, q: Sequence[float]) -> Any:
+        """Joint-space inertia (n, n), kg m2, at ``q``, by the published inertias of an FR3 with its hand.
+
+        A Panda has the same lengths and nearly the same masses; the URDF that comes with PyBullet invents inertias.
+        """
+        if self._inertias is None:
+            spec = self.spec.kinematics
+            if self.settings.arm != "fr3":
+                joints = tuple(f"fr3_joint{k}" for k in range(1, 8))
+                urdf = str(find_data("robots", "fr3.urdf"))
+                spec = replace(spec, urdf=urdf, joints=joints, base_link=None, tcp_link="fr3_hand")
+            self._inertias = Kinematics(spec)
+        return self._inertias.mass_matrix(q)
 
     def halt(self) -> None:
         """End the motion: the robot holds by itself."""

@@ -49,6 +49,8 @@ class Sample(NamedTuple):
     q_d: Floats
     """The joint positions that the controller took last, rad."""
     dq_d: Floats
+    tau_d: Floats
+    """The torques that the controller took last, Nm."""
     tau_ext: Floats
     wrench_ext: Floats
     success_rate: float
@@ -154,6 +156,7 @@ class Link(ABC):
             state.tau_J,
             state.q_d,
             state.dq_d,
+            state.tau_J_d,
             state.tau_ext_hat_filtered,
             state.O_F_ext_hat_K,
             state.control_command_success_rate,

@@ -121,6 +121,7 @@ class MockRobot(RobotDriver):
             tau_ext=knobs.tau_ext,
             wrench_ext=knobs.wrench_ext,
             fault=fault,
+            tau_commanded=self._commanded.tau,
         )
 
     def write(self, setpoint: Setpoint) -> None:

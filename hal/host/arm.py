@@ -36,7 +36,8 @@ class ArmUnit:
         self.mail = mail
         self.driver: RobotDriver = registry.load(spec.driver, "robot")(spec, world)
         self.kinematics = Kinematics(spec.kinematics)
-        self.servo = Servo(spec, dt, self.kinematics)
+        mass_matrix = self.driver.mass_matrix if "torque" in self.driver.modes else None
+        self.servo = Servo(spec, dt, self.kinematics, mass_matrix)
         self.reset_statistics()
         self.reading: Reading | None = None
         self.error: ConnectionLost | None = None
@@ -151,7 +152,7 @@ class ArmUnit:
             self._lose(error)
             return
         self._t_written = now
-        self.audit.add(setpoint.q)
+        self.audit.take(setpoint)
 
     def finish_session(self) -> bool:
         """After the last set-point of a session: hand the arm back to its own hold. True while none is open."""

@@ -152,7 +152,9 @@ class Servo:
         torque.see(reading if self._is_known(reading, device) else None)
         if torque.active:
             device = device or self._overruns()
-        elif session is not None and self._anchoring.look(reading, not device, self._sent if ready is not None else None):
+        elif session is not None and self._anchoring.look(
+            reading, not device, self._sent if ready is not None else None
+        ):
             ready = None
             self.report.reanchored += 1
             self._envelope.limited = Limited.REANCHORED

@@ -106,6 +106,8 @@ class TorqueMotion(Motion):
         if self.active:
             self._weigh()  # where the arm was a tick ago: it is the same, and may be computed ahead
         self.q, self.dq = reading.q, reading.dq
+        if self.active and reading.tau_commanded is not None:
+            self._tau = list(reading.tau_commanded)  # what was lost on its way must not make the next step greater
         self._still = self._still + dt if max(map(abs, reading.dq)) < _REST else 0.0
         if self.active:
             self._look()

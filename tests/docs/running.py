@@ -119,7 +119,8 @@ class Reader:
         for make in names["ROBOTS"].values():
             for test in tests:
                 with make() as bench:
-                    test(bench)
+                    if "torqued" not in inspect.signature(test).parameters or "torque" in bench.driver.modes:
+                        test(bench)
 
     # Commands.
 

@@ -17,7 +17,7 @@ from torque_kit import NOTHING, Driven, N, one, wheels
 from hal.commands import Kind
 from hal.drivers.mock.robot import MockRobot
 from hal.inbox import Session
-from hal.robot import Reading
+from hal.robot import Reading, Setpoint
 from hal.servo.servo import Servo
 from hal.specs import WorkspaceSpec
 from hal.types import Fault, Limited, RobotStatus, Trip
@@ -249,16 +249,15 @@ class TestStopping:
 
 
 class TestGuards:
-    def pushed(self, arm: Driven, tau: list[float]) -> None:
-        """Somebody pushes: the driver gets these torques on top of the servo's."""
-        write = arm.driver.write
+    def pushed(self, arm: Driven, push: list[float]) -> None:
+        """Somebody pushes with these torques, Nm."""
+        driven = arm.driver._driven
 
-        def pushing(setpoint):  # type: ignore[no-untyped-def]
-            if setpoint.tau is not None:
-                setpoint = setpoint._replace(tau=[x + y for x, y in zip(setpoint.tau, tau, strict=True)])
-            write(setpoint)
+        def and_pushed(tau: list[float], dt: float) -> Setpoint:
+            moved: Setpoint = driven([x + y for x, y in zip(tau, push, strict=True)], dt)
+            return moved._replace(tau=tau)
 
-        arm.driver.write = pushing
+        arm.driver._driven = and_pushed
 
     def test_an_arm_that_is_pushed_too_fast_trips(self) -> None:
         arm = wheels(tcp_speed=9.0)
@@ -438,6 +437,17 @@ class TestTheDevice:
         arm.until_held()
         arm.drive(0.2, one(0, 3.0))
         assert arm.state == (RobotStatus.TRIPPED, Trip.DEVICE_LOST)
+
+    def test_torques_that_were_lost_do_not_make_the_next_step_greater(self) -> None:
+        arm = wheels(tcp_speed=9.0)
+        arm.drive(0.05)
+        arm.driver.inject(drop=2)
+        before = len(arm.driver.log)
+        arm.drive(0.1, one(0, 20.0))
+        taken = [setpoint.tau[0] for setpoint in list(arm.driver.log)[before::2]]
+        steps = np.abs(np.diff([0.0, *taken]))
+        assert steps.max() == pytest.approx(990.0 * arm.dt)
+        assert max(taken) > 10.0
 
     def test_one_that_answers_again_soon_is_braked_on(self) -> None:
         arm = moving()

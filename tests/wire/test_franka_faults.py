@@ -114,7 +114,7 @@ def test_a_fault_is_named_and_the_arm_can_go_on(emulator: Emulator, rig: Rig, ca
     again.go(rig, 0.5)
     assert again.error is None, again.error
     assert "success" in emulator.events("motion ended")[-1]["text"]
-    named = f"{case.error.__name__}: {error}"
+    named = f"{case.error.__name__}: {str(error).partition(';')[0]}"
     if drive.t_stale:
         named = f"StaleStateError after {1e3 * (drive.t_stale - struck[0]):.0f} ms, then {named}"
     how = [f"`{case.undo}`"] if case.undo else []
