@@ -2,9 +2,9 @@
 
     python benchmarks/servo_tick.py [ticks] [--idle]
 
-"Prepared" is the tick that a host sees: what depends on the set-point alone was computed after the last write, which
-takes the time in the next column. ``--idle`` waits for the rest of each millisecond, as a host does: what a processor
-has forgotten meanwhile is part of the truth.
+"Prepared" is the tick of a device that sets the pace (a Franka): the set-point was computed after the last write, which
+takes the time in the next column, and is handed out when the device took the last one. ``--idle`` waits for the rest of
+each millisecond, as a host does: what a processor has forgotten meanwhile is part of the truth.
 
 Times differ from machine to machine and from minute to minute; the last column, the ratio to the reference measured in
 turn with it, is what to compare.
@@ -121,7 +121,7 @@ def measure(
             q = [x + v / RATE_HZ for x, v in zip(q, dq, strict=True)]
         if prepared:
             begun = time.perf_counter_ns()
-            servo.prepare()
+            servo.prepare(inbox)
             ahead.append(time.perf_counter_ns() - begun)
         if idle:
             time.sleep(max(0.0, due - time.perf_counter()))

@@ -7,7 +7,6 @@ the robot does not answer ─► lost; a new connection is tried, and what moved
 
 from __future__ import annotations
 
-import contextlib
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -15,7 +14,7 @@ from math import inf
 from typing import Any, ClassVar
 
 from hal.config.data_files import find_data
-from hal.errors import ConnectionLost, HalError, RobotFault
+from hal.errors import RobotFault
 from hal.histogram import Histogram
 from hal.kinematics import Kinematics
 from hal.machine import has_realtime_kernel
@@ -23,30 +22,20 @@ from hal.robot import Reading, RobotDriver, Setpoint
 from hal.specs import RobotSpec
 from hal.types import Fault
 
-from .claim import Claim
-from .faults import ARM_PORT, fault_of, fault_of_exception, is_connection_lost
+from .connection import Connection
+from .faults import fault_of, fault_of_exception, is_connection_lost
 from .flags import FLAGS
 from .link import Kind, Link, Mode, Sample
-from .links import link_to
-from .preflight_network import Answer, knock
 from .settings import ArmSettings
 
 __all__ = ["FrankaArm"]
 
-_RETRY = 0.5
-"""s between attempts to find a lost robot again."""
-_PATIENCE, _KNOCK = 2.0, 0.05
-"""s to wait for a robot that is asked whether it is there, at first and when it was lost."""
-_BREATH = 0.02
-"""s between that question and the connection, so that the robot does not take them for two clients."""
-_SAYS = {
-    Answer.REFUSED: "Connection to FCI refused",
-    Answer.SILENT: "Connection timeout",
-    Answer.NO_WAY: "Connection error",
-}
-"""How the libraries would say it."""
 _RECOVERY = 3.0
 """Longest time that a recovery may take until the robot is idle, s."""
+_AVERAGE = 200
+"""Commands after which a success rate, which is an average of the last 100, says something."""
+_NO_TORQUE = (0.0,) * 7
+_NOTHING_SHOWN: tuple[Mode | None, Fault | None] = (None, None)
 _CALM = frozenset({Mode.IDLE, Mode.MOVE})
 _BY_HAND = frozenset({Mode.USER_STOPPED, Mode.GUIDING, Mode.OTHER})
 """What a person brought about at the arm or in Desk, and ends there."""
@@ -61,18 +50,13 @@ class FrankaArm(RobotDriver):
     def __init__(self, spec: RobotSpec, world: object | None = None) -> None:
         super().__init__(spec, world)
         self.settings = ArmSettings.of(spec)
-        self._link: Link | None = None
-        self._troubles: tuple[type[Exception], ...] = (RuntimeError,)
-        """What the library raises of its own."""
-        self._claim: Claim | None = None
+        self._connection = Connection(spec.name, self.settings)
         self._sample: Sample | None = None
         self._fault: Fault | None = None
         """What ended a motion; kept until recover(), though the robot may be idle again."""
-        self._lost: Fault | None = None
-        """Why there is no connection."""
-        self._configured = False
+        self._shown = _NOTHING_SHOWN
+        """The mode that was looked at last, and what it means."""
         self._inertias: Kinematics | None = None
-        self._retry_at = 0.0
         self.success_min = inf
         """Lowest success rate so far."""
         self._success: float | None = None
@@ -84,147 +68,92 @@ class FrankaArm(RobotDriver):
 
     def open(self) -> None:
         """Connect, and tell the robot the rig's settings. Nothing moves."""
-        self._claim = Claim(self.settings.host)
-        try:
-            link = link_to(self.settings.arm)
-            self._find(_PATIENCE)
-            self._connect(link)
-        except BaseException as error:
-            self.close()
-            if isinstance(error, self._troubles) and not isinstance(error, HalError):
-                raise self._connection_lost(self._explain(error)) from None
-            raise
-
-    def _find(self, patience: float) -> None:
-        """Raise ConnectionLost when nobody listens there: a library that calls nobody may hang for a minute."""
-        answer = knock(self.settings.host, ARM_PORT, patience)
-        if answer is not Answer.OPEN:
-            raise self._connection_lost(self._explain(RuntimeError(_SAYS[answer])))
-        time.sleep(_BREATH)
-
-    def _connect(self, link: Link) -> None:
-        self._link = link
-        self._troubles = link.troubles
-        link.connect(self.settings.host)
-        self._configured = False
-        self._sample = link.read()
-        self._configure()
-        self._lost = None
-
-    def _configure(self) -> None:
-        """A robot that is stopped or in reflex takes no settings; it gets them before it moves."""
-        if not self._configured and self._link is not None and self._now_in() is Mode.IDLE:
-            self._link.configure(self.settings)
-            self._configured = True
+        self._sample = self._connection.open()
 
     def own_tcp(self) -> list[float] | None:
         """Where the robot says that its end effector is: 4x4 by columns, in the base frame, m."""
-        return None if self._link is None else self._link.tcp()
+        link = self._connection.link
+        return None if link is None else link.tcp()
 
     def close(self) -> None:
         """End the motion, if there is one, and disconnect. Idempotent."""
         try:
-            if self._link is not None:
-                if not self._link.owns_loop:
-                    self.halt()
-                self._link.disconnect()
+            link = self._connection.link
+            if link is not None and not link.owns_loop:
+                self.halt()
         finally:
-            self._link = None
-            if self._claim is not None:
-                self._claim.release()
-                self._claim = None
-
-    def _lose(self, reason: Fault) -> None:
-        """The robot does not answer: the library's object is of no use any more."""
-        self._lost = reason
-        self._retry_at = time.monotonic() + _RETRY
-        link, self._link = self._link, None
-        if link is not None:
-            with contextlib.suppress(*self._troubles):  # it may complain that it could not say goodbye
-                link.disconnect()
-
-    def _look_for_it(self) -> None:
-        """One attempt to connect again, now and then; in between, a pause instead of the robot's pace."""
-        if time.monotonic() < self._retry_at:
-            time.sleep(0.01)
-            return
-        try:
-            self._find(_KNOCK)
-            self._connect(link_to(self.settings.arm))
-            self.reconnects += 1
-        except ConnectionLost as error:
-            self._lose(error.fault or self._explain(error))
-        except self._troubles as error:
-            self._lose(self._explain(error))
+            self._connection.close()
 
     # Every cycle.
 
     def wait(self) -> None:
-        link = self._link
-        if link is None:
-            self._look_for_it()
+        connection = self._connection
+        if connection.link is None:
+            self._sample = connection.look_for_it() or self._sample
             return
         before = self._sample
         try:
-            self._sample = link.read()
-        except self._troubles as error:
+            self._sample = connection.link.read()
+        except connection.troubles as error:
             self._failed(error)
         self._t_received = time.perf_counter()
         if before is not None and self._sample is not None:
             self.lost_states += max(0, round(1e3 * (self._sample.t - before.t)) - 1)
 
     def read(self, now: float) -> Reading:
-        s = self._sample
-        if self._lost is not None or s is None:
-            raise self._connection_lost(self._lost)
-        fault = self._fault
-        if s.mode not in _CALM:
-            fault = self._present_fault(s)
+        s, link = self._sample, self._connection.link
+        if link is None or s is None:
+            raise self._connection.error()
+        if s.mode in _CALM:
+            fault, self._shown = self._fault, _NOTHING_SHOWN
+        else:
+            fault = self._present_fault(link, s.mode)
+        # In torque mode: what drives the arm. Else tau_d is what its own controller wants.
+        taken = s.tau_d if link.motion is Kind.TORQUE else _NO_TORQUE
         seq = round(1e3 * s.t)
-        driven = self._link is not None and self._link.motion is Kind.TORQUE
-        taken = s.tau_d if driven else (0.0,) * 7  # else it is what its own controller wants
         return Reading(now, s.t, seq, s.q, s.dq, s.tau, s.q_d, s.dq_d, s.tau_ext, s.wrench_ext, fault, taken)
 
     def write(self, setpoint: Setpoint) -> None:
-        link = self._link
-        if link is None:
-            raise self._connection_lost(self._lost)
-        if self._fault is not None or self._now_in() not in _CALM:
+        s, link = self._sample, self._connection.link
+        if link is None or s is None:
+            raise self._connection.error()
+        if self._fault is not None or s.mode not in _CALM:
             return
         kind = self._kind(setpoint)
         try:
             if link.motion is not kind:
-                self._begin(link, kind)
+                self._begin(link, kind, s)
                 return
-            link.send(self._values(kind, setpoint))
-        except self._troubles as error:
+            link.send(self._values(kind, setpoint, s))
+        except self._connection.troubles as error:
             self._failed(error)
             return
         self.commands += 1
         if not link.owns_loop:
             self.answer_times.add(time.perf_counter() - self._t_received)
-        self._note_success()
+        self._success = s.success_rate
+        if self.commands > _AVERAGE:
+            self.success_min = min(self.success_min, s.success_rate)
 
     def _kind(self, setpoint: Setpoint) -> Kind:
         if setpoint.tau is not None:
             return Kind.TORQUE
         return Kind.VELOCITY if self.settings.stream == "velocity" else Kind.POSITION
 
-    def _values(self, kind: Kind, setpoint: Setpoint) -> Any:
+    def _values(self, kind: Kind, setpoint: Setpoint, s: Sample) -> Any:
         if kind is Kind.TORQUE:
             return setpoint.tau
         if kind is Kind.POSITION:
             return setpoint.q
         # The velocity that brings the controller's own position to the set-point in one cycle: nothing drifts.
-        assert self._sample is not None
-        return [(q - q_d) * self.spec.rate_hz for q, q_d in zip(setpoint.q, self._sample.q_d, strict=True)]
+        return [(q - q_d) * self.spec.rate_hz for q, q_d in zip(setpoint.q, s.q_d, strict=True)]
 
-    def _begin(self, link: Link, kind: Kind) -> None:
+    def _begin(self, link: Link, kind: Kind, s: Sample) -> None:
         """Start a motion of this kind; where another one runs, end that first."""
         if link.motion is not None:
             link.finish()
         if link.motion is None:  # a library with a loop of its own ends a motion when the cycle returns to it
-            self._configure()
+            self._connection.configure(s)
             link.start(kind)
 
     def mass_matrix(self, q: Sequence[float]) -> Any:
@@ -243,22 +172,23 @@ class FrankaArm(RobotDriver):
 
     def halt(self) -> None:
         """End the motion: the robot holds by itself."""
-        link = self._link
+        link = self._connection.link
         if link is None or link.motion is None:
             return
         try:
             link.finish()
-        except self._troubles as error:
+        except self._connection.troubles as error:
             self._failed(error)
 
     @property
     def wants_loop(self) -> bool:
         """A Panda's motion runs in its library's loop."""
-        return self._link is not None and self._link.owns_loop and self._link.motion is not None
+        link = self._connection.link
+        return link is not None and link.owns_loop and link.motion is not None
 
     def loop(self, turn: Callable[[], None]) -> None:
         """Run the motion that was begun."""
-        link = self._link
+        link = self._connection.link
         assert link is not None
         failed: list[BaseException] = []
 
@@ -273,7 +203,7 @@ class FrankaArm(RobotDriver):
         try:
             link.run(guarded)
         except BaseException as error:
-            if failed or not isinstance(error, self._troubles):
+            if failed or not isinstance(error, self._connection.troubles):
                 raise
             self._failed(error)
 
@@ -281,61 +211,51 @@ class FrankaArm(RobotDriver):
 
     def _failed(self, error: Exception) -> None:
         """A call of the library failed: is the robot gone, or did it end the motion?"""
-        link = self._link
+        connection = self._connection
+        link = connection.link
         assert link is not None
         link.abandon()
         if is_connection_lost(error):
-            self._lose(self._explain(error))
+            connection.lose(connection.explain(error))
             return
         self.aborts += 1
         self._fault = fault_of_exception(error, **self._circumstances())
         try:
-            self._sample = link.read()
-        except self._troubles as other:
-            self._lose(self._explain(other))
+            self._sample = s = link.read()
+        except connection.troubles as other:
+            connection.lose(connection.explain(other))
             return
-        if self._sample.mode in _BY_HAND:
+        if s.mode in _BY_HAND:
             self._fault = None  # it is there for as long as the robot says so
 
-    def _present_fault(self, s: Sample) -> Fault | None:
+    def _present_fault(self, link: Link, mode: Mode) -> Fault | None:
         """What keeps the robot from moving. What ended the motion explains a reflex best; the rest is as it is now."""
-        if s.mode is Mode.REFLEX and self._fault is not None:
+        if mode is Mode.REFLEX and self._fault is not None:
             return self._fault
-        assert self._link is not None
-        return fault_of(self._link.errors(FLAGS), s.mode.name.lower(), **self._circumstances())
+        if mode is not self._shown[0]:
+            self._shown = (mode, fault_of(link.errors(FLAGS), mode.name.lower(), **self._circumstances()))
+        return self._shown[1]
 
     def _circumstances(self) -> dict[str, Any]:
         return {"success_rate": self._success, "realtime_kernel": has_realtime_kernel()}
-
-    def _explain(self, error: BaseException) -> Fault:
-        return fault_of_exception(error, host=self.settings.host)
-
-    def _connection_lost(self, fault: Fault | None) -> ConnectionLost:
-        fault = fault or Fault("closed", "it is not open", "open the rig")
-        error = ConnectionLost(f"{self.spec.name}: {fault.cause}; {fault.remedy}")
-        error.fault = fault
-        return error
-
-    def _now_in(self) -> Mode | None:
-        return None if self._sample is None else self._sample.mode
 
     def recover(self) -> None:
         """Automatic error recovery, and wait until the robot is idle.
 
         Raises RobotFault where that cannot help (user stop, guiding), ConnectionLost when the robot does not answer.
         """
-        link = self._link
-        if link is None:
-            raise self._connection_lost(self._lost)
+        link, s = self._connection.link, self._sample
+        if link is None or s is None:
+            raise self._connection.error()
         if link.motion is not None:
             return
         try:
-            if self._now_in() is Mode.REFLEX:
+            if s.mode is Mode.REFLEX:
                 link.recover()
             self._await_idle(link)
         except RobotFault:
             raise
-        except self._troubles as error:
+        except self._connection.troubles as error:
             fault = fault_of_exception(error, **self._circumstances())
             raise RobotFault(fault.cause, fault.remedy) from None
         self._fault = None
@@ -347,20 +267,15 @@ class FrankaArm(RobotDriver):
             if s.mode is Mode.IDLE:
                 return
             if s.mode in (Mode.USER_STOPPED, Mode.GUIDING) or time.monotonic() > deadline:
-                fault = self._present_fault(s) or Fault(s.mode.name.lower(), "the robot is not idle", "look at Desk")
-                raise RobotFault(fault.cause, fault.remedy)
+                fault = self._present_fault(link, s.mode)
+                raise RobotFault(
+                    fault.cause if fault else "the robot does not get ready", fault.remedy if fault else "look at Desk"
+                )
 
     # Statistics.
 
-    def _note_success(self) -> None:
-        """The lowest success rate of motions that are longer than what the rate is an average of."""
-        assert self._sample is not None
-        self._success = self._sample.success_rate
-        if self.commands > 200:
-            self.success_min = min(self.success_min, self._success)
-
     def reset_statistics(self) -> None:
-        self.commands = self.lost_states = self.reconnects = self.aborts = 0
+        self.commands = self.lost_states = self.aborts = 0
         self.success_min = inf
         self.answer_times = Histogram(2e-6, 2500)
 
@@ -371,5 +286,5 @@ class FrankaArm(RobotDriver):
             "success_rate_min": None if self.success_min == inf else self.success_min,
             "received_to_sent_s": self.answer_times.summary(),
             "aborts": self.aborts,
-            "reconnects": self.reconnects,
+            "reconnects": self._connection.found_again,
         }

@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import socket
 import struct
+import time
 
 from hal.errors import ControlTaken
 
@@ -20,19 +21,31 @@ class Claim:
     The robot itself refuses a second client too, but cannot say who the first one is.
     """
 
-    def __init__(self, host: str) -> None:
-        """Raises ControlTaken, with the other process's number, while somebody else holds the arm at ``host``."""
+    def __init__(self, host: str, patience: float = 1.0) -> None:
+        """Raises ControlTaken, with the other process's number, while somebody else holds the arm at ``host``.
+
+        The arm's process of a program that has just ended brakes first: so it is waited for, ``patience`` s.
+        """
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
         name = f"\0hal-franka-{host}"[:_LONGEST]
+        deadline = time.monotonic() + patience
+        while not self._take(name):
+            if time.monotonic() > deadline:
+                self._socket.close()
+                owner = _owner(name)
+                raise ControlTaken(f"the arm at {host} is in use by another program on this computer{owner}")
+            time.sleep(0.02)
+
+    def _take(self, name: str) -> bool:
         try:
             self._socket.bind(name)
-            self._socket.listen(1)
         except OSError as error:
+            if error.errno == errno.EADDRINUSE:
+                return False
             self._socket.close()
-            if error.errno != errno.EADDRINUSE:
-                raise
-            owner = _owner(name)
-            raise ControlTaken(f"the arm at {host} is in use by another program on this computer{owner}") from None
+            raise
+        self._socket.listen(1)
+        return True
 
     def release(self) -> None:
         """Let go. Idempotent."""

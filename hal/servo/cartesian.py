@@ -52,9 +52,6 @@ _BRAKE = (0.8, 0.5)
 class _CartesianMotion(Motion):
     """What twists and poses share."""
 
-    def prepare(self) -> None:
-        self.envelope.prepare()
-
     def _follow_twist(self, twist: list[float]) -> None:
         """One tick towards this twist (6,) of the tcp, along the base's axes."""
         envelope, smoother = self.envelope, self.smoother

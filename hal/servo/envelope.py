@@ -149,10 +149,6 @@ class Envelope:
         """From twists of the tcp to joint speeds at the set-point."""
         return self._tcp.inverse()
 
-    def prepare(self) -> None:
-        """Compute ahead what `here` and `inverse` will answer in the next tick."""
-        self._tcp.prepare()
-
     def far_from_faces(self) -> bool:
         """Is the tcp surely where no face of the workspace slows it down?"""
         return self.workspace is None or self._tcp.surely_inside(self.goal_tcp_speed / _FACE_GAIN)

@@ -49,9 +49,6 @@ class Motion(ABC):
         """Is this first target farther from the set-point than a stream may begin?"""
         return False
 
-    def prepare(self) -> None:  # noqa: B027  # most have nothing to compute ahead
-        """The tick is over: compute ahead what the next one will need, and change nothing else."""
-
     @abstractmethod
     def accept(self, command: CommandRecord) -> None:
         """Follow this command from now on; it is ``usable``."""

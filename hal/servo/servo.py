@@ -192,7 +192,7 @@ class Servo:
         self._forget_goals()
         return self._move(now, RobotStatus.LOST) if ready is None else ready
 
-    def prepare(self, inbox: Inbox | None = None) -> None:
+    def prepare(self, inbox: Inbox) -> None:
         """Compute the next set-point ahead, in the idle part of the cycle: after the write.
 
         For a device that wants its answer quickly (a Franka: within 0.3 ms of its state). The next tick then only looks
@@ -201,9 +201,6 @@ class Servo:
         """
         if self._torque.active:
             self._torque.prepare()
-        elif inbox is None:
-            if self._motion is not None:
-                self._motion.prepare()
         elif self._session is not None and self._t_tick is not None:
             now, device, late, faulty = self._seen
             smoother = self._smoother

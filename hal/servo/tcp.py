@@ -54,8 +54,6 @@ class TcpReference:
         """Joint positions of the reference; infinitely far before the first look."""
         self._pose: Pose7 = (inf,) * 7
         self._jacobian: Any = None
-        self._prepared: tuple[Floats, Pose7, Any, Inverse] | None = None
-        """Pose, Jacobian and its inverse at a set-point, computed ahead of the tick that will ask for them."""
         self._rows: list[list[float]] = []
         """The linear Jacobian there, (3, n)."""
         self._stretch = inf
@@ -103,24 +101,11 @@ class TcpReference:
 
     def inverse(self) -> Inverse:
         """From twists of the tcp to joint speeds at the set-point, which becomes the reference."""
-        q = self._smoother.q
-        prepared = self._prepared
-        if prepared is not None and prepared[0] is q:
-            return prepared[3]
-        return self._kinematics.inverse(q, self.here()[1])
-
-    def prepare(self) -> None:
-        """Compute now what `here` and `inverse` will be asked for in the next tick. Changes none of their answers."""
-        q = self._smoother.q
-        pose, jacobian = self._kinematics.fk_and_jacobian(q)
-        self._prepared = (q, pose, jacobian, self._kinematics.inverse(q, jacobian))
+        return self._kinematics.inverse(self._smoother.q, self.here()[1])
 
     def _look(self) -> None:
         q = self._smoother.q
-        if self._prepared is not None and self._prepared[0] is q:
-            _, pose, jacobian, _ = self._prepared
-        else:
-            pose, jacobian = self._kinematics.fk_and_jacobian(q)
+        pose, jacobian = self._kinematics.fk_and_jacobian(q)
         self._at, self._pose, self._jacobian = q, pose, jacobian
         self._rows = jacobian[:3].tolist()
         self._stretch = hypot(*chain.from_iterable(self._rows))

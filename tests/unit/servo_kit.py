@@ -75,7 +75,10 @@ class Bench:
         self.late = False
         """Was there a pause that the clock does not show?"""
         self.prepares = False
-        """Does the host use the idle part of its cycle?"""
+        """Does the host have set-points computed ahead?"""
+        self.delays = False
+        """Does the servo hear what the app says one tick later?"""
+        self._heard: Inbox | None = None
         self.fault: Fault | None = None
         self.reading: dict[str, Any] = {}
         """What the next readings say instead of the truth."""
@@ -131,9 +134,12 @@ class Bench:
         self.ticks += 1
         values = {"q": self.q, "dq": STILL, "fault": self.fault} | self.reading
         reading = Reading(values.pop("t", self.now), self.now, values.pop("seq", self.ticks), **values)
-        setpoint = self.servo.tick(self.now, reading, self.inbox(), self.late)
-        if self.prepares:
-            self.servo.prepare()
+        inbox, self._heard = self._heard or self.inbox(), None
+        setpoint = self.servo.tick(self.now, reading, inbox, self.late)
+        if self.prepares or self.delays:
+            self._heard = self.inbox()
+        if self.prepares and self._heard is not None:
+            self.servo.prepare(self._heard)
         return self._take(setpoint)
 
     def lose(self) -> Setpoint | None:

@@ -53,8 +53,10 @@ class Device:
 
 @pytest.mark.parametrize("kind", ["repeats", "extrapolates"])
 @pytest.mark.parametrize("loss", [0.0, 0.05])
-def test_a_device_that_misses_set_points(kind: str, loss: float) -> None:
+@pytest.mark.parametrize("ahead", [False, True], ids=["at once", "computed ahead"])
+def test_a_device_that_misses_set_points(kind: str, loss: float, ahead: bool) -> None:
     bench = Bench(rate_hz=1000.0)
+    bench.prepares = ahead
     device = Device(bench, kind)
     rng = random.Random(4)
     target = list(bench.q)

@@ -133,7 +133,7 @@ class Driven:
             self.given.append(self.setpoint)
             self.audit.take(self.setpoint)
         if self.prepared:
-            self.servo.prepare()
+            self.servo.prepare(self.inbox())
         return self.setpoint
 
     def run(self, seconds: float) -> None:
