@@ -104,6 +104,8 @@ class Session:
         self.line = StatusLine()
         self.end = rig.clock.now() + args.duration if args.duration else None
         self.stopped: str | None = None
+        self.hand = ""
+        """What is wrong with the gripper."""
         if rig.console is not None:
             rig.console.explain(teleop.labels(actions=("home",)))
 
@@ -143,7 +145,7 @@ class Session:
 
     def _turn(self) -> bool:
         """Drive, and go home when that was asked for. False when the run is over."""
-        from hal.errors import MotionStopped
+        from hal.errors import ConnectionLost, MotionStopped, RobotFault, StaleStateError
 
         try:
             go_on = self._drive()
@@ -151,9 +153,14 @@ class Session:
                 self._go_home()
         except MotionStopped as stop:  # a new session wants the stop to be acknowledged first
             self._tripped(stop)
-            self.rig.clock.sleep(0.1)
-            return not self._over()
-        return go_on
+        except RobotFault as fault:
+            self._faulted(fault)
+        except (ConnectionLost, StaleStateError) as lost:
+            self._lost(lost)
+        else:
+            return go_on
+        self.rig.clock.sleep(0.1)
+        return not self._over()
 
     def _drive(self) -> bool:
         """Follow the pad. True when the home button was pressed, False when the run is over."""
@@ -220,6 +227,12 @@ class Session:
     def _over(self) -> bool:
         return self.pad.finished or (self.end is not None and self.rig.clock.now() >= self.end)
 
+    def _lost(self, lost: Exception) -> None:
+        """The arm does not answer: it may come back, but not if its process is gone."""
+        self.robot.check()
+        if self.stopped is None:  # its text counts the seconds: it is told once
+            self._tripped(lost)
+
     def _tripped(self, stop: Exception) -> None:
         if self.stopped != str(stop):
             self.stopped = str(stop)
@@ -237,16 +250,32 @@ class Session:
             self.stopped = None
             self._event("going on")
 
+    def _look_at_the_hand(self) -> None:
+        """Say once what is wrong with the gripper; the arm goes on without it."""
+        trouble = self.robot.gripper.trouble if self.robot.gripper is not None else ""
+        if bool(trouble) != bool(self.hand):
+            self._event(f"GRIPPER: {trouble}" if trouble else "the gripper is there again")
+        self.hand = trouble
+
     def _show(self, control: Control) -> None:
-        state = self.robot.state(max_age=STALE)  # what is only shown may be older than what is acted on
+        from hal.errors import ConnectionLost, StaleStateError
+
+        try:
+            state = self.robot.state(max_age=STALE)  # what is only shown may be older than what is acted on
+        except (ConnectionLost, StaleStateError) as lost:
+            self.robot.check()
+            reason = str(lost)
+            self.line.update(lambda: f"  {reason}")
+            return
         self.report.saw(state)
+        self._look_at_the_hand()
 
         def text() -> str:
             x, y, z = state.tcp.position
             held = "held" if self.deadman.held else "released"
             status = state.status.name.lower()
-            gripper = self.robot.gripper
-            width = f"gripper {1e3 * gripper.state().width:4.0f} mm  " if gripper else ""
+            hand = self.robot.gripper.newest() if self.robot.gripper is not None else None
+            width = f"gripper {1e3 * hand.width:4.0f} mm  " if hand is not None and not self.hand else ""
             trips = f"  trips {len(self.report.trips)}" if self.report.trips else ""
             limited = f"  held back: {state.limited}" if state.limited else ""
             frames = "  ".join(

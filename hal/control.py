@@ -229,6 +229,7 @@ class Control:
         if servo.status is RobotStatus.FAULT:
             fault = self.robot.state(max_age=math.inf).fault
             cause, remedy = (fault.cause, fault.remedy) if fault else ("the robot reports a fault", "")
+            self._told = True
             raise RobotFault(cause, f"{remedy}; then robot.recover()" if remedy else "call robot.recover()")
         if servo.trip is Trip.NONE:
             self._told = False

@@ -236,6 +236,10 @@ class Robot:
             raise StaleStateError(f"the newest state of {self.name} is {age:.3f} s old, more than {max_age:g} s")
         return state
 
+    def check(self) -> None:
+        """Raise ConnectionLost when the process that owns the arm is gone: then nothing brings the arm back."""
+        self._host.check()
+
     def fk(self, q: ArrayLike) -> Pose:
         """Pose of the tcp in the base frame at joint positions ``q`` (n,), rad."""
         return self.kinematics.pose(np.asarray(q, float))

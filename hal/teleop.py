@@ -86,7 +86,9 @@ class Teleop:
             return 0.0 if pad.pressed(str(mapping.open)) else None
         wanted = min(1.0, max(0.0, pad.axis(mapping.axis)))
         if not self._has_grip:
-            state = gripper.state()
+            state = gripper.newest()
+            if state is None or gripper.trouble:
+                return None  # nobody knows where the fingers are
             difference = wanted - (1.0 - state.width / gripper.width_max)
             crossed = self._side * difference < 0.0
             self._has_grip = crossed or abs(difference) < _CROSSED

@@ -35,6 +35,9 @@ _RECOVERY = 3.0
 _AVERAGE = 200
 """Commands after which a success rate, which is an average of the last 100, says something."""
 _NO_TORQUE = (0.0,) * 7
+_STILL = 5e-3
+"""A motion begins at rest: no set-point faster than this is its first, rad/s (5 rad/s2 within a cycle)."""
+_ENDED = Fault("ended", "the robot ended the motion by itself", "see that nothing is in its way, and go on")
 _NOTHING_SHOWN: tuple[Mode | None, Fault | None] = (None, None)
 _CALM = frozenset({Mode.IDLE, Mode.MOVE})
 _BY_HAND = frozenset({Mode.USER_STOPPED, Mode.GUIDING, Mode.OTHER})
@@ -54,13 +57,13 @@ class FrankaArm(RobotDriver):
         self._sample: Sample | None = None
         self._fault: Fault | None = None
         """What ended a motion; kept until recover(), though the robot may be idle again."""
+        self._passing = self._told = False
+        """Does the fault go by itself, once the robot is ready again and it was told?"""
         self._shown = _NOTHING_SHOWN
         """The mode that was looked at last, and what it means."""
         self._inertias: Kinematics | None = None
         self.success_min = inf
         """Lowest success rate so far."""
-        self._success: float | None = None
-        """The success rate when the last command was sent."""
         self._t_received = 0.0
         self.reset_statistics()
 
@@ -91,6 +94,8 @@ class FrankaArm(RobotDriver):
         if connection.link is None:
             self._sample = connection.look_for_it() or self._sample
             return
+        if self._passing and self._told:
+            self._fault, self._passing = None, False
         before = self._sample
         try:
             self._sample = connection.link.read()
@@ -108,6 +113,7 @@ class FrankaArm(RobotDriver):
             fault, self._shown = self._fault, _NOTHING_SHOWN
         else:
             fault = self._present_fault(link, s.mode)
+        self._told = fault is not None
         # In torque mode: what drives the arm. Else tau_d is what its own controller wants.
         taken = s.tau_d if link.motion is Kind.TORQUE else _NO_TORQUE
         seq = round(1e3 * s.t)
@@ -120,6 +126,8 @@ class FrankaArm(RobotDriver):
         if self._fault is not None or s.mode not in _CALM:
             return
         kind = self._kind(setpoint)
+        if link.motion is None and max(map(abs, setpoint.dq)) > _STILL:
+            raise self._connection.error(_ENDED)
         try:
             if link.motion is not kind:
                 self._begin(link, kind, s)
@@ -131,7 +139,6 @@ class FrankaArm(RobotDriver):
         self.commands += 1
         if not link.owns_loop:
             self.answer_times.add(time.perf_counter() - self._t_received)
-        self._success = s.success_rate
         if self.commands > _AVERAGE:
             self.success_min = min(self.success_min, s.success_rate)
 
@@ -219,25 +226,23 @@ class FrankaArm(RobotDriver):
             connection.lose(connection.explain(error))
             return
         self.aborts += 1
-        self._fault = fault_of_exception(error, **self._circumstances())
+        self._fault = fault_of_exception(error, realtime_kernel=has_realtime_kernel())
+        self._passing = self._told = False
         try:
             self._sample = s = link.read()
         except connection.troubles as other:
             connection.lose(connection.explain(other))
             return
-        if s.mode in _BY_HAND:
-            self._fault = None  # it is there for as long as the robot says so
+        self._passing = s.mode in _BY_HAND
 
     def _present_fault(self, link: Link, mode: Mode) -> Fault | None:
         """What keeps the robot from moving. What ended the motion explains a reflex best; the rest is as it is now."""
         if mode is Mode.REFLEX and self._fault is not None:
             return self._fault
         if mode is not self._shown[0]:
-            self._shown = (mode, fault_of(link.errors(FLAGS), mode.name.lower(), **self._circumstances()))
+            fault = fault_of(link.errors(FLAGS), mode.name.lower(), realtime_kernel=has_realtime_kernel())
+            self._shown = (mode, fault)
         return self._shown[1]
-
-    def _circumstances(self) -> dict[str, Any]:
-        return {"success_rate": self._success, "realtime_kernel": has_realtime_kernel()}
 
     def recover(self) -> None:
         """Automatic error recovery, and wait until the robot is idle.
@@ -256,7 +261,7 @@ class FrankaArm(RobotDriver):
         except RobotFault:
             raise
         except self._connection.troubles as error:
-            fault = fault_of_exception(error, **self._circumstances())
+            fault = fault_of_exception(error, realtime_kernel=has_realtime_kernel())
             raise RobotFault(fault.cause, fault.remedy) from None
         self._fault = None
 

@@ -12,7 +12,7 @@ from .claim import Claim
 from .faults import ARM_PORT, fault_of_exception
 from .link import Link, Mode, Sample
 from .links import link_to
-from .preflight_network import Answer, knock
+from .preflight_network import Answer, knock, resolve
 from .settings import ArmSettings
 
 __all__ = ["Connection"]
@@ -49,7 +49,7 @@ class Connection:
 
     def open(self) -> Sample:
         """Take the arm and connect; its first state. Raises ControlTaken, DriverMissing and ConnectionLost."""
-        self._claim = Claim(self.settings.host)
+        self._claim = Claim(resolve(self.settings.host) or self.settings.host)
         try:
             link = link_to(self.settings.arm)
             self._find(_PATIENCE)

@@ -27,9 +27,10 @@ def about_rig(rig: Rig, cameras: Sequence[CameraSpec], driven_by: str | None) ->
         "source": rig.plan.source,
         "sim": rig.plan.sim,
         "attended": rig.attended,
+        "emulated": rig.emulated,
         "drivable": driven_by is None,
         "driven_by": driven_by,
-        "demo": driven_by is None and not rig.attended,
+        "demo": driven_by is None and (rig.emulated or not rig.attended),
         "pad_may_hold": not rig.attended or _accepts_silent_pads(rig),
         "robots": [_about_robot(robot) for robot in rig.plan.robots],
         "cameras": [

@@ -79,7 +79,7 @@ class WebConsole(Console):
         if is_loopback(self._address):
             return ()
         text = f"the console listens on {self._address}: whoever has the link, and whoever can listen in, "
-        text += "can drive the REAL ARM" if self.rig.attended else "can drive"
+        text += "can drive the REAL ARM" if self.rig.attended and not self.rig.emulated else "can drive"
         return (text + "; nothing on the way is encrypted (an ssh tunnel is: leave --listen out)",)
 
     # What it is.
@@ -188,7 +188,7 @@ class WebConsole(Console):
 
     def _play(self, on: bool, page: str) -> None:
         pad = self._pad()
-        if pad is None or self.rig.attended:
+        if pad is None or (self.rig.attended and not self.rig.emulated):
             self._conversation.tell("refused", page=page, why="the tour is played in simulation only")
             return
         assert isinstance(pad.driver, WebPad)

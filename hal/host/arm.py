@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from .. import registry
-from ..errors import ConnectionLost, ControlTaken, HalError
+from ..errors import ConnectionLost, ControlTaken
 from ..histogram import Histogram
 from ..inbox import Inbox, Session
 from ..kinematics import Kinematics
@@ -79,7 +79,7 @@ class ArmUnit:
         device = Pose.from_matrix(np.array(theirs, float).reshape(4, 4).T)
         distance, angle = self.kinematics.pose(self.reading.q).distance(device)
         if distance > TCP_APART or angle > TCP_TURNED:
-            raise HalError(
+            raise ConnectionLost(
                 f"{self.spec.name}: the arm and model {self.spec.model!r} do not mean the same tool centre point: they "
                 f"are {1e3 * distance:.1f} mm and {angle:.3f} rad apart; mend the arm's end effector or the model's tcp"
             )
@@ -98,7 +98,8 @@ class ArmUnit:
         before = self.reading
         try:
             self.reading = reading = self.driver.read(now)
-            if not self._write_failed:
+            if self.error is not None and not self._write_failed:
+                self._compare_tcp()  # whoever comes back may have another tool
                 self.error = None
         except Exception as error:
             self._lose(error)

@@ -27,6 +27,8 @@ __all__ = ["main"]
 
 APP_GONE = 30.0
 """An app that is there but has given no sign of life for so long is taken for gone, s. Its arms stopped long before."""
+HANG = 15
+"""A library that has not come back for so long, s, waits for a network that is gone: the process is ended."""
 STATES_HZ = 500.0
 """States are published at about this rate at most."""
 SNAPSHOTS_HZ = 250.0
@@ -71,8 +73,10 @@ class HostProcess:
     def run(self) -> None:
         """Open, cycle, stop, close."""
         signal.signal(signal.SIGTERM, self._terminate)
+        signal.signal(signal.SIGALRM, signal.SIG_DFL)
         cycle = self.cycle
         try:
+            self._alarm()
             cycle.open(self.pace.now())
             scheduling = prepare_process(self.realtime)
             self.pace.restart()
@@ -85,6 +89,7 @@ class HostProcess:
                 self._cycle_until_closed()  # whatever went wrong, the arms are brought to rest if that can be done
             raise
         finally:
+            self._alarm()
             cycle.close()
 
     def _cycle_until_closed(self) -> None:
@@ -103,6 +108,11 @@ class HostProcess:
             self._give_up_at = now + STOP_LIMIT
         return self._resting or now > self._give_up_at
 
+    def _alarm(self) -> None:
+        """Have this process end if a vendor's library does not come back: nothing in Python could end it then."""
+        if self.cycle.paces_itself:
+            signal.alarm(HANG)
+
     def _terminate(self, signum: int, frame: object) -> None:
         self.closing = True
         self.pace.run_free()
@@ -113,7 +123,11 @@ class HostProcess:
         if self.closing:
             self._resting = cycle.stop_sessions()
             if self._is_over():
+                driver = cycle.looping_driver()
+                if driver is not None:
+                    driver.halt()
                 return
+        self._alarm()
         now = self.pace.wait()
         late = self._suspension is not None and self._suspension.ended()
         cycle.step(now, self.pace.heard(self.memory.get_app()), late)

@@ -78,6 +78,10 @@ class Servo:
         """When the last tick was."""
         self._seq = 0
         """Newest command that was looked at, or that does not count any more."""
+        self._resting = 0
+        """For how many ticks a session that ends was found at rest."""
+        self._ahead = False
+        """Are set-points computed ahead in this session?"""
         self._ready: Setpoint | None = None
         """What :meth:`prepare` computed for the next tick."""
         self._sent: Motion3 | None = None
@@ -120,7 +124,8 @@ class Servo:
         if session.move_to is not None:
             self._path.aim(session.move_to)
         self._session = session
-        self._ending = False
+        self._ending = self._ahead = False
+        self._resting = 0
         self._ready = None
         self._seq = 0
         self.report.target_seq = self.report.refused = 0
@@ -156,6 +161,7 @@ class Servo:
             reading, not device, self._sent if ready is not None else None
         ):
             ready = None
+            self._resting = 0
             self.report.reanchored += 1
             self._envelope.limited = Limited.REANCHORED
             if self._motion is not None:
@@ -206,6 +212,7 @@ class Servo:
             smoother = self._smoother
             self._sent = (smoother.q, smoother.dq, smoother.ddq)
             self._envelope.limited &= Limited.REANCHORED  # for whoever looks between two ticks
+            self._ahead = True
             self._ready = self._decide(inbox, now + smoother.dt, device, late, faulty)
 
     def _judge(self, now: float, reading: Reading) -> Trip:
@@ -316,12 +323,14 @@ class Servo:
         """Has the session, which ends, come to rest? Then it is closed."""
         if self._torque.active and self._torque.blind:  # the device was left alone: it holds by itself
             self._leave_torques()
-        if self._at_rest():
-            self._session = None
-            self._ending = False
-            self._anchoring.forget()
-            return True
-        return False
+        self._resting = self._resting + 1 if self._at_rest() else 0
+        # What is computed ahead is given one tick later, and seen to be taken another one later.
+        if self._resting < (3 if self._ahead else 1):
+            return False
+        self._session = None
+        self._ending = False
+        self._anchoring.forget()
+        return True
 
     def _idle(self, status: RobotStatus) -> None:
         self.report.status = status

@@ -21,7 +21,6 @@ from .franka_kit import Emulator
 from .rig_kit import Drive, arm_of, rig_of, settled, wait_until
 
 pytest.importorskip("pylibfranka", reason="needs pylibfranka: pip install 'robot-hal[franka]'")
-pytestmark = pytest.mark.filterwarnings("ignore:arm was stopped:RuntimeWarning")
 
 DOCS = Path(__file__).parents[2] / "docs" / "franka.md"
 

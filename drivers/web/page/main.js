@@ -59,7 +59,7 @@ const HEARD = {
     log.clear();
     setText(byId("rig"), called(rig.source));
     byId("rig").title = rig.source;
-    setText(byId("kind"), isReal() ? "REAL ARM" : "SIMULATION");
+    setText(byId("kind"), rig.emulated ? "EMULATED ARM" : isReal() ? "REAL ARM" : "SIMULATION");
     show(byId("kind"), true);
     setData(document.documentElement, "real", isReal() ? "" : null);
     setData(document.documentElement, "connected", "");
