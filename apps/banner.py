@@ -24,6 +24,8 @@ def listing(plan: Plan) -> list[str]:
         if gripper and robot.attended and simulated:
             hand += f", {_real(robot, gripper)}"
         lines.append(f"robot    {robot.name:10s} {robot.model}, {where}, {robot.rate_hz:g} Hz{hand}")
+        if robot.attended:
+            lines.append(f"limits   {robot.name:10s} {_limits(robot)}")
     for camera in plan.cameras:
         streams = "+".join(camera.streams)
         lines.append(
@@ -42,6 +44,18 @@ def _real(robot: RobotSpec, device: RobotSpec | GripperSpec) -> str:
     """What drives a device that counts as real, and where: nobody may take a robot for its stand-in."""
     host = f" at {device.options['host']}" if "host" in device.options else ""
     return f"{'EMULATED' if robot.emulated else 'REAL'} ({device.driver}{host})"
+
+
+def _limits(robot: RobotSpec) -> str:
+    """What holds an arm back that really moves."""
+    box = robot.workspace
+    where = "no workspace" if box is None else f"workspace {_triple(box.lower)} to {_triple(box.upper)} m"
+    most = f"at most {max(robot.limits.acceleration):g} rad/s2, {max(robot.limits.jerk):g} rad/s3"
+    return f"{robot.speed:g} of the joint speeds, tcp {robot.tcp_speed:g} m/s, {most}; {where}"
+
+
+def _triple(values: tuple[float, ...]) -> str:
+    return " ".join(f"{value:g}" for value in values)
 
 
 def banner(rig: Rig) -> str:

@@ -27,6 +27,9 @@ __all__ = ["Reading", "Robot", "RobotDriver", "Setpoint"]
 
 Floats = Sequence[float]
 
+_NEWS = 0.2
+"""Longest wait for a state after a recovery, s."""
+
 
 class Reading(NamedTuple):
     """What a robot driver reports once per cycle. Plain floats: this is the hot path."""
@@ -303,8 +306,15 @@ class Robot:
         )
 
     def recover(self) -> None:
-        """Clear a fault of the device. It is always the user's own act."""
+        """Clear a fault of the device. It is always the user's own act. Afterwards :meth:`state` is newer than this."""
         self._host.request("recover", {"robot": self.name})
+        if self.spec.attended and self._host.spec.clock == "real_time":
+            asked = self.clock.now()
+            while (now := self.clock.now()) < asked + _NEWS:
+                state = self._mail.get_state()
+                if state is not None and state.stamp.t >= asked:
+                    return
+                self.clock.sleep(min(0.001, asked + _NEWS - now))
 
     def inject(self, **knobs: object) -> None:
         """Switch faults of a simulated driver on or off, for tests; the driver's ``inject`` lists its knobs."""

@@ -37,7 +37,6 @@ _AVERAGE = 200
 _NO_TORQUE = (0.0,) * 7
 _STILL = 5e-3
 """A motion begins at rest: no set-point faster than this is its first, rad/s (5 rad/s2 within a cycle)."""
-_ENDED = Fault("ended", "the robot ended the motion by itself", "see that nothing is in its way, and go on")
 _NOTHING_SHOWN: tuple[Mode | None, Fault | None] = (None, None)
 _CALM = frozenset({Mode.IDLE, Mode.MOVE})
 _BY_HAND = frozenset({Mode.USER_STOPPED, Mode.GUIDING, Mode.OTHER})
@@ -127,7 +126,7 @@ class FrankaArm(RobotDriver):
             return
         kind = self._kind(setpoint)
         if link.motion is None and max(map(abs, setpoint.dq)) > _STILL:
-            raise self._connection.error(_ENDED)
+            return  # the robot ended the last one by itself: the servo comes to rest first
         try:
             if link.motion is not kind:
                 self._begin(link, kind, s)

@@ -13,7 +13,7 @@ from .faults import ARM_PORT, fault_of_exception
 from .link import Link, Mode, Sample
 from .links import link_to
 from .preflight_network import Answer, knock, resolve
-from .settings import ArmSettings
+from .settings import ArmSettings, is_emulated
 
 __all__ = ["Connection"]
 
@@ -29,6 +29,7 @@ _SAYS = {
     Answer.NO_WAY: "Connection error",
 }
 """How the libraries would say it."""
+_START = "start it in another terminal: python -m hal.drivers.franka.emulator --host {} (--help says more)"
 
 
 class Connection:
@@ -62,7 +63,12 @@ class Connection:
 
     def _find(self, patience: float) -> None:
         """Raise ConnectionLost when nobody listens there: a library that calls nobody may hang for a minute."""
-        answer = knock(self.settings.host, ARM_PORT, patience)
+        host = self.settings.host
+        if resolve(host) is None:
+            raise self.error(self.explain(RuntimeError("Host not found")))
+        answer = knock(host, ARM_PORT, patience)
+        if answer is Answer.REFUSED and is_emulated({"host": host}):
+            raise self.error(Fault("refused", f"no emulator listens at {host}, port {ARM_PORT}", _START.format(host)))
         if answer is not Answer.OPEN:
             raise self.error(self.explain(RuntimeError(_SAYS[answer])))
         time.sleep(_BREATH)

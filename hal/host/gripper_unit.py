@@ -158,7 +158,8 @@ def _fault_of(error: Exception) -> Fault:
     if isinstance(error, RobotFault):
         return Fault("gripper", error.cause, error.remedy)
     if isinstance(error, ConnectionLost):
-        return Fault("lost", str(error), _SWITCH_ON)
+        cause, _, remedy = str(error).partition("; ")
+        return error.fault or Fault("lost", cause, remedy or _SWITCH_ON)
     if isinstance(error, HalError):
         return Fault("refused", str(error), "")
     return Fault("driver", f"{type(error).__name__}: {error}", "this is a mistake in the driver")

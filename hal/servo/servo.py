@@ -80,6 +80,8 @@ class Servo:
         """Newest command that was looked at, or that does not count any more."""
         self._resting = 0
         """For how many ticks a session that ends was found at rest."""
+        self._corrected = False
+        """Was the set-point re-anchored in the last tick?"""
         self._ahead = False
         """Are set-points computed ahead in this session?"""
         self._ready: Setpoint | None = None
@@ -150,6 +152,7 @@ class Servo:
         session = self._session
         late = self._is_late(now) or late
         ready, self._ready = self._ready, None
+        self._corrected = False
         if ready is None:
             self._envelope.limited = _UNLIMITED
         device = self._judge(now, reading)
@@ -161,6 +164,7 @@ class Servo:
             reading, not device, self._sent if ready is not None else None
         ):
             ready = None
+            self._corrected = True
             self._resting = 0
             self.report.reanchored += 1
             self._envelope.limited = Limited.REANCHORED
@@ -211,7 +215,8 @@ class Servo:
             now, device, late, faulty = self._seen
             smoother = self._smoother
             self._sent = (smoother.q, smoother.dq, smoother.ddq)
-            self._envelope.limited &= Limited.REANCHORED  # for whoever looks between two ticks
+            # Said until the next tick, for whoever looks in between.
+            self._envelope.limited = Limited.REANCHORED if self._corrected else _UNLIMITED
             self._ahead = True
             self._ready = self._decide(inbox, now + smoother.dt, device, late, faulty)
 

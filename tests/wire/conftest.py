@@ -12,14 +12,14 @@ from .franka_kit import Emulator, shared
 @pytest.fixture(scope="module")
 def _lockstep_fr3() -> Iterator[Emulator]:
     pytest.importorskip("pylibfranka", reason="needs pylibfranka: pip install 'robot-hal[franka]'")
-    with shared("--lockstep", robot="fr3") as emulator:
+    with shared("--lockstep", "--unpaced", robot="fr3") as emulator:
         yield emulator
 
 
 @pytest.fixture(scope="module")
 def _lockstep_panda() -> Iterator[Emulator]:
     pytest.importorskip("panda_py", reason="needs panda-python: pip install 'robot-hal[panda]'")
-    with shared("--lockstep", robot="panda") as emulator:
+    with shared("--lockstep", "--unpaced", robot="panda") as emulator:
         yield emulator
 
 

@@ -44,7 +44,7 @@ with hal.open("franka_emulator", pad="none", overrides=[*overrides, "robots.arm.
 @pytest.fixture(params=["fr3", "panda"])
 def emulator(request: pytest.FixtureRequest) -> Iterator[Emulator]:
     # It waits for a set-point that is late: a busy machine must not look like a fault of the arm.
-    with Emulator("--lockstep", "--paced", robot=request.param) as started:
+    with Emulator("--lockstep", robot=request.param) as started:
         yield started
 
 
@@ -137,8 +137,13 @@ def opening(host: str, robot: str = "fr3", *more: str) -> str:
 def test_nobody_is_there(robot: str) -> None:
     host = free_host()
     said = opening(host, robot)
-    assert said.startswith("ConnectionLost: arm: ")
-    assert host in said
+    assert said.startswith("ConnectionLost: arm: no emulator listens")
+    assert f"python -m hal.drivers.franka.emulator --host {host}" in said
+
+
+def test_a_name_that_nobody_has_is_named() -> None:
+    said = opening("no-such-robot.invalid")
+    assert "there is no computer called no-such-robot.invalid" in said
 
 
 def test_the_wrong_model_is_named(emulator: Emulator) -> None:

@@ -19,7 +19,7 @@ pytest.importorskip("panda_py", reason="needs panda-python: pip install 'robot-h
 
 @pytest.fixture(params=["fr3", "panda"])
 def emulator(request: pytest.FixtureRequest) -> Iterator[Emulator]:
-    with Emulator("--lockstep", robot=request.param) as started:
+    with Emulator("--lockstep", "--unpaced", robot=request.param) as started:
         yield started
 
 

@@ -97,3 +97,28 @@ def test_packets_that_are_lost_end_no_motion(request: pytest.FixtureRequest, rob
             assert statistics["reanchored"] > 10, "nothing was lost: the test shows nothing"
         else:
             assert statistics["driver"]["lost_states"] > 50
+
+
+def test_the_app_outlives_an_arm_that_is_lost(tmp_path: Path) -> None:
+    """Robot and cable come back now and then; the program that drives is still there when they do."""
+    tour = write_tour(tmp_path / "calm.jsonl")
+    with Emulator("--lockstep") as emulator:
+        command = [sys.executable, str(APP), "--real", "--config", "franka_emulator", "--pad", str(tour)]
+        command += [
+            "--set",
+            "cameras={}",
+            *at(emulator, "fr3"),
+            "--duration",
+            "9",
+            "--report",
+            str(tmp_path / "r.json"),
+        ]
+        with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as app:
+            emulator.wait_event("motion started", timeout=20.0)
+            emulator.control.send("restart 0.3")
+            said, _ = app.communicate(timeout=60)
+        assert app.returncode == 0, said
+        assert "does not answer" in said
+    report = json.loads((tmp_path / "r.json").read_text())
+    assert report["trips"]
+    assert report["servo"]["driver"]["reconnects"] == 1

@@ -69,7 +69,7 @@ def _prepare(options: argparse.Namespace, stack: ExitStack, journal: Journal) ->
     stack.callback(plant.close)
     with_hand = options.end_effector == "hand"
     arm = Arm(PROTOCOLS[version], LIMITS[model], plant, journal, with_hand)
-    pacing = Pacing(options.lockstep, options.paced or not options.lockstep, options.patience)
+    pacing = Pacing(options.lockstep, not (options.lockstep and options.unpaced), options.patience)
     server = ArmServer(options.host, arm, files, pacing, options.seed)
     stack.callback(server.close)
     hand = _hand(options)
@@ -103,7 +103,7 @@ def _parser() -> argparse.ArgumentParser:
     add("--plant", choices=("ideal", "lag", "pybullet"), default="ideal", help="what moves behind it (%(default)s)")
     add("--lag", type=_positive, default=0.01, metavar="S", help="time constant of --plant lag, s (%(default)s)")
     add("--lockstep", action="store_true", help="while a motion runs, wait for the answer to each state")
-    add("--paced", action="store_true", help="with --lockstep: never faster than real time")
+    add("--unpaced", action="store_true", help="with --lockstep: as fast as a client answers that steps its own time")
     add("--patience", type=_positive, default=5.0, metavar="S", help="with --lockstep: wait so long, s (%(default)s)")
     add("--q", type=float, nargs=7, default=_HOME, metavar="RAD", help="joint positions at the start (home)")
     add("--urdf", type=Path, help="the arm's URDF (the project's fr3.urdf)")
