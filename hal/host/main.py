@@ -73,7 +73,6 @@ class HostProcess:
     def run(self) -> None:
         """Open, cycle, stop, close."""
         signal.signal(signal.SIGTERM, self._terminate)
-        signal.signal(signal.SIGALRM, signal.SIG_DFL)
         cycle = self.cycle
         try:
             self._alarm()
@@ -109,8 +108,11 @@ class HostProcess:
         return self._resting or now > self._give_up_at
 
     def _alarm(self) -> None:
-        """Have this process end if a vendor's library does not come back: nothing in Python could end it then."""
-        if self.cycle.paces_itself:
+        """Have this process end if a vendor's library does not come back: nothing in Python could end it then.
+
+        Not in lock-step, where the app may take its time. (The signal's default is the end.)
+        """
+        if isinstance(self.pace, DevicePace):
             signal.alarm(HANG)
 
     def _terminate(self, signum: int, frame: object) -> None:

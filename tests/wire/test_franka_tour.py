@@ -122,3 +122,19 @@ def test_the_app_outlives_an_arm_that_is_lost(tmp_path: Path) -> None:
     report = json.loads((tmp_path / "r.json").read_text())
     assert report["trips"]
     assert report["servo"]["driver"]["reconnects"] == 1
+
+
+@pytest.mark.parametrize("robot", ["fr3", "panda"])
+def test_velocities_instead_of_positions_go_to_the_same_place(request: pytest.FixtureRequest, robot: str) -> None:
+    emulator: Emulator = request.getfixturevalue(robot)
+    with rig_of(emulator.host, robot, "robots.arm.real.stream=velocity", lock_step=True) as rig:
+        arm = arm_of(rig)
+        goal = arm.home.copy()
+        goal[[0, 3, 6]] += (0.2, 0.1, -0.3)
+        emulator.control.send("lose-commands 0.05")
+        arm.move_to(goal, unattended=True, speed=0.3)
+        emulator.control.send("lose-commands 0")
+        assert np.abs(arm.state().q - goal).max() < 1e-4
+    assert not emulator.events("reflex")
+    assert "joint velocity" in emulator.events("motion started")[-1]["text"]
+    assert "success" in emulator.events("motion ended")[-1]["text"]
