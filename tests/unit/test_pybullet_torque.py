@@ -162,7 +162,7 @@ class TestServed:
                 arm.rearms += 1
             assert (arm.q <= limits.upper).all()
             assert (arm.q >= limits.lower).all()
-            assert np.abs(arm.dq / limits.velocity).max() <= 1.4 * speed  # predicted, so not exact
+            assert np.abs(arm.dq / limits.velocity).max() <= 1.3 * speed  # predicted, so not exact
             assert arm.tcp_speed <= 0.3  # of 0.25 m/s
         assert any(setpoint.tau for setpoint in arm.given)
         assert arm.audit.peaks()["torque"] <= 1.0
