@@ -125,7 +125,10 @@ def show(name: str, found: dict[str, Any], stalls: list[Any]) -> None:
         f"re-anchored {found['reanchored']}, success rate min {'-' if rate is None else f'{rate:.2f}'}, "
         f"answer us p50 {1e6 * answer['p50']:.0f} p99 {1e6 * answer['p99']:.0f} max {1e6 * answer['max']:.0f}"
     )
-    print(f"  {'':34s} errors {len(found['trips'])}; the emulator's own stalls of 20 ms and more: {len(stalls)}")
+    print(
+        f"  {'':34s} ready {found['opened']:.2f} s after hal.open; errors {len(found['trips'])}; "
+        f"the emulator's own stalls of 20 ms and more: {len(stalls)}"
+    )
     for trip in found["trips"]:
         print(f"  {'':34s}   {trip}")
 
@@ -151,8 +154,6 @@ def main() -> None:
         with emulator(args.robot, args.host) as control:
             found = drive(args.host, args.robot, seconds, **options)
             stalls = control.send("stats").get("stalls", [])
-        if name == runs[0][0]:
-            print(f"  open to ready {found['opened']:.2f} s")
         show(name, found, stalls)
 
 

@@ -308,7 +308,7 @@ class Robot:
     def recover(self) -> None:
         """Clear a fault of the device. It is always the user's own act. Afterwards :meth:`state` is newer than this."""
         self._host.request("recover", {"robot": self.name})
-        if self.spec.attended and self._host.spec.clock == "real_time":
+        if self._host.spec.clock == "real_time":
             asked = self.clock.now()
             while (now := self.clock.now()) < asked + _NEWS:
                 state = self._mail.get_state()
