@@ -1,72 +1,38 @@
-"""A camera: the driver's abstract class and the public class."""
+"""A camera of a rig: the public class."""
 
 from __future__ import annotations
 
 import logging
 import threading
-from abc import ABC, abstractmethod
+import time
 from collections.abc import Callable
-from typing import TYPE_CHECKING, ClassVar, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
-import numpy as np
 from numpy.typing import NDArray
 
-from .errors import ConnectionLost, NotSupported, StaleStateError
+from .camera_driver import CameraDriver, CameraTally, RawFrame
+from .errors import ConnectionLost, StaleStateError
 from .histogram import Histogram
-from .pose import Pose, frozen
 from .types import Frame, Stamp
 
 if TYPE_CHECKING:
-    from .clock import Clock
-    from .specs import CameraSpec
+    import numpy as np
 
-__all__ = ["Camera", "CameraCounts", "CameraDriver", "RawFrame"]
+    from .camera_info import CameraInfo
+    from .clock import Clock
+    from .pose import Pose
+
+__all__ = ["Camera", "CameraCounts", "CameraDriver", "CameraTally", "RawFrame"]
 
 _LOG = logging.getLogger("hal.camera")
+_GRAB = 0.1  # s; how long the camera's thread waits for a frame before it looks whether it is to end
+_SOON, _LATER = 0.2, 2.0  # s between two attempts to reach a lost camera, in its first minute and after
+_MINUTE = 60.0
+GIVE_UP = 1800.0
+"""s after which a lost camera is not looked for any more."""
 
-
-class RawFrame(NamedTuple):
-    """One capture as a driver hands it over: already at the output's size, colour as RGB, depth in metres."""
-
-    t: float
-    """When it was taken, on the host's clock, s: for a simulated frame, the time of the world that it shows."""
-    t_device: float
-    seq: int
-    color: NDArray[np.uint8] | None
-    depth: NDArray[np.float32] | None
-    infrared: NDArray[np.uint8] | None
-    segmentation: NDArray[np.int32] | None
-    T_world_camera: Pose | None
-
-
-class CameraDriver(ABC):
-    """One camera. The calls come from one thread, which may be another one than that of ``open``."""
-
-    simulated: ClassVar[bool] = False
-
-    def __init__(self, spec: CameraSpec, source: object | None = None) -> None:
-        self.spec = spec
-        self.source = source
-        """Where a simulated camera gets its pictures from; the rig's clock where nothing draws for it."""
-
-    @abstractmethod
-    def open(self) -> None:
-        """Connect and start streaming."""
-
-    @abstractmethod
-    def grab(self, timeout: float) -> RawFrame | None:
-        """The newest frame that was not handed out yet; waits up to ``timeout`` s, then None.
-
-        Raises :class:`~hal.errors.ConnectionLost` when the device is gone.
-        """
-
-    def inject(self, **knobs: object) -> None:
-        """Switch faults on or off, for tests. Only drivers that simulate have any."""
-        raise NotSupported(f"driver {type(self).__name__} has no faults to inject")
-
-    @abstractmethod
-    def close(self) -> None:
-        """Stop streaming, let go of the device. Idempotent."""
+Place = Callable[[float], "Pose | None"]
+"""Where the camera is in the world at a time on the rig's clock, s; None where that is not known."""
 
 
 class CameraCounts(NamedTuple):
@@ -79,6 +45,12 @@ class CameraCounts(NamedTuple):
     """Over the whole run; None before two frames."""
     age_p50: float | None
     """Median age of a frame when it arrived, s."""
+    repeated: int = 0
+    """Sets of pictures in which nothing was new, and which were not handed out."""
+    mismatched: int = 0
+    """Sets whose pictures did not belong together, and which were not handed out."""
+    reconnects: int = 0
+    """How often the camera was lost and came back."""
 
 
 class Camera:
@@ -86,14 +58,18 @@ class Camera:
 
     In real time a thread of its own takes every frame from the driver, so a slow camera never holds up its reader,
     and ``latest`` never waits. In lock-step ``read`` draws the present state of the world.
+
+    A camera that is lost (unplugged, reset, silent) raises ConnectionLost from ``read`` and ``latest``, is looked for
+    in the background for half an hour, and then works again, the same object.
     """
 
-    def __init__(self, driver: CameraDriver, clock: Clock, *, threaded: bool) -> None:
+    def __init__(self, driver: CameraDriver, clock: Clock, *, threaded: bool, place: Place | None = None) -> None:
         self.spec = driver.spec
         self.name = driver.spec.name
         self.clock = clock
         self._driver = driver
-        self._threaded = threaded
+        self._threaded = threaded and not driver.on_demand
+        self._place = place
         self._news = threading.Condition()
         self._newest: Frame | None = None
         self._handed_out = -1
@@ -101,23 +77,36 @@ class Camera:
         self._closing = threading.Event()
         self._thread: threading.Thread | None = None
         self._listeners: dict[object, Callable[[Frame], None]] = {}
+        self._watchers: dict[object, Callable[[ConnectionLost | None], None]] = {}
         self._ages = Histogram(5e-4, 2000)
         self._first = self._last = 0.0
-        self._frames = self._dropped = 0
-        self._K = frozen(self.spec.K)
-        self._distortion = frozen(self.spec.distortion)
+        self._frames = self._dropped = self._reconnects = 0
+        self._offset: int | None = 0
+        """Added to the driver's numbers, which start anew when it is opened again; None until its first one."""
+        self._info: CameraInfo = driver.info
 
     def open(self) -> None:
         """Connect and start to take frames; :func:`hal.open` does it."""
         self._driver.open()
+        self._info = self._driver.info
         if self._threaded:
-            self._thread = threading.Thread(target=self._take, name=f"hal-camera-{self.name}", daemon=True)
+            self._thread = threading.Thread(target=self._run, name=f"hal-camera-{self.name}", daemon=True)
             self._thread.start()
 
     @property
+    def info(self) -> CameraInfo:
+        """Serial number, calibration of every stream, link, options: read when the camera was opened."""
+        return self._info
+
+    @property
     def K(self) -> NDArray[np.float64]:
-        """Camera matrix (3, 3), pixels."""
-        return self._K
+        """Camera matrix (3, 3) of colour and depth as they are handed out, pixels."""
+        return self._info.K
+
+    @property
+    def connected(self) -> bool:
+        """False from the moment that the camera is lost until its next frame."""
+        return self._error is None
 
     def read(self, timeout: float = 1.0, after: float | None = None) -> Frame:
         """The next frame that was not handed out yet; with ``after``, the first one taken at that time or later.
@@ -127,7 +116,7 @@ class Camera:
         Raises StaleStateError when none came within ``timeout`` s, ConnectionLost when the camera is gone.
         """
         if not self._threaded:
-            return self._grab(timeout)
+            return self._grab(timeout, after)
         with self._news:
             fresh = self._news.wait_for(lambda: self._error is not None or self._unseen(after), timeout)
             if self._error is not None:
@@ -170,12 +159,34 @@ class Camera:
 
         return detach
 
+    def on_connection(self, callback: Callable[[ConnectionLost | None], None]) -> Callable[[], None]:
+        """Call ``callback`` when the camera is lost, with the error, and when it is back, with None.
+
+        From the camera's own thread. An exception in it ends it, and is logged. What comes back ends it, too.
+        """
+        token = object()
+        with self._news:
+            self._watchers[token] = callback
+
+        def detach() -> None:
+            with self._news:
+                self._watchers.pop(token, None)
+
+        return detach
+
+    def inject(self, **knobs: object) -> None:
+        """Switch faults on or off, for tests: what there is, the driver says. Raises NotSupported, CommandError."""
+        self._driver.inject(**knobs)
+
     def counts(self) -> CameraCounts:
         """Frames, gaps, rate and age so far."""
         with self._news:
             span = self._last - self._first
             fps = (self._frames - 1) / span if self._frames > 1 and span > 0.0 else None
-            return CameraCounts(self._frames, self._dropped, fps, self._ages.percentile(0.5))
+            tally = self._driver.tally
+            return CameraCounts(
+                self._frames, self._dropped, fps, self._ages.percentile(0.5), *tally, reconnects=self._reconnects
+            )
 
     def _unseen(self, after: float | None) -> bool:
         newest = self._newest
@@ -195,63 +206,132 @@ class Camera:
         self._handed_out = self._newest.stamp.seq
         return self._newest
 
-    def _grab(self, timeout: float) -> Frame:
-        raw = self._driver.grab(timeout)
-        if raw is None:
-            raise StaleStateError(f"camera {self.name} took no frame within {timeout:g} s")
-        self._newest = self._frame(raw)
-        return self._hand_out()
+    # Where nothing takes frames ahead: lock-step, and recordings that are not paced.
 
-    def _take(self) -> None:
+    def _grab(self, timeout: float, after: float | None = None) -> Frame:
+        deadline = time.monotonic() + timeout
+        try:
+            if self._error is not None:
+                self._reopen()
+            while True:
+                raw = self._driver.grab(max(0.0, deadline - time.monotonic()))
+                if raw is None:
+                    raise StaleStateError(f"camera {self.name} took no frame within {timeout:g} s")
+                self._take(raw)
+                if after is None or raw.t >= after or not self._driver.on_demand:
+                    return self._hand_out()
+        except ConnectionLost as error:
+            lost = self._lose(error)
+            raise lost from error
+
+    # The camera's own thread.
+
+    def _run(self) -> None:
         while not self._closing.is_set():
             try:
-                raw = self._driver.grab(0.1)
-                if raw is None:
-                    continue
-                frame = self._frame(raw)
+                raw = self._driver.grab(_GRAB)
             except Exception as error:
-                lost = error if isinstance(error, ConnectionLost) else ConnectionLost(f"camera {self.name}: {error!r}")
-                with self._news:
-                    self._error = lost
-                    self._news.notify_all()
-                self._closing.wait(0.2)
+                self._lose(error)
+                if not self._look_for_it():
+                    return
                 continue
-            with self._news:
-                self._error = None
-                self._newest = frame
-                self._news.notify_all()
-                listeners = tuple(self._listeners.items())
-            for token, callback in listeners:
-                try:
-                    callback(frame)
-                except Exception:
-                    _LOG.exception(
-                        "camera %s: what was called with every frame failed, and is called no more", self.name
-                    )
-                    with self._news:
-                        self._listeners.pop(token, None)
+            if raw is not None:
+                self._call(self._listeners, self._take(raw))
+
+    def _look_for_it(self) -> bool:
+        """Open the lost camera again, and see a frame of it. False where that is given up, or the camera is closed."""
+        since = time.monotonic()
+        while (gone := time.monotonic() - since) < GIVE_UP:
+            if self._closing.wait(_SOON if gone < _MINUTE else _LATER):
+                return False
+            try:
+                self._reopen()
+                raw = None
+                while raw is None and not self._closing.is_set():
+                    raw = self._driver.grab(_GRAB)  # a driver whose device stays silent says so in time
+            except Exception as error:
+                self._lose(error)
+                continue
+            if raw is not None:
+                self._call(self._listeners, self._take(raw))
+                return True
+        return False
+
+    def _reopen(self) -> None:
+        self._driver.close()
+        self._driver.open()
+        info = self._driver.info
+        with self._news:
+            self._info = info
+            self._offset = None
+
+    def _lose(self, error: Exception) -> ConnectionLost:
+        """Note that the camera is gone, tell whoever waits for it; the error to raise comes back."""
+        newest = self._newest
+        seen = "no frame came from it" if newest is None else f"its last frame is of {newest.stamp.t:.3f} s"
+        lost = ConnectionLost(f"camera {self.name} is lost ({seen}, now is {self.clock.now():.3f} s): {error}")
+        lost.__cause__ = error
+        lost.fault = getattr(error, "fault", None)
+        with self._news:
+            first, self._error = self._error is None, lost
+            self._news.notify_all()
+        if first:
+            _LOG.warning("%s", lost)
+            self._call(self._watchers, lost)
+        return lost
+
+    def _take(self, raw: RawFrame) -> Frame:
+        frame = self._frame(raw)
+        with self._news:
+            back, self._error = self._error is not None, None
+            self._newest = frame
+            self._reconnects += back
+            self._news.notify_all()
+        if back:
+            _LOG.warning("camera %s is back", self.name)
+            self._call(self._watchers, None)
+        return frame
+
+    def _call(self, listeners: dict[object, Callable[[Any], None]], news: Frame | ConnectionLost | None) -> None:
+        with self._news:
+            present = tuple(listeners.items())
+        for token, callback in present:
+            try:
+                callback(news)
+            except Exception:
+                _LOG.exception("camera %s: what was called with its news failed, and is called no more", self.name)
+                with self._news:
+                    listeners.pop(token, None)
 
     def _frame(self, raw: RawFrame) -> Frame:
-        for image in (raw.color, raw.depth, raw.infrared, raw.segmentation):
+        for image in (raw.color, raw.depth, raw.infrared, raw.infrared_right, raw.segmentation):
             if image is not None:
                 image.flags.writeable = False
-        newest = self._newest
+        newest, info = self._newest, self._info
         if newest is None:
             self._first = raw.t
+            self._offset = 0
+        elif self._offset is None:
+            self._offset = newest.stamp.seq + 1 - raw.seq
         else:
-            self._dropped += max(0, raw.seq - newest.stamp.seq - 1)
+            self._dropped += max(0, raw.seq + self._offset - newest.stamp.seq - 1)
         self._last = raw.t
         self._frames += 1
         self._ages.add(self.clock.now() - raw.t)
+        where = raw.T_world_camera
+        if where is None and self._place is not None:
+            where = self._place(raw.t)
         return Frame(
-            stamp=Stamp(raw.t, raw.t_device, raw.seq),
+            stamp=Stamp(raw.t, raw.t_device, raw.seq + self._offset),
             color=raw.color,
             depth=raw.depth,
             infrared=raw.infrared,
             segmentation=raw.segmentation,
-            K=self._K,
-            distortion=self._distortion,
-            T_world_camera=raw.T_world_camera,
+            K=info.K,
+            distortion=info.distortion,
+            T_world_camera=where,
+            infrared_right=raw.infrared_right,
+            skew=raw.skew,
         )
 
     def close(self) -> None:

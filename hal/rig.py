@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from . import registry
 from .camera import Camera
+from .camera_place import place_of
 from .clock import Clock, LockStepClock, RealClock
 from .console import Console, Listen
 from .devices import Devices
@@ -192,7 +193,8 @@ class Rig:
             drawn = self._pictures is not None and spec.name in self._pictures
             source: object = self._pictures.source(spec.name) if self._pictures and drawn else self.clock
             driver = registry.load(spec.driver, "camera")(spec, source)
-            camera = Camera(driver, self.clock, threaded=not self.lock_step)
+            place = place_of(spec, self.robots) if not driver.simulated else None
+            camera = Camera(driver, self.clock, threaded=not self.lock_step, place=place)
             self._devices[spec.name] = driver
             self.cameras[spec.name] = camera
             camera.open()

@@ -20,6 +20,7 @@ __all__ = [
     "LimitsSpec",
     "PadSpec",
     "RobotSpec",
+    "SensorSpec",
     "ViewSpec",
     "WorkspaceSpec",
     "WorldSpec",
@@ -166,6 +167,22 @@ class ViewSpec:
 
 
 @dataclass(frozen=True)
+class SensorSpec:
+    """One stream of a camera as its sensor takes it, by the figures of the camera's model."""
+
+    width: int
+    height: int
+    rate_hz: float
+    K: tuple[Vector3, Vector3, Vector3]
+    """The centre of the upper left pixel is (0, 0)."""
+    format: str | None = None
+    """Of the real camera; None for its driver's choice."""
+    position: Vector3 = (0.0, 0.0, 0.0)
+    orientation: Quaternion = (0.0, 0.0, 0.0, 1.0)
+    """Pose of this sensor's optical frame in that of the colour sensor, m."""
+
+
+@dataclass(frozen=True)
 class CameraSpec:
     """One camera on a rig."""
 
@@ -185,9 +202,17 @@ class CameraSpec:
     """Nearest and farthest depth that the camera measures, m; outside it reports 0."""
     depth_max: float
     streams: tuple[str, ...]
-    """Some of ``color``, ``depth``, ``infrared``, ``segmentation``."""
+    """Some of ``color``, ``depth``, ``infrared`` (the left one of two), ``infrared_right``, ``segmentation``."""
     view: ViewSpec | None
+    """Where the colour sensor's optical frame is."""
     options: dict[str, Any] = field(default_factory=dict)
+    align: str = "color"
+    """Whose view colour and depth are handed out in: ``color`` or ``depth``. Infrared keeps its own."""
+    sensors: dict[str, SensorSpec] = field(default_factory=dict)
+    """The streams before alignment, crop and scaling, by name; empty where colour, depth and all others are one view
+    of the captured size."""
+    K_infrared: tuple[Vector3, Vector3, Vector3] | None = None
+    """Of both infrared pictures as they are handed out; None where they have the view of K."""
 
 
 @dataclass(frozen=True)
@@ -252,6 +277,8 @@ def _revive(hint: Any, value: Any) -> Any:
         return _revive(next(a for a in typing.get_args(hint) if a is not type(None)), value)
     if is_dataclass(hint) and isinstance(hint, type):
         return from_json(hint, value)
+    if origin is dict and is_dataclass(typing.get_args(hint)[1]):
+        return {key: _revive(typing.get_args(hint)[1], item) for key, item in value.items()}
     if origin is tuple:
         args = typing.get_args(hint)
         inner = args[0] if len(args) == 2 and args[1] is Ellipsis else None

@@ -228,7 +228,7 @@ class Frame:
     depth: NDArray[np.float32] | None
     """(H, W) metres along the optical axis, aligned to colour; 0 where there is no measurement."""
     infrared: NDArray[np.uint8] | None
-    """(H, W)."""
+    """(H, W), of the left imager where there are two; in its own view (``camera.info.K_infrared``), never aligned."""
     segmentation: NDArray[np.int32] | None
     """(H, W) number of the body in ``rig.world.bodies``, -1 for none; simulation only, on request."""
     K: Array
@@ -237,6 +237,10 @@ class Frame:
     """(5,) k1, k2, p1, p2, k3 (OpenCV's order)."""
     T_world_camera: Pose | None
     """Pose of the camera in the world when the frame was taken, where it is known."""
+    infrared_right: NDArray[np.uint8] | None = None
+    """(H, W), of the right imager."""
+    skew: float | None = None
+    """By how much colour was taken later than depth, s; None without both."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -134,6 +134,7 @@ class _Camera:
                     copies.get("infrared"),
                     copies.get("segmentation"),
                     Pose(pose[:3], pose[3:]),
+                    copies.get("infrared_right"),
                 )
         return None
 
@@ -148,6 +149,7 @@ def _layers(spec: CameraSpec) -> dict[str, tuple[tuple[int, ...], DTypeLike]]:
         "color": ((*flat, 3), np.uint8),
         "depth": (flat, np.float32),
         "infrared": (flat, np.uint8),
+        "infrared_right": (flat, np.uint8),
         "segmentation": (flat, np.int32),
     }
     return {name: layer for name, layer in layers.items() if name in spec.streams}

@@ -1,0 +1,55 @@
+"""The crop and the scaling that every real camera's pictures go through."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from hal.cropping import Cropping
+
+SIZES = [((640, 480), (256, 256)), ((848, 480), (640, 480)), ((640, 480), (640, 480)), ((640, 480), (1280, 960))]
+
+
+def ramp(width: int, height: int) -> np.ndarray:
+    """Each pixel holds its own place: column in the first layer, row in the second (as shares of 255)."""
+    image = np.zeros((height, width, 3), np.uint8)
+    image[..., 0] = np.round(np.linspace(0, 255, width))
+    image[..., 1] = np.round(np.linspace(0, 255, height))[:, None]
+    return image
+
+
+@pytest.mark.parametrize(("size", "output"), SIZES)
+def test_a_ray_meets_the_same_thing_before_and_after(size: tuple[int, int], output: tuple[int, int]) -> None:
+    (width, height), (out_width, out_height) = size, output
+    K = np.array([[0.9 * width, 0, (width - 1) / 2 + 3], [0, 0.9 * width, (height - 1) / 2 - 2], [0, 0, 1]])
+    cropping = Cropping(width, height, out_width, out_height)
+    image, K_out = ramp(width, height), cropping.matrix(K)
+    out = cropping.color(image)
+    assert out.shape == (out_height, out_width, 3)
+    assert out.dtype == np.uint8
+    scale = out_width / cropping.crop.width
+    for u, v in ((0.1, 0.2), (-0.2, 0.15), (0.0, 0.0)):  # rays, as x/z and y/z
+        at = K @ (u, v, 1.0)
+        there = np.round(K_out @ (u, v, 1.0)).astype(int)
+        column, row = (there[:2] - K_out[:2, 2]) / K_out[[0, 1], [0, 1]] * K[[0, 1], [0, 1]] + K[:2, 2]
+        assert np.hypot(column - at[0], row - at[1]) <= 0.8 / scale, "rounding to the nearest new pixel"
+        assert out[there[1], there[0], 0] == pytest.approx(column * 255 / (width - 1), abs=1.5)
+        assert out[there[1], there[0], 1] == pytest.approx(row * 255 / (height - 1), abs=1.5)
+
+
+@pytest.mark.parametrize(("size", "output"), SIZES)
+def test_depth_is_never_a_mean(size: tuple[int, int], output: tuple[int, int]) -> None:
+    depth = np.ones((size[1], size[0]), np.float32)
+    depth[:, ::2] = 3.0
+    out = Cropping(*size, *output).depth(depth)
+    assert out.shape == (output[1], output[0])
+    assert set(np.unique(out)) <= {1.0, 3.0}
+
+
+def test_what_comes_out_is_ones_own() -> None:
+    image = ramp(64, 48)
+    for output in ((64, 48), (32, 32)):
+        out = Cropping(64, 48, *output).color(image)
+        assert not np.shares_memory(out, image)
+        out[:] = 0
+    assert image.any()
