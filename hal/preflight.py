@@ -1,4 +1,5 @@
-"""Before a real arm moves: is this computer fit for it, is the arm there, and is the way to it fast enough?
+"""Before a real arm moves: is this computer fit for it, is the arm there, and is the way to it fast enough? And the
+cameras: are they plugged in, by which link, and do they keep their rate?
 
 Nothing moves, and nothing stays open.
 """
@@ -7,21 +8,23 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from . import registry
 from .errors import HalError
 from .machine import check_machine
-from .specs import RobotSpec
+from .specs import CameraSpec, RobotSpec
 from .verdict import Level, Verdict
 
 if TYPE_CHECKING:
     from .config.plan import Plan
 
-__all__ = ["Check", "Level", "Verdict", "preflight", "real_arms"]
+__all__ = ["CameraCheck", "Check", "Level", "Verdict", "checked_cameras", "preflight", "real_arms"]
 
 Check = Callable[[RobotSpec, float], Iterator[Verdict]]
 """What a driver offers as ``DriverSpec.preflight``: it is given the arm, and how long it may measure, s."""
+CameraCheck = Callable[[CameraSpec, float], Iterator[Verdict]]
+"""And as ``DriverSpec.camera_preflight``."""
 
 
 def real_arms(plan: Plan) -> tuple[RobotSpec, ...]:
@@ -29,25 +32,35 @@ def real_arms(plan: Plan) -> tuple[RobotSpec, ...]:
     return tuple(robot for robot in plan.robots if robot.attended or robot.emulated)
 
 
-def preflight(plan: Plan, duration: float = 2.0) -> Iterator[Verdict]:
-    """Look at the machine, then at every real arm; each verdict comes as soon as it is known.
+def checked_cameras(plan: Plan) -> tuple[CameraSpec, ...]:
+    """The cameras of a rig whose driver can look at them before they are opened."""
+    return tuple(camera for camera in plan.cameras if registry.driver(camera.driver).camera_preflight is not None)
 
-    ``duration`` is how long each arm's network is measured, s. Raises nothing that a driver's check raises: that is a
-    verdict, too.
+
+def preflight(plan: Plan, duration: float = 2.0, *, cameras: bool = True) -> Iterator[Verdict]:
+    """Look at the machine, then at every real arm and camera; each verdict comes as soon as it is known.
+
+    ``duration`` is how long each arm's network, and each camera's rate, is measured, s. ``cameras=False`` leaves the
+    cameras out. Raises nothing that a driver's check raises: that is a verdict, too.
     """
     yield from check_machine()
-    for robot in real_arms(plan):
-        for verdict in _check_arm(robot, duration):
-            yield replace(verdict, name=f"{robot.name}: {verdict.name}")
+    devices = [*real_arms(plan), *(checked_cameras(plan) if cameras else ())]
+    for device in devices:
+        for verdict in _check(device, duration):
+            yield replace(verdict, name=f"{device.name}: {verdict.name}")
 
 
-def _check_arm(robot: RobotSpec, duration: float) -> Iterator[Verdict]:
+def _check(device: RobotSpec | CameraSpec, duration: float) -> Iterator[Verdict]:
+    arm = isinstance(device, RobotSpec)
     try:
-        spec = registry.driver(robot.driver)
-        check: Check | None = registry.function(robot.driver, spec.preflight)
+        spec = registry.driver(device.driver)
+        check: Callable[[Any, float], Iterator[Verdict]] | None = registry.function(
+            device.driver, spec.preflight if arm else spec.camera_preflight
+        )
         if check is None:
-            yield Verdict("arm", "unknown", f"its driver {robot.driver!r} has no check of its own")
+            kind = "arm" if arm else "camera"
+            yield Verdict(kind, "unknown", f"its driver {device.driver!r} has no check of its own")
             return
-        yield from check(robot, duration)
+        yield from check(device, duration)
     except (HalError, OSError) as error:
         yield Verdict("check", "fail", f"{type(error).__name__}: {error}", "mend this first, then check again")

@@ -7,6 +7,7 @@ import contextlib
 import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any
@@ -197,6 +198,7 @@ class Rig:
             camera = Camera(driver, self.clock, threaded=not self.lock_step, place=place)
             self._devices[spec.name] = driver
             self.cameras[spec.name] = camera
+            camera.on_connection(partial(self._camera_news, spec.name))
             camera.open()
         for camera in self.cameras.values():
             if not camera.wait_for_first(_FIRST_FRAME):
@@ -310,6 +312,9 @@ class Rig:
         """Show a line to whoever watches: on the console's pages, where there are some."""
         if self.console is not None:
             self.console.say(text)
+
+    def _camera_news(self, name: str, lost: ConnectionLost | None) -> None:
+        self.say(f"camera {name} is back" if lost is None else str(lost))
 
     def rearm(self) -> None:
         """Acknowledge :meth:`stop`, so that sessions without a dead-man can be opened again."""

@@ -14,7 +14,7 @@ from hal.config.plan import Plan
 from hal.errors import DriverMissing
 from hal.preflight import preflight, real_arms
 from hal.registry import DriverSpec
-from hal.specs import RobotSpec
+from hal.specs import CameraSpec, RobotSpec
 from hal.verdict import Verdict
 
 
@@ -70,3 +70,17 @@ def test_a_driver_without_a_check_is_unknown(plan: Plan) -> None:
 def test_a_driver_that_is_not_there_is_a_failure(plan: Plan) -> None:
     (found,) = of_arms(replace(plan, robots=(replace(plan.robots[0], driver="nothing:DRIVER"),)))
     assert found.level == "fail"
+
+
+def test_a_camera_is_checked_by_its_driver_unless_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    def look(spec: CameraSpec, duration: float) -> Iterator[Verdict]:
+        yield Verdict("rate", "ok", f"{spec.rate_hz:g} Hz over {duration:g} s")
+
+    module = ModuleType("checked_camera")
+    vars(module).update(look=look, DRIVER=DriverSpec("checked_camera", camera_preflight="checked_camera:look"))
+    monkeypatch.setitem(sys.modules, "checked_camera", module)
+    plan = load("panda_table", sim=True).resolve()
+    first, *others = plan.cameras
+    plan = replace(plan, cameras=(replace(first, driver="checked_camera:DRIVER"), *others))
+    assert of_arms(plan) == [Verdict(f"{first.name}: rate", "ok", "30 Hz over 0.25 s")]
+    assert [v for v in preflight(plan, 0.25, cameras=False) if ":" in v.name] == []

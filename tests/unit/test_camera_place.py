@@ -1,0 +1,82 @@
+"""Where a real camera is, worked out from the rig and the arm: the same as the simulator says of its own."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import hal
+from hal.camera_place import LONGEST, place_of
+from hal.specs import SensorSpec
+
+
+def difference(a: hal.Pose, b: hal.Pose) -> tuple[float, float]:
+    apart = a.inverse() @ b
+    return float(np.linalg.norm(apart.position)), 2.0 * float(np.linalg.norm(apart.orientation[:3]))
+
+
+@pytest.mark.parametrize("name", ["scene", "wrist"])
+def test_it_is_where_the_simulator_says(name: str) -> None:
+    with hal.open("panda_table", sim=True, clock="lock_step", pad="none") as rig:
+        arm, camera = rig.robots["panda"], rig.cameras[name]
+        place = place_of(camera.spec, rig.robots)
+        assert place is not None
+        poses = []
+        with arm.control(rate_hz=50) as control:
+            for tick in rig.clock.rate(50):
+                control.send(hal.Twist(linear=[0.1, 0.05, 0.05], angular=[0.0, 0.3, 0.4]))
+                if tick.elapsed >= 0.2 * (len(poses) + 1):
+                    frame = camera.read()
+                    found = place(frame.stamp.t)
+                    assert found is not None
+                    assert frame.T_world_camera is not None
+                    assert difference(found, frame.T_world_camera) == pytest.approx((0.0, 0.0), abs=1e-5)
+                    poses.append(found)
+                if tick.elapsed > 1.0:
+                    break
+        moved, turned = difference(poses[0], poses[-1])
+        assert (moved > 0.03 and turned > 0.1) == (name == "wrist"), "only a camera on the arm moves"
+
+
+def test_a_picture_of_a_little_while_ago_is_carried_back() -> None:
+    with hal.open("panda_table", sim=True, clock="lock_step", pad="none") as rig:
+        arm, camera = rig.robots["panda"], rig.cameras["wrist"]
+        place = place_of(camera.spec, rig.robots)
+        assert place is not None
+        with arm.control(rate_hz=50) as control:
+            for tick in rig.clock.rate(50):
+                control.send(hal.Twist(linear=[0.0, 0.1, 0.0]))
+                if tick.elapsed > 0.6:
+                    break
+            frame = camera.read()
+            rig.clock.sleep(0.03)
+            control.send(hal.Twist(linear=[0.0, 0.1, 0.0]))
+            then, now = place(frame.stamp.t), place(rig.clock.now())
+            assert then is not None
+            assert now is not None
+            assert frame.T_world_camera is not None
+            assert difference(now, frame.T_world_camera)[0] > 2e-3, "the arm went on"
+            assert difference(then, frame.T_world_camera)[0] < 2e-4
+            assert place(rig.clock.now() - 2 * LONGEST) is None, "nobody knows any more"
+
+
+def test_a_camera_that_stands_nowhere_has_no_place() -> None:
+    with hal.open("panda_table", driver="mock") as rig:
+        spec = replace(rig.cameras["scene"].spec, view=None)
+        assert place_of(spec, rig.robots) is None
+
+
+def test_the_view_handed_out_is_that_of_the_sensor_that_others_are_aligned_to() -> None:
+    with hal.open("panda_table", driver="mock") as rig:
+        spec = rig.cameras["scene"].spec
+        depth = SensorSpec(640, 480, 30.0, spec.K, position=(-0.015, 0.0, 0.0))
+        spec = replace(spec, sensors={**spec.sensors, "depth": depth})
+        by_color, by_depth = (place_of(replace(spec, align=align), rig.robots) for align in ("color", "depth"))
+        assert by_color is not None
+        assert by_depth is not None
+        color, apart = by_color(0.0), None
+        assert color is not None
+        apart = color.inverse() @ (by_depth(0.0) or hal.Pose())
+        assert apart.position == pytest.approx([-0.015, 0.0, 0.0], abs=1e-9)
