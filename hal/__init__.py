@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from .commands import (
         CartesianTarget,
         Command,
+        JointChunk,
         JointTarget,
         JointTorque,
         JointVelocity,
@@ -78,6 +79,7 @@ __all__ = [
     "GripperResult",
     "GripperState",
     "HalError",
+    "JointChunk",
     "JointTarget",
     "JointTorque",
     "JointVelocity",
@@ -103,7 +105,16 @@ __all__ = [
 # Without `open`: a star import must not shadow the builtin.
 
 _MODULES = {
-    "commands": ("CartesianTarget", "Command", "JointTarget", "JointTorque", "JointVelocity", "Sent", "Twist"),
+    "commands": (
+        "CartesianTarget",
+        "Command",
+        "JointChunk",
+        "JointTarget",
+        "JointTorque",
+        "JointVelocity",
+        "Sent",
+        "Twist",
+    ),
     "control": ("Control",),
     "errors": (
         "CommandError",

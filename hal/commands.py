@@ -16,6 +16,7 @@ from .pose import Pose, frozen
 __all__ = [
     "CartesianTarget",
     "Command",
+    "JointChunk",
     "JointTarget",
     "JointTorque",
     "JointVelocity",
@@ -54,6 +55,7 @@ class Kind(IntEnum):
     JOINT_TORQUE = 3
     CARTESIAN_TARGET = 4
     TWIST = 5
+    JOINT_CHUNK = 6
 
 
 @dataclass(frozen=True, slots=True, eq=False, init=False)
@@ -69,6 +71,45 @@ class JointTarget:
     def __init__(self, q: ArrayLike, dq: ArrayLike | None = None) -> None:
         _set(self, "q", _vector("q", q))
         _set(self, "dq", None if dq is None else _vector("dq", dq, self.q.size))
+
+
+CHUNK_POINTS = 256
+"""At most so many targets in one chunk."""
+CHUNK_AHEAD = 3.0
+"""s; a chunk may reach no farther into the future: for so long the arm may move by what was decided before."""
+
+
+@dataclass(frozen=True, slots=True, eq=False, init=False)
+class JointChunk:
+    """Be at joint positions ``q`` (k, n) in rad at the times ``t`` (k,), s on ``rig.clock``: what policies that predict
+    action chunks put out.
+
+    The servo interpolates, without overshoot. A new chunk replaces what is left of the one before from its own first
+    time on; targets whose time has passed only lead to those that follow. The end of the last one is the deadline: who
+    sends nothing more until then is late, and trips.
+    """
+
+    t: Array
+    q: Array
+
+    def __init__(self, t: ArrayLike, q: ArrayLike) -> None:
+        times = _vector("t", t)
+        try:
+            points = frozen(q)
+        except (TypeError, ValueError) as error:
+            raise CommandError(f"q must be numbers: {error}") from None
+        if not 1 <= times.size <= CHUNK_POINTS:
+            raise CommandError(f"a chunk has 1 to {CHUNK_POINTS} targets, not {times.size}")
+        if points.ndim != 2 or len(points) != times.size:
+            raise CommandError(
+                f"q must have shape ({times.size}, n), as there are {times.size} times, not {points.shape}"
+            )
+        if not np.isfinite(points).all():
+            raise CommandError("q holds a number that is not finite")
+        if not (np.diff(times) > 0.0).all():
+            raise CommandError("the times of a chunk must increase")
+        _set(self, "t", times)
+        _set(self, "q", points)
 
 
 @dataclass(frozen=True, slots=True, eq=False, init=False)
@@ -127,11 +168,13 @@ class Twist:
         _set(self, "frame", frame)
 
 
-Command: TypeAlias = JointTarget | JointVelocity | JointTorque | CartesianTarget | Twist
+Command: TypeAlias = JointTarget | JointChunk | JointVelocity | JointTorque | CartesianTarget | Twist
 
 
-def encode(command: Command) -> tuple[Kind, tuple[float, ...]]:
-    """A command as it travels; see :class:`hal.inbox.CommandRecord`."""
+def encode(command: Command, now: float) -> tuple[Kind, tuple[float, ...]]:
+    """A command as it travels from ``now`` on; see :class:`hal.inbox.CommandRecord`."""
+    if isinstance(command, JointChunk):
+        return Kind.JOINT_CHUNK, (*(command.t - now).tolist(), *command.q.ravel().tolist())
     if isinstance(command, JointTarget):
         q = command.q.tolist()
         return Kind.JOINT_TARGET, (*q, *(command.dq.tolist() if command.dq is not None else [0.0] * len(q)))

@@ -7,10 +7,8 @@ import warnings
 from types import TracebackType
 from typing import TYPE_CHECKING
 
-import numpy as np
-
-from . import registry
-from .commands import CartesianTarget, Command, JointTarget, JointTorque, JointVelocity, Sent, Twist, encode
+from .command_checks import CommandChecks
+from .commands import Command, JointChunk, Sent, encode
 from .errors import (
     CommandError,
     ConnectionLost,
@@ -19,7 +17,6 @@ from .errors import (
     MotionStopped,
     NotSupported,
     RobotFault,
-    Unreachable,
 )
 from .inbox import CommandRecord, Session
 from .stops import trip_text
@@ -32,13 +29,8 @@ if TYPE_CHECKING:
     from .host.records import ServoRecord
     from .robot import Robot
 
-__all__ = ["FIRST_STEP_ANGLE", "FIRST_STEP_DISTANCE", "FIRST_STEP_TURN", "Control"]
+__all__ = ["Control"]
 
-FIRST_STEP_ANGLE = 0.1
-"""Farthest that a first joint target may be from the set-point, rad per joint."""
-FIRST_STEP_DISTANCE = 0.05
-FIRST_STEP_TURN = 0.2
-"""Farthest that a first pose may be from the set-point, m and rad. The servo keeps the same bounds by itself."""
 _SHORTEST_DEADLINE = 0.1
 _PERIODS = 2.5
 _REST_LIMIT = 5.0
@@ -88,8 +80,7 @@ class Control:
         self._detach: Callable[[], None] | None = None
         self._grip: float | None = None
         self._refused = 0
-        self._takes_torques = False
-        """Is it known that the arm takes torques?"""
+        self._checks = CommandChecks(robot)
 
     # Opening and leaving.
 
@@ -212,14 +203,16 @@ class Control:
                 "of command without a rest in between"
             )
         if command is not None:
-            command = self._checked(command, reasons)
+            if self._goal is not None:
+                raise CommandError("this session moves to a goal; it takes no commands")
+            command = self._checks.checked(command, now, reasons)
             if waiting:
                 reasons.append("the dead-man is not held: the arm does not move")
             elif servo.status is RobotStatus.HOLDING:
-                self._check_first(command, servo)
-            kind, values = encode(command)
+                self._checks.check_first(command, now, servo.q_set)
+            kind, values = encode(command, now)
             self.robot._commands += 1
-            deadline = now + self._deadline
+            deadline = float(command.t[-1]) if isinstance(command, JointChunk) else now + self._deadline
             self._mail.put_command(CommandRecord(self.robot._commands, self._id, now, deadline, kind, values, t_event))
         if gripper is not None:
             self._send_grip(gripper, waiting, reasons)
@@ -258,73 +251,6 @@ class Control:
         self.robot._latch.stopped = False
         self._mail.rearm()
         self._rearmed_at = self._mail.state.seq() + 1
-
-    def _checked(self, command: Command, reasons: list[str]) -> Command:
-        robot, n = self.robot, self.robot.n
-        if self._goal is not None:
-            raise CommandError("this session moves to a goal; it takes no commands")
-        if isinstance(command, JointTorque):
-            self._check_torques()
-        size = {JointTarget: "q", JointVelocity: "dq", JointTorque: "tau"}.get(type(command))
-        if size is not None:
-            count = getattr(command, size).size
-            if count != n:
-                raise CommandError(f"{robot.name} has {n} joints; {type(command).__name__} has {count}")
-        elif not isinstance(command, (CartesianTarget, Twist)):
-            hint = "; did you mean hal.JointTarget(q)?" if isinstance(command, (np.ndarray, list, tuple)) else ""
-            raise CommandError(f"{type(command).__name__} is no command{hint}")
-        if isinstance(command, CartesianTarget):
-            farthest = robot.kinematics.farthest()
-            away = float(np.linalg.norm(command.pose.position)) - farthest
-            if away > 0.0:
-                raise Unreachable(
-                    f"{robot.name} reaches {farthest:.2f} m from its base", position_error=away, rotation_error=0.0
-                )
-        if isinstance(command, JointTarget):
-            limits = robot.limits
-            wanted = zip(limits.lower, command.q.tolist(), limits.upper, robot.joints, strict=True)
-            over = [name for low, x, high, name in wanted if not low <= x <= high]
-            if over:
-                reasons.append(f"position limit of {', '.join(over)}")
-                return JointTarget(np.clip(command.q, limits.lower, limits.upper), command.dq)
-        if isinstance(command, JointTorque) and (most := robot.limits.torque) is not None:
-            over = [
-                name for x, limit, name in zip(command.tau.tolist(), most, robot.joints, strict=True) if abs(x) > limit
-            ]
-            if over:
-                reasons.append(f"torque limit of {', '.join(over)}")
-                return JointTorque(np.clip(command.tau, np.negative(most), most))
-        return command
-
-    def _check_torques(self) -> None:
-        """NotSupported for an arm that takes no torques. Its driver's class says so, and is looked at once."""
-        spec = self.robot.spec
-        if self._takes_torques:
-            return
-        modes: frozenset[str] = registry.load(spec.driver, "robot").modes
-        if "torque" not in modes:
-            raise NotSupported(f"{spec.name}: driver {spec.driver} takes no torques, only: {', '.join(sorted(modes))}")
-        if spec.limits.torque is None:
-            raise NotSupported(f"{spec.name}: model {spec.model} takes no torques without limits.torque, Nm per joint")
-        self._takes_torques = True
-
-    def _check_first(self, command: Command, servo: ServoRecord) -> None:
-        """A first target far from where the arm stands would make it leap."""
-        if isinstance(command, JointTarget):
-            step = np.abs(command.q - np.asarray(servo.q_set))
-            worst = int(np.argmax(step))
-            if step[worst] > FIRST_STEP_ANGLE:
-                raise CommandError(
-                    f"the first target is {step[worst]:.3f} rad from the set-point at {self.robot.joints[worst]}, more "
-                    f"than {FIRST_STEP_ANGLE} rad: use move_to first"
-                )
-        elif isinstance(command, CartesianTarget):
-            distance, turn = self.robot.fk(servo.q_set).distance(command.pose)
-            if distance > FIRST_STEP_DISTANCE or turn > FIRST_STEP_TURN:
-                raise CommandError(
-                    f"the first pose is {distance:.3f} m and {turn:.3f} rad from the set-point, more than "
-                    f"{FIRST_STEP_DISTANCE} m or {FIRST_STEP_TURN} rad: use move_to first"
-                )
 
     def _send_grip(self, fraction: float, waiting: bool, reasons: list[str]) -> None:
         gripper = self.robot.gripper

@@ -38,7 +38,8 @@ class CommandRecord(NamedTuple):
     kind: Kind
     values: tuple[float, ...]
     """JOINT_TARGET: q then dq; JOINT_VELOCITY: dq; JOINT_TORQUE: tau; CARTESIAN_TARGET: position and quaternion;
-    TWIST: linear, angular, then 1.0 where they are given along the tcp's axes and 0.0 where along the base's."""
+    TWIST: linear, angular, then 1.0 where they are given along the tcp's axes and 0.0 where along the base's;
+    JOINT_CHUNK: k times, counted from ``t``, then k times q."""
     t_event: float = 0.0
     """When the pad event behind it happened, s; 0 where there is none. Only latency is computed from it."""
 

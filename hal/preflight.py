@@ -44,7 +44,7 @@ def preflight(plan: Plan, duration: float = 2.0, *, cameras: bool = True) -> Ite
     cameras out. Raises nothing that a driver's check raises: that is a verdict, too.
     """
     yield from check_machine()
-    devices = [*real_arms(plan), *(checked_cameras(plan) if cameras else ())]
+    devices: list[RobotSpec | CameraSpec] = [*real_arms(plan), *(checked_cameras(plan) if cameras else ())]
     for device in devices:
         for verdict in _check(device, duration):
             yield replace(verdict, name=f"{device.name}: {verdict.name}")

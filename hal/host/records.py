@@ -10,11 +10,11 @@ import threading
 from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from ..commands import Kind
+from ..commands import CHUNK_POINTS, Kind
 from ..inbox import CommandRecord, DeadmanRecord
 from ..robot import Reading
 from .gripper_mail import GripperMail
-from .mailbox import Mailbox
+from .mailbox import Mailbox, SeriesBox
 from .newest import Newest, newest
 from .state_layout import ServoRecord, StateLayout
 
@@ -71,8 +71,9 @@ class RobotMail:
             boxes.append(Mailbox(buffer[offset:], layout))
             offset += Mailbox.size(layout)
         self.command, self.deadman, self.marks, self.state = boxes
+        self._chunk = SeriesBox(buffer[offset:], _chunk_capacity(n))
         state = self.state
-        self.get_command = newest(self.command, _command)
+        self.get_command = newest(self.command, self._command)
         """The newest command."""
         self.get_deadman = newest(self.deadman, DeadmanRecord._make)
         """How the dead-man stood last."""
@@ -92,13 +93,16 @@ class RobotMail:
     @classmethod
     def size(cls, n: int) -> int:
         """Bytes that the mailboxes take."""
-        return sum(Mailbox.size(layout) for layout in cls.layouts(n))
+        return sum(Mailbox.size(layout) for layout in cls.layouts(n)) + SeriesBox.size(_chunk_capacity(n))
 
     # From the app to the servo.
 
     def put_command(self, record: CommandRecord) -> None:
-        """Send a command."""
+        """Send a command. A chunk goes into a box of its own first: most commands are short, and often sent."""
         width = max(2 * self.n, 7)
+        if record.kind is Kind.JOINT_CHUNK:
+            self._chunk.write(record.t, record.seq, record.values)
+            record = record._replace(values=())
         values = tuple(record.values) + (0.0,) * (width - len(record.values))
         self.command.write(
             record.seq,
@@ -130,6 +134,15 @@ class RobotMail:
         with self._marking:
             self.marks.write(self.get_marks().rearms, session)
 
+    def _command(self, values: tuple[Any, ...]) -> CommandRecord:
+        seq, t, deadline, kind, t_event, session, count, *rest = values
+        told = tuple(rest[:count])
+        if kind == Kind.JOINT_CHUNK:
+            chunk = self._chunk.read()
+            # Another number: overtaken by the next chunk, whose command comes in a moment.
+            told = tuple(chunk[3]) if chunk is not None and chunk[2] == seq else ()
+        return CommandRecord(seq, session, t, deadline, Kind(kind), told, t_event)
+
     # From the servo to the app.
 
     def put_state(
@@ -144,9 +157,8 @@ class RobotMail:
         self.state.write(*self._layout.values(reading, servo, tcp, tcp_set, twist))
 
 
-def _command(values: tuple[Any, ...]) -> CommandRecord:
-    seq, t, deadline, kind, t_event, session, count, *rest = values
-    return CommandRecord(seq, session, t, deadline, Kind(kind), tuple(rest[:count]), t_event)
+def _chunk_capacity(n: int) -> int:
+    return CHUNK_POINTS * (n + 1)
 
 
 class GroupMemory:

@@ -21,6 +21,7 @@ from ..types import Limited, RobotStatus, Trip
 from .anchoring import Anchoring
 from .anchoring import Motion as Motion3
 from .cartesian import PoseMotion, TwistMotion
+from .chunk import ChunkMotion
 from .envelope import Envelope
 from .motions import JointTargetMotion, JointVelocityMotion, Motion
 from .path import PathMotion
@@ -61,6 +62,7 @@ class Servo:
         self._torque = TorqueMotion(smoother, envelope, spec.limits, mass_matrix)
         self._motions: dict[Kind, Motion] = {
             Kind.JOINT_TARGET: JointTargetMotion(smoother, envelope),
+            Kind.JOINT_CHUNK: ChunkMotion(smoother, envelope),
             Kind.JOINT_VELOCITY: JointVelocityMotion(smoother, envelope),
             Kind.JOINT_TORQUE: self._torque,
             Kind.CARTESIAN_TARGET: PoseMotion(smoother, envelope),
