@@ -16,9 +16,6 @@ if TYPE_CHECKING:
 
 __all__ = ["Moving", "place_of"]
 
-LONGEST = 0.2
-"""s between a picture and the state that its pose is worked out from; beyond that nobody knows where it was."""
-
 
 def place_of(spec: CameraSpec, robots: Mapping[str, Robot]) -> Place | None:
     """Pose in the world of the optical frame that colour and depth are handed out in; None where the rig does not
@@ -39,11 +36,7 @@ def handed_out(spec: CameraSpec) -> Pose:
 
 
 class Moving:
-    """A camera on an arm's link: by the arm's newest state, carried back to the time of the picture.
-
-    Within :data:`LONGEST` the joints are taken to turn at a constant speed; at 0.03 s and an acceleration of 10 rad/s2
-    that is wrong by 4.5 mrad (a t^2 / 2).
-    """
+    """A camera on an arm's link: by the arm's state at the time of the picture."""
 
     def __init__(self, robot: Robot, view: ViewSpec, pose: Pose) -> None:
         from .kinematics import Kinematics
@@ -52,14 +45,10 @@ class Moving:
         self._link = str(view.link)
         self._pose = pose
         self._kinematics = Kinematics(robot.spec.kinematics)  # its own: one for each thread
-        self._base = Pose(robot.spec.base_position, robot.spec.base_orientation)
 
     def __call__(self, t: float) -> Pose | None:
         try:
-            state = self._robot.state(max_age=LONGEST)
+            q = self._robot.state_at(t).q
         except HalError:
             return None
-        if abs(state.stamp.t - t) > LONGEST:
-            return None
-        q = state.q - state.dq * (state.stamp.t - t)
-        return self._base @ self._kinematics.link_pose(self._link, q) @ self._pose
+        return self._robot.base @ self._kinematics.link_pose(self._link, q) @ self._pose

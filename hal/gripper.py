@@ -151,6 +151,18 @@ class Gripper:
             raise StaleStateError(f"the gripper of {self._robot} has been silent for {age:.3f} s")
         return found.state
 
+    def state_at(self, t: float) -> GripperState:
+        """The state at ``t`` (s on ``rig.clock``), interpolated; as :meth:`hal.robot.Robot.state_at`."""
+        from .interpolation import gripper_at
+
+        self.check()
+        return gripper_at(self._mail.history, t, f"the gripper of {self._robot}")
+
+    def states(self, after: float) -> list[GripperState]:
+        """Every state that is newer than ``after`` (s on ``rig.clock``), oldest first; the last second is kept."""
+        self.check()
+        return self._mail.history.since(after)
+
     @property
     def trouble(self) -> str:
         """Why commands do not move the fingers: nobody answers, or the newest command failed. Empty when they do.

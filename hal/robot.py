@@ -239,6 +239,24 @@ class Robot:
             raise StaleStateError(f"the newest state of {self.name} is {age:.3f} s old, more than {max_age:g} s")
         return state
 
+    def state_at(self, t: float) -> RobotState:
+        """The state at ``t`` (s on ``rig.clock``), a picture's stamp for example: interpolated between two samples.
+
+        The last second is kept. Raises StaleStateError for a time that is older, or more than 50 ms in the future.
+        """
+        from .interpolation import robot_at
+
+        self._host.check()
+        return robot_at(self._mail.history, t, self.name)
+
+    def states(self, after: float) -> list[RobotState]:
+        """Every state that is newer than ``after`` (s on ``rig.clock``), oldest first.
+
+        In real time one for each cycle of the last second, in lock-step one for each time that somebody waited.
+        """
+        self._host.check()
+        return self._mail.history.since(after)
+
     def check(self) -> None:
         """Raise ConnectionLost when the process that owns the arm is gone: then nothing brings the arm back."""
         self._host.check()

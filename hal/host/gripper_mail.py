@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
+import struct
 from enum import IntEnum
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from ..types import Fault, GripperOutcome, GripperState, Stamp
 from . import fault_layout
+from .history import History
 from .mailbox import Mailbox
 from .newest import newest
 
@@ -18,6 +20,9 @@ __all__ = ["GripperAct", "GripperCommand", "GripperMail", "GripperRecord"]
 
 _COMMAND = "QQB5d"
 _STATE = "ddQdd?bdQB?"
+_LAYOUT = struct.Struct("<" + _STATE + fault_layout.FORMAT)
+STATES = 512
+"""So many states of a gripper stay readable: 2 s at 240 Hz, 5 s at 100 Hz."""
 _UNKNOWN, _NO, _YES = -1, 0, 1
 
 
@@ -60,7 +65,9 @@ class GripperMail:
 
     def __init__(self, buffer: memoryview) -> None:
         self.command = Mailbox(buffer, _COMMAND)
-        self.state = Mailbox(buffer[Mailbox.size(_COMMAND) :], _STATE + fault_layout.FORMAT)
+        self.state = Mailbox(buffer[Mailbox.size(_COMMAND) :], _STATE + fault_layout.FORMAT, STATES)
+        self.history = History(self.state, _state)
+        """The last :data:`STATES` states."""
         self.get_command = newest(self.command, _command)
         """The newest command; None before the first one."""
         self.get = newest(self.state, _record)
@@ -69,7 +76,7 @@ class GripperMail:
     @classmethod
     def size(cls) -> int:
         """Bytes that the mailboxes take."""
-        return Mailbox.size(_COMMAND) + Mailbox.size(_STATE + fault_layout.FORMAT)
+        return Mailbox.size(_COMMAND) + Mailbox.size(_STATE + fault_layout.FORMAT, STATES)
 
     def put_command(self, command: GripperCommand) -> None:
         """Tell the gripper what to do; the newest command wins."""
@@ -109,3 +116,7 @@ def _record(values: tuple[Any, ...]) -> GripperRecord:
         target_seq=target_seq,
     )
     return GripperRecord(state, lost)
+
+
+def _state(record: bytes) -> GripperState:
+    return _record(_LAYOUT.unpack(record)).state

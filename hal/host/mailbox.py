@@ -1,9 +1,9 @@
 """The newest record of one writer for any number of readers, in memory that processes share.
 
-A mailbox holds two slots. The writer fills the one that is not announced, then announces it by one aligned 8-byte
-store, so a writer that is killed in the middle of a write leaves the last whole record in place and no reader ever
-waits. Each slot carries its number and a checksum: a reader that was overtaken, or that runs on a processor which
-reorders stores, notices and tries again, a bounded number of times.
+A mailbox holds two slots, or more where readers want to look back. The writer fills the oldest one, then announces it
+by one aligned 8-byte store, so a writer that is killed in the middle of a write leaves the last whole record in place
+and no reader ever waits. Each slot carries its number and a checksum: a reader that was overtaken, or that runs on a
+processor which reorders stores, notices and tries again, a bounded number of times.
 """
 
 from __future__ import annotations
@@ -22,15 +22,16 @@ _TRIES = 16
 
 
 class _Slots:
-    """Two slots of ``capacity`` payload bytes and the number of the announced one."""
+    """Slots of ``capacity`` payload bytes, a power of two of them, and the number of the announced one."""
 
-    __slots__ = ("_announced", "_buffer", "_payloads", "_seen", "_seq", "_starts")
+    __slots__ = ("_announced", "_buffer", "_mask", "_payloads", "_seen", "_seq", "_starts")
 
-    def __init__(self, buffer: memoryview, capacity: int) -> None:
+    def __init__(self, buffer: memoryview, capacity: int, slots: int = 2) -> None:
         stride = self._stride(capacity)
-        self._buffer = buffer[: _HEADER + 2 * stride]
+        self._buffer = buffer[: _HEADER + slots * stride]
         self._announced = self._buffer[:_HEADER].cast("Q")
-        self._starts = (_HEADER, _HEADER + stride)
+        self._mask = slots - 1
+        self._starts = tuple(_HEADER + k * stride for k in range(slots))
         self._payloads = tuple(self._buffer[s + _SLOT.size : s + _SLOT.size + capacity] for s in self._starts)
         self._seq: int = self._announced[0]
         self._seen = 0
@@ -40,13 +41,15 @@ class _Slots:
         return (_SLOT.size + capacity + 7) // 8 * 8
 
     @classmethod
-    def _size(cls, capacity: int) -> int:
-        return _HEADER + 2 * cls._stride(capacity)
+    def _size(cls, capacity: int, slots: int = 2) -> int:
+        if slots < 2 or slots & (slots - 1):
+            raise ValueError(f"the number of slots must be a power of two, not {slots}")
+        return _HEADER + slots * cls._stride(capacity)
 
     def _announce(self, length: int) -> int:
         """Publish what was filled into the free slot, ``length`` bytes of it."""
         seq = self._seq + 1
-        which = seq & 1
+        which = seq & self._mask
         _SLOT.pack_into(self._buffer, self._starts[which], seq, crc32(self._payloads[which][:length]))
         self._announced[0] = seq
         self._seq = seq
@@ -71,19 +74,19 @@ class Mailbox(_Slots):
 
     __slots__ = ("_layout", "_record")
 
-    def __init__(self, buffer: memoryview, layout: str) -> None:
+    def __init__(self, buffer: memoryview, layout: str, slots: int = 2) -> None:
         self._layout = struct.Struct("<" + layout)
         self._record = b""
-        super().__init__(buffer, self._layout.size)
+        super().__init__(buffer, self._layout.size, slots)
 
     @classmethod
-    def size(cls, layout: str) -> int:
+    def size(cls, layout: str, slots: int = 2) -> int:
         """Bytes that a mailbox of this layout takes; a multiple of 8."""
-        return cls._size(struct.calcsize("<" + layout))
+        return cls._size(struct.calcsize("<" + layout), slots)
 
     def write(self, *values: Any) -> int:
         """Announce a record; returns its number. ``struct.error`` when the values do not fit the layout."""
-        self._layout.pack_into(self._payloads[(self._seq + 1) & 1], 0, *values)
+        self._layout.pack_into(self._payloads[(self._seq + 1) & self._mask], 0, *values)
         return self._announce(self._layout.size)
 
     def read(self) -> tuple[int, tuple[Any, ...]] | None:
@@ -100,13 +103,23 @@ class Mailbox(_Slots):
             seq = self._announced[0]
             if seq == self._seen:
                 break
-            which = seq & 1
-            number, check = _SLOT.unpack_from(self._buffer, self._starts[which])
-            record = bytes(self._payloads[which])
-            if number == seq and crc32(record) == check:
+            record = self.bytes_at(seq)
+            if record is not None:
                 self._seen, self._record = seq, record
                 break
         return (self._seen, self._record) if self._seen else None
+
+    def bytes_at(self, seq: int) -> bytes | None:
+        """The whole record of that number, not unpacked; None where it is not there yet, or not any more."""
+        which = seq & self._mask
+        number, check = _SLOT.unpack_from(self._buffer, self._starts[which])
+        record = bytes(self._payloads[which])
+        return record if number == seq > 0 and crc32(record) == check else None
+
+    @property
+    def oldest(self) -> int:
+        """Number of the oldest record that nobody is about to write over."""
+        return max(1, self._announced[0] - self._mask + 1)
 
 
 _SERIES = struct.Struct("<dQQ")  # time, revision, count
@@ -132,7 +145,7 @@ class SeriesBox(_Slots):
         count = len(values)
         if count > self._capacity:
             raise ValueError(f"{count} numbers do not fit into {self._capacity}")
-        payload = self._payloads[(self._seq + 1) & 1]
+        payload = self._payloads[(self._seq + 1) & self._mask]
         _SERIES.pack_into(payload, 0, t, revision, count)
         end = _SERIES.size + 8 * count
         payload[_SERIES.size : end] = array("d", values).tobytes()
@@ -144,7 +157,7 @@ class SeriesBox(_Slots):
             seq = self._announced[0]
             if seq == self._seen:
                 break
-            which = seq & 1
+            which = seq & self._mask
             number, check = _SLOT.unpack_from(self._buffer, self._starts[which])
             t, revision, count = _SERIES.unpack_from(self._payloads[which], 0)
             if count > self._capacity:

@@ -14,6 +14,7 @@ from ..commands import CHUNK_POINTS, Kind
 from ..inbox import CommandRecord, DeadmanRecord
 from ..robot import Reading
 from .gripper_mail import GripperMail
+from .history import History
 from .mailbox import Mailbox, SeriesBox
 from .newest import Newest, newest
 from .state_layout import ServoRecord, StateLayout
@@ -26,6 +27,8 @@ __all__ = ["AppRecord", "GroupMemory", "HostRecord", "RobotMail", "ServoRecord"]
 _APP = "dQ"
 _HOST = "dQQ?"
 _DEADMAN = "??Qd"
+STATES = 1024
+"""So many states of an arm stay readable: 4 s at 240 Hz, 1 s at 1 kHz."""
 
 
 class AppRecord(NamedTuple):
@@ -67,9 +70,9 @@ class RobotMail:
         self._layout = StateLayout(n)
         boxes = []
         offset = 0
-        for layout in self.layouts(n):
-            boxes.append(Mailbox(buffer[offset:], layout))
-            offset += Mailbox.size(layout)
+        for layout, slots in self.layouts(n):
+            boxes.append(Mailbox(buffer[offset:], layout, slots))
+            offset += Mailbox.size(layout, slots)
         self.command, self.deadman, self.marks, self.state = boxes
         self._chunk = SeriesBox(buffer[offset:], _chunk_capacity(n))
         state = self.state
@@ -81,19 +84,21 @@ class RobotMail:
         """The newest state; None before the first one."""
         self.peek = Newest(state.seq, state.read_bytes, self._layout.servo).get
         """Only what the servo said: for every ``send``."""
+        self.history = History(state, self._layout.state)
+        """The last :data:`STATES` states."""
         self._newest_marks = newest(self.marks, Marks._make)
         self._marking = threading.Lock()
 
     @staticmethod
-    def layouts(n: int) -> tuple[str, ...]:
-        """Formats, in the order in which the boxes lie."""
+    def layouts(n: int) -> tuple[tuple[str, int], ...]:
+        """Formats and numbers of slots, in the order in which the boxes lie."""
         width = max(2 * n, 7)
-        return (f"QddidQH{width}d", _DEADMAN, "QQ", StateLayout(n).format)
+        return ((f"QddidQH{width}d", 2), (_DEADMAN, 2), ("QQ", 2), (StateLayout(n).format, STATES))
 
     @classmethod
     def size(cls, n: int) -> int:
         """Bytes that the mailboxes take."""
-        return sum(Mailbox.size(layout) for layout in cls.layouts(n)) + SeriesBox.size(_chunk_capacity(n))
+        return sum(Mailbox.size(*layout) for layout in cls.layouts(n)) + SeriesBox.size(_chunk_capacity(n))
 
     # From the app to the servo.
 
