@@ -5,7 +5,7 @@ from __future__ import annotations
 import atexit
 import contextlib
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -23,6 +23,7 @@ from .gamepad import Gamepad
 from .gripper import Gripper
 from .host.groups import groups_of
 from .host.hosts import Host, LocalHost, RemoteHost, SteppedHost
+from .observation import Observation, Observer
 from .pads.choice import Chosen, choose_pad, in_words, tour
 from .robot import Robot
 from .specs import GroupSpec, PadSpec, RobotSpec
@@ -103,6 +104,7 @@ class Rig:
         self._pictures: Pictures | None = None
         self._viewer: Viewer | None = None
         self._devices: dict[str, Any] = {}
+        self._observer = Observer(self)
         self._closed = False
         atexit.register(self._close_at_exit)
 
@@ -296,7 +298,29 @@ class Rig:
         """Per group: ticks, missed ticks, periods (s), and per robot the peaks of its set-points and latencies."""
         return {host.spec.name: host.request("statistics") for host in self._hosts}
 
-    # What it does.
+    # What it sees and does.
+
+    def observe(
+        self,
+        after: float | None = None,
+        *,
+        timeout: float = 1.0,
+        history: int = 1,
+        cameras: Collection[str] | None = None,
+    ) -> Observation:
+        """Every camera's newest picture with the arms and grippers interpolated to its stamp, in one record.
+
+        With ``after`` (s on ``rig.clock``) everything is from that time or later: after a motion,
+        ``rig.observe(after=rig.clock.now())`` shows its end. ``history`` says how many observations, this one included,
+        are in :attr:`~hal.observation.Observation.history`. ``cameras`` are the names of those that count, else all.
+
+        Raises StaleStateError when a picture or a state did not come within ``timeout`` s, ConnectionLost.
+        """
+        return self._observer.observe(after, timeout, history, cameras)
+
+    def forget_observations(self) -> None:
+        """A new episode begins: what was observed before is no part of its history."""
+        self._observer.forget()
 
     def stop(self) -> None:
         """Stop every arm, within its limits, and latch it. Any thread may call it, at any time.

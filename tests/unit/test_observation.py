@@ -1,0 +1,79 @@
+"""One record of everything that a rig sees."""
+
+from __future__ import annotations
+
+import pytest
+
+import hal
+from hal.drivers.mock.camera import read_picture
+from hal.errors import CommandError, DeviceNotFound, StaleStateError
+
+
+def test_pictures_and_states_of_the_same_time_in_real_time() -> None:
+    with hal.open("panda_table", driver="mock", clock="real_time", pad="none") as rig:
+        arm = rig.robots["panda"]
+        seen = []
+        with arm.control(rate_hz=50) as control:
+            for tick in rig.clock.rate(50):
+                control.send(hal.Twist([0.1, 0.0, 0.0]), gripper=min(1.0, tick.elapsed))
+                if tick.elapsed > 0.5:
+                    seen.append(rig.observe())
+                if tick.elapsed > 1.0:
+                    break
+        for observation in seen:
+            assert set(observation.cameras) == {"scene", "wrist"}
+            assert observation.t == max(moment.frame.stamp.t for moment in observation.cameras.values())
+            for moment in observation.cameras.values():
+                state = moment.robots["panda"]
+                assert state.stamp.t == pytest.approx(moment.frame.stamp.t, abs=1e-9)
+                assert moment.grippers["panda"].stamp.t == pytest.approx(moment.frame.stamp.t, abs=1e-9)
+                assert read_picture(moment.frame.color).t == pytest.approx(state.stamp.t, abs=1e-5)
+            assert observation.robots["panda"].stamp.t == pytest.approx(observation.t, abs=1e-9)
+        first, last = (observation.robots["panda"].tcp.position for observation in (seen[0], seen[-1]))
+        assert last[0] - first[0] > 0.02, "it moved"
+        after = rig.clock.now()
+        assert all(m.frame.stamp.t >= after for m in rig.observe(after=after).cameras.values())
+
+
+def test_history_is_as_long_as_asked_for_and_begins_anew() -> None:
+    with hal.open("panda_table", driver="mock") as rig:
+
+        def stamps() -> list[float]:
+            rig.clock.sleep(0.1)
+            return [round(past.t, 3) for past in rig.observe(history=3).history]
+
+        start = rig.clock.now()
+        first = round(start + 0.1, 3)
+        assert stamps() == [first] * 3, "what was not there yet is the oldest again"
+        assert stamps() == pytest.approx([first, first, first + 0.1])
+        stamps()
+        assert stamps() == pytest.approx([first + 0.1, first + 0.2, first + 0.3])
+        rig.forget_observations()
+        assert len(set(stamps())) == 1
+        assert len(rig.observe().history) == 1
+        with pytest.raises(CommandError):
+            rig.observe(history=0)
+
+
+def test_some_cameras_or_none() -> None:
+    with hal.open("panda_table", driver="mock") as rig:
+        assert set(rig.observe(cameras=["wrist"]).cameras) == {"wrist"}
+        bare = rig.observe(cameras=[])
+        assert bare.t == rig.robots["panda"].state().stamp.t
+        with pytest.raises(DeviceNotFound, match="scene, wrist"):
+            rig.observe(cameras=["wirst"])
+
+
+def test_a_camera_that_takes_nothing_new_is_an_error() -> None:
+    with hal.open("panda_table", driver="mock", clock="real_time", pad="none") as rig:
+        rig.observe()
+        rig.cameras["wrist"].inject(freeze=True)
+        with pytest.raises(StaleStateError, match="wrist"):
+            rig.observe(after=rig.clock.now(), timeout=0.3)
+
+
+def test_without_cameras_a_fresh_state_is_waited_for() -> None:
+    with hal.open("panda_table", driver="mock", clock="real_time", pad="none", overrides=["cameras={}"]) as rig:
+        for _ in range(20):
+            now = rig.clock.now()
+            assert rig.observe(after=now).robots["panda"].stamp.t >= now
