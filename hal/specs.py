@@ -14,6 +14,7 @@ from typing import Any, TypeVar
 __all__ = [
     "BodySpec",
     "CameraSpec",
+    "DepthSensorSpec",
     "GripperSpec",
     "GroupSpec",
     "KinematicsSpec",
@@ -150,6 +151,10 @@ class BodySpec:
     rgba: tuple[float, float, float, float] = (0.7, 0.7, 0.7, 1.0)
     collision: bool = True
     visible: bool = True
+    robot: str | None = None
+    """The arm that carries it on ``link``: it goes where that goes, and touches nothing. ``position`` and
+    ``orientation`` are then in the frame of the link."""
+    link: str | None = None
 
 
 @dataclass(frozen=True)
@@ -183,6 +188,18 @@ class SensorSpec:
 
 
 @dataclass(frozen=True)
+class DepthSensorSpec:
+    """How a camera measures depth: what a simulation of its noise needs to know."""
+
+    kind: str
+    """``stereo`` or ``lidar``."""
+    unit: float
+    """Metres in one unit of the raw picture."""
+    baseline: float = 0.0
+    """From the left imager to the right one, m; 0 where there is no pair."""
+
+
+@dataclass(frozen=True)
 class CameraSpec:
     """One camera on a rig."""
 
@@ -213,6 +230,8 @@ class CameraSpec:
     of the captured size."""
     K_infrared: tuple[Vector3, Vector3, Vector3] | None = None
     """Of both infrared pictures as they are handed out; None where they have the view of K."""
+    depth_sensor: DepthSensorSpec | None = None
+    """None where the model does not say."""
 
 
 @dataclass(frozen=True)

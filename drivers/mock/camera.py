@@ -128,6 +128,8 @@ class MockCamera(CameraDriver):
             infrared=infrared if "infrared" in wanted else None,
             segmentation=segmentation if "segmentation" in wanted else None,
             T_world_camera=self._view,
+            infrared_right=infrared.copy() if "infrared_right" in wanted else None,
+            skew=0.0 if {"color", "depth"} <= set(wanted) else None,
         )
 
     def _draw(

@@ -11,5 +11,6 @@ DRIVER = DriverSpec(
     gamepad="hal.drivers.pybullet.keyboard:KeyboardPad",
     pictures="hal.drivers.pybullet.pictures:PyBulletPictures",
     viewer="hal.drivers.pybullet.viewer:PyBulletViewer",
+    checks={"camera": "hal.drivers.pybullet.depth_settings:check"},
     requires={"pybullet": "pip install 'robot-hal[sim]'"},
 )

@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
+from pathlib import PurePath
 from typing import ClassVar, Protocol
 
 from hal.camera import CameraDriver, RawFrame
-from hal.errors import ConfigError, DeviceNotFound, NotSupported, Problem
+from hal.camera_info import CameraInfo, nominal_info
+from hal.errors import ConnectionLost, NotSupported
 from hal.host.frames import FrameRing
-from hal.pose import Pose
 from hal.specs import CameraSpec
 
+from .depth_settings import noise_of
+from .exposure import Exposure, camera_pose, check_view
 from .rendering import Renderer
 from .world import World
 
-__all__ = ["DirectSource", "FrameSource", "PyBulletCamera", "SharedSource", "camera_pose", "draw"]
+__all__ = ["DirectSource", "FrameSource", "PyBulletCamera", "SharedSource", "camera_pose"]
 
 
 class FrameSource(Protocol):
@@ -29,16 +33,33 @@ class PyBulletCamera(CameraDriver):
 
     simulated: ClassVar[bool] = True
 
+    def __init__(self, spec: CameraSpec, source: object | None = None) -> None:
+        super().__init__(spec, source)
+        self._open = False
+        info = nominal_info(spec, "simulated", f"simulated {PurePath(spec.model).stem}")
+        sensor = spec.depth_sensor if noise_of(spec) is not None else None
+        # With noise, depth comes in whole units, as from a real camera.
+        self._info = replace(info, depth_scale=sensor.unit) if sensor is not None else info
+
+    @property
+    def info(self) -> CameraInfo:
+        """The figures of the camera's model, which the pictures are drawn by."""
+        return self._info
+
     def open(self) -> None:
         if not hasattr(self.source, "grab"):
             raise NotSupported(f"camera {self.spec.name} is simulated: it needs a simulated world to look at")
+        self._open = True
 
     def grab(self, timeout: float) -> RawFrame | None:
+        if not self._open:
+            raise ConnectionLost(f"camera {self.spec.name} is not open")
         source: FrameSource = self.source  # type: ignore[assignment]  # checked by open
         return source.grab(timeout)
 
     def close(self) -> None:
         """Nothing to let go of: the pictures' owner is the rig."""
+        self._open = False
 
 
 class DirectSource:
@@ -48,13 +69,13 @@ class DirectSource:
         check_view(world, spec)
         self._world = world
         self._renderer = renderer
-        self._spec = spec
+        self._exposure = Exposure(spec)
         self._now = now
         self._seq = 0
 
     def grab(self, timeout: float) -> RawFrame:
         self._seq += 1
-        return draw(self._world, self._renderer, self._spec, self._now(), self._world.t, self._seq)
+        return self._exposure.take(self._world, self._renderer, self._now(), self._world.t, self._seq)
 
 
 class SharedSource:
@@ -73,35 +94,3 @@ class SharedSource:
         else:
             self._seq = frame.seq
         return frame
-
-
-def draw(world: World, renderer: Renderer, spec: CameraSpec, t: float, t_device: float, seq: int) -> RawFrame:
-    """The picture that a camera takes of the world as it is."""
-    pose = camera_pose(world, spec)
-    images = renderer.render(spec, pose)
-    return RawFrame(t, t_device, seq, images.color, images.depth, images.infrared, images.segmentation, pose)
-
-
-def camera_pose(world: World, spec: CameraSpec) -> Pose:
-    """Where the camera's optical frame is in the world now."""
-    view = spec.view
-    if view is None:
-        return Pose()
-    here = Pose(view.position, view.orientation)
-    if view.robot is None:
-        return here
-    link = world.pose(view.robot, view.link)
-    return Pose(link["position"], link["orientation"]) @ here
-
-
-def check_view(world: World, spec: CameraSpec) -> None:
-    """Raise ConfigError when a camera cannot be where it says that it is."""
-    view = spec.view
-    if view is None:
-        message = "a simulated camera needs look_at, pose or attached to know where it is"
-        raise ConfigError([Problem("cameras", f"cameras.{spec.name}", message)])
-    if view.robot is not None:
-        try:
-            world.pose(view.robot, view.link)
-        except DeviceNotFound as error:
-            raise ConfigError([Problem("cameras", f"cameras.{spec.name}.attached", str(error))]) from None

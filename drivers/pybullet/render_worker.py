@@ -19,7 +19,7 @@ from hal.host.pacer import yield_to_others
 from hal.host.process import Channel, SharedMemory
 from hal.specs import CameraSpec, WorldSpec, from_json
 
-from .camera import check_view, draw
+from .exposure import Exposure, check_view
 from .mirror import Mirror
 from .rendering import Renderer, choose_renderer
 from .world import World
@@ -42,6 +42,8 @@ class RenderWorker:
         self._ring = ring
         for camera in cameras:
             check_view(mirror.world, camera)
+        self._exposures = {camera.name: Exposure(camera) for camera in cameras}
+        self._numbers = dict.fromkeys(self._exposures, 0)
         start = time.monotonic()
         self._due = {camera.name: start + k / len(cameras) / camera.rate_hz for k, camera in enumerate(cameras)}
         self._shown = dict.fromkeys(self._due, float("-inf"))
@@ -49,8 +51,8 @@ class RenderWorker:
 
     def warm_up(self) -> None:
         """Draw every camera once, so that meshes and shaders are ready when the first snapshot comes."""
-        for camera in self._cameras:
-            draw(self._mirror.world, self._renderer, camera, 0.0, 0.0, 0)
+        for exposure in self._exposures.values():
+            exposure.take(self._mirror.world, self._renderer, 0.0, 0.0, 0)
 
     def run_once(self) -> float:
         """Draw the cameras that are due; returns when to come again, on the monotonic clock."""
@@ -60,7 +62,10 @@ class RenderWorker:
                 t = self._mirror.update()
                 if t is None or t <= self._shown[camera.name]:
                     return now + _IDLE  # the world stands still, or an edit is on its way
-                self._ring.put(camera.name, draw(self._mirror.world, self._renderer, camera, t, t, 0))
+                self._numbers[camera.name] += 1
+                number = self._numbers[camera.name]
+                frame = self._exposures[camera.name].take(self._mirror.world, self._renderer, t, t, number)
+                self._ring.put(camera.name, frame)
                 self._shown[camera.name] = t
                 period = 1.0 / camera.rate_hz
                 late = time.monotonic() - self._due[camera.name]

@@ -9,8 +9,9 @@ from typing import TypeVar
 
 from .. import registry
 from ..errors import HalError
+from .camera_models import CameraModel
 from .files import Problems, read_yaml
-from .models import CameraModel, GripperModel, RobotModel, find_model
+from .models import GripperModel, RobotModel, find_model
 from .rigfile import CameraConfig, Device, RigFile, RobotConfig
 from .schema import Unknown
 from .urdf import UrdfModel

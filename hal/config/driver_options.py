@@ -7,20 +7,22 @@ from pathlib import Path
 from typing import Any
 
 from .. import registry
-from ..specs import GripperSpec, RobotSpec
+from ..specs import CameraSpec, GripperSpec, RobotSpec
+from .camera_models import CameraModel
 from .context import Context
 from .models import GripperModel, RobotModel
-from .rigfile import GripperConfig, RobotConfig
+from .rigfile import CameraConfig, GripperConfig, RobotConfig
 
-__all__ = ["SHARED", "ask_driver", "is_emulated", "options_of"]
+__all__ = ["SHARED", "ask_camera_driver", "ask_driver", "is_emulated", "options_of"]
+
+Config = RobotConfig | GripperConfig | CameraConfig
+Model = RobotModel | GripperModel | CameraModel
 
 SHARED = ("host",)
 """Options of a real arm that its gripper has too, unless it has its own."""
 
 
-def options_of(
-    config: RobotConfig | GripperConfig, model: RobotModel | GripperModel, simulated: bool, driver: str
-) -> dict[str, Any]:
+def options_of(config: Config, model: Model, simulated: bool, driver: str) -> dict[str, Any]:
     """The rig's options for this driver, on top of the model's. The latter are for the model's own driver only."""
     own = model.drivers.sim if simulated else model.drivers.real
     of_model = (model.simulated if simulated else model.real) if driver == own else {}
@@ -46,7 +48,15 @@ def ask_driver(context: Context, key: str, spec: RobotSpec, config: RobotConfig,
             _note(context, key, "gripper.", relative, message, config.gripper, kind, file)
 
 
-def _found(driver: str, kind: str, spec: RobotSpec | GripperSpec) -> list[tuple[str, str]]:
+def ask_camera_driver(
+    context: Context, key: str, spec: CameraSpec, config: CameraConfig, model: CameraModel, file: Path
+) -> None:
+    """Note what the driver of a camera finds wrong in its record."""
+    for relative, message in _found(spec.driver, "camera", spec):
+        _note(context, key, "", relative, message, config, model, file)
+
+
+def _found(driver: str, kind: str, spec: RobotSpec | GripperSpec | CameraSpec) -> list[tuple[str, str]]:
     check = registry.function(driver, registry.driver(driver).checks.get(kind))
     return list(check(spec)) if check is not None else []
 
@@ -57,8 +67,8 @@ def _note(
     part: str,
     relative: str,
     message: str,
-    config: RobotConfig | GripperConfig,
-    model: RobotModel | GripperModel,
+    config: Config,
+    model: Model,
     file: Path,
 ) -> None:
     """In the rig's file, unless what is wrong stands in the model's. ``relative`` is a key of the device's entry."""
@@ -72,6 +82,8 @@ def _note(
         in_model = name not in given if name else not given
         if in_model and name in model.real_limits.model_fields_set and not context.simulated(config):
             relative = f"real_{relative}"
+    elif section in ("capture", "depth", "field_of_view") and isinstance(config, CameraConfig):
+        in_model = getattr(config, section) is None
     if in_model:
         context.problems.add(file, f"{part}{relative}", message)
     else:

@@ -1,6 +1,5 @@
-"""Robot and camera models: what is the same for every one of its kind. YAML files in ``robots/`` and ``sensors/``.
-
-A model of your own is a file of the same shape; a rig names it by its path.
+"""Robot models: what is the same for every one of its kind. YAML files in ``robots/``; cameras' are in
+:mod:`.camera_models`. A model of your own is a file of the same shape; a rig names it by its path.
 """
 
 from __future__ import annotations
@@ -13,11 +12,9 @@ from pydantic import Field, model_validator
 from .data_files import data_folder, is_path, list_data
 from .files import Problems, nearest, read_yaml
 from .schema import (
-    Flag,
     Name,
     Numbers,
     PerJoint,
-    Pixels,
     PoseConfig,
     Positive,
     QuaternionConfig,
@@ -26,12 +23,9 @@ from .schema import (
 )
 
 __all__ = [
-    "CameraModel",
     "Drivers",
-    "FieldOfView",
     "GripperModel",
     "LimitsModel",
-    "Mode",
     "PoseConfig",
     "RobotModel",
     "UrdfSource",
@@ -121,88 +115,6 @@ class RobotModel(Strict):
     real: dict[str, Any] = Field(default_factory=dict)
     """What only the real driver needs; a rig adds to it."""
     simulated: dict[str, Any] = Field(default_factory=dict)
-
-
-class Mode(Strict):
-    """A size of picture and the rates that it comes at."""
-
-    width: Pixels
-    height: Pixels
-    rates_hz: tuple[Positive, ...] = Field(min_length=1)
-    depth_min: Positive | None = None
-    """Nearest depth in this mode, m; the model's when left out."""
-
-    def __str__(self) -> str:
-        return f"{self.width}x{self.height} at {', '.join(f'{rate:g}' for rate in self.rates_hz)} Hz"
-
-
-class FieldOfView(Strict):
-    """Angles of view of the whole sensor, from edge to edge of its outermost pixels, deg.
-
-    ``width`` and ``height`` are those of the picture that shows the whole sensor; a mode of another shape is its
-    centre. Left out, every mode shows the same angles. One angle alone means square pixels.
-    """
-
-    horizontal_deg: float | None = Field(default=None, gt=0.0, lt=180.0, strict=True)
-    vertical_deg: float | None = Field(default=None, gt=0.0, lt=180.0, strict=True)
-    width: Pixels | None = None
-    height: Pixels | None = None
-
-    @model_validator(mode="after")
-    def _complete(self) -> FieldOfView:
-        if self.horizontal_deg is None and self.vertical_deg is None:
-            raise ValueError("needs horizontal_deg, vertical_deg or both")
-        if (self.width is None) != (self.height is None):
-            raise ValueError("needs width and height of the whole sensor's picture, or neither")
-        return self
-
-
-class Depth(Strict):
-    """What can be measured, m."""
-
-    min: Positive
-    max: Positive
-
-    @model_validator(mode="after")
-    def _ordered(self) -> Depth:
-        if self.min >= self.max:
-            raise ValueError(f"min must be less than max, not {self.min:g} and {self.max:g}")
-        return self
-
-
-class Capture(Strict):
-    """What a camera takes."""
-
-    width: Pixels
-    height: Pixels
-    rate_hz: Positive
-
-
-class CameraModel(Strict):
-    """A camera."""
-
-    description: str = ""
-    drivers: Drivers = Drivers()
-    modes: tuple[Mode, ...] | None = None
-    """What it can take; None where anything goes."""
-    capture: Capture
-    """What it takes unless a rig says otherwise."""
-    field_of_view: FieldOfView
-    distortion: Numbers = (0.0, 0.0, 0.0, 0.0, 0.0)
-    """k1, k2, p1, p2, k3 (OpenCV's order)."""
-    depth: Depth
-    streams: tuple[str, ...] = ("color", "depth", "infrared")
-    """What it can give."""
-    adjustable: Flag = False
-    """May a rig choose the field of view and the range of depth? (A real camera's are what they are.)"""
-    real: dict[str, Any] = Field(default_factory=dict)
-    simulated: dict[str, Any] = Field(default_factory=dict)
-
-    @model_validator(mode="after")
-    def _five(self) -> CameraModel:
-        if len(self.distortion) != 5:
-            raise ValueError(f"distortion must be 5 numbers k1, k2, p1, p2, k3, not {len(self.distortion)}")
-        return self
 
 
 def find_model(name: str, folder: str, parts: tuple[str, ...], base: Path) -> Path | str:

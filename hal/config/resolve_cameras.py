@@ -1,17 +1,21 @@
-"""A camera of a rig: model, mode, crop and place into one :class:`~hal.specs.CameraSpec`."""
+"""A camera of a rig: model, modes, crop and place into one :class:`~hal.specs.CameraSpec`."""
 
 from __future__ import annotations
 
 from contextlib import suppress
-from typing import get_args
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, get_args
 
 from ..pose import Pose
-from ..specs import CameraSpec, ViewSpec
+from ..specs import CameraSpec, DepthSensorSpec, SensorSpec, ViewSpec
+from .camera_models import CameraModel
 from .context import Context
+from .driver_options import ask_camera_driver, options_of
 from .files import nearest
-from .intrinsics import Intrinsics, centre_crop, from_field_of_view
-from .models import CameraModel, Capture, Mode
-from .rigfile import CameraConfig, Stream
+from .intrinsics import Intrinsics, centre_crop
+from .resolve_streams import Streams, resolve_streams
+from .rigfile import CameraConfig, Output, Stream
 from .schema import Unknown
 from .views import view_of
 
@@ -21,47 +25,71 @@ __all__ = ["resolve_camera"]
 def resolve_camera(context: Context, name: str, config: CameraConfig) -> CameraSpec | None:
     """The camera, or None with the problems noted."""
     key = f"cameras.{name}"
-    model, _ = context.read_model(CameraModel, key, config, "sensors", "cameras")
+    model, file = context.read_model(CameraModel, key, config, "sensors", "cameras")
     for check in (_check_attached, _check_place):
         with suppress(Unknown):
             check(context, key, config)
-    for check_with_model in (_check_mode, _check_adjustable, _check_streams):
+    for check_with_model in (_check_adjustable, _check_streams):
         with suppress(Unknown):
             check_with_model(context, key, config, model)
+    streams: Streams | None = None
+    with suppress(Unknown):
+        streams = resolve_streams(context, key, config, model)
     driver = context.choose_driver("camera", key, config, model)
-    return None if context.problems.found else _spec(context, name, config, model, driver)
+    if streams is None or not driver or _has_problems(context, key, file):
+        return None
+    with suppress(Unknown):
+        spec = _spec(context, name, config, model, driver, streams)
+        ask_camera_driver(context, key, spec, config, model, file)
+        return spec
+    return None
 
 
-def _spec(context: Context, name: str, config: CameraConfig, model: CameraModel, driver: str) -> CameraSpec:
+def _has_problems(context: Context, key: str, file: Path) -> bool:
+    """Is anything wrong in the camera's entry, or in its model's file?"""
+    return any(f"{found.key}.".startswith(f"{key}.") or found.file == str(file) for found in context.problems.found)
+
+
+def _spec(
+    context: Context, name: str, config: CameraConfig, model: CameraModel, driver: str, streams: Streams
+) -> CameraSpec:
     simulated = context.simulated(config)
-    capture = config.capture or model.capture
-    output = config.output or capture
-    K = _intrinsics(config, model, capture).through(
-        centre_crop(capture.width, capture.height, output.width, output.height), output.width, output.height
-    )
-    mode = _mode(model, capture)
-    depth = config.depth or model.depth
-    options = {**model.simulated, **config.simulated} if simulated else {**model.real, **config.real}
-    formats = {stream: kind.format for stream, kind in config.streams.items() if kind.format is not None}
-    if formats and not simulated:
-        options["formats"] = formats
+    reference = streams.reference
+    output = config.output or Output(width=reference.width, height=reference.height)
+    sensor = model.depth_sensor
+    infrared = [streams.sensors[name] for name in ("infrared", "infrared_right") if name in streams.sensors]
     return CameraSpec(
         name=name,
         model=config.model,
         driver=driver,
-        capture_width=capture.width,
-        capture_height=capture.height,
+        capture_width=reference.width,
+        capture_height=reference.height,
         width=output.width,
         height=output.height,
-        rate_hz=capture.rate_hz,
-        K=K.matrix(),
+        rate_hz=min((sensor.rate_hz for sensor in streams.sensors.values()), default=reference.rate_hz),
+        K=_through(reference, output),
         distortion=(0.0,) * 5 if simulated else model.distortion,  # what is drawn has none
-        depth_min=(mode.depth_min if mode and not config.depth else None) or depth.min,
-        depth_max=depth.max,
+        depth_min=streams.depth_min,
+        depth_max=(config.depth or model.depth).max,
         streams=tuple(config.streams),
         view=_view(context, config),
-        options=options,
+        options=options_of(config, model, simulated, driver),
+        align=streams.align,
+        sensors=streams.sensors,
+        depth_sensor=DepthSensorSpec(sensor.kind, sensor.unit, model.baseline) if sensor is not None else None,
+        K_infrared=None if all(_same_view(one, reference) for one in infrared) else _through(infrared[0], output),
     )
+
+
+def _same_view(one: SensorSpec, other: SensorSpec) -> bool:
+    return replace(one, rate_hz=0.0, format=None) == replace(other, rate_hz=0.0, format=None)
+
+
+def _through(sensor: SensorSpec, output: Output) -> Any:
+    """The camera matrix of a sensor's pictures after crop and scaling."""
+    (fx, _, cx), (_, fy, cy), _ = sensor.K
+    crop = centre_crop(sensor.width, sensor.height, output.width, output.height)
+    return Intrinsics(fx, fy, cx, cy).through(crop, output.width, output.height).matrix()
 
 
 def _check_place(context: Context, key: str, config: CameraConfig) -> None:
@@ -83,23 +111,6 @@ def _check_attached(context: Context, key: str, config: CameraConfig) -> None:
         context.problem(f"{key}.attached.link", text)
 
 
-def _mode(model: CameraModel, capture: Capture) -> Mode | None:
-    """The model's mode that takes this, where the model has modes and this is one of them."""
-    for mode in model.modes or ():
-        if (mode.width, mode.height) == (capture.width, capture.height) and capture.rate_hz in mode.rates_hz:
-            return mode
-    return None
-
-
-def _check_mode(context: Context, key: str, config: CameraConfig, model: CameraModel) -> None:
-    capture = config.capture or model.capture
-    if model.modes is None or _mode(model, capture) is not None:
-        return
-    asked = f"{capture.width}x{capture.height} at {capture.rate_hz:g} Hz"
-    modes = "; ".join(str(mode) for mode in model.modes)
-    context.problem(f"{key}.capture", f"model {config.model!r} has no mode {asked}; it has: {modes}")
-
-
 def _check_adjustable(context: Context, key: str, config: CameraConfig, model: CameraModel) -> None:
     for part in ("field_of_view", "depth"):
         if not model.adjustable and getattr(config, part, None) is not None:
@@ -111,17 +122,14 @@ def _check_streams(context: Context, key: str, config: CameraConfig, model: Came
     if not config.streams:
         context.problem(f"{key}.streams", f"must name at least one of {', '.join(model.streams)}")
     simulated = context.simulated(config)
-    allowed = (*model.streams, "segmentation") if simulated else model.streams
+    allowed = (*model.streams, "segmentation") if simulated else tuple(model.streams)
     for stream in config.streams:
         if stream not in allowed and stream in get_args(Stream):  # others are noted already
             hint = "; only simulated cameras have it" if stream == "segmentation" else ""
             context.problem(f"{key}.streams.{stream}", f"model {config.model!r} has {', '.join(allowed)}{hint}")
-
-
-def _intrinsics(config: CameraConfig, model: CameraModel, capture: Capture) -> Intrinsics:
-    angles = (config.field_of_view if model.adjustable else None) or model.field_of_view
-    sensor = (angles.width, angles.height) if angles.width is not None and angles.height is not None else None
-    return from_field_of_view(capture.width, capture.height, angles.horizontal_deg, angles.vertical_deg, sensor)
+    drawn = config.streams.get("segmentation")
+    if simulated and drawn is not None and drawn.model_fields_set:
+        context.problem(f"{key}.streams.segmentation", "is drawn with the frame: there is nothing to choose")
 
 
 def _view(context: Context, config: CameraConfig) -> ViewSpec | None:

@@ -19,7 +19,8 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, Field, model_validator
 
-from .models import Capture, Depth, Drivers, FieldOfView
+from .camera_models import Capture, Depth, FieldOfView, by_name
+from .models import Drivers
 from .schema import (
     Flag,
     Name,
@@ -123,21 +124,22 @@ class Output(Strict):
 
 
 class StreamConfig(Strict):
-    """One kind of picture."""
+    """One kind of picture. What is left out is as in ``capture``."""
 
     format: str | None = None
     """Of the real camera (``bgr8``, ``z16``, ...). Frames are RGB and metres whatever it is."""
+    width: Pixels | None = None
+    height: Pixels | None = None
+    rate_hz: Positive | None = None
+
+    @model_validator(mode="after")
+    def _whole_size(self) -> StreamConfig:
+        if (self.width is None) != (self.height is None):
+            raise ValueError("needs width and height, or neither")
+        return self
 
 
-def _streams(value: Any) -> Any:
-    if isinstance(value, (list, tuple)):
-        return {str(name): {} for name in value}
-    if isinstance(value, dict):
-        return {name: {} if item is None else item for name, item in value.items()}
-    return value
-
-
-Stream = Literal["color", "depth", "infrared", "segmentation"]
+Stream = Literal["color", "depth", "infrared", "infrared_right", "segmentation"]
 
 
 def _color_and_depth() -> dict[Stream, StreamConfig]:
@@ -150,11 +152,13 @@ class CameraConfig(Device):
     model: str
     """A name in ``sensors/cameras/``, or the path of a file of your own."""
     capture: Capture | None = None
-    """One of the model's modes."""
+    """One of the model's modes, for every stream that does not say otherwise."""
     output: Output | None = None
     """Centre crop and scaling of what was captured; none when left out."""
-    streams: Annotated[dict[Stream, StreamConfig], BeforeValidator(_streams)] = Field(default_factory=_color_and_depth)
+    streams: Annotated[dict[Stream, StreamConfig], BeforeValidator(by_name)] = Field(default_factory=_color_and_depth)
     """``{color: {format: bgr8}, ...}`` or just ``[color, depth]``."""
+    align: Literal["color", "depth"] | None = None
+    """Whose view colour and depth are handed out in; colour's when left out, where there is colour."""
     look_at: LookAt | None = None
     pose: PoseConfig | None = None
     """Of the optical frame (x right, y down, z forward) in the world, as calibration writes it."""

@@ -8,6 +8,7 @@ leaves one unfinished slot, which no reader takes.
 
 from __future__ import annotations
 
+import math
 import struct
 import time
 from collections.abc import Sequence
@@ -25,7 +26,7 @@ __all__ = ["FrameRing"]
 _SLOTS = 4
 """Per camera. A reader has two periods of the camera to copy a picture before its slot is written again."""
 _NUMBER = struct.Struct("<Q")
-_HEADER = struct.Struct("<Qdd7d")  # number, t, t_device, position and quaternion of the camera
+_HEADER = struct.Struct("<Qddd7d")  # number, t, t_device, skew (NaN for none), position and quaternion of the camera
 _ALIGNMENT = 64
 _POLL = 0.0005
 """s between two looks while a picture is due."""
@@ -111,7 +112,8 @@ class _Camera:
             np.copyto(image, getattr(frame, name))
         pose = frame.T_world_camera or Pose()
         numbers = (*pose.position.tolist(), *pose.orientation.tolist())
-        _HEADER.pack_into(self._buffer, start, 0, frame.t, frame.t_device, *numbers)
+        skew = math.nan if frame.skew is None else frame.skew
+        _HEADER.pack_into(self._buffer, start, 0, frame.t, frame.t_device, skew, *numbers)
         _NUMBER.pack_into(self._buffer, start, number)
         _NUMBER.pack_into(self._buffer, self._offset, number)
         return number
@@ -122,7 +124,7 @@ class _Camera:
             if number <= after:
                 return None
             start, images = self._starts[number % _SLOTS], self._images[number % _SLOTS]
-            before, t, t_device, *pose = _HEADER.unpack_from(self._buffer, start)
+            before, t, t_device, skew, *pose = _HEADER.unpack_from(self._buffer, start)
             copies = {name: image.copy() for name, image in images.items()}
             if before == number and _NUMBER.unpack_from(self._buffer, start)[0] == number:
                 return RawFrame(
@@ -135,6 +137,7 @@ class _Camera:
                     copies.get("segmentation"),
                     Pose(pose[:3], pose[3:]),
                     copies.get("infrared_right"),
+                    None if math.isnan(skew) else skew,
                 )
         return None
 

@@ -388,8 +388,10 @@ def test_streams_as_list_or_with_formats() -> None:
     assert camera().streams == ("color", "depth")
     real = {"model": "realsense_d435", "sim": False, "drivers": {"real": "mock"}}
     real["streams"] = {"color": {"format": "bgr8"}, "depth": None}
-    assert plan({"cameras": {"eye": real}}).cameras[0].options == {"formats": {"color": "bgr8"}}
-    assert plan({"cameras": {"eye": real}}).cameras[0].view is None  # a real one may stand anywhere
+    (eye,) = plan({"cameras": {"eye": real}}).cameras
+    assert {name: sensor.format for name, sensor in eye.sensors.items()} == {"color": "bgr8", "depth": None}
+    assert eye.options == {}
+    assert eye.view is None  # a real one may stand anywhere
 
 
 def test_yaml_numbers_with_exponents_are_numbers(tmp_path: Path) -> None:

@@ -61,7 +61,11 @@ def thing(**keys: Any) -> dict[str, Any]:
         (thing(half_extent=[1, 1, 1]), "objects.0.half_extent", ["did you mean 'half_extents'"]),
         # Unknown names, with the nearest right one.
         ({"robots": {"arm": {"model": "pnada"}}}, "robots.arm.model", ["did you mean 'panda'", "iiwa"]),
-        ({"cameras": {"e": {**CAMERA, "model": "realsense_d453"}}}, "cameras.e.model", ["'realsense_d435'", "pinhole"]),
+        (
+            {"cameras": {"e": {**CAMERA, "model": "realsens_d435"}}},
+            "cameras.e.model",
+            ["mean 'realsense_d435'", "pinhole"],
+        ),
         ({"gamepads": {"p": {"model": "dualshok4"}}}, "gamepads.p.model", ["did you mean 'dualshock4'", "auto"]),
         ({"gamepads": {"p": {"driver": "evdve"}}}, "gamepads.p.driver", ["did you mean 'evdev'"]),
         ({"objects": ["cub"]}, "objects.0", ["did you mean 'cube'", "table"]),

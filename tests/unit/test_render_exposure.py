@@ -1,0 +1,214 @@
+"""The frames of a simulated depth camera: each picture from where its sensor is, at its rate, with its own matrix."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from pictures_kit import box, look_at, renderer, world
+
+from hal.config import load
+from hal.drivers.pybullet import render_worker
+from hal.drivers.pybullet.camera import DirectSource, PyBulletCamera, SharedSource
+from hal.drivers.pybullet.exposure import Exposure
+from hal.drivers.pybullet.mirror import Mirror
+from hal.drivers.pybullet.render_worker import RenderWorker
+from hal.drivers.pybullet.rendering import Images, Renderer
+from hal.drivers.pybullet.tiny import TinyRenderer
+from hal.drivers.pybullet.world import World
+from hal.errors import ConnectionLost
+from hal.host.frames import FrameRing
+from hal.host.mailbox import SeriesBox
+from hal.pose import Pose
+from hal.specs import BodySpec, CameraSpec
+
+EYE = look_at((0.0, 0.0, 1.0), (0.0, 0.0, 0.0), (0.0, 1.0, 0.0))  # straight down: x is right, y up in the picture
+SMALL = {"width": 160, "height": 120}
+EVERYTHING = ["color", "depth", "infrared", "infrared_right", "segmentation"]
+
+
+def camera(model: str = "realsense_d435", **keys: Any) -> CameraSpec:
+    pose = {"position": EYE.position.tolist(), "orientation": EYE.orientation.tolist()}
+    eye = {"model": model, "pose": pose, "output": SMALL, "streams": EVERYTHING, **keys}
+    (spec,) = load({"cameras": {"eye": eye}}).resolve().cameras
+    return spec
+
+
+def things() -> tuple[BodySpec, ...]:
+    floor = box("floor", (3.0, 3.0, 0.05), (0.0, 0.0, -0.05), rgba=(0.3, 0.3, 0.3, 1.0))
+    return floor, box("brick", (0.05, 0.05, 0.05), (0.0, 0.0, 0.05), rgba=(1.0, 1.0, 1.0, 1.0))
+
+
+def middle_of(bright: np.ndarray) -> tuple[float, float]:
+    """Column and row of the middle of a bright thing, pixels."""
+    rows, columns = np.nonzero(bright)
+    return float(columns.min() + columns.max()) / 2, float(rows.min() + rows.max()) / 2
+
+
+def face(spec: CameraSpec, K: Any, x: float) -> tuple[float, float]:
+    """Where the middle of the brick's upper face, 0.9 m away, is seen from ``x`` m right of the colour sensor."""
+    u, v, w = np.array(K) @ (-x, 0.0, 0.9)
+    return u / w, v / w
+
+
+@pytest.mark.parametrize("draws", ["tiny", "gl"])
+@pytest.mark.parametrize("model", ["realsense_d435", "realsense_d455", "realsense_d405"])
+@pytest.mark.parametrize("align", ["color", "depth"])
+def test_each_picture_is_taken_from_where_its_sensor_is(draws: str, model: str, align: str) -> None:
+    scene = world(*things())
+    spec = camera(model, align=align)
+    drawing = renderer(draws, scene)
+    frame = Exposure(spec).take(scene, drawing, 1.0, 2.0, 3)
+    places = {name: sensor.position[0] for name, sensor in spec.sensors.items()}
+    assert frame.segmentation is not None
+    assert frame.depth is not None
+    K_infrared = spec.K_infrared or spec.K
+    top = np.abs(frame.depth - 0.9) < 0.01
+    assert middle_of(top) == pytest.approx(face(spec, spec.K, places[align]), abs=1.0)
+    for name in ("infrared", "infrared_right"):
+        image = getattr(frame, name)
+        # The upper face is the brightest thing: the light comes from above.
+        assert middle_of(image > image.max() * 0.97) == pytest.approx(face(spec, K_infrared, places[name]), abs=1.5)
+    here = EYE @ Pose((places[align], 0.0, 0.0))
+    assert frame.T_world_camera is not None
+    assert frame.T_world_camera.distance(here)[0] < 1e-9
+    assert (frame.t, frame.t_device, frame.seq, frame.skew) == (1.0, 2.0, 3, 0.0)
+    # A point of the picture is where the world has it, by the frame's own matrix and pose.
+    v, u = np.argwhere(top)[0]
+    ray = np.linalg.inv(np.array(spec.K)) @ (u, v, 1.0)
+    point = frame.T_world_camera.transform(ray * frame.depth[v, u])
+    assert point[2] == pytest.approx(0.1, abs=0.002)
+    assert np.abs(point[:2]).max() < 0.055
+    drawing.close()
+    scene.close()
+
+
+class Counting(Renderer):
+    """Notes what it was asked to draw."""
+
+    description = "counts"
+
+    def __init__(self) -> None:
+        self.asked: list[tuple[str, ...]] = []
+
+    def render(self, camera: CameraSpec, T_world_camera: Pose) -> Images:
+        self.asked.append(camera.streams)
+        flat = (camera.height, camera.width)
+        return Images(
+            np.zeros((*flat, 3), np.uint8) if "color" in camera.streams else None,
+            np.ones(flat, np.float32) if "depth" in camera.streams else None,
+            np.zeros(flat, np.uint8) if "infrared" in camera.streams else None,
+            np.zeros(flat, np.int32) if "segmentation" in camera.streams else None,
+        )
+
+
+@pytest.mark.parametrize(
+    ("model", "keys", "asked"),
+    [
+        ("realsense_d435", {"streams": ["color", "depth"]}, [("color", "depth")]),
+        ("realsense_d435", {"streams": ["color", "infrared"]}, [("color",), ("infrared",)]),
+        ("realsense_d435", {"streams": ["infrared_right"]}, [("infrared",)]),
+        (
+            "realsense_d435",
+            {"streams": ["color", "depth", "infrared"], "align": "depth"},
+            [("color", "depth", "infrared")],
+        ),
+        ("pinhole", {"streams": ["color", "infrared"]}, [("color", "infrared")]),
+    ],
+)
+def test_nothing_is_drawn_that_nobody_asked_for(model: str, keys: dict[str, Any], asked: list[Any]) -> None:
+    scene = world(*things())
+    drawing, spec = Counting(), camera(model, **keys)
+    frame = Exposure(spec).take(scene, drawing, 0.0, 0.0, 1)
+    assert drawing.asked == asked
+    for stream in EVERYTHING:
+        assert (getattr(frame, stream) is not None) == (stream in spec.streams)
+    assert (frame.skew is None) == (not {"color", "depth"} <= set(spec.streams))
+    scene.close()
+
+
+def test_without_noise_depth_is_as_it_is_drawn() -> None:
+    scene = world(*things())
+    drawing = TinyRenderer(scene)
+    spec = camera(streams=["color", "depth"])
+    plain = drawing.render(spec, EYE).depth
+    assert plain is not None
+    frame = Exposure(spec).take(scene, drawing, 0.0, 0.0, 1)
+    assert np.array_equal(frame.depth, plain)
+    assert frame.T_world_camera == Pose(spec.view.position, spec.view.orientation)  # type: ignore[union-attr]
+    noisy = camera(streams=["color", "depth"], simulated={"depth_noise": {"subpixel": 0.08}})
+    takes = [Exposure(noisy).take(scene, drawing, 0.0, 0.0, number).depth for number in (1, 1, 2)]
+    assert np.array_equal(takes[0], takes[1])
+    assert not np.array_equal(takes[0], takes[2])
+    both = (plain > 0) & (takes[0] > 0)
+    assert both.mean() > 0.8
+    assert 0.0005 < np.abs(takes[0] - plain)[both].mean() < 0.01
+    assert np.array_equal(drawing.render(spec, EYE).depth, plain), "the picture that was drawn is not written to"
+    scene.close()
+
+
+def test_what_is_not_open_is_an_error() -> None:
+    scene = world(*things())
+    spec = camera(streams=["depth"])
+    driver = PyBulletCamera(spec, DirectSource(scene, Counting(), spec, lambda: 0.0))
+    with pytest.raises(ConnectionLost, match="not open"):
+        driver.grab(0.0)
+    driver.open()
+    assert driver.grab(0.0) is not None
+    driver.close()
+    with pytest.raises(ConnectionLost):
+        driver.grab(0.0)
+    info = driver.info
+    assert (info.title, info.clock) == ("simulated realsense_d435", "simulated")
+    assert info.streams["depth"].K.shape == (3, 3)
+    scene.close()
+
+
+class FakeTime:
+    """The worker's clock, which the test moves."""
+
+    now = 1000.0
+
+    def monotonic(self) -> float:
+        return self.now
+
+
+@pytest.mark.parametrize("rate", [6.0, 15.0, 60.0, 90.0])
+def test_frames_come_at_the_rate_that_was_asked_for(rate: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    clock = FakeTime()
+    monkeypatch.setattr(render_worker, "time", clock)
+    scene = world(*things())
+    streams = ["color", "depth", "infrared_right"] if rate <= 60 else ["depth", "infrared_right"]
+    spec = replace(
+        camera(
+            capture={"width": 640, "height": 480, "rate_hz": rate}, streams=streams, simulated={"depth_noise": True}
+        ),
+        width=32,
+        height=24,
+    )
+    assert spec.rate_hz == rate
+    snapshots = SeriesBox(memoryview(bytearray(SeriesBox.size(256))), 256)
+    buffer = memoryview(bytearray(FrameRing.size([spec])))
+    mirrored = World(scene.spec, mirror=True)
+    worker = RenderWorker(Mirror(mirrored, snapshots), Counting(), [spec], FrameRing(buffer, [spec]))
+    driver = PyBulletCamera(spec, SharedSource(FrameRing(buffer, [spec]), spec, lambda: None))
+    driver.open()
+    frames = []
+    for k in range(960):  # 4 s of a world at 240 Hz
+        clock.now = 1000.0 + k / 240
+        snapshots.write(k / 240 + 0.001, scene.revision, scene.snapshot())
+        worker.run_once()
+        frame = driver.grab(0.0)
+        if frame is not None:
+            frames.append(frame)
+    stamps = np.array([frame.t for frame in frames])
+    assert len(frames) == pytest.approx(4 * rate, abs=1.5)
+    assert np.abs(np.diff(stamps) - 1 / rate).max() <= 1 / 240 + 1e-9, "no earlier and no later than the world's steps"
+    assert [frame.seq for frame in frames] == list(range(1, len(frames) + 1))
+    assert frames[0].infrared_right is not None
+    assert frames[0].skew == (0.0 if "color" in streams else None)
+    assert not np.array_equal(frames[0].depth, frames[1].depth), "each frame has noise of its own"
+    mirrored.close()
+    scene.close()
