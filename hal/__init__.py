@@ -15,6 +15,8 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from .camera import Camera
+    from .camera_info import CameraInfo
     from .commands import (
         CartesianTarget,
         Command,
@@ -40,7 +42,10 @@ if TYPE_CHECKING:
         StaleStateError,
         Unreachable,
     )
+    from .gamepad import Gamepad
+    from .gripper import Gripper
     from .gripper_motion import GripperMotion, GripperResult
+    from .observation import Observation
     from .pose import Pose
     from .rig import Rig, open_rig
     from .robot import Robot
@@ -63,6 +68,8 @@ if TYPE_CHECKING:
 
 __all__ = [
     "BodySpec",
+    "Camera",
+    "CameraInfo",
     "CartesianTarget",
     "Command",
     "CommandError",
@@ -74,6 +81,8 @@ __all__ = [
     "DriverMissing",
     "Fault",
     "Frame",
+    "Gamepad",
+    "Gripper",
     "GripperMotion",
     "GripperOutcome",
     "GripperResult",
@@ -86,6 +95,7 @@ __all__ = [
     "Limited",
     "MotionStopped",
     "NotSupported",
+    "Observation",
     "PadState",
     "Pose",
     "Rig",
@@ -105,6 +115,8 @@ __all__ = [
 # Without `open`: a star import must not shadow the builtin.
 
 _MODULES = {
+    "camera": ("Camera",),
+    "camera_info": ("CameraInfo",),
     "commands": (
         "CartesianTarget",
         "Command",
@@ -130,7 +142,10 @@ _MODULES = {
         "StaleStateError",
         "Unreachable",
     ),
+    "gamepad": ("Gamepad",),
+    "gripper": ("Gripper",),
     "gripper_motion": ("GripperMotion", "GripperResult"),
+    "observation": ("Observation",),
     "pose": ("Pose",),
     "rig": ("Rig",),
     "robot": ("Robot",),
