@@ -8,13 +8,14 @@ from __future__ import annotations
 
 import argparse
 import sys
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 from hal.apps.cli import ACTION_NEEDED, add_rig_options, rig_options, run_app
 
 if TYPE_CHECKING:
     from hal.commands import Twist
     from hal.control import Control
+    from hal.deadman import Deadman
     from hal.gamepad import Gamepad
     from hal.rig import Rig
     from hal.robot import Robot
@@ -36,7 +37,7 @@ def parser() -> argparse.ArgumentParser:
     add_rig_options(made)
     drive = made.add_argument_group("driving")
     drive.add_argument("--robot", metavar="NAME", help="which arm, where the rig has several (the first)")
-    drive.add_argument("--mapping", default="default", metavar="FILE", help="what the pad's controls do (%(default)s)")
+    drive.add_argument("--mapping", metavar="FILE", help="what the pad's controls do (what the pad is meant for)")
     drive.add_argument("--speed", type=float, metavar="SHARE", help="share of the mapping's speeds, above 0, at most 1")
     drive.add_argument("--duration", type=float, metavar="S", help="end after so many seconds")
     drive.add_argument("--report", metavar="FILE", help="write how the run went, as JSON")
@@ -66,7 +67,7 @@ def _main(args: argparse.Namespace) -> int:
     from hal.config.mapping import load_mapping
     from hal.pads.choice import check_wanted
 
-    load_mapping(args.mapping)
+    load_mapping(args.mapping or "default")
     check_wanted(args.pad)
     plan = load(args.config, sim=args.sim, overrides=args.overrides).resolve()
     if args.dry_run:
@@ -87,27 +88,37 @@ def _main(args: argparse.Namespace) -> int:
         if not rig.gamepads:
             raise CommandError(f"{rig.plan.source} has no gamepad; add 'gamepads: {{pad: {{model: auto}}}}'")
         robot, pad = rig.robots[name], next(iter(rig.gamepads.values()))
-        teleop = hal.Teleop(robot, mapping=args.mapping, speed=args.speed or 1.0)
-        return Session(rig, robot, pad, teleop, args).run()
+        return Session(rig, robot, pad, args).run()
 
 
 class Session:
     """One run of the app."""
 
-    def __init__(self, rig: Rig, robot: Robot, pad: Gamepad, teleop: Teleop, args: argparse.Namespace) -> None:
+    def __init__(self, rig: Rig, robot: Robot, pad: Gamepad, args: argparse.Namespace) -> None:
         from hal.apps.report import RunReport
         from hal.apps.status import StatusLine
+        from hal.apps.steering import Steering
 
-        self.rig, self.robot, self.pad, self.teleop, self.args = rig, robot, pad, teleop, args
-        self.deadman = pad.hold(teleop.mapping.deadman)
+        self.rig, self.robot, self.pad, self.args = rig, robot, pad, args
         self.report = RunReport(rig, robot)
         self.line = StatusLine()
         self.end = rig.clock.now() + args.duration if args.duration else None
         self.stopped: str | None = None
         self.hand = ""
         """What is wrong with the gripper."""
-        if rig.console is not None:
-            rig.console.explain(teleop.labels(actions=("home",)))
+        self.distrusted = ""
+        """Why the pad that was plugged in may not drive."""
+        self.steering = Steering(rig, robot, pad, args.mapping, args.speed or 1.0)
+
+    @property
+    def teleop(self) -> Teleop:
+        """What the pad asks for."""
+        return self.steering.teleop
+
+    @property
+    def deadman(self) -> Deadman:
+        """What must be held."""
+        return self.steering.deadman
 
     def run(self) -> int:
         """Drive until the time is over, the recording ends or Ctrl-C; then stop, report, close."""
@@ -115,7 +126,7 @@ class Session:
 
         clean = False
         try:
-            print("\n".join(f"  {line}" for line in self.teleop.help(self.pad)))
+            print(self.steering.help())
             print(invitation(self.rig), flush=True)
             while self._turn():
                 pass
@@ -148,9 +159,13 @@ class Session:
         from hal.errors import ConnectionLost, MotionStopped, RobotFault, StaleStateError
 
         try:
-            go_on = self._drive()
-            if go_on:
+            after = self._drive()
+            if after == "home":
                 self._go_home()
+            elif after == "other pad":
+                self.steering.take()
+                self._event(f"{self.pad.describe()} drives")
+                self.line.event(self.steering.help())
         except MotionStopped as stop:  # a new session wants the stop to be acknowledged first
             self._tripped(stop)
         except RobotFault as fault:
@@ -158,12 +173,12 @@ class Session:
         except (ConnectionLost, StaleStateError) as lost:
             self._lost(lost)
         else:
-            return go_on
+            return after != "over"
         self.rig.clock.sleep(0.1)
         return not self._over()
 
-    def _drive(self) -> bool:
-        """Follow the pad. True when the home button was pressed, False when the run is over."""
+    def _drive(self) -> Literal["home", "other pad", "over"]:
+        """Follow the pad, until something else is due."""
         from hal.errors import MotionStopped, RobotFault
 
         seen = -1
@@ -185,10 +200,22 @@ class Session:
                     self._faulted(fault)
                 self._show(control)
                 if self._over():
-                    return False
+                    return "over"
                 if self.teleop.home_pressed(state) and self.deadman.held:
-                    return True
-        return False
+                    return "home"
+                if self._other_pad():
+                    return "other pad"
+        return "over"
+
+    def _other_pad(self) -> bool:
+        """Was a pad plugged in whose controls are others, and which may drive this arm?"""
+        if not self.steering.is_due:
+            return False
+        why = self.steering.distrust()
+        if why and why != self.distrusted:
+            self._event(why)
+        self.distrusted = why
+        return not why
 
     def _towards_goal(self, motion: Twist) -> Twist:
         """Sticks at rest and the handle of the 3D view dragged: there. It moves only while the dead-man is held."""

@@ -221,8 +221,8 @@ class Control:
     def _check_trip(self, servo: ServoRecord, now: float) -> None:
         if servo.status is RobotStatus.FAULT:
             fault = self.robot.state(max_age=math.inf).fault
+            self._tell()
             cause, remedy = (fault.cause, fault.remedy) if fault else ("the robot reports a fault", "")
-            self._told = True
             raise RobotFault(cause, f"{remedy}; then robot.recover()" if remedy else "call robot.recover()")
         if servo.trip is Trip.NONE:
             self._told = False
@@ -232,9 +232,15 @@ class Control:
         if self._rearmed_at > -math.inf and self._mail.state.seq() <= self._rearmed_at:
             return  # the servo has not seen the rearm yet
         self._stopped = servo.trip is Trip.STOP
-        self._told = True
+        self._tell()
         remedy = "release the dead-man and press it again" if self.deadman else "call control.rearm() to go on"
         raise MotionStopped(trip_text(servo.trip) + self._why_lost(servo), remedy)
+
+    def _tell(self) -> None:
+        """The program is told of a stop; so is the hand on the dead-man, once."""
+        if self.deadman is not None and not self._told:
+            self.deadman.alarm()
+        self._told = True
 
     def _why_lost(self, servo: ServoRecord) -> str:
         """What the driver says of a device that does not answer."""

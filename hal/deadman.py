@@ -40,9 +40,16 @@ class Deadman:
     through an interruption, moves nothing. Every method may be called from any thread.
     """
 
-    def __init__(self, name: str, distrust: Callable[[], str | None] | None = None) -> None:
-        """``distrust`` says why this switch may not guard a real arm at the moment, or None where it may."""
+    def __init__(
+        self,
+        name: str,
+        distrust: Callable[[], str | None] | None = None,
+        alarm: Callable[[], object] | None = None,
+    ) -> None:
+        """``distrust`` says why this switch may not guard a real arm at the moment, or None where it may. ``alarm``
+        tells the hand that holds it of a stop, and returns at once: a pad rumbles."""
         self.name = name
+        self._alarm = alarm
         self._distrust = distrust
         self._must_be_trusted = False
         self._armed = False
@@ -51,6 +58,11 @@ class Deadman:
         self._lock = threading.RLock()
         self.error: Exception | None = None
         """Why a listener was dropped."""
+
+    def alarm(self) -> None:
+        """Tell the hand that holds it that the arm was stopped, where it can be told."""
+        if self._alarm is not None:
+            self._alarm()
 
     @property
     def record(self) -> DeadmanRecord:

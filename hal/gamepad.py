@@ -18,7 +18,11 @@ from .types import AXES, BUTTONS, PadState, Stamp
 if TYPE_CHECKING:
     from .specs import PadSpec
 
-__all__ = ["Gamepad", "GamepadDriver", "PadReading", "Plugged"]
+__all__ = ["RUMBLE_SECONDS", "RUMBLE_STRONG", "RUMBLE_WEAK", "Gamepad", "GamepadDriver", "PadReading", "Plugged"]
+
+RUMBLE_STRONG, RUMBLE_WEAK, RUMBLE_SECONDS = 1.0, 0.5, 0.5
+"""How a pad rumbles unless told otherwise: shares of what its heavy and its light motor can, and s. A driver that must
+prepare a rumble prepares this one, so that a trip is felt at once."""
 
 _POLL = 0.01  # s; how long a poll may wait for news, and so how often a dead-man's heartbeat is passed on
 _AFTER_ERROR = 0.2  # s
@@ -50,6 +54,8 @@ class Plugged(NamedTuple):
     """Pads that are there, in words."""
     notes: tuple[str, ...] = ()
     """What stands in the way of others, each with the command that mends it."""
+    devices: tuple[str, ...] = ()
+    """What ``options.device`` of a rig calls each of :attr:`pads`, where the driver has such an option."""
 
 
 _NOTHING = PadReading(-math.inf, -math.inf, 0.0, 0, MappingProxyType({}), frozenset(), connected=False)
@@ -90,6 +96,22 @@ class GamepadDriver(ABC):
     def describe(self) -> str:
         """What drives, in words, for the banner."""
         return type(self).__name__
+
+    def details(self) -> Mapping[str, str]:
+        """What is known of the pad that is plugged in, for a person who has trouble with it: what -> in words."""
+        return {}
+
+    @property
+    def mapping(self) -> str | None:
+        """Teleoperation mapping that is meant for the pad that is plugged in; None where any will do."""
+        return None
+
+    def rumble(self, strong: float, weak: float, seconds: float) -> bool:
+        """Let the pad's motors shake the hand: shares of what they can (0..1), and how long, s. True where they will.
+
+        Returns at once, from whatever thread it is called.
+        """
+        return False
 
     @property
     def can_hold(self) -> bool:
@@ -157,7 +179,8 @@ class Gamepad:
         with self._lock:
             held = self._held.get(control)
             if held is None:
-                held = self._held[control] = HeldControl(control, Deadman(f"{control} of {self.name}", self._distrust))
+                deadman = Deadman(f"{control} of {self.name}", self.distrust, self.rumble)
+                held = self._held[control] = HeldControl(control, deadman)
                 held.update(self._reading, gate_open=self._gate.open)
             return held.deadman
 
@@ -187,6 +210,12 @@ class Gamepad:
         return self._gate.waiting_for
 
     @property
+    def reported(self) -> tuple[str, ...]:
+        """The axes that the pad which is plugged in has, of ``hal.types.AXES``; :meth:`state` has all of them."""
+        axes = self._reading.axes
+        return tuple(name for name in AXES if name in axes)
+
+    @property
     def can_hold(self) -> bool:
         """Can a control be held down? Where not (a terminal's keys), each press is one small step."""
         return self.driver.can_hold
@@ -197,6 +226,24 @@ class Gamepad:
         return self.driver.finished
 
     @property
+    def mapping(self) -> str | None:
+        """Teleoperation mapping that is meant for the pad that is plugged in; None where any will do."""
+        return self.driver.mapping
+
+    def rumble(
+        self, *, strong: float = RUMBLE_STRONG, weak: float = RUMBLE_WEAK, seconds: float = RUMBLE_SECONDS
+    ) -> bool:
+        """Shake the hand that holds the pad: shares of what its heavy and its light motor can (0..1), and s.
+
+        Returns at once: True where the pad will. One that cannot, or is not plugged in, is no error.
+        """
+        try:
+            return self.driver.rumble(_share(strong), _share(weak), seconds if seconds > 0.0 else 0.0)
+        except Exception as error:
+            self._callback_error = error
+            return False
+
+    @property
     def notes(self) -> tuple[str, ...]:
         """What a person should know about the pad, each with what mends it."""
         return self.driver.notes
@@ -205,7 +252,8 @@ class Gamepad:
         """What drives, in words."""
         return self.driver.describe()
 
-    def _distrust(self) -> str | None:
+    def distrust(self) -> str | None:
+        """Why this pad may not be the dead-man of a real arm at the moment, with the remedy; None where it may."""
         driver = self.driver
         if driver.simulated:
             return f"{driver.describe()} cannot be the dead-man of a real arm: nobody holds it; plug a gamepad in"
@@ -309,3 +357,8 @@ class Gamepad:
         self._open = False
         self.driver.close()
         self._lose(self._state.stamp.t)
+
+
+def _share(value: float) -> float:
+    """0..1; what is not a number is 0."""
+    return min(1.0, value) if value > 0.0 else 0.0

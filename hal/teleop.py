@@ -14,12 +14,15 @@ from .types import PadState
 
 if TYPE_CHECKING:
     from .gamepad import Gamepad
+    from .gripper import Gripper
     from .robot import Robot
 
 __all__ = ["Teleop"]
 
 _CROSSED = 0.05
 """A trigger this close to the present grip has reached it (share of the travel)."""
+_HALF = 0.5
+"""Share of its greatest width below which a gripper that was told to go there is closed."""
 _DIRECTIONS = ("x", "y", "z", "roll", "pitch", "yaw")
 _WORDS = (
     ("back", "forward"),
@@ -36,7 +39,9 @@ class Teleop:
     """Turns pad states into commands by a mapping (``config/teleop``).
 
     A trigger that closes the gripper takes it over only after it has crossed the present grip, so that neither the
-    start of a session, nor a new press of the dead-man, nor a pad that comes back ever drops what the fingers hold.
+    start of a session, nor a new press of the dead-man, nor a pad that comes back ever drops what the fingers hold. A
+    button that opens and closes does so when it is pressed with the dead-man held, whatever was before: what it does
+    follows from what the gripper was told last, by whomever.
     """
 
     def __init__(
@@ -50,12 +55,17 @@ class Teleop:
         self.speed = speed
         self._has_grip = False
         self._side = 0.0
+        self._was_toggle = True
+        self._toggled: float | None = None
         self._was_home = True
 
     def reset(self) -> None:
-        """A new session: the gripper's trigger must cross the present grip again before it counts."""
+        """A new session: the gripper's trigger must cross the present grip again before it counts, and a button that
+        opens and closes must be let go of."""
         self._has_grip = False
         self._side = 0.0
+        self._was_toggle = True
+        self._toggled = None
 
     def step(self, pad: PadState, dt: float) -> tuple[Twist, float | None]:
         """The command for the arm, and for the gripper: a grip from 0 (open) to 1 (closed), or None for none.
@@ -80,6 +90,8 @@ class Teleop:
         if not (pad.connected and pad.pressed(self.mapping.deadman)):
             self.reset()
             return None
+        if mapping.toggle is not None:
+            return self._toggle(pad.pressed(mapping.toggle), gripper)
         if mapping.axis is None:
             if pad.pressed(str(mapping.close)):
                 return 1.0
@@ -94,6 +106,18 @@ class Teleop:
             self._has_grip = crossed or abs(difference) < _CROSSED
             self._side = difference
         return wanted if self._has_grip else None
+
+    def _toggle(self, pressed: bool, gripper: Gripper) -> float | None:
+        """The grip that a press asks for, for as long as it lasts, so that no single command matters."""
+        if pressed and not self._was_toggle:
+            state = gripper.newest()
+            if state is not None and not gripper.trouble:
+                closed = state.grasped is True or state.width_target < _HALF * gripper.width_max
+                self._toggled = 0.0 if closed else 1.0
+        elif not pressed:
+            self._toggled = None
+        self._was_toggle = pressed
+        return self._toggled
 
     def labels(self, actions: Collection[str] = ()) -> dict[str, Any]:
         """What the controls do, for a page that draws them.
@@ -117,6 +141,8 @@ class Teleop:
         grip = mapping.gripper if self.robot.gripper is not None else None
         if grip is not None and grip.axis is not None:
             controls[grip.axis] = ["gripper: open", "gripper: closed"]
+        elif grip is not None and grip.toggle is not None:
+            controls[grip.toggle] = ["open or close the gripper"]
         elif grip is not None:
             controls |= {str(grip.open): ["open the gripper"], str(grip.close): ["close the gripper"]}
         controls |= {button: [action] for action, button in mapping.actions.items() if action in actions}

@@ -20,6 +20,7 @@ from .pose import Pose
 __all__ = [
     "AXES",
     "BUTTONS",
+    "CAP_AXES",
     "Fault",
     "Frame",
     "GripperOutcome",
@@ -29,14 +30,23 @@ __all__ = [
     "Pose",
     "RobotState",
     "RobotStatus",
+    "STICK_AXES",
     "Stamp",
     "Trip",
 ]
 
 Array = NDArray[np.float64]
 
-AXES = ("left_x", "left_y", "right_x", "right_y", "l2", "r2", "dpad_x", "dpad_y")
-"""Names of a pad's axes. Sticks and d-pad in -1..1, right and up positive; triggers in 0..1."""
+STICK_AXES = ("left_x", "left_y", "right_x", "right_y", "l2", "r2", "dpad_x", "dpad_y")
+"""Names of a gamepad's axes. Sticks and d-pad in -1..1, right and up positive; triggers in 0..1."""
+
+CAP_AXES = ("push_x", "push_y", "push_z", "turn_x", "turn_y", "turn_z")
+"""Names of the axes of a pad whose one cap moves in every direction (a SpaceMouse), -1..1: pushed forwards, to the
+left and up, and turned about these, right-handed. So they are those of an arm's base frame for whoever stands behind
+it."""
+
+AXES = STICK_AXES + CAP_AXES
+"""Names of all axes that a pad may have."""
 
 BUTTONS = ("south", "east", "west", "north", "l1", "r1", "l2", "r2", "select", "start", "l3", "r3", "home", "touchpad")
 """Names of a pad's buttons, by place rather than by print: ``south`` is Cross on a Sony pad and A on an Xbox pad."""

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import fcntl
+import os
 import struct
 import time
 from collections.abc import Sequence
 from typing import Any, NamedTuple, Protocol
 
 from hal.errors import DriverMissing
-from hal.pads.codes import EV_ABS, EV_KEY
+from hal.pads.codes import EV_ABS, EV_FF, EV_KEY, EV_REL, FF_RUMBLE
 from hal.pads.mapper import AxisRange
 
 __all__ = ["Event", "EvdevNode", "Node", "evdev_module"]
@@ -38,6 +39,10 @@ class Node(Protocol):
     """Event code -> what the device says about it."""
     keys: frozenset[int]
     """Event codes of the buttons that it has."""
+    rels: frozenset[int]
+    """Event codes of its axes that say how far, and not where."""
+    can_rumble: bool
+    """Has it motors, and may they be turned on?"""
 
     def fileno(self) -> int:
         """Readable when there is news, and when the device is gone."""
@@ -72,6 +77,9 @@ class EvdevNode:
         capabilities: dict[int, list[Any]] = self._device.capabilities()
         self.axes = {code: AxisRange(info.min, info.max, info.flat) for code, info in capabilities.get(EV_ABS, ())}
         self.keys = frozenset(capabilities.get(EV_KEY, ()))
+        self.rels = frozenset(capabilities.get(EV_REL, ()))
+        writable = fcntl.fcntl(self._device.fd, fcntl.F_GETFL) & os.O_ACCMODE == os.O_RDWR
+        self.can_rumble = writable and FF_RUMBLE in capabilities.get(EV_FF, ())
         self._monotonic = self._stamp_monotonic()
 
     def _stamp_monotonic(self) -> bool:

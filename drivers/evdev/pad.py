@@ -6,25 +6,27 @@ import contextlib
 import math
 import os
 import sys
-import time
+from collections.abc import Mapping
 from types import MappingProxyType
 
 from pydantic import BaseModel, ConfigDict
 
+from hal.config.files import Problems
+from hal.config.models import load_pad_models
 from hal.errors import NotSupported
 from hal.gamepad import GamepadDriver, PadReading, Plugged
 from hal.pads.guess import guess_model, guess_warning
-from hal.pads.model import choose_model, pad_model, validated
+from hal.pads.model import PadModel, choose_model, pad_model, validated
 from hal.specs import PadSpec
 from hal.types import AXES
 
+from .finder import Finder
 from .link import Link
 from .node import Node, evdev_module
 from .system import InputSystem, LinuxInput, NodeInfo, permission_note
 
 __all__ = ["EvdevPad"]
 
-_RESCAN = 0.2  # s between two looks at what is plugged in
 _RELEASED = MappingProxyType(dict.fromkeys(AXES, 0.0))
 
 
@@ -44,9 +46,9 @@ class Options(BaseModel):
 class EvdevPad(GamepadDriver):
     """The first pad that is plugged in, or that the options name; one that is unplugged may come back at any time.
 
-    Pads are told from other devices by their buttons and sticks, and take the model of ``spec.models`` that matches
-    best, or are guessed with a warning in ``notes``. With ``spec.model`` only a pad that it matches is taken, unless
-    the options name one.
+    Pads are told from other devices by what they can send, and take the model of ``spec.models`` that matches best, or
+    are guessed with a warning in ``notes``. With ``spec.model`` only a pad that it matches is taken, unless the options
+    name one.
     """
 
     def __init__(self, spec: PadSpec, source: object | None = None, *, system: InputSystem | None = None) -> None:
@@ -55,11 +57,11 @@ class EvdevPad(GamepadDriver):
         self._options = validated(Options, spec.options, place)
         chosen = (spec.model,) if spec.model is not None else spec.models
         self._models = tuple(pad_model(data, f"{place}, model {data.get('name')}") for data in chosen)
-        self._system = system
+        self._finder: Finder | None = Finder(system, watched=False) if system is not None else None
         self._is_open = False
         self._link: Link | None = None
-        self._seen: object = None
-        self._next_look = -math.inf
+        self._rumble: tuple[float, float, float] | None = None
+        """What the motors shall do, said in any thread. The one that polls does it, for it alone closes the device."""
         self._seq = 0
         self._last = PadReading(-math.inf, -math.inf, 0.0, 0, _RELEASED, frozenset(), connected=False)
 
@@ -67,32 +69,39 @@ class EvdevPad(GamepadDriver):
     def plugged(cls) -> Plugged:
         if sys.platform != "linux":
             return Plugged(())
-        pads = [info for info in LinuxInput().nodes() if info.is_pad]
+        nodes = LinuxInput().nodes()
+        models = _built_in() if any(info.is_joystick for info in nodes) else ()
+        pads = [info for info in nodes if info.is_pad or (info.is_joystick and choose_model(models, info.identity))]
         readable = [info for info in pads if os.access(info.path, os.R_OK)]
         return Plugged(
             tuple(info.describe() for info in readable),
             tuple(permission_note(info) for info in pads if info not in readable),
+            tuple(info.path for info in readable),
         )
 
     def open(self) -> None:
         """Raises NotSupported anywhere but on Linux, and DriverMissing."""
-        if self._system is None:
+        if self._finder is None:
             if sys.platform != "linux":
                 raise NotSupported("the evdev driver reads gamepads on Linux only")
             evdev_module()
-            self._system = LinuxInput()
+            self._finder = Finder(LinuxInput(), watched=True)
         self._is_open = True
-        self._look()
+        self._look(self._finder)
 
     def poll(self, now: float, timeout: float) -> PadReading:
-        if time.monotonic() >= self._next_look and (self._link is None or self._link.lacks_motion):
-            self._look()
+        finder = self._finder
+        if finder is None or not self._is_open:
+            return self._last
+        if (self._link is None or self._link.lacks_motion or self._link.lacks_touch) and finder.due():
+            self._look(finder)
         if self._link is None:
-            if timeout > 0.0:
-                time.sleep(timeout)
+            if timeout > 0.0 and finder.wait(timeout):
+                self._look(finder)
             return self._last
         try:
             self._link.poll(now, timeout)
+            self._play(self._link)
         except OSError:
             return self._lose(now)
         link = self._link
@@ -113,7 +122,8 @@ class EvdevPad(GamepadDriver):
         if self._link is not None:
             self._seq += self._link.events + 1
             self._drop_link()
-        self._seen = None
+        if self._finder is not None:
+            self._finder.forget()
         self._last = self._last._replace(
             t=t, seq=self._seq, axes=_RELEASED, buttons=frozenset(), connected=False, unknown=()
         )
@@ -124,31 +134,31 @@ class EvdevPad(GamepadDriver):
             with contextlib.suppress(OSError):
                 self._link.close()
         self._link = None
+        self._rumble = None
         self.proves_liveness = False
 
     # Looking for it.
 
-    def _look(self) -> None:
-        """Open the pad, or its motion sensor, if something changed since the last look."""
-        if self._system is None or not self._is_open:
+    def _look(self, finder: Finder) -> None:
+        """Open the pad, its motion sensor or its touchpad, if something changed since the last look."""
+        nodes = finder.look()
+        if nodes is None:
             return
-        self._next_look = time.monotonic() + _RESCAN
-        mark = self._system.fingerprint()
-        if mark == self._seen:
-            return
-        self._seen = mark
-        nodes = self._system.nodes()
         if self._link is None:
-            self._find_pad([info for info in nodes if info.is_pad])
-        if self._link is not None and self._link.lacks_motion:
-            self._find_motion(self._link, nodes)
+            self._find_pad(finder, nodes)
+        link = self._link
+        if link is not None and link.lacks_motion:
+            self._find_part(finder, link, link.model.motion_node, nodes)
+        if link is not None and link.lacks_touch:
+            self._find_part(finder, link, link.model.touch_node, nodes)
 
-    def _find_pad(self, pads: list[NodeInfo]) -> None:
+    def _find_pad(self, finder: Finder, nodes: list[NodeInfo]) -> None:
+        pads = [info for info in nodes if info.is_pad or info.is_joystick]
         wanted = [info for info in pads if self._wanted(info)]
-        others = ", ".join(info.describe() for info in pads)
-        self.notes = (f"not the pad that the rig asks for: {others}",) if pads and not wanted else ()
+        others = ", ".join(info.describe() for info in pads if info.is_pad)
+        self.notes = (f"not the pad that the rig asks for: {others}",) if others and not wanted else ()
         for info in wanted:
-            self._connect(info)
+            self._connect(finder, info)
             if self._link is not None:
                 return
 
@@ -157,10 +167,12 @@ class EvdevPad(GamepadDriver):
         if options.device is not None or options.name is not None:
             by_name = options.name is None or options.name.lower() in info.identity.name.lower()
             return by_name and (options.device is None or os.path.realpath(options.device) == info.path)
-        return self.spec.model is None or choose_model(self._models, info.identity) is not None
+        if self.spec.model is None and info.is_pad:
+            return True
+        return choose_model(self._models, info.identity) is not None
 
-    def _connect(self, info: NodeInfo) -> None:
-        node = self._try_open(info)
+    def _connect(self, finder: Finder, info: NodeInfo) -> None:
+        node = self._try_open(finder, info)
         if node is None:
             return
         found = choose_model(self._models, info.identity)
@@ -169,9 +181,7 @@ class EvdevPad(GamepadDriver):
         elif self.spec.model is not None:
             model, rule = self._models[0], None
         else:
-            model = guess_model(info.identity, node.axes, node.keys)
-            rule = None
-            self.notes = (*self.notes, guess_warning(model))
+            model, rule = self._guessed(info, node), None
         try:
             self._link = Link(info, node, model, rule)
         except OSError:  # unplugged again already
@@ -179,38 +189,91 @@ class EvdevPad(GamepadDriver):
             return
         self.flat = self._link.mapper.flat
 
-    def _find_motion(self, link: Link, nodes: list[NodeInfo]) -> None:
-        ending = link.model.motion_node or ""
-        for info in nodes:
-            if info.identity.name.endswith(ending) and info.belongs_to(link.info) and not info.is_pad:
-                motion = self._try_open(info)
-                if motion is not None:
-                    link.listen_to(motion)
-                    return
+    def _guessed(self, info: NodeInfo, node: Node) -> PadModel:
+        model = guess_model(info.identity, node.axes, node.keys, node.rels)
+        self.notes = (*self.notes, guess_warning(model))
+        return model
 
-    def _try_open(self, info: NodeInfo) -> Node | None:
-        """None where it went away, or may not be read: udev sets the permissions a moment after it appears."""
-        assert self._system is not None
+    def _find_part(self, finder: Finder, link: Link, ending: str | None, nodes: list[NodeInfo]) -> None:
+        """Another device of the same pad."""
+        for info in nodes:
+            if info.identity.name.endswith(ending or "") and info.belongs_to(link.info) and not info.is_pad:
+                part = self._try_open(finder, info, quiet=ending == link.model.touch_node)
+                if part is None:
+                    continue
+                try:
+                    if ending == link.model.motion_node:
+                        link.listen_to(part)
+                    else:
+                        link.take_touch(part)
+                except OSError:  # unplugged again already; so will be the pad
+                    part.close()
+                return
+
+    def _try_open(self, finder: Finder, info: NodeInfo, *, quiet: bool = False) -> Node | None:
+        """None where it went away, or may not be read: udev sets the permissions a moment after it appears.
+
+        ``quiet``: nobody needs to know, for a desktop keeps touchpads to itself.
+        """
         try:
-            return self._system.open(info.path)
+            return finder.open(info)
         except PermissionError:
             note = permission_note(info)
-            if note not in self.notes:
+            if note not in self.notes and not quiet:
                 self.notes = (*self.notes, note)
         except OSError:
-            self._seen = None
+            finder.forget()
         return None
 
     # The rest.
 
+    def rumble(self, strong: float, weak: float, seconds: float) -> bool:
+        """The next poll turns the motors, at most 10 ms later in a rig."""
+        link = self._link
+        if link is None or not link.can_rumble or seconds <= 0.0:
+            return False
+        self._rumble = strong, weak, seconds
+        return True
+
+    def _play(self, link: Link) -> None:
+        wanted, self._rumble = self._rumble, None
+        if wanted is not None:
+            link.rumble(*wanted)
+
+    @property
+    def mapping(self) -> str | None:
+        link = self._link
+        return link.model.mapping if link is not None else None
+
     def describe(self) -> str:
-        if self._link is None:
+        link = self._link
+        if link is None:
             return "no gamepad" if not self.notes else f"no gamepad: {self.notes[0]}"
-        title = self._link.model.title
-        info = self._link.info
-        return info._replace(identity=info.identity._replace(name=title)).describe()
+        return link.info._replace(identity=link.info.identity._replace(name=link.title)).describe()
+
+    def details(self) -> Mapping[str, str]:
+        link = self._link
+        if link is None:
+            return {}
+        identity = link.info.identity
+        known = any(model.name == link.model.name for model in self._models)
+        return {
+            "model": link.model.name if known else f"{link.model.name} (guessed)",
+            "system's name": identity.name,
+            "ids": f"{identity.vendor:04x}:{identity.product:04x}",
+            "kernel driver": identity.driver or "unknown",
+            "device": link.info.path,
+            "access": "read and write" if os.access(link.info.path, os.W_OK) else "read only, so it cannot rumble",
+            "rumbles": "yes" if link.can_rumble else "no",
+        }
 
     def close(self) -> None:
         self._drop_link()
+        if self._finder is not None:
+            self._finder.close()
         self._last = self._last._replace(axes=_RELEASED, buttons=frozenset(), connected=False, unknown=())
         self._is_open = False
+
+
+def _built_in() -> tuple[PadModel, ...]:
+    return tuple(pad_model(data) for data in load_pad_models(Problems()).values())

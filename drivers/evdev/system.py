@@ -7,7 +7,7 @@ import struct
 from pathlib import Path
 from typing import NamedTuple, Protocol
 
-from hal.pads.codes import ABS, KEY
+from hal.pads.codes import ABS, KEY, REL
 from hal.pads.model import Identity
 
 from .node import EvdevNode, Node
@@ -15,6 +15,7 @@ from .node import EvdevNode, Node
 __all__ = ["InputSystem", "LinuxInput", "NodeInfo", "permission_note"]
 
 _WORD = 8 * struct.calcsize("l")  # sysfs prints bitmaps as words of this many bits, the highest first
+_SIX = ("X", "Y", "Z", "RX", "RY", "RZ")
 
 
 class NodeInfo(NamedTuple):
@@ -27,7 +28,11 @@ class NodeInfo(NamedTuple):
     parent: str
     """The hardware behind it, which is the same for all devices of one pad."""
     is_pad: bool
-    """Has it the buttons and sticks of a gamepad? A pad's motion sensor and touchpad are devices of their own."""
+    """Has it the buttons and sticks of a gamepad, or the six axes and buttons of a SpaceMouse? A pad's motion sensor
+    and touchpad are devices of their own."""
+    is_joystick: bool = False
+    """Has it the buttons of a joystick? Some gamepads look like one (Logitech's in D mode), and so do steering wheels:
+    it is a pad only where a model knows it, or the rig names it."""
 
     def belongs_to(self, other: NodeInfo) -> bool:
         """Are the two parts of the same pad?"""
@@ -45,7 +50,7 @@ class InputSystem(Protocol):
     """Where input devices come from."""
 
     def nodes(self) -> list[NodeInfo]:
-        """All that are there now, in the order of their numbers."""
+        """All that are there now, in the order of their numbers. Takes some ms on a computer with many."""
 
     def fingerprint(self) -> object:
         """Differs when a device came or went, or its permissions changed. Cheap."""
@@ -73,10 +78,9 @@ class LinuxInput:
                 bus=_hex(device / "id" / "bustype"),
                 driver=_driver(parent),
             )
-            is_pad = _bit(device / "capabilities" / "key", KEY["BTN_SOUTH"]) and _bit(
-                device / "capabilities" / "abs", ABS["ABS_X"]
-            )
-            found.append(NodeInfo(str(self._devices / name), identity, _text(device / "uniq"), parent, is_pad))
+            is_pad, is_joystick = _kind(device / "capabilities")
+            uniq = _text(device / "uniq")
+            found.append(NodeInfo(str(self._devices / name), identity, uniq, parent, is_pad, is_joystick))
         return found
 
     def fingerprint(self) -> object:
@@ -121,10 +125,26 @@ def _hex(path: Path) -> int:
         return 0
 
 
-def _bit(path: Path, number: int) -> bool:
-    words = _text(path).split()
-    place, bit = divmod(number, _WORD)
-    return place < len(words) and bool(int(words[-1 - place], 16) >> bit & 1)
+def _kind(capabilities: Path) -> tuple[bool, bool]:
+    """Is it a pad, and does it look like a joystick? From what it can send."""
+    key, rel, axes = (_bits(capabilities / name) for name in ("key", "rel", "abs"))
+
+    def has(bits: int, *codes: int) -> bool:
+        return all(bits >> code & 1 for code in codes)
+
+    sticks = has(axes, ABS["ABS_X"])
+    if has(key, KEY["BTN_SOUTH"]):
+        return sticks, False
+    six = has(rel, *(REL[f"REL_{name}"] for name in _SIX)) or has(axes, *(ABS[f"ABS_{name}"] for name in _SIX))
+    return six and has(key, KEY["BTN_0"]), sticks and has(key, KEY["BTN_TRIGGER"])
+
+
+def _bits(path: Path) -> int:
+    """A bitmap of sysfs as one number."""
+    whole = 0
+    for word in _text(path).split():
+        whole = whole << _WORD | int(word, 16)
+    return whole
 
 
 def _driver(parent: str) -> str:

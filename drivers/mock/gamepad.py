@@ -35,6 +35,10 @@ class MockPad(GamepadDriver):
         super().__init__(spec, source)
         self.knobs = PadKnobs()
         self.is_open = False
+        self.meant_for: str | None = None
+        """The mapping that this pad asks for."""
+        self.rumbles: list[tuple[float, float, float]] = []
+        """How its motors were turned: shares of the heavy and the light one, s."""
         self._axes = dict.fromkeys(AXES, 0.0)
         self._buttons: frozenset[str] = frozenset()
         self._lock = threading.Lock()
@@ -112,6 +116,14 @@ class MockPad(GamepadDriver):
             connected=connected,
         )
         return self._reading
+
+    @property
+    def mapping(self) -> str | None:
+        return self.meant_for
+
+    def rumble(self, strong: float, weak: float, seconds: float) -> bool:
+        self.rumbles.append((strong, weak, seconds))
+        return True
 
     def describe(self) -> str:
         return "a mock pad"

@@ -10,7 +10,7 @@ from typing import Annotated, Any, ClassVar
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from hal.errors import ConfigError, Problem
+from hal.errors import ConfigError, ConnectionLost, Problem
 from hal.gamepad import GamepadDriver, PadReading
 from hal.pads.mapper import PadMapper
 from hal.pads.model import PadModel, pad_model, validated
@@ -83,7 +83,7 @@ class PlaybackPad(GamepadDriver):
 
     def poll(self, now: float, timeout: float) -> PadReading:
         if self._mapper is None:
-            raise RuntimeError("open the pad before polling it")
+            raise ConnectionLost(f"the recording {self._options.file.name} is not open")
         if self._t0 is None:
             self._t0 = self._t_event = now
         if timeout > 0.0:

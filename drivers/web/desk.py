@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping
 from typing import Any, Protocol
 
 from hal.servo.watchdog import SILENCE
-from hal.types import AXES, BUTTONS
+from hal.types import BUTTONS, STICK_AXES
 
 from .applink import Waiting
 from .lease import Change, Lease
@@ -79,7 +79,7 @@ class Desk:
         return page
 
     def _hello(self, page: Page) -> str:
-        hello = {"type": "hello", "page": page.number, "name": page.name, "axes": AXES, "buttons": BUTTONS}
+        hello = {"type": "hello", "page": page.number, "name": page.name, "axes": STICK_AXES, "buttons": BUTTONS}
         return encode(hello | {"rig": self._rig})
 
     def leave(self, page: Page) -> None:

@@ -43,7 +43,7 @@ def reading(message: Mapping[str, Any], seq: int) -> PadReading:
         t_alive=t,
         t_device=t,
         seq=seq,
-        axes=MappingProxyType(dict(zip(AXES, map(float, message["axes"]), strict=True))),
+        axes=MappingProxyType(dict(zip(AXES, map(float, message["axes"]), strict=False))),  # a page has the first ones
         buttons=frozenset(name for bit, name in enumerate(BUTTONS) if mask >> bit & 1),
         connected=True,
     )

@@ -12,12 +12,12 @@ from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 from hal.servo.watchdog import SILENCE
-from hal.types import AXES, BUTTONS
+from hal.types import BUTTONS, STICK_AXES
 
 __all__ = ["Malformed", "PadMessage", "PadWatch", "Verdict", "pad_message"]
 
 _ONE_SIDED = ("l2", "r2")
-_RANGES = tuple((0.0 if axis in _ONE_SIDED else -1.0, 1.0) for axis in AXES)
+_RANGES = tuple((0.0 if axis in _ONE_SIDED else -1.0, 1.0) for axis in STICK_AXES)
 _MASKS = 1 << len(BUTTONS)
 _LONGEST = 1e9
 """ms, and s: more than any clock here shows."""
@@ -39,7 +39,7 @@ class PadMessage(NamedTuple):
     since: float
     """How long it had it, s."""
     axes: tuple[float, ...]
-    """In the order of ``hal.types.AXES``; -1..1, triggers 0..1."""
+    """In the order of ``hal.types.STICK_AXES``; -1..1, triggers 0..1. A page has no cap to push and turn."""
     buttons: int
     """Bit k: button k of ``hal.types.BUTTONS`` is down."""
 

@@ -75,20 +75,25 @@ class TurnsMapping(Strict):
 
 
 class GripperMapping(Strict):
-    """An axis whose place is how far the gripper is closed (0 open, 1 closed), or two buttons."""
+    """An axis whose place is how far the gripper is closed (0 open, 1 closed), two buttons, or one for both."""
 
     axis: str | None = None
     open: str | None = None
     """Button that opens."""
     close: str | None = None
     """Button that closes."""
+    toggle: str | None = None
+    """Button that closes an open gripper and opens a closed one."""
 
     @model_validator(mode="after")
     def _one_control(self) -> GripperMapping:
-        if (self.axis is None) == (self.open is None and self.close is None):
-            raise ValueError("needs an axis, or the buttons open and close")
+        ways = (self.axis is not None, self.open is not None or self.close is not None, self.toggle is not None)
+        if sum(ways) != 1:
+            raise ValueError("needs an axis, or the buttons open and close, or one button: toggle")
         if self.axis is not None:
             _known(self.axis, AXES, "axis")
+        elif self.toggle is not None:
+            _known(self.toggle, BUTTONS, "button")
         elif self.open is None or self.close is None:
             raise ValueError("needs both buttons, open and close")
         else:
@@ -99,7 +104,7 @@ class GripperMapping(Strict):
     @property
     def controls(self) -> tuple[str, ...]:
         """Names of the controls that it uses."""
-        return tuple(control for control in (self.axis, self.open, self.close) if control is not None)
+        return tuple(c for c in (self.axis, self.open, self.close, self.toggle) if c is not None)
 
 
 class TeleopMapping(Strict):

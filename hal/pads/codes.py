@@ -15,17 +15,22 @@ __all__ = [
     "BUS_BLUETOOTH",
     "BUS_USB",
     "EV_ABS",
+    "EV_FF",
     "EV_KEY",
     "EV_MSC",
+    "EV_REL",
     "EV_SYN",
+    "FF_RUMBLE",
     "KEY",
     "KEY_NAME",
+    "REL",
     "SYN_DROPPED",
     "SYN_REPORT",
 ]
 
-EV_SYN, EV_KEY, EV_ABS, EV_MSC = 0x00, 0x01, 0x03, 0x04
+EV_SYN, EV_KEY, EV_REL, EV_ABS, EV_MSC, EV_FF = 0x00, 0x01, 0x02, 0x03, 0x04, 0x15
 SYN_REPORT, SYN_DROPPED = 0, 3
+FF_RUMBLE = 0x50
 BUS_USB, BUS_BLUETOOTH = 0x03, 0x05
 
 
@@ -46,12 +51,16 @@ def _key() -> dict[str, int]:
     codes.update({f"BTN_{name}": 0x130 + place for place, name in enumerate((*gamepad, "THUMBL", "THUMBR"))})
     codes.update({f"BTN_DPAD_{name}": 0x220 + place for place, name in enumerate(("UP", "DOWN", "LEFT", "RIGHT"))})
     codes.update({f"BTN_TRIGGER_HAPPY{number}": 0x2C0 + number - 1 for number in range(1, 41)})
-    codes["KEY_RECORD"] = 167
+    codes |= {"BTN_LEFT": 0x110, "KEY_MENU": 139, "KEY_BACK": 158, "KEY_RECORD": 167, "KEY_HOMEPAGE": 172}
     return codes
 
 
 ABS: Mapping[str, int] = MappingProxyType(_abs())
 """Axes: name -> code."""
+REL: Mapping[str, int] = MappingProxyType(
+    {f"REL_{name}": code for code, name in enumerate(("X", "Y", "Z", "RX", "RY", "RZ"))}
+)
+"""Axes that say how far, and nothing when they are let go of: name -> code."""
 KEY: Mapping[str, int] = MappingProxyType(_key())
 """Buttons: name -> code."""
 ABS_NAME: Mapping[int, str] = MappingProxyType({code: name for name, code in ABS.items()})

@@ -2,20 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from typing import TYPE_CHECKING, NamedTuple
 
 from ..deadman import Threshold
-from .codes import ABS, EV_ABS, EV_KEY, KEY
+from .codes import ABS, EV_ABS, EV_KEY, EV_REL, KEY, REL
 
 if TYPE_CHECKING:
     from .model import PadModel
 
-__all__ = ["AxisRange", "PadMapper"]
+__all__ = ["REL_SILENCE", "AxisRange", "PadMapper"]
 
+REL_SILENCE = 0.1
+"""s without an event after which a ``REL_`` axis is at rest: nothing is sent when it is let go of. A cap that is pushed
+reports at the pace of USB, every 8 or 16 ms, so a motion does not stutter when some reports are late. And it is less
+than the 150 ms after which a pad that says nothing at all trips the arm."""
 _TRIGGERS = ("l2", "r2")
-# An axis that the system shows this near to neutral is believed before its first event.
-_AT_REST = 0.25
 
 
 class AxisRange(NamedTuple):
@@ -46,26 +48,32 @@ class _Axis(NamedTuple):
 class PadMapper:
     """Keeps the canonical state of one pad: feed it events, or what the system says is the present state.
 
-    ``ranges`` holds what the pad says about its axes, by event code; an axis of the model that is not in there does
-    not exist. An axis counts as unknown, and shows 0, until its first event: before that the system may show 0, which
-    on many pads is a stick held to the left (hid-sony does so until the first report). One that the system shows at
-    rest is believed.
+    ``ranges`` holds what the pad says about its ``ABS_`` axes, by event code, and ``rels`` the codes of its ``REL_``
+    axes; an axis of the model that is in neither does not exist. An axis counts as unknown, and shows 0, until its
+    first event, or until :meth:`sync`.
 
     A pad whose triggers are only axes, or only buttons, gets the other one computed.
     """
 
-    def __init__(self, model: PadModel, ranges: Mapping[int, AxisRange]) -> None:
+    def __init__(self, model: PadModel, ranges: Mapping[int, AxisRange], rels: Collection[int] = ()) -> None:
         self.model = model
         self._axes: dict[int, _Axis] = {}
+        self._rels: dict[int, _Axis] = {}
         for code_name, text in model.axes.items():
-            code = ABS[code_name]
-            span = ranges.get(code)
-            if span is not None and code_name in model.ranges:
-                span = AxisRange(*model.ranges[code_name], span.flat)
+            control, sign = text.removeprefix("-"), -1.0 if text.startswith("-") else 1.0
+            known = AxisRange(*model.ranges[code_name]) if code_name in model.ranges else None
+            if code_name in REL:
+                if REL[code_name] in rels and known is not None:
+                    self._rels[REL[code_name]] = _Axis(control, sign, known)
+                continue
+            span = ranges.get(ABS[code_name])
+            if span is not None and known is not None:
+                span = known._replace(flat=span.flat)
             if span is not None and span.maximum > span.minimum:
-                self._axes[code] = _Axis(text.removeprefix("-"), -1.0 if text.startswith("-") else 1.0, span)
+                self._axes[ABS[code_name]] = _Axis(control, sign, span)
         self._keys = {KEY[name]: control for name, control in model.buttons.items()}
-        reported = {axis.control for axis in self._axes.values()}
+        axes = (*self._axes.values(), *self._rels.values())
+        reported = self._reported = frozenset(axis.control for axis in axes)
         pressed = set(self._keys.values())
         self._computed_axes = tuple(name for name in _TRIGGERS if name in pressed - reported)
         self._thresholds = {name: Threshold() for name in _TRIGGERS if name in reported - pressed}
@@ -73,9 +81,13 @@ class PadMapper:
         self._controls = (*sorted(reported | directions), *self._computed_axes)
         self.flat: Mapping[str, float] = {
             axis.control: axis.range.flat / (axis.range.maximum - axis.range.minimum) * _spread(axis.control)
-            for axis in self._axes.values()
+            for axis in axes
         }
         """Share of each axis' travel from neutral that the pad says means nothing."""
+        self._heard: dict[int, float] = {}
+        """When each ``REL_`` axis spoke last, or could have first."""
+        self._fed: set[str] = set()
+        """Controls that an event spoke of."""
         self.axes: dict[str, float] = {}
         self.buttons: frozenset[str] = frozenset()
         self.unknown: frozenset[str] = frozenset()
@@ -86,36 +98,66 @@ class PadMapper:
         """Everything neutral, and no axis known."""
         self.axes = dict.fromkeys(self._controls, 0.0)
         self.buttons = frozenset()
-        self.unknown = frozenset(axis.control for axis in self._axes.values())
+        self.unknown = frozenset(axis.control for axis in (*self._axes.values(), *self._rels.values()))
+        self._heard.clear()
+        self._fed.clear()
         for threshold in self._thresholds.values():
             threshold.held = False
 
-    def feed(self, kind: int, code: int, value: int) -> bool:
-        """Take one event; True when it was about a control that the model knows."""
+    def feed(self, kind: int, code: int, value: int, t: float = 0.0) -> bool:
+        """Take one event of the time ``t`` (s, the clock of :meth:`expire`); True when the model knows its control."""
         if kind == EV_ABS and code in self._axes:
             axis = self._axes[code]
+            self._fed.add(axis.control)
+            self._set_axis(axis.control, axis.value(value))
+        elif kind == EV_REL and code in self._rels:
+            axis = self._rels[code]
+            self._heard[code] = t
+            self._fed.add(axis.control)
             self._set_axis(axis.control, axis.value(value))
         elif kind == EV_KEY and code in self._keys:
+            self._fed.add(self._keys[code])
             self._set_key(self._keys[code], value != 0)
         else:
             return False
         return True
 
-    def sync(self, values: Mapping[int, int], keys: Iterable[int], *, trusted: bool) -> None:
+    def expire(self, now: float) -> bool:
+        """Let go of the ``REL_`` axes that have said nothing for :data:`REL_SILENCE`; True when one changed."""
+        changed = False
+        for code, axis in self._rels.items():
+            silent = now - self._heard.setdefault(code, now) >= REL_SILENCE
+            if silent and self.axes[axis.control]:
+                self._set_axis(axis.control, 0.0)
+                changed = True
+        return changed
+
+    def sync(self, values: Mapping[int, int], keys: Iterable[int], *, rest: bool = False) -> None:
         """Take the state that the system shows: axis code -> value, and the codes of the pressed buttons.
 
-        Before a pad's first events (``trusted=False``) only axes at rest are believed.
+        With ``rest``, only of the controls that no event spoke of yet.
+
+        Only for a pad that has spoken: before its first report the system shows what is not so (hid-sony 0, which is a
+        stick held to the left; hid-playstation and xpad a pad at rest). Of ``REL_`` axes the system knows nothing: they
+        are let go of until they speak again.
         """
         for code, value in values.items():
             axis = self._axes.get(code)
-            if axis is None:
+            if axis is not None and not (rest and axis.control in self._fed):
+                self._set_axis(axis.control, axis.value(value))
+        for axis in self._rels.values():
+            if not (rest and axis.control in self._fed):
+                self._set_axis(axis.control, 0.0)
+        down = {self._keys[code] for code in keys if code in self._keys}
+        for control in set(self._keys.values()):
+            if rest and control in self._fed:
                 continue
-            shown = axis.value(value)
-            if trusted or abs(shown) <= _AT_REST:
-                self._set_axis(axis.control, shown)
-        down = set(keys)
-        for code, control in self._keys.items():
-            self._set_key(control, code in down)
+            if control in down or control[1:] not in self._reported:  # else the d-pad's axis has said it
+                self._set_key(control, control in down)
+
+    def press(self, control: str, down: bool) -> None:
+        """A button that another device of the pad reports is pressed, or let go of."""
+        self._set_button(control, down)
 
     def _set_axis(self, control: str, value: float) -> None:
         self.axes[control] = value

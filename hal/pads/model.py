@@ -9,16 +9,17 @@ import re
 from collections.abc import Collection, Iterable, Mapping
 from typing import Annotated, Any, NamedTuple, TypeVar
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from ..errors import ConfigError, Problem
 from ..types import AXES, BUTTONS
-from .codes import ABS, BUS_BLUETOOTH, BUS_USB, KEY
+from .codes import ABS, BUS_BLUETOOTH, BUS_USB, KEY, REL
 
 __all__ = ["Identity", "MatchRule", "PadModel", "choose_model", "pad_model", "validated"]
 
 _M = TypeVar("_M", bound=BaseModel)
 _BUSES = {BUS_USB: "usb", BUS_BLUETOOTH: "bluetooth"}
+_AXIS_CODES = (*ABS, *REL)
 
 
 class Identity(NamedTuple):
@@ -76,6 +77,8 @@ class MatchRule(_Strict):
     bus: Annotated[str, _known("bus", ("usb", "bluetooth"))] | None = None
     wireless: bool = False
     """What is plugged in is only the receiver of a wireless pad, so unplugging says nothing about the pad."""
+    title: str | None = None
+    """For people, where the model's own title is not this pad's."""
 
     def fits(self, pad: Identity) -> int:
         """How many of the pad's properties the rule names, all of them right; 0 when it does not match."""
@@ -96,14 +99,27 @@ class PadModel(_Strict):
     title: str
     """For people."""
     match: tuple[MatchRule, ...] = ()
-    axes: dict[Annotated[str, _known("event code of an axis", ABS)], Annotated[str, AfterValidator(_axis)]]
-    """Event code -> axis, ``-axis`` where the kernel's value grows to the left or downwards."""
+    axes: dict[Annotated[str, _known("event code of an axis", _AXIS_CODES)], Annotated[str, AfterValidator(_axis)]]
+    """Event code -> axis, ``-axis`` where the kernel's value grows the other way (on sticks, downwards). Codes that a
+    pad does not send may stand here too."""
     buttons: dict[Annotated[str, _known("event code of a button", KEY)], Annotated[str, AfterValidator(_button)]]
     """Event code -> button; ``+dpad_y`` and its like where the d-pad's directions are buttons."""
-    ranges: dict[Annotated[str, _known("event code of an axis", ABS)], tuple[int, int]] = {}
-    """Event code -> (minimum, maximum), only for a pad whose own answer is wrong."""
+    ranges: dict[Annotated[str, _known("event code of an axis", _AXIS_CODES)], tuple[int, int]] = {}
+    """Event code -> (minimum, maximum): of every ``REL_`` axis, for nobody can be asked, and of the axes of a pad whose
+    own answer is wrong."""
     motion_node: str | None = None
     """End of the name of the pad's motion sensor, which speaks all the time and so shows that the pad is alive."""
+    touch_node: str | None = None
+    """End of the name of the pad's touchpad, a device of its own; pressing it down is the button ``touchpad``."""
+    mapping: str | None = None
+    """Teleoperation mapping that is meant for this pad (``config/teleop``); the default one when left out."""
+
+    @model_validator(mode="after")
+    def _has_ranges(self) -> PadModel:
+        missing = [code for code in self.axes if code in REL and code not in self.ranges]
+        if missing:
+            raise ValueError(f"needs ranges of {', '.join(missing)}, such as [-350, 350]")
+        return self
 
     def rule_for(self, pad: Identity) -> MatchRule | None:
         """The rule that describes ``pad`` best; None when the model does not match."""

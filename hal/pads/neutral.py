@@ -35,7 +35,8 @@ class NeutralGate:
         if not self.open:
             away = tuple(name for name in AXES if name in unknown or not abs(axes.get(name, 0.0)) <= self.near)
             self.open = not away
-            self.waiting_for = away
+            silent = bool(axes) and all(name in unknown for name in axes)
+            self.waiting_for = ("any control: the pad has said nothing yet",) if silent else away
         if not self.open:
             return frozenset()
         self._seen_up |= frozenset(BUTTONS) - buttons

@@ -109,6 +109,25 @@ def test_a_chunk_that_begins_later_is_gone_to_from_here() -> None:
     bench.assert_within_limits()
 
 
+def test_a_released_dead_man_forgets_the_rest_of_a_chunk() -> None:
+    bench = Bench(deadman=True)
+    bench.tick()
+    bench.press()
+    bench.tick()
+    start = bench.now
+    times = [start + 0.1 * k for k in range(20)]
+    send(bench, times, [swing(t - start) for t in times])
+    bench.run(0.8)
+    assert bench.moving
+    bench.release()
+    bench.until_rest()
+    there = list(bench.q)
+    bench.press()
+    bench.run(0.5)
+    assert bench.q == pytest.approx(there), "nothing is resumed after a new press"
+    assert bench.trip is Trip.NONE
+
+
 @pytest.mark.parametrize("where", ["far", "short", "backwards", "nan"])
 def test_what_cannot_be_followed_is_refused_and_moves_nothing(where: str) -> None:
     bench = Bench()

@@ -281,6 +281,59 @@ def test_only_a_pad_whose_silence_is_noticed_may_guard_a_real_arm(pad_spec: PadS
     pad.hold("l2").check_trust()
 
 
+def test_what_is_distrusted_is_said_without_asking_a_dead_man(pad: Gamepad, driver: Played) -> None:
+    assert pad.distrust() is None
+    driver.proves_liveness = False
+    assert "accept_silent_pad" in str(pad.distrust())
+
+
+class Shaking(Played):
+    """It has motors, and a mapping of its own."""
+
+    mapping = "spacemouse"
+
+    def __init__(self, spec: PadSpec) -> None:
+        super().__init__(spec)
+        self.rumbles: list[tuple[float, float, float]] = []
+
+    def rumble(self, strong: float, weak: float, seconds: float) -> bool:
+        self.rumbles.append((strong, weak, seconds))
+        if self.failure is not None:
+            raise self.failure
+        return True
+
+
+def test_a_pad_rumbles_within_what_it_can_and_never_raises(pad_spec: PadSpec, driver: Played) -> None:
+    shaking = Shaking(pad_spec)
+    pad = Gamepad(shaking)
+    assert pad.rumble()
+    assert pad.rumble(strong=2.0, weak=-1.0, seconds=1.0)
+    assert pad.rumble(strong=math.nan, seconds=math.nan)
+    assert shaking.rumbles[1:] == [(1.0, 0.0, 1.0), (0.0, shaking.rumbles[0][1], 0.0)]
+    assert all(0.0 <= share <= 1.0 for share in shaking.rumbles[0][:2])
+    shaking.failure = OSError(19, "unplugged")
+    assert not pad.rumble()
+    assert pad.error is shaking.failure
+    assert not Gamepad(driver).rumble(), "one without motors"
+
+
+def test_a_pad_says_which_mapping_it_is_meant_for_and_which_axes_it_has(pad_spec: PadSpec, driver: Played) -> None:
+    assert Gamepad(driver).mapping is None
+    assert Gamepad(Shaking(pad_spec)).mapping == "spacemouse"
+    driver.reading = driver.reading._replace(axes={"push_x": 0.0, "left_x": 0.0})
+    pad = Gamepad(driver)
+    assert pad.reported == ()
+    pad.open(0.0)
+    assert pad.reported == ("left_x", "push_x")
+    assert set(pad.state().axes) == set(AXES), "the others are 0"
+
+
+def test_a_cap_has_a_dead_zone_like_a_stick(see: See, pad: Gamepad) -> None:
+    zone = pad.driver.spec.dead_zone
+    assert see(push_x=zone).axis("push_x") == 0.0
+    assert see(turn_z=-1.0).axis("turn_z") == -1.0
+
+
 def test_its_own_thread_polls_it_and_close_ends_the_thread(driver: Played) -> None:
     pad = Gamepad(driver)
     pad.open(0.0)

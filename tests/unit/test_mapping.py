@@ -7,6 +7,7 @@ from typing import Any
 
 import pytest
 
+from hal.config.data_files import list_data
 from hal.config.mapping import TeleopMapping, load_mapping
 from hal.errors import ConfigError
 from hal.types import PadState, Stamp
@@ -46,6 +47,14 @@ def test_the_defaults_other_controls() -> None:
     assert load_mapping(mapping) is mapping
 
 
+def test_every_built_in_mapping_is_sound_and_says_what_it_is_for() -> None:
+    for name in list_data("config", "teleop"):
+        mapping = load_mapping(name)
+        assert mapping.description
+        assert min(mapping.speeds()) > 0.0
+    assert {"default", "spacemouse"} <= set(list_data("config", "teleop"))
+
+
 def test_a_mapping_of_ones_own(tmp_path: Path) -> None:
     (tmp_path / "mine.yaml").write_text(
         "{deadman: l1, frame: tcp, linear: {z: {axis: left_y, scale: 0.1}}, gripper: {open: east, close: south}}"
@@ -68,6 +77,9 @@ def test_a_mapping_of_ones_own(tmp_path: Path) -> None:
         ({"frame": "tool"}, "frame", ["'tool'", "base, tcp"]),
         ({"deadman": "l4"}, "deadman", ["no button 'l4'"]),
         ({"gripper": {"open": "east"}}, "gripper", ["open and close"]),
+        ({"gripper": {"toggle": "r9"}}, "gripper", ["no button 'r9'"]),
+        ({"gripper": {"toggle": "r1", "axis": "r2"}}, "gripper", ["needs an axis, or", "toggle"]),
+        ({"gripper": {"toggle": "l2"}}, "", ["'l2' has two meanings"]),
         ({"linear": {"x": {"axis": "l2", "scale": 1.0}}}, "", ["'l2' has two meanings"]),
         ({"go_home": "north", "actions": {"record": "north"}}, "", ["'north' has two meanings"]),
     ],

@@ -1,5 +1,6 @@
 """From a pad to an arm and its gripper, on the built-in rig with mock devices."""
 
+import time
 from collections.abc import Iterator
 
 import pytest
@@ -81,6 +82,72 @@ def test_buttons_open_and_close(arm: hal.Robot) -> None:
     assert teleop.step(pad("l2", "east"), 0.02)[1] == 0.0
     assert teleop.step(pad("l2"), 0.02)[1] is None
     assert teleop.step(pad("south"), 0.02)[1] is None, "not without the dead-man"
+
+
+TOGGLE = {"deadman": "l2", "gripper": {"toggle": "r1"}}
+
+
+def wait_for_target(arm: hal.Robot, share: float) -> None:
+    """Until the gripper's state shows the command of that grip."""
+    width = (1.0 - share) * arm.gripper.width_max
+    end = time.monotonic() + 10.0
+    while arm.gripper.state(10.0).width_target != pytest.approx(width):
+        assert time.monotonic() < end, arm.gripper.state(10.0)
+        time.sleep(0.005)
+
+
+def test_one_button_closes_and_opens_in_turn(arm: hal.Robot) -> None:
+    teleop = hal.Teleop(arm, mapping=TOGGLE)
+
+    def press() -> float | None:
+        """All that a press of some ticks asks for."""
+        asked = [teleop.step(pad("l2", "r1"), 0.02)[1] for _ in range(3)]
+        assert len(set(asked)) == 1, "as long as it is held: no single command matters"
+        assert teleop.step(pad("l2"), 0.02)[1] is None
+        return asked[0]
+
+    assert teleop.step(pad("l2"), 0.02)[1] is None
+    for wanted in (1.0, 0.0, 1.0):
+        assert press() == wanted
+        arm.gripper.grip(wanted)
+        wait_for_target(arm, wanted)
+
+
+def test_a_toggle_says_what_follows_from_the_gripper_and_not_from_its_own_count(arm: hal.Robot) -> None:
+    teleop = hal.Teleop(arm, mapping=TOGGLE)
+    arm.gripper.grip(1.0)  # somebody else closed it
+    wait_for_target(arm, 1.0)
+    teleop.step(pad("l2"), 0.02)
+    assert teleop.step(pad("l2", "r1"), 0.02)[1] == 0.0
+
+
+@pytest.mark.parametrize("interruption", ["the dead-man is released", "the pad is gone", "a new session"])
+def test_a_toggle_that_is_held_through_an_interruption_does_not_flip_anything(
+    arm: hal.Robot, interruption: str
+) -> None:
+    teleop = hal.Teleop(arm, mapping=TOGGLE)
+    assert teleop.step(pad("l2", "r1"), 0.02)[1] is None, "held from the start"
+    teleop.step(pad("l2"), 0.02)
+    assert teleop.step(pad("l2", "r1"), 0.02)[1] == 1.0
+    arm.gripper.grip(1.0)
+    wait_for_target(arm, 1.0)
+    if interruption == "the dead-man is released":
+        assert teleop.step(pad("r1"), 0.02)[1] is None
+    elif interruption == "the pad is gone":
+        assert teleop.step(PadState(Stamp(0.0, 0.0, 2)), 0.02)[1] is None
+    else:
+        teleop.reset()
+    assert [teleop.step(pad("l2", "r1"), 0.02)[1] for _ in range(3)] == [None] * 3
+    teleop.step(pad("l2"), 0.02)
+    assert teleop.step(pad("l2", "r1"), 0.02)[1] == 0.0, "a press of its own"
+
+
+def test_a_toggle_is_explained(rig: hal.Rig, arm: hal.Robot) -> None:
+    teleop = hal.Teleop(arm, mapping="spacemouse")
+    assert teleop.labels()["controls"]["r1"] == ["open or close the gripper"]
+    text = "\n".join(teleop.help(rig.gamepads["pad"]))
+    assert "gripper: r1" in text
+    assert "hold l1 to move" in text
 
 
 def test_home_counts_once_a_press(arm: hal.Robot) -> None:

@@ -1,0 +1,208 @@
+"""The motors of a pad: told once, then played with one write, and never in anybody's way."""
+
+from __future__ import annotations
+
+import fcntl
+import math
+import os
+import struct
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+
+import pytest
+
+if sys.platform != "linux":
+    pytest.skip("evdev is Linux only", allow_module_level=True)
+
+from evdev_kit import FakeInput, MakePad, pads_on, poll, poll_until
+
+from hal.drivers.evdev.pad import EvdevPad
+from hal.drivers.evdev.rumble import Rumble
+from hal.gamepad import RUMBLE_STRONG, RUMBLE_WEAK, Gamepad
+from hal.pads.codes import BUS_USB, EV_FF, FF_RUMBLE
+from hal.pads.model import Identity
+
+DS4 = Identity("Wireless Controller", 0x054C, 0x09CC, BUS_USB, "playstation")
+EVENT = struct.Struct("@llHHi")
+
+
+class Kernel:
+    """What takes effects and play events: it notes the first, and lets the test read the second."""
+
+    def __init__(self) -> None:
+        self.reader, self.writer = os.pipe()
+        os.set_blocking(self.reader, False)
+        self.effects: list[tuple[int, int, int, int]] = []
+        """Type, number, strong and weak magnitude."""
+        self.answer = threading.Event()
+        self.answer.set()
+        self.error: OSError | None = None
+
+    def ioctl(self, fd: int, request: int, data: bytearray) -> int:
+        assert request & 0xFF == 0x80
+        assert request >> 8 & 0xFF == ord("E")
+        assert request >> 16 & 0x3FFF == len(data)
+        assert self.answer.wait(10.0)
+        if self.error is not None:
+            raise self.error
+        kind, number = struct.unpack_from("@Hh", data, 0)
+        strong, weak = struct.unpack_from("@HH", data, 16)
+        self.effects.append((kind, number, strong, weak))
+        struct.pack_into("@h", data, 2, 5)
+        return 0
+
+    def played(self) -> list[tuple[int, int, int]]:
+        """Type, number and count of every event that was written since."""
+        try:
+            data = os.read(self.reader, 65536)
+        except BlockingIOError:
+            return []
+        return [EVENT.unpack_from(data, at)[2:] for at in range(0, len(data), EVENT.size)]
+
+    def close(self) -> None:
+        self.answer.set()
+        os.close(self.reader)
+        os.close(self.writer)
+
+
+@pytest.fixture
+def kernel(monkeypatch: pytest.MonkeyPatch) -> Iterator[Kernel]:
+    made = Kernel()
+    monkeypatch.setattr(fcntl, "ioctl", made.ioctl)
+    yield made
+    made.close()
+
+
+def until(true: Callable[[], object], limit: float = 10.0) -> None:
+    end = time.monotonic() + limit
+    while not true():
+        assert time.monotonic() < end, "it did not happen"
+        time.sleep(0.002)
+
+
+def test_the_structure_is_the_kernels(kernel: Kernel, monkeypatch: pytest.MonkeyPatch) -> None:
+    """sizeof(struct ff_effect) as python-evdev has it too."""
+    evdev_ff = pytest.importorskip("evdev.ff", reason="needs python-evdev: pip install evdev-binary")
+    import ctypes
+
+    seen: list[int] = []
+
+    def note(fd: int, request: int, data: bytearray) -> int:
+        seen.append(len(data))
+        return kernel.ioctl(fd, request, data)
+
+    monkeypatch.setattr(fcntl, "ioctl", note)
+    assert Rumble(kernel.writer, 1.0, 0.5).wait(10.0)
+    assert seen == [ctypes.sizeof(evdev_ff.Effect)]
+    assert evdev_ff.Effect.u.offset == 16
+
+
+def test_the_effect_is_made_once_and_playing_it_is_one_write(kernel: Kernel) -> None:
+    rumble = Rumble(kernel.writer, 1.0, 0.5)
+    assert rumble.wait(10.0)
+    assert kernel.effects == [(FF_RUMBLE, -1, 0xFFFF, 0x8000)]
+    assert kernel.played() == []
+    assert rumble.play(1.0, 0.5, 0.5)
+    assert rumble.play(1.0, 0.5, 0.01)
+    assert kernel.played() == [(EV_FF, 5, 1), (EV_FF, 5, 1)]
+    assert len(kernel.effects) == 1
+
+
+def test_another_strength_changes_the_same_effect_and_then_plays_it(kernel: Kernel) -> None:
+    rumble = Rumble(kernel.writer, 1.0, 0.5)
+    assert rumble.wait(10.0)
+    assert rumble.play(0.0, 1.0, 0.2)
+    assert rumble.wait(10.0)
+    assert kernel.effects[1] == (FF_RUMBLE, 5, 0, 0xFFFF)
+    assert kernel.played() == [(EV_FF, 5, 1)]
+
+
+def test_a_kernel_that_does_not_answer_holds_nobody_up(kernel: Kernel) -> None:
+    """A pad that another program makes may take half a minute to take an effect."""
+    kernel.answer.clear()
+    start = time.monotonic()
+    rumble = Rumble(kernel.writer, 1.0, 0.5)
+    assert not rumble.play(1.0, 0.5, 0.5)
+    assert time.monotonic() - start < 5.0
+    kernel.answer.set()
+    assert rumble.wait(10.0)
+    assert rumble.play(1.0, 0.5, 0.5)
+
+
+def test_a_pad_that_takes_no_effect_does_not_rumble_and_that_is_no_error(kernel: Kernel) -> None:
+    kernel.error = OSError(28, "no room for another effect")
+    rumble = Rumble(kernel.writer, 1.0, 0.5)
+    assert not rumble.wait(10.0)
+    rumble.close()
+    assert not rumble.play(1.0, 0.5, 0.5)
+    assert kernel.played() == []
+
+
+# Behind the driver.
+
+
+@pytest.fixture
+def system() -> FakeInput:
+    return FakeInput()
+
+
+@pytest.fixture
+def make_pad(system: FakeInput) -> Iterator[MakePad]:
+    with pads_on(system) as make:
+        yield make
+
+
+def test_a_rumble_is_played_by_the_thread_that_polls(system: FakeInput, make_pad: MakePad, kernel: Kernel) -> None:
+    node = system.plug(DS4)
+    node.can_rumble = True
+    pad = make_pad()
+    until(lambda: kernel.effects)
+    assert kernel.effects == [(FF_RUMBLE, -1, round(RUMBLE_STRONG * 0xFFFF), round(RUMBLE_WEAK * 0xFFFF))]
+    asked: list[bool] = []
+
+    def shaken() -> bytes:
+        caller = threading.Thread(target=lambda: asked.append(Gamepad(pad).rumble()))
+        caller.start()
+        caller.join(10.0)
+        assert node.written() == b"", "not from the caller's thread: the device may be closed meanwhile"
+        poll(pad)
+        return node.written()
+
+    until(shaken)  # the effect may be ready a moment later
+    assert all(asked)
+    assert Gamepad(pad).rumble(seconds=0.3)
+    poll(pad)
+    assert EVENT.unpack(node.written())[2:] == (EV_FF, 5, 1)
+    assert len(kernel.effects) == 1, "nothing is uploaded when it matters"
+
+
+def test_a_pad_that_is_read_only_or_not_there_does_not_rumble(system: FakeInput, make_pad: MakePad) -> None:
+    pad = make_pad()
+    assert not Gamepad(pad).rumble()
+    node = system.plug(DS4)
+    poll_until(pad, lambda reading: reading.connected)
+    assert pad.details()["rumbles"] == "no"
+    assert not Gamepad(pad).rumble()
+    system.unplug(node)
+    assert not poll(pad).connected
+    assert not Gamepad(pad).rumble()
+
+
+def test_a_rumble_for_a_pad_that_went_is_not_played_by_the_next(
+    system: FakeInput, make_pad: MakePad, kernel: Kernel
+) -> None:
+    node = system.plug(DS4)
+    node.can_rumble = True
+    pad: EvdevPad = make_pad()
+    assert pad.rumble(1.0, 0.5, 0.5)
+    system.unplug(node)
+    assert not poll(pad).connected
+    assert pad._rumble is None
+
+
+@pytest.mark.parametrize("seconds", [0.0, -1.0, math.nan])
+def test_no_time_no_rumble(system: FakeInput, make_pad: MakePad, kernel: Kernel, seconds: float) -> None:
+    system.plug(DS4).can_rumble = True
+    assert not Gamepad(make_pad()).rumble(seconds=seconds)

@@ -1,0 +1,218 @@
+"""A SpaceMouse: which way is which, and what its silence means in its two modes."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Iterator
+
+import pytest
+
+if sys.platform != "linux":
+    pytest.skip("evdev is Linux only", allow_module_level=True)
+
+from evdev_kit import FakeInput, FakeNode, MakePad, pads_on, poll, poll_until
+
+import hal
+from hal.config.mapping import load_mapping
+from hal.drivers.evdev.pad import EvdevPad
+from hal.gamepad import Gamepad
+from hal.pads.codes import ABS, BUS_USB, EV_ABS, EV_KEY, EV_REL, EV_SYN, KEY, REL, SYN_DROPPED
+from hal.pads.guess import guess_model
+from hal.pads.mapper import REL_SILENCE, AxisRange
+from hal.pads.model import Identity
+from hal.servo.watchdog import SILENCE
+from hal.types import CAP_AXES
+
+COMPACT = Identity("3Dconnexion SpaceMouse Compact", 0x256F, 0xC635, BUS_USB, "hid-generic")
+BUTTONS = [KEY["BTN_0"], KEY["BTN_1"]]
+LEFT = KEY["BTN_0"]
+
+
+@pytest.fixture
+def system() -> FakeInput:
+    return FakeInput()
+
+
+@pytest.fixture
+def make_pad(system: FakeInput) -> Iterator[MakePad]:
+    with pads_on(system) as make:
+        yield make
+
+
+def rel_node(number: int = 3) -> FakeNode:
+    return FakeNode(f"/dev/input/event{number}", {}, BUTTONS, REL.values())
+
+
+def abs_node() -> FakeNode:
+    return FakeNode("/dev/input/event3", {code: AxisRange(-350, 350) for code in range(6)}, BUTTONS)
+
+
+def moved(pad: EvdevPad) -> dict[str, float]:
+    return {name: value for name, value in poll(pad).axes.items() if value}
+
+
+@pytest.mark.parametrize("mode", ["REL", "ABS"])
+@pytest.mark.parametrize(
+    ("code", "value", "control", "expected"),
+    [
+        ("Y", -350, "push_x", 1.0),  # the device's Y points to the person: away from him is forwards
+        ("X", -350, "push_y", 1.0),  # its X points right: to the left
+        ("Z", -350, "push_z", 1.0),  # its Z points down: pulled up
+        ("RY", -350, "turn_x", 1.0),  # tilted to the right
+        ("RX", -350, "turn_y", 1.0),  # tilted forwards
+        ("RZ", -350, "turn_z", 1.0),  # turned to the left, seen from above
+        ("X", 175, "push_y", -0.5),
+        ("RZ", 500, "turn_z", -1.0),  # farther than it can
+    ],
+)
+def test_pushes_and_turns_are_those_of_the_arms_base(
+    mode: str, code: str, value: int, control: str, expected: float, system: FakeInput, make_pad: MakePad
+) -> None:
+    node = system.put(rel_node() if mode == "REL" else abs_node(), COMPACT)
+    pad = make_pad()
+    assert pad.describe() == "SpaceMouse Compact (USB, /dev/input/event3)"
+    node.send((EV_REL, REL[f"REL_{code}"], value) if mode == "REL" else (EV_ABS, ABS[f"ABS_{code}"], value))
+    assert moved(pad) == {control: pytest.approx(expected)}
+
+
+def test_an_axis_that_falls_silent_was_let_go_of_in_rel_mode(system: FakeInput, make_pad: MakePad) -> None:
+    """Nothing is sent on release: without this the arm would go on for ever."""
+    node = system.put(rel_node(), COMPACT)
+    pad = make_pad()
+    pressed = time.monotonic()
+    node.send((EV_REL, REL["REL_X"], -350), (EV_KEY, LEFT, 1), t=pressed)
+    held = poll(pad)
+    assert held.axes["push_y"] == 1.0
+    released = poll_until(pad, lambda reading: reading.axes["push_y"] == 0.0)
+    assert time.monotonic() - pressed >= REL_SILENCE
+    assert released.seq > held.seq
+    assert released.t > held.t, "letting go is an event of its own"
+    assert released.buttons == {"l1"}, "a button says itself when it is let go of"
+    assert REL_SILENCE < SILENCE, "the arm brakes before a pad that says nothing at all would trip it"
+
+
+def test_each_axis_is_on_its_own(system: FakeInput, make_pad: MakePad) -> None:
+    node = system.put(rel_node(), COMPACT)
+    pad = make_pad()
+    old = time.monotonic() - REL_SILENCE - 0.01
+    node.send((EV_REL, REL["REL_X"], -350), t=old)
+    node.send((EV_REL, REL["REL_RZ"], -350))
+    assert moved(pad) == {"turn_z": 1.0}, "events count from when they happened, however late they are read"
+
+
+def test_a_steady_hold_says_nothing_and_is_no_release_in_abs_mode(system: FakeInput, make_pad: MakePad) -> None:
+    node = system.put(abs_node(), COMPACT)
+    pad = make_pad()
+    node.send((EV_ABS, ABS["ABS_X"], -350), t=time.monotonic() - 60.0)
+    assert moved(pad) == {"push_y": 1.0}
+    end = time.monotonic() + 2.0 * REL_SILENCE
+    while time.monotonic() < end:
+        assert moved(pad) == {"push_y": 1.0}
+        time.sleep(0.01)
+    node.send((EV_ABS, ABS["ABS_X"], 0))
+    assert moved(pad) == {}
+
+
+def test_after_dropped_events_every_push_is_forgotten_and_buttons_are_asked_anew(
+    system: FakeInput, make_pad: MakePad
+) -> None:
+    node = system.put(rel_node(), COMPACT)
+    pad = make_pad()
+    node.send((EV_REL, REL["REL_X"], -350), (EV_KEY, LEFT, 1))
+    assert moved(pad) == {"push_y": 1.0}
+    node.send((EV_SYN, SYN_DROPPED, 0), (EV_REL, REL["REL_Y"], -350))
+    reading = poll(pad)
+    assert (moved(pad), reading.buttons) == ({}, frozenset())
+
+
+# Behind the public pad.
+
+
+def drive(pad: Gamepad, node: FakeNode, *events: tuple[int, int, int]) -> None:
+    node.send(*events)
+    pad.poll_once(time.monotonic())
+
+
+def settle(pad: Gamepad, limit: float = 10.0) -> None:
+    """Until the pad counts."""
+    end = time.monotonic() + limit
+    while pad.waiting_for:
+        assert time.monotonic() < end, pad.waiting_for
+        pad.poll_once(time.monotonic())
+        time.sleep(0.005)
+
+
+def test_a_cap_that_was_pushed_when_it_was_plugged_in_moves_nothing_until_it_was_let_go_of(
+    system: FakeInput, make_pad: MakePad
+) -> None:
+    node = system.put(rel_node(), COMPACT)
+    node.speaks = False
+    pad = Gamepad(make_pad())
+    pad.open(time.monotonic())
+    deadman = pad.hold("l1")
+    assert pad.waiting_for == ("any control: the pad has said nothing yet",), "it may be pushed"
+    push = (EV_REL, REL["REL_X"], -350)
+    end = time.monotonic() + 2.0 * REL_SILENCE
+    while time.monotonic() < end:  # held all the time, and the button too
+        drive(pad, node, push, (EV_KEY, LEFT, 1))
+        assert not any(pad.state().axes.values())
+        assert not deadman.held
+        time.sleep(0.01)
+    settle_from = pad.waiting_for
+    assert "push_y" in settle_from
+    drive(pad, node, (EV_KEY, LEFT, 0))
+    settle(pad)
+    drive(pad, node, push, (EV_KEY, LEFT, 1))
+    assert (pad.state().axis("push_y"), deadman.held) == (1.0, True)
+
+
+def test_unplugged_in_mid_push_it_stops_and_wants_the_button_anew(system: FakeInput, make_pad: MakePad) -> None:
+    node = system.put(rel_node(), COMPACT)
+    pad = Gamepad(make_pad())
+    pad.open(time.monotonic())
+    deadman = pad.hold("l1")
+    settle(pad)
+    drive(pad, node, (EV_REL, REL["REL_Y"], -350), (EV_KEY, LEFT, 1))
+    assert (pad.state().axis("push_x"), deadman.held) == (1.0, True)
+    system.unplug(node)
+    pad.poll_once(time.monotonic())
+    assert (pad.state().connected, pad.state().axis("push_x"), deadman.held) == (False, 0.0, False)
+    again = rel_node(5)
+    again.down = [LEFT]  # nobody let go of it
+    system.put(again, COMPACT)
+    poll_until(pad.driver, lambda reading: reading.connected)  # type: ignore[arg-type]
+    settle_end = time.monotonic() + 10.0
+    while pad.waiting_for != ("l1",):
+        assert time.monotonic() < settle_end, pad.waiting_for
+        pad.poll_once(time.monotonic())
+        time.sleep(0.005)
+    drive(pad, again, (EV_REL, REL["REL_Y"], -350))
+    assert not deadman.held
+    drive(pad, again, (EV_KEY, LEFT, 0))
+    drive(pad, again, (EV_KEY, LEFT, 1), (EV_REL, REL["REL_Y"], -350))
+    assert (deadman.held, pad.state().axis("push_x")) == (True, 1.0)
+
+
+def test_its_mapping_moves_the_tool_the_way_that_the_cap_goes() -> None:
+    mapping = load_mapping("spacemouse")
+    stamp = hal.Stamp(0.0, 0.0, 1)
+    twists = [mapping.twist(hal.PadState(stamp, {axis: 1.0}, frozenset(), connected=True)) for axis in CAP_AXES]
+    for k, twist in enumerate(twists):
+        assert twist[k] > 0.0
+        assert sum(map(abs, twist)) == twist[k], "and nowhere else"
+    assert mapping.frame == "base"
+
+
+def test_an_unknown_one_is_guessed_as_a_model_knows_them(system: FakeInput, make_pad: MakePad) -> None:
+    stranger = COMPACT._replace(vendor=0x1234, name="ACME Cap")
+    node = system.put(rel_node(), stranger)
+    pad = make_pad()
+    assert "unknown gamepad" in pad.notes[0]
+    assert (pad.mapping, pad.proves_liveness) == ("spacemouse", False)
+    node.send((EV_REL, REL["REL_Z"], -350), (EV_KEY, LEFT, 1))
+    assert moved(pad) == {"push_z": 1.0}
+    guessed = guess_model(stranger, {}, BUTTONS, REL.values())
+    known = next(model for model in pad._models if model.name == "spacemouse")
+    assert guessed.axes == {code: axis for code, axis in known.axes.items() if code.startswith("REL")}
+    assert guessed.buttons == known.buttons
