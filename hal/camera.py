@@ -32,7 +32,7 @@ GIVE_UP = 1800.0
 """s after which a lost camera is not looked for any more."""
 
 Place = Callable[[float], "Pose | None"]
-"""Where the camera is in the world at a time on the rig's clock, s; None where that is not known."""
+"""Where the colour sensor is in the world at a time on the rig's clock, s; None where that is not known."""
 
 
 class CameraCounts(NamedTuple):
@@ -212,6 +212,8 @@ class Camera:
         deadline = time.monotonic() + timeout
         try:
             if self._error is not None:
+                if self._error.final:
+                    raise self._error
                 self._reopen()
             while True:
                 raw = self._driver.grab(max(0.0, deadline - time.monotonic()))
@@ -221,8 +223,9 @@ class Camera:
                 if after is None or raw.t >= after or not self._driver.on_demand:
                     return self._hand_out()
         except ConnectionLost as error:
-            lost = self._lose(error)
-            raise lost from error
+            if error is self._error:
+                raise
+            raise self._lose(error) from error
 
     # The camera's own thread.
 
@@ -231,8 +234,7 @@ class Camera:
             try:
                 raw = self._driver.grab(_GRAB)
             except Exception as error:
-                self._lose(error)
-                if not self._look_for_it():
+                if self._lose(error).final or not self._look_for_it():
                     return
                 continue
             if raw is not None:
@@ -272,6 +274,7 @@ class Camera:
         lost = ConnectionLost(f"camera {self.name} is lost ({seen}, now is {self.clock.now():.3f} s): {error}")
         lost.__cause__ = error
         lost.fault = getattr(error, "fault", None)
+        lost.final = getattr(error, "final", False)
         with self._news:
             first, self._error = self._error is None, lost
             self._news.notify_all()
@@ -321,6 +324,8 @@ class Camera:
         where = raw.T_world_camera
         if where is None and self._place is not None:
             where = self._place(raw.t)
+            if where is not None and self.spec.align == "depth" and "depth" in info.streams:
+                where = where @ info.streams["depth"].T_color_stream
         return Frame(
             stamp=Stamp(raw.t, raw.t_device, raw.seq + self._offset),
             color=raw.color,

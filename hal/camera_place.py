@@ -18,19 +18,19 @@ __all__ = ["Moving", "place_of"]
 
 
 def place_of(spec: CameraSpec, robots: Mapping[str, Robot]) -> Place | None:
-    """Pose in the world of the optical frame that colour and depth are handed out in; None where the rig does not
-    say where the camera is."""
+    """Pose in the world of the colour sensor's optical frame; None where the rig does not say where the camera is."""
     view = spec.view
     if view is None:
         return None
-    here = Pose(view.position, view.orientation) @ handed_out(spec)
+    here = Pose(view.position, view.orientation)
     if view.robot is None:
         return lambda t: here
     return Moving(robots[view.robot], view, here)
 
 
 def handed_out(spec: CameraSpec) -> Pose:
-    """Pose of the optical frame of colour and depth, as they are handed out, in that of the colour sensor."""
+    """Pose of the optical frame of colour and depth, as they are handed out, in that of the colour sensor, by the
+    model's figures."""
     depth = spec.sensors.get("depth") if spec.align == "depth" else None
     return Pose(depth.position, depth.orientation) if depth is not None else Pose()
 

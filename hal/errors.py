@@ -104,6 +104,8 @@ class ConnectionLost(HalError, ConnectionError):
 
     fault: Fault | None = None
     """Cause and remedy, where the driver knows them."""
+    final: bool = False
+    """True where nothing will bring the device back (a recording has ended): nobody looks for it any more."""
 
 
 class StaleStateError(HalError, TimeoutError):

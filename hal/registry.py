@@ -37,6 +37,7 @@ BUILT_IN: Mapping[str, str] = MappingProxyType(
         "mock": "hal.drivers.mock:DRIVER",
         "playback": "hal.drivers.playback:DRIVER",
         "pybullet": "hal.drivers.pybullet:DRIVER",
+        "realsense": "hal.drivers.realsense:DRIVER",
         "terminal": "hal.drivers.terminal:DRIVER",
         "viser": "hal.drivers.viser:DRIVER",
         "web": "hal.drivers.web:DRIVER",
@@ -69,14 +70,18 @@ class DriverSpec:
     console: str | None = None
     """A page in a browser that shows a rig and drives it."""
     checks: Mapping[str, str] = field(default_factory=dict)
-    """Kind of device (``robot``, ``gripper``) -> "module:function", which looks at the resolved record of such a device
-    before anything is opened, and yields (key, message) for each thing that is wrong in it; keys are relative to the
-    device's entry in the rig, for example ``real.host``. It must not import the driver's libraries."""
+    """Kind of device (``robot``, ``gripper``, ``camera``) -> "module:function", which looks at the resolved record of
+    such a device before anything is opened, and yields (key, message) for each thing that is wrong in it; keys are
+    relative to the device's entry in the rig, for example ``real.host``. It must not import the driver's libraries."""
     emulated: str | None = None
     """"module:function" that says of the options of a real device whether a program stands in for it, which may be
     stepped by ``rig.clock`` (an address on this computer)."""
     preflight: str | None = None
     """"module:function" that looks at a real arm before it moves (see :mod:`hal.preflight`)."""
+    camera_preflight: str | None = None
+    """The same for a real camera."""
+    path_options: frozenset[str] = frozenset()
+    """Options that are paths of files: in a rig or a model they are relative to the file that names them."""
     own_process: frozenset[str] = frozenset()
     """Kinds of device that need a process of their own (``gripper``: the vendor's calls block)."""
     requires: Mapping[str, str] = field(default_factory=dict)
@@ -88,7 +93,7 @@ class DriverSpec:
         return tuple(kind for kind in _KINDS if getattr(self, kind) is not None)
 
 
-_NO_KINDS = ("name", "checks", "emulated", "preflight", "own_process", "requires")
+_NO_KINDS = ("name", "checks", "emulated", "preflight", "camera_preflight", "path_options", "own_process", "requires")
 _KINDS = tuple(f.name for f in fields(DriverSpec) if f.name not in _NO_KINDS)
 
 

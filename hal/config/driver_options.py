@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -22,11 +22,28 @@ SHARED = ("host",)
 """Options of a real arm that its gripper has too, unless it has its own."""
 
 
-def options_of(config: Config, model: Model, simulated: bool, driver: str) -> dict[str, Any]:
-    """The rig's options for this driver, on top of the model's. The latter are for the model's own driver only."""
+def options_of(
+    config: Config, model: Model, simulated: bool, driver: str, base: Path | None = None, file: Path | None = None
+) -> dict[str, Any]:
+    """The rig's options for this driver, on top of the model's. The latter are for the model's own driver only.
+
+    Those that are paths become absolute: ``base`` is the folder of the rig's file, ``file`` that of the model.
+    """
     own = model.drivers.sim if simulated else model.drivers.real
     of_model = (model.simulated if simulated else model.real) if driver == own else {}
-    return {**of_model, **(config.simulated if simulated else config.real)}
+    of_rig = config.simulated if simulated else config.real
+    if base is not None and file is not None and driver:
+        paths = registry.driver(driver).path_options
+        of_model, of_rig = _absolute(of_model, paths, file.parent), _absolute(of_rig, paths, base)
+    return {**of_model, **of_rig}
+
+
+def _absolute(options: Mapping[str, Any], paths: Collection[str], folder: Path) -> dict[str, Any]:
+    """What is no text is left as it is: the driver's own check says what is wrong with it."""
+    return {
+        name: str((folder / Path(value).expanduser()).resolve()) if name in paths and isinstance(value, str) else value
+        for name, value in options.items()
+    }
 
 
 def is_emulated(driver: str, options: Mapping[str, Any]) -> bool:

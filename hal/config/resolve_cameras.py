@@ -39,7 +39,7 @@ def resolve_camera(context: Context, name: str, config: CameraConfig) -> CameraS
     if streams is None or not driver or _has_problems(context, key, file):
         return None
     with suppress(Unknown):
-        spec = _spec(context, name, config, model, driver, streams)
+        spec = _spec(context, name, config, model, driver, streams, file)
         ask_camera_driver(context, key, spec, config, model, file)
         return spec
     return None
@@ -51,7 +51,7 @@ def _has_problems(context: Context, key: str, file: Path) -> bool:
 
 
 def _spec(
-    context: Context, name: str, config: CameraConfig, model: CameraModel, driver: str, streams: Streams
+    context: Context, name: str, config: CameraConfig, model: CameraModel, driver: str, streams: Streams, file: Path
 ) -> CameraSpec:
     simulated = context.simulated(config)
     reference = streams.reference
@@ -73,7 +73,7 @@ def _spec(
         depth_max=(config.depth or model.depth).max,
         streams=tuple(config.streams),
         view=_view(context, config),
-        options=options_of(config, model, simulated, driver),
+        options=options_of(config, model, simulated, driver, context.base, file),
         align=streams.align,
         sensors=streams.sensors,
         depth_sensor=DepthSensorSpec(sensor.kind, sensor.unit, model.baseline) if sensor is not None else None,
@@ -141,4 +141,4 @@ def _view(context: Context, config: CameraConfig) -> ViewSpec | None:
     if attached is None:
         return None
     link = context.links.get(attached.robot, {}).get(attached.link, attached.link)
-    return view_of(attached.pose(), attached.robot, link)
+    return view_of(attached.optical(), attached.robot, link)

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 import hal
+from hal.camera import Camera, CameraDriver, RawFrame
+from hal.camera_info import CameraInfo, nominal_info
 from hal.camera_place import place_of
-from hal.specs import SensorSpec
 
 
 def difference(a: hal.Pose, b: hal.Pose) -> tuple[float, float]:
@@ -69,15 +70,31 @@ def test_a_camera_that_stands_nowhere_has_no_place() -> None:
         assert place_of(spec, rig.robots) is None
 
 
-def test_the_view_handed_out_is_that_of_the_sensor_that_others_are_aligned_to() -> None:
-    with hal.open("panda_table", driver="mock") as rig:
+class Still(CameraDriver):
+    """A camera that does not know where it is, and whose depth sensor is not where its model says."""
+
+    @property
+    def info(self) -> CameraInfo:
+        info = nominal_info(self.spec, "hardware")
+        depth = replace(info.streams["depth"], T_color_stream=hal.Pose([0.016, 0.0, 0.0]))
+        return replace(info, streams={**info.streams, "depth": depth})
+
+    def open(self) -> None: ...
+
+    def grab(self, timeout: float) -> RawFrame:
+        return RawFrame(0.0, 0.0, 1, None, None, None, None, None)
+
+    def close(self) -> None: ...
+
+
+@pytest.mark.parametrize("align", ["color", "depth"])
+def test_the_view_handed_out_is_that_of_the_sensor_that_others_are_aligned_to(align: str) -> None:
+    with hal.open("panda_table", driver="mock", overrides=[f"cameras.scene.align={align}"]) as rig:
         spec = rig.cameras["scene"].spec
-        depth = SensorSpec(640, 480, 30.0, spec.K, position=(-0.015, 0.0, 0.0))
-        spec = replace(spec, sensors={**spec.sensors, "depth": depth})
-        by_color, by_depth = (place_of(replace(spec, align=align), rig.robots) for align in ("color", "depth"))
-        assert by_color is not None
-        assert by_depth is not None
-        color, apart = by_color(0.0), None
-        assert color is not None
-        apart = color.inverse() @ (by_depth(0.0) or hal.Pose())
-        assert apart.position == pytest.approx([-0.015, 0.0, 0.0], abs=1e-9)
+        camera = Camera(Still(spec), rig.clock, threaded=False, place=place_of(spec, rig.robots))
+        camera.open()
+        pose = camera.read().T_world_camera
+        assert pose is not None
+        assert spec.view is not None
+        apart = hal.Pose(spec.view.position, spec.view.orientation).inverse() @ pose
+        assert apart.position == pytest.approx([0.016 if align == "depth" else 0.0, 0.0, 0.0], abs=1e-9)

@@ -1,0 +1,120 @@
+"""RealSense cameras without any hardware, for tests: in software, and as recordings."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from hal.camera import Camera
+from hal.clock import RealClock
+from hal.errors import ConnectionLost
+from hal.specs import CameraSpec, SensorSpec
+from hal.types import Frame
+
+pytest.importorskip("pyrealsense2", reason="needs pyrealsense2: pip install 'robot-hal[realsense]'")
+
+from hal.drivers.realsense.camera import RealSenseCamera
+from hal.drivers.realsense.emulator import write_recording
+from hal.drivers.realsense.emulator.figures import streams_of
+from hal.drivers.realsense.emulator.pictures import Pictures
+
+SIZE = (640, 480)
+
+
+def spec(
+    *streams: str,
+    name: str = "wrist",
+    size: tuple[int, int] = SIZE,
+    output: tuple[int, int] | None = None,
+    rate_hz: float = 30.0,
+    align: str = "color",
+    formats: dict[str, str] | None = None,
+    **options: Any,
+) -> CameraSpec:
+    """A camera whose streams all have one size; colour and depth unless told otherwise."""
+    streams = streams or ("color", "depth")
+    K = ((600.0, 0.0, (size[0] - 1) / 2), (0.0, 600.0, (size[1] - 1) / 2), (0.0, 0.0, 1.0))
+    width, height = output or size
+    sensors = {
+        stream: SensorSpec(*size, rate_hz, K, format, (0.015 * (stream != "color"), 0.0, 0.0))
+        for stream, format in (formats or {}).items()
+    }
+    return CameraSpec(
+        name=name,
+        model="realsense_d435",
+        driver="realsense",
+        capture_width=size[0],
+        capture_height=size[1],
+        width=width,
+        height=height,
+        rate_hz=rate_hz,
+        K=K,
+        distortion=(0.0,) * 5,
+        depth_min=0.2,
+        depth_max=5.0,
+        streams=streams,
+        view=None,
+        options=options,
+        align=align,
+        sensors=sensors,
+    )
+
+
+@contextmanager
+def opened(camera: CameraSpec) -> Iterator[Camera]:
+    """The public camera, as a rig in real time has it."""
+    it = Camera(RealSenseCamera(camera), RealClock(), threaded=True)
+    it.open()
+    try:
+        yield it
+    finally:
+        it.close()
+
+
+def software(*streams: str, emulated: Any = True, warm_up_s: float = 0.0, **changes: Any) -> CameraSpec:
+    """A camera in software."""
+    return spec(*streams, emulated=emulated, warm_up_s=warm_up_s, **changes)
+
+
+def recording(folder: Path, camera: CameraSpec, frames: int = 40, **how: Any) -> str:
+    """A file with the pictures of that camera, those from number 2 on."""
+    file = folder / f"{camera.name}.db3"
+    write_recording(file, camera, frames, **how)
+    return str(file)
+
+
+def sent(camera: CameraSpec, stream: str, number: int, pattern: str = "test") -> Any:
+    """Exactly what the camera in software, or the recording, has as that picture of a stream."""
+    streams = streams_of(camera)
+    return Pictures(streams, pattern, 0).expected(stream, streams[stream].mode, number)
+
+
+def wait_until(holds: Callable[[], bool], seconds: float) -> float:
+    """How long that took; fails where it took too long."""
+    began = time.monotonic()
+    while not holds():
+        assert time.monotonic() - began < seconds, f"not within {seconds} s"
+        time.sleep(0.005)
+    return time.monotonic() - began
+
+
+def read_until_lost(camera: Camera, seconds: float) -> ConnectionLost:
+    """The error with which the camera says that it is gone."""
+    deadline = time.monotonic() + seconds
+    while time.monotonic() < deadline:
+        try:
+            camera.read(timeout=seconds)
+        except ConnectionLost as error:
+            return error
+    raise AssertionError(f"the camera was not lost within {seconds} s")
+
+
+def read_again(camera: Camera, seconds: float) -> Frame:
+    """The first frame of a camera that was lost."""
+    wait_until(lambda: camera.connected, seconds)
+    return camera.read(timeout=seconds)

@@ -1,0 +1,136 @@
+"""The vendor's library as a client of an emulated RealSense, and nothing of ours between the two."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import pyrealsense2 as rs
+
+from hal.drivers.realsense.emulator import SoftwareCamera, emulated_context
+from hal.specs import CameraSpec
+from hal.testing.specs import camera_spec
+
+PATIENCE = 10.0
+"""s within which a first picture comes on a busy machine."""
+VGA = camera_spec(width=640, height=480, streams=("color", "depth", "infrared"))
+STREAMS = {"depth": ("depth", 0), "color": ("color", 0), "infrared": ("infrared", 1), "infrared_right": ("infrared", 2)}
+
+
+class Picture(NamedTuple):
+    """One picture of a set, copied."""
+
+    number: int
+    stamp: float
+    """s"""
+    domain: str
+    pixels: np.ndarray
+
+
+class Client:
+    """A pipeline on a camera. The context outlives it, as it must."""
+
+    def __init__(self, context: Any, serial: str, *streams: str, color: str = "rgb8", **mode: int) -> None:
+        self.pipeline = rs.pipeline(context)
+        config = rs.config()
+        config.enable_device(serial)
+        self.streams = streams or ("depth", "color", "infrared")
+        size, rate = (mode.get("width", 640), mode.get("height", 480)), mode.get("rate", 30)
+        for name in self.streams:
+            kind, index = STREAMS[name]
+            format = {"depth": "z16", "color": color}.get(name, "y8")
+            config.enable_stream(getattr(rs.stream, kind), index, *size, getattr(rs.format, format), rate)
+        self.profile = self.pipeline.start(config)
+
+    def set(self, timeout: float = PATIENCE) -> dict[str, Picture]:
+        """The next set of pictures, with all streams in it."""
+        deadline = time.monotonic() + timeout
+        while time.monotonic() < deadline:
+            arrived, frames = self.pipeline.try_wait_for_frames(200)
+            if arrived and len(found := pictures(frames, self.streams)) == len(self.streams):
+                return found
+        raise AssertionError(f"no set of {self.streams} within {timeout} s")
+
+    def whole(self) -> dict[str, Picture]:
+        """The next set whose pictures all have the same number: sensors do not begin at once."""
+        for _ in range(30):
+            found = self.set()
+            if len({picture.number for picture in found.values()}) == 1:
+                return found
+        raise AssertionError("30 sets and none that belongs together")
+
+    def silent(self, seconds: float) -> bool:
+        """Does nothing new come for so long? What was on its way is not counted."""
+        while self.pipeline.poll_for_frames():
+            pass
+        arrived, _ = self.pipeline.try_wait_for_frames(round(1e3 * seconds))
+        return not arrived
+
+    def stop(self) -> None:
+        self.pipeline.stop()
+
+
+def pictures(frames: Any, streams: tuple[str, ...]) -> dict[str, Picture]:
+    """Those of a set that are wanted, by the names of a rig's file."""
+    found = {}
+    for frame in frames:
+        kind = (frame.profile.stream_type().name, frame.profile.stream_index())
+        name = next(name for name, known in STREAMS.items() if known == kind)
+        if name in streams:
+            domain = frame.get_frame_timestamp_domain().name
+            pixels = np.asanyarray(frame.get_data()).copy()
+            found[name] = Picture(frame.get_frame_number(), frame.get_timestamp() / 1e3, domain, pixels)
+    return found
+
+
+def played(
+    path: Path, *, paced: bool = False, streams: tuple[str, ...] = ("depth", "color", "infrared")
+) -> Iterator[dict[str, Picture]]:
+    """Every set of a recording to its end; the first one or two may come before their last stream is started."""
+    context = rs.context()
+    device = context.load_device(str(path))
+    pipeline = rs.pipeline(context)
+    pipeline.set_device(device)  # told the file's name, it would open the file once more, and not know of this:
+    device.set_real_time(paced)
+    pipeline.start(rs.config())
+    try:
+        while True:
+            arrived, frames = pipeline.try_wait_for_frames(1000)
+            if not arrived:
+                return
+            yield pictures(frames, streams)
+    finally:
+        pipeline.stop()
+
+
+def listed(context: Any) -> list[str]:
+    """Serial numbers of what is plugged in."""
+    return [device.get_info(rs.camera_info.serial_number) for device in context.query_devices()]
+
+
+class Bench:
+    """A camera in a context that notes what is announced."""
+
+    def __init__(self, spec: CameraSpec = VGA, context: Any = None, **options: Any) -> None:
+        self.context = context if context is not None else emulated_context()
+        self.announced: list[tuple[list[str], list[bool]]] = []
+        """(serials that came, whether each watched device went)"""
+        self.watched: list[Any] = []
+        self.context.set_devices_changed_callback(self._note)
+        self.camera = SoftwareCamera(spec, **options)
+        self.camera.attach(self.context)
+
+    def _note(self, change: Any) -> None:
+        came = [device.get_info(rs.camera_info.serial_number) for device in change.get_new_devices()]
+        self.announced.append((came, [change.was_removed(device) for device in self.watched]))
+
+    def client(self, *streams: str, **options: Any) -> Client:
+        """A pipeline on this camera."""
+        return Client(self.context, self.camera.serial, *streams, **options)
+
+    def close(self) -> None:
+        """Take the camera away."""
+        self.camera.close()

@@ -1,0 +1,122 @@
+"""Recordings of a RealSense: made and played by the unmodified library."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hal.errors import ConnectionLost, NotSupported
+
+from .realsense_bench import RealSenseCamera, opened, read_again, read_until_lost, recording, sent, software, spec
+
+from hal.drivers.realsense.emulator import read_number  # isort: skip  # needs the library
+
+
+def test_unpaced_every_picture_comes_once_and_in_order(tmp_path: Path) -> None:
+    file = recording(tmp_path, spec(), 60)
+    played = spec(play=file, paced=False, repeat=False)
+    numbers, last = [], None
+    with opened(played) as cam:
+        with pytest.raises(ConnectionLost, match="has ended"):
+            while True:
+                last = cam.read()
+                numbers.append(read_number(last.color))
+                assert np.array_equal(last.color, sent(played, "color", numbers[-1]))
+                if len(numbers) == 3:
+                    time.sleep(0.3)  # the recording waits
+        with pytest.raises(ConnectionLost, match="open the rig anew"):  # and stays ended
+            cam.read()
+        assert cam.counts().dropped == cam.counts().repeated == 0
+    assert numbers == list(range(numbers[0], 61))
+    assert numbers[0] <= 2
+
+
+def test_repeating_it_time_and_numbers_go_on(tmp_path: Path) -> None:
+    file = recording(tmp_path, spec(), 20)
+    with opened(spec(play=file, paced=False)) as cam:
+        frames = [cam.read() for _ in range(70)]
+    numbers = [read_number(frame.color) for frame in frames]
+    assert (np.diff(numbers) < 0).sum() == 3
+    assert (np.diff([frame.stamp.t for frame in frames]) > 0.0).all()
+    assert (np.diff([frame.stamp.seq for frame in frames]) > 0).all()
+
+
+def test_paced_it_takes_as_long_as_it_took(tmp_path: Path) -> None:
+    file = recording(tmp_path, spec(), 45)
+    with opened(spec(play=file, repeat=False)) as cam:
+        first = last = cam.read(timeout=5.0)
+        with pytest.raises(ConnectionLost, match="has ended"):
+            while True:
+                last = cam.read(timeout=5.0)
+        passed = last.stamp.t - first.stamp.t
+        assert passed == pytest.approx(last.stamp.t_device - first.stamp.t_device, abs=0.1)
+        assert 0.5 < passed < 1.5
+        time.sleep(0.5)
+        assert not cam.connected, "a recording that has ended stays ended"
+
+
+def test_without_the_rate_in_its_frames_a_recording_is_matched_here(tmp_path: Path) -> None:
+    """The library repeats pictures then, and mixes those of two moments."""
+    file = recording(tmp_path, spec(), 60, metadata=False)
+    with opened(spec(play=file, paced=False, repeat=False)) as cam:
+        pairs = []
+        with pytest.raises(ConnectionLost, match="has ended"):
+            while True:
+                frame = cam.read()
+                assert frame.skew == 0.0
+                pairs.append(read_number(frame.color))
+        counts = cam.counts()
+    assert len(set(pairs)) == len(pairs) >= 20
+    assert counts.repeated + counts.mismatched > 0, "else this recording shows nothing"
+
+
+def test_a_mode_that_it_lacks_is_answered_with_those_it_has(tmp_path: Path) -> None:
+    file = recording(tmp_path, spec())
+    wrong = spec("color", "depth", size=(848, 480), play=file)
+    with pytest.raises(NotSupported, match=r"stream color: .*848x480 at 30 Hz.*it has: 640x480 at 30 Hz \(rgb8\)"):
+        RealSenseCamera(wrong).open()
+    with pytest.raises(NotSupported, match="stream infrared: this camera has none"):
+        RealSenseCamera(spec("color", "infrared", play=file)).open()
+
+
+def test_files_that_are_none(tmp_path: Path) -> None:
+    with pytest.raises(NotSupported, match="there is no recording"):
+        RealSenseCamera(spec(play=str(tmp_path / "no.db3"))).open()
+    junk = tmp_path / "junk.db3"
+    junk.write_bytes(b"this is not a database" * 100)
+    with pytest.raises((NotSupported, ConnectionLost)):
+        RealSenseCamera(spec(play=str(junk))).open()
+
+
+def test_what_is_streamed_is_recorded_and_played_back_the_same(tmp_path: Path) -> None:
+    file = tmp_path / "mine.db3"
+    camera = software(record=str(file))
+    with opened(camera) as cam:
+        seen = {read_number(cam.read(timeout=5.0).color) for _ in range(20)}
+        cam.inject(disconnect=True)
+        read_until_lost(cam, 3.0)
+        cam.inject(disconnect=False)
+        read_again(cam, 5.0)
+        for _ in range(10):
+            cam.read(timeout=5.0)
+    for part in (file, tmp_path / "mine-2.db3"):
+        played = []
+        with (
+            opened(spec(play=str(part), paced=False, repeat=False)) as cam,
+            pytest.raises(ConnectionLost, match="ended"),
+        ):
+            while True:
+                frame = cam.read(timeout=5.0)
+                played.append(read_number(frame.color))
+                assert np.array_equal(frame.color, sent(camera, "color", played[-1]))
+        assert len(played) >= 8
+        if part == file:
+            assert len(seen & set(played)) >= 15
+    with pytest.raises(NotSupported, match="is there already"):
+        RealSenseCamera(camera).open()
+    with opened(replace(camera, options={**camera.options, "overwrite": True})) as cam:
+        cam.read(timeout=5.0)

@@ -1,0 +1,99 @@
+"""A rig with a RealSense, the check before it is opened, and what is done for a camera that does not start."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import hal
+from hal import registry
+from hal.errors import ConfigError, ConnectionLost
+
+from .realsense_bench import RealSenseCamera, opened, read_again, read_until_lost, recording, software, spec, wait_until
+
+from hal.drivers.realsense.emulator import read_number  # isort: skip  # needs the library
+from hal.drivers.realsense.preflight import preflight  # isort: skip
+
+
+def rig(**real: Any) -> dict[str, Any]:
+    return {
+        "sim": False,
+        "cameras": {
+            "wrist": {
+                "model": "realsense_d435",
+                "capture": {"width": 640, "height": 480, "rate_hz": 30},
+                "output": {"width": 256, "height": 256},
+                "pose": {"position": [0.0, 0.0, 1.0], "orientation": [0.0, 0.0, 0.0, 1.0]},
+                "real": real,
+            }
+        },
+    }
+
+
+def test_a_rig_says_which_camera_and_what_it_is_to_do() -> None:
+    with hal.open(rig(emulated=True, warm_up_s=0.0)) as bench:
+        cam = bench.cameras["wrist"]
+        frame = cam.read(timeout=5.0)
+        assert frame.color is not None
+        assert frame.color.shape == (256, 256, 3)
+        assert read_number(frame.color) > 0
+        assert cam.info.serial is not None
+        assert frame.T_world_camera is not None
+
+
+def test_a_rig_with_mistakes_is_refused_with_all_of_them() -> None:
+    with pytest.raises(ConfigError) as caught:
+        hal.open(rig(serial=123, stall_s=-1.0))
+    assert {problem.key for problem in caught.value.problems} == {
+        "cameras.wrist.real.serial",
+        "cameras.wrist.real.stall_s",
+    }
+
+
+def test_the_check_before() -> None:
+    found = {verdict.name: verdict for verdict in preflight(software(emulated={"usb": "2.1"}), 1.0)}
+    assert found["camera"].level == "ok"
+    assert "firmware 5.16.0.1" in found["camera"].found
+    assert found["USB"].level == "warn"
+    assert "of 30" in found["pictures"].found
+    missing = list(preflight(spec(serial="0123"), 1.0))
+    assert [(verdict.name, verdict.level) for verdict in missing] == [("camera", "fail")]
+    assert "serial 0123" in missing[0].found
+    assert missing[0].remedy
+
+
+def test_nothing_is_plugged_in_here() -> None:
+    assert RealSenseCamera.plugged() == ()
+    assert registry.load("realsense", "camera") is RealSenseCamera
+
+
+def test_a_camera_that_starts_and_sends_nothing_is_reset_once() -> None:
+    with opened(software(stall_s=0.4)) as cam:
+        cam.read(timeout=5.0)
+        cam.inject(freeze=True)
+        assert "stalled" in str(read_until_lost(cam, 3.0))
+        texts: set[str] = set()
+
+        def was_reset() -> bool:
+            with pytest.raises(ConnectionLost) as caught:
+                cam.read(timeout=0.1)
+            texts.add(str(caught.value))
+            return "reset" in str(caught.value)
+
+        wait_until(was_reset, 20.0)
+        assert any("was started and sent nothing" in text and "reset" not in text for text in texts), "not at once"
+        assert any("could not be reset: hardware_reset is not implemented" in text for text in texts)
+        cam.inject(freeze=False)
+        read_again(cam, 15.0)
+
+
+def test_the_same_rig_runs_on_a_recording(tmp_path: Path) -> None:
+    file = recording(tmp_path, spec())
+    with hal.open(rig(play=file, paced=False, repeat=False)) as bench:
+        cam = bench.cameras["wrist"]
+        frame = cam.read()
+        assert frame.color is not None
+        assert frame.color.shape == (256, 256, 3)
+        assert cam.read().stamp.seq == frame.stamp.seq + 1
