@@ -57,9 +57,19 @@ class Body:
         return isinstance(self.spec, RobotSpec)
 
     @property
+    def carried(self) -> bool:
+        """Does it go where a link of an arm goes?"""
+        return isinstance(self.spec, BodySpec) and self.spec.robot is not None
+
+    @property
+    def roams(self) -> bool:
+        """May its base be elsewhere in the next step?"""
+        return self.floating or self.carried
+
+    @property
     def moves(self) -> bool:
-        """Can physics move any of it?"""
-        return self.floating or bool(self.movable)
+        """May any of it?"""
+        return self.roams or bool(self.movable)
 
     def base_pose(self, client: Client) -> Transform:
         """The pose of the base link in the world."""

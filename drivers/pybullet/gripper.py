@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import ClassVar
 
-from hal.errors import CommandError, ConfigError, Problem
+from hal.errors import CommandError, ConfigError, ConnectionLost, Problem
 from hal.gripper import GripperDriver, GripperReading
 from hal.specs import GripperSpec, RobotSpec
 
@@ -59,6 +59,7 @@ class PyBulletGripper(GripperDriver):
 
     def read(self, now: float) -> GripperReading:
         """The fingers as the last physics step left them; ``force`` is what the weaker motor pressed with, N."""
+        self._expect_open()
         width, speed, force = self._width()
         t = self._world.t
         short = abs(width - self._aim) > AT_TARGET
@@ -89,13 +90,19 @@ class PyBulletGripper(GripperDriver):
         self._target, self._aim = min(max(width, 0.0), self.spec.width_max), 0.0
         self._start(speed, force)
 
+    def _expect_open(self) -> None:
+        if not self._open:
+            raise ConnectionLost(f"{self.spec.name} is not open")
+
     def _start(self, speed: float, force: float) -> None:
+        self._expect_open()
         self._force = force
         self._moving, self._moved_at = True, self._world.t
         self._drive(min(speed, self.spec.speed))
 
     def stop(self) -> None:
         """Stay where the fingers are. On an object, they go on pressing."""
+        self._expect_open()
         width, speed, force = self._width()
         self._moving = False
         if abs(speed) <= AT_REST and force >= PRESSING * self._force:

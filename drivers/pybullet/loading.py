@@ -49,7 +49,7 @@ def load_object(client: Client, spec: BodySpec) -> tuple[Body, list[str]]:
     if spec.urdf is None:
         raise ConfigError([Problem("objects", f"{key}.urdf", "is missing, and the shape is urdf")])
     facts = read_urdf(spec.urdf, f"{key}.urdf")
-    number = _load_urdf(client, spec.urdf, f"{key}.urdf", fixed=spec.fixed, scale=spec.scale)
+    number = _load_urdf(client, spec.urdf, f"{key}.urdf", fixed=_is_fixed(spec), scale=spec.scale)
     body = _describe(client, spec, number, f"{key}.urdf")
     _couple(client, body, facts.mimics)
     return body, _mass_warnings(spec.urdf, facts) + mend_inertias(client, body, spec.urdf, facts.massless)
@@ -136,9 +136,14 @@ def _make_shape(client: Client, spec: BodySpec, key: str) -> int:
     visual = (
         client.createVisualShape(**drawn, rgbaColor=spec.rgba, visualFramePosition=drawn_at) if spec.visible else -1
     )
-    mass = 0.0 if spec.fixed or spec.shape == "plane" else spec.mass
+    mass = 0.0 if _is_fixed(spec) else spec.mass
     number: int = client.createMultiBody(mass, shape, visual)
     return number
+
+
+def _is_fixed(spec: BodySpec) -> bool:
+    """Does physics leave its base where it is? What an arm carries is put where it belongs instead."""
+    return spec.fixed or spec.shape == "plane" or spec.robot is not None
 
 
 def _describe(client: Client, spec: BodySpec | RobotSpec, number: int, key: str) -> Body:
@@ -156,7 +161,7 @@ def _describe(client: Client, spec: BodySpec | RobotSpec, number: int, key: str)
             message = f"joint {info[1].decode()!r} is neither fixed, revolute, continuous nor prismatic"
             raise ConfigError([Problem(str(spec.urdf), key, message)])
     dynamics = client.getDynamicsInfo(number, -1)
-    fixed = isinstance(spec, RobotSpec) or spec.fixed or spec.shape == "plane"
+    fixed = isinstance(spec, RobotSpec) or _is_fixed(spec)
     base: Transform = ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
     if isinstance(spec, BodySpec):
         base = (tuple(spec.position), tuple(spec.orientation))

@@ -14,7 +14,7 @@ class Picture:
     """The order of the numbers, for one set of bodies.
 
     First the poses (7) of all bodies whose base stands still, then of each other body, in order, the pose (7) of its
-    base if that moves freely, and its joint positions. Poses are PyBullet's own, of the centre of mass.
+    base if that moves freely or is carried, and its joint positions. Poses are PyBullet's own, of the centre of mass.
 
     Bases that stand still are read once, here: make a new picture when one was moved by hand.
     """
@@ -22,20 +22,20 @@ class Picture:
     def __init__(self, client: Client, bodies: Iterable[Body]) -> None:
         everything = list(bodies)
         self._client = client
-        self._still = [body.id for body in everything if not body.floating]
+        self._still = [body.id for body in everything if not body.roams]
         self._still_values: list[float] = []
         for number in self._still:
             position, orientation = client.getBasePositionAndOrientation(number)
             self._still_values += [*position, *orientation]
-        self._moving = [(body.id, body.floating, body.movable) for body in everything if body.moves]
-        self.size = len(self._still_values) + sum(7 * floating + len(joints) for _, floating, joints in self._moving)
+        self._moving = [(body.id, body.roams, body.movable) for body in everything if body.moves]
+        self.size = len(self._still_values) + sum(7 * roams + len(joints) for _, roams, joints in self._moving)
 
     def take(self) -> list[float]:
         """Where everything is now."""
         values = self._still_values.copy()
         pose_of, joints_of = self._client.getBasePositionAndOrientation, self._client.getJointStates
-        for number, floating, movable in self._moving:
-            if floating:
+        for number, roams, movable in self._moving:
+            if roams:
                 position, orientation = pose_of(number)
                 values += position
                 values += orientation
@@ -54,8 +54,8 @@ class Picture:
             for k, number in enumerate(self._still):
                 put(number, values[7 * k : 7 * k + 3], values[7 * k + 3 : 7 * k + 7])
             self._still_values = values[:place]
-        for number, floating, movable in self._moving:
-            if floating:
+        for number, roams, movable in self._moving:
+            if roams:
                 put(number, values[place : place + 3], values[place + 3 : place + 7])
                 place += 7
             if movable:

@@ -68,8 +68,8 @@ class PyBulletRobot(RobotDriver):
 
     def read(self, now: float) -> Reading:
         """The joints as the last physics step left them; ``tau`` is what the motors applied in it."""
-        if not self._connected:
-            raise ConnectionLost(f"{self.spec.name} does not answer (injected)")
+        if not self._open or not self._connected:
+            raise self._silence()
         if self._tau is not None:
             self._keep_up(self._tau)
         if self._freeze and self._frozen is not None:
@@ -84,8 +84,8 @@ class PyBulletRobot(RobotDriver):
 
     def write(self, setpoint: Setpoint) -> None:
         """Hand over a set-point; a robot with a fault does not take it, which its ``q_commanded`` shows."""
-        if not self._connected:
-            raise ConnectionLost(f"{self.spec.name} does not answer (injected)")
+        if not self._open or not self._connected:
+            raise self._silence()
         if self._fault is not None:
             return
         if setpoint.tau is not None:
@@ -170,6 +170,9 @@ class PyBulletRobot(RobotDriver):
         if self._open:
             self._world.off_reset(self.spec.name, self._was_reset)
         self._open = False
+
+    def _silence(self) -> ConnectionLost:
+        return ConnectionLost(f"{self.spec.name} {'does not answer (injected)' if self._open else 'is not open'}")
 
     def _hold(self, q: Sequence[float]) -> None:
         hold(self._world.client, self._body, dict(zip(self._joints, q, strict=True)), self._world.dt)

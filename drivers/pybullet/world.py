@@ -8,7 +8,7 @@ order of the bodies the same, and :meth:`World.show` poses it by a :meth:`World.
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, ClassVar
 
 from hal.errors import CommandError, ConfigError, DeviceNotFound, NotSupported, Problem
@@ -16,6 +16,7 @@ from hal.specs import BodySpec, RobotSpec, WorldSpec
 
 from .arm_copy import ArmCopy
 from .body import Body
+from .carrying import Carried
 from .contacts import bounding_box, find_contacts, forget_contacts
 from .dynamics import read_dynamics, write_dynamics
 from .library import Client
@@ -78,7 +79,7 @@ class World:
             raise
         self._step = self.client.stepSimulation
 
-    def _load(self, specs: Iterable[BodySpec | RobotSpec]) -> None:
+    def _load(self, specs: Sequence[BodySpec | RobotSpec]) -> None:
         problems: list[Problem] = []
         for spec in specs:
             try:
@@ -87,7 +88,16 @@ class World:
                 problems.extend(error.problems)
         if problems:
             raise ConfigError(problems)
+        try:
+            self._carried = Carried(self.client, self.bodies)
+        except ConfigError:  # something is attached to what is not there
+            for spec in specs:
+                self.client.removeBody(self.bodies.pop(spec.name).id)
+            self._arrange()
+            raise
         self._arrange()
+        self._carried.leave_physics(self.bodies[spec.name] for spec in specs)
+        self._carried.follow()
 
     def _place(self, spec: BodySpec | RobotSpec) -> Body:
         if spec.name in self.bodies:
@@ -120,6 +130,7 @@ class World:
         for copy in self._copies.values():
             copy.prepare_step()
         self._step()
+        self._carried.follow()
         self.steps += 1
 
     def close(self) -> None:
@@ -169,6 +180,8 @@ class World:
         body = self.body(name)
         if body.is_robot:
             raise CommandError(f"{name!r} is a robot: its servo moves it, and reset() puts it back")
+        if body.carried:
+            raise CommandError(f"{name!r} is attached to an arm: it goes where that goes")
         self._set_base(body, transform(pose))
 
     def velocity(self, name: str) -> list[list[float]]:
@@ -228,6 +241,7 @@ class World:
             raise CommandError(f"{name!r} is a robot: robots stay in the world")
         self.client.removeBody(body.id)
         del self.bodies[name]
+        self._carried = Carried(self.client, self.bodies)
         self._arrange()
         return self._edited()
 
@@ -270,16 +284,20 @@ class World:
             for body in everything:
                 if body.name not in self._copies:
                     self._put_home(body)
+            self._carried.follow()
             return
         body = self.body(name)
         if name in self._copies:
             raise CommandError(f"{name!r} stands where the real arm is; move that")
         if pose is not None and body.is_robot:
             raise CommandError(f"{name!r} is a robot: its base stays where the rig says")
+        if pose is not None and body.carried:
+            raise CommandError(f"{name!r} is attached to an arm: it goes where that goes")
         base = body.base if pose is None else transform(pose)
         joints = body.home if q is None else {**body.home, **joint_positions(body, q)}
         forget_contacts(self.client, [body])
         self._put(body, base, joints)
+        self._carried.follow()
 
     # --- for drivers, the renderer and the viewer ----------------------------------------------------------------
 
@@ -346,7 +364,8 @@ class World:
         self._put(body, body.base, body.home)
 
     def _put(self, body: Body, base: Transform, joints: Mapping[int, float]) -> None:
-        self._set_base(body, base)
+        if not body.carried:
+            self._set_base(body, base)
         for joint, position in joints.items():
             self.client.resetJointState(body.id, joint, position, 0.0)
         if body.is_robot:

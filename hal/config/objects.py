@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, Literal
 
 from pydantic import model_validator
@@ -26,7 +28,7 @@ from .schema import (
     describe,
 )
 from .sources import locate_urdf
-from .urdf import read_urdf
+from .urdf import UrdfModel, read_urdf
 from .validation import validate
 
 __all__ = ["ObjectConfig", "load_objects"]
@@ -40,6 +42,17 @@ SIZES = {
     "urdf": ("urdf",),
 }
 """What each shape needs, and what no other shape may have."""
+_NONE: Mapping[str, Any] = MappingProxyType({})
+
+
+class CarriedBy(Strict):
+    """What an arm carries: it goes where the link goes, weighs nothing and touches nothing."""
+
+    robot: str
+    link: str
+    """Of the URDF, or a name that the robot's model gives one."""
+    pose: PoseConfig = PoseConfig()
+    """In the link's frame."""
 
 
 class ObjectConfig(Strict):
@@ -64,6 +77,8 @@ class ObjectConfig(Strict):
     orientation: QuaternionConfig = (0.0, 0.0, 0.0, 1.0)
     pose: PoseConfig | None = None
     """Both in one."""
+    attached: CarriedBy | None = None
+    """In the place of all three: in the hand of an arm."""
     rgba: Rgba = (0.7, 0.7, 0.7, 1.0)
     collision: Flag = True
     visible: Flag = True
@@ -88,14 +103,28 @@ class ObjectConfig(Strict):
             raise ValueError("mass must not be negative" if self.mass < 0.0 else "a urdf brings its own mass")
         if self.scale is not None and self.shape != "urdf":
             raise ValueError(f"scale is for a urdf; a {self.shape} has its size in m")
+        if self.attached is not None and self.shape == "plane":
+            raise ValueError("a plane has no end; nobody can carry it")
         return self
 
 
 def load_objects(
-    entries: list[Any], source: str, base: Path, taken: dict[str, str], problems: Problems, warnings: list[str]
+    entries: list[Any],
+    source: str,
+    base: Path,
+    taken: dict[str, str],
+    problems: Problems,
+    warnings: list[str],
+    urdfs: Mapping[str, UrdfModel] = _NONE,
+    links: Mapping[str, Mapping[str, str]] = _NONE,
 ) -> tuple[BodySpec, ...]:
-    """The bodies of a rig. ``taken`` are the names of its robots, with the key where each stands."""
+    """The bodies of a rig.
+
+    ``taken`` are the names of its robots, with the key where each stands; ``urdfs`` and ``links`` their URDFs, and
+    other names of their links, as far as they are known.
+    """
     bodies = []
+    robots = tuple(taken)
     for k, entry in enumerate(entries):
         key = f"objects.{k}"
         loaded = _load(entry, source, base, key, problems)
@@ -111,8 +140,12 @@ def load_objects(
         urdf: Path | None = None
         with suppress(Unknown):
             urdf = _urdf(config, folder, file, f"{prefix}.urdf" if prefix else "urdf", problems, warnings)
+        with suppress(Unknown):
+            if config.attached is not None:
+                where = f"{prefix}.attached" if prefix else "attached"
+                _check_attached(config.attached, robots, urdfs, links, file, where, problems)
         if not problems.found:
-            bodies.append(_body(config, urdf))
+            bodies.append(_body(config, urdf, links))
     return tuple(bodies)
 
 
@@ -173,8 +206,30 @@ def _urdf(
     return path
 
 
-def _body(config: ObjectConfig, urdf: Path | None) -> BodySpec:
-    pose, given = config.pose or PoseConfig(), config.model_fields_set
+def _check_attached(
+    carried: CarriedBy,
+    robots: tuple[str, ...],
+    urdfs: Mapping[str, UrdfModel],
+    links: Mapping[str, Mapping[str, str]],
+    file: str,
+    key: str,
+    problems: Problems,
+) -> None:
+    if carried.robot not in robots:
+        text = f"this rig has no robot {carried.robot!r}{nearest(carried.robot, robots)}"
+        problems.add(file, f"{key}.robot", text)
+    urdf, others = urdfs.get(carried.robot), links.get(carried.robot, {})
+    if urdf is not None and carried.link not in urdf.links and carried.link not in others:
+        text = f"robot {carried.robot!r} has no link {carried.link!r}{nearest(carried.link, (*urdf.links, *others))}"
+        problems.add(file, f"{key}.link", text)
+
+
+def _body(config: ObjectConfig, urdf: Path | None, links: Mapping[str, Mapping[str, str]]) -> BodySpec:
+    carried = config.attached
+    if carried is not None:
+        pose, given = carried.pose, set[str]()
+    else:
+        pose, given = config.pose or PoseConfig(), config.model_fields_set
     return BodySpec(
         name=config.name,
         position=config.position if "position" in given else pose.position,
@@ -190,4 +245,6 @@ def _body(config: ObjectConfig, urdf: Path | None) -> BodySpec:
         rgba=config.rgba,
         collision=config.collision,
         visible=config.visible,
+        robot=carried.robot if carried is not None else None,
+        link=links.get(carried.robot, {}).get(carried.link, carried.link) if carried is not None else None,
     )

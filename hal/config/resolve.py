@@ -41,7 +41,16 @@ def resolve(context: Context) -> Plan:
     with suppress(Unknown):
         # Objects are looked at in any case, so that their mistakes are found on the real rig too.
         taken = {name: f"robots.{name} in {context.source}" for name in getattr(rig, "robots", ())}
-        bodies = load_objects(rig.objects, context.source, context.base, taken, context.problems, context.warnings)
+        bodies = load_objects(
+            rig.objects,
+            context.source,
+            context.base,
+            taken,
+            context.problems,
+            context.warnings,
+            urdfs=context.urdfs,
+            links=context.links,
+        )
     context.problems.raise_any()
     physics = rig.simulation
     world = WorldSpec(driver, physics.physics_hz, physics.gravity, bodies, robots) if driver is not None else None

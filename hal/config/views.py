@@ -11,7 +11,7 @@ from pydantic import BeforeValidator, model_validator
 
 from ..pose import Pose, matrix_to_quaternion, quaternion_to_matrix, rpy_to_matrix
 from ..specs import ViewSpec
-from .schema import Number, Positive, Strict, Vector, describe, is_number
+from .schema import Number, PoseConfig, Positive, Strict, Vector, describe, is_number
 
 __all__ = ["Attached", "LookAt", "optical_pose", "view_of"]
 
@@ -65,6 +65,9 @@ class Attached(Strict):
     turns a bracket there; in the bracket's frame the optical axis points along ``target`` and ``up`` is upwards in
     the picture (z when left out, or x for a camera that looks along z). So, without a rotation, a camera that looks
     along the fingers of a hand has ``target: [0, 0, 1]``.
+
+    Or ``pose`` alone: of the optical frame (x right, y down, z forward) in the frame of the link, as calibration
+    writes it.
     """
 
     robot: str
@@ -73,6 +76,14 @@ class Attached(Strict):
     rotation: Annotated[tuple[float, ...], BeforeValidator(_rotation)] = (0.0, 0.0, 0.0)
     target: Vector = (0.0, 0.0, 1.0)
     up: Vector | None = None
+    pose: PoseConfig | None = None
+
+    @model_validator(mode="after")
+    def _one_way(self) -> Attached:
+        others = sorted(self.model_fields_set & {"translation", "rotation", "target", "up"})
+        if self.pose is not None and others:
+            raise ValueError(f"pose says everything; it cannot stand beside {', '.join(others)}")
+        return self
 
     @model_validator(mode="after")
     def _directions(self) -> Attached:
@@ -82,8 +93,10 @@ class Attached(Strict):
             raise ValueError("up must not lie along target")
         return self
 
-    def pose(self) -> Pose:
-        """Of the optical frame in the frame of the link."""
+    def optical(self) -> Pose:
+        """Pose of the optical frame in the frame of the link."""
+        if self.pose is not None:
+            return Pose(self.pose.position, self.pose.orientation)
         target = np.asarray(self.target) / np.linalg.norm(self.target)
         up = self.up or ((0.0, 0.0, 1.0) if abs(target[2]) < 0.999 else (1.0, 0.0, 0.0))
         bracket = quaternion_to_matrix(self.rotation) if len(self.rotation) == 4 else rpy_to_matrix(*self.rotation)

@@ -1,0 +1,196 @@
+"""The whole of it against the simulated truth: the arm goes around the board, and the camera is found.
+
+Nothing of the truth is left where it could be read: the frames come without the camera's pose, the rig's own word for
+it is taken out of the setting, and the arm starts from a guess that is 3 cm and 5 degrees off.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import replace
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import pytest
+
+import hal
+from hal.calibration import Calibration, CalibrationFailed, load_board, solve
+from hal.calibration.byhand import PadDriver
+from hal.calibration.collecting import Collector
+from hal.calibration.detection import Detector
+from hal.calibration.recording import drive, take_and_tell
+from hal.calibration.rotations import exponential
+from hal.calibration.setting import setting_of
+from hal.config import load
+from hal.deadman import Deadman
+from hal.pose import Pose
+
+pytest.importorskip("cv2", reason="pip install opencv-python-headless")
+
+MOST_MM, MOST_DEGREES = 2.0, 0.3
+CAMERAS = {"panda_calibration": "wrist", "panda_calibration_held": "scene"}
+
+
+def wrong(pose: Pose, seed: int) -> Pose:
+    """A pose that is 3 cm and 5 degrees away, in a direction that the seed says."""
+    twist = np.random.default_rng(seed).normal(size=6)
+    twist[:3] *= 0.03 / np.linalg.norm(twist[:3])
+    twist[3:] *= math.radians(5.0) / np.linalg.norm(twist[3:])
+    return pose @ Pose.from_matrix(exponential(twist))
+
+
+class Bench:
+    """An open rig, a collector that cannot see the truth, and the truth."""
+
+    def __init__(self, rig: hal.Rig, name: str) -> None:
+        config = load(name, sim=True)
+        setting = setting_of(config, config.resolve())
+        assert setting.known is not None
+        self.rig, self.truth = rig, setting.known
+        self.collector = Collector(rig, replace(setting, known=None), Detector(load_board()))
+        camera = self.collector.camera
+        read = camera.read
+
+        def blind(*arguments: Any, **options: Any) -> hal.Frame:
+            return replace(read(*arguments, **options), T_world_camera=None)
+
+        camera.read = blind  # type: ignore[method-assign]
+        self.told: list[str] = []
+
+    def drive(self, wanted: int, seed: int = 0, **options: Any) -> Calibration:
+        drive(self.collector, wrong(self.truth, seed), wanted, self.told.append, **options)
+        return solve(self.collector.views, self.collector.setting.eye)
+
+    def off(self, found: Calibration) -> tuple[float, float]:
+        distance, angle = found.camera.distance(self.truth)
+        return 1e3 * distance, math.degrees(angle)
+
+
+@pytest.fixture(params=list(CAMERAS))
+def name(request: pytest.FixtureRequest) -> str:
+    return str(request.param)
+
+
+@pytest.fixture
+def bench(name: str) -> Iterator[Bench]:
+    with hal.open(name, sim=True, clock="lock_step", pad="none") as rig:
+        rig.clock.sleep(0.2)
+        yield Bench(rig, name)
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_the_camera_is_found(bench: Bench, seed: int) -> None:
+    arm = bench.collector.robot
+    start = arm.state().q
+    found = bench.drive(15, seed)
+    millimetres, degrees = bench.off(found)
+    assert millimetres <= MOST_MM
+    assert degrees <= MOST_DEGREES
+    assert millimetres < 0.5, "it is well inside of what was asked for, and shall stay so"
+    assert len(found.used) == 15
+    links = np.array([view.T_world_link.position for view in bench.collector.views])
+    assert np.ptp(links, axis=0).max() > 0.1, "the arm went somewhere"
+    assert any("30 mm and 5.0 degrees from where it was believed" in line for line in bench.told)
+    assert np.abs(arm.state().q - start).max() < 0.01, "and came back"
+
+
+@pytest.mark.slow
+def test_pybullets_own_renderer_will_do(name: str) -> None:
+    options = ["simulation.renderer=tiny"]
+    with hal.open(name, sim=True, clock="lock_step", pad="none", overrides=options) as rig:
+        rig.clock.sleep(0.2)
+        bench = Bench(rig, name)
+        millimetres, degrees = bench.off(bench.drive(15))
+        assert millimetres <= MOST_MM
+        assert degrees <= MOST_DEGREES
+
+
+def test_without_the_dead_man_nothing_moves(bench: Bench) -> None:
+    deadman = Deadman("nobody")
+    deadman.update(pressed=False, connected=True, t_alive=0.0)
+    before = bench.collector.robot.state().q_set
+    with pytest.raises(hal.MotionStopped, match="nobody held the dead-man"):
+        bench.drive(10, deadman=deadman)
+    assert np.abs(bench.collector.robot.state().q_set - before).max() < 1e-4
+    assert len(bench.collector.views) == 1, "the picture from where it stood"
+
+
+def test_a_board_out_of_sight_is_told_before_anything_moves(bench: Bench) -> None:
+    arm = bench.collector.robot
+    arm.move_to(arm.home + np.array([0.9, 0, 0, 0, 0, 0, -1.6]), speed=0.5)
+    before = arm.state().q_set
+    with pytest.raises(CalibrationFailed, match="sees the board"):
+        bench.drive(10)
+    assert np.abs(arm.state().q_set - before).max() < 1e-4
+    assert bench.collector.rejected
+
+
+def test_a_view_from_where_one_was_taken_is_rejected(bench: Bench) -> None:
+    assert take_and_tell(bench.collector, bench.told.append) is not None
+    assert take_and_tell(bench.collector, bench.told.append) is None
+    assert "too near" in bench.told[-1]
+    assert len(bench.collector.views) == 1
+    assert len(bench.collector.rejected) == 1
+
+
+def test_the_arm_keeps_its_distance_and_its_workspace(bench: Bench) -> None:
+    """Looked at in every step, by the world's own truth."""
+    world, arm = bench.rig.world, bench.collector.robot
+    box = arm.spec.workspace
+    assert box is not None
+    nearest, lowest = math.inf, math.inf
+    take = bench.collector.take
+
+    def watched() -> Any:
+        nonlocal nearest, lowest
+        in_hand = bench.collector.setting.eye == "in-hand"
+        camera = world.pose("panda", "panda_hand") @ bench.truth if in_hand else bench.truth
+        nearest = min(nearest, float(np.linalg.norm(camera.position - world.pose("charuco_board").position)))
+        lowest = min(lowest, float(arm.state().tcp.position[2] - box.lower[2]))
+        return take()
+
+    bench.collector.take = watched  # type: ignore[method-assign]
+    bench.drive(12)
+    assert nearest > 0.3
+    assert lowest > 0.0
+
+
+class Presses(hal.Teleop):
+    """A person who tilts the hand for a while, lets go, and presses a button: again and again."""
+
+    def __init__(self, robot: hal.Robot, hand: Any) -> None:
+        super().__init__(robot)
+        self.hand, self.turn, self.calls = hand, 0, 0
+
+    def step(self, pad: hal.PadState, dt: float) -> tuple[hal.Twist, float | None]:
+        self.calls += 1
+        if self.calls == 10:
+            self.hand.press("l2")
+        if self.calls == 40:
+            self.hand.release("l2")
+        if self.calls == 60:
+            self.hand.press("south" if self.turn < 2 else "home")
+        if self.calls == 65:
+            raise AssertionError("the button was not seen")
+        return hal.Twist([0.0, 0.0, 0.0], [0.3, 0.0, 0.0]), 1.0
+
+
+def test_a_person_drives_from_view_to_view_with_a_pad() -> None:
+    with hal.open("panda_table", driver="mock") as rig:
+        arm, pad, hand = rig.robots["panda"], rig.gamepads["pad"], rig.driver("pad")
+        teleop = Presses(arm, hand)
+        driver = PadDriver(rig, arm, pad, teleop, print)
+        assert "south: take a view, home: no more views" in driver.help()
+        width = arm.gripper.state().width
+        answers, places = [], [arm.state().q_set]
+        for turn in range(3):
+            teleop.turn, teleop.calls = turn, 0
+            answers.append(driver.wait())
+            hand.release("south")
+            rig.clock.sleep(0.1)
+            places.append(arm.state().q_set)
+        assert answers == [True, True, False]
+        assert all(np.abs(a - b).max() > 0.02 for a, b in pairwise(places)), "it moved each time"
+        assert arm.gripper.state().width == width, "the gripper was never told anything: it may hold the board"

@@ -1,0 +1,99 @@
+"""Views of a board that was never there, from poses that the tests know, and pictures of it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hal.calibration import Board, Eye, Sighting, View
+from hal.calibration.detection import flat_pose
+from hal.calibration.lens import distorted, ideal_pixels
+from hal.calibration.rotations import exponential, inverse
+from hal.pose import Pose
+
+BOARD = Board(7, 5, 0.035, 0.027)
+SIZE = (640, 480)
+K = np.array([[614.0, 0.0, 319.5], [0.0, 612.0, 240.5], [0.0, 0.0, 1.0]])
+X = exponential(np.array([0.05, -0.02, 0.06, 0.1, -0.2, 1.5]))
+"""Where the camera is: in the link's frame, or in the world."""
+Z = exponential(np.array([0.5, 0.1, 0.02, 3.0, 0.1, 0.3]))
+"""Where the board is: in the world, or in the link's frame."""
+CAMERA = Pose.from_matrix(X)
+LENS = (0.12, -0.25, 0.001, -0.0008, 0.05)
+
+Array = NDArray[np.float64]
+
+
+def poses(count: int, seed: int = 0, turns: tuple[float, float, float] = (0.5, 0.5, 0.5)) -> list[Array]:
+    """Of the board in the camera's frame: facing it, turned by up to ``turns`` rad about each of its axes."""
+    chance, found = np.random.default_rng(seed), []
+    for _ in range(count):
+        pose = exponential(np.array([0.0, 0.0, 0.0, *(chance.uniform(-1.0, 1.0, 3) * turns)]))
+        middle = np.array([*chance.uniform(-0.04, 0.04, 2), chance.uniform(0.4, 0.6)])
+        pose[:3, 3] = middle - pose[:3, :3] @ BOARD.centre
+        found.append(pose)
+    return found
+
+
+def pixels_of(pose: Array, lens: tuple[float, ...] = (0.0,) * 5, board: Board = BOARD) -> Array:
+    """(n, 2) where the camera sees the corners of a board that is there."""
+    p = board.corners @ pose[:3, :3].T + pose[:3, 3]
+    seen = distorted(p[:, :2] / p[:, 2:], lens)
+    return np.column_stack([seen, np.ones(len(seen))]) @ K[:2].T
+
+
+def views(
+    eye: Eye,
+    seen: list[Array],
+    *,
+    noise_px: float = 0.0,
+    arm: float = 0.0,
+    lens: tuple[float, ...] = (0.0,) * 5,
+    believed: Array = K,
+    real_board: Board = BOARD,
+    seed: int = 1,
+) -> list[View]:
+    """What an arm would report and a detector find.
+
+    Args:
+        eye: what the camera is on.
+        seen: the board in the camera's frame, in each view.
+        noise_px: of each corner's coordinates, standard deviation.
+        arm: by how much the arm is elsewhere than it says, m along and twice as many rad about each axis.
+        lens: the lens's distortion, which is known.
+        believed: the K that the camera says it has.
+        real_board: as it really is; it is always taken for ``BOARD``.
+        seed: of all chance.
+    """
+    chance, made = np.random.default_rng(seed), []
+    for k, pose in enumerate(seen):
+        pixels = pixels_of(pose, lens, real_board)
+        pixels = ideal_pixels(pixels + noise_px * chance.normal(size=pixels.shape), believed, lens)
+        C, error = flat_pose(BOARD.corners, pixels, believed)
+        A = Z @ inverse(pose) @ inverse(X)
+        link = (A if eye == "in-hand" else inverse(A)) @ exponential(arm * chance.normal(size=6) * [1, 1, 1, 2, 2, 2])
+        made.append(View(f"view {k}", Pose.from_matrix(link), Sighting(BOARD.corners, pixels, believed, C, error)))
+    return made
+
+
+def picture(pose: Array, cv2: Any, lens: tuple[float, ...] = (0.0,) * 5, finer: int = 4) -> NDArray[np.uint8]:
+    """A grey picture (480, 640) of the board on a grey ground, smooth at its edges as a camera's is."""
+    scale, width, height = 20.0, *SIZE
+    paper = np.pad(BOARD.picture(scale), int(10 * scale), constant_values=255)
+    v, u = np.mgrid[0 : height * finer, 0 : width * finer].reshape(2, -1)
+    fine = (np.column_stack([u, v]) + 0.5) / finer - 0.5
+    ideal = ideal_pixels(fine, K, lens) if any(lens) else fine
+    plane = K @ np.column_stack([pose[:3, 0], pose[:3, 1], pose[:3, 3]])
+    on_paper = np.column_stack([ideal, np.ones(len(ideal))]) @ np.linalg.inv(plane).T
+    x, y = (on_paper[:, :2] / on_paper[:, 2:] * 1e3 * scale + 10 * scale - 0.5).T
+    shape = (height * finer, width * finer)
+    maps = [values.reshape(shape).astype(np.float32) for values in (x, y)]
+    drawn = cv2.remap(paper, *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=120)
+    blocks = drawn.reshape(height, finer, width, finer).mean(axis=(1, 3))
+    return np.clip(np.round(40.0 + 0.7 * blocks), 0, 255).astype(np.uint8)
+
+
+def degrees(angle: float) -> float:
+    return float(np.degrees(angle))

@@ -1,0 +1,151 @@
+"""The board in drawn pictures: its corners to a fraction of a pixel, and why a picture is of no use."""
+
+from __future__ import annotations
+
+import sys
+
+import numpy as np
+import pytest
+from calibration_kit import BOARD, LENS, K, picture, pixels_of
+from numpy.typing import NDArray
+
+from hal.calibration import CalibrationFailed, NoView, load_board, solve
+from hal.calibration.detection import Detector
+from hal.calibration.lens import distorted, ideal_pixels
+from hal.calibration.rotations import exponential
+from hal.calibration.sampling import looks
+from hal.errors import DriverMissing
+from hal.pose import Pose
+
+cv2 = pytest.importorskip("cv2", reason="pip install opencv-python-headless")
+NO_LENS = (0.0,) * 5
+
+
+def facing(distance: float = 0.45, tilt: float = 0.35, turn: float = 0.3) -> NDArray[np.float64]:
+    pose = exponential(np.array([0.0, 0.0, 0.0, tilt, -0.2, turn]))
+    pose[:3, 3] = np.array([0.0, 0.0, distance]) - pose[:3, :3] @ BOARD.centre
+    return pose
+
+
+@pytest.mark.parametrize("lens", [NO_LENS, LENS])
+def test_corners_and_pose_are_found(lens: tuple[float, ...]) -> None:
+    pose = facing()
+    found = Detector(BOARD).find(picture(pose, cv2, lens), K, lens)
+    assert np.array_equal(found.points, BOARD.corners)
+    assert np.abs(found.pixels - pixels_of(pose)).max() < 0.12
+    assert found.error_px < 0.08
+    distance, angle = found.T_camera_board.distance(Pose.from_matrix(pose))
+    assert distance < 1e-3
+    assert angle < 5e-3
+    assert 1.0 < found.blur_px < 3.0
+
+
+def test_colour_and_a_part_of_the_board_will_do() -> None:
+    pose = facing()
+    grey = picture(pose, cv2)
+    grey[:, :260] = 120
+    found = Detector(BOARD).find(np.repeat(grey[:, :, None], 3, axis=2), K, NO_LENS)
+    assert 8 <= len(found.points) < 24
+    assert found.T_camera_board.distance(Pose.from_matrix(pose))[0] < 2e-3
+
+
+def test_corners_that_were_taken_for_others_are_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    pose, detector = facing(), Detector(BOARD)
+    find = detector._exact
+
+    def mistaken(*given: object) -> NDArray[np.float64]:
+        pixels = find(*given)
+        pixels[[3, 9]] = pixels[[9, 3]]
+        pixels[20] += 6.0
+        return pixels
+
+    monkeypatch.setattr(detector, "_exact", mistaken)
+    found = detector.find(picture(pose, cv2), K, NO_LENS)
+    assert len(found.points) == 21
+    assert found.T_camera_board.distance(Pose.from_matrix(pose))[0] < 1e-3
+
+
+def test_pictures_of_no_use_say_why() -> None:
+    detector = Detector(BOARD)
+
+    def reason(grey: NDArray[np.uint8], lens: tuple[float, ...] = NO_LENS) -> str:
+        with pytest.raises(NoView) as caught:
+            detector.find(grey, K, lens)
+        return str(caught.value)
+
+    sharp = picture(facing(), cv2)
+    assert reason(np.full((480, 640), 120, np.uint8)) == "the board is not in the picture"
+    assert "blurred" in reason(cv2.GaussianBlur(sharp, (0, 0), 2.0))
+    corner = sharp.copy()
+    corner[:, :370] = 120
+    assert "corners are seen clearly" in reason(corner)
+    assert "off a flat board" in reason(picture(facing(0.3, 0.0, 0.0), cv2, (-0.8, 0.5, 0.0, 0.0, 0.0)))
+
+
+def test_the_board_that_comes_with_the_hal_is_this_one() -> None:
+    assert load_board() == BOARD
+
+
+def test_distortion_and_its_inverse_agree_with_opencv() -> None:
+    chance = np.random.default_rng(0)
+    points = chance.uniform(-0.5, 0.5, (50, 2))
+    ours = np.column_stack([distorted(points, LENS), np.ones(50)]) @ K[:2].T
+    theirs = cv2.projectPoints(np.column_stack([points, np.ones(50)]), np.zeros(3), np.zeros(3), K, np.array(LENS))[0]
+    assert np.abs(ours - theirs.reshape(-1, 2)).max() < 1e-9
+    back = ideal_pixels(ours, K, LENS)
+    assert np.abs(back - np.column_stack([points, np.ones(50)]) @ K[:2].T).max() < 1e-6
+
+
+def test_a_lens_that_cannot_be_undone_is_no_view() -> None:
+    with pytest.raises(NoView, match="distortion"):
+        ideal_pixels([[5000.0, 4000.0]], K, (-2.0, 3.0, 0.0, 0.0, -1.0))
+
+
+def test_without_opencv_the_command_that_installs_it_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "cv2", None)
+    with pytest.raises(DriverMissing, match=r"pip install 'robot-hal\[calibration\]'"):
+        Detector(BOARD)
+
+
+def test_an_opencv_that_is_too_old_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delattr(cv2.aruco, "CharucoDetector")
+    with pytest.raises(DriverMissing, match="CharucoDetector"):
+        load_board()
+
+
+def test_places_to_look_from_see_the_whole_board_from_all_sides() -> None:
+    first = Pose.from_matrix(facing(0.6))
+    places = looks(BOARD, K, (640, 480), first, 60)
+    normals, distances = [], []
+    for place in places:
+        pixels = pixels_of(place.matrix())
+        assert (pixels > 0).all()
+        assert (pixels < [640, 480]).all()
+        assert np.linalg.norm(pixels[1] - pixels[0]) > 8.0
+        normals.append(place.matrix()[:3, 2])
+        distances.append(place.transform(BOARD.centre)[2])
+    assert min(n[2] for n in normals) > 0.7, "none from so flat that markers vanish"
+    assert np.ptp(np.array(normals)[:, :2], axis=0).min() > 0.8, "tilted to all sides"
+    assert max(distances) > 1.2 * min(distances)
+    assert [p.position.tolist() for p in places] == [
+        p.position.tolist() for p in looks(BOARD, K, (640, 480), first, 60)
+    ]
+
+
+def test_pictures_alone_lead_to_the_camera() -> None:
+    """Everything but an arm: drawn pictures through a lens, found, solved."""
+    from calibration_kit import CAMERA, X, Z
+
+    from hal.calibration import View
+    from hal.calibration.rotations import inverse
+
+    detector, taken = Detector(BOARD), []
+    for k, place in enumerate(looks(BOARD, K, (640, 480), Pose.from_matrix(facing(0.5)), 8)):
+        link = Z @ inverse(place.matrix()) @ inverse(X)
+        grey = picture(place.matrix(), cv2, LENS, finer=2)
+        taken.append(View(f"view {k}", Pose.from_matrix(link), detector.find(grey, K, LENS)))
+    distance, angle = solve(taken, "in-hand").camera.distance(CAMERA)
+    assert distance < 1e-3
+    assert angle < 2e-3
+    with pytest.raises(CalibrationFailed):
+        solve(taken[:4], "in-hand")

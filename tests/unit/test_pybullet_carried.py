@@ -1,0 +1,178 @@
+"""Things in an arm's hand: they go where the link goes, in the world and in its mirrors, and touch nothing."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+from specs import panda
+
+import hal
+from hal.config import load
+from hal.drivers.pybullet.world import World
+from hal.errors import CommandError, ConfigError
+from hal.pose import Pose
+from hal.specs import BodySpec, WorldSpec, from_json, to_json
+
+IN_HAND = Pose([0.03, 0.0, 0.19], [0.5, 0.5, 0.5, 0.5])
+
+
+def held(name: str = "board", robot: str | None = "panda", link: str | None = "panda_hand") -> BodySpec:
+    x, y, z = IN_HAND.position.tolist()
+    a, b, c, d = IN_HAND.orientation.tolist()
+    return BodySpec(
+        name, (x, y, z), (a, b, c, d), "box", half_extents=(0.1, 0.1, 0.002), mass=5.0, robot=robot, link=link
+    )
+
+
+def pose_of(scene: World, name: str, link: str | None = None) -> Pose:
+    found = scene.pose(name, link)
+    return Pose(found["position"], found["orientation"])
+
+
+def off(scene: World) -> tuple[float, float]:
+    return pose_of(scene, "board").distance(pose_of(scene, "panda", "panda_hand") @ IN_HAND)
+
+
+@pytest.fixture
+def spec() -> WorldSpec:
+    return WorldSpec("pybullet", 240.0, (0.0, 0.0, -9.81), (held(),), (panda(),))
+
+
+@pytest.fixture
+def scene(spec: WorldSpec) -> Iterator[World]:
+    made = World(spec)
+    yield made
+    made.close()
+
+
+def bend(scene: World, steps: int = 60) -> None:
+    """Let the arm fall: its motors hold nothing any more."""
+    body = scene.body("panda")
+    for joint in body.movable:
+        scene.client.setJointMotorControl2(body.id, joint, scene.client.VELOCITY_CONTROL, force=0.0)
+    for _ in range(steps):
+        scene.step()
+
+
+def test_it_follows_the_link_from_the_start_and_through_every_step(scene: World, spec: WorldSpec) -> None:
+    assert max(off(scene)) < 1e-6
+    start = pose_of(scene, "board")
+    bend(scene)
+    assert pose_of(scene, "board").distance(start)[0] > 0.05, "it moved"
+    assert max(off(scene)) < 1e-6
+    scene.reset("panda")
+    assert max(off(scene)) < 1e-6
+    bend(scene)
+    scene.reset()
+    assert pose_of(scene, "board").distance(start)[0] < 1e-6
+
+
+def test_it_weighs_nothing_and_touches_nothing(spec: WorldSpec) -> None:
+    def fall(bodies: tuple[BodySpec, ...]) -> np.ndarray:
+        scene = World(WorldSpec(spec.driver, spec.physics_hz, spec.gravity, bodies, spec.robots))
+        try:
+            bend(scene)
+            assert all("board" not in (c["a"], c["b"]) for c in scene.contacts())
+            return np.array(scene.pose("panda", "panda_hand")["position"])
+        finally:
+            scene.close()
+
+    obstacle = BodySpec("box", (0.35, 0.0, 0.1), (0, 0, 0, 1), "box", half_extents=(0.01, 0.01, 0.1), fixed=True)
+    assert np.array_equal(fall((obstacle,)), fall((held(), obstacle)))
+
+
+def test_mirrors_show_it_where_it_is(scene: World, spec: WorldSpec) -> None:
+    mirror = World(from_json(WorldSpec, to_json(spec)), mirror=True)
+    try:
+        bend(scene)
+        mirror.show(scene.snapshot())
+        assert max(off(mirror)) < 1e-6
+        assert pose_of(mirror, "board").distance(pose_of(scene, "board"))[0] < 1e-6
+    finally:
+        mirror.close()
+
+
+def test_it_comes_and_goes_and_nobody_puts_it_elsewhere(scene: World) -> None:
+    scene.add(held("second", link="panda_link7"))
+    scene.step()
+    expected = pose_of(scene, "panda", "panda_link7") @ IN_HAND
+    assert pose_of(scene, "second").distance(expected)[0] < 1e-6
+    for act in (scene.set_pose, scene.reset):
+        with pytest.raises(CommandError, match="attached"):
+            act("second", pose={"position": [0, 0, 0]})
+    scene.remove("second")
+    bend(scene, 10)
+    assert max(off(scene)) < 1e-6
+
+
+@pytest.mark.parametrize(
+    ("wrong", "text"),
+    [
+        ({"robot": "pandas"}, "did you mean 'panda'"),
+        ({"link": "panda_hnad"}, "did you mean 'panda_hand'"),
+        ({"robot": "board"}, "no arm 'board'"),
+    ],
+)
+def test_an_arm_or_link_that_is_not_there_is_told_and_nothing_changes(
+    scene: World, wrong: dict[str, str], text: str
+) -> None:
+    with pytest.raises(ConfigError, match=text):
+        scene.add(held("second", **wrong))
+    assert scene.names() == ["board", "panda"]
+    bend(scene, 10)
+    assert max(off(scene)) < 1e-6
+
+
+HELD = "{file: charuco_board, attached: {robot: panda, link: panda_hand, pose: [0.03, 0, 0.19, 0.5, 0.5, 0.5, 0.5]}}"
+
+
+def test_a_rig_may_say_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    rig = {"cameras": {}, "objects": f"[{HELD}]"}
+    overrides = [f"{key}={value}" for key, value in rig.items()]
+    with hal.open("panda_table", sim=True, clock="lock_step", pad="none", overrides=overrides) as opened:
+        arm = opened.robots["panda"]
+        opened.clock.sleep(0.1)
+        arm.move_to(arm.home + 0.2)
+        expected = opened.world.pose("panda", "panda_hand") @ IN_HAND
+        assert opened.world.pose("charuco_board").distance(expected)[0] < 1e-6
+
+
+@pytest.mark.parametrize(
+    ("entry", "text"),
+    [
+        ("{file: charuco_board, attached: {robot: pandas, link: hand}}", "did you mean 'panda'"),
+        ("{file: charuco_board, attached: {robot: panda}}", "link: is missing"),
+        ("{name: p, shape: plane, attached: {robot: panda, link: panda_hand}}", "nobody can carry it"),
+    ],
+)
+def test_a_rig_that_says_it_wrongly_is_told(entry: str, text: str) -> None:
+    with pytest.raises(ConfigError, match=text):
+        load("panda_table", sim=True, overrides=[f"objects=[{entry}]"])
+
+
+P = "[0.1, 0.2, 0.3, 0, 0, 0.6, 0.8]"
+
+
+def test_a_camera_may_be_attached_by_its_pose() -> None:
+    place = f"cameras.wrist.attached={{robot: panda, link: hand, pose: {P}}}"
+    plan = load("panda_table", sim=True, overrides=[place]).resolve()
+    view = next(camera.view for camera in plan.cameras if camera.name == "wrist")
+    assert view is not None
+    assert (view.robot, view.link) == ("panda", "panda_hand")
+    assert view.position == (0.1, 0.2, 0.3)
+    assert view.orientation == pytest.approx((0, 0, 0.6, 0.8))
+
+
+@pytest.mark.parametrize(
+    ("more", "text"),
+    [
+        ("target: [0, 0, 1]", "cannot stand beside target"),
+        ("translation: [0, 0, 1]", "cannot stand beside translation"),
+    ],
+)
+def test_and_then_by_nothing_else(more: str, text: str) -> None:
+    place = f"cameras.wrist.attached={{robot: panda, link: hand, pose: {P}, {more}}}"
+    with pytest.raises(ConfigError, match=text):
+        load("panda_table", sim=True, overrides=[place])
