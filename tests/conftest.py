@@ -8,7 +8,8 @@ from typing import Any
 
 import pytest
 
-from hal.specs import CameraSpec, GripperSpec, KinematicsSpec, LimitsSpec, PadSpec, RobotSpec, ViewSpec
+from hal import testing
+from hal.specs import CameraSpec, GripperSpec, PadSpec, RobotSpec
 
 STRICT = os.environ.get("HAL_TEST_STRICT", "") not in ("", "0")
 
@@ -36,53 +37,22 @@ def _strict(report: Any) -> Any:
 @pytest.fixture
 def robot_spec() -> RobotSpec:
     """An arm of three joints for drivers that need no URDF."""
-    lower, upper = (-2.0, -2.0, -2.0), (2.0, 2.0, 2.0)
-    return RobotSpec(
-        name="arm",
-        model="three_joints",
-        driver="mock",
-        rate_hz=100.0,
-        urdf="",
-        joints=("j1", "j2", "j3"),
-        home=(0.0, 0.0, 0.0),
-        initial=(0.1, -0.2, 0.3),
-        limits=LimitsSpec(lower, upper, (2.0,) * 3, (10.0,) * 3, (100.0,) * 3),
-        kinematics=KinematicsSpec(
-            "", ("j1", "j2", "j3"), lower, upper, (0.0,) * 3, None, "tip", (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0)
-        ),
-        base_position=(0.0, 0.0, 0.0),
-        base_orientation=(0.0, 0.0, 0.0, 1.0),
-    )
+    return testing.robot_spec()
 
 
 @pytest.fixture
 def gripper_spec() -> GripperSpec:
     """A hand that opens to 80 mm at 0.1 m/s."""
-    return GripperSpec(name="arm.gripper", driver="mock", width_max=0.08, speed=0.1, force=20.0)
+    return testing.gripper_spec()
 
 
 @pytest.fixture
 def camera_spec() -> CameraSpec:
     """A small fixed camera at 30 Hz with every stream."""
-    return CameraSpec(
-        name="scene",
-        model="test",
-        driver="mock",
-        capture_width=64,
-        capture_height=48,
-        width=64,
-        height=48,
-        rate_hz=30.0,
-        K=((60.0, 0.0, 31.5), (0.0, 60.0, 23.5), (0.0, 0.0, 1.0)),
-        distortion=(0.0,) * 5,
-        depth_min=0.1,
-        depth_max=3.0,
-        streams=("color", "depth", "infrared", "segmentation"),
-        view=ViewSpec((0.0, 0.0, 1.0), (1.0, 0.0, 0.0, 0.0)),
-    )
+    return testing.camera_spec()
 
 
 @pytest.fixture
 def pad_spec() -> PadSpec:
     """A pad of no particular make."""
-    return PadSpec(name="pad", driver="mock", model=None)
+    return testing.pad_spec()

@@ -56,6 +56,7 @@ class FrankaHand(GripperDriver):
         """Connect, and wait for a first state. Raises ConnectionLost, NotSupported; nothing moves."""
         if self._is_open:
             return
+        self._pilot = HandPilot(self._range)  # what was seen before it was closed is old
         self._link.open()
         self._is_open = True
         deadline = time.monotonic() + _FIRST_STATE

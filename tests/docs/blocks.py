@@ -5,7 +5,6 @@ language, and ``text``, are pictures and output. A comment on the line before ch
 
     <!-- file: NAME -->          written to that file, for the blocks after it; YAML is checked, Python compiled
     <!-- file: NAME, broken -->  the same, and the check must fail
-    <!-- runs in: MODULE.py -->  run with that module's names
     <!-- not run: WHY -->
 """
 
@@ -20,7 +19,7 @@ SHOWN = ("", "text", "toml")
 """Never run: pictures, output, and parts of other people's files."""
 
 _FENCE = re.compile(r"^```(\w*)[^\n]*\n(.*?)^```\s*?$", re.MULTILINE | re.DOTALL)
-_COMMENT = re.compile(r"<!--\s*(file|runs in|not run):\s*(.*?)\s*-->\n\Z")
+_COMMENT = re.compile(r"<!--\s*(file|not run):\s*(.*?)\s*-->\n\Z")
 
 
 class Block(NamedTuple):
@@ -30,7 +29,7 @@ class Block(NamedTuple):
     language: str
     text: str
     mark: str
-    """``file``, ``runs in``, ``not run``, or nothing."""
+    """``file``, ``not run``, or nothing."""
     value: str
     """What the mark says."""
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import fnmatch
-import importlib
 import inspect
 import itertools
 import os
@@ -64,8 +63,6 @@ class Reader:
             else:
                 with pytest.raises(ConfigError):
                     check_yaml(block.text, self.folder, name)
-        elif block.mark == "runs in":
-            self._contract(block)
         elif block.language == "python":
             self._python(block)
         elif block.language == "yaml":
@@ -101,28 +98,6 @@ class Reader:
 
         rig.clock.rate = rate  # of this rig only
         return rig
-
-    def _contract(self, block: Block) -> None:
-        """The block adds a driver to the contract suite's benches: it must pass every test there."""
-        assert block.value == "tests/contract/benches.py", f"{block}: only the contract's benches are known"
-        sys.path.insert(0, str(ROOT))
-        try:
-            benches = importlib.import_module("tests.contract.benches")
-            suite = importlib.import_module("tests.contract.test_robot_drivers")
-        finally:
-            sys.path.remove(str(ROOT))
-        names = {**vars(benches), "ROBOTS": {}}
-        exec(self._compiled(block), names)
-        tests = [value for name, value in vars(suite).items() if name.startswith("test_")]
-        assert names["ROBOTS"], f"{block} adds no bench"
-        assert len(tests) > 5
-        for make in names["ROBOTS"].values():
-            for test in tests:
-                with make() as bench:
-                    if "torqued" not in inspect.signature(test).parameters or "torque" in bench.driver.modes:
-                        test(bench)
-
-    # Commands.
 
     def _commands(self, block: Block) -> None:
         lines = block.text.splitlines()

@@ -1,0 +1,156 @@
+"""A driver on a bench as a program sees it: the host's own code around it, and the public class in front."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+from unittest.mock import patch
+
+from .. import registry
+from ..clock import LockStepClock
+from ..gripper import Gripper
+from ..host.arm import ArmUnit
+from ..host.gripper_unit import GripperUnit
+from ..host.hosts import Host
+from ..host.records import AppRecord, GroupMemory
+from ..robot import Robot
+from ..specs import GroupSpec, RobotSpec
+from ..stops import StopLatch
+from ..types import GripperState, RobotState
+from .benches import GripperBench, RobotBench
+
+__all__ = ["Hosted", "HostedHand"]
+
+
+class _BenchHost(Host):
+    """A host whose cycles the checks run themselves."""
+
+    def __init__(self, spec: GroupSpec) -> None:
+        self.spec = spec
+        self.memory = GroupMemory.of(memoryview(bytearray(GroupMemory.size_of(spec))), spec)
+        self.stopped = 0
+
+    @property
+    def stops(self) -> int:
+        return self.stopped
+
+    def request(self, method: str, params: dict[str, Any] | None = None) -> Any:
+        raise NotImplementedError(f"the checks make no requests: {method}")
+
+    def check(self) -> None:
+        """It is always there."""
+
+    def stop(self) -> None:
+        self.stopped += 1
+
+    def close(self) -> None:
+        """The checks close what they opened."""
+
+
+class Hosted:
+    """An arm: the host's unit around the driver, and the public :class:`~hal.robot.Robot` in front of it.
+
+    ``with Hosted(bench) as hosted`` opens the driver, and closes it.
+    """
+
+    def __init__(self, bench: RobotBench) -> None:
+        self.bench = bench
+        self._folder = TemporaryDirectory()
+        spec = with_kinematics(bench.driver.spec, Path(self._folder.name))
+        clock = "real_time" if bench.real_time else "lock_step"
+        host = _BenchHost(GroupSpec("bench", clock, 1.0 / bench.dt, (spec,)))
+        with patch.object(registry, "load", lambda name, kind: lambda spec, world: bench.driver):
+            self.unit = ArmUnit(spec, bench.dt, host.memory.robots[spec.name], None)
+        self.robot = Robot(spec, host, LockStepClock(lambda: bench.now, self._advance_to), StopLatch())
+
+    def turn(self, cycles: int) -> RobotState:
+        """So many cycles of the host, and what the program sees then; raises what the program's ``state()`` raises."""
+        for _ in range(cycles):
+            self._cycle()
+        return self.robot.state()
+
+    def _cycle(self) -> None:
+        unit, now = self.unit, self.bench.pass_time()
+        app = AppRecord(now, 0)
+        unit.read(now)
+        unit.tick(now, app)
+        unit.write(now)
+        unit.finish_session()
+        unit.prepare(app)
+        unit.publish(now)
+
+    def _advance_to(self, t: float) -> None:
+        while self.bench.now < t:
+            self._cycle()
+
+    def __enter__(self) -> Hosted:
+        self.unit.open(self.bench.pass_time())
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.unit.close()
+        self._folder.cleanup()
+
+
+class HostedHand:
+    """A gripper: the host's unit around the driver, and the public :class:`~hal.gripper.Gripper` in front of it.
+
+    Whatever waits on the gripper makes the bench's time pass.
+    """
+
+    def __init__(self, bench: GripperBench) -> None:
+        spec = bench.driver.spec
+        clock = "real_time" if bench.real_time else "lock_step"
+        self.bench = bench
+        self.host = _BenchHost(GroupSpec("bench", clock, 1.0 / bench.dt, (), grippers=(spec,)))
+        self.unit = GripperUnit(bench.driver, self.host.memory.grippers[spec.name])
+        self.gripper = Gripper(
+            spec, "bench", self.host, LockStepClock(lambda: bench.now, self._advance_to), StopLatch()
+        )
+
+    def turn(self, seconds: float) -> GripperState:
+        """So many seconds of the host, and what the program sees then; raises what its ``state()`` raises."""
+        for _ in self.bench.turns(seconds):
+            self._cycle()
+        return self.gripper.state()
+
+    def _cycle(self) -> None:
+        now = self.bench.pass_time()
+        self.unit.serve(AppRecord(now, self.host.stops))
+        self.unit.publish(now)
+
+    def _advance_to(self, t: float) -> None:
+        while self.bench.now < t:
+            self._cycle()
+
+    def __enter__(self) -> HostedHand:
+        self.unit.open()
+        self.turn(self.bench.dt)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.unit.close()
+
+
+def with_kinematics(spec: RobotSpec, folder: Path) -> RobotSpec:
+    """The spec itself, or, where it names no URDF, one with an arm drawn up for it: links of 0.2 m, in a plane."""
+    if spec.kinematics.urdf:
+        return spec
+    file = folder / "arm.urdf"
+    file.write_text(_chain(spec), encoding="utf-8")
+    tip = f"link{len(spec.joints)}"
+    return replace(spec, urdf=str(file), kinematics=replace(spec.kinematics, urdf=str(file), tcp_link=tip))
+
+
+def _chain(spec: RobotSpec) -> str:
+    limits = spec.limits
+    parts = ['<robot name="chain"><link name="link0"/>']
+    for k, name in enumerate(spec.joints):
+        parts.append(
+            f'<link name="link{k + 1}"/><joint name="{name}" type="revolute"><parent link="link{k}"/>'
+            f'<child link="link{k + 1}"/><origin xyz="0.2 0 0"/><axis xyz="0 0 1"/><limit lower="{limits.lower[k]}" '
+            f'upper="{limits.upper[k]}" velocity="{limits.velocity[k]}" effort="100"/></joint>'
+        )
+    return "".join(parts) + "</robot>"

@@ -1,0 +1,108 @@
+"""An arm's driver in a process of its own, call by call: for a library that keeps Python's lock while it blocks.
+
+Such a library would stop the tests' own threads and time-outs, and one call of it that hangs would end the whole run.
+"""
+
+from __future__ import annotations
+
+import importlib
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from hal.host.process import Channel, Child, pack_error
+from hal.robot import Reading, RobotDriver, Setpoint
+from hal.specs import RobotSpec, from_json, to_json
+from hal.types import Fault
+
+__all__ = ["Apart", "main"]
+
+HERE = str(Path(__file__).parent)
+LIMIT = 20.0
+"""s for each call; then the process is ended, and the check fails."""
+
+
+class Apart(RobotDriver):
+    """A driver that passes every call on to one of that class in another process, and every error back."""
+
+    modes = frozenset()  # type: ignore[assignment]  # known once the other one is made
+    paces_itself = False
+
+    def __init__(self, place: str, spec: RobotSpec) -> None:
+        super().__init__(spec)
+        sys.path.append(HERE)
+        try:
+            self._child = Child("driver", "apart:main", {"place": place, "spec": to_json(spec)})
+        finally:
+            sys.path.remove(HERE)
+        about = self._child.wait_ready()
+        self.modes = frozenset(about["modes"])  # type: ignore[misc]
+        self.paces_itself = about["paces_itself"]  # type: ignore[misc]
+
+    def _call(self, method: str, *arguments: Any, **knobs: Any) -> Any:
+        return self._child.request(method, {"arguments": arguments, "knobs": knobs}, LIMIT)
+
+    def open(self) -> None:
+        self._call("open")
+
+    def wait(self) -> None:
+        self._call("wait")
+
+    def read(self, now: float) -> Reading:
+        reading = Reading(*self._call("read", now))
+        return reading if reading.fault is None else reading._replace(fault=Fault(*reading.fault))  # type: ignore[misc]
+
+    def write(self, setpoint: Setpoint) -> None:
+        self._call("write", setpoint)
+
+    def halt(self) -> None:
+        self._call("halt")
+
+    def recover(self) -> None:
+        self._call("recover")
+
+    def mass_matrix(self, q: Any) -> Any:
+        return self._call("mass_matrix", list(q))
+
+    def own_tcp(self) -> Any:
+        return self._call("own_tcp")
+
+    def inject(self, **knobs: object) -> None:
+        self._call("inject", **knobs)
+
+    def close(self) -> None:
+        self._call("close")
+
+    def end(self) -> None:
+        """End the process."""
+        self._child.close()
+
+
+def main(channel: Channel, memories: object, config: Mapping[str, Any]) -> None:
+    """The other process."""
+    module, _, name = config["place"].partition(":")
+    driver: RobotDriver = getattr(importlib.import_module(module), name)(from_json(RobotSpec, config["spec"]))
+    channel.send({"ready": {"modes": sorted(driver.modes), "paces_itself": driver.paces_itself}})
+    while True:
+        request = channel.receive(60.0)
+        if request is None:
+            continue
+        if request["id"] == 0:
+            driver.close()
+            return
+        try:
+            arguments = request["params"]["arguments"]
+            if request["method"] == "write":
+                arguments = [Setpoint(*arguments[0])]
+            result = getattr(driver, request["method"])(*arguments, **request["params"]["knobs"])
+            channel.send({"id": request["id"], "result": _plain(result)})
+        except Exception as error:
+            channel.send({"id": request["id"], "error": pack_error(error)})
+
+
+def _plain(result: Any) -> Any:
+    if isinstance(result, Reading):
+        fault = result.fault
+        return [*result[:10], None if fault is None else [fault.code, fault.cause, fault.remedy], *result[11:]]
+    return result.tolist() if hasattr(result, "tolist") else result

@@ -1,0 +1,143 @@
+"""Gamepads on a bench."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+from hal.drivers.mock.gamepad import MockPad
+from hal.testing import PadBench, pad_spec
+
+__all__ = ["mock_pad", "playback_pad", "terminal_keys_held", "terminal_steps", "web_pad"]
+
+
+@contextmanager
+def mock_pad() -> Iterator[PadBench]:
+    driver = MockPad(pad_spec())
+    yield PadBench(
+        driver=driver,
+        press=lambda: driver.press("south"),
+        release=lambda: driver.release("south"),
+        lose=lambda: driver.inject(disconnect=True),
+        restore=lambda: driver.inject(disconnect=False),
+        freeze=lambda: driver.inject(freeze=True),
+    )
+    driver.close()
+
+
+RECORDED_PAD = """\
+{"format": "hal-pad-events", "version": 1, "ranges": {"ABS_X": [0, 255]}, "model": {"name": "test", "title": "a test", \
+"axes": {"ABS_X": "left_x"}, "buttons": {"BTN_SOUTH": "south"}}}
+{"t": 0.5, "type": "abs", "code": "ABS_X", "value": 255}
+{"t": 1.0, "type": "key", "code": "BTN_SOUTH", "value": 1}
+{"t": 60.0, "type": "key", "code": "BTN_SOUTH", "value": 0}
+"""
+
+
+@contextmanager
+def playback_pad() -> Iterator[PadBench]:
+    """What happens is in the file and its options; the bench only goes to that time."""
+    from hal.drivers.playback.pad import PlaybackPad
+
+    with TemporaryDirectory() as folder:
+        file = Path(folder) / "pad.jsonl"
+        file.write_text(RECORDED_PAD)
+        options = {"file": str(file), "disconnect_at": 2.0, "reconnect_at": 4.0, "freeze_at": 30.0}
+        driver = PlaybackPad(pad_spec(driver="playback", options=options))
+        bench = PadBench(driver=driver)
+        start = bench.now
+
+        def go_to(seconds: float) -> None:
+            bench.now = start + seconds
+
+        bench.press = lambda: None  # it comes by itself
+        bench.lose = lambda: go_to(2.5)
+        bench.restore = lambda: go_to(4.5)
+        bench.freeze = lambda: go_to(30.0)
+        yield bench
+        driver.close()
+
+
+@contextmanager
+def web_pad() -> Iterator[PadBench]:
+    """The page of the console; every 10 ms it says how its pad stands."""
+    from hal.drivers.web.pad import PadMail, WebPad, reading
+    from hal.types import AXES
+
+    class Page:
+        mail = PadMail()
+        driver = "page 1"
+        stops = 0
+        there, frozen, mask = True, False, 0
+
+        def subscribe(self) -> PadMail:
+            return self.mail
+
+        def show_playing(self, on: bool) -> None:
+            """No recording is played here."""
+
+        def speak(self) -> None:
+            now, axes = bench.now, [0.0] * len(AXES)
+            message = {"connected": self.there, "t": now, "t_alive": now, "axes": axes, "buttons": self.mask}
+            if not self.frozen:
+                self.mail.put(reading(message, 0))
+
+    page = Page()
+    driver = WebPad(pad_spec(driver="web"), page)
+    bench = PadBench(
+        driver=driver,
+        advance=page.speak,
+        press=lambda: setattr(page, "mask", 1),
+        release=lambda: setattr(page, "mask", 0),
+        lose=lambda: setattr(page, "there", False),
+        restore=lambda: setattr(page, "there", True),
+        freeze=lambda: setattr(page, "frozen", True),
+    )
+    yield bench
+    driver.close()
+
+
+@contextmanager
+def terminal_steps() -> Iterator[PadBench]:
+    """The keys of a terminal that never says when one is let go of."""
+    from terminal_kit import FarEnd
+
+    from hal.drivers.terminal.pad import TerminalPad
+
+    with FarEnd() as far:
+        driver = TerminalPad(pad_spec(driver="terminal", options={"tty": far.path, "mode": "step"}))
+        yield PadBench(driver=driver, press=lambda: far.put("1"), lose=far.hang_up)
+        driver.close()
+
+
+@contextmanager
+def terminal_keys_held() -> Iterator[PadBench]:
+    """The keys of a terminal that says when one is let go of, and whether it is looked at."""
+    from terminal_kit import FarEnd
+
+    from hal.drivers.terminal.pad import TerminalPad
+
+    with FarEnd(kitty=True) as far:
+        driver = TerminalPad(pad_spec(driver="terminal", options={"tty": far.path, "mode": "auto"}))
+
+        def focus(on: bool) -> None:
+            far.put("\x1b[I" if on else "\x1b[O")
+
+        def freeze() -> None:
+            far.silent = True
+            time.sleep(0.05)  # what was on its way
+
+        yield PadBench(
+            driver=driver,
+            real_time=True,
+            patience=2.0,
+            press=lambda: far.put("\x1b[49;1:1u"),
+            release=lambda: far.put("\x1b[49;1:3u"),
+            lose=lambda: focus(False),
+            restore=lambda: focus(True),
+            freeze=freeze,
+        )
+        driver.close()
