@@ -1,0 +1,149 @@
+"""Coming from Ark: its configuration files into a rig's file, with an account of every key.
+
+python apps/import_ark.py global_config.yaml -o config/mine.yaml
+python apps/import_ark.py global_config.yaml --check
+"""
+
+from __future__ import annotations
+
+import argparse
+import shutil
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from hal.apps.cli import run_app
+
+if TYPE_CHECKING:
+    from hal.ark import Imported, Options
+
+__all__ = ["main", "parser"]
+
+
+def parser() -> argparse.ArgumentParser:
+    """The command line."""
+    made = argparse.ArgumentParser(
+        prog="import_ark",
+        description="Make a rig's file of Ark's configuration files, and tell what became of every key.",
+        epilog="Ark's files are only read. The exit status is 2, and nothing is written, when something is wrong.",
+    )
+    made.add_argument("source", type=Path, metavar="GLOBAL_FILE", help="Ark's global_config.yaml")
+    what = made.add_mutually_exclusive_group(required=True)
+    what.add_argument("-o", "--out", type=Path, metavar="FILE", help="the rig's file to write")
+    what.add_argument("--check", action="store_true", help="only tell; write nothing")
+    made.add_argument("--force", action="store_true", help="write over a file that is there")
+    made.add_argument(
+        "--start", type=Path, metavar="FOLDER", help="where Ark is started: its paths are relative to it (searched for)"
+    )
+    made.add_argument(
+        "--arm",
+        action="append",
+        default=[],
+        metavar="NAME=MODEL",
+        help="which model of the hal a robot is (told by its joints); may be repeated, like the next two",
+    )
+    made.add_argument(
+        "--urdf", action="append", default=[], metavar="NAME=FILE", help="where the URDF of a robot or an object is"
+    )
+    made.add_argument("--without", action="append", default=[], metavar="NAME", help="leave something out")
+    made.add_argument(
+        "--camera-model",
+        default="pinhole",
+        metavar="MODEL",
+        help="of every camera: %(default)s has the angles that Ark's file says; realsense_d435 has the real one's",
+    )
+    return made
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Entry point."""
+    return run_app(_main, parser().parse_args(argv))
+
+
+def _main(args: argparse.Namespace) -> int:
+    from hal.ark import import_ark
+    from hal.errors import CommandError
+
+    if args.out is not None:
+        if args.out.suffix not in (".yaml", ".yml"):
+            raise CommandError(f"-o {args.out}: a rig's file ends in .yaml")
+        if not args.out.expanduser().resolve().parent.is_dir():
+            raise CommandError(f"-o {args.out}: there is no folder {args.out.parent}")
+    imported = import_ark(args.source, _options(args))
+    path = args.out.expanduser().resolve() if args.out is not None else None
+    texts = imported.texts(path) if path is not None else {}
+    there = [str(file) for file in texts if file.exists()]
+    if there and not args.force:
+        raise CommandError(f"{', '.join(there)} is there already; --force writes over it")
+    print("\n".join(_report(imported)))
+    if path is None:
+        print("\nin order; nothing is written: --check")
+        return 0
+    _write(texts, path)
+    program = "python apps/teleop.py" if sys.argv[0].endswith(".py") else "hal-teleop"
+    print(f"\nstart it: {program} --sim --config {args.out}")
+    return 0
+
+
+def _options(args: argparse.Namespace) -> Options:
+    from hal.ark import Options
+
+    return Options(
+        start=args.start,
+        arms=_pairs("--arm", args.arm),
+        urdfs={name: Path(file).expanduser() for name, file in _pairs("--urdf", args.urdf).items()},
+        without=frozenset(args.without),
+        camera_model=args.camera_model,
+    )
+
+
+def _pairs(option: str, given: Sequence[str]) -> dict[str, str]:
+    from hal.errors import CommandError
+
+    pairs = {}
+    for text in given:
+        name, equals, value = text.partition("=")
+        if not (name and equals and value):
+            raise CommandError(f"{option} {text}: must be NAME=..., with a robot's or object's name in Ark's files")
+        pairs[name] = value
+    return pairs
+
+
+def _report(imported: Imported) -> list[str]:
+    from hal.ark.ledger import summary, table
+
+    width = max(100, min(160, shutil.get_terminal_size((120, 24)).columns))
+    lines = [*table(imported.rows, imported.source.parent, width), "", summary(imported.rows)]
+    if imported.left_out:
+        lines.append(f"left out, as --without says: {', '.join(imported.left_out)}")
+    for name, model in imported.models.items():
+        lines += ["", f"{name}: Ark's files do not say everything about this arm. In the model made for it, look at"]
+        lines += [f"  - {text}" for text in model.to_fill_in]
+    return lines
+
+
+def _write(texts: dict[Path, str], path: Path) -> None:
+    """Write the rig's file ``path`` and the others, and tell what the rig has."""
+    from hal.apps.banner import listing
+    from hal.config import load
+
+    for file, text in texts.items():
+        _put(file, text)
+    plan = load(path).resolve()
+    lines = [*listing(plan), *(f"note     {warning}" for warning in plan.warnings)]
+    print("\n".join(["", *(f"written: {file}" for file in texts), *(f"  {line}" for line in lines)]))
+
+
+def _put(path: Path, text: str) -> None:
+    """Write a file, whole or not at all."""
+    temporary = path.with_name(f".{path.name}.new")
+    try:
+        temporary.write_text(text, encoding="utf-8")
+        temporary.replace(path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,224 @@
+"""Robots: known arms with 7, 9, 10 or 12 numbers, real addresses, and models made of other URDFs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pybullet as p
+import pybullet_data
+import pytest
+from ark_kit import CAMERA, PANDA, PANDA_URDF, changed, imported, row
+from pybullet_utils.bullet_client import BulletClient
+
+import hal
+from hal.ark import Options
+from hal.ark.links import ArkUrdf
+from hal.config import load
+from hal.config.files import parse_yaml
+from hal.pose import Pose
+
+HOME = [0, -0.785, 0, -2.356, 0, 1.571, 0.785]
+OTHER = [0.1, -0.5, 0, -2.0, 0, 1.5, 0.7]
+XARM = Path(pybullet_data.getDataPath(), "xarm")
+
+
+@pytest.mark.parametrize("more", [0, 2, 3, 5])
+def test_the_arms_joints_are_the_first_of_7_9_10_or_12(tmp_path: Path, more: int) -> None:
+    key = "robots.0.config.initial_configuration"
+    data, result = imported(tmp_path, robots={"Franka": changed(PANDA, initial_configuration=HOME + [0] * more)})
+    assert "initial" not in data["robots"]["Franka"], "it is the model's home"
+    outcome, here = row(result, key)
+    assert outcome == "kept"
+    assert ("the first 7 of" in here) == (more > 0)
+
+    data, result = imported(tmp_path, robots={"Franka": changed(PANDA, initial_configuration=OTHER + [0.04] * more)})
+    assert data["robots"]["Franka"]["initial"] == OTHER
+    assert row(result, key)[0] == "changed"
+    assert load(tmp_path / "rig.yaml").resolve().robots[0].initial == tuple(OTHER)
+
+
+@pytest.mark.parametrize(
+    ("keys", "model"),
+    [
+        ({}, "panda"),
+        ({"joint_groups__arm__joints": [f"fr3_joint{k}" for k in range(1, 8)]}, "fr3"),
+        ({"joint_groups": None}, "panda"),  # the URDF's name
+    ],
+)
+def test_frankas_are_known_by_their_joints(tmp_path: Path, keys: dict[str, Any], model: str) -> None:
+    data, _ = imported(tmp_path, robots={"arm": changed(PANDA, **keys)})
+    assert data["robots"]["arm"]["model"] == model
+
+
+def test_a_person_may_say_which_arm_it_is(tmp_path: Path) -> None:
+    data, result = imported(tmp_path, Options(arms={"arm": "fr3"}), robots={"arm": PANDA})
+    assert data["robots"]["arm"]["model"] == "fr3"
+    assert "as --arm says" in row(result, "robots.0.config.urdf_path")[1]
+    with pytest.raises(hal.ConfigError, match="--arm arm=fr4: there is no such model; did you mean 'fr3'"):
+        imported(tmp_path, Options(arms={"arm": "fr4"}), robots={"arm": PANDA})
+
+
+def test_base(tmp_path: Path) -> None:
+    keys = {"base_position": [1, 2, 3], "base_orientation": [0, 0, np.pi / 2]}
+    data, result = imported(tmp_path, robots={"arm": changed(PANDA, **keys)})
+    base = data["robots"]["arm"]["base"]
+    turned = Pose(base["position"], base["orientation"])
+    assert turned.distance(Pose.from_rpy([1, 2, 3], [0, 0, np.pi / 2])) == pytest.approx((0, 0), abs=1e-5)
+    assert row(result, "robots.0.config.base_orientation")[0] == "changed"
+
+    keys["base_orientation"] = [0, 0, 2, 2]
+    data, result = imported(tmp_path, robots={"arm": changed(PANDA, **keys)})
+    assert data["robots"]["arm"]["base"]["orientation"] == pytest.approx([0, 0, 0.5**0.5, 0.5**0.5], abs=1e-6)
+    assert "of length 2.83" in row(result, "robots.0.config.base_orientation")[1]
+
+
+def test_a_real_arms_address_is_kept_and_nothing_becomes_real_or_faster_by_it(tmp_path: Path) -> None:
+    real = {
+        "robot_ip": "172.16.0.2",
+        "gripper_ip": "172.16.0.2",
+        "relative_dynamics_factor": 0.9,
+        "gripper_speed": 0.5,
+    }
+    data, result = imported(tmp_path, robots={"arm": changed(PANDA, real_config=real)})
+    assert data["sim"] is True
+    assert data["robots"]["arm"] == {
+        "model": "panda",
+        "base": {"position": [0, 0, 0]},
+        "real": {"host": "172.16.0.2"},
+    }
+    assert row(result, "robots.0.config.real_config.relative_dynamics_factor") == (
+        "changed",
+        "robots.arm.speed stays 0.3 of the joint speeds: more is for you to write",
+    )
+    assert row(result, "robots.0.config.real_config.gripper_speed")[0] == "changed"
+    spec = load(tmp_path / "rig.yaml", sim=False).resolve().robots[0]
+    assert spec.options["host"] == "172.16.0.2"
+    assert spec.speed == 0.3
+
+    real |= {"gripper_ip": "172.16.0.3", "relative_dynamics_factor": 0.1, "gripper_speed": 0.05}
+    data, _ = imported(tmp_path, robots={"arm": changed(PANDA, real_config=real)})
+    assert data["robots"]["arm"]["speed"] == 0.1
+    assert data["robots"]["arm"]["gripper"] == {"real": {"host": "172.16.0.3"}, "speed": 0.05}
+    load(tmp_path / "rig.yaml", sim=False)
+
+
+def test_where_ark_has_its_tcp_is_told(tmp_path: Path) -> None:
+    robot = changed(PANDA, ee_index=11)
+    for options in (Options(), Options(urdfs={"arm": PANDA_URDF})):
+        _, result = imported(tmp_path, options, robots={"arm": robot})
+        assert "Ark's tcp_link: 3.4 mm before it" in row(result, "robots.0.config.ee_index")[1]
+    _, result = imported(tmp_path, Options(urdfs={"arm": PANDA_URDF}), robots={"arm": changed(robot, ee_index=6)})
+    assert "not Ark's panda_link7" in row(result, "robots.0.config.ee_index")[1]
+
+
+@pytest.mark.parametrize("merged", [False, True])
+@pytest.mark.parametrize("file", ["panda", "xarm6_robot.urdf", "xarm6_with_gripper.urdf"])
+def test_joints_are_numbered_as_pybullet_does(file: str, merged: bool) -> None:
+    path = PANDA_URDF if file == "panda" else XARM / file
+    client = BulletClient(p.DIRECT)
+    body = client.loadURDF(str(path), flags=p.URDF_MERGE_FIXED_LINKS if merged else 0)
+    names = [client.getJointInfo(body, k)[1].decode() for k in range(client.getNumJoints(body))]
+    client.disconnect()
+    ours = [joint.name for joint in ArkUrdf(path).order(merged)]
+    assert ours == names[: len(ours)]
+    assert len(ours) >= 6, "to the end of the arm at least"
+    assert merged or len(ours) == len(names)
+
+
+def xarm(**keys: Any) -> dict[str, Any]:
+    return changed(
+        {
+            "urdf_path": "xarm6_robot.urdf",
+            "class_dir": str(XARM),
+            "base_position": [0, 0, 0],
+            "initial_configuration": [0, -0.3, -1.2, 0, 1.5, 0],
+            "ee_index": 5,
+        },
+        **keys,
+    )
+
+
+def test_a_model_is_made_of_another_urdf_and_the_arm_runs(tmp_path: Path) -> None:
+    data, result = imported(tmp_path, robots={"my arm": xarm()}, sensors={"eye": CAMERA})
+    assert data["robots"]["my_arm"]["model"] == "rig_my_arm.yaml"
+    text = (tmp_path / "rig_my_arm.yaml").read_text()
+    model = parse_yaml(text)
+    assert model["joints"] == [f"joint{k}" for k in range(1, 7)]
+    assert model["home"] == [0, -0.3, -1.2, 0, 1.5, 0]
+    assert model["tcp"]["link"] == "link6"
+    assert model["drivers"] == {"sim": "pybullet"}, "no arm moves by guessed limits"
+    speed, acceleration, jerk = (np.array(model["limits"][key]) for key in ("velocity", "acceleration", "jerk"))
+    assert acceleration == pytest.approx(speed / 0.3, rel=1e-3)
+    assert jerk == pytest.approx(acceleration / 0.02, rel=1e-3)
+    for key in ("acceleration", "jerk", "velocity", "tcp"):
+        (line,) = [line for line in text.splitlines() if line.strip().startswith(f"{key}:")]
+        assert "# CHECK" in line
+    assert any("acceleration" in told for told in result.models["my_arm"].to_fill_in)
+    with hal.open(str(tmp_path / "rig.yaml"), sim=True, clock="lock_step", pad="none") as rig:
+        arm = rig.robots["my_arm"]
+        arm.move_to(arm.home + np.array([0.2, 0, 0, 0, 0, 0]), speed=0.5)
+        arm.move_to(arm.home, speed=0.5)
+        assert arm.state().q == pytest.approx(arm.home, abs=0.01)
+    with pytest.raises(hal.ConfigError, match="drivers.real"):
+        load(tmp_path / "rig.yaml", sim=False)
+
+
+def test_fingers_are_no_joints_of_the_arm(tmp_path: Path) -> None:
+    groups = {
+        "gripper": {"control_mode": "position", "joints": ["drive_joint", "left_finger_joint"]},
+        "all": {"control_mode": "position", "joints": [*(f"joint{k}" for k in range(1, 7)), "drive_joint"]},
+    }
+    robot = xarm(urdf_path="xarm6_with_gripper.urdf", joint_groups=groups)
+    _, result = imported(tmp_path, robots={"arm": robot})
+    model = parse_yaml((tmp_path / "rig_arm.yaml").read_text())
+    assert model["joints"] == [f"joint{k}" for k in range(1, 7)]
+    assert "gripper" not in model
+    assert row(result, "robots.0.config.joint_groups.gripper.joints")[0] == "nothing"
+
+
+def test_fixed_joints_of_a_group_are_no_joints_of_the_arm(tmp_path: Path) -> None:
+    group = {"control_mode": "position", "joints": ["world_joint", *(f"joint{k}" for k in range(1, 7))]}
+    _, result = imported(tmp_path, robots={"arm": xarm(joint_groups={"all": group})})
+    assert parse_yaml((tmp_path / "rig_arm.yaml").read_text())["joints"] == [f"joint{k}" for k in range(1, 7)]
+    assert "without those that are fixed" in row(result, "robots.0.config.joint_groups.all.joints")[1]
+
+
+def test_numbers_are_those_of_the_arms_joints_whatever_stands_between(tmp_path: Path) -> None:
+    """Without merging, PyBullet counts the fixed joint to the world too."""
+    robot = xarm(merge_fixed_links=False, initial_configuration=[9, 0, -0.3, -1.2, 0, 1.5, 0], ee_index=6)
+    imported(tmp_path, robots={"arm": robot})
+    model = parse_yaml((tmp_path / "rig_arm.yaml").read_text())
+    assert model["home"] == [0, -0.3, -1.2, 0, 1.5, 0]
+    assert model["tcp"]["link"] == "link6"
+
+
+def test_speeds_that_a_urdf_lacks_or_makes_up_are_told(tmp_path: Path) -> None:
+    urdf = tmp_path / "arm.urdf"
+    text = (XARM / "xarm6_robot.urdf").read_text()
+    assert text.count('velocity="3.14"') >= 2
+    urdf.write_text(text.replace('velocity="3.14"', 'velocity="100"', 1).replace('velocity="3.14"', "", 1))
+    _, result = imported(tmp_path, Options(urdfs={"arm": urdf}), robots={"arm": xarm(class_dir=None)})
+    told = result.models["arm"].to_fill_in
+    assert any("joint1 has 100 in the URDF, which looks like a placeholder" in one for one in told)
+    assert any("joint2 has none in the URDF" in one for one in told)
+    assert parse_yaml((tmp_path / "rig_arm.yaml").read_text())["limits"]["velocity"][:2] == [3.2, 0.5]
+
+
+def test_what_is_wrong_in_a_made_model_is_told_at_arks_line(tmp_path: Path) -> None:
+    with pytest.raises(hal.ConfigError, match="joint 'joint2' is at 3, outside its limits") as caught:
+        imported(tmp_path, robots={"arm": xarm(initial_configuration=[0, 3, 0, 0, 0, 0])})
+    (problem,) = caught.value.problems
+    assert problem.file.startswith(str(tmp_path / "global_config.yaml:"))
+    assert problem.message.endswith("(as home of the model made for it)")
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [("<robot", "is not valid XML"), ("<nonsense/>", "is not a URDF"), ('<robot name="x"/>', "has no links")],
+)
+def test_a_broken_urdf_is_told(tmp_path: Path, text: str, said: str) -> None:
+    (tmp_path / "arm.urdf").write_text(text)
+    with pytest.raises(hal.ConfigError, match=said):
+        imported(tmp_path, robots={"arm": xarm(urdf_path="arm.urdf", class_dir=None)})
