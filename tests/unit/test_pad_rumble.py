@@ -20,7 +20,7 @@ from evdev_kit import FakeInput, MakePad, pads_on, poll, poll_until
 
 from hal.drivers.evdev.pad import EvdevPad
 from hal.drivers.evdev.rumble import Rumble
-from hal.gamepad import RUMBLE_STRONG, RUMBLE_WEAK, Gamepad
+from hal.gamepad import RUMBLE_SECONDS, RUMBLE_STRONG, RUMBLE_WEAK, Gamepad
 from hal.pads.codes import BUS_USB, EV_FF, FF_RUMBLE
 from hal.pads.model import Identity
 
@@ -36,6 +36,8 @@ class Kernel:
         os.set_blocking(self.reader, False)
         self.effects: list[tuple[int, int, int, int]] = []
         """Type, number, strong and weak magnitude."""
+        self.lengths: list[int] = []
+        """ms"""
         self.answer = threading.Event()
         self.answer.set()
         self.error: OSError | None = None
@@ -50,6 +52,7 @@ class Kernel:
         kind, number = struct.unpack_from("@Hh", data, 0)
         strong, weak = struct.unpack_from("@HH", data, 16)
         self.effects.append((kind, number, strong, weak))
+        self.lengths.append(struct.unpack_from("@H", data, 10)[0])
         struct.pack_into("@h", data, 2, 5)
         return 0
 
@@ -104,18 +107,22 @@ def test_the_effect_is_made_once_and_playing_it_is_one_write(kernel: Kernel) -> 
     assert rumble.wait(10.0)
     assert kernel.effects == [(FF_RUMBLE, -1, 0xFFFF, 0x8000)]
     assert kernel.played() == []
-    assert rumble.play(1.0, 0.5, 0.5)
-    assert rumble.play(1.0, 0.5, 0.01)
+    assert rumble.play(1.0, 0.5, RUMBLE_SECONDS)
+    assert rumble.play(1.0, 0.5, RUMBLE_SECONDS)
     assert kernel.played() == [(EV_FF, 5, 1), (EV_FF, 5, 1)]
     assert len(kernel.effects) == 1
 
 
-def test_another_strength_changes_the_same_effect_and_then_plays_it(kernel: Kernel) -> None:
+def test_another_strength_or_length_changes_the_same_effect_and_then_plays_it(kernel: Kernel) -> None:
     rumble = Rumble(kernel.writer, 1.0, 0.5)
     assert rumble.wait(10.0)
-    assert rumble.play(0.0, 1.0, 0.2)
+    assert rumble.play(0.0, 1.0, RUMBLE_SECONDS)
     assert rumble.wait(10.0)
     assert kernel.effects[1] == (FF_RUMBLE, 5, 0, 0xFFFF)
+    assert kernel.played() == [(EV_FF, 5, 1)]
+    assert rumble.play(0.0, 1.0, 0.2)
+    assert rumble.wait(10.0)
+    assert kernel.lengths == [round(1000 * RUMBLE_SECONDS)] * 2 + [200], "ms"
     assert kernel.played() == [(EV_FF, 5, 1)]
 
 
@@ -124,11 +131,11 @@ def test_a_kernel_that_does_not_answer_holds_nobody_up(kernel: Kernel) -> None:
     kernel.answer.clear()
     start = time.monotonic()
     rumble = Rumble(kernel.writer, 1.0, 0.5)
-    assert not rumble.play(1.0, 0.5, 0.5)
+    assert not rumble.play(1.0, 0.5, RUMBLE_SECONDS)
     assert time.monotonic() - start < 5.0
     kernel.answer.set()
     assert rumble.wait(10.0)
-    assert rumble.play(1.0, 0.5, 0.5)
+    assert rumble.play(1.0, 0.5, RUMBLE_SECONDS)
 
 
 def test_a_pad_that_takes_no_effect_does_not_rumble_and_that_is_no_error(kernel: Kernel) -> None:
@@ -172,7 +179,7 @@ def test_a_rumble_is_played_by_the_thread_that_polls(system: FakeInput, make_pad
 
     until(shaken)  # the effect may be ready a moment later
     assert all(asked)
-    assert Gamepad(pad).rumble(seconds=0.3)
+    assert Gamepad(pad).rumble()
     poll(pad)
     assert EVENT.unpack(node.written())[2:] == (EV_FF, 5, 1)
     assert len(kernel.effects) == 1, "nothing is uploaded when it matters"
