@@ -52,7 +52,7 @@ class Bench:
         assert self.rig.console is not None
         self.console = self.rig.console
         self.link = self.console.link
-        self.session = Session(self.rig, self.arm, self.rig.gamepads["pad"], hal.Teleop(self.arm), self.args)
+        self.session = Session(self.rig, self.arm, self.rig.gamepads["pad"], self.args)
         self._thread = threading.Thread(target=self.session.run, name="the app's loop")
         self._thread.start()
 
