@@ -8,7 +8,7 @@ from urllib.parse import urlsplit
 if TYPE_CHECKING:
     from hal.config.plan import Plan
     from hal.rig import Rig
-    from hal.specs import GripperSpec, RobotSpec
+    from hal.specs import CameraSpec, GripperSpec, RobotSpec
 
 __all__ = ["banner", "invitation", "listing"]
 
@@ -29,8 +29,8 @@ def listing(plan: Plan) -> list[str]:
     for camera in plan.cameras:
         streams = "+".join(camera.streams)
         lines.append(
-            f"camera   {camera.name:10s} {camera.model} ({camera.driver}), {camera.width}x{camera.height} {streams} "
-            f"at {camera.rate_hz:g} Hz"
+            f"camera   {camera.name:10s} {camera.model} ({camera.driver}{_stands_in(camera)}), "
+            f"{camera.width}x{camera.height} {streams} at {camera.rate_hz:g} Hz"
         )
     lines.extend(f"gamepad  {pad.name:10s} {pad.driver}" for pad in plan.pads)
     if plan.world is not None:
@@ -38,6 +38,14 @@ def listing(plan: Plan) -> list[str]:
         lines.append(f"world    {plan.world.driver}, {plan.world.physics_hz:g} Hz: {things}")
     lines.append(f"clock    {plan.clock.replace('_', ' ')}")
     return lines
+
+
+def _stands_in(camera: CameraSpec) -> str:
+    """What a real camera's pictures come from where that is no camera."""
+    if camera.options.get("emulated"):
+        return ", EMULATED"
+    played = camera.options.get("play")
+    return f", playing {played}" if played else ""
 
 
 def _real(robot: RobotSpec, device: RobotSpec | GripperSpec) -> str:

@@ -82,7 +82,7 @@ def _main(args: argparse.Namespace) -> int:
     else:
         found = _shown(verdicts)
         if not real_arms(plan) and not checked_cameras(plan):
-            print(f"everything in {plan.source} is simulated: there is nothing to check but this computer")
+            print(f"nothing in {plan.source} has a check of its own: only this computer was looked at")
     return 0 if _fit(found) else ACTION_NEEDED
 
 

@@ -300,6 +300,8 @@ class Session:
         def text() -> str:
             x, y, z = state.tcp.position
             held = "held" if self.deadman.held else "released"
+            if self.pad.waiting_for and self.pad.state().connected:
+                held = f"waits: let go of, or move once: {', '.join(self.pad.waiting_for)}"
             status = state.status.name.lower()
             hand = self.robot.gripper.newest() if self.robot.gripper is not None else None
             width = f"gripper {1e3 * hand.width:4.0f} mm  " if hand is not None and not self.hand else ""

@@ -75,6 +75,7 @@ class Camera:
         self._handed_out = -1
         self._error: ConnectionLost | None = None
         self._closing = threading.Event()
+        self._grabbing = threading.RLock()
         self._thread: threading.Thread | None = None
         self._listeners: dict[object, Callable[[Frame], None]] = {}
         self._watchers: dict[object, Callable[[ConnectionLost | None], None]] = {}
@@ -211,17 +212,21 @@ class Camera:
     def _grab(self, timeout: float, after: float | None = None) -> Frame:
         deadline = time.monotonic() + timeout
         try:
-            if self._error is not None:
-                if self._error.final:
-                    raise self._error
-                self._reopen()
-            while True:
-                raw = self._driver.grab(max(0.0, deadline - time.monotonic()))
-                if raw is None:
-                    raise StaleStateError(f"camera {self.name} took no frame within {timeout:g} s")
-                self._take(raw)
-                if after is None or raw.t >= after or not self._driver.on_demand:
-                    return self._hand_out()
+            with self._grabbing:  # two threads may read one camera
+                if self._error is not None:
+                    if self._error.final:
+                        raise self._error
+                    self._reopen()
+                while True:
+                    rest = deadline - time.monotonic()
+                    raw = self._driver.grab(max(0.0, rest))
+                    if raw is None or (after is not None and raw.t < after and rest < 0.0):
+                        raise StaleStateError(f"camera {self.name} took no frame within {timeout:g} s")
+                    frame = self._take(raw)
+                    self._call(self._listeners, frame)
+                    if after is None or raw.t >= after or not self._driver.on_demand:
+                        self._handed_out = frame.stamp.seq
+                        return frame
         except ConnectionLost as error:
             if error is self._error:
                 raise
@@ -257,6 +262,9 @@ class Camera:
             if raw is not None:
                 self._call(self._listeners, self._take(raw))
                 return True
+        over = ConnectionLost(f"it did not come back within {GIVE_UP / 60.0:g} minutes, and is looked for no more")
+        over.final = True
+        self._lose(over)
         return False
 
     def _reopen(self) -> None:
@@ -324,8 +332,9 @@ class Camera:
         where = raw.T_world_camera
         if where is None and self._place is not None:
             where = self._place(raw.t)
-            if where is not None and self.spec.align == "depth" and "depth" in info.streams:
-                where = where @ info.streams["depth"].T_color_stream
+            seen_from = info.streams.get(self.spec.reference)
+            if where is not None and seen_from is not None:
+                where = where @ seen_from.T_color_stream
         return Frame(
             stamp=Stamp(raw.t, raw.t_device, raw.seq + self._offset),
             color=raw.color,
@@ -346,6 +355,7 @@ class Camera:
             self._thread.join(timeout=2.0)
             self._thread = None
         self._driver.close()
+        self._driver.close()  # the first one may be the end of a loss, after which a driver expects to be opened again
 
     def __repr__(self) -> str:
         spec = self.spec

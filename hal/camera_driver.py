@@ -92,4 +92,7 @@ class CameraDriver(ABC):
 
     @abstractmethod
     def close(self) -> None:
-        """Stop streaming, let go of the device. Idempotent, and bounded in time whatever the device does."""
+        """Stop streaming, let go of the device. Idempotent, and bounded in time whatever the device does.
+
+        A second call without ``open`` in between means that the camera is closed for good.
+        """

@@ -29,10 +29,9 @@ def place_of(spec: CameraSpec, robots: Mapping[str, Robot]) -> Place | None:
 
 
 def handed_out(spec: CameraSpec) -> Pose:
-    """Pose of the optical frame of colour and depth, as they are handed out, in that of the colour sensor, by the
-    model's figures."""
-    depth = spec.sensors.get("depth") if spec.align == "depth" else None
-    return Pose(depth.position, depth.orientation) if depth is not None else Pose()
+    """Pose of the optical frame that the frames have, in that of the colour sensor, by the model's figures."""
+    sensor = spec.sensors.get(spec.reference)
+    return Pose(sensor.position, sensor.orientation) if sensor is not None else Pose()
 
 
 class Moving:

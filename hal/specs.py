@@ -233,6 +233,13 @@ class CameraSpec:
     depth_sensor: DepthSensorSpec | None = None
     """None where the model does not say."""
 
+    @property
+    def reference(self) -> str:
+        """The stream whose sensor's view the frames have: ``K`` and ``T_world_camera`` are of that."""
+        if self.align == "depth" or {"color", "depth", "segmentation"} & set(self.streams):
+            return self.align
+        return next((name for name in ("infrared", "infrared_right") if name in self.streams), "color")
+
 
 @dataclass(frozen=True)
 class PadSpec:

@@ -18,6 +18,9 @@ from .system import NodeInfo
 
 __all__ = ["Link"]
 
+_APART = frozenset({KEY["BTN_MODE"], KEY["BTN_LEFT"]})
+"""Buttons that may come in reports of their own, which say nothing of the others: xpad does so with the Xbox button of
+an Xbox One pad."""
 _GONE = select.POLLHUP | select.POLLERR | select.POLLNVAL
 
 
@@ -52,6 +55,8 @@ class Link:
         """Events of the motion sensor so far."""
         self._spoken = False
         """Has the pad reported since it was opened, so that the kernel knows how it stands?"""
+        self._said = False
+        """Was there an event in this report that comes with all others? Some buttons have reports of their own."""
         self._dropping = False
         self._poller = select.poll()
         self._poller.register(node.fileno(), select.POLLIN)
@@ -101,8 +106,8 @@ class Link:
             self._count(event.t + ahead, event.t_device)
             if event.kind == EV_SYN:
                 self._synchronise(event.code)
-            elif not self._dropping:
-                self.mapper.feed(event.kind, event.code, event.value, event.t)
+            elif not self._dropping and self.mapper.feed(event.kind, event.code, event.value, event.t):
+                self._said |= event.kind != EV_KEY or (event.code not in _APART)
         if self.mapper.expire(polled):
             self._count(polled + ahead, self.t_device)
         self._read_touch(ahead)
@@ -129,7 +134,8 @@ class Link:
             if self._dropping:
                 self._dropping, self._spoken = False, True
                 self.mapper.sync(*self._node.snapshot())
-            self._believe()
+            if self._said:
+                self._believe()
 
     def _believe(self) -> None:
         """The pad has spoken: from here on it is as the kernel shows it, and every change is an event."""

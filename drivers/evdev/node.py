@@ -13,7 +13,7 @@ from hal.errors import DriverMissing
 from hal.pads.codes import EV_ABS, EV_FF, EV_KEY, EV_REL, FF_RUMBLE
 from hal.pads.mapper import AxisRange
 
-__all__ = ["Event", "EvdevNode", "Node", "evdev_module"]
+__all__ = ["Event", "EvdevNode", "Node", "evdev_module", "lock"]
 
 _EVIOCSCLOCKID = 0x400445A0  # _IOW('E', 0xa0, int), linux/input.h
 _READS = 32  # at most, in one go; each brings up to 64 events
@@ -53,6 +53,12 @@ class Node(Protocol):
     def snapshot(self) -> tuple[dict[int, int], list[int]]:
         """What the kernel says of now: axis code -> value, and the codes of the pressed buttons."""
 
+    def claim(self) -> bool:
+        """Take it for one gamepad, in every program of the hal, until it is closed; False where somebody has it.
+
+        Two gamepads on one device would be one hand on two dead-men.
+        """
+
     def close(self) -> None:
         """Let go of it. Idempotent."""
 
@@ -65,6 +71,15 @@ def evdev_module() -> Any:
         remedy = "install it with: pip install evdev-binary"
         raise DriverMissing(f"gamepads need python-evdev, which does not import ({error}); {remedy}") from error
     return evdev
+
+
+def lock(fd: int) -> bool:
+    """Lock a device for as long as this opening of it lasts; False where another opening has it, here or elsewhere."""
+    try:
+        fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    return True
 
 
 class EvdevNode:
@@ -111,6 +126,9 @@ class EvdevNode:
     def snapshot(self) -> tuple[dict[int, int], list[int]]:
         values = {code: int(self._device.absinfo(code).value) for code in self.axes}
         return values, [int(code) for code in self._device.active_keys()]
+
+    def claim(self) -> bool:
+        return lock(self._device.fd)
 
     def close(self) -> None:
         self._device.close()

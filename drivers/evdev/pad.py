@@ -175,6 +175,13 @@ class EvdevPad(GamepadDriver):
         node = self._try_open(finder, info)
         if node is None:
             return
+        if not node.claim():
+            node.close()
+            self.notes = (
+                *self.notes,
+                f"{info.describe()} is taken: by another gamepad of this rig, or another program",
+            )
+            return
         found = choose_model(self._models, info.identity)
         if found is not None:
             model, rule = found

@@ -55,7 +55,12 @@ class PyBulletCamera(CameraDriver):
         if not self._open:
             raise ConnectionLost(f"camera {self.spec.name} is not open")
         source: FrameSource = self.source  # type: ignore[assignment]  # checked by open
-        return source.grab(timeout)
+        try:
+            return source.grab(timeout)
+        except ConnectionLost as error:  # whatever drew the pictures is gone, and is not begun anew
+            lost = ConnectionLost(f"{error}; open the rig anew")
+            lost.final = True
+            raise lost from error
 
     def close(self) -> None:
         """Nothing to let go of: the pictures' owner is the rig."""

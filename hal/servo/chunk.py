@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from bisect import bisect_right
+from bisect import bisect_left, bisect_right
 from collections.abc import Sequence
 from itertools import pairwise
 from math import isfinite
@@ -15,6 +15,10 @@ from .smoothing import JointSmoother
 __all__ = ["ChunkMotion", "slope"]
 
 Floats = Sequence[float]
+
+
+_SAME = 1e-6
+"""Targets this near in time are one, s: plans on one grid differ by rounding."""
 
 
 class ChunkMotion(JointTargetMotion):
@@ -52,9 +56,7 @@ class ChunkMotion(JointTargetMotion):
     def accept(self, command: CommandRecord) -> None:
         ahead, points = self._split(command.values)
         times = [command.t + age for age in ahead]
-        kept = bisect_right(self._times, times[0])
-        if kept and self._times[kept - 1] == times[0]:
-            kept -= 1
+        kept = bisect_left(self._times, times[0] - _SAME)
         begin = max(0, bisect_right(self._times, command.t) - 2)  # what led to the present slope, and no more
         self._times = self._times[begin:kept] + times
         self._points = self._points[begin:kept] + points

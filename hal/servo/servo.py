@@ -271,6 +271,8 @@ class Servo:
             self._seq = max(self._seq, command.seq)
         if not watchdog.allowed or command is None or not mine or command.seq <= self._seq:
             return
+        if command.kind is Kind.JOINT_CHUNK and not command.values:
+            return  # overtaken by the next chunk, whose command comes in a moment
         self._seq = command.seq
         motion = self._motions.get(command.kind)
         if motion is None or not is_timely(now, command) or not motion.usable(command.values):

@@ -80,6 +80,9 @@ class PipeNode:
     def snapshot(self) -> tuple[dict[int, int], list[int]]:
         return {code: self.shown if code in STICKS else 0 for code in self.axes}, list(self.held)
 
+    def claim(self) -> bool:
+        return True
+
     def close(self) -> None:
         """The bench lets go of the pipe."""
 

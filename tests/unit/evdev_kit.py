@@ -17,7 +17,7 @@ from hal.drivers.evdev.node import Event
 from hal.drivers.evdev.pad import EvdevPad
 from hal.drivers.evdev.system import NodeInfo
 from hal.gamepad import PadReading
-from hal.pads.codes import ABS, EV_ABS, EV_SYN, KEY, SYN_REPORT
+from hal.pads.codes import ABS, EV_ABS, EV_REL, EV_SYN, KEY, SYN_REPORT
 from hal.pads.mapper import AxisRange
 from hal.pads.model import Identity
 from hal.specs import PadSpec
@@ -49,6 +49,7 @@ class FakeNode:
         self.speaks = True
         """Does it report how it stands as soon as it is opened? Until a pad does, nothing is known of it."""
         self.open_ends = 0
+        self._claimed, self._refused = False, 0
         self._waiting: list[Event] = []
         self._ends = socket.socketpair()
         self._reader, self._writer = (end.fileno() for end in self._ends)
@@ -75,6 +76,11 @@ class FakeNode:
         except BlockingIOError:
             return b""
 
+    def claim(self) -> bool:
+        free, self._claimed = not self._claimed, True
+        self._refused += not free
+        return free
+
     def fileno(self) -> int:
         return self._reader
 
@@ -91,6 +97,10 @@ class FakeNode:
 
     def close(self) -> None:
         self.open_ends -= 1
+        if self._refused:  # whoever was refused closes it first
+            self._refused -= 1
+        else:
+            self._claimed = False
 
     def dispose(self) -> None:
         """The test is over."""
@@ -144,8 +154,9 @@ class FakeInput:
         self.opened.append(path)
         info, node = self.plugged[path]
         node.open_ends += 1
-        if node.speaks and info.is_pad:
-            node.send()
+        if node.speaks and (info.is_pad or info.is_joystick):
+            code, value = next(iter(node.shown.items()), (next(iter(node.rels), 0), 0))
+            node.send((EV_ABS if node.shown else EV_REL, code, value))
         return node
 
 

@@ -86,6 +86,23 @@ def test_a_new_chunk_replaces_the_rest_from_its_first_time_on() -> None:
     bench.assert_within_limits()
 
 
+def test_plans_on_one_grid_may_differ_by_rounding() -> None:
+    """A step in the joint would be a wait and then a leap."""
+    bench = Bench()
+    start = bench.now
+    ramp = [[x + 0.1 * 0.1 * k * (i == 0) for i, x in enumerate(PANDA_HOME)] for k in range(20)]
+    send(bench, [start + 0.1 * k for k in range(20)], ramp)
+    bench.run(0.3)
+    later = [start + 0.6 + 0.1 * k + 1e-10 for k in range(10)]
+    send(bench, later, ramp[6:16])
+    speeds = []
+    for _ in range(round(0.6 / bench.dt)):
+        bench.tick()
+        speeds.append(bench.servo.report.dq_set[0])
+    assert min(speeds) > 0.08, "of 0.1 rad/s"
+    assert max(speeds) < 0.12
+
+
 def test_running_out_is_the_deadline() -> None:
     bench = Bench()
     times = [bench.now + 0.1 * k for k in range(6)]

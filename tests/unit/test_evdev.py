@@ -36,6 +36,7 @@ if sys.platform != "linux":
 
 from evdev_kit import AXES, MODELS, REST, ROOT, FakeInput, FakeNode, MakePad, pads_on, poll, poll_until
 
+from hal.drivers.evdev.node import lock
 from hal.drivers.evdev.pad import EvdevPad
 from hal.drivers.evdev.system import LinuxInput, NodeInfo
 
@@ -166,7 +167,7 @@ def test_events_become_readings(system: FakeInput, make_pad: MakePad) -> None:
     assert reading.connected
     assert reading.axes["left_y"] == 1.0
     assert reading.buttons == {"west"}
-    assert reading.seq == 8, "with the report that it made when it was opened"
+    assert reading.seq == 9, "with the report that it made when it was opened"
     assert not reading.unknown
 
 
@@ -205,6 +206,50 @@ def test_a_dead_man_that_was_held_while_the_pad_was_plugged_in_must_be_let_go_of
     node.send(full)
     pad.poll_once(time.monotonic())
     assert deadman.held, "let go of and pressed again"
+
+
+def test_the_xbox_button_alone_says_nothing_of_the_rest(system: FakeInput, make_pad: MakePad) -> None:
+    """xpad reports it in a packet of its own; the kernel shows every other control at rest then, whatever is held."""
+    node = system.plug(XBOX)
+    node.keys |= {KEY["BTN_MODE"]}
+    node.speaks = False
+    pad = Gamepad(make_pad())
+    pad.open(time.monotonic())
+    deadman = pad.hold("l2")
+    for value in (1, 0):
+        node.send((EV_KEY, KEY["BTN_MODE"], value))
+        pad.poll_once(time.monotonic())
+        assert pad.waiting_for, "nothing is known yet"
+    node.shown[ABS["ABS_Z"]] = 255
+    node.send((EV_ABS, ABS["ABS_Z"], 255))
+    pad.poll_once(time.monotonic())
+    assert not deadman.held, "it was held all the time"
+
+
+def test_a_device_is_taken_once(tmp_path: Path) -> None:
+    (tmp_path / "event3").touch()
+    with (tmp_path / "event3").open() as first, (tmp_path / "event3").open() as second:
+        assert lock(first.fileno())
+        assert not lock(second.fileno())
+        first.close()
+        assert lock(second.fileno())
+
+
+def test_two_gamepads_of_a_program_are_two_pads(make_pad: MakePad, system: FakeInput) -> None:
+    """One pad for two arms would be one hand on two dead-men; and an unplugged pad is not replaced by a neighbour's."""
+    first = system.plug(DS4, number=3)
+    system.plug(XBOX, number=6, uniq="cc:dd")
+    one, two = make_pad(), make_pad()
+    assert [poll(pad).connected for pad in (one, two)] == [True, True]
+    assert one.describe().endswith("event3)")
+    assert two.describe().endswith("event6)")
+    system.unplug(first)
+    end = time.monotonic() + 10.0
+    while not any("is taken" in note for note in one.notes):
+        assert time.monotonic() < end, one.notes
+        assert not poll(one).connected
+        assert poll(two).connected
+        time.sleep(0.01)
 
 
 def test_a_sony_pad_has_spoken_when_its_motion_sensor_did_twice(system: FakeInput, make_pad: MakePad) -> None:
@@ -292,7 +337,7 @@ def test_waiting_for_news_ends_with_news_or_with_the_plug(system: FakeInput, mak
     node = system.plug(DS4)
     pad = make_pad()
     node.send(*REST)
-    assert pad.poll(time.monotonic(), 60.0).seq == 6
+    assert pad.poll(time.monotonic(), 60.0).seq == 7
     system.unplug(node)
     assert not pad.poll(time.monotonic(), 60.0).connected
 
@@ -469,7 +514,9 @@ def test_the_options_name_the_pad(system: FakeInput, make_pad: MakePad) -> None:
     system.plug(DS4, number=3)
     system.plug(DS4._replace(name="The other one"), number=7, uniq="cc:dd")
     assert make_pad().describe().endswith("event3)")
-    assert make_pad(name="OTHER").describe().endswith("event7)")
+    other = make_pad(name="OTHER")
+    assert other.describe().endswith("event7)")
+    other.close()
     assert make_pad(device="/dev/input/event7").describe().endswith("event7)")
     missing = make_pad(device="/dev/input/event9")
     assert not poll(missing).connected
