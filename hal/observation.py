@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import TYPE_CHECKING
 
@@ -18,8 +18,11 @@ if TYPE_CHECKING:
 
 __all__ = ["Moment", "Observation", "Observer"]
 
+_NONE: Mapping[str, RobotState] = MappingProxyType({})
 _FRESH = 0.2
 """s; a picture that is older is waited for."""
+_NEXT = 0.02
+"""s that a state may be waited for that is as new as the newest picture."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -34,7 +37,9 @@ class Moment:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Observation:
-    """All of a rig."""
+    """All of a rig at one moment, ``t``: ``cameras`` by name, each with the states of its own stamp; ``robots`` and
+    ``grippers`` by the arm's name, interpolated to ``t``; ``history``, the last observations that were *asked for*.
+    """
 
     t: float
     """The stamp of the newest picture; without cameras, that of the newest state. s on ``rig.clock``."""
@@ -44,8 +49,11 @@ class Observation:
     grippers: Mapping[str, GripperState]
     """By the name of the arm, interpolated to ``t``."""
     history: tuple[Observation, ...] = field(default=())
-    """This one and those before it, oldest first: as many as were asked for. What was not there yet is the oldest one
-    again."""
+    """This one and those of the calls before, oldest first: as many as were asked for. What was not there yet is the
+    oldest one again."""
+
+    def __repr__(self) -> str:
+        return f"<Observation of {self.t:.3f} s: cameras {', '.join(self.cameras) or 'none'}; {', '.join(self.robots)}>"
 
 
 class Observer:
@@ -70,16 +78,20 @@ class Observer:
             there = ", ".join(self._rig.cameras) or "none"
             raise DeviceNotFound(f"this rig has no camera {', '.join(unknown)}; it has: {there}")
         frames = {name: self._frame(name, after, timeout) for name in names}
-        newest = max((frame.stamp.t for frame in frames.values()), default=None)
-        t = self._newest_state(after, timeout) if newest is None else newest
+        if frames:
+            t, known = max(frame.stamp.t for frame in frames.values()), _NONE
+            self._await_states(t)
+        else:
+            t, known = self._newest_states(after, timeout)
         moments = {name: Moment(frame, *self._states(frame.stamp.t)) for name, frame in frames.items()}
-        now = Observation(t, MappingProxyType(moments), *self._states(t))
+        seen = (t, MappingProxyType(moments), *self._states(t, known))
+        now = Observation(*seen)
         if self._past.maxlen != history - 1:
             self._past = deque(self._past, maxlen=history - 1)
         past = (*self._past, now)
         padded = (past[0],) * (history - len(past)) + past
         self._past.append(now)
-        return replace(now, history=padded)
+        return Observation(*seen, history=padded)
 
     def _frame(self, name: str, after: float | None, timeout: float) -> Frame:
         camera = self._rig.cameras[name]
@@ -90,20 +102,40 @@ class Observer:
         except StaleStateError:
             return camera.read(timeout)
 
-    def _newest_state(self, after: float | None, timeout: float) -> float:
-        """Time of the newest state of all arms, waiting for one that is not older than ``after``."""
+    def _await_states(self, t: float) -> None:
+        """A picture may be some ms newer than the newest state: wait for the next one, but not for long."""
+        if self._rig.lock_step:
+            return
+        deadline = self._rig.clock.now() + _NEXT
+        for robot in self._rig.robots.values():
+            while robot.state().stamp.t < t and self._rig.clock.now() < deadline:
+                self._rig.clock.sleep(0.0005)
+
+    def _newest_states(self, after: float | None, timeout: float) -> tuple[float, Mapping[str, RobotState]]:
+        """The newest states of all arms, waiting for ones that are not older than ``after``, and the oldest's time."""
         clock = self._rig.clock
         deadline = clock.now() + timeout
         while True:
-            stamps = [robot.state().stamp.t for robot in self._rig.robots.values()]
-            t = min(stamps, default=clock.now())
+            states = {robot.name: robot.state() for robot in self._rig.robots.values()}
+            t = min((state.stamp.t for state in states.values()), default=clock.now())
             if after is None or t >= after:
-                return t
+                return t, states
             if clock.now() > deadline:
                 raise StaleStateError(f"no state newer than {after:.3f} s came within {timeout:g} s")
             clock.sleep(0.001)
 
-    def _states(self, t: float) -> tuple[Mapping[str, RobotState], Mapping[str, GripperState]]:
-        robots = self._rig.robots.values()
-        grippers = {robot.name: robot.gripper.state_at(t) for robot in robots if robot.gripper is not None}
-        return MappingProxyType({robot.name: robot.state_at(t) for robot in robots}), MappingProxyType(grippers)
+    def _states(
+        self, t: float, known: Mapping[str, RobotState] = _NONE
+    ) -> tuple[Mapping[str, RobotState], Mapping[str, GripperState]]:
+        """Those of ``t``. The newest ones are mostly just these, and need no search in what is kept."""
+        robots: dict[str, RobotState] = {}
+        grippers: dict[str, GripperState] = {}
+        for robot in self._rig.robots.values():
+            state = known.get(robot.name)
+            robots[robot.name] = state if state is not None and state.stamp.t == t else robot.state_at(t)
+            if robot.gripper is not None:
+                grip = robot.gripper.newest()
+                if grip is None or grip.stamp.t != t:
+                    grip = robot.gripper.state_at(t)
+                grippers[robot.name] = grip
+        return MappingProxyType(robots), MappingProxyType(grippers)

@@ -267,6 +267,11 @@ class Rig:
         return self.attended and all(robot.emulated for robot in self.plan.robots if robot.attended)
 
     @property
+    def has_world(self) -> bool:
+        """Is there a simulated world, ``rig.world``?"""
+        return isinstance(self.world, World)
+
+    @property
     def _local(self) -> LocalHost:
         host = self._hosts[0]
         if not isinstance(host, LocalHost):

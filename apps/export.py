@@ -1,0 +1,125 @@
+"""Write a recording in a form that other programs train on: robomimic, diffusion policy, or plain .npz files.
+
+python apps/export.py data/demo --to robomimic
+python apps/export.py data/demo --to zarr --resize 96x96 --successful-only
+python apps/export.py data/demo --to npz --episodes 0,3-5
+"""
+
+from __future__ import annotations
+
+import argparse
+import re
+import sys
+import time
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+from hal.apps.cli import run_app
+
+if TYPE_CHECKING:
+    from hal.recording.exporters import Progress
+
+__all__ = ["main", "parser"]
+
+_OFTEN = 0.1
+"""s between two words about how far it is, on a terminal."""
+
+
+def parser() -> argparse.ArgumentParser:
+    """The command line."""
+    made = argparse.ArgumentParser(
+        prog="export",
+        description="Write a recording in a form that other programs train on. The recording itself is only read; "
+        "LeRobot trains on it as it is.",
+        epilog="What is written appears when it is whole. The exit status is 0 then, else 2.",
+    )
+    made.add_argument("dataset", metavar="DATASET", help="the folder of a recording")
+    made.add_argument(
+        "--to",
+        dest="kind",
+        required=True,
+        choices=("robomimic", "zarr", "npz"),
+        help="robomimic: one HDF5 file; zarr: as diffusion policy's replay buffer; npz: one .npz per episode",
+    )
+    made.add_argument("--out", metavar="PATH", help="where it goes (beside the dataset)")
+    made.add_argument("--force", action="store_true", help="overwrite such an export that is there")
+    what = made.add_argument_group("what is taken along")
+    what.add_argument("--episodes", metavar="0,3-5", help="these only")
+    what.add_argument("--successful-only", action="store_true", help="only those that were marked a success")
+    what.add_argument("--cameras", metavar="A,B", help="these only, or none")
+    what.add_argument("--no-depth", dest="depth", action="store_false", help="leave depth out")
+    what.add_argument("--resize", metavar="WxH", help="crop pictures to this shape about their middle, and scale them")
+    names = made.add_argument_group("for --to npz")
+    names.add_argument("--camera", metavar="NAME", help="which one is called camera (the first that no arm carries)")
+    names.add_argument("--gripper-camera", metavar="NAME", help="and gripper_camera (the first that an arm carries)")
+    split = made.add_argument_group("for --to robomimic")
+    split.add_argument(
+        "--valid", type=float, default=0.1, metavar="SHARE", help="share of episodes to validate with (%(default)s)"
+    )
+    return made
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Entry point."""
+    return run_app(_main, parser().parse_args(argv))
+
+
+def _main(args: argparse.Namespace) -> int:
+    from hal.recording.exporters import export
+
+    made = export(
+        args.dataset,
+        args.kind,
+        args.out,
+        episodes=args.episodes,
+        successful_only=args.successful_only,
+        cameras=_names(args.cameras),
+        depth=args.depth,
+        size=_size(args.resize),
+        camera=args.camera,
+        gripper_camera=args.gripper_camera,
+        valid=args.valid,
+        force=args.force,
+        progress=_shown() if sys.stderr.isatty() else None,
+    )
+    for note in made.notes:
+        print(f"note: {note}")
+    many = f"{made.episodes} episode{'' if made.episodes == 1 else 's'}"
+    print(f"wrote {made.path}: {many}, {made.rows} rows, {made.size / 1e6:.1f} MB")
+    return 0
+
+
+def _names(text: str | None) -> list[str] | None:
+    if text is None:
+        return None
+    return [] if text == "none" else [name.strip() for name in text.split(",")]
+
+
+def _size(text: str | None) -> tuple[int, int] | None:
+    from hal.errors import CommandError
+
+    if text is None:
+        return None
+    match = re.fullmatch(r"(\d+)x(\d+)", text)
+    if match is None:
+        raise CommandError(f"--resize takes a width and a height, such as 96x96, not {text!r}")
+    return int(match[1]), int(match[2])
+
+
+def _shown() -> Callable[[Progress], None]:
+    """Says how far it is, in one line of the terminal."""
+    last = 0.0
+
+    def show(progress: Progress) -> None:
+        nonlocal last
+        now = time.monotonic()
+        if now - last > _OFTEN or progress.share >= 1.0:
+            last = now
+            end = "\n" if progress.share >= 1.0 else ""
+            print(f"\r{100 * progress.share:3.0f} %  episode {progress.episode}", end=end, file=sys.stderr, flush=True)
+
+    return show
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,140 @@
+"""Look at what was recorded: a dataset in numbers, an episode as a picture or for the rerun viewer.
+
+python apps/review.py data/demo
+python apps/review.py data/demo --episode 3
+python apps/review.py data/demo --episode 3 --rrd look.rrd
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from hal.apps.cli import ACTION_NEEDED, run_app
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from hal.recording.exporters.summary import Spread, Summary
+    from hal.recording.reader import Episode
+
+__all__ = ["main", "parser"]
+
+_MARK = {True: "success", False: "failure", None: "-"}
+
+
+def parser() -> argparse.ArgumentParser:
+    """The command line."""
+    made = argparse.ArgumentParser(
+        prog="review",
+        description="Look at what was recorded: a dataset in numbers, an episode as a picture or for the rerun viewer.",
+        epilog="The dataset is only read. The exit status is 2 when an episode of it cannot be read, else 0.",
+    )
+    made.add_argument("dataset", metavar="DATASET", help="the folder of a recording")
+    made.add_argument(
+        "--episode", type=int, metavar="N", help="only this one, and draw it: pictures in time, joints, gripper, stops"
+    )
+    made.add_argument("--png", metavar="FILE", help="where the picture goes (beside the dataset)")
+    made.add_argument(
+        "--rrd", metavar="FILE", help="write a file for the rerun viewer instead; needs the extra [review]"
+    )
+    made.add_argument("--json", action="store_true", help="print the numbers as one JSON object")
+    made.add_argument("--force", action="store_true", help="overwrite a picture or .rrd that is there")
+    return made
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Entry point."""
+    return run_app(_main, parser().parse_args(argv))
+
+
+def _main(args: argparse.Namespace) -> int:
+    from hal.errors import CommandError
+    from hal.recording import Dataset
+    from hal.recording.exporters.selection import chosen
+    from hal.recording.exporters.summary import as_json, summary
+
+    dataset = Dataset(args.dataset)
+    if args.episode is None:
+        if args.png or args.rrd:
+            raise CommandError("--png and --rrd show one episode: say which with --episode N")
+        found = summary(dataset)
+    else:
+        (episode,) = chosen(dataset, [args.episode], successful_only=False)
+        found = summary(dataset, [episode])
+    print(as_json(found) if args.json else "\n".join(_table(found)))
+    if args.episode is not None and not found.broken:
+        for path in _drawn(args, dataset.root, episode):
+            print(f"wrote {path}", file=sys.stderr if args.json else sys.stdout)
+    return ACTION_NEEDED if found.broken else 0
+
+
+def _drawn(args: argparse.Namespace, root: Path, episode: Episode) -> Iterator[Path]:
+    """Write what shows the episode; where that is."""
+    from hal.recording.exporters.output import fresh
+
+    if args.rrd:
+        from hal.recording.exporters.rrd import write_rrd
+
+        path = Path(args.rrd).expanduser().absolute()
+        with fresh(path, force=args.force, is_ours=Path.is_file) as new:
+            write_rrd(episode, new)
+        yield path
+    if args.png or not args.rrd:
+        from hal.recording.exporters.sheet import draw_sheet
+
+        beside = root.with_name(f"{root.name}_episode_{episode.number:06d}.png")
+        path = Path(args.png or beside).expanduser().absolute()
+        with fresh(path, force=args.force, is_ours=Path.is_file) as new:
+            draw_sheet(episode).save(new, format="png")
+        yield path
+
+
+def _table(found: Summary) -> Iterator[str]:
+    """The numbers, line by line."""
+    count = len(found.episodes)
+    many = f"{count} episode{'' if count == 1 else 's'}"
+    yield f"{found.path}: {many} of {found.robot_type}, {found.rows} rows at {found.fps} Hz, {found.seconds:.1f} s"
+    marked = found.successes + found.failures
+    share = f" ({100 * found.successes / marked:.0f} % of those marked)" if marked else ""
+    yield f"{found.successes} succeeded{share}, {found.failures} failed, {found.unmarked} not marked"
+    yield f"{found.dropped} rows dropped; the whole dataset takes {_size(found.bytes)}"
+    yield ""
+    yield f"{'episode':>7}  {'rows':>6}  {'seconds':>7}  {'mark':8}  {'dropped':>7}  {'stops':>5}  task"
+    for line in found.episodes:
+        end = f"{line.dropped:7d}  {line.trips:5d}  {line.task}" + (f"  [{line.trouble}]" if line.trouble else "")
+        yield f"{line.number:7d}  {line.rows:6d}  {line.seconds:7.2f}  {_MARK[line.success]:8}  {end}"
+    yield from (f"cannot be read: {line}" for line in found.broken)
+    if not found.episodes:
+        return
+    width = max(len(each.name) for each in found.state)
+    yield ""
+    heads = " ".join(f"{head:>8}" for head in ("min", "max", "mean", "std"))
+    yield f"{'':{width}}  {'measured: observation.state':39}{'commanded: action'}"
+    yield f"{'rad, gripper m':{width}}  {heads}    {heads}"
+    for state, action in zip(found.state, found.action, strict=True):
+        yield f"{state.name:{width}}  {_numbers(state)}    {_numbers(action)}"
+    yield ""
+    width = max(len(each.source) for each in found.timing)
+    yield f"{'times, ms':{width}}  {'period':>8} {'jitter':>8} {'longest':>8} {'age':>8} {'oldest':>8}  repeated"
+    for each in found.timing:
+        values = (each.period, each.jitter, each.longest, each.age, each.oldest)
+        yield f"{each.source:{width}}  {' '.join(f'{value:8.2f}' for value in values)}  {each.repeated:8d}"
+
+
+def _numbers(spread: Spread) -> str:
+    return " ".join(f"{value:8.4f}" for value in (spread.min, spread.max, spread.mean, spread.std))
+
+
+def _size(count: float) -> str:
+    for unit in ("bytes", "kB", "MB"):
+        if count < 1000:
+            return f"{count:.3g} {unit}"
+        count /= 1000
+    return f"{count:.3g} GB"
+
+
+if __name__ == "__main__":
+    sys.exit(main())

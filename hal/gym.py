@@ -1,0 +1,298 @@
+"""A rig as a Gymnasium environment: the same file on the simulated and on the real arm.
+
+    from hal.gym import RigEnv
+
+    env = RigEnv("panda_table", action="twist", rate_hz=20)
+    observation, info = env.reset(seed=1)
+    observation, reward, terminated, truncated, info = env.step(env.action_space.sample())
+
+Simulated rigs run in lock-step, as fast as the machine can; real ones in real time, under the same dead-man, limits and
+watchdog as a person with a pad. Needs ``pip install 'robot-hal[gym]'``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Mapping
+from pathlib import Path
+from typing import Any, Literal
+
+import gymnasium
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from .command_checks import FIRST_STEP_ANGLE
+from .commands import CartesianTarget, Command, JointTarget, Twist
+from .control import Control
+from .deadman import Deadman
+from .errors import CommandError, MotionStopped, NotSupported
+from .observation import Observation
+from .pose import Pose
+from .quaternion import after_rotation
+from .rig import Rig, open_rig
+from .robot import Robot
+
+__all__ = ["Action", "RigEnv"]
+
+Action = Literal["joint", "tcp_delta", "twist"]
+"""``joint``: positions (n,), rad; farther than 0.1 rad from the set-point they are cut to that, and
+``info["clipped"]`` says so. ``tcp_delta``: by how much the tcp's goal moves (m) and turns (rotation vector, rad)
+in this step, along the base's axes. ``twist``: speed of the tcp, m/s and rad/s, along the base's axes. With a gripper
+one more number follows, 0 (open) to 1 (closed)."""
+
+Spaces = dict[str, NDArray[Any]]
+Result = tuple[Spaces, dict[str, Any]]
+
+
+_LEAD = (0.03, 0.12)
+"""A goal that is ahead of the set-point by more is given up, m and rad."""
+_FARTHEST = 0.999 * FIRST_STEP_ANGLE  # what rounds to more would be refused
+
+
+class RigEnv(gymnasium.Env[Spaces, NDArray[np.float32]]):
+    """One arm of a rig, its gripper and its cameras.
+
+    Observations are a dict: ``q`` and ``dq`` (n,), rad and rad/s; ``tcp`` (7,), position in m and quaternion xyzw in
+    the arm's base frame; ``gripper`` (1,), width in m; per camera ``<name>.color`` (H, W, 3) uint8 and, where it
+    streams depth, ``<name>.depth`` (H, W, 1) float32 in m. :attr:`observation` is the whole record behind it, with
+    every stamp; ``info["elapsed"]`` is its time since the reset, s.
+
+    ``step`` sends the action, lets one period pass and waits for an observation that was taken after that: none is ever
+    handed out twice. When the arm is stopped (a released dead-man is no stop), the episode is truncated and
+    ``info["stopped"]`` says why.
+    """
+
+    metadata = {"render_modes": ["rgb_array"]}  # noqa: RUF012  # Gymnasium's own name and type
+
+    def __init__(
+        self,
+        config: str | Path | Mapping[str, Any] = "panda_table",
+        *,
+        sim: bool | None = None,
+        driver: str | None = None,
+        robot: str | None = None,
+        action: Action = "joint",
+        cameras: Collection[str] | None = None,
+        rate_hz: float = 20.0,
+        max_steps: int | None = None,
+        speeds: tuple[float, float] = (0.25, 1.0),
+        reward: Callable[[RigEnv, Observation], float] | None = None,
+        terminated: Callable[[RigEnv, Observation], bool] | None = None,
+        on_reset: Callable[[RigEnv, dict[str, Any]], None] | None = None,
+        deadman: Callable[[Rig], Deadman] | None = None,
+        unattended: bool = False,
+        overrides: tuple[str, ...] = (),
+        render_mode: str | None = None,
+    ) -> None:
+        """``speeds`` are the greatest of the tcp in ``twist`` and, per step, in ``tcp_delta``: m/s and rad/s.
+
+        ``on_reset(env, options)`` runs after the reset and before the first observation: where a person puts things
+        back on a real bench, or a task moves objects with ``env.rig.world`` and ``env.np_random``. ``deadman`` is made
+        from the open rig, for example ``lambda rig: rig.gamepads["pad"].hold("l2")``; something that really moves needs
+        it, or ``unattended=True``.
+        """
+        if render_mode not in (None, "rgb_array"):
+            raise NotSupported(f"render_mode {render_mode!r}: there is rgb_array, the first camera's picture")
+        self.render_mode = render_mode
+        self._reward, self._terminated, self._on_reset = reward, terminated, on_reset
+        self._kind, self._rate, self._max_steps, self._speeds = action, rate_hz, max_steps, speeds
+        self._unattended = unattended
+        self.rig = self._open(config, sim, driver, overrides, deadman is not None)
+        try:
+            self.robot: Robot = self.rig.robots[robot] if robot else next(iter(self.rig.robots.values()))
+            self._lower, self._upper = np.array(self.robot.limits.lower), np.array(self.robot.limits.upper)
+            self._deadman = deadman(self.rig) if deadman is not None else None
+            self._cameras = tuple(self.rig.cameras) if cameras is None else tuple(cameras)
+            self.action_space: spaces.Box = self._action_space()  # type: ignore[assignment]  # invariant in its type
+            self.observation_space: spaces.Dict = self._observation_space()  # type: ignore[assignment]
+        except BaseException:
+            self.rig.close()
+            raise
+        self._control: Control | None = None
+        self._goal = Pose()
+        self._steps = 0
+        self._due = 0.0
+        self._start = 0.0
+        self._clipped = False
+        self.observation: Observation | None = None
+        """The whole record behind the newest observation."""
+
+    @staticmethod
+    def _open(
+        config: str | Path | Mapping[str, Any],
+        sim: bool | None,
+        driver: str | None,
+        overrides: tuple[str, ...],
+        pads: bool,
+    ) -> Rig:
+        from .config import load
+
+        plan = load(config, sim=sim, driver=driver, overrides=overrides).resolve()
+        attended = any(arm.attended for arm in plan.robots)
+        clock = None if attended or pads else "lock_step"
+        return open_rig(config, sim=sim, driver=driver, overrides=overrides, clock=clock, pad=None if pads else "none")
+
+    # Spaces.
+
+    def _action_space(self) -> spaces.Box:
+        limits, (linear, angular) = self.robot.limits, self._speeds
+        if self._kind == "joint":
+            low, high = list(limits.lower), list(limits.upper)
+        elif self._kind in ("tcp_delta", "twist"):
+            share = 1.0 / self._rate if self._kind == "tcp_delta" else 1.0
+            high = [linear * share] * 3 + [angular * share] * 3
+            low = [-value for value in high]
+        else:
+            raise CommandError(f"action must be joint, tcp_delta or twist, not {self._kind!r}")
+        if self.robot.gripper is not None:
+            low, high = [*low, 0.0], [*high, 1.0]
+        return spaces.Box(np.array(low, np.float32), np.array(high, np.float32), dtype=np.float32)
+
+    def _observation_space(self) -> spaces.Dict:
+        robot, n = self.robot, self.robot.n
+
+        def free(size: int) -> spaces.Box:
+            return spaces.Box(-np.inf, np.inf, (size,), np.float64)
+
+        parts: dict[str, spaces.Space[Any]] = {"q": free(n), "dq": free(n), "tcp": free(7)}
+        if robot.gripper is not None:
+            parts["gripper"] = free(1)
+        for name in self._cameras:
+            spec = self.rig.cameras[name].spec
+            if "color" in spec.streams:
+                parts[f"{name}.color"] = spaces.Box(0, 255, (spec.height, spec.width, 3), np.uint8)
+            if "depth" in spec.streams:
+                parts[f"{name}.depth"] = spaces.Box(0.0, spec.depth_max, (spec.height, spec.width, 1), np.float32)
+        return spaces.Dict(parts)
+
+    # An episode.
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Result:
+        """Everything back to where the rig says that it starts; a real arm drives home.
+
+        ``options``: ``q`` (n,) to start from, rad; ``poses``, name of an object -> :class:`~hal.pose.Pose`.
+        """
+        super().reset(seed=seed)
+        options = options or {}
+        self._end()
+        self.rig.rearm()
+        q = np.asarray(options.get("q", self.robot.spec.initial), float)
+        if self.rig.has_world:
+            self.rig.world.reset()
+            for name, pose in dict(options.get("poses", {})).items():
+                self.rig.world.reset(name, pose=pose)
+        if self.rig.plan.world is not None and self.robot.spec.driver == self.rig.plan.world.driver:
+            self.rig.world.reset(self.robot.name, q=q)
+        else:  # a real arm may have a simulated world beside it
+            self.robot.move_to(q, deadman=self._deadman, unattended=self._unattended)
+            if self.robot.gripper is not None:
+                self.robot.gripper.open()
+        if self._on_reset is not None:
+            self._on_reset(self, options)
+        self._begin()
+        self.rig.forget_observations()
+        observation = self.rig.observe(after=self.rig.clock.now(), cameras=self._cameras)
+        self._goal = observation.robots[self.robot.name].tcp_set
+        self._steps = 0
+        self._clipped = False
+        self._due = self.rig.clock.now()
+        self._start = observation.t
+        return self._shown(observation), self._info(observation)
+
+    def _begin(self) -> None:
+        control = self.robot.control(deadman=self._deadman, rate_hz=self._rate, unattended=self._unattended)
+        self._control = control.__enter__()
+
+    def _end(self) -> None:
+        control, self._control = self._control, None
+        if control is not None:
+            control.close()
+
+    def step(self, action: NDArray[np.float32]) -> tuple[Spaces, float, bool, bool, dict[str, Any]]:
+        """One period; ``action`` as the action space says."""
+        if self._control is None:
+            raise CommandError("call reset before step")
+        command, grip = self._command(np.asarray(action, float))
+        clock = self.rig.clock
+        stopped = ""
+        try:
+            self._control.send(command, gripper=grip)
+        except MotionStopped as stop:
+            stopped = str(stop)
+        now = clock.now()
+        self._due = max(self._due + 1.0 / self._rate, now)  # a turn that came late is not caught up
+        clock.sleep_until(self._due)
+        observation = self.rig.observe(after=self._fresh_from(now), cameras=self._cameras)
+        self._steps += 1
+        terminated = self._terminated is not None and bool(self._terminated(self, observation))
+        truncated = bool(stopped) or (self._max_steps is not None and self._steps >= self._max_steps)
+        info = self._info(observation)
+        if stopped:
+            info["stopped"] = stopped
+        reward = float(self._reward(self, observation)) if self._reward is not None else 0.0
+        return self._shown(observation), reward, terminated, truncated, info
+
+    def _fresh_from(self, sent: float) -> float | None:
+        """A picture that may be handed out is no older than this: later than the action, and as new as its camera's
+        rate lets it be. None in lock-step, where every picture shows the present."""
+        if self.rig.lock_step:
+            return None
+        slowest = min((self.rig.cameras[name].spec.rate_hz for name in self._cameras), default=np.inf)
+        return max(float(np.nextafter(sent, np.inf)), self._due - 1.0 / slowest)
+
+    def _command(self, action: NDArray[np.float64]) -> tuple[Command, float | None]:
+        if action.shape != self.action_space.shape:
+            raise CommandError(f"an action has shape {self.action_space.shape}, not {action.shape}")
+        grip = min(max(float(action[-1]), 0.0), 1.0) if self.robot.gripper is not None else None
+        numbers = action if grip is None else action[:-1]
+        if self._kind == "joint":
+            q_set = self.robot.state().q_set
+            q = np.minimum(np.maximum(numbers, q_set - _FARTHEST), q_set + _FARTHEST)
+            q = np.minimum(np.maximum(q, self._lower), self._upper)
+            self._clipped = bool((q != numbers).any())
+            return JointTarget(q), grip
+        if self._kind == "twist":
+            return Twist(numbers[:3], numbers[3:]), grip
+        reached = self.robot.state().tcp_set
+        distance, turn = reached.distance(self._goal)
+        if distance > _LEAD[0] or turn > _LEAD[1]:  # the arm was held back: no goal runs away from it
+            self._goal = reached
+        turned = after_rotation(self._goal.orientation.tolist(), numbers[3:].tolist())
+        self._goal = Pose(self._goal.position + numbers[:3], turned)
+        return CartesianTarget(self._goal), grip
+
+    def _shown(self, observation: Observation) -> Spaces:
+        self.observation = observation
+        state = observation.robots[self.robot.name]
+        shown: Spaces = {
+            "q": np.array(state.q),
+            "dq": np.array(state.dq),
+            "tcp": np.concatenate([state.tcp.position, state.tcp.orientation]),
+        }
+        if self.robot.gripper is not None:
+            shown["gripper"] = np.array([observation.grippers[self.robot.name].width])
+        for name in self._cameras:
+            frame = observation.cameras[name].frame
+            if frame.color is not None:
+                shown[f"{name}.color"] = frame.color
+            if frame.depth is not None:
+                shown[f"{name}.depth"] = frame.depth[..., None]
+        return shown
+
+    def _info(self, observation: Observation) -> dict[str, Any]:
+        info: dict[str, Any] = {"elapsed": round(observation.t - self._start, 6)}
+        return info | {"clipped": True} if self._clipped else info
+
+    def render(self) -> NDArray[np.uint8] | None:
+        """The first camera's newest picture."""
+        if self.observation is None or not self._cameras:
+            return None
+        color = self.observation.cameras[self._cameras[0]].frame.color
+        return None if color is None else np.array(color)
+
+    def close(self) -> None:
+        """Bring the arm to rest and close the rig. Idempotent."""
+        try:
+            self._end()
+        finally:
+            self.rig.close()

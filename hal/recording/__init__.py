@@ -1,0 +1,48 @@
+"""Demonstrations on disk: a crash-safe recorder, what repairs after a crash, and a reader.
+
+    from hal.recording import Dataset, Recorder, recover
+
+    recorder = Recorder(rig, out="data/demo", fps=30, task="lift the cube")
+    recorder.start(seed=1)
+    ...                                    # drive; the recorder looks on
+    recorder.save(success=True)
+    recorder.close()
+
+    for episode in Dataset("data/demo").episodes:
+        print(episode.length, episode.columns["action"].shape)
+
+What lies on disk is a LeRobotDataset v3.0, with lossless depth, the true time stamps and the rig's whole configuration
+beside it (docs/record.md). Needs ``pip install 'robot-hal[record]'``; importing this package does not.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from .reader import Dataset, Episode
+    from .recorder import Recorder, RecorderStatus
+    from .recovery import recover
+
+__all__ = ["Dataset", "Episode", "Recorder", "RecorderStatus", "recover"]
+
+_HOME = {
+    "Dataset": "reader",
+    "Episode": "reader",
+    "Recorder": "recorder",
+    "RecorderStatus": "recorder",
+    "recover": "recovery",
+}
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOME:
+        raise AttributeError(f"module 'hal.recording' has no attribute {name!r}")
+    value = getattr(import_module(f".{_HOME[name]}", __name__), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)

@@ -1,0 +1,96 @@
+"""The columns of a recording: one row of plain numbers per grid time, and how a dataset announces them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+__all__ = [
+    "ACTION",
+    "BOOKKEEPING",
+    "GRID",
+    "SETPOINT",
+    "STATE",
+    "TIMES",
+    "Column",
+    "CameraSetup",
+    "features_of",
+    "video_key",
+]
+
+STATE = "observation.state"
+SETPOINT = "observation.setpoint"
+ACTION = "action"
+TIMES = "observation.time."
+"""What stands first in these columns is a time, s: on the rig's clock while it is recorded, in the dataset since the
+episode's first row."""
+GRID = f"{TIMES}grid"
+
+BOOKKEEPING: dict[str, str] = {
+    "timestamp": "float32",
+    "frame_index": "int64",
+    "episode_index": "int64",
+    "index": "int64",
+    "task_index": "int64",
+}
+"""Columns that every LeRobotDataset has, with their types."""
+
+
+class Column(NamedTuple):
+    """One column of the dataset: ``len(names)`` numbers in every row."""
+
+    key: str
+    dtype: str
+    """``float32``, ``float64`` or ``int64``, on disk; while a row is on its way, every number is a double."""
+    names: tuple[str, ...]
+
+    @property
+    def feature(self) -> dict[str, Any]:
+        """As ``meta/info.json`` says it."""
+        return {"dtype": self.dtype, "shape": [len(self.names)], "names": list(self.names)}
+
+
+class CameraSetup(NamedTuple):
+    """How the pictures of one camera are kept."""
+
+    name: str
+    width: int
+    height: int
+    color: bool
+    depth_unit: float | None
+    """Metres in one unit of the stored depth; None where no depth is kept."""
+    depth_lossless: bool
+    """Does the camera itself measure in that unit?"""
+    seq: int
+    """Which number of a row counts this camera's frames."""
+
+
+def video_key(camera: str) -> str:
+    """The dataset's key of a camera's video."""
+    return f"observation.images.{camera}"
+
+
+def features_of(
+    columns: Sequence[Column], cameras: Sequence[CameraSetup], fps: int, video: dict[str, Any]
+) -> dict[str, dict[str, Any]]:
+    """``features`` of ``meta/info.json``; ``video`` is what the encoder says of itself."""
+    found = {column.key: column.feature for column in columns}
+    features = {STATE: found.pop(STATE), ACTION: {**found[SETPOINT]}, **found}
+    for camera in cameras:
+        if camera.color:
+            features[video_key(camera.name)] = {
+                "dtype": "video",
+                "shape": [camera.height, camera.width, 3],
+                "names": ["height", "width", "channels"],
+                "info": {
+                    "video.height": camera.height,
+                    "video.width": camera.width,
+                    **video,
+                    "video.is_depth_map": False,
+                    "video.fps": fps,
+                    "video.channels": 3,
+                    "has_audio": False,
+                },
+            }
+    features |= {key: {"dtype": dtype, "shape": [1], "names": None} for key, dtype in BOOKKEEPING.items()}
+    return features

@@ -1,0 +1,143 @@
+"""Depth pictures in a file of their own, without loss: zstd over differences of neighbours, low and high bytes apart.
+
+A file is one line of JSON (size, unit), then a record per row of the episode: length and checksum of what follows, and
+that. A record of no length says that the row shows the same picture as the one before. Records are appended and flushed
+one by one, so a program that is killed leaves whole ones, and at most half of one, which is cut off.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import struct
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+from zlib import crc32
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["DepthFile", "DepthReader", "to_units", "unit_for"]
+
+_RECORD = struct.Struct("<II")  # length, checksum
+_LEVEL = 1
+_MOST = 65535
+_UNITS = (0.0001, 0.00025, 0.0005, 0.001, 0.002, 0.005, 0.01)
+
+Units = NDArray[np.uint16]
+
+
+def unit_for(depth_max: float) -> float:
+    """The finest unit, in m, in which 16 bits reach as far as a simulated camera sees."""
+    return next((unit for unit in _UNITS if depth_max <= _MOST * unit), depth_max / _MOST)
+
+
+def to_units(depth: NDArray[np.float32], unit: float) -> Units:
+    """Metres in whole units, rounded to the nearest one; 0 for what was not measured, or does not fit."""
+    whole = np.rint(depth / np.float32(unit))
+    whole[~((whole >= 0.0) & (whole <= _MOST))] = 0.0  # what is not a number, too
+    units: Units = whole.astype("<u2")
+    return units
+
+
+class DepthFile:
+    """Appends pictures to an open, unbuffered file."""
+
+    def __init__(self, file: io.RawIOBase, width: int, height: int, unit: float) -> None:
+        import zstandard
+
+        self._compressor = zstandard.ZstdCompressor(level=_LEVEL)
+        self._file = file
+        head = {"format": "delta, byte shuffle, zstd", "width": width, "height": height, "unit_m": unit}
+        _write(file, json.dumps(head).encode() + b"\n")
+        self._unit = unit
+
+    def add(self, depth: NDArray[np.float32] | None) -> None:
+        """One row's picture (H, W) in m; None for the same one again."""
+        payload = b"" if depth is None else self._compressor.compress(_shuffled(to_units(depth, self._unit)))
+        _write(self._file, _RECORD.pack(len(payload), crc32(payload)) + payload)
+
+
+class DepthReader:
+    """The whole records of a file; reads them one by one."""
+
+    def __init__(self, path: str | Path) -> None:
+        self.path = Path(path)
+        with self.path.open("rb") as file:
+            head: dict[str, Any] = json.loads(file.readline())
+            self.shape = (int(head["height"]), int(head["width"]))
+            self.unit = float(head["unit_m"])
+            self._places = list(_records(file, self.path.stat().st_size))
+
+    def __len__(self) -> int:
+        return len(self._places)
+
+    def end_of(self, count: int) -> int:
+        """Where the first ``count`` records end in the file, bytes."""
+        if count == 0:
+            with self.path.open("rb") as file:
+                return len(file.readline())
+        start, length = self._places[count - 1]
+        return start + length
+
+    def units(self) -> Iterator[Units]:
+        """Every row's picture (H, W), in units of :attr:`unit` m."""
+        import zstandard
+
+        expand = zstandard.ZstdDecompressor()
+        picture = np.zeros(self.shape, "<u2")
+        with self.path.open("rb") as file:
+            for start, length in self._places:
+                if length:
+                    file.seek(start)
+                    picture = _unshuffled(expand.decompress(file.read(length)), self.shape)
+                yield picture
+
+    def __iter__(self) -> Iterator[NDArray[np.float32]]:
+        """Every row's picture (H, W) in m; 0 where nothing was measured."""
+        unit = np.float32(self.unit)
+        return (units.astype(np.float32) * unit for units in self.units())
+
+
+def _records(file: io.BufferedReader, size: int) -> Iterator[tuple[int, int]]:
+    """Start and length of each whole record, from where the file stands."""
+    while True:
+        head = file.read(_RECORD.size)
+        if len(head) < _RECORD.size:
+            return
+        length, check = _RECORD.unpack(head)
+        start = file.tell()
+        if start + length > size:
+            return
+        last = start + length == size
+        if last and crc32(file.read(length)) != check:
+            return
+        file.seek(start + length)
+        yield start, length
+
+
+def _shuffled(units: Units) -> bytes:
+    steps = units.copy()
+    steps[:, 1:] -= units[:, :-1]
+    return np.ascontiguousarray(steps.view(np.uint8).reshape(-1, 2).T).tobytes()
+
+
+def _unshuffled(data: bytes, shape: tuple[int, int]) -> Units:
+    steps = np.ascontiguousarray(np.frombuffer(data, np.uint8).reshape(2, -1).T).view("<u2").reshape(shape)
+    units: Units = np.cumsum(steps, axis=1, dtype=np.uint16)
+    return units
+
+
+def _write(file: io.RawIOBase, data: bytes) -> None:
+    """All of it: an unbuffered file may take only a part. OSError when the disk is full."""
+    rest = memoryview(data)
+    while rest:
+        written = file.write(rest)
+        rest = rest[written or 0 :]
+
+
+def cut(path: Path, count: int) -> None:
+    """Leave the first ``count`` records."""
+    os.truncate(path, DepthReader(path).end_of(count))

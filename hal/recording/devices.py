@@ -1,0 +1,43 @@
+"""Which devices of a rig are recorded, and whether they can be."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from typing import TYPE_CHECKING
+
+from ..errors import CommandError
+from .cameras import CameraTrack
+from .columns import TIMES
+from .sampling import Sampler
+
+if TYPE_CHECKING:
+    from ..rig import Rig
+
+__all__ = ["chosen"]
+
+
+def chosen(rig: Rig, cameras: Collection[str] | None, depth: bool) -> tuple[Sampler, list[CameraTrack], list[str]]:
+    """Every arm and pad, and the cameras of these names, else all; and what a person should know of it.
+
+    Raises CommandError for what cannot be recorded, DeviceNotFound, StaleStateError, ConnectionLost.
+    """
+    if not rig.robots:
+        raise CommandError("this rig has no arm to record")
+    names = tuple(rig.cameras) if cameras is None else tuple(cameras)
+    tracks, notes = [], []
+    for name in names:
+        track = CameraTrack(rig.cameras[name], depth=depth, lock_step=rig.lock_step)
+        setup = track.setup
+        if setup.color and (setup.width % 2 or setup.height % 2):
+            size = f"{setup.width}x{setup.height}"
+            raise CommandError(f"a video has even sizes: change cameras.{name}.output, which is {size}")
+        if setup.color or setup.depth_unit is not None:
+            tracks.append(track)
+        streams = rig.cameras[name].spec.streams
+        if left := [stream for stream in streams if stream not in ("color", "depth")]:
+            notes.append(f"camera {name}: {', '.join(left)} not recorded")
+    sampler = Sampler(rig, [track.camera.name for track in tracks])
+    for track in tracks:
+        seq = sampler.place_of(f"{TIMES}camera.{track.camera.name}") + 2
+        track.setup = track.setup._replace(seq=seq)
+    return sampler, tracks, notes

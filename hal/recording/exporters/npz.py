@@ -1,0 +1,92 @@
+"""A folder with one ``.npz`` per episode: plain arrays that ``numpy.load`` reads without pickle.
+
+The names are those of the tutorial that people come from; beside them stands every column of the dataset under its own
+key, so nothing of the numbers is lost.
+"""
+
+from __future__ import annotations
+
+import json
+import zipfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...errors import CommandError
+from ..columns import ACTION
+from .content import EpisodeContent
+from .job import Job
+from .roles import roles
+
+__all__ = ["is_one", "write"]
+
+_ABOUT = "export.json"
+_LEVEL = 1  # higher ones take far longer and save little
+
+
+def is_one(path: Path) -> bool:
+    """Was this folder written here?"""
+    return path.is_dir() and (path / _ABOUT).is_file()
+
+
+def write(job: Job, path: Path) -> None:
+    """Make the folder."""
+    path.mkdir()
+    files = []
+    for content in job.contents:
+        name = f"episode_{content.episode.number:06d}.npz"
+        _write_episode(job, content, path / name)
+        files.append({"file": name, **content.about()})
+    about = job.about() | {"camera_names": roles(job.contents[0], job.camera, job.gripper_camera), "episodes": files}
+    (path / _ABOUT).write_text(json.dumps(about, indent=1) + "\n", encoding="utf-8")
+
+
+def _write_episode(job: Job, content: EpisodeContent, path: Path) -> None:
+    numbers = _numbers(content)
+    job.unknown(content, {name: numbers[name] for name in ("joint_states", "action") if name in numbers})
+    called = roles(content, job.camera, job.gripper_camera)
+    texts: dict[str, str | list[str]] = {
+        "info": json.dumps(content.episode.info | {"cameras_written": content.lenses()})
+    }
+    for key in ("observation.state", ACTION):
+        texts[f"{key}.names"] = content.episode.names(key)
+    for camera, name in called.items():
+        numbers[f"{name}_stamps"] = content.episode.stamps[f"camera.{camera}"]
+    streams = {f"{called[stream.camera]}_{stream.what}": stream for stream in content.pictures}
+    if double := sorted(set(streams) & set(numbers)):
+        raise CommandError(f"two things would be called {double[0]}; choose with --camera and --gripper-camera")
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED, compresslevel=_LEVEL) as file:
+        for name, values in (numbers | {name: np.array(text) for name, text in texts.items()}).items():
+            _add(file, name, values.shape, values.dtype, iter([values]))
+        job.numbers_done(content)
+        for name, stream in streams.items():
+            _add(file, name, (stream.rows, *stream.shape), stream.dtype, job.pictures(content, stream))
+
+
+def _numbers(content: EpisodeContent) -> dict[str, NDArray[Any]]:
+    episode = content.episode
+    found: dict[str, NDArray[Any]] = {}
+    for arm in content.arms:
+        lead = f"{arm.name}_" if len(content.arms) > 1 else ""
+        found[lead + "joint_states"] = content.of(arm, "observation.state")
+        pose = content.of(arm, "observation.tcp")
+        found[lead + "eef_position"], found[lead + "eef_orientation"] = pose[:, :3], pose[:, 3:]
+        if (width := content.width(arm)) is not None:
+            found[lead + "gripper"] = width
+    found["action"] = episode.columns[ACTION]
+    found["stamps"] = episode.stamps["grid"]
+    return found | {key: values for key, values in episode.columns.items() if key not in found}
+
+
+def _add(
+    file: zipfile.ZipFile, name: str, shape: tuple[int, ...], dtype: np.dtype[Any], parts: Iterator[NDArray[Any]]
+) -> None:
+    """One array, part by part: an episode's pictures need not fit into memory."""
+    head = {"descr": np.lib.format.dtype_to_descr(dtype), "fortran_order": False, "shape": shape}
+    with file.open(f"{name}.npy", "w", force_zip64=True) as entry:
+        np.lib.format.write_array_header_1_0(entry, head)
+        for part in parts:
+            entry.write(np.ascontiguousarray(part, dtype).data)

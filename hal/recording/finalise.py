@@ -1,0 +1,155 @@
+"""From a live folder to an episode of the dataset. Killed at any moment, it can be done again.
+
+First everything is made inside the folder, in ``final/``: the episode's files, and ``meta/`` as it will be. Then a list
+of what goes where is written: from here on the episode counts as saved. Then each file is renamed to its place,
+``info.json`` last, and the folder is removed. Whoever finds the list does what is left of it; whoever finds none
+starts anew.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .columns import ACTION, GRID, SETPOINT, STATE, TIMES
+from .layout import Layout, read_json, sync, write_json
+from .live import Rest, read_rest
+from .stats import Stats, column_stats, merged, plain
+from .tables import entry_table, new_info, read_tasks, rows_table, tasks_table
+from .video import remux
+
+__all__ = ["CLOSING", "finalise"]
+
+CLOSING = "closing.json"
+"""In the live folder: what was said when the episode was closed."""
+_FINAL, _LIST = "final", "list.json"
+_UNCLOSED: dict[str, Any] = {
+    "success": None,
+    "recovered": True,
+    "dropped": None,
+    "late": None,
+    "gaps": [],
+    "repeated": {},
+    "trouble": "nobody closed it: the program ended, or its writer",
+}
+
+
+def finalise(layout: Layout, partial: Path) -> int | None:
+    """Make an episode of a live folder; its number comes back. None where it holds no row: then it is removed.
+
+    The dataset must be locked. OSError where the disk does not take it; the folder stays as it is then.
+    """
+    if not (partial / _LIST).exists():
+        rest = read_rest(partial)
+        if rest is None or rest.length == 0:
+            layout.remove(partial)
+            return None
+        moves = _prepare(layout, rest)
+        write_json(partial / _LIST, moves)
+    return _move(layout, partial)
+
+
+def _move(layout: Layout, partial: Path) -> int:
+    moves = read_json(partial / _LIST)
+    for source, target in moves:
+        here, there = partial / source, layout.root / target
+        if here.exists():
+            there.parent.mkdir(parents=True, exist_ok=True)
+            here.replace(there)
+            sync(there.parent)
+    layout.remove(partial)
+    return int(read_json(layout.info)["total_episodes"]) - 1
+
+
+def _prepare(layout: Layout, rest: Rest) -> list[tuple[str, str]]:
+    """Make everything; which file of the folder goes where comes back, in that order."""
+    import pyarrow.parquet as pq
+
+    final = rest.folder / _FINAL
+    final.mkdir(exist_ok=True)
+    about = rest.about
+    info = read_json(layout.info) if layout.info.exists() else None
+    info = info or new_info(about["features"], about["fps"], about["robot_type"])
+    number, start, fps = int(info["total_episodes"]), int(info["total_frames"]), int(info["fps"])
+    tasks = read_tasks(layout.tasks)
+    if about["task"] not in tasks:
+        tasks.append(about["task"])
+    made: list[tuple[Path, Path]] = []
+
+    t_start = float(rest.rows[0, _place(about["columns"], GRID)])
+    columns = _columns(rest, t_start)
+    rows = len(rest.rows)
+    columns |= {
+        "timestamp": np.arange(rows)[:, None] / fps,
+        "frame_index": np.arange(rows)[:, None],
+        "episode_index": np.full((rows, 1), number),
+        "index": np.arange(start, start + rows)[:, None],
+        "task_index": np.full((rows, 1), tasks.index(about["task"])),
+    }
+    pq.write_table(rows_table(columns, info["features"]), final / "data.parquet")
+    made.append((final / "data.parquet", layout.data(number)))
+    stats: dict[str, Stats] = {key: column_stats(values) for key, values in columns.items()}
+    for camera in rest.cameras:
+        if camera.color:
+            live = rest.folder / f"{camera.name}.mp4"
+            pictures = remux(live, final / f"{camera.name}.mp4", rows, every=fps)
+            stats[f"observation.images.{camera.name}"] = pictures.stats()
+            made.append((final / f"{camera.name}.mp4", layout.video(camera.name, number)))
+        if camera.depth_unit is not None:
+            made.append((rest.folder / f"{camera.name}.depth", layout.depth(camera.name, number)))
+    write_json(final / "about.json", _about(rest, number, t_start))
+    made.append((final / "about.json", layout.about(number)))
+
+    videos = [camera.name for camera in rest.cameras if camera.color]
+    entry = entry_table(number, rows, start, about["task"], videos, fps, stats)
+    pq.write_table(entry, final / "entry.parquet", use_dictionary=False, write_statistics=False)
+    made.append((final / "entry.parquet", layout.entry(number)))
+    pq.write_table(tasks_table(tasks), final / "tasks.parquet")
+    made.append((final / "tasks.parquet", layout.tasks))
+    before = read_json(layout.stats) if layout.stats.exists() else {}
+    write_json(final / "stats.json", {key: plain(merged(before.get(key), found)) for key, found in stats.items()})
+    made.append((final / "stats.json", layout.stats))
+    total = {"total_episodes": number + 1, "total_frames": start + rows, "total_tasks": len(tasks)}
+    write_json(final / "info.json", info | total | {"splits": {"train": f"0:{number + 1}"}})
+    made.append((final / "info.json", layout.info))
+    for source, _ in made:
+        sync(source)
+    sync(final)
+    return [(str(source.relative_to(rest.folder)), str(target.relative_to(layout.root))) for source, target in made]
+
+
+def _columns(rest: Rest, t_start: float) -> dict[str, NDArray[Any]]:
+    """Columns (rows, n) of a live folder, and the action: what the arm was told to be at by the next row.
+
+    Times count from the first row on.
+    """
+    columns: dict[str, NDArray[Any]] = {}
+    place = 0
+    for key, _, names in rest.about["columns"]:
+        columns[key] = rest.rows[:, place : place + len(names)]
+        place += len(names)
+    for key, values in columns.items():
+        if key.startswith(TIMES):
+            values[:, 0] -= t_start
+    setpoint = columns[SETPOINT]
+    columns[ACTION] = np.concatenate([setpoint[1:], setpoint[-1:]])
+    assert columns[ACTION].shape[1] == columns[STATE].shape[1]
+    return columns
+
+
+def _place(columns: list[list[Any]], key: str) -> int:
+    """Where a column begins in a row."""
+    keys = [column[0] for column in columns]
+    return sum(len(names) for _, _, names in columns[: keys.index(key)])
+
+
+def _about(rest: Rest, number: int, t_start: float) -> dict[str, Any]:
+    """The episode's own file: what was known at its start and at its end."""
+    closing = rest.folder / CLOSING
+    said = read_json(closing) if closing.exists() else _UNCLOSED
+    skip = ("features", "columns", "cameras_kept")
+    about = {key: value for key, value in rest.about.items() if key not in skip}
+    return {"episode": number, "length": rest.length, "t_start": t_start} | said | about

@@ -1,0 +1,252 @@
+"""The recorder: looks on while somebody drives, and keeps what it sees."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Collection, Mapping
+from pathlib import Path
+from types import TracebackType
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from ..errors import CommandError
+from ..host.process import Child, SharedMemory
+from .about import about_rig, about_start, checked_info
+from .columns import features_of
+from .compatible import check_compatible
+from .devices import chosen
+from .layout import Layout
+from .library import require
+from .ring import RowRing
+from .take import Take
+from .video import Encoder
+
+if TYPE_CHECKING:
+    from ..rig import Rig
+
+__all__ = ["Recorder", "RecorderStatus"]
+
+_QUEUE = 0.6
+"""s of rows that may wait for the writer."""
+_SAVING = 600.0
+"""s that finishing an episode may take."""
+_FASTEST = 240
+
+
+class RecorderStatus(NamedTuple):
+    """How it goes."""
+
+    state: str
+    """``idle``, ``recording`` or ``saving``."""
+    episode: int
+    """Number of the present episode, or of the last one; -1 before the first."""
+    frames: int
+    """Its rows so far."""
+    seconds: float
+    """Time from its first row to its newest one."""
+    dropped: int
+    """Grid times of which there is no row; the episode's file says when and why."""
+    late: int
+    """Grid times that were noticed late. Nothing is missing in those rows."""
+    free_bytes: int
+    """Free space on the disk."""
+    trouble: str
+    """What a person should look at; empty where all is well. An episode that cannot go on takes no more rows, and can
+    be saved, or discarded, with those that it has."""
+
+
+class Recorder:
+    """Records episodes of ``rig`` into the dataset in the folder ``out``, ``fps`` rows a second.
+
+    ``cameras`` are the names of those that are kept, else all. ``depth=False`` leaves depth out. ``codec`` is ``h264``,
+    ``av1`` or ``auto``. Below ``warn_free`` bytes of free disk :meth:`status` says so, below ``stop_free`` an episode
+    ends. Nothing is written before :meth:`start`. Use it in a ``with`` statement, inside that of the rig.
+
+    Raises DriverMissing, CommandError for whatever would not work later, StaleStateError, ConnectionLost.
+    """
+
+    def __init__(
+        self,
+        rig: Rig,
+        out: str | Path,
+        fps: int = 30,
+        task: str = "",
+        depth: bool = True,
+        *,
+        cameras: Collection[str] | None = None,
+        codec: str = "auto",
+        warn_free: int = 5_000_000_000,
+        stop_free: int = 1_000_000_000,
+    ) -> None:
+        require()
+        if int(fps) != fps or not 1 <= fps <= _FASTEST:
+            raise CommandError(f"fps must be a whole number from 1 to {_FASTEST}, not {fps!r}")
+        self.rig = rig
+        self.fps = fps
+        self.task = task
+        """Of the episodes to come."""
+        self.root = Layout(out).root
+        self._sampler, self._tracks, self.notes = chosen(rig, cameras, depth)
+        """``notes``: what a person should know. What is not kept, what was recovered."""
+        self._warn_free = warn_free
+        setups = [track.setup for track in self._tracks]
+        width, slots = self._sampler.width, max(4, round(_QUEUE * fps))
+        self._memory = SharedMemory(RowRing.size(width, setups, slots))
+        self._ring = RowRing(self._memory.buffer, width, setups, slots)
+        self._config = {
+            "out": str(self.root),
+            "cameras": setups,
+            "width": width,
+            "slots": slots,
+            "codec": codec,
+            "stop_free": stop_free,
+        }
+        self._child = self._start_child()
+        try:
+            encoder = Encoder(*self._child.ready["encoder"])
+            self._about = {
+                "fps": fps,
+                "robot_type": "+".join(robot.spec.model for robot in rig.robots.values()),
+                "features": features_of(self._sampler.columns, setups, fps, encoder.feature),
+                "columns": self._sampler.columns,
+                "cameras_kept": setups,
+                "encoder": encoder,
+                **about_rig(rig),
+            }
+            check_compatible(Layout(out), self._about["features"], fps, self._about["robot_type"])
+        except BaseException:
+            self._child.close()
+            raise
+        self._lock = threading.RLock()
+        self._take: Take | None = None
+        """The present episode, or the last one."""
+        self._open = False
+        """Is it being recorded?"""
+        self._saver: threading.Thread | None = None
+        self._failure: Exception | None = None
+        self._episode = -1
+        self._closed = False
+
+    def _start_child(self) -> Child:
+        child = Child("recorder", "hal.recording.writer:main", self._config, [self._memory])
+        try:
+            child.wait_ready()
+        except BaseException:
+            child.close()
+            raise
+        return child
+
+    # An episode.
+
+    def start(self, seed: int | None = None, info: Mapping[str, Any] | None = None) -> None:
+        """Begin an episode. ``seed`` and ``info`` (plain numbers, texts, lists, dicts) are kept with it.
+
+        Waits for one that is still being saved. What an earlier program left unfinished in the folder is recovered
+        first, see :attr:`notes`.
+
+        Raises CommandError (the folder, the disk, ``info``), StaleStateError and ConnectionLost (a camera).
+        """
+        said = {"task": self.task, "seed": seed, "info": checked_info(info)}
+        with self._lock:
+            if self._closed:
+                raise CommandError("the recorder is closed")
+            if self._open:
+                raise CommandError(f"episode {self._episode} is still being recorded: save or discard it first")
+            self._wait_saved()
+            self._failure = None
+            if self._child.process.poll() is not None:
+                self._child.close()
+                self._child = self._start_child()
+            try:
+                for track in self._tracks:
+                    track.begin()
+                about = said | about_start(self.rig, self._tracks) | self._about
+                begun = self._child.request("begin", {"about": about}, _SAVING)
+                self.notes.extend(begun["notes"])
+                self._episode = begun["episode"]
+                self._take = Take(self.rig, self.fps, self._sampler, self._tracks, self._ring, self._child)
+                self._take.start()
+                self._open = True
+            except BaseException:
+                self._end_tracks()
+                raise
+
+    def status(self) -> RecorderStatus:
+        """How it goes; never waits."""
+        take = self._take
+        saving = self._saver is not None and self._saver.is_alive()
+        state = "saving" if saving else "recording" if self._open else "idle"
+        free = self._ring.free_bytes or int(self._child.ready["free_bytes"])
+        trouble = str(self._failure or (take.trouble if take is not None else ""))
+        if not trouble and free < self._warn_free:
+            trouble = f"only {free / 1e9:.1f} GB are free on the disk of {self.root}"
+        if take is None:
+            return RecorderStatus(state, self._episode, 0, 0.0, 0, 0, free, trouble)
+        counts = take.frames, take.seconds, take.gaps.rows, take.grid.late
+        return RecorderStatus(state, self._episode, *counts, free, trouble)
+
+    def save(self, success: bool | None = None, wait: bool = False) -> None:
+        """End the episode and make it part of the dataset, in the background unless ``wait``.
+
+        ``success`` is the mark that it gets. Until it is saved ``status().state`` is ``saving``; where that fails,
+        ``status().trouble`` says why, ``wait=True`` raises it, and the next :meth:`start`, or
+        :func:`~hal.recording.recover`, tries it again.
+        """
+        with self._lock:
+            take = self._end()
+            self._saver = threading.Thread(target=self._save, args=(take, success), name="hal-recorder-save")
+            self._saver.start()
+        if wait:
+            self._wait_saved()
+            if self._failure is not None:
+                raise self._failure
+
+    def _save(self, take: Take, success: bool | None) -> None:
+        try:
+            take.stop()
+            self._end_tracks()
+            if self._child.request("save", {"closing": take.closing(success)}, _SAVING) is None:
+                raise CommandError(f"nothing was recorded, so there is nothing to save. {take.trouble}".strip())
+        except Exception as error:
+            self._failure = error
+
+    def discard(self) -> None:
+        """End the episode and remove it."""
+        with self._lock:
+            self._end().stop()
+            self._end_tracks()
+            self._child.request("discard", {}, _SAVING)
+
+    def _end(self) -> Take:
+        """The episode that is open ends."""
+        if self._take is None or not self._open:
+            raise CommandError("no episode is being recorded: call start first")
+        self._open = False
+        return self._take
+
+    def _end_tracks(self) -> None:
+        for track in self._tracks:
+            track.end()
+
+    def _wait_saved(self) -> None:
+        if self._saver is not None:
+            self._saver.join()
+
+    def close(self) -> None:
+        """End the writer. An episode that is still open is kept, unmarked. Idempotent."""
+        with self._lock:
+            if self._closed:
+                return
+            self._closed = True
+            if self._open:
+                self.save()
+            self._wait_saved()
+            self._child.close()
+            self._memory.close()
+
+    def __enter__(self) -> Recorder:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()

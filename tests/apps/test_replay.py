@@ -1,0 +1,150 @@
+"""``apps/replay.py`` as a person starts it, on an episode that the recorder wrote."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import hal
+
+for library in ("pyarrow", "av", "zstandard"):
+    pytest.importorskip(library, reason="pip install 'robot-hal[record]'")
+
+ROOT = Path(__file__).resolve().parents[2]
+APP = ROOT / "apps" / "replay.py"
+TOUR = ROOT / "config" / "teleop" / "tour.jsonl"
+BARE = ("--sim", "--set", "cameras={}")
+FAST = (*BARE, "--set", "simulation.clock=lock_step")
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The recorded tour, driven in simulation."""
+    from hal.recording import Recorder
+
+    out = tmp_path_factory.mktemp("replay") / "demo"
+    options: dict[str, Any] = {"sim": True, "clock": "lock_step", "pad": str(TOUR), "overrides": ["cameras={}"]}
+    with hal.open("panda_table", **options) as rig, Recorder(rig, out, fps=30, task="a tour") as recorder:
+        arm, pad = rig.robots["panda"], rig.gamepads["pad"]
+        teleop = hal.Teleop(arm)
+        recorder.start(seed=1)
+        with arm.control(deadman=pad.hold("l2"), rate_hz=50) as control:
+            for tick in rig.clock.rate(50):
+                motion, grip = teleop.step(pad.state(), tick.dt)
+                control.send(motion, gripper=grip)
+                if pad.finished:
+                    break
+        recorder.save(success=True, wait=True)
+    return out
+
+
+def replay(*arguments: object, timeout: float = 90.0) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, str(APP), *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, timeout=timeout)
+
+
+@pytest.mark.parametrize("speed", [1.0, 0.5])
+def test_a_simulated_episode_replayed_in_simulation(dataset: Path, tmp_path: Path, speed: float) -> None:
+    out = tmp_path / "report.json"
+    done = replay(dataset, "--episode", "-1", "--speed", speed, "--report", out, *FAST)
+    assert done.returncode == 0, done.stderr
+    found = json.loads(out.read_text())
+    joints = found["deviation"]["joints_rad"]
+    assert len(joints) == 7
+    assert max(joint["rms"] for joint in joints.values()) < 0.01
+    assert found["deviation"]["tcp_mm"]["rms"] < 5.0
+    assert found["finished"] is True
+    assert found["pauses"] == 0
+    assert found["duration_s"] > 10.0
+    assert found["took_s"] == pytest.approx(found["duration_s"] / speed, abs=2.0)
+    assert re.search(r"panda_joint7 +rms 0\.00", done.stdout)
+    assert "a tour" in done.stdout
+
+
+@pytest.mark.slow
+def test_the_same_in_real_time(dataset: Path, tmp_path: Path) -> None:
+    out = tmp_path / "report.json"
+    done = replay(dataset, "--report", out, *BARE)
+    assert done.returncode == 0, done.stdout + done.stderr
+    found = json.loads(out.read_text())
+    assert found["finished"] is True
+    assert found["servo"]["ticks"] > 1000
+    joints = found["deviation"]["joints_rad"]
+    if found["servo"]["missed"] < 0.05 * found["servo"]["ticks"]:  # else it cannot be where it should
+        assert max(joint["rms"] for joint in joints.values()) < 0.01
+    else:
+        assert "too much else to do" in done.stdout
+
+
+@pytest.mark.slow
+def test_ctrl_c_stops_it_and_says_how_far_it_was(dataset: Path, tmp_path: Path) -> None:
+    out = tmp_path / "report.json"
+    command = [sys.executable, "-u", str(APP), str(dataset), "--report", str(out), *BARE]
+    process = subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True
+    )
+    assert process.stdout is not None
+    for line in process.stdout:
+        if "to the first pose" in line:
+            break
+    os.kill(process.pid, signal.SIGINT)
+    text, errors = process.communicate(timeout=30)
+    assert process.returncode == 1, errors
+    assert "Traceback" not in errors
+    assert "ENDED" in text
+    assert "Ctrl-C" in text
+    assert json.loads(out.read_text())["finished"] is False
+
+
+@pytest.mark.parametrize(
+    ("arguments", "texts"),
+    [
+        (["--episode", "3"], ["--episode 3", "has 1"]),
+        (["--speed", "1.5"], ["--speed", "at most 1"]),
+        (["--report", "/nowhere/at/all.json"], ["/nowhere/at"]),
+        (["--robot", "pandas"], ["no robot 'pandas'", "did you mean 'panda'"]),
+        (["--set", "robots.panda.speed=0.02"], ["CommandError", "rad/s", "at speed"]),
+        (["--set", "robots.panda.limits.upper=[2,1.7,2,-2.3,2,3.7,2]"], ["panda_joint4 goes through"]),
+        (["--set", "objects=[floor, table]"], ["cube, duck"]),
+    ],
+)
+def test_what_cannot_be_replayed_is_a_message(dataset: Path, arguments: list[str], texts: list[str]) -> None:
+    done = replay(dataset, *FAST, *arguments)
+    assert done.returncode == 2, done.stdout + done.stderr
+    assert "Traceback" not in done.stderr
+    for text in texts:
+        assert text in done.stderr
+
+
+def test_a_folder_without_episodes_and_another_arm(dataset: Path, tmp_path: Path) -> None:
+    done = replay(tmp_path, *FAST)
+    assert done.returncode == 2
+    assert "no episode" in done.stderr
+    other = replay(dataset, *FAST, "--set", "robots.panda.model=fr3")
+    assert other.returncode == 2, other.stdout + other.stderr
+    assert "recorded with the model panda, and this arm is a fr3" in other.stderr
+
+
+def test_a_dry_run_opens_nothing(dataset: Path) -> None:
+    done = replay(dataset, "--dry-run", *FAST)
+    assert done.returncode == 0, done.stderr
+    assert "'a tour'" in done.stdout
+
+
+def test_what_lies_on_disk_is_what_was_driven(dataset: Path) -> None:
+    """Not only what the replay makes of it."""
+    from hal.recording import Dataset
+
+    episode = Dataset(dataset).episodes[0]
+    q = episode.columns["observation.setpoint"][:, :7]
+    assert np.ptp(q, axis=0).max() > 0.1
+    assert episode.success is True

@@ -1,0 +1,115 @@
+"""The review as a person starts it."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from export_kit import make_recording
+from PIL import Image
+
+ROOT = Path(__file__).resolve().parents[2]
+needs_rerun = pytest.mark.skipif(
+    importlib.util.find_spec("rerun") is None,
+    reason="pip install 'robot-hal[review]'",
+)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return make_recording(tmp_path_factory.mktemp("apps") / "demo").root
+
+
+def run(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, str(ROOT / "apps" / "review.py"), *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, timeout=60)
+
+
+def test_a_dataset_is_a_table(folder: Path) -> None:
+    done = run(folder)
+    assert done.returncode == 0, done.stderr
+    lines = done.stdout.splitlines()
+    assert lines[0] == f"{folder}: 3 episodes of panda, 30 rows at 20 Hz, 1.5 s"
+    assert lines[1] == "1 succeeded (50 % of those marked), 1 failed, 1 not marked"
+    assert [line.split()[:6] for line in lines[5:8]] == [
+        ["0", "14", "0.70", "success", "0", "1"],
+        ["1", "9", "0.45", "failure", "0", "0"],
+        ["2", "7", "0.35", "-", "0", "0"],
+    ]
+    assert sum(line.startswith("panda_joint") for line in lines) == 7
+    assert sum(line.startswith(("robot.", "gripper.", "camera.")) for line in lines) == 4
+
+
+def test_an_episode_is_a_picture(folder: Path, tmp_path: Path) -> None:
+    path = tmp_path / "look.png"
+    done = run(folder, "--episode", "1", "--png", path, "--json")
+    assert done.returncode == 0, done.stderr
+    assert json.loads(done.stdout)["episodes"][0]["number"] == 1, "only JSON on the standard output"
+    assert f"wrote {path}" in done.stderr
+    with Image.open(path) as image:
+        image.load()
+        assert image.size[0] == 1600
+    again = run(folder, "--episode", "1", "--png", path)
+    assert again.returncode == 2
+    assert "--force overwrites it" in again.stderr
+    beside = folder.with_name("demo_episode_000002.png")
+    assert f"wrote {beside}" in run(folder, "--episode", "2").stdout
+    assert beside.is_file()
+
+
+def test_what_is_wrong_is_said_in_words(folder: Path) -> None:
+    for wrong, says in ((("--episode", "7"), "no episode 7"), (("--png", "x.png"), "which with --episode")):
+        done = run(folder, *wrong)
+        assert done.returncode == 2
+        assert says in done.stderr
+        assert "Traceback" not in done.stderr
+
+
+def test_a_damaged_episode_is_told_and_is_the_exit_status(tmp_path: Path) -> None:
+    root = make_recording(tmp_path / "demo").root
+    (root / "data/chunk-000/file-002.parquet").unlink()
+    done = run(root)
+    assert done.returncode == 2
+    assert "cannot be read: episode 2: " in done.stdout
+    assert "2 episodes of panda, 23 rows" in done.stdout
+
+
+@needs_rerun
+def test_an_episode_for_rerun(folder: Path, tmp_path: Path) -> None:
+    """Read again by rerun's own program, which must not tell anybody that it was."""
+    path = tmp_path / "look.rrd"
+    done = run(folder, "--episode", "0", "--rrd", path)
+    assert done.returncode == 0, done.stderr
+    assert not folder.with_name("demo_episode_000000.png").exists(), "only what was asked for"
+    assert path.read_bytes()[:4] == b"RRF2"
+
+    home = {**os.environ, "HOME": str(tmp_path), "XDG_CONFIG_HOME": str(tmp_path)}
+
+    def rerun(*arguments: str) -> str:
+        command = [sys.executable, "-m", "rerun", *arguments]
+        return subprocess.run(command, env=home, capture_output=True, text=True, timeout=60, check=True).stdout
+
+    rerun("analytics", "disable")
+    rerun("rrd", "verify", str(path))
+    rows: dict[tuple[str, str], int] = {}
+    for line in rerun("rrd", "print", str(path)).splitlines():  # a chunk; slow logging makes several of one thing
+        if match := re.match(r"Chunk\(\w+\) with (\d+) rows .* - /(\S+) - data columns: \[(\w+):", line):
+            thing = (match[2], match[3])
+            rows[thing] = rows.get(thing, 0) + int(match[1])
+    for place, kind in (
+        ("joints/panda/panda_joint7/measured", "Scalars"),
+        ("gripper/panda/commanded", "Scalars"),
+        ("world/panda/tcp", "Transform3D"),
+        ("world/cameras/scene", "Transform3D"),
+        ("world/cameras/wrist/rgb", "EncodedImage"),
+        ("world/cameras/scene/depth", "EncodedDepthImage"),
+    ):
+        assert rows.get((place, kind)) == 14, place
+    assert rows["world/cameras/scene", "Pinhole"] == 1
+    assert rows["status/panda", "TextLog"] == 3, "idle, following, stopped"

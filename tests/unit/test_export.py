@@ -1,0 +1,197 @@
+"""What every export shares: which episodes, which pictures, and that a file appears whole or not at all."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from export_kit import make_recording, pictures
+from recording_kit import SIZE
+
+import hal
+from hal.errors import CommandError
+from hal.recording import Dataset, Recorder
+from hal.recording.exporters import default_path, export
+from hal.recording.exporters.output import fresh
+from hal.recording.exporters.selection import episode_numbers
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
+    return make_recording(tmp_path_factory.mktemp("export") / "demo")
+
+
+def test_episodes_are_numbers_and_ranges() -> None:
+    assert episode_numbers("0, 3-5,7") == [0, 3, 4, 5, 7]
+    for wrong in ("", "1-", "a", "3-1", "-1", "1,,2"):
+        with pytest.raises(CommandError, match="range"):
+            episode_numbers(wrong)
+
+
+@pytest.mark.parametrize(
+    ("chosen", "numbers"),
+    [
+        ({}, [0, 1, 2]),
+        ({"episodes": "2,0-1,1"}, [0, 1, 2]),
+        ({"episodes": [2, 1]}, [1, 2]),
+        ({"successful_only": True}, [0]),
+    ],
+)
+def test_the_chosen_episodes_are_written_in_their_order(
+    dataset: Dataset, tmp_path: Path, chosen: dict[str, object], numbers: list[int]
+) -> None:
+    made = export(dataset, "npz", tmp_path / "out", cameras=[], **chosen)  # type: ignore[arg-type]
+    about = json.loads((made.path / "export.json").read_text())
+    assert [episode["episode"] for episode in about["episodes"]] == numbers
+    assert [episode["success"] for episode in about["episodes"]] == [(True, False, None)[k] for k in numbers]
+    assert made.episodes == len(numbers)
+    assert made.rows == sum(dataset.episodes[k].length for k in numbers)
+
+
+@pytest.mark.parametrize(
+    ("kind", "wrong", "says"),
+    [
+        ("npz", {"episodes": "0-3"}, "no episode 3 .* there are 3"),
+        ("npz", {"episodes": "1", "successful_only": True}, "marked a success"),
+        ("npz", {"episodes": []}, "no episode was chosen"),
+        ("zarr", {"cameras": ["front"]}, "no camera front; cameras: scene, wrist"),
+        ("npz", {"camera": "front"}, "no camera front"),
+        ("npz", {"camera": "wrist", "gripper_camera": "wrist"}, "both"),
+        ("zarr", {"size": (0, 4)}, "size"),
+        ("robomimic", {"valid": 1.0}, "valid"),
+        ("tfds", {}, "robomimic, zarr, npz"),
+    ],
+)
+def test_what_does_not_fit_is_refused_and_nothing_is_left(
+    dataset: Dataset, tmp_path: Path, kind: str, wrong: dict[str, object], says: str
+) -> None:
+    if kind == "robomimic":
+        pytest.importorskip("h5py", reason="pip install 'robot-hal[export]'")
+    with pytest.raises(CommandError, match=says):
+        export(dataset, kind, tmp_path / "out", **wrong)  # type: ignore[arg-type]
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_it_goes_beside_the_dataset(dataset: Dataset) -> None:
+    made = export(dataset, "zarr", cameras=[])
+    assert made.path == default_path(dataset.root, "zarr") == dataset.root.with_name("demo.zarr")
+    files = [file for file in made.path.rglob("*") if file.is_file()]
+    assert made.size == sum(file.stat().st_size for file in files) > 0
+
+
+# Whole or not at all.
+
+
+@pytest.mark.parametrize("kind", ["npz", "zarr", "robomimic"])
+def test_only_such_an_export_is_overwritten_and_only_when_asked(dataset: Dataset, tmp_path: Path, kind: str) -> None:
+    if kind == "robomimic":
+        pytest.importorskip("h5py", reason="pip install 'robot-hal[export]'")
+    path = tmp_path / "out"
+    first = export(dataset, kind, path, cameras=[])
+    with pytest.raises(CommandError, match="there already; --force"):
+        export(dataset, kind, path, cameras=[], episodes="0")
+    assert export(dataset, kind, path, cameras=[], episodes="0", force=True).size < first.size
+    strange = tmp_path / "mine"
+    strange.mkdir()
+    (strange / "thesis.txt").write_text("years of work")
+    with pytest.raises(CommandError, match="not written by this program"):
+        export(dataset, kind, strange, cameras=[], force=True)
+    assert (strange / "thesis.txt").read_text() == "years of work"
+    with pytest.raises(CommandError, match="not written by this program"):
+        export(dataset, kind, dataset.root, cameras=[], force=True)
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["mine", "out"]
+
+
+def test_an_export_that_fails_leaves_the_old_one(dataset: Dataset, tmp_path: Path) -> None:
+    path = tmp_path / "out"
+    export(dataset, "npz", path, cameras=[])
+    before = sorted((file.name, file.stat().st_mtime_ns) for file in path.iterdir())
+
+    def stop(progress: object) -> None:
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        export(dataset, "npz", path, force=True, progress=stop)
+    assert sorted((file.name, file.stat().st_mtime_ns) for file in path.iterdir()) == before
+    assert [file.name for file in tmp_path.iterdir()] == ["out"]
+
+
+def test_what_a_killed_program_left_is_removed_and_what_runs_is_left_alone(tmp_path: Path) -> None:
+    gone = subprocess.Popen([sys.executable, "-c", ""])
+    gone.wait()
+    (tmp_path / f".out.{gone.pid}.partial").mkdir()
+    old = tmp_path / f".out.{gone.pid}.old"
+    old.mkdir()
+    (old / "kept").touch()
+    other = tmp_path / f".out.{os.getppid()}.partial"
+    other.mkdir()
+    with pytest.raises(ZeroDivisionError), fresh(tmp_path / "out", force=False, is_ours=Path.is_dir):
+        raise ZeroDivisionError
+    assert sorted(file.name for file in tmp_path.iterdir()) == [other.name, "out"]
+    assert (tmp_path / "out" / "kept").exists(), "it was killed between two renames: the old one is back"
+
+
+def test_a_missing_library_is_named(dataset: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "h5py", None)
+    with pytest.raises(hal.errors.DriverMissing, match=r"pip install 'robot-hal\[export\]'"):
+        export(dataset, "robomimic", tmp_path / "out")
+    assert list(tmp_path.iterdir()) == []
+
+
+# Pictures.
+
+
+def test_pictures_are_cropped_and_scaled_and_the_lens_with_them(dataset: Dataset, tmp_path: Path) -> None:
+    width, height = SIZE
+    assert (width, height) == (64, 48)
+    made = export(dataset, "npz", tmp_path / "out", size=(24, 24), episodes="1")
+    with np.load(made.path / "episode_000001.npz", allow_pickle=False) as file:
+        color, depth = file["camera_rgb"], file["camera_depth"]
+        lens = json.loads(str(file["info"]))["cameras_written"]["scene"]
+    assert color.shape == (dataset.episodes[1].length, 24, 24, 3)
+    whole = pictures(dataset, "rgb", "scene")[1][:, :, 8:56].astype(np.float64)  # the middle 48 x 48
+    mean = whole.reshape(-1, 24, 2, 24, 2, 3).mean(axis=(2, 4))
+    assert np.abs(color - mean).max() <= 1.0, "rounded once for each direction"
+    assert np.isin(np.unique(depth), np.unique(pictures(dataset, "depth", "scene")[1])).all(), "nothing in between"
+    K, before = np.array(lens["K"]), np.array(dataset.episodes[1].info["cameras"]["scene"]["K"])
+    assert (lens["width"], lens["height"]) == (24, 24)
+    assert K[0, 0] == pytest.approx(before[0, 0] / 2)
+    assert K[0, 2] == pytest.approx((before[0, 2] - 8 + 0.5) / 2 - 0.5)
+    assert K[1, 2] == pytest.approx((before[1, 2] + 0.5) / 2 - 0.5)
+
+
+def test_progress_goes_from_nothing_to_all(dataset: Dataset, tmp_path: Path) -> None:
+    told = []
+    export(dataset, "npz", tmp_path / "out", progress=told.append)
+    shares = [progress.share for progress in told]
+    assert shares == sorted(shares)
+    assert 0.0 < shares[0] < 0.2
+    assert shares[-1] == 1.0
+    assert [progress.episode for progress in told] == sorted(progress.episode for progress in told)
+
+
+def test_episodes_with_other_pictures_are_told_apart(tmp_path: Path) -> None:
+    """Depth is no column of the dataset, so one episode may have it and the next one not."""
+    from recording_kit import mock_rig, record
+
+    with mock_rig() as rig:
+        for depth in (True, False):
+            with Recorder(rig, out=tmp_path / "demo", fps=20, task="x", depth=depth) as recorder:
+                record(recorder, 0.2)
+    with pytest.raises(CommandError, match="episodes 0 and 1 differ in depth of scene, depth of wrist.*--no-depth"):
+        export(tmp_path / "demo", "zarr", tmp_path / "out")
+    assert export(tmp_path / "demo", "zarr", tmp_path / "out", depth=False).episodes == 2
+
+
+def test_a_video_that_is_too_short_is_an_error(tmp_path: Path) -> None:
+    dataset = make_recording(tmp_path / "demo")
+    short = dataset.root / "videos/observation.images.wrist/chunk-000"
+    (short / "file-000.mp4").write_bytes((short / "file-002.mp4").read_bytes())
+    with pytest.raises(CommandError, match="the rgb of camera wrist has 7 pictures, for 14 rows"):
+        export(dataset, "zarr", tmp_path / "out")
+    assert [file.name for file in tmp_path.iterdir()] == ["demo"]

@@ -1,0 +1,224 @@
+"""The forms themselves, read again as the programs read them that train on them."""
+
+from __future__ import annotations
+
+import json
+import warnings
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from export_kit import make_recording, pictures
+
+import hal
+from hal.recording import Dataset, Recorder
+from hal.recording.exporters import export
+
+ROBOMIMIC = {
+    "robot0_joint_pos": ("observation.state", slice(0, 7)),
+    "robot0_joint_vel": ("observation.velocity", slice(0, 7)),
+    "robot0_eef_pos": ("observation.tcp", slice(0, 3)),
+    "robot0_eef_quat": ("observation.tcp", slice(3, 7)),
+    "robot0_eef_vel": ("observation.twist", slice(0, 6)),
+    "robot0_gripper_width": ("observation.state", slice(7, 8)),
+}
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
+    return make_recording(tmp_path_factory.mktemp("forms") / "demo")
+
+
+@pytest.fixture(scope="module")
+def two_arms(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
+    out = tmp_path_factory.mktemp("two") / "demo"
+    robots = {
+        name: {"model": "panda", "base": {"position": [0.0, y, 0.0]}} for name, y in (("left", 0.4), ("right", -0.4))
+    }
+    with (
+        hal.open({"robots": robots, "cameras": {}}, sim=True, driver="mock", clock="lock_step") as rig,
+        Recorder(rig, out=out, fps=20, task="both") as recorder,
+    ):
+        recorder.start()
+        with rig.robots["right"].control(rate_hz=50, unattended=True) as control:
+            for tick in rig.clock.rate(50):
+                if tick.elapsed > 0.3:
+                    break
+                control.send(hal.Twist([0.0, 0.0, 0.1]), gripper=0.25)
+        recorder.save(True, wait=True)
+    return Dataset(out)
+
+
+def column(dataset: Dataset, key: str) -> np.ndarray[Any, Any]:
+    """Of all episodes, one after the other."""
+    return np.concatenate([episode.columns[key] for episode in dataset.episodes])
+
+
+# npz
+
+
+def test_npz_has_the_tutorials_names(dataset: Dataset, tmp_path: Path) -> None:
+    made = export(dataset, "npz", tmp_path / "out")
+    for episode in dataset.episodes:
+        state, tcp = episode.columns["observation.state"], episode.columns["observation.tcp"]
+        with np.load(made.path / f"episode_{episode.number:06d}.npz", allow_pickle=False) as file:
+            assert np.array_equal(file["joint_states"], state[:, :7])
+            assert np.array_equal(file["gripper"], state[:, 7])
+            assert np.array_equal(file["eef_position"], tcp[:, :3])
+            assert np.array_equal(file["eef_orientation"], tcp[:, 3:])
+            assert np.array_equal(file["action"], episode.columns["action"])
+            assert np.array_equal(file["stamps"], episode.stamps["grid"])
+            assert np.array_equal(file["gripper_camera_stamps"], episode.stamps["camera.wrist"])
+            for name, camera in (("camera", "scene"), ("gripper_camera", "wrist")):
+                assert np.array_equal(file[f"{name}_rgb"], pictures(dataset, "rgb", camera)[episode.number])
+                assert np.array_equal(file[f"{name}_depth"], pictures(dataset, "depth", camera)[episode.number])
+                assert file[f"{name}_depth"].dtype == np.float32
+            for key, values in episode.columns.items():
+                assert np.array_equal(file[key], values, equal_nan=values.dtype.kind == "f"), key
+            assert file["action.names"].tolist() == episode.names("action")
+            info = json.loads(str(file["info"]))
+        assert info["rig"] == episode.info["rig"], "with everything that made it"
+        assert info["seed"] == 1
+
+
+def test_npz_cameras_are_called_as_asked(dataset: Dataset, tmp_path: Path) -> None:
+    def names(out: str, **options: Any) -> set[str]:
+        made = export(dataset, "npz", tmp_path / out, episodes="2", **options)
+        with np.load(made.path / "episode_000002.npz") as file:
+            return {name for name in file.files if name.endswith(("_rgb", "_depth"))}
+
+    assert names("a", camera="wrist") == {"camera_rgb", "camera_depth", "scene_rgb", "scene_depth"}
+    assert names("b", gripper_camera="scene", depth=False) == {"gripper_camera_rgb", "wrist_rgb"}
+    assert names("c", cameras=["wrist"], depth=False) == {"gripper_camera_rgb"}
+
+
+def test_npz_names_each_of_two_arms(two_arms: Dataset, tmp_path: Path) -> None:
+    made = export(two_arms, "npz", tmp_path / "out")
+    state = two_arms.episodes[0].columns["observation.state"]
+    with np.load(made.path / "episode_000000.npz") as file:
+        assert np.array_equal(file["left_joint_states"], state[:, :7])
+        assert np.array_equal(file["right_joint_states"], state[:, 8:15])
+        assert np.array_equal(file["right_gripper"], state[:, 15])
+        assert np.ptp(file["right_eef_position"][:, 2]) > 0.01 > np.ptp(file["left_eef_position"][:, 2]), "one moved"
+
+
+# robomimic
+
+
+def test_robomimic(dataset: Dataset, tmp_path: Path) -> None:
+    h5py = pytest.importorskip("h5py", reason="pip install 'robot-hal[export]'")
+    made = export(dataset, "robomimic", tmp_path / "out.hdf5", valid=0.34)
+    # Opened as its SequenceDataset opens it.
+    with h5py.File(made.path, "r", swmr=True, libver="latest") as file:
+        data = file["data"]
+        demos = sorted(data, key=lambda name: int(name[5:]))
+        assert demos == ["demo_0", "demo_1", "demo_2"]
+        assert data.attrs["total"] == made.rows
+        assert set(json.loads(data.attrs["env_args"])) == {"env_name", "type", "env_kwargs"}
+        for demo, episode in zip(demos, dataset.episodes, strict=True):
+            group, rows = data[demo], episode.length
+            assert group.attrs["num_samples"] == rows
+            assert np.array_equal(group["actions"][()], episode.columns["action"])
+            assert np.array_equal(group["dones"][()], np.arange(rows) == rows - 1)
+            assert group["rewards"][()].sum() == (1.0 if episode.success else 0.0)
+            images = {f"{camera}_{kind}" for camera in ("scene", "wrist") for kind in ("image", "depth")}
+            assert set(group["obs"]) == set(group["next_obs"]) == set(ROBOMIMIC) | images
+            for name, (key, part) in ROBOMIMIC.items():
+                values = episode.columns[key][:, part]
+                assert np.array_equal(group[f"obs/{name}"][()], values), name
+                assert np.array_equal(group[f"next_obs/{name}"][()], np.concatenate([values[1:], values[-1:]])), name
+            for camera in ("scene", "wrist"):
+                color = pictures(dataset, "rgb", camera)[episode.number]
+                depth = pictures(dataset, "depth", camera)[episode.number][..., None]
+                assert group[f"obs/{camera}_image"].dtype == np.uint8
+                for name, values in ((f"{camera}_image", color), (f"{camera}_depth", depth)):
+                    assert np.array_equal(group[f"obs/{name}"][()], values)
+                    assert np.array_equal(group[f"next_obs/{name}"][: rows - 1], values[1:])
+                    assert np.array_equal(group[f"next_obs/{name}"][rows - 1], values[-1])
+        masks = {name: [demo.decode() for demo in np.array(file[f"mask/{name}"])] for name in file["mask"]}
+    assert masks["successful"] == ["demo_0"]
+    assert len(masks["valid"]) == 1
+    assert sorted(masks["train"] + masks["valid"]) == demos
+
+
+def test_robomimic_without_what_cannot_be_split(dataset: Dataset, tmp_path: Path) -> None:
+    h5py = pytest.importorskip("h5py", reason="pip install 'robot-hal[export]'")
+    made = export(dataset, "robomimic", tmp_path / "out.hdf5", cameras=[], episodes="1")
+    with h5py.File(made.path) as file:
+        assert set(file["mask"]) == {"train"}, "an empty filter would train on nothing"
+        assert json.loads(file["data/demo_0"].attrs["info"])["episode"] == 1
+    assert "cannot be split" in made.notes[0]
+
+
+def test_a_second_arm_is_robot1(two_arms: Dataset, tmp_path: Path) -> None:
+    h5py = pytest.importorskip("h5py", reason="pip install 'robot-hal[export]'")
+    made = export(two_arms, "robomimic", tmp_path / "out.hdf5")
+    state = two_arms.episodes[0].columns["observation.state"]
+    with h5py.File(made.path) as file:
+        seen = file["data/demo_0/obs"]
+        assert np.array_equal(seen["robot0_joint_pos"][()], state[:, :7])
+        assert np.array_equal(seen["robot1_joint_pos"][()], state[:, 8:15])
+        assert np.array_equal(seen["robot1_gripper_width"][()], state[:, 15:])
+
+
+# zarr
+
+
+def test_zarr_is_a_replay_buffer(dataset: Dataset, tmp_path: Path) -> None:
+    zarr = pytest.importorskip("zarr", reason="pip install zarr")
+    made = export(dataset, "zarr", tmp_path / "out.zarr")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        root = zarr.open(str(made.path), mode="r")
+        ends = root["meta"]["episode_ends"][:]
+        data = {name: array[:] for name, array in root["data"].arrays()}
+    lengths = [episode.length for episode in dataset.episodes]
+    assert ends.dtype == np.int64
+    assert ends.tolist() == np.cumsum(lengths).tolist()
+    assert list(root["meta"].array_keys()) == ["episode_ends"]
+    for name, values in data.items():
+        assert len(values) == ends[-1], f"{name}: a replay buffer wants every array as long as the last episode's end"
+    images = {f"{camera}_{kind}" for camera in ("scene", "wrist") for kind in ("image", "depth")}
+    assert set(data) == set(ROBOMIMIC) | images | {"action", "timestamp"}
+    assert np.array_equal(data["action"], column(dataset, "action"))
+    for name, (key, part) in ROBOMIMIC.items():
+        assert np.array_equal(data[name], column(dataset, key)[:, part]), name
+    for camera in ("scene", "wrist"):
+        assert np.array_equal(data[f"{camera}_image"], np.concatenate(pictures(dataset, "rgb", camera)))
+        assert np.array_equal(data[f"{camera}_depth"][..., 0], np.concatenate(pictures(dataset, "depth", camera)))
+    assert data["scene_image"].dtype == np.uint8
+    assert data["timestamp"][ends[:-1]].tolist() == [0.0, 0.0]
+    assert [episode["success"] for episode in root.attrs["episodes"]] == [True, False, None]
+
+
+@pytest.mark.parametrize("rows", [1, 2, 3, 7])
+@pytest.mark.parametrize("dtype", [np.uint8, np.float32, np.float64, np.int64])
+def test_zarr_chunks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, rows: int, dtype: type) -> None:
+    """Whole chunks, a part of one, and one alone."""
+    zarr = pytest.importorskip("zarr", reason="pip install zarr")
+    from hal.recording.exporters import zarr_folder
+
+    values = np.random.default_rng(0).integers(0, 200, (rows, 5, 4, 3)).astype(dtype)
+    monkeypatch.setattr(zarr_folder, "_CHUNK", 3 * values[0].nbytes)
+    group = zarr_folder.make_group(tmp_path / "group", {"unit": "m"})
+    array = zarr_folder.ZarrArray(group / "values", values.shape[1:], values.dtype, rows)
+    for value in values:
+        array.add(value)
+    array.close()
+    found = zarr.open(str(group), mode="r")
+    assert found.attrs["unit"] == "m"
+    assert found["values"].chunks[0] == min(3, rows)
+    assert found["values"].dtype == dtype
+    assert np.array_equal(found["values"][:], values)
+
+
+# What was never known.
+
+
+def test_values_that_were_not_known_are_told(dataset: Dataset, tmp_path: Path) -> None:
+    silent = Dataset(dataset.root)
+    columns = silent.episodes[1].columns
+    columns["observation.velocity"] = np.where(np.arange(7) == 2, np.nan, columns["observation.velocity"])
+    made = export(silent, "zarr", tmp_path / "out", cameras=[])
+    assert made.notes == ("robot0_joint_vel of episode 1 has values that were not known (NaN)",)

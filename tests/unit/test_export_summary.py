@@ -1,0 +1,120 @@
+"""A dataset in numbers, and an episode on a sheet."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from export_kit import make_recording
+
+from hal.recording import Dataset
+from hal.recording.exporters import canvas
+from hal.recording.exporters.canvas import Canvas, ticks
+from hal.recording.exporters.sheet import draw_sheet
+from hal.recording.exporters.summary import as_json, summary
+
+RED, BLUE, ORANGE, PINK = (215, 60, 50), (0, 90, 181), (240, 140, 30), (250, 205, 200)
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
+    return make_recording(tmp_path_factory.mktemp("summary") / "demo")
+
+
+def test_the_numbers_are_those_of_the_rows(dataset: Dataset) -> None:
+    found = summary(dataset)
+    assert (found.successes, found.failures, found.unmarked) == (1, 1, 1)
+    assert found.rows == sum(episode.length for episode in dataset.episodes)
+    assert found.seconds == pytest.approx(found.rows / 20)
+    assert [line.trips for line in found.episodes] == [1, 0, 0], "somebody stopped the first one"
+    assert found.bytes == sum(file.stat().st_size for file in dataset.root.rglob("*") if file.is_file())
+    for key, spreads in (("observation.state", found.state), ("action", found.action)):
+        table = np.concatenate([episode.columns[key] for episode in dataset.episodes]).astype(float)
+        assert [each.name for each in spreads] == dataset.episodes[0].names(key)
+        for k, each in enumerate(spreads):
+            told = (each.min, each.max, each.mean, each.std)
+            assert told == pytest.approx((table[:, k].min(), table[:, k].max(), table[:, k].mean(), table[:, k].std()))
+    assert [each.source for each in found.timing] == ["robot.panda", "gripper.panda", "camera.scene", "camera.wrist"]
+    assert all(each.period == pytest.approx(50.0) for each in found.timing), "lock-step is even"
+    assert all(each.jitter == pytest.approx(0.0, abs=0.01) for each in found.timing)
+
+
+def test_times_that_are_not_even_are_told(dataset: Dataset) -> None:
+    (episode,) = Dataset(dataset.root).episodes[:1]
+    wrist, scene = (episode.columns[f"observation.time.camera.{name}"].copy() for name in ("wrist", "scene"))
+    wrist[4:, 0] -= 0.02  # one came 20 ms early, and all after it
+    wrist[8] = wrist[7]  # and one not at all
+    scene[:2] = np.nan
+    episode.columns.update({"observation.time.camera.wrist": wrist, "observation.time.camera.scene": scene})
+    found = {each.source: each for each in summary(dataset, [episode]).timing}
+    told = found["camera.wrist"]
+    assert told.repeated == 1
+    assert told.longest == pytest.approx(100.0)
+    assert told.oldest == pytest.approx(70.0)
+    assert told.jitter > 5.0
+    assert found["camera.scene"].repeated == 0, "what never spoke does not count"
+    assert found["camera.scene"].period == pytest.approx(50.0)
+
+
+def test_an_episode_that_cannot_be_read_does_not_hide_the_others(tmp_path: Path) -> None:
+    dataset = make_recording(tmp_path / "demo")
+    (dataset.root / "data/chunk-000/file-001.parquet").write_bytes(b"nothing")
+    found = summary(Dataset(dataset.root))
+    assert [line.number for line in found.episodes] == [0, 2]
+    assert len(found.broken) == 1
+    assert found.broken[0].startswith("episode 1: ")
+
+
+def test_json_has_no_number_that_json_does_not_have(dataset: Dataset) -> None:
+    def refuse(text: str) -> None:
+        raise AssertionError(text)
+
+    found = json.loads(as_json(summary(dataset, dataset.episodes[:1])), parse_constant=refuse)
+    assert found["rows"] == dataset.episodes[0].length
+    assert found["state"][0]["name"] == "panda_joint1"
+
+
+# The sheet.
+
+
+def has(image: np.ndarray, colour: tuple[int, int, int]) -> int:
+    """How many pixels have it."""
+    return int((image == colour).all(axis=2).sum())
+
+
+def test_the_sheet_shows_pictures_curves_and_stops(dataset: Dataset) -> None:
+    stopped, calm = (np.asarray(draw_sheet(dataset.episodes[k])) for k in (0, 1))
+    assert stopped.shape == calm.shape
+    assert stopped.shape[1] == 1600
+    for image in (stopped, calm):
+        assert has(image, BLUE) > 500
+        assert has(image, ORANGE) > 500
+    assert has(stopped, RED) > 1000
+    assert has(stopped, PINK) > 10_000
+    assert has(calm, RED) == has(calm, PINK) == 0
+    first = next(dataset.episodes[0].frames("scene"))
+    corner = stopped[104 + 18 + 8, 40 + 8].astype(int)
+    assert np.abs(corner - first[1:5, 1:5].mean(axis=(0, 1))).max() < 25, "the first picture is the upper left one"
+
+
+def test_a_curve_goes_through_its_points() -> None:
+    paper = Canvas(100, 50)
+    paper.line([(10, 40), (90, 10)], BLUE, 2.0)
+    paper.box(0, 0, 5, 5, RED)
+    paper.text(60, 30, "x", 12)
+    image = np.asarray(paper.finished())
+    assert tuple(image[25, 50]) == BLUE
+    assert tuple(image[2, 2]) == RED
+    assert tuple(image[40, 90]) == (255, 255, 255)
+    assert image[30:46, 58:72].min() < 100, "a word is there"
+    assert canvas.Canvas.length("xx") > canvas.Canvas.length("x") > 0
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "found"),
+    [(0.0, 1.0, [0.0, 0.5, 1.0]), (-0.21, 0.19, [-0.2, -0.1, 0.0, 0.1]), (0.0, 80.0, [0.0, 20.0, 40.0, 60.0, 80.0])],
+)
+def test_ticks_are_round(low: float, high: float, found: list[float]) -> None:
+    assert ticks(low, high, 5) == pytest.approx(found)

@@ -1,0 +1,172 @@
+"""A rig as a Gymnasium environment."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import hal
+from hal.drivers.mock.camera import read_picture
+
+gymnasium = pytest.importorskip("gymnasium", reason="pip install 'robot-hal[gym]'")
+
+from gymnasium.utils.env_checker import check_env  # noqa: E402
+
+from hal.gym import RigEnv  # noqa: E402
+
+BARE = ("cameras={}",)
+
+
+@pytest.mark.filterwarnings("ignore:.*Box observation space.*")
+@pytest.mark.parametrize("action", ["joint", "tcp_delta", "twist"])
+def test_gymnasium_finds_nothing_wrong(action: str) -> None:
+    env = RigEnv("panda_table", sim=True, action=action, max_steps=50, overrides=("cameras.scene.output.width=64",))
+    try:
+        check_env(env, skip_render_check=True)
+    finally:
+        env.close()
+
+
+def run(steps: int) -> bytes:
+    env = RigEnv("panda_table", sim=True, action="joint", overrides=BARE)
+    try:
+        seen, _ = env.reset(seed=7)
+        env.action_space.seed(7)
+        trace = [seen["q"]]
+        for _ in range(steps):
+            seen, *_ = env.step(env.action_space.sample())
+            trace += [seen["q"], seen["dq"], seen["tcp"], seen["gripper"], env.rig.world.pose("cube").position]
+        assert np.ptp([q[0] for q in trace[1::5]]) > 0.02, "it moved"
+        return np.concatenate(trace).tobytes()
+    finally:
+        env.close()
+
+
+def test_the_same_seed_and_actions_give_the_same_states_to_the_bit() -> None:
+    assert run(1000) == run(1000)
+
+
+def test_an_action_does_what_it_says() -> None:
+    env = RigEnv("panda_table", sim=True, action="tcp_delta", overrides=BARE)
+    try:
+        before, _ = env.reset()
+        for _ in range(20):
+            after, *_ = env.step(np.array([0.005, 0, 0, 0, 0, 0, 1.0], np.float32))
+        assert after["tcp"][0] - before["tcp"][0] == pytest.approx(0.1, abs=0.015)
+        assert np.abs(after["tcp"][1:3] - before["tcp"][1:3]).max() < 0.01
+        assert after["gripper"][0] < 0.5 * before["gripper"][0], "closing"
+    finally:
+        env.close()
+
+
+def test_a_reset_puts_everything_back_or_where_it_is_told() -> None:
+    calls = []
+    env = RigEnv("panda_table", sim=True, action="twist", overrides=BARE, on_reset=lambda env, o: calls.append(o))
+    try:
+        first, info = env.reset(seed=1)
+        assert info == {"elapsed": 0.0}
+        for _ in range(20):
+            env.step(np.array([0.2, 0.1, 0, 0, 0, 0, 0], np.float32))
+        again, _ = env.reset(options={"poses": {"cube": hal.Pose([0.1, 0.1, 0.7])}})
+        assert again["q"] == pytest.approx(first["q"], abs=1e-3)
+        assert env.rig.world.pose("cube").position[:2] == pytest.approx([0.1, 0.1], abs=1e-3)
+        assert len(calls) == 2
+        q = np.array(first["q"]) + 0.05
+        elsewhere, _ = env.reset(options={"q": q})
+        assert elsewhere["q"] == pytest.approx(q, abs=1e-3)
+    finally:
+        env.close()
+
+
+def test_the_hooks_decide_and_steps_are_counted() -> None:
+    env = RigEnv(
+        "panda_table",
+        driver="mock",
+        action="twist",
+        max_steps=5,
+        reward=lambda env, o: o.robots["panda"].tcp.position[0],
+        terminated=lambda env, o: o.robots["panda"].tcp.position[2] < -10.0,
+    )
+    try:
+        env.reset()
+        for step in range(1, 6):
+            seen, reward, terminated, truncated, _ = env.step(np.zeros(7, np.float32))
+            assert reward == pytest.approx(seen["tcp"][0])
+            assert (terminated, truncated) == (False, step == 5)
+    finally:
+        env.close()
+
+
+def test_a_stop_truncates_and_says_why_and_a_reset_goes_on() -> None:
+    env = RigEnv("panda_table", driver="mock", action="twist", overrides=BARE)
+    try:
+        env.reset()
+        env.step(np.zeros(7, np.float32))
+        env.rig.stop()
+        env.rig.clock.sleep(0.05)
+        *_, truncated, info = env.step(np.zeros(7, np.float32))
+        assert truncated
+        assert "rig.stop()" in info["stopped"]
+        env.reset()
+        *_, truncated, info = env.step(np.zeros(7, np.float32))
+        assert not truncated
+        assert "stopped" not in info
+    finally:
+        env.close()
+
+
+def test_in_real_time_every_observation_is_a_fresh_one() -> None:
+    """Another system handed out the same observation again in 96 to 98 of 100 steps."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(
+            "hal.gym.RigEnv._open",
+            staticmethod(lambda *a: hal.open("panda_table", driver="mock", clock="real_time", pad="none")),
+        )
+        env = RigEnv(action="twist", rate_hz=20.0)
+    try:
+        env.reset()
+        pictures, stamps = [], []
+        for _ in range(40):
+            sent = env.rig.clock.now()
+            seen, *_ = env.step(np.array([0.05, 0, 0, 0, 0, 0, 0], np.float32))
+            assert env.observation is not None
+            frames = [moment.frame for moment in env.observation.cameras.values()]
+            assert all(frame.stamp.t > sent for frame in frames)
+            pictures.append(read_picture(seen["scene.color"]).seq)
+            stamps.append(env.observation.robots["panda"].stamp.t)
+        assert len(set(pictures)) == len(pictures)
+        assert (np.diff(stamps) > 0.0).all()
+    finally:
+        env.close()
+
+
+def test_what_cannot_be_is_refused_before_anything_is_left_open() -> None:
+    for wrong in ({"action": "jump"}, {"robot": "pandda"}, {"cameras": ["wirst"]}):
+        with pytest.raises(hal.HalError):
+            RigEnv("panda_table", driver="mock", **wrong)
+    env = RigEnv("panda_table", driver="mock", overrides=BARE)
+    try:
+        with pytest.raises(hal.CommandError, match="reset"):
+            env.step(np.zeros(8, np.float32))
+        env.reset()
+        with pytest.raises(hal.CommandError, match="shape"):
+            env.step(np.zeros(3, np.float32))
+    finally:
+        env.close()
+        env.close()
+
+
+def make() -> RigEnv:
+    return RigEnv("panda_table", sim=True, action="twist", overrides=BARE)
+
+
+def test_several_in_processes_of_their_own() -> None:
+    envs = gymnasium.vector.AsyncVectorEnv([make, make], context="spawn")
+    try:
+        seen, _ = envs.reset(seed=3)
+        assert seen["q"].shape == (2, 7)
+        for _ in range(5):
+            seen, *_ = envs.step(np.array([[0.1, 0, 0, 0, 0, 0, 0], [-0.1, 0, 0, 0, 0, 0, 0]], np.float32))
+        assert seen["tcp"][0, 0] - seen["tcp"][1, 0] > 0.01
+    finally:
+        envs.close()

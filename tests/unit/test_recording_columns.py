@@ -1,0 +1,63 @@
+"""Rigs that are not the built-in one: two arms, no gripper known, objects that come and go."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from recording_kit import check_layout, mock_rig
+
+import hal
+from hal.recording import Dataset, Recorder
+
+TWO = {
+    "robots": {
+        "left": {"model": "panda", "base": {"position": [0, 0.4, 0]}},
+        "right": {"model": "panda", "base": {"position": [0, -0.4, 0]}},
+    },
+    "objects": [],
+}
+
+
+def test_two_arms_share_the_columns(tmp_path: Path) -> None:
+    with hal.open(TWO, driver="mock") as rig, Recorder(rig, tmp_path / "out") as recorder:
+        recorder.start()
+        rig.clock.sleep(0.5)
+        recorder.save(wait=True)
+    info = check_layout(tmp_path / "out")
+    names = info["features"]["action"]["names"]
+    assert len(names) == 16
+    assert names[0].startswith("left.")
+    assert names[7] == "left.gripper"
+    assert names[8].startswith("right.")
+    episode = Dataset(tmp_path / "out").episodes[0]
+    assert episode.columns["observation.tcp"].shape == (episode.length, 14)
+    assert set(episode.stamps) == {"grid", "robot.left", "robot.right", "gripper.left", "gripper.right"}
+
+
+def test_an_object_that_is_taken_away_is_not_known_any_more(tmp_path: Path) -> None:
+    pytest.importorskip("pybullet", reason="pip install 'robot-hal[sim]'")
+    with (
+        hal.open("panda_table", sim=True, clock="lock_step", pad="none", overrides=["cameras={}"]) as rig,
+        Recorder(rig, tmp_path / "out") as recorder,
+    ):
+        recorder.start()
+        rig.clock.sleep(0.2)
+        rig.world.remove("duck")
+        rig.clock.sleep(0.2)
+        recorder.save(wait=True)
+    check_layout(tmp_path / "out")
+    episode = Dataset(tmp_path / "out").episodes[0]
+    duck = episode.columns["observation.object.duck"]
+    assert np.isfinite(duck[:6]).all()
+    assert np.isnan(duck[-5:]).all()
+    assert np.isfinite(episode.columns["observation.object.cube"]).all()
+    assert "observation.object.table" not in episode.columns, "what stands still is in the episode's own file"
+    assert set(episode.info["objects_at_start"]) == {"floor", "table", "cube", "duck"}
+
+
+def test_infrared_is_said_to_be_left_out(tmp_path: Path) -> None:
+    streams = "cameras.scene.streams={color: {format: bgr8}, infrared: {format: y8}}"
+    with mock_rig("lock_step", streams) as rig, Recorder(rig, tmp_path / "out") as recorder:
+        assert recorder.notes == ["camera scene: infrared not recorded"]

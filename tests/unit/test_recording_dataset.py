@@ -1,0 +1,189 @@
+"""What lies on disk, and how it is read."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from recording_kit import CAMERAS, check_layout, drive, mock_rig, record
+
+from hal.errors import CommandError, DeviceNotFound
+from hal.recording import Dataset, Recorder, recover
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("made") / "demo"
+    with mock_rig() as rig, Recorder(rig, out, task="lift") as recorder:
+        recorder.start(seed=7, info={"note": "the first"})
+        drive(rig, 1.0)
+        recorder.save(True, wait=True)
+        recorder.task = "lower"
+        record(recorder, 0.5, success=False)
+        record(recorder, 0.5, success=None)
+    return out
+
+
+def test_the_layout_is_that_of_a_lerobot_dataset(made: Path) -> None:
+    info = check_layout(made)
+    assert (info["total_episodes"], info["total_tasks"], info["fps"], info["robot_type"]) == (3, 2, 30, "panda")
+    assert info["features"]["observation.state"]["names"][-1] == "gripper"
+    assert info["features"]["observation.images.wrist"]["shape"] == [48, 64, 3]
+
+
+def test_an_episode_says_where_it_comes_from(made: Path) -> None:
+    episodes = Dataset(made).episodes
+    assert [episode.task for episode in episodes] == ["lift", "lower", "lower"]
+    assert [episode.success for episode in episodes] == [True, False, None]
+    info = episodes[0].info
+    assert (info["seed"], info["info"]) == (7, {"note": "the first"})
+    assert info["rig"]["resolved"]["robots"][0]["name"] == "panda"
+    assert "cameras:" in info["rig"]["written"], "the file itself"
+    assert {"python", "numpy", "av", "pyarrow"} <= set(info["versions"])
+    assert info["gaps"] == []
+
+
+def test_rows_are_at_their_times_and_nothing_is_missing(made: Path) -> None:
+    episode = Dataset(made).episodes[0]
+    assert episode.length == len(episode.columns["timestamp"])
+    grid = episode.stamps["grid"]
+    assert 1.0 <= grid[-1] - grid[0] <= 1.2
+    assert np.abs(np.diff(grid) - 1 / 30).max() < 0.005, "to within a step of the simulation"
+    for name, times in episode.stamps.items():
+        assert (np.diff(times) > 0).all() or name == "pad.pad", name
+        assert name == "pad.pad" or np.abs(times - grid).max() < 1e-9, f"{name}: in lock-step everything is of now"
+    assert set(episode.stamps) >= {"robot.panda", "gripper.panda", "camera.scene", "camera.wrist"}
+
+
+def test_the_action_is_where_the_arm_was_told_to_be_by_the_next_row(made: Path) -> None:
+    columns = Dataset(made).episodes[0].columns
+    action, told = columns["action"], columns["observation.setpoint"]
+    assert np.array_equal(action[:-1], told[1:])
+    assert np.array_equal(action[-1], told[-1])
+    assert np.ptp(action[:, :7], axis=0).max() > 0.01, "it moved"
+    assert action[-1, -1] == pytest.approx(0.04, abs=1e-3), "half closed, m"
+
+
+def test_pictures_and_depth_come_back(made: Path) -> None:
+    episode = Dataset(made).episodes[0]
+    for camera in CAMERAS:
+        frames, depths = list(episode.frames(camera)), list(episode.depth(camera))
+        assert len(frames) == len(depths) == episode.length
+        assert frames[0].shape == (48, 64, 3)
+        assert frames[0].dtype == np.uint8
+        numbers = episode.columns[f"observation.time.camera.{camera}"][:, 2].astype(int)
+        for number, frame, depth in zip(numbers, frames, depths, strict=True):
+            left = int(number) * 4 % 64  # where the mock's bright square is
+            assert frame[24, min(63, left + 4) :].max() > 200
+            near = depth < depth.max() - 0.05
+            assert near.any(), "the square is nearer than the background"
+            assert np.unique(depth).size == 2
+            assert np.isclose(np.unique(depth), [0.9, 1.0], atol=2e-4).all()
+    with pytest.raises(DeviceNotFound, match="cameras: scene, wrist"):
+        episode.frames("nose")
+
+
+def test_statistics_are_those_of_all_rows(made: Path) -> None:
+    stats = json.loads((made / "meta/stats.json").read_text())
+    states = np.concatenate([episode.columns["observation.state"] for episode in Dataset(made).episodes])
+    found = stats["observation.state"]
+    assert found["count"] == [len(states)]
+    assert np.allclose(found["mean"], states.mean(axis=0), atol=1e-6)
+    assert np.allclose(found["std"], states.std(axis=0), atol=1e-6)
+    assert np.allclose(found["min"], states.min(axis=0), atol=1e-6)
+    assert np.allclose(found["max"], states.max(axis=0), atol=1e-6)
+    pixels = np.concatenate([list(episode.frames("scene")) for episode in Dataset(made).episodes]) / 255.0
+    assert np.allclose(np.ravel(stats["observation.images.scene"]["mean"]), pixels.mean(axis=(0, 1, 2)), atol=0.02)
+
+
+def test_what_differs_is_said_before_anything_is_written(made: Path) -> None:
+    before = sorted(str(path) for path in made.rglob("*"))
+    with mock_rig("lock_step", "cameras.wrist.output.width=80") as rig, pytest.raises(CommandError) as caught:
+        Recorder(rig, made, fps=15, depth=False)
+    said = str(caught.value)
+    assert "fps is 30 there, and 15 here" in said
+    assert "shape of observation.images.wrist is [48, 64, 3] there, and [48, 80, 3] here" in said
+    assert sorted(str(path) for path in made.rglob("*")) == before
+
+
+def test_a_folder_of_something_else_is_left_alone(tmp_path: Path) -> None:
+    (tmp_path / "thesis.tex").write_text("important")
+    with mock_rig() as rig, pytest.raises(CommandError, match="holds other things"):
+        Recorder(rig, tmp_path)
+    with mock_rig() as rig, Recorder(rig, tmp_path / "new"):
+        assert not (tmp_path / "new").exists(), "before the first episode nothing is written"
+
+
+@pytest.mark.parametrize("wrong", [{"fps": 0}, {"fps": 2.5}, {"codec": "mpeg2"}, {"cameras": ["nose"]}])
+def test_what_cannot_be_is_refused_at_once(tmp_path: Path, wrong: dict[str, object]) -> None:
+    with mock_rig() as rig, pytest.raises((CommandError, DeviceNotFound)):
+        Recorder(rig, tmp_path / "out", **wrong)
+
+
+def test_a_discarded_episode_is_gone_and_one_that_is_left_open_is_kept(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    with mock_rig() as rig:
+        with Recorder(rig, out) as recorder:
+            recorder.start()
+            drive(rig, 0.3)
+            assert recorder.status().state == "recording"
+            with pytest.raises(CommandError, match="save or discard it first"):
+                recorder.start()
+            recorder.discard()
+            assert not list(out.rglob("*.parquet"))
+            recorder.start()
+            drive(rig, 0.3)
+        assert recorder.status().state == "idle"
+        with pytest.raises(CommandError, match="closed"):
+            recorder.start()
+    check_layout(out)
+    assert [episode.success for episode in Dataset(out).episodes] == [None]
+    assert recover(out) == []
+
+
+def test_two_programs_do_not_record_into_one_folder(tmp_path: Path) -> None:
+    with mock_rig() as rig, Recorder(rig, tmp_path / "out") as first, Recorder(rig, tmp_path / "out") as second:
+        first.start()
+        with pytest.raises(CommandError, match="another program is recording"):
+            second.start()
+        drive(rig, 0.2)
+        first.save(wait=True)
+    check_layout(tmp_path / "out")
+
+
+def test_only_depth_and_only_colour(tmp_path: Path) -> None:
+    streams = "cameras.scene.streams={depth: {format: z16}}"
+    with mock_rig("lock_step", streams) as rig, Recorder(rig, tmp_path / "a", cameras=["scene"]) as recorder:
+        record(recorder, 0.3)
+    assert check_layout(tmp_path / "a")["video_path"] is None
+    episode = Dataset(tmp_path / "a").episodes[0]
+    assert sum(1 for _ in episode.depth("scene")) == episode.length
+    with mock_rig() as rig, Recorder(rig, tmp_path / "b", depth=False, codec="av1") as recorder:
+        record(recorder, 0.3)
+    info = check_layout(tmp_path / "b")
+    assert info["features"]["observation.images.scene"]["info"]["video.codec"] == "av1"
+    with pytest.raises(DeviceNotFound, match="no depth"):
+        Dataset(tmp_path / "b").episodes[0].depth("scene")
+
+
+def test_the_package_imports_without_its_libraries() -> None:
+    """And says what to install when it is used."""
+    code = (
+        "import sys\n"
+        "class No:\n"
+        "    def find_spec(self, name, path=None, target=None):\n"
+        "        if name.split('.')[0] in ('pyarrow', 'av', 'zstandard'): raise ModuleNotFoundError(name)\n"
+        "sys.meta_path.insert(0, No())\n"
+        "import importlib.util as u; real = u.find_spec\n"
+        "u.find_spec = lambda n, p=None: None if n in ('pyarrow', 'av', 'zstandard') else real(n, p)\n"
+        "from hal.recording import Dataset, Recorder, recover\n"
+        "for use in (lambda: Dataset('x'), lambda: recover('x'), lambda: Recorder(None, 'x')):\n"
+        "    try: use()\n"
+        "    except ImportError as error: print(error)\n"
+    )
+    said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    assert said.count("pip install 'robot-hal[record]'") == 3

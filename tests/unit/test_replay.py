@@ -1,0 +1,288 @@
+"""Replaying an episode: how exactly, at which speed, under whose thumb, and what is refused before anything moves."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+import hal
+from hal.course import Course
+from hal.deviation import Deviation
+from hal.replaying import Player
+
+FPS = 30
+BARE = ["cameras={}"]
+
+
+@dataclass
+class Recorded:
+    """An episode in memory, in the place of one on disk."""
+
+    columns: dict[str, Any] = field(default_factory=dict)
+    stamps: dict[str, Any] = field(default_factory=dict)
+    info: dict[str, Any] = field(default_factory=dict)
+    joints: tuple[str, ...] = ()
+
+    def names(self, key: str) -> list[str]:
+        return ["x", "y", "z", "qx", "qy", "qz", "qw"] if key == "observation.tcp" else [*self.joints, "gripper"]
+
+
+def opened(driver: str, **options: Any) -> hal.Rig:
+    kind: dict[str, Any] = {"driver": "mock"} if driver == "mock" else {"sim": True, "clock": "lock_step"}
+    return hal.open("panda_table", **{"overrides": BARE, "pad": "none", **kind, **options})
+
+
+def twist(t: float) -> hal.Twist:
+    return hal.Twist([0.12 * np.sin(1.5 * t), 0.15 * np.cos(2.0 * t), -0.05 * np.sin(t)], [0.0, 0.2 * np.sin(t), 0.3])
+
+
+def record(driver: str = "mock", seconds: float = 4.0, cube: hal.Pose | None = None) -> Recorded:
+    """Drive, close the hand half-way, and keep a row at every turn."""
+    rows: dict[str, list[Any]] = {"setpoint": [], "state": [], "tcp": [], "object.cube": []}
+    stamps = []
+    with opened(driver) as rig:
+        arm = rig.robots["panda"]
+        assert arm.gripper is not None
+        if cube is not None:
+            rig.world.reset("cube", pose=cube)
+        with arm.control(rate_hz=FPS) as control:
+            for tick in rig.clock.rate(FPS):
+                control.send(twist(tick.elapsed), gripper=0.0 if tick.elapsed < seconds / 2 else 0.8)
+                state, hand = arm.state(), arm.gripper.state()
+                stamps.append(state.stamp.t)
+                rows["setpoint"].append([*state.q_set, hand.width_target])
+                rows["state"].append([*state.q, hand.width])
+                rows["tcp"].append([*state.tcp.position, *state.tcp.orientation])
+                if rig.has_world:
+                    pose = rig.world.pose("cube")
+                    rows["object.cube"].append([*pose.position, *pose.orientation])
+                if tick.elapsed > seconds:
+                    break
+        return Recorded(
+            columns={f"observation.{key}": np.array(values, np.float32) for key, values in rows.items() if values},
+            stamps={"robot.panda": np.array(stamps)},
+            info={"rig": {"resolved": {"robots": [{"name": "panda", "model": "panda"}]}}},
+            joints=arm.joints,
+        )
+
+
+def course_of(episode: Recorded, robot: hal.Robot) -> Course:
+    return Course.of(episode, robot)  # type: ignore[arg-type]
+
+
+@pytest.fixture(scope="module")
+def episode() -> Recorded:
+    return record()
+
+
+# How it goes.
+
+
+@pytest.mark.parametrize("driver", ["mock", "pybullet"])
+@pytest.mark.parametrize("speed", [1.0, 0.5])
+def test_a_replay_is_where_the_recording_was(driver: str, speed: float) -> None:
+    episode = record(driver)
+    with opened(driver) as rig:
+        arm = rig.robots["panda"]
+        player = Player(rig, arm, course_of(episode, arm), speed=speed)
+        player.approach()
+        start, widths = rig.clock.now(), []
+        player.play(lambda player, plays: widths.append((player.place, arm.gripper.state().width)))
+        took = rig.clock.now() - start
+    assert player.finished
+    assert player.deviation.samples > 150
+    assert player.deviation.rms.max() < 0.01
+    assert player.deviation.tcp[0] < 0.01
+    assert player.deviation.most.max() > 0.0, "it was measured"
+    assert took == pytest.approx(player.course.duration / speed, abs=1.5)
+    recorded = episode.columns["observation.state"][:, -1]
+    for place, width in widths:
+        if not 1.9 < place < 2.8:  # not while the fingers are on their way, at a speed of their own
+            assert width == pytest.approx(np.interp(place, player.course.t, recorded), abs=0.012)
+
+
+def test_things_are_put_back_where_they_lay() -> None:
+    episode = record("pybullet", seconds=1.0, cube=hal.Pose([0.15, 0.2, 0.63]))
+    with opened("pybullet") as rig:
+        arm = rig.robots["panda"]
+        away = rig.world.pose("cube").position[:2] - [0.15, 0.2]
+        assert np.linalg.norm(away) > 0.05
+        player = Player(rig, arm, course_of(episode, arm))
+        player.approach()
+        assert rig.world.pose("cube").position == pytest.approx(player.course.objects["cube"].position, abs=1e-6)
+        assert rig.world.pose("cube").position[:2] == pytest.approx([0.15, 0.2], abs=0.01)
+        rig.world.remove("cube")
+        with pytest.raises(hal.CommandError, match="cube"):
+            player.approach()
+
+
+# Under whose thumb.
+
+
+def test_while_the_dead_man_is_released_time_stands_still_and_a_press_goes_on(episode: Recorded) -> None:
+    with opened("mock", pad=None, overrides=[*BARE, "gamepads.pad.model=auto"]) as rig:
+        arm, hand = rig.robots["panda"], rig.driver("pad")
+        player = Player(rig, arm, course_of(episode, arm), deadman=rig.gamepads["pad"].hold("l2"))
+        rig.clock.sleep(0.1)
+        hand.press("l2")
+        player.approach()
+        before = arm.state().q
+        turns, rest, places = 0, [], []
+
+        def on_turn(player: Player, plays: bool) -> None:
+            nonlocal turns
+            turns += 1
+            if turns == 25:  # what was held through the approach moves nothing
+                assert player.place == 0.0
+                assert np.abs(arm.state().q - before).max() < 1e-6
+                hand.release("l2")
+            elif turns == 30:
+                hand.press("l2")
+            elif turns == 130:
+                hand.release("l2")
+            elif 150 < turns < 200:
+                rest.append(arm.state().q)
+                places.append(player.place)
+                assert not plays
+            elif turns == 200:
+                hand.press("l2")
+            assert turns < 1000
+
+        player.play(on_turn)
+    assert player.finished
+    assert player.pauses == 1
+    assert np.ptp(rest, axis=0).max() < 1e-6, "at rest"
+    assert len(set(places)) == 1
+    assert 0.5 < places[0] < player.course.duration - 0.5, "in the middle"
+    assert player.deviation.rms.max() < 0.01, "and on from there"
+
+
+@pytest.mark.parametrize("cause", ["pad", "stop", "program"])
+def test_a_trip_ends_it(episode: Recorded, cause: str) -> None:
+    with opened("mock", pad=None, overrides=[*BARE, "gamepads.pad.model=auto"]) as rig:
+        arm, hand = rig.robots["panda"], rig.driver("pad")
+        player = Player(rig, arm, course_of(episode, arm), deadman=rig.gamepads["pad"].hold("l2"))
+        rig.clock.sleep(0.1)
+        hand.press("l2")
+        player.approach()
+        hand.release("l2")
+        turns = 0
+
+        def on_turn(player: Player, plays: bool) -> None:
+            nonlocal turns
+            turns += 1
+            assert turns < 500
+            if turns == 5:
+                hand.press("l2")
+            if turns == 80:
+                if cause == "pad":
+                    hand.inject(freeze=True)
+                elif cause == "stop":
+                    rig.stop()
+                else:
+                    rig.clock.sleep(1.0)  # this program hangs
+
+        texts = {"pad": "sign of life", "stop": r"rig\.stop", "program": "commands stopped"}
+        with pytest.raises(hal.MotionStopped, match=texts[cause]):
+            player.play(on_turn)
+        assert not player.finished
+        assert np.abs(arm.state().dq_set).max() < 1e-9
+        hand.inject(freeze=False)
+
+
+# What is refused.
+
+
+def test_what_cannot_be_replayed_is_refused_with_the_reason(episode: Recorded) -> None:
+    with opened("mock") as rig:
+        arm = rig.robots["panda"]
+        good = course_of(episode, arm)
+        good.check(arm, 1.0)
+
+        def moved(k: int, j: int, value: float) -> np.ndarray:
+            q = good.q_set.copy()
+            q[k, j] = value
+            return q
+
+        wrong: list[tuple[Course, str]] = [
+            (replace(good, model="fr3"), "model fr3"),
+            (replace(good, joints=("a", "b")), "joints a, b"),
+            (replace(good, q_set=moved(20, 3, 0.5)), "panda_joint4 goes through .* its limits here"),
+            (replace(good, q_set=moved(20, 3, np.nan)), "not a number"),
+            (replace(good, t=good.t[:1], q_set=good.q_set[:1]), "nothing to replay"),
+        ]
+        for course, text in wrong:
+            with pytest.raises(hal.CommandError, match=text):
+                Player(rig, arm, course)
+        for speed in (0.0, -1.0, 1.5, np.nan):
+            with pytest.raises(hal.CommandError, match="speed"):
+                Player(rig, arm, good, speed=speed)
+
+
+def test_what_is_too_fast_here_names_the_speed_that_is_not(episode: Recorded) -> None:
+    with opened("mock", overrides=[*BARE, "robots.panda.speed=0.05"]) as rig:
+        arm = rig.robots["panda"]
+        course = course_of(episode, arm)
+        with pytest.raises(hal.CommandError, match="at speed [0-9.]+ it could") as refused:
+            Player(rig, arm, course)
+        possible = float(str(refused.value).rpartition("at speed ")[2].split()[0])
+        Player(rig, arm, course, speed=possible)
+
+
+def test_an_arm_without_a_gripper_does_not_replay_one_that_has_it(episode: Recorded) -> None:
+    with opened("mock") as rig:
+        arm = rig.robots["panda"]
+        course = course_of(episode, arm)
+        arm.gripper = None
+        with pytest.raises(hal.CommandError, match="gripper"):
+            course.check(arm, 1.0)
+
+
+def test_one_arm_of_two_is_found_by_its_name(episode: Recorded) -> None:
+    with opened("mock") as rig:
+        arm = rig.robots["panda"]
+        single = course_of(episode, arm)
+
+        @dataclass
+        class Two(Recorded):
+            def names(self, key: str) -> list[str]:
+                own = Recorded.names(self, key)
+                return [f"{name}.{label}" for name in ("left", "panda") for label in own]
+
+        both = {key: np.hstack([0.0 * rows, rows]) for key, rows in episode.columns.items()}
+        two = Two(both, {"robot.left": 0.0 * episode.stamps["robot.panda"], **episode.stamps}, {}, episode.joints)
+        course = course_of(two, arm)
+        assert course.joints == single.joints
+        for name in ("t", "q_set", "q", "tcp", "width"):
+            assert getattr(course, name) == pytest.approx(getattr(single, name))
+        arm.name = "right"
+        with pytest.raises(hal.CommandError, match="no arm 'right'; it has: left, panda"):
+            course_of(two, arm)
+
+
+def test_the_deviation_is_what_it_says() -> None:
+    deviation = Deviation(["a", "b"])
+    assert deviation.as_json()["joints_rad"] is None
+    for off in (0.03, -0.04):
+        deviation.add(np.array([off, 0.0]), np.array([0.0, off, 0.0]))
+    assert deviation.rms == pytest.approx([np.sqrt(0.00125), 0.0])
+    assert deviation.most == pytest.approx([0.04, 0.0])
+    assert deviation.as_json()["tcp_mm"] == pytest.approx({"rms": 1e3 * np.sqrt(0.00125), "max": 40.0})
+    assert any("40.00 mm" in line for line in deviation.lines())
+
+
+def test_every_stretch_is_monotone_and_its_two_ways_agree() -> None:
+    from hal.replaying import Stretch
+
+    stretch = Stretch(t=10.0, s=2.0, speed=0.5)
+    times: Callable[[float], float] = stretch.time
+    places = [stretch.place(t) for t in np.arange(9.5, 14.0, 0.01)]
+    assert (np.diff(places) >= 0.0).all()
+    assert places[0] == 2.0
+    for s in np.arange(2.0, 4.0, 0.01):
+        assert stretch.place(times(s)) == pytest.approx(s)
+    assert np.diff(places)[-1] == pytest.approx(0.005)
