@@ -53,7 +53,7 @@ def parser() -> argparse.ArgumentParser:
     result = made.add_argument_group("result")
     result.add_argument("--compare", action="store_true", help="only show how far off the rig's file is; write nothing")
     result.add_argument("--out", metavar="FILE", help="write the rig there instead of over its own file")
-    result.add_argument("--yes", action="store_true", help="write without asking")
+    result.add_argument("--yes", action="store_true", help="write without asking, unless the answer is doubtful")
     return made
 
 
@@ -173,12 +173,17 @@ def _collect(args: argparse.Namespace, rig: Rig, collector: Collector, guess: Po
 
 
 def _write(args: argparse.Namespace, output: Output, setting: Setting, found: Calibration) -> int:
-    """Into the rig's file, if that is wanted."""
+    """Into the rig's file, if that is wanted. Raises CalibrationFailed for a doubtful answer and nobody to ask."""
+    from hal.calibration import CalibrationFailed
+
     key, value = setting.entry(found.camera)
     print(f"\ncameras.{setting.camera} of {output.path}:\n  {key}: {value}", flush=True)
+    if args.yes and found.doubtful:
+        why = "; ".join(found.doubtful)
+        raise CalibrationFailed(f"not written, for --yes writes no doubtful answer (without it you are asked): {why}")
     if not args.yes:
         try:
-            answer = input("Write it? [y/N] ")
+            answer = input("Write it all the same? [y/N] " if found.doubtful else "Write it? [y/N] ")
         except EOFError:
             answer = ""
         if not answer.strip().lower().startswith("y"):

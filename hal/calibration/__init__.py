@@ -4,6 +4,7 @@ One file, one question:
 
 ``board``       what is printed?
 ``printing``    how does it come onto paper, to scale?
+``looking``     which picture is it, and of which sensor?
 ``detection``   where are the board's corners in this picture, and is the picture good enough?
 ``lens``        where would a camera without distortion see them?
 ``views``       what belongs to one picture, and what is solved for?

@@ -9,6 +9,7 @@ import numpy as np
 from ..errors import StaleStateError
 from .detection import Detector
 from .errors import NoView
+from .looking import look_of
 from .setting import Setting
 from .views import View
 
@@ -66,15 +67,13 @@ class Collector:
         after = self.robot.state()
         if np.abs(after.q - before.q).max() > SHAKE:
             raise NoView("the arm moved while the picture was taken")
-        picture = frame.color if frame.color is not None else frame.infrared
-        if picture is None:
-            raise NoView(f"camera {self.camera.name} streams neither colour nor infrared")
-        sighting = self.detector.find(picture, frame.K, frame.distortion)
+        look = look_of(frame, self.camera.info, self.camera.spec.align)
+        sighting = self.detector.find(look.picture, look.K, look.distortion)
         if self.views and not np.allclose(self.views[0].sighting.K, sighting.K):
             raise NoView("the camera's K is not what it was in the first view")
         q = (before.q + after.q) / 2.0
         link = self.robot.base @ self.robot.kinematics.link_pose(self.setting.link, q)
-        return View(f"view {len(self.views) + 1}", link, sighting, q)
+        return View(f"view {len(self.views) + 1}", link, sighting, q, look.T_color_eye)
 
     def _wait_for_rest(self) -> None:
         end = self._clock.now() + PATIENCE

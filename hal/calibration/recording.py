@@ -56,9 +56,9 @@ def drive(
 ) -> None:
     """Take ``wanted`` views by ``move_to``, starting where the arm is and the board is seen.
 
-    ``guess`` is where the camera is, to some cm and degrees; it only decides where the arm goes, and is replaced by
-    what the views say as soon as there are enough of them. Raises CalibrationFailed where the board is not seen at the
-    start, and what ``move_to`` raises when the arm was stopped.
+    ``guess`` is where the camera's colour sensor is, to some cm and degrees; it only decides where the arm goes, and is
+    replaced by what the views say as soon as there are enough of them. Raises CalibrationFailed where the board is not
+    seen at the start, and what ``move_to`` raises when the arm was stopped.
     """
     first = take_and_tell(collector, say)
     if first is None or first.q is None:
@@ -83,7 +83,7 @@ def drive(
 
 
 class _Tour:
-    """Where to go next."""
+    """Where to go next. Its camera is the optical frame that the pictures are of."""
 
     def __init__(self, collector: Collector, first: View, guess: Pose, places: int) -> None:
         assert first.q is not None
@@ -91,7 +91,8 @@ class _Tour:
         spec, board = collector.camera.spec, collector.detector.board
         self._middle = board.centre
         self._reach = Reach(collector.robot, collector.setting.link, collector.setting.eye, first.q)
-        self._camera = guess
+        self._to_eye = first.T_color_eye
+        self._camera = guess @ self._to_eye
         self._board = self._believed(first)
         seen = first.sighting.T_camera_board
         self._places = looks(board, first.sighting.K, (spec.width, spec.height), seen, places)
@@ -109,10 +110,11 @@ class _Tour:
             found = solve(self._collector.views, self._collector.setting.eye)
         except CalibrationFailed:
             return
-        distance, angle = self._camera.distance(found.camera)
+        camera = found.camera @ self._to_eye
+        distance, angle = self._camera.distance(camera)
         off = f"{1e3 * distance:.0f} mm and {np.degrees(angle):.1f} degrees"
         say(f"the camera is {off} from where it was believed to be")
-        self._camera, self._board = found.camera, found.board
+        self._camera, self._board = camera, found.board
 
     def next(self) -> Array | None:
         """(n,) rad of the place that is the shortest way from here, clear of the board; None when none is left."""

@@ -29,7 +29,11 @@ MOST_BAD = 1.0 / 3.0
 MOST_STD = 0.01, np.radians(1.0)
 """m and rad: with more doubt than this there is no answer."""
 SIZE_TOLD = 0.003
-"""Share by which the board's size may seem wrong before that is told."""
+SIZE_MOST = 0.03
+"""Shares by which the board's size may seem wrong before that is told, and before there is no answer."""
+RMS_TOLD, RMS_MOST = 1.0 / 300.0, 1.0 / 150.0
+"""By how much the corners may be off, as a share of the focal length (2 and 4 px at 600 px), before that is told, and
+before there is no answer. What moved is off by an angle, however fine the pixels are."""
 
 
 @dataclass(frozen=True)
@@ -54,7 +58,8 @@ class Calibration:
 
     eye: Eye
     camera: Pose
-    """Of the optical frame: in the frame of the link (in-hand), or in the world (to-hand)."""
+    """Of the colour sensor's optical frame, as a rig's file has it, whichever sensor the pictures were of: in the frame
+    of the link (in-hand), or in the world (to-hand)."""
     board: Pose
     """In the world (in-hand), or in the frame of the link (to-hand)."""
     residuals: tuple[Residual, ...]
@@ -62,6 +67,8 @@ class Calibration:
     arm: float
     """How wrong the arm seems to be about where it is, m: standard deviation along each axis."""
     doubt: Doubt
+    focal: float
+    """Of the camera, pixels."""
 
     @property
     def used(self) -> tuple[Residual, ...]:
@@ -75,19 +82,41 @@ class Calibration:
         return px, distance, angle
 
     @property
-    def warnings(self) -> tuple[str, ...]:
-        """What a person should look at before believing it."""
+    def doubtful(self) -> tuple[str, ...]:
+        """Why the answer may be wrong by more than it is said to be certain to. A person should decide on it."""
         told = []
-        doubt = self.doubt
-        if abs(doubt.scale) > max(SIZE_TOLD, 3.0 * doubt.scale_std):
-            told.append(
-                f"by the arm's own measure the board is {100.0 * abs(doubt.scale):.1f} % "
-                f"{'larger' if doubt.scale > 0 else 'smaller'} than was said: measure its squares (--square)"
-            )
-        left_out = [one.name for one in self.residuals if not one.used]
-        if left_out:
-            told.append(f"left out, since they do not fit the others: {', '.join(left_out)}")
+        if self.rms()[0] > RMS_TOLD * self.focal:
+            told.append(_misfit(self.rms()[0]))
+        if _is_off(self.doubt, SIZE_TOLD):
+            told.append(_size(self.doubt))
         return tuple(told)
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """All that a person should look at before believing it."""
+        left_out = [one.name for one in self.residuals if not one.used]
+        if not left_out:
+            return self.doubtful
+        return *self.doubtful, f"left out, since they do not fit the others: {', '.join(left_out)}"
+
+
+def _misfit(px: float) -> str:
+    return (
+        f"the views do not fit each other, corners are off by {px:.1f} px (rms): did the board, the camera or the "
+        "arm's base move, is the arm that inexact, or are the board's squares (--square) or the camera's K wrong?"
+    )
+
+
+def _is_off(doubt: Doubt, share: float) -> bool:
+    return abs(doubt.scale) > max(share, 3.0 * doubt.scale_std)
+
+
+def _size(doubt: Doubt) -> str:
+    larger = "larger" if doubt.scale > 0 else "smaller"
+    return (
+        f"by the arm's own measure the board is {100.0 * abs(doubt.scale):.1f} % {larger} than was said: measure its "
+        "squares (--square), or the camera's K is wrong"
+    )
 
 
 def solve(views: Sequence[View], eye: Eye) -> Calibration:
@@ -108,20 +137,25 @@ def solve(views: Sequence[View], eye: Eye) -> Calibration:
     noise = arm_noise(kept, fit.X, fit.Z)
     fit = refine(kept, fit.X, fit.Z, noise)
     doubt = doubt_of(kept, fit, noise)
+    px = _errors(corners, fit)
+    rms, focal = float(np.sqrt((px[used] ** 2).mean())), float(corners.K[0, 0])
+    if rms > RMS_MOST * focal:
+        raise CalibrationFailed("; ".join([_misfit(rms), *([_size(doubt)] if _is_off(doubt, SIZE_MOST) else [])]))
     if doubt.position > MOST_STD[0] or doubt.rotation > MOST_STD[1]:
-        px = float(np.median(fit.per_view(kept)))
         raise CalibrationFailed(
             f"the answer is uncertain by {1e3 * doubt.position:.1f} mm and {np.degrees(doubt.rotation):.2f} degrees, "
-            f"with corners off by {px:.1f} px. If that is more than two, many views do "
-            "not fit the others: something moved. If not, take more views, from more sides, with a larger board"
+            f"with corners off by {rms:.1f} px. Take more views, from more sides, with a larger board"
         )
+    if _is_off(doubt, SIZE_MOST):
+        raise CalibrationFailed(_size(doubt))
     return Calibration(
         eye,
-        Pose.from_matrix(fit.X),
+        Pose.from_matrix(fit.X) @ views[0].T_color_eye.inverse(),
         Pose.from_matrix(fit.Z),
-        _residuals(views, _errors(corners, fit), A @ fit.X @ C, used, fit.Z, doubt),
+        _residuals(views, px, A @ fit.X @ C, used, fit.Z, doubt),
         noise.position,
         doubt,
+        focal,
     )
 
 

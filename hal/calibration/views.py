@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
@@ -47,6 +47,8 @@ class View:
     sighting: Sighting
     q: Array | None = None
     """The arm's joints, rad."""
+    T_color_eye: Pose = field(default_factory=Pose)
+    """The optical frame that the picture is of, in the colour sensor's; the same in all views of a camera."""
 
 
 def camera_matrix(eye: Eye, view: View) -> Array:

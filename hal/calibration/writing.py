@@ -83,6 +83,9 @@ def _edited(text: str, camera: str, entry: str) -> str:
     settings = _value(_value(root, "cameras"), camera)
     if not isinstance(settings, yaml.MappingNode) or not settings.value:
         raise LookupError(f"cameras.{camera} holds no keys")
+    places = [name.value for name, _ in settings.value if name.value in PLACES]
+    if len(places) > 1:
+        raise LookupError(f"cameras.{camera} says {len(places)} times where the camera is: {', '.join(places)}")
     for name, value in settings.value:
         if name.value in PLACES:
             start, end = name.start_mark.index, _end(value)
@@ -103,10 +106,10 @@ def _edited(text: str, camera: str, entry: str) -> str:
 def _value(node: Any, key: str) -> Any:
     if not isinstance(node, yaml.MappingNode):
         raise LookupError(f"there are no keys where {key!r} should be")
-    for name, value in node.value:
-        if name.value == key:
-            return value
-    raise LookupError(f"there is no key {key!r}")
+    found = [value for name, value in node.value if name.value == key]
+    if len(found) != 1:
+        raise LookupError(f"the key {key!r} is there {len(found)} times" if found else f"there is no key {key!r}")
+    return found[0]
 
 
 def _end(node: Any) -> int:

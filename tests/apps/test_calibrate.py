@@ -97,6 +97,26 @@ def test_it_asks_before_it_writes(tmp_path: Path, answer: str, written: bool) ->
         assert place(out).distance(place("panda_calibration"))[0] < 2e-3
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize(("extra", "answer", "written"), [(["--yes"], "y\n", False), ([], "y\n", True)])
+def test_a_doubtful_answer_is_written_by_a_person_only(
+    tmp_path: Path, extra: list[str], answer: str, written: bool
+) -> None:
+    path = copy(tmp_path, "panda_calibration")
+    before = path.read_bytes()
+    wrong = ["--square", "0.0343"]  # 2 % too small
+    done = calibrate("--sim", "--config", str(path), "--auto", "--views", "8", *wrong, *extra, *STEPPED, answer=answer)
+    assert "WARNING: by the arm's own measure" in done.stdout
+    assert (path.read_bytes() != before) is written
+    if written:
+        assert done.returncode == 0, done.stderr
+        assert "Write it all the same? [y/N]" in done.stdout
+    else:
+        assert done.returncode == 2
+        assert re.search(r"not written, for --yes writes no doubtful answer.*by the arm's own measure", done.stderr)
+        assert [entry.name for entry in tmp_path.iterdir()] == ["rig.yaml"], "no copy, no rest"
+
+
 def test_by_hand_with_enter_and_too_few_views_nothing_is_written(tmp_path: Path) -> None:
     path = copy(tmp_path, "panda_calibration")
     before = path.read_bytes()

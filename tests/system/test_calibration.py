@@ -96,6 +96,26 @@ def test_the_camera_is_found(bench: Bench, seed: int) -> None:
     assert np.abs(arm.state().q - start).max() < 0.01, "and came back"
 
 
+@pytest.mark.parametrize(
+    "options",
+    [
+        ["cameras.wrist.streams=[color,depth]", "cameras.wrist.align=depth"],
+        ["cameras.wrist.streams=[infrared]"],
+    ],
+)
+def test_pictures_of_another_sensors_view_still_tell_where_the_colour_sensor_is(options: list[str]) -> None:
+    """Between the two are 15 mm."""
+    with hal.open("panda_calibration", sim=True, clock="lock_step", pad="none", overrides=options) as rig:
+        rig.clock.sleep(0.2)
+        bench = Bench(rig, "panda_calibration")
+        found = bench.drive(10)
+        assert np.linalg.norm(bench.collector.views[0].T_color_eye.position) > 0.01
+        millimetres, degrees = bench.off(found)
+        assert millimetres <= MOST_MM
+        assert degrees <= MOST_DEGREES
+        assert any("30 mm and 5.0 degrees from where it was believed" in line for line in bench.told)
+
+
 @pytest.mark.slow
 def test_pybullets_own_renderer_will_do(name: str) -> None:
     options = ["simulation.renderer=tiny"]

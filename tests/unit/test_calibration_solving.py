@@ -6,11 +6,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from calibration_kit import BOARD, CAMERA, LENS, K, degrees, poses, views
+from calibration_kit import BOARD, CAMERA, LENS, K, Z, degrees, poses, views
 
-from hal.calibration import CalibrationFailed, Eye, solve
+from hal.calibration import CalibrationFailed, Eye, View, solve
 from hal.calibration.report import difference_lines, report_lines
-from hal.calibration.rotations import exponential
+from hal.calibration.rotations import exponential, inverse
 from hal.pose import Pose
 
 EYES: tuple[Eye, ...] = ("in-hand", "to-hand")
@@ -69,6 +69,7 @@ def test_views_during_which_something_moved_are_left_out_and_named(eye: Eye) -> 
     found = solve(taken, eye)
     assert [one.name for one in found.residuals if not one.used] == ["view 3", "view 11"]
     assert any("view 3, view 11" in text for text in found.warnings)
+    assert found.doubtful == (), "the others fit each other"
     distance, angle = found.camera.distance(CAMERA)
     assert distance < 1e-3
     assert degrees(angle) < 0.1
@@ -100,6 +101,53 @@ def test_a_board_that_was_printed_at_another_size_is_told(share: float, word: st
     (warning,) = found.warnings
     assert f"2.0 % {word}" in warning
     assert "--square" in warning
+    assert "or the camera's K" in warning
+    assert found.doubtful == (warning,)
+
+
+@pytest.mark.parametrize("eye", EYES)
+@pytest.mark.parametrize("share", [0.9, 1.1])
+def test_a_k_or_a_board_that_is_wrong_by_a_tenth_is_refused(eye: Eye, share: float) -> None:
+    wrong = K * [[share], [share], [1.0]]
+    with pytest.raises(CalibrationFailed, match="or the camera's K"):
+        solve(views(eye, poses(15, 3), noise_px=0.2, arm=2e-4, believed=wrong), eye)
+    with pytest.raises(CalibrationFailed, match="--square"):
+        solve(views(eye, poses(15, 3), noise_px=0.2, real_board=BOARD.measured(share * 0.035)), eye)
+
+
+def moved(eye: Eye, after: int, metres: float) -> list[View]:
+    """15 views; after so many of them somebody pushed the board."""
+    taken = views(eye, poses(15, 3), noise_px=0.2, arm=2e-4)
+    push = Pose.from_matrix(Z @ exponential(np.array([metres, 0.0, 0.0, 0.0, 0.0, 0.0])) @ inverse(Z))
+    for k in range(after, 15):
+        link = taken[k].T_world_link
+        # the same pictures as before, of a board that is elsewhere: so the arm is, too
+        at = push.inverse() @ link if eye == "in-hand" else link @ push
+        taken[k] = replace(taken[k], T_world_link=at)
+    return taken
+
+
+@pytest.mark.parametrize("eye", EYES)
+@pytest.mark.parametrize("after", [7, 10])
+def test_a_board_that_moved_in_the_middle_is_refused(eye: Eye, after: int) -> None:
+    with pytest.raises(CalibrationFailed, match=r"off by [3-6]\.\d px.*did the board"):
+        solve(moved(eye, after, 0.008), eye)
+
+
+@pytest.mark.parametrize("eye", EYES)
+def test_one_that_moved_half_as_far_makes_the_answer_doubtful(eye: Eye) -> None:
+    found = solve(moved(eye, 7, 0.0045), eye)
+    assert any("did the board" in text for text in found.doubtful)
+    assert set(found.doubtful) <= set(found.warnings)
+
+
+@pytest.mark.parametrize("eye", EYES)
+def test_the_answer_is_the_colour_sensors_whichever_took_the_pictures(eye: Eye) -> None:
+    stereo = Pose([0.015, 0.001, -0.002], [0.0, 0.01, 0.0, 1.0])
+    taken = [replace(view, T_color_eye=stereo) for view in views(eye, poses(8))]
+    distance, angle = (solve(taken, eye).camera @ stereo).distance(CAMERA)
+    assert distance < 1e-8
+    assert angle < 1e-7
 
 
 @pytest.mark.parametrize(
@@ -140,7 +188,7 @@ def test_too_many_bad_views_are_refused() -> None:
     for k in (0, 2, 5, 8, 10):
         push = Pose.from_matrix(exponential(0.02 * chance.normal(size=6)))
         taken[k] = replace(taken[k], T_world_link=taken[k].T_world_link @ push)
-    with pytest.raises(CalibrationFailed, match="not fit the others"):
+    with pytest.raises(CalibrationFailed, match="do not fit"):
         solve(taken, "in-hand")
 
 

@@ -96,6 +96,26 @@ def test_what_cannot_be_changed_safely_is_told_with_what_to_write(text: str) -> 
     assert "cameras.wrist" in str(caught.value)
 
 
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        (
+            "cameras:\n  wrist: {model: a, pose: [1], look_at: {distance: 1}}\n",
+            "says 2 times where the camera is: pose, look_at",
+        ),
+        ("cameras:\n  wrist:\n    pose: [1]\n    pose: [2]\n", "says 2 times where the camera is: pose, pose"),
+        ("cameras:\n  wrist: {model: a}\n  wrist: {model: b}\n", "the key 'wrist' is there 2 times"),
+        ("cameras: {wrist: {model: a}}\ncameras: {wrist: {model: b}}\n", "the key 'cameras' is there 2 times"),
+        ("cameras:\n  a: &a {model: m}\n  wrist: *a\n", "shares keys between entries"),
+    ],
+)
+def test_the_reason_why_it_cannot_be_changed_is_the_right_one(text: str, reason: str) -> None:
+    with pytest.raises(CommandError) as caught:
+        replaced(text, "wrist", "pose", VALUE)
+    assert reason in str(caught.value)
+    assert ("shares keys" in str(caught.value)) is ("shares keys" in reason)
+
+
 def test_a_file_is_replaced_whole_and_keeps_its_rights(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     real, link = tmp_path / "real.yaml", tmp_path / "link.yaml"
     real.write_text("old")
