@@ -61,6 +61,7 @@ class RealSenseCamera(CameraDriver):
         self._link: CameraLink | None = None
         self._lock = threading.Lock()
         self._closings = 0
+        self._is_closed = False
         self._lost = False
         """Was the camera lost, so that whoever closes it now opens it again?"""
         self._tally_before = CameraTally()
@@ -84,8 +85,9 @@ class RealSenseCamera(CameraDriver):
         return self._info if self._info is not None else super().info
 
     def open(self) -> None:
+        self._is_closed = False
         if self._ended:
-            raise self._over(f"{self._ended}; open the rig anew to play it again")
+            raise self._over(self._ended)
         attempts = 1 if self._sessions else _ATTEMPTS
         for attempt in range(attempts):
             try:
@@ -163,7 +165,7 @@ class RealSenseCamera(CameraDriver):
 
     def _reset_if_due(self) -> str:
         """Have a camera restart that is there and sends nothing; what was done comes back in words, if anything."""
-        if self._fruitless < _FRUITLESS or self._was_reset or self._settings.play is not None:
+        if self._fruitless < _FRUITLESS or self._was_reset or not self._settings.is_real:
             return ""
         self._was_reset = True
         with suppress(ConnectionLost, DeviceNotFound):
@@ -200,8 +202,8 @@ class RealSenseCamera(CameraDriver):
         if link.lost:
             self._lost = True
             if link.is_final:
-                self._ended = link.lost
-            raise self._over(link.lost)
+                self._ended = f"{link.lost}; open the rig anew to play it again"
+            raise self._over(self._ended or link.lost)
         if link.quiet > self._silence:
             self._lost = True
             self._drop(link)
@@ -220,12 +222,14 @@ class RealSenseCamera(CameraDriver):
         link.ask("inject", _ANSWER, **knobs)
 
     def close(self) -> None:
+        """Stop. The process of a lost camera is kept for the next ``open``; a second ``close`` ends it, too."""
         with self._lock:
             self._closings += 1
+            again, self._is_closed = self._is_closed, True
             link = self._link
         if link is None:
             return
-        if not self._lost:
+        if again or not self._lost:
             self._drop(link, _SHUT)  # for good
             return
         try:

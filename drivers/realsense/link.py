@@ -35,6 +35,7 @@ class CameraLink:
         )
         self._listening = threading.Lock()
         self._asking = threading.Lock()
+        self._taking = threading.Lock()
         self._number = 0
         self._answers: dict[int, dict[str, Any]] = {}
         self._after = 0
@@ -92,16 +93,18 @@ class CameraLink:
     def take(self, timeout: float, every: bool) -> RawFrame | None:
         """The newest picture that was not taken, or each one in turn; None when none came within ``timeout`` s.
 
+        Where each one counts, its time is the present: it may have waited for minutes to be asked for.
         Raises ConnectionLost when the process is gone.
         """
         deadline = time.monotonic() + timeout
         listened = False
         while True:
-            taken = self._ring.take(self._after, every)
-            if taken is not None:
-                self._after, frame = taken
-                self._quiet = 0.0
-                return frame
+            with self._taking:  # else two threads would take one picture, and the slower one go back to it
+                taken = self._ring.take(self._after, every)
+                if taken is not None:
+                    self._after, frame = taken
+                    self._quiet = 0.0
+                    return frame._replace(t=time.monotonic()) if every else frame
             now = time.monotonic()
             if self.lost or (listened and now >= deadline):
                 return None

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 
 from hal.camera_info import CameraInfo
 from hal.errors import ConnectionLost, ControlTaken, DeviceNotFound, HalError, NotSupported
@@ -29,8 +30,9 @@ _REMEDIES: dict[type[HalError], str] = {
 
 
 def preflight(spec: CameraSpec, duration: float) -> Iterator[Verdict]:
-    """Open the camera, watch it for ``duration`` s, close it."""
-    driver = RealSenseCamera(spec)
+    """Open the camera, watch it for ``duration`` s, close it. Nothing is written: ``record`` is left out."""
+    quiet = {name: value for name, value in spec.options.items() if name not in ("record", "overwrite")}
+    driver = RealSenseCamera(replace(spec, options=quiet))
     try:
         try:
             driver.open()

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 from hal.camera_driver import CameraTally, RawFrame
+from hal.errors import ConnectionLost
 from hal.specs import CameraSpec
 
 __all__ = ["Images", "PictureRing"]
@@ -94,7 +95,10 @@ class PictureRing:
         return number
 
     def take(self, after: int, every: bool = False) -> tuple[int, RawFrame] | None:
-        """A copy of the newest picture, or of the one next to ``after`` if every one counts; None if there is none."""
+        """A copy of the newest picture, or of the one next to ``after`` if every one counts; None if there is none.
+
+        Raises ConnectionLost where every one counts and that one was written over.
+        """
         while (number := self.written) > after:
             number = after + 1 if every else number
             slot = number % SLOTS
@@ -103,6 +107,8 @@ class PictureRing:
             if before == number and _NUMBER.unpack_from(self._buffer, self._starts[slot])[0] == number:
                 _NUMBER.pack_into(self._buffer, 8, number)
                 return number, _frame(copies, t, t_device, seq, skew)
+            if every:  # the writer waits for the reader: who looks again would look for ever
+                raise ConnectionLost(f"picture {number} was written over before it was read")
         return None
 
 

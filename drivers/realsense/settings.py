@@ -27,6 +27,8 @@ FORMATS = {"color": COLOR_FORMATS, "depth": ("z16",), "infrared": ("y8",), "infr
 """Streams by the names of a rig's file -> the formats that they may have, the default first."""
 _SENSORS = ("color", "depth")
 _SUFFIX = ".db3"
+_NEEDS = {"overwrite": "record", "repeat": "play", "paced": "play"}
+"""Keys -> those without which they would be ignored."""
 
 
 def _serial(value: Any) -> Any:
@@ -107,7 +109,17 @@ class RealSenseSettings(Strict):
             raise ValueError("plays one recording or makes one: give play or record")
         if self.play is not None and self.emulated is not None:
             raise ValueError("has one place where its pictures come from: give play or emulated")
+        if self.play is not None and self.options:
+            raise ValueError("plays a recording, whose options were set when it was made: leave options out")
+        for key, other in _NEEDS.items():
+            if key in self.model_fields_set and getattr(self, other) is None:
+                raise ValueError(f"has {key}, which says nothing without {other}")
         return self
+
+    @property
+    def is_real(self) -> bool:
+        """Is it a camera that is plugged in?"""
+        return self.play is None and self.emulated is None
 
     @classmethod
     def of(cls, spec: CameraSpec) -> RealSenseSettings:
@@ -125,6 +137,12 @@ def problems(spec: CameraSpec) -> Iterator[tuple[str, str]]:
     validate(RealSenseSettings, spec.options, "", found, "real")
     for problem in found.found:
         yield problem.key, problem.message
+    played = spec.options.get("play")
+    if isinstance(played, str) and not found.found and not Path(played).expanduser().is_file():
+        yield "real.play", f"there is no recording {played}"
+    recorded = spec.options.get("record")
+    if isinstance(recorded, str) and not found.found and not Path(recorded).expanduser().parent.is_dir():
+        yield "real.record", f"there is no folder {Path(recorded).expanduser().parent} for the recording"
     for stream in spec.streams:
         formats = FORMATS.get(stream)
         if formats is None:

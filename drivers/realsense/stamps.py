@@ -23,7 +23,8 @@ _WINDOW, _BIN = 10.0, 1.0
 _CREDIBLE = 1.0
 """s; a time of day that gives an older or a younger capture was set in between."""
 _JUMP = 1.0
-"""s by which stamps and arrivals may drift apart before the camera's clock must have begun anew."""
+"""s by which stamps and arrivals may drift apart before the camera's clock must have begun anew. So it has whenever a
+stamp is older than the one before, by however little: a recording of less than this repeats."""
 
 
 class Unwrapped:
@@ -46,13 +47,14 @@ class _Offset:
     def __init__(self) -> None:
         self._bins: deque[tuple[float, float]] = deque()
         """(arrival that began it, its smallest difference)"""
-        self._last: float | None = None
+        self._last: tuple[float, float] | None = None
+        """Stamp, and difference."""
 
     def __call__(self, stamp: float, arrival: float) -> float:
         difference = arrival - stamp
-        if self._last is not None and abs(difference - self._last) > _JUMP:
+        if self._last is not None and (stamp < self._last[0] or abs(difference - self._last[1]) > _JUMP):
             self._bins.clear()  # another clock: the camera was reset, or a recording repeats
-        self._last = difference
+        self._last = stamp, difference
         if not self._bins or arrival - self._bins[-1][0] >= _BIN:
             self._bins.append((arrival, difference))
         elif difference < self._bins[-1][1]:

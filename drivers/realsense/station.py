@@ -17,6 +17,7 @@ from . import options
 from .calibration import calibration_of
 from .devices import Claim, Found, described, find, said
 from .modes import choose
+from .recordings import Recordings
 from .ring import PictureRing
 from .session import Live, Playing, Session
 from .settings import RealSenseSettings
@@ -44,6 +45,9 @@ class Station:
         self._tell = tell
         self._context, self._emulated = self._plug(spec)
         self._claim: Claim | None = None
+        self._recordings: Recordings | None = None
+        if self._settings.record is not None:
+            self._recordings = Recordings(self._settings.record, spec.name, self._settings.overwrite)
         self._session: Session | None = None
         self._streaming: Streaming | None = None
         self._played = ""
@@ -147,9 +151,7 @@ class Station:
         settings = self._settings
         if self._played:
             return Playing(self._context, self._played, chosen, repeat=settings.repeat, paced=settings.paced)
-        record = None
-        if settings.record is not None:
-            record = recording_path(settings.record, first, settings.overwrite)
+        record = self._recordings.next(first) if self._recordings is not None else None
         try:
             session = Live(self._context, found.device, found.serial, chosen, record)
         except ConnectionLost as error:
@@ -204,8 +206,10 @@ class Station:
         gc.collect()  # what the library holds open goes with the last of its objects
 
     def end(self) -> None:
-        """Close, and take the emulated camera away. Idempotent."""
+        """Close, let go of the recordings, and take the emulated camera away. Idempotent."""
         self.close()
+        if self._recordings is not None:
+            self._recordings.end()
         if self._emulated is not None:
             self._emulated.close()
             self._emulated = None
@@ -216,22 +220,3 @@ def _fruitless(text: str) -> ConnectionLost:
     error = ConnectionLost(text)
     vars(error)["fruitless"] = True
     return error
-
-
-def recording_path(wanted: str, first: bool, overwrite: bool) -> str:
-    """``wanted`` for the first recording of a program, and the next free number after it for those that follow.
-
-    Raises NotSupported where the first one is there and must not be overwritten.
-    """
-    path = Path(wanted)
-    if not path.parent.is_dir():
-        raise NotSupported(f"there is no folder {path.parent} for the recording")
-    if first and overwrite:
-        path.unlink(missing_ok=True)
-    elif first and path.exists():
-        raise NotSupported(f"{path} is there already: move it away, or say real: {{overwrite: true}}")
-    number = 2
-    while path.exists():
-        path = path.with_name(f"{Path(wanted).stem}-{number}{path.suffix}")
-        number += 1
-    return str(path)

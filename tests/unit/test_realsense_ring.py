@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Any
+
 import numpy as np
 import pytest
 
 from hal.camera_driver import CameraTally
 from hal.drivers.realsense.ring import SLOTS, PictureRing
+from hal.errors import ConnectionLost
 from hal.specs import CameraSpec
 
 from .test_realsense_settings import camera
@@ -68,12 +72,65 @@ def test_it_is_full_until_somebody_reads(ring: PictureRing) -> None:
     assert not ring.is_full
 
 
-def test_a_slot_that_is_written_to_is_not_read(ring: PictureRing) -> None:
+class _Interrupted(np.ndarray[Any, Any]):
+    """A picture; once it is copied, something happens before the next one is."""
+
+    then: Callable[[], None]
+
+    def copy(self, order: Any = "C") -> Any:
+        copied = np.array(self, order=order, subok=False)
+        self.then()
+        return copied
+
+
+def when_copied(ring: PictureRing, number: int, then: Callable[[], None]) -> None:
+    """Have it happen in the middle of the reader's copy of that picture, once."""
+    images = ring._images[number % SLOTS]
+    plain = images["color"]
+    interrupted = plain.view(_Interrupted)
+
+    def once() -> None:
+        images["color"] = plain
+        then()
+
+    interrupted.then = once
+    images["color"] = interrupted
+
+
+@pytest.mark.parametrize("finished", [True, False])
+def test_a_copy_that_the_writer_laps_is_thrown_away(finished: bool) -> None:
+    memory = memoryview(bytearray(PictureRing.size(small())))
+    writer, reader = PictureRing(memory, small()), PictureRing(memory, small())
+    put(writer, 1)
+
+    def lap() -> None:
+        for k in range(2, SLOTS + 1):
+            put(writer, k)
+        for image in writer.begin().values():  # over the one that is being copied
+            image[:] = SLOTS + 1
+        if finished:
+            writer.end(SLOTS + 1.0, 0.0, 0, None)
+
+    when_copied(reader, 1, lap)
+    number, frame = reader.take(0) or pytest.fail("there is one")
+    assert number == SLOTS + finished
+    assert frame.color is not None
+    assert frame.depth is not None
+    assert frame.infrared_right is not None
+    assert {*frame.color.flat, *frame.depth.flat, *frame.infrared_right.flat} == {number}, "all of one capture"
+
+
+@pytest.mark.parametrize("finished", [True, False])
+def test_who_wants_every_picture_is_told_that_one_was_written_over(ring: PictureRing, finished: bool) -> None:
     for k in range(1, SLOTS + 1):
         put(ring, k)
-    ring.begin()["color"][:] = 99  # over the oldest
-    assert (taken := ring.take(SLOTS - 1)) is not None
-    assert (taken[1].color == SLOTS).all()  # type: ignore[union-attr]
+    if finished:
+        put(ring, SLOTS + 1)
+    else:
+        ring.begin()
+    with pytest.raises(ConnectionLost, match="picture 1 was written over"):
+        ring.take(0, every=True)
+    assert ring.take(0) is not None
 
 
 def test_what_was_not_handed_out_is_counted(ring: PictureRing) -> None:

@@ -5,10 +5,12 @@ from __future__ import annotations
 import subprocess
 import sys
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import pytest
 
+from hal.config import load
 from hal.drivers.realsense.settings import RealSenseSettings, problems
 from hal.errors import ConfigError
 from hal.specs import CameraSpec, SensorSpec
@@ -44,7 +46,6 @@ def camera(**options: Any) -> CameraSpec:
         {"options": {"laser_power": 150, "depth": {"exposure": 8500, "enable_auto_exposure": False}}},
         {"options": {"visual_preset": "high_accuracy"}, "warm_up_s": 0, "stall_s": 0.5},
         {"record": "today.db3", "overwrite": True},
-        {"play": "~/today.db3", "repeat": False, "paced": False},
         {"emulated": True},
         {"emulated": {"pattern": "scene", "drift_ppm": 20.0}},
         {"emulated": False, "serial": None},
@@ -53,6 +54,21 @@ def camera(**options: Any) -> CameraSpec:
 def test_what_is_right(options: dict[str, Any]) -> None:
     assert list(problems(camera(**options))) == []
     RealSenseSettings.of(camera(**options))
+
+
+def test_a_recording_and_how_it_is_played(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("HOME", str(tmp_path))
+    options = {"play": "~/today.db3", "repeat": False, "paced": False}
+    assert list(problems(camera(**options))) == [("real.play", "there is no recording ~/today.db3")]
+    (tmp_path / "today.db3").touch()
+    assert list(problems(camera(**options))) == []
+    assert RealSenseSettings.of(camera(**options)).play == str(tmp_path / "today.db3")
+
+
+def test_a_folder_to_record_to_is_there(tmp_path: Path) -> None:
+    assert list(problems(camera(record=str(tmp_path / "today.db3")))) == []
+    (found,) = problems(camera(record=str(tmp_path / "none" / "today.db3")))
+    assert found == ("real.record", f"there is no folder {tmp_path / 'none'} for the recording")
 
 
 @pytest.mark.parametrize(
@@ -65,6 +81,10 @@ def test_what_is_right(options: dict[str, Any]) -> None:
         ({"play": "today"}, "real.play", "ends in .db3"),
         ({"play": "a.db3", "record": "b.db3"}, "real", "give play or record"),
         ({"play": "a.db3", "emulated": True}, "real", "give play or emulated"),
+        ({"play": "a.db3", "options": {"laser_power": 150}}, "real", "leave options out"),
+        ({"paced": False}, "real", "has paced, which says nothing without play"),
+        ({"repeat": True, "emulated": True}, "real", "has repeat, which says nothing without play"),
+        ({"overwrite": True}, "real", "has overwrite, which says nothing without record"),
         ({"stall_s": 0}, "real.stall_s", "greater than 0"),
         ({"warm_up_s": -1}, "real.warm_up_s", "greater than or equal to 0"),
         ({"options": [1]}, "real.options", "names and values"),
@@ -95,9 +115,13 @@ def test_streams_and_formats_are_those_of_the_cameras() -> None:
     assert "'y16' is none of rgb8, bgr8" in found["streams.color.format"]
 
 
-def test_alignment_to_depth_needs_both() -> None:
-    assert dict(problems(replace(camera(), streams=("depth",), align="depth"))).keys() == {"align"}
-    assert not list(problems(replace(camera(), align="depth")))
+@pytest.mark.parametrize("align", ["color", "depth"])
+def test_alignment_is_to_a_stream_that_is_on(align: str) -> None:
+    other = "depth" if align == "color" else "color"
+    pose = {"position": [0, 0, 1], "orientation": [0, 0, 0, 1]}
+    wrong = {"sim": False, "model": "realsense_d435", "streams": [other], "align": align, "pose": pose}
+    with pytest.raises(ConfigError, match=f"is {align}, which is none of the streams that are on: {other}"):
+        load({"cameras": {"wrist": wrong}}).resolve()
 
 
 def test_it_needs_no_library() -> None:

@@ -51,6 +51,16 @@ def test_a_camera_that_was_reset_or_a_recording_that_repeats_goes_on() -> None:
     assert np.allclose(first + again, 50.0 + np.arange(120) / 30.0, atol=0.001)
 
 
+@pytest.mark.parametrize("domain", [GLOBAL, HARDWARE])
+def test_a_recording_of_less_than_a_second_repeats_and_is_never_old(domain: str) -> None:
+    times = CaptureTimes(played=True)
+    ages = []
+    for k in range(600):
+        arrival = 50.0 + k / 30.0
+        ages.append(arrival - times(1000.0 + (k % 20) / 30.0, domain, arrival, 0.0)[0])
+    assert max(ages) < 0.001
+
+
 @pytest.mark.parametrize("domain", [GLOBAL, SYSTEM])
 def test_the_time_of_day_is_brought_to_the_monotonic_clock(domain: str) -> None:
     times = CaptureTimes()

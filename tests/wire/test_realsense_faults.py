@@ -9,6 +9,7 @@ import sys
 import textwrap
 import threading
 import time
+from typing import Any
 
 import pytest
 
@@ -18,6 +19,9 @@ from .realsense_bench import RealSenseCamera, opened, read_again, read_until_los
 
 from hal.drivers.realsense.devices import Claim, find  # isort: skip  # needs the library
 from hal.drivers.realsense.emulator import SoftwareCamera, emulated_context  # isort: skip
+from hal.drivers.realsense.options import apply, sensors_of  # isort: skip
+from hal.drivers.realsense.ring import PictureRing  # isort: skip
+from hal.drivers.realsense.station import Station  # isort: skip
 
 
 def test_unplugged_and_plugged_in_again_the_same_camera_works() -> None:
@@ -113,6 +117,34 @@ def test_a_closed_camera_leaves_no_process() -> None:
     assert not os.path.exists(f"/proc/{pid}")
 
 
+def test_a_lost_camera_that_is_closed_for_good_leaves_no_process() -> None:
+    driver = RealSenseCamera(software())
+    driver.open()
+    pid = driver._link._child.process.pid  # type: ignore[union-attr]
+    driver.inject(disconnect=True)
+    with pytest.raises(ConnectionLost):
+        while True:
+            driver.grab(1.0)
+    driver.close()
+    assert os.path.exists(f"/proc/{pid}"), "the camera in software is in it, and may be plugged in again"
+    with pytest.raises(DeviceNotFound):
+        driver.open()
+    driver.close()
+    assert os.path.exists(f"/proc/{pid}")
+    driver.close()
+    assert not os.path.exists(f"/proc/{pid}")
+
+
+def test_a_camera_that_is_closed_while_it_is_looked_for_leaves_no_process() -> None:
+    with opened(software()) as cam:
+        cam.read(timeout=5.0)
+        pid = process_of(cam)
+        cam.inject(disconnect=True)
+        read_until_lost(cam, 3.0)
+        time.sleep(0.5)  # meanwhile it is closed and opened in vain
+    wait_until(lambda: not os.path.exists(f"/proc/{pid}"), 2.0)
+
+
 def test_without_a_camera_the_error_comes_at_once() -> None:
     for options, words in (({}, "no RealSense is plugged in"), ({"serial": "0123"}, "no RealSense with serial 0123")):
         driver = RealSenseCamera(spec(**options))
@@ -153,6 +185,55 @@ def test_a_camera_that_another_program_has_is_refused_with_its_number() -> None:
         Claim("test-refused")
     claim.release()
     Claim("test-refused").release()
+
+
+def test_an_open_camera_is_held_against_other_programs(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The whole way of a real one, but for the wire: the library lists it, and nothing says that it is in software."""
+    camera = spec(serial="900000000042", warm_up_s=0.0)
+    context, plugged = emulated_context(), SoftwareCamera(camera, serial="900000000042")
+    plugged.attach(context)
+    monkeypatch.setattr(Station, "_plug", lambda self, spec: (context, None))
+    station = Station(camera, PictureRing(memoryview(bytearray(PictureRing.size(camera))), camera), lambda news: None)
+    try:
+        other = Claim(plugged.serial)
+        with pytest.raises(ControlTaken, match=f"camera {plugged.serial} is in use already"):
+            station.open()
+        other.release()
+        assert station.open()["serial"] == plugged.serial
+        with pytest.raises(ControlTaken):
+            Claim(plugged.serial)
+        station.close()
+        Claim(plugged.serial).release()
+    finally:
+        station.end()
+        plugged.close()
+
+
+class _Stubborn:
+    """A sensor that takes every value and keeps its own."""
+
+    def __init__(self, sensor: Any) -> None:
+        self._sensor = sensor
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._sensor, name)
+
+    def set_option(self, option: Any, value: float) -> None:
+        """Nothing comes of it."""
+
+
+def test_an_option_that_the_camera_does_not_keep_is_an_error() -> None:
+    context, plugged = emulated_context(), SoftwareCamera(software())
+    plugged.attach(context)
+    try:
+        sensors = sensors_of(find(context, plugged.serial).device)
+        assert apply(sensors, {"laser_power": 120}) == ()
+        stubborn = {name: _Stubborn(sensor) for name, sensor in sensors.items()}
+        assert apply(stubborn, {"laser_power": 120}) == ()
+        with pytest.raises(NotSupported, match="keeps 120 for option depth.laser_power, not 180"):
+            apply(stubborn, {"laser_power": 180})
+    finally:
+        plugged.close()
 
 
 def test_options_are_set_and_read_back() -> None:

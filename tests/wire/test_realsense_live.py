@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -51,6 +52,18 @@ def test_every_stream_comes_pixel_by_pixel() -> None:
             assert frame.depth.dtype == np.float32
             assert np.allclose(frame.depth, raw * 0.001, atol=1e-6)
             assert (frame.depth[raw == 0] == 0.0).all()
+
+
+def test_depth_outside_of_the_cameras_range_is_zero() -> None:
+    camera = software("depth")
+    near, far = 0.5995, 1.0505  # of 0.5 to 1.5 m
+    with opened(replace(camera, depth_min=near, depth_max=far)) as cam:
+        frame = cam.read(timeout=5.0)
+    truth = sent(camera, "depth", read_number(frame.depth)) * 0.001
+    too_near, too_far = (truth > 0.0) & (truth < near), truth > far
+    assert too_near.any()
+    assert too_far.any()
+    assert np.allclose(frame.depth, np.where(too_near | too_far, 0.0, truth), atol=1e-6)
 
 
 @pytest.mark.parametrize("align", ["color", "depth"])

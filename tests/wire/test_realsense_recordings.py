@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hal.errors import ConnectionLost, NotSupported
+from hal.errors import ConnectionLost, ControlTaken, NotSupported
 
 from .realsense_bench import RealSenseCamera, opened, read_again, read_until_lost, recording, sent, software, spec
 
@@ -33,6 +33,16 @@ def test_unpaced_every_picture_comes_once_and_in_order(tmp_path: Path) -> None:
         assert cam.counts().dropped == cam.counts().repeated == 0
     assert numbers == list(range(numbers[0], 61))
     assert numbers[0] <= 2
+
+
+def test_unpaced_a_pictures_time_is_that_of_its_reading(tmp_path: Path) -> None:
+    file = recording(tmp_path, spec(), 40)
+    with opened(spec(play=file, paced=False)) as cam:
+        for _ in range(12):
+            time.sleep(0.1)  # slower than it was taken, so that pictures wait
+            before = cam.clock.now()
+            frame = cam.read(timeout=5.0)
+            assert before <= frame.stamp.t <= cam.clock.now()
 
 
 def test_repeating_it_time_and_numbers_go_on(tmp_path: Path) -> None:
@@ -120,3 +130,38 @@ def test_what_is_streamed_is_recorded_and_played_back_the_same(tmp_path: Path) -
         RealSenseCamera(camera).open()
     with opened(replace(camera, options={**camera.options, "overwrite": True})) as cam:
         cam.read(timeout=5.0)
+
+
+@pytest.mark.parametrize("overwrite", [False, True])
+def test_two_cameras_cannot_write_one_file(tmp_path: Path, overwrite: bool) -> None:
+    file = tmp_path / "same.db3"
+    real = {"record": str(file), "overwrite": overwrite}
+    with opened(software(name="left", **real)) as left:
+        left.read(timeout=5.0)
+        written = file.stat().st_ino
+        for path in (file, tmp_path / ".." / tmp_path.name / "same.db3"):
+            right = RealSenseCamera(software(name="right", record=str(path), overwrite=overwrite))
+            try:
+                with pytest.raises(ControlTaken, match="camera right .*same.db3, and camera left does so already"):
+                    right.open()
+            finally:
+                right.close()
+        assert file.stat().st_ino == written
+        left.read(timeout=5.0)
+    with opened(software(name="right", record=str(file), overwrite=True)) as cam:  # now it may
+        cam.read(timeout=5.0)
+
+
+def test_a_file_stays_its_cameras_while_that_one_is_unplugged(tmp_path: Path) -> None:
+    file = tmp_path / "mine.db3"
+    with opened(software(name="left", record=str(file))) as left:
+        left.read(timeout=5.0)
+        left.inject(disconnect=True)
+        read_until_lost(left, 3.0)
+        right = RealSenseCamera(software(name="right", record=str(file), overwrite=True))
+        try:
+            with pytest.raises(ControlTaken):
+                right.open()
+        finally:
+            right.close()
+        assert file.is_file()

@@ -15,6 +15,7 @@ from .realsense_bench import RealSenseCamera, opened, read_again, read_until_los
 
 from hal.drivers.realsense.emulator import read_number  # isort: skip  # needs the library
 from hal.drivers.realsense.preflight import preflight  # isort: skip
+from hal.drivers.realsense.settings import RealSenseSettings  # isort: skip
 
 
 def rig(**real: Any) -> dict[str, Any]:
@@ -69,7 +70,8 @@ def test_nothing_is_plugged_in_here() -> None:
     assert registry.load("realsense", "camera") is RealSenseCamera
 
 
-def test_a_camera_that_starts_and_sends_nothing_is_reset_once() -> None:
+def test_a_camera_that_starts_and_sends_nothing_is_reset_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(RealSenseSettings, "is_real", True)  # one in software is never reset
     with opened(software(stall_s=0.4)) as cam:
         cam.read(timeout=5.0)
         cam.inject(freeze=True)
