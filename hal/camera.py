@@ -257,7 +257,8 @@ class Camera:
                 while raw is None and not self._closing.is_set():
                     raw = self._driver.grab(_GRAB)  # a driver whose device stays silent says so in time
             except Exception as error:
-                self._lose(error)
+                if self._lose(error).final:
+                    return False
                 continue
             if raw is not None:
                 self._call(self._listeners, self._take(raw))

@@ -114,6 +114,10 @@ class Scripted(CameraDriver):
             raise ConnectionLost("unplugged")
         if word == "bug":
             raise ZeroDivisionError("a driver's mistake")
+        if word == "over":
+            error = ConnectionLost("the recording has ended")
+            error.final = True
+            raise error
         self.seq += 1
         now = time.monotonic()
         return RawFrame(now, now, self.seq, None, None, None, None, None)
@@ -155,6 +159,20 @@ def test_a_drivers_own_mistake_is_a_loss_that_names_it(camera_spec: CameraSpec) 
         assert lost is not None
         assert "a driver's mistake" in str(lost)
         assert isinstance(lost.__cause__, ZeroDivisionError)
+    finally:
+        camera.close()
+
+
+@pytest.mark.parametrize("words", [["frame", "over"], ["frame", "lost", "here", "over"]])
+def test_what_nothing_brings_back_is_not_looked_for(camera_spec: CameraSpec, words: list[str]) -> None:
+    camera, _, news = opened(camera_spec, *words)
+    try:
+        assert isinstance(news.get(timeout=20.0), ConnectionLost)
+        assert camera._thread is not None
+        camera._thread.join(20.0)
+        assert not camera._thread.is_alive(), "nobody looks for it any more"
+        with pytest.raises(ConnectionLost, match="has ended"):
+            camera.read()
     finally:
         camera.close()
 

@@ -64,6 +64,18 @@ def test_some_cameras_or_none() -> None:
             rig.observe(cameras=["wirst"])
 
 
+def test_an_old_picture_is_waited_for_and_not_handed_out() -> None:
+    with hal.open("panda_table", driver="mock", clock="real_time", pad="none") as rig:
+        wrist = rig.cameras["wrist"]
+        old = rig.observe().cameras["wrist"].frame
+        wrist.inject(freeze=True)
+        rig.clock.sleep(0.5)
+        with pytest.raises(StaleStateError, match="wrist"):
+            rig.observe(timeout=0.2)
+        wrist.inject(freeze=False)
+        assert rig.observe(timeout=5.0).cameras["wrist"].frame.stamp.t > old.stamp.t + 0.3
+
+
 def test_a_camera_that_takes_nothing_new_is_an_error() -> None:
     with hal.open("panda_table", driver="mock", clock="real_time", pad="none") as rig:
         rig.observe()

@@ -38,6 +38,7 @@ class Kernel:
         """Type, number, strong and weak magnitude."""
         self.lengths: list[int] = []
         """ms"""
+        self.asked = 0
         self.answer = threading.Event()
         self.answer.set()
         self.error: OSError | None = None
@@ -46,6 +47,7 @@ class Kernel:
         assert request & 0xFF == 0x80
         assert request >> 8 & 0xFF == ord("E")
         assert request >> 16 & 0x3FFF == len(data)
+        self.asked += 1
         assert self.answer.wait(10.0)
         if self.error is not None:
             raise self.error
@@ -183,6 +185,30 @@ def test_a_rumble_is_played_by_the_thread_that_polls(system: FakeInput, make_pad
     poll(pad)
     assert EVENT.unpack(node.written())[2:] == (EV_FF, 5, 1)
     assert len(kernel.effects) == 1, "nothing is uploaded when it matters"
+
+
+def test_who_polls_a_dead_man_waits_for_no_motor(system: FakeInput, make_pad: MakePad, kernel: Kernel) -> None:
+    node = system.plug(DS4)
+    node.can_rumble = True
+    pad = make_pad()
+    until(lambda: kernel.effects)
+    kernel.answer.clear()  # another strength is told anew, and the kernel does not answer for 10 s
+
+    def told() -> bool:
+        began = time.monotonic()
+        Gamepad(pad).rumble(strong=0.1)
+        poll(pad)
+        assert time.monotonic() - began < 2.0
+        return kernel.asked == 2
+
+    until(told)
+    for _ in range(5):
+        began = time.monotonic()
+        assert poll(pad).connected
+        assert time.monotonic() - began < 2.0
+    assert len(kernel.effects) == 1, "it is still being told"
+    kernel.answer.set()
+    until(lambda: len(kernel.effects) == 2)
 
 
 def test_a_pad_that_is_read_only_or_not_there_does_not_rumble(system: FakeInput, make_pad: MakePad) -> None:
