@@ -171,6 +171,8 @@ def _resolve(place: str, name: str, requires: Mapping[str, str]) -> Any:
         remedy = requires.get(library)
         hints = [remedy] if remedy else [f"{command} (for {wanted})" for wanted, command in requires.items()]
         advice = f"; install it with: {', '.join(hints)}" if hints else ""
+        if library and module_name.partition(".")[0] == library and not advice:
+            advice = "; install its package, or name its folder in PYTHONPATH"
         raise DriverMissing(f"driver {name!r} does not import: {error}{advice}", name=error.name) from error
     try:
         return getattr(module, attribute)
