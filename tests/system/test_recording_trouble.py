@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import resource
 import shutil
@@ -32,6 +33,8 @@ class Driver:
         self.rig = rig
         self.error: Exception | None = None
         self._end = threading.Event()
+        gc.collect()
+        gc.freeze()  # looking through what thousands of tests left takes longer than a command may be late
         self._thread = threading.Thread(target=self._run)
         self._thread.start()
 
@@ -50,6 +53,7 @@ class Driver:
         state = self.rig.robots["panda"].state()
         self._end.set()
         self._thread.join()
+        gc.unfreeze()
         assert self.error is None
         assert (state.status, state.trip) == (RobotStatus.FOLLOWING, Trip.NONE)
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+
 import numpy as np
 import pytest
 
@@ -156,11 +158,8 @@ def test_what_cannot_be_is_refused_before_anything_is_left_open() -> None:
         env.close()
 
 
-def make() -> RigEnv:
-    return RigEnv("panda_table", sim=True, action="twist", overrides=BARE)
-
-
 def test_several_in_processes_of_their_own() -> None:
+    make = functools.partial(RigEnv, "panda_table", sim=True, action="twist", overrides=BARE)  # importable there
     envs = gymnasium.vector.AsyncVectorEnv([make, make], context="spawn")
     try:
         seen, _ = envs.reset(seed=3)
