@@ -207,18 +207,13 @@ class Run:
         """Everything back to where it starts; a real arm drives home."""
         import numpy as np
 
+        from hal.resetting import put_back, stands_in_world
+
         rig, robot = self.rig, self.robot
-        if rig.has_world:
-            rig.world.reset()
-        if rig.plan.world is not None and robot.spec.driver == rig.plan.world.driver:
-            rig.world.reset(robot.name, q=robot.spec.initial)
-        else:
-            self._say(
-                f"episode {number}: home" + (f"; hold {self.button} until the arm is there" if self.button else "")
-            )
-            robot.move_to(robot.home, deadman=self.deadman, unattended=self.args.unattended)
-            if robot.gripper is not None:
-                robot.gripper.open()
+        if not stands_in_world(rig, robot):
+            held = f"; hold {self.button} until the arm is there" if self.button else ""
+            self._say(f"episode {number}: home, and the gripper opens{held}")
+        put_back(rig, robot, deadman=self.deadman, unattended=self.args.unattended)
         if self.put_back is not None:
             self.put_back(rig, np.random.default_rng(seed))
         if self.button:

@@ -202,6 +202,7 @@ class Control:
                 "the servo refused an earlier command: too far for a first one, too late, or torques and another kind "
                 "of command without a rest in between"
             )
+        width = None if gripper is None else self._width(gripper)
         if command is not None:
             if self._goal is not None:
                 raise CommandError("this session moves to a goal; it takes no commands")
@@ -214,8 +215,8 @@ class Control:
             self.robot._commands += 1
             deadline = float(command.t[-1]) if isinstance(command, JointChunk) else now + self._deadline
             self._mail.put_command(CommandRecord(self.robot._commands, self._id, now, deadline, kind, values, t_event))
-        if gripper is not None:
-            self._send_grip(gripper, waiting, reasons)
+        if width is not None:
+            self._send_width(width, waiting, reasons)
         return Sent(command, tuple(reasons))
 
     def _check_trip(self, servo: ServoRecord, now: float) -> None:
@@ -258,11 +259,15 @@ class Control:
         self._mail.rearm()
         self._rearmed_at = self._mail.state.seq() + 1
 
-    def _send_grip(self, fraction: float, waiting: bool, reasons: list[str]) -> None:
-        gripper = self.robot.gripper
-        if gripper is None:
+    def _width(self, fraction: float) -> float:
+        """A grip as a width, m; checked before anything is sent, the arm's command included."""
+        if self.robot.gripper is None:
             raise NotSupported(f"{self.robot.name} has no gripper")
-        width = gripper.width_of(fraction)
+        return self.robot.gripper.width_of(fraction)
+
+    def _send_width(self, width: float, waiting: bool, reasons: list[str]) -> None:
+        gripper = self.robot.gripper
+        assert gripper is not None
         if gripper.trouble:
             reasons.append(gripper.trouble)
         if waiting:

@@ -29,6 +29,7 @@ from .errors import CommandError, MotionStopped, NotSupported
 from .observation import Observation
 from .pose import Pose
 from .quaternion import after_rotation
+from .resetting import put_back
 from .rig import Rig, open_rig
 from .robot import Robot
 
@@ -168,25 +169,18 @@ class RigEnv(gymnasium.Env[Spaces, NDArray[np.float32]]):
     # An episode.
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Result:
-        """Everything back to where the rig says that it starts; a real arm drives home.
+        """Everything back to where the rig says that it starts; a real arm drives there, and opens its gripper.
 
         ``options``: ``q`` (n,) to start from, rad; ``poses``, name of an object -> :class:`~hal.pose.Pose`.
+
+        Raises MotionStopped after ``rig.stop()``, whoever called it: only a person, or a program that knows better, may
+        call ``env.rig.rearm()``.
         """
         super().reset(seed=seed)
         options = options or {}
         self._end()
-        self.rig.rearm()
-        q = np.asarray(options.get("q", self.robot.spec.initial), float)
-        if self.rig.has_world:
-            self.rig.world.reset()
-            for name, pose in dict(options.get("poses", {})).items():
-                self.rig.world.reset(name, pose=pose)
-        if self.rig.plan.world is not None and self.robot.spec.driver == self.rig.plan.world.driver:
-            self.rig.world.reset(self.robot.name, q=q)
-        else:  # a real arm may have a simulated world beside it
-            self.robot.move_to(q, deadman=self._deadman, unattended=self._unattended)
-            if self.robot.gripper is not None:
-                self.robot.gripper.open()
+        q, poses = options.get("q", self.robot.spec.initial), options.get("poses")
+        put_back(self.rig, self.robot, q, poses=poses, deadman=self._deadman, unattended=self._unattended)
         if self._on_reset is not None:
             self._on_reset(self, options)
         self._begin()

@@ -5,10 +5,11 @@ from __future__ import annotations
 import contextlib
 import time
 
+from hal.claim import Claim
 from hal.errors import ConnectionLost, HalError
 from hal.types import Fault
 
-from .claim import Claim
+from .claim import claim_arm
 from .faults import ARM_PORT, fault_of_exception
 from .link import Link, Mode, Sample
 from .links import link_to
@@ -50,7 +51,7 @@ class Connection:
 
     def open(self) -> Sample:
         """Take the arm and connect; its first state. Raises ControlTaken, DriverMissing and ConnectionLost."""
-        self._claim = Claim(resolve(self.settings.host) or self.settings.host)
+        self._claim = claim_arm(resolve(self.settings.host) or self.settings.host)
         try:
             link = link_to(self.settings.arm)
             self._find(_PATIENCE)

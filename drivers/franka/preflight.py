@@ -16,7 +16,7 @@ from hal.specs import RobotSpec
 from hal.types import Fault
 from hal.verdict import Verdict
 
-from .claim import Claim
+from .claim import claim_arm
 from .faults import ARM_PORT, HAND_PORT, fault_of
 from .preflight_network import Answer, knock, resolve, route_to
 from .preflight_ping import ALLOW, NotMeasured, judge, measure
@@ -37,7 +37,7 @@ def check(spec: RobotSpec, duration: float) -> Iterator[Verdict]:
     """Look at one arm; the network is measured for ``duration`` s. Nothing moves, and nothing stays connected."""
     settings = ArmSettings.of(spec)
     try:
-        claim = Claim(settings.host)
+        claim = claim_arm(settings.host)
     except ControlTaken as error:
         yield Verdict("in use", "fail", str(error), "end that program first; nothing else was looked at")
         return

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import errno
-import socket
-import struct
 from typing import Any, NamedTuple
 
 import pyrealsense2 as rs
 
-from hal.errors import ControlTaken, DeviceNotFound
+from hal.claim import Claim
+from hal.errors import DeviceNotFound
 
-__all__ = ["Claim", "Found", "find", "found_in", "said"]
+__all__ = ["Found", "claim_camera", "find", "found_in", "said"]
 
 
 class Found(NamedTuple):
@@ -78,39 +76,6 @@ def find(context: Any, serial: str | None, camera: str = "") -> Found:
     raise DeviceNotFound(f'{who}several are plugged in: {listed}; say which one: real: {{serial: "{found[0].serial}"}}')
 
 
-class Claim:
-    """Holds a camera for this process, by a socket in Linux's abstract name space: nothing is left behind.
-
-    The system refuses a second user too, but late, and cannot say who the first one is.
-    """
-
-    def __init__(self, serial: str) -> None:
-        """Raises ControlTaken, with the other program's number, while somebody else holds the camera."""
-        name = f"\0hal-realsense-{serial}"
-        self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
-        try:
-            self._socket.bind(name)
-        except OSError as error:
-            self._socket.close()
-            if error.errno != errno.EADDRINUSE:
-                raise
-            raise ControlTaken(f"camera {serial} is in use already{_owner(name)}") from None
-        self._socket.listen(1)
-
-    def release(self) -> None:
-        """Let go. Idempotent."""
-        self._socket.close()
-
-
-def _owner(name: str) -> str:
-    """Who listens there, in words: the program behind the camera's own process."""
-    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as asking:
-        asking.settimeout(0.2)
-        try:
-            asking.connect(name)
-            pid = struct.unpack("iII", asking.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, 12))[0]
-            with open(f"/proc/{pid}/status") as file:
-                parent = next((int(line.split()[1]) for line in file if line.startswith("PPid:")), pid)
-        except OSError:
-            return ""
-    return f", by program {parent} on this computer"
+def claim_camera(serial: str) -> Claim:
+    """Hold the camera of that serial number for this process. Raises ControlTaken, with the other program's number."""
+    return Claim(f"realsense-{serial}", f"camera {serial}")

@@ -10,12 +10,13 @@ from typing import Any
 
 import pyrealsense2 as rs
 
+from hal.claim import Claim
 from hal.errors import ConnectionLost, NotSupported
 from hal.specs import CameraSpec
 
 from . import options
 from .calibration import calibration_of
-from .devices import Claim, Found, described, find, said
+from .devices import Found, claim_camera, described, find, said
 from .modes import choose
 from .recordings import Recordings
 from .ring import PictureRing
@@ -134,7 +135,7 @@ class Station:
         if self._emulated is not None:
             return find(self._context, self._emulated.serial, self._spec.name)
         found = find(self._context, settings.serial, self._spec.name)
-        self._claim = Claim(found.serial)
+        self._claim = claim_camera(found.serial)
         return found
 
     def _load(self, file: str) -> Found:

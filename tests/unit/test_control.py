@@ -517,3 +517,14 @@ def test_a_warning_that_is_an_error_does_not_keep_the_arm_from_stopping(rig: hal
     assert arm.state().status is RobotStatus.IDLE
     with arm.control():
         pass
+
+
+@pytest.mark.parametrize("grip", [float("nan"), -0.1, 1.1])
+def test_a_grip_that_cannot_be_sends_nothing_to_the_arm_either(rig: hal.Rig, arm: hal.Robot, grip: float) -> None:
+    with arm.control() as control:
+        for _ in range(3):
+            with pytest.raises(CommandError):
+                control.send(hal.Twist([0.1, 0.0, 0.0]), gripper=grip)
+            rig.clock.sleep(0.02)
+        assert not arm.state().dq_set.any()
+        assert arm.state().target_seq == 0

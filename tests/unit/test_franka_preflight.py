@@ -13,7 +13,7 @@ from franka_at_home import address, emulator
 
 from hal.config import load
 from hal.drivers.franka import preflight
-from hal.drivers.franka.claim import Claim
+from hal.drivers.franka.claim import claim_arm
 from hal.drivers.franka.emulator.control import Control
 from hal.drivers.franka.fault_texts import FLAG_TEXTS
 from hal.drivers.franka.preflight import check
@@ -139,7 +139,7 @@ def test_another_client_holds_the_robot(robot: Control) -> None:
 
 
 def test_another_program_on_this_computer_uses_the_arm() -> None:
-    claim = Claim(EMPTY)
+    claim = claim_arm(EMPTY)
     try:
         (found,) = checked(rig(EMPTY)).values()
     finally:

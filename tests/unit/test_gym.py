@@ -99,7 +99,7 @@ def test_the_hooks_decide_and_steps_are_counted() -> None:
         env.close()
 
 
-def test_a_stop_truncates_and_says_why_and_a_reset_goes_on() -> None:
+def test_a_stop_truncates_says_why_and_is_not_acknowledged_by_a_reset() -> None:
     env = RigEnv("panda_table", driver="mock", action="twist", overrides=BARE)
     try:
         env.reset()
@@ -109,10 +109,27 @@ def test_a_stop_truncates_and_says_why_and_a_reset_goes_on() -> None:
         *_, truncated, info = env.step(np.zeros(7, np.float32))
         assert truncated
         assert "rig.stop()" in info["stopped"]
+        before = env.robot.state().q
+        for _ in range(2):  # a training loop that knows nothing of the person who stopped it
+            with pytest.raises(hal.MotionStopped, match="rearm"):
+                env.reset()
+        assert env.robot.state().q == pytest.approx(before)
+        env.rig.rearm()
         env.reset()
         *_, truncated, info = env.step(np.zeros(7, np.float32))
         assert not truncated
         assert "stopped" not in info
+    finally:
+        env.close()
+
+
+def test_a_stop_stays_in_a_simulated_world_too() -> None:
+    env = RigEnv("panda_table", sim=True, action="twist", overrides=BARE)
+    try:
+        env.reset()
+        env.rig.stop()
+        with pytest.raises(hal.MotionStopped, match="rearm"):
+            env.reset()
     finally:
         env.close()
 

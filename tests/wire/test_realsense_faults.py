@@ -17,7 +17,7 @@ from hal.errors import CommandError, ConnectionLost, ControlTaken, DeviceNotFoun
 
 from .realsense_bench import RealSenseCamera, opened, read_again, read_until_lost, software, spec, wait_until
 
-from hal.drivers.realsense.devices import Claim, find  # isort: skip  # needs the library
+from hal.drivers.realsense.devices import claim_camera, find  # isort: skip  # needs the library
 from hal.drivers.realsense.emulator import SoftwareCamera, emulated_context  # isort: skip
 from hal.drivers.realsense.options import apply, sensors_of  # isort: skip
 from hal.drivers.realsense.ring import PictureRing  # isort: skip
@@ -180,11 +180,11 @@ def test_the_error_lists_what_is_plugged_in() -> None:
 
 
 def test_a_camera_that_another_program_has_is_refused_with_its_number() -> None:
-    claim = Claim("test-refused")
-    with pytest.raises(ControlTaken, match=f"by program {os.getppid()} on this computer"):
-        Claim("test-refused")
+    claim = claim_camera("test-refused")
+    with pytest.raises(ControlTaken, match=rf"another program on this computer \(process {os.getppid()}\)"):
+        claim_camera("test-refused")
     claim.release()
-    Claim("test-refused").release()
+    claim_camera("test-refused").release()
 
 
 def test_an_open_camera_is_held_against_other_programs(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -195,15 +195,15 @@ def test_an_open_camera_is_held_against_other_programs(monkeypatch: pytest.Monke
     monkeypatch.setattr(Station, "_plug", lambda self, spec: (context, None))
     station = Station(camera, PictureRing(memoryview(bytearray(PictureRing.size(camera))), camera), lambda news: None)
     try:
-        other = Claim(plugged.serial)
-        with pytest.raises(ControlTaken, match=f"camera {plugged.serial} is in use already"):
+        other = claim_camera(plugged.serial)
+        with pytest.raises(ControlTaken, match=f"camera {plugged.serial} is in use by another program"):
             station.open()
         other.release()
         assert station.open()["serial"] == plugged.serial
         with pytest.raises(ControlTaken):
-            Claim(plugged.serial)
+            claim_camera(plugged.serial)
         station.close()
-        Claim(plugged.serial).release()
+        claim_camera(plugged.serial).release()
     finally:
         station.end()
         plugged.close()
