@@ -89,8 +89,6 @@ class FrankaHand(GripperDriver):
         )
 
     def _fresh(self) -> Seen:
-        if not self._is_open:
-            raise ConnectionLost(f"{self.spec.name} is not open")
         seen = self._pilot.seen
         assert seen is not None
         age = time.monotonic() - seen.t
@@ -100,7 +98,9 @@ class FrankaHand(GripperDriver):
         return seen
 
     def _pump(self) -> None:
-        """Take what came, do what is due."""
+        """Take what came, do what is due. Raises ConnectionLost before :meth:`open`: the link connects by itself."""
+        if not self._is_open:
+            raise ConnectionLost(f"{self.spec.name} is not open")
         for event in self._link.poll():
             if isinstance(event, Seen):
                 self._seq += 1

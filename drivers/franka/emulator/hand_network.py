@@ -87,16 +87,17 @@ class HandNetwork:
     def take(self, keys: list[selectors.SelectorKey]) -> list[Request]:
         """What the client asks for, after a :meth:`wait`."""
         requests: list[Request] = []
-        for source in [key.fileobj for key in keys]:
+        sources = [key.fileobj for key in keys]
+        for source in sources:
             if source is self._wake_in:
                 self._wake_in.recv(64)
-            elif source is self._listener:
-                self._welcome(self._listener)
             elif self.client is not None and source is self.client.sock:
                 try:
                     requests += self.client.hear()
                 except (OSError, ValueError):  # it hung up, or is no client of a hand
                     self.hang_up()
+        if self._listener is not None and self._listener in sources:  # last: the one before may just have hung up
+            self._welcome(self._listener)
         return requests
 
     def _welcome(self, listener: socket.socket) -> None:
