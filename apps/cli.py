@@ -10,7 +10,15 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
-__all__ = ["ACTION_NEEDED", "add_config_options", "add_rig_options", "interruptible", "rig_options", "run_app"]
+__all__ = [
+    "ACTION_NEEDED",
+    "add_config_options",
+    "add_driving_options",
+    "add_rig_options",
+    "interruptible",
+    "rig_options",
+    "run_app",
+]
 
 ACTION_NEEDED = 2
 """Exit status when a person must mend something first."""
@@ -67,6 +75,15 @@ def add_rig_options(parser: argparse.ArgumentParser) -> None:
     rig.add_argument(
         "--dry-run", action="store_true", help="check everything, list what would be opened, touch nothing"
     )
+
+
+def add_driving_options(parser: argparse.ArgumentParser) -> argparse._ArgumentGroup:
+    """What an app needs to know in which a person drives."""
+    drive = parser.add_argument_group("driving")
+    drive.add_argument("--robot", metavar="NAME", help="which arm, where the rig has several (the first)")
+    drive.add_argument("--mapping", metavar="FILE", help="what the pad's controls do (what the pad is meant for)")
+    drive.add_argument("--speed", type=float, metavar="SHARE", help="share of the mapping's speeds, above 0, at most 1")
+    return drive
 
 
 def rig_options(args: argparse.Namespace) -> dict[str, Any]:

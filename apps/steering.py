@@ -21,9 +21,13 @@ class Steering:
     deadman: Deadman
     mapping = ""
 
-    def __init__(self, rig: Rig, robot: Robot, pad: Gamepad, asked: str | None, speed: float) -> None:
-        """``asked`` is the mapping that a person wants, whatever the pad is. Raises ConfigError for a bad one."""
+    def __init__(
+        self, rig: Rig, robot: Robot, pad: Gamepad, asked: str | None, speed: float, actions: tuple[str, ...] = ()
+    ) -> None:
+        """``asked`` is the mapping that a person wants, whatever the pad is; ``actions`` are those of the mapping that
+        the app knows. Raises ConfigError for a bad mapping."""
         self._rig, self._robot, self._pad, self._asked, self._speed = rig, robot, pad, asked, speed
+        self._actions = actions
         self.take()
 
     def _wanted(self) -> str:
@@ -50,7 +54,7 @@ class Steering:
         self.teleop = hal.Teleop(self._robot, mapping=self.mapping, speed=self._speed)
         self.deadman = self._pad.hold(self.teleop.mapping.deadman)
         if self._rig.console is not None:
-            self._rig.console.explain(self.teleop.labels(actions=("home",)))
+            self._rig.console.explain(self.teleop.labels(actions=("home", *self._actions)))
 
     def help(self) -> str:
         """For people, some lines."""

@@ -58,6 +58,7 @@ class Teleop:
         self._was_toggle = True
         self._toggled: float | None = None
         self._was_home = True
+        self._was_acting = frozenset(self.mapping.actions)
 
     def reset(self) -> None:
         """A new session: the gripper's trigger must cross the present grip again before it counts, and a button that
@@ -81,6 +82,12 @@ class Teleop:
         button = self.mapping.go_home
         pressed = button is not None and pad.pressed(button)
         fresh, self._was_home = pressed and not self._was_home, pressed
+        return fresh
+
+    def pressed(self, pad: PadState) -> frozenset[str]:
+        """Which of the mapping's actions had their button pressed since the last call, with the dead-man or without."""
+        acting = frozenset(action for action, button in self.mapping.actions.items() if pad.pressed(button))
+        fresh, self._was_acting = acting - self._was_acting, acting
         return fresh
 
     def _grip(self, pad: PadState) -> float | None:

@@ -60,7 +60,7 @@ def test_a_pad_with_a_mapping_of_its_own_gets_it_and_drives(
 ) -> None:
     hand.meant_for = "spacemouse"
     with App(rig) as app:
-        assert app.session.steering.mapping == "spacemouse"
+        assert app.session.driving.mapping == "spacemouse"
         app.until_ready()
         where = app.robot.state().tcp.position[2]
         hand.press("l1")
@@ -76,11 +76,11 @@ def test_a_pad_without_one_gets_the_default_and_an_option_beats_both(
     rig: hal.Rig, hand: MockPad, capsys: pytest.CaptureFixture[str]
 ) -> None:
     with App(rig) as app:
-        assert app.session.steering.mapping == "default"
+        assert app.session.driving.mapping == "default"
     assert "mapping default: the tutorial's PS4 mapping" in capsys.readouterr().out
     hand.meant_for = "spacemouse"
     with App(rig, "--mapping", "default") as app:
-        assert app.session.steering.mapping == "default"
+        assert app.session.driving.mapping == "default"
 
 
 def test_a_pad_that_is_plugged_in_later_brings_its_mapping_with_it(
@@ -93,10 +93,10 @@ def test_a_pad_that_is_plugged_in_later_brings_its_mapping_with_it(
         hand.press("l1")  # and holds its dead-man while doing so
         hand.stick("push_x", 1.0)
         hand.clear()
-        app.until(lambda: app.session.steering.mapping == "spacemouse" and app.pad.state().connected)
+        app.until(lambda: app.session.driving.mapping == "spacemouse" and app.pad.state().connected)
         where = app.robot.state().q_set
         time.sleep(0.3)
-        assert not app.session.deadman.held
+        assert not app.session.driving.deadman.held
         assert (app.robot.state().q_set == where).all(), "what was held when it came moves nothing"
         hand.release("l1")
         hand.stick("push_x", 0.0)
@@ -107,11 +107,11 @@ def test_a_pad_that_is_plugged_in_later_brings_its_mapping_with_it(
         hand.release("l1")
         hand.inject(disconnect=True)
         app.until(lambda: not app.pad.state().connected)
-        assert app.session.steering.mapping == "spacemouse", "while there is none, nothing changes"
+        assert app.session.driving.mapping == "spacemouse", "while there is none, nothing changes"
         hand.meant_for = None
         hand.stick("push_x", 0.0)
         hand.clear()
-        app.until(lambda: app.session.steering.mapping == "default")
+        app.until(lambda: app.session.driving.mapping == "default")
     text = capsys.readouterr().out
     assert "a mock pad drives" in text
     assert text.count("hold l2 to move") == 2
@@ -121,10 +121,10 @@ def test_a_trip_shakes_the_hand_once(rig: hal.Rig, hand: MockPad) -> None:
     with App(rig) as app:
         app.until_ready()
         hand.press("l2")
-        app.until(lambda: app.session.deadman.held)
+        app.until(lambda: app.session.driving.deadman.held)
         assert hand.rumbles == []
         hand.inject(freeze=True)  # held, and silent
-        app.until(lambda: app.session.stopped)
+        app.until(lambda: app.session.driving.stopped)
         time.sleep(0.2)
         assert len(hand.rumbles) == 1
         strong, _, seconds = hand.rumbles[0]

@@ -51,11 +51,11 @@ def hold_and_drive() -> str | None:
             turn += 1
             moved += abs(bench.tcp - last).max()
             last = bench.tcp
-            if bench.trip != "none" or not bench.session.deadman.held:
+            if bench.trip != "none" or not bench.deadman.held:
                 log = browser.text("#log")
                 assert "stood still" in log, f"stopped in turn {turn} without a reason: {bench.trip}\n{log}"
                 return log
-        assert bench.session.report.trips == []
+        assert bench.session.driving.report.trips == []
         assert moved > 0.03 * SECONDS, "the arm went to and fro"
         return None
     finally:

@@ -43,7 +43,7 @@ def test_the_defaults_other_controls() -> None:
     assert (mapping.frame, mapping.deadman, mapping.go_home) == ("base", "l2", "north")
     assert mapping.gripper is not None
     assert mapping.gripper.axis == "r2"
-    assert mapping.actions == {"record": "south", "finish": "home"}
+    assert mapping.actions == {"record": "south", "finish": "home", "fail": "west", "discard": "east"}
     assert load_mapping(mapping) is mapping
 
 

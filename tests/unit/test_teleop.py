@@ -163,6 +163,14 @@ def test_home_counts_once_a_press(arm: hal.Robot) -> None:
 
 def test_a_button_held_from_the_start_is_no_press(arm: hal.Robot) -> None:
     assert hal.Teleop(arm).home_pressed(pad("north")) is False
+    assert hal.Teleop(arm).pressed(pad("south")) == frozenset()
+
+
+def test_an_action_counts_once_a_press_with_the_dead_man_or_without(arm: hal.Robot) -> None:
+    teleop = hal.Teleop(arm)
+    presses = [(), ("south",), ("south", "l2"), ("l2",), ("south", "home", "l2"), ("north",)]
+    found = [teleop.pressed(pad(*buttons)) for buttons in presses]
+    assert found == [set(), {"record"}, set(), set(), {"record", "finish"}, set()]
 
 
 def test_a_bad_mapping_lists_every_problem(arm: hal.Robot) -> None:

@@ -1,0 +1,282 @@
+"""A person drives an arm with a pad: one session after another, with the stops, the faults and the way home between."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable
+from typing import TYPE_CHECKING, TypeVar
+
+from hal.apps.status import StatusLine
+
+if TYPE_CHECKING:
+    from hal.commands import Twist
+    from hal.control import Control
+    from hal.deadman import Deadman
+    from hal.gamepad import Gamepad
+    from hal.rig import Rig
+    from hal.robot import Robot
+    from hal.teleop import Teleop
+    from hal.types import PadState
+
+__all__ = ["Driving", "check_driving", "chosen_devices"]
+
+RATE_HZ = 50.0
+STALE = 2.0
+"""s; what is only shown may be older than what is acted on."""
+LET_GO = 0.2
+"""s without the dead-man after which somebody does not want to go home any more."""
+AGAIN = 0.1
+"""s between two tries where no session can be had."""
+
+T = TypeVar("T")
+Look = Callable[["PadState"], str]
+"""Called in every turn with what the pad does; the reason to end, or nothing."""
+
+
+def check_driving(args: argparse.Namespace) -> None:
+    """Raise what is wrong with the options of :func:`~hal.apps.cli.add_driving_options` before anything is opened."""
+    from hal.config.mapping import load_mapping
+    from hal.errors import CommandError
+    from hal.pads.choice import check_wanted
+
+    if args.speed is not None and not 0.0 < args.speed <= 1.0:
+        raise CommandError(f"--speed must be above 0 and at most 1, not {args.speed:g}")
+    load_mapping(args.mapping or "default")
+    check_wanted(args.pad)
+
+
+def chosen_devices(rig: Rig, args: argparse.Namespace) -> tuple[Robot, Gamepad]:
+    """The arm that is driven, and the pad that drives it. CommandError where there is none."""
+    from hal.errors import CommandError
+
+    name = args.robot or next(iter(rig.robots), None)
+    if name is None:
+        raise CommandError(f"{rig.plan.source} has no robot to drive")
+    if args.pad == "none":
+        raise CommandError("--pad none: this program needs something that drives")
+    if not rig.gamepads:
+        raise CommandError(f"{rig.plan.source} has no gamepad; add 'gamepads: {{pad: {{model: auto}}}}'")
+    return rig.robots[name], next(iter(rig.gamepads.values()))
+
+
+class Driving:
+    """:meth:`drive` follows the pad, whatever stops the arm in between, until the caller has a reason to end."""
+
+    def __init__(
+        self,
+        rig: Rig,
+        robot: Robot,
+        pad: Gamepad,
+        *,
+        mapping: str | None = None,
+        speed: float = 1.0,
+        actions: tuple[str, ...] = (),
+    ) -> None:
+        """``actions`` are those of the mapping that the app knows."""
+        from hal.apps.report import RunReport
+        from hal.apps.steering import Steering
+
+        self.rig, self.robot, self.pad = rig, robot, pad
+        self.report = RunReport(rig, robot)
+        self.line = StatusLine()
+        self.note = ""
+        """What stands first in the live line."""
+        self.stopped: str | None = None
+        """What stopped the arm, until it follows again."""
+        self._hand = ""
+        """What is wrong with the gripper."""
+        self._distrusted = ""
+        """Why the pad that was plugged in may not drive."""
+        self._steering = Steering(rig, robot, pad, mapping, speed, actions)
+
+    @property
+    def teleop(self) -> Teleop:
+        """What the pad asks for."""
+        return self._steering.teleop
+
+    @property
+    def mapping(self) -> str:
+        """Name, or file, of what the pad's controls do."""
+        return self._steering.mapping
+
+    @property
+    def deadman(self) -> Deadman:
+        """What must be held."""
+        return self._steering.deadman
+
+    def help(self) -> str:
+        """What the pad's controls do, for people, some lines."""
+        return self._steering.help()
+
+    def event(self, text: str) -> None:
+        """Tell it here and on the console's pages."""
+        self.line.event(text)
+        self.rig.say(text)
+
+    def drive(self, look: Look) -> str:
+        """Follow the pad until ``look`` gives a reason to end; returns that. The arm is at rest then."""
+        while True:
+            after = self.guarded(lambda: self._session(look))
+            if after == "home":
+                self.guarded(self._go_home)
+            elif after == "other pad":
+                self._steering.take()
+                self.event(f"{self.pad.describe()} drives")
+                self.line.event(self.help())
+            elif reason := after or look(self.pad.state()):
+                return reason
+
+    def guarded(self, motion: Callable[[], T]) -> T | None:
+        """Do what moves the arm. None, a moment later, where something stopped that; a person was told what.
+
+        Raises ConnectionLost where the arm's process is gone, so that trying again has no sense.
+        """
+        from hal.errors import ConnectionLost, MotionStopped, RobotFault, StaleStateError
+
+        try:
+            return motion()
+        except MotionStopped as stop:  # a new session wants the stop to be acknowledged first
+            self._tripped(stop)
+        except RobotFault as fault:
+            self._faulted(fault)
+        except (ConnectionLost, StaleStateError) as lost:
+            self._lost(lost)
+        self.rig.clock.sleep(AGAIN)
+        return None
+
+    def _session(self, look: Look) -> str:
+        """Follow the pad, until something else is due; returns that."""
+        from hal.errors import MotionStopped, RobotFault
+
+        seen = -1
+        with self.robot.control(deadman=self.deadman, rate_hz=RATE_HZ) as control:
+            self.teleop.reset()
+            if self.rig.viewer3d is not None:
+                self.rig.viewer3d.clear_goal(self.robot.name)
+            for tick in self.rig.clock.rate(RATE_HZ):
+                state = self.pad.state()
+                fresh, seen = state.stamp.seq != seen, state.stamp.seq
+                motion, grip = self.teleop.step(state, tick.dt)
+                motion = self._towards_goal(motion)
+                try:
+                    control.send(motion, gripper=grip, t_event=state.stamp.t if fresh else 0.0)
+                    self._resumed()
+                except MotionStopped as stop:
+                    self._tripped(stop)
+                except RobotFault as fault:
+                    self._faulted(fault)
+                self._show(control)
+                if due := look(state) or self._due(state):
+                    return due
+        raise AssertionError("a rate never ends")
+
+    def _due(self, state: PadState) -> str:
+        """What must be done outside of a session."""
+        if self.teleop.home_pressed(state) and self.deadman.held:
+            return "home"
+        return "other pad" if self._other_pad() else ""
+
+    def _other_pad(self) -> bool:
+        """Was a pad plugged in whose controls are others, and which may drive this arm?"""
+        if not self._steering.is_due:
+            return False
+        why = self._steering.distrust()
+        if why and why != self._distrusted:
+            self.event(why)
+        self._distrusted = why
+        return not why
+
+    def _towards_goal(self, motion: Twist) -> Twist:
+        """Sticks at rest and the handle of the 3D view dragged: there. It moves only while the dead-man is held."""
+        from hal.following import towards
+
+        view, name = self.rig.viewer3d, self.robot.name
+        goal = view.goal(name) if view is not None else None
+        if view is None or goal is None:
+            return motion
+        if motion.linear.any() or motion.angular.any():
+            view.clear_goal(name)  # the sticks come first
+            return motion
+        linear, angular = self.teleop.mapping.speeds()
+        speed = self.teleop.speed
+        return towards(goal, self.robot.state(max_age=STALE).tcp_set, speed * linear, speed * angular)
+
+    def _go_home(self) -> None:
+        from hal.errors import MotionStopped
+
+        self.event("home: hold the dead-man until the arm is there")
+        try:
+            self.robot.move_to(self.robot.home, deadman=self.deadman, patience=LET_GO)
+        except MotionStopped:
+            if self.deadman.held or not self.deadman.connected:
+                raise
+            self.event("home: given up, the dead-man was let go of")
+        else:
+            self.event("home: there; let go of the dead-man and hold it again to drive")
+
+    # What went wrong, told once.
+
+    def _lost(self, lost: Exception) -> None:
+        """The arm does not answer: it may come back, but not if its process is gone."""
+        self.robot.check()
+        if self.stopped is None:  # its text counts the seconds: it is told once
+            self._tripped(lost)
+
+    def _tripped(self, stop: Exception) -> None:
+        if self.stopped != str(stop):
+            self.stopped = str(stop)
+            self.report.tripped(getattr(stop, "reason", str(stop)))
+            self.event(f"STOPPED: {stop}")
+
+    def _faulted(self, fault: Exception) -> None:
+        if self.stopped != str(fault):
+            self.stopped = str(fault)
+            self.report.faulted(getattr(fault, "cause", str(fault)))
+            self.event(f"FAULT: {fault}")
+
+    def _resumed(self) -> None:
+        if self.stopped is not None:
+            self.stopped = None
+            self.event("going on")
+
+    def _look_at_the_hand(self) -> None:
+        """Say once what is wrong with the gripper; the arm goes on without it."""
+        trouble = self.robot.gripper.trouble if self.robot.gripper is not None else ""
+        if bool(trouble) != bool(self._hand):
+            self.event(f"GRIPPER: {trouble}" if trouble else "the gripper is there again")
+        self._hand = trouble
+
+    def _show(self, control: Control) -> None:
+        from hal.errors import ConnectionLost, StaleStateError
+
+        try:
+            state = self.robot.state(max_age=STALE)
+        except (ConnectionLost, StaleStateError) as lost:
+            self.robot.check()
+            reason = str(lost)
+            self.line.update(lambda: f"  {self.note}{reason}")
+            return
+        self.report.saw(state)
+        self._look_at_the_hand()
+
+        def text() -> str:
+            x, y, z = state.tcp.position
+            held = "held" if self.deadman.held else "released"
+            if self.pad.waiting_for and self.pad.state().connected:
+                held = f"waits: let go of, or move once: {', '.join(self.pad.waiting_for)}"
+            status = state.status.name.lower()
+            hand = self.robot.gripper.newest() if self.robot.gripper is not None else None
+            width = f"gripper {1e3 * hand.width:4.0f} mm  " if hand is not None and not self._hand else ""
+            trips = f"  trips {len(self.report.trips)}" if self.report.trips else ""
+            limited = f"  held back: {state.limited}" if state.limited else ""
+            frames = "  ".join(
+                f"{name} {counts.fps:.0f}/s"
+                for name, camera in self.rig.cameras.items()
+                if (counts := camera.counts()).fps is not None
+            )
+            return (
+                f"  {self.note}dead-man {held:8s}  {status:9s}{trips}  tcp {x:6.3f} {y:6.3f} {z:6.3f} m  {width}"
+                f"{limited}  {frames}"
+            )
+
+        self.line.update(text)

@@ -1,0 +1,32 @@
+"""What an app does between its command line and an open rig."""
+
+from __future__ import annotations
+
+import argparse
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from hal.config.plan import Plan
+
+__all__ = ["planned"]
+
+
+def planned(args: argparse.Namespace, *more: str) -> Plan | None:
+    """The plan of the rig that the options name. None after ``--dry-run``, which has told what would be opened.
+
+    ``more`` are lines that follow. Raises ConfigError, and DeviceNotFound for a ``--robot`` that is not there.
+    """
+    from hal.apps.banner import listing
+    from hal.config import load
+    from hal.config.files import nearest
+    from hal.errors import DeviceNotFound
+
+    plan = load(args.config, sim=args.sim, overrides=args.overrides).resolve()
+    names = [robot.name for robot in plan.robots]
+    if args.robot and args.robot not in names:
+        raise DeviceNotFound(f"--robot: this rig has no robot {args.robot!r}{nearest(args.robot, names)}")
+    if not args.dry_run:
+        return plan
+    print(f"{plan.source} is in order; it would open:")
+    print("\n".join(f"  {line}" for line in [*listing(plan), *plan.warnings, *more]))
+    return None
