@@ -55,11 +55,11 @@ def main(argv: list[str] | None = None) -> int:
 
 def _main(args: argparse.Namespace) -> int:
     import hal
-    from hal.apps.banner import banner, invitation, listing
+    from hal.apps.banner import banner, invitation
     from hal.apps.check import may_open
     from hal.apps.holding import held_by, needs_holding
+    from hal.apps.opening import planned
     from hal.apps.report import check_writable
-    from hal.config import load
     from hal.errors import CommandError
     from hal.recording import Dataset
 
@@ -71,11 +71,9 @@ def _main(args: argparse.Namespace) -> int:
     if not -len(episodes) <= args.episode < len(episodes):
         raise CommandError(f"--episode {args.episode}: {args.dataset} has {len(episodes)}, counted from 0")
     episode = episodes[args.episode]
-    plan = load(args.config, sim=args.sim, overrides=args.overrides).resolve()
     what = f"episode  {episode.number}: {episode.length} rows at {episode.fps:g} Hz, {episode.task or 'no task'!r}"
-    if args.dry_run:
-        print(f"{plan.source} is in order; it would open:")
-        print("\n".join(f"  {line}" for line in [*listing(plan), *plan.warnings, what]))
+    plan = planned(args, what)
+    if plan is None:
         return 0
     if not may_open(plan):
         return ACTION_NEEDED

@@ -19,6 +19,7 @@ from hal.apps.cli import ACTION_NEEDED, add_rig_options, rig_options, run_app
 if TYPE_CHECKING:
     from hal.deadman import Deadman
     from hal.policy import Outcome
+    from hal.pose import Pose
     from hal.recording import Recorder
     from hal.rig import Rig
     from hal.robot import Robot
@@ -78,6 +79,8 @@ def _main(args: argparse.Namespace) -> int:
     for name in ("rate", "episodes", "seconds", "history"):
         if not getattr(args, name) > 0:
             raise CommandError(f"--{name} must be positive, not {getattr(args, name):g}")
+    if args.seed < 0:
+        raise CommandError(f"--seed must be 0 or more, not {args.seed}")
     if args.report:
         check_writable(args.report)
     if os.getcwd() not in sys.path:
@@ -204,7 +207,7 @@ class Run:
         return outcome
 
     def _begin(self, number: int, seed: int) -> None:
-        """Everything back to where it starts; a real arm drives home."""
+        """Everything back to where it starts: a real arm drives home, things with random ranges as the seed says."""
         import numpy as np
 
         from hal.resetting import put_back, stands_in_world
@@ -213,9 +216,12 @@ class Run:
         if not stands_in_world(rig, robot):
             held = f"; hold {self.button} until the arm is there" if self.button else ""
             self._say(f"episode {number}: home, and the gripper opens{held}")
-        put_back(rig, robot, deadman=self.deadman, unattended=self.args.unattended)
+        random = np.random.default_rng(seed)
+        put = put_back(rig, robot, random=random, deadman=self.deadman, unattended=self.args.unattended)
         if self.put_back is not None:
-            self.put_back(rig, np.random.default_rng(seed))
+            self.put_back(rig, random)
+        elif put:
+            self._say(f"episode {number}: {', '.join(_placed(name, pose) for name, pose in put.items())}")
         if self.button:
             marks = "south (Cross) is a success, east (Circle) a failure"
             self._say(f"episode {number}: let go of {self.button} and hold it, and the policy drives; {marks}")
@@ -255,6 +261,11 @@ class Run:
                 for outcome in self.outcomes
             ],
         }
+
+
+def _placed(name: str, pose: Pose) -> str:
+    x, y, z = pose.position
+    return f"{name} at x {x:.3f}, y {y:.3f}, z {z:.3f} m"
 
 
 def _ms(seconds: float | None) -> float | None:

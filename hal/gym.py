@@ -171,7 +171,10 @@ class RigEnv(gymnasium.Env[Spaces, NDArray[np.float32]]):
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Result:
         """Everything back to where the rig says that it starts; a real arm drives there, and opens its gripper.
 
-        ``options``: ``q`` (n,) to start from, rad; ``poses``, name of an object -> :class:`~hal.pose.Pose`.
+        Things that have random ranges start at poses drawn from ``np_random``: with the same ``seed`` at the same ones,
+        without a seed at the next ones. ``options``: ``q`` (n,) to start from, rad; ``poses``, name of an object ->
+        :class:`~hal.pose.Pose`, in the place of a drawn one. ``info["poses"]`` says where things were put, if any were:
+        name -> (7,), position in m and quaternion xyzw in the world.
 
         Raises MotionStopped after ``rig.stop()``, whoever called it: only a person, or a program that knows better, may
         call ``env.rig.rearm()``.
@@ -180,7 +183,15 @@ class RigEnv(gymnasium.Env[Spaces, NDArray[np.float32]]):
         options = options or {}
         self._end()
         q, poses = options.get("q", self.robot.spec.initial), options.get("poses")
-        put_back(self.rig, self.robot, q, poses=poses, deadman=self._deadman, unattended=self._unattended)
+        put = put_back(
+            self.rig,
+            self.robot,
+            q,
+            poses=poses,
+            random=self.np_random,
+            deadman=self._deadman,
+            unattended=self._unattended,
+        )
         if self._on_reset is not None:
             self._on_reset(self, options)
         self._begin()
@@ -191,7 +202,10 @@ class RigEnv(gymnasium.Env[Spaces, NDArray[np.float32]]):
         self._clipped = False
         self._due = self.rig.clock.now()
         self._start = observation.t
-        return self._shown(observation), self._info(observation)
+        info = self._info(observation)
+        if put:
+            info["poses"] = {name: np.concatenate([pose.position, pose.orientation]) for name, pose in put.items()}
+        return self._shown(observation), info
 
     def _begin(self) -> None:
         control = self.robot.control(deadman=self._deadman, rate_hz=self._rate, unattended=self._unattended)

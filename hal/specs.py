@@ -20,6 +20,7 @@ __all__ = [
     "KinematicsSpec",
     "LimitsSpec",
     "PadSpec",
+    "RangesSpec",
     "RobotSpec",
     "SensorSpec",
     "ViewSpec",
@@ -130,6 +131,15 @@ class RobotSpec:
 
 
 @dataclass(frozen=True)
+class RangesSpec:
+    """Where a thing may start in an episode: anywhere between two ends, each (6,)."""
+
+    lower: Floats
+    """x, y, z in the world, m; roll, pitch, yaw: a turn about the world's axes on top of its orientation, rad."""
+    upper: Floats
+
+
+@dataclass(frozen=True)
 class BodySpec:
     """A thing in the simulated world that is not a robot."""
 
@@ -155,6 +165,8 @@ class BodySpec:
     """The arm that carries it on ``link``: it goes where that goes, and touches nothing. ``position`` and
     ``orientation`` are then in the frame of the link."""
     link: str | None = None
+    random: RangesSpec | None = None
+    """Where :func:`hal.placement.draw_poses` may put it, if it is one of the rig's own things."""
 
 
 @dataclass(frozen=True)

@@ -14,6 +14,7 @@ from ..specs import BodySpec
 from .data_files import data_folder, is_path, list_data
 from .files import Problems, nearest, read_yaml
 from .models import UrdfSource
+from .random_poses import RandomPose
 from .schema import (
     Flag,
     Name,
@@ -42,6 +43,8 @@ SIZES = {
     "urdf": ("urdf",),
 }
 """What each shape needs, and what no other shape may have."""
+PLACES = frozenset({"position", "pose", "attached"})
+"""Keys that say where a thing is. The random ranges of its file are for the place that the file gives it."""
 _NONE: Mapping[str, Any] = MappingProxyType({})
 
 
@@ -79,6 +82,8 @@ class ObjectConfig(Strict):
     """Both in one."""
     attached: CarriedBy | None = None
     """In the place of all three: in the hand of an arm."""
+    random: RandomPose | None = None
+    """Where it starts in each episode; at its pose without."""
     rgba: Rgba = (0.7, 0.7, 0.7, 1.0)
     collision: Flag = True
     visible: Flag = True
@@ -105,6 +110,10 @@ class ObjectConfig(Strict):
             raise ValueError(f"scale is for a urdf; a {self.shape} has its size in m")
         if self.attached is not None and self.shape == "plane":
             raise ValueError("a plane has no end; nobody can carry it")
+        if self.random is not None and self.shape == "plane":
+            raise ValueError("a plane has no end; it has no random place")
+        if self.random is not None and self.attached is not None:
+            raise ValueError("attached and random exclude each other: it is where the arm is")
         return self
 
 
@@ -178,6 +187,10 @@ def _load(entry: Any, source: str, base: Path, key: str, problems: Problems) -> 
     config = validate(ObjectConfig, data, path, problems)
     if not changes:
         return config, str(path), ""
+    gone = {"random"} if changes.keys() & PLACES else set()
+    if "pose" in changes:
+        gone |= {"position", "orientation"}
+    data = {name: value for name, value in data.items() if name not in gone}
     # The file stood on its own first, so that a mistake is reported where it is, and here not again.
     in_order = all(problem.file != str(path) for problem in problems.found)
     noted = Problems()
@@ -230,9 +243,10 @@ def _body(config: ObjectConfig, urdf: Path | None, links: Mapping[str, Mapping[s
         pose, given = carried.pose, set[str]()
     else:
         pose, given = config.pose or PoseConfig(), config.model_fields_set
+    position = config.position if "position" in given else pose.position
     return BodySpec(
         name=config.name,
-        position=config.position if "position" in given else pose.position,
+        position=position,
         orientation=config.orientation if "orientation" in given else pose.orientation,
         shape=config.shape,
         half_extents=config.half_extents,
@@ -247,4 +261,5 @@ def _body(config: ObjectConfig, urdf: Path | None, links: Mapping[str, Mapping[s
         visible=config.visible,
         robot=carried.robot if carried is not None else None,
         link=links.get(carried.robot, {}).get(carried.link, carried.link) if carried is not None else None,
+        random=config.random.around(position) if config.random is not None else None,
     )

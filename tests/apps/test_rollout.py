@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -40,6 +41,11 @@ def above(rig, observation):
 
 def put(rig, random):
     rig.world.reset("cube", pose=hal.Pose([random.uniform(-0.1, 0.1), random.uniform(-0.2, 0.2), 0.65]))
+
+
+def check(rig, random):
+    with open("at.txt", "w") as file:
+        print(*rig.world.pose("cube").position, file=file)
 
 
 def lost(observation):
@@ -94,6 +100,20 @@ def test_a_policy_reaches_its_goal_in_every_episode(folder: Path) -> None:
     assert report(folder)["episodes"][0]["success"] is False
 
 
+def test_things_with_ranges_start_where_the_episodes_seed_says(folder: Path) -> None:
+    def places(*options: object) -> list[str]:
+        done = rollout(folder, "--policy", "policies:Reach", "--seconds", 0.2, *options, *FAST)
+        assert done.returncode == 0, done.stderr
+        return re.findall(r"cube at x (.*?) m", done.stdout)
+
+    three = places("--episodes", 3, "--seed", 5)
+    assert len(set(three)) == 3
+    assert places("--episodes", 2, "--seed", 6) == three[1:], "the next episode has one more"
+    assert places("--reset", "policies:check", "--seed", 5) == [], "the hook has the last word"
+    at = np.array((folder / "at.txt").read_text().split(), float)
+    assert [f"{value:.3f}" for value in at] == re.findall(r"-?[0-9.]+", three[0].replace("y", "").replace("z", ""))
+
+
 def test_it_is_recorded(folder: Path) -> None:
     for library in ("pyarrow", "av", "zstandard"):
         pytest.importorskip(library, reason="pip install 'robot-hal[record]'")
@@ -138,6 +158,7 @@ def test_what_ends_a_run(folder: Path, policy: str, options: tuple[str, ...], en
         (["--policy", "policies:dumb"], ["ndarray"]),
         (["--policy", "policies:Reach", "--success", "policies:over"], ["--success", "over"]),
         (["--policy", "policies:Reach", "--rate", "0"], ["--rate must be positive"]),
+        (["--policy", "policies:Reach", "--seed", "-1"], ["--seed must be 0 or more"]),
         (["--policy", "policies:Reach", "--rate", "1"], ["too slow"]),
         (["--policy", "policies:Reach", "--robot", "pandas"], ["did you mean 'panda'"]),
     ],

@@ -17,7 +17,7 @@ from hal.config.intrinsics import centre_crop
 from hal.config.plan import Plan
 from hal.errors import ConfigError
 from hal.pose import Pose
-from hal.specs import WorldSpec, from_json, to_json
+from hal.specs import BodySpec, WorldSpec, from_json, to_json
 
 MIXED: dict[str, Any] = {
     "robots": {"one": {"model": "panda"}, "two": {"model": "panda", "sim": True, "base": {"position": [0, 1, 0]}}},
@@ -218,6 +218,44 @@ def test_a_rig_of_the_users_own_names_files_beside_it(tmp_path: Path, monkeypatc
         ("brick", 0.0, (3.0, 0.0, 0.0)),
         ("other", 2.0, (3.0, 0.0, 0.0)),
     ]
+
+
+def test_random_ranges_of_objects() -> None:
+    brick = {"name": "brick", "shape": "box", "half_extents": [1, 1, 1], "position": [1, 2, 3]}
+    ranges = {"x": [-1, 2], "roll_deg": [-90, 90], "yaw_deg": [0, 180]}
+    rig = plan({"robots": {"arm": {"model": "panda"}}, "objects": ["table", {**brick, "random": ranges}]})
+    assert rig.world is not None
+    table, body = rig.world.bodies
+    assert table.random is None
+    assert body.random is not None
+    assert body.random.lower == pytest.approx((-1, 2, 3, -math.pi / 2, 0, 0)), "what is left out stays"
+    assert body.random.upper == pytest.approx((2, 2, 3, math.pi / 2, 0, math.pi))
+    assert from_json(BodySpec, json.loads(json.dumps(to_json(body)))) == body
+
+
+@pytest.mark.parametrize(
+    ("changes", "ranges"),
+    [
+        ({"mass": 1.0}, True),
+        ({"random": None}, False),
+        ({"position": [0, 0, 1]}, False),
+        ({"pose": [0, 0, 1, 0, 0, 0, 1]}, False),
+        ({"attached": {"robot": "arm", "link": "hand"}}, False),
+        ({"position": [0, 0, 1], "random": {"x": [0, 1]}}, True),
+    ],
+)
+def test_ranges_of_a_file_are_for_the_place_that_it_gives(changes: dict[str, Any], ranges: bool) -> None:
+    rig = plan({"robots": {"arm": {"model": "panda"}}, "objects": [{"file": "cube", **changes}]})
+    assert rig.world is not None
+    assert (rig.world.bodies[0].random is not None) == ranges
+
+
+def test_a_pose_in_the_rig_takes_the_place_of_the_files_position() -> None:
+    turned = [0.1, 0.2, 0.9, 0, 0, 1, 0]
+    rig = plan({"robots": {"arm": {"model": "panda"}}, "objects": [{"file": "duck", "pose": turned}]})
+    assert rig.world is not None
+    body = rig.world.bodies[0]
+    assert (*body.position, *body.orientation) == pytest.approx(turned)
 
 
 def test_limits_may_be_tightened_by_the_rig() -> None:

@@ -157,6 +157,22 @@ def thing(**keys: Any) -> dict[str, Any]:
         ({"objects": ["cube", "cube"]}, "name", ["'cube' is also the name of objects.0", "differ"]),
         ({"robots": {"cube": ROBOT}, "objects": ["cube"]}, "name", ["robots.cube"]),
         ({"objects": ["cubes/brick.yaml"]}, "objects.0", ["there is no file"]),
+        (thing(random={"x": [0.1, -0.1]}), "objects.0.random.x", ["the least and the greatest", "0.1 is above -0.1"]),
+        (thing(random={"y": 0.3}), "objects.0.random.y", ["two numbers", "0.3"]),
+        (thing(random={"z": [1, 2, 3]}), "objects.0.random.z", ["two numbers", "a list of 3"]),
+        (thing(random={"x": [0, float("nan")]}), "objects.0.random.x", ["two numbers", "nan"]),
+        (thing(random={"x": [0, "far"]}), "objects.0.random.x", ["two numbers", "'far'"]),
+        (thing(random={"yaw_deg": [-400, 0]}), "objects.0.random.yaw_deg", ["within -360 and 360 degrees"]),
+        (thing(random={"yaw": [-1, 1]}), "objects.0.random.yaw", ["did you mean 'yaw_deg'"]),
+        (thing(random={}), "objects.0.random", ["no range", "yaw_deg"]),
+        (thing(random=[-1, 1]), "objects.0.random", ["keys and values"]),
+        ({"objects": [{"name": "f", "shape": "plane", "random": {"x": [0, 1]}}]}, "objects.0", ["plane", "random"]),
+        (
+            {"objects": [{"file": "cube", "attached": {"robot": "arm", "link": "hand"}, "random": {"x": [0, 1]}}]}
+            | robot(),
+            "objects.0",
+            ["attached and random"],
+        ),
         # Pads.
         ({"gamepads": {"p": {"driver": "playback"}}}, "gamepads.p.file", ["is missing", "recording"]),
         ({"gamepads": {"p": {"driver": "playback", "file": "no.jsonl"}}}, "gamepads.p.file", ["there is no file"]),
@@ -522,6 +538,8 @@ MISTAKES: dict[tuple[str, str], Callable[[Bench], object]] = {
     # Objects: in files, in the rig, changed.
     ("cup.yaml", "colour"): lambda b: b.cup.update(colour="red"),
     ("cup.yaml", "urdf"): lambda b: b.cup.update(urdf="cpu.urdf"),
+    ("cup.yaml", "random.z"): lambda b: b.cup.setdefault("random", {}).update(z=[2, 1]),
+    ("cup.yaml", "random.yaw"): lambda b: b.cup.setdefault("random", {}).update(yaw=[0, 1]),
     ("rig.yaml", "objects.5.mas"): lambda b: b.objects[5].update(mas=1),
     ("rig.yaml", "objects.6"): lambda b: b.objects.append({"file": "cube", "name": "ball", "radius": 0.1}),
     # The pad, the simulation, the caller.

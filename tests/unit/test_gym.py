@@ -66,16 +66,78 @@ def test_a_reset_puts_everything_back_or_where_it_is_told() -> None:
     env = RigEnv("panda_table", sim=True, action="twist", overrides=BARE, on_reset=lambda env, o: calls.append(o))
     try:
         first, info = env.reset(seed=1)
-        assert info == {"elapsed": 0.0}
+        assert info["elapsed"] == 0.0
         for _ in range(20):
             env.step(np.array([0.2, 0.1, 0, 0, 0, 0, 0], np.float32))
-        again, _ = env.reset(options={"poses": {"cube": hal.Pose([0.1, 0.1, 0.7])}})
+        again, info = env.reset(options={"poses": {"cube": hal.Pose([0.1, 0.1, 0.7])}})
+        assert info["poses"]["cube"] == pytest.approx([0.1, 0.1, 0.7, 0, 0, 0, 1]), "not where it was drawn"
         assert again["q"] == pytest.approx(first["q"], abs=1e-3)
         assert env.rig.world.pose("cube").position[:2] == pytest.approx([0.1, 0.1], abs=1e-3)
         assert len(calls) == 2
         q = np.array(first["q"]) + 0.05
         elsewhere, _ = env.reset(options={"q": q})
         assert elsewhere["q"] == pytest.approx(q, abs=1e-3)
+    finally:
+        env.close()
+
+
+RANGES = "objects.3={file: duck, random: {x: [0.2, 0.3], y: [-0.3, 0.3], yaw_deg: [-180, 180]}}"
+
+
+def test_the_same_seed_starts_at_the_same_poses_to_the_bit_and_without_one_come_the_next() -> None:
+    def used(env: RigEnv, options: dict[str, object]) -> None:
+        env.np_random.uniform(size=1 if env.observation is None else 5)
+
+    env = RigEnv("panda_table", sim=True, action="twist", overrides=(*BARE, RANGES), on_reset=used)
+
+    def episode(seed: int | None) -> tuple[dict[str, bytes], bytes]:
+        seen, info = env.reset(seed=seed)
+        start = info["poses"]["cube"][:3]
+        beside = start - env.robot.base.position + [-0.1, 0.0, -0.05]
+        trace = [np.concatenate(list(seen.values()))]
+        for step in range(100):  # down beside the cube, and on through where it lies
+            away = beside + [0.2 * (step > 70), 0.0, 0.0] - seen["tcp"][:3]
+            twist = away * min(5.0, 0.25 / max(np.linalg.norm(away), 1e-9))
+            seen, *_ = env.step(np.array([*twist, 0, 0, 0, 1], np.float32))
+            poses = [env.rig.world.pose(name) for name in ("cube", "duck")]
+            trace += [*seen.values(), *(part for pose in poses for part in (pose.position, pose.orientation))]
+        pushed.append(env.rig.world.pose("cube").position[0] - start[0])
+        return {name: pose.tobytes() for name, pose in info["poses"].items()}, np.concatenate(trace).tobytes()
+
+    pushed: list[float] = []
+    try:
+        first, second, third = episode(5), episode(None), episode(None)
+        assert max(pushed) > 0.05
+        assert list(first[0]) == ["cube", "duck"]
+        assert len({poses[name] for poses, _ in (first, second, third) for name in ("cube", "duck")}) == 6
+        assert episode(5) == first, "the poses, and all that follows"
+        assert episode(6)[0] != first[0]
+    finally:
+        env.close()
+
+
+def test_observations_show_things_where_they_were_drawn() -> None:
+    env = RigEnv("panda_table", sim=True, cameras=["scene"])
+    try:
+        pictures = []
+        for seed in (1, 1, 2):
+            seen, info = env.reset(seed=seed)
+            pictures.append(seen["scene.color"])
+            at = info["poses"]["cube"]
+            assert env.rig.world.pose("cube").position == pytest.approx(at[:3], abs=1e-6), "time stood still"
+        assert (pictures[0] == pictures[1]).all()
+        assert (pictures[0] != pictures[2]).any()
+    finally:
+        env.close()
+
+
+def test_ranges_that_leave_no_room_are_told() -> None:
+    full = "objects.3={file: duck, random: {x: [0, 0], y: [0, 0]}}"
+    here = "objects.2={file: cube, random: {x: [0, 0], y: [0, 0]}}"
+    env = RigEnv("panda_table", sim=True, overrides=(*BARE, full, here))
+    try:
+        with pytest.raises(hal.CommandError, match="no room for 'duck'.*'cube'"):
+            env.reset(seed=1)
     finally:
         env.close()
 
@@ -179,8 +241,11 @@ def test_several_in_processes_of_their_own() -> None:
     make = functools.partial(RigEnv, "panda_table", sim=True, action="twist", overrides=BARE)  # importable there
     envs = gymnasium.vector.AsyncVectorEnv([make, make], context="spawn")
     try:
-        seen, _ = envs.reset(seed=3)
+        seen, infos = envs.reset(seed=3)
         assert seen["q"].shape == (2, 7)
+        cubes = infos["poses"]["cube"]
+        assert cubes.shape == (2, 7)
+        assert (cubes[0] != cubes[1]).any(), "each has a seed of its own"
         for _ in range(5):
             seen, *_ = envs.step(np.array([[0.1, 0, 0, 0, 0, 0, 0], [-0.1, 0, 0, 0, 0, 0, 0]], np.float32))
         assert seen["tcp"][0, 0] - seen["tcp"][1, 0] > 0.01
