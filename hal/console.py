@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from .errors import CommandError
@@ -12,12 +14,16 @@ if TYPE_CHECKING:
     from .camera import Camera
     from .rig import Rig
 
-__all__ = ["PORT", "Console", "Listen"]
+__all__ = ["ACTIONS", "PHASES", "PORT", "Console", "Listen", "RecordingView"]
 
 LOOPBACK = "127.0.0.1"
 PORT = 8470
 """Where the console listens unless told otherwise; the next free port where that is taken."""
 _PORTS = 65535
+PHASES = ("resetting", "ready", "recording", "saving", "done")
+"""What a program that records episodes may be at."""
+ACTIONS = ("record", "finish", "fail", "discard")
+"""What a page may ask it for: start an episode, save it as a success, save it as a failure, throw it away."""
 
 
 class Listen(NamedTuple):
@@ -50,6 +56,47 @@ class Listen(NamedTuple):
         if port and not (port.isascii() and port.isdigit() and int(port) <= _PORTS):
             raise wrong
         return cls(address or LOOPBACK, int(port) if port else PORT, bool(port))
+
+
+@dataclass(frozen=True, slots=True)
+class RecordingView:
+    """A recording, as pages show it. CommandError for a phase or an action that is none, or for times that are none."""
+
+    phase: str
+    """One of :data:`PHASES`."""
+    prompt: str
+    """What the person should do now, one line."""
+    task: str
+    episode: int
+    """Number in the dataset of the present episode, or of the next one."""
+    saved: int
+    """Episodes of this run that are kept: :attr:`succeeded` and :attr:`failed`."""
+    wanted: int
+    """Episodes that this run is to keep; 0: no number was given."""
+    succeeded: int
+    failed: int
+    discarded: int
+    seconds: float
+    """Length of the present episode."""
+    frames: int
+    """Its rows so far."""
+    dropped: int
+    """Rows that it lacks."""
+    free_bytes: int
+    """Free space on the disk."""
+    trouble: str
+    """What a person should look at; empty where all is well."""
+    actions: tuple[str, ...]
+    """Those of :data:`ACTIONS` that are possible now."""
+
+    def __post_init__(self) -> None:
+        if self.phase not in PHASES:
+            raise CommandError(f"a recording is one of {', '.join(PHASES)}, not {self.phase!r}")
+        wrong = [action for action in self.actions if action not in ACTIONS]
+        if wrong:
+            raise CommandError(f"an action is one of {', '.join(ACTIONS)}, not {wrong[0]!r}")
+        if not (math.isfinite(self.seconds) and self.seconds >= 0.0):
+            raise CommandError(f"seconds must be finite and at least 0, not {self.seconds}")
 
 
 class Console(ABC):
@@ -89,6 +136,22 @@ class Console(ABC):
     @abstractmethod
     def explain(self, labels: Mapping[str, Any]) -> None:
         """Write onto the page's controls what they do: :meth:`hal.teleop.Teleop.labels`."""
+
+    @abstractmethod
+    def show_recording(self, view: RecordingView) -> None:
+        """Show how a recording goes, from now on; never waits. The panel for it appears with the first one.
+
+        Only the newest counts. While an episode is recorded, say so at least once a second: after two without news,
+        pages show that there are none.
+        """
+
+    @abstractmethod
+    def on_action(self, taken: Callable[[str], None]) -> None:
+        """Call ``taken`` with one of :data:`ACTIONS` when the page that drives presses that button.
+
+        It may come when it is no longer possible, and it is called in the thread that brings the pad, which trips the
+        arm where it is held up: note it, and return. What it raises is printed. A later ``taken`` replaces this one.
+        """
 
     @abstractmethod
     def close(self) -> None:

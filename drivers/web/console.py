@@ -6,12 +6,12 @@ import secrets
 import sys
 import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from hal.camera import Camera, RawFrame
-from hal.console import Console, Listen
+from hal.console import Console, Listen, RecordingView
 from hal.errors import HalError, NotSupported
 from hal.gamepad import Gamepad, PadReading
 from hal.host.frames import FrameRing
@@ -24,6 +24,7 @@ from .about import about_rig, shown_stream
 from .addresses import is_loopback, link, names, tunnel
 from .conversation import Conversation
 from .pad import PadMail, WebPad, gone, reading
+from .recording import as_message
 
 if TYPE_CHECKING:
     from hal.rig import Rig
@@ -48,6 +49,7 @@ class WebConsole(Console):
         self._watched: frozenset[str] = frozenset()
         self._waiting: tuple[str, ...] = ()
         self._detach: list[Any] = []
+        self._taken: Callable[[str], None] | None = None
         self._closed = False
         self._recovering = threading.Lock()
         hosts = [host for host in rig._hosts if isinstance(host, RemoteHost)]
@@ -124,6 +126,9 @@ class WebConsole(Console):
         """Tell the pages whether the recorded tour is being played."""
         self._conversation.tell("playing", on=on)
 
+    def show_recording(self, view: RecordingView) -> None:
+        self._conversation.tell_newest("recording", t=time.monotonic(), view=as_message(view))
+
     def show(self, camera: Camera) -> None:
         """Show this camera's frames to whoever watches it."""
         spec = next((spec for spec in self._shown if spec.name == camera.name), None)
@@ -140,6 +145,9 @@ class WebConsole(Console):
         self._conversation.show(spec.name)
 
     # What it hears.
+
+    def on_action(self, taken: Callable[[str], None]) -> None:
+        self._taken = taken
 
     def _is_lost(self) -> None:
         self._driver = None
@@ -164,6 +172,8 @@ class WebConsole(Console):
             self._start_recovery(str(message["recover"]), str(message["page"]))
         elif "demo" in message:
             self._play(bool(message["demo"]), str(message["page"]))
+        elif "action" in message:
+            self._act(str(message["action"]), str(message["page"]))
 
     def _start_recovery(self, robot: str, page: str) -> None:
         """One at a time, in a thread of its own: it may take long, and the pad must be heard meanwhile."""
@@ -193,6 +203,17 @@ class WebConsole(Console):
             return
         assert isinstance(pad.driver, WebPad)
         pad.driver.play(on)
+
+    def _act(self, action: str, page: str) -> None:
+        if self._taken is None:
+            self._conversation.tell("refused", page=page, why="this program takes no such wish")
+            return
+        try:
+            self._taken(action)
+        except Exception:
+            why = f"the program made a mistake at {action!r}: its own output says which"
+            self._conversation.tell("refused", page=page, why=why)
+            raise  # to be printed by whoever brought the message
 
     def _pad(self) -> Gamepad | None:
         return next((pad for pad in self.rig.gamepads.values() if isinstance(pad.driver, WebPad)), None)

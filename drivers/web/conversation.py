@@ -38,6 +38,7 @@ class Conversation:
         self._lost = lost
         self._news = threading.Condition()
         self._words: deque[dict[str, Any]] = deque(maxlen=_WORDS)
+        self._newest: dict[str, dict[str, Any]] = {}
         self._frames: dict[str, None] = {}
         self._over = False
         self._threads = [
@@ -56,6 +57,12 @@ class Conversation:
             self._words.append({"method": method, **more})
             self._news.notify()
 
+    def tell_newest(self, method: str, **more: Any) -> None:
+        """The same for what is said often: it replaces the last one of this method that still waits."""
+        with self._news:
+            self._newest[method] = {"method": method, **more}
+            self._news.notify()
+
     def show(self, camera: str) -> None:
         """There is a new picture of this camera. Two that wait are one, and words come first."""
         with self._news:
@@ -64,11 +71,13 @@ class Conversation:
 
     def _next(self) -> dict[str, Any] | None:
         with self._news:
-            self._news.wait_for(lambda: self._words or self._frames or self._over)
+            self._news.wait_for(lambda: self._words or self._newest or self._frames or self._over)
             if self._over:
                 return None
             if self._words:
                 return self._words.popleft()
+            if self._newest:
+                return self._newest.pop(next(iter(self._newest)))
             camera = next(iter(self._frames))
             del self._frames[camera]
             return {"method": "frame", "camera": camera}

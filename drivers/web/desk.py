@@ -13,7 +13,7 @@ from hal.types import BUTTONS, STICK_AXES
 
 from .applink import Waiting
 from .lease import Change, Lease
-from .messages import Away, Demo, Malformed, Recover, Stop, Take, encode, parse
+from .messages import Act, Away, Demo, Malformed, Recover, Stop, Take, encode, parse
 from .outbox import Outbox
 from .padmessage import PadMessage
 
@@ -59,6 +59,8 @@ class Desk:
         self._labels: str | None = None
         self._says: deque[str] = deque(maxlen=_SAYS)
         self._waiting_for: list[str] = []
+        self._recording: str | None = None
+        self._possible: frozenset[str] = frozenset()
         self.pages: dict[str, Page] = {}
         self.playing = False
 
@@ -76,6 +78,8 @@ class Desk:
         page.outbox.note(self._pad_waits())
         for text in self._says:
             page.outbox.note(text)
+        if self._recording is not None:
+            page.outbox.newest("recording", self._recording)
         return page
 
     def _hello(self, page: Page) -> str:
@@ -104,6 +108,8 @@ class Desk:
             self._wish(page, {"recover": message.robot, "page": page.name}, "clear a fault")
         elif isinstance(message, Demo):
             self._play(page, message.play)
+        elif isinstance(message, Act):
+            self._act(page, message.action)
         else:
             raise Malformed("not on this socket")
 
@@ -149,6 +155,12 @@ class Desk:
         else:
             self._wish(page, {"demo": play, "page": page.name}, "play the tour")
 
+    def _act(self, page: Page, action: str) -> None:
+        if self._lease.driver == page.name and action not in self._possible:
+            self._refuse(page, "that cannot be done now" if self._recording else "this program records nothing")
+        else:
+            self._wish(page, {"action": action, "page": page.name}, "steer the recording")
+
     def _wish(self, page: Page, message: dict[str, Any], what: str) -> None:
         if self._lease.driver != page.name:
             self._refuse(page, f"only the page that drives may {what}")
@@ -188,10 +200,18 @@ class Desk:
             self._tell_text(self._pad_waits())
         elif method == "playing":
             self.playing = bool(message["on"])
+        elif method == "recording":
+            self._show_recording(message["t"], message["view"])
         elif method == "refused":
             page = self.pages.get(message["page"])
             if page is not None:
                 self._refuse(page, message["why"])
+
+    def _show_recording(self, t: float, view: Mapping[str, Any]) -> None:
+        self._recording = encode({"type": "recording", "t": t, **view})
+        self._possible = frozenset(view["actions"])
+        for page in self.pages.values():
+            page.outbox.newest("recording", self._recording)
 
     def _pad_waits(self) -> str:
         return encode({"type": "pad", "waiting": self._waiting_for})
@@ -212,7 +232,7 @@ class Desk:
         """Tell every page how things are."""
         text = encode({"type": "state", **state, "pages": len(self.pages), "playing": self.playing})
         for page in self.pages.values():
-            page.outbox.state(text)
+            page.outbox.newest("state", text)
 
     def look(self, now: float) -> None:
         """Now and then: has the page that drives fallen silent?"""

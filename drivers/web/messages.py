@@ -6,10 +6,13 @@ import json
 from collections.abc import Collection, Mapping
 from typing import Any, NamedTuple
 
+from hal.console import ACTIONS
+
 from .padmessage import Malformed, PadMessage, pad_message
 
 __all__ = [
     "LONGEST",
+    "Act",
     "Away",
     "Demo",
     "Drawn",
@@ -62,6 +65,12 @@ class Demo(NamedTuple):
     play: bool
 
 
+class Act(NamedTuple):
+    """Steer a recording: one of ``hal.console.ACTIONS``."""
+
+    action: str
+
+
 class Watch(NamedTuple):
     """The cameras that the page shows from now on."""
 
@@ -74,7 +83,7 @@ class Drawn(NamedTuple):
     camera: str
 
 
-Message = PadMessage | Away | Take | Stop | Recover | Demo | Watch | Drawn
+Message = PadMessage | Away | Take | Stop | Recover | Demo | Act | Watch | Drawn
 
 _KEYS = {
     "pad": {"type", "seen", "since", "axes", "buttons"},
@@ -83,6 +92,7 @@ _KEYS = {
     "stop": {"type"},
     "recover": {"type", "robot"},
     "demo": {"type", "play"},
+    "action": {"type", "action"},
     "watch": {"type", "cameras"},
     "drawn": {"type", "camera"},
 }
@@ -130,6 +140,8 @@ def _record(kind: str, data: Mapping[str, Any], robots: Collection[str], cameras
         return Recover(_one_of(data["robot"], robots))
     if kind == "demo":
         return Demo(_flag(data["play"]))
+    if kind == "action":
+        return Act(_one_of(data["action"], ACTIONS))
     names = data["cameras"]
     if not isinstance(names, list):
         raise Malformed("no list of cameras")

@@ -13,7 +13,7 @@ _NOTES = 256
 
 
 class Outbox:
-    """Messages for one page, in three kinds: the newest beat first, then notes in their order, then the newest state.
+    """Messages for one page: the newest beat first, then notes in their order, then the newest of everything else.
 
     Nothing in here waits for the page except :meth:`pump`, so a page that is slow or frozen costs the others nothing.
     """
@@ -23,7 +23,7 @@ class Outbox:
         self._overflow = overflow
         self._beat: str | None = None
         self._notes: deque[str] = deque()
-        self._state: str | None = None
+        self._newest: dict[str, str] = {}
         self._news = asyncio.Event()
 
     def beat(self, text: str) -> None:
@@ -39,9 +39,9 @@ class Outbox:
         self._notes.append(text)
         self._news.set()
 
-    def state(self, text: str) -> None:
-        """The state of things; replaces the last one."""
-        self._state = text
+    def newest(self, kind: str, text: str) -> None:
+        """How something stands; replaces the last one of this kind."""
+        self._newest[kind] = text
         self._news.set()
 
     def take(self) -> str | None:
@@ -51,8 +51,7 @@ class Outbox:
             return text
         if self._notes:
             return self._notes.popleft()
-        newest, self._state = self._state, None
-        return newest
+        return self._newest.pop(next(iter(self._newest))) if self._newest else None
 
     async def pump(self, send: Callable[[str], Awaitable[None]]) -> None:
         """Send what comes, until the connection breaks or the task is cancelled. ``send`` waits for a slow page."""

@@ -17,6 +17,7 @@ import pytest
 
 import hal
 from hal.apps.teleop import Session, parser
+from hal.deadman import Deadman
 from hal.host.records import ServoRecord
 from hal.robot import Robot
 
@@ -62,6 +63,11 @@ class Bench:
         found = self.arm._mail.peek()
         assert found is not None
         return found
+
+    @property
+    def deadman(self) -> Deadman:
+        """What must be held for the arm to move."""
+        return self.session.driving.deadman
 
     @property
     def status(self) -> str:

@@ -13,7 +13,7 @@ SPEED = 0.2
 
 
 def held(bench: Bench) -> bool:
-    return bench.session.deadman.held
+    return bench.deadman.held
 
 
 @pytest.mark.slow

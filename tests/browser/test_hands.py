@@ -25,7 +25,7 @@ def nothing_is_left(bench: Bench) -> Iterator[None]:
 
 
 def held(bench: Bench) -> bool:
-    return bench.session.deadman.held
+    return bench.deadman.held
 
 
 def repeat(page: Browser, code: str, key: str) -> None:

@@ -25,7 +25,7 @@ def test_one_page_drives_and_another_watches_stops_and_takes_over(bench: Bench, 
     second.hold()
     with second.drag("dpad", 0.0, 1.0):
         page.hold()
-        wait_for(lambda: bench.session.deadman.held, "the driver's dead-man")
+        wait_for(lambda: bench.deadman.held, "the driver's dead-man")
         with page.drag("dpad", -1.0, 0.0):
             wait_for(lambda: bench.tcp_speed[1] > 0.1, "the driver's motion")
             assert abs(bench.tcp_speed[0]) < 0.02, "a watcher moves nothing"
@@ -33,7 +33,7 @@ def test_one_page_drives_and_another_watches_stops_and_takes_over(bench: Bench, 
             wait_for(lambda: bench.trip == "stop" and bench.rests(), "a watcher's stop")
         page.let_go()
     second.let_go()
-    wait_for(lambda: not bench.session.deadman.held, "the release")
+    wait_for(lambda: not bench.deadman.held, "the release")
     page.hold()
     with page.drag("dpad", 1.0, 0.0):
         wait_for(lambda: bench.tcp_speed[1] < -0.1, "motion again")
@@ -127,13 +127,13 @@ def test_two_thumbs(bench: Bench, page: Browser) -> None:
         left = {"x": hold["x"], "y": hold["y"], "id": 1}
         right = {"x": disc["x"], "y": disc["y"], "id": 2}
         page.cdp("Input.dispatchTouchEvent", type="touchStart", touchPoints=[left])
-        wait_for(lambda: bench.session.deadman.held, "the thumb to hold")
+        wait_for(lambda: bench.deadman.held, "the thumb to hold")
         page.cdp("Input.dispatchTouchEvent", type="touchStart", touchPoints=[left, right])
         right["x"] -= 0.5 * disc["width"]
         page.cdp("Input.dispatchTouchEvent", type="touchMove", touchPoints=[left, right])
         wait_for(lambda: bench.tcp_speed[1] > 0.1, "motion")
         page.cdp("Input.dispatchTouchEvent", type="touchEnd", touchPoints=[left])
-        wait_for(lambda: not bench.session.deadman.held and bench.rests(), "the arm to rest")
+        wait_for(lambda: not bench.deadman.held and bench.rests(), "the arm to rest")
         page.cdp("Input.dispatchTouchEvent", type="touchEnd", touchPoints=[])
     finally:
         page.size(1280, 800)

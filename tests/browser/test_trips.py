@@ -43,7 +43,7 @@ def goes_on_after_release_and_press(bench: Bench, page: Browser) -> None:
     page.key("ArrowLeft", "ArrowLeft", False)
     page.let_go()
     wait_for(lambda: bench.session.pad.state().connected, "the pad to be back")
-    wait_for(lambda: not bench.session.deadman.held and not bench.session.pad.waiting_for, "everything to be released")
+    wait_for(lambda: not bench.deadman.held and not bench.session.pad.waiting_for, "everything to be released")
     move(bench, page)
     assert bench.trip == "none"
 

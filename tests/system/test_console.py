@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import os
+import queue
 import signal
 import time
 from collections.abc import Callable, Iterator
@@ -16,6 +17,7 @@ import pytest
 from web_kit import REST, Page, run
 
 import hal
+from hal.console import RecordingView
 
 L2, PRESSED = 1 << 6, [0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0]
 WAIT = 20.0
@@ -49,6 +51,13 @@ async def until(condition: Callable[[], Any], page: Page | None = None, **pad: A
 
 def process_of(rig: hal.Rig) -> int:
     return int(console(rig)._child.process.pid)
+
+
+def view(frames: int, *actions: str) -> RecordingView:
+    """How a recording goes, after so many rows."""
+    counts = {"episode": 0, "saved": 0, "wanted": 3, "succeeded": 0, "failed": 0, "discarded": 0, "dropped": 0}
+    words = {"phase": "recording", "prompt": "drive", "task": "the task", "trouble": ""}
+    return RecordingView(**words, **counts, seconds=0.1, frames=frames, free_bytes=10**10, actions=actions)  # type: ignore[arg-type]
 
 
 def speed(rig: hal.Rig) -> float:
@@ -150,5 +159,57 @@ def test_a_stop_ends_the_tour_for_good(rig: hal.Rig) -> None:
                 await page.say(type="stop")
                 assert await drive(lambda: control.trip is hal.Trip.STOP and speed(rig) == 0.0), "the arm stops"
                 assert not await drive(lambda: speed(rig) > 1e-6, seconds=9.0), "the recording's next press is no press"
+
+    run(test)
+
+
+def test_a_recording_is_steered_from_the_page_and_a_mistake_in_the_app_costs_nothing_else(
+    rig: hal.Rig, capfd: pytest.CaptureFixture[str]
+) -> None:
+    asked: queue.SimpleQueue[str] = queue.SimpleQueue()
+
+    def take(action: str) -> None:
+        asked.put(action)
+        if action == "fail":
+            raise RuntimeError("the disk is gone")
+
+    async def test() -> None:
+        async with page_of(rig) as page:
+            await page.take()
+            console(rig).show_recording(view(0, "record", "fail"))
+            await page.next("recording")
+            await page.say(type="action", action="record")
+            assert "no such wish" in (await page.next("refused"))["why"], "the program did not ask for any"
+            console(rig).on_action(take)
+            await page.say(type="action", action="fail")
+            assert "made a mistake" in (await page.next("refused"))["why"]
+            await page.say(type="action", action="record")
+            await until(lambda: asked.qsize() == 2)
+            await page.say(type="stop")
+            await until(lambda: rig._latch.stopped)
+
+    run(test)
+    assert [asked.get(), asked.get()] == ["fail", "record"]
+    assert "the disk is gone" in capfd.readouterr().err
+
+
+def test_a_console_that_is_stopped_holds_up_no_recording_and_shows_the_newest_later(rig: hal.Rig) -> None:
+    """Nor does what is said so often push out what was said once."""
+    os.kill(process_of(rig), signal.SIGSTOP)
+    try:
+        rig.say("said before")
+        begin = time.monotonic()
+        for frames in range(20_000):
+            console(rig).show_recording(view(frames))
+        assert time.monotonic() - begin < 5.0, "it waits for nobody"
+    finally:
+        os.kill(process_of(rig), signal.SIGCONT)
+
+    async def test() -> None:
+        async with page_of(rig) as page:
+            while (await page.next("say"))["text"] != "said before":
+                pass
+            while (await page.next("recording"))["frames"] != 19_999:
+                pass
 
     run(test)

@@ -288,6 +288,60 @@ def test_what_the_app_says_reaches_the_pages_that_it_is_for() -> None:
     assert inbox(second) == [{"type": "refused", "why": "it is too late"}, say, state]
 
 
+# A recording.
+
+
+def recording(k: int = 0, *actions: str) -> dict[str, Any]:
+    """The app shows how it goes."""
+    return {"method": "recording", "t": float(k), "view": {"phase": "recording", "frames": k, "actions": list(actions)}}
+
+
+def test_every_page_is_shown_the_newest_of_a_recording_and_so_is_one_that_opens_later() -> None:
+    room = Room()
+    page = room.page()
+    assert "recording" not in {message["type"] for message in inbox(page)}, "there is none"
+    for k in range(1000):
+        room.desk.heard(recording(k, "finish"))
+    newest = {"type": "recording", "t": 999.0, "phase": "recording", "frames": 999, "actions": ["finish"]}
+    assert inbox(page) == [newest], "a slow page misses what is outdated, and nothing else"
+    assert room.cut == []
+    assert inbox(room.page())[-1] == newest
+
+
+def test_only_the_page_that_drives_steers_a_recording_and_only_to_what_is_possible() -> None:
+    room = Room()
+    driver, other = room.driver(), room.page()
+    inbox(other)
+    room.say(driver, type="action", action="record")
+    assert [message["why"] for message in inbox(driver)] == ["this program records nothing"]
+    room.desk.heard(recording(1, "finish", "discard"))
+    inbox(driver), inbox(other)
+    room.say(other, type="action", action="finish")
+    room.say(driver, type="action", action="record")
+    assert room.app.news() == []
+    assert "only the page that drives" in inbox(other)[0]["why"]
+    assert "cannot be done now" in inbox(driver)[0]["why"]
+    room.say(driver, type="action", action="finish")
+    assert room.app.news() == [{"action": "finish", "page": "page 1"}]
+    assert inbox(driver) == []
+    room.desk.heard(recording(2))
+    room.say(driver, type="action", action="finish")
+    assert room.app.news() == [], "twice is once"
+
+
+def test_a_view_with_a_number_that_is_none_changes_nothing() -> None:
+    room = Room()
+    page = room.page()
+    room.desk.heard(recording(1, "finish"))
+    newest = inbox(page)[-1]
+    wrong = recording(2, "record")
+    wrong["view"]["seconds"] = float("nan")
+    with pytest.raises(ValueError, match="JSON"):
+        room.desk.heard(wrong)
+    assert inbox(page) == []
+    assert inbox(room.page())[-1] == newest
+
+
 # What waits for an app that does not read.
 
 
@@ -336,13 +390,14 @@ def test_wishes_that_nobody_hears_are_refused() -> None:
 # What waits for a page that does not read.
 
 
-def test_beats_first_then_notes_in_order_then_the_newest_state() -> None:
+def test_beats_first_then_notes_in_order_then_the_newest_of_the_rest() -> None:
     outbox = Outbox(lambda: None)
     for k in range(3):
-        outbox.state(f"state {k}")
+        outbox.newest("state", f"state {k}")
+        outbox.newest("recording", f"recording {k}")
         outbox.note(f"note {k}")
         outbox.beat(f"beat {k}")
-    assert list(iter(outbox.take, None)) == ["beat 2", "note 0", "note 1", "note 2", "state 2"]
+    assert list(iter(outbox.take, None)) == ["beat 2", "note 0", "note 1", "note 2", "state 2", "recording 2"]
 
 
 def test_a_page_that_misses_a_note_is_cut_off() -> None:

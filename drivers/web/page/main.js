@@ -14,6 +14,7 @@ import { Log } from "./log.js";
 import { Overlay } from "./overlay.js";
 import { Pad } from "./pad.js";
 import { Presence } from "./presence.js";
+import { Recording } from "./recording.js";
 import { Status } from "./status.js";
 import { Stopping } from "./stopping.js";
 import { openTheme } from "./theme.js";
@@ -29,6 +30,7 @@ const log = new Log();
 const status = new Status(connection, lease);
 const facts = new Facts();
 const cameras = new Cameras();
+const recording = new Recording(connection, lease);
 const overlay = new Overlay(() => connection.open());
 const mayDrive = () => lease.mine && presence.present;
 const drive = new Drive(pad, mayDrive);
@@ -68,6 +70,7 @@ const HEARD = {
     drive.paint();
     status.waiting = [];
     lease.hello(hello);
+    recording.forget();
     facts.open(rig.robots);
     cameras.open(rig.cameras);
     gamepad.describe();
@@ -75,11 +78,17 @@ const HEARD = {
   lease(message) {
     log.synchronise(message.t);
     lease.heard(message);
+    recording.paint();
     retitle();
     advise();
   },
   labels(message) {
     drive.explain(message);
+    recording.explain(message);
+  },
+  recording(message) {
+    recording.heard(message);
+    retitle();
   },
   beat(message) {
     heartbeat.answered(message.t);
@@ -91,6 +100,7 @@ const HEARD = {
     connection.proved();
     overlay.hide();
     log.synchronise(state.t);
+    recording.look(state.t);
     facts.take(state);
     status.show(state.robots, facts.name, 0);
     setText(byId("demo"), state.playing ? "End the tour" : "Play the tour");
@@ -116,7 +126,8 @@ function advise() {
 }
 
 function retitle() {
-  document.title = `${lease.mine ? "driving " : ""}${hello ? called(hello.rig.source) : "console"}`;
+  const title = `${recording.title}${lease.mine ? "driving " : ""}${hello ? called(hello.rig.source) : "console"}`;
+  if (document.title !== title) document.title = title;
   setAttribute(byId("demo"), "aria-disabled", String(!lease.mine));
   byId("demo").title = lease.mine ? "" : "Only the page that drives can do that";
 }
@@ -132,6 +143,7 @@ connection.lost = (code, reason, retry) => {
   setData(document.documentElement, "connected", null);
   stateAt = -Infinity;
   lease.disconnected();
+  recording.forget();
   cameras.close();
   retitle();
 };
@@ -187,6 +199,7 @@ function paintLink() {
 setInterval(() => {
   paintLink();
   cameras.paint();
+  recording.paint();
   if (!state) return;
   const pages = state.pages;
   setText(byId("pages"), `${pages} page${pages === 1 ? "" : "s"}`);
@@ -208,5 +221,6 @@ Object.defineProperty(window, "halConsole", {
     get lastState() { return state; },
     get beats() { return heartbeat.beats; },
     get page() { return hello?.page ?? null; },
+    get recording() { return recording.view; },
   }),
 });

@@ -28,6 +28,7 @@ export const AXIS_KEYS = {
 export const BUTTON_KEYS = {
   PageUp: "l1", KeyQ: "l1", PageDown: "r1", KeyE: "r1",
   Digit1: "south", Digit2: "east", Digit3: "west", Digit4: "north", Enter: "start",
+  Digit0: "home", // far from the keys that drive
 };
 
 export const HOLD_KEY = "Space";
@@ -44,4 +45,5 @@ export const LEGEND = [
   ["↑ ↓", "dpad_y"], ["← →", "dpad_x"], ["Q / Page Up", "l1"], ["E / Page Down", "r1"],
   ["W S", "left_y"], ["A D", "left_x"], ["I K", "right_y"], ["J L", "right_x"], ["G H", "r2"],
   ["1", "south"], ["2", "east"], ["3", "west"], ["4", "north"], ["Enter", "start"],
+  ["0", "home"],
 ];

@@ -1,4 +1,4 @@
-// A press of a finger or a mouse on a control, until it ends in whichever way.
+// A press of a finger or a mouse: on a control, until it ends in whichever way; or on a button that asks for something.
 
 /**
  * @typedef {object} Handlers
@@ -48,4 +48,28 @@ export function onPress(element, { down, move, up }) {
     pointers.clear();
     up();
   };
+}
+
+/**
+ * Do something when a press ends on the element; who slides off it has thought better of it. Unlike a click this works
+ * with a second finger, while the first one holds the dead-man. Needs `touch-action: none`.
+ *
+ * @param {HTMLElement} element @param {() => void} act
+ */
+export function onTap(element, act) {
+  let pointer = NaN;
+  element.addEventListener("pointerdown", (event) => {
+    if (event.pointerType === "mouse" && event.button !== 0) return;
+    pointer = event.pointerId;
+    element.setPointerCapture(pointer); // or it may end elsewhere unheard
+  });
+  element.addEventListener("pointerup", (event) => {
+    if (event.pointerId !== pointer) return;
+    pointer = NaN;
+    const { left, right, top, bottom } = element.getBoundingClientRect();
+    const { clientX: x, clientY: y } = event;
+    if (left <= x && x <= right && top <= y && y <= bottom) act();
+  });
+  element.addEventListener("pointercancel", () => (pointer = NaN));
+  element.addEventListener("click", (event) => event.detail === 0 && act()); // from the keyboard or an aid
 }

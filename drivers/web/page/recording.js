@@ -1,0 +1,138 @@
+// The panel of a program that records demonstrations: how it goes, and the buttons that steer it.
+
+import { byId, setAttribute, setData, setText, show } from "./dom.js";
+import { LEGEND } from "./names.js";
+import { onTap } from "./press.js";
+
+const OLD = 10; // s; a program that records says so more often, unless it is driving the arm home
+
+/** Phase -> tone of its lamp. @type {Record<string, string>} */
+const TONES = { ready: "on", recording: "record" };
+
+/** Fact of the panel -> its words. @type {Record<string, (view: any) => string>} */
+const FACTS = {
+  episode: ({ saved, wanted }) => (wanted ? `${Math.min(saved + 1, wanted)} of ${wanted}` : String(saved + 1)),
+  seconds: ({ seconds }) => `${seconds.toFixed(1)} s`,
+  rows: ({ frames }) => String(frames),
+  dropped: ({ dropped }) => String(dropped),
+  succeeded: ({ succeeded }) => String(succeeded),
+  failed: ({ failed }) => String(failed),
+  discarded: ({ discarded }) => String(discarded),
+  free: ({ free_bytes: bytes }) => `${(bytes / 1e9).toFixed(1)} GB`,
+};
+
+/** Write a text of which there may be more than room. @param {HTMLElement} element @param {string} text */
+function tell(element, text) {
+  setText(element, text);
+  if (element.title !== text) element.title = text;
+}
+
+export class Recording {
+  /** @param {import("./connection.js").Connection} connection @param {import("./lease.js").Lease} lease */
+  constructor(connection, lease) {
+    this.connection = connection;
+    this.lease = lease;
+    /** What the program showed last; null: it records nothing. @type {any} */
+    this.view = null;
+    /** @type {HTMLElement[]} */
+    this.buttons = [...byId("recording").querySelectorAll("[data-action]")];
+    for (const button of this.buttons) onTap(button, () => this.#ask(button.dataset.action));
+  }
+
+  /** s since the newest view. */
+  #age = 0;
+
+  /** For the page's title: empty while nothing is recorded. */
+  get title() {
+    return this.view?.phase === "recording" ? `REC ${Math.floor(this.view.seconds)} s ` : "";
+  }
+
+  /** The program shows how it goes. @param {any} view */
+  heard(view) {
+    this.view = view;
+    this.#age = 0;
+    this.paint();
+  }
+
+  /** It is the app's time `t` now, s. @param {number} t */
+  look(t) {
+    if (this.view) this.#age = t - this.view.t;
+  }
+
+  /** Another program, or none: it may record nothing. */
+  forget() {
+    this.view = null;
+    this.paint();
+  }
+
+  /** Write on every button which one of the pad does the same. @param {any} labels */
+  explain({ controls }) {
+    for (const button of this.buttons) {
+      const same = Object.keys(controls).find((name) => controls[name].join() === button.dataset.action);
+      const key = LEGEND.find(([, control]) => control === same)?.[0];
+      const note = /** @type {Element} */ (button.querySelector("small"));
+      setText(/** @type {Element} */ (note.querySelector("span")), same ?? "");
+      setText(/** @type {Element} */ (note.querySelector("kbd")), key ?? "");
+      if (key) setAttribute(button, "aria-keyshortcuts", key);
+      else button.removeAttribute("aria-keyshortcuts");
+    }
+  }
+
+  /** @param {string | undefined} action */
+  #ask(action) {
+    if (this.#may(action)) this.connection.send({ type: "action", action });
+  }
+
+  /** @param {string | undefined} action */
+  #may(action) {
+    return this.lease.mine && this.view !== null && this.view.actions.includes(action);
+  }
+
+  /** Show it; also when the lease changes hands, and ten times a second. */
+  paint() {
+    const { view } = this;
+    show(byId("recording"), view !== null);
+    setData(document.documentElement, "recording", view?.phase ?? null);
+    this.#sign(view);
+    if (!view) return;
+    const { phase, prompt, task, trouble, saved, wanted } = view;
+    const lost = this.#lost(view);
+    setText(byId("recording-phase"), lost ? `no news for ${Math.floor(this.#age)} s` : phase);
+    setData(byId("recording-lamp"), "tone", lost || trouble ? "alarm" : TONES[phase] ?? "calm");
+    tell(byId("recording-prompt"), prompt);
+    tell(byId("recording-task"), task);
+    setText(byId("recording-number"), `number ${view.episode} in the dataset`);
+    const progress = byId("recording-progress");
+    show(progress, wanted > 0);
+    setAttribute(progress, "max", String(Math.max(1, wanted)));
+    setAttribute(progress, "value", String(saved));
+    setText(byId("recording-saved"), wanted ? `${saved} of ${wanted} saved` : `${saved} saved`);
+    for (const [name, words] of Object.entries(FACTS)) setText(byId(`recording-${name}`), words(view));
+    setData(byId("recording-dropped"), "tone", view.dropped > 0 ? "alarm" : null);
+    tell(byId("recording-trouble").firstElementChild, trouble);
+    show(byId("recording-trouble"), trouble !== "");
+    this.#paintButtons();
+  }
+
+  /** Nobody may take an episode for recorded that the program no longer speaks of. @param {any} view */
+  #lost(view) {
+    return view.phase === "recording" && this.#age > OLD;
+  }
+
+  /** The sign in the header, in view wherever the panel is. @param {any} view */
+  #sign(view) {
+    const records = view?.phase === "recording";
+    show(byId("rec-lamp"), view !== null); // it keeps its place, so that nothing moves when it lights up
+    setData(byId("rec-lamp"), "tone", !records ? null : view.trouble || this.#lost(view) ? "alarm" : "record");
+    setText(byId("rec"), records ? `REC ${view.seconds.toFixed(1)} s` : "");
+  }
+
+  #paintButtons() {
+    const why = this.lease.mine ? "" : "Only the page that drives can do that";
+    show(byId("recording-actions"), Boolean(this.lease.rig?.drivable));
+    for (const button of this.buttons) {
+      setAttribute(button, "aria-disabled", String(!this.#may(button.dataset.action)));
+      if (button.title !== why) button.title = why;
+    }
+  }
+}
