@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import contextlib
+import threading
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
 __all__ = ["Clock", "LockStepClock", "RealClock", "Tick"]
+
+_ROUNDING = 1e-9
 
 
 class Tick(NamedTuple):
@@ -76,9 +80,58 @@ class LockStepClock(Clock):
     def __init__(self, now: Callable[[], float], advance_to: Callable[[float], None]) -> None:
         self._now = now
         self._advance_to = advance_to
+        self._stops: list[_Stop] = []
+        self._going = threading.RLock()
+        """Time goes on in one thread only."""
 
     def now(self) -> float:
         return self._now()
 
     def sleep_until(self, t: float) -> None:
-        self._advance_to(t)
+        with self._going:
+            while (stop := self._next(t)) is not None:
+                self._advance_to(stop.due)
+                stop.take(self._now())
+            self._advance_to(t)
+
+    def every(self, seconds: float, call: Callable[[], object]) -> Callable[[], None]:
+        """Have time stop every ``seconds`` from now on, whoever waits for however long, and ``call`` called there.
+
+        It is called by the thread that waits, and what it raises is raised there. The function that comes back ends
+        this; any thread may call it, at any time, more than once. Raises ValueError for a time that is not positive.
+        """
+        if not seconds > 0.0:
+            raise ValueError(f"time can stop only after a positive time, not every {seconds} s")
+        stop = _Stop(self.now(), seconds, call)
+        self._stops.append(stop)
+
+        def detach() -> None:
+            with contextlib.suppress(ValueError):  # it was ended before
+                self._stops.remove(stop)
+
+        return detach
+
+    def _next(self, t: float) -> _Stop | None:
+        """The first stop on the way to ``t``; of several at one time, the one that was there first."""
+        ahead = [stop for stop in tuple(self._stops) if stop.due <= t + _ROUNDING]
+        return min(ahead, key=lambda stop: stop.due, default=None)
+
+
+class _Stop:
+    """What is called at ``start`` and every ``period`` s from then on, but for the start itself."""
+
+    def __init__(self, start: float, period: float, call: Callable[[], object]) -> None:
+        self._start = start
+        self._period = period
+        self._call = call
+        self._number = 1
+
+    @property
+    def due(self) -> float:
+        """When it is called next, s."""
+        return self._start + self._number * self._period
+
+    def take(self, now: float) -> None:
+        """Call it; what lies behind by now is not caught up."""
+        self._number = 1 + max(self._number, int((now - self._start) / self._period + _ROUNDING))
+        self._call()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any, NamedTuple
 
@@ -13,7 +13,7 @@ from .errors import NotSupported
 from .pose import Pose, frozen
 from .specs import BodySpec, to_json
 
-__all__ = ["Contact", "NoWorld", "World"]
+__all__ = ["Contact", "NoWorld", "Poses", "World"]
 
 Array = NDArray[np.float64]
 
@@ -33,6 +33,15 @@ class Contact(NamedTuple):
     """Negative where they overlap, m."""
     force: float
     """Along the normal, N."""
+
+
+class Poses(NamedTuple):
+    """Where bodies were at one moment."""
+
+    t: float
+    """The time of the world that they show, s on ``rig.clock``."""
+    poses: Mapping[str, Pose]
+    """Of each body's base in the world, by the body's name."""
 
 
 class World:
@@ -72,6 +81,11 @@ class World:
     def pose(self, name: str, link: str | None = None) -> Pose:
         """Pose of a body's base, or of one of its links, in the world: ground truth."""
         return _pose(self._ask("pose", name=name, link=link))
+
+    def poses(self, names: Collection[str] | None = None) -> Poses:
+        """Those of the bases of many bodies, else of all, at one moment: one request, however many there are."""
+        found = self._ask("poses", names=None if names is None else list(names))
+        return Poses(float(found["t"]), {name: _pose(pose) for name, pose in found["poses"].items()})
 
     def set_pose(self, name: str, pose: Pose) -> None:
         """Put a body somewhere else, at rest. Robots are moved by their servo, or put back by :meth:`reset`."""

@@ -47,7 +47,7 @@ class World:
 
     REQUESTS: ClassVar[frozenset[str]] = frozenset(
         {
-            *("names", "describe", "pose", "velocity", "dynamics", "contacts", "aabb"),
+            *("names", "describe", "pose", "poses", "velocity", "dynamics", "contacts", "aabb"),
             *("add", "remove", "set_color", "set_pose", "set_velocity", "set_dynamics", "reset"),
         }
     )
@@ -174,6 +174,11 @@ class World:
             return pose_json(body.base_pose(self.client))
         state = self.client.getLinkState(body.id, index, computeForwardKinematics=True)
         return pose_json((state[4], state[5]))
+
+    def poses(self, names: Sequence[str] | None = None) -> dict[str, Any]:
+        """``poses`` by name of the base links of many bodies, None: of all; and ``t``, the simulated time, s."""
+        found = self.bodies.values() if names is None else [self.body(name) for name in names]
+        return {"t": self.t, "poses": {body.name: pose_json(body.base_pose(self.client)) for body in found}}
 
     def set_pose(self, name: str, pose: Mapping[str, Sequence[float]]) -> None:
         """Put an object's base link there, at rest, whatever is in the way; its joints keep their positions."""

@@ -32,6 +32,8 @@ class Cycle:
         self._copies = copies_of(spec, others)
         self.dt = 1.0 / spec.rate_hz
         self.ticks = 0
+        self.t = 0.0
+        """Of the newest cycle, s on the group's clock."""
         self._counted_from = 0
         self.world: Any = None
         if spec.world is not None:
@@ -65,6 +67,7 @@ class Cycle:
 
     def open(self, now: float) -> None:
         """Connect to every device and publish a first state. Nothing moves."""
+        self.t = now
         for unit in self._units:
             unit.open(now)
         for hand in self._hands:
@@ -80,6 +83,7 @@ class Cycle:
     def step(self, now: float, app: AppRecord, late: bool = False) -> None:
         """One cycle. ``now`` is the time on the group's clock; ``late``: this process could not run for a while."""
         self.ticks += 1
+        self.t = now
         if self.world is not None:
             for copy in self._copies:
                 copy.follow(self.world)
@@ -164,6 +168,8 @@ class Cycle:
         if self.world is None:
             raise NotSupported("this rig has no simulated world; rig.world exists in simulation only")
         result = self.world.request(method, params)
+        if method == "poses":
+            result["t"] = self.t  # a world only counts its steps
         if method == "reset":
             name = params.get("name")
             for unit in self._units:

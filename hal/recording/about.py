@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import operator
 import platform
 import sys
 from collections.abc import Iterable, Mapping
@@ -19,7 +20,7 @@ if TYPE_CHECKING:
     from ..pose import Pose
     from ..rig import Rig
 
-__all__ = ["about_rig", "about_start", "checked_info"]
+__all__ = ["about_call", "about_rig", "about_start"]
 
 _PACKAGES = (
     "robot-hal",
@@ -65,7 +66,8 @@ def about_start(rig: Rig, tracks: Iterable[CameraTrack]) -> dict[str, Any]:
     """What is so when an episode begins."""
     objects = {}
     if rig.has_world:
-        objects = {name: _pose(rig.world.pose(name)) for name in rig.world.bodies if name not in rig.robots}
+        seen = rig.world.poses().poses
+        objects = {name: _pose(pose) for name, pose in seen.items() if name not in rig.robots}
     return {
         "started": datetime.now(timezone.utc).isoformat(timespec="milliseconds"),
         "clock": rig.plan.clock,
@@ -92,10 +94,17 @@ def _pose(pose: Pose) -> list[float]:
     return [*pose.position.tolist(), *pose.orientation.tolist()]
 
 
-def checked_info(info: Mapping[str, Any] | None) -> dict[str, Any]:
-    """What a caller wants to have kept with an episode. CommandError for what JSON cannot hold."""
+def about_call(task: str, seed: int | None, info: Mapping[str, Any] | None) -> dict[str, Any]:
+    """What a caller wants to have kept with an episode. CommandError for what the files cannot hold."""
     try:
-        found: dict[str, Any] = json.loads(json.dumps(dict(info or {}), allow_nan=False))
-        return found
+        task.encode()
+    except (AttributeError, UnicodeEncodeError) as error:
+        raise CommandError(f"the task must be a text, not {task!r}: {error}") from None
+    try:
+        number = None if seed is None else operator.index(seed)
+    except TypeError:
+        raise CommandError(f"the seed must be a whole number, not {seed!r}") from None
+    try:
+        return {"task": task, "seed": number, "info": json.loads(json.dumps(dict(info or {}), allow_nan=False))}
     except (TypeError, ValueError) as error:
         raise CommandError(f"info must be plain numbers, texts, lists and dicts: {error}") from None

@@ -56,16 +56,18 @@ class CameraTrack:
 
     def begin(self) -> None:
         """A new episode. StaleStateError, ConnectionLost where the camera has no picture now."""
-        first = self.camera.latest(max_age=_SILENT)
         self._lost, self.repeated, self._put = None, 0, -1
         with self._lock:
             self._frames.clear()
-            self._frames.append(first)
-        if not self._lock_step:
+        if not self._lock_step:  # from here on nothing is missed, also not that it is lost
             self._detach = [self.camera.on_frame(self._keep), self.camera.on_connection(self._hear)]
+        first = self.camera.latest(max_age=_SILENT)
+        with self._lock:
+            if not self._frames or first.stamp.seq < self._frames[0].stamp.seq:
+                self._frames.appendleft(first)
 
     def end(self) -> None:
-        """It is over."""
+        """It is over. Idempotent."""
         for detach in self._detach:
             detach()
         self._detach = []

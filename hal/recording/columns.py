@@ -9,6 +9,7 @@ __all__ = [
     "ACTION",
     "BOOKKEEPING",
     "GRID",
+    "PAD",
     "SETPOINT",
     "STATE",
     "TIMES",
@@ -21,6 +22,8 @@ __all__ = [
 STATE = "observation.state"
 SETPOINT = "observation.setpoint"
 ACTION = "action"
+PAD = "observation.pad"
+"""No ``action.pad``: LeRobot takes every column whose name begins with ``action`` for an action."""
 TIMES = "observation.time."
 """What stands first in these columns is a time, s: on the rig's clock while it is recorded, in the dataset since the
 episode's first row."""

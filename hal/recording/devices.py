@@ -6,14 +6,21 @@ from collections.abc import Collection
 from typing import TYPE_CHECKING
 
 from ..errors import CommandError
+from ..host.groups import groups_of
 from .cameras import CameraTrack
 from .columns import TIMES
-from .sampling import Sampler
+from .sampling import Sampler, movable
 
 if TYPE_CHECKING:
     from ..rig import Rig
 
-__all__ = ["chosen"]
+__all__ = ["check_rate", "chosen"]
+
+
+def check_rate(rig: Rig, fps: int) -> None:
+    """Raise CommandError where a simulation in lock-step makes fewer steps than rows are wanted."""
+    if rig.lock_step and fps > (steps := groups_of(rig.plan)[0].rate_hz):
+        raise CommandError(f"fps must be at most {steps:g}, the steps of this simulation in a second, not {fps}")
 
 
 def chosen(rig: Rig, cameras: Collection[str] | None, depth: bool) -> tuple[Sampler, list[CameraTrack], list[str]]:
@@ -23,7 +30,9 @@ def chosen(rig: Rig, cameras: Collection[str] | None, depth: bool) -> tuple[Samp
     """
     if not rig.robots:
         raise CommandError("this rig has no arm to record")
-    names = tuple(rig.cameras) if cameras is None else tuple(cameras)
+    if odd := [name for name in movable(rig) if "/" in name]:
+        raise CommandError(f"an object's name becomes that of a column, which has no slash: {odd[0]!r}")
+    names = tuple(rig.cameras) if cameras is None else tuple(dict.fromkeys(cameras))
     tracks, notes = [], []
     for name in names:
         track = CameraTrack(rig.cameras[name], depth=depth, lock_step=rig.lock_step)

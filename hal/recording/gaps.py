@@ -15,6 +15,8 @@ class Gaps:
         """Rows that are missing."""
         self.lasting = 0.0
         """How long there has been no row now, s."""
+        self.why = ""
+        """The newest reason."""
         self._fps = fps
         self._found: list[dict[str, Any]] = []
         self._open = False
@@ -23,6 +25,7 @@ class Gaps:
         """No row at ``t``, s since the episode's first one."""
         self.rows += 1
         self.lasting += 1.0 / self._fps
+        self.why = why
         if not self._open:
             self._found.append({"from_s": round(t, 6), "rows": 0, "why": why})
             self._open = True

@@ -39,18 +39,18 @@ class Grid(ABC):
         """Of the first row, s on the clock."""
         self.late = 0
         """Grid times that were noticed more than a period late."""
-        self._number = 0
-
-    def _due(self) -> float:
-        return self.start_time + self._number * self._period
 
     @abstractmethod
     def start(self) -> None:
         """Begin with a row of the present."""
 
     @abstractmethod
+    def end(self) -> None:
+        """No further grid times, and nothing is looked at any more once this returns. Idempotent."""
+
+    @abstractmethod
     def stop(self) -> None:
-        """No further grid times; returns when all rows are made. Idempotent."""
+        """The same; returns when all rows are made."""
 
 
 class RealTimeGrid(Grid):
@@ -58,37 +58,56 @@ class RealTimeGrid(Grid):
 
     def __init__(self, clock: Clock, fps: int, look: Look, make: Make) -> None:
         super().__init__(clock, fps, look, make)
-        self._stopping = threading.Event()
+        self._number = 0
+        """Of the next row."""
+        self._waiting: deque[tuple[float, Moment | Exception]] = deque()
+        self._ending = threading.Event()
+        self._looking = threading.Lock()
         self._thread = threading.Thread(target=self._run, name="hal-recorder", daemon=True)
 
     def start(self) -> None:
+        self._notice()  # here and now: whatever comes next, there is a first row
         self._thread.start()
 
+    def end(self) -> None:
+        self._ending.set()
+        with self._looking:  # a look that is under way is let end
+            pass
+
     def stop(self) -> None:
-        self._stopping.set()
-        if self._thread is not threading.current_thread():
+        self.end()
+        if self._thread.is_alive() and self._thread is not threading.current_thread():
             self._thread.join()
 
-    def _run(self) -> None:
-        waiting: deque[tuple[float, Moment | Exception]] = deque()
-        while True:
+    def _due(self) -> float:
+        return self.start_time + self._number * self._period
+
+    def _notice(self) -> None:
+        """Look, where a row is due."""
+        with self._looking:
             now = self._clock.now()
-            if not self._stopping.is_set() and self._due() <= now:
-                moment = self._look()
-                while self._due() <= now:
-                    self.late += now - self._due() > _LATE * self._period
-                    waiting.append((self._due(), moment))
-                    self._number += 1
+            if self._ending.is_set() or self._due() > now:
+                return
+            moment = self._look()
+        while self._due() <= now:
+            self.late += now - self._due() > _LATE * self._period
+            self._waiting.append((self._due(), moment))
+            self._number += 1
+
+    def _run(self) -> None:
+        waiting = self._waiting
+        while True:
+            self._notice()
             while waiting and waiting[0][0] + LAG <= self._clock.now():
                 if not self._make(*waiting.popleft()):
                     return
-            if self._stopping.is_set():
+            if self._ending.is_set():
                 if not waiting:
                     return
                 self._clock.sleep_until(waiting[0][0] + LAG)
             else:
                 next_row = waiting[0][0] + LAG if waiting else self._due()
-                self._stopping.wait(max(0.0, min(next_row, self._due()) - self._clock.now()))
+                self._ending.wait(max(0.0, min(next_row, self._due()) - self._clock.now()))
 
 
 class LockStepGrid(Grid):
@@ -98,24 +117,27 @@ class LockStepGrid(Grid):
         super().__init__(clock, fps, look, make)
         assert isinstance(clock, LockStepClock)
         self._stepped = clock
-        self._advance = clock._advance_to
         self._wanted = True
+        self._taking = threading.RLock()
+        """Held while a row is made: another thread may end this meanwhile."""
+        self._detach: Callable[[], None] = lambda: None
 
     def start(self) -> None:
-        self._stepped._advance_to = self._advance_by_rows
         self._take()
+        if self._wanted:
+            self._detach = self._stepped.every(self._period, self._take)
+
+    def end(self) -> None:
+        self._wanted = False
+        self._detach()
+        with self._taking:  # a row that is under way is made
+            pass
 
     def stop(self) -> None:
-        self._wanted = False
-        if self._stepped._advance_to == self._advance_by_rows:
-            self._stepped._advance_to = self._advance
-
-    def _advance_by_rows(self, t: float) -> None:
-        while self._wanted and self._due() <= t + 1e-9:
-            self._advance(self._due())
-            self._take()
-        self._advance(t)
+        self.end()
 
     def _take(self) -> None:
-        self._number += 1
-        self._wanted = self._wanted and self._make(self._clock.now(), self._look())
+        with self._taking:
+            if self._wanted and not self._make(self._clock.now(), self._look()):
+                self._wanted = False
+                self._detach()

@@ -90,7 +90,7 @@ def locked(layout: Layout) -> Iterator[None]:
             try:
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
                 break
-            except OSError:
+            except BlockingIOError:
                 if time.monotonic() > deadline:
                     raise CommandError(f"another program is recording into {layout.root}") from None
                 time.sleep(0.05)

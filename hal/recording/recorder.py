@@ -8,15 +8,16 @@ from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from ..errors import CommandError
+from ..errors import CommandError, ConnectionLost
 from ..host.process import Child, SharedMemory
-from .about import about_rig, about_start, checked_info
+from .about import about_call, about_rig, about_start
 from .columns import features_of
 from .compatible import check_compatible
-from .devices import chosen
-from .layout import Layout
+from .devices import check_rate, chosen
+from .layout import Layout, locked, read_json
 from .library import require
 from .ring import RowRing
+from .saving import Saving
 from .take import Take
 from .video import Encoder
 
@@ -78,10 +79,11 @@ class Recorder:
         stop_free: int = 1_000_000_000,
     ) -> None:
         require()
-        if int(fps) != fps or not 1 <= fps <= _FASTEST:
+        if not (1 <= fps <= _FASTEST and int(fps) == fps):
             raise CommandError(f"fps must be a whole number from 1 to {_FASTEST}, not {fps!r}")
+        check_rate(rig, fps)
         self.rig = rig
-        self.fps = fps
+        self.fps = fps = int(fps)
         self.task = task
         """Of the episodes to come."""
         self.root = Layout(out).root
@@ -100,7 +102,11 @@ class Recorder:
             "codec": codec,
             "stop_free": stop_free,
         }
-        self._child = self._start_child()
+        try:
+            self._child = self._start_child()
+        except BaseException:
+            self._memory.close()
+            raise
         try:
             encoder = Encoder(*self._child.ready["encoder"])
             self._about = {
@@ -115,14 +121,15 @@ class Recorder:
             check_compatible(Layout(out), self._about["features"], fps, self._about["robot_type"])
         except BaseException:
             self._child.close()
+            self._memory.close()
             raise
         self._lock = threading.RLock()
         self._take: Take | None = None
         """The present episode, or the last one."""
         self._open = False
         """Is it being recorded?"""
-        self._saver: threading.Thread | None = None
-        self._failure: Exception | None = None
+        self._saving: Saving | None = None
+        """Of the last episode that was saved."""
         self._episode = -1
         self._closed = False
 
@@ -135,27 +142,37 @@ class Recorder:
             raise
         return child
 
+    @property
+    def episodes(self) -> int:
+        """How many are in the dataset by now, those that are being saved left out."""
+        info = Layout(self.root).info
+        return int(read_json(info)["total_episodes"]) if info.is_file() else 0
+
     # An episode.
 
     def start(self, seed: int | None = None, info: Mapping[str, Any] | None = None) -> None:
         """Begin an episode. ``seed`` and ``info`` (plain numbers, texts, lists, dicts) are kept with it.
 
-        Waits for one that is still being saved. What an earlier program left unfinished in the folder is recovered
-        first, see :attr:`notes`.
+        Waits for one that is still being saved; where that failed, :attr:`notes` say why. What was left unfinished in
+        the folder is recovered first, see there, too.
 
-        Raises CommandError (the folder, the disk, ``info``), StaleStateError and ConnectionLost (a camera).
+        Raises CommandError (the folder, the disk, what is to be kept), StaleStateError and ConnectionLost (a camera).
         """
-        said = {"task": self.task, "seed": seed, "info": checked_info(info)}
+        said = about_call(self.task, seed, info)
         with self._lock:
             if self._closed:
                 raise CommandError("the recorder is closed")
             if self._open:
                 raise CommandError(f"episode {self._episode} is still being recorded: save or discard it first")
-            self._wait_saved()
-            self._failure = None
+            if self._saving is not None:
+                self._saving.wait()
+                if self._saving.error is not None:
+                    self.notes.append(str(self._saving.error))
+            self._saving = None
             if self._child.process.poll() is not None:
                 self._child.close()
                 self._child = self._start_child()
+            take = None
             try:
                 for track in self._tracks:
                     track.begin()
@@ -163,20 +180,23 @@ class Recorder:
                 begun = self._child.request("begin", {"about": about}, _SAVING)
                 self.notes.extend(begun["notes"])
                 self._episode = begun["episode"]
-                self._take = Take(self.rig, self.fps, self._sampler, self._tracks, self._ring, self._child)
-                self._take.start()
-                self._open = True
+                take = Take(self.rig, self.fps, self._sampler, self._tracks, self._ring, self._child)
+                take.start()
             except BaseException:
+                if take is not None:
+                    take.stop()
                 self._end_tracks()
                 raise
+            self._take, self._open = take, True
 
     def status(self) -> RecorderStatus:
         """How it goes; never waits."""
-        take = self._take
-        saving = self._saver is not None and self._saver.is_alive()
-        state = "saving" if saving else "recording" if self._open else "idle"
+        take, saving = self._take, self._saving
+        busy = saving is not None and not saving.done
+        state = "saving" if busy else "recording" if self._open else "idle"
         free = self._ring.free_bytes or int(self._child.ready["free_bytes"])
-        trouble = str(self._failure or (take.trouble if take is not None else ""))
+        failure = saving.error if saving is not None else None
+        trouble = str(failure or (take.trouble if take is not None else ""))
         if not trouble and free < self._warn_free:
             trouble = f"only {free / 1e9:.1f} GB are free on the disk of {self.root}"
         if take is None:
@@ -185,51 +205,55 @@ class Recorder:
         return RecorderStatus(state, self._episode, *counts, free, trouble)
 
     def save(self, success: bool | None = None, wait: bool = False) -> None:
-        """End the episode and make it part of the dataset, in the background unless ``wait``.
+        """End the episode with the rows until now and make it part of the dataset, in the background unless ``wait``.
 
         ``success`` is the mark that it gets. Until it is saved ``status().state`` is ``saving``; where that fails,
-        ``status().trouble`` says why, ``wait=True`` raises it, and the next :meth:`start`, or
+        ``status().trouble`` says why, :meth:`wait_saved` raises it, and the next :meth:`start`, or
         :func:`~hal.recording.recover`, tries it again.
         """
         with self._lock:
             take = self._end()
-            self._saver = threading.Thread(target=self._save, args=(take, success), name="hal-recorder-save")
-            self._saver.start()
+            saving = self._saving = Saving(lambda: self._save(take, success))
         if wait:
-            self._wait_saved()
-            if self._failure is not None:
-                raise self._failure
+            saving.result()
+
+    def wait_saved(self) -> None:
+        """Wait until the last episode is saved; raises what kept it from that."""
+        saving = self._saving
+        if saving is not None:
+            saving.result()
 
     def _save(self, take: Take, success: bool | None) -> None:
-        try:
-            take.stop()
-            self._end_tracks()
-            if self._child.request("save", {"closing": take.closing(success)}, _SAVING) is None:
-                raise CommandError(f"nothing was recorded, so there is nothing to save. {take.trouble}".strip())
-        except Exception as error:
-            self._failure = error
+        take.stop()
+        self._end_tracks()
+        if self._child.request("save", {"closing": take.closing(success)}, _SAVING) is None:
+            why = take.gaps.why or "it ended at once"
+            raise CommandError(f"nothing was recorded, so there is nothing to save: {why}")
 
     def discard(self) -> None:
         """End the episode and remove it."""
         with self._lock:
             self._end().stop()
             self._end_tracks()
-            self._child.request("discard", {}, _SAVING)
+            try:
+                self._child.request("discard", {}, _SAVING)
+            except ConnectionLost:  # the writer is gone, and its lock with it
+                layout = Layout(self.root)
+                with locked(layout):
+                    if (partial := layout.partial(self._episode)).exists():
+                        layout.remove(partial)
 
     def _end(self) -> Take:
-        """The episode that is open ends."""
+        """The episode that is open ends here and now, whatever is still to be done with it."""
         if self._take is None or not self._open:
             raise CommandError("no episode is being recorded: call start first")
         self._open = False
+        self._take.end()
         return self._take
 
     def _end_tracks(self) -> None:
         for track in self._tracks:
             track.end()
-
-    def _wait_saved(self) -> None:
-        if self._saver is not None:
-            self._saver.join()
 
     def close(self) -> None:
         """End the writer. An episode that is still open is kept, unmarked. Idempotent."""
@@ -239,7 +263,8 @@ class Recorder:
             self._closed = True
             if self._open:
                 self.save()
-            self._wait_saved()
+            if self._saving is not None:
+                self._saving.wait()
             self._child.close()
             self._memory.close()
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from ..errors import CommandError
+from ..errors import CommandError, HalError
 from .finalise import finalise
 from .layout import Layout, locked
 from .library import require
@@ -18,7 +18,8 @@ def recover(out: str | Path) -> list[str]:
     Every episode that was begun and not finished is closed with its last whole row, and becomes part of the dataset,
     unmarked (``success`` is None) unless it had been marked already.
 
-    Raises DriverMissing, CommandError (no such folder, or another program is recording into it), OSError.
+    Raises DriverMissing, CommandError (no such folder, or another program is recording into it), OSError (the disk),
+    and HalError for what cannot be made an episode.
     """
     require()
     layout = Layout(out)
@@ -35,7 +36,13 @@ def recover_all(layout: Layout) -> list[str]:
     layout.sweep()
     done = []
     for partial in layout.partials():
-        number = finalise(layout, partial)
+        try:
+            number = finalise(layout, partial)
+        except OSError:
+            raise
+        except Exception as error:  # damaged in a way that no crash leaves behind
+            why = f"{type(error).__name__}: {error}"
+            raise HalError(f"{partial} cannot be made an episode ({why}); move it elsewhere, and go on") from error
         if number is None:
             done.append(f"{partial.name} held no whole row and was removed")
         else:

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from typing import TYPE_CHECKING, NamedTuple
 
 from ..errors import DeviceNotFound, StaleStateError
 from ..types import AXES, BUTTONS, Frame, GripperState, PadState, RobotState, Stamp
-from .columns import GRID, SETPOINT, STATE, TIMES, Column
+from .columns import GRID, PAD, SETPOINT, STATE, TIMES, Column
 
 if TYPE_CHECKING:
     from ..pose import Pose
@@ -29,16 +29,20 @@ class Moment(NamedTuple):
     """What is known only while it is so: asked for at the grid time itself. Of the rest there is a history."""
 
     pads: dict[str, PadState]
-    objects: dict[str, Pose | None]
+    objects: Mapping[str, Pose]
+    """Of the simulated world; without those that were taken out of it."""
     t_objects: float
+    """The time that they show, s on the rig's clock."""
 
 
 def movable(rig: Rig) -> tuple[str, ...]:
-    """Objects of the simulated world that can move by themselves."""
+    """Objects of the simulated world that can move by themselves, or that episodes begin with elsewhere."""
     if not rig.has_world or rig.plan.world is None:
         return ()
-    still = {body.name for body in rig.plan.world.bodies if body.fixed or body.robot is not None}
-    still |= {body.name for body in rig.plan.world.bodies if body.urdf is None and not body.mass > 0.0}
+    bodies = rig.plan.world.bodies
+    heavy = {body.name for body in bodies if body.urdf is not None or body.mass > 0.0}
+    still = {body.name for body in bodies if body.random is None and (body.fixed or body.name not in heavy)}
+    still |= {body.name for body in bodies if body.robot is not None}
     return tuple(name for name in rig.world.bodies if name not in still and name not in rig.robots)
 
 
@@ -61,7 +65,7 @@ class Sampler:
         for pad in rig.gamepads.values():
             lead = f"{pad.name}." if len(rig.gamepads) > 1 else ""
             names = [*AXES, *(f"button_{button}" for button in BUTTONS), "connected"]
-            self._add("action.pad", [lead + name for name in names])
+            self._add(PAD, [lead + name for name in names])
             self._add(f"{TIMES}pad.{pad.name}", _STAMP, "float64")
         for name in self._cameras:
             self._add(f"{TIMES}camera.{name}", _STAMP, "float64")
@@ -104,14 +108,14 @@ class Sampler:
     def look(self) -> Moment:
         """What has no history, now."""
         pads = {pad.name: pad.state() for pad in self._rig.gamepads.values()}
-        objects = {name: self._pose(name) for name in self._objects}
-        return Moment(pads, objects, self._rig.clock.now())
-
-    def _pose(self, name: str) -> Pose | None:
+        if not self._objects:
+            return Moment(pads, {}, math.nan)
+        world = self._rig.world
         try:
-            return self._rig.world.pose(name)
-        except DeviceNotFound:  # it was taken out of the world
-            return None
+            seen = world.poses(self._objects)
+        except DeviceNotFound:  # one was taken out of the world
+            seen = world.poses()
+        return Moment(pads, seen.poses, seen.t)
 
     def row(self, t: float, moment: Moment, frames: dict[str, Frame]) -> list[float]:
         """The numbers of the row that was due at ``t``; all times in it are on the rig's clock, s.
@@ -128,13 +132,13 @@ class Sampler:
             self._put_robot(put, robot, robot.state_at(t))
         for name, pad in moment.pads.items():
             pressed = [float(button in pad.buttons) for button in BUTTONS]
-            put("action.pad", [*(pad.axes.get(axis, 0.0) for axis in AXES), *pressed, float(pad.connected)])
+            put(PAD, [*(pad.axes.get(axis, 0.0) for axis in AXES), *pressed, float(pad.connected)])
             put(f"{TIMES}pad.{name}", _stamp(pad.stamp))
         for name, frame in frames.items():
             put(f"{TIMES}camera.{name}", _stamp(frame.stamp))
             put(f"observation.camera_pose.{name}", _pose(frame.T_world_camera))
-        for name, pose in moment.objects.items():
-            put(f"observation.object.{name}", _pose(pose))
+        for name in self._objects:
+            put(f"observation.object.{name}", _pose(moment.objects.get(name)))
         if self._objects:
             put(f"{TIMES}objects", [moment.t_objects])
         return [value for values in found.values() for value in values]

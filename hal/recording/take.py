@@ -6,7 +6,7 @@ import threading
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
-from ..errors import ConnectionLost, StaleStateError
+from ..errors import HalError, StaleStateError
 from .cameras import CameraTrack
 from .gaps import Gaps
 from .grid import Grid, LockStepGrid, RealTimeGrid
@@ -29,7 +29,7 @@ _WORD = 1.0
 
 
 class Take:
-    """Looks on from :meth:`start` to :meth:`stop`."""
+    """Looks on from :meth:`start` to :meth:`end`."""
 
     def __init__(
         self, rig: Rig, fps: int, sampler: Sampler, tracks: Sequence[CameraTrack], ring: RowRing, child: Child
@@ -53,8 +53,12 @@ class Take:
         """The first row is one of the present."""
         self.grid.start()
 
+    def end(self) -> None:
+        """No rows of later times, and nothing is looked at any more; those that are due are still made. Idempotent."""
+        self.grid.end()
+
     def stop(self) -> None:
-        """No more rows; returns when the writer has been handed all of them. Idempotent."""
+        """The same; returns when the writer has been handed every row."""
         self.grid.stop()
 
     def closing(self, success: bool | None) -> dict[str, Any]:
@@ -83,7 +87,7 @@ class Take:
             self._child.check()
             self.trouble = self._ring.trouble
             why = self.trouble or self._put(t, moment)
-        except (ConnectionLost, ValueError) as error:
+        except (HalError, ValueError) as error:
             why = self.trouble = str(error)
         except Exception as error:  # nothing of a recording may be lost without a word
             why = self.trouble = f"{type(error).__name__}: {error}"

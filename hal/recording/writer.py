@@ -114,6 +114,17 @@ class Writer:
     # What the app asks for.
 
     def _do_begin(self, about: dict[str, Any]) -> dict[str, Any]:
+        if self.live is not None:  # the app gave up in the middle of a start
+            self._closed()
+        try:
+            return self._begin(about)
+        except Exception as error:
+            self._lock.close()  # whoever mends it needs it
+            if isinstance(error, OSError):
+                raise CommandError(f"cannot record into {self.layout.root}: {error}") from error
+            raise
+
+    def _begin(self, about: dict[str, Any]) -> dict[str, Any]:
         layout = self.layout
         free = free_bytes(layout.root)
         if free < self.stop_free:
@@ -134,7 +145,7 @@ class Writer:
             (live.folder / RESERVE).unlink(missing_ok=True)
             write_json(live.folder / CLOSING, closing)
             return finalise(self.layout, live.folder)
-        except OSError as error:
+        except Exception as error:  # a disk that is full, and whatever a library makes of that
             stays = f"what was recorded stays in {live.folder}: mend that, then record on, or call recover()"
             raise HalError(f"the episode cannot be finished now: {error}; {stays}") from error
 

@@ -60,6 +60,6 @@ def test_a_drive_is_recorded_as_it_was(tmp_path: Path) -> None:
         for joint in range(7):
             want = np.interp(grid[inside], t, values[:, joint])
             assert np.abs(episode.columns[key][inside, joint] - want).max() < 1e-6
-    pad = episode.columns["action.pad"]
-    assert (pad[:, episode.names("action.pad").index("connected")] == 1.0).all(), "the pad was recorded, too"
+    pad = episode.columns["observation.pad"]
+    assert (pad[:, episode.names("observation.pad").index("connected")] == 1.0).all(), "the pad was recorded, too"
     assert (np.diff(episode.stamps["objects"]) >= 0.0).all(), "two rows share one where the thread came late"

@@ -19,7 +19,7 @@ import hal
 from hal.errors import CommandError, ConnectionLost
 from hal.recording import Dataset, Recorder, recover
 from hal.rig import Rig
-from hal.types import RobotStatus, Trip
+from hal.types import Frame, RobotStatus, Trip
 
 pytestmark = pytest.mark.slow
 
@@ -116,6 +116,12 @@ def test_a_disk_that_is_full(rig: Rig, out: Path) -> None:
         begin(recorder, 5)  # recovers what is there
         recorder.save(wait=True)
         assert "recovered as episode 0" in recorder.notes[-1]
+        limit(recorder, 100)
+        with pytest.raises(CommandError, match="cannot record into .*File too large"):
+            recorder.start()
+        limit(recorder, resource.RLIM_INFINITY)
+        begin(recorder, 5)
+        recorder.discard()
     usable(out, 5)
     first = Dataset(out).episodes[0]
     assert first.length >= 13
@@ -181,6 +187,30 @@ def test_a_camera_that_is_lost(rig: Rig, out: Path) -> None:
     assert first.length >= 15
     assert "camera wrist is lost" in first.info["trouble"]
     assert first.info["gaps"][-1]["why"] == first.info["trouble"]
+
+
+def test_a_camera_that_is_lost_while_an_episode_begins(rig: Rig, out: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    camera = rig.cameras["wrist"]
+    latest = camera.latest
+
+    def last(**more: float) -> Frame:
+        frame = latest(**more)
+        camera.inject(disconnect=True)
+        wait(lambda: not camera.connected)
+        return frame
+
+    with Recorder(rig, out) as recorder:
+        with monkeypatch.context() as patched:
+            patched.setattr(camera, "latest", last)
+            recorder.start()
+        wait(lambda: recorder.status().trouble)
+        assert "camera wrist is lost" in recorder.status().trouble, "and not only silent, a second later"
+        recorder.discard()
+        camera.inject(disconnect=False)
+        wait(lambda: camera.connected)
+        begin(recorder)
+        recorder.save(wait=True)
+    usable(out, 15)
 
 
 def test_a_camera_that_falls_silent(rig: Rig, out: Path) -> None:

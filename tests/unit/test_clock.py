@@ -61,3 +61,77 @@ def test_real_time_waits() -> None:
 def test_a_rate_must_be_positive(hz: float) -> None:
     with pytest.raises(ValueError, match="positive"):
         next(lock_step()[0].rate(hz))
+
+
+class Looker:
+    """Notes when it was called."""
+
+    def __init__(self, clock: LockStepClock) -> None:
+        self.clock = clock
+        self.seen: list[float] = []
+
+    def __call__(self) -> None:
+        self.seen.append(round(self.clock.now(), 6))
+
+
+def test_time_stops_at_the_times_that_somebody_wants_whoever_waits() -> None:
+    clock, world = lock_step()
+    clock.sleep(1.0)
+    slow, fast = Looker(clock), Looker(clock)
+    clock.every(0.5, slow)
+    end = clock.every(0.2, fast)
+    clock.sleep(0.3)
+    clock.sleep(0.7)
+    assert slow.seen == [1.5, 2.0]
+    assert fast.seen == [1.2, 1.4, 1.6, 1.8, 2.0]
+    end()
+    end()
+    clock.sleep(1.0)
+    assert slow.seen[2:] == [2.5, 3.0]
+    assert len(fast.seen) == 5
+    assert world.t == pytest.approx(3.0)
+
+
+@pytest.mark.parametrize("first", [0, 1])
+def test_those_who_have_time_stopped_may_leave_in_any_order(first: int) -> None:
+    clock, _ = lock_step()
+    lookers = [Looker(clock), Looker(clock)]
+    ends = [clock.every(0.1, looker) for looker in lookers]
+    clock.sleep(0.25)
+    ends[first]()
+    clock.sleep(0.25)
+    ends[1 - first]()
+    clock.sleep(0.25)
+    assert lookers[first].seen == [0.1, 0.2]
+    assert lookers[1 - first].seen == pytest.approx([0.1, 0.2, 0.3, 0.4, 0.5])
+
+
+def test_one_who_is_called_may_end_it_and_may_wait_itself() -> None:
+    clock, _ = lock_step()
+    once = Looker(clock)
+
+    def look() -> None:
+        once()
+        end()
+        clock.sleep(0.05)
+        once()
+
+    end = clock.every(0.1, look)
+    clock.sleep(1.0)
+    assert once.seen == [0.1, 0.15]
+    assert clock.now() == pytest.approx(1.0)
+
+
+def test_stops_that_lie_behind_are_not_caught_up() -> None:
+    clock, world = lock_step()
+    looker = Looker(clock)
+    clock.every(0.1, looker)
+    world.t = 0.35  # time went on in another thread meanwhile
+    clock.sleep(0.1)
+    assert looker.seen == pytest.approx([0.35, 0.4])
+
+
+@pytest.mark.parametrize("seconds", [0.0, -1.0, float("nan")])
+def test_time_stops_only_after_a_positive_time(seconds: float) -> None:
+    with pytest.raises(ValueError, match="positive"):
+        lock_step()[0].every(seconds, lambda: None)

@@ -193,6 +193,7 @@ class TestRequests:
             ("names", {}),
             ("describe", {"name": "panda"}),
             ("pose", {"name": "panda", "link": "panda_hand"}),
+            ("poses", {"names": ["mug", "panda"]}),
             ("velocity", {"name": "cube"}),
             ("dynamics", {"name": "cube"}),
             ("contacts", {"a": "cube"}),
@@ -224,6 +225,16 @@ class TestRequests:
         world.set_pose("cube", {"position": [1.0, 2.0, 3.0]})
         assert pose(world, "cube").position.tolist() == [1.0, 2.0, 3.0]
         assert world.velocity("cube") == [[0.0, 0.0, 0.0], [0.0, 0.0, 0.0]]
+
+    def test_poses_of_many_bodies_at_once(self, lasting: World) -> None:
+        world = lasting
+        run(world, 20)
+        seen = world.poses()
+        assert seen["t"] == world.t
+        assert seen["poses"] == {name: world.pose(name) for name in world.names()}
+        assert list(world.poses(["mug", "cube"])["poses"]) == ["mug", "cube"]
+        with pytest.raises(DeviceNotFound, match="did you mean 'cube'"):
+            world.poses(["mug", "cub"])
 
     def test_contacts_carry_the_weight(self) -> None:
         world = World(world_spec(floor(), cube((0.0, 0.0, 0.03)), box("far", (3, 3, 0.1), (0.1, 0.1, 0.1), mass=1.0)))

@@ -1,0 +1,230 @@
+"""Is this folder a LeRobotDataset v3.0? Asked of its documentation and its loader, and not of the recorder.
+
+One file of each kind per episode, which both allow.
+"""
+
+from __future__ import annotations
+
+import itertools
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from hal.recording import Episode
+
+pa = pytest.importorskip("pyarrow", reason="pip install 'robot-hal[record]'")
+av = pytest.importorskip("av", reason="pip install 'robot-hal[record]'")
+
+import pyarrow.parquet as pq  # noqa: E402
+
+TYPES = {"float32": pa.float32(), "float64": pa.float64(), "int64": pa.int64()}
+BOOKKEEPING = {
+    "timestamp": "float32",
+    "frame_index": "int64",
+    "episode_index": "int64",
+    "index": "int64",
+    "task_index": "int64",
+}
+INFO = {
+    "codebase_version": str,
+    "robot_type": str,
+    "total_episodes": int,
+    "total_frames": int,
+    "total_tasks": int,
+    "chunks_size": int,
+    "data_files_size_in_mb": int,
+    "video_files_size_in_mb": int,
+    "fps": int,
+    "splits": dict,
+    "data_path": str,
+    "features": dict,
+}
+QUANTILES = ("q01", "q10", "q50", "q90", "q99")
+INDICES = ["episode_index", "length", "dataset_from_index", "dataset_to_index"]
+PER_FILE = 1000
+
+
+def check_layout(root: Path) -> dict[str, Any]:
+    """All of it; ``info`` comes back."""
+    info: dict[str, Any] = json.loads((root / "meta/info.json").read_text())
+    check_info(info)
+    total, features = info["total_episodes"], info["features"]
+    videos = [key for key, feature in features.items() if feature["dtype"] == "video"]
+    tasks = read_tasks(root, info["total_tasks"])
+    stats = json.loads((root / "meta/stats.json").read_text())
+    assert set(stats) == set(features)
+    for key, feature in features.items():
+        check_stats(stats[key], feature, key)
+
+    entries = sorted(root.glob("meta/episodes/*/*.parquet"))
+    assert len(entries) == total
+    at = 0
+    files = {root / "meta/info.json", root / "meta/stats.json", root / "meta/tasks.parquet", *entries}
+    for number, entry in enumerate(entries):
+        place = {"chunk_index": number // PER_FILE, "file_index": number % PER_FILE}
+        row = read_entry(entry, place)
+        length = row["length"]
+        assert [row[key] for key in INDICES] == [number, length, at, at + length]
+        data = root / info["data_path"].format(**place)
+        check_rows(data, info, row, tasks)
+        for key, feature in features.items():
+            check_stats({part: row[f"stats/{key}/{part}"] for part in stats[key]}, feature, key)
+        files.add(data)
+        for key in videos:
+            assert [row[f"videos/{key}/{part}"] for part in place] == list(place.values())
+            assert row[f"videos/{key}/from_timestamp"] == 0.0
+            assert row[f"videos/{key}/to_timestamp"] == pytest.approx(length / info["fps"])
+            video = root / info["video_path"].format(video_key=key, **place)
+            check_video(video, features[key], info["fps"], length)
+            files.add(video)
+        at += length
+    assert at == info["total_frames"]
+    for folder in ("meta", "data", "videos"):
+        assert {path for path in (root / folder).rglob("*") if path.is_file()} <= files, "nothing is left over"
+    assert not list(root.glob("episodes/*.partial"))
+    return info
+
+
+def check_info(info: dict[str, Any]) -> None:
+    """What ``meta/info.json`` says of the whole, and of each column."""
+    assert {key: type(info[key]) for key in INFO} == INFO
+    assert info["codebase_version"] == "v3.0"
+    assert info["chunks_size"] == PER_FILE
+    assert info["splits"] == {"train": f"0:{info['total_episodes']}"}
+    features = info["features"]
+    assert (info["video_path"] is None) == all(feature["dtype"] != "video" for feature in features.values())
+    for key, dtype in BOOKKEEPING.items():
+        assert features[key] == {"dtype": dtype, "shape": [1], "names": None}
+    for key in ("observation.state", "action"):
+        assert features[key]["dtype"] == "float32"
+    assert [key for key in features if key.startswith("action")] == ["action"], "each one would count as an action"
+    for key, feature in features.items():
+        assert "/" not in key
+        if feature["dtype"] == "video":
+            assert feature["names"] == ["height", "width", "channels"]
+        elif key not in BOOKKEEPING:
+            assert feature["shape"] == [len(feature["names"])]
+            assert len(set(feature["names"])) == len(feature["names"])
+
+
+def read_tasks(root: Path, total: int) -> list[str]:
+    """The texts, by their number, from a table that pandas reads with the text as its index."""
+    table = pq.read_table(root / "meta/tasks.parquet")
+    assert table.schema.names == ["task_index", "__index_level_0__"]
+    assert json.loads(table.schema.metadata[b"pandas"])["index_columns"] == ["__index_level_0__"]
+    assert table["task_index"].to_pylist() == list(range(total))
+    texts: list[str] = table["__index_level_0__"].to_pylist()
+    return texts
+
+
+def read_entry(path: Path, place: dict[str, int]) -> dict[str, Any]:
+    """The one row of an episode."""
+    table = pq.read_table(path)
+    for name in table.schema.names:
+        kind = table.schema.field(name).type
+        if name.startswith("stats/"):
+            assert pa.types.is_list(kind)
+        elif name == "tasks":
+            assert kind == pa.list_(pa.string())
+        else:
+            assert kind == (pa.float64() if name.endswith("timestamp") else pa.int64()), name
+    (row,) = table.to_pylist()
+    for lead in ("data", "meta/episodes"):
+        assert [row[f"{lead}/{part}"] for part in place] == list(place.values())
+    assert path.parts[-2:] == (f"chunk-{place['chunk_index']:03d}", f"file-{place['file_index']:03d}.parquet")
+    return dict(row)
+
+
+def check_rows(path: Path, info: dict[str, Any], entry: dict[str, Any], tasks: list[str]) -> None:
+    """The rows of an episode: types, numbers, and that the statistics are those of these rows."""
+    features = {key: feature for key, feature in info["features"].items() if feature["dtype"] != "video"}
+    length, start = entry["length"], entry["dataset_from_index"]
+    table = pq.read_table(path)
+    assert table.schema.names == list(features)
+    assert len(table) == length > 0
+    for key, feature in features.items():
+        kind, (size,) = TYPES[feature["dtype"]], feature["shape"]
+        assert table.schema.field(key).type == (kind if size == 1 else pa.list_(kind, size)), key
+        assert table[key].null_count == 0
+        column = table[key].combine_chunks()
+        values = (column if size == 1 else column.flatten()).to_numpy().reshape(length, size)
+        known = np.isfinite(values).any(axis=0)
+        for part, of in (("min", np.nanmin), ("max", np.nanmax), ("mean", np.nanmean), ("std", np.nanstd)):
+            said = np.array(entry[f"stats/{key}/{part}"])[known]
+            assert np.allclose(said, of(values[:, known], axis=0), atol=1e-6), (key, part)
+        assert entry[f"stats/{key}/count"] == [length]
+    assert table["index"].to_pylist() == list(range(start, start + length))
+    assert table["frame_index"].to_pylist() == list(range(length))
+    assert set(table["episode_index"].to_pylist()) == {entry["episode_index"]}
+    (task,) = set(table["task_index"].to_pylist())
+    assert entry["tasks"] == [tasks[task]]
+    stamps = table["timestamp"].to_numpy()
+    assert np.abs(stamps - np.arange(length) / info["fps"]).max() < 1e-5
+
+
+def check_stats(stats: dict[str, Any], feature: dict[str, Any], key: str) -> None:
+    """Shapes, and an order that statistics of anything have."""
+    shape = (3, 1, 1) if feature["dtype"] == "video" else tuple(feature["shape"])
+    found = {part: np.array(value, float) for part, value in stats.items()}
+    assert set(found) == {"min", "max", "mean", "std", "count", *QUANTILES}
+    assert found.pop("count").shape == (1,)
+    assert stats["count"][0] > 0
+    for part, values in found.items():
+        assert values.shape == shape, (key, part)
+    rising = [found[part] for part in ("min", *QUANTILES, "max")]
+    for low, high in itertools.pairwise(rising):
+        assert not (low > high + 1e-6 * np.abs(high)).any(), key
+    if feature["dtype"] == "video":
+        assert found["min"].min() >= 0.0
+        assert found["max"].max() <= 1.0
+
+
+def check_video(path: Path, feature: dict[str, Any], fps: int, length: int) -> None:
+    """It is what its feature says, and every picture is there, at its time to within LeRobot's tolerance of 0.1 ms."""
+    height, width, _ = feature["shape"]
+    with av.open(str(path)) as container:
+        (stream,) = container.streams
+        said = {
+            "video.height": stream.codec_context.height,
+            "video.width": stream.codec_context.width,
+            "video.codec": stream.codec_context.codec.canonical_name,
+            "video.pix_fmt": stream.codec_context.pix_fmt,
+            "video.fps": float(stream.average_rate),
+            "video.channels": 3,
+            "video.is_depth_map": False,
+            "has_audio": False,
+        }
+        assert said == feature["info"]
+        assert [height, width, 3] == feature["shape"]
+        assert said["video.fps"] == fps
+        times = []
+        for frame in container.decode(stream):
+            times.append(float(frame.pts * stream.time_base))
+            assert (frame.height, frame.width) == (height, width)
+    assert len(times) == length
+    assert np.abs(np.array(times) - np.arange(length) / fps).max() < 1e-4
+
+
+def check_stamps(episode: Episode) -> None:
+    """Rows follow each other in time, and so do the samples in them; a picture's stamp is new as a whole or not."""
+    assert (np.diff(episode.stamps["grid"]) > 0.0).all()
+    for key, column in episode.columns.items():
+        if not key.startswith("observation.time.") or column.ndim == 1:
+            continue
+        source = key.removeprefix("observation.time.")
+        known: NDArray[np.float64] = column[np.isfinite(column[:, 0])]
+        steps = np.diff(known, axis=0)
+        assert (steps >= 0.0).all(), source
+        if source.startswith("robot."):
+            assert (steps[:, 0] > 0.0).all(), source
+        if source.startswith("camera."):
+            new = steps[:, 2] > 0.0
+            assert (steps[new] > 0.0).all(), source
+            assert (steps[~new] == 0.0).all(), source
+            assert new.sum() > 0.5 * len(new), f"{source}: most rows have a picture of their own"
+    if "objects" in episode.stamps:
+        assert (np.diff(episode.stamps["objects"]) >= 0.0).all()
