@@ -39,6 +39,7 @@ class CommandChecks:
 
     def __init__(self, robot: Robot) -> None:
         self._robot = robot
+        self._lower, self._upper = np.array(robot.limits.lower), np.array(robot.limits.upper)
         self._takes_torques = False
         """Is it known that the arm takes torques?"""
 
@@ -114,8 +115,7 @@ class CommandChecks:
 
     def _in_limits(self, q: NDArray[np.float64], reasons: list[str]) -> NDArray[np.float64]:
         """``q`` (n,) or (k, n) cut to the position limits; the very same array where that changes nothing."""
-        limits = self._robot.limits
-        inside = np.clip(q, limits.lower, limits.upper)
+        inside: NDArray[np.float64] = np.minimum(np.maximum(q, self._lower), self._upper)
         over = (inside != q).any(axis=0) if q.ndim > 1 else inside != q
         if not over.any():
             return q

@@ -132,10 +132,9 @@ class PyBulletGripper(GripperDriver):
 
     def _width(self) -> tuple[float, float, float]:
         """Width in m, its speed in m/s (positive opens), and the force of the weaker motor in N (positive closes)."""
-        states = self._read(self._body.id, self._joints)
-        share = 2.0 / len(states)
-        width = share * sum(state[0] for state in states)
-        return width, share * sum(state[1] for state in states), min(-state[3] for state in states)
+        widths, speeds, _, forces = zip(*self._read(self._body.id, self._joints), strict=True)
+        share = 2.0 / len(widths)
+        return share * sum(widths), share * sum(speeds), -max(forces)
 
     def _was_reset(self) -> None:
         self._target = self._aim = self._width()[0]

@@ -19,7 +19,7 @@ from ..servo.audit import SetpointAudit
 from ..servo.servo import Servo
 from ..specs import RobotSpec
 from ..types import Fault, RobotStatus
-from .records import AppRecord, RobotMail, ServoRecord
+from .records import AppRecord, Marks, RobotMail, ServoRecord
 
 __all__ = ["ArmUnit"]
 
@@ -118,12 +118,14 @@ class ArmUnit:
 
     def tick(self, now: float, app: AppRecord, late: bool = False) -> None:
         """Compute the next set-point."""
-        self._look_for_end()
+        marks = self.mail.get_marks()
+        if self._session and marks.ended == self._session:  # the app says so in memory: that waits for no answer
+            self.servo.end()
         if self.error is not None or self.reading is None:
             self._prepared = None
             self._setpoint = self.servo.lost(now)
             return
-        inbox, self._prepared = self._prepared or self._inbox(app), None
+        inbox, self._prepared = self._prepared or self._inbox(app, marks), None
         self._setpoint = self.servo.tick(now, self.reading, inbox, late)
         if self.servo.report.reanchored != self._reanchored:
             self._reanchored = self.servo.report.reanchored
@@ -133,12 +135,11 @@ class ArmUnit:
     def prepare(self, app: AppRecord) -> None:
         """A device that sets the pace waits for its answer: compute the next one before it asks."""
         if self._setpoint is not None and self.driver.paces_itself:
-            self._prepared = self._inbox(app)
+            self._prepared = self._inbox(app, self.mail.get_marks())
             self.servo.prepare(self._prepared)
 
-    def _inbox(self, app: AppRecord) -> Inbox:
-        mail = self.mail
-        return Inbox(mail.get_command(), mail.get_deadman(), app.stops, mail.get_marks().rearms, app.t)
+    def _inbox(self, app: AppRecord, marks: Marks) -> Inbox:
+        return Inbox(self.mail.get_command(), self.mail.get_deadman(), app.stops, marks.rearms, app.t)
 
     def write(self, now: float) -> None:
         """Hand it to the device."""
@@ -167,11 +168,6 @@ class ArmUnit:
             except Exception as error:
                 self._lose(error)
         return self._session == 0
-
-    def _look_for_end(self) -> None:
-        """Was the session ended? The app says so in memory: that needs no answer and waits for nothing."""
-        if self._session and self.mail.get_marks().ended == self._session:
-            self.servo.end()
 
     def note_latency(self, clock_now: float) -> None:
         """Time from a pad's event to the set-point that follows it, once per command."""
@@ -219,14 +215,15 @@ class ArmUnit:
 
     def begin(self, session: Session, app: AppRecord) -> None:
         """Open a control session. Raises ControlTaken while another one is open, ConnectionLost without an arm."""
-        if self.mail.get_marks().ended == session.id:
+        marks = self.mail.get_marks()
+        if marks.ended == session.id:
             return  # the app gave up while this request was on its way
         if self._session:
             raise ControlTaken(f"{self.spec.name} is under the control of session {self._session}")
         if self.error is not None:
             raise self.error
         self._anchor()
-        self.servo.begin(session, self._inbox(app))
+        self.servo.begin(session, self._inbox(app, marks))
         self._session = session.id
 
     def recover(self) -> None:

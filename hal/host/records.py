@@ -22,7 +22,7 @@ from .state_layout import ServoRecord, StateLayout
 if TYPE_CHECKING:
     from ..specs import GroupSpec
 
-__all__ = ["AppRecord", "GroupMemory", "HostRecord", "RobotMail", "ServoRecord"]
+__all__ = ["AppRecord", "GroupMemory", "HostRecord", "Marks", "RobotMail", "ServoRecord"]
 
 _APP = "dQ"
 _HOST = "dQQ?"

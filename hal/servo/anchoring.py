@@ -66,11 +66,8 @@ class Anchoring:
         if not sound:
             self._silent = True
             return False
-        seq = reading.seq
-        old = seq == self._seq  # it knows nothing of the last set-point
-        cycles = 1 if self._seq is None else max(1, seq - self._seq)  # more where samples were lost
-        self._seq = seq
-        if old or not self._written:
+        last, self._seq = self._seq, reading.seq
+        if reading.seq == last or not self._written:  # one that is repeated knows nothing of the last set-point
             return False
         smoother = self._smoother
         q_sent, dq_sent, ddq_sent = (smoother.q, smoother.dq, smoother.ddq) if sent is None else sent
@@ -82,6 +79,7 @@ class Anchoring:
             return False
         corrected = q is not q_sent and _apart(q, q_sent) > _SAME
         if corrected:
+            cycles = 1 if last is None else max(1, reading.seq - last)  # more where samples were lost
             dq, ddq = self._device_motion(reading, cycles)
             smoother.anchor(q, dq, ddq)
         else:

@@ -172,9 +172,10 @@ class Servo:
             self._envelope.limited = Limited.REANCHORED
             if self._motion is not None:
                 self._motion.reanchored()
-        self._seen = (now, device, late, reading.fault is not None)
+        faulty = reading.fault is not None
+        self._seen = (now, device, late, faulty)
         # What was computed ahead goes out even when something is wrong: the stop begins where it ends.
-        return self._decide(inbox, *self._seen) if ready is None else ready
+        return self._decide(inbox, now, device, late, faulty) if ready is None else ready
 
     def _decide(self, inbox: Inbox, now: float, device: Trip, late: bool, faulty: bool) -> Setpoint | None:
         """The next set-point, from what the device and the app said."""

@@ -27,6 +27,9 @@ __all__ = ["Guard", "JointSmoother"]
 
 Floats = Sequence[float]
 
+# Members of an enumeration that every tick names: to find one there takes longer than to hand it over.
+_VELOCITY, _POSITION = ControlInterface.Velocity, ControlInterface.Position
+
 Guard = Callable[["JointSmoother"], bool]
 """Looks at the step that is proposed (``q_next``, ``dq_next``, ``ddq_next``) and answers whether it may be taken."""
 
@@ -149,7 +152,7 @@ class JointSmoother:
         cannot plan it.
         """
         inputs = self._input
-        inputs.control_interface = ControlInterface.Position
+        inputs.control_interface = _POSITION
         if velocity is not self._speeds:
             self._speeds = velocity
             inputs.max_velocity = [v * _ABOVE for v in velocity]
@@ -195,7 +198,7 @@ class JointSmoother:
 
     def _propose_velocity(self, dq: Floats) -> None:
         inputs = self._input
-        inputs.control_interface = ControlInterface.Velocity
+        inputs.control_interface = _VELOCITY
         inputs.target_velocity = dq
         if not self._propose():  # never seen, but an arm that moves must not depend on it: stop by hand
             state = zip(self.q, self.dq, self.ddq, self.acceleration, self.jerk, strict=True)

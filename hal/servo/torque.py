@@ -95,7 +95,9 @@ class TorqueMotion(Motion):
 
     def see(self, reading: Reading | None) -> None:
         """What the device reports in this tick; None when it does not, or when that makes no sense."""
-        if self._bounds is None:
+        if not self.active:
+            if reading is not None:  # where torques would begin
+                self.q, self.dq = reading.q, reading.dq
             return
         dt = self.smoother.dt
         self._arm = None
@@ -103,14 +105,12 @@ class TorqueMotion(Motion):
         if reading is None:
             self._still = 0.0
             return
-        if self.active:
-            self._weigh()  # where the arm was a tick ago: it is the same, and may be computed ahead
+        self._weigh()  # where the arm was a tick ago: it is the same, and may be computed ahead
         self.q, self.dq = reading.q, reading.dq
-        if self.active and reading.tau_commanded is not None:
+        if reading.tau_commanded is not None:
             self._tau = list(reading.tau_commanded)  # what was lost on its way must not make the next step greater
         self._still = self._still + dt if max(map(abs, reading.dq)) < _REST else 0.0
-        if self.active:
-            self._look()
+        self._look()
 
     def prepare(self) -> None:
         if self.active:
@@ -177,6 +177,7 @@ class TorqueMotion(Motion):
         self._begun = self._given_up = False
         self._overran = None
         self._unseen = self._still = self._braking = self._share = 0.0
+        self._arm = None
         self._weigh()
         self._look()
 
