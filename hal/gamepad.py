@@ -74,7 +74,7 @@ class GamepadDriver(ABC):
     def __init__(self, spec: PadSpec, source: object | None = None) -> None:
         self.spec = spec
         self.source = source
-        """Where a pad that lives in another process gets its record from; for ``playback``, the rig's clock."""
+        """Where a pad that lives in another process gets its record from; for ``playback``, the world's time."""
         self.notes: tuple[str, ...] = ()
         """What a person should know about the pad, each with what mends it."""
         self.flat: Mapping[str, float] = MappingProxyType({})

@@ -5,7 +5,7 @@ from __future__ import annotations
 import atexit
 import contextlib
 import logging
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -243,6 +243,8 @@ class Rig:
             return spec, self.console
         if spec.driver == "terminal":
             return spec, self.stop
+        if spec.driver == "playback":
+            return spec, self._world_time()
         if spec.driver != "keyboard":
             return spec, None
         keyboard = self._viewer.keyboard() if self._viewer is not None else None
@@ -252,7 +254,15 @@ class Rig:
         if self._viewer is None or self.attended:
             raise DeviceNotFound("the keyboard is that of the viewer's window: add --viewer gui")
         self.notes.append("the window's keyboard cannot be used: playing the recorded tour")
-        return tour(spec), None
+        return tour(spec), self._world_time()
+
+    def _world_time(self) -> Callable[[], float] | None:
+        """How far a simulated world with arms has come, s, where that is not what the clock shows: in real time."""
+        host = next((host for host in self._hosts if host.spec.world is not None and host.spec.robots), None)
+        if host is None or self.lock_step:
+            return None
+        memory, rate_hz = host.memory, host.spec.rate_hz
+        return lambda: memory.get_host().ticks / rate_hz
 
     # What it is.
 

@@ -151,7 +151,7 @@ def check_rows(path: Path, info: dict[str, Any], entry: dict[str, Any], tasks: l
         assert table.schema.field(key).type == (kind if size == 1 else pa.list_(kind, size)), key
         assert table[key].null_count == 0
         column = table[key].combine_chunks()
-        values = (column if size == 1 else column.flatten()).to_numpy().reshape(length, size)
+        values = (column if size == 1 else column.flatten()).to_numpy().reshape(length, size).astype(float)
         known = np.isfinite(values).any(axis=0)
         for part, of in (("min", np.nanmin), ("max", np.nanmax), ("mean", np.nanmean), ("std", np.nanstd)):
             said = np.array(entry[f"stats/{key}/{part}"])[known]

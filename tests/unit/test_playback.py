@@ -67,6 +67,25 @@ def test_events_come_when_they_are_due_on_the_rigs_clock(write: Write) -> None:
     assert pad.poll(101.0, 0.0).buttons == frozenset()
 
 
+def test_it_waits_for_a_simulated_world_that_falls_behind_the_clock(write: Write) -> None:
+    path, came = write((0.0, "ABS_X", 128), (0.5, "BTN_SOUTH", 1), (1.0, "BTN_SOUTH", 0)), 7.0
+    pad = PlaybackPad(PadSpec("pad", "playback", None, MODELS, options={"file": str(path)}), source=lambda: came)
+    pad.open()
+    pad.poll(100.0, 0.0)
+    came = 7.3
+    for now in (100.35, 101.0, 105.0):
+        held_up = pad.poll(now, 0.0)
+        assert (held_up.buttons, held_up.t, held_up.t_alive) == (frozenset(), 100.0, now), "the world stands still"
+    came = 7.6
+    pressed = pad.poll(105.3, 0.0)
+    assert pressed.buttons == {"south"}
+    assert (pressed.t, pressed.t_device) == (pytest.approx(105.2), 0.5), "4.7 s of the clock were no time of the world"
+    came = 7.9
+    assert pad.poll(105.6, 0.0).buttons == {"south"}
+    came = 8.1
+    assert pad.poll(105.8, 0.0).buttons == frozenset()
+
+
 def test_after_the_end_the_pad_is_released_connected_and_alive(write: Write) -> None:
     pad = player(write((0.0, "ABS_X", 255), (0.1, "BTN_SOUTH", 1)))
     assert pad.poll(0.0, 0.0).axes["left_x"] == 1.0

@@ -6,9 +6,10 @@ Written as what the kernel reports of a DualShock 4; no hand moved a pad for it.
 from __future__ import annotations
 
 import json
+from collections.abc import Iterable
 from pathlib import Path
 
-__all__ = ["SECONDS", "write_tour"]
+__all__ = ["DEADMAN", "SECONDS", "Held", "write_pad", "write_tour"]
 
 SECONDS = 11.0
 _STICKS = {name: [0, 255, 15] for name in ("ABS_X", "ABS_Y", "ABS_RX", "ABS_RY", "ABS_Z", "ABS_RZ")}
@@ -17,9 +18,12 @@ _HEAD = {
     "version": 1,
     "model": "dualshock4",
     "ranges": {**_STICKS, "ABS_HAT0X": [-1, 1, 0], "ABS_HAT0Y": [-1, 1, 0]},
-    "about": "written by tests/wire/calm_tour.py; no hand moved a pad for it",
+    "about": "written by the tests in tests/wire; no hand moved a pad for it",
 }
-_HELD = (
+Held = tuple[float, float, str, int, int]
+DEADMAN = ("ABS_Z", 255, 0), ("BTN_TL2", 1, 0)
+"""L2."""
+_HELD: tuple[Held, ...] = (
     # from s, to s, control, value, at rest
     (0.6, 2.6, "ABS_HAT0Y", -1, 0),  # forwards
     (1.6, 3.6, "ABS_HAT0X", -1, 0),  # to the left
@@ -37,11 +41,16 @@ _HELD = (
 
 def write_tour(path: Path) -> Path:
     """Write it; returns the path."""
+    return write_pad(path, _HELD, SECONDS)
+
+
+def write_pad(path: Path, held: Iterable[Held], seconds: float) -> Path:
+    """Write what a pad reports on which controls are held: from s, to s, control, value, value at rest."""
     events = [(0.0, name, 128) for name in ("ABS_X", "ABS_Y", "ABS_RX", "ABS_RY")]
-    for start, end, name, value, rest in _HELD:
+    for start, end, name, value, rest in held:
         events += [(start, name, value), (end, name, rest)]
     # A pad in a hand is never quite still; one that says nothing counts as gone.
-    events += [(0.1 * k, "ABS_Y", 128 + k % 2) for k in range(1, round(10 * SECONDS))]
+    events += [(0.1 * k, "ABS_Y", 128 + k % 2) for k in range(1, round(10 * seconds))]
     lines = [json.dumps(_HEAD)]
     for t, name, value in sorted(events):
         kind = "key" if name.startswith("BTN") else "abs"

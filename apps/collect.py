@@ -1,0 +1,87 @@
+"""Collect demonstrations: a person drives, and what happens becomes a dataset; simulated and real, the same program.
+
+python apps/collect.py --sim --episodes 10 --task "lift the cube" --out data/lift
+python apps/collect.py --real --config my_rig.yaml --episodes 10 --task "lift the cube" --out data/lift
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+
+from hal.apps.cli import ACTION_NEEDED, add_driving_options, add_rig_options, rig_options, run_app
+
+
+def parser() -> argparse.ArgumentParser:
+    """The command line."""
+    made = argparse.ArgumentParser(
+        prog="collect",
+        description="Collect demonstrations: everything goes back to where it starts, you drive, and each episode is "
+        "saved, marked as a success or a failure, or forgotten.",
+        epilog="--pad demo plays two demonstrations that were made for this program. Ctrl-C stops the arm and ends the "
+        "run; an episode that is being recorded is kept, unmarked. The exit status is 1 when fewer episodes were saved "
+        "than asked for.",
+    )
+    add_rig_options(made)
+    add_driving_options(made)
+    what = made.add_argument_group("collecting")
+    what.add_argument("--out", default="demonstrations", metavar="DIR", help="dataset that they go into (%(default)s)")
+    what.add_argument("--episodes", type=int, default=10, metavar="N", help="how many (%(default)s)")
+    what.add_argument("--task", default="", metavar="TEXT", help="what is to be done; kept with each episode")
+    what.add_argument("--fps", type=int, default=30, metavar="N", help="rows a second (%(default)s)")
+    what.add_argument("--seed", type=int, default=0, metavar="N", help="of where objects start (%(default)s)")
+    what.add_argument("--cameras", metavar="NAMES", help="those that are kept, separated by commas (all)")
+    what.add_argument("--no-depth", dest="depth", action="store_false", help="leave depth out")
+    what.add_argument("--codec", choices=["auto", "h264", "av1"], default="auto", help="of the videos (%(default)s)")
+    what.add_argument("--report", metavar="FILE", help="write how it went, as JSON")
+    return made
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Entry point."""
+    return run_app(_main, parser().parse_args(argv))
+
+
+def _main(args: argparse.Namespace) -> int:
+    import hal
+    from hal.apps.banner import banner
+    from hal.apps.check import may_open
+    from hal.apps.collecting import Collection
+    from hal.apps.driving import check_driving, chosen_devices
+    from hal.apps.opening import planned
+    from hal.apps.report import check_writable
+    from hal.config.data_files import data_folder
+    from hal.errors import CommandError
+    from hal.recording import Recorder, recover
+    from hal.recording.library import require
+
+    check_driving(args)
+    if args.episodes < 1:
+        raise CommandError(f"--episodes must be 1 or more, not {args.episodes}")
+    if args.seed < 0:
+        raise CommandError(f"--seed must be 0 or more, not {args.seed}")
+    if args.report:
+        check_writable(args.report)
+    plan = planned(args, f"dataset  {args.out}: {args.episodes} episode(s) at {args.fps} rows/s")
+    if plan is None:
+        return 0
+    require()
+    if not may_open(plan):
+        return ACTION_NEEDED
+    cameras = None if args.cameras is None else [name.strip() for name in args.cameras.split(",") if name.strip()]
+    options = rig_options(args)
+    if args.pad == "demo":  # the tour presses no button that records
+        options["pad"] = str(data_folder("config") / "teleop" / "demonstrations.jsonl")
+    with hal.open(**options) as rig:
+        print(banner(rig), flush=True)
+        robot, pad = chosen_devices(rig, args)
+        recovered = recover(args.out) if Path(args.out).is_dir() else []
+        with Recorder(rig, args.out, args.fps, args.task, args.depth, cameras=cameras, codec=args.codec) as recorder:
+            for note in [*recovered, *recorder.notes]:
+                print(f"  note     {note}")
+            return Collection(rig, robot, pad, recorder, args).run()
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,300 @@
+"""Episode after episode: things go back to where they start, a person drives, and what happens is kept or forgotten."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+from queue import Empty, SimpleQueue
+from typing import TYPE_CHECKING
+
+from hal.apps.collected import Kept, summary
+from hal.apps.driving import Driving
+from hal.apps.taping import Tape
+from hal.console import ACTIONS
+
+if TYPE_CHECKING:
+    from concurrent.futures import Future
+
+    from hal.gamepad import Gamepad
+    from hal.recording import Recorder, RecorderStatus
+    from hal.rig import Rig
+    from hal.robot import Robot
+    from hal.types import PadState
+
+__all__ = ["Collection", "seed_of"]
+
+TOO_FEW = 1
+"""Exit status."""
+SHOW = 0.2
+"""s between two looks at the recorder."""
+ALLOWED = {"ready": ("record", "discard"), "recording": ("finish", "fail", "discard")}
+"""What may be pressed when."""
+SONY = {"south": "Cross", "east": "Circle", "west": "Square", "north": "Triangle", "home": "PS"}
+SAVED, DISCARDED, ANEW = "saved", "discarded", "anew"
+"""Why a try ended, where another one follows."""
+
+
+class Collection:
+    """One run of ``apps/collect.py``."""
+
+    def __init__(self, rig: Rig, robot: Robot, pad: Gamepad, recorder: Recorder, args: argparse.Namespace) -> None:
+        from hal.resetting import stands_in_world
+
+        self.rig, self.robot, self.pad, self.recorder, self.args = rig, robot, pad, recorder, args
+        self.driving = Driving(rig, robot, pad, mapping=args.mapping, speed=args.speed or 1.0, actions=ACTIONS)
+        self.tape = Tape(recorder)
+        self.phase = "resetting"
+        self.kept: list[Kept] = []
+        self.discarded = 0
+        self._first = recorder.episodes
+        self._drives_home = not stands_in_world(rig, robot)
+        self._draws = 0
+        """How often other places were wanted for the things of this episode."""
+        self._starting: Future[None] | None = None
+        self._trouble = ""
+        """The recorder's, as far as a person was told."""
+        self._asked: SimpleQueue[str] = SimpleQueue()
+        """What pages ask for."""
+        self._next_look = 0.0
+        if rig.console is not None:
+            rig.console.on_action(self._asked.put)
+
+    def run(self) -> int:
+        """All episodes, or until Ctrl-C or the end of a recorded pad; then everything is saved, and told."""
+        from hal.apps.banner import invitation
+
+        ended = ""
+        self._check_buttons()
+        print(f"{self.driving.help()}\n  record: {self._buttons(ACTIONS)}\n{invitation(self.rig)}", flush=True)
+        try:
+            while not ended and len(self.kept) < self.args.episodes:
+                ended = self._episode()
+        except KeyboardInterrupt:
+            ended = "Ctrl-C"  # the session's end brought the arm to rest
+        finally:
+            self._enter("saving")
+            self.driving.line.clear()
+            if self.tape.close():
+                self.driving.event(f"episode {self.number} was being recorded: it is kept, unmarked")
+        self._enter("done")
+        return self._tell(ended)
+
+    # One episode.
+
+    @property
+    def number(self) -> int:
+        """Of the present episode, in the dataset."""
+        return self._first + len(self.kept)
+
+    @property
+    def seed(self) -> int:
+        """Of where its things start."""
+        return seed_of(self.args.seed, self.number, self._draws)
+
+    def _episode(self) -> str:
+        """One try. Why no other one should follow, or nothing."""
+        if not self._put_back():
+            return self._over()
+        self._enter("ready")
+        reason = self.driving.drive(self._look)
+        if reason == SAVED:
+            self._draws = 0
+        elif reason == ANEW:
+            self._draws += 1
+        elif reason == DISCARDED:
+            self.discarded += 1
+            self.driving.event(f"episode {self.number}: forgotten")
+        else:
+            return reason
+        return ""
+
+    def _put_back(self) -> bool:
+        """Everything to where an episode starts; a real arm drives home. False where the run is over before that."""
+        import numpy as np
+
+        from hal.resetting import put_back
+
+        def reset() -> object:
+            random = np.random.default_rng(self.seed)
+            return put_back(self.rig, self.robot, random=random, deadman=self.driving.deadman)
+
+        self._enter("resetting")
+        while self.driving.guarded(reset) is None:
+            if self._over():
+                return False
+        return True
+
+    def _look(self, state: PadState) -> str:
+        """What the pad, the pages and the recorder say; why this try ends, or nothing."""
+        self._look_at_start()
+        for action in self._wishes(state):
+            if action in self._allowed and (reason := self._act(action)):
+                return reason
+        if self.rig.clock.now() >= self._next_look:
+            self._show()
+        return self._over()
+
+    def _look_at_start(self) -> None:
+        """Has the recording begun that was asked for?"""
+        if self._starting is None or not self._starting.done():
+            return
+        failure, self._starting = self._starting.exception(), None
+        if failure is not None:
+            self.driving.event(f"NOT RECORDING: {failure}")
+        self._enter("ready" if failure is not None else "recording")
+
+    @property
+    def _allowed(self) -> tuple[str, ...]:
+        """What may be pressed now."""
+        return ALLOWED.get(self.phase, ()) if self._starting is None else ()
+
+    def _wishes(self, state: PadState) -> list[str]:
+        pressed = self.driving.teleop.pressed(state)
+        if "discard" in pressed and self.phase == "recording" and self.driving.deadman.held:
+            pressed -= {"discard"}  # a slip of the thumb while driving
+            self.driving.event(f"to forget the episode, let go of {self.driving.teleop.mapping.deadman} first")
+        found = [action for action in ACTIONS if action in pressed]
+        try:
+            while True:
+                found.append(self._asked.get_nowait())
+        except Empty:
+            return found
+
+    def _act(self, action: str) -> str:
+        """Do what is wished for; why this try ends with that, or nothing."""
+        if action == "record":
+            info = {"program": "collect", "mapping": self.driving.mapping, "speed": self.args.speed or 1.0}
+            self._starting = self.tape.start(self.seed, info)
+            self._look_at_start()
+            return ""
+        if action == "discard" and self.phase == "ready":
+            return ANEW
+        if action == "discard":
+            self.tape.discard()
+            return DISCARDED
+        success, seconds = action == "finish", self.recorder.status().seconds
+        self.kept.append(Kept(self.number, self.seed, success, self.tape.save(success)))
+        mark = "a success" if success else "a failure"
+        number, count = self.kept[-1].number, len(self.kept)
+        self.driving.event(f"episode {number}: {seconds:.1f} s, {mark}; {count} of {self.args.episodes} in this run")
+        return SAVED
+
+    def _over(self) -> str:
+        """Why the run should end, or nothing."""
+        failed = next(
+            (f"episode {one.number} could not be saved: {one.failure}" for one in self.kept if one.failure), ""
+        )
+        return failed or (f"{self.pad.describe()} was played to its end" if self.pad.finished else "")
+
+    # What a person sees.
+
+    def _enter(self, phase: str) -> None:
+        self.phase = phase
+        prompt = self._prompt()
+        if prompt:
+            doing = "RECORDING" if phase == "recording" else phase
+            self.driving.event(f"episode {self.number}: {doing}; {prompt}")
+        self._show()
+
+    def _show(self) -> None:
+        """The recording on the pages and in the live line; what is new about it is told."""
+        self._next_look = self.rig.clock.now() + SHOW
+        status = self.recorder.status()
+        if status.trouble != self._trouble:
+            self._trouble = status.trouble
+            self.driving.event(f"RECORDING: {status.trouble or 'all is well again'}")
+        lost = f", {status.dropped} DROPPED" if status.dropped else ""
+        doing = f"REC {status.seconds:.1f} s{lost}" if self.phase == "recording" else self.phase
+        self.driving.note = f"{len(self.kept)} of {self.args.episodes}  {doing}  "
+        self._show_pages(status if self.phase == "recording" else status._replace(seconds=0.0, frames=0, dropped=0))
+
+    def _show_pages(self, status: RecorderStatus) -> None:
+        if self.rig.console is None:
+            return
+        from hal.console import RecordingView
+
+        succeeded = sum(one.success for one in self.kept)
+        self.rig.console.show_recording(
+            RecordingView(
+                phase=self.phase,
+                prompt=self._prompt(),
+                task=self.args.task,
+                episode=self.number,
+                saved=len(self.kept),
+                wanted=self.args.episodes,
+                succeeded=succeeded,
+                failed=len(self.kept) - succeeded,
+                discarded=self.discarded,
+                seconds=status.seconds,
+                frames=status.frames,
+                dropped=status.dropped,
+                free_bytes=status.free_bytes,
+                trouble=status.trouble,
+                actions=self._allowed,
+            )
+        )
+
+    def _prompt(self) -> str:
+        """What a person should do now, or nothing."""
+        if self.phase == "resetting":
+            hold = self.driving.teleop.mapping.deadman
+            return f"hold {hold} until the arm is home; then its gripper opens" if self._drives_home else ""
+        place = "put everything where it starts; " if self._drives_home and self.phase == "ready" else ""
+        return f"{place}{self._buttons(self._allowed)}" if self._allowed else ""
+
+    def _buttons(self, actions: tuple[str, ...]) -> str:
+        """What these actions are done with."""
+        hold = self.driving.teleop.mapping.deadman
+        words = {
+            "record": "starts the recording",
+            "finish": "saves it as a success",
+            "fail": "saves it as a failure",
+            "discard": "puts things elsewhere" if self.phase == "ready" else f"forgets it, once {hold} is let go of",
+        }
+        mapped = self.driving.teleop.mapping.actions
+        told = [f"{_called(mapped[action])} {words[action]}" for action in actions if action in mapped]
+        return ", ".join(told) or "the page has the buttons"
+
+    def _check_buttons(self) -> None:
+        """CommandError where nobody could start a recording, or end it."""
+        from hal.errors import CommandError
+
+        missing = [action for action in ("record", "finish") if action not in self.driving.teleop.mapping.actions]
+        if missing and self.rig.console is None:
+            raise CommandError(
+                f"the mapping {self.driving.mapping} has no button for {' and '.join(missing)}: give it some, for "
+                "example 'actions: {record: south, finish: home}', or add --console, whose page has buttons for that"
+            )
+
+    # The end.
+
+    def _tell(self, ended: str) -> int:
+        """How it went. Everything is saved by now."""
+        for text in summary(self.kept, self.recorder.root, self.discarded, ended):
+            self.driving.line.event(text)
+        if self.args.report:
+            report = {
+                "out": str(self.recorder.root),
+                "backend": self.robot.spec.driver,
+                "clock": self.rig.plan.clock,
+                "ended": ended,
+                "discarded": self.discarded,
+                "trips": self.driving.report.trips,
+                "faults": self.driving.report.faults,
+                "episodes": [one.as_json() for one in self.kept],
+            }
+            Path(self.args.report).write_text(json.dumps(report, indent=2) + "\n")
+        return TOO_FEW if sum(not one.failure for one in self.kept) < self.args.episodes else 0
+
+
+def seed_of(base: int, number: int, draws: int = 0) -> int:
+    """An episode's seed: the same for the same number, whenever that is recorded; another one for every other draw."""
+    import numpy as np
+
+    return int(np.random.SeedSequence([base, number, draws]).generate_state(1)[0])
+
+
+def _called(button: str) -> str:
+    """A button's name, with that on the tutorial's pad."""
+    return f"{button} ({SONY[button]})" if button in SONY else button
