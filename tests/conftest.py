@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 from collections.abc import Generator
 from typing import Any
 
@@ -12,6 +13,13 @@ from hal import testing
 from hal.specs import CameraSpec, GripperSpec, PadSpec, RobotSpec
 
 STRICT = os.environ.get("HAL_TEST_STRICT", "") not in ("", "0")
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """A program inherits which signals are ignored: after ``nohup``, or ``&`` in a script, no Ctrl-C would end one."""
+    for number in (signal.SIGINT, signal.SIGHUP):
+        if signal.getsignal(number) is signal.SIG_IGN:
+            signal.signal(number, lambda *_: None)  # as before for pytest itself; an app begins with the default
 
 
 @pytest.hookimpl(wrapper=True)

@@ -13,6 +13,7 @@ themselves say: :func:`arm_noise`.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -182,9 +183,11 @@ def _columns(corners: Corners, X: Array, Z: Array, noise: Noise) -> Array:
 
 def _moments(corners: Corners, columns: Array, weights: Array) -> Array:
     """(v, 20, 20): products of the columns, summed over the corners of each view, in units of the corners' noise."""
-    each = np.einsum("nka,n,nkb->nab", columns, weights / corners.noise_px**2, columns)
-    starts = np.flatnonzero(np.diff(corners.view, prepend=-1))
-    return np.asarray(np.add.reduceat(each, starts, axis=0))
+    count = columns.shape[2]
+    weighted = columns * (weights / corners.noise_px**2)[:, None, None]
+    bounds = [*np.flatnonzero(np.diff(corners.view, prepend=-1)), len(columns)]
+    pairs = [(weighted[a:b].reshape(-1, count), columns[a:b].reshape(-1, count)) for a, b in pairwise(bounds)]
+    return np.stack([left.T @ right for left, right in pairs])
 
 
 def _reduced(corners: Corners, columns: Array, weights: Array) -> tuple[Array, Array, float, float]:

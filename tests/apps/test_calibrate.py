@@ -9,7 +9,9 @@ import sys
 from pathlib import Path
 
 import pytest
+from app_kit import Done, run_here
 
+from hal.apps.calibrate import main
 from hal.config import load
 from hal.config.data_files import find_data
 from hal.pose import Pose
@@ -21,10 +23,14 @@ APP = ROOT / "apps" / "calibrate.py"
 STEPPED = ("--set", "simulation.clock=lock_step")
 
 
-def calibrate(*arguments: str, answer: str = "", timeout: float = 110.0) -> subprocess.CompletedProcess[str]:
+def program(*arguments: str, answer: str = "", timeout: float = 110.0) -> subprocess.CompletedProcess[str]:
     return subprocess.run(
         [sys.executable, str(APP), *arguments], input=answer, capture_output=True, text=True, timeout=timeout
     )
+
+
+def calibrate(*arguments: str, answer: str = "") -> Done:
+    return run_here(main, *arguments, answer=answer)
 
 
 def place(path: Path | str) -> Pose:
@@ -51,9 +57,7 @@ def guess(name: str) -> str:
 def test_the_answer_stands_in_the_rig(tmp_path: Path, name: str) -> None:
     path = copy(tmp_path, name)
     before = path.read_text()
-    done = calibrate(
-        "--sim", "--config", str(path), "--auto", "--views", "12", "--guess", guess(name), "--yes", *STEPPED
-    )
+    done = program("--sim", "--config", str(path), "--auto", "--views", "12", "--guess", guess(name), "--yes", *STEPPED)
     assert done.returncode == 0, done.stderr
     assert done.stderr == ""
     distance, angle = place(path).distance(place(name))
@@ -71,8 +75,8 @@ def test_the_answer_stands_in_the_rig(tmp_path: Path, name: str) -> None:
 def test_in_real_time_with_the_board_in_the_hand_it_only_compares(tmp_path: Path) -> None:
     path = copy(tmp_path, "panda_calibration_held")
     before = path.read_bytes()
-    done = calibrate(
-        "--sim", "--config", str(path), "--auto", "--views", "8", "--compare", "--set", "robots.panda.move_speed=0.3"
+    done = program(
+        "--sim", "--config", str(path), "--auto", "--views", "6", "--compare", "--set", "robots.panda.move_speed=0.3"
     )
     assert done.returncode == 0, done.stderr
     found = re.search(r"differ +by ([\d.]+) mm and ([\d.]+) degrees", done.stdout)
@@ -120,7 +124,8 @@ def test_a_doubtful_answer_is_written_by_a_person_only(
 def test_by_hand_with_enter_and_too_few_views_nothing_is_written(tmp_path: Path) -> None:
     path = copy(tmp_path, "panda_calibration")
     before = path.read_bytes()
-    done = calibrate("--sim", "--config", str(path), "--yes", *STEPPED, answer="\n\nq\n")
+    done = program("--sim", "--config", str(path), "--yes", *STEPPED, answer="\n\nq\n")
+    assert "Traceback" not in done.stderr
     assert done.returncode == 2
     assert "view 1: 24 corners" in done.stdout
     assert "no view: 0 mm and 0.0 degrees from view 1: too near" in done.stdout
@@ -131,7 +136,7 @@ def test_by_hand_with_enter_and_too_few_views_nothing_is_written(tmp_path: Path)
 @pytest.mark.parametrize("ending", ["pdf", "png"])
 def test_a_board_to_print(tmp_path: Path, ending: str) -> None:
     out = tmp_path / f"board.{ending}"
-    done = calibrate("board", "--out", str(out))
+    done = (program if ending == "pdf" else calibrate)("board", "--out", str(out))
     assert done.returncode == 0, done.stderr
     assert "297 x 210 mm" in done.stdout
     assert out.stat().st_size > 1000
@@ -160,7 +165,6 @@ def test_dry_run_opens_nothing_and_says_what_would_be_found_out() -> None:
 def test_a_persons_mistake_is_a_message_not_a_traceback(arguments: list[str], texts: list[str]) -> None:
     done = calibrate("--sim", "--config", "panda_calibration", *STEPPED, *arguments)
     assert done.returncode == 2
-    assert "Traceback" not in done.stderr
     for text in texts:
         assert text in done.stderr
 

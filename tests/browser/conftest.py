@@ -7,6 +7,7 @@ from collections.abc import Iterator
 import pytest
 
 from .kit import Bench, Browser, need_browser, wait_for
+from .moves import clear_trip
 
 
 @pytest.fixture(scope="module")
@@ -28,10 +29,11 @@ def browser(bench: Bench) -> Iterator[Browser]:
 
 @pytest.fixture
 def page(bench: Bench, browser: Browser) -> Iterator[Browser]:
-    """The console, opened anew; it drives, and nothing is held."""
+    """The console, opened anew; it drives, nothing is held, and no stop is latched."""
     browser.open(bench.link)
     browser.wait_driving()
     wait_for(lambda: bench.session.pad.state().connected and not bench.session.pad.waiting_for, "the pad to be at rest")
+    clear_trip(bench, browser)
     yield browser
     complaints = browser.complaints()
     browser.chrome.get("about:blank")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import os
 import shutil
 import signal
@@ -19,7 +20,9 @@ import hal
 from hal.apps.teleop import Session, parser
 from hal.deadman import Deadman
 from hal.host.records import ServoRecord
+from hal.inbox import DeadmanRecord
 from hal.robot import Robot
+from hal.servo.watchdog import SILENCE
 
 CHROMIUM = next(
     (found for name in ("chromium", "chromium-browser", "google-chrome") if (found := shutil.which(name))), ""
@@ -38,6 +41,8 @@ FLAGS = (
     "--disable-extensions",
     "--mute-audio",
 )
+MAX_AGE = 0.1
+"""s after which the console shows no state any more."""
 PATIENCE = 20.0
 """s until a test gives up on a browser that shares two processors with a simulation."""
 
@@ -54,6 +59,9 @@ class Bench:
         self.console = self.rig.console
         self.link = self.console.link
         self.session = Session(self.rig, self.arm, self.rig.gamepads["pad"], self.args)
+        self._silences: list[float] = []
+        self._alive = math.inf
+        self.deadman.attach(self._heard)
         self._thread = threading.Thread(target=self.session.run, name="the app's loop")
         self._thread.start()
 
@@ -92,6 +100,22 @@ class Bench:
     def speed(self) -> float:
         """Greatest joint speed of the set-point, rad/s."""
         return max(abs(value) for value in self.servo.dq_set)
+
+    def _heard(self, record: DeadmanRecord) -> None:
+        """Called whenever the pad was looked at: notes when that, or the arm, was silent for too long."""
+        now = time.monotonic()
+        servo = self.arm._mail.peek()
+        if now - self._alive > SILENCE or (servo is not None and now - servo.t_written > MAX_AGE):
+            self._silences.append(now)
+        self._alive = record.t_alive if record.connected else math.inf
+
+    def disturbed(self, since: float) -> bool:
+        """Was the pad, the arm or the app's loop silent for longer than they may be, since then (s, monotonic)?
+
+        On a machine with too much else to do that happens, and the arm must not move then, nor a press count.
+        """
+        app = self.trip in ("app_silent", "command_late", "host_late") and self.servo.t_stop >= since
+        return app or any(t >= since for t in self._silences)
 
     def rests(self) -> bool:
         """Does the arm stand still? A goal that is held may leave its set-point a last bit of speed."""

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from .kit import Bench, Browser, wait_for
-from .moves import drive_left, let_go_of_all, lines
+from .moves import BRIEF, clear_trip, drive_left, let_go_of_all, lines, undisturbed
 
 ALARM = "#alarm"
 
@@ -143,11 +143,15 @@ def test_a_second_mouse_button_ends_the_press(bench: Bench, page: Browser) -> No
 
 def test_keys_that_cease_to_repeat_were_let_go_of(bench: Bench, page: Browser) -> None:
     """As when a locked screen takes the keyboard: no more repetitions, no release, and the focus stays."""
-    drive_left(bench, page)
-    repeat_for(page, 0.3)
-    event = time.monotonic()
-    wait_for(lambda: bench.trip == "deadman_lost" and bench.rests(), "the arm to be stopped")
-    assert 0.2 < bench.servo.t_stop - event < 1.0
+
+    def cease() -> None:
+        drive_left(bench, page)
+        repeat_for(page, 0.3)
+        event = time.monotonic()
+        wait_for(lambda: bench.trip == "deadman_lost" and bench.rests(), "the arm to be stopped", BRIEF)
+        assert 0.2 < bench.servo.t_stop - event < 1.0
+
+    undisturbed(bench, page, cease)
     repeat_for(page, 0.3)
     assert not held(bench), "keys that come back without a new press hold nothing"
     assert "keys went to another program" in page.text("#log")
@@ -187,16 +191,19 @@ def test_the_older_key_does_not_go_on_repeating(bench: Bench, page: Browser) -> 
 
 @pytest.mark.parametrize("what", ["a click", "another key", "a key of no meaning"])
 def test_what_may_end_a_repetition_by_right(bench: Bench, page: Browser, what: str) -> None:
-    page.hold()
-    wait_for(lambda: held(bench), "the dead-man")
-    repeat_for(page, 0.2, "Space", " ")
-    if what == "a click":
-        page.click('[data-disc="dpad"]')
-    else:
-        code, key = ("Digit2", "2") if what == "another key" else ("KeyZ", "z")
-        page.key(code, key, True)
-        page.key(code, key, False)
-    stays_held(page)
+    def hold() -> None:
+        page.hold()
+        wait_for(lambda: held(bench), "the dead-man", BRIEF)
+        repeat_for(page, 0.2, "Space", " ")
+        if what == "a click":
+            page.click('[data-disc="dpad"]')
+        else:
+            code, key = ("Digit2", "2") if what == "another key" else ("KeyZ", "z")
+            page.key(code, key, True)
+            page.key(code, key, False)
+        stays_held(page)
+
+    undisturbed(bench, page, hold)
     page.let_go()
 
 
@@ -222,22 +229,26 @@ def main_process(browser: Browser) -> int:
 
 @pytest.mark.parametrize("by", ["keys", "mouse"])
 def test_a_browser_that_hangs_though_its_page_does_not(bench: Bench, page: Browser, by: str) -> None:
-    if by == "keys":
-        page.hold()
-    else:
-        button(page, "mousePressed", page.place("#hold"), "left", 1)
-    page.key("ArrowLeft", "ArrowLeft", True)
-    wait_for(lambda: bench.tcp_speed[1] > 0.1, "motion")
-    pid = main_process(page)
-    os.kill(pid, signal.SIGSTOP)
-    event = time.monotonic()
-    try:
-        wait_for(lambda: bench.trip == "deadman_lost" and bench.rests(), "the arm to be stopped")
-        assert bench.servo.t_stop - event < 1.0  # 0.2 s where the machine is idle
-        print(f"braked after {bench.servo.t_stop - event:.3f} s")
-        wait_for(lambda: bench.session.pad.state().connected, "the page itself to go on")
-    finally:
-        os.kill(pid, signal.SIGCONT)
+    def hang() -> None:
+        button(page, "mouseReleased", page.place("#hold"), "left", 0)
+        if by == "keys":
+            page.hold()
+        else:
+            button(page, "mousePressed", page.place("#hold"), "left", 1)
+        page.key("ArrowLeft", "ArrowLeft", True)
+        wait_for(lambda: bench.tcp_speed[1] > 0.1, "motion", BRIEF)
+        pid = main_process(page)
+        os.kill(pid, signal.SIGSTOP)
+        event = time.monotonic()
+        try:
+            wait_for(lambda: bench.trip == "deadman_lost" and bench.rests(), "the arm to be stopped", BRIEF)
+            assert bench.servo.t_stop - event < 1.0  # 0.2 s where the machine is idle
+            print(f"braked after {bench.servo.t_stop - event:.3f} s")
+            wait_for(lambda: bench.session.pad.state().connected, "the page itself to go on", BRIEF)
+        finally:
+            os.kill(pid, signal.SIGCONT)
+
+    undisturbed(bench, page, hang)
     time.sleep(0.3)
     assert not held(bench), "what is held since before holds nothing"
     button(page, "mouseReleased", page.place("#hold"), "left", 0)
@@ -251,25 +262,36 @@ def test_a_browser_that_hangs_though_its_page_does_not(bench: Bench, page: Brows
 
 
 def test_space_on_the_stop_button_stops(bench: Bench, page: Browser) -> None:
-    page.run("document.querySelector('#stop').focus()")
-    page.hold()
-    wait_for(lambda: bench.trip == "stop", "the stop")
-    repeat_for(page, 0.2, "Space", " ")
-    page.let_go()
-    time.sleep(0.2)
-    assert not held(bench)
-    assert lines(page, "STOP was sent") == 1, "one press is one stop"
-    page.run("document.activeElement.blur()")
+    def press() -> None:
+        clear_trip(bench, page)
+        before = lines(page, "STOP was sent")
+        page.run("document.querySelector('#stop').focus()")
+        page.hold()
+        wait_for(lambda: bench.trip == "stop", "the stop", BRIEF)
+        repeat_for(page, 0.2, "Space", " ")
+        page.let_go()
+        time.sleep(0.2)
+        assert not held(bench)
+        assert lines(page, "STOP was sent") == before + 1, "one press is one stop"
+        page.run("document.activeElement.blur()")
+
+    undisturbed(bench, page, press)
 
 
 def test_enter_on_the_stop_button_stops(bench: Bench, page: Browser) -> None:
-    page.run("document.querySelector('#stop').focus()")
-    enter(page, True)
-    wait_for(lambda: bench.trip == "stop", "the stop")
-    for _ in range(5):
-        enter(page, True, again=True)
-    enter(page, False)
-    assert lines(page, "STOP was sent") == 1, "one press is one stop"
+    def press() -> None:
+        clear_trip(bench, page)
+        before = lines(page, "STOP was sent")
+        page.run("document.querySelector('#stop').focus()")
+        enter(page, True)
+        wait_for(lambda: bench.trip == "stop", "the stop", BRIEF)
+        for _ in range(5):
+            enter(page, True, again=True)
+        enter(page, False)
+        assert lines(page, "STOP was sent") == before + 1, "one press is one stop"
+        page.run("document.activeElement.blur()")
+
+    undisturbed(bench, page, press)
 
 
 def test_a_held_enter_clicks_once(page: Browser) -> None:

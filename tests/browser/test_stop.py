@@ -13,7 +13,7 @@ import hal
 
 from .cable import Cable
 from .kit import Bench, Browser, wait_for
-from .moves import drive_left, let_go_of_all, lines
+from .moves import BRIEF, drive_left, let_go_of_all, lines, undisturbed
 
 ALARM = "#alarm"
 
@@ -40,13 +40,17 @@ def quiet(page: Browser, seconds: float = 0.8) -> bool:
 
 
 def test_a_stop_that_works_alarms_nobody(bench: Bench, page: Browser) -> None:
-    drive_left(bench, page)
-    page.click("#stop")
-    wait_for(lambda: bench.trip == "stop", "the stop")
-    assert quiet(page)
-    page.click("#stop")  # an arm that is stopped for this or another reason shows just that
-    assert quiet(page)
-    assert lines(page, "STOP was sent") == 2
+    def stop() -> None:
+        drive_left(bench, page)
+        before = lines(page, "STOP was sent")
+        page.click("#stop")
+        wait_for(lambda: bench.trip == "stop", "the stop", BRIEF)
+        assert quiet(page)
+        page.click("#stop")  # an arm that is stopped for this or another reason shows just that
+        assert quiet(page)
+        assert lines(page, "STOP was sent") == before + 2
+
+    undisturbed(bench, page, stop)
     let_go_of_all(page)
 
 
@@ -64,21 +68,25 @@ def test_a_stop_with_nothing_to_stop(page: Browser) -> None:
 
 def test_a_stop_that_nothing_follows(bench: Bench, page: Browser, monkeypatch: pytest.MonkeyPatch) -> None:
     """It is heard, and the arm goes on."""
-    drive_left(bench, page)
-    with monkeypatch.context() as broken:
-        broken.setattr(bench.rig, "stop", lambda: None)
+
+    def stop_in_vain() -> None:
+        drive_left(bench, page)
+        with monkeypatch.context() as broken:
+            broken.setattr(bench.rig, "stop", lambda: None)
+            page.click("#stop")
+            wait_for(lambda: "STOP was not confirmed: use the robot's own stop" in alarm(page), "the alarm", BRIEF)
+            assert "panda is " in alarm(page)
+            page.click("#alarm-close")
+            wait_for(lambda: not alarm(page), "the alarm to be closed", BRIEF)
+            page.click("#stop")
+            wait_for(lambda: alarm(page), "the alarm", BRIEF)
+            time.sleep(0.3)
+            assert alarm(page), "it stays"
         page.click("#stop")
-        wait_for(lambda: "STOP was not confirmed: use the robot's own stop" in alarm(page), "the alarm")
-        assert "panda is " in alarm(page)
-        page.click("#alarm-close")
-        wait_for(lambda: not alarm(page), "the alarm to be closed")
-        page.click("#stop")
-        wait_for(lambda: alarm(page), "the alarm")
-        time.sleep(0.3)
-        assert alarm(page), "it stays"
-    page.click("#stop")
-    wait_for(lambda: bench.trip == "stop", "the stop")
-    wait_for(lambda: not alarm(page), "the alarm to end with what it tells")
+        wait_for(lambda: bench.trip == "stop", "the stop", BRIEF)
+        wait_for(lambda: not alarm(page), "the alarm to end with what it tells", BRIEF)
+
+    undisturbed(bench, page, stop_in_vain)
     let_go_of_all(page)
 
 

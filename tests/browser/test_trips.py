@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from urllib.parse import urlsplit
 
 import pytest
 
 from .cable import Cable
 from .kit import Bench, Browser, wait_for
+from .moves import drive_left, undisturbed
 
 
 @pytest.fixture
@@ -23,9 +24,7 @@ def moving(bench: Bench, page: Browser) -> Iterator[Browser]:
 
 
 def move(bench: Bench, page: Browser) -> None:
-    page.hold()
-    page.key("ArrowLeft", "ArrowLeft", True)
-    wait_for(lambda: bench.tcp_speed[1] > 0.15, "full speed")
+    drive_left(bench, page, 0.15)
 
 
 def bring_home(bench: Bench) -> None:
@@ -46,6 +45,19 @@ def goes_on_after_release_and_press(bench: Bench, page: Browser) -> None:
     wait_for(lambda: not bench.deadman.held and not bench.session.pad.waiting_for, "everything to be released")
     move(bench, page)
     assert bench.trip == "none"
+
+
+def stops_for(bench: Bench, page: Browser, trip: str, cause: Callable[[], None]) -> None:
+    """``cause`` stops the arm for that reason, and for no other."""
+
+    def attempt() -> None:
+        if bench.trip != "none":
+            move(bench, page)
+        cause()
+        braking_after(bench, time.monotonic())
+        assert bench.trip == trip
+
+    undisturbed(bench, page, attempt)
 
 
 def braking_after(bench: Bench, event: float) -> float:
@@ -89,27 +101,24 @@ def test_a_hidden_tab(bench: Bench, moving: Browser) -> None:
 
 
 def test_a_window_that_lost_the_focus(bench: Bench, moving: Browser) -> None:
-    moving.run("window.dispatchEvent(new Event('blur'))")
-    braking_after(bench, time.monotonic())
-    assert bench.trip == "deadman_lost"
+    stops_for(bench, moving, "deadman_lost", lambda: moving.run("window.dispatchEvent(new Event('blur'))"))
     wait_for(lambda: "focus" in moving.text("#trip"), "the page to say why")
     moving.run("window.dispatchEvent(new Event('focus'))")
     goes_on_after_release_and_press(bench, moving)
 
 
 def test_stop_by_the_person_who_drives(bench: Bench, moving: Browser) -> None:
-    moving.key("Escape", "Escape", True)
-    moving.key("Escape", "Escape", False)
-    braking_after(bench, time.monotonic())
-    assert bench.trip == "stop"
-    assert "STOP" in moving.text("#trip")
+    def escape() -> None:
+        moving.key("Escape", "Escape", True)
+        moving.key("Escape", "Escape", False)
+
+    stops_for(bench, moving, "stop", escape)
+    wait_for(lambda: "STOP" in moving.text("#trip"), "the page to say why")
     goes_on_after_release_and_press(bench, moving)
 
 
 def test_the_stop_button(bench: Bench, moving: Browser) -> None:
-    moving.click("#stop")
-    braking_after(bench, time.monotonic())
-    assert bench.trip == "stop"
+    stops_for(bench, moving, "stop", lambda: moving.click("#stop"))
     goes_on_after_release_and_press(bench, moving)
 
 

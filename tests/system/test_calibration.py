@@ -7,6 +7,7 @@ it is taken out of the setting, and the arm starts from a guess that is 3 cm and
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Iterator
 from dataclasses import replace
 from itertools import pairwise
@@ -80,7 +81,7 @@ def bench(name: str) -> Iterator[Bench]:
         yield Bench(rig, name)
 
 
-@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize("seed", range(3 if os.environ.get("HAL_SOAK") == "1" else 1))
 def test_the_camera_is_found(bench: Bench, seed: int) -> None:
     arm = bench.collector.robot
     start = arm.state().q
@@ -122,7 +123,7 @@ def test_pybullets_own_renderer_will_do(name: str) -> None:
     with hal.open(name, sim=True, clock="lock_step", pad="none", overrides=options) as rig:
         rig.clock.sleep(0.2)
         bench = Bench(rig, name)
-        millimetres, degrees = bench.off(bench.drive(15))
+        millimetres, degrees = bench.off(bench.drive(8))
         assert millimetres <= MOST_MM
         assert degrees <= MOST_DEGREES
 

@@ -82,9 +82,12 @@ def picture(pose: Array, cv2: Any, lens: tuple[float, ...] = (0.0,) * 5, finer: 
     """A grey picture (480, 640) of the board on a grey ground, smooth at its edges as a camera's is."""
     scale, width, height = 20.0, *SIZE
     paper = np.pad(BOARD.picture(scale), int(10 * scale), constant_values=255)
-    v, u = np.mgrid[0 : height * finer, 0 : width * finer].reshape(2, -1)
-    fine = (np.column_stack([u, v]) + 0.5) / finer - 0.5
-    ideal = ideal_pixels(fine, K, lens) if any(lens) else fine
+    v, u = np.mgrid[-1 : height + 1, -1 : width + 1]
+    ideal = np.dstack([u, v]).astype(float)
+    if any(lens):  # at every pixel, and in between as if it were straight, which it is to 1e-4 pixels
+        ideal = ideal_pixels(ideal.reshape(-1, 2), K, lens).reshape(ideal.shape)
+    fine = cv2.resize(ideal, None, fx=finer, fy=finer, interpolation=cv2.INTER_LINEAR)
+    ideal = fine[finer:-finer, finer:-finer].reshape(-1, 2)
     plane = K @ np.column_stack([pose[:3, 0], pose[:3, 1], pose[:3, 3]])
     on_paper = np.column_stack([ideal, np.ones(len(ideal))]) @ np.linalg.inv(plane).T
     x, y = (on_paper[:, :2] / on_paper[:, 2:] * 1e3 * scale + 10 * scale - 0.5).T

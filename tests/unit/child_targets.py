@@ -1,4 +1,4 @@
-"""What the children of test_process.py run."""
+"""What children run in tests: of test_process.py, and a console that waits for nobody long."""
 
 import os
 import time
@@ -31,3 +31,20 @@ def echo(channel, memories, config):
             channel.send({"id": message["id"], "error": pack_error(ConnectionLost("the arm is gone"))})
         else:
             channel.send({"id": message["id"], "result": message["params"]})
+
+
+HURRY = 2.5
+"""So many times sooner than any other does an impatient console show out whoever is too slow."""
+
+
+def impatient_console(channel, memories, config):
+    """The console's process, with less patience."""
+    from hal.drivers.web import process, service, sockets, visitors
+
+    class Visitors(visitors.Visitors):
+        def __init__(self):  # the service's way to make them
+            super().__init__(patience=visitors._PATIENCE / HURRY)
+
+    service.Visitors = Visitors
+    sockets._PATIENCE /= HURRY
+    process.main(channel, memories, config)

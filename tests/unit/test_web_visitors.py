@@ -15,6 +15,7 @@ from pathlib import Path
 
 import aiohttp
 import pytest
+from child_targets import HURRY
 from web_kit import WAIT, App, Page, run
 
 from hal.drivers.web.logs import Bound
@@ -28,6 +29,13 @@ KEY = b"AAAAAAAAAAAAAAAAAAAAAA=="
 def app() -> Iterator[App]:
     """Where it ends, it looks whether the console's process wrote anything."""
     with App() as found:
+        yield found
+
+
+@pytest.fixture
+def hasty() -> Iterator[App]:
+    """One that has less patience, so that less has to be waited for."""
+    with App(target="child_targets:impatient_console") as found:
         yield found
 
 
@@ -146,13 +154,13 @@ def test_what_ends_the_process_is_written() -> None:
 
 
 @pytest.mark.parametrize("sent", [b"", b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\n"])
-def test_whoever_asks_for_nothing_is_shown_out_and_a_page_is_not(app: App, sent: bytes) -> None:
+def test_whoever_asks_for_nothing_is_shown_out_and_a_page_is_not(hasty: App, sent: bytes) -> None:
     """The second one goes on sending a byte at a time."""
 
     async def test() -> None:
-        async with Page(app) as page:
+        async with Page(hasty) as page:
             await page.take()
-            reader, writer = await visit(app, sent)
+            reader, writer = await visit(hasty, sent)
             start = time.monotonic()
             ended = asyncio.ensure_future(answer(reader))
             while not ended.done():
@@ -161,18 +169,18 @@ def test_whoever_asks_for_nothing_is_shown_out_and_a_page_is_not(app: App, sent:
                 await page.drive()
                 await asyncio.sleep(0.05)
             assert await ended == b""
-            assert time.monotonic() - start > 4.0, "whoever is slow has some time"
+            assert time.monotonic() - start > 4.0 / HURRY, "whoever is slow has some time"
             await page.drive()
             await page.next("state")
 
     run(test)
 
 
-def test_whoever_asks_now_and_then_stays(app: App) -> None:
+def test_whoever_asks_now_and_then_stays(hasty: App) -> None:
     async def test() -> None:
-        reader, writer = await visit(app)
+        reader, writer = await visit(hasty)
         for _ in range(3):
-            await asyncio.sleep(2.0)
+            await asyncio.sleep(2.0 / HURRY)
             writer.write(b"GET /page/nothing HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n")
             assert (await asyncio.wait_for(reader.readuntil(b"no such file\n"), WAIT)).startswith(b"HTTP/1.1 404")
         writer.close()

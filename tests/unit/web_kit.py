@@ -70,7 +70,13 @@ def run(test: Callable[[], Awaitable[None]]) -> None:
 class App:
     """The app's side of the channel, and of the memory."""
 
-    def __init__(self, *cameras: CameraSpec, rig: dict[str, Any] | None = None, **config: Any) -> None:
+    def __init__(
+        self,
+        *cameras: CameraSpec,
+        rig: dict[str, Any] | None = None,
+        target: str = "hal.drivers.web.process:main",
+        **config: Any,
+    ) -> None:
         self.cameras = {spec.name: spec for spec in cameras}
         self.ring_memory = SharedMemory(FrameRing.size(cameras))
         self.ring = FrameRing(self.ring_memory.buffer, cameras)
@@ -96,7 +102,7 @@ class App:
             **config,
         }
         memories = [self.ring_memory, self.host_memory]
-        self.child = Child("console", "hal.drivers.web.process:main", settings, memories)
+        self.child = Child("console", target, settings, memories)
         ready = self.child.wait_ready(30.0)
         self._log = os.dup(self.child._log.fileno())
         self.port = int(ready["port"])

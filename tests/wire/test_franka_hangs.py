@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import signal
 import time
+from collections.abc import Iterator
 
 import pytest
 
@@ -17,6 +19,7 @@ pytestmark = pytest.mark.slow
 
 LONGEST = 40.0
 """s: what docs/safety.md gives an app that is silent (30), and some."""
+ROBOTS = ("fr3", "panda")
 
 
 def runs(pid: int) -> bool:
@@ -27,8 +30,9 @@ def runs(pid: int) -> bool:
         return False
 
 
-@pytest.mark.parametrize("robot", ["fr3", "panda"])
-def test_an_app_is_killed_while_the_robot_hangs(robot: str) -> None:
+@contextlib.contextmanager
+def killed(robot: str) -> Iterator[int]:
+    """The process of an arm whose robot hangs, and whose app was killed."""
     with Emulator(robot=robot) as emulator:
         app = App(emulator, robot)
         host = app.children[0]
@@ -36,12 +40,20 @@ def test_an_app_is_killed_while_the_robot_hangs(robot: str) -> None:
             emulator.process.send_signal(signal.SIGSTOP)
             time.sleep(0.05)
             app.process.kill()
-            deadline = time.monotonic() + LONGEST
-            while runs(host) and time.monotonic() < deadline:
-                time.sleep(0.05)
-            assert not runs(host), "the arm's process holds the arm for ever"
+            yield host
         finally:
             emulator.process.send_signal(signal.SIGCONT)
             if runs(host):
                 os.kill(host, signal.SIGKILL)
             app.close()
+
+
+def test_an_app_is_killed_while_the_robot_hangs() -> None:
+    """Both arms at once, for both wait for as long."""
+    with contextlib.ExitStack() as stack:
+        hosts = {robot: stack.enter_context(killed(robot)) for robot in ROBOTS}
+        deadline = time.monotonic() + LONGEST
+        while any(map(runs, hosts.values())) and time.monotonic() < deadline:
+            time.sleep(0.05)
+        left = [robot for robot, host in hosts.items() if runs(host)]
+        assert not left, "the arm's process holds the arm for ever"

@@ -109,7 +109,7 @@ def test_the_app_outlives_an_arm_that_is_lost(tmp_path: Path) -> None:
             "cameras={}",
             *at(emulator, "fr3"),
             "--duration",
-            "9",
+            "6",
             "--report",
             str(tmp_path / "r.json"),
         ]
