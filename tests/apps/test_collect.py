@@ -19,7 +19,9 @@ pytest.importorskip("gymnasium", reason="pip install 'robot-hal[gym]'")
 pytest.importorskip("pybullet", reason="pip install 'robot-hal[sim]'")
 
 from collect_kit import CIRCLE, CROSS, PS, SQUARE, seed_of, write_pad
+from recording_kit import small
 from recording_layout import check_layout, check_stamps
+from stage_kit import ROUNDED, Stage, at_row
 
 import hal
 from hal.apps import collect
@@ -35,6 +37,7 @@ MADE_BY = ROOT / "tests" / "data" / "pads" / "make_demonstrations.py"
 LOCK_STEP = ("--set", "simulation.clock=lock_step")
 QUIET = ("--sim", "--set", "cameras={}")
 FAST = (*QUIET, *LOCK_STEP)
+SMALL = small(160, 120)
 
 
 def run(folder: Path, *arguments: object, timeout: float = 100.0) -> subprocess.CompletedProcess[str]:
@@ -126,7 +129,8 @@ def check_demonstrations(folder: Path, wanted: int) -> None:
 
 
 def test_two_demonstrations_by_one_command(tmp_path: Path, world: hal.Rig) -> None:
-    done = run(tmp_path, "--sim", *LOCK_STEP, "--pad", PAD, "--episodes", 2, "--task", "lift the cube")
+    pictures = [word for override in SMALL for word in ("--set", override)]
+    done = run(tmp_path, "--sim", *LOCK_STEP, *pictures, "--pad", PAD, "--episodes", 2, "--task", "lift the cube")
     assert done.returncode == 0, done.stdout + done.stderr
     assert "Traceback" not in done.stderr
     check_demonstrations(tmp_path, 2)
@@ -135,6 +139,20 @@ def test_two_demonstrations_by_one_command(tmp_path: Path, world: hal.Rig) -> No
     assert "unmarked" not in done.stdout
     for episode in episodes(tmp_path):
         assert np.allclose(start_of_cube(episode), put(world, episode.info["seed"]), atol=1e-3)
+    check_pictures(tmp_path)
+
+
+def check_pictures(folder: Path) -> None:
+    """Every picture shows what its row says: put up in another world and drawn again, depth does not differ."""
+    with hal.open("panda_table", sim=True, clock="lock_step", pad="none", overrides=SMALL) as rig:
+        for episode in episodes(folder):
+            stage = Stage(rig, episode)
+            for row in (0, episode.length // 2, episode.length - 1):
+                stage.put(at_row(episode, row))
+                for camera in stage.frames:
+                    assert stage.look(camera, row).wrong <= ROUNDED, (episode.number, row, camera)
+                    other = 0 if row > 0 else episode.length - 1
+                    assert stage.look(camera, other).wrong > 100 * ROUNDED, "another row's picture is another one"
 
 
 @pytest.mark.slow
