@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import logging
+import os
 import signal
 import sys
 from collections.abc import Iterator
@@ -128,6 +129,9 @@ def run_app(main: Any, args: argparse.Namespace) -> int:
     except HalError as error:
         print(f"{type(error).__name__}: {error}", file=sys.stderr)
         return ACTION_NEEDED
+    except BrokenPipeError:  # nobody reads the output any more, as behind "| head"
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # nor may the flush at the end fail
+        return 1
     except OSError as error:  # a device or a file that cannot be opened
         print(f"{type(error).__name__}: {error}", file=sys.stderr)
         return ACTION_NEEDED

@@ -61,17 +61,23 @@ def _main(args: argparse.Namespace) -> int:
         raise CommandError(f"--episodes must be 1 or more, not {args.episodes}")
     if args.seed < 0:
         raise CommandError(f"--seed must be 0 or more, not {args.seed}")
+    if args.fps < 1:
+        raise CommandError(f"--fps must be 1 or more, not {args.fps}")
+    if args.pad == "none":
+        raise CommandError("--pad none: this program needs something that drives")
+    if Path(args.out).exists() and not Path(args.out).is_dir():
+        raise CommandError(f"--out {args.out} is no folder")
     if args.report:
         check_writable(args.report)
     plan = planned(args, f"dataset  {args.out}: {args.episodes} episode(s) at {args.fps} rows/s")
+    require()
     if plan is None:
         return 0
-    require()
     if not may_open(plan):
         return ACTION_NEEDED
     cameras = None if args.cameras is None else [name.strip() for name in args.cameras.split(",") if name.strip()]
     options = rig_options(args)
-    if args.pad == "demo":  # the tour presses no button that records
+    if args.pad == "demo" or (args.pad == "auto" and plan.clock == "lock_step"):  # the tour presses no Cross
         options["pad"] = str(data_folder("config") / "teleop" / "demonstrations.jsonl")
     with hal.open(**options) as rig:
         print(banner(rig), flush=True)

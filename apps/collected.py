@@ -21,7 +21,8 @@ class Kept:
 
     number: int
     seed: int
-    success: bool
+    success: bool | None
+    """None where nobody said: the run ended while it was recorded."""
     status: Future[RecorderStatus]
     """The recorder's, once it is saved."""
 
@@ -46,10 +47,11 @@ def summary(kept: Sequence[Kept], root: Path, discarded: int, ended: str) -> Ite
         yield f"ended: {ended}"
     found = [one.status.result() for one in saved]
     rows, seconds = sum(status.frames for status in found), sum(status.seconds for status in found)
-    dropped, succeeded = sum(status.dropped for status in found), sum(one.success for one in saved)
+    dropped, marks = sum(status.dropped for status in found), [one.success for one in saved]
+    unmarked = f", {marks.count(None)} not marked" if None in marks else ""
     yield (
         f"{len(saved)} episode(s) saved in {root}: {rows} rows, {seconds:.1f} s, {dropped} dropped; "
-        f"{succeeded} succeeded, {len(saved) - succeeded} failed, {discarded} forgotten"
+        f"{marks.count(True)} succeeded, {marks.count(False)} failed{unmarked}, {discarded} forgotten"
     )
     if saved:
         yield f"look at them: hal-review {root}"

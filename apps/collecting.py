@@ -8,10 +8,13 @@ from pathlib import Path
 from queue import Empty, SimpleQueue
 from typing import TYPE_CHECKING
 
+from hal.apps.cli import ACTION_NEEDED
 from hal.apps.collected import Kept, summary
 from hal.apps.driving import Driving
+from hal.apps.prompts import Prompts
 from hal.apps.taping import Tape
 from hal.console import ACTIONS
+from hal.errors import HalError
 
 if TYPE_CHECKING:
     from concurrent.futures import Future
@@ -30,7 +33,6 @@ SHOW = 0.2
 """s between two looks at the recorder."""
 ALLOWED = {"ready": ("record", "discard"), "recording": ("finish", "fail", "discard")}
 """What may be pressed when."""
-SONY = {"south": "Cross", "east": "Circle", "west": "Square", "north": "Triangle", "home": "PS"}
 SAVED, DISCARDED, ANEW = "saved", "discarded", "anew"
 """Why a try ended, where another one follows."""
 
@@ -57,6 +59,9 @@ class Collection:
         self._asked: SimpleQueue[str] = SimpleQueue()
         """What pages ask for."""
         self._next_look = 0.0
+        self._warned = False
+        """Does a person who drives know that nothing is recorded yet?"""
+        self._prompts = Prompts(rig, robot, self._drives_home)
         if rig.console is not None:
             rig.console.on_action(self._asked.put)
 
@@ -64,21 +69,36 @@ class Collection:
         """All episodes, or until Ctrl-C or the end of a recorded pad; then everything is saved, and told."""
         from hal.apps.banner import invitation
 
-        ended = ""
+        ended, failed = "", False
         self._check_buttons()
-        print(f"{self.driving.help()}\n  record: {self._buttons(ACTIONS)}\n{invitation(self.rig)}", flush=True)
+        buttons = self._prompts.buttons(ACTIONS, self.driving.teleop.mapping)
+        print(f"{self.driving.help()}\n  record: {buttons}\n{invitation(self.rig)}", flush=True)
         try:
             while not ended and len(self.kept) < self.args.episodes:
                 ended = self._episode()
         except KeyboardInterrupt:
-            ended = "Ctrl-C"  # the session's end brought the arm to rest
-        finally:
-            self._enter("saving")
-            self.driving.line.clear()
-            if self.tape.close():
-                self.driving.event(f"episode {self.number} was being recorded: it is kept, unmarked")
+            ended = "interrupted"  # the session's end brought the arm to rest
+        except (HalError, OSError) as error:  # such as the end of the arm's process
+            ended, failed = f"{type(error).__name__}: {error}", True
+        self._enter("saving")
+        self._keep_all()
         self._enter("done")
-        return self._tell(ended)
+        few = self._tell(ended) < self.args.episodes
+        return ACTION_NEEDED if failed else TOO_FEW if few else 0
+
+    def _keep_all(self) -> None:
+        """Everything to disk. One Ctrl-C meanwhile is answered, the next one gives up."""
+        for last in (False, True):
+            try:
+                if (rest := self.tape.keep()) is not None:
+                    self.driving.event(f"episode {self.number} was being recorded: it is kept, unmarked")
+                    self.kept.append(Kept(self.number, self.seed, None, rest))
+                self.tape.close()
+                return
+            except KeyboardInterrupt:
+                if last:
+                    raise
+                self.driving.event("saving; Ctrl-C once more gives up")
 
     # One episode.
 
@@ -131,6 +151,9 @@ class Collection:
         for action in self._wishes(state):
             if action in self._allowed and (reason := self._act(action)):
                 return reason
+        if self.phase == "ready" and self.driving.deadman.held and not self._warned:
+            self._warned = True
+            self.driving.event(f"not recording yet: {self._prompts.buttons(('record',), self.driving.teleop.mapping)}")
         if self.rig.clock.now() >= self._next_look:
             self._show()
         return self._over()
@@ -164,8 +187,8 @@ class Collection:
     def _act(self, action: str) -> str:
         """Do what is wished for; why this try ends with that, or nothing."""
         if action == "record":
-            info = {"program": "collect", "mapping": self.driving.mapping, "speed": self.args.speed or 1.0}
-            self._starting = self.tape.start(self.seed, info)
+            what = {"program": "collect", "robot": self.robot.name, "mapping": self.driving.mapping}
+            self._starting = self.tape.start(self.seed, what | {"speed": self.args.speed or 1.0})
             self._look_at_start()
             return ""
         if action == "discard" and self.phase == "ready":
@@ -191,8 +214,8 @@ class Collection:
 
     def _enter(self, phase: str) -> None:
         self.phase = phase
-        prompt = self._prompt()
-        if prompt:
+        self._warned = self._warned and phase != "resetting"
+        if prompt := self._prompt:
             doing = "RECORDING" if phase == "recording" else phase
             self.driving.event(f"episode {self.number}: {doing}; {prompt}")
         self._show()
@@ -209,22 +232,27 @@ class Collection:
         self.driving.note = f"{len(self.kept)} of {self.args.episodes}  {doing}  "
         self._show_pages(status if self.phase == "recording" else status._replace(seconds=0.0, frames=0, dropped=0))
 
+    @property
+    def _prompt(self) -> str:
+        """What a person should do now, or nothing."""
+        return self._prompts.now(self.phase, self._allowed, self.driving.teleop.mapping)
+
     def _show_pages(self, status: RecorderStatus) -> None:
         if self.rig.console is None:
             return
         from hal.console import RecordingView
 
-        succeeded = sum(one.success for one in self.kept)
+        succeeded = sum(one.success is True for one in self.kept)
         self.rig.console.show_recording(
             RecordingView(
                 phase=self.phase,
-                prompt=self._prompt(),
+                prompt=self._prompt,
                 task=self.args.task,
                 episode=self.number,
                 saved=len(self.kept),
                 wanted=self.args.episodes,
                 succeeded=succeeded,
-                failed=len(self.kept) - succeeded,
+                failed=sum(one.success is False for one in self.kept),
                 discarded=self.discarded,
                 seconds=status.seconds,
                 frames=status.frames,
@@ -234,27 +262,6 @@ class Collection:
                 actions=self._allowed,
             )
         )
-
-    def _prompt(self) -> str:
-        """What a person should do now, or nothing."""
-        if self.phase == "resetting":
-            hold = self.driving.teleop.mapping.deadman
-            return f"hold {hold} until the arm is home; then its gripper opens" if self._drives_home else ""
-        place = "put everything where it starts; " if self._drives_home and self.phase == "ready" else ""
-        return f"{place}{self._buttons(self._allowed)}" if self._allowed else ""
-
-    def _buttons(self, actions: tuple[str, ...]) -> str:
-        """What these actions are done with."""
-        hold = self.driving.teleop.mapping.deadman
-        words = {
-            "record": "starts the recording",
-            "finish": "saves it as a success",
-            "fail": "saves it as a failure",
-            "discard": "puts things elsewhere" if self.phase == "ready" else f"forgets it, once {hold} is let go of",
-        }
-        mapped = self.driving.teleop.mapping.actions
-        told = [f"{_called(mapped[action])} {words[action]}" for action in actions if action in mapped]
-        return ", ".join(told) or "the page has the buttons"
 
     def _check_buttons(self) -> None:
         """CommandError where nobody could start a recording, or end it."""
@@ -270,12 +277,13 @@ class Collection:
     # The end.
 
     def _tell(self, ended: str) -> int:
-        """How it went. Everything is saved by now."""
+        """How it went. Everything is saved by now; returns how many episodes are."""
         for text in summary(self.kept, self.recorder.root, self.discarded, ended):
             self.driving.line.event(text)
         if self.args.report:
             report = {
                 "out": str(self.recorder.root),
+                "robot": self.robot.name,
                 "backend": self.robot.spec.driver,
                 "clock": self.rig.plan.clock,
                 "ended": ended,
@@ -285,7 +293,7 @@ class Collection:
                 "episodes": [one.as_json() for one in self.kept],
             }
             Path(self.args.report).write_text(json.dumps(report, indent=2) + "\n")
-        return TOO_FEW if sum(not one.failure for one in self.kept) < self.args.episodes else 0
+        return sum(not one.failure for one in self.kept)
 
 
 def seed_of(base: int, number: int, draws: int = 0) -> int:
@@ -293,8 +301,3 @@ def seed_of(base: int, number: int, draws: int = 0) -> int:
     import numpy as np
 
     return int(np.random.SeedSequence([base, number, draws]).generate_state(1)[0])
-
-
-def _called(button: str) -> str:
-    """A button's name, with that on the tutorial's pad."""
-    return f"{button} ({SONY[button]})" if button in SONY else button

@@ -248,6 +248,7 @@ class Run:
             "ended": ended,
             "episodes": [
                 {
+                    "seed": self.args.seed + number,
                     "success": outcome.success,
                     "ended": outcome.ended,
                     "reason": outcome.reason,
@@ -258,7 +259,7 @@ class Run:
                     "pauses": outcome.pauses,
                     "inference_ms": {name: _ms(value) for name, value in outcome.inference.items()},
                 }
-                for outcome in self.outcomes
+                for number, outcome in enumerate(self.outcomes)
             ],
         }
 

@@ -59,5 +59,6 @@ class Steering:
     def help(self) -> str:
         """For people, some lines."""
         about = self.teleop.mapping.description
-        lines = [f"mapping {self.mapping}{': ' if about else ''}{about}", *self.teleop.help(self._pad)]
+        drives = [f"drives {self._robot.name}"] if len(self._rig.robots) > 1 else []
+        lines = [*drives, f"mapping {self.mapping}{': ' if about else ''}{about}", *self.teleop.help(self._pad)]
         return "\n".join(f"  {line}" for line in lines)

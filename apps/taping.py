@@ -29,7 +29,7 @@ class Tape:
         """Begin an episode, once the last one is saved."""
         return self._do(lambda: self.recorder.start(seed=seed, info=info))
 
-    def save(self, success: bool) -> Future[RecorderStatus]:
+    def save(self, success: bool | None) -> Future[RecorderStatus]:
         """End it now, and keep it; how many rows it has is known when that is done."""
         self.recorder.save(success)
         return self._do(self._saved)
@@ -52,9 +52,12 @@ class Tape:
             done.set_exception(error)
         return done
 
-    def close(self) -> bool:
-        """Wait for all of that. True where an episode was still being recorded: it is kept, unmarked."""
+    def keep(self) -> Future[RecorderStatus] | None:
+        """End what is still being recorded and keep it, unmarked; None where nothing is."""
+        self._do(lambda: None).result()  # a start that was under way is over
+        return self.save(None) if self.recorder.status().state == "recording" else None
+
+    def close(self) -> None:
+        """Wait for all of that. May be called again where that was interrupted."""
         self._thread.shutdown()
-        still_open = self.recorder.status().state == "recording"
         self.recorder.close()
-        return still_open

@@ -16,22 +16,27 @@ from collections.abc import Callable, Collection, Mapping
 from pathlib import Path
 from typing import Any, Literal
 
-import gymnasium
 import numpy as np
-from gymnasium import spaces
 from numpy.typing import NDArray
 
 from .command_checks import FIRST_STEP_ANGLE
 from .commands import CartesianTarget, Command, JointTarget, Twist
 from .control import Control
 from .deadman import Deadman
-from .errors import CommandError, MotionStopped, NotSupported
+from .errors import CommandError, DriverMissing, MotionStopped, NotSupported
 from .observation import Observation
 from .pose import Pose
 from .quaternion import after_rotation
 from .resetting import put_back
 from .rig import Rig, open_rig
 from .robot import Robot
+
+try:
+    import gymnasium
+    from gymnasium import spaces
+except ImportError as error:
+    text = "RigEnv needs gymnasium; install with: pip install 'robot-hal[gym]'"
+    raise DriverMissing(text, name="gymnasium") from error
 
 __all__ = ["Action", "RigEnv"]
 

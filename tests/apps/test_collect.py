@@ -107,7 +107,7 @@ def check_demonstrations(folder: Path, wanted: int) -> None:
     for number, episode in enumerate(episodes(folder)):
         assert (episode.success, episode.task) == (True, "lift the cube")
         assert episode.info["seed"] == seed_of(number)
-        assert episode.info["info"] == {"program": "collect", "mapping": "default", "speed": 1.0}
+        assert episode.info["info"] == {"program": "collect", "robot": "panda", "mapping": "default", "speed": 1.0}
         assert episode.info["gaps"] == []
         check_stamps(episode)
         cube, tcp = episode.columns["observation.object.cube"], episode.columns["observation.tcp"]
@@ -251,7 +251,10 @@ def test_a_recording_that_ends_early_keeps_what_was_recorded(
     assert episode.length == pytest.approx(30, abs=3)
     told = capsys.readouterr().out
     assert all(text in told for text in ("was played to its end", "episode 0 was being recorded: it is kept, unmarked"))
-    assert report(tmp_path)["episodes"] == []
+    (told_of,) = report(tmp_path)["episodes"]
+    assert (told_of["success"], told_of["frames"]) == (None, episode.length)
+    assert "1 episode(s) saved" in told
+    assert "0 succeeded, 0 failed, 1 not marked, 0 forgotten" in told
 
 
 def test_ctrl_c_keeps_what_was_recorded_unmarked(tmp_path: Path) -> None:
@@ -267,11 +270,11 @@ def test_ctrl_c_keeps_what_was_recorded_unmarked(tmp_path: Path) -> None:
         app.send_signal(signal.SIGINT)
         told += app.communicate(timeout=60.0)[0]
     assert app.returncode == 1, told
-    assert all(text in told for text in ("episode 0 was being recorded: it is kept, unmarked", "ended: Ctrl-C"))
+    assert all(text in told for text in ("episode 0 was being recorded: it is kept, unmarked", "ended: interrupted"))
     assert "Traceback" not in told
     (episode,) = episodes(tmp_path)
     assert episode.success is None
-    assert report(tmp_path)["ended"] == "Ctrl-C"
+    assert report(tmp_path)["ended"] == "interrupted"
 
 
 # What is wrong is said.
@@ -282,7 +285,9 @@ def test_ctrl_c_keeps_what_was_recorded_unmarked(tmp_path: Path) -> None:
     [
         (["--episodes", "0"], ["--episodes must be 1 or more"]),
         (["--seed", "-1"], ["--seed must be 0 or more"]),
-        (["--fps", "0"], ["fps must be a whole number from 1"]),
+        (["--fps", "0"], ["--fps must be 1 or more"]),
+        (["--fps", "500"], ["fps must be"]),
+        (["--out", __file__], ["is no folder"]),
         (["--cameras", "wirst"], ["no camera 'wirst'"]),
         (["--robot", "pandas"], ["pandas", "panda"]),
         (["--pad", "none"], ["needs something that drives"]),
