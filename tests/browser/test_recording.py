@@ -170,3 +170,41 @@ def test_keys_press_the_buttons_of_the_pad_that_do_the_same(bench: Bench, page: 
         wait_for(lambda name=name: bench.session.pad.state().pressed(name), f"{name} to be pressed")  # type: ignore[misc]
         page.key(f"Digit{key}", key, False)
         wait_for(lambda name=name: not bench.session.pad.state().pressed(name), f"{name} to be let go of")  # type: ignore[misc]
+
+
+@pytest.mark.parametrize(
+    ("phase", "title"),
+    [("done", "The program has finished: 2 episodes saved"), ("saving", "The program has ended")],
+)
+def test_a_run_that_ends_by_itself_is_no_alarm(browser: Browser, phase: str, title: str) -> None:
+    program = Bench()
+    try:
+        browser.open(program.link)
+        browser.wait_driving()
+        show(program, browser, replace(READY, actions=()))
+        program.console.show_recording(replace(READY, phase=phase, prompt="", actions=()))
+    finally:
+        program.close()
+    wait_for(lambda: browser.text("#overlay-title").lower() == title.lower(), title)
+    assert "stopped" not in browser.text("#overlay")
+    browser.chrome.get("about:blank")
+    browser.complaints()  # that nobody answers any more
+
+
+@pytest.mark.parametrize(
+    ("view", "words"),
+    [(RUNNING, "the arm has been stopped"), (replace(READY, phase="done", saved=1), "has finished: 1 episode saved")],
+    ids=["recording", "done"],
+)
+def test_a_link_that_breaks_is_an_alarm_unless_the_run_was_done(
+    bench: Bench, page: Browser, view: RecordingView, words: str
+) -> None:
+    show(bench, page, view)
+    page.run(
+        """const {send} = WebSocket.prototype, title = document.querySelector('#overlay-title');
+           const look = new MutationObserver(() => (window.told ??= title.textContent));
+           look.observe(title, {childList: true, subtree: true});
+           WebSocket.prototype.send = function () { WebSocket.prototype.send = send; this.close(); };"""
+    )
+    wait_for(lambda: page.run("return window.told"), "the page to say that it has no connection")
+    assert words in page.run("return window.told")

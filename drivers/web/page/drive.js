@@ -2,11 +2,9 @@
 
 import { DEAD, Disc } from "./disc.js";
 import { byId, make, setAttribute, setData, setText, show } from "./dom.js";
-import { AXIS, BIT, DISCS, LEGEND } from "./names.js";
+import { ACTIONS, AXIS, BIT, DISCS, LEGEND } from "./names.js";
 import { onPress } from "./press.js";
 import { Slider } from "./slider.js";
-
-const TAP = 60; // ms that a press of Home lasts at least
 
 export class Drive {
   /** @param {import("./pad.js").Pad} pad @param {() => boolean} enabled does this page drive? */
@@ -48,14 +46,9 @@ export class Drive {
   }
 
   #homing() {
-    let ends = 0;
     return onPress(this.home, {
-      down: () => {
-        if (!this.enabled() || !this.pad.held) return false;
-        clearTimeout(ends);
-        this.pad.goHome("page", true);
-      },
-      up: () => (ends = setTimeout(() => this.pad.goHome("page", false), TAP)), // the app looks 50 times a second
+      down: () => (this.enabled() && this.pad.held ? this.pad.goHome("page", true) : false),
+      up: () => this.pad.goHome("page", false),
     });
   }
 
@@ -89,7 +82,7 @@ export class Drive {
     this.#explained ||= Object.keys(controls).length > 0;
     /** What a control does, or null. @param {string} name @returns {string[] | null} */
     const meaning = (name) => (name === deadman ? null : (controls[name] ?? null));
-    this.pad.explain(deadman, home);
+    this.pad.explain(deadman, home, Object.keys(controls).filter((name) => ACTIONS.includes(controls[name].join())));
     for (const [disc] of this.discs) {
       const [across, up] = DISCS[/** @type {keyof typeof DISCS} */ (disc.element.dataset.disc)];
       disc.explain(meaning(across), meaning(up));

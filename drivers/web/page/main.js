@@ -137,7 +137,7 @@ connection.heard = (message) => HEARD[message.type]?.(message);
 connection.lost = (code, reason, retry) => {
   const watched = document.documentElement.dataset.connected !== undefined;
   if (watched || code >= 4400 || !told) { // a further try that fails must not hide that the arm was stopped
-    overlay.show(code, reason, retry, { drove: lease.mine, watched, real: isReal() });
+    overlay.show(code, reason, retry, { drove: lease.mine, watched, real: isReal(), saved: recording.outcome });
   }
   told = true;
   setData(document.documentElement, "connected", null);

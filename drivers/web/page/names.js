@@ -14,6 +14,9 @@ export const AXIS = Object.fromEntries(AXES.map((name, place) => [name, place]))
 /** Name of a button -> its bit, as a number with only that bit set. */
 export const BIT = Object.fromEntries(BUTTONS.map((name, place) => [name, 1 << place]));
 
+/** What a button may do that moves nothing: it steers a recording. */
+export const ACTIONS = ["record", "finish", "fail", "discard"];
+
 /** Name of a disc -> its two axes, across and up. */
 export const DISCS = { dpad: ["dpad_x", "dpad_y"], left: ["left_x", "left_y"], right: ["right_x", "right_y"] };
 

@@ -29,17 +29,31 @@ export class Overlay {
   /**
    * @param {number} code the socket's close code @param {string} reason
    * @param {number | null} retry ms until the next try
-   * @param {{drove: boolean, watched: boolean, real: boolean}} before what this page did until now
+   * @param {{drove: boolean, watched: boolean, real: boolean, saved: number | null}} before what this page did until
+   *   now; `saved`: episodes of a recording that was done
    */
-  show(code, reason, retry, { drove, watched, real }) {
-    const [title, text] = ENDINGS[code] ?? [lostTitle(drove, watched), lostText(drove, watched, real)];
+  show(code, reason, retry, { drove, watched, real, saved }) {
+    const lost = [lostTitle(drove, watched), lostText(drove, watched, real)];
+    const [title, text] = saved === null ? ENDINGS[code] ?? lost : finished(saved, real && code !== ENDED);
     setText(byId("overlay-title"), title);
     setText(byId("overlay-text"), text);
     const told = code >= 4400 && !(code in ENDINGS) && reason ? `The program closed it: ${reason}. ` : "";
-    setText(byId("overlay-next"), told + (retry === null ? "" : "Connecting again by itself."));
+    setText(byId("overlay-next"), told + (retry === null || saved !== null ? "" : "Connecting again by itself."));
     show(byId("again"), code === TOO_MANY);
     show(byId("overlay"), true);
   }
+}
+
+/**
+ * A recording was done when the program went away.
+ * @param {number} saved episodes @param {boolean} doubtful might a real arm be driven still?
+ */
+function finished(saved, doubtful) {
+  const own = doubtful ? " Use the robot's own stop if the arm moves." : "";
+  return [
+    `the program has finished: ${saved} episode${saved === 1 ? "" : "s"} saved`,
+    `When it is started again it prints a new link: open that one.${own}`,
+  ];
 }
 
 /** @param {boolean} drove @param {boolean} watched */

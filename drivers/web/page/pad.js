@@ -1,6 +1,7 @@
 // One pad out of everything that a person may use at once: fingers on the page, keys, a gamepad.
 
 import { AXES, AXIS, BIT } from "./names.js";
+import { Taps } from "./taps.js";
 
 const TRIGGERS = [AXIS.l2, AXIS.r2];
 const PRESSED = 0.5;
@@ -23,7 +24,8 @@ export class Source {
 /**
  * Sticks add up, triggers count at their farthest, a button is pressed when any of them presses it.
  *
- * Home counts only while the dead-man is held, and is let go of with it.
+ * Home counts only while the dead-man is held, and is let go of with it. A press that moves nothing may be prolonged;
+ * one of the dead-man, or of anything that moves the arm, never is.
  */
 export class Pad {
   constructor() {
@@ -40,6 +42,7 @@ export class Pad {
     this.sources = [];
     this.#holding = new Set();
     this.#homing = new Set();
+    this.#taps = new Taps(() => this.update());
     /** Called after every change; `edge`: something was pressed or let go of. @type {((edge: boolean) => void)[]} */
     this.changed = [];
     /** Called by reset(): forget whatever is held. @type {(() => void)[]} */
@@ -48,6 +51,9 @@ export class Pad {
 
   /** @type {Set<string>} */ #holding;
   /** @type {Set<string>} */ #homing;
+  /** @type {Taps} */ #taps;
+  /** Mask of the buttons that move nothing. */
+  #moveless = 0;
 
   /** A further way of driving. */
   source() {
@@ -76,11 +82,15 @@ export class Pad {
     this.update();
   }
 
-  /** What the app calls its dead-man and its way home. @param {string} deadman @param {string | null} home */
-  explain(deadman, home) {
+  /**
+   * What the app calls its dead-man and its way home, and which buttons move nothing.
+   * @param {string} deadman @param {string | null} home @param {string[]} moveless
+   */
+  explain(deadman, home, moveless) {
     const other = deadman !== this.deadman;
     this.deadman = deadman;
     this.home = home;
+    this.#moveless = moveless.reduce((mask, name) => mask | BIT[name], 0) & ~BIT[deadman];
     if (other) this.reset();
     else this.update();
   }
@@ -89,6 +99,7 @@ export class Pad {
   reset() {
     this.#holding.clear();
     this.#homing.clear();
+    this.#taps.forget();
     this.grip = 0;
     for (const source of this.sources) source.clear();
     for (const forget of this.released) forget();
@@ -109,7 +120,16 @@ export class Pad {
     const held = (mask & BIT[this.deadman]) !== 0;
     if (!held) this.#homing.clear();
     if (this.home && this.#homing.size) mask |= BIT[this.home];
-    this.#take(axes, mask, held);
+    this.#take(axes, this.#taps.look(mask, this.#prolonged(held)), held);
+  }
+
+  /**
+   * Mask of the buttons of which a short press is prolonged: also of the way home, but never beyond the dead-man.
+   * @param {boolean} held
+   */
+  #prolonged(held) {
+    const home = this.home ? BIT[this.home] : 0;
+    return held ? this.#moveless | home : this.#moveless & ~home;
   }
 
   /** @param {number[]} axes @param {Source} source @returns {number} the buttons that count */

@@ -47,6 +47,11 @@ export class Recording {
     return this.view?.phase === "recording" ? `REC ${Math.floor(this.view.seconds)} s ` : "";
   }
 
+  /** Episodes that a program saved which said last that it is done; null: it has not said so. @type {number | null} */
+  get outcome() {
+    return this.view?.phase === "done" ? this.view.saved : null;
+  }
+
   /** The program shows how it goes. @param {any} view */
   heard(view) {
     this.view = view;
