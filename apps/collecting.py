@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import argparse
 import json
+from concurrent.futures import wait
 from pathlib import Path
 from queue import Empty, SimpleQueue
 from typing import TYPE_CHECKING
 
+from hal.apps.beginning import Beginning
 from hal.apps.cli import ACTION_NEEDED
 from hal.apps.collected import Kept, summary
 from hal.apps.driving import Driving
@@ -41,8 +43,6 @@ class Collection:
     """One run of ``apps/collect.py``."""
 
     def __init__(self, rig: Rig, robot: Robot, pad: Gamepad, recorder: Recorder, args: argparse.Namespace) -> None:
-        from hal.resetting import stands_in_world
-
         self.rig, self.robot, self.pad, self.recorder, self.args = rig, robot, pad, recorder, args
         self.driving = Driving(rig, robot, pad, mapping=args.mapping, speed=args.speed or 1.0, actions=ACTIONS)
         self.tape = Tape(recorder)
@@ -50,10 +50,15 @@ class Collection:
         self.kept: list[Kept] = []
         self.discarded = 0
         self._first = recorder.episodes
-        self._drives_home = not stands_in_world(rig, robot)
+        self._beginning = Beginning(self.driving)
         self._draws = 0
         """How often other places were wanted for the things of this episode."""
+        self._seed = 0
+        """Of the episode that is being recorded."""
         self._starting: Future[None] | None = None
+        self._discarding: Future[None] | None = None
+        self._notes = len(recorder.notes)
+        """So many of the recorder's were told."""
         self._trouble = ""
         """The recorder's, as far as a person was told."""
         self._asked: SimpleQueue[str] = SimpleQueue()
@@ -61,7 +66,7 @@ class Collection:
         self._next_look = 0.0
         self._warned = False
         """Does a person who drives know that nothing is recorded yet?"""
-        self._prompts = Prompts(rig, robot, self._drives_home)
+        self._prompts = Prompts(rig, robot, self._beginning.drives_home)
         if rig.console is not None:
             rig.console.on_action(self._asked.put)
 
@@ -92,7 +97,7 @@ class Collection:
             try:
                 if (rest := self.tape.keep()) is not None:
                     self.driving.event(f"episode {self.number} was being recorded: it is kept, unmarked")
-                    self.kept.append(Kept(self.number, self.seed, None, rest))
+                    self.kept.append(Kept(self.number, self._seed, None, rest))
                 self.tape.close()
                 return
             except KeyboardInterrupt:
@@ -114,7 +119,8 @@ class Collection:
 
     def _episode(self) -> str:
         """One try. Why no other one should follow, or nothing."""
-        if not self._put_back():
+        self._enter("resetting")
+        if not self._beginning.put_back(self.seed, self._goes_on):
             return self._over()
         self._enter("ready")
         reason = self.driving.drive(self._look)
@@ -129,25 +135,14 @@ class Collection:
             return reason
         return ""
 
-    def _put_back(self) -> bool:
-        """Everything to where an episode starts; a real arm drives home. False where the run is over before that."""
-        import numpy as np
-
-        from hal.resetting import put_back
-
-        def reset() -> object:
-            random = np.random.default_rng(self.seed)
-            return put_back(self.rig, self.robot, random=random, deadman=self.driving.deadman)
-
-        self._enter("resetting")
-        while self.driving.guarded(reset) is None:
-            if self._over():
-                return False
-        return True
+    def _goes_on(self) -> bool:
+        """While nobody holds the dead-man: has it sense to wait?"""
+        self._show()
+        return not self._over()
 
     def _look(self, state: PadState) -> str:
         """What the pad, the pages and the recorder say; why this try ends, or nothing."""
-        self._look_at_start()
+        self._look_at_tape()
         for action in self._wishes(state):
             if action in self._allowed and (reason := self._act(action)):
                 return reason
@@ -158,14 +153,24 @@ class Collection:
             self._show()
         return self._over()
 
-    def _look_at_start(self) -> None:
-        """Has the recording begun that was asked for?"""
+    def _look_at_tape(self) -> None:
+        """Has the recording begun that was asked for, and was the one forgotten that should be?"""
+        if self._discarding is not None and self._discarding.done():
+            failure, self._discarding = self._discarding.exception(), None
+            if failure is not None:
+                self.driving.event(f"NOT FORGOTTEN: {failure}")
         if self._starting is None or not self._starting.done():
             return
         failure, self._starting = self._starting.exception(), None
+        for note in self.recorder.notes[self._notes :]:
+            self.driving.event(f"note: {note}")
+        self._notes = len(self.recorder.notes)
         if failure is not None:
             self.driving.event(f"NOT RECORDING: {failure}")
-        self._enter("ready" if failure is not None else "recording")
+            self._enter("ready")
+        else:
+            self._first = self.recorder.status().episode - len(self.kept)
+            self._enter("recording")
 
     @property
     def _allowed(self) -> tuple[str, ...]:
@@ -188,16 +193,19 @@ class Collection:
         """Do what is wished for; why this try ends with that, or nothing."""
         if action == "record":
             what = {"program": "collect", "robot": self.robot.name, "mapping": self.driving.mapping}
-            self._starting = self.tape.start(self.seed, what | {"speed": self.args.speed or 1.0})
-            self._look_at_start()
+            self._seed = self.seed
+            self._starting = self.tape.start(self._seed, what | {"speed": self.args.speed or 1.0})
+            self._look_at_tape()
             return ""
         if action == "discard" and self.phase == "ready":
             return ANEW
         if action == "discard":
-            self.tape.discard()
+            self._discarding = self.tape.discard()
             return DISCARDED
         success, seconds = action == "finish", self.recorder.status().seconds
-        self.kept.append(Kept(self.number, self.seed, success, self.tape.save(success)))
+        self.kept.append(Kept(self.number, self._seed, success, self.tape.save(success)))
+        if self.rig.lock_step:
+            wait([self.kept[-1].status])  # time stands still
         mark = "a success" if success else "a failure"
         number, count = self.kept[-1].number, len(self.kept)
         self.driving.event(f"episode {number}: {seconds:.1f} s, {mark}; {count} of {self.args.episodes} in this run")
@@ -213,6 +221,8 @@ class Collection:
     # What a person sees.
 
     def _enter(self, phase: str) -> None:
+        if phase == "ready" and self.phase == "resetting":
+            self._wishes(self.pad.state())  # what was pressed before counts no more
         self.phase = phase
         self._warned = self._warned and phase != "resetting"
         if prompt := self._prompt:
@@ -235,6 +245,8 @@ class Collection:
     @property
     def _prompt(self) -> str:
         """What a person should do now, or nothing."""
+        if self._starting is not None:
+            return "starting"
         return self._prompts.now(self.phase, self._allowed, self.driving.teleop.mapping)
 
     def _show_pages(self, status: RecorderStatus) -> None:

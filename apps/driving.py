@@ -28,6 +28,9 @@ LET_GO = 0.2
 AGAIN = 0.1
 """s between two tries where no session can be had."""
 
+HOME, OTHER_PAD = "home", "other pad"
+"""What may be due after a session."""
+
 T = TypeVar("T")
 Look = Callable[["PadState"], str]
 """Called in every turn with what the pad does; the reason to end, or nothing."""
@@ -117,12 +120,10 @@ class Driving:
         """Follow the pad until ``look`` gives a reason to end; returns that. The arm is at rest then."""
         while True:
             after = self.guarded(lambda: self._session(look))
-            if after == "home":
+            if after == HOME:
                 self.guarded(self._go_home)
-            elif after == "other pad":
-                self._steering.take()
-                self.event(f"{self.pad.describe()} drives")
-                self.line.event(self.help())
+            elif after == OTHER_PAD:
+                self.take_other_pad()
             elif reason := after or look(self.pad.state()):
                 return reason
 
@@ -131,7 +132,7 @@ class Driving:
 
         Raises ConnectionLost where the arm's process is gone, so that trying again has no sense.
         """
-        from hal.errors import ConnectionLost, MotionStopped, RobotFault, StaleStateError
+        from hal.errors import ConnectionLost, MotionStopped, NotSupported, RobotFault, StaleStateError
 
         try:
             return motion()
@@ -141,6 +142,10 @@ class Driving:
             self._faulted(fault)
         except (ConnectionLost, StaleStateError) as lost:
             self._lost(lost)
+        except NotSupported as why:
+            if self.pad.state().connected:
+                raise
+            self._tripped(why)  # nobody can hold a pad that is not plugged in
         self.rig.clock.sleep(AGAIN)
         return None
 
@@ -173,8 +178,15 @@ class Driving:
     def _due(self, state: PadState) -> str:
         """What must be done outside of a session."""
         if self.teleop.home_pressed(state) and self.deadman.held:
-            return "home"
-        return "other pad" if self._other_pad() else ""
+            return HOME
+        return OTHER_PAD if self._other_pad() else ""
+
+    def take_other_pad(self) -> None:
+        """Was a pad plugged in whose controls are others, and which may drive? From now on it does."""
+        if self._other_pad():
+            self._steering.take()
+            self.event(f"{self.pad.describe()} drives")
+            self.line.event(self.help())
 
     def _other_pad(self) -> bool:
         """Was a pad plugged in whose controls are others, and which may drive this arm?"""

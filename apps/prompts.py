@@ -23,6 +23,7 @@ class Prompts:
     def __init__(self, rig: Rig, robot: Robot, drives_home: bool) -> None:
         """``drives_home``: is the arm one that drives to where an episode starts, and nobody puts things back?"""
         self._by_page = rig.console is not None and rig.console.driven_by is None
+        self._has_page = rig.console is not None
         self._drives_home = drives_home
         self._has_gripper = robot.gripper is not None
 
@@ -30,7 +31,7 @@ class Prompts:
         """What a person should do in this phase, in which ``actions`` are possible; nothing where they only wait."""
         if phase == "resetting":
             then = "; then its gripper opens" if self._has_gripper else ""
-            return f"hold {mapping.deadman} until the arm is home{then}" if self._drives_home else ""
+            return f"let go of {mapping.deadman}, then hold it until the arm is home{then}" if self._drives_home else ""
         place = "put everything where it starts; " if self._drives_home and phase == "ready" else ""
         return f"{place}{self.buttons(actions, mapping, phase)}" if actions else ""
 
@@ -45,7 +46,7 @@ class Prompts:
         }
         called = PAGE if self._by_page else {action: _called(button) for action, button in mapping.actions.items()}
         told = [f"{called[action]} {words[action]}" for action in actions if action in called]
-        return ", ".join(told) or "the page has the buttons"
+        return ", ".join(told) or ("the page has the buttons" if self._has_page else "this pad has no buttons for it")
 
 
 def _called(button: str) -> str:

@@ -15,6 +15,8 @@ from typing import TYPE_CHECKING, Any
 from hal.apps.cli import ACTION_NEEDED, add_rig_options, rig_options, run_app
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
     from hal.deadman import Deadman
     from hal.recording import Episode
     from hal.replaying import Player
@@ -37,7 +39,7 @@ def parser() -> argparse.ArgumentParser:
     add_rig_options(made)
     play = made.add_argument_group("replaying")
     play.add_argument("--episode", type=int, default=0, metavar="N", help="which one; -1 is the last (%(default)s)")
-    play.add_argument("--robot", metavar="NAME", help="which arm, where the rig has several (the first)")
+    play.add_argument("--robot", metavar="NAME", help="which arm (the one that was driven)")
     play.add_argument(
         "--speed", type=float, default=1.0, metavar="SHARE", help="of the recording's, above 0, at most 1 (%(default)s)"
     )
@@ -81,10 +83,30 @@ def _main(args: argparse.Namespace) -> int:
     with hal.open(**{**rig_options(args), "pad": args.pad if holds else "none"}) as rig:
         if not rig.robots:
             raise CommandError(f"{rig.plan.source} has no robot")
-        robot = rig.robots[args.robot or next(iter(rig.robots))]
-        print(f"{banner(rig)}\n  {what}\n{invitation(rig)}", flush=True)
+        robot = rig.robots[args.robot or _driven(rig, episode)]
+        print("\n  ".join([banner(rig), what, *_replayed(robot, episode)]) + f"\n{invitation(rig)}", flush=True)
         deadman, button = held_by(rig) if holds else (None, "")
         return Replay(rig, robot, episode, args, deadman, button).run()
+
+
+def _driven(rig: Rig, episode: Episode) -> str:
+    """The arm that the recording says was driven, else the first of the rig that is in it, else the first."""
+    from hal.course import arms_of
+
+    said = episode.info.get("info", {}).get("robot")
+    recorded = arms_of(episode)
+    if said in rig.robots:
+        return str(said)
+    return next((name for name in rig.robots if name in recorded), next(iter(rig.robots)))
+
+
+def _replayed(robot: Robot, episode: Episode) -> Iterator[str]:
+    """Which arm moves, and which others of the recording do not."""
+    from hal.course import moved_besides
+
+    yield f"replays  {robot.name}"
+    for name in moved_besides(episode, robot.name):
+        yield f"still    {name} moved in the recording, too; it is not replayed"
 
 
 class Replay:

@@ -94,6 +94,8 @@ def _drawn(args: argparse.Namespace, root: Path, episode: Episode) -> Iterator[P
 
 def _table(found: Summary) -> Iterator[str]:
     """The numbers, line by line."""
+    from hal.recording.pace import SLOW
+
     count = len(found.episodes)
     many = f"{count} episode{'' if count == 1 else 's'}"
     yield f"{found.path}: {many} of {found.robot_type}, {found.rows} rows at {found.fps} Hz, {found.seconds:.1f} s"
@@ -106,6 +108,9 @@ def _table(found: Summary) -> Iterator[str]:
     for line in found.episodes:
         end = f"{line.dropped:7d}  {line.trips:5d}  {line.task}" + (f"  [{line.trouble}]" if line.trouble else "")
         yield f"{line.number:7d}  {line.rows:6d}  {line.seconds:7.2f}  {_MARK[line.success]:8}  {end}"
+    for line in found.episodes:
+        if line.pace is not None and line.pace < SLOW:
+            yield f"episode {line.number}: the simulation ran at {line.pace:.2f} of real time; its speeds are too low"
     yield from (f"cannot be read: {line}" for line in found.broken)
     if not found.episodes:
         return

@@ -190,7 +190,7 @@ class Run:
         self._begin(number, seed)
         self.pressed = set(MARKS)
         if self.recorder is not None:
-            self.recorder.start(seed=seed, info={"policy": self.args.policy, "rate_hz": self.args.rate})
+            self.recorder.start(seed=seed, info=self._about())
         outcome: Outcome | None = None
         try:
             outcome = self.runner.run(seed, lambda seconds: self._show(number, seconds))
@@ -206,6 +206,9 @@ class Run:
             traceback.print_exception(outcome.error)
         return outcome
 
+    def _about(self) -> dict[str, Any]:
+        return {"policy": self.args.policy, "robot": self.robot.name, "rate_hz": self.args.rate}
+
     def _begin(self, number: int, seed: int) -> None:
         """Everything back to where it starts: a real arm drives home, things with random ranges as the seed says."""
         import numpy as np
@@ -214,7 +217,7 @@ class Run:
 
         rig, robot = self.rig, self.robot
         if not stands_in_world(rig, robot):
-            held = f"; hold {self.button} until the arm is there" if self.button else ""
+            held = f"; let go of {self.button}, then hold it until the arm is there" if self.button else ""
             self._say(f"episode {number}: home, and the gripper opens{held}")
         random = np.random.default_rng(seed)
         put = put_back(rig, robot, random=random, deadman=self.deadman, unattended=self.args.unattended)

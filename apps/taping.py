@@ -17,7 +17,7 @@ T = TypeVar("T")
 class Tape:
     """What takes long is done one after the other in a thread of its own; in lock-step at once, as time stands still.
 
-    Every call comes back with a future, which has the error where there was one.
+    :meth:`start` and :meth:`discard` come back with a future, which has the error where there was one.
     """
 
     def __init__(self, recorder: Recorder) -> None:
@@ -30,9 +30,12 @@ class Tape:
         return self._do(lambda: self.recorder.start(seed=seed, info=info))
 
     def save(self, success: bool | None) -> Future[RecorderStatus]:
-        """End it now, and keep it; how many rows it has is known when that is done."""
+        """End it now, and keep it; how many rows it has is known when that is done, later in any case.
+
+        Raises CommandError where none is being recorded.
+        """
         self.recorder.save(success)
-        return self._do(self._saved)
+        return self._thread.submit(self._saved)
 
     def _saved(self) -> RecorderStatus:
         self.recorder.wait_saved()

@@ -141,8 +141,8 @@ class Console(ABC):
     def show_recording(self, view: RecordingView) -> None:
         """Show how a recording goes, from now on; never waits. The panel for it appears with the first one.
 
-        Only the newest counts. While an episode is recorded, say so at least once a second: after two without news,
-        pages show that there are none.
+        Only the newest counts. While an episode is recorded, say so now and then: after ten seconds without news pages
+        show that there are none.
         """
 
     @abstractmethod

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from .recording import Episode
     from .robot import Robot
 
-__all__ = ["Course"]
+__all__ = ["Course", "arms_of", "moved_besides"]
 
 Array = NDArray[np.float64]
 
@@ -24,6 +24,13 @@ _ROUNDED = 1e-5
 """rad; recordings hold positions as 32-bit numbers."""
 _SPEED_ROOM = 1.02
 """Speeds are differences of rounded positions."""
+_SPANS = (0.1, 1.0)
+"""s over which a speed is measured: in a burst, and for long."""
+_JITTER = 0.010
+"""s by which the stamps of rows may be off: a tick of the servo that came late is followed by one that came in time, so
+between two neighbours a set-point seems faster than it was."""
+_MOVED = 0.01
+"""rad, or m of a gripper; less is an arm that stood still."""
 _OBJECT = "observation.object."
 
 
@@ -126,16 +133,25 @@ class Course:
 
     def _too_fast(self, robot: Robot, speed: float) -> list[str]:
         """The servo would hold it back, and the arm would not be where it was."""
-        joint = np.abs(np.diff(self.q_set, axis=0)) / np.diff(self.t)[:, None]
         most = robot.spec.speed * np.asarray(robot.limits.velocity)
-        share = float((joint / most).max())
+        share, row, worst = max(self._fastest(span, most) for span in _SPANS)
         if share * speed <= _SPEED_ROOM:
             return []
-        row, worst = np.unravel_index(int((joint / most).argmax()), joint.shape)
         return [
-            f"{self.joints[worst]} moves at {speed * joint[row, worst]:.3f} rad/s at {self.t[row]:.2f} s, and may at "
+            f"{self.joints[worst]} moves at {speed * share * most[worst]:.3f} rad/s at {self.t[row]:.2f} s, and may at "
             f"{most[worst]:.3f} here: at speed {np.floor(100.0 / share) / 100.0:g} it could"
         ]
+
+    def _fastest(self, span: float, most: Array) -> tuple[float, int, int]:
+        """The highest mean speed over ``span`` s, as a share of ``most``; the row in which it begins, and the joint."""
+        last = len(self.t) - 1
+        ends = np.minimum(np.searchsorted(self.t, self.t + span - _ROUNDED), last)
+        starts = np.flatnonzero(np.append(True, ends[:-1] < last))  # one of the spans that reach the end will do
+        ends = ends[starts]
+        took = self.t[ends] - self.t[starts] + _JITTER
+        shares = np.abs(self.q_set[ends] - self.q_set[starts]) / took[:, None] / most
+        row, joint = np.unravel_index(int(shares.argmax()), shares.shape)
+        return float(shares[row, joint]), int(starts[row]), int(joint)
 
     # At a time.
 
@@ -152,6 +168,23 @@ class Course:
             return None
         value = float(self.width[max(0, int(np.searchsorted(self.t, s, side="right")) - 1)])
         return value if np.isfinite(value) else None
+
+
+def arms_of(episode: Episode) -> list[str]:
+    """Names of the arms in the recording."""
+    return [key.removeprefix("robot.") for key in episode.stamps if key.startswith("robot.")]
+
+
+def moved_besides(episode: Episode, name: str) -> list[str]:
+    """The other arms of the recording that did more than stand still: the replay of one arm leaves them out."""
+    arms, names = arms_of(episode), episode.names("observation.setpoint")
+    setpoint = np.asarray(episode.columns["observation.setpoint"], float)
+    found = []
+    for arm in arms if len(arms) > 1 else ():
+        own = setpoint[:, [k for k, label in enumerate(names) if label.startswith(f"{arm}.")]]
+        if arm != name and (np.nanmax(own, axis=0) - np.nanmin(own, axis=0) > _MOVED).any():
+            found.append(arm)
+    return found
 
 
 def _model(info: Mapping[str, Any], name: str) -> str:

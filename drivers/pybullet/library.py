@@ -83,7 +83,7 @@ class Client:
 
     def __getattr__(self, name: str) -> Any:
         attribute = getattr(self._module, name)
-        if isinstance(attribute, Callable):  # type: ignore[arg-type]
+        if isinstance(attribute, Callable) and not isinstance(attribute, type):  # type: ignore[arg-type]  # its error
             attribute = partial(attribute, physicsClientId=self.id)
         setattr(self, name, attribute)
         return attribute

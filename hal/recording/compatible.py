@@ -2,17 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+import math
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from ..errors import CommandError
+from .columns import CameraSetup
 from .layout import Layout, read_json
 from .tables import VERSION
 
 __all__ = ["check_compatible"]
 
+_SAID_ELSEWHERE = ("video.fps", "video.width", "video.height")
+"""Of a video: the dataset's own fps, and its shape, say it."""
 
-def check_compatible(layout: Layout, features: Mapping[str, Any], fps: int, robot_type: str) -> None:
+
+def check_compatible(
+    layout: Layout, features: Mapping[str, Any], fps: int, robot_type: str, cameras: Sequence[CameraSetup]
+) -> None:
     """Raise CommandError, which says everything that differs, where episodes of this kind cannot be added."""
     root = layout.root
     if root.exists() and not root.is_dir():
@@ -26,6 +33,8 @@ def check_compatible(layout: Layout, features: Mapping[str, Any], fps: int, robo
     if info.get("codebase_version") != VERSION or (last >= 0 and not layout.about(last).exists()):
         raise CommandError(f"the dataset in {root} was not recorded by this program; choose a new folder")
     found = [*_settings(info, fps, robot_type), *_features(info["features"], features)]
+    if last >= 0:
+        found += _depth(read_json(layout.about(last))["cameras"], cameras)
     if found:
         raise CommandError(f"the dataset in {root} is another kind: {'; '.join(found)}; choose a new folder")
 
@@ -41,9 +50,37 @@ def _features(old: Mapping[str, Any], new: Mapping[str, Any]) -> Iterator[str]:
         yield f"only there: {', '.join(missing)}"
     if added := [key for key in new if key not in old]:
         yield f"only here: {', '.join(added)}"
-    for key in old:
-        if key not in new:
+    for key in (key for key in old if key in new):
+        there, here = old[key], new[key]
+        for what in ("dtype", "shape"):
+            if there.get(what) != here.get(what):
+                yield f"{what} of {key} is {there.get(what)} there, and {here.get(what)} here"
+        if there.get("names") != here.get("names"):
+            yield _names(key, there.get("names") or [], here.get("names") or [])
+        video, ours = there.get("info") or {}, here.get("info") or {}
+        for what in dict.fromkeys([*video, *ours]):
+            if what not in _SAID_ELSEWHERE and video.get(what) != ours.get(what):
+                yield f"{what} of {key} is {video.get(what)} there, and {ours.get(what)} here"
+
+
+def _names(key: str, old: Sequence[str], new: Sequence[str]) -> str:
+    """In which numbers a column differs, at most three of each."""
+    parts = []
+    for where, names, others in (("there", old, new), ("here", new, old)):
+        if own := [name for name in names if name not in others]:
+            parts.append(f"only {where} it has {', '.join(own[:3])}{' and more' if len(own) > 3 else ''}")
+    return f"the names of {key} differ: {'; '.join(parts) or 'their order is another'}"
+
+
+def _depth(old: Mapping[str, Any], new: Sequence[CameraSetup]) -> Iterator[str]:
+    """Cameras, in both, whose depth is not kept alike; no feature of the dataset says so."""
+    for camera in new:
+        if camera.name not in old:
             continue
-        for what in ("dtype", "shape", "names", "info"):
-            if old[key].get(what) != new[key].get(what):
-                yield f"{what} of {key} is {old[key].get(what)} there, and {new[key].get(what)} here"
+        there, here = old[camera.name].get("depth_unit_m"), camera.depth_unit
+        if there is None and here is not None:
+            yield f"depth of {camera.name} is not kept there, and is here"
+        elif there is not None and here is None:
+            yield f"depth of {camera.name} is kept there, and not here"
+        elif there is not None and here is not None and not math.isclose(there, here, rel_tol=1e-6):
+            yield f"depth of {camera.name} is in units of {1e3 * there:g} mm there, and {1e3 * here:g} mm here"

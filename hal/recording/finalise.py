@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from .columns import ACTION, GRID, SETPOINT, STATE, TIMES
 from .layout import Layout, read_json, sync, write_json
 from .live import Rest, read_rest
+from .pace import Pace
 from .stats import Stats, column_stats, merged, plain
 from .tables import entry_table, new_info, read_tasks, rows_table, tasks_table
 from .video import remux
@@ -152,4 +153,13 @@ def _about(rest: Rest, number: int, t_start: float) -> dict[str, Any]:
     said = read_json(closing) if closing.exists() else _UNCLOSED
     skip = ("features", "columns", "cameras_kept")
     about = {key: value for key, value in rest.about.items() if key not in skip}
-    return {"episode": number, "length": rest.length, "t_start": t_start} | said | about
+    found = {"episode": number, "length": rest.length, "t_start": t_start, "pace": _pace(rest)}
+    return found | said | about
+
+
+def _pace(rest: Rest) -> dict[str, float]:
+    """How fast the time of each arm's own clock passed, as a share of the rig's; in lock-step they are one clock."""
+    pace = Pace(() if rest.about["clock"] == "lock_step" else rest.about["columns"])
+    for row in rest.rows:
+        pace.add(row)
+    return pace.as_json()

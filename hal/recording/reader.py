@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Iterator
 from functools import cached_property
 from pathlib import Path
@@ -110,9 +111,7 @@ class Dataset:
         require()
         layout = Layout(out)
         if not layout.info.exists():
-            left = layout.partials()
-            hint = f"; there are {len(left)} that were not finished: hal.recording.recover mends that" if left else ""
-            raise CommandError(f"there is no episode in {layout.root}{hint}")
+            raise CommandError(f"there is no episode in {layout.root}{_hint(layout)}")
         self.root = layout.root
         self.info: dict[str, Any] = read_json(layout.info)
         """``meta/info.json``."""
@@ -124,3 +123,13 @@ class Dataset:
 
     def __repr__(self) -> str:
         return f"<Dataset {self.root}: {len(self.episodes)} episodes, {self.info['total_frames']} rows>"
+
+
+def _hint(layout: Layout) -> str:
+    """How to mend what was not finished; nothing where all was."""
+    left = len(layout.partials())
+    if not left:
+        return ""
+    call = f"from hal.recording import recover; print(recover({str(layout.root)!r}))"
+    many = "is one" if left == 1 else f"are {left}"
+    return f"; there {many} not finished; mend that with: python -c {shlex.quote(call)}"

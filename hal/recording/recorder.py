@@ -118,7 +118,7 @@ class Recorder:
                 "encoder": encoder,
                 **about_rig(rig),
             }
-            check_compatible(Layout(out), self._about["features"], fps, self._about["robot_type"])
+            check_compatible(Layout(out), self._about["features"], fps, self._about["robot_type"], setups)
         except BaseException:
             self._child.close()
             self._memory.close()
@@ -199,6 +199,8 @@ class Recorder:
         trouble = str(failure or (take.trouble if take is not None else ""))
         if not trouble and free < self._warn_free:
             trouble = f"only {free / 1e9:.1f} GB are free on the disk of {self.root}"
+        if not trouble and take is not None:
+            trouble = take.pace.trouble
         if take is None:
             return RecorderStatus(state, self._episode, 0, 0.0, 0, 0, free, trouble)
         counts = take.frames, take.seconds, take.gaps.rows, take.grid.late

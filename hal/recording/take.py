@@ -7,9 +7,11 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 from ..errors import HalError, StaleStateError
+from ..resetting import stands_in_world
 from .cameras import CameraTrack
 from .gaps import Gaps
 from .grid import Grid, LockStepGrid, RealTimeGrid
+from .pace import Pace
 
 if TYPE_CHECKING:
     from ..host.process import Child
@@ -41,6 +43,8 @@ class Take:
         self.trouble = ""
         """Why there are no more rows; empty while there are."""
         self.gaps = Gaps(fps)
+        in_world = {robot.name for robot in rig.robots.values() if stands_in_world(rig, robot)}
+        self.pace = Pace(() if rig.lock_step else sampler.columns, in_world)
         self._lock_step = rig.lock_step
         self._sampler = sampler
         self._tracks = tracks
@@ -108,6 +112,7 @@ class Take:
             return "the writer cannot keep up: the processor or the disk is too slow"
         slot = self._ring.next()
         slot.values[:] = values
+        self.pace.add(values)
         for track, images in zip(self._tracks, slot.images, strict=True):
             track.fill(frames[track.camera.name], images)
         self._ring.announce()

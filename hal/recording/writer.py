@@ -132,7 +132,8 @@ class Writer:
         self._lock.close()  # the folder may have been deleted meanwhile, and the lock with it
         self._lock.enter_context(locked(layout))
         notes = recover_all(layout)
-        check_compatible(layout, about["features"], about["fps"], about["robot_type"])
+        cameras = [CameraSetup(*camera) for camera in about["cameras_kept"]]
+        check_compatible(layout, about["features"], about["fps"], about["robot_type"], cameras)
         number = int(read_json(layout.info)["total_episodes"]) if layout.info.exists() else 0
         self.failed = False
         self.ring.say(free_bytes=free, trouble="")

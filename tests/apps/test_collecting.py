@@ -160,5 +160,5 @@ def test_an_arm_that_is_not_simulated_drives_home_first_while_l2_is_held(
     (episode,) = Dataset(tmp_path / "data").episodes
     assert (episode.success, episode.info["seed"]) == (True, seed_of(0))
     told = capsys.readouterr().out
-    assert "hold l2 until the arm is home; then its gripper opens" in told
+    assert "let go of l2, then hold it until the arm is home; then its gripper opens" in told
     assert "put everything where it starts; south (Cross) starts the recording" in told

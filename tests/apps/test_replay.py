@@ -159,3 +159,55 @@ def test_what_lies_on_disk_is_what_was_driven(dataset: Path) -> None:
     q = episode.columns["observation.setpoint"][:, :7]
     assert np.ptp(q, axis=0).max() > 0.1
     assert episode.success is True
+
+
+TWO = """
+robots:
+  left: {model: panda, base: {position: [0, 0.5, 0]}}
+  right: {model: panda, base: {position: [0, -0.5, 0]}}
+"""
+
+
+def drive_two(out: Path, rig_file: Path, arms: tuple[str, ...], info: dict[str, str]) -> Path:
+    """Some of two arms move for a moment."""
+    from hal.recording import Recorder
+
+    rig_file.write_text(TWO)
+    with hal.open(rig_file, sim=True, clock="lock_step", pad="none") as rig, Recorder(rig, out, fps=30) as recorder:
+        recorder.start(info=info)
+        for name in arms:
+            with rig.robots[name].control(rate_hz=50) as control:
+                for tick in rig.clock.rate(50):
+                    control.send(hal.Twist([0.0, 0.0, 0.1]), gripper=0.0)
+                    if tick.elapsed > 0.6:
+                        break
+        recorder.save(wait=True)
+    return out
+
+
+@pytest.mark.parametrize(
+    ("arms", "info", "arguments", "replayed", "still"),
+    [
+        (("right",), {"robot": "right"}, (), "right", []),
+        (("left", "right"), {"robot": "right"}, (), "right", ["left"]),
+        (("left", "right"), {"robot": "right"}, ("--robot", "left"), "left", ["right"]),
+        (("left", "right"), {"robot": "middle"}, (), "left", ["right"]),
+    ],
+)
+def test_of_two_arms_the_one_that_was_driven_is_replayed(
+    tmp_path: Path,
+    arms: tuple[str, ...],
+    info: dict[str, str],
+    arguments: tuple[str, ...],
+    replayed: str,
+    still: list[str],
+) -> None:
+    rig_file, report = tmp_path / "two.yaml", tmp_path / "report.json"
+    out = drive_two(tmp_path / "out", rig_file, arms, info)
+    options = ("--config", rig_file, "--sim", "--set", "simulation.clock=lock_step", "--report", report)
+    done = run_here(main, out, *options, *arguments)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert json.loads(report.read_text())["robot"] == replayed
+    assert re.findall(r"^  replays +(\w+)$", done.stdout, re.MULTILINE) == [replayed]
+    told = re.findall(r"^  still +(\w+) moved in the recording, too; it is not replayed$", done.stdout, re.MULTILINE)
+    assert told == still

@@ -80,6 +80,23 @@ def test_a_damaged_episode_is_told_and_is_the_exit_status(tmp_path: Path) -> Non
     assert "2 episodes of panda, 23 rows" in done.stdout
 
 
+def test_a_simulation_that_was_too_slow_is_told(tmp_path: Path) -> None:
+    root = make_recording(tmp_path / "demo").root
+    assert "real time" not in run(root).stdout
+    for number, pace in ((0, 0.99), (1, 0.8912)):
+        file = root / f"episodes/{number:06d}.json"
+        about = json.loads(file.read_text())
+        driver = about["rig"]["resolved"]["robots"][0]["driver"]
+        about["rig"]["resolved"]["world"] = {"driver": driver}
+        file.write_text(json.dumps(about | {"pace": {"panda": pace}}))
+    done = run(root)
+    told = [line for line in done.stdout.splitlines() if "real time" in line]
+    assert told == ["episode 1: the simulation ran at 0.89 of real time; its speeds are too low"]
+    assert done.returncode == 0
+    found = json.loads(run(root, "--json").stdout)
+    assert [line["pace"] for line in found["episodes"]] == [0.99, 0.8912, None]
+
+
 @needs_rerun
 def test_an_episode_for_rerun(folder: Path, tmp_path: Path) -> None:
     """Read again by rerun's own program, which must not tell anybody that it was."""

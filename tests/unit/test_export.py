@@ -179,10 +179,15 @@ def test_episodes_with_other_pictures_are_told_apart(tmp_path: Path) -> None:
     """Depth is no column of the dataset, so one episode may have it and the next one not."""
     from recording_kit import mock_rig, record
 
-    with mock_rig() as rig:
-        for depth in (True, False):
-            with Recorder(rig, out=tmp_path / "demo", fps=20, task="x", depth=depth) as recorder:
-                record(recorder, 0.2)
+    with mock_rig() as rig, Recorder(rig, out=tmp_path / "demo", fps=20, task="x") as recorder:
+        record(recorder, 0.2)
+        record(recorder, 0.2)
+    file = tmp_path / "demo/episodes/000001.json"  # as a recorder that did not look at this once left it
+    about = json.loads(file.read_text())
+    for name, camera in about["cameras"].items():
+        camera |= {"depth_unit_m": None, "depth_lossless": None}
+        (tmp_path / f"demo/depth/{name}/chunk-000/file-001.depth").unlink()
+    file.write_text(json.dumps(about))
     with pytest.raises(CommandError, match="episodes 0 and 1 differ in depth of scene, depth of wrist.*--no-depth"):
         export(tmp_path / "demo", "zarr", tmp_path / "out")
     assert export(tmp_path / "demo", "zarr", tmp_path / "out", depth=False).episodes == 2

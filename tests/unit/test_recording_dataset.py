@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import json
+import re
+import shlex
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -11,7 +14,7 @@ import numpy as np
 import pytest
 from recording_kit import CAMERAS, check_layout, drive, mock_rig, record
 
-from hal.errors import CommandError, DeviceNotFound
+from hal.errors import CommandError, DeviceNotFound, HalError
 from hal.recording import Dataset, Recorder, recover
 
 
@@ -104,10 +107,72 @@ def test_what_differs_is_said_before_anything_is_written(made: Path) -> None:
     before = sorted(str(path) for path in made.rglob("*"))
     with mock_rig("lock_step", "cameras.wrist.output.width=80") as rig, pytest.raises(CommandError) as caught:
         Recorder(rig, made, fps=15, depth=False)
-    said = str(caught.value)
-    assert "fps is 30 there, and 15 here" in said
-    assert "shape of observation.images.wrist is [48, 64, 3] there, and [48, 80, 3] here" in said
+    said = str(caught.value).partition("another kind: ")[2].split("; ")
+    assert said == [
+        "fps is 30 there, and 15 here",
+        "shape of observation.images.wrist is [48, 64, 3] there, and [48, 80, 3] here",
+        "depth of scene is kept there, and not here",
+        "depth of wrist is kept there, and not here",
+        "choose a new folder",
+    ], "each once, and in words"
     assert sorted(str(path) for path in made.rglob("*")) == before
+
+
+def test_depth_is_kept_by_all_episodes_or_by_none(tmp_path: Path) -> None:
+    with mock_rig() as rig:
+        with Recorder(rig, tmp_path, depth=False) as recorder:
+            record(recorder, 0.1)
+        with pytest.raises(CommandError, match=r"kind: depth of scene is not kept there, and is here; depth of wrist"):
+            Recorder(rig, tmp_path)
+        with Recorder(rig, tmp_path, depth=False) as recorder:
+            record(recorder, 0.1)
+    assert check_layout(tmp_path)["total_episodes"] == 2
+
+
+def test_depth_in_another_unit_is_another_kind(made: Path, tmp_path: Path) -> None:
+    copy = tmp_path / "copy"
+    shutil.copytree(made, copy)
+    for file in copy.glob("episodes/*.json"):
+        about = json.loads(file.read_text())
+        unit = about["cameras"]["wrist"]["depth_unit_m"]
+        about["cameras"]["wrist"]["depth_unit_m"] = 2.0 * unit
+        file.write_text(json.dumps(about))
+    with mock_rig() as rig, pytest.raises(CommandError) as caught:
+        Recorder(rig, copy)
+    told = f"depth of wrist is in units of {2e3 * unit:g} mm there, and {1e3 * unit:g} mm here; choose a new folder"
+    assert str(caught.value).endswith(f"another kind: {told}")
+
+
+def test_names_that_differ_are_told_without_the_others(made: Path, tmp_path: Path) -> None:
+    copy = tmp_path / "copy"
+    shutil.copytree(made, copy)
+    info = json.loads((copy / "meta/info.json").read_text())
+    info["features"]["action"]["names"][0] = "elbow"
+    info["features"]["observation.images.scene"]["info"]["video.codec"] = "vp9"
+    (copy / "meta/info.json").write_text(json.dumps(info))
+    with mock_rig() as rig, pytest.raises(CommandError) as caught:
+        Recorder(rig, copy)
+    said = str(caught.value)
+    assert "the names of action differ: only there it has elbow; only here it has panda_joint1;" in said
+    assert re.search(r"video\.codec of observation\.images\.scene is vp9 there, and \w+ here", said)
+    assert len(said.partition("another kind")[2]) < 250
+
+
+def test_how_to_mend_an_unfinished_episode_can_be_typed(tmp_path: Path) -> None:
+    out = tmp_path / "it's here"
+    with mock_rig() as rig, Recorder(rig, out) as recorder:
+        recorder.start()
+        drive(rig, 1.5)
+        recorder._child.process.kill()
+        recorder._child.process.wait()
+        with pytest.raises(HalError):
+            recorder.save(wait=True)
+    with pytest.raises(CommandError, match="there is one not finished; mend that with: python -c ") as caught:
+        Dataset(out)
+    words = shlex.split(str(caught.value).partition("with: ")[2])
+    done = subprocess.run([sys.executable, *words[1:]], capture_output=True, text=True, timeout=60)
+    assert "recovered as episode 0" in done.stdout, done.stderr
+    assert len(Dataset(out)) == 1
 
 
 def test_a_folder_of_something_else_is_left_alone(tmp_path: Path) -> None:

@@ -3,37 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 import pytest
+from replay_kit import BARE, FPS, Recorded, course_of, opened
 
 import hal
-from hal.course import Course
+from hal.course import Course, arms_of, moved_besides
 from hal.deviation import Deviation
 from hal.replaying import Player
-
-FPS = 30
-BARE = ["cameras={}"]
-
-
-@dataclass
-class Recorded:
-    """An episode in memory, in the place of one on disk."""
-
-    columns: dict[str, Any] = field(default_factory=dict)
-    stamps: dict[str, Any] = field(default_factory=dict)
-    info: dict[str, Any] = field(default_factory=dict)
-    joints: tuple[str, ...] = ()
-
-    def names(self, key: str) -> list[str]:
-        return ["x", "y", "z", "qx", "qy", "qz", "qw"] if key == "observation.tcp" else [*self.joints, "gripper"]
-
-
-def opened(driver: str, **options: Any) -> hal.Rig:
-    kind: dict[str, Any] = {"driver": "mock"} if driver == "mock" else {"sim": True, "clock": "lock_step"}
-    return hal.open("panda_table", **{"overrides": BARE, "pad": "none", **kind, **options})
 
 
 def twist(t: float) -> hal.Twist:
@@ -68,10 +48,6 @@ def record(driver: str = "mock", seconds: float = 4.0, cube: hal.Pose | None = N
             info={"rig": {"resolved": {"robots": [{"name": "panda", "model": "panda"}]}}},
             joints=arm.joints,
         )
-
-
-def course_of(episode: Recorded, robot: hal.Robot) -> Course:
-    return Course.of(episode, robot)  # type: ignore[arg-type]
 
 
 @pytest.fixture(scope="module")
@@ -259,6 +235,10 @@ def test_one_arm_of_two_is_found_by_its_name(episode: Recorded) -> None:
         assert course.joints == single.joints
         for name in ("t", "q_set", "q", "tcp", "width"):
             assert getattr(course, name) == pytest.approx(getattr(single, name))
+        assert arms_of(two) == ["left", "panda"]  # type: ignore[arg-type]
+        assert moved_besides(two, "panda") == [], "the other one stood still"  # type: ignore[arg-type]
+        assert moved_besides(two, "left") == ["panda"]  # type: ignore[arg-type]
+        assert moved_besides(episode, "left") == [], "there is no other"  # type: ignore[arg-type]
         arm.name = "right"
         with pytest.raises(hal.CommandError, match="no arm 'right'; it has: left, panda"):
             course_of(two, arm)

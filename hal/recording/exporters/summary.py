@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..columns import ACTION, STATE
+from ..pace import simulated_pace
 from ..reader import Dataset, Episode
 
 __all__ = ["EpisodeLine", "Spread", "Summary", "Timing", "as_json", "summary"]
@@ -62,6 +63,8 @@ class EpisodeLine:
     """How often a stop was latched in it."""
     task: str
     trouble: str
+    pace: float | None
+    """How fast a simulation's time passed, as a share of real time; None in lock-step, and without one."""
 
 
 @dataclass(frozen=True)
@@ -156,6 +159,7 @@ def _line(episode: Episode) -> EpisodeLine:
         trips=trips,
         task=episode.task,
         trouble=str(episode.info.get("trouble") or ("recovered" if episode.info.get("recovered") else "")),
+        pace=simulated_pace(episode.info),
     )
 
 
