@@ -46,7 +46,7 @@ class Collection:
         self.rig, self.robot, self.pad, self.recorder, self.args = rig, robot, pad, recorder, args
         self.driving = Driving(rig, robot, pad, mapping=args.mapping, speed=args.speed or 1.0, actions=ACTIONS)
         self.tape = Tape(recorder)
-        self.phase = "resetting"
+        self.phase = ""
         self.kept: list[Kept] = []
         self.discarded = 0
         self._first = recorder.episodes
