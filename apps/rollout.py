@@ -68,11 +68,11 @@ def main(argv: list[str] | None = None) -> int:
 
 def _main(args: argparse.Namespace) -> int:
     import hal
-    from hal.apps.banner import banner, invitation, listing
+    from hal.apps.banner import banner, invitation
     from hal.apps.check import may_open
     from hal.apps.holding import held_by, needs_holding
+    from hal.apps.opening import planned
     from hal.apps.report import check_writable
-    from hal.config import load
     from hal.errors import CommandError
     from hal.policy import found
 
@@ -88,10 +88,8 @@ def _main(args: argparse.Namespace) -> int:
     for what in ("policy", "reset", "success"):
         if getattr(args, what):
             found(getattr(args, what), f"--{what}")
-    plan = load(args.config, sim=args.sim, overrides=args.overrides).resolve()
-    if args.dry_run:
-        print(f"{plan.source} is in order; it would open:")
-        print("\n".join(f"  {line}" for line in [*listing(plan), *plan.warnings, f"policy   {args.policy}"]))
+    plan = planned(args, f"policy   {args.policy}")
+    if plan is None:
         return 0
     if not may_open(plan):
         return ACTION_NEEDED
