@@ -84,8 +84,12 @@ class LocalHost(Host):
         return self.cycle.ticks * self.cycle.dt
 
     def advance_to(self, t: float) -> None:
-        """Step until simulated time is ``t``, to within half a step; at least once where ``t`` lies ahead."""
+        """Step until simulated time is ``t``, to within half a step; at least once where ``t`` lies ahead.
+
+        Raises HalError after :meth:`close`: a thread that waits for time to go on must not go on for ever.
+        """
         with self._busy:
+            self.check()
             ahead = (t - self.now()) / self.cycle.dt
             if ahead > 1e-6:
                 for _ in range(max(1, round(ahead))):
@@ -111,6 +115,7 @@ class LocalHost(Host):
 
     def request(self, method: str, params: dict[str, Any] | None = None) -> Any:
         with self._busy:
+            self.check()
             result = self.cycle.request(method, params or {})
             self.publish()
             return result

@@ -65,7 +65,7 @@ def test_the_tutorials_scene() -> None:
         "box",
         (0.03, 0.015, 0.03),
         2.0,
-        (0.0, -0.2, 0.7),
+        (0.0, -0.2, 0.631),
     )
     assert any(body.shape == "urdf" and not body.fixed for body in bodies.values())
     cameras = {camera.name: camera for camera in rig.cameras}

@@ -416,6 +416,8 @@ def test_closing_is_idempotent_and_ends_an_open_session() -> None:
     rig.close()
     with pytest.raises(hal.HalError):
         arm.state()
+    with pytest.raises(hal.HalError, match="closed"):
+        rig.clock.sleep(0.1)
 
 
 def test_a_pose_beyond_reach_is_refused_in_mid_session_too(rig: hal.Rig, arm: hal.Robot) -> None:
