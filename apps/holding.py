@@ -6,6 +6,7 @@ import argparse
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from hal.config.mapping import TeleopMapping
     from hal.config.plan import Plan
     from hal.deadman import Deadman
     from hal.rig import Rig
@@ -18,13 +19,13 @@ def needs_holding(plan: Plan, args: argparse.Namespace) -> bool:
     return bool(args.deadman) or (any(robot.attended for robot in plan.robots) and not args.unattended)
 
 
-def held_by(rig: Rig) -> tuple[Deadman, str]:
-    """The dead-man of the rig's pad, and the name of its control. CommandError where there is no pad."""
+def held_by(rig: Rig) -> tuple[Deadman, TeleopMapping]:
+    """The dead-man of the rig's pad, and what the pad's controls are. CommandError where there is no pad."""
     from hal.config.mapping import load_mapping
     from hal.errors import CommandError
 
     pad = next(iter(rig.gamepads.values()), None)
     if pad is None:
         raise CommandError(f"{rig.plan.source}: no pad is open that could be the dead-man; see --pad, --unattended")
-    button = load_mapping(pad.mapping or "default").deadman
-    return pad.hold(button), button
+    mapping = load_mapping(pad.mapping or "default")
+    return pad.hold(mapping.deadman), mapping

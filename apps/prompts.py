@@ -10,7 +10,7 @@ if TYPE_CHECKING:
     from hal.rig import Rig
     from hal.robot import Robot
 
-__all__ = ["Prompts"]
+__all__ = ["Prompts", "called"]
 
 PAGE = {"record": "Record", "finish": "Save", "fail": "Save as failure", "discard": "Discard"}
 """What the page's buttons are called."""
@@ -44,11 +44,11 @@ class Prompts:
             "fail": "saves it as a failure",
             "discard": "puts things elsewhere" if phase == "ready" else forgets,
         }
-        called = PAGE if self._by_page else {action: _called(button) for action, button in mapping.actions.items()}
+        called = PAGE if self._by_page else {action: called(button) for action, button in mapping.actions.items()}
         told = [f"{called[action]} {words[action]}" for action in actions if action in called]
         return ", ".join(told) or ("the page has the buttons" if self._has_page else "this pad has no buttons for it")
 
 
-def _called(button: str) -> str:
+def called(button: str) -> str:
     """A button's name, with that on the tutorial's pad."""
     return f"{button} ({SONY[button]})" if button in SONY else button

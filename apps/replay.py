@@ -85,8 +85,8 @@ def _main(args: argparse.Namespace) -> int:
             raise CommandError(f"{rig.plan.source} has no robot")
         robot = rig.robots[args.robot or _driven(rig, episode)]
         print("\n  ".join([banner(rig), what, *_replayed(robot, episode)]) + f"\n{invitation(rig)}", flush=True)
-        deadman, button = held_by(rig) if holds else (None, "")
-        return Replay(rig, robot, episode, args, deadman, button).run()
+        deadman, mapping = held_by(rig) if holds else (None, None)
+        return Replay(rig, robot, episode, args, deadman, mapping.deadman if mapping is not None else "").run()
 
 
 def _driven(rig: Rig, episode: Episode) -> str:

@@ -15,8 +15,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from hal.apps.cli import ACTION_NEEDED, add_rig_options, rig_options, run_app
+from hal.apps.prompts import called
 
 if TYPE_CHECKING:
+    from hal.config.mapping import TeleopMapping
     from hal.deadman import Deadman
     from hal.policy import Outcome
     from hal.pose import Pose
@@ -25,8 +27,8 @@ if TYPE_CHECKING:
     from hal.robot import Robot
 
 ENDED_EARLY = 1
-MARKS = {"south": True, "east": False}
-"""Buttons of the pad that end an episode: Cross for a success, Circle for a failure."""
+MARKS = {"finish": True, "fail": False}
+"""What ends an episode, of the actions of a pad's mapping, and how it is marked then: as in ``apps/collect.py``."""
 
 
 def parser() -> argparse.ArgumentParser:
@@ -99,10 +101,10 @@ def _main(args: argparse.Namespace) -> int:
             raise CommandError(f"{rig.plan.source} has no robot")
         robot = rig.robots[args.robot or next(iter(rig.robots))]
         print(f"{banner(rig)}\n  policy   {args.policy}\n{invitation(rig)}", flush=True)
-        deadman, button = held_by(rig) if holds else (None, "")
+        deadman, mapping = held_by(rig) if holds else (None, None)
         recorder = _recorder(rig, args)
         try:
-            return Run(rig, robot, args, recorder, deadman, button).run()
+            return Run(rig, robot, args, recorder, deadman, mapping).run()
         finally:
             if recorder is not None:
                 recorder.close()
@@ -126,13 +128,19 @@ class Run:
         args: argparse.Namespace,
         recorder: Recorder | None,
         deadman: Deadman | None,
-        button: str,
+        mapping: TeleopMapping | None,
     ) -> None:
+        """``mapping`` says what the pad's controls are, where somebody holds one."""
         from hal.apps.status import StatusLine
         from hal.policy import PolicyRunner, found, load_policy
 
         self.rig, self.robot, self.args, self.recorder = rig, robot, args, recorder
-        self.deadman, self.button = deadman, button
+        self.deadman = deadman
+        self.button = mapping.deadman if mapping is not None else ""
+        """That must be held."""
+        actions = mapping.actions if mapping is not None else {}
+        self.marks = {actions[action]: mark for action, mark in MARKS.items() if action in actions}
+        """Of the pad's buttons: what they say of an episode."""
         self.line = StatusLine()
         self.put_back: Any = found(args.reset, "--reset") if args.reset else None
         self.runner = PolicyRunner(
@@ -142,7 +150,7 @@ class Run:
             rate_hz=args.rate,
             seconds=args.seconds,
             deadman=deadman,
-            unattended=args.unattended or not button,
+            unattended=args.unattended or mapping is None,
             history=args.history,
             success=found(args.success, "--success") if args.success else None,
             mark=self._mark,
@@ -179,14 +187,14 @@ class Run:
 
     def _mark(self) -> bool | None:
         """What a person says with the pad, with the dead-man held or not."""
-        before = self.pressed
-        self.pressed = {name for name in MARKS if any(pad.state().pressed(name) for pad in self.rig.gamepads.values())}
-        return next((MARKS[name] for name in self.pressed - before), None)
+        before, pads = self.pressed, self.rig.gamepads.values()
+        self.pressed = {name for name in self.marks if any(pad.state().pressed(name) for pad in pads)}
+        return next((self.marks[name] for name in self.pressed - before), None)
 
     def _episode(self, seed: int) -> Outcome:
         number = len(self.outcomes)
         self._begin(number, seed)
-        self.pressed = set(MARKS)
+        self.pressed = set(self.marks)
         if self.recorder is not None:
             self.recorder.start(seed=seed, info=self._about())
         outcome: Outcome | None = None
@@ -224,8 +232,9 @@ class Run:
         elif put:
             self._say(f"episode {number}: {', '.join(_placed(name, pose) for name, pose in put.items())}")
         if self.button:
-            marks = "south (Cross) is a success, east (Circle) a failure"
-            self._say(f"episode {number}: let go of {self.button} and hold it, and the policy drives; {marks}")
+            words = {True: "a success", False: "a failure"}
+            marks = "".join(f"; {called(name)} marks {words[mark]}" for name, mark in self.marks.items())
+            self._say(f"episode {number}: let go of {self.button} and hold it, and the policy drives{marks}")
 
     def _show(self, number: int, seconds: float) -> None:
         self.line.update(lambda: f"  episode {number}: {seconds:6.1f} of {self.args.seconds:g} s")

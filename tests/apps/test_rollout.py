@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from collect_kit import CIRCLE, CROSS, PS, SQUARE, write_pad
 
 ROOT = Path(__file__).resolve().parents[2]
 APP = ROOT / "apps" / "rollout.py"
@@ -130,6 +131,17 @@ def test_it_is_recorded(folder: Path) -> None:
     for episode, told in zip(episodes, report(folder)["episodes"], strict=True):
         assert episode.length / 30 == pytest.approx(told["seconds"], abs=1.0)
         assert np.ptp(episode.columns["observation.tcp"][:, 0]) > 0.05
+
+
+def test_who_holds_the_dead_man_marks_with_the_buttons_that_save_a_demonstration(folder: Path) -> None:
+    pad = write_pad(folder, (1.5, CROSS), (2.2, PS), (3.0, CIRCLE), (4.0, SQUARE), until=5.0, held=(0.5, 2.0))
+    done = rollout(folder, "--policy", "policies:Reach", "--episodes", 2, "--deadman", "--pad", pad, *FAST)
+    assert done.returncode == 0, done.stderr
+    succeeded, failed = report(folder)["episodes"]
+    assert (succeeded["ended"], succeeded["success"]) == ("success", True)
+    assert 1.3 < succeeded["seconds"] < 1.6, "it counts while the dead-man is held"
+    assert (failed["ended"], failed["success"], failed["turns"]) == ("failure", False, 0)
+    assert "home (PS) marks a success; west (Square) marks a failure" in done.stdout
 
 
 @pytest.mark.parametrize(
