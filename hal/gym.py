@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,22 +33,24 @@ from .robot import Robot
 
 try:
     import gymnasium
-    from gymnasium import spaces
+    from gymnasium.spaces import Box, Dict
 except ImportError as error:
     text = "RigEnv needs gymnasium; install with: pip install 'robot-hal[gym]'"
     raise DriverMissing(text, name="gymnasium") from error
 
+from .gym_spaces import (
+    Action,
+    Spaces,
+    action_space,
+    as_numbers,
+    numbers_and_pictures,
+    object_key,
+    observation_space,
+)
+
 __all__ = ["Action", "RigEnv"]
 
-Action = Literal["joint", "tcp_delta", "twist"]
-"""``joint``: positions (n,), rad; farther than 0.1 rad from the set-point they are cut to that, and
-``info["clipped"]`` says so. ``tcp_delta``: by how much the tcp's goal moves (m) and turns (rotation vector, rad)
-in this step, along the base's axes. ``twist``: speed of the tcp, m/s and rad/s, along the base's axes. With a gripper
-one more number follows, 0 (open) to 1 (closed)."""
-
-Spaces = dict[str, NDArray[Any]]
 Result = tuple[Spaces, dict[str, Any]]
-
 
 _LEAD = (0.03, 0.12)
 """A goal that is ahead of the set-point by more is given up, m and rad."""
@@ -60,8 +62,9 @@ class RigEnv(gymnasium.Env[Spaces, NDArray[np.float32]]):
 
     Observations are a dict: ``q`` and ``dq`` (n,), rad and rad/s; ``tcp`` (7,), position in m and quaternion xyzw in
     the arm's base frame; ``gripper`` (1,), width in m; per camera ``<name>.color`` (H, W, 3) uint8 and, where it
-    streams depth, ``<name>.depth`` (H, W, 1) float32 in m. :attr:`observation` is the whole record behind it, with
-    every stamp; ``info["elapsed"]`` is its time since the reset, s.
+    streams depth, ``<name>.depth`` (H, W, 1) float32 in m; per object that was asked for ``object.<name>`` (7,), its
+    pose in the world. :attr:`observation` is the whole record behind it, with every stamp; ``info["elapsed"]`` is its
+    time since the reset, s.
 
     ``step`` sends the action, lets one period pass and waits for an observation that was taken after that: none is ever
     handed out twice. When the arm is stopped (a released dead-man is no stop), the episode is truncated and
@@ -79,6 +82,7 @@ class RigEnv(gymnasium.Env[Spaces, NDArray[np.float32]]):
         robot: str | None = None,
         action: Action = "joint",
         cameras: Collection[str] | None = None,
+        objects: Collection[str] = (),
         rate_hz: float = 20.0,
         max_steps: int | None = None,
         speeds: tuple[float, float] = (0.25, 1.0),
@@ -90,7 +94,9 @@ class RigEnv(gymnasium.Env[Spaces, NDArray[np.float32]]):
         overrides: tuple[str, ...] = (),
         render_mode: str | None = None,
     ) -> None:
-        """``speeds`` are the greatest of the tcp in ``twist`` and, per step, in ``tcp_delta``: m/s and rad/s.
+        """``cameras`` are the names of those that are observed, else all; ``objects`` those of things of the simulated
+        world whose poses are. ``speeds`` are the greatest of the tcp in ``twist`` and, per step, in ``tcp_delta``: m/s
+        and rad/s.
 
         ``on_reset(env, options)`` runs after the reset and before the first observation: where a person puts things
         back on a real bench, or a task moves objects with ``env.rig.world`` and ``env.np_random``. ``deadman`` is made
@@ -109,8 +115,12 @@ class RigEnv(gymnasium.Env[Spaces, NDArray[np.float32]]):
             self._lower, self._upper = np.array(self.robot.limits.lower), np.array(self.robot.limits.upper)
             self._deadman = deadman(self.rig) if deadman is not None else None
             self._cameras = tuple(self.rig.cameras) if cameras is None else tuple(cameras)
-            self.action_space: spaces.Box = self._action_space()  # type: ignore[assignment]  # invariant in its type
-            self.observation_space: spaces.Dict = self._observation_space()  # type: ignore[assignment]
+            self._objects = _known(objects, self.rig)
+            chosen = [self.rig.cameras[name] for name in self._cameras]
+            self.action_space: Box = action_space(self.robot, action, rate_hz, speeds)  # type: ignore[assignment]
+            self.observation_space: Dict = observation_space(  # type: ignore[assignment]  # invariant in their types
+                self.robot, chosen, self._objects
+            )
         except BaseException:
             self.rig.close()
             raise
@@ -137,39 +147,6 @@ class RigEnv(gymnasium.Env[Spaces, NDArray[np.float32]]):
         attended = any(arm.attended for arm in plan.robots)
         clock = None if attended or pads else "lock_step"
         return open_rig(config, sim=sim, driver=driver, overrides=overrides, clock=clock, pad=None if pads else "none")
-
-    # Spaces.
-
-    def _action_space(self) -> spaces.Box:
-        limits, (linear, angular) = self.robot.limits, self._speeds
-        if self._kind == "joint":
-            low, high = list(limits.lower), list(limits.upper)
-        elif self._kind in ("tcp_delta", "twist"):
-            share = 1.0 / self._rate if self._kind == "tcp_delta" else 1.0
-            high = [linear * share] * 3 + [angular * share] * 3
-            low = [-value for value in high]
-        else:
-            raise CommandError(f"action must be joint, tcp_delta or twist, not {self._kind!r}")
-        if self.robot.gripper is not None:
-            low, high = [*low, 0.0], [*high, 1.0]
-        return spaces.Box(np.array(low, np.float32), np.array(high, np.float32), dtype=np.float32)
-
-    def _observation_space(self) -> spaces.Dict:
-        robot, n = self.robot, self.robot.n
-
-        def free(size: int) -> spaces.Box:
-            return spaces.Box(-np.inf, np.inf, (size,), np.float64)
-
-        parts: dict[str, spaces.Space[Any]] = {"q": free(n), "dq": free(n), "tcp": free(7)}
-        if robot.gripper is not None:
-            parts["gripper"] = free(1)
-        for name in self._cameras:
-            spec = self.rig.cameras[name].spec
-            if "color" in spec.streams:
-                parts[f"{name}.color"] = spaces.Box(0, 255, (spec.height, spec.width, 3), np.uint8)
-            if "depth" in spec.streams:
-                parts[f"{name}.depth"] = spaces.Box(0.0, spec.depth_max, (spec.height, spec.width, 1), np.float32)
-        return spaces.Dict(parts)
 
     # An episode.
 
@@ -209,7 +186,7 @@ class RigEnv(gymnasium.Env[Spaces, NDArray[np.float32]]):
         self._start = observation.t
         info = self._info(observation)
         if put:
-            info["poses"] = {name: np.concatenate([pose.position, pose.orientation]) for name, pose in put.items()}
+            info["poses"] = {name: as_numbers(pose) for name, pose in put.items()}
         return self._shown(observation), info
 
     def _begin(self) -> None:
@@ -276,20 +253,10 @@ class RigEnv(gymnasium.Env[Spaces, NDArray[np.float32]]):
 
     def _shown(self, observation: Observation) -> Spaces:
         self.observation = observation
-        state = observation.robots[self.robot.name]
-        shown: Spaces = {
-            "q": np.array(state.q),
-            "dq": np.array(state.dq),
-            "tcp": np.concatenate([state.tcp.position, state.tcp.orientation]),
-        }
-        if self.robot.gripper is not None:
-            shown["gripper"] = np.array([observation.grippers[self.robot.name].width])
-        for name in self._cameras:
-            frame = observation.cameras[name].frame
-            if frame.color is not None:
-                shown[f"{name}.color"] = frame.color
-            if frame.depth is not None:
-                shown[f"{name}.depth"] = frame.depth[..., None]
+        shown = numbers_and_pictures(observation, self.robot, self._cameras)
+        if self._objects and self.rig.world is not None:
+            poses = self.rig.world.poses(self._objects).poses
+            shown |= {object_key(name): as_numbers(poses[name]) for name in self._objects}
         return shown
 
     def _info(self, observation: Observation) -> dict[str, Any]:
@@ -309,3 +276,12 @@ class RigEnv(gymnasium.Env[Spaces, NDArray[np.float32]]):
             self._end()
         finally:
             self.rig.close()
+
+
+def _known(objects: Collection[str], rig: Rig) -> tuple[str, ...]:
+    """Names of things whose poses can be observed. NotSupported, DeviceNotFound where they cannot."""
+    if not objects:
+        return ()
+    if rig.world is None:
+        raise NotSupported("objects=: only a simulated world knows where things are")
+    return tuple(rig.world.poses(objects).poses)

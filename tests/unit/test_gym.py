@@ -131,6 +131,26 @@ def test_observations_show_things_where_they_were_drawn() -> None:
         env.close()
 
 
+def test_poses_of_things_are_observed_where_they_are_asked_for() -> None:
+    env = RigEnv("panda_table", sim=True, action="twist", objects=["duck", "cube"], overrides=BARE)
+    try:
+        seen, info = env.reset(seed=3)
+        assert env.observation_space.contains(seen)
+        assert [key for key in seen if key.startswith("object.")] == ["object.duck", "object.cube"]
+        assert seen["object.cube"] == pytest.approx(info["poses"]["cube"], abs=1e-3)
+        assert env.rig.world is not None
+        env.rig.world.set_velocity("cube", linear=(0.0, 0.5, 0.0))
+        after, *_ = env.step(np.zeros(7, np.float32))
+        assert after["object.cube"][1] - seen["object.cube"][1] > 0.005
+        assert (after["object.cube"][:3] == env.rig.world.pose("cube").position).all()
+    finally:
+        env.close()
+    with pytest.raises(hal.DeviceNotFound, match="cube"):
+        RigEnv("panda_table", sim=True, objects=["cup"], overrides=BARE)
+    with pytest.raises(hal.NotSupported, match="simulated world"):
+        RigEnv("panda_table", driver="mock", objects=["cube"], overrides=BARE)
+
+
 def test_ranges_that_leave_no_room_are_told() -> None:
     full = "objects.3={file: duck, random: {x: [0, 0], y: [0, 0]}}"
     here = "objects.2={file: cube, random: {x: [0, 0], y: [0, 0]}}"
