@@ -69,13 +69,14 @@ def _main(args: argparse.Namespace) -> int:
         raise CommandError(f"--out {args.out} is no folder")
     if args.report:
         check_writable(args.report)
-    plan = planned(args, f"dataset  {args.out}: {args.episodes} episode(s) at {args.fps} rows/s")
+    cameras = None if args.cameras is None else [name.strip() for name in args.cameras.split(",") if name.strip()]
+    what = f"dataset  {args.out}: {args.episodes} episode(s) at {args.fps} rows/s"
+    plan = planned(args, what, cameras=cameras or ())
     require()
     if plan is None:
         return 0
     if not may_open(plan):
         return ACTION_NEEDED
-    cameras = None if args.cameras is None else [name.strip() for name in args.cameras.split(",") if name.strip()]
     options = rig_options(args)
     if args.pad == "demo" or (args.pad == "auto" and plan.clock == "lock_step"):  # the tour presses no Cross
         options["pad"] = str(data_folder("config") / "teleop" / "demonstrations.jsonl")

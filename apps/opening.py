@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -11,10 +12,11 @@ if TYPE_CHECKING:
 __all__ = ["planned"]
 
 
-def planned(args: argparse.Namespace, *more: str) -> Plan | None:
+def planned(args: argparse.Namespace, *more: str, cameras: Iterable[str] = ()) -> Plan | None:
     """The plan of the rig that the options name. None after ``--dry-run``, which has told what would be opened.
 
-    ``more`` are lines that follow. Raises ConfigError, and DeviceNotFound for a ``--robot`` that is not there.
+    ``more`` are lines that follow. Raises ConfigError, and DeviceNotFound for a ``--robot``, or one of ``cameras``,
+    that is not there.
     """
     from hal.apps.banner import listing
     from hal.config import load
@@ -25,6 +27,10 @@ def planned(args: argparse.Namespace, *more: str) -> Plan | None:
     names = [robot.name for robot in plan.robots]
     if args.robot and args.robot not in names:
         raise DeviceNotFound(f"--robot: this rig has no robot {args.robot!r}{nearest(args.robot, names)}")
+    known = [camera.name for camera in plan.cameras]
+    for name in cameras:
+        if name not in known:
+            raise DeviceNotFound(f"--cameras: this rig has no camera {name!r}{nearest(name, known)}")
     if not args.dry_run:
         return plan
     print(f"{plan.source} is in order; it would open:")

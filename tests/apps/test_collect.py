@@ -288,7 +288,7 @@ def test_ctrl_c_keeps_what_was_recorded_unmarked(tmp_path: Path) -> None:
         (["--fps", "0"], ["--fps must be 1 or more"]),
         (["--fps", "500"], ["fps must be"]),
         (["--out", __file__], ["is no folder"]),
-        (["--cameras", "wirst"], ["no camera 'wirst'"]),
+        (["--cameras", "wirst", "--dry-run"], ["no camera 'wirst'"]),
         (["--robot", "pandas"], ["pandas", "panda"]),
         (["--pad", "none"], ["needs something that drives"]),
         (["--pad", "nothing.jsonl"], ["nothing.jsonl"]),
