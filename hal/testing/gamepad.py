@@ -44,14 +44,15 @@ def poll_until_pressed(bench: PadBench) -> list[PadReading]:
     raise AssertionError("south was never pressed")
 
 
-def poll_until(bench: PadBench, connected: bool) -> PadReading:
-    """Poll until the pad is there, or gone."""
+def poll_until(bench: PadBench, connected: bool, alive_after: float | None = None) -> PadReading:
+    """Poll until the pad is there, if wanted with a proof of life later than ``alive_after`` (s), or gone."""
     deadline = time.monotonic() + bench.patience
     for turn in itertools.count():
         reading = poll(bench)
-        if reading.connected is connected:
+        if reading.connected is connected and (alive_after is None or reading.t_alive > alive_after):
             return reading
-        assert turn < 20 or time.monotonic() < deadline, "it comes back by itself" if connected else "it is unplugged"
+        what = "it comes back by itself, and shows life again" if connected else "it is unplugged"
+        assert turn < 20 or time.monotonic() < deadline, what
     raise AssertionError
 
 
@@ -154,8 +155,8 @@ class GamepadContract(Contract):
         is_released(gone)
         assert gone.t_alive <= pressed.t_alive + 3 * bench.dt, "a pad that is gone shows no life"
         bench.restore()
-        back = poll_until(bench, connected=True)
-        assert back.t_alive > gone.t_alive or not bench.driver.proves_liveness
+        proof = gone.t_alive if bench.driver.proves_liveness else None
+        back = poll_until(bench, connected=True, alive_after=proof)
         assert back.seq >= gone.seq
 
     @needs("press", "release", "lose", "restore")
