@@ -21,6 +21,8 @@ _POSE = ("x", "y", "z", "qx", "qy", "qz", "qw")
 _TWIST = ("vx", "vy", "vz", "wx", "wy", "wz")
 _STAMP = ("t", "t_device", "seq")
 _UNKNOWN = [math.nan] * 7
+_NO_PAD = PadState(Stamp(math.nan, math.nan, 0))
+"""One that the rig has, and that is not open."""
 
 Put = Callable[[str, Iterable[float]], None]
 
@@ -56,17 +58,19 @@ class Sampler:
         self._rig = rig
         self._cameras = tuple(cameras)
         self._objects = movable(rig)
+        self._pads = tuple(spec.name for spec in rig.plan.pads)
+        """Open or not: what a policy does has the columns of what a person does."""
         self._parts: dict[str, tuple[str, list[str]]] = {}
         several = len(rig.robots) > 1
         self._add(GRID, ["t"], "float64")
         self._efforts = [robot for robot in rig.robots.values() if robot.state().tau is not None]
         for robot in rig.robots.values():
             self._add_robot(robot, f"{robot.name}." if several else "")
-        for pad in rig.gamepads.values():
-            lead = f"{pad.name}." if len(rig.gamepads) > 1 else ""
+        for name in self._pads:
+            lead = f"{name}." if len(self._pads) > 1 else ""
             names = [*AXES, *(f"button_{button}" for button in BUTTONS), "connected"]
-            self._add(PAD, [lead + name for name in names])
-            self._add(f"{TIMES}pad.{pad.name}", _STAMP, "float64")
+            self._add(PAD, [lead + part for part in names])
+            self._add(f"{TIMES}pad.{name}", _STAMP, "float64")
         for name in self._cameras:
             self._add(f"{TIMES}camera.{name}", _STAMP, "float64")
             self._add(f"observation.camera_pose.{name}", _POSE)
@@ -107,7 +111,8 @@ class Sampler:
 
     def look(self) -> Moment:
         """What has no history, now."""
-        pads = {pad.name: pad.state() for pad in self._rig.gamepads.values()}
+        opened = self._rig.gamepads
+        pads = {name: opened[name].state() if name in opened else _NO_PAD for name in self._pads}
         if not self._objects:
             return Moment(pads, {}, math.nan)
         world = self._rig.world

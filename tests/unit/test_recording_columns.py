@@ -61,3 +61,21 @@ def test_infrared_is_said_to_be_left_out(tmp_path: Path) -> None:
     streams = "cameras.scene.streams={color: {format: bgr8}, infrared: {format: y8}}"
     with mock_rig("lock_step", streams) as rig, Recorder(rig, tmp_path / "out") as recorder:
         assert recorder.notes == ["camera scene: infrared not recorded"]
+
+
+def test_what_is_recorded_without_the_pad_fits_what_a_person_recorded(tmp_path: Path) -> None:
+    for pad in (None, "none"):
+        with (
+            hal.open("panda_table", driver="mock", pad=pad, overrides=["cameras={}"]) as rig,
+            Recorder(rig, tmp_path / "out") as recorder,
+        ):
+            assert set(rig.gamepads) == ({"pad"} if pad is None else set())
+            recorder.start()
+            rig.clock.sleep(0.3)
+            recorder.save(wait=True)
+    check_layout(tmp_path / "out")
+    driven, by_itself = Dataset(tmp_path / "out").episodes
+    connected = driven.names("observation.pad").index("connected")
+    assert (driven.columns["observation.pad"][:, connected] == 1.0).all()
+    assert (by_itself.columns["observation.pad"] == 0.0).all()
+    assert np.isnan(by_itself.stamps["pad.pad"]).all()
