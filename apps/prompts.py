@@ -44,8 +44,8 @@ class Prompts:
             "fail": "saves it as a failure",
             "discard": "puts things elsewhere" if phase == "ready" else forgets,
         }
-        called = PAGE if self._by_page else {action: called(button) for action, button in mapping.actions.items()}
-        told = [f"{called[action]} {words[action]}" for action in actions if action in called]
+        names = PAGE if self._by_page else {action: called(button) for action, button in mapping.actions.items()}
+        told = [f"{names[action]} {words[action]}" for action in actions if action in names]
         return ", ".join(told) or ("the page has the buttons" if self._has_page else "this pad has no buttons for it")
 
 

@@ -1,9 +1,9 @@
 """The fenced blocks of a Markdown file, and what the comment before each says about running it.
 
-A block is run by its language: ``python``, ``yaml``, and commands in ``bash`` or ``console``. Blocks without a
-language, and ``text``, are pictures and output. A comment on the line before changes that:
+A block is run by its language: ``python``, ``yaml``, ``jsonl``, and commands in ``bash`` or ``console``. Blocks without
+a language, and ``text``, are pictures and output. A comment on the line before changes that:
 
-    <!-- file: NAME -->          written to that file, for the blocks after it; YAML is checked, Python compiled
+    <!-- file: NAME -->          written to that file, for the blocks after it; YAML, JSON are checked, Python compiled
     <!-- file: NAME, broken -->  the same, and the check must fail
     <!-- not run: WHY -->
 """
@@ -14,7 +14,7 @@ import re
 from pathlib import Path
 from typing import NamedTuple
 
-RUN = ("python", "yaml", "bash", "console")
+RUN = ("python", "yaml", "jsonl", "bash", "console")
 SHOWN = ("", "text", "toml")
 """Never run: pictures, output, and parts of other people's files."""
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import fnmatch
 import inspect
 import itertools
+import json
 import os
 import re
 import shlex
@@ -58,6 +59,8 @@ class Reader:
             (self.folder / name).write_text(block.text, encoding="utf-8")
             if block.language == "python":
                 compile(block.text, str(block), "exec")
+            elif block.language == "jsonl":
+                check_json(block)
             elif broken.strip() != "broken":
                 check_yaml(block.text, self.folder, name)
             else:
@@ -67,6 +70,8 @@ class Reader:
             self._python(block)
         elif block.language == "yaml":
             check_yaml(block.text, self.folder, "block.yaml")
+        elif block.language == "jsonl":
+            check_json(block)
         else:
             self._commands(block)
         self.ran += 1
@@ -195,3 +200,9 @@ def check_yaml(text: str, folder: Path, name: str) -> None:
         load_mapping(file)
     else:
         raise AssertionError(f"what is a file with the keys {', '.join(sorted(keys))}?")
+
+
+def check_json(block: Block) -> None:
+    """Each line is an object."""
+    for line in block.text.splitlines():
+        assert isinstance(json.loads(line), dict), f"{block}: {line}"
