@@ -99,6 +99,7 @@ def report(out: Path, found: dict[str, Any]) -> None:
         f"{1e3 * np.diff(grid).max():.1f} ms; finished in {found['saving']:.1f} s"
     )
     print(f"    MB per minute: {sum(sizes.values()):.0f} ({shares})")
+    print(f"    the simulation ran at {episode.info['pace'].get('panda', float('nan')):.4f} of real time")
     for name in _NAMES:
         age = (grid - episode.stamps[f"camera.{name}"]) * 1e3
         print(

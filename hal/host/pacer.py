@@ -45,8 +45,11 @@ class Pacer(Pace):
         return now
 
     def restart(self) -> None:
-        super().restart()
-        self._next = time.monotonic() + self.period
+        """What took less than a period was no pause: many of those would slow time down, and no count would show it."""
+        paused = int((time.monotonic() - self._next) / self.period)
+        if paused > 0:
+            super().restart()
+            self._next += paused * self.period
 
     def reset_statistics(self) -> None:
         super().reset_statistics()
