@@ -1,8 +1,7 @@
 """Where the data that come with the hal are: robot and sensor models, rigs, objects, mappings.
 
-They are found by path. In a checkout the folders ``robots/``, ``sensors/`` and ``config/`` stand beside ``hal/``;
-in an installed wheel they are in ``hal/data/``. Nothing of the user's is looked at, so no folder of theirs can shadow
-ours.
+They are found by path, in ``hal/data/``, which in a checkout holds links to the top-level folders ``robots/``,
+``sensors/`` and ``config/``. No folder of the user is searched, so none can shadow these.
 """
 
 from __future__ import annotations
@@ -18,9 +17,7 @@ def data_folder(name: str) -> Path:
     """The folder ``robots``, ``sensors`` or ``config``. LookupError for another name."""
     if name not in FOLDERS:
         raise LookupError(f"there is no data folder {name!r}; folders: {', '.join(FOLDERS)}")
-    package = Path(__file__).resolve().parents[1]
-    installed = package / "data" / name
-    return installed if installed.is_dir() else package.parent / name
+    return (Path(__file__).parents[1] / "data" / name).resolve()
 
 
 def find_data(folder: str, *parts: str) -> Path:
