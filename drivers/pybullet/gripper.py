@@ -16,10 +16,13 @@ __all__ = ["PyBulletGripper"]
 
 AT_TARGET = 0.001
 """m: a width this close to the target is there."""
-AT_REST = 0.002
-"""m/s: slower than this is standing still."""
+SLOW = 0.002
+"""m/s: fingers that are this slow at their target have arrived."""
+STILL = 0.0005
+"""m: a width that stays within this of one value stands still. Pressed on a hard, crooked thing, the joints of the
+fingers chatter at up to 20 mm/s while the width moves by 0.1 mm, so their speed does not tell."""
 SETTLE = 0.1
-"""s of standing still after which a motion has ended, wherever it is."""
+"""s of standing still after which a motion has ended, wherever it is. Slow motions take longer."""
 PRESSING = 0.5
 """Share of the commanded force from which on the fingers press on something."""
 
@@ -44,15 +47,17 @@ class PyBulletGripper(GripperDriver):
         self._open = False
         self._target = self._aim = spec.width_max
         self._force = spec.force
-        self._moving = False
-        self._moved_at = 0.0
+        self._stood = self._stood_since = 0.0
+        """The width, m, that the fingers have stayed near, and since when, s."""
+        self._settle = SETTLE
+        self._resting = True
 
     def open(self) -> None:
         """Find the fingers in the world."""
         self._body = _owner(self.spec, self._world)
         self._joints = [self._body.joints[name] for name in self.spec.joints]
         self._read = self._world.client.getJointStates
-        self._target = self._aim = self._width()[0]
+        self._was_reset()
         if not self._open:
             self._world.on_reset(self._body.name, self._was_reset)
         self._open = True
@@ -61,17 +66,11 @@ class PyBulletGripper(GripperDriver):
         """The fingers as the last physics step left them; ``force`` is what the weaker motor pressed with, N."""
         self._expect_open()
         width, speed, force = self._width()
-        t = self._world.t
-        short = abs(width - self._aim) > AT_TARGET
-        if abs(speed) > AT_REST:
-            self._moved_at = t
-        if self._moving and not (short and t - self._moved_at < SETTLE) and abs(speed) <= AT_REST:
-            self._moving = False
-        moving = self._moving or abs(speed) > AT_REST
+        moving = not self._at_rest(width, speed)
         pressing = force >= PRESSING * self._force
         return GripperReading(
             t=now,
-            t_device=t,
+            t_device=self._world.t,
             seq=self._world.steps,
             width=width,
             width_target=self._target,
@@ -97,15 +96,27 @@ class PyBulletGripper(GripperDriver):
     def _start(self, speed: float, force: float) -> None:
         self._expect_open()
         self._force = force
-        self._moving, self._moved_at = True, self._world.t
-        self._drive(min(speed, self.spec.speed))
+        speed = min(speed, self.spec.speed)
+        self._resting, self._stood_since = False, self._world.t
+        self._settle = max(SETTLE, 2.0 * STILL / speed)
+        self._drive(speed)
+
+    def _at_rest(self, width: float, speed: float) -> bool:
+        """Whether the fingers have arrived, or stand still elsewhere. Call it for every new width."""
+        t = self._world.t
+        stood_long = t - self._stood_since >= self._settle
+        if abs(width - self._stood) > STILL:
+            self._resting = self._resting and stood_long  # what creeps has stood long at every place
+            self._stood, self._stood_since = width, t
+        elif stood_long:
+            self._resting = True
+        return self._resting or (abs(width - self._aim) <= AT_TARGET and abs(speed) <= SLOW)
 
     def stop(self) -> None:
         """Stay where the fingers are. On an object, they go on pressing."""
         self._expect_open()
         width, speed, force = self._width()
-        self._moving = False
-        if abs(speed) <= AT_REST and force >= PRESSING * self._force:
+        if force >= PRESSING * self._force and (abs(speed) <= SLOW or self._at_rest(width, speed)):
             return
         self._target = self._aim = width
         self._drive(self.spec.speed)
@@ -137,9 +148,9 @@ class PyBulletGripper(GripperDriver):
         return share * sum(widths), share * sum(speeds), -max(forces)
 
     def _was_reset(self) -> None:
-        self._target = self._aim = self._width()[0]
+        self._target = self._aim = self._stood = self._width()[0]
+        self._resting, self._stood_since = True, self._world.t
         self._force = self.spec.force
-        self._moving = False
 
 
 def _owner(spec: GripperSpec, world: World) -> Body:

@@ -6,13 +6,14 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from specs import PANDA_HOME, box, cube, floor, iiwa, panda, world_spec
+from specs import PANDA_HOME, box, cube, data, floor, iiwa, panda, world_spec
 
 from hal.drivers.pybullet.gripper import PyBulletGripper
 from hal.drivers.pybullet.robot import PyBulletRobot
 from hal.drivers.pybullet.world import World
 from hal.errors import CommandError, ConfigError
 from hal.gripper import GripperReading
+from hal.pose import Pose
 from hal.robot import Setpoint
 from hal.specs import GripperSpec
 
@@ -54,6 +55,20 @@ class Bench:
         half = (z - 0.03) / 2.0
         self.world.add(box("stand", (x, y, half), (0.1, 0.1, half)))
         self.world.add(cube((x, y, z)))
+
+    def put_duck(self, yaw: float) -> None:
+        """The duck of the built-in rigs between the fingers, on a stand, turned by ``yaw`` rad."""
+        turned = Pose([0, 0, 0], [0, 0, np.sin(yaw / 2), np.cos(yaw / 2)]) @ Pose(
+            [0, 0, 0], [0.7071068, 0, 0, 0.7071068]
+        )
+        duck = {"name": "duck", "shape": "urdf", "urdf": data("duck_vhacd.urdf"), "scale": 0.8}
+        self.world.add({**duck, "position": [0, 0, 0], "orientation": turned.orientation.tolist()})
+        lower, upper = (np.array(corner) for corner in self.world.aabb("duck").values())
+        place = self.tcp - (lower + upper) / 2.0
+        self.world.set_pose("duck", {"position": place.tolist(), "orientation": turned.orientation.tolist()})
+        x, y, z = self.tcp
+        half = (z - (upper - lower)[2] / 2.0) / 2.0
+        self.world.add(box("stand", (x, y, half), (0.1, 0.1, half)))
 
     def lift(self, t: float) -> None:
         """Turn the shoulder back by 0.35 rad within a second, with no jerk at either end."""
@@ -188,6 +203,25 @@ class TestGrasping:
         assert (held.width_target, held.force) == (0.03, pytest.approx(40.0, rel=0.2))
         assert bench.run(2.0, bench.lift)[-1].grasped
         assert bench.world.pose("cube")["position"][2] > 0.5
+
+    @pytest.mark.parametrize("yaw", [-2.9, 0.2, 0.6, 1.1, 2.0])
+    def test_fingers_that_only_chatter_are_at_rest(self, yaw: float) -> None:
+        bench = Bench()
+        bench.put_duck(yaw)
+        bench.hand.grasp(0.03, 0.1, 70.0, 0.05, 0.05)
+        readings = bench.run(2.0)[-120:]
+        assert np.ptp([reading.width for reading in readings]) < 5e-4
+        assert not any(reading.moving for reading in readings)
+        assert all(reading.grasped for reading in readings)
+        bench.hand.stop()
+        assert all(reading.grasped for reading in bench.run(0.5)), "a stop keeps the force"
+
+    def test_a_slow_motion_is_one(self) -> None:
+        bench = Bench()
+        bench.hand.move(0.075, 0.001, 20.0)
+        readings = bench.run(3.0)
+        assert all(reading.moving for reading in readings)
+        assert readings[-1].width == pytest.approx(0.077, abs=5e-4)
 
     def test_a_grasp_of_nothing_closes(self) -> None:
         bench = Bench()
