@@ -20,6 +20,8 @@ from .urdf import UrdfModel, read_urdf
 
 __all__ = ["resolve_robot"]
 
+TURNING = ("revolute", "continuous")
+"""Joints whose positions are angles."""
 FAR = 10.0
 """m; where a workspace is open."""
 DEADLINE_SIMULATED, DEADLINE_REAL = 1.0, 0.3
@@ -140,7 +142,16 @@ def _check_names(model: RobotModel, urdf: UrdfModel, file: Path, problems: Probl
     with suppress(Unknown):
         _check_joints(model.joints, "joints", urdf, file, problems)
     with suppress(Unknown):
-        _check_joints(model.gripper.joints if model.gripper else (), "gripper.joints", urdf, file, problems)
+        fingers = model.gripper.joints if model.gripper else ()
+        _check_joints(fingers, "gripper.joints", urdf, file, problems)
+        for k, name in enumerate(fingers):
+            kind = urdf.joints[name].kind if name in urdf.joints else ""
+            if kind in TURNING and name not in model.joints:
+                message = (
+                    f"joint {name!r} turns ({kind}); fingers that turn are not supported yet, only ones that slide"
+                )
+                remedy = "remove the model's gripper, and its joints stay where they start"
+                problems.add(file, f"gripper.joints.{k}", f"{message} (prismatic): {remedy}")
     with suppress(Unknown):
         if model.base_link is not None:
             _check_link(model.base_link, "base_link", urdf, file, problems)

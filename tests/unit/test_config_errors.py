@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import random
+import xml.etree.ElementTree as ElementTree
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -426,6 +427,17 @@ def test_one_of_the_arms_own_joints_is_no_finger(own_model: Callable[..., Path])
     problem = only(own_model(lambda model: model["gripper"]["joints"].__setitem__(0, "panda_joint7")))
     assert problem.key == "gripper.joints"
     assert "one of the arm's joints" in problem.message
+
+
+def test_a_finger_that_turns_is_refused(own_model: Callable[..., Path], tmp_path: Path) -> None:
+    own_model()
+    urdf = ElementTree.parse(tmp_path / "arm.urdf")
+    (finger,) = (joint for joint in urdf.iter("joint") if joint.get("name") == "panda_finger_joint2")
+    finger.set("type", "revolute")
+    problem = only(own_model(urdf=ElementTree.tostring(urdf.getroot(), "unicode")))
+    assert (problem.file, problem.key) == (str(tmp_path / "arm.yaml"), "gripper.joints.1")
+    for word in ("panda_finger_joint2", "revolute", "prismatic"):
+        assert word in problem.message
 
 
 def test_a_model_and_a_urdf_without_speed_limits(own_model: Callable[..., Path], tmp_path: Path) -> None:
