@@ -25,11 +25,11 @@ from .simplify import simplified
 
 __all__ = ["MeshLibrary", "cache_folder", "parse"]
 
-_FORMAT = 6
+_FORMAT = 7
 """Raised whenever the records or the parsing change, so that old cache files are not read."""
 _BESIDE = {".mtl", ".png", ".jpg", ".jpeg", ".bmp", ".tga"}
 """Files in a mesh's folder that may decide its colours."""
-_PACKAGE = {".dae": "pycollada", ".3mf": "lxml networkx", ".stp": "cascadio", ".step": "cascadio"}
+_PACKAGE = {".3mf": "lxml networkx", ".stp": "cascadio", ".step": "cascadio"}
 """Formats for which trimesh wants one more package."""
 _CREASE = float(np.cos(np.radians(35)))
 """An edge is sharp where its faces turn by more than this."""
@@ -83,10 +83,11 @@ def parse(path: str) -> list[Mesh]:
     import trimesh  # half a second, and not needed when everything is in the cache
 
     loaded = trimesh.load(path, process=False)
+    metres = np.diag([trimesh.units.unit_conversion(loaded.units or "meters", "meters")] * 3 + [1.0])
     meshes: dict[Any, list[Mesh]] = {}
     for matrix, part in _parts(loaded) if isinstance(loaded, trimesh.Scene) else [(np.eye(4), loaded)]:
         if isinstance(part, trimesh.Trimesh) and len(part.faces):
-            mesh = _part(part).moved(matrix)
+            mesh = _part(part).moved(metres @ matrix)
             look = None if mesh.texture is None else (mesh.texture.shape, mesh.texture.tobytes())
             meshes.setdefault((look, mesh.material), []).append(mesh)
     if not meshes:

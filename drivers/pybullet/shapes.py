@@ -56,12 +56,14 @@ class Mesh:
         )
 
     def moved(self, matrix: NDArray[np.float64]) -> Mesh:
-        """In the frame in which ``matrix`` (4, 4) gives the pose of this mesh's own frame."""
-        rotation, translation = matrix[:3, :3], matrix[:3, 3]
+        """In the frame in which ``matrix`` (4, 4) gives the pose of this mesh's own frame; it may scale and mirror."""
+        linear, translation = matrix[:3, :3], matrix[:3, 3]
+        faces = self.faces[:, ::-1] if np.linalg.det(linear) < 0 else self.faces
         return replace(
             self,
-            positions=(self.positions @ rotation.T + translation).astype(np.float32),
-            normals=(self.normals @ rotation.T).astype(np.float32),
+            positions=(self.positions @ linear.T + translation).astype(np.float32),
+            normals=unit(self.normals @ np.linalg.inv(linear)).astype(np.float32),
+            faces=np.ascontiguousarray(faces),
         )
 
     def tinted(self, rgba: tuple[float, ...]) -> Mesh:

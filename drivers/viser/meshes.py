@@ -97,9 +97,10 @@ def _mesh(visual: Visual) -> list[Any]:
         raise ValueError(f"{visual.file} is not there")
     try:
         loaded = trimesh.load(visual.file, process=False)
+        metres = trimesh.units.unit_conversion(loaded.units or "meters", "meters")
         pictured, parts = [], []
         for matrix, piece in _pieces(loaded):
-            whole = np.diag([*visual.size, 1.0]) @ matrix
+            whole = np.diag([*(metres * np.array(visual.size)), 1.0]) @ matrix
             if _needs_picture(piece):
                 pictured.append(_pictured(piece, whole))
             elif len(piece.faces):

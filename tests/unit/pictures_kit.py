@@ -15,6 +15,26 @@ from hal.pose import Pose
 from hal.specs import BodySpec, CameraSpec, RobotSpec, ViewSpec, WorldSpec
 
 STREAMS = ("color", "depth", "segmentation")
+COLLADA = """<?xml version="1.0" encoding="utf-8"?>
+<COLLADA xmlns="http://www.collada.org/2005/11/COLLADASchema" version="1.4.1">
+  <asset><unit name="centimetre" meter="0.01"/><up_axis>Z_UP</up_axis></asset>
+  <library_effects><effect id="fx"><profile_COMMON><technique sid="common"><lambert>
+    <diffuse><color>1 0 0 1</color></diffuse></lambert></technique></profile_COMMON></effect></library_effects>
+  <library_materials><material id="red"><instance_effect url="#fx"/></material></library_materials>
+  <library_geometries><geometry id="corner"><mesh>
+    <source id="points"><float_array id="numbers" count="12">0 0 0 2 0 0 0 2 0 0 0 2</float_array>
+      <technique_common><accessor source="#numbers" count="4" stride="3"><param name="X" type="float"/>
+      <param name="Y" type="float"/><param name="Z" type="float"/></accessor></technique_common></source>
+    <vertices id="corners"><input semantic="POSITION" source="#points"/></vertices>
+    <triangles count="4" material="paint"><input semantic="VERTEX" source="#corners" offset="0"/>
+      <p>0 2 1 0 1 3 0 3 2 1 2 3</p></triangles></mesh></geometry></library_geometries>
+  <library_visual_scenes><visual_scene id="scene"><node><scale>1 1 3</scale><instance_geometry
+    url="#corner"><bind_material><technique_common><instance_material symbol="paint" target="#red"/></technique_common>
+    </bind_material></instance_geometry></node></visual_scene></library_visual_scenes>
+  <scene><instance_visual_scene url="#scene"/></scene>
+</COLLADA>
+"""
+"""The corner of a cube with sides of 2 cm, three times as high."""
 
 
 def world(*bodies: BodySpec, robots: tuple[RobotSpec, ...] = (), **changes: Any) -> World:

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from pictures_kit import COLLADA
 
 from hal.drivers.pybullet.meshes import MeshLibrary, cache_folder, parse
 from hal.drivers.pybullet.shapes import Mesh, box, capsule, cylinder, sphere
@@ -132,7 +133,7 @@ def test_what_cannot_be_parsed_is_left_out_with_a_warning(tmp_path: Path) -> Non
         assert MeshLibrary(tmp_path / "cache").load(str(broken)) == []
     collada = tmp_path / "part.dae"
     collada.write_text("<COLLADA/>")
-    with pytest.warns(UserWarning, match="pip install pycollada"):
+    with pytest.warns(UserWarning, match="part.dae"):
         assert MeshLibrary(tmp_path / "cache").load(str(collada)) == []
     with pytest.warns(UserWarning, match="gone.obj"):
         assert MeshLibrary(tmp_path / "cache").load(str(tmp_path / "gone.obj")) == []
@@ -148,6 +149,17 @@ def test_materials_normals_and_solidity(cube: Path) -> None:
     assert (mesh.colors[~flat] == [0, 255, 0, 255]).all()
     painted = mesh.tinted((0.0, 0.0, 1.0, 1.0))
     assert (painted.colors == [0, 0, 255, 255]).all()  # the URDF's colour replaces the file's
+
+
+def test_a_collada_file_keeps_its_units_its_nodes_scale_and_its_colours(tmp_path: Path) -> None:
+    part = tmp_path / "part.dae"
+    part.write_text(COLLADA)
+    (mesh,) = parse(str(part))
+    assert np.ptp(mesh.positions, axis=0) == pytest.approx([0.02, 0.02, 0.06])
+    assert volume(mesh) == pytest.approx(0.02 * 0.02 * 0.06 / 6.0)
+    assert (mesh.colors == [255, 0, 0, 255]).all()
+    slope = np.array([3.0, 3.0, 1.0]) / np.sqrt(19.0)
+    assert np.linalg.norm(mesh.normals - slope, axis=1).min() < 1e-6, "the normal of the stretched face"
 
 
 def test_primitives_have_their_volume_and_look_outwards() -> None:

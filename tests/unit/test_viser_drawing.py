@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import trimesh
+from pictures_kit import COLLADA
 from specs import data, panda
 
 from hal.drivers.viser.meshes import glb
@@ -52,6 +53,14 @@ def test_an_arms_meshes_keep_their_place_and_their_colours() -> None:
     assert (np.ptp(shades, axis=1) < 20).all()  # greys
     assert shades.min() < 70  # the dark pad, in linear numbers
     assert shades.max() > 180  # the white rest
+
+
+def test_a_collada_file_keeps_its_units_and_its_colours(tmp_path: Path) -> None:
+    part = tmp_path / "part.dae"
+    part.write_text(COLLADA)
+    scene = loaded(Visual(Pose(), "mesh", (1.0, 1.0, 1.0), None, str(part)))
+    assert scene.extents == pytest.approx([0.02, 0.02, 0.06])
+    assert (colors(scene) == (255, 0, 0)).all()
 
 
 def test_few_large_triangles_keep_their_picture() -> None:
