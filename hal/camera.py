@@ -57,7 +57,7 @@ class Camera:
     """One camera of a rig, the same whatever driver it ends in. Made by :func:`hal.open`.
 
     In real time a thread of its own takes every frame from the driver, so a slow camera never holds up its reader,
-    and ``latest`` never waits. In lock-step ``read`` draws the present state of the world.
+    and ``latest`` never waits. In lock-step both return the present state of the world, which is drawn once.
 
     A camera that is lost (unplugged, reset, silent) raises ConnectionLost from ``read`` and ``latest``, is looked for
     in the background for half an hour, and then works again, the same object.
@@ -72,6 +72,8 @@ class Camera:
         self._place = place
         self._news = threading.Condition()
         self._newest: Frame | None = None
+        self._raw: RawFrame | None = None
+        """What the driver gave for the newest frame."""
         self._handed_out = -1
         self._error: ConnectionLost | None = None
         self._closing = threading.Event()
@@ -132,8 +134,7 @@ class Camera:
         Raises StaleStateError when it is older than ``max_age`` s, ConnectionLost when the camera is gone.
         """
         if not self._threaded:
-            newest = self._newest
-            return newest if newest is not None and newest.stamp.t == self.clock.now() else self._grab(1.0)
+            return self._grab(1.0)
         with self._news:
             if self._error is not None:
                 raise self._error
@@ -222,8 +223,11 @@ class Camera:
                     raw = self._driver.grab(max(0.0, rest))
                     if raw is None or (after is not None and raw.t < after and rest < 0.0):
                         raise StaleStateError(f"camera {self.name} took no frame within {timeout:g} s")
-                    frame = self._take(raw)
-                    self._call(self._listeners, frame)
+                    if raw is self._raw and self._newest is not None:
+                        frame = self._newest  # nothing has changed since it was drawn
+                    else:
+                        frame = self._take(raw)
+                        self._call(self._listeners, frame)
                     if after is None or raw.t >= after or not self._driver.on_demand:
                         self._handed_out = frame.stamp.seq
                         return frame
@@ -296,7 +300,7 @@ class Camera:
         frame = self._frame(raw)
         with self._news:
             back, self._error = self._error is not None, None
-            self._newest = frame
+            self._newest, self._raw = frame, raw
             self._reconnects += back
             self._news.notify_all()
         if back:

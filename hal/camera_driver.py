@@ -83,6 +83,8 @@ class CameraDriver(ABC):
     def grab(self, timeout: float) -> RawFrame | None:
         """The newest frame that was not handed out yet; waits up to ``timeout`` s, then None.
 
+        In lock-step, a simulated camera returns the same frame again while nothing in the world has changed.
+
         Raises :class:`~hal.errors.ConnectionLost` when the device is gone, or so silent that it must be opened anew.
         """
 

@@ -68,7 +68,7 @@ class PyBulletCamera(CameraDriver):
 
 
 class DirectSource:
-    """Lock-step: draws the present state of the world, in the caller's thread."""
+    """Lock-step: draws the present state of the world, in the caller's thread, and each state once."""
 
     def __init__(self, world: World, renderer: Renderer, spec: CameraSpec, now: Callable[[], float]) -> None:
         check_view(world, spec)
@@ -77,10 +77,16 @@ class DirectSource:
         self._exposure = Exposure(spec)
         self._now = now
         self._seq = 0
+        self._drawn: tuple[tuple[int, int], RawFrame] | None = None
+        """The newest frame, and the world's version that it shows."""
 
     def grab(self, timeout: float) -> RawFrame:
-        self._seq += 1
-        return self._exposure.take(self._world, self._renderer, self._now(), self._world.t, self._seq)
+        version = self._world.version
+        if self._drawn is None or self._drawn[0] != version:
+            self._seq += 1
+            frame = self._exposure.take(self._world, self._renderer, self._now(), self._world.t, self._seq)
+            self._drawn = version, frame
+        return self._drawn[1]
 
 
 class SharedSource:

@@ -62,6 +62,7 @@ class World:
         """One physics step, s."""
         self.steps = 0
         self.revision = 0
+        self._changes = 0
         self.bodies: dict[str, Body] = {}
         self.warnings: list[str] = []
         """What a person should know about the files that were loaded."""
@@ -122,6 +123,11 @@ class World:
     def t(self) -> float:
         """Simulated time, s."""
         return self.steps * self.dt
+
+    @property
+    def version(self) -> tuple[int, int]:
+        """Differs from an earlier one if anything may look different since: after a step, an edit or a reset."""
+        return self.steps, self._changes
 
     def step(self) -> None:
         """One physics step."""
@@ -261,6 +267,7 @@ class World:
         return self._edited()
 
     def _edited(self) -> int:
+        self._changes += 1
         self.revision += 1
         return self.revision
 
@@ -324,6 +331,7 @@ class World:
             self.body(name)
             raise CommandError(f"{name!r} is not the copy of a real arm")
         copy.follow(q, dq, width)
+        self._changes += 1
 
     def body(self, name: str) -> Body:
         """The body of that name, or a DeviceNotFound that lists all."""
@@ -369,6 +377,7 @@ class World:
         self._put(body, body.base, body.home)
 
     def _put(self, body: Body, base: Transform, joints: Mapping[int, float]) -> None:
+        self._changes += 1
         if not body.carried:
             self._set_base(body, base)
         for joint, position in joints.items():
@@ -379,6 +388,7 @@ class World:
             callback()
 
     def _set_base(self, body: Body, base: Transform) -> None:
+        self._changes += 1
         body.set_base_pose(self.client, base)
         if body.floating:
             self.client.resetBaseVelocity(body.id, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))

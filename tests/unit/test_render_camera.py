@@ -44,16 +44,13 @@ class TestDirect:
         scene = world(ball("ball", 0.0))
         driver = direct(scene, camera(view=FROM_ABOVE))
         first = driver.grab(0.0)
-        again = driver.grab(0.0)
         for _ in range(48):
             scene.step()
         later = driver.grab(0.0)
         assert first is not None
-        assert again is not None
         assert later is not None
         assert (first.t, first.t_device) == (10.0, 0.0)
-        assert (again.t, again.seq) == (first.t, first.seq + 1)
-        assert np.array_equal(first.depth, again.depth)
+        assert later.seq == first.seq + 1
         assert later.t_device == pytest.approx(0.2)
         assert later.t == pytest.approx(10.2)
         assert later.depth is not None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -9,6 +10,8 @@ import numpy as np
 import pytest
 from pictures_kit import box, look_at, renderer, world
 
+from hal.camera import Camera
+from hal.clock import LockStepClock
 from hal.config import load
 from hal.drivers.pybullet import render_worker
 from hal.drivers.pybullet.camera import DirectSource, PyBulletCamera, SharedSource
@@ -23,6 +26,7 @@ from hal.host.frames import FrameRing
 from hal.host.mailbox import SeriesBox
 from hal.pose import Pose
 from hal.specs import BodySpec, CameraSpec
+from hal.types import Frame
 
 EYE = look_at((0.0, 0.0, 1.0), (0.0, 0.0, 0.0), (0.0, 1.0, 0.0))  # straight down: x is right, y up in the picture
 SMALL = {"width": 160, "height": 120}
@@ -146,6 +150,33 @@ def test_without_noise_depth_is_as_it_is_drawn() -> None:
     assert both.mean() > 0.8
     assert 0.0005 < np.abs(takes[0] - plain)[both].mean() < 0.01
     assert np.array_equal(drawing.render(spec, EYE).depth, plain), "the picture that was drawn is not written to"
+    scene.close()
+
+
+def test_in_lock_step_a_picture_of_one_state_of_the_world_is_drawn_once() -> None:
+    scene = world(*things())
+    drawing, spec = Counting(), camera(streams=["color", "depth"])
+    clock = LockStepClock(lambda: scene.t, lambda t: None)
+    public = Camera(PyBulletCamera(spec, DirectSource(scene, drawing, spec, clock.now)), clock, threaded=False)
+    public.open()
+    heard: list[Frame] = []
+    public.on_frame(heard.append)
+    elsewhere = {"position": (1.0, 0.0, 0.5), "orientation": (0.0, 0.0, 0.0, 1.0)}
+    changes: list[Callable[[], object]] = [
+        lambda: None,
+        scene.step,
+        lambda: scene.set_pose("brick", elsewhere),
+        lambda: scene.set_color("brick", (1.0, 0.0, 0.0, 1.0)),
+        lambda: scene.reset("brick"),
+        scene.reset,
+        lambda: scene.remove("brick"),
+    ]
+    for number, change in enumerate(changes, start=1):
+        change()
+        frame = public.read()
+        assert public.read() is frame
+        assert public.latest() is frame
+        assert len(drawing.asked) == len(heard) == public.counts().frames == number
     scene.close()
 
 
