@@ -15,7 +15,7 @@ import numpy as np
 from pydantic import BaseModel, BeforeValidator, Field, model_validator
 
 from hal.config.files import Problems
-from hal.config.schema import Positive, Strict, Vector, describe, is_number
+from hal.config.schema import Offset, Size, Strict, describe, is_number
 from hal.config.validation import validate
 from hal.errors import ConfigError
 from hal.specs import Floats, GripperSpec, RobotSpec
@@ -109,7 +109,7 @@ class Load(Strict):
 
     mass: float = Field(ge=0.0, le=3.0, strict=True)
     """kg; both arms' data sheets give a payload of 3 kg."""
-    com: Vector = (0.0, 0.0, 0.0)
+    com: Offset = (0.0, 0.0, 0.0)
     """Centre of mass in the frame of the flange, m."""
     inertia: Annotated[Floats, _each("xx, yy, zz, xy, xz, yz in kg m2", *[(0.0, 10.0)] * 3, *[(-10.0, 10.0)] * 3)] = (
         0.0,
@@ -162,7 +162,7 @@ class HandSettings(Strict):
     """``real:`` of a gripper. The arm's host is put in where none is given."""
 
     host: Host
-    tolerance: Positive = 0.002
+    tolerance: Size = 0.002
     """How far from the width that was asked for the fingers may end and still be there, m."""
 
     @classmethod

@@ -12,7 +12,7 @@ from typing import Annotated, Any
 from pydantic import BeforeValidator, Field, model_validator
 
 from hal.config.files import Problems
-from hal.config.schema import Flag, Positive, Strict, describe, is_number
+from hal.config.schema import Flag, Quantity, Seconds, Strict, describe, is_number
 from hal.config.validation import validate
 from hal.errors import CommandError, ConfigError
 from hal.specs import CameraSpec
@@ -86,9 +86,9 @@ class RealSenseSettings(Strict):
     """Which one; needed where several are plugged in."""
     options: Annotated[dict[str, Any], BeforeValidator(_options)] = Field(default_factory=dict)
     """What the camera is told before it streams, see :mod:`.options`."""
-    warm_up_s: Annotated[float, Field(strict=True, ge=0.0)] = 1.0
+    warm_up_s: Annotated[float, Quantity("s", 0.0, 60.0)] = 1.0
     """For so long after the first picture none is handed out, while automatic exposure settles."""
-    stall_s: Positive = 1.0
+    stall_s: Seconds = 1.0
     """A camera that sends nothing new for so long counts as lost."""
     record: Annotated[str | None, BeforeValidator(_recording)] = None
     """File that everything streamed is written to."""

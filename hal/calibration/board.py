@@ -12,7 +12,7 @@ from pydantic import Field, model_validator
 
 from ..config.data_files import data_folder, is_path
 from ..config.files import Problems, read_yaml
-from ..config.schema import Pixels, Positive, Strict
+from ..config.schema import Pixels, Size, Strict
 from ..config.validation import validate
 from ..errors import CommandError
 from .library import opencv
@@ -103,8 +103,8 @@ class BoardConfig(Strict):
     description: str = ""
     columns: Pixels = Field(ge=3, le=50)
     rows: Pixels = Field(ge=3, le=50)
-    square: Positive
-    marker: Positive
+    square: Size
+    marker: Size
     dictionary: str = "DICT_4X4_50"
 
     @model_validator(mode="after")

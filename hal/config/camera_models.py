@@ -10,7 +10,20 @@ from typing import Annotated, Any, Literal, NamedTuple
 from pydantic import BeforeValidator, Field, model_validator
 
 from .models import Drivers
-from .schema import Flag, Numbers, Pixels, Positive, QuaternionConfig, Strict, Unknown, Vector
+from .schema import (
+    CameraRate,
+    Distance,
+    Flag,
+    Offset,
+    Pixels,
+    Quantity,
+    QuaternionConfig,
+    Several,
+    Size,
+    Strict,
+    Unknown,
+    ViewAngle,
+)
 
 __all__ = [
     "CameraModel",
@@ -31,8 +44,8 @@ class Mode(Strict):
 
     width: Pixels
     height: Pixels
-    rates_hz: tuple[Positive, ...] = Field(min_length=1)
-    depth_min: Positive | None = None
+    rates_hz: tuple[CameraRate, ...] = Field(min_length=1)
+    depth_min: Distance | None = None
     """Nearest depth in this mode, m; the model's when left out."""
 
     def __str__(self) -> str:
@@ -46,8 +59,8 @@ class FieldOfView(Strict):
     centre. Left out, every mode shows the same angles. One angle alone means square pixels.
     """
 
-    horizontal_deg: float | None = Field(default=None, gt=0.0, lt=180.0, strict=True)
-    vertical_deg: float | None = Field(default=None, gt=0.0, lt=180.0, strict=True)
+    horizontal_deg: ViewAngle | None = None
+    vertical_deg: ViewAngle | None = None
     width: Pixels | None = None
     height: Pixels | None = None
 
@@ -63,8 +76,8 @@ class FieldOfView(Strict):
 class Depth(Strict):
     """What can be measured, m."""
 
-    min: Positive
-    max: Positive
+    min: Distance
+    max: Annotated[float, Quantity("m", 0.0, 1000.0, above=True)]
 
     @model_validator(mode="after")
     def _ordered(self) -> Depth:
@@ -78,7 +91,7 @@ class Capture(Strict):
 
     width: Pixels
     height: Pixels
-    rate_hz: Positive
+    rate_hz: CameraRate
 
     def __str__(self) -> str:
         return f"{self.width}x{self.height} at {self.rate_hz:g} Hz"
@@ -103,7 +116,7 @@ class StreamModel(Strict):
     formats: tuple[str, ...] | None = None
     """Names of librealsense (``z16``); None where anything goes."""
     field_of_view: FieldOfView | None = None
-    position: Vector | None = None
+    position: Offset | None = None
     orientation: QuaternionConfig | None = None
     """Pose of this sensor's optical frame (x right, y down, z forward) in that of the colour sensor, m."""
 
@@ -113,7 +126,7 @@ class DepthSensor(Strict):
 
     kind: Literal["stereo", "lidar"]
     """``stereo``: from ``infrared`` and ``infrared_right``, seen from the former."""
-    unit: Positive
+    unit: Size
     """Metres in one unit of the raw picture."""
 
 
@@ -136,7 +149,13 @@ class CameraModel(Strict):
     """What it takes unless a rig says otherwise."""
     field_of_view: FieldOfView | None = None
     """Of every stream that has none of its own."""
-    distortion: Numbers = (0.0, 0.0, 0.0, 0.0, 0.0)
+    distortion: Annotated[tuple[float, ...], Several(Quantity("", -1e3, 1e3), 5, "k1, k2, p1, p2, k3")] = (
+        0.0,
+        0.0,
+        0.0,
+        0.0,
+        0.0,
+    )
     """k1, k2, p1, p2, k3 (OpenCV's order)."""
     depth: Depth
     streams: Annotated[dict[SensorStream, StreamModel], BeforeValidator(by_name)] = Field(default_factory=_three)
@@ -149,8 +168,6 @@ class CameraModel(Strict):
 
     @model_validator(mode="after")
     def _complete(self) -> CameraModel:
-        if len(self.distortion) != 5:
-            raise ValueError(f"distortion must be 5 numbers k1, k2, p1, p2, k3, not {len(self.distortion)}")
         for name in self.streams:
             if self._of(name, "field_of_view") is None:
                 raise ValueError(f"needs field_of_view, or one in streams.{name}")

@@ -8,14 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import Field, field_validator, model_validator
 
 from ..types import AXES, BUTTONS, PadState
 from .data_files import data_folder, is_path, list_data
 from .files import Problems, nearest, read_yaml
-from .schema import Flag, Positive, Strict
+from .schema import Flag, Quantity, Strict
 from .validation import validate
 
 __all__ = ["AxisMapping", "DirectionsMapping", "GripperMapping", "TeleopMapping", "TurnsMapping", "load_mapping"]
@@ -28,7 +28,7 @@ class AxisMapping(Strict):
     """Name of an axis: -1..1 for sticks and d-pad, 0..1 for triggers."""
     buttons: tuple[str, str] | None = None
     """Two buttons: the first moves backwards, the second forwards."""
-    scale: Positive
+    scale: Annotated[float, Quantity("m/s or rad/s", 0.0, 10.0, above=True)]
     """Speed at the end of the axis, or while the button is held: m/s or rad/s."""
     invert: Flag = False
 

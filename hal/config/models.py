@@ -12,14 +12,21 @@ from pydantic import Field, model_validator
 from .data_files import data_folder, is_path, list_data
 from .files import Problems, nearest, read_yaml
 from .schema import (
+    Accelerations,
+    Force,
+    Jerks,
+    JointLimits,
+    JointPositions,
     Name,
-    Numbers,
-    PerJoint,
+    Offset,
     PoseConfig,
-    Positive,
     QuaternionConfig,
+    RateHz,
+    Size,
+    Speed,
     Strict,
-    Vector,
+    Torques,
+    Velocities,
 )
 
 __all__ = [
@@ -59,19 +66,19 @@ class LimitsModel(Strict):
     Position, speed and torque come from the URDF where they are left out; acceleration and jerk must be given.
     """
 
-    lower: PerJoint | None = None
-    upper: PerJoint | None = None
-    velocity: PerJoint | None = None
-    acceleration: PerJoint | None = None
-    jerk: PerJoint | None = None
-    torque: PerJoint | None = None
+    lower: JointLimits | None = None
+    upper: JointLimits | None = None
+    velocity: Velocities | None = None
+    acceleration: Accelerations | None = None
+    jerk: Jerks | None = None
+    torque: Torques | None = None
 
 
 class TcpModel(Strict):
     """The tool centre point in the frame of a link."""
 
     link: str
-    position: Vector = (0.0, 0.0, 0.0)
+    position: Offset = (0.0, 0.0, 0.0)
     orientation: QuaternionConfig = (0.0, 0.0, 0.0, 1.0)
 
 
@@ -80,11 +87,11 @@ class GripperModel(Strict):
 
     joints: tuple[str, ...] = ()
     drivers: Drivers = Drivers()
-    width_max: Positive
+    width_max: Size
     """m"""
-    speed: Positive
+    speed: Speed
     """Of the width, m/s."""
-    force: Positive
+    force: Force
     """N"""
     real: dict[str, Any] = Field(default_factory=dict)
     simulated: dict[str, Any] = Field(default_factory=dict)
@@ -96,14 +103,14 @@ class RobotModel(Strict):
     description: str = ""
     urdf: UrdfSource
     drivers: Drivers = Drivers()
-    rate_hz: Positive = 1000.0
+    rate_hz: RateHz = 1000.0
     """Of the real arm's control cycle. A simulated one runs at the rig's ``physics_hz``."""
     joints: tuple[Name, ...] = Field(min_length=1)
     """Of the arm, from base to tip; the fingers are the gripper's."""
     base_link: str | None = None
     """The URDF's root when left out."""
     tcp: TcpModel
-    home: Numbers
+    home: JointPositions
     """rad"""
     links: dict[Name, str] = Field(default_factory=dict)
     """Other names for links, which a rig can use in ``attached`` whatever the model: ``{hand: panda_hand}``."""

@@ -16,16 +16,18 @@ from .files import Problems, nearest, read_yaml
 from .models import UrdfSource
 from .random_poses import RandomPose
 from .schema import (
+    Factor,
     Flag,
+    Mass,
     Name,
-    Number,
     PoseConfig,
-    Positive,
+    Position,
     QuaternionConfig,
     Rgba,
+    Size,
+    Sizes,
     Strict,
     Unknown,
-    Vector,
     describe,
 )
 from .sources import locate_urdf
@@ -64,19 +66,19 @@ class ObjectConfig(Strict):
     name: Name
     shape: Literal["box", "sphere", "cylinder", "capsule", "plane", "urdf"]
     """May be left out where ``urdf`` is given."""
-    half_extents: Vector | None = None
+    half_extents: Sizes | None = None
     """Of a box."""
-    radius: Positive | None = None
+    radius: Size | None = None
     """Of a sphere, a cylinder or a capsule."""
-    length: Positive | None = None
+    length: Size | None = None
     """Of a cylinder, or of a capsule without its caps."""
     urdf: UrdfSource | None = None
-    scale: Positive | None = None
+    scale: Factor | None = None
     """Of a URDF."""
-    mass: Number | None = None
+    mass: Mass | None = None
     """kg; 0, or left out, stands still. A URDF brings its own."""
     fixed: Flag = False
-    position: Vector = (0.0, 0.0, 0.0)
+    position: Position = (0.0, 0.0, 0.0)
     orientation: QuaternionConfig = (0.0, 0.0, 0.0, 1.0)
     pose: PoseConfig | None = None
     """Both in one."""
@@ -102,10 +104,8 @@ class ObjectConfig(Strict):
             wants = ", ".join(needed) or "no size"
             wrong = [*(f"{key} is missing" for key in missing), *(f"{key} has no meaning" for key in extra)]
             raise ValueError(f"a {self.shape} has {wants}: {', '.join(wrong)}")
-        if self.half_extents is not None and min(self.half_extents) <= 0.0:
-            raise ValueError("half_extents must be above 0")
-        if self.mass is not None and (self.mass < 0.0 or self.shape == "urdf"):
-            raise ValueError("mass must not be negative" if self.mass < 0.0 else "a urdf brings its own mass")
+        if self.mass is not None and self.shape == "urdf":
+            raise ValueError("a urdf brings its own mass")
         if self.scale is not None and self.shape != "urdf":
             raise ValueError(f"scale is for a urdf; a {self.shape} has its size in m")
         if self.attached is not None and self.shape == "plane":

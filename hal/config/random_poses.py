@@ -3,37 +3,29 @@
 from __future__ import annotations
 
 import math
-from typing import Annotated, Any
+from typing import Annotated
 
-from pydantic import BeforeValidator, model_validator
+from pydantic import AfterValidator, model_validator
 
-from ..specs import RangesSpec
-from .schema import Strict, Vector, describe, is_number
+from ..specs import RangesSpec, Vector3
+from .schema import Quantity, Several, Strict
 
 __all__ = ["RandomPose"]
 
 
-def _range(value: Any) -> tuple[float, float]:
-    if not isinstance(value, (list, tuple)) or len(value) != 2:
-        raise ValueError(f"must be two numbers, the least and the greatest, not {describe(value)}")
-    for item in value:
-        if not is_number(item):
-            raise ValueError(f"must be two numbers, the least and the greatest; one is {describe(item)}")
-    least, greatest = float(value[0]), float(value[1])
+_ENDS = "the least and the greatest"
+
+
+def _ordered(ends: tuple[float, float]) -> tuple[float, float]:
+    least, greatest = ends
     if least > greatest:
-        raise ValueError(f"must be the least and the greatest; {least:g} is above {greatest:g}")
-    return least, greatest
+        raise ValueError(f"must be {_ENDS}; {least:g} is above {greatest:g}")
+    return ends
 
 
-def _turn(value: Any) -> tuple[float, float]:
-    least, greatest = _range(value)
-    if least < -360.0 or greatest > 360.0:
-        raise ValueError(f"must be within -360 and 360 degrees, not {least:g} to {greatest:g}")
-    return least, greatest
-
-
-Range = Annotated[tuple[float, float], BeforeValidator(_range)]
-Turn = Annotated[tuple[float, float], BeforeValidator(_turn)]
+_Two = tuple[float, float]
+Range = Annotated[_Two, Several(Quantity("m", -50.0, 50.0), 2, _ENDS), AfterValidator(_ordered)]
+Turn = Annotated[_Two, Several(Quantity("deg", -360.0, 360.0), 2, _ENDS), AfterValidator(_ordered)]
 
 
 class RandomPose(Strict):
@@ -54,7 +46,7 @@ class RandomPose(Strict):
             raise ValueError(f"holds no range; keys: {', '.join(type(self).model_fields)}")
         return self
 
-    def around(self, position: Vector) -> RangesSpec:
+    def around(self, position: Vector3) -> RangesSpec:
         """The ranges of a thing that is configured at ``position``."""
         places = [given or (value, value) for given, value in zip((self.x, self.y, self.z), position, strict=True)]
         turns = [given or (0.0, 0.0) for given in (self.roll_deg, self.pitch_deg, self.yaw_deg)]

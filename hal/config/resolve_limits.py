@@ -11,7 +11,7 @@ from ..specs import Floats, LimitsSpec
 from .files import Problems
 from .models import LimitsModel, RobotModel
 from .rigfile import LimitsConfig, RobotConfig
-from .schema import Unknown
+from .schema import Quantity, Unknown
 from .urdf import UrdfModel
 
 __all__ = ["resolve_limits", "spread"]
@@ -24,6 +24,16 @@ UNITS = {
     "jerk": "rad/s3",
     "torque": "Nm",
 }
+MOST_REAL = {
+    "velocity": Quantity("rad/s", 0.0, 15.0, above=True),
+    "acceleration": Quantity("rad/s2", 0.0, 100.0, above=True),
+    "jerk": Quantity("rad/s3", 0.0, 20000.0, above=True),
+    "torque": Quantity("Nm", 0.0, 1000.0, above=True),
+}
+"""What no file can loosen on a real arm, wherever a limit is from. The fastest joints of arms on a bench reach about
+12 rad/s; a Panda's jerk limit is 10000 rad/s3."""
+MOST_REAL_TCP_SPEED = Quantity("m/s", 0.0, 1.5, above=True)
+"""Below the 1.7 m/s at which a Panda stops by itself; 0.25 m/s is ISO 10218's reduced speed."""
 ENDLESS = 1e4
 """rad; the limit of a joint that turns without end."""
 
@@ -60,8 +70,6 @@ def resolve_limits(
             if getattr(model.limits, name, ()) is None:
                 text = f"is missing: {UNITS[name]}, one number for each joint or one for all; a URDF does not hold it"
                 problems.add(file, f"limits.{name}", text)
-    with suppress(Unknown):
-        _check_positive(model.limits, file, "limits", problems)
     limits = {name: _of_model(model, urdf, name, file, problems) for name in UNITS}
     _check_order(limits, model.joints, file, "limits", problems)
     own = dict(limits)  # looked at in simulation, too, so that mistakes are found there
@@ -72,6 +80,16 @@ def resolve_limits(
     with suppress(Unknown):
         rule = None if getattr(config.limits, "allow_looser_limits", True) else _LOOSER_THAN_MODEL
         _tighten(limits, config.limits, model.joints, source, key, problems, rule)
+    if real:
+        given = getattr(config, "limits", LimitsConfig()).model_fields_set
+        for name, most in MOST_REAL.items():
+            fast = [value for value in limits[name] or () if value > most.most]
+            if fast:
+                text = f"must be {most} for every joint of a real arm, not {max(fast):g}"
+                if name in given:
+                    problems.add(source, f"{key}.{name}", text)
+                else:
+                    problems.add(file, f"limits.{name}", text)
     return LimitsSpec(**limits)  # type: ignore[arg-type]  # None only for torque, which may be
 
 
@@ -93,7 +111,6 @@ def _tighten(
     rule: tuple[str, str] | None,
 ) -> None:
     """Put ``changes`` in place of those of ``limits``, in place; where there is a ``rule``, looser ones are noted."""
-    _check_positive(changes, file, key, problems)
     for name, unit in UNITS.items():
         changed: Floats | None = getattr(changes, name, None)
         if changed is None:
@@ -106,12 +123,6 @@ def _tighten(
         limits[name] = values
     if not {"lower", "upper"}.isdisjoint(changes.model_fields_set):
         _check_order(limits, joints, file, key, problems)
-
-
-def _check_positive(limits: LimitsModel | LimitsConfig, file: Path | str, key: str, problems: Problems) -> None:
-    for name in ("velocity", "acceleration", "jerk", "torque"):
-        if any(value <= 0.0 for value in getattr(limits, name, None) or ()):
-            problems.add(file, f"{key}.{name}", f"must be above 0 ({UNITS[name]}) for every joint")
 
 
 def _check_tighter(
@@ -155,8 +166,7 @@ def _of_model(model: RobotModel, urdf: UrdfModel | None, name: str, file: Path, 
     with suppress(Unknown):
         own: Floats | None = getattr(model.limits, name)
         if own is not None:
-            values = spread(own, n, file, f"limits.{name}", UNITS[name], problems, one_for_all=True) or unknown
-            return tuple(value if name in ("lower", "upper") or value > 0.0 else math.nan for value in values)
+            return spread(own, n, file, f"limits.{name}", UNITS[name], problems, one_for_all=True) or unknown
         if urdf is not None and name not in ("acceleration", "jerk"):
             return _from_urdf(model, urdf, name, file, problems)
     return unknown

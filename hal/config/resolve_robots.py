@@ -12,7 +12,7 @@ from .context import Context
 from .driver_options import SHARED, ask_driver, is_emulated, options_of
 from .files import Problems, nearest
 from .models import RobotModel
-from .resolve_limits import resolve_limits, spread
+from .resolve_limits import MOST_REAL_TCP_SPEED, resolve_limits, spread
 from .rigfile import RobotConfig, WorkspaceConfig
 from .schema import Unknown
 from .sources import locate_urdf
@@ -44,6 +44,11 @@ def resolve_robot(context: Context, name: str, config: RobotConfig) -> RobotSpec
     simulated = True
     with suppress(Unknown):
         simulated = context.simulated(config)
+    with suppress(Unknown):
+        if not simulated and config.tcp_speed not in MOST_REAL_TCP_SPEED:
+            context.problem(
+                f"{key}.tcp_speed", f"must be {MOST_REAL_TCP_SPEED} on a real arm, not {config.tcp_speed:g}"
+            )
     limits, home, initial = _joint_numbers(context, key, config, model, file, urdf, simulated)
     driver = context.choose_driver("robot", key, config, model)
     gripper_driver = _check_gripper(context, f"{key}.gripper", config, model)

@@ -22,17 +22,27 @@ from pydantic import BeforeValidator, Field, model_validator
 from .camera_models import Capture, Depth, FieldOfView, by_name
 from .models import Drivers
 from .schema import (
+    Accelerations,
+    CameraRate,
+    Coordinate,
     Flag,
+    Force,
+    Gravity,
+    Jerks,
+    JointLimits,
+    JointPositions,
     Name,
-    Number,
-    Numbers,
-    PerJoint,
     Pixels,
     PoseConfig,
-    Positive,
+    Position,
+    Quantity,
+    RateHz,
     Share,
+    Speed,
     Strict,
-    Vector,
+    TcpSpeed,
+    Torques,
+    Velocities,
     describe,
 )
 from .views import Attached, LookAt
@@ -65,12 +75,12 @@ class Device(Strict):
 class LimitsConfig(Strict):
     """Tighter limits than the model's, per joint or one number for all; rad, rad/s, rad/s2, rad/s3, Nm."""
 
-    lower: PerJoint | None = None
-    upper: PerJoint | None = None
-    velocity: PerJoint | None = None
-    acceleration: PerJoint | None = None
-    jerk: PerJoint | None = None
-    torque: PerJoint | None = None
+    lower: JointLimits | None = None
+    upper: JointLimits | None = None
+    velocity: Velocities | None = None
+    acceleration: Accelerations | None = None
+    jerk: Jerks | None = None
+    torque: Torques | None = None
     allow_looser_limits: Flag = False
     """Without it a limit may only be tighter than the model's."""
 
@@ -78,9 +88,9 @@ class LimitsConfig(Strict):
 class WorkspaceConfig(Strict):
     """Where the tcp may be, in the arm's base frame, m."""
 
-    lower: Vector | None = None
-    upper: Vector | None = None
-    table_height: Number | None = None
+    lower: Position | None = None
+    upper: Position | None = None
+    table_height: Coordinate | None = None
     """Of a plane that the tcp stays above."""
 
 
@@ -88,9 +98,9 @@ class GripperConfig(Device):
     """The model's gripper on this arm."""
 
     enabled: Flag = True
-    speed: Positive | None = None
+    speed: Speed | None = None
     """Of the width, m/s; at most the model's."""
-    force: Positive | None = None
+    force: Force | None = None
     """N"""
 
 
@@ -101,16 +111,16 @@ class RobotConfig(Device):
     """A name in ``robots/``, or the path of a file of your own."""
     base: PoseConfig = PoseConfig()
     """Of the base link in the world."""
-    initial: Numbers | None = None
+    initial: JointPositions | None = None
     """Joint positions at the start of a simulation, rad; home when left out."""
-    rate_hz: Positive | None = None
+    rate_hz: RateHz | None = None
     """Of a real arm's control cycle; the model's when left out."""
     gripper: GripperConfig = GripperConfig()
     speed: Share = 0.3
     """Greatest share of the joint speed limits in a control session."""
     move_speed: Share = 0.1
     """Share of the joint speed limits in ``move_to`` unless told otherwise."""
-    tcp_speed: Positive = 0.25
+    tcp_speed: TcpSpeed = 0.25
     """Greatest speed of the tcp, m/s (ISO 10218's reduced speed)."""
     limits: LimitsConfig = LimitsConfig()
     workspace: WorkspaceConfig | None = None
@@ -130,7 +140,7 @@ class StreamConfig(Strict):
     """Of the real camera (``bgr8``, ``z16``, ...). Frames are RGB and metres whatever it is."""
     width: Pixels | None = None
     height: Pixels | None = None
-    rate_hz: Positive | None = None
+    rate_hz: CameraRate | None = None
 
     @model_validator(mode="after")
     def _whole_size(self) -> StreamConfig:
@@ -185,7 +195,7 @@ class PadConfig(Strict):
     """``auto``, ``evdev``, ``keyboard``, ``playback`` or another driver."""
     file: str | None = None
     """The recording that ``playback`` plays."""
-    dead_zone: float = Field(default=0.08, ge=0.0, lt=1.0, strict=True)
+    dead_zone: Annotated[float, Quantity("", 0.0, 0.9)] = 0.08
     """Share of a stick's way that counts as its rest."""
     options: dict[str, Any] = Field(default_factory=dict)
     """What only this driver needs."""
@@ -194,9 +204,9 @@ class PadConfig(Strict):
 class SimulationConfig(Strict):
     """The simulated world."""
 
-    physics_hz: float = Field(default=240.0, ge=50.0, le=10000.0, strict=True)
+    physics_hz: Annotated[float, Quantity("Hz", 50.0, 10000.0)] = 240.0
     """Steps of the simulation, and of the servos in it, per second."""
-    gravity: Vector = (0.0, 0.0, -9.81)
+    gravity: Gravity = (0.0, 0.0, -9.81)
     """m/s2"""
     clock: Literal["real_time", "lock_step"] | None = None
     """``lock_step``: time stands still until somebody waits. Left out: real time, and lock-step for the mock."""

@@ -1,29 +1,60 @@
-"""What the schemas of all YAML files are built from: strict records, vectors, poses; units stand in the docs."""
+"""What the schemas of all YAML files are built from: strict records, quantities with their units, vectors, poses."""
 
 from __future__ import annotations
 
 import math
 import typing
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Any
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    ConfigDict,
+    Field,
+    GetCoreSchemaHandler,
+    GetJsonSchemaHandler,
+    model_validator,
+)
+from pydantic_core import CoreSchema, core_schema
 
 __all__ = [
+    "Accelerations",
+    "CameraRate",
+    "Coordinate",
+    "Degrees",
+    "Direction",
+    "Distance",
+    "Factor",
     "Flag",
+    "Force",
+    "Gravity",
+    "Jerks",
+    "JointLimits",
+    "JointPositions",
+    "Mass",
     "Name",
-    "Number",
-    "Numbers",
-    "PerJoint",
+    "Offset",
     "Pixels",
     "PoseConfig",
-    "Positive",
+    "Position",
+    "Quantity",
     "QuaternionConfig",
+    "RateHz",
     "Rgba",
+    "Seconds",
+    "Several",
     "Share",
+    "Size",
+    "Sizes",
+    "Speed",
     "Strict",
+    "TcpSpeed",
+    "Torques",
     "Unknown",
-    "Vector",
+    "Velocities",
+    "ViewAngle",
     "describe",
     "is_number",
     "keys_at",
@@ -59,6 +90,8 @@ def describe(value: Any) -> str:
         return f"a list of {len(value)}"
     if isinstance(value, dict):
         return "keys and values"
+    if isinstance(value, int) and not -1e12 < value < 1e12:
+        return f"a whole number of about {math.ceil(value.bit_length() * math.log10(2))} digits"
     text = repr(value)
     return text if len(text) <= 60 else text[:57] + "..."
 
@@ -68,69 +101,176 @@ def is_number(value: Any) -> bool:
     return isinstance(value, (int, float)) and not isinstance(value, bool) and -1e12 < value < 1e12
 
 
-def _numbers(count: int | None, what: str) -> Callable[[Any], tuple[float, ...]]:
-    """A validator of a list of finite numbers."""
+_SMALLER = {
+    "m": ("mm", 1e-3),
+    "m/s": ("mm/s", 1e-3),
+    "kg": ("g", 1e-3),
+    "rad": ("deg", math.pi / 180.0),
+    "rad/s": ("deg/s", math.pi / 180.0),
+}
+"""Units that are mistaken for others: what a value out of range was probably written in, and how much that is."""
 
-    def check(value: Any) -> tuple[float, ...]:
-        size = f"{count} numbers" if count is not None else "numbers"
+
+@dataclass(frozen=True)
+class Quantity:
+    """A physical quantity: its unit, and the range outside which a value is a mistake (mostly a wrong unit).
+
+    Stands in an ``Annotated`` type: it checks the value, and puts range and unit into the JSON schema.
+    """
+
+    unit: str
+    least: float
+    most: float
+    above: bool = False
+    """Whether the value must be above ``least`` instead of at least that."""
+
+    def __str__(self) -> str:
+        low = f"above {self.least:g} and at most" if self.above else f"{self.least:g} to"
+        return f"{low} {self.most:g} {self.unit}".rstrip()
+
+    def __contains__(self, value: float) -> bool:
+        return (value > self.least if self.above else value >= self.least) and value <= self.most
+
+    def check(self, value: Any) -> float:
+        """Return the value as a float. Raises ValueError with the range and the unit."""
+        if not is_number(value):
+            raise ValueError(f"must be a number{f' in {self.unit}' if self.unit else ''}, not {describe(value)}")
+        if value not in self:
+            raise ValueError(f"must be {self}, not {value:g}{self.hint(value)}")
+        return float(value)
+
+    def hint(self, value: float) -> str:
+        """Return what a value out of range is in the unit that was probably meant; empty where there is none."""
+        name, factor = _SMALLER.get(self.unit, ("", 0.0))
+        return f"; {value:g} {name} would be {value * factor:.4g}" if name and value * factor in self else ""
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
+        return core_schema.no_info_before_validator_function(self.check, handler(source))
+
+    def __get_pydantic_json_schema__(self, schema: CoreSchema, handler: GetJsonSchemaHandler) -> dict[str, Any]:
+        return self.json_schema()
+
+    def json_schema(self) -> dict[str, Any]:
+        """Return the JSON schema of one number."""
+        unit = {"description": self.unit} if self.unit else {}
+        lower = "exclusiveMinimum" if self.above else "minimum"
+        return {"type": "number", lower: self.least, "maximum": self.most, **unit}
+
+
+@dataclass(frozen=True)
+class Several:
+    """A list of numbers of one quantity; stands in an ``Annotated`` type, as :class:`Quantity` does."""
+
+    quantity: Quantity
+    count: int | None
+    """None: any count."""
+    what: str
+    """Names of the numbers."""
+    single: bool = False
+    """Whether one number may stand for all of them."""
+
+    def check(self, value: Any) -> tuple[float, ...]:
+        """Return the numbers as floats. Raises ValueError that names the first wrong one."""
+        if self.single and is_number(value):
+            value = (value,)
+        count = f"{self.count} numbers" if self.count is not None else "numbers"
+        what = f"{self.what} in {self.quantity.unit}" if self.quantity.unit else self.what
         if not isinstance(value, (list, tuple)):
-            raise ValueError(f"must be a list of {size} ({what}), not {describe(value)}")
-        if count is not None and len(value) != count:
-            raise ValueError(f"must be {size} ({what}), not {len(value)}")
+            raise ValueError(f"must be a list of {count} ({what}), not {describe(value)}")
+        if self.count is not None and len(value) != self.count:
+            raise ValueError(f"must be {count} ({what}), not {len(value)}")
         for k, item in enumerate(value):
             if not is_number(item):
-                raise ValueError(f"must be {size} ({what}); item {k + 1} is {describe(item)}")
+                raise ValueError(f"must be {count} ({what}); item {k + 1} is {describe(item)}")
+            if item not in self.quantity:
+                which = f"; item {k + 1} is {item:g}" if len(value) > 1 else f", not {item:g}"
+                raise ValueError(f"must be {self.quantity} ({self.what}){which}{self.quantity.hint(item)}")
         return tuple(float(item) for item in value)
 
-    return check
+    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
+        return core_schema.no_info_before_validator_function(self.check, handler(source))
+
+    def __get_pydantic_json_schema__(self, schema: CoreSchema, handler: GetJsonSchemaHandler) -> dict[str, Any]:
+        item = self.quantity.json_schema()
+        size = {"minItems": self.count, "maxItems": self.count} if self.count is not None else {}
+        several = {"type": "array", "items": item, "description": self.what, **size}
+        return {"anyOf": [item, several]} if self.single else several
 
 
-def _quaternion(value: Any) -> tuple[float, ...]:
-    q = _numbers(4, "a unit quaternion x, y, z, w")(value)
+def _unit_quaternion(q: tuple[float, ...]) -> tuple[float, ...]:
     norm = math.hypot(*q)
     if abs(norm - 1.0) > 0.01:
         raise ValueError(f"must be a unit quaternion x, y, z, w; the length of this one is {norm:.3g}")
     return tuple(item / norm for item in q)
 
 
-def _per_joint(value: Any) -> Any:
-    if is_number(value):
-        return (float(value),)
-    return _numbers(None, "one for each joint, or one number for all of them")(value)
-
-
-def _rgba(value: Any) -> tuple[float, ...]:
-    colour = _numbers(4, "red, green, blue, alpha, each 0..1")(value)
-    if not all(0.0 <= item <= 1.0 for item in colour):
-        raise ValueError("must be red, green, blue, alpha, each in 0..1")
-    return colour
+def _with_length(direction: tuple[float, ...]) -> tuple[float, ...]:
+    if math.hypot(*direction) < 1e-6:
+        raise ValueError("must be a direction; its length may be any but 0")
+    return direction
 
 
 Flag = Annotated[bool, Field(strict=True)]
-Number = Annotated[float, Field(strict=True)]
-Positive = Annotated[float, Field(strict=True, gt=0.0)]
-Pixels = Annotated[int, Field(strict=True, gt=0, le=16384)]
-Share = Annotated[float, Field(strict=True, gt=0.0, le=1.0)]
 Name = Annotated[str, Field(pattern=r"^[A-Za-z_][A-Za-z0-9_-]*$")]
-Vector = Annotated[tuple[float, float, float], BeforeValidator(_numbers(3, "x, y, z in m"))]
-QuaternionConfig = Annotated[tuple[float, float, float, float], BeforeValidator(_quaternion)]
-Rgba = Annotated[tuple[float, float, float, float], BeforeValidator(_rgba)]
-Numbers = Annotated[tuple[float, ...], BeforeValidator(_numbers(None, "one for each joint"))]
-PerJoint = Annotated[tuple[float, ...], BeforeValidator(_per_joint)]
-"""One number for each joint; a single one stands for all of them."""
+Pixels = Annotated[int, Field(strict=True, gt=0, le=16384)]
+
+# Every number of a rig, a model, an object or a mapping is one of these. The ranges hold what can stand on one bench;
+# what a real arm may be given at most is in resolve_limits.py.
+Share = Annotated[float, Quantity("", 0.0, 1.0, above=True)]
+Factor = Annotated[float, Quantity("", 0.0, 1000.0, above=True)]
+Size = Annotated[float, Quantity("m", 0.0, 5.0, above=True)]
+Distance = Annotated[float, Quantity("m", 0.0, 50.0, above=True)]
+Coordinate = Annotated[float, Quantity("m", -50.0, 50.0)]
+Mass = Annotated[float, Quantity("kg", 0.0, 50.0)]
+Force = Annotated[float, Quantity("N", 0.0, 1000.0, above=True)]
+Speed = Annotated[float, Quantity("m/s", 0.0, 2.0, above=True)]
+TcpSpeed = Annotated[float, Quantity("m/s", 0.0, 10.0, above=True)]
+Degrees = Annotated[float, Quantity("deg", -360.0, 360.0)]
+ViewAngle = Annotated[float, Quantity("deg", 0.0, 179.0, above=True)]
+Seconds = Annotated[float, Quantity("s", 0.0, 60.0, above=True)]
+RateHz = Annotated[float, Quantity("Hz", 10.0, 10000.0)]
+CameraRate = Annotated[float, Quantity("Hz", 0.0, 1000.0, above=True)]
+
+_Three = tuple[float, float, float]
+_Four = tuple[float, float, float, float]
+Position = Annotated[_Three, Several(Quantity("m", -50.0, 50.0), 3, "x, y, z")]
+"""In the world, or in the base frame of an arm."""
+Offset = Annotated[_Three, Several(Quantity("m", -5.0, 5.0), 3, "x, y, z")]
+"""In the frame of a link or of a sensor."""
+Sizes = Annotated[_Three, Several(Quantity("m", 0.0, 5.0, above=True), 3, "x, y, z")]
+Gravity = Annotated[_Three, Several(Quantity("m/s2", -100.0, 100.0), 3, "x, y, z")]
+Direction = Annotated[_Three, Several(Quantity("", -1e6, 1e6), 3, "x, y, z"), AfterValidator(_with_length)]
+QuaternionConfig = Annotated[
+    _Four, Several(Quantity("", -1e6, 1e6), 4, "a unit quaternion x, y, z, w"), AfterValidator(_unit_quaternion)
+]
+Rgba = Annotated[_Four, Several(Quantity("", 0.0, 1.0), 4, "red, green, blue, alpha")]
+
+_Any = tuple[float, ...]
+_EACH = "one for each joint"
+_OR_ALL = "one for each joint, or one for all of them"
+# Joints that slide have m in the place of rad.
+JointPositions = Annotated[_Any, Several(Quantity("rad", -1e4, 1e4), None, _EACH)]
+"""Compared with the limits of the joints later."""
+JointLimits = Annotated[_Any, Several(Quantity("rad", -30.0, 30.0), None, _OR_ALL, single=True)]
+Velocities = Annotated[_Any, Several(Quantity("rad/s", 0.0, 50.0, above=True), None, _OR_ALL, single=True)]
+Accelerations = Annotated[_Any, Several(Quantity("rad/s2", 0.0, 2000.0, above=True), None, _OR_ALL, single=True)]
+Jerks = Annotated[_Any, Several(Quantity("rad/s3", 0.0, 1e6, above=True), None, _OR_ALL, single=True)]
+Torques = Annotated[_Any, Several(Quantity("Nm", 0.0, 5000.0, above=True), None, _OR_ALL, single=True)]
+
+_POSE = Several(Quantity("", -50.0, 50.0), 7, "x, y, z in m, then a quaternion x, y, z, w; or {position, orientation}")
 
 
 class PoseConfig(Strict):
     """``{position: [x, y, z], orientation: [x, y, z, w]}``, or the same seven numbers as one list. m."""
 
-    position: Vector = (0.0, 0.0, 0.0)
+    position: Position = (0.0, 0.0, 0.0)
     orientation: QuaternionConfig = (0.0, 0.0, 0.0, 1.0)
 
     @model_validator(mode="before")
     @classmethod
     def _seven_numbers(cls, data: Any) -> Any:
         if isinstance(data, (list, tuple)):
-            seven = _numbers(7, "x, y, z in m, then a quaternion x, y, z, w; or {position, orientation}")(data)
+            seven = _POSE.check(data)
             return {"position": seven[:3], "orientation": seven[3:]}
         return data
 

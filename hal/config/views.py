@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import math
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from pydantic import BeforeValidator, model_validator
+from pydantic import AfterValidator, model_validator
 
 from ..pose import Pose, matrix_to_quaternion, quaternion_to_matrix, rpy_to_matrix
 from ..specs import ViewSpec
-from .schema import Number, PoseConfig, Positive, Strict, Vector, describe, is_number
+from .schema import Degrees, Direction, Distance, Offset, PoseConfig, Position, Quantity, Several, Strict
 
 __all__ = ["Attached", "LookAt", "optical_pose", "view_of"]
 
@@ -27,11 +27,11 @@ class LookAt(Strict):
     frame.
     """
 
-    target: Vector
-    distance: Positive
-    yaw_deg: Number = 0.0
-    pitch_deg: Number = 0.0
-    roll_deg: Number = 0.0
+    target: Position
+    distance: Distance
+    yaw_deg: Degrees = 0.0
+    pitch_deg: Degrees = 0.0
+    roll_deg: Degrees = 0.0
     up_axis: Literal["y", "z"] = "z"
 
     def pose(self) -> Pose:
@@ -47,15 +47,17 @@ class LookAt(Strict):
         return optical_pose(eye, -(turn @ back), turn @ up)
 
 
-def _rotation(value: Any) -> tuple[float, ...]:
-    if not isinstance(value, (list, tuple)) or len(value) not in (3, 4):
-        raise ValueError(f"must be roll, pitch, yaw in rad, or a quaternion x, y, z, w, not {describe(value)}")
-    for item in value:
-        if not is_number(item):
-            raise ValueError(f"must be numbers; one is {describe(item)}")
-    if len(value) == 4 and abs(math.hypot(*value) - 1.0) > 0.01:
+_ROTATION = Several(
+    Quantity("rad", -2.0 * math.pi, 2.0 * math.pi), None, "roll, pitch, yaw; or a unit quaternion x, y, z, w"
+)
+
+
+def _three_or_unit(rotation: tuple[float, ...]) -> tuple[float, ...]:
+    if len(rotation) not in (3, 4):
+        raise ValueError(f"must be roll, pitch, yaw in rad, or a quaternion x, y, z, w, not {len(rotation)} numbers")
+    if len(rotation) == 4 and abs(math.hypot(*rotation) - 1.0) > 0.01:
         raise ValueError("must be a unit quaternion x, y, z, w, or three angles in rad")
-    return tuple(float(item) for item in value)
+    return rotation
 
 
 class Attached(Strict):
@@ -72,10 +74,10 @@ class Attached(Strict):
 
     robot: str
     link: str
-    translation: Vector = (0.0, 0.0, 0.0)
-    rotation: Annotated[tuple[float, ...], BeforeValidator(_rotation)] = (0.0, 0.0, 0.0)
-    target: Vector = (0.0, 0.0, 1.0)
-    up: Vector | None = None
+    translation: Offset = (0.0, 0.0, 0.0)
+    rotation: Annotated[tuple[float, ...], _ROTATION, AfterValidator(_three_or_unit)] = (0.0, 0.0, 0.0)
+    target: Direction = (0.0, 0.0, 1.0)
+    up: Direction | None = None
     pose: PoseConfig | None = None
 
     @model_validator(mode="after")
@@ -87,8 +89,6 @@ class Attached(Strict):
 
     @model_validator(mode="after")
     def _directions(self) -> Attached:
-        if not any(self.target):
-            raise ValueError("target must be a direction, not [0, 0, 0]")
         if self.up is not None and np.linalg.norm(np.cross(self.target, self.up)) < 1e-6:
             raise ValueError("up must not lie along target")
         return self

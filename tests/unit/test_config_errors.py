@@ -5,15 +5,22 @@ from __future__ import annotations
 import copy
 import random
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 import yaml
+from pydantic import BaseModel
 
+from hal.calibration.board import BoardConfig
 from hal.config import load
+from hal.config.camera_models import CameraModel
 from hal.config.data_files import find_data
+from hal.config.mapping import TeleopMapping
+from hal.config.models import RobotModel
+from hal.config.objects import ObjectConfig
+from hal.config.rigfile import RigFile
 from hal.errors import ConfigError, Problem
 
 ROBOT = {"model": "panda"}
@@ -105,7 +112,7 @@ def thing(**keys: Any) -> dict[str, Any]:
         ({"objects": {"cube": 1}}, "objects", ["a list"]),
         ({"objects": [7]}, "objects.0", ["a file, a name"]),
         (robot(speed="fast"), "robots.arm.speed", ["a number", "'fast'"]),
-        (robot(speed=1.5), "robots.arm.speed", ["less than or equal to 1", "1.5"]),
+        (robot(speed=1.5), "robots.arm.speed", ["at most 1", "1.5"]),
         (robot(speed=True), "robots.arm.speed", ["a number"]),
         (robot(model=5), "robots.arm.model", ["text"]),
         ({"robots": {"arm": {}}}, "robots.arm.model", ["is missing"]),
@@ -131,18 +138,44 @@ def thing(**keys: Any) -> dict[str, Any]:
         ),
         (
             camera(look_at=None, attached={"robot": "arm", "link": "panda_hand", "target": [0, 0, 0]}),
-            "cameras.eye.attached",
+            "cameras.eye.attached.target",
             ["direction"],
         ),
         # A simulated camera must stand somewhere, and in one place.
         (camera(look_at=None), "cameras.eye", ["look_at, pose or attached"]),
         (camera(pose={}), "cameras.eye", ["one place", "look_at", "pose"]),
+        # Numbers that are out of every plausible range are mostly in another unit.
+        (robot(tcp_speed=250), "robots.arm.tcp_speed", ["at most 10 m/s", "250 mm/s would be 0.25"]),
+        (camera(look_at={**LOOK, "distance": 1200}), "cameras.eye.look_at.distance", ["50 m", "1200 mm would be 1.2"]),
+        (camera(look_at={**LOOK, "target": [0, 500, 0]}), "cameras.eye.look_at.target", ["50 m", "item 2 is 500"]),
+        (camera(look_at={**LOOK, "pitch_deg": 1e9}), "cameras.eye.look_at.pitch_deg", ["-360 to 360 deg"]),
+        (thing(half_extents=[1, 10, 1]), "objects.0.half_extents", ["at most 5 m", "item 2 is 10", "10 mm would be"]),
+        (thing(half_extents=[1, 0, 1]), "objects.0.half_extents", ["above 0"]),
+        (thing(mass=100), "objects.0.mass", ["0 to 50 kg", "100 g would be 0.1"]),
+        (thing(position=[0, 0, 600]), "objects.0.position", ["-50 to 50 m", "item 3 is 600", "0.6"]),
+        (robot(base={"position": [-550, 0, 0]}), "robots.arm.base.position", ["-550 mm would be -0.55"]),
+        (robot(limits={"velocity": 150}), "robots.arm.limits.velocity", ["50 rad/s", "150 deg/s would be 2.618"]),
+        (robot(limits={"upper": 170, "allow_looser_limits": True}), "robots.arm.limits.upper", ["30 rad", "2.967"]),
+        (robot(workspace={"table_height": 200}), "robots.arm.workspace.table_height", ["50 m"]),
+        (robot(gripper={"speed": 50}), "robots.arm.gripper.speed", ["50 mm/s would be 0.05"]),
+        (robot(rate_hz=1e6), "robots.arm.rate_hz", ["10 to 10000 Hz"]),
+        ({"simulation": {"gravity": [0, 0, -981]}}, "simulation.gravity", ["-100 to 100 m/s2"]),
+        (
+            camera(look_at=None, attached={"robot": "arm", "link": "panda_hand", "rotation": [0, 90, 0]}),
+            "cameras.eye.attached.rotation",
+            ["rad", "item 2 is 90", "90 deg would be 1.571"],
+        ),
+        (
+            camera(look_at=None, attached={"robot": "arm", "link": "panda_hand", "translation": [90, 0, 0]}),
+            "cameras.eye.attached.translation",
+            ["5 m", "90 mm would be 0.09"],
+        ),
         # Limits.
         (robot(limits={"velocity": [1, 1]}), "robots.arm.limits.velocity", ["7 numbers", "rad/s", "not 2"]),
         (robot(limits={"velocity": 3.0}), "robots.arm.limits.velocity", ["looser", "allow_looser_limits", "2.175"]),
         (robot(limits={"lower": -3.0}), "robots.arm.limits.lower", ["looser"]),
         (robot(limits={"velocity": -1.0}), "robots.arm.limits.velocity", ["above 0"]),
-        (robot(gripper={"speed": 9.0}), "robots.arm.gripper.speed", ["at most 0.1"]),
+        (robot(gripper={"speed": 0.9}), "robots.arm.gripper.speed", ["at most 0.1"]),
         ({"robots": {"a": {"model": "iiwa", "gripper": {"speed": 0.1}}}}, "robots.a.gripper", ["no gripper"]),
         (
             robot(workspace={"upper": [1, 1, 0.1], "table_height": 0.2}),
@@ -153,17 +186,17 @@ def thing(**keys: Any) -> dict[str, Any]:
         (thing(half_extents=None), "objects.0", ["a box has half_extents", "missing"]),
         (thing(radius=1), "objects.0", ["radius has no meaning"]),
         (thing(shape="cone"), "objects.0.shape", ["'cone'", "cylinder"]),
-        (thing(mass=-1), "objects.0", ["must not be negative"]),
-        (thing(rgba=[255, 0, 0, 1]), "objects.0.rgba", ["0..1"]),
+        (thing(mass=-1), "objects.0.mass", ["0 to 50 kg"]),
+        (thing(rgba=[255, 0, 0, 1]), "objects.0.rgba", ["0 to 1"]),
         ({"objects": ["cube", "cube"]}, "name", ["'cube' is also the name of objects.0", "differ"]),
         ({"robots": {"cube": ROBOT}, "objects": ["cube"]}, "name", ["robots.cube"]),
         ({"objects": ["cubes/brick.yaml"]}, "objects.0", ["there is no file"]),
         (thing(random={"x": [0.1, -0.1]}), "objects.0.random.x", ["the least and the greatest", "0.1 is above -0.1"]),
-        (thing(random={"y": 0.3}), "objects.0.random.y", ["two numbers", "0.3"]),
-        (thing(random={"z": [1, 2, 3]}), "objects.0.random.z", ["two numbers", "a list of 3"]),
-        (thing(random={"x": [0, float("nan")]}), "objects.0.random.x", ["two numbers", "nan"]),
-        (thing(random={"x": [0, "far"]}), "objects.0.random.x", ["two numbers", "'far'"]),
-        (thing(random={"yaw_deg": [-400, 0]}), "objects.0.random.yaw_deg", ["within -360 and 360 degrees"]),
+        (thing(random={"y": 0.3}), "objects.0.random.y", ["2 numbers", "0.3"]),
+        (thing(random={"z": [1, 2, 3]}), "objects.0.random.z", ["2 numbers", "not 3"]),
+        (thing(random={"x": [0, float("nan")]}), "objects.0.random.x", ["2 numbers", "nan"]),
+        (thing(random={"x": [0, "far"]}), "objects.0.random.x", ["2 numbers", "'far'"]),
+        (thing(random={"yaw_deg": [-400, 0]}), "objects.0.random.yaw_deg", ["-360 to 360 deg"]),
         (thing(random={"yaw": [-1, 1]}), "objects.0.random.yaw", ["did you mean 'yaw_deg'"]),
         (thing(random={}), "objects.0.random", ["no range", "yaw_deg"]),
         (thing(random=[-1, 1]), "objects.0.random", ["keys and values"]),
@@ -187,6 +220,59 @@ def test_one_mistake_is_one_problem_with_its_key(config: dict[str, Any], key: st
     assert problem.key == key
     for word in words:
         assert word in problem.message
+
+
+@pytest.mark.parametrize(
+    "model",
+    [RigFile, RobotModel, CameraModel, ObjectConfig, TeleopMapping, BoardConfig],
+    ids=lambda model: str(model.__name__),
+)
+def test_every_number_of_a_file_has_a_range(model: type[BaseModel]) -> None:
+    def unlimited(schema: Any, place: str) -> Iterator[str]:
+        if isinstance(schema, dict):
+            most = {"maximum", "exclusiveMaximum"} & schema.keys()
+            least = {"minimum", "exclusiveMinimum"} & schema.keys()
+            if schema.get("type") in ("number", "integer") and not (most and least):
+                yield place
+        inner = schema.items() if isinstance(schema, dict) else enumerate(schema) if isinstance(schema, list) else ()
+        for key, value in inner:
+            yield from unlimited(value, f"{place}.{key}")
+
+    assert list(unlimited(model.model_json_schema(), model.__name__)) == []
+
+
+REAL = {"model": "panda", "sim": False, "drivers": {"real": "mock"}}
+
+
+@pytest.mark.parametrize(
+    ("keys", "place", "words"),
+    [
+        ({"tcp_speed": 3.0}, "robots.arm.tcp_speed", ["at most 1.5 m/s on a real arm", "3"]),
+        (
+            {"limits": {"velocity": 20, "allow_looser_limits": True}},
+            "robots.arm.limits.velocity",
+            ["at most 15 rad/s for every joint of a real arm", "20"],
+        ),
+        (
+            {"limits": {"jerk": 30000, "allow_looser_limits": True}},
+            "robots.arm.limits.jerk",
+            ["at most 20000 rad/s3"],
+        ),
+    ],
+)
+def test_what_a_simulation_may_do_a_real_arm_may_not(keys: dict[str, Any], place: str, words: list[str]) -> None:
+    config = {"robots": {"arm": {**REAL, **keys}}}
+    load(config, sim=True)
+    found = {problem.key: problem.message for problem in problems(config)}
+    for word in words:
+        assert word in found[place]
+
+
+def test_the_hard_limits_of_a_real_arm_hold_for_its_model_too(own_model: Callable[..., Path]) -> None:
+    rig = own_model(lambda m: m.update(real_limits={}, limits=m["limits"] | {"acceleration": 150}))
+    load(rig, sim=True)
+    found = problems(rig, sim=False, overrides=["robots.arm.drivers.real=mock"])
+    assert ("arm.yaml", "limits.acceleration") in {(Path(problem.file).name, problem.key) for problem in found}
 
 
 def test_every_mistake_in_every_file_is_listed(tmp_path: Path) -> None:
@@ -546,7 +632,7 @@ MISTAKES: dict[tuple[str, str], Callable[[Bench], object]] = {
     ("rig.yaml", "cameras.scene.look_at.yaw"): lambda b: b.rig["cameras"]["scene"]["look_at"].update(yaw=3),
     ("rig.yaml", "cameras.eye"): lambda b: b.rig["cameras"].update(eye={"model": "realsense_d435"}),
     ("camera.yaml", "mode"): lambda b: b.camera.update(mode=[]),
-    ("camera.yaml", ""): lambda b: b.camera.update(distortion=[0, 0]),
+    ("camera.yaml", "distortion"): lambda b: b.camera.update(distortion=[0, 0]),
     # Objects: in files, in the rig, changed.
     ("cup.yaml", "colour"): lambda b: b.cup.update(colour="red"),
     ("cup.yaml", "urdf"): lambda b: b.cup.update(urdf="cpu.urdf"),

@@ -138,7 +138,7 @@ def test_a_host_must_be_given() -> None:
 
 def test_what_a_hand_may_not_be_told() -> None:
     assert "did you mean 'tolerance'" in dict(check_hand(hand(tolerence=0.01)))["real.tolerence"]
-    assert "greater than 0" in dict(check_hand(hand(tolerance=0)))["real.tolerance"]
+    assert "above 0" in dict(check_hand(hand(tolerance=0)))["real.tolerance"]
 
 
 @pytest.mark.parametrize(

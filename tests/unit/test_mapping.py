@@ -72,7 +72,7 @@ def test_a_mapping_of_ones_own(tmp_path: Path) -> None:
         ({"linear": {"x": {"buttons": ["l1", "cross"], "scale": 1.0}}}, "linear.x", ["no button 'cross'", "south"]),
         ({"linear": {"x": {"scale": 1.0}}}, "linear.x", ["needs an axis"]),
         ({"linear": {"x": {"axis": "dpad_x"}}}, "linear.x.scale", ["is missing"]),
-        ({"linear": {"x": {"axis": "dpad_x", "scale": 0.0}}}, "linear.x.scale", ["greater than 0"]),
+        ({"linear": {"x": {"axis": "dpad_x", "scale": 0.0}}}, "linear.x.scale", ["above 0"]),
         ({"linear": {"roll": {}}}, "linear.roll", ["no key here", "x, y, z"]),
         ({"frame": "tool"}, "frame", ["'tool'", "base, tcp"]),
         ({"deadman": "l4"}, "deadman", ["no button 'l4'"]),
