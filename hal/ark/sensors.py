@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection, Mapping
 from typing import Any
 
@@ -188,6 +189,8 @@ class Camera:
                 turn, f"{key}.rotation", note or ("Euler angles, rad" if euler else "a quaternion x, y, z, w")
             )
             found: dict[str, Any] = {"translation": translation}
+            if degrees:  # a rig takes no more than a full turn
+                rotation = tidy([math.remainder(angle, 2.0 * math.pi) for angle in rotation])
             return found | ({"rotation": rotation} if any(rotation[:3]) else {})
         matrix = rpy_to_matrix(*rotation) if euler else quaternion_to_matrix(rotation)
         bracket = pose @ Pose(translation, matrix_to_quaternion(matrix))

@@ -173,7 +173,7 @@ BAD_OBJECTS: list[tuple[dict[str, Any], str]] = [
     ({"collision": None, "visual": None}, "has neither a collision nor a visual shape"),
     ({"base_position": [0, 0, float("inf")]}, "must be numbers; item 3 is inf"),
     ({"multi_body__baseMass": "heavy"}, "must be a number, not 'heavy'"),
-    ({"multi_body__baseMass": -1}, "mass must not be negative (as objects.0"),
+    ({"multi_body__baseMass": -1}, "must be 0 to 50 kg, not -1 (as objects.0"),
 ]
 
 
