@@ -23,6 +23,8 @@ STILL = 0.0005
 fingers chatter at up to 20 mm/s while the width moves by 0.1 mm, so their speed does not tell."""
 SETTLE = 0.1
 """s of standing still after which a motion has ended, wherever it is. Slow motions take longer."""
+BLOCKED = 0.25
+"""Share of the commanded speed: fingers that are slower, long after the command, are held up by something."""
 PRESSING = 0.5
 """Share of the commanded force from which on the fingers press on something."""
 
@@ -51,6 +53,9 @@ class PyBulletGripper(GripperDriver):
         """The width, m, that the fingers have stayed near, and since when, s."""
         self._settle = SETTLE
         self._resting = True
+        self._seen = 0.0
+        """When the width was looked at last, s."""
+        self._speed = spec.speed
 
     def open(self) -> None:
         """Find the fingers in the world."""
@@ -96,17 +101,21 @@ class PyBulletGripper(GripperDriver):
     def _start(self, speed: float, force: float) -> None:
         self._expect_open()
         self._force = force
-        speed = min(speed, self.spec.speed)
+        self._speed = min(speed, self.spec.speed)
         self._resting, self._stood_since = False, self._world.t
-        self._settle = max(SETTLE, 2.0 * STILL / speed)
-        self._drive(speed)
+        self._settle = max(SETTLE, 2.0 * STILL / self._speed)
+        self._drive(self._speed)
 
     def _at_rest(self, width: float, speed: float) -> bool:
         """Whether the fingers have arrived, or stand still elsewhere. Call it for every new width."""
         t = self._world.t
+        unseen, self._seen = t - self._seen, t
         stood_long = t - self._stood_since >= self._settle
         if abs(width - self._stood) > STILL:
-            self._resting = self._resting and stood_long  # what creeps has stood long at every place
+            if unseen < self._settle:
+                self._resting = self._resting and stood_long  # what creeps has stood long at every place
+            else:  # in lock-step nothing is read while a program sleeps
+                self._resting = abs(speed) <= BLOCKED * self._speed
             self._stood, self._stood_since = width, t
         elif stood_long:
             self._resting = True

@@ -215,6 +215,12 @@ class TestGrasping:
         assert all(reading.grasped for reading in readings)
         bench.hand.stop()
         assert all(reading.grasped for reading in bench.run(0.5)), "a stop keeps the force"
+        bench.hand.move(0.08, 0.1, 70.0)
+        assert bench.run(1.0)[-1].width > 0.07
+        bench.hand.grasp(0.03, 0.1, 70.0, 0.05, 0.05)
+        for _ in range(480):
+            bench.world.step()
+        assert bench.hand.read(0.0).grasped, "also where the fingers were not read on their way"
 
     def test_a_slow_motion_is_one(self) -> None:
         bench = Bench()
