@@ -135,6 +135,7 @@ class Rig:
                     self.notes.append(f"servo process {host.spec.name}: {scheduling}")
         if world_host is not None:
             self.world = World(world_host.request, self._world_edited)
+            self.notes.extend(world_host.request("warnings"))
         for host in self._hosts:
             for spec in host.spec.robots:
                 self.robots[spec.name] = Robot(spec, host, self.clock, self._latch, self._gripper_of(spec))

@@ -6,11 +6,12 @@ from collections.abc import Container
 
 from .body import Body
 from .library import Client
+from .values import listed
 
 __all__ = ["mend_inertias"]
 
 
-def mend_inertias(client: Client, body: Body, urdf: str, massless: Container[str]) -> list[str]:
+def mend_inertias(client: Client, body: Body, massless: Container[str]) -> list[str]:
     """Give links whose inertia cannot be that of their shape.
 
     The mass of a link lies inside the box around its collision shape. All of it in the corners would have three times
@@ -19,7 +20,6 @@ def mend_inertias(client: Client, body: Body, urdf: str, massless: Container[str
     has to keep its own acceleration limits. Links without a shape, or with a possible inertia, keep the file's.
 
     Args:
-        urdf: the file, for the warning.
         massless: links of which the file says nothing; they are mended without a word.
 
     Returns:
@@ -44,4 +44,4 @@ def mend_inertias(client: Client, body: Body, urdf: str, massless: Container[str
     wrong = [name for name in mended if name not in massless]
     if not wrong:
         return []
-    return [f"{urdf}: impossible <inertia> in {', '.join(wrong)}; that of the collision shape is used"]
+    return [f"{body.name}: impossible <inertia> in {listed(wrong)}; that of the collision shape is used"]

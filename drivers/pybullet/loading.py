@@ -11,7 +11,8 @@ from .body import Body
 from .inertias import mend_inertias
 from .library import Client, silenced
 from .transforms import Transform, compose, inverse
-from .urdf import Mimic, UrdfFacts, loadable, read_urdf
+from .urdf import Mimic, loadable, read_urdf
+from .values import listed
 
 __all__ = ["load_object", "load_robot"]
 
@@ -52,7 +53,10 @@ def load_object(client: Client, spec: BodySpec) -> tuple[Body, list[str]]:
     number = _load_urdf(client, spec.urdf, f"{key}.urdf", fixed=_is_fixed(spec), scale=spec.scale)
     body = _describe(client, spec, number, f"{key}.urdf")
     _couple(client, body, facts.mimics)
-    return body, _mass_warnings(spec.urdf, facts) + mend_inertias(client, body, spec.urdf, facts.massless)
+    warnings = mend_inertias(client, body, facts.massless)
+    if facts.massless:
+        warnings.append(f"{spec.name}: no <inertial> in {listed(facts.massless)}; PyBullet takes 1 kg for each")
+    return body, warnings
 
 
 def load_robot(client: Client, spec: RobotSpec) -> tuple[Body, list[str]]:
@@ -67,7 +71,8 @@ def load_robot(client: Client, spec: RobotSpec) -> tuple[Body, list[str]]:
     fingers = spec.gripper.joints if spec.gripper else ()
     _check_names(body, spec, fingers, key)
 
-    warnings = _mass_warnings(spec.urdf, facts) + mend_inertias(client, body, spec.urdf, facts.massless)
+    warnings = mend_inertias(client, body, facts.massless)
+    without_effort: list[str] = []
     limits = spec.limits
     for joint in body.movable:
         info = client.getJointInfo(number, joint)
@@ -83,9 +88,11 @@ def load_robot(client: Client, spec: RobotSpec) -> tuple[Body, list[str]]:
             if client.getDynamicsInfo(number, joint)[0] < FINGER_MASS:
                 client.changeDynamics(number, joint, mass=FINGER_MASS)
         if effort <= 0.0:
-            warnings.append(f"{spec.urdf}: joint {name!r} has no effort limit; {UNKNOWN_EFFORT:g} is used")
+            without_effort.append(name)
         body.efforts[joint] = effort if effort > 0.0 else UNKNOWN_EFFORT
         body.speeds[joint] = speed if speed > 0.0 else UNKNOWN_SPEED
+    if without_effort:
+        warnings.append(f"{spec.name}: no effort limit of {listed(without_effort)}; {UNKNOWN_EFFORT:g} Nm (N) is used")
     body.base = _root_pose(client, body, spec)
     mimics = facts.mimics or tuple(Mimic(finger, fingers[0], 1.0, 0.0) for finger in fingers[1:])
     _couple(client, body, mimics)
@@ -222,9 +229,3 @@ def _couple(client: Client, body: Body, mimics: Sequence[Mimic]) -> None:
         client.changeConstraint(
             gear, gearRatio=-1.0 / mimic.multiplier, erp=GEAR_SHARE / CONSTRAINT_ERP, maxForce=force
         )
-
-
-def _mass_warnings(urdf: str, facts: UrdfFacts) -> list[str]:
-    if not facts.massless:
-        return []
-    return [f"{urdf}: no <inertial> in {', '.join(facts.massless)}; PyBullet takes 1 kg for each"]

@@ -75,3 +75,9 @@ def nearest(name: str, names: Iterable[str]) -> str:
     close = difflib.get_close_matches(name, known, n=1)
     hint = f"; did you mean {close[0]!r}?" if close else "."
     return f"{hint} There are: {', '.join(known)}" if known else "; there is none"
+
+
+def listed(names: Sequence[str], most: int = 3) -> str:
+    """Names for a message: the first ones, and how many more there are."""
+    more = len(names) - most
+    return ", ".join(names) if more <= 0 else f"{', '.join(names[:most])} and {more} more"

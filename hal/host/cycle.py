@@ -145,6 +145,10 @@ class Cycle:
     def _do_inject_gripper(self, gripper: str, knobs: dict[str, Any]) -> None:
         self.grippers[gripper].driver.inject(**knobs)
 
+    def _do_warnings(self) -> list[str]:
+        """What the simulation had to change in the files that it loaded."""
+        return list(getattr(self.world, "warnings", ()))
+
     def _do_statistics(self) -> dict[str, Any]:
         return {
             "ticks": self.ticks - self._counted_from,

@@ -6,7 +6,8 @@ from typing import Any
 
 import pytest
 
-from hal.apps.banner import listing
+import hal
+from hal.apps.banner import banner, listing
 from hal.config import load
 
 
@@ -32,3 +33,11 @@ def test_a_real_hand_on_a_simulated_arm_is_called_real() -> None:
     hand = {"sim": False, "real": {"host": "172.16.0.2"}}
     line = robot_line({"robots": {"arm": {"model": "fr3", "gripper": hand}}})
     assert "simulated (pybullet), 240 Hz, gripper 0..0.08 m, REAL (franka at 172.16.0.2)" in line
+
+
+def test_what_the_simulation_changed_in_a_file_is_a_note() -> None:
+    with hal.open("panda_table", sim=True, clock="lock_step", pad="none", overrides=("cameras={}",)) as rig:
+        duck, arm = rig.notes
+        assert duck.startswith("duck: impossible <inertia> in baseLink")
+        assert arm.startswith("panda: impossible <inertia> in panda_link1, ")
+        assert f"note     {duck}" in banner(rig)
