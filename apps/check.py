@@ -104,7 +104,9 @@ def may_open(plan: Plan) -> bool:
     """The same, briefly and in print, for a program that is about to open a rig. True at once without a real arm."""
     from hal.preflight import preflight, real_arms
 
-    return not real_arms(plan) or _fit(_shown(preflight(plan, BRIEFLY, cameras=False)))
+    arms = real_arms(plan)
+    emulated = all(robot.emulated for robot in arms)  # a rehearsal does not depend on how fit this computer is
+    return not arms or _fit(_shown(preflight(plan, BRIEFLY, machine=not emulated, cameras=False)))
 
 
 def _fit(verdicts: Sequence[Verdict]) -> bool:
@@ -112,12 +114,14 @@ def _fit(verdicts: Sequence[Verdict]) -> bool:
 
 
 def _shown(verdicts: Iterable[Verdict]) -> list[Verdict]:
-    """Print each as soon as it is known, with what mends it below."""
+    """Print each as soon as it is known, and below it what to do, once where it is the same for several."""
     found = []
+    remedies = set()
     for verdict in verdicts:
         found.append(verdict)
         print(f"{_SHOWN[verdict.level]:10s}{verdict.name:16s} {verdict.found}")
-        if verdict.level != "ok" and verdict.remedy:
+        if verdict.level != "ok" and verdict.remedy and verdict.remedy not in remedies:
+            remedies.add(verdict.remedy)
             print(f"{_INDENT}-> {verdict.remedy}")
         sys.stdout.flush()
     return found

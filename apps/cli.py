@@ -71,7 +71,10 @@ def add_rig_options(parser: argparse.ArgumentParser) -> None:
         help="where the page is served; only this machine can open it unless you say otherwise",
     )
     rig.add_argument(
-        "--realtime", action="store_true", help="ask for real-time scheduling and locked memory for the servos"
+        "--realtime",
+        action=argparse.BooleanOptionalAction,
+        default=True,
+        help="ask for real-time priority and locked memory for the servos (default)",
     )
     rig.add_argument(
         "--dry-run", action="store_true", help="check everything, list what would be opened, touch nothing"

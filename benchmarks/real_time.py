@@ -1,17 +1,28 @@
 """Real time: missed servo ticks, frame rates, ages of states and frames, with both cameras of the built-in rig.
 
-    python benchmarks/real_time.py [--seconds 20] [--rates 240 1000]
+    python benchmarks/real_time.py [--seconds 20] [--rates 240 1000] [--loaded]
 
-The reference in the same run is the same rig without cameras, and a bare pacer at the same rate that does nothing.
+The reference in the same run is the same rig without cameras, and a bare pacer at the same rate that does nothing. With
+``--loaded``: both cameras, with and without as many busy programs as there are processors, with real-time priority,
+where it is refused, and (the reference) where it is not asked for.
 """
 
 from __future__ import annotations
 
 import argparse
+import contextlib
+import os
+import subprocess
+import sys
 import time
+from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "unit"))
+from child_targets import give_up_right
 
 import hal
 from hal.histogram import Histogram
@@ -28,10 +39,24 @@ def bare(rate_hz: float, seconds: float) -> float:
     return pacer.missed / (turns + pacer.missed)
 
 
-def run(rate_hz: float, seconds: float, cameras: bool) -> dict[str, Any]:
+@contextlib.contextmanager
+def busy_programs(number: int) -> Iterator[None]:
+    """Other programs that compute without a pause."""
+    programs = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(number)]
+    try:
+        yield
+    finally:
+        for program in programs:
+            program.kill()
+            program.wait()
+
+
+def run(rate_hz: float, seconds: float, cameras: bool, realtime: bool = True) -> dict[str, Any]:
     """Drive the arm at 50 Hz and look at its state and every frame."""
     overrides = [f"simulation.physics_hz={rate_hz:g}"] + ([] if cameras else ["cameras={}"])
-    with hal.open("panda_table", sim=True, clock="real_time", overrides=overrides, pad="none") as rig:
+    with hal.open(
+        "panda_table", sim=True, clock="real_time", overrides=overrides, pad="none", realtime=realtime
+    ) as rig:
         arm = rig.robots["panda"]
         before = next(iter(rig.statistics().values()))
         ages = Histogram(1e-4, 5000)
@@ -40,7 +65,7 @@ def run(rate_hz: float, seconds: float, cameras: bool) -> dict[str, Any]:
             for tick in rig.clock.rate(50):
                 turn = tick.t - start
                 control.send(hal.Twist([0.05 * np.sin(turn), 0.05 * np.cos(turn), 0.0]))
-                state = arm.state()
+                state = arm.state(max_age=1.0)
                 ages.add(rig.clock.now() - state.stamp.t)
                 for camera in rig.cameras.values():
                     camera.latest(max_age=5.0)
@@ -52,10 +77,29 @@ def run(rate_hz: float, seconds: float, cameras: bool) -> dict[str, Any]:
         return {
             "missed": missed / (ticks + missed),
             "period": after["period_s"],
+            "scheduling": after["scheduling"],
             "age": ages.summary(),
             "cameras": {name: camera.counts() for name, camera in rig.cameras.items()},
             "renderer": rig.renderer,
         }
+
+
+def loaded(rates: list[float], seconds: float) -> None:
+    """Print what is missed with and without load, by scheduling; the right is given up on the way."""
+    for asked in ("asked for", "refused", "not asked for"):
+        if asked == "refused":
+            give_up_right()
+        for rate_hz in rates:
+            for number in (0, os.cpu_count() or 1):
+                with busy_programs(number):
+                    found = run(rate_hz, seconds, True, realtime=asked != "not asked for")
+                period, frames = found["period"], [f"{counts.fps:.1f}" for counts in found["cameras"].values()]
+                print(
+                    f"  priority {asked:13s}  {rate_hz:4g} Hz, {number} busy programs: "
+                    f"missed {100 * found['missed']:.3f} %, period ms p99 {1e3 * period['p99']:.2f} "
+                    f"max {1e3 * period['max']:.1f}, frames/s {', '.join(frames)} ({found['scheduling']})",
+                    flush=True,
+                )
 
 
 def main() -> None:
@@ -63,7 +107,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(description="missed ticks, frame rates and ages in real time")
     parser.add_argument("--seconds", type=float, default=20.0, help="length of each run (%(default)s)")
     parser.add_argument("--rates", type=float, nargs="+", default=[240.0, 1000.0], help="servo rates, Hz")
+    parser.add_argument("--loaded", action="store_true", help="the loaded computer instead")
     args = parser.parse_args()
+    if args.loaded:
+        loaded(args.rates, args.seconds)
+        return
     for rate_hz in args.rates:
         print(f"\nservo {rate_hz:g} Hz, {args.seconds:g} s each")
         print(f"  bare pacer            missed {100 * bare(rate_hz, args.seconds / 2):.2f} %")

@@ -11,17 +11,17 @@ from pathlib import Path
 
 from .verdict import Verdict
 
-__all__ = ["check_machine", "has_realtime_kernel"]
+__all__ = ["REALTIME_RIGHT", "check_machine", "has_realtime_kernel", "may_lock_memory"]
 
 _ROOT = Path("/")
 _GOVERNORS = "sys/devices/system/cpu/cpu[0-9]*/cpufreq/scaling_governor"
 _IPC_LOCK = 14
 """Number of the capability to lock memory without a limit (capabilities(7))."""
-_RIGHTS = (
+REALTIME_RIGHT = (
     'printf \'%s - rtprio 99\\n%s - memlock unlimited\\n\' "$USER" "$USER" | '
     "sudo tee /etc/security/limits.d/99-realtime.conf; then log out and in"
 )
-"""Gives this user the right to real-time scheduling and to locked memory."""
+"""Command that gives this user the right to real-time scheduling and to locked memory."""
 _FULL_SPEED = "echo performance | sudo tee /sys/devices/system/cpu/cpu*/cpufreq/scaling_governor (until the next start)"
 _KERNELS = {
     "debian": "sudo apt install linux-image-rt-amd64, then start the computer with it",
@@ -81,7 +81,7 @@ def _scheduling() -> Verdict:
         return Verdict("scheduling", "ok", f"SCHED_FIFO is allowed, up to priority {priority}")
     limit = resource.getrlimit(resource.RLIMIT_RTPRIO)[0]
     found = f"SCHED_FIFO is not allowed up to priority {priority} ('ulimit -r' says {limit})"
-    return Verdict("scheduling", "warn", found, _RIGHTS)
+    return Verdict("scheduling", "warn", found, REALTIME_RIGHT)
 
 
 def _may_be_fifo(priority: int) -> bool:
@@ -102,13 +102,18 @@ def _may_be_fifo(priority: int) -> bool:
     return allowed
 
 
-def _memory(root: Path) -> Verdict:
+def may_lock_memory(root: Path = _ROOT) -> bool:
+    """Whether this process may lock all of its memory."""
     limit = resource.getrlimit(resource.RLIMIT_MEMLOCK)[0]
-    capabilities = _capabilities(root)
-    if limit == resource.RLIM_INFINITY or (capabilities is not None and capabilities >> _IPC_LOCK & 1):
+    return limit == resource.RLIM_INFINITY or bool((_capabilities(root) or 0) >> _IPC_LOCK & 1)
+
+
+def _memory(root: Path) -> Verdict:
+    if may_lock_memory(root):
         return Verdict("memory", "ok", "all of a process's memory may be locked")
+    limit = resource.getrlimit(resource.RLIMIT_MEMLOCK)[0]
     found = f"only {limit / 2**20:.0f} MiB may be locked ('ulimit -l'); a servo's process needs more"
-    return Verdict("memory", "unknown" if capabilities is None else "warn", found, _RIGHTS)
+    return Verdict("memory", "unknown" if _capabilities(root) is None else "warn", found, REALTIME_RIGHT)
 
 
 def _capabilities(root: Path) -> int | None:

@@ -37,13 +37,19 @@ def checked_cameras(plan: Plan) -> tuple[CameraSpec, ...]:
     return tuple(camera for camera in plan.cameras if registry.driver(camera.driver).camera_preflight is not None)
 
 
-def preflight(plan: Plan, duration: float = 2.0, *, cameras: bool = True) -> Iterator[Verdict]:
-    """Look at the machine, then at every real arm and camera; each verdict comes as soon as it is known.
+def preflight(plan: Plan, duration: float = 2.0, *, machine: bool = True, cameras: bool = True) -> Iterator[Verdict]:
+    """Check the machine, then every real arm and camera; each verdict comes as soon as it is known.
 
-    ``duration`` is how long each arm's network, and each camera's rate, is measured, s. ``cameras=False`` leaves the
-    cameras out. Raises nothing that a driver's check raises: that is a verdict, too.
+    Errors of a driver's check are verdicts, too, and are not raised.
+
+    Args:
+        plan: The rig.
+        duration: How long each arm's network, and each camera's rate, is measured, s.
+        machine: Whether to check this computer.
+        cameras: Whether to check the cameras.
     """
-    yield from check_machine()
+    if machine:
+        yield from check_machine()
     devices: list[RobotSpec | CameraSpec] = [*real_arms(plan), *(checked_cameras(plan) if cameras else ())]
     for device in devices:
         for verdict in _check(device, duration):

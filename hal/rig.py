@@ -51,7 +51,7 @@ def open_rig(
     viewer: str = "none",
     console: bool = False,
     listen: str | None = None,
-    realtime: bool = False,
+    realtime: bool = True,
 ) -> Rig:
     """Open a rig: a file, the name of a built-in one, or a dict of the same shape.
 
@@ -61,8 +61,9 @@ def open_rig(
     ``evdev``, ``web`` (the console), ``terminal``, ``keyboard``, ``demo`` (the recorded tour), the path of a recording,
     or ``none`` to open no pad. ``viewer="gui"`` opens a window onto the simulated world, ``viewer="3d"`` a page with
     the arms in three dimensions. ``console=True`` serves the console also where another pad drives; ``listen`` is the
-    address, and the port, at which it listens: loopback unless told otherwise. ``realtime`` asks for SCHED_FIFO and
-    locked memory in the processes that run servos, where the user may.
+    address, and the port, at which it listens: loopback unless told otherwise. ``realtime=False``
+    leaves the processes that run servos at the default scheduling; otherwise, in real time, they ask for SCHED_FIFO and
+    locked memory, and :attr:`Rig.notes` says how to allow it where it is refused.
 
     Nothing moves. Raises ConfigError (every problem at once), DriverMissing, DeviceNotFound, ConnectionLost.
     """
@@ -128,11 +129,13 @@ class Rig:
             raise NotSupported("there is no simulated world to look at; leave the viewer out")
         if viewer == "3d":
             self.viewer3d = registry.load("viser", "viewer3d")(self)
+        refused = False
         for host in self._hosts:
             if isinstance(host, RemoteHost):
-                scheduling = host.wait_ready()["scheduling"]
-                if realtime and host.spec.robots:
-                    self.notes.append(f"servo process {host.spec.name}: {scheduling}")
+                ready = host.wait_ready()
+                refused |= realtime and bool(host.spec.robots) and not self.lock_step and not ready["realtime"]
+        if refused:
+            self._note_refused_priority()
         if world_host is not None:
             self.world = World(world_host.request, self._world_edited)
             self.notes.extend(world_host.request("warnings"))
@@ -150,6 +153,13 @@ class Rig:
         self._open_pads(pads)
         for host in self._hosts:
             host.request("reset_statistics")  # starting up is not what anybody wants to measure
+
+    def _note_refused_priority(self) -> None:
+        from .machine import REALTIME_RIGHT
+
+        checked = self.attended and not self.emulated  # the check before a real arm has printed the command
+        remedy = "hal-check prints what allows it" if checked else f"to allow it: {REALTIME_RIGHT}"
+        self.notes.append(f"real-time priority (SCHED_FIFO) is refused: a busy computer delays the servos; {remedy}")
 
     def _start_hosts(self, groups: Sequence[GroupSpec], realtime: bool) -> Host | None:
         """The processes of the groups; returns the one with the simulated world. Its copies of arms follow the rest."""

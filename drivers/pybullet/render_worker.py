@@ -15,8 +15,8 @@ from typing import Any
 from hal.errors import ConnectionLost
 from hal.host.frames import FrameRing
 from hal.host.mailbox import SeriesBox
-from hal.host.pacer import yield_to_others
 from hal.host.process import Channel, SharedMemory
+from hal.host.scheduling import yield_to_others
 from hal.specs import CameraSpec, WorldSpec, from_json
 
 from .exposure import Exposure, check_view

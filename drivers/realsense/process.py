@@ -16,8 +16,8 @@ from collections.abc import Sequence
 from typing import Any
 
 from hal.errors import CommandError, HalError
-from hal.host.pacer import yield_to_others
 from hal.host.process import Channel, SharedMemory, pack_error
+from hal.host.scheduling import yield_to_others
 from hal.specs import CameraSpec, from_json
 
 from .devices import found_in

@@ -11,8 +11,8 @@ from collections.abc import Sequence
 from typing import Any
 
 from hal.errors import ConnectionLost
-from hal.host.pacer import yield_to_others
 from hal.host.process import Channel, SharedMemory
+from hal.host.scheduling import yield_to_others
 from hal.specs import GroupSpec, from_json
 
 from .guard import HOST, serve

@@ -19,9 +19,10 @@ from ..specs import GroupSpec, from_json
 from .cycle import Cycle
 from .mailbox import SeriesBox
 from .pace import DevicePace, Pace, Steps, Suspension
-from .pacer import Pacer, prepare_process
+from .pacer import Pacer
 from .process import Channel, SharedMemory, pack_error
 from .records import GroupMemory
+from .scheduling import describe, is_realtime, prepare_process
 
 __all__ = ["main"]
 
@@ -77,10 +78,10 @@ class HostProcess:
         try:
             self._alarm()
             cycle.open(self.pace.now())
-            scheduling = prepare_process(self.realtime)
+            prepare_process(self.realtime)
             self.pace.restart()
             self._publish(self.pace.now())
-            self.channel.send({"ready": {"scheduling": scheduling, "rate_hz": cycle.spec.rate_hz}})
+            self.channel.send({"ready": {"realtime": is_realtime(), "rate_hz": cycle.spec.rate_hz}})
             self._cycle_until_closed()
         except BaseException:
             self.closing = True
@@ -198,7 +199,11 @@ class HostProcess:
         result = self.cycle.request(method, params)
         pace = self.pace
         if method == "statistics":
-            result = result | {"missed": pace.missed, "period_s": pace.periods.summary()}
+            result = result | {
+                "missed": pace.missed,
+                "period_s": pace.periods.summary(),
+                "scheduling": describe(),
+            }
         elif method == "reset_statistics":
             pace.reset_statistics()
         return result

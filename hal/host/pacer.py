@@ -2,18 +2,11 @@
 
 from __future__ import annotations
 
-import contextlib
-import ctypes
-import gc
-import os
-import sys
 import time
 
 from .pace import Pace
 
-__all__ = ["Pacer", "prepare_process"]
-
-_PR_SET_TIMERSLACK = 29
+__all__ = ["Pacer"]
 
 
 class Pacer(Pace):
@@ -54,40 +47,3 @@ class Pacer(Pace):
     def reset_statistics(self) -> None:
         super().reset_statistics()
         self._missed = 0
-
-
-def prepare_process(realtime: bool = False) -> str:
-    """Make this process wake up on time; returns what was done, in words.
-
-    Needs no privilege: a timer slack of 1 ns (prctl), and no garbage collection. With ``realtime``: SCHED_FIFO and
-    locked memory as well, where the user may; without them it goes on all the same.
-    """
-    gc.collect()
-    gc.freeze()
-    gc.disable()
-    if not sys.platform.startswith("linux"):
-        return "default scheduling"
-    libc = ctypes.CDLL(None, use_errno=True)
-    libc.prctl(_PR_SET_TIMERSLACK, 1, 0, 0, 0)
-    if not realtime:
-        return "default scheduling"
-    try:
-        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(50))
-    except OSError:
-        return "default scheduling (no right to SCHED_FIFO: see 'ulimit -r')"
-    locked = libc.mlockall(3) == 0
-    return "SCHED_FIFO, memory locked" if locked else "SCHED_FIFO"
-
-
-def yield_to_others(nice: int) -> None:
-    """What draws comes after the servo: a lower priority, no claim to run at once, and one processor left alone.
-
-    The last of these matters most: a servo at 1 kHz beside two cameras on two cores missed 6 to 10 % of its ticks
-    without it, 0.3 to 0.4 % with it (benchmarks/real_time.py).
-    """
-    os.nice(nice)
-    with contextlib.suppress(AttributeError, OSError):  # Linux only
-        os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
-        processors = sorted(os.sched_getaffinity(0))
-        if len(processors) > 1:
-            os.sched_setaffinity(0, processors[1:])

@@ -14,8 +14,8 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import CommandError, HalError
-from ..host.pacer import yield_to_others
 from ..host.process import Channel, ChannelClosed, SharedMemory, pack_error
+from ..host.scheduling import yield_to_others
 from .columns import CameraSetup
 from .compatible import check_compatible
 from .finalise import CLOSING, finalise

@@ -86,6 +86,19 @@ def test_teleoperation_of_an_arm_that_is_not_there_ends_before_anything_is_opene
     assert "FAIL" in done.stdout
     assert f"{EMPTY}:1337 refuses" in done.stdout
     assert "Open this in a browser" not in done.stdout
+    assert "kernel" not in done.stdout, "a rehearsal does not depend on how fit this computer is"
+
+
+def test_the_command_that_grants_real_time_rights_is_shown_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: object) -> None:
+        raise PermissionError
+
+    monkeypatch.setattr("os.sched_setscheduler", refuse)
+    monkeypatch.setattr("hal.machine.may_lock_memory", lambda _: False)
+    done = run_here(check, "--sim")
+    assert done.stdout.count("WARN      scheduling") == 1
+    assert "only" in done.stdout
+    assert done.stdout.count("limits.d/99-realtime.conf") == 1
 
 
 def test_teleoperation_of_a_simulation_is_not_checked() -> None:

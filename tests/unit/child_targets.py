@@ -48,3 +48,44 @@ def impatient_console(channel, memories, config):
     service.Visitors = Visitors
     sockets._PATIENCE /= HURRY
     process.main(channel, memories, config)
+
+
+def scheduled(channel, memories, config):
+    """Prepare as a servo's host, without the right to real-time priority if so configured; tell how it is scheduled."""
+    import resource
+
+    from hal.host.scheduling import describe, is_realtime, prepare_process
+
+    if config["refused"]:
+        give_up_right()
+    prepare_process(config["realtime"])
+
+    def state():
+        with open("/proc/self/status") as file:
+            locked = next(int(line.split()[1]) for line in file if line.startswith("VmLck"))
+        limits = resource.getrlimit(resource.RLIMIT_RTTIME)
+        return {"realtime": is_realtime(), "text": describe(), "limits": limits, "locked_kb": locked}
+
+    channel.send({"ready": state()})
+    message = channel.receive(60.0)
+    end = time.monotonic() + message["params"]["busy"]
+    while time.monotonic() < end:
+        pass
+    channel.send({"id": message["id"], "result": state()})
+    channel.receive(60.0)
+
+
+def give_up_right():
+    """Refuse SCHED_FIFO to this process and its children, as to an ordinary user: no CAP_SYS_NICE, no RLIMIT_RTPRIO."""
+    import ctypes
+    import resource
+
+    resource.setrlimit(resource.RLIMIT_RTPRIO, (0, 0))
+    libc = ctypes.CDLL(None)
+    libc.prctl(24, 23, 0, 0, 0)  # PR_CAPBSET_DROP: children of root do not regain it; fails for others, who lack it
+    header = (ctypes.c_uint32 * 2)(0x20080522, 0)
+    sets = (ctypes.c_uint32 * 6)()
+    assert libc.capget(header, sets) == 0
+    for k in range(3):
+        sets[k] &= ~(1 << 23)
+    assert libc.capset(header, sets) == 0
