@@ -17,6 +17,7 @@ from hal.specs import CameraSpec
 from .about import info_of
 from .link import CameraLink
 from .settings import RealSenseSettings
+from .stamps import SYSTEM
 
 __all__ = ["RealSenseCamera"]
 
@@ -157,6 +158,12 @@ class RealSenseCamera(CameraDriver):
                 "camera %s is on USB %s, where it has fewer modes and loses frames: try a USB 3 port and cable",
                 self.spec.name,
                 self._info.usb,
+            )
+        if self._info.clock == SYSTEM and self._sessions == 1:
+            _LOG.warning(
+                "camera %s: its frames carry no metadata, as with a kernel without RealSense's patches: pictures are "
+                "matched by their arrival, and stamps are late by each frame's own way (docs/realsense.md, Clocks)",
+                self.spec.name,
             )
         if residual > 0.1:
             _LOG.warning(

@@ -10,6 +10,8 @@ from collections.abc import Mapping
 from enum import Enum
 from typing import NamedTuple
 
+from .stamps import SYSTEM
+
 __all__ = ["Matcher", "Numbering", "Taken", "Verdict"]
 
 _ORDER = ("depth", "color", "infrared", "infrared_right")
@@ -39,13 +41,17 @@ class Matcher:
     """Judges one set after the other.
 
     The leading stream is the slowest one: it decides what a capture is. The others belong to it where their stamps
-    differ by no more than half a period of the fastest stream; stamps of different clocks are not compared.
+    differ by no more than half a period of the fastest stream; stamps of different clocks are not compared. Frames
+    without metadata (a kernel without RealSense's patches) are stamped when they arrive, each stream after a delay of
+    its own: these may differ by a period of the slowest stream.
     """
 
     def __init__(self, rates: Mapping[str, float]) -> None:
         self.lead = min(rates, key=lambda name: (rates[name], _ORDER.index(name)))
         self.tolerance = 0.5 / max(rates.values())
-        """s"""
+        """Of times of capture, s."""
+        self.arrival_tolerance = 1.0 / min(rates.values())
+        """Of times of arrival, s."""
         self._handed_out: dict[str, int] = {}
 
     def judge(self, taken: Mapping[str, Taken]) -> Verdict:
@@ -56,16 +62,17 @@ class Matcher:
         for name, picture in taken.items():
             if self._handed_out.get(name) == picture.number:
                 return Verdict.MISMATCHED
-            if picture.domain == first.domain and abs(picture.stamp - first.stamp) > self.tolerance:
+            tolerance = self.arrival_tolerance if picture.domain == SYSTEM else self.tolerance
+            if picture.domain == first.domain and abs(picture.stamp - first.stamp) > tolerance:
                 return Verdict.MISMATCHED
         self._handed_out = {name: picture.number for name, picture in taken.items()}
         return Verdict.NEW
 
 
 def skew(taken: Mapping[str, Taken]) -> float | None:
-    """By how much colour was taken later than depth, s; None where nobody can know."""
+    """Return by how much colour was taken later than depth, s; None where the stamps do not show it."""
     color, depth = taken.get("color"), taken.get("depth")
-    if color is None or depth is None or color.domain != depth.domain:
+    if color is None or depth is None or color.domain != depth.domain or color.domain == SYSTEM:
         return None
     return color.stamp - depth.stamp
 

@@ -41,6 +41,21 @@ def test_two_clocks_are_not_compared() -> None:
     assert skew({"color": Taken(1, 0.0, "system")}) is None
 
 
+def test_pictures_without_metadata_are_matched_by_arrival_and_number() -> None:
+    def arrived(depth: int, color: int, late: float) -> dict[str, Taken]:
+        return {"depth": Taken(depth, depth / 30.0, "system"), "color": Taken(color, depth / 30.0 + late, "system")}
+
+    sets = (
+        arrived(1, 7, 0.025),
+        arrived(2, 8, 0.020),
+        arrived(3, 8, -0.013),
+        arrived(3, 9, 0.030),
+        arrived(4, 11, 0.034),
+    )
+    assert judged(*sets) == [NEW, NEW, MISMATCHED, NEW, MISMATCHED]
+    assert skew(sets[0]) is None, "how late they were taken does not follow from how late they came"
+
+
 def test_the_slowest_stream_leads() -> None:
     matcher = Matcher({"depth": 30.0, "color": 15.0})
     assert matcher.lead == "color"
