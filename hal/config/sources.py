@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import platform
+import sys
 from pathlib import Path
 
 from ..packages import package_folder
@@ -10,8 +12,13 @@ from .models import UrdfSource
 
 __all__ = ["locate_urdf"]
 
+_HAS_WHEEL = sys.version_info < (3, 12) and (sys.platform, platform.machine()) == ("linux", "x86_64")
+_NO_WHEEL = (
+    f"PyBullet has no wheel for Python {platform.python_version()} on {platform.machine()}: use Python 3.11 on x86-64 "
+    "Linux (uv venv --seed --python 3.11 .venv, then install again), or build it (C++ compiler): pip install pybullet"
+)
 INSTALL = {
-    "pybullet_data": "pip install pybullet",
+    "pybullet_data": "pip install pybullet" if _HAS_WHEEL else _NO_WHEEL,
     "example_robot_data": "pip install example-robot-data",
     "airo_models": "pip install airo-models",
 }
@@ -26,7 +33,9 @@ def locate_urdf(source: UrdfSource, base: Path, file: Path | str, key: str, prob
         folder = package_folder(source.package)
         if folder is None:
             command = INSTALL.get(source.package, f"pip install {source.package.replace('_', '-')}")
-            problems.add(file, f"{key}.package", f"package {source.package!r} is not installed; {command}")
+            message = f"package {source.package!r} is not installed; {command}"
+            if all(problem.message != message for problem in problems.found):  # robot and objects may share a package
+                problems.add(file, f"{key}.package", message)
             return None
         path = (folder / source.path).resolve()
     if not path.is_file():

@@ -92,6 +92,21 @@ def test_dry_run_lists_and_opens_nothing() -> None:
     assert "256x256" in done.stdout
 
 
+def test_without_pybullet_one_line_says_what_to_do() -> None:
+    """As on Python 3.12 or ARM, where PyBullet has no wheel."""
+    code = (
+        "import platform, sys; platform.machine = lambda: 'aarch64'\n"
+        "import hal.config.sources; hal.config.sources.package_folder = lambda name: None\n"
+        "from hal.apps.teleop import main; sys.exit(main(['--sim']))\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
+    assert done.returncode == 2
+    head, *lines = done.stderr.strip().splitlines()
+    assert head == "ConfigError: 1 problem in the configuration:"
+    assert len(lines) == 1
+    assert "use Python 3.11" in lines[0]
+
+
 @pytest.mark.parametrize(
     ("arguments", "texts"),
     [
