@@ -12,7 +12,7 @@ from hal.camera_info import CameraInfo
 from hal.cropping import Cropping
 from hal.specs import CameraSpec
 
-from .realsense_bench import opened, read_until_lost, sent, software
+from .realsense_bench import opened, read_again, read_until_lost, sent, software
 
 from hal.drivers.realsense.emulator import SoftwareCamera, read_number  # isort: skip  # needs the library
 
@@ -192,3 +192,19 @@ def test_two_cameras_at_once() -> None:
         left.inject(disconnect=True)
         assert "unplugged" in str(read_until_lost(left, 5.0))
         assert right.read(timeout=5.0).stamp.t > time.monotonic() - 1.0
+
+
+def test_frames_without_metadata_are_matched_by_arrival_which_is_logged_once(caplog: pytest.LogCaptureFixture) -> None:
+    """As from a stock kernel: stamps are times of arrival, and colour arrives 25 ms after depth."""
+    with opened(software(emulated={"clock": "system", "metadata": False})) as cam:
+        cam.inject(skew=0.025)
+        cam.read(timeout=5.0, after=time.monotonic())
+        before = cam.counts().mismatched
+        frames = [cam.read(timeout=5.0) for _ in range(30)]
+        assert all(frame.skew is None for frame in frames)
+        assert cam.counts().mismatched - before < 10
+        cam.inject(disconnect=True)
+        read_until_lost(cam, 5.0)
+        cam.inject(disconnect=False)
+        read_again(cam, 10.0)
+    assert sum("carry no metadata" in record.message for record in caplog.records) == 1
