@@ -28,7 +28,7 @@ LET_GO = 0.2
 AGAIN = 0.1
 """s between two tries where no session can be had."""
 
-HOME, OTHER_PAD = "home", "other pad"
+HOME, OTHER_PAD, OTHER_ARM, RESET = "home", "other pad", "other arm", "reset"
 """What may be due after a session."""
 
 T = TypeVar("T")
@@ -62,6 +62,13 @@ def chosen_devices(rig: Rig, args: argparse.Namespace) -> tuple[Robot, Gamepad]:
     return rig.robots[name], next(iter(rig.gamepads.values()))
 
 
+def _settings(rig: Rig) -> tuple[str, ...]:
+    """What a page may set: the arm where there are several, and the scene where nothing real moves."""
+    arms = ("robot",) if len(rig.robots) > 1 else ()
+    scene = ("scene",) if rig.plan.world is not None and not rig.attended else ()
+    return ("speed", "frame", *arms, *scene)
+
+
 class Driving:
     """:meth:`drive` follows the pad, whatever stops the arm in between, until the caller has a reason to end."""
 
@@ -74,8 +81,10 @@ class Driving:
         mapping: str | None = None,
         speed: float = 1.0,
         actions: tuple[str, ...] = (),
+        adjustable: bool = False,
     ) -> None:
-        """``actions`` are those of the mapping that the app knows."""
+        """``actions`` are those of the mapping that the app knows. ``adjustable``: a page of the console may choose the
+        arm, the speed and the frame, and reset a simulated scene."""
         from hal.apps.report import RunReport
         from hal.apps.steering import Steering
 
@@ -90,7 +99,13 @@ class Driving:
         """What is wrong with the gripper."""
         self._distrusted = ""
         """Why the pad that was plugged in may not drive."""
-        self._steering = Steering(rig, robot, pad, mapping, speed, actions)
+        self._wishes: dict[str, str | float] = {}
+        """Settings that the page in control changed: the newest of each."""
+        self._next_arm = ""
+        settings = _settings(rig) if adjustable else ()
+        self._steering = Steering(rig, robot, pad, mapping, speed, actions, settings)
+        if settings and rig.console is not None:
+            rig.console.on_setting(self._wishes.__setitem__)
 
     @property
     def teleop(self) -> Teleop:
@@ -119,11 +134,15 @@ class Driving:
     def drive(self, look: Look) -> str:
         """Follow the pad until ``look`` gives a reason to end; returns that. The arm is at rest then."""
         while True:
-            after = self.guarded(lambda: self._session(look))
+            after = self.guarded(lambda: self._session(look)) or self._apply_settings()
             if after == HOME:
                 self.guarded(self._go_home)
             elif after == OTHER_PAD:
                 self.take_other_pad()
+            elif after == OTHER_ARM:
+                self._take_other_arm()
+            elif after == RESET:
+                self._reset_scene()
             elif reason := after or look(self.pad.state()):
                 return reason
 
@@ -179,13 +198,47 @@ class Driving:
         """What must be done outside of a session."""
         if self.teleop.home_pressed(state) and self.deadman.held:
             return HOME
-        return OTHER_PAD if self._other_pad() else ""
+        return OTHER_PAD if self._other_pad() else self._apply_settings()
+
+    def _apply_settings(self) -> str:
+        """Apply what the page in control has set; return what must be done outside of a session, or nothing.
+
+        What the controls mean changes only while the dead-man is released, so that nothing that is held moves
+        another arm, or moves another way.
+        """
+        while self._wishes:
+            name, value = self._wishes.popitem()
+            if name == "speed":
+                self._steering.set_speed(float(value))
+            elif name == "scene":
+                return RESET
+            elif self.deadman.held:
+                self.event(f"the {'arm' if name == 'robot' else name} was not changed: release the dead-man first")
+            elif name == "frame":
+                self._steering.set_frame(str(value))
+            elif value != self.robot.name:
+                self._next_arm = str(value)
+                return OTHER_ARM
+        return ""
+
+    def _take_other_arm(self) -> None:
+        """Drive the arm that was chosen on the page. It needs a new press of the dead-man."""
+        self.robot = self.rig.robots[self._next_arm]
+        self.stopped = None
+        self.report.follow(self.robot)
+        self._steering.drive(self.robot)
+        self.event(f"driving {self.robot.name}")
+
+    def _reset_scene(self) -> None:
+        """Put the simulated objects and arms back to where they started. The session has ended, so the arm rests."""
+        self.rig.world.reset()
+        self.event("scene reset: hold the dead-man again to drive")
 
     def take_other_pad(self) -> None:
         """Was a pad plugged in whose controls are others, and which may drive? From now on it does."""
         if self._other_pad():
             self._steering.take()
-            self.event(f"{self.pad.describe()} drives")
+            self.event(f"driving with {self.pad.describe()}")
             self.line.event(self.help())
 
     def _other_pad(self) -> bool:
@@ -216,15 +269,15 @@ class Driving:
     def _go_home(self) -> None:
         from hal.errors import MotionStopped
 
-        self.event("home: hold the dead-man until the arm is there")
+        self.event("homing: hold the dead-man until the arm is there")
         try:
             self.robot.move_to(self.robot.home, deadman=self.deadman, patience=LET_GO)
         except MotionStopped:
             if self.deadman.held or not self.deadman.connected:
                 raise
-            self.event("home: given up, the dead-man was let go of")
+            self.event("homing cancelled: dead-man released")
         else:
-            self.event("home: there; let go of the dead-man and hold it again to drive")
+            self.event("home reached: release the dead-man, then hold it again to drive")
 
     # What went wrong, told once.
 
@@ -249,13 +302,13 @@ class Driving:
     def _resumed(self) -> None:
         if self.stopped is not None:
             self.stopped = None
-            self.event("going on")
+            self.event("resumed")
 
     def _look_at_the_hand(self) -> None:
         """Say once what is wrong with the gripper; the arm goes on without it."""
         trouble = self.robot.gripper.trouble if self.robot.gripper is not None else ""
         if bool(trouble) != bool(self._hand):
-            self.event(f"GRIPPER: {trouble}" if trouble else "the gripper is there again")
+            self.event(f"GRIPPER: {trouble}" if trouble else "the gripper answers again")
         self._hand = trouble
 
     def _show(self, control: Control) -> None:
@@ -275,12 +328,12 @@ class Driving:
             x, y, z = state.tcp.position
             held = "held" if self.deadman.held else "released"
             if self.pad.waiting_for and self.pad.state().connected:
-                held = f"waits: let go of, or move once: {', '.join(self.pad.waiting_for)}"
+                held = f"waits: release, or move once: {', '.join(self.pad.waiting_for)}"
             status = state.status.name.lower()
             hand = self.robot.gripper.newest() if self.robot.gripper is not None else None
             width = f"gripper {1e3 * hand.width:4.0f} mm  " if hand is not None and not self._hand else ""
             trips = f"  trips {len(self.report.trips)}" if self.report.trips else ""
-            limited = f"  held back: {state.limited}" if state.limited else ""
+            limited = f"  limited: {state.limited}" if state.limited else ""
             frames = "  ".join(
                 f"{name} {counts.fps:.0f}/s"
                 for name, camera in self.rig.cameras.items()

@@ -30,6 +30,10 @@ class RunReport:
         self.trips: list[dict[str, Any]] = []
         self.faults: list[dict[str, Any]] = []
 
+    def follow(self, robot: Robot) -> None:
+        """Report about this arm, which is driven from now on. The travel of all of them adds up."""
+        self._robot, self._position = robot, None
+
     def saw(self, state: RobotState) -> None:
         """Note a state that the app looked at."""
         self._ages.add(self._rig.clock.now() - state.stamp.t)

@@ -22,12 +22,29 @@ class Steering:
     mapping = ""
 
     def __init__(
-        self, rig: Rig, robot: Robot, pad: Gamepad, asked: str | None, speed: float, actions: tuple[str, ...] = ()
+        self,
+        rig: Rig,
+        robot: Robot,
+        pad: Gamepad,
+        asked: str | None,
+        speed: float,
+        actions: tuple[str, ...] = (),
+        settings: tuple[str, ...] = (),
     ) -> None:
-        """``asked`` is the mapping that a person wants, whatever the pad is; ``actions`` are those of the mapping that
-        the app knows. Raises ConfigError for a bad mapping."""
-        self._rig, self._robot, self._pad, self._asked, self._speed = rig, robot, pad, asked, speed
-        self._actions = actions
+        """Use the mapping that is due now.
+
+        Args:
+            asked: The mapping that the user wants, whatever the pad is.
+            speed: Share of the mapping's speeds; the console cannot exceed it.
+            actions: Those of the mapping that the app knows.
+            settings: Those of ``hal.console.SETTINGS`` that the console may change.
+
+        Raises:
+            ConfigError: For a bad mapping.
+        """
+        self._rig, self._robot, self._pad, self._asked = rig, robot, pad, asked
+        self._speed = self._speed_max = speed
+        self._actions, self._settings = actions, settings
         self.take()
 
     def _wanted(self) -> str:
@@ -47,14 +64,39 @@ class Steering:
         return (self._pad.distrust() or "") if spec.attended and not spec.emulated else ""
 
     def take(self) -> None:
-        """Use the mapping that is due. Its dead-man must be let go of and pressed before it counts."""
+        """Use the mapping that is due. Its dead-man must be released and pressed before it counts."""
         import hal
 
         self.mapping = self._wanted()
         self.teleop = hal.Teleop(self._robot, mapping=self.mapping, speed=self._speed)
         self.deadman = self._pad.hold(self.teleop.mapping.deadman)
-        if self._rig.console is not None:
-            self._rig.console.explain(self.teleop.labels(actions=("home", *self._actions)))
+        self._show()
+
+    def drive(self, robot: Robot) -> None:
+        """Drive this arm from the next session on."""
+        self._robot = robot
+        self.take()
+
+    def set_speed(self, speed: float) -> None:
+        """Drive at this share of the mapping's speeds, or at the greatest one that is allowed."""
+        self._speed = self.teleop.speed = min(speed, self._speed_max)
+        self._show()
+
+    def set_frame(self, frame: str) -> None:
+        """Move along the axes of the arm's base, or of its tool."""
+        self.teleop.frame = "tcp" if frame == "tcp" else "base"
+        self._show()
+
+    def _show(self) -> None:
+        """Show on the console's pages which arm is driven, and what the controls do."""
+        from hal.console import DrivingView
+
+        console, teleop = self._rig.console, self.teleop
+        if console is None:
+            return
+        console.explain(teleop.labels(actions=("home", *self._actions)))
+        view = DrivingView(self._robot.name, teleop.speed, self._speed_max, teleop.frame, self._settings)
+        console.show_driving(view)
 
     def help(self) -> str:
         """For people, some lines."""

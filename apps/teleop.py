@@ -70,7 +70,7 @@ class Session:
         from hal.apps.driving import Driving
 
         self.rig, self.pad, self.args = rig, pad, args
-        self.driving = Driving(rig, robot, pad, mapping=args.mapping, speed=args.speed or 1.0)
+        self.driving = Driving(rig, robot, pad, mapping=args.mapping, speed=args.speed or 1.0, adjustable=True)
         self.end = rig.clock.now() + args.duration if args.duration else None
 
     def run(self) -> int:

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from .camera import Camera
     from .rig import Rig
 
-__all__ = ["ACTIONS", "PHASES", "PORT", "Console", "Listen", "RecordingView"]
+__all__ = ["ACTIONS", "PHASES", "PORT", "SETTINGS", "Console", "DrivingView", "Listen", "RecordingView"]
 
 LOOPBACK = "127.0.0.1"
 PORT = 8470
@@ -24,6 +24,11 @@ PHASES = ("resetting", "ready", "recording", "saving", "done")
 """What a program that records episodes may be at."""
 ACTIONS = ("record", "finish", "fail", "discard")
 """What a page may ask it for: start an episode, save it as a success, save it as a failure, throw it away."""
+
+SETTINGS = ("robot", "speed", "frame", "scene")
+"""What the page in control may set: the arm that it drives, its speed, its frame; and ``scene``, which is reset."""
+FRAMES = ("base", "tcp")
+"""Whose axes an arm may be driven along: those of its base, or of its tool."""
 
 
 class Listen(NamedTuple):
@@ -99,6 +104,31 @@ class RecordingView:
             raise CommandError(f"seconds must be finite and at least 0, not {self.seconds}")
 
 
+@dataclass(frozen=True, slots=True)
+class DrivingView:
+    """Which arm a pad drives, and how. CommandError for a frame or a setting that does not exist, or a wrong speed."""
+
+    robot: str
+    """Name of the arm that the pad drives."""
+    speed: float = 1.0
+    """Share of the mapping's speeds, above 0, at most :attr:`speed_max`."""
+    speed_max: float = 1.0
+    """Greatest :attr:`speed` that a page may set, at most 1."""
+    frame: str = "base"
+    """``base`` or ``tcp``: the axes that the controls move along."""
+    settings: tuple[str, ...] = ()
+    """Those of :data:`SETTINGS` that the page in control may set."""
+
+    def __post_init__(self) -> None:
+        if not 0.0 < self.speed <= self.speed_max <= 1.0:
+            raise CommandError(f"a speed must be above 0 and at most 1, not {self.speed} of {self.speed_max}")
+        if self.frame not in FRAMES:
+            raise CommandError(f"a frame must be one of {', '.join(FRAMES)}, not {self.frame!r}")
+        unknown = [name for name in self.settings if name not in SETTINGS]
+        if unknown:
+            raise CommandError(f"a setting must be one of {', '.join(SETTINGS)}, not {unknown[0]!r}")
+
+
 class Console(ABC):
     """The page and the server behind it. ``wait_ready`` comes once, then everything else, from any thread."""
 
@@ -136,6 +166,20 @@ class Console(ABC):
     @abstractmethod
     def explain(self, labels: Mapping[str, Any]) -> None:
         """Write onto the page's controls what they do: :meth:`hal.teleop.Teleop.labels`."""
+
+    @abstractmethod
+    def show_driving(self, view: DrivingView) -> None:
+        """Show which arm is driven, how fast and in which frame; never waits. Only the newest view counts."""
+
+    @abstractmethod
+    def on_setting(self, changed: Callable[[str, str | float], None]) -> None:
+        """Call ``changed`` when the page in control changes one of the settings of the newest :class:`DrivingView`.
+
+        It gets the setting's name and value: the name of an arm, a share of the mapping's speeds, a frame, or
+        ``"reset"`` for ``scene``. As with :meth:`on_action`, it must only note them and return. The program decides:
+        it must change the arm or the frame only while the dead-man is released, and stop the arm before it resets the
+        scene. What it does shows in its next :class:`DrivingView`.
+        """
 
     @abstractmethod
     def show_recording(self, view: RecordingView) -> None:

@@ -53,6 +53,9 @@ class Teleop:
         self.robot = robot
         self.mapping = load_mapping(mapping)
         self.speed = speed
+        """Share of the mapping's speeds, above 0, at most 1."""
+        self.frame = self.mapping.frame
+        """``base`` or ``tcp``: the axes that the controls move along; at first the mapping's."""
         self._has_grip = False
         self._side = 0.0
         self._was_toggle = True
@@ -75,7 +78,7 @@ class Teleop:
         """
         twist = self.mapping.twist(pad)
         linear, angular = ([self.speed * value for value in part] for part in (twist[:3], twist[3:]))
-        return Twist(linear, angular, frame=self.mapping.frame), self._grip(pad)
+        return Twist(linear, angular, frame=self.frame), self._grip(pad)
 
     def home_pressed(self, pad: PadState) -> bool:
         """Was the button that drives the arm home pressed since the last call?"""
@@ -138,7 +141,7 @@ class Teleop:
         for name, words, axis in zip(_DIRECTIONS, _WORDS, mapping.axes(), strict=True):
             if axis is None:
                 continue
-            low, high = words if mapping.frame == "base" else (f"tool {name} -", f"tool {name} +")
+            low, high = words if self.frame == "base" else (f"tool {name} -", f"tool {name} +")
             if axis.invert:
                 low, high = high, low
             if axis.buttons is not None:
@@ -159,7 +162,7 @@ class Teleop:
         return {
             "deadman": mapping.deadman,
             "home": home,
-            "frame": mapping.frame,
+            "frame": self.frame,
             "robot": self.robot.name,
             "controls": controls,
         }

@@ -23,7 +23,9 @@ _LONGEST = 48
 _PATIENCE = 0.1
 """The rest of a sequence comes within this time, s. Esc alone is known by it."""
 
-_CONTROLS = MappingProxyType({0x00: "space", 0x09: "tab", 0x0A: "enter", 0x0D: "enter", 0x20: "space"})
+_CONTROLS = MappingProxyType(
+    {0x00: "space", 0x08: "backspace", 0x09: "tab", 0x7F: "backspace", 0x0A: "enter", 0x0D: "enter", 0x20: "space"}
+)
 _LETTERS = MappingProxyType({"A": "up", "B": "down", "C": "right", "D": "left", "H": "home", "F": "end"})
 _TILDES = MappingProxyType({1: "home", 4: "end", 5: "pageup", 6: "pagedown", 7: "home", 8: "end"})
 _CODES = MappingProxyType(
@@ -32,6 +34,7 @@ _CODES = MappingProxyType(
         13: "enter",
         27: "escape",
         32: "space",
+        127: "backspace",
         57414: "enter",  # from here on: the keypad
         57417: "left",
         57418: "right",

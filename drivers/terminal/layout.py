@@ -17,6 +17,7 @@ __all__ = [
     "RELEASED",
     "SHOULDER_KEYS",
     "STEP_HELP",
+    "STOP_KEYS",
     "Controls",
     "raw",
 ]
@@ -46,6 +47,8 @@ BUTTON_KEYS: Mapping[str, str] = MappingProxyType(
 """Key -> the button that it is; these are what an app gives a meaning."""
 CLOSE, OPEN = "g", "h"
 """They pull r2, and let it go."""
+STOP_KEYS = ("backspace", "escape")
+"""They stop every arm, also while keys are held. A terminal sends Esc a moment late."""
 
 _KEYS = (
     "    arrows: d-pad; Page Up/Down or Q/E: l1/r1; WASD, IJKL: left, right stick; G/H: r2, close/open\n"
@@ -53,13 +56,14 @@ _KEYS = (
 )
 STEP_HELP = (
     "keys of this terminal, one small step for each press (l2 is pressed with it)\n"
-    "    Space or Esc: STOP; the next key goes on. While the arm steps, other keys do not count\n"
+    "    Backspace or Esc: STOP; the next key continues. While the arm steps, other keys do not count\n"
     f"{_KEYS}\n"
     "    buttons are pressed without l2: what wants l2 held the whole way, like driving home, cannot be done here"
 )
 HOLD_HELP = (
     "keys of this terminal, held down\n"
-    f"    hold Space (l2) and other keys to move; let go to stop. Esc: STOP; press Space again to go on\n{_KEYS}\n"
+    "    hold Space (l2) and other keys to move; release it to stop\n"
+    f"    Backspace or Esc: STOP; hold Space again to continue\n{_KEYS}\n"
     "    Shift: slower. When the window loses the focus, or the link is slow, everything counts as released"
 )
 

@@ -14,7 +14,7 @@ from hal.specs import PadSpec
 from .device import Terminal
 from .holding import Holding
 from .keys import CTRL, PRESS, Answer, Key, KeyParser
-from .layout import HOLD_HELP, RELEASED, STEP_HELP, Controls
+from .layout import HOLD_HELP, RELEASED, STEP_HELP, STOP_KEYS, Controls
 from .negotiation import leave, why_not_hold
 from .options import Options
 from .steps import Steps
@@ -26,7 +26,7 @@ _SIGNALS = {"c": signal.SIGINT, "z": signal.SIGTSTP, "\\": signal.SIGQUIT}
 
 
 class TerminalPad(GamepadDriver):
-    """Keys of a terminal. ``source``, if it can be called, stops every arm: Esc calls it, and in steps Space, too.
+    """Keys of a terminal. ``source``, if it can be called, stops every arm: Backspace and Esc call it.
 
     A plain terminal never says when a key is let go of, so nothing can be held there: a key press is one bounded
     *step* (:class:`.steps.Steps`). Where the terminal reports releases and the loss of focus, and answers fast enough
@@ -138,7 +138,6 @@ class TerminalPad(GamepadDriver):
 
     def _take(self, event: Key | Answer, now: float) -> None:
         hand = self._hand
-        holding = isinstance(hand, Holding)
         if isinstance(event, Answer):
             if isinstance(hand, Holding):
                 self._hear(event, hand)
@@ -146,7 +145,7 @@ class TerminalPad(GamepadDriver):
         if event.event == PRESS:
             self._focus = True
             self._obey(event)
-            if event.name == "escape" or (event.name == "space" and not holding):
+            if event.name in STOP_KEYS:
                 hand.stop(now)
                 if callable(self.source):
                     self.source()

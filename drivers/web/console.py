@@ -7,11 +7,11 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import replace
+from dataclasses import asdict, replace
 from typing import TYPE_CHECKING, Any
 
 from hal.camera import Camera, RawFrame
-from hal.console import Console, Listen, RecordingView
+from hal.console import Console, DrivingView, Listen, RecordingView
 from hal.errors import HalError, NotSupported
 from hal.gamepad import Gamepad, PadReading
 from hal.host.frames import FrameRing
@@ -23,7 +23,9 @@ from hal.types import Frame
 from .about import about_rig, shown_stream
 from .addresses import is_loopback, link, names, tunnel
 from .conversation import Conversation
+from .messages import HANDS
 from .pad import PadMail, WebPad, gone, reading
+from .padmessage import ALARMS
 from .recording import as_message
 
 if TYPE_CHECKING:
@@ -48,8 +50,11 @@ class WebConsole(Console):
         self._address, self._port = listen.address, listen.port
         self._watched: frozenset[str] = frozenset()
         self._waiting: tuple[str, ...] = ()
+        self._loss = ("", "")
+        """Why the pad was lost last, and whether that is an alarm; forgotten once it is back."""
         self._detach: list[Any] = []
         self._taken: Callable[[str], None] | None = None
+        self._changed: Callable[[str, str | float], None] | None = None
         self._closed = False
         self._recovering = threading.Lock()
         hosts = [host for host in rig._hosts if isinstance(host, RemoteHost)]
@@ -122,9 +127,14 @@ class WebConsole(Console):
     def explain(self, labels: Mapping[str, Any]) -> None:
         self._conversation.tell("labels", labels=dict(labels))
 
+    def show_driving(self, view: DrivingView) -> None:
+        self._conversation.tell("driving", view=asdict(view))
+
     def show_playing(self, on: bool) -> None:
         """Tell the pages whether the recorded tour is being played."""
         self._conversation.tell("playing", on=on)
+        if not on:
+            self._say_loss("the tour has ended")
 
     def show_recording(self, view: RecordingView) -> None:
         self._conversation.tell_newest("recording", t=time.monotonic(), view=as_message(view))
@@ -149,21 +159,27 @@ class WebConsole(Console):
     def on_action(self, taken: Callable[[str], None]) -> None:
         self._taken = taken
 
+    def on_setting(self, changed: Callable[[str, str | float], None]) -> None:
+        self._changed = changed
+
     def _is_lost(self) -> None:
         self._driver = None
         self._put(gone(time.monotonic(), 0))
-        print("the console is gone: no page can drive or stop any more; start the program anew", file=sys.stderr)
+        print("the console has ended: no page can drive or stop any more; start the program again", file=sys.stderr)
 
     def _take(self, message: dict[str, Any]) -> None:
         if "pad" in message:
             pad = message["pad"]
             self._put(reading(pad, 0))
             if not pad["connected"]:
-                self.say(f"the pad is gone: {pad['why']}")
+                self._say_loss(str(pad["why"]))
+            else:
+                self._loss = ("", "")
             self._say_what_is_waited_for()
         elif "stop" in message:
             self.rig.stop()
-            self.say(f"stopped by {message['stop']}")
+            page = message["stop"]
+            self._conversation.tell("say", t=time.monotonic(), text=f"STOP was pressed on {page}", stop=page)
         elif "driver" in message:
             self._driver = message["driver"]
         elif "watched" in message:
@@ -174,11 +190,20 @@ class WebConsole(Console):
             self._play(bool(message["demo"]), str(message["page"]))
         elif "action" in message:
             self._act(str(message["action"]), str(message["page"]))
+        elif "setting" in message and self._changed is not None:
+            self._changed(str(message["setting"]), message["value"])
+
+    def _say_loss(self, why: str) -> None:
+        """Tell the pages why the pad was lost, and whether that was somebody's intention."""
+        loss = "alarm" if why in ALARMS or why == HANDS else "calm"
+        if (why, loss) != self._loss:
+            self._conversation.tell("say", t=time.monotonic(), text=why, loss=loss)
+        self._loss = (why, loss)
 
     def _start_recovery(self, robot: str, page: str) -> None:
         """One at a time, in a thread of its own: it may take long, and the pad must be heard meanwhile."""
         if not self._recovering.acquire(blocking=False):
-            self._conversation.tell("refused", page=page, why="a robot is being recovered already")
+            self._conversation.tell("refused", page=page, why="a robot is already being recovered")
             return
         try:
             threading.Thread(target=self._recover, args=(robot, page), name="hal-console-recover", daemon=True).start()
@@ -192,26 +217,26 @@ class WebConsole(Console):
         except (HalError, OSError) as error:
             self._conversation.tell("refused", page=page, why=str(error))
         else:
-            self.say(f"{robot} recovered by {page}: release the dead-man and press it again")
+            self.say(f"{robot} recovered by {page}: release the dead-man, then hold it again")
         finally:
             self._recovering.release()
 
     def _play(self, on: bool, page: str) -> None:
         pad = self._pad()
         if pad is None or (self.rig.attended and not self.rig.emulated):
-            self._conversation.tell("refused", page=page, why="the tour is played in simulation only")
+            self._conversation.tell("refused", page=page, why="the tour plays in simulation only")
             return
         assert isinstance(pad.driver, WebPad)
         pad.driver.play(on)
 
     def _act(self, action: str, page: str) -> None:
         if self._taken is None:
-            self._conversation.tell("refused", page=page, why="this program takes no such wish")
+            self._conversation.tell("refused", page=page, why="this program records nothing")
             return
         try:
             self._taken(action)
         except Exception:
-            why = f"the program made a mistake at {action!r}: its own output says which"
+            why = f"the program failed at {action!r}: see its own output"
             self._conversation.tell("refused", page=page, why=why)
             raise  # to be printed by whoever brought the message
 

@@ -13,13 +13,13 @@ from hal.types import BUTTONS, STICK_AXES
 
 from .applink import Waiting
 from .lease import Change, Lease
-from .messages import Act, Away, Demo, Malformed, Recover, Stop, Take, encode, parse
+from .messages import CLOSED, Act, Away, Demo, Malformed, Recover, Setting, Stop, Take, encode, parse
 from .outbox import Outbox
 from .padmessage import PadMessage
 
 __all__ = ["App", "Desk", "Page"]
 
-_UNHEARD = f"this page is not heard in time, {{}}: there and back it may take {1e3 * SILENCE:g} ms at most"
+_UNHEARD = f"the connection is too slow to drive, {{}}: a round trip may take {1e3 * SILENCE:g} ms at most"
 _COMPLAINT = 2.0
 """s between two complaints to one page about that."""
 _SAYS = 50
@@ -60,6 +60,8 @@ class Desk:
         self._says: deque[str] = deque(maxlen=_SAYS)
         self._waiting_for: list[str] = []
         self._recording: str | None = None
+        self._driving: str | None = None
+        self._settings: frozenset[str] = frozenset()
         self._possible: frozenset[str] = frozenset()
         self.pages: dict[str, Page] = {}
         self.playing = False
@@ -74,6 +76,8 @@ class Desk:
         page.outbox.note(self._hello(page))
         if self._labels is not None:
             page.outbox.note(self._labels)
+        if self._driving is not None:
+            page.outbox.note(self._driving)
         self._tell_lease(page, self._clock())
         page.outbox.note(self._pad_waits())
         for text in self._says:
@@ -89,7 +93,7 @@ class Desk:
     def leave(self, page: Page) -> None:
         """A page is gone, or about to be: whatever it held, it holds no more. Idempotent."""
         if self.pages.pop(page.name, None) is not None:
-            self._change(self._lease.let_go(page.name, self._clock(), f"{page.name} is gone"))
+            self._change(self._lease.let_go(page.name, self._clock(), CLOSED))
 
     # What pages say.
 
@@ -110,6 +114,8 @@ class Desk:
             self._play(page, message.play)
         elif isinstance(message, Act):
             self._act(page, message.action)
+        elif isinstance(message, Setting):
+            self._set(page, message)
         else:
             raise Malformed("not on this socket")
 
@@ -143,9 +149,9 @@ class Desk:
     def _take_or_let_go(self, page: Page, take: bool) -> None:
         now = self._clock()
         if not take:
-            self._change(self._lease.let_go(page.name, now, f"{page.name} let it go"))
+            self._change(self._lease.let_go(page.name, now, f"{page.name} released control"))
         elif not self._rig["drivable"]:
-            self._refuse(page, f"no page drives this rig: {self._rig['driven_by']} does")
+            self._refuse(page, f"a page cannot drive this rig: {self._rig['driven_by']} drives it")
         else:
             self._change(self._lease.take(page.name, now))
 
@@ -161,11 +167,17 @@ class Desk:
         else:
             self._wish(page, {"action": action, "page": page.name}, "steer the recording")
 
+    def _set(self, page: Page, setting: Setting) -> None:
+        if self._lease.driver == page.name and setting.name not in self._settings:
+            self._refuse(page, f"this program does not let a page set the {setting.name}")
+        else:
+            self._wish(page, {"setting": setting.name, "value": setting.value, "page": page.name}, "change settings")
+
     def _wish(self, page: Page, message: dict[str, Any], what: str) -> None:
         if self._lease.driver != page.name:
-            self._refuse(page, f"only the page that drives may {what}")
+            self._refuse(page, f"only the page in control may {what}")
         elif not self._app.waiting.wish(message):
-            self._refuse(page, "the app does not answer")
+            self._refuse(page, "the program does not answer")
         else:
             self._app.flush()
 
@@ -194,12 +206,16 @@ class Desk:
         if method == "labels":
             self._labels = self._tell({"type": "labels", **message["labels"]})
         elif method == "say":
-            self._says.append(self._tell({"type": "say", "t": message["t"], "text": message["text"]}))
+            say = {"type": "say", "t": message["t"], "text": message["text"]}
+            self._says.append(self._tell(say | {name: message[name] for name in ("loss", "stop") if name in message}))
         elif method == "waiting":
             self._waiting_for = list(message["controls"])
             self._tell_text(self._pad_waits())
         elif method == "playing":
             self.playing = bool(message["on"])
+        elif method == "driving":
+            self._settings = frozenset(message["view"]["settings"])
+            self._driving = self._tell({"type": "driving", **message["view"]})
         elif method == "recording":
             self._show_recording(message["t"], message["view"])
         elif method == "refused":

@@ -39,7 +39,7 @@ class Lease:
         """``page`` drives from now on, whoever did. None where it does already."""
         if page == self.driver:
             return None
-        return self._change(page, now, f"{page} took it" if self.driver is not None else "")
+        return self._change(page, now, f"{page} took control" if self.driver is not None else "")
 
     def let_go(self, page: str, now: float, why: str) -> Change | None:
         """``page`` does not drive any more. None where it did not."""

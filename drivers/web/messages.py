@@ -6,9 +6,9 @@ import json
 from collections.abc import Collection, Mapping
 from typing import Any, NamedTuple
 
-from hal.console import ACTIONS
+from hal.console import ACTIONS, FRAMES, SETTINGS
 
-from .padmessage import Malformed, PadMessage, pad_message
+from .padmessage import Malformed, PadMessage, number, pad_message
 
 __all__ = [
     "LONGEST",
@@ -19,6 +19,7 @@ __all__ = [
     "Malformed",
     "Message",
     "Recover",
+    "Setting",
     "Stop",
     "Take",
     "Watch",
@@ -26,13 +27,17 @@ __all__ = [
     "parse",
 ]
 
+SLOWEST = 0.01
+"""Smallest share of the mapping's speeds that a page may set."""
 LONGEST = 4096
 """Bytes that a page's message may have."""
+CLOSED = "the page in control was closed"
+HANDS = "a release of the controls may have been missed"
 _AWAY = {
     "hidden": "the page was hidden",
-    "blur": "the page lost the keyboard's focus",
-    "closing": "the page was closed",
-    "hands": "the page may have missed that somebody let go",
+    "blur": "the page lost the keyboard focus",
+    "closing": CLOSED,
+    "hands": HANDS,
 }
 
 
@@ -71,6 +76,13 @@ class Act(NamedTuple):
     action: str
 
 
+class Setting(NamedTuple):
+    """Change one of ``hal.console.SETTINGS``."""
+
+    name: str
+    value: str | float
+
+
 class Watch(NamedTuple):
     """The cameras that the page shows from now on."""
 
@@ -83,7 +95,7 @@ class Drawn(NamedTuple):
     camera: str
 
 
-Message = PadMessage | Away | Take | Stop | Recover | Demo | Act | Watch | Drawn
+Message = PadMessage | Away | Take | Stop | Recover | Demo | Act | Setting | Watch | Drawn
 
 _KEYS = {
     "pad": {"type", "seen", "since", "axes", "buttons"},
@@ -93,6 +105,7 @@ _KEYS = {
     "recover": {"type", "robot"},
     "demo": {"type", "play"},
     "action": {"type", "action"},
+    "setting": {"type", "name", "value"},
     "watch": {"type", "cameras"},
     "drawn": {"type", "camera"},
 }
@@ -142,10 +155,18 @@ def _record(kind: str, data: Mapping[str, Any], robots: Collection[str], cameras
         return Demo(_flag(data["play"]))
     if kind == "action":
         return Act(_one_of(data["action"], ACTIONS))
+    if kind == "setting":
+        return _setting(_one_of(data["name"], SETTINGS), data["value"], robots)
     names = data["cameras"]
     if not isinstance(names, list):
         raise Malformed("no list of cameras")
     return Watch(tuple(dict.fromkeys(_one_of(name, cameras) for name in names)))
+
+
+def _setting(name: str, value: object, robots: Collection[str]) -> Setting:
+    if name == "speed":
+        return Setting(name, number(value, SLOWEST, 1.0))
+    return Setting(name, _one_of(value, {"robot": robots, "frame": FRAMES, "scene": ("reset",)}[name]))
 
 
 def _flag(value: object) -> bool:

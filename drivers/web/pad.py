@@ -187,7 +187,7 @@ class WebPad(GamepadDriver):
 
     def describe(self) -> str:
         page = self._console.driver
-        return f"the console: {page} drives" if page else "the console: nobody drives yet"
+        return f"browser ({page})" if page else "browser (no one connected)"
 
     def close(self) -> None:
         if self._tour is not None:

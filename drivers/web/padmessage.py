@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 from hal.servo.watchdog import SILENCE
 from hal.types import BUTTONS, STICK_AXES
 
-__all__ = ["Malformed", "PadMessage", "PadWatch", "Verdict", "pad_message"]
+__all__ = ["ALARMS", "Malformed", "PadMessage", "PadWatch", "Verdict", "number", "pad_message"]
 
 _ONE_SIDED = ("l2", "r2")
 _RANGES = tuple((0.0 if axis in _ONE_SIDED else -1.0, 1.0) for axis in STICK_AXES)
@@ -25,6 +25,8 @@ _LONGEST = 1e9
 _AHEAD = "the clock of its page runs ahead"
 _LATE = "its messages came late"
 _SILENT = "its page gave no sign of life"
+ALARMS = frozenset((_AHEAD, _LATE, _SILENT))
+"""Losses of the pad that nobody intended."""
 
 
 class Malformed(ValueError):
@@ -52,14 +54,15 @@ def pad_message(data: Mapping[str, Any]) -> PadMessage:
     if type(buttons) is not int or not 0 <= buttons < _MASKS:
         raise Malformed("no mask of buttons")
     return PadMessage(
-        seen=_number(data["seen"], 0.0, _LONGEST),
-        since=_number(data["since"], 0.0, _LONGEST) / 1000.0,
-        axes=tuple(_number(value, *limits) for value, limits in zip(axes, _RANGES, strict=True)),
+        seen=number(data["seen"], 0.0, _LONGEST),
+        since=number(data["since"], 0.0, _LONGEST) / 1000.0,
+        axes=tuple(number(value, *limits) for value, limits in zip(axes, _RANGES, strict=True)),
         buttons=buttons,
     )
 
 
-def _number(value: object, low: float, high: float) -> float:
+def number(value: object, low: float, high: float) -> float:
+    """Return ``value`` as a float. Raises Malformed if it is not a number from ``low`` to ``high``."""
     # Not isinstance: True is an int. NaN and whole numbers too large for a float fail the comparison.
     if type(value) is not float and type(value) is not int:
         raise Malformed("not a number")

@@ -113,7 +113,7 @@ def test_a_pad_that_is_plugged_in_later_brings_its_mapping_with_it(
         hand.clear()
         app.until(lambda: app.session.driving.mapping == "default")
     text = capsys.readouterr().out
-    assert "a mock pad drives" in text
+    assert "driving with a mock pad" in text
     assert text.count("hold l2 to move") == 2
 
 

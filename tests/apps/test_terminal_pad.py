@@ -66,7 +66,7 @@ def app(*, kitty: bool) -> Iterator[tuple[FarEnd, App]]:
         yield far, it
 
 
-def test_one_key_press_is_one_step_and_space_stops() -> None:
+def test_one_key_press_is_one_step_and_backspace_stops() -> None:
     with app(kitty=False) as (far, it):
         it.shows("one small step for each press")
         place = it.at_rest()
@@ -83,13 +83,13 @@ def test_one_key_press_is_one_step_and_space_stops() -> None:
         wait_for(lambda: it.moved(place), "a step")
         burst = it.at_rest() - place
         assert burst[0] <= 24.0, "a burst is a step, or two where it came in pieces"
-        far.type(" ")
+        far.type("\x7f")
         it.shows("STOPPED")
         far.type("\x1b[B")
         stopped = it.at_rest()
         time.sleep(0.6)  # keys that come right after a stop do not count
         far.type("\x1b[B")
-        it.shows("going on")
+        it.shows("resumed")
         wait_for(lambda: it.moved(stopped), "a step")
         far.type("\x03")
         assert it.process.wait(30) == 0
@@ -121,7 +121,7 @@ def test_a_link_that_is_cut_while_a_key_is_held_trips() -> None:
         far.type("\x1b[32;1:3u")
         time.sleep(0.1)
         far.type(SPACE)
-        it.shows("going on")
+        it.shows("resumed")
         far.type("\x1b[99;5u")  # Ctrl-C, which this terminal reports as a key
         assert it.process.wait(30) == 0
         it.is_put_back()

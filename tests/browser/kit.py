@@ -50,11 +50,11 @@ PATIENCE = 20.0
 class Bench:
     """A simulated rig that its console drives, with the teleoperation app's own loop in a thread."""
 
-    def __init__(self, cameras: bool = False, **options: Any) -> None:
+    def __init__(self, cameras: bool = False, rig: Any = "panda_table", **options: Any) -> None:
         self.args = parser().parse_args(["--sim"])
         overrides = [] if cameras else ["cameras={}"]
-        self.rig = hal.open("panda_table", sim=True, pad="web", listen=":0", overrides=overrides, **options)
-        self.arm: Robot = self.rig.robots["panda"]
+        self.rig = hal.open(rig, sim=True, pad="web", listen=":0", overrides=overrides, **options)
+        self.arm: Robot = next(iter(self.rig.robots.values()))
         assert self.rig.console is not None
         self.console = self.rig.console
         self.link = self.console.link

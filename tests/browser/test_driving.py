@@ -115,7 +115,7 @@ def test_letting_go_on_the_way_home_gives_it_up(bench: Bench, page: Browser) -> 
     page.click("#home")
     wait_for(lambda: "hold the dead-man until" in page.text("#log") and bench.speed() > 0.01, "the way home")
     page.let_go()
-    wait_for(lambda: "given up" in page.text("#log"), "the app to give it up")
+    wait_for(lambda: "cancelled" in page.text("#log"), "the app to give it up")
     wait_for(lambda: bench.status == "holding", "the app to drive again")  # a press from before does not count
 
     def drive() -> None:

@@ -115,10 +115,10 @@ def test_no_text_can_be_dragged(page: Browser) -> None:
     assert page.run("return window.drags") == [True]
 
 
-def test_labels_cannot_be_selected(page: Browser) -> None:
+def test_text_can_be_selected_and_controls_cannot(page: Browser) -> None:
     script = "return getComputedStyle(document.querySelector(arguments[0])).userSelect"
-    assert {page.run(script, place) for place in ("#rig", "#model", "#joints", "#status", "#waiting")} == {"none"}
-    assert page.run(script, "#log") == "text"
+    assert {page.run(script, place) for place in ("#hold", "#stop", "#gripper", '[data-disc="left"]')} == {"none"}
+    assert {page.run(script, place) for place in ("#rig", "#tcp", "#width", "#waiting", "#log")} <= {"auto", "text"}
 
 
 # Hands that let go while nobody tells.
@@ -154,7 +154,7 @@ def test_keys_that_cease_to_repeat_were_let_go_of(bench: Bench, page: Browser) -
     undisturbed(bench, page, cease)
     repeat_for(page, 0.3)
     assert not held(bench), "keys that come back without a new press hold nothing"
-    assert "keys went to another program" in page.text("#log")
+    assert "lost the keyboard" in page.text("#log")
     let_go_of_all(page)
     drive_left(bench, page)
     let_go_of_all(page)

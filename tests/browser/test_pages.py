@@ -119,6 +119,94 @@ def test_what_one_needs_is_in_view_and_apart(page: Browser, width: int, height: 
         page.size(1280, 800)
 
 
+TEXTS = """const found = [];
+    const walk = document.createTreeWalker(document.body, NodeFilter.SHOW_TEXT);
+    for (let node = walk.nextNode(); node; node = walk.nextNode()) {
+      const parent = node.parentElement;
+      if (node.data.trim() && parent.checkVisibility() && !parent.closest('noscript')) found.push([parent, node.data]);
+    }"""
+
+
+@pytest.mark.parametrize(("width", "height", "touch"), [*SIZES, (390, 844, True), (960, 600, False)])
+def test_no_text_is_smaller_than_twelve_pixels(page: Browser, width: int, height: int, touch: bool) -> None:
+    page.size(width, height, touch)
+    try:
+        script = "return found.filter(([at]) => parseFloat(getComputedStyle(at).fontSize) < 12).map(([, text]) => text)"
+        assert page.run(TEXTS + script) == []
+        assert page.run("return document.documentElement.scrollWidth") <= width
+    finally:
+        page.size(1280, 800)
+
+
+@pytest.mark.parametrize(("width", "height"), [(1440, 900), (1024, 768), (960, 600)])
+def test_every_key_that_drives_is_named_on_a_screen_with_a_keyboard(page: Browser, width: int, height: int) -> None:
+    """960x600 is a laptop's window at 150 % zoom."""
+    page.size(width, height)
+    try:
+        shown = page.run(
+            """return [...document.querySelectorAll('.discs kbd, #home kbd')]
+                   .filter((one) => one.checkVisibility())
+                   .map((one) => one.textContent + (one.getBoundingClientRect().bottom <= innerHeight ? '' : ' below'))"""
+        )
+        assert set(shown) == {"Q", "E", "arrows", "G", "H", "W A S D", "I J K L", "Home"}
+        assert page.run("return [...document.querySelectorAll('.pad')].every((one) => !one.checkVisibility())")
+    finally:
+        page.size(1280, 800)
+
+
+def test_the_knob_covers_no_label(page: Browser) -> None:
+    """Wherever it is pushed, its label lies above it."""
+    with page.drag("dpad", 0.0, 1.0):
+        above = """const r = document.querySelector('[data-disc="dpad"] .up').getBoundingClientRect();
+            const e = document.querySelector('[data-disc="dpad"]');
+            for (const one of e.children) one.style.pointerEvents = 'auto';
+            const top = document.elementFromPoint(r.left + r.width / 2, r.top + r.height / 2);
+            for (const one of e.children) one.style.pointerEvents = '';
+            return top.className"""
+        assert page.run(above) == "up"
+
+
+def test_only_buttons_that_do_something_are_shown(page: Browser) -> None:
+    labels = page.run("return [...document.querySelectorAll('.buttons button')].filter((one) => one.checkVisibility())")
+    assert labels == [], "the default mapping gives no button but the way home a meaning"
+
+
+def test_an_arrow_without_space_says_what_is_missing(bench: Bench, page: Browser) -> None:
+    wait_for(lambda: page.text("#waiting") == "Stopped. Hold Space to move.", "the advice")
+    page.key("ArrowUp", "ArrowUp", True)
+    wait_for(lambda: "Space too" in page.text("#waiting"), "the hint")
+    assert page.run("return document.querySelector('#waiting').dataset.tone") == "strong"
+    page.key("ArrowUp", "ArrowUp", False)
+    wait_for(lambda: "Space too" not in page.text("#waiting"), "the hint to go")
+
+
+@pytest.mark.parametrize("what", ["a reload", "the end of the tour"])
+def test_what_somebody_intended_is_no_alarm(bench: Bench, page: Browser, what: str) -> None:
+    if what == "a reload":
+        page.hold()
+        wait_for(lambda: bench.deadman.held, "the dead-man")
+        page.open(bench.link)
+        page.wait_driving()
+        words = "was closed"
+    else:
+        page.click("#demo")
+        wait_for(lambda: bench.speed() > 0.05, "the tour to move the arm")
+        page.click("#demo")
+        words = "tour has ended"
+    wait_for(lambda: words in page.text("#trip") and "Hold Space to continue" in page.text("#trip"), "what happened")
+    assert not page.run("return document.querySelector('#trip').classList.contains('alarm')")
+    assert page.run("return document.querySelector('#status-lamp').dataset.tone") == "calm"
+    page.let_go()
+
+
+def test_backspace_stops_as_in_a_terminal(bench: Bench, page: Browser) -> None:
+    page.key("Backspace", "Backspace", True)
+    page.key("Backspace", "Backspace", False)
+    wait_for(lambda: bench.trip == "stop", "the stop")
+    wait_for(lambda: "Stopped by STOP (you," in page.text("#trip"), "the page to say who stopped it")
+    assert page.run("return document.querySelector('#trip').classList.contains('alarm')")
+
+
 def test_two_thumbs(bench: Bench, page: Browser) -> None:
     """One on the dead-man, the other one on a disc; lifting the first stops the arm."""
     page.size(844, 390, touch=True)

@@ -54,7 +54,7 @@ def hold_and_drive() -> str | None:
             last = bench.tcp
             if bench.trip != "none" or not bench.deadman.held:
                 log = browser.text("#log")
-                assert "stood still" in log, f"stopped in turn {turn} without a reason: {bench.trip}\n{log}"
+                assert "hung" in log, f"stopped in turn {turn} without a reason: {bench.trip}\n{log}"
                 return log
         assert bench.session.driving.report.trips == []
         assert moved > 0.03 * SECONDS, "the arm went to and fro"

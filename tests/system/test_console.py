@@ -179,7 +179,7 @@ def test_a_recording_is_steered_from_the_page_and_a_mistake_in_the_app_costs_not
             console(rig).show_recording(view(0, "record", "fail"))
             await page.next("recording")
             await page.say(type="action", action="record")
-            assert "no such wish" in (await page.next("refused"))["why"], "the program did not ask for any"
+            assert "records nothing" in (await page.next("refused"))["why"], "the program did not ask for any"
             console(rig).on_action(take)
             await page.say(type="action", action="fail")
             assert "made a mistake" in (await page.next("refused"))["why"]

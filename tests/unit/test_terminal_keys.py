@@ -37,7 +37,8 @@ def parsed(*pieces: bytes) -> list[Key | Answer]:
         (b"\x1b[?15u\x1b[?62;22c", [Answer("?u", (15,)), Answer("?c", (62, 22))]),
         (b"\x1b[?1004;1$y\x1b[I\x1b[O", [Answer("?$y", (1004, 1)), Answer("I"), Answer("O")]),
         # What means nothing.
-        (b"\x1b[12;40R\x1b[99~\x1b[>1;2c\x1b[<0;3;5M\x1b[3;1:9u\x7f\x01\xc3\xa4", []),
+        (b"\x1b[12;40R\x1b[99~\x1b[>1;2c\x1b[<0;3;5M\x1b[3;1:9u\x01\xc3\xa4", []),
+        (b"\x7f\x08\x1b[127u", [Key("backspace"), Key("backspace"), Key("backspace")]),
         (b"\x1b[" + b"1" * 1000 + b"uw", [Key("1")] * 953 + [Key("u"), Key("w")]),
         # Esc: alone in front of another key it is a stop, and so is Alt with a key, which looks the same.
         (b"\x1bw", [Key("escape")]),

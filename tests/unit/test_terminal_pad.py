@@ -143,8 +143,8 @@ def test_a_step_proves_life_by_its_key_press_alone(bench) -> None:
     assert it.deadman.record.t_alive == it.now
 
 
-@pytest.mark.parametrize("key", [" ", "\x1b"])
-def test_space_and_esc_end_the_step_stop_the_rig_and_the_next_key_goes_on(bench, key: str) -> None:
+@pytest.mark.parametrize("key", ["\x7f", "\x1b"])
+def test_backspace_and_esc_end_the_step_stop_the_rig_and_the_next_key_goes_on(bench, key: str) -> None:
     it = bench()
     it.press(UP)
     it.press(key)
@@ -162,9 +162,17 @@ def test_space_and_esc_end_the_step_stop_the_rig_and_the_next_key_goes_on(bench,
     assert it.presses() == 2
 
 
+def test_space_holds_where_keys_can_be_held_and_else_does_nothing(bench) -> None:
+    """It means the same wherever a person drives: it never stops here what it moves there."""
+    it = bench()
+    it.press(" ")
+    it.run(0.2)
+    assert (it.stops, it.presses()) == (0, 0)
+
+
 def test_a_stop_in_the_middle_of_a_burst_counts(bench) -> None:
     it = bench()
-    it.press(20 * UP + " " + 20 * UP)
+    it.press(20 * UP + "\x7f" + 20 * UP)
     it.run(0.4)
     assert it.stops == 1
     assert it.held() == 0.0
@@ -336,9 +344,10 @@ def test_a_window_without_the_focus_is_a_pad_that_is_unplugged(held: Held) -> No
     assert held.deadman.held
 
 
-def test_esc_stops_and_space_must_be_pressed_anew(held: Held) -> None:
+@pytest.mark.parametrize("stop", ["\x1b[27u", "\x1b[127u"])
+def test_a_stop_key_stops_and_space_must_be_pressed_anew(held: Held, stop: str) -> None:
     held.press(SPACE + W)
-    held.press("\x1b[27u")
+    held.press(stop)
     assert held.stops == 1
     assert not held.deadman.held
     held.press("\x1b[32;1:2u")

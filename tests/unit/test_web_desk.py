@@ -173,11 +173,11 @@ def test_the_lease_goes_to_whoever_takes_it_and_the_pad_is_gone_in_between() -> 
     room.now = 100.01
     room.say(second, type="lease", take=True)
     told = room.app.news()
-    assert told[0]["pad"]["why"] == "page 2 took it"
+    assert told[0]["pad"]["why"] == "page 2 took control"
     assert not told[0]["pad"]["connected"]
     assert told[1:] == [{"driver": "page 2"}]
     assert inbox(first) == [
-        {"type": "lease", "driver": "page 2", "you": False, "t": 100.01, "why": "page 2 took it"},
+        {"type": "lease", "driver": "page 2", "you": False, "t": 100.01, "why": "page 2 took control"},
     ]
     assert inbox(second)[0]["you"]
     room.pad(first, 100.0, 10.0, [1.0] * 8)
@@ -213,7 +213,7 @@ def test_nobody_drives_after_the_driver_let_go_or_left(how: str) -> None:
         room.desk.leave(driver)
     gone, free = room.app.news()
     assert not gone["pad"]["connected"]
-    assert gone["pad"]["why"].startswith("page 1")
+    assert gone["pad"]["why"] == ("page 1 released control" if how == "let go" else "the page in control was closed")
     assert free == {"driver": None}
     (lease,) = inbox(other)
     assert (lease["driver"], lease["you"]) == (None, False)
@@ -319,7 +319,7 @@ def test_only_the_page_that_drives_steers_a_recording_and_only_to_what_is_possib
     room.say(other, type="action", action="finish")
     room.say(driver, type="action", action="record")
     assert room.app.news() == []
-    assert "only the page that drives" in inbox(other)[0]["why"]
+    assert "only the page in control" in inbox(other)[0]["why"]
     assert "cannot be done now" in inbox(driver)[0]["why"]
     room.say(driver, type="action", action="finish")
     assert room.app.news() == [{"action": "finish", "page": "page 1"}]
@@ -340,6 +340,22 @@ def test_a_view_with_a_number_that_is_none_changes_nothing() -> None:
         room.desk.heard(wrong)
     assert inbox(page) == []
     assert inbox(room.page())[-1] == newest
+
+
+def test_only_the_page_in_control_sets_only_what_the_program_offers() -> None:
+    room = Room()
+    driver, other = room.driver(), room.page()
+    view = {"robot": "panda", "speed": 0.5, "speed_max": 1.0, "frame": "base", "settings": ["speed"]}
+    room.desk.heard({"method": "driving", "view": view})
+    assert inbox(driver) == [{"type": "driving", **view}]
+    assert {"type": "driving", **view} in inbox(room.page()), "a page that opens later sees it, too"
+    inbox(other)
+    room.say(other, type="setting", name="speed", value=0.1)
+    room.say(driver, type="setting", name="scene", value="reset")
+    assert room.app.news() == []
+    assert [inbox(page)[0]["type"] for page in (other, driver)] == ["refused", "refused"]
+    room.say(driver, type="setting", name="speed", value=0.1)
+    assert room.app.news() == [{"setting": "speed", "value": 0.1, "page": "page 1"}]
 
 
 # What waits for an app that does not read.
@@ -378,7 +394,7 @@ def test_wishes_that_nobody_hears_are_refused() -> None:
     room.app.reads = False
     for _ in range(100):
         room.say(driver, type="recover", robot="panda")
-    assert inbox(driver)[-1] == {"type": "refused", "why": "the app does not answer"}
+    assert inbox(driver)[-1] == {"type": "refused", "why": "the program does not answer"}
     room.say(driver, type="stop")
     room.app.reads = True
     room.app.flush()

@@ -160,7 +160,7 @@ def test_one_page_drives_and_whoever_takes_it_has_it() -> None:
     mine = lease.watch_of("page 1")
     assert mine is not None
     assert lease.watch_of("page 2") is None
-    assert lease.take("page 2", T + 2) == ("page 1", "page 2", T + 2, "page 2 took it")
+    assert lease.take("page 2", T + 2) == ("page 1", "page 2", T + 2, "page 2 took control")
     assert lease.watch_of("page 1") is None
     assert lease.let_go("page 1", T + 3, "it is gone") is None, "not its own any more"
     assert lease.let_go("page 2", T + 4, "it is gone") == ("page 2", None, T + 4, "it is gone")

@@ -53,7 +53,7 @@ def test_nonsense_is_survived_until_there_is_too_much_of_it(app: App) -> None:
             assert (await app.pad())["connected"]
             await page.ws.send_str("nonsense")
             assert await page.closed() == 4400
-            assert (await app.pad())["why"] == "page 1 is gone"
+            assert (await app.pad())["why"] == "the page in control was closed"
         async with Page(app) as page:
             await page.next("hello")
 
@@ -95,7 +95,7 @@ def test_a_watcher_stops_the_arm(app: App) -> None:
             await watcher.say(type="stop")
             assert await app.next(lambda message: "stop" in message) == {"stop": "page 2"}
             await watcher.say(type="recover", robot="arm")
-            assert "only the page that drives" in (await watcher.next("refused"))["why"]
+            assert "only the page in control" in (await watcher.next("refused"))["why"]
             await driver.say(type="recover", robot="arm")
             assert await app.next() == {"recover": "arm", "page": "page 1"}
 
@@ -114,14 +114,14 @@ def test_the_lease_between_two_pages(app: App) -> None:
             assert pad["t"] - SILENCE <= pad["t_alive"] <= pad["t"] <= time.monotonic()
             async with Page(app) as second:
                 await second.take()
-                assert (await app.pad())["why"] == "page 2 took it"
+                assert (await app.pad())["why"] == "page 2 took control"
                 assert await app.next() == {"driver": "page 2"}
                 lost = await first.next("lease")
-                assert (lost["driver"], lost["you"], lost["why"]) == ("page 2", False, "page 2 took it")
+                assert (lost["driver"], lost["you"], lost["why"]) == ("page 2", False, "page 2 took control")
                 await first.ws.send_json(first.pad([1.0] * 8))
                 await second.drive()
                 assert (await app.pad())["from"] == "page 2"
-            assert (await app.pad())["why"] == "page 2 is gone"
+            assert (await app.pad())["why"] == "the page in control was closed"
             assert await app.next() == {"driver": None}
             assert (await first.next("lease"))["driver"] is None
 
@@ -143,7 +143,7 @@ def test_a_page_that_goes_away_is_a_pad_that_is_gone_at_once(app: App, how: str)
                 page.ws._response.connection.transport.abort()  # type: ignore[union-attr]
             pad = await app.pad()
             assert not pad["connected"]
-            assert pad["why"] == ("the page was hidden" if how == "hidden" else "page 1 is gone")
+            assert pad["why"] == ("the page was hidden" if how == "hidden" else "the page in control was closed")
 
     run(test)
 

@@ -18,6 +18,7 @@ class View {
     this.canvas.dataset.camera = camera.name;
     this.canvas.width = camera.width;
     this.canvas.height = camera.height;
+    this.shape = camera.width / camera.height;
     this.canvas.setAttribute("role", "img");
     this.canvas.setAttribute("aria-label", `Camera ${camera.name}`);
     this.context = this.canvas.getContext("2d", { alpha: false });
@@ -36,6 +37,13 @@ class View {
   #taken = -Infinity;
   #latency = 0;
   /** @type {number[]} */ #drawn = [];
+
+  /** Device pixels that the picture covers, across and up; null while it is not shown. @returns {number[] | null} */
+  get size() {
+    const { clientWidth, clientHeight } = this.figure;
+    const across = Math.min(clientWidth, clientHeight * this.shape) * devicePixelRatio;
+    return across < 1 ? null : [across, across / this.shape].map((one) => Math.max(1, Math.round(one)));
+  }
 
   /** @param {import("./pictures.js").Picture} picture */
   draw({ bitmap, taken }) {
@@ -71,12 +79,14 @@ class View {
 export class Cameras {
   constructor() {
     this.pictures = new Pictures();
+    this.pictures.sizeOf = (camera) => this.views[camera]?.size ?? null;
     this.pictures.came = (picture) => this.views[picture.camera]?.draw(picture);
     /** @type {View[]} */
     this.views = [];
     this.large = "";
     this.seen = new IntersectionObserver((entries) => this.#moved(entries));
     document.addEventListener("visibilitychange", () => this.#watch());
+    new ResizeObserver(() => this.#place()).observe(byId("cameras"));
   }
 
   /** Show these cameras. @param {any[]} cameras of hello */
@@ -114,6 +124,23 @@ export class Cameras {
     this.large = name;
     for (const view of this.views) view.figure.classList.toggle("large", view.name === name);
     choose(byId("tabs"), name);
+    this.#place();
+  }
+
+  /** Fill the panel: the other pictures below the large one or beside it, whichever shows them larger. */
+  #place() {
+    const { clientWidth: width, clientHeight: height } = byId("cameras");
+    const large = this.views.find((view) => view.name === this.large);
+    if (!large || !width || !height) return;
+    const others = this.views.filter((view) => view !== large && getComputedStyle(view.figure).display !== "none");
+    const below = stacked(width, height, large, others, (view) => view.shape);
+    const beside = stacked(height, width, large, others, (view) => 1 / view.shape).map(turned);
+    const area = (/** @type {number[][]} */ boxes) => boxes.reduce((sum, [, , w, h]) => sum + w * h, 0);
+    const boxes = area(below) >= area(beside) ? below : beside;
+    [large, ...others].forEach(({ figure }, k) => {
+      const [left, top, w, h] = boxes[k];
+      Object.assign(figure.style, { left: `${left}px`, top: `${top}px`, width: `${w}px`, height: `${h}px` });
+    });
   }
 
   /** @param {IntersectionObserverEntry[]} entries */
@@ -129,4 +156,31 @@ export class Cameras {
     const visible = document.visibilityState === "visible";
     this.pictures.watch(this.views.filter((view) => visible && view.visible).map((view) => view.name));
   }
+}
+
+const GAP = 10; // px
+const MOST = 0.7; // share of the panel that the large picture may take from the others
+
+/** @param {number[]} box */
+const turned = ([left, top, width, height]) => [top, left, height, width];
+
+/**
+ * Boxes (left, top, width, height) of a large picture and of a row of others below it.
+ * @param {number} width @param {number} height @param {View} large @param {View[]} others
+ * @param {(view: View) => number} shapeOf width by height
+ */
+function stacked(width, height, large, others, shapeOf) {
+  const room = others.length ? MOST * height : height;
+  const first = Math.min(room, width / shapeOf(large));
+  const gaps = GAP * (others.length - 1);
+  const all = others.reduce((sum, view) => sum + shapeOf(view), 0);
+  const row = others.length ? Math.min(height - GAP - first, (width - gaps) / all) : 0;
+  const top = Math.max(0, (height - first - (row && GAP + row)) / 2);
+  const boxes = [[(width - first * shapeOf(large)) / 2, top, first * shapeOf(large), first]];
+  let left = (width - gaps - row * all) / 2;
+  for (const view of others) {
+    boxes.push([left, top + first + GAP, row * shapeOf(view), row]);
+    left += row * shapeOf(view) + GAP;
+  }
+  return boxes;
 }

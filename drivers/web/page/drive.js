@@ -12,8 +12,8 @@ export class Drive {
     this.pad = pad;
     this.enabled = enabled;
     this.source = pad.source();
-    /** May a gamepad's dead-man count by itself? */
-    this.padHolds = true;
+    /** What holds, besides the button on the page. */
+    this.ways = () => "Space";
     this.hold = byId("hold");
     this.home = byId("home");
     this.slider = new Slider(byId("gripper"), enabled, () => pad.grip, (place) => pad.setGrip(place));
@@ -82,28 +82,35 @@ export class Drive {
     this.#explained ||= Object.keys(controls).length > 0;
     /** What a control does, or null. @param {string} name @returns {string[] | null} */
     const meaning = (name) => (name === deadman ? null : (controls[name] ?? null));
-    this.pad.explain(deadman, home, Object.keys(controls).filter((name) => ACTIONS.includes(controls[name].join())));
+    const actions = Object.keys(controls).filter((name) => ACTIONS.includes(controls[name].join()));
+    const moving = Object.keys(controls).filter((name) => !actions.includes(name));
+    setData(document.documentElement, "explained", this.#explained ? "" : null);
+    this.pad.explain(deadman, home, actions, moving);
     for (const [disc] of this.discs) {
       const [across, up] = DISCS[/** @type {keyof typeof DISCS} */ (disc.element.dataset.disc)];
       disc.explain(meaning(across), meaning(up));
       disc.element.toggleAttribute("data-idle", this.#explained && !meaning(across) && !meaning(up));
     }
     this.slider.explain(meaning("r2"));
-    for (const [element] of this.buttons) this.#name(element, deadman, meaning);
+    for (const [element] of this.buttons) this.#name(element, deadman, home, meaning);
     show(this.home, home !== null);
     this.#legend(meaning, home);
     this.paint();
   }
 
-  /** @param {HTMLElement} element @param {string} deadman @param {(name: string) => string[] | null} meaning */
-  #name(element, deadman, meaning) {
+  /**
+   * Buttons that do nothing are hidden; the dead-man and the way home have one of their own.
+   * @param {HTMLElement} element @param {string} deadman @param {string | null} home
+   * @param {(name: string) => string[] | null} meaning
+   */
+  #name(element, deadman, home, meaning) {
     const name = String(element.dataset.button);
     const found = meaning(name);
     const text = found ? found[found.length - 1] : "";
     setText(/** @type {Element} */ (element.querySelector("b")), text);
     setAttribute(element, "aria-label", text ? `${text} (${name})` : `${name}: does nothing here`);
-    element.toggleAttribute("data-idle", this.#explained && !found);
-    show(element, name !== deadman && (found !== null || !("rare" in element.dataset)));
+    const useful = found !== null || (!this.#explained && !("rare" in element.dataset));
+    show(element, useful && name !== deadman && name !== home);
   }
 
   /** @param {(name: string) => string[] | null} meaning @param {string | null} home */
@@ -112,11 +119,12 @@ export class Drive {
     const rows = [["Space", "hold to move"]];
     for (const [keys, control] of LEGEND) {
       const found = meaning(control);
+      if (control === home) continue; // it has a key of its own
       if (found) rows.push([keys, control === "r2" ? "close / open" : [...found].reverse().join(" / ")]);
       else if (!this.#explained) rows.push([keys, control.replace("_", " ")]);
     }
-    if (home) rows.push(["Home", "drive home, while held"]);
-    rows.push(["Shift", "slower"], ["Esc", "STOP"]);
+    if (home) rows.push(["Home", "drive home, with Space held"]);
+    rows.push(["Shift", "slower"], ["Esc, Backspace", "STOP"]);
     const body = /** @type {Element} */ (document.querySelector("#legend tbody"));
     body.replaceChildren(...rows.map(([keys, text]) => {
       const row = make("tr");
@@ -156,11 +164,10 @@ export class Drive {
     setData(this.hold, "pressed", held ? "" : null);
     setAttribute(this.hold, "aria-pressed", String(held));
     setText(/** @type {Element} */ (this.hold.querySelector("b")), held ? "HELD" : "HOLD TO MOVE");
-    const ways = this.padHolds ? `Space or a pad's ${this.pad.deadman.toUpperCase()}` : "Space";
-    setText(byId("hold-keys"), held ? "let go to stop" : ways);
+    setText(byId("hold-keys"), held ? "Release to stop" : this.ways());
     setAttribute(this.home, "aria-disabled", String(!held));
     const homing = this.pad.home !== null && (mask & BIT[this.pad.home]) !== 0;
     setData(this.home, "pressed", homing ? "" : null);
-    setText(byId("home-note"), held ? "drives the arm home" : "hold to move first");
+    setText(byId("home-note"), held ? "hold until it is there" : "hold to move first");
   }
 }

@@ -33,6 +33,8 @@ export class Facts {
     this.rates = new Map();
     /** @type {Map<string, number | null>} */
     this.measured = new Map();
+    /** An arm was chosen by hand. @type {(name: string) => void} */
+    this.picked = () => {};
   }
 
   #gripMax = /** @type {number | null} */ (null);
@@ -40,18 +42,21 @@ export class Facts {
   /** @param {any[]} robots of hello */
   open(robots) {
     this.robots = robots;
-    segments(byId("robots"), robots.map((robot) => robot.name), (name) => this.#choose(name));
+    segments(byId("robots"), robots.map((robot) => robot.name), (name) => this.picked(name));
     const names = robots.map((robot) => robot.name);
-    if (names.length) this.#choose(names.includes(this.name) ? this.name : names[0]);
+    const shown = names.includes(this.name) ? this.name : names[0];
+    this.name = "";
+    if (shown !== undefined) this.show(shown);
   }
 
-  /** @param {string} name */
-  #choose(name) {
+  /** Show this arm. @param {string} name */
+  show(name) {
     const robot = this.robots.find((one) => one.name === name);
+    if (!robot || name === this.name) return;
     this.name = name;
     this.#gripMax = robot.width_max;
     choose(byId("robots"), name);
-    setText(byId("model"), this.robots.length > 1 ? robot.model : robot.name);
+    setText(byId("model"), robot.name);
     byId("model").title = `${robot.name}: ${robot.model}, ${robot.driver}, ${robot.real ? "a real arm" : "simulated"}`;
     this.joints.open(robot);
     this.plot.open(robot.joints);
@@ -119,7 +124,7 @@ export function angles([x, y, z, w]) {
 function gripperWords(gripper) {
   if (!gripper) return "none";
   const mm = (/** @type {number} */ width) => (1000 * width).toFixed(1);
-  const target = Math.abs(gripper.width - gripper.width_target) > 5e-4 ? ` to ${mm(gripper.width_target)}` : "";
-  const does = gripper.grasped ? ", holds something" : gripper.moving ? ", moves" : "";
-  return `${mm(gripper.width)}${target} mm${does}`;
+  const target = Math.abs(gripper.width - gripper.width_target) > 5e-4 ? ` (target ${mm(gripper.width_target)})` : "";
+  const does = gripper.grasped ? ": object gripped" : gripper.moving ? ", moving" : "";
+  return `${mm(gripper.width)} mm${target}${does}`;
 }

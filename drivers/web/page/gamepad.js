@@ -1,6 +1,6 @@
 // A gamepad that the browser knows (its Gamepad API).
 
-import { byId, setText } from "./dom.js";
+import { byId, setData, setText } from "./dom.js";
 import { AXIS, BIT } from "./names.js";
 
 const NEAR = 0.25; // what counts as let go of, share of the travel
@@ -31,6 +31,11 @@ export class BrowserGamepad {
   /** @type {number | null} */ #index = null;
   #free = false;
 
+  /** Does the dead-man of a gamepad count? */
+  get holds() {
+    return this.#index !== null && this.mayHold;
+  }
+
   /** Take the present state. */
   look() {
     const found = this.#admit();
@@ -47,6 +52,7 @@ export class BrowserGamepad {
   /** Tell a person what there is. */
   describe() {
     setText(byId("gamepad"), this.#words());
+    setData(document.documentElement, "gamepad", this.#index === null ? null : "");
   }
 
   #words() {
@@ -54,13 +60,13 @@ export class BrowserGamepad {
     const found = this.#admit();
     if (found) {
       const name = found.id.replace(/\s*\(.*\)\s*$/, "") || found.id;
-      if (!this.#free) return `${name}: let go of all its sticks and buttons first.`;
-      if (!this.mayHold) return `${name}. Its dead-man is not enough on a real arm: hold Space or the button as well.`;
+      if (!this.#free) return `${name}: release all its sticks and buttons first.`;
+      if (!this.mayHold) return `${name}. On a real arm its dead-man is not enough: hold Space or the button as well.`;
       return `${name}: ${this.pad.deadman.toUpperCase()} is the dead-man.`;
     }
     const other = navigator.getGamepads().find((one) => one?.connected);
-    if (other) return `${other.id} is not used: this browser does not know which of its buttons is which.`;
-    return "No gamepad yet: plug one in and press a button on it.";
+    if (other) return `${other.id} is not used: this browser does not know its layout.`;
+    return "No gamepad detected. Plug one in and press one of its buttons.";
   }
 
   /** The pad, if there is one; whether it counts by now stands in #free. @returns {Gamepad | null} */
@@ -84,7 +90,7 @@ export class BrowserGamepad {
   #lose() {
     this.#index = null;
     this.pad.reset();
-    this.lost("the gamepad was disconnected: everything counts as let go of");
+    this.lost("gamepad disconnected: all controls released");
   }
 }
 

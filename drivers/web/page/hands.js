@@ -23,8 +23,8 @@ export class Hands {
   look(dt) {
     const ceased = this.repeats.ceased(dt) && this.keyboard.holds;
     const overdue = this.echo.overdue(dt) && this.pad.held;
-    if (ceased) this.lost("the keys went to another program: everything counts as let go of");
-    else if (overdue) this.lost("the browser hung: everything counts as let go of");
+    if (ceased) this.lost("this window lost the keyboard: all controls released");
+    else if (overdue) this.lost("the browser hung: all controls released");
   }
 
   /** With Shift, Firefox opens its menu without asking. @param {PointerEvent} event */

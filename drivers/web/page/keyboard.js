@@ -1,7 +1,7 @@
 // The keyboard as a pad.
 
 import { AXIS, BIT, SLOWER } from "./names.js";
-import { AXIS_KEYS, BUTTON_KEYS, GRIP_KEYS, HOLD_KEY, HOME_KEY, SLOW_KEYS, STOP_KEY } from "./names.js";
+import { AXIS_KEYS, BUTTON_KEYS, GRIP_KEYS, HOLD_KEY, HOME_KEY, SLOW_KEYS, STOP_KEYS } from "./names.js";
 
 const GRIP_SPEED = 1; // full travels of the slider per second
 const USED = new Set([
@@ -56,7 +56,8 @@ export class Keyboard {
   #pressed(event) {
     const key = event.code;
     if (event.repeat && isActivation(event)) event.preventDefault(); // one press is one click
-    if (key === STOP_KEY || (key === HOLD_KEY && document.activeElement?.id === "stop")) return this.#stopped(event);
+    const stop = STOP_KEYS.includes(key) || (key === HOLD_KEY && document.activeElement?.id === "stop");
+    if (stop) return this.#stopped(event);
     if (event.key === "Meta") return this.#releaseAll(); // its system swallows the releases of other keys
     if (!USED.has(key) || event.ctrlKey || event.metaKey || event.altKey) return;
     if (event.repeat) {
@@ -70,7 +71,7 @@ export class Keyboard {
     this.#apply();
   }
 
-  /** Esc, or Space on the button that was reached with Tab. @param {KeyboardEvent} event */
+  /** Esc or Backspace, or Space on the button that was reached with Tab. @param {KeyboardEvent} event */
   #stopped(event) {
     if (event.code === HOLD_KEY) {
       event.preventDefault();

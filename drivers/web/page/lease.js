@@ -12,6 +12,8 @@ export class Lease {
     this.driver = null;
     this.page = "";
     this.rig = /** @type {any} */ (null);
+    /** Name of the arm that is driven, where there are several. */
+    this.arm = "";
     /** @type {(t: number) => void} */
     this.granted = () => {};
     this.ended = () => {};
@@ -28,7 +30,7 @@ export class Lease {
   hello(hello) {
     this.page = hello.name;
     this.rig = hello.rig;
-    this.#paint();
+    this.paint();
   }
 
   /** @param {any} message */
@@ -43,7 +45,7 @@ export class Lease {
     if (!this.mine && had) this.ended();
     this.#letGo = false;
     this.#takeOnce();
-    this.#paint();
+    this.paint();
   }
 
   /** The socket is gone, and the lease with it. */
@@ -52,15 +54,16 @@ export class Lease {
     this.mine = this.#known = false;
     this.driver = null;
     if (had) this.ended();
-    this.#paint();
+    this.paint();
   }
 
   /** Who drives, for people. */
   get words() {
     if (!this.rig) return "";
-    if (!this.rig.drivable) return `${this.rig.driven_by ?? "another pad"} drives`;
-    if (this.mine) return `you drive (${this.page})`;
-    return this.driver ? `${this.driver} drives` : "nobody drives";
+    const of = this.arm && ` of ${this.arm}`;
+    if (!this.rig.drivable) return `View only: ${this.rig.driven_by ?? "another pad"} is in control${of}`;
+    if (this.mine) return `You are in control${of}`;
+    return this.driver ? `View only: ${this.driver} is in control${of}` : "No page is in control";
   }
 
   /** A page that was just opened takes a lease that nobody has; after that only a click does. */
@@ -79,15 +82,17 @@ export class Lease {
   /** @param {string} why */
   #lost(why) {
     if (this.#letGo) return;
-    setText(byId("lost-text"), `This page no longer drives${why ? `: ${why}` : ""}`);
+    const text = why || "This page is no longer in control";
+    setText(byId("lost-text"), `${text[0].toUpperCase()}${text.slice(1)}.`);
     show(byId("lost"), true);
   }
 
-  #paint() {
+  /** Show it; also when another arm is driven. */
+  paint() {
     setData(document.documentElement, "driving", this.mine ? "" : null);
     const button = byId("lease");
-    setText(button, this.mine ? "Let go" : "Drive from here");
-    button.title = this.mine ? "Let another page drive" : this.words;
+    setText(button, this.mine ? "Stop driving" : "Take control");
+    button.title = this.mine ? "Give up control, so that another page can take it" : this.words;
     button.classList.toggle("primary", !this.mine);
     show(button, Boolean(this.rig?.drivable));
     setText(byId("who"), this.words);

@@ -18,7 +18,7 @@ export class Log {
     if (jumped || shift < Number(this.shift)) this.shift = shift; // the quickest message is the truest
   }
 
-  /** @param {string} text @param {number | null} [t] on the app's clock, s; null: now */
+  /** @param {string} text @param {number | null} [t] on the app's clock, s; null: now @returns {Date} */
   add(text, t = null) {
     const at = t === null || this.shift === null ? new Date() : new Date(1000 * (t + this.shift));
     const line = make("li");
@@ -29,6 +29,7 @@ export class Log {
     this.list.append(line);
     while (this.list.childElementCount > MOST) this.list.firstElementChild.remove();
     if (atEnd) this.list.scrollTop = this.list.scrollHeight;
+    return at;
   }
 
   /** A new socket: the program sends its last lines again. */

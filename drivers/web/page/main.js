@@ -15,11 +15,13 @@ import { Overlay } from "./overlay.js";
 import { Pad } from "./pad.js";
 import { Presence } from "./presence.js";
 import { Recording } from "./recording.js";
+import { Settings } from "./settings.js";
 import { Status } from "./status.js";
 import { Stopping } from "./stopping.js";
 import { openTheme } from "./theme.js";
 
 const REPAINT = 100; // ms
+const COARSE = matchMedia("(hover: none) and (pointer: coarse)"); // fingers, and no keyboard
 
 const connection = new Connection();
 const pad = new Pad();
@@ -31,6 +33,7 @@ const status = new Status(connection, lease);
 const facts = new Facts();
 const cameras = new Cameras();
 const recording = new Recording(connection, lease);
+const settings = new Settings(connection, lease, facts, () => pad.held, (text) => status.notice(text));
 const overlay = new Overlay(() => connection.open());
 const mayDrive = () => lease.mine && presence.present;
 const drive = new Drive(pad, mayDrive);
@@ -66,12 +69,13 @@ const HEARD = {
     setData(document.documentElement, "real", isReal() ? "" : null);
     setData(document.documentElement, "connected", "");
     show(byId("demo"), rig.demo);
-    gamepad.mayHold = drive.padHolds = rig.pad_may_hold;
+    gamepad.mayHold = rig.pad_may_hold;
     drive.paint();
     status.waiting = [];
     lease.hello(hello);
     recording.forget();
     facts.open(rig.robots);
+    settings.open(rig);
     cameras.open(rig.cameras);
     gamepad.describe();
   },
@@ -79,12 +83,19 @@ const HEARD = {
     log.synchronise(message.t);
     lease.heard(message);
     recording.paint();
+    paintSettings();
     retitle();
     advise();
   },
   labels(message) {
     drive.explain(message);
     recording.explain(message);
+    settings.explain(message);
+    paintSettings();
+  },
+  driving(message) {
+    settings.heard(message);
+    paintSettings();
   },
   recording(message) {
     recording.heard(message);
@@ -102,8 +113,8 @@ const HEARD = {
     log.synchronise(state.t);
     recording.look(state.t);
     facts.take(state);
-    status.show(state.robots, facts.name, 0);
-    setText(byId("demo"), state.playing ? "End the tour" : "Play the tour");
+    status.show(state.robots, settings.robot || facts.name, 0);
+    setText(byId("demo"), state.playing ? "End tour" : "Play tour");
     advise();
   },
   pad(message) {
@@ -112,8 +123,7 @@ const HEARD = {
     advise();
   },
   say(message) {
-    log.add(message.text, message.t);
-    status.told(message.text);
+    status.told(message, log.add(message.text, message.t));
   },
   refused(message) {
     log.add(message.why);
@@ -121,15 +131,20 @@ const HEARD = {
   },
 };
 
+function paintSettings() {
+  settings.paint();
+  lease.paint();
+}
+
 function advise() {
-  status.advise(presence.present, pad.held, state?.playing ?? false);
+  status.advise(presence.present, pad.held, pad.pushed, state?.playing ?? false);
 }
 
 function retitle() {
   const title = `${recording.title}${lease.mine ? "driving " : ""}${hello ? called(hello.rig.source) : "console"}`;
   if (document.title !== title) document.title = title;
   setAttribute(byId("demo"), "aria-disabled", String(!lease.mine));
-  byId("demo").title = lease.mine ? "" : "Only the page that drives can do that";
+  byId("demo").title = lease.mine ? "" : "Only the page in control can do that";
 }
 
 connection.heard = (message) => HEARD[message.type]?.(message);
@@ -147,6 +162,9 @@ connection.lost = (code, reason, retry) => {
   cameras.close();
   retitle();
 };
+
+drive.ways = () => (gamepad.holds ? `Space or ${pad.deadman.toUpperCase()}` : "Space");
+status.hold = () => (COARSE.matches ? "the button" : gamepad.holds ? pad.deadman.toUpperCase() : "Space");
 
 lease.granted = (t) => {
   pad.reset();
@@ -171,7 +189,7 @@ hands.lost = (why) => {
 };
 
 heartbeat.before.push((dt) => hands.look(dt), (dt) => keyboard.look(dt), () => gamepad.look());
-heartbeat.stalled = (ms) => log.add(`this page stood still for ${Math.round(ms)} ms`);
+heartbeat.stalled = (ms) => log.add(`this page hung for ${Math.round(ms)} ms`);
 pad.changed.push(() => advise());
 
 // A finger on STOP counts at once; a click without a pointer comes from the keyboard or an aid.
@@ -203,7 +221,7 @@ setInterval(() => {
   if (!state) return;
   const pages = state.pages;
   setText(byId("pages"), `${pages} page${pages === 1 ? "" : "s"}`);
-  status.show(state.robots, facts.name, silence());
+  status.show(state.robots, settings.robot || facts.name, silence());
   drive.mark(facts.closed(state));
   facts.paint(state, silence());
 }, REPAINT);

@@ -38,7 +38,7 @@ export const HOLD_KEY = "Space";
 export const HOME_KEY = "Home";
 export const GRIP_KEYS = { KeyG: 1, KeyH: -1 };
 export const SLOW_KEYS = ["ShiftLeft", "ShiftRight"];
-export const STOP_KEY = "Escape";
+export const STOP_KEYS = ["Escape", "Backspace"];
 
 /** How far keys push while a slow key is held. */
 export const SLOWER = 0.3;

@@ -7,12 +7,12 @@ import { byId, setText, show } from "./dom.js";
 const ENDINGS = {
   [REFUSED]: [
     "this link is not valid",
-    "Use the link that the program printed last: it ends in # and a long word, and is a new one each time.",
+    "Use the newest link in the terminal.",
   ],
   [TOO_MANY]: ["too many pages are open", "Close one of the others, then try again."],
   [ENDED]: [
     "the program has ended",
-    "When it is started again it prints a new link: open that one. This page goes on looking for the old one.",
+    "Start it again and open the new link that it prints.",
   ],
 };
 
@@ -38,7 +38,7 @@ export class Overlay {
     setText(byId("overlay-title"), title);
     setText(byId("overlay-text"), text);
     const told = code >= 4400 && !(code in ENDINGS) && reason ? `The program closed it: ${reason}. ` : "";
-    setText(byId("overlay-next"), told + (retry === null || saved !== null ? "" : "Connecting again by itself."));
+    setText(byId("overlay-next"), told + (retry === null || saved !== null ? "" : "Reconnecting..."));
     show(byId("again"), code === TOO_MANY);
     show(byId("overlay"), true);
   }
@@ -52,20 +52,20 @@ function finished(saved, doubtful) {
   const own = doubtful ? " Use the robot's own stop if the arm moves." : "";
   return [
     `the program has finished: ${saved} episode${saved === 1 ? "" : "s"} saved`,
-    `When it is started again it prints a new link: open that one.${own}`,
+    `Start it again and open the new link that it prints.${own}`,
   ];
 }
 
 /** @param {boolean} drove @param {boolean} watched */
 function lostTitle(drove, watched) {
-  if (drove) return "no connection to the program: the arm has been stopped";
-  return watched ? "no connection to the program: nothing here is live" : "no connection to the program";
+  if (drove) return "connection lost: the arm has been stopped";
+  return watched ? "connection lost: nothing here is live" : "no connection to the program";
 }
 
 /** @param {boolean} drove @param {boolean} watched @param {boolean} real */
 function lostText(drove, watched, real) {
   const own = real ? " Use the robot's own stop if it moves." : "";
-  if (drove) return `An arm whose page falls silent stops by itself.${own}`;
+  if (drove) return `The arm stops when the connection is lost.${own}`;
   if (watched) return `STOP does not reach the arm from here.${own}`;
-  return "Is it still running, and is this the link that it printed last?";
+  return "Is it still running, and is this the newest link in the terminal?";
 }

@@ -52,8 +52,15 @@ export class Pad {
   /** @type {Set<string>} */ #holding;
   /** @type {Set<string>} */ #homing;
   /** @type {Taps} */ #taps;
-  /** Mask of the buttons that move nothing. */
+  /** Mask of the buttons that move nothing, and of those that do. */
   #moveless = 0;
+  #moving = 0;
+
+  /** Is something pushed that may move the arm? The gripper's slider stays where it is, and does not count. */
+  get pushed() {
+    const sticks = this.axes.some((value, place) => value !== 0 && !TRIGGERS.includes(place));
+    return sticks || (this.mask & this.#moving) !== 0;
+  }
 
   /** A further way of driving. */
   source() {
@@ -83,14 +90,15 @@ export class Pad {
   }
 
   /**
-   * What the app calls its dead-man and its way home, and which buttons move nothing.
-   * @param {string} deadman @param {string | null} home @param {string[]} moveless
+   * What the app calls its dead-man and its way home, which buttons move nothing, and which controls move the arm.
+   * @param {string} deadman @param {string | null} home @param {string[]} moveless @param {string[]} moving
    */
-  explain(deadman, home, moveless) {
+  explain(deadman, home, moveless, moving) {
     const other = deadman !== this.deadman;
     this.deadman = deadman;
     this.home = home;
     this.#moveless = moveless.reduce((mask, name) => mask | BIT[name], 0) & ~BIT[deadman];
+    this.#moving = moving.reduce((mask, name) => mask | (name in AXIS ? 0 : BIT[name]), 0) & ~BIT[deadman];
     if (other) this.reset();
     else this.update();
   }

@@ -4,6 +4,7 @@ import { socketTo, tokenOfPage } from "./connection.js";
 
 const HEADER = 20; // bytes before the JPEG
 const AGAIN = 1000; // ms until the next try
+const SMOOTH = /** @type {const} */ ("high");
 const JPEG = "image/jpeg";
 
 /**
@@ -17,6 +18,8 @@ export class Pictures {
   constructor() {
     /** Draw it now; the bitmap is closed afterwards. @type {(picture: Picture) => void} */
     this.came = () => {};
+    /** Device pixels, across and up, at which a camera is shown; null: unknown. @type {(camera: number) => number[] | null} */
+    this.sizeOf = () => null;
     /** @type {string[]} */
     this.cameras = [];
     /** @type {string[]} */
@@ -71,7 +74,9 @@ export class Pictures {
     const camera = view.getUint8(0);
     const taken = arrived - 1000 * view.getFloat32(16, true);
     try {
-      const bitmap = await createImageBitmap(new Blob([new Uint8Array(data, HEADER)], { type: JPEG }));
+      const size = this.sizeOf(camera);
+      const resize = size && { resizeWidth: size[0], resizeHeight: size[1], resizeQuality: SMOOTH };
+      const bitmap = await createImageBitmap(new Blob([new Uint8Array(data, HEADER)], { type: JPEG }), resize ?? {});
       if (socket === this.#socket) this.came({ camera, bitmap, taken });
       bitmap.close();
     } catch {

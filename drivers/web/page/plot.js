@@ -67,7 +67,7 @@ export class Plot {
     const panel = byId("plotting");
     const colour = (/** @type {string} */ part) => getComputedStyle(panel.querySelector(part)).color;
     this.#colours = { measured: colour(".measured"), target: colour(".target"), quiet: colour(".keys") };
-    this.#font = `11px ${getComputedStyle(document.body).fontFamily}`;
+    this.#font = `12px ${getComputedStyle(document.body).fontFamily}`;
   }
 
   #resize() {

@@ -106,7 +106,7 @@ export class Recording {
     setData(byId("recording-lamp"), "tone", lost || trouble ? "alarm" : TONES[phase] ?? "calm");
     tell(byId("recording-prompt"), prompt);
     tell(byId("recording-task"), task);
-    setText(byId("recording-number"), `number ${view.episode} in the dataset`);
+    setText(byId("recording-number"), `dataset episode ${view.episode}`);
     const progress = byId("recording-progress");
     show(progress, wanted > 0);
     setAttribute(progress, "max", String(Math.max(1, wanted)));
@@ -133,7 +133,7 @@ export class Recording {
   }
 
   #paintButtons() {
-    const why = this.lease.mine ? "" : "Only the page that drives can do that";
+    const why = this.lease.mine ? "" : "Only the page in control can do that";
     show(byId("recording-actions"), Boolean(this.lease.rig?.drivable));
     for (const button of this.buttons) {
       setAttribute(button, "aria-disabled", String(!this.#may(button.dataset.action)));

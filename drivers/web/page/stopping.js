@@ -28,7 +28,7 @@ export class Stopping {
     const sent = this.connection.send({ type: "stop" });
     this.#asked ??= this.#t + (performance.now() - this.#cameAt) / 1000;
     if (!sent) {
-      this.log.add("STOP could not be sent: there is no connection");
+      this.log.add("STOP could not be sent: not connected");
       this.#alarm("STOP does not reach the arm", "There is no connection to the program.");
       return;
     }
@@ -46,7 +46,7 @@ export class Stopping {
     if (this.#asked === null || state.t < this.#asked) return;
     this.#doubt = doubts(state.robots);
     if (this.#doubt) return;
-    if (!byId("alarm").hidden) this.log.add("every arm shows a stop now");
+    if (!byId("alarm").hidden) this.log.add("every arm has stopped now");
     this.#settle();
   }
 
