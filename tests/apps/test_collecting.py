@@ -19,7 +19,7 @@ import hal
 from hal.apps.collect import parser
 from hal.apps.collecting import Collection
 from hal.camera import Camera
-from hal.console import Console, Listen, RecordingView
+from hal.console import Console, DrivingView, Listen, RecordingView
 from hal.drivers.mock.gamepad import MockPad
 from hal.recording import Dataset, Recorder
 
@@ -40,6 +40,10 @@ class Page(Console):
 
     def on_action(self, taken: Callable[[str], None]) -> None:
         self._taken = taken
+
+    def show_driving(self, view: DrivingView) -> None: ...
+
+    def on_setting(self, changed: Callable[[str, str | float], None]) -> None: ...
 
     def wait_ready(self) -> None: ...
 
