@@ -9,7 +9,7 @@ from typing import Any
 
 import yaml
 
-from ..config.files import Problems, nearest
+from ..config.files import PlacedErrors, Problems, check_size, nearest
 from ..config.schema import describe, is_number
 from ..errors import ConfigError
 
@@ -85,9 +85,6 @@ class Reading:
         except yaml.YAMLError as error:
             line, message = _not_yaml(text, error)
             self.problems.add(f"{path}:{line}", "", message)
-            raise Wrong from None
-        except RecursionError:
-            self.problems.add(path, "", "is nested too deeply")
             raise Wrong from None
         if not isinstance(data, dict) or root is None:
             self.problems.add(path, "", f"must hold keys and values, not {describe(data)}")
@@ -165,9 +162,14 @@ class Reading:
             raise ConfigError(sorted(found, key=lambda problem: problem.file.rpartition(":")[0] or problem.file))
 
 
+class _Loader(PlacedErrors, yaml.SafeLoader):
+    """YAML 1.1, as Ark reads it."""
+
+
 def _parse(text: str) -> tuple[yaml.Node | None, Any]:
-    """One document, as nodes with their lines and as data. Raises yaml.YAMLError and RecursionError."""
-    loader = yaml.SafeLoader(text)
+    """Return one document, as nodes with their lines and as data. Raises yaml.YAMLError."""
+    check_size(text, _Loader)
+    loader = _Loader(text)
     try:
         root = loader.get_single_node()
         return root, loader.construct_document(root) if root is not None else None

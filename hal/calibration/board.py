@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
-from ..config.data_files import data_folder, is_path
+from ..config.data_files import data_folder, is_path, user_path
 from ..config.files import Problems, read_yaml
 from ..config.schema import Pixels, Size, Strict
 from ..config.validation import validate
@@ -120,7 +120,7 @@ def load_board(name: str = BUILT_IN) -> Board:
     Raises ConfigError with every problem, DriverMissing where OpenCV is not installed.
     """
     if is_path(name):
-        path = Path(name).expanduser().resolve()
+        path = user_path(name, Path.cwd())
     elif name == BUILT_IN:
         path = data_folder("config") / "objects" / BUILT_IN / "board.yaml"
     else:

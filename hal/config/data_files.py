@@ -6,9 +6,10 @@ They are found by path, in ``hal/data/``, which in a checkout holds links to the
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
-__all__ = ["FOLDERS", "data_folder", "find_data", "is_path", "list_data"]
+__all__ = ["FOLDERS", "data_folder", "find_data", "is_path", "list_data", "user_path"]
 
 FOLDERS = ("robots", "sensors", "config")
 
@@ -40,3 +41,12 @@ def list_data(folder: str, *parts: str) -> tuple[str, ...]:
 def is_path(name: str) -> bool:
     """Does ``name`` mean a file of the user's, rather than the name of something that comes with the hal?"""
     return "/" in name or "\\" in name or name.endswith((".yaml", ".yml"))
+
+
+def user_path(name: str | Path, base: Path) -> Path:
+    """Return the absolute path that a person wrote as ``name``, relative to ``base``, with links followed.
+
+    Raises nothing: a path that leads nowhere (a loop of links, an unknown user, a NUL) is one that is not there.
+    """
+    path = os.path.join(base, os.path.expanduser(str(name).replace("\0", "\\0")))
+    return Path(os.path.realpath(path))

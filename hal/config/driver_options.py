@@ -10,6 +10,7 @@ from .. import registry
 from ..specs import CameraSpec, GripperSpec, RobotSpec
 from .camera_models import CameraModel
 from .context import Context
+from .data_files import user_path
 from .models import GripperModel, RobotModel
 from .rigfile import CameraConfig, GripperConfig, RobotConfig
 
@@ -41,7 +42,7 @@ def options_of(
 def _absolute(options: Mapping[str, Any], paths: Collection[str], folder: Path) -> dict[str, Any]:
     """What is no text is left as it is: the driver's own check says what is wrong with it."""
     return {
-        name: str((folder / Path(value).expanduser()).resolve()) if name in paths and isinstance(value, str) else value
+        name: str(user_path(value, folder)) if name in paths and isinstance(value, str) else value
         for name, value in options.items()
     }
 

@@ -13,7 +13,7 @@ from typing import Any
 from pydantic import PrivateAttr
 
 from .context import Context
-from .data_files import data_folder, is_path, list_data
+from .data_files import data_folder, is_path, list_data, user_path
 from .files import Problems, nearest, read_yaml
 from .overrides import apply_overrides
 from .plan import Plan
@@ -80,7 +80,7 @@ def _read(config: str | Path | Mapping[str, Any], problems: Problems) -> tuple[d
         return dict(config), "<dict>", Path.cwd()
     name = str(config)
     if isinstance(config, Path) or is_path(name):
-        path = Path(config).expanduser().resolve()
+        path = user_path(config, Path.cwd())
         return read_yaml(path, problems), str(path), path.parent
     rigs = list_data("config")
     if name not in rigs:

@@ -13,7 +13,7 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, field_validator, model_validator
 
 from ..types import AXES, BUTTONS, PadState
-from .data_files import data_folder, is_path, list_data
+from .data_files import data_folder, is_path, list_data, user_path
 from .files import Problems, nearest, read_yaml
 from .schema import Flag, Quantity, Strict
 from .validation import validate
@@ -174,7 +174,7 @@ def load_mapping(mapping: str | Path | Mapping[str, Any] | TeleopMapping = "defa
     if isinstance(mapping, Mapping):
         source, data = "<dict>", dict(mapping)
     elif isinstance(mapping, Path) or is_path(str(mapping)):
-        path = Path(mapping).expanduser().resolve()
+        path = user_path(mapping, Path.cwd())
         source, data = str(path), read_yaml(path, problems)
     else:
         source = str(data_folder("config") / "teleop" / f"{mapping}.yaml")

@@ -9,7 +9,7 @@ from typing import Any
 
 from pydantic import Field, model_validator
 
-from .data_files import data_folder, is_path, list_data
+from .data_files import data_folder, is_path, list_data, user_path
 from .files import Problems, nearest, read_yaml
 from .schema import (
     Accelerations,
@@ -130,7 +130,7 @@ def find_model(name: str, folder: str, parts: tuple[str, ...], base: Path) -> Pa
     Returns a sentence where there is none.
     """
     if is_path(name):
-        return (base / Path(name).expanduser()).resolve()
+        return user_path(name, base)
     there = list_data(folder, *parts)
     if name not in there:
         return f"there is no {'/'.join((folder, *parts))} model {name!r}{nearest(name, there)}, or a path to your own"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
@@ -11,7 +12,7 @@ from typing import Any, Literal
 from pydantic import model_validator
 
 from ..specs import BodySpec
-from .data_files import data_folder, is_path, list_data
+from .data_files import data_folder, is_path, list_data, user_path
 from .files import Problems, nearest, read_yaml
 from .models import UrdfSource
 from .random_poses import RandomPose
@@ -170,8 +171,8 @@ def _load(entry: Any, source: str, base: Path, key: str, problems: Problems) -> 
         problems.add(source, key, f"must be a file, a name or keys and values, not {describe(entry)}")
         return None
     if is_path(entry):
-        path = (base / Path(entry).expanduser()).resolve()
-        if not path.is_file():
+        path = user_path(entry, base)
+        if not os.path.isfile(path):
             there = [f"{path.parent.name}/{p.name}" for p in path.parent.glob("*.yaml")] if path.parent.is_dir() else []
             problems.add(source, key, f"there is no file {path}{nearest(f'{path.parent.name}/{path.name}', there)}")
             return None

@@ -7,7 +7,7 @@ from typing import Any
 
 import yaml
 
-from .files import Problems, nearest, parse_yaml, plain_copy
+from .files import Problems, nearest, parse_yaml, plain_copy, yaml_problem
 
 __all__ = ["apply_overrides"]
 
@@ -37,7 +37,7 @@ def _pairs(overrides: Sequence[str] | Mapping[str, Any], problems: Problems) -> 
         try:
             pairs.append((key.strip(), parse_yaml(value)))
         except yaml.YAMLError as error:
-            problems.add(SET, key.strip(), f"the value is not valid YAML: {' '.join(str(error).split())}")
+            problems.add(SET, key.strip(), f"the value {yaml_problem(error)}")
     return pairs
 
 

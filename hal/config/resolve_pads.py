@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import os
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 from ..specs import PadSpec
 from .context import Context
+from .data_files import user_path
 from .files import read_yaml
 from .models import find_model, load_pad_models
 from .rigfile import PadConfig
@@ -58,7 +60,7 @@ def _model(context: Context, key: str, config: PadConfig) -> dict[str, Any] | No
 
 
 def _recording(context: Context, file: str) -> Path:
-    return (context.base / Path(file).expanduser()).resolve()
+    return user_path(file, context.base)
 
 
 def _check_recording(context: Context, key: str, config: PadConfig) -> None:
@@ -67,5 +69,5 @@ def _check_recording(context: Context, key: str, config: PadConfig) -> None:
             context.problem(key, f"is for the driver playback, not {config.driver!r}")
     elif config.file is None:
         context.problem(key, "is missing: the recording that is to be played")
-    elif not _recording(context, config.file).is_file():
+    elif not os.path.isfile(_recording(context, config.file)):
         context.problem(key, f"there is no file {_recording(context, config.file)}")

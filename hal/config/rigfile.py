@@ -59,6 +59,10 @@ __all__ = [
 ]
 
 
+DEVICES, OBJECTS = 64, 1000
+"""Most devices of one kind, and most objects, in a rig; more would take minutes to check."""
+
+
 class Device(Strict):
     """What robots, grippers and cameras share."""
 
@@ -227,15 +231,18 @@ def _section(value: Any) -> Any:
     return {} if value is None else value
 
 
+_FEW = Field(max_length=DEVICES)
+
+
 class RigFile(Strict):
     """A rig as written."""
 
     description: str = ""
     sim: Flag = True
     """The one flag: is everything simulated that does not say otherwise?"""
-    robots: Annotated[dict[Name, RobotConfig], BeforeValidator(_section)] = Field(default_factory=dict)
-    cameras: Annotated[dict[Name, CameraConfig], BeforeValidator(_section)] = Field(default_factory=dict)
-    gamepads: Annotated[dict[Name, PadConfig], BeforeValidator(_section)] = Field(default_factory=dict)
-    objects: Annotated[list[Any], BeforeValidator(_objects)] = Field(default_factory=list)
+    robots: Annotated[dict[Name, RobotConfig], BeforeValidator(_section), _FEW] = Field(default_factory=dict)
+    cameras: Annotated[dict[Name, CameraConfig], BeforeValidator(_section), _FEW] = Field(default_factory=dict)
+    gamepads: Annotated[dict[Name, PadConfig], BeforeValidator(_section), _FEW] = Field(default_factory=dict)
+    objects: Annotated[list[Any], BeforeValidator(_objects)] = Field(default_factory=list, max_length=OBJECTS)
     """Of the simulated world: names in ``config/objects/``, paths, or ``{name, shape, ...}``."""
     simulation: Annotated[SimulationConfig, BeforeValidator(_section)] = SimulationConfig()

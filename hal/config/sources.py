@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import os
 import platform
 import sys
 from pathlib import Path
 
 from ..packages import package_folder
+from .data_files import user_path
 from .files import Problems, nearest
 from .models import UrdfSource
 
@@ -28,7 +30,7 @@ INSTALL = {
 def locate_urdf(source: UrdfSource, base: Path, file: Path | str, key: str, problems: Problems) -> Path | None:
     """Absolute path of a URDF; None, and a problem noted, where it is not there. Imports nothing."""
     if source.package is None:
-        path = (base / Path(source.path).expanduser()).resolve()
+        path = user_path(source.path, base)
     else:
         folder = package_folder(source.package)
         if folder is None:
@@ -37,8 +39,8 @@ def locate_urdf(source: UrdfSource, base: Path, file: Path | str, key: str, prob
             if all(problem.message != message for problem in problems.found):  # robot and objects may share a package
                 problems.add(file, f"{key}.package", message)
             return None
-        path = (folder / source.path).resolve()
-    if not path.is_file():
+        path = user_path(source.path, folder)
+    if not os.path.isfile(path):
         there = [p.name for p in path.parent.glob("*.urdf")] if path.parent.is_dir() else []
         problems.add(file, key, f"there is no file {path}{nearest(path.name, there) if there else ''}")
         return None

@@ -114,6 +114,8 @@ def _sentence(model: type[BaseModel], found: Any) -> str:
     if kind in ("model_type", "dict_type", "model_attributes_type"):
         keys = keys_at(model, loc)
         return f"must hold keys and values, not {describe(given)}" + (f"; keys: {', '.join(keys)}" if keys else "")
+    if kind == "too_long":
+        return f"must have at most {found['ctx']['max_length']} entries, not {len(given)}"
     wanted = _WANTED.get(kind) or found["msg"].replace("Input should be", "must be").replace("String should", "must")
     return f"{wanted}, not {describe(given)}"
 

@@ -336,7 +336,7 @@ def test_missing_file_and_unknown_rig(tmp_path: Path) -> None:
         ("", ["is empty"]),
         ("robots: !!python/object/apply:os.system ['true']", ["not valid YAML"]),
         ("a: 1\n---\nb: 2\n", ["not valid YAML"]),
-        ("objects: &all [*all]", ["an alias"]),
+        ("objects: &all [*all]", ["alias *all"]),
     ],
 )
 def test_files_that_are_no_rig(tmp_path: Path, text: str, words: list[str]) -> None:
