@@ -8,7 +8,7 @@ from typing import Any
 from .body import Body
 from .library import Client
 
-__all__ = ["bounding_box", "find_contacts", "forget_contacts"]
+__all__ = ["bounding_box", "deepest_overlap", "find_contacts", "forget_contacts"]
 
 FAR = 1000.0
 """m: where nothing touches anything."""
@@ -34,6 +34,15 @@ def find_contacts(client: Client, bodies: Iterable[Body], a: Body | None, b: Bod
             }
         )
     return found
+
+
+def deepest_overlap(client: Client, a: Body, b: Body) -> tuple[float, str, str]:
+    """How deep two bodies are in each other as they stand, m, and by which links; 0 where they are apart."""
+    points = client.getClosestPoints(a.id, b.id, distance=0.0)
+    if not points:
+        return 0.0, "", ""
+    deepest = min(points, key=lambda point: point[8])
+    return max(0.0, -deepest[8]), a.link_names[deepest[3]], b.link_names[deepest[4]]
 
 
 def bounding_box(client: Client, body: Body) -> tuple[list[float], list[float]]:

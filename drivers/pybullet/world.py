@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable, Mapping, Sequence
+from itertools import combinations
 from typing import Any, ClassVar
 
 from hal.errors import CommandError, ConfigError, DeviceNotFound, NotSupported, Problem
@@ -17,7 +18,7 @@ from hal.specs import BodySpec, RobotSpec, WorldSpec
 from .arm_copy import ArmCopy
 from .body import Body
 from .carrying import Carried
-from .contacts import bounding_box, find_contacts, forget_contacts
+from .contacts import bounding_box, deepest_overlap, find_contacts, forget_contacts
 from .dynamics import read_dynamics, write_dynamics
 from .library import Client
 from .loading import load_object, load_robot
@@ -31,6 +32,8 @@ __all__ = ["World"]
 ITERATIONS = 100
 """Of the solver, at most; it ends sooner where nothing is left to solve. With PyBullet's 50, fingers that grasp with
 70 N reach half of it, and fast arms are 0.2 % over their speed limits."""
+OVERLAP = 0.005
+"""m: two arms that start deeper in each other are refused."""
 
 
 class World:
@@ -75,6 +78,8 @@ class World:
             self.client.setGravity(*spec.gravity)
             self.client.setPhysicsEngineParameter(deterministicOverlappingPairs=1, numSolverIterations=ITERATIONS)
             self._load((*spec.bodies, *spec.robots))
+            if not mirror:
+                self._check_overlaps()
         except BaseException:
             self.close()
             raise
@@ -99,6 +104,19 @@ class World:
         self._arrange()
         self._carried.leave_physics(self.bodies[spec.name] for spec in specs)
         self._carried.follow()
+
+    def _check_overlaps(self) -> None:
+        """Refuse arms that start inside each other: the solver would throw them apart."""
+        robots = [body for body in self.bodies.values() if body.is_robot and body.name not in self._copies]
+        problems = []
+        for a, b in combinations(robots, 2):
+            depth, link_a, link_b = deepest_overlap(self.client, a, b)
+            if depth > OVERLAP:
+                message = f"starts {depth:.3f} m inside robot {a.name!r} (its {link_b} in {link_a})"
+                remedy = "change its base or initial; a URDF with two arms is loaded whole for every entry: split it"
+                problems.append(Problem("simulation", f"robots.{b.name}", f"{message}; {remedy}"))
+        if problems:
+            raise ConfigError(problems)
 
     def _place(self, spec: BodySpec | RobotSpec) -> Body:
         if spec.name in self.bodies:

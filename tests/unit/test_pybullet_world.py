@@ -7,6 +7,7 @@ import math
 import subprocess
 import sys
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -498,6 +499,18 @@ class TestBadInput:
         assert len(said) == 6
         for expected in ("nowhere.urdf", "not a URDF", "radius", "dodecahedron", "unique", "panda_jiont7"):
             assert sum(expected in line for line in said) >= 1, expected
+
+    def test_arms_that_start_inside_each_other_are_refused_by_name(self) -> None:
+        apart = panda("right", base_position=(0.0, 0.4, 0.0))
+        World(world_spec(panda("left"), apart)).close()
+        for right in (panda("right"), replace(apart, initial=(-1.57, *PANDA_HOME[1:]))):
+            with pytest.raises(ConfigError) as error:
+                World(world_spec(panda("left"), right))
+            (problem,) = error.value.problems
+            assert problem.key == "robots.right"
+            assert "'left'" in problem.message
+        World(world_spec(panda("left"), replace(panda("right"), driver="franka"))).close()  # a copy of a real arm
+        World(world_spec(panda("left"), panda("right")), mirror=True).close()
 
     def test_a_link_without_mass_is_told(self, tmp_path: Path) -> None:
         urdf = tmp_path / "massless.urdf"
