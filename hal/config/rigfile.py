@@ -56,6 +56,7 @@ __all__ = [
     "RobotConfig",
     "SimulationConfig",
     "WorkspaceConfig",
+    "rig_schema",
 ]
 
 
@@ -169,7 +170,10 @@ class CameraConfig(Device):
     """One of the model's modes, for every stream that does not say otherwise."""
     output: Output | None = None
     """Centre crop and scaling of what was captured; none when left out."""
-    streams: Annotated[dict[Stream, StreamConfig], BeforeValidator(by_name)] = Field(default_factory=_color_and_depth)
+    streams: Annotated[
+        dict[Stream, StreamConfig],
+        BeforeValidator(by_name, json_schema_input_type=dict[Stream, StreamConfig | None] | list[Stream]),
+    ] = Field(default_factory=_color_and_depth)
     """``{color: {format: bgr8}, ...}`` or just ``[color, depth]``."""
     align: Literal["color", "depth"] | None = None
     """Whose view colour and depth are handed out in; colour's when left out, where there is colour."""
@@ -246,3 +250,8 @@ class RigFile(Strict):
     objects: Annotated[list[Any], BeforeValidator(_objects)] = Field(default_factory=list, max_length=OBJECTS)
     """Of the simulated world: names in ``config/objects/``, paths, or ``{name, shape, ...}``."""
     simulation: Annotated[SimulationConfig, BeforeValidator(_section)] = SimulationConfig()
+
+
+def rig_schema() -> dict[str, Any]:
+    """Return the JSON schema of a rig's file: what an editor completes, explains and underlines."""
+    return {"$schema": "https://json-schema.org/draft/2020-12/schema"} | RigFile.model_json_schema()

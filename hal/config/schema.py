@@ -70,7 +70,7 @@ class Unknown(AttributeError):
 class Strict(BaseModel):
     """A record that knows all its keys. One from a file with mistakes can have holes, which raise :class:`Unknown`."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, use_attribute_docstrings=True)
 
     if not TYPE_CHECKING:  # so that mypy still finds misspelt attributes
 
@@ -265,6 +265,13 @@ class PoseConfig(Strict):
 
     position: Position = (0.0, 0.0, 0.0)
     orientation: QuaternionConfig = (0.0, 0.0, 0.0, 1.0)
+
+    @classmethod
+    def __get_pydantic_json_schema__(cls, core_schema: Any, handler: Any) -> dict[str, Any]:
+        """Both ways to write it."""
+        own = handler(core_schema)
+        seven = {"type": "array", "items": {"type": "number"}, "minItems": 7, "maxItems": 7}
+        return {"description": own.pop("description", ""), "anyOf": [handler.resolve_ref_schema(own), seven]}
 
     @model_validator(mode="before")
     @classmethod

@@ -15,7 +15,7 @@ ROOT = Path(__file__).parents[2]
 MAPPED = {"hal": "hal", "apps": "hal/apps", "drivers": "hal/drivers"}
 DATA = {name: f"hal/data/{name}" for name in ("config", "robots", "sensors")}
 SHIPPED_CODE = (".py", ".html", ".css", ".js")
-SHIPPED_DATA = {".yaml", ".jsonl", ".urdf", ".obj", ".mtl", ".png"}
+SHIPPED_DATA = {".yaml", ".json", ".jsonl", ".urdf", ".obj", ".mtl", ".png"}
 
 pytestmark = pytest.mark.slow
 

@@ -10,11 +10,13 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
+from jsonschema import Draft202012Validator, ValidationError
 
 from hal.config import load
 from hal.config.data_files import find_data, list_data
 from hal.config.intrinsics import centre_crop
 from hal.config.plan import Plan
+from hal.config.rigfile import rig_schema
 from hal.errors import ConfigError
 from hal.pose import Pose
 from hal.specs import BodySpec, WorldSpec, from_json, to_json
@@ -451,3 +453,19 @@ def test_missing_inertials_are_a_warning(tmp_path: Path) -> None:
     (warning,) = plan(tmp_path / "rig.yaml").warnings
     assert "panda_link3" in warning
     assert "inertial" in warning
+
+
+def test_the_json_schema_for_editors_is_up_to_date() -> None:
+    shipped = find_data("config", "rig.schema.json").read_text()
+    assert json.loads(shipped) == rig_schema(), "run: hal schema > config/rig.schema.json"
+
+
+@pytest.mark.parametrize("name", list_data("config"))
+def test_shipped_rigs_name_the_schema_and_fit_it(name: str) -> None:
+    file = find_data("config", f"{name}.yaml")
+    first, _, text = file.read_text().partition("\n")
+    assert first == "# yaml-language-server: $schema=rig.schema.json"
+    validator = Draft202012Validator(rig_schema())
+    validator.validate(yaml.safe_load(text))
+    with pytest.raises(ValidationError):
+        validator.validate(yaml.safe_load(text) | {"robots": {"arm": {"modle": "panda"}}})

@@ -1,0 +1,117 @@
+"""Every program under one command, and what comes with the hal.
+
+hal teleop --sim
+hal list robots
+hal schema > rig.schema.json
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from importlib import import_module
+from pathlib import Path
+
+from hal.apps.cli import run_app
+
+__all__ = ["PROGRAMS", "main", "parser"]
+
+PROGRAMS = {
+    "teleop": "drive an arm: page in a browser, gamepad, keyboard, recorded tour",
+    "check": "check this computer, real arms and cameras before they move; show gamepads",
+    "collect": "record demonstrations",
+    "review": "look through a dataset, mark and delete episodes",
+    "replay": "play a recorded episode again",
+    "rollout": "run a policy and count its successes",
+    "export": "convert a dataset for training",
+    "calibrate": "find out where a camera is",
+    "import-ark": "convert a configuration of Ark",
+}
+LISTS = {
+    "robots": ("robots",),
+    "cameras": ("sensors", "cameras"),
+    "rigs": ("config",),
+    "pads": ("sensors", "gamepads"),
+}
+"""What ``hal list`` knows -> the folder of its files."""
+
+
+def parser() -> argparse.ArgumentParser:
+    """Return the command line."""
+    programs = "\n".join(f"  {name:12s} {what}" for name, what in PROGRAMS.items())
+    made = argparse.ArgumentParser(
+        prog="hal",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        description=f"programs:\n{programs}\n\n"
+        f"  {'list':12s} list what comes with the hal: {', '.join(LISTS)}\n"
+        f"  {'schema':12s} print the JSON schema of a rig's file, for editors",
+        epilog="hal PROGRAM --help shows a program's own options.",
+    )
+    made.add_argument("--version", action="store_true", help="print the version")
+    made.add_argument("command", nargs="?", choices=[*PROGRAMS, "list", "schema"], metavar="PROGRAM")
+    made.add_argument("arguments", nargs=argparse.REMAINDER, metavar="...", help="the program's options")
+    return made
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Entry point."""
+    words = sys.argv[1:] if argv is None else argv
+    args = parser().parse_args(words)
+    if args.command in PROGRAMS:
+        return int(import_module(f"hal.apps.{args.command.replace('-', '_')}").main(args.arguments))
+    return run_app(_main, args)
+
+
+def _main(args: argparse.Namespace) -> int:
+    import hal
+
+    if args.version:
+        print(f"robot-hal {hal.__version__}")
+    elif args.command == "list":
+        return _list(args.arguments)
+    elif args.command == "schema":
+        from hal.config.rigfile import rig_schema
+
+        print(json.dumps(rig_schema(), indent=2))
+    else:
+        parser().print_help()
+    return 0
+
+
+def _list(arguments: list[str]) -> int:
+    made = argparse.ArgumentParser(prog="hal list", description="List what comes with the hal, by the names to use.")
+    made.add_argument("kinds", nargs="*", metavar="KIND", help=f"{', '.join(LISTS)} (all)")
+    kinds = made.parse_args(arguments).kinds or list(LISTS)
+    for kind in kinds:
+        if kind not in LISTS:
+            made.error(f"there is no kind {kind!r}; kinds: {', '.join(LISTS)}")
+    from hal.config.data_files import find_data, list_data
+
+    for kind in kinds:
+        if len(kinds) > 1:
+            print(f"{kind}:")
+        folder = LISTS[kind]
+        for name in list_data(*folder):
+            print(f"  {name:24s} {_summary(find_data(*folder, f'{name}.yaml'))}")
+    return 0
+
+
+def _summary(file: Path) -> str:
+    """Return the description of a file: its key of that name, or the first sentence of its first comment."""
+    lines = file.read_text(encoding="utf-8").splitlines()
+    described = next((line for line in lines if line.startswith("description:")), None)
+    if described is not None:
+        return described.partition(":")[2].strip()
+    comment = []
+    for line in lines:
+        if line.startswith("# yaml-language-server"):
+            continue
+        if not line.startswith("#") or not line.strip("# "):
+            break
+        comment.append(line.lstrip("# "))
+    return " ".join(comment).partition(". ")[0].rstrip(".")
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,62 @@
+"""The examples run as their first lines say, and use nothing private."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from PIL import Image
+
+EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
+
+
+def run(name: str, folder: Path, *arguments: str) -> str:
+    command = [sys.executable, str(EXAMPLES / name), *arguments]
+    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=90)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout
+
+
+def test_a_point_cloud_shows_the_table_where_it_is(tmp_path: Path) -> None:
+    assert "5 poses" in run("point_cloud.py", tmp_path)
+    heights = trimesh.load(tmp_path / "cloud.ply").vertices[:, 2]
+    assert len(heights) > 100_000
+    assert np.median(heights) == pytest.approx(0.6, abs=0.002)
+    assert heights.max() > 0.63, "the things on the table are there too"
+
+
+@pytest.mark.parametrize("seed", ["0", "1", "2"])
+def test_the_cube_is_picked_up_wherever_it_lies(tmp_path: Path, seed: str) -> None:
+    assert "held: True" in run("pick.py", tmp_path, seed)
+
+
+def test_random_scenes_have_pictures_and_true_poses(tmp_path: Path) -> None:
+    run("random_scenes.py", tmp_path, "here")
+    pictures = [np.asarray(Image.open(file)) for file in sorted((tmp_path / "here").glob("*.png"))]
+    assert len(pictures) == 5
+    assert np.abs(pictures[0].astype(int) - pictures[1]).max() > 50
+    poses = json.loads((tmp_path / "here" / "scene_0.json").read_text())
+    assert len(poses) == 6
+    assert all(len(pose) == 7 for pose in poses.values())
+
+
+def test_an_arm_of_ones_own_goes_up(tmp_path: Path) -> None:
+    assert "6 joints" in run("own_arm.py", tmp_path)
+
+
+def test_the_unit_tests_with_the_mock_pass(tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", str(EXAMPLES / "test_circle.py")]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=90)
+    assert "3 passed" in done.stdout, done.stdout
+
+
+def test_every_example_is_tested_here_and_uses_nothing_private() -> None:
+    here = Path(__file__).read_text()
+    for file in EXAMPLES.glob("*.py"):
+        assert file.name in here
+        assert "._" not in file.read_text()
