@@ -11,7 +11,7 @@ import xml.etree.ElementTree as ElementTree
 from collections.abc import Sequence
 from math import dist, hypot, inf, sqrt
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -23,7 +23,7 @@ from .quaternion import difference
 if TYPE_CHECKING:
     from .specs import KinematicsSpec
 
-__all__ = ["Inverse", "Kinematics", "Pose7"]
+__all__ = ["Kinematics", "Pose7"]
 
 Array = NDArray[np.float64]
 Pose7 = tuple[float, float, float, float, float, float, float]
@@ -33,27 +33,6 @@ NEAR_SINGULAR = 0.05
 """Smallest singular value of the Jacobian (m and rad mixed) down to which twists are tracked exactly."""
 POSTURE_SPEED = 0.5
 """Bound of the fastest joint in the pull towards the home posture, rad/s."""
-
-
-class Inverse(NamedTuple):
-    """From twists of the tcp to joint speeds, at one place: everything that does not depend on the twist."""
-
-    matrix: Array
-    """(6, n): what 1 m/s and 1 rad/s along each of the base's axes add to the joint speeds, rad/s."""
-    posture: Array | None
-    """(n,) the way home that does not move the tcp, rad; None where nothing is left free for it."""
-    posture_most: float
-    """The greatest gain for which no joint goes home faster than :data:`POSTURE_SPEED`, 1/s."""
-    near_singular: bool
-    """Is a singular value of the Jacobian below :data:`NEAR_SINGULAR`?"""
-
-    def speeds(self, twist: Sequence[float] | Array, posture_gain: float) -> list[float]:
-        """Joint speeds (n,) in rad/s for a twist (6,), and towards home at ``posture_gain`` (1/s)."""
-        speeds = np.dot(twist, self.matrix)
-        if self.posture is not None and posture_gain != 0.0:
-            speeds += min(posture_gain, self.posture_most) * self.posture
-        result: list[float] = speeds.tolist()
-        return result
 
 
 class Kinematics:
@@ -73,6 +52,7 @@ class Kinematics:
         self.lower: Array = np.array(spec.lower, float)
         self.upper: Array = np.array(spec.upper, float)
         self.home: Array = np.array(spec.home, float)
+        self._home: list[float] = self.home.tolist()
         for name, values in (("lower", self.lower), ("upper", self.upper), ("home", self.home)):
             if values.shape != (self.n,):
                 raise ValueError(f"{name} has {values.size} numbers for {self.n} joints")
@@ -147,45 +127,49 @@ class Kinematics:
         posture_gain: float = 0.5,
         jacobian: Array | None = None,
     ) -> tuple[list[float], bool]:
-        """Joint speeds (n,) in rad/s for a twist (6,) of the tcp; and whether the arm is near a singularity.
+        """Return the joint speeds (n,) in rad/s for a twist (6,) of the tcp, and whether the arm is near a singularity.
 
         What the twist leaves free moves towards home at ``posture_gain`` (1/s) times the distance, at most
-        :data:`POSTURE_SPEED`; that motion is in the null space and does not move the tcp. Who has the Jacobian at
-        ``q`` already can pass it. For several twists at one place see :meth:`inverse`.
-        """
-        inverse = self.inverse(q, self.jacobian(q) if jacobian is None else jacobian)
-        return inverse.speeds(twist, posture_gain), inverse.near_singular
-
-    def inverse(self, q: Sequence[float] | Array, jacobian: Array) -> Inverse:
-        """From twists to joint speeds at ``q`` (n,), rad, whose Jacobian is known.
+        :data:`POSTURE_SPEED`; that motion is in the null space and does not move the tcp. Callers that have the
+        Jacobian at ``q`` already can pass it.
 
         Far from singularities a twist is met exactly. Near one, the component along each direction whose singular
         value s is below :data:`NEAR_SINGULAR` (e) is met to the share (s/e)^2, so that joint speeds stay below
         |twist| / e: damped least squares with numerical filtering (Maciejewski and Klein, J. Robotic Systems 5(6),
         1988) with the damping s^2 + l^2 = max(s, e)^2. All other directions stay exact.
         """
+        if jacobian is None:
+            jacobian = self.jacobian(q)
         gram = np.dot(jacobian, jacobian.T, self._gram)
         near = not self._is_surely_regular(q) and self._is_near_singular(q, gram)
-        home = self.home - q if self.n > 6 else None  # else nothing is left free for a posture
+        home = self._pull(q, posture_gain) if self.n > 6 else None  # else nothing is left free for a posture
+        wanted = np.array(twist, float)
         if not near:
             self._llt.compute(gram)
-            matrix = self._llt.solve(jacobian)
-            drift = None if home is None else jacobian.dot(home).dot(matrix)
+            if home is None:
+                speeds = self._llt.solve(wanted).dot(jacobian)
+            else:  # the way home, less what it would move the tcp
+                speeds = self._llt.solve(wanted - jacobian.dot(home)).dot(jacobian) + home
         else:
             squares = self._eigen.eigenvalues()  # of the singular values, in ascending order
             vectors = self._eigen.eigenvectors()
             along = vectors.T.dot(jacobian)
-            matrix = (vectors / np.maximum(squares, NEAR_SINGULAR**2)).dot(along)
-            drift = None
+            speeds = (vectors.T.dot(wanted) / np.maximum(squares, NEAR_SINGULAR**2)).dot(along)
             if home is not None:
                 # The null space is taken undamped, or the posture would creep along the singular direction.
                 regular = squares > 1e-12
-                drift = (along[regular].dot(home) / squares[regular]).dot(along[regular])
-        if home is None or drift is None:
-            return Inverse(matrix, None, 0.0, near)
-        fastest = float(np.abs(home).max())
-        most = POSTURE_SPEED / fastest if fastest > 0.0 else inf
-        return Inverse(matrix, home - drift, most, near)
+                speeds += home - (along[regular].dot(home) / squares[regular]).dot(along[regular])
+        result: list[float] = speeds.tolist()
+        return result, near
+
+    def _pull(self, q: Sequence[float] | Array, gain: float) -> Array | None:
+        """Return the speeds (n,) towards home, rad/s; None where there are none."""
+        way = [x - y for x, y in zip(self._home, q, strict=True)]
+        farthest = max(map(abs, way))
+        if gain == 0.0 or farthest == 0.0:
+            return None
+        gain = min(gain, POSTURE_SPEED / farthest)
+        return np.array([gain * x for x in way])
 
     def _is_near_singular(self, q: Sequence[float] | Array, gram: Array) -> bool:
         """Is a singular value of the Jacobian at ``q`` below :data:`NEAR_SINGULAR`? Its ``gram`` matrix is J J^T."""

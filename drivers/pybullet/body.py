@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 from hal.specs import BodySpec, RobotSpec
 
 from .library import Client
 from .transforms import Transform, compose, inverse
+
+if TYPE_CHECKING:
+    from .motors import Gear
 
 __all__ = ["Body"]
 
@@ -46,6 +50,8 @@ class Body:
     """Where the base link starts, in the world."""
     damping: tuple[float, float] = (0.04, 0.04)
     """Linear and angular damping. PyBullet does not give them back; 0.04 is what it starts with."""
+    gears: list[Gear] = field(default_factory=list)
+    """Between joints that move together (fingers)."""
     hardened: set[int] = field(default_factory=set)
     """Links whose contacts were made soft and then hard again (see :mod:`.dynamics`)."""
 

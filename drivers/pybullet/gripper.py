@@ -70,9 +70,11 @@ class PyBulletGripper(GripperDriver):
     def read(self, now: float) -> GripperReading:
         """The fingers as the last physics step left them; ``force`` is what the weaker motor pressed with, N."""
         self._expect_open()
-        width, speed, force = self._width()
+        width, speed, force, load = self._width()
         moving = not self._at_rest(width, speed)
         pressing = force >= PRESSING * self._force
+        idle = not moving and abs(width - self._aim) <= AT_TARGET and load < PRESSING * self._force
+        self._world.handle(self._body.name, not idle)
         return GripperReading(
             t=now,
             t_device=self._world.t,
@@ -124,7 +126,7 @@ class PyBulletGripper(GripperDriver):
     def stop(self) -> None:
         """Stay where the fingers are. On an object, they go on pressing."""
         self._expect_open()
-        width, speed, force = self._width()
+        width, speed, force, _ = self._width()
         if force >= PRESSING * self._force and (abs(speed) <= SLOW or self._at_rest(width, speed)):
             return
         self._target = self._aim = width
@@ -137,6 +139,7 @@ class PyBulletGripper(GripperDriver):
         self._open = False
 
     def _drive(self, speed: float) -> None:
+        self._world.handle(self._body.name, True)
         client = self._world.client
         for joint in self._joints:
             client.setJointMotorControl2(
@@ -150,11 +153,13 @@ class PyBulletGripper(GripperDriver):
                 maxVelocity=speed / 2.0,
             )
 
-    def _width(self) -> tuple[float, float, float]:
-        """Width in m, its speed in m/s (positive opens), and the force of the weaker motor in N (positive closes)."""
+    def _width(self) -> tuple[float, float, float, float]:
+        """Width in m, its speed in m/s (positive opens), the force of the weaker motor in N (positive closes), and the
+        greatest force of a motor, either way.
+        """
         widths, speeds, _, forces = zip(*self._read(self._body.id, self._joints), strict=True)
         share = 2.0 / len(widths)
-        return share * sum(widths), share * sum(speeds), -max(forces)
+        return share * sum(widths), share * sum(speeds), -max(forces), max(map(abs, forces))
 
     def _was_reset(self) -> None:
         self._target = self._aim = self._stood = self._width()[0]

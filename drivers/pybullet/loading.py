@@ -10,6 +10,7 @@ from hal.specs import BodySpec, RobotSpec
 from .body import Body
 from .inertias import mend_inertias
 from .library import Client, silenced
+from .motors import Gear
 from .transforms import Transform, compose, inverse
 from .urdf import Mimic, loadable, read_urdf
 from .values import listed
@@ -22,15 +23,9 @@ UNKNOWN_EFFORT = 200.0
 """Nm or N for a joint whose limit is given nowhere (a URDF's effort of 0 means unknown, not powerless)."""
 UNKNOWN_SPEED = 2.0
 """rad/s or m/s, likewise."""
-GEAR_SHARE = 0.8
-"""Share of the error between coupled joints that one physics step takes away."""
-GEAR_FORCE = 10.0
-"""Strength of the coupling, as a multiple of the effort of the joints that it couples."""
 FINGER_MASS = 0.1
 """kg, at least: the solver lets a finger of 29 g press with no more than 26 N. What drives it moves along, and is in no
 URDF."""
-CONSTRAINT_ERP = 0.2
-"""PyBullet's own share, which it multiplies a gear's by."""
 
 
 def load_object(client: Client, spec: BodySpec) -> tuple[Body, list[str]]:
@@ -214,18 +209,10 @@ def _root_pose(client: Client, body: Body, spec: RobotSpec) -> Transform:
 
 
 def _couple(client: Client, body: Body, mimics: Sequence[Mimic]) -> None:
-    """Make joints follow each other as ``<mimic>`` says, which PyBullet reads and ignores.
-
-    The gear acts between the two joints, so a finger that is blocked holds back the other one too.
-    """
+    """Make joints follow each other as ``<mimic>`` says, which PyBullet reads and ignores."""
     for mimic in mimics:
         if mimic.joint not in body.joints or mimic.of not in body.joints or mimic.multiplier == 0.0:
             continue
         follower, leader = body.joints[mimic.joint], body.joints[mimic.of]
-        gear = client.createConstraint(
-            body.id, leader, body.id, follower, client.JOINT_GEAR, (1, 0, 0), (0, 0, 0), (0, 0, 0)
-        )
-        force = GEAR_FORCE * max(body.efforts.get(leader, 0.0), body.efforts.get(follower, 0.0), 100.0)
-        client.changeConstraint(
-            gear, gearRatio=-1.0 / mimic.multiplier, erp=GEAR_SHARE / CONSTRAINT_ERP, maxForce=force
-        )
+        effort = max(body.efforts.get(leader, 0.0), body.efforts.get(follower, 0.0), 100.0)
+        body.gears.append(Gear(client, body.id, leader, follower, mimic.multiplier, effort))

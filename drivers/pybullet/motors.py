@@ -9,11 +9,17 @@ from .library import Client
 
 Floats = Sequence[float]
 
-__all__ = ["Torques", "hold", "position_gain"]
+__all__ = ["Gear", "Torques", "hold", "position_gain"]
 
 STIFFNESS = 72.0
 """1/s: a position error dies away at this rate. At 240 Hz that is a gain of 0.3 per step. A loaded arm follows best
 with it: from 0.5 on, the solver's remaining errors are fed back and grow."""
+GEAR_SHARE = 0.8
+"""Share of the error between coupled joints that one physics step takes away."""
+GEAR_FORCE = 10.0
+"""Strength of a coupling, as a multiple of the effort of the joints that it couples."""
+CONSTRAINT_ERP = 0.2
+"""PyBullet's own share, which it multiplies a gear's by."""
 
 
 def position_gain(dt: float) -> float:
@@ -38,6 +44,38 @@ def hold(client: Client, body: Body, targets: Mapping[int, float], dt: float) ->
             velocityGain=1.0,
             maxVelocity=body.speeds[joint],
         )
+
+
+class Gear:
+    """Makes one joint of a body follow another: ``q[follower] = multiplier * q[leader]``, plus what it is at the start.
+
+    It acts between the two joints, so a finger that is blocked holds back the other one too.
+    """
+
+    def __init__(self, client: Client, body: int, leader: int, follower: int, multiplier: float, effort: float) -> None:
+        """``effort`` is the greatest torque or force of the two joints, Nm or N."""
+        self.joints = frozenset((leader, follower))
+        self._client = client
+        self._make = (body, leader, body, follower, client.JOINT_GEAR, (1, 0, 0), (0, 0, 0), (0, 0, 0))
+        self._set = {
+            "gearRatio": -1.0 / multiplier,
+            "erp": GEAR_SHARE / CONSTRAINT_ERP,
+            "maxForce": GEAR_FORCE * effort,
+        }
+        self._number: int | None = None
+        self.engage()
+
+    def engage(self) -> None:
+        """Couple the joints. Idempotent."""
+        if self._number is None:
+            self._number = self._client.createConstraint(*self._make)
+            self._client.changeConstraint(self._number, **self._set)
+
+    def release(self) -> None:
+        """Uncouple the joints, which makes a physics step 4 % shorter. Idempotent."""
+        if self._number is not None:
+            self._client.removeConstraint(self._number)
+            self._number = None
 
 
 class Torques:

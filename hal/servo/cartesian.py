@@ -57,9 +57,8 @@ class _CartesianMotion(Motion):
         envelope, smoother = self.envelope, self.smoother
         speed = max(hypot(*twist[:3]), hypot(*twist[3:]))
         posture = _POSTURE * min(1.0, speed / _POSTURE_FULL)
-        inverse = envelope.inverse()
-        dq = inverse.speeds(twist, posture)
-        if inverse.near_singular:
+        dq, near_singular = envelope.kinematics.velocity(smoother.q, twist, posture, envelope.here()[1])
+        if near_singular:
             envelope.limited |= Limited.SINGULAR
         if not isfinite(sum(dq)):
             dq = [0.0] * smoother.n

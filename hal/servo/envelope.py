@@ -7,7 +7,7 @@ from math import hypot
 from typing import TYPE_CHECKING
 
 from ..inbox import Session
-from ..kinematics import Inverse, Kinematics, Pose7
+from ..kinematics import Kinematics, Pose7
 from ..specs import WorkspaceSpec
 from ..types import Limited
 from .limits import speed_for
@@ -144,10 +144,6 @@ class Envelope:
     def here(self) -> tuple[Pose7, NDArray[np.float64]]:
         """Pose of the tcp and its Jacobian (6, n) at the set-point; computed once a tick, whoever asks."""
         return self._tcp.here()
-
-    def inverse(self) -> Inverse:
-        """From twists of the tcp to joint speeds at the set-point."""
-        return self._tcp.inverse()
 
     def far_from_faces(self) -> bool:
         """Is the tcp surely where no face of the workspace slows it down?"""

@@ -23,7 +23,7 @@ from math import dist, hypot, inf, sqrt
 from operator import mul
 from typing import TYPE_CHECKING, Any
 
-from ..kinematics import Inverse, Kinematics, Pose7
+from ..kinematics import Kinematics, Pose7
 from ..specs import WorkspaceSpec
 from .limits import stop_displacement
 from .smoothing import JointSmoother
@@ -98,10 +98,6 @@ class TcpReference:
         if self._at is not self._smoother.q:
             self._look()
         return self._pose, self._jacobian
-
-    def inverse(self) -> Inverse:
-        """From twists of the tcp to joint speeds at the set-point, which becomes the reference."""
-        return self._kinematics.inverse(self._smoother.q, self.here()[1])
 
     def _look(self) -> None:
         q = self._smoother.q

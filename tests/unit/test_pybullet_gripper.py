@@ -159,6 +159,25 @@ class TestCoupling:
         assert 0.005 < min(bench.fingers()) < 0.03  # both moved, and neither closed
         assert max(apart) < 5e-4
 
+    def test_a_push_against_one_of_two_idle_fingers_moves_both(self) -> None:
+        """A hand that idles is uncoupled, and coupled again before its motors give way, read 20 times a second."""
+        bench = Bench()
+        bench.hand.move(0.04, 0.1, 20.0)
+        bench.run(1.0)
+        world, body = bench.world, bench.world.body("panda")
+        push, apart = 0.0, []
+        for tick in range(240):
+            push = 0.25 * tick  # N, up to 60
+            world.client.applyExternalForce(
+                body.id, body.links["panda_leftfinger"], (0.0, -push, 0.0), (0.0, 0.0, 0.0), world.client.LINK_FRAME
+            )
+            world.step()
+            if tick % 12 == 0:
+                bench.hand.read(world.t)
+            apart.append(abs(np.subtract(*bench.fingers())))
+        assert max(apart) < 5e-4
+        assert max(bench.fingers()) < 0.01, "both gave way in the end"
+
     def test_fingers_move_together(self) -> None:
         bench = Bench()
         bench.hand.move(0.0, 0.1, 20.0)
