@@ -64,6 +64,7 @@ def _main(args: argparse.Namespace) -> int:
     from hal.apps.report import check_writable
     from hal.errors import CommandError
     from hal.recording import Dataset
+    from hal.recording.checking import check_rows
 
     if not 0.0 < args.speed <= 1.0:
         raise CommandError(f"--speed must be above 0 and at most 1, not {args.speed:g}")
@@ -73,6 +74,7 @@ def _main(args: argparse.Namespace) -> int:
     if not -len(episodes) <= args.episode < len(episodes):
         raise CommandError(f"--episode {args.episode}: {args.dataset} has {len(episodes)}, counted from 0")
     episode = episodes[args.episode]
+    check_rows(episode, None)  # before anything is opened
     what = f"episode  {episode.number}: {episode.length} rows at {episode.fps:g} Hz, {episode.task or 'no task'!r}"
     plan = planned(args, what)
     if plan is None:
@@ -93,18 +95,23 @@ def _driven(rig: Rig, episode: Episode) -> str:
     """The arm that the recording says was driven, else the first of the rig that is in it, else the first."""
     from hal.course import arms_of
 
-    said = episode.info.get("info", {}).get("robot")
+    driven = str(episode.info.get("info", {}).get("robot"))
     recorded = arms_of(episode)
-    if said in rig.robots:
-        return str(said)
+    if driven in rig.robots:
+        return driven
     return next((name for name in rig.robots if name in recorded), next(iter(rig.robots)))
 
 
 def _replayed(robot: Robot, episode: Episode) -> Iterator[str]:
-    """Which arm moves, and which others of the recording do not."""
+    """Which arm moves, which others of the recording do not, and what is damaged but not needed."""
     from hal.course import moved_besides
+    from hal.errors import DatasetError
 
     yield f"replays  {robot.name}"
+    try:
+        episode.check_pictures()
+    except DatasetError as error:
+        yield f"damaged  {error}; pictures are not replayed"
     for name in moved_besides(episode, robot.name):
         yield f"still    {name} moved in the recording, too; it is not replayed"
 

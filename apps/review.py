@@ -1,24 +1,27 @@
-"""Look at what was recorded: a dataset in numbers, an episode as a picture or for the rerun viewer.
+"""Show what was recorded: a dataset in numbers, an episode as a picture or for the rerun viewer.
 
 python apps/review.py data/demo
 python apps/review.py data/demo --episode 3
 python apps/review.py data/demo --episode 3 --rrd look.rrd
+python apps/review.py data/demo --check
 """
 
 from __future__ import annotations
 
 import argparse
+import json
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from hal.apps.cli import ACTION_NEEDED, run_app
+from hal.errors import CommandError
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from hal.recording.exporters.summary import Spread, Summary
-    from hal.recording.reader import Episode
+    from hal.recording.reader import Dataset, Episode
 
 __all__ = ["main", "parser"]
 
@@ -29,8 +32,9 @@ def parser() -> argparse.ArgumentParser:
     """The command line."""
     made = argparse.ArgumentParser(
         prog="review",
-        description="Look at what was recorded: a dataset in numbers, an episode as a picture or for the rerun viewer.",
-        epilog="The dataset is only read. The exit status is 2 when an episode of it cannot be read, else 0.",
+        description="Show what was recorded: a dataset in numbers, an episode as a picture or for the rerun viewer.",
+        epilog="The dataset is only read, except by --repair. The exit status is 2 when an episode cannot be read or "
+        "--check finds something, else 0.",
     )
     made.add_argument("dataset", metavar="DATASET", help="the folder of a recording")
     made.add_argument(
@@ -39,6 +43,13 @@ def parser() -> argparse.ArgumentParser:
     made.add_argument("--png", metavar="FILE", help="where the picture goes (beside the dataset)")
     made.add_argument(
         "--rrd", metavar="FILE", help="write a file for the rerun viewer instead; needs the extra [review]"
+    )
+    files = made.add_mutually_exclusive_group()
+    files.add_argument(
+        "--check", action="store_true", help="compare every file with the index: rows, pictures, depth, time stamps"
+    )
+    files.add_argument(
+        "--repair", action="store_true", help="finish interrupted episodes, and rebuild a lost index from the episodes"
     )
     made.add_argument("--json", action="store_true", help="print the numbers as one JSON object")
     made.add_argument("--force", action="store_true", help="overwrite a picture or .rrd that is there")
@@ -51,12 +62,15 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def _main(args: argparse.Namespace) -> int:
-    from hal.errors import CommandError
     from hal.recording import Dataset
     from hal.recording.exporters.selection import chosen
     from hal.recording.exporters.summary import as_json, summary
 
+    if args.repair:
+        return _repair(args)
     dataset = Dataset(args.dataset)
+    if args.check:
+        return _check(args, dataset)
     if args.episode is None:
         if args.png or args.rrd:
             raise CommandError("--png and --rrd show one episode: say which with --episode N")
@@ -69,6 +83,31 @@ def _main(args: argparse.Namespace) -> int:
         for path in _drawn(args, dataset.root, episode):
             print(f"wrote {path}", file=sys.stderr if args.json else sys.stdout)
     return ACTION_NEEDED if found.broken else 0
+
+
+def _check(args: argparse.Namespace, dataset: Dataset) -> int:
+    from hal.recording.checking import check_dataset
+    from hal.recording.exporters.selection import chosen
+
+    if args.png or args.rrd:
+        raise CommandError("--check draws nothing: leave out --png and --rrd")
+    wanted = None if args.episode is None else [args.episode]
+    count = len(chosen(dataset, wanted, successful_only=False))
+    found = [str(error) for error in check_dataset(dataset, wanted)]
+    if args.json:
+        print(json.dumps({"path": str(dataset.root), "episodes": count, "wrong": found}, indent=2))
+    else:
+        print("\n".join([*found, f"{count} episode{'' if count == 1 else 's'} checked, {len(found)} problem(s)"]))
+    return ACTION_NEEDED if found else 0
+
+
+def _repair(args: argparse.Namespace) -> int:
+    from hal.recording import repair
+
+    if args.episode is not None or args.png or args.rrd or args.json:
+        raise CommandError("--repair is for the whole dataset and takes no other option")
+    print("\n".join(repair(args.dataset) or ["nothing to repair; --check compares every file with the index"]))
+    return 0
 
 
 def _drawn(args: argparse.Namespace, root: Path, episode: Episode) -> Iterator[Path]:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .errors import CommandError
+from .errors import CommandError, DatasetError
 from .pose import Pose
 
 if TYPE_CHECKING:
@@ -70,6 +70,8 @@ class Course:
         n, first = len(joints), places.index(f"{lead}x")
 
         clocks = [key for key in episode.stamps if key.startswith("robot.")]
+        if not clocks or episode.names("observation.state") != names:
+            raise DatasetError("does not have the columns of an arm", file="meta/info.json")
         key = f"robot.{robot.name}" if several else clocks[0]
         stamps = episode.stamps[key]
         t = stamps - stamps[0]

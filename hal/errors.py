@@ -3,6 +3,7 @@
     HalError
     ├── ConfigError (ValueError)            a rig, a model or an argument file is wrong; lists every problem
     ├── CommandError (ValueError)           a command was malformed; nothing was sent
+    ├── DatasetError (ValueError)           a file of a recording is missing or damaged; names the file and the episode
     ├── Unreachable (ValueError)            no joint position reaches the pose; carries the residual
     ├── DriverMissing (ImportError)         a library is not installed; names the command that installs it
     ├── DeviceNotFound (LookupError)        no such device; lists those that are there
@@ -30,6 +31,7 @@ __all__ = [
     "ConfigError",
     "ConnectionLost",
     "ControlTaken",
+    "DatasetError",
     "DeviceNotFound",
     "DriverMissing",
     "HalError",
@@ -74,6 +76,20 @@ class ConfigError(HalError, ValueError):
 
 class CommandError(HalError, ValueError):
     """A command has the wrong shape, a non-finite number or an impossible value. Nothing was sent."""
+
+
+class DatasetError(HalError, ValueError):
+    """A file of a recording is missing, truncated, damaged, or does not fit the other files."""
+
+    file: str | None = None
+    """The file, relative to the dataset's folder; None where the error is not about one file."""
+    episode: int | None = None
+    """Number of the episode; None where the error is about the whole dataset."""
+
+    def __init__(self, message: str, *, file: str | None = None, episode: int | None = None) -> None:
+        place = [] if episode is None else [f"episode {episode}"]
+        super().__init__(": ".join([*place, *([file] if file else []), message]))
+        self.file, self.episode = file, episode
 
 
 class Unreachable(HalError, ValueError):

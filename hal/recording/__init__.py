@@ -23,9 +23,9 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from .reader import Dataset, Episode
     from .recorder import Recorder, RecorderStatus
-    from .recovery import recover
+    from .recovery import recover, repair
 
-__all__ = ["Dataset", "Episode", "Recorder", "RecorderStatus", "recover"]
+__all__ = ["Dataset", "Episode", "Recorder", "RecorderStatus", "recover", "repair"]
 
 _HOME = {
     "Dataset": "reader",
@@ -33,6 +33,7 @@ _HOME = {
     "Recorder": "recorder",
     "RecorderStatus": "recorder",
     "recover": "recovery",
+    "repair": "recovery",
 }
 
 

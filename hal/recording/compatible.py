@@ -8,7 +8,8 @@ from typing import Any
 
 from ..errors import CommandError
 from .columns import CameraSetup
-from .layout import Layout, read_json
+from .index import check_next, read_about, read_index
+from .layout import Layout
 from .tables import VERSION
 
 __all__ = ["check_compatible"]
@@ -20,29 +21,34 @@ _SAID_ELSEWHERE = ("video.fps", "video.width", "video.height")
 def check_compatible(
     layout: Layout, features: Mapping[str, Any], fps: int, robot_type: str, cameras: Sequence[CameraSetup]
 ) -> None:
-    """Raise CommandError, which says everything that differs, where episodes of this kind cannot be added."""
+    """Raise CommandError, with everything that differs, where episodes of this kind cannot be added; DatasetError where
+    the dataset is damaged."""
     root = layout.root
     if root.exists() and not root.is_dir():
         raise CommandError(f"{root} is a file; a recording needs a folder")
-    if not layout.info.exists():
+    if layout.info.exists() and not layout.numbers():
+        raise CommandError(f"the dataset in {root} was not recorded by this program; choose a new folder")
+    info = read_index(layout)
+    if info is None:
         if root.is_dir() and not layout.episodes.is_dir() and any(root.iterdir()):
             raise CommandError(f"{root} holds other things than a recording; choose a new folder")
         return
-    info = read_json(layout.info)
     last = int(info["total_episodes"]) - 1
-    if info.get("codebase_version") != VERSION or (last >= 0 and not layout.about(last).exists()):
+    if not layout.interrupted:
+        check_next(layout, info)
+    if info["codebase_version"] != VERSION:
         raise CommandError(f"the dataset in {root} was not recorded by this program; choose a new folder")
     found = [*_settings(info, fps, robot_type), *_features(info["features"], features)]
     if last >= 0:
-        found += _depth(read_json(layout.about(last))["cameras"], cameras)
+        found += _depth(read_about(layout, last)["cameras"], cameras)
     if found:
         raise CommandError(f"the dataset in {root} is another kind: {'; '.join(found)}; choose a new folder")
 
 
 def _settings(info: Mapping[str, Any], fps: int, robot_type: str) -> Iterator[str]:
     for name, new in (("fps", fps), ("robot_type", robot_type)):
-        if info[name] != new:
-            yield f"{name} is {info[name]} there, and {new} here"
+        if info.get(name) != new:
+            yield f"{name} is {info.get(name)} there, and {new} here"
 
 
 def _features(old: Mapping[str, Any], new: Mapping[str, Any]) -> Iterator[str]:

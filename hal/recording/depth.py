@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import io
 import json
+import math
 import os
 import struct
 from collections.abc import Iterator
@@ -24,6 +25,8 @@ __all__ = ["DepthFile", "DepthReader", "to_units", "unit_for"]
 _RECORD = struct.Struct("<II")  # length, checksum
 _LEVEL = 1
 _MOST = 65535
+_LINE, _SIDE = 4096, 16384
+"""Bytes of the first line, and pixels of a side, at most: a damaged file must not ask for all memory."""
 _UNITS = (0.0001, 0.00025, 0.0005, 0.001, 0.002, 0.005, 0.01)
 
 Units = NDArray[np.uint16]
@@ -66,9 +69,11 @@ class DepthReader:
     def __init__(self, path: str | Path) -> None:
         self.path = Path(path)
         with self.path.open("rb") as file:
-            head: dict[str, Any] = json.loads(file.readline())
+            head: dict[str, Any] = json.loads(file.readline(_LINE))
             self.shape = (int(head["height"]), int(head["width"]))
             self.unit = float(head["unit_m"])
+            if not (all(1 <= side <= _SIDE for side in self.shape) and 0.0 < self.unit < math.inf):
+                raise ValueError(f"its first line is damaged: {head}")
             self._places = list(_records(file, self.path.stat().st_size))
 
     def __len__(self) -> int:
@@ -83,16 +88,20 @@ class DepthReader:
         return start + length
 
     def units(self) -> Iterator[Units]:
-        """Every row's picture (H, W), in units of :attr:`unit` m."""
+        """Yield every row's picture (H, W), in units of :attr:`unit` m. ValueError for a damaged one."""
         import zstandard
 
         expand = zstandard.ZstdDecompressor()
         picture = np.zeros(self.shape, "<u2")
         with self.path.open("rb") as file:
-            for start, length in self._places:
+            for k, (start, length) in enumerate(self._places):
                 if length:
-                    file.seek(start)
-                    picture = _unshuffled(expand.decompress(file.read(length)), self.shape)
+                    file.seek(start - _RECORD.size)
+                    _, check = _RECORD.unpack(file.read(_RECORD.size))
+                    data = file.read(length)
+                    if crc32(data) != check or zstandard.frame_content_size(data) != picture.nbytes:
+                        raise ValueError(f"picture {k} is damaged")
+                    picture = _unshuffled(expand.decompress(data), self.shape)
                 yield picture
 
     def __iter__(self) -> Iterator[NDArray[np.float32]]:

@@ -8,28 +8,30 @@ starts anew.
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from .columns import ACTION, GRID, SETPOINT, STATE, TIMES
-from .layout import Layout, read_json, sync, write_json
+from ..errors import DatasetError
+from .columns import ACTION, GRID, SETPOINT, STATE, TIMES, video_key
+from .index import check_next, read_index
+from .layout import LIST, Layout, read_json, sync, write_json
 from .live import Rest, read_rest
 from .pace import Pace
 from .stats import Stats, column_stats, merged, plain
 from .tables import entry_table, new_info, read_tasks, rows_table, tasks_table
-from .video import remux
+from .video import picture_stats, remux
 
 __all__ = ["CLOSING", "finalise"]
 
 CLOSING = "closing.json"
 """In the live folder: what was said when the episode was closed."""
-_FINAL, _LIST = "final", "list.json"
+_FINAL = "final"
 _UNCLOSED: dict[str, Any] = {
     "success": None,
-    "recovered": True,
     "dropped": None,
     "late": None,
     "gaps": [],
@@ -38,43 +40,71 @@ _UNCLOSED: dict[str, Any] = {
 }
 
 
-def finalise(layout: Layout, partial: Path) -> int | None:
-    """Make an episode of a live folder; its number comes back. None where it holds no row: then it is removed.
+def finalise(layout: Layout, partial: Path, *, recovered: bool = False) -> int | None:
+    """Make an episode of a partial folder.
 
-    The dataset must be locked. OSError where the disk does not take it; the folder stays as it is then.
+    Args:
+        layout: The dataset, which must be locked.
+        partial: The folder; its content is not trusted.
+        recovered: Whether the program that recorded it did not get to finish it.
+
+    Returns:
+        The episode's number; None where the folder holds no row: then it is removed.
+
+    Raises:
+        DatasetError: The dataset's index is missing or damaged, or the folder would write over a finished episode or
+            outside of the dataset.
+        OSError: The disk does not take it; the folder stays as it is then.
     """
-    if not (partial / _LIST).exists():
+    _check_no_links(partial)
+    if not (partial / LIST).exists():
         rest = read_rest(partial)
         if rest is None or rest.length == 0:
             layout.remove(partial)
             return None
-        moves = _prepare(layout, rest)
-        write_json(partial / _LIST, moves)
+        moves = _prepare(layout, rest, recovered)
+        write_json(partial / LIST, moves)
     return _move(layout, partial)
 
 
+def _check_no_links(partial: Path) -> None:
+    """A link would let what is written or cut off here change a file elsewhere."""
+    for path in (partial, *partial.rglob("*")):
+        if path.is_symlink():
+            raise ValueError(f"{path.name} is a link")
+
+
 def _move(layout: Layout, partial: Path) -> int:
-    moves = read_json(partial / _LIST)
-    for source, target in moves:
-        here, there = partial / source, layout.root / target
+    shared = {layout.info, layout.stats, layout.tasks}
+    moves = []
+    for source, target in read_json(partial / LIST):
+        here, there = partial / source, layout.target(target)
+        if Path(source).is_absolute() or ".." in Path(source).parts:
+            raise ValueError(f"{source!r} is not a file of this folder")
         if here.exists():
-            there.parent.mkdir(parents=True, exist_ok=True)
-            here.replace(there)
-            sync(there.parent)
+            if there.exists() and there not in shared:
+                raise DatasetError("belongs to a finished episode; it is not written over", file=target)
+            moves.append((here, there))
+    for here, there in moves:
+        there.parent.mkdir(parents=True, exist_ok=True)
+        here.replace(there)
+        sync(there.parent)
     layout.remove(partial)
     return int(read_json(layout.info)["total_episodes"]) - 1
 
 
-def _prepare(layout: Layout, rest: Rest) -> list[tuple[str, str]]:
+def _prepare(layout: Layout, rest: Rest, recovered: bool) -> list[tuple[str, str]]:
     """Make everything; which file of the folder goes where comes back, in that order."""
     import pyarrow.parquet as pq
 
-    final = rest.folder / _FINAL
-    final.mkdir(exist_ok=True)
     about = rest.about
-    info = read_json(layout.info) if layout.info.exists() else None
-    info = info or new_info(about["features"], about["fps"], about["robot_type"])
+    there = read_index(layout)
+    check_next(layout, there)
+    info = there or new_info(about["features"], about["fps"], about["robot_type"])
     number, start, fps = int(info["total_episodes"]), int(info["total_frames"]), int(info["fps"])
+    final = rest.folder / _FINAL
+    shutil.rmtree(final, ignore_errors=True)
+    final.mkdir()
     tasks = read_tasks(layout.tasks)
     if about["task"] not in tasks:
         tasks.append(about["task"])
@@ -90,18 +120,18 @@ def _prepare(layout: Layout, rest: Rest) -> list[tuple[str, str]]:
         "index": np.arange(start, start + rows)[:, None],
         "task_index": np.full((rows, 1), tasks.index(about["task"])),
     }
-    pq.write_table(rows_table(columns, info["features"]), final / "data.parquet")
+    pq.write_table(rows_table(columns, info["features"]), final / "data.parquet", write_page_checksum=True)
     made.append((final / "data.parquet", layout.data(number)))
     stats: dict[str, Stats] = {key: column_stats(values) for key, values in columns.items()}
     for camera in rest.cameras:
         if camera.color:
             live = rest.folder / f"{camera.name}.mp4"
-            pictures = remux(live, final / f"{camera.name}.mp4", rows, every=fps)
-            stats[f"observation.images.{camera.name}"] = pictures.stats()
+            remux(live, final / f"{camera.name}.mp4", rows)
+            stats[video_key(camera.name)] = picture_stats(final / f"{camera.name}.mp4", rows, fps).stats()
             made.append((final / f"{camera.name}.mp4", layout.video(camera.name, number)))
         if camera.depth_unit is not None:
             made.append((rest.folder / f"{camera.name}.depth", layout.depth(camera.name, number)))
-    write_json(final / "about.json", _about(rest, number, t_start))
+    write_json(final / "about.json", _about(rest, number, t_start, recovered))
     made.append((final / "about.json", layout.about(number)))
 
     videos = [camera.name for camera in rest.cameras if camera.color]
@@ -111,7 +141,7 @@ def _prepare(layout: Layout, rest: Rest) -> list[tuple[str, str]]:
     pq.write_table(tasks_table(tasks), final / "tasks.parquet")
     made.append((final / "tasks.parquet", layout.tasks))
     before = read_json(layout.stats) if layout.stats.exists() else {}
-    write_json(final / "stats.json", {key: plain(merged(before.get(key), found)) for key, found in stats.items()})
+    write_json(final / "stats.json", plain({key: merged(before.get(key), found) for key, found in stats.items()}))
     made.append((final / "stats.json", layout.stats))
     total = {"total_episodes": number + 1, "total_frames": start + rows, "total_tasks": len(tasks)}
     write_json(final / "info.json", info | total | {"splits": {"train": f"0:{number + 1}"}})
@@ -147,14 +177,13 @@ def _place(columns: list[list[Any]], key: str) -> int:
     return sum(len(names) for _, _, names in columns[: keys.index(key)])
 
 
-def _about(rest: Rest, number: int, t_start: float) -> dict[str, Any]:
-    """The episode's own file: what was known at its start and at its end."""
+def _about(rest: Rest, number: int, t_start: float, recovered: bool) -> dict[str, Any]:
+    """Return the content of the episode's own file: what was known at its start and at its end."""
     closing = rest.folder / CLOSING
-    said = read_json(closing) if closing.exists() else _UNCLOSED
-    skip = ("features", "columns", "cameras_kept")
-    about = {key: value for key, value in rest.about.items() if key not in skip}
+    closed = _UNCLOSED | (read_json(closing) if closing.exists() else {})
+    about = {key: value for key, value in rest.about.items() if key not in ("columns", "cameras_kept")}
     found = {"episode": number, "length": rest.length, "t_start": t_start, "pace": _pace(rest)}
-    return found | said | about
+    return found | closed | {"recovered": recovered} | about
 
 
 def _pace(rest: Rest) -> dict[str, float]:

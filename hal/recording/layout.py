@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import fcntl
 import json
+import math
 import os
 import shutil
 import time
@@ -15,10 +16,15 @@ from typing import Any
 from ..errors import CommandError
 from .columns import video_key
 
-__all__ = ["Layout", "locked", "read_json", "sync", "write_json"]
+__all__ = ["LIST", "Layout", "locked", "read_json", "sync", "write_json"]
 
 CHUNK = 1000
 """Files in a folder."""
+LIST = "list.json"
+"""In a partial folder: which of its files goes where. From then on the episode counts as saved."""
+_DIGITS = "[0-9]" * 3
+_ABOUT_FILES = f"{_DIGITS}{_DIGITS}.json"
+_CHUNK_FILES = f"chunk-{_DIGITS}/file-{_DIGITS}"
 _PATIENCE = 5.0
 """s that somebody else may take to let go of a dataset: the writer of a program that was killed just ends."""
 
@@ -66,6 +72,51 @@ class Layout:
         """All of them, oldest first."""
         return sorted(self.episodes.glob("*.partial"))
 
+    @property
+    def interrupted(self) -> list[Path]:
+        """Partial folders of episodes that count as saved, and whose files are not all in their places yet."""
+        return [partial for partial in self.partials() if (partial / LIST).exists()]
+
+    def files_of(self, number: int) -> list[Path]:
+        """Return where an episode's files are, or would be; of videos and depth those that exist."""
+        file = self._file(number)
+        found = [self.data(number), self.about(number), self.entry(number)]
+        return found + [path for kind in ("videos", "depth") for path in self.root.glob(f"{kind}/*/{file}.*")]
+
+    def finished(self) -> Iterator[Path]:
+        """Yield every file of a finished episode."""
+        yield from self.episodes.glob(_ABOUT_FILES)
+        for kind, ending in (
+            ("data", "parquet"),
+            ("meta/episodes", "parquet"),
+            ("videos/*", "mp4"),
+            ("depth/*", "depth"),
+        ):
+            yield from self.root.glob(f"{kind}/{_CHUNK_FILES}.{ending}")
+
+    @staticmethod
+    def number_of(path: Path) -> int:
+        """Return the number of the episode that a file of :meth:`finished` belongs to."""
+        if path.suffix == ".json":
+            return int(path.stem)
+        return CHUNK * int(path.parent.name.removeprefix("chunk-")) + int(path.stem.removeprefix("file-"))
+
+    def numbers(self) -> list[int]:
+        """Return the numbers of the episodes whose own file is there, in order."""
+        return sorted(int(path.stem) for path in self.episodes.glob(_ABOUT_FILES))
+
+    def target(self, name: str) -> Path:
+        """Return where a file of a partial folder's list goes. ValueError for a place outside of the dataset."""
+        path = self.root / name
+        if Path(name).is_absolute() or ".." in Path(name).parts or path == self.root:
+            raise ValueError(f"{name!r} is not a place in the dataset")
+        there = path.parent
+        while not there.exists():
+            there = there.parent
+        if not there.resolve().is_relative_to(self.root.resolve()):
+            raise ValueError(f"{name!r} leads out of the dataset through a link")
+        return path
+
     def remove(self, partial: Path) -> None:
         """Remove a partial folder as a whole: whoever dies in the middle leaves nothing that looks like an episode."""
         gone = partial.with_suffix(".removed")
@@ -84,7 +135,10 @@ class Layout:
 def locked(layout: Layout) -> Iterator[None]:
     """Nobody else adds to this dataset meanwhile; the lock goes with the process. CommandError where somebody does."""
     layout.episodes.mkdir(parents=True, exist_ok=True)
-    with (layout.episodes / ".lock").open("w") as file:
+    if layout.episodes.is_symlink():
+        raise CommandError(f"{layout.episodes} is a link; nothing is recorded through it")
+    fd = os.open(layout.episodes / ".lock", os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o666)
+    with os.fdopen(fd, "w") as file:
         deadline = time.monotonic() + _PATIENCE
         while True:
             try:
@@ -107,14 +161,26 @@ def sync(path: Path) -> None:
 
 
 def read_json(path: Path) -> Any:
-    """What a JSON file holds."""
+    """Return what a JSON file holds."""
     return json.loads(path.read_text(encoding="utf-8"))
 
 
 def write_json(path: Path, data: Any) -> None:
-    """Write it whole or not at all."""
+    """Write a JSON file, whole or not at all. Numbers that are not finite become null: JSON has no NaN."""
     beside = path.with_name(path.name + ".new")
-    beside.write_text(json.dumps(data, indent=1, default=str) + "\n", encoding="utf-8")
+    beside.unlink(missing_ok=True)
+    with beside.open("x", encoding="utf-8") as file:
+        file.write(json.dumps(_finite(data), indent=1, default=str, allow_nan=False) + "\n")
     sync(beside)
     beside.replace(path)
     sync(path.parent)
+
+
+def _finite(data: Any) -> Any:
+    if isinstance(data, float):
+        return data if math.isfinite(data) else None
+    if isinstance(data, dict):
+        return {key: _finite(value) for key, value in data.items()}
+    if isinstance(data, (list, tuple)):
+        return [_finite(value) for value in data]
+    return data

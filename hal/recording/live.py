@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from .columns import CameraSetup
 from .depth import DepthFile, DepthReader, cut
+from .index import plain_name
 from .layout import read_json, sync, write_json
 from .ring import Slot
 from .video import Encoder, VideoFile, count_frames, mend
@@ -132,6 +133,8 @@ class Rest:
         self.folder = folder
         self.about: dict[str, Any] = read_json(folder / ABOUT)
         self.cameras = [CameraSetup(*camera) for camera in self.about["cameras_kept"]]
+        for camera in self.cameras:
+            plain_name(camera.name)
         rows = list(_rows(folder / ROWS))
         lengths = [len(rows), *(self._pictures(camera) for camera in self.cameras)]
         self.length = min(lengths)
@@ -157,11 +160,8 @@ class Rest:
 
 
 def read_rest(folder: Path) -> Rest | None:
-    """What can be read back; None where the folder was not even begun."""
-    try:
-        return Rest(folder)
-    except (FileNotFoundError, ValueError):
-        return None
+    """Return what can be read back; None for a folder that was not even begun."""
+    return Rest(folder) if (folder / ABOUT).exists() else None
 
 
 def _rows(path: Path) -> Iterator[NDArray[np.float64]]:

@@ -1,28 +1,46 @@
-"""Reading what was recorded: columns as arrays, pictures one by one."""
+"""Read a recording: columns as arrays, pictures one by one."""
 
 from __future__ import annotations
 
-import shlex
 from collections.abc import Iterator
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import CommandError, DeviceNotFound
-from .columns import TIMES
+from ..errors import CommandError, DatasetError, DeviceNotFound
+from .columns import TIMES, video_key
 from .depth import DepthReader
-from .layout import Layout, read_json
+from .index import read_about, read_index, reading, repair_command
+from .layout import Layout
 from .library import require
-from .video import read_video
+from .video import count_frames, read_video
 
 __all__ = ["Dataset", "Episode"]
 
+P = TypeVar("P", bound=NDArray[Any])
+
+
+class _Columns(dict[str, NDArray[Any]]):
+    """Columns by their keys; a key that the episode lacks raises DatasetError."""
+
+    def __init__(self, file: str, episode: int) -> None:
+        super().__init__()
+        self._place = file, episode
+
+    def __missing__(self, key: str) -> NDArray[Any]:
+        file, episode = self._place
+        raise DatasetError(f"has no column {key}", file=file, episode=episode)
+
 
 class Episode:
-    """One episode. Nothing is read before it is asked for."""
+    """One episode. Nothing is read before it is asked for.
+
+    Whatever reads a file raises DatasetError where that file is missing, truncated or damaged, or does not have what
+    ``meta/info.json`` and ``episodes/N.json`` say; the error names the file and the episode.
+    """
 
     def __init__(self, layout: Layout, number: int, meta: dict[str, Any]) -> None:
         self._layout = layout
@@ -32,9 +50,8 @@ class Episode:
 
     @cached_property
     def info(self) -> dict[str, Any]:
-        """What else is known: seed, cameras, gaps, versions, the rig's whole configuration. As ``episodes/N.json``."""
-        found: dict[str, Any] = read_json(self._layout.about(self.number))
-        return found
+        """Seed, cameras, gaps, versions, the rig's whole configuration: the content of ``episodes/N.json``."""
+        return read_about(self._layout, self.number)
 
     @property
     def length(self) -> int:
@@ -48,26 +65,45 @@ class Episode:
 
     @property
     def success(self) -> bool | None:
-        """Was it? None where nobody said."""
+        """Whether the episode was marked a success; None if it was not marked."""
         mark = self.info["success"]
         return None if mark is None else bool(mark)
+
+    @property
+    def data_file(self) -> str:
+        """The file of the rows, relative to the dataset's folder."""
+        return self._name(self._layout.data(self.number))
 
     @cached_property
     def columns(self) -> dict[str, NDArray[Any]]:
         """Every column by its key: (rows, n), or (rows,) where it is one number."""
         import pyarrow.parquet as pq
 
-        table = pq.read_table(self._layout.data(self.number))
-        found = {}
-        for key in table.column_names:
+        path = self._layout.data(self.number)
+        found = _Columns(self.data_file, self.number)
+        features = {key: each for key, each in self._meta["features"].items() if each["dtype"] != "video"}
+        with (
+            reading(self._layout.root, path, self.number),
+            pq.ParquetFile(path, page_checksum_verification=True) as file,
+        ):
+            if file.metadata.num_rows != self.length:
+                raise self._wrong(path, f"has {file.metadata.num_rows} rows, and the episode has {self.length}")
+            if odd := sorted(set(file.schema_arrow.names) ^ features.keys()):
+                raise self._wrong(path, f"does not have the columns of meta/info.json: {', '.join(odd[:5])}")
+            table = file.read()
+        for key, feature in features.items():
             column = table[key].combine_chunks()
-            shape = self._meta["features"][key]["shape"]
-            values = column.flatten() if shape != [1] else column
-            found[key] = values.to_numpy(zero_copy_only=False).reshape(-1, *(shape if shape != [1] else ()))
+            shape = [] if feature["shape"] == [1] else feature["shape"]
+            values = (column.flatten() if shape else column).to_numpy(zero_copy_only=False)
+            if str(values.dtype) != feature["dtype"] or values.size != self.length * int(np.prod(shape)):
+                raise self._wrong(path, f"{key} is not {feature['dtype']} {feature['shape']} in every row")
+            found[key] = values.reshape(-1, *shape)
         return found
 
     def names(self, key: str) -> list[str]:
-        """What the numbers of a column are."""
+        """Return what the numbers of a column are called. DatasetError for a column that the dataset lacks."""
+        if key not in self._meta["features"]:
+            raise DatasetError(f"has no column {key}", file="meta/info.json")
         return list(self._meta["features"][key]["names"] or [key])
 
     @cached_property
@@ -75,8 +111,11 @@ class Episode:
         """True times (rows,) on the rig's clock, s: ``grid``, when each row was due, and of each source
         (``robot.panda``, ``camera.wrist``) when it measured what stands in the row. NaN where it never did."""
         start = float(self.info["t_start"])
-        times = {key.removeprefix(TIMES): value for key, value in self.columns.items() if key.startswith(TIMES)}
-        return {name: start + (value if value.ndim == 1 else value[:, 0]) for name, value in times.items()}
+        found = _Columns(self.data_file, self.number)
+        for key, value in self.columns.items():
+            if key.startswith(TIMES):
+                found[key.removeprefix(TIMES)] = start + (value if value.ndim == 1 else value[:, 0])
+        return found
 
     @property
     def cameras(self) -> tuple[str, ...]:
@@ -84,18 +123,70 @@ class Episode:
         return tuple(self.info["cameras"])
 
     def frames(self, camera: str) -> Iterator[NDArray[np.uint8]]:
-        """The colour picture (H, W, 3) RGB of every row. DeviceNotFound where none was kept."""
-        return read_video(self._kept(self._layout.video(camera, self.number), camera, "colour"))
+        """Return the colour picture (H, W, 3) RGB of every row. DeviceNotFound where none was kept."""
+        path = self.video_file(camera)
+        if path is None:
+            raise self._not_kept(camera, "colour")
+        shape = self._meta["features"][video_key(camera)]["shape"]
+        return self._each(path, read_video(path), tuple(shape))
 
     def depth(self, camera: str) -> Iterator[NDArray[np.float32]]:
-        """The depth picture (H, W) of every row, m; 0 for what was not measured. DeviceNotFound where none was kept."""
-        return iter(DepthReader(self._kept(self._layout.depth(camera, self.number), camera, "depth")))
+        """Return the depth picture (H, W) of every row, m; 0 for what was not measured. DeviceNotFound where none was
+        kept."""
+        path = self._depth_file(camera)
+        if path is None:
+            raise self._not_kept(camera, "depth")
+        with reading(self._layout.root, path, self.number):
+            reader = DepthReader(path)
+        return self._each(path, iter(reader), reader.shape)
 
-    def _kept(self, path: Path, camera: str, what: str) -> Path:
-        if not path.exists():
-            there = ", ".join(self.cameras) or "none"
-            raise DeviceNotFound(f"episode {self.number} has no {what} of a camera {camera!r}; cameras: {there}")
-        return path
+    def check_pictures(self) -> None:
+        """Raise DatasetError where a video or depth file is missing or does not have a picture per row.
+
+        Pictures are counted and not decoded, which takes milliseconds.
+        """
+        for camera in self.cameras:
+            for path, count in ((self.video_file(camera), count_frames), (self._depth_file(camera), _count_depth)):
+                if path is not None:
+                    with reading(self._layout.root, path, self.number):
+                        self._check_count(path, count(path))
+
+    def _each(self, path: Path, pictures: Iterator[P], shape: tuple[int, ...]) -> Iterator[P]:
+        """Yield one picture per row, each of ``shape``."""
+        count = 0
+        with reading(self._layout.root, path, self.number):
+            for picture in pictures:
+                if picture.shape != shape:
+                    raise self._wrong(path, f"has a picture of {picture.shape}, not {shape}")
+                count += 1
+                if count > self.length:
+                    break
+                yield picture
+            self._check_count(path, count)
+
+    def _check_count(self, path: Path, count: int) -> None:
+        if count != self.length:
+            found = f"has {count} pictures" if count < self.length else "has more pictures than rows"
+            raise self._wrong(path, f"{found}, for {self.length} rows")
+
+    def video_file(self, camera: str) -> Path | None:
+        """Return where a camera's video is; None where none was kept."""
+        kept = camera in self.info["cameras"] and video_key(camera) in self._meta["features"]
+        return self._layout.video(camera, self.number) if kept else None
+
+    def _depth_file(self, camera: str) -> Path | None:
+        kept = self.info["cameras"].get(camera, {}).get("depth_unit_m") is not None
+        return self._layout.depth(camera, self.number) if kept else None
+
+    def _not_kept(self, camera: str, what: str) -> DeviceNotFound:
+        there = ", ".join(self.cameras) or "none"
+        return DeviceNotFound(f"episode {self.number} has no {what} of a camera {camera!r}; cameras: {there}")
+
+    def _wrong(self, path: Path, what: str) -> DatasetError:
+        return DatasetError(what, file=self._name(path), episode=self.number)
+
+    def _name(self, path: Path) -> str:
+        return str(path.relative_to(self._layout.root))
 
     def __len__(self) -> int:
         return self.length
@@ -104,16 +195,27 @@ class Episode:
         return f"<Episode {self.number}: {self.length} rows at {self.fps} Hz, {self.task!r}>"
 
 
+def _count_depth(path: Path) -> int:
+    return len(DepthReader(path))
+
+
 class Dataset:
-    """The finished episodes in a folder. Raises CommandError where there are none, DriverMissing."""
+    """The finished episodes in a folder.
+
+    Raises:
+        CommandError: There are no episodes in the folder.
+        DatasetError: ``meta/info.json`` is damaged, or missing although there are episodes.
+        DriverMissing: A library is not installed.
+    """
 
     def __init__(self, out: str | Path) -> None:
         require()
         layout = Layout(out)
-        if not layout.info.exists():
+        info = read_index(layout)
+        if info is None:
             raise CommandError(f"there is no episode in {layout.root}{_hint(layout)}")
         self.root = layout.root
-        self.info: dict[str, Any] = read_json(layout.info)
+        self.info: dict[str, Any] = info
         """``meta/info.json``."""
         self.fps: int = self.info["fps"]
         self.episodes = tuple(Episode(layout, number, self.info) for number in range(self.info["total_episodes"]))
@@ -126,10 +228,8 @@ class Dataset:
 
 
 def _hint(layout: Layout) -> str:
-    """How to mend what was not finished; nothing where all was."""
+    """Return the command that finishes what was not finished; an empty text where all was."""
     left = len(layout.partials())
     if not left:
         return ""
-    call = f"from hal.recording import recover; print(recover({str(layout.root)!r}))"
-    many = "is one" if left == 1 else f"are {left}"
-    return f"; there {many} not finished; mend that with: python -c {shlex.quote(call)}"
+    return f"; {left} {'was' if left == 1 else 'were'} not finished; finish with: {repair_command(layout)}"

@@ -14,7 +14,8 @@ from .about import about_call, about_rig, about_start
 from .columns import features_of
 from .compatible import check_compatible
 from .devices import check_rate, chosen
-from .layout import Layout, locked, read_json
+from .index import read_index
+from .layout import Layout, locked
 from .library import require
 from .ring import RowRing
 from .saving import Saving
@@ -145,8 +146,8 @@ class Recorder:
     @property
     def episodes(self) -> int:
         """How many are in the dataset by now, those that are being saved left out."""
-        info = Layout(self.root).info
-        return int(read_json(info)["total_episodes"]) if info.is_file() else 0
+        info = read_index(Layout(self.root))
+        return int(info["total_episodes"]) if info is not None else 0
 
     # An episode.
 

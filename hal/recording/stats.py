@@ -90,6 +90,10 @@ def merged(old: Mapping[str, Any] | None, new: Stats) -> Stats:
     }
 
 
-def plain(stats: Mapping[str, NDArray[Any]]) -> dict[str, list[Any]]:
-    """As lists, ready for JSON."""
-    return {key: value.tolist() for key, value in stats.items()}
+def plain(stats: Mapping[str, Stats]) -> dict[str, dict[str, list[Any]]]:
+    """Return the statistics of each column as lists, ready for JSON.
+
+    A column of which a number was never known in any row has none: JSON has no NaN, and a made-up number would mislead.
+    """
+    complete = {key: found for key, found in stats.items() if all(np.isfinite(each).all() for each in found.values())}
+    return {key: {name: each.tolist() for name, each in found.items()} for key, found in complete.items()}

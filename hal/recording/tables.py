@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .columns import video_key
-from .layout import CHUNK
+from .layout import CHUNK, sync
 from .stats import Stats
 
-__all__ = ["VERSION", "entry_table", "new_info", "read_tasks", "rows_table", "tasks_table"]
+__all__ = ["VERSION", "entry_table", "new_info", "read_entry", "read_tasks", "rows_table", "tasks_table", "write_table"]
 
 VERSION = "v3.0"
 _TASK = "__index_level_0__"
@@ -81,13 +81,34 @@ def entry_table(
     return pa.table(row)
 
 
+def write_table(path: Path, table: Any) -> None:
+    """Write a Parquet file, whole or not at all."""
+    import pyarrow.parquet as pq
+
+    path.parent.mkdir(parents=True, exist_ok=True)
+    beside = path.with_name(path.name + ".new")
+    beside.unlink(missing_ok=True)
+    pq.write_table(table, beside, use_dictionary=False, write_statistics=False)
+    sync(beside)
+    beside.replace(path)
+    sync(path.parent)
+
+
+def read_entry(path: Path) -> dict[str, Any]:
+    """Return the one row of an episode's :func:`entry_table`. ValueError where there is not one."""
+    import pyarrow.parquet as pq
+
+    (row,) = pq.ParquetFile(path).read().to_pylist()
+    return dict(row)
+
+
 def read_tasks(path: Path) -> list[str]:
     """All tasks, by their number."""
     if not path.exists():
         return []
     import pyarrow.parquet as pq
 
-    table = pq.read_table(path)
+    table = pq.ParquetFile(path).read()
     numbered = sorted(zip(table["task_index"].to_pylist(), table[_TASK].to_pylist(), strict=True))
     return [text for _, text in numbered]
 

@@ -16,12 +16,14 @@ from numpy.typing import NDArray
 from ..errors import CommandError, NotSupported
 from .stats import PictureStats
 
-__all__ = ["Encoder", "VideoFile", "choose_encoder", "count_frames", "mend", "read_video", "remux"]
+__all__ = ["Encoder", "VideoFile", "choose_encoder", "count_frames", "mend", "picture_stats", "read_video", "remux"]
 
 Picture = NDArray[np.uint8]
 
 _LIVE = {"movflags": "frag_keyframe+empty_moov+default_base_moof", "flush_packets": "1"}
 """In fragments, each written as soon as it is whole: a file that ends anywhere can be read up to its last fragment."""
+_SAMPLES = 50
+"""Pictures of a video that are looked at, at least."""
 _BOX = struct.Struct(">I4s")
 
 
@@ -109,7 +111,7 @@ def mend(path: Path) -> None:
 
 
 def count_frames(path: Path) -> int:
-    """How many pictures a mended live file holds."""
+    """Return how many pictures a video holds, without decoding them."""
     import av
 
     if path.stat().st_size == 0:
@@ -118,28 +120,35 @@ def count_frames(path: Path) -> int:
         return sum(1 for packet in container.demux(video=0) if packet.size)
 
 
-def remux(source: Path, target: Path, length: int, every: int) -> PictureStats:
-    """The first ``length`` pictures of a live file as a plain one, not encoded anew, and statistics of every n-th.
+def remux(source: Path, target: Path, length: int) -> None:
+    """Write the first ``length`` pictures of a live file as a plain one, without encoding them anew."""
+    import av
 
-    Of every n-th or the one after it: only pictures that stand for themselves are looked at.
-    """
+    with av.open(str(source)) as live, av.open(str(target), "w", options={"movflags": "faststart"}) as plain:
+        read = live.streams.video[0]
+        write = plain.add_stream_from_template(read, opaque=True)  # what is read is written, whatever encoded it
+        packets = (packet for packet in live.demux(read) if packet.size)
+        for _, packet in zip(range(length), packets, strict=False):
+            packet.stream = write
+            plain.mux(packet)
+
+
+def picture_stats(path: Path, length: int, fps: int) -> PictureStats:
+    """Return statistics of a picture per second, or of more in a short video. Only key frames are decoded."""
     import av
 
     stats = PictureStats()
-    with av.open(str(source)) as live, av.open(str(target), "w", options={"movflags": "faststart"}) as plain:
-        read = live.streams.video[0]
-        read.thread_count = 1
-        write = plain.add_stream_from_template(read, opaque=True)  # what is read is written, whoever made it
+    every = max(1, min(fps, length // _SAMPLES))
+    with av.open(str(path)) as container:
+        stream = container.streams.video[0]
+        stream.thread_count = 1
         due = 0
-        packets = (packet for packet in live.demux(read) if packet.size)
-        for count, packet in zip(range(length), packets, strict=False):
+        for count, packet in enumerate(packet for packet in container.demux(stream) if packet.size):
             if packet.is_keyframe and count >= due:
                 due = count + every
-                for frame in read.codec_context.decode(packet):
+                for frame in stream.codec_context.decode(packet):
                     stats.add(frame.to_ndarray(format="rgb24"))
-            packet.stream = write
-            plain.mux(packet)
-        for frame in read.codec_context.decode(None):
+        for frame in stream.codec_context.decode(None):
             stats.add(frame.to_ndarray(format="rgb24"))
     return stats
 

@@ -19,7 +19,8 @@ from ..host.scheduling import yield_to_others
 from .columns import CameraSetup
 from .compatible import check_compatible
 from .finalise import CLOSING, finalise
-from .layout import Layout, locked, read_json, write_json
+from .index import check_next, read_index
+from .layout import Layout, locked, write_json
 from .library import require
 from .live import RESERVE, LiveFolder
 from .recovery import recover_all
@@ -134,7 +135,9 @@ class Writer:
         notes = recover_all(layout)
         cameras = [CameraSetup(*camera) for camera in about["cameras_kept"]]
         check_compatible(layout, about["features"], about["fps"], about["robot_type"], cameras)
-        number = int(read_json(layout.info)["total_episodes"]) if layout.info.exists() else 0
+        info = read_index(layout)
+        check_next(layout, info)
+        number = int(info["total_episodes"]) if info is not None else 0
         self.failed = False
         self.ring.say(free_bytes=free, trouble="")
         self.live = LiveFolder(layout.partial(number), about, self.width)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -211,3 +212,16 @@ def test_of_two_arms_the_one_that_was_driven_is_replayed(
     assert re.findall(r"^  replays +(\w+)$", done.stdout, re.MULTILINE) == [replayed]
     told = re.findall(r"^  still +(\w+) moved in the recording, too; it is not replayed$", done.stdout, re.MULTILINE)
     assert told == still
+
+
+@pytest.mark.parametrize("keep", [0.0, 0.5, 1.0])
+def test_a_damaged_episode_is_named_before_anything_is_opened(dataset: Path, tmp_path: Path, keep: float) -> None:
+    root = Path(shutil.copytree(dataset, tmp_path / "demo"))
+    file = root / "data/chunk-000/file-000.parquet"
+    file.write_bytes(file.read_bytes()[: int(keep * file.stat().st_size)])
+    if keep == 1.0:
+        file.unlink()
+    done = replay(root, *FAST)
+    assert done.returncode == 2
+    assert done.stderr.startswith("DatasetError: episode 0: data/chunk-000/file-000.parquet: "), done.stderr
+    assert "simulated" not in done.stdout

@@ -130,3 +130,29 @@ def test_an_episode_for_rerun(folder: Path, tmp_path: Path) -> None:
         assert rows.get((place, kind)) == 14, place
     assert rows["world/cameras/scene", "Pinhole"] == 1
     assert rows["status/panda", "TextLog"] == 3, "idle, following, stopped"
+
+
+def test_every_file_is_checked_and_a_lost_index_is_rebuilt(tmp_path: Path) -> None:
+    root = make_recording(tmp_path / "demo").root
+    done = run(root, "--check")
+    assert (done.returncode, done.stdout) == (0, "3 episodes checked, 0 problem(s)\n"), done.stderr
+    assert run(root, "--repair").stdout.startswith("nothing to repair")
+    (root / "meta/info.json").unlink()
+    for options in ([], ["--check"], ["--episode", "0"]):
+        done = run(root, *options)
+        assert done.returncode == 2
+        assert done.stderr.startswith("DatasetError: meta/info.json: is missing")
+        assert f"hal-review {root} --repair" in done.stderr
+    done = run(root, "--repair")
+    assert done.stdout.startswith("the index was rebuilt from 3 episodes"), done.stderr
+    video = root / "videos/observation.images.wrist/chunk-000/file-001.mp4"
+    video.write_bytes(video.read_bytes()[: video.stat().st_size // 2])
+    done = run(root, "--check", "--json")
+    assert done.returncode == 2
+    (wrong,) = json.loads(done.stdout)["wrong"]
+    assert wrong.startswith(f"episode 1: {video.relative_to(root)}: ")
+    assert run(root, "--check", "--episode", "0").returncode == 0
+    done = run(root)
+    assert done.returncode == 2
+    assert f"cannot be read: episode 1: {video.relative_to(root)}: " in done.stdout
+    assert run(root, "--repair", "--episode", "0").returncode == 2

@@ -44,24 +44,26 @@ INFO = {
     "features": dict,
 }
 QUANTILES = ("q01", "q10", "q50", "q90", "q99")
+PARTS = ("min", "max", "mean", "std", "count", *QUANTILES)
 INDICES = ["episode_index", "length", "dataset_from_index", "dataset_to_index"]
 PER_FILE = 1000
 
 
 def check_layout(root: Path) -> dict[str, Any]:
     """All of it; ``info`` comes back."""
-    info: dict[str, Any] = json.loads((root / "meta/info.json").read_text())
+    info = strict_json(root / "meta/info.json")
     check_info(info)
     total, features = info["total_episodes"], info["features"]
     videos = [key for key, feature in features.items() if feature["dtype"] == "video"]
     tasks = read_tasks(root, info["total_tasks"])
-    stats = json.loads((root / "meta/stats.json").read_text())
-    assert set(stats) == set(features)
-    for key, feature in features.items():
-        check_stats(stats[key], feature, key)
+    stats = strict_json(root / "meta/stats.json")
+    for key, found in stats.items():
+        check_stats(found, features[key], key)
 
     entries = sorted(root.glob("meta/episodes/*/*.parquet"))
     assert len(entries) == total
+    unknown = set()
+    """Columns of which a number was not known in some episode: the whole dataset may have no statistics of those."""
     at = 0
     files = {root / "meta/info.json", root / "meta/stats.json", root / "meta/tasks.parquet", *entries}
     for number, entry in enumerate(entries):
@@ -72,7 +74,9 @@ def check_layout(root: Path) -> dict[str, Any]:
         data = root / info["data_path"].format(**place)
         check_rows(data, info, row, tasks)
         for key, feature in features.items():
-            check_stats({part: row[f"stats/{key}/{part}"] for part in stats[key]}, feature, key)
+            own = {part: row[f"stats/{key}/{part}"] for part in PARTS}
+            check_stats(own, feature, key)
+            unknown |= set() if np.isfinite(np.array(own["mean"])).all() else {key}
         files.add(data)
         for key in videos:
             assert [row[f"videos/{key}/{part}"] for part in place] == list(place.values())
@@ -82,11 +86,22 @@ def check_layout(root: Path) -> dict[str, Any]:
             check_video(video, features[key], info["fps"], length)
             files.add(video)
         at += length
+        strict_json(root / f"episodes/{number:06d}.json")
     assert at == info["total_frames"]
+    assert set(features) - unknown <= set(stats)
     for folder in ("meta", "data", "videos"):
         assert {path for path in (root / folder).rglob("*") if path.is_file()} <= files, "nothing is left over"
     assert not list(root.glob("episodes/*.partial"))
     return info
+
+
+def strict_json(path: Path) -> dict[str, Any]:
+    """Read a file as JSON is defined: without NaN and infinities, which Python would take."""
+
+    def refuse(name: str) -> None:
+        raise AssertionError(f"{path.name} holds {name}")
+
+    return dict(json.loads(path.read_text(), parse_constant=refuse))
 
 
 def check_info(info: dict[str, Any]) -> None:
@@ -170,7 +185,7 @@ def check_stats(stats: dict[str, Any], feature: dict[str, Any], key: str) -> Non
     """Shapes, and an order that statistics of anything have."""
     shape = (3, 1, 1) if feature["dtype"] == "video" else tuple(feature["shape"])
     found = {part: np.array(value, float) for part, value in stats.items()}
-    assert set(found) == {"min", "max", "mean", "std", "count", *QUANTILES}
+    assert set(found) == set(PARTS)
     assert found.pop("count").shape == (1,)
     assert stats["count"][0] > 0
     for part, values in found.items():

@@ -14,7 +14,7 @@ from export_kit import make_recording, pictures
 from recording_kit import SIZE
 
 import hal
-from hal.errors import CommandError
+from hal.errors import CommandError, DatasetError
 from hal.recording import Dataset, Recorder
 from hal.recording.exporters import default_path, export
 from hal.recording.exporters.output import fresh
@@ -197,6 +197,6 @@ def test_a_video_that_is_too_short_is_an_error(tmp_path: Path) -> None:
     dataset = make_recording(tmp_path / "demo")
     short = dataset.root / "videos/observation.images.wrist/chunk-000"
     (short / "file-000.mp4").write_bytes((short / "file-002.mp4").read_bytes())
-    with pytest.raises(CommandError, match="the rgb of camera wrist has 7 pictures, for 14 rows"):
+    with pytest.raises(DatasetError, match="episode 0: videos/.*/file-000.mp4: has 7 pictures, for 14 rows"):
         export(dataset, "zarr", tmp_path / "out")
     assert [file.name for file in tmp_path.iterdir()] == ["demo"]

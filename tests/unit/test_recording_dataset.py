@@ -167,10 +167,12 @@ def test_how_to_mend_an_unfinished_episode_can_be_typed(tmp_path: Path) -> None:
         recorder._child.process.wait()
         with pytest.raises(HalError):
             recorder.save(wait=True)
-    with pytest.raises(CommandError, match="there is one not finished; mend that with: python -c ") as caught:
+    with pytest.raises(CommandError, match="1 was not finished; finish with: hal-review ") as caught:
         Dataset(out)
     words = shlex.split(str(caught.value).partition("with: ")[2])
-    done = subprocess.run([sys.executable, *words[1:]], capture_output=True, text=True, timeout=60)
+    done = subprocess.run(
+        [sys.executable, "-m", "hal.apps.review", *words[1:]], capture_output=True, text=True, timeout=60
+    )
     assert "recovered as episode 0" in done.stdout, done.stderr
     assert len(Dataset(out)) == 1
 

@@ -48,16 +48,8 @@ class Pictures:
     read: Callable[[], Iterator[NDArray[Any]]]
 
     def __iter__(self) -> Iterator[NDArray[Any]]:
-        """Every picture. CommandError where there is not one per row."""
-        count = 0
-        for picture in self.read():
-            count += 1
-            if count > self.rows:
-                break
-            yield picture
-        if count != self.rows:
-            found = f"{count} pictures" if count < self.rows else "more pictures"
-            raise CommandError(f"the {self.what} of camera {self.camera} has {found}, for {self.rows} rows")
+        """Return every picture. DatasetError where there is not one per row."""
+        return self.read()
 
 
 class EpisodeContent:
@@ -154,11 +146,9 @@ class EpisodeContent:
             return episode.frames(camera) if what == "rgb" else episode.depth(camera)
 
         try:
-            first = next(plain(), None)
+            first = next(plain())
         except DeviceNotFound:  # this one was not kept
             return None
-        if first is None:
-            raise CommandError(f"episode {episode.number} has not one picture of camera {camera}")
         scaling = self._scaling(first.shape[1], first.shape[0])
         if scaling is None:
             return Pictures(camera, what, first.shape, first.dtype, self.rows, plain)

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ...errors import DatasetError
 from ..columns import ACTION, STATE
 from ..pace import simulated_pace
 from ..reader import Dataset, Episode
@@ -90,7 +91,7 @@ class Summary:
 
 
 def summary(dataset: Dataset, episodes: Iterable[Episode] | None = None) -> Summary:
-    """Read every row of these episodes, else of all; no picture is read."""
+    """Read every row of these episodes, else of all. Pictures are counted, not decoded."""
     lines: list[EpisodeLine] = []
     broken: list[str] = []
     states, actions = _Moments(), _Moments()
@@ -99,13 +100,15 @@ def summary(dataset: Dataset, episodes: Iterable[Episode] | None = None) -> Summ
     for episode in dataset.episodes if episodes is None else episodes:
         try:
             line, columns, stamps = _line(episode), episode.columns, episode.stamps
-        except Exception as error:  # whatever a damaged file leads to: the others are still worth a look
-            broken.append(f"episode {episode.number}: {error}")
+            parts = columns[STATE], columns[ACTION]
+            episode.check_pictures()
+        except DatasetError as error:
+            broken.append(str(error))
             continue
         lines.append(line)
         names = episode.names(STATE)
-        states.add(columns[STATE])
-        actions.add(columns[ACTION])
+        states.add(parts[0])
+        actions.add(parts[1])
         for source, stamp in stamps.items():
             if source.startswith(_WATCHED):
                 times.setdefault(source, _Times()).add(stamp, stamps["grid"])
