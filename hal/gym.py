@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from .camera import Camera
 from .command_checks import FIRST_STEP_ANGLE
 from .commands import CartesianTarget, Command, JointTarget, Twist
 from .control import Control
@@ -43,8 +44,8 @@ from .gym_spaces import (
     Spaces,
     action_space,
     as_numbers,
+    key,
     numbers_and_pictures,
-    object_key,
     observation_space,
 )
 
@@ -61,10 +62,11 @@ class RigEnv(gymnasium.Env[Spaces, NDArray[np.float32]]):
     """One arm of a rig, its gripper and its cameras.
 
     Observations are a dict: ``q`` and ``dq`` (n,), rad and rad/s; ``tcp`` (7,), position in m and quaternion xyzw in
-    the arm's base frame; ``gripper`` (1,), width in m; per camera ``<name>.color`` (H, W, 3) uint8 and, where it
-    streams depth, ``<name>.depth`` (H, W, 1) float32 in m; per object that was asked for ``object.<name>`` (7,), its
-    pose in the world. :attr:`observation` is the whole record behind it, with every stamp; ``info["elapsed"]`` is its
-    time since the reset, s.
+    the arm's base frame; ``gripper`` (1,), width in m; per camera, of the streams that it has, ``<name>_color``
+    (H, W, 3) uint8, ``<name>_depth`` (H, W, 1) float32 in m, ``<name>_infrared`` and ``<name>_infrared_right``
+    (H, W, 1) uint8, ``<name>_segmentation`` (H, W, 1) int32 (see :class:`~hal.types.Frame`); per object that was asked
+    for ``object_<name>`` (7,), its pose in the world. A dash in a name becomes an underscore. :attr:`observation` is
+    the whole record behind it, with every stamp; ``info["elapsed"]`` is its time since the reset, s.
 
     ``step`` sends the action, lets one period pass and waits for an observation that was taken after that: none is ever
     handed out twice. When the arm is stopped (a released dead-man is no stop), the episode is truncated and
@@ -82,6 +84,7 @@ class RigEnv(gymnasium.Env[Spaces, NDArray[np.float32]]):
         robot: str | None = None,
         action: Action = "joint",
         cameras: Collection[str] | None = None,
+        streams: Collection[str] | None = None,
         objects: Collection[str] = (),
         rate_hz: float = 20.0,
         max_steps: int | None = None,
@@ -94,9 +97,10 @@ class RigEnv(gymnasium.Env[Spaces, NDArray[np.float32]]):
         overrides: tuple[str, ...] = (),
         render_mode: str | None = None,
     ) -> None:
-        """``cameras`` are the names of those that are observed, else all; ``objects`` those of things of the simulated
-        world whose poses are. ``speeds`` are the greatest of the tcp in ``twist`` and, per step, in ``tcp_delta``: m/s
-        and rad/s.
+        """``cameras`` are the names of those that are observed, else all; ``streams`` the streams of these that are:
+        some of ``color``, ``depth``, ``infrared``, ``infrared_right`` and ``segmentation``, else colour and depth.
+        ``objects`` are the names of things of the simulated world whose poses are observed. ``speeds`` are the
+        greatest of the tcp in ``twist`` and, per step, in ``tcp_delta``: m/s and rad/s.
 
         ``on_reset(env, options)`` runs after the reset and before the first observation: where a person puts things
         back on a real bench, or a task moves objects with ``env.rig.world`` and ``env.np_random``. ``deadman`` is made
@@ -117,9 +121,10 @@ class RigEnv(gymnasium.Env[Spaces, NDArray[np.float32]]):
             self._cameras = tuple(self.rig.cameras) if cameras is None else tuple(cameras)
             self._objects = _known(objects, self.rig)
             chosen = [self.rig.cameras[name] for name in self._cameras]
+            self._streams = ("color", "depth") if streams is None else _streamed(streams, chosen)
             self.action_space: Box = action_space(self.robot, action, rate_hz, speeds)  # type: ignore[assignment]
             self.observation_space: Dict = observation_space(  # type: ignore[assignment]  # invariant in their types
-                self.robot, chosen, self._objects
+                self.robot, chosen, self._streams, self._objects
             )
         except BaseException:
             self.rig.close()
@@ -253,10 +258,10 @@ class RigEnv(gymnasium.Env[Spaces, NDArray[np.float32]]):
 
     def _shown(self, observation: Observation) -> Spaces:
         self.observation = observation
-        shown = numbers_and_pictures(observation, self.robot, self._cameras)
+        shown = numbers_and_pictures(observation, self.robot, self._cameras, self._streams)
         if self._objects and self.rig.world is not None:
             poses = self.rig.world.poses(self._objects).poses
-            shown |= {object_key(name): as_numbers(poses[name]) for name in self._objects}
+            shown |= {key("object", name): as_numbers(poses[name]) for name in self._objects}
         return shown
 
     def _info(self, observation: Observation) -> dict[str, Any]:
@@ -285,3 +290,14 @@ def _known(objects: Collection[str], rig: Rig) -> tuple[str, ...]:
     if rig.world is None:
         raise NotSupported("objects=: only a simulated world knows where things are")
     return tuple(rig.world.poses(objects).poses)
+
+
+def _streamed(streams: Collection[str], cameras: Collection[Camera]) -> tuple[str, ...]:
+    """Return the streams that are observed. Raises NotSupported for one that none of the cameras has."""
+    there = {stream for camera in cameras for stream in camera.spec.streams}
+    if missing := [stream for stream in streams if stream not in there]:
+        message = (
+            f"streams=: no observed camera has {', '.join(missing)}; they have: {', '.join(sorted(there)) or 'none'}"
+        )
+        raise NotSupported(f"{message}. The streams of a camera are chosen in its entry of the rig")
+    return tuple(streams)

@@ -14,14 +14,15 @@ from .errors import CommandError
 from .observation import Observation
 from .pose import Pose
 from .robot import Robot
+from .specs import CameraSpec
 
 __all__ = [
     "Action",
     "Spaces",
     "action_space",
     "as_numbers",
+    "key",
     "numbers_and_pictures",
-    "object_key",
     "observation_space",
 ]
 
@@ -50,42 +51,65 @@ def action_space(robot: Robot, kind: Action, rate_hz: float, speeds: tuple[float
     return spaces.Box(np.array(low, np.float32), np.array(high, np.float32), dtype=np.float32)
 
 
-def observation_space(robot: Robot, cameras: Iterable[Camera], objects: Collection[str]) -> spaces.Dict:
-    """One box for each part of what :func:`numbers_and_pictures` shows, and for the pose of each of ``objects``."""
+def observation_space(
+    robot: Robot, cameras: Iterable[Camera], streams: Collection[str], objects: Collection[str]
+) -> spaces.Dict:
+    """Return a box for each entry of what :func:`numbers_and_pictures` gives, and for the pose of each of ``objects``.
+
+    Raises:
+        CommandError: Two entries would have the same key.
+    """
 
     def free(size: int) -> spaces.Box:
         return spaces.Box(-np.inf, np.inf, (size,), np.float64)
 
-    parts: dict[str, spaces.Space[Any]] = {"q": free(robot.n), "dq": free(robot.n), "tcp": free(7)}
+    parts: list[tuple[str, spaces.Space[Any]]] = [("q", free(robot.n)), ("dq", free(robot.n)), ("tcp", free(7))]
     if robot.gripper is not None:
-        parts["gripper"] = free(1)
+        parts.append(("gripper", free(1)))
     for camera in cameras:
-        spec = camera.spec
-        if "color" in spec.streams:
-            parts[f"{camera.name}.color"] = spaces.Box(0, 255, (spec.height, spec.width, 3), np.uint8)
-        if "depth" in spec.streams:
-            parts[f"{camera.name}.depth"] = spaces.Box(0.0, spec.depth_max, (spec.height, spec.width, 1), np.float32)
-    return spaces.Dict(parts | {object_key(name): free(7) for name in objects})
+        found = [stream for stream in streams if stream in camera.spec.streams]
+        parts += [(key(camera.name, stream), _picture_space(camera.spec, stream)) for stream in found]
+    parts += [(key("object", name), free(7)) for name in objects]
+    keys = [name for name, _ in parts]
+    if twice := sorted({name for name in keys if keys.count(name) > 1}):
+        raise CommandError(
+            f"two parts of the observation would be called {', '.join(twice)}: rename a camera or an object"
+        )
+    return spaces.Dict(dict(parts))
 
 
-def numbers_and_pictures(observation: Observation, robot: Robot, cameras: Collection[str]) -> Spaces:
-    """What an observation says of the arm, its gripper and these cameras."""
+def _picture_space(camera: CameraSpec, stream: str) -> spaces.Box:
+    """Return the box of one camera's pictures: (H, W, 3) colour, (H, W, 1) anything else."""
+    size = (camera.height, camera.width)
+    if stream == "color":
+        return spaces.Box(0, 255, (*size, 3), np.uint8)
+    if stream == "depth":
+        return spaces.Box(0.0, camera.depth_max, (*size, 1), np.float32)
+    if stream == "segmentation":
+        return spaces.Box(-1, np.iinfo(np.int32).max, (*size, 1), np.int32)
+    return spaces.Box(0, 255, (*size, 1), np.uint8)
+
+
+def numbers_and_pictures(
+    observation: Observation, robot: Robot, cameras: Collection[str], streams: Collection[str]
+) -> Spaces:
+    """Return what an observation holds of the arm, its gripper and these streams of these cameras."""
     state = observation.robots[robot.name]
     shown: Spaces = {"q": np.array(state.q), "dq": np.array(state.dq), "tcp": as_numbers(state.tcp)}
     if robot.gripper is not None:
         shown["gripper"] = np.array([observation.grippers[robot.name].width])
     for name in cameras:
         frame = observation.cameras[name].frame
-        if frame.color is not None:
-            shown[f"{name}.color"] = frame.color
-        if frame.depth is not None:
-            shown[f"{name}.depth"] = frame.depth[..., None]
+        for stream in streams:
+            picture = getattr(frame, stream)
+            if picture is not None:
+                shown[key(name, stream)] = picture if picture.ndim == 3 else picture[..., None]
     return shown
 
 
-def object_key(name: str) -> str:
-    """Under which the pose of a thing of the simulated world is observed."""
-    return f"object.{name}"
+def key(*parts: str) -> str:
+    """Return the key of an entry: an identifier, because PyTorch modules that are named by keys allow no dots."""
+    return "_".join(parts).replace("-", "_")
 
 
 def as_numbers(pose: Pose) -> NDArray[np.float64]:

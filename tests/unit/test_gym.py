@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import functools
+import os
+import re
 
 import numpy as np
 import pytest
@@ -27,6 +29,59 @@ def test_gymnasium_finds_nothing_wrong(action: str) -> None:
         check_env(env, skip_render_check=True)
     finally:
         env.close()
+
+
+STREAMS = "cameras.scene.streams=[color, depth, infrared, segmentation]"
+
+
+def test_keys_are_identifiers_and_every_stream_can_be_chosen() -> None:
+    streams = ["color", "infrared", "segmentation"]
+    env = RigEnv("panda_table", sim=True, streams=streams, objects=["cube"], overrides=(STREAMS,))
+    try:
+        seen, _ = env.reset()
+        assert env.observation_space.contains(seen)
+        assert all(re.fullmatch(r"[A-Za-z_][A-Za-z0-9_]*", key) for key in seen)
+        pictures = {key: (space.shape, space.dtype) for key, space in env.observation_space.items() if "_" in key}
+        del pictures["object_cube"]
+        size = (256, 256)
+        assert pictures == {
+            "scene_color": ((*size, 3), np.uint8),
+            "scene_infrared": ((*size, 1), np.uint8),
+            "scene_segmentation": ((*size, 1), np.int32),
+            "wrist_color": ((*size, 3), np.uint8),
+        }
+        assert env.rig.world is not None
+        bodies = env.rig.world.bodies
+        assert {bodies.index("cube"), bodies.index("panda")} <= set(np.unique(seen["scene_segmentation"]))
+        assert seen["scene_infrared"].std() > 5.0
+    finally:
+        env.close()
+    for wrong in (["color", "thermal"], ["segmentation"]):
+        with pytest.raises(hal.NotSupported, match=wrong[-1]):
+            RigEnv("panda_table", driver="mock", streams=wrong)
+
+
+def test_two_parts_of_an_observation_never_share_a_key() -> None:
+    twins = ("cameras.scene-2={model: realsense_d435}", "cameras.scene_2={model: realsense_d435}")
+    with pytest.raises(hal.CommandError, match="scene_2_color"):
+        RigEnv("panda_table", driver="mock", overrides=twins)
+
+
+if os.environ.get("HAL_SB3") == "1":  # not by default: PyTorch may bring gigabytes of CUDA
+
+    @pytest.mark.timeout(600)
+    def test_stable_baselines3_trains_with_pictures() -> None:
+        from stable_baselines3 import PPO
+        from stable_baselines3.common import env_checker
+
+        small = ("cameras.scene.output={width: 64, height: 64}", "cameras.wrist.output={width: 64, height: 64}")
+        env = RigEnv("panda_table", sim=True, action="tcp_delta", objects=["cube"], max_steps=50, overrides=small)
+        try:
+            env_checker.check_env(env)
+            PPO("MultiInputPolicy", env, n_steps=100, batch_size=50).learn(500)
+            assert env.observation is not None
+        finally:
+            env.close()
 
 
 def run(steps: int) -> bytes:
@@ -122,7 +177,7 @@ def test_observations_show_things_where_they_were_drawn() -> None:
         pictures = []
         for seed in (1, 1, 2):
             seen, info = env.reset(seed=seed)
-            pictures.append(seen["scene.color"])
+            pictures.append(seen["scene_color"])
             at = info["poses"]["cube"]
             assert env.rig.world.pose("cube").position == pytest.approx(at[:3], abs=1e-6), "time stood still"
         assert (pictures[0] == pictures[1]).all()
@@ -136,13 +191,13 @@ def test_poses_of_things_are_observed_where_they_are_asked_for() -> None:
     try:
         seen, info = env.reset(seed=3)
         assert env.observation_space.contains(seen)
-        assert [key for key in seen if key.startswith("object.")] == ["object.duck", "object.cube"]
-        assert seen["object.cube"] == pytest.approx(info["poses"]["cube"], abs=1e-3)
+        assert [key for key in seen if key.startswith("object_")] == ["object_duck", "object_cube"]
+        assert seen["object_cube"] == pytest.approx(info["poses"]["cube"], abs=1e-3)
         assert env.rig.world is not None
         env.rig.world.set_velocity("cube", linear=(0.0, 0.5, 0.0))
         after, *_ = env.step(np.zeros(7, np.float32))
-        assert after["object.cube"][1] - seen["object.cube"][1] > 0.005
-        assert (after["object.cube"][:3] == env.rig.world.pose("cube").position).all()
+        assert after["object_cube"][1] - seen["object_cube"][1] > 0.005
+        assert (after["object_cube"][:3] == env.rig.world.pose("cube").position).all()
     finally:
         env.close()
     with pytest.raises(hal.DeviceNotFound, match="cube"):
@@ -233,7 +288,7 @@ def test_in_real_time_every_observation_is_a_fresh_one() -> None:
             assert env.observation is not None
             frames = [moment.frame for moment in env.observation.cameras.values()]
             assert all(frame.stamp.t > sent for frame in frames)
-            pictures.append(read_picture(seen["scene.color"]).seq)
+            pictures.append(read_picture(seen["scene_color"]).seq)
             stamps.append(env.observation.robots["panda"].stamp.t)
         assert len(set(pictures)) == len(pictures)
         assert (np.diff(stamps) > 0.0).all()
