@@ -74,6 +74,9 @@ class Kinematics:
         self._inverse_columns: NDArray[np.intp] | None = None
         if columns != list(range(self.n)):
             self._columns, self._inverse_columns = np.array(columns), np.argsort(columns)
+        ranks = np.array([self._model.getJointId(name) for name in spec.joints])
+        self._inner = (ranks[:, None] <= ranks)[:, :, None]
+        """Is joint i nearer to the base than joint j, or the same? (n, n, 1)"""
         # Greatest change of the Jacobian (Frobenius norm) for a turn of the joints of length 1.
         self._change = sqrt(self.n) * hypot(*self.reach(), sqrt(self.n))
 
@@ -114,6 +117,15 @@ class Kinematics:
         self._pin.updateFramePlacement(self._model, self._data, self._tcp)
         pose: Pose7 = self._pin.SE3ToXYZQUATtuple(self._tcp_placement)
         return pose, jacobian
+
+    def curvature(self, jacobian: Array) -> Array:
+        """(n, n, 3): change of the linear Jacobian's column j, in m/rad, for each rad that joint i turns.
+
+        ``jacobian`` (6, n) is that of the place in question. Turning joint i turns the levers of all joints from i to
+        the tip; the rest follows, since second derivatives of the tcp's position are symmetric.
+        """
+        turned = np.cross(jacobian[3:].T[:, None], jacobian[:3].T)
+        return np.where(self._inner, turned, turned.transpose(1, 0, 2))
 
     def mass_matrix(self, q: Sequence[float] | Array) -> Array:
         """(n, n) joint-space inertia, kg m2, as the URDF says: some invent it, and then it is good for nothing."""

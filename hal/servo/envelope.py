@@ -6,6 +6,8 @@ from collections.abc import Sequence
 from math import hypot
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from ..inbox import Session
 from ..kinematics import Kinematics, Pose7
 from ..specs import WorkspaceSpec
@@ -15,7 +17,6 @@ from .smoothing import Guard, JointSmoother
 from .tcp import TcpReference
 
 if TYPE_CHECKING:
-    import numpy as np
     from numpy.typing import NDArray
 
 __all__ = ["Envelope"]
@@ -57,6 +58,8 @@ class Envelope:
         self.limited = Limited.NONE
         self.guard: Guard | None = None if workspace is None else self.stays_inside
         """What a proposed step must satisfy beyond joint limits."""
+        self._too_fast = False
+        """Was the tcp's speed why the guard refused the last step?"""
         self._tcp = TcpReference(smoother, kinematics, workspace)
 
     def open(self, session: Session) -> None:
@@ -66,6 +69,7 @@ class Envelope:
         self._tcp.open(self.velocity)
         self.tcp_speed = session.tcp_speed
         self.goal_tcp_speed = _TCP_SHARE * session.tcp_speed
+        self.guard = None if self.workspace is None and self.tcp_speed >= _UNLIMITED else self.allows
 
     # Goals: smooth caps, so that the hard checks below seldom have to act.
 
@@ -75,7 +79,7 @@ class Envelope:
         speed = hypot(*dq)
         if not (speed <= self._slowest and smoother.is_free(smoother.q)):
             return False
-        if self.tcp_speed < _UNLIMITED and not self._tcp.lets_pass(speed, self.goal_tcp_speed):
+        if self.tcp_speed < _UNLIMITED and not self._tcp.surely_slower(dq, self.goal_tcp_speed):
             return False
         return self.far_from_faces()
 
@@ -101,27 +105,31 @@ class Envelope:
         return dq if scale == 1.0 else [scale * v for v in dq]
 
     def cap_tcp(self, dq: list[float]) -> tuple[list[float], bool]:
-        """Scale a goal velocity so that the tcp keeps its speed limit, and slows down before the workspace's faces.
+        """Scale a goal velocity so that the tcp keeps its speed limit, also in a stop from there, and slows down before
+        the workspace's faces.
 
-        Also says whether the tcp's speed was what limited it.
+        Returns:
+            The goal, and whether the joints must change their speeds in proportion on the way there: each by itself,
+            they might move the tcp too fast in between.
         """
         if self.tcp_speed >= _UNLIMITED and self.workspace is None:
             return dq, False
-        if self._tcp.surely_slower(dq, self.goal_tcp_speed) and self.far_from_faces():
+        fast = not self._tcp.surely_slower(dq, self.goal_tcp_speed)
+        if not fast and self.far_from_faces():
             return dq, False
-        tcp = self._tcp.velocity(dq)
-        speed = hypot(*tcp)
         scale = 1.0
-        slowed = speed > self.goal_tcp_speed
-        if slowed:
-            scale = self.goal_tcp_speed / speed
-            self.limited |= Limited.TCP_SPEED
-        if self.workspace is not None and speed > 0.0:
+        if fast:
+            speed = self._tcp.stop_speed(dq)
+            if speed > self.goal_tcp_speed:
+                scale = self.goal_tcp_speed / speed
+                self.limited |= Limited.TCP_SPEED
+        if self.workspace is not None:
+            tcp = self._tcp.velocity(dq)
             for v, cap in zip(tcp, self.face_speeds(tcp), strict=True):
                 if abs(v) * scale > cap:
                     scale = cap / abs(v)
                     self.limited |= Limited.WORKSPACE
-        return (dq if scale == 1.0 else [scale * v for v in dq]), slowed
+        return (dq if scale == 1.0 else [scale * v for v in dq]), fast
 
     def in_proportion(self, dq: list[float], before: Floats) -> list[float]:
         """From the goal velocity of the last tick towards ``dq``, no faster than the slowest joint can, all alike."""
@@ -144,6 +152,11 @@ class Envelope:
     def here(self) -> tuple[Pose7, NDArray[np.float64]]:
         """Pose of the tcp and its Jacobian (6, n) at the set-point; computed once a tick, whoever asks."""
         return self._tcp.here()
+
+    def stop_speed(self, dq: list[float], places: Sequence[Floats]) -> float:
+        """Greatest speed (m/s) of the tcp that moves with joint speeds ``dq`` at any of these joint positions, or stops
+        from there."""
+        return self._tcp.stop_speed(dq, np.array([self.kinematics.jacobian(q)[:3].T for q in places]))
 
     def far_from_faces(self) -> bool:
         """Is the tcp surely where no face of the workspace slows it down?"""
@@ -181,17 +194,18 @@ class Envelope:
                 return False
         return True
 
+    def keeps_tcp_speed(self, smoother: JointSmoother) -> bool:
+        """Return whether the tcp keeps its speed limit in the proposed step and in a stop after it."""
+        self._too_fast = self.tcp_speed < _UNLIMITED and not self._tcp.surely_stops_slower(self.tcp_speed)
+        return not self._too_fast
+
     def allows(self, smoother: JointSmoother) -> bool:
-        """`stays_inside`, and the proposed step keeps the tcp's speed limit, or at least slows the tcp down."""
-        if self.tcp_speed < _UNLIMITED and not self._tcp.surely_slower(smoother.dq_next, self.goal_tcp_speed):
-            speed = hypot(*self._tcp.velocity(smoother.dq_next))
-            if speed > self.goal_tcp_speed and speed > hypot(*self._tcp.velocity(smoother.dq)):
-                return False
-        return self.stays_inside(smoother)
+        """`keeps_tcp_speed` and `stays_inside`."""
+        return self.keeps_tcp_speed(smoother) and self.stays_inside(smoother)
 
     def note(self, smoother: JointSmoother) -> None:
         """Collect what the last step held back."""
         if smoother.held_back:
             self.limited |= Limited.POSITION
         if smoother.guarded:
-            self.limited |= Limited.WORKSPACE
+            self.limited |= Limited.TCP_SPEED if self._too_fast else Limited.WORKSPACE

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from math import sqrt
 
-__all__ = ["speed_for", "stop_displacement", "stop_distance", "stop_peak", "stop_step"]
+__all__ = ["speed_for", "stop_displacement", "stop_distance", "stop_peak", "stop_phases", "stop_step"]
 
 
 def stop_distance(v: float, A: float, J: float) -> float:
@@ -63,6 +63,20 @@ def stop_peak(v: float, a: float, A: float, J: float) -> float:
     return max(0.0, stop_displacement(v, a, A, J))
 
 
+def stop_phases(v: float, a: float, A: float, J: float) -> tuple[float, float, float, float]:
+    """Jerk of the first phase of the stop from speed ``v`` and acceleration ``a``, and when each of its phases ends.
+
+    Returns:
+        The first phase's jerk, rad/s3 (the second phase has none, the third the opposite one), and the times after
+        which the first, the second and the third phase are over, s.
+    """
+    jerk = -J
+    if v + 0.5 * a * abs(a) / J < 0.0:
+        v, a, jerk = -v, -a, J
+    build, constant, release = _phases(v, a, A, J)
+    return jerk, build, build + constant, build + constant + release
+
+
 def stop_step(q: float, v: float, a: float, A: float, J: float, dt: float) -> tuple[float, float, float]:
     """Position, speed and acceleration ``dt`` seconds into the stop from (q, v, a); |a| <= A.
 
@@ -71,12 +85,7 @@ def stop_step(q: float, v: float, a: float, A: float, J: float, dt: float) -> tu
     if v + 0.5 * a * abs(a) / J < 0.0:
         q, v, a = stop_step(-q, -v, -a, A, J, dt)
         return -q, -v, -a
-    brake = min(A, sqrt(max(0.0, v * J + 0.5 * a * a)))
-    brake = max(brake, -a)
-    build = (a + brake) / J
-    release = brake / J
-    # What the two ramps do not take away is braked at the constant rate; rounding must not make that time negative.
-    constant = max(0.0, (v + 0.5 * a * a / J) / brake - release) if brake > 0.0 else 0.0
+    build, constant, release = _phases(v, a, A, J)
     for jerk, duration in ((-J, build), (0.0, constant), (J, release)):
         step = min(dt, duration)
         q += step * (v + step * (0.5 * a + step * jerk / 6.0))
@@ -86,3 +95,13 @@ def stop_step(q: float, v: float, a: float, A: float, J: float, dt: float) -> tu
         if dt <= 0.0:
             return q, v, a
     return q, 0.0, 0.0
+
+
+def _phases(v: float, a: float, A: float, J: float) -> tuple[float, float, float]:
+    """Durations (s) of the three phases of a stop that brakes against the positive direction."""
+    brake = min(A, sqrt(max(0.0, v * J + 0.5 * a * a)))
+    brake = max(brake, -a)
+    release = brake / J
+    # What the two ramps do not take away is braked at the constant rate; rounding must not make that time negative.
+    constant = max(0.0, (v + 0.5 * a * a / J) / brake - release) if brake > 0.0 else 0.0
+    return (a + brake) / J, constant, release

@@ -60,13 +60,13 @@ class Motion(ABC):
     def _follow(self, dq: list[float], together: bool = False) -> None:
         """One tick towards these joint speeds (n,), no faster than the tcp may go.
 
-        With ``together``, and where the tcp's speed is what limits them, all joints change speed in proportion. Left to
+        With ``together``, and where the tcp is near its greatest speed, all joints change speed in proportion. Left to
         themselves, those with acceleration to spare would run ahead: the tcp would leave its line, and on the way from
         one permitted speed to another it could be too fast.
         """
         smoother, envelope = self.smoother, self.envelope
-        dq, slowed = envelope.cap_tcp(dq)
-        if together or slowed:
+        dq, fast = envelope.cap_tcp(dq)
+        if together or fast:
             self._wanted = dq = envelope.in_proportion(dq, smoother.dq if self._wanted is None else self._wanted)
         else:
             self._wanted = None

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from math import ceil, sqrt
+from math import ceil
 
 from ruckig import InputParameter, OutputParameter, Result, Ruckig, RuckigError
 
@@ -95,7 +95,8 @@ class PathMotion(Motion):
         s, ds, dds = output.new_position[0], output.new_velocity[0], output.new_acceleration[0]
         along = self._direction
         q = [x + s * d for x, d in zip(self._from, along, strict=True)]
-        smoother.adopt(q, [ds * d for d in along], [dds * d for d in along])
+        if not smoother.adopt(q, [ds * d for d in along], [dds * d for d in along], self.envelope.keeps_tcp_speed):
+            self._planned = False  # stops, and goes on from there
 
     def _plan(self) -> None:
         smoother, envelope = self.smoother, self.envelope
@@ -112,7 +113,7 @@ class PathMotion(Motion):
             return min(limit / abs(d) for limit, d in zip(limits, along, strict=True) if d)
 
         speed = slowest(envelope.velocity)
-        fastest_tcp = max(self._tcp_speed(q) for q in self._samples(self._goal))
+        fastest_tcp = envelope.stop_speed(along, self._samples(self._goal))
         if fastest_tcp * speed > envelope.goal_tcp_speed:
             speed = envelope.goal_tcp_speed / fastest_tcp
         inputs = self._input
@@ -127,11 +128,6 @@ class PathMotion(Motion):
         start = self.smoother.q
         count = min(_SAMPLES, 1 + ceil(max(abs(b - a) for a, b in zip(start, goal, strict=True)) / _SAMPLE))
         return [[a + k / count * (b - a) for a, b in zip(start, goal, strict=True)] for k in range(count + 1)]
-
-    def _tcp_speed(self, q: Floats) -> float:
-        """Speed of the tcp (m/s) at ``q`` for a path speed of 1 rad/s."""
-        velocity = self.envelope.kinematics.jacobian(q)[:3] @ self._direction
-        return sqrt(float(velocity @ velocity))
 
     def _check_workspace(self, goal: Floats) -> None:
         """The tcp must stay inside the workspace on its way, or come back in from where it starts."""

@@ -116,11 +116,18 @@ class JointSmoother:
         self.held_back = self._none
         self.guarded = False
 
-    def adopt(self, q: Floats, dq: Floats, ddq: Floats) -> None:
-        """Take a set-point that somebody else computed inside the limits (a planned path)."""
-        self.q, self.dq, self.ddq = list(q), list(dq), list(ddq)
+    def adopt(self, q: Floats, dq: Floats, ddq: Floats, guard: Guard | None = None) -> bool:
+        """Move to a set-point that was computed elsewhere inside the limits (a planned path).
+
+        A step that the guard refuses becomes a stop of all joints; returns whether it was not refused.
+        """
+        self.q_next, self.dq_next, self.ddq_next = list(q), list(dq), list(ddq)
         self.held_back = self._none
-        self.guarded = False
+        self.guarded = guard is not None and not guard(self)
+        if self.guarded:
+            self._propose_velocity(self._zeros)
+        self._commit()
+        return not self.guarded
 
     def at_rest(self) -> bool:
         """Does nothing move? (1e-6 rad/s, 1e-4 rad/s2: Ruckig's numbers at the end of a profile.)"""

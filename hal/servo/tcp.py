@@ -1,4 +1,4 @@
-"""What can be said about the tcp without computing it anew: where it was a moment ago, and how far it can have got.
+"""Bounds on where the tcp is, on its speed and on that of its stops, without computing the kinematics in every tick.
 
 Forward kinematics and a Jacobian in every tick would cost more than all the rest of it. Most ticks need neither: the
 tcp is nowhere near a face of the workspace or its greatest speed, and a bound that costs a few multiplications proves
@@ -6,7 +6,7 @@ it. Only where the bound does not are they computed.
 
 Every bound rests on `Kinematics.reach`, r: joint i at 1 rad/s moves the tcp at r_i m/s at most, wherever the arm is,
 and turning joint j by x rad changes each column of the linear Jacobian J by r_j |x| at most. With dq the joint speeds,
-and d = q - q_reference the way of the joints from where the tcp was looked at:
+and d = q - q_reference the distance of the joints from where the tcp was computed:
 
 * |tcp(q) - tcp(q_reference)| <= m, where m = sum r_i |d_i| <= |r| |d|;
 * |J(q) dq| <= sum r_i |dq_i|;
@@ -23,13 +23,14 @@ from math import dist, hypot, inf, sqrt
 from operator import mul
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from ..kinematics import Kinematics, Pose7
 from ..specs import WorkspaceSpec
-from .limits import stop_displacement
+from .limits import stop_displacement, stop_phases
 from .smoothing import JointSmoother
 
 if TYPE_CHECKING:
-    import numpy as np
     from numpy.typing import NDArray
 
 __all__ = ["TcpReference"]
@@ -38,6 +39,9 @@ Floats = Sequence[float]
 
 _SAME = 2e-3
 """The Jacobian is computed anew when the tcp may have moved this far, m: it errs by 2 mm/s per rad/s."""
+
+_PARTS = np.linspace(0.0, 1.0, 9)
+"""A stop is looked at in at least these parts of its duration."""
 
 
 class TcpReference:
@@ -49,13 +53,28 @@ class TcpReference:
         self._workspace = workspace
         self._reach = kinematics.reach()
         self._reach_length = hypot(*self._reach)
-        self._spread = self._reach_length * sqrt(smoother.n)
+        self._root = sqrt(smoother.n)
+        self._spread = self._reach_length * self._root
+        limits = list(zip(smoother.acceleration, smoother.jerk, strict=True))
+        self._overrun = max([0.5 * A / J for A, J in limits])
+        """What a joint's acceleration adds to its speed until it is taken back, at most: rad/s for each rad/s2."""
+        self._overrun_tcp = max([0.5 * r / J for r, (_, J) in zip(self._reach, limits, strict=True)])
+        """The same for the tcp: m/s for each (rad/s2)^2."""
+        self._reach_array = np.array(self._reach)
+        self._accelerations = np.array(smoother.acceleration)
+        self._bend = sum(map(mul, self._reach, smoother.acceleration)) / 8.0
         self._at: Floats = [inf] * smoother.n
         """Joint positions of the reference; infinitely far before the first look."""
         self._pose: Pose7 = (inf,) * 7
         self._jacobian: Any = None
         self._rows: list[list[float]] = []
         """The linear Jacobian there, (3, n)."""
+        self._curvature: Any = None
+        """How they change with each joint, (n, 3 n); None until it is asked for."""
+        self._centre: Floats = (0.0,) * smoother.n
+        self._centre_speed = self._centre_length = 0.0
+        """Joint speeds, rad/s, and the greatest speed of the tcp there, m/s, for any shares from 0 to 1 of them;
+        the length of these speeds."""
         self._stretch = inf
         """The tcp's speed there for joint speeds of length 1 is no greater (it is the Jacobian's Frobenius norm)."""
         self._clearance = inf
@@ -101,9 +120,12 @@ class TcpReference:
 
     def _look(self) -> None:
         q = self._smoother.q
+        if self._centre_length:
+            self._centre_speed += self._spread * dist(q, self._at) * self._centre_length
         pose, jacobian = self._kinematics.fk_and_jacobian(q)
         self._at, self._pose, self._jacobian = q, pose, jacobian
         self._rows = jacobian[:3].tolist()
+        self._curvature = None
         self._stretch = hypot(*chain.from_iterable(self._rows))
         box = self._workspace
         if box is not None:
@@ -115,19 +137,125 @@ class TcpReference:
         self._refresh()
         return [sum(map(mul, row, dq)) for row in self._rows]
 
-    def lets_pass(self, speed: float, cap: float) -> bool:
-        """`surely_slower` for any joint speeds of this length (rad/s)."""
-        return speed * (self._stretch + self._spread * dist(self._smoother.q, self._at)) <= cap
-
     def surely_slower(self, dq: Floats, cap: float) -> bool:
-        """Does the tcp keep below ``cap`` (m/s) when the joints move so? False: not proven."""
-        if self.lets_pass(hypot(*dq), cap) or self._proves_slower(dq, cap):
+        """Return whether the tcp surely keeps below ``cap`` (m/s) while each joint changes its speed by itself, in
+        whatever order, between the present one, ``dq`` and rest. False: not proven."""
+        smoother = self._smoother
+        now = smoother.dq
+        speed = self._root * hypot(*dq, *now)
+        near = self._around(dist(dq, self._centre), dist(now, self._centre))
+        if near + speed * self._reach_length * dist(smoother.q, self._at) <= cap:
             return True
-        return self._refresh() and self._proves_slower(dq, cap)
+        self._put_centre(dq)
+        return self._around(0.0, dist(now, dq)) + speed * self._moved() <= cap
 
-    def _proves_slower(self, dq: Floats, cap: float) -> bool:
-        rest = cap - self._moved() * sum(map(abs, dq))
-        return hypot(*[sum(map(mul, row, dq)) for row in self._rows]) <= rest
+    def _around(self, *distances: float) -> float:
+        """Greatest speed of the tcp (m/s) at the reference when each joint moves at any share of its speed at the
+        centre, plus what it may be away from there: in all, joint speeds of these lengths (rad/s)."""
+        return self._centre_speed + self._stretch * hypot(*distances)
+
+    def _put_centre(self, dq: Floats) -> None:
+        """Compute the tcp's greatest speed for all shares of the joint speeds ``dq``."""
+        self._refresh()
+        axes = []
+        for row in self._rows:
+            parts = list(map(mul, row, dq))
+            axes.append(0.5 * (sum(map(abs, parts)) + abs(sum(parts))))  # the greater of the axis' two directions
+        self._centre, self._centre_speed, self._centre_length = dq, hypot(*axes), hypot(*dq)
+
+    def stop_speed(self, dq: Floats, linear: NDArray[np.float64] | None = None) -> float:
+        """Greatest speed of the tcp (m/s) in a stop from these steady joint speeds, the ramps of braking left out.
+
+        Each joint slows down evenly, so that the tcp is fastest at the start or when one of the joints comes to rest.
+        ``linear`` holds transposed linear Jacobians (..., n, 3); without it, that of the set-point counts.
+        """
+        if linear is None:
+            self._refresh()
+            linear = self._jacobian[:3].T
+        speeds = np.abs(dq)
+        ends = np.append(speeds / self._accelerations, 0.0)
+        slowed = np.copysign(np.maximum(speeds - ends[:, None] * self._accelerations, 0.0), dq)
+        return sqrt(np.square(slowed @ linear).sum(axis=-1).max())
+
+    def surely_stops_slower(self, cap: float) -> bool:
+        """Return whether the tcp surely keeps below ``cap`` (m/s) in the proposed step and in the stop after it."""
+        smoother = self._smoother
+        q, dq, dt = smoother.q, smoother.dq_next, smoother.dt
+        speed, acceleration = hypot(*dq), hypot(*smoother.ddq_next)
+        if speed <= self._slowest:
+            mean = [(x - x0) / dt for x, x0 in zip(smoother.q_next, q, strict=True)]
+            step = hypot(*mean)
+            # In its stop no joint gets faster than its speed and what its acceleration adds until it is taken back.
+            fastest = self._root * max(speed + self._overrun * acceleration, step)
+            way = self._reach_length * step * dt + self._per_speed * speed + self._per_acceleration * acceleration
+            ramps = self._overrun_tcp * acceleration * acceleration + fastest * way
+            near = self._around(max(dist(dq, self._centre), dist(mean, self._centre)))
+            if near + ramps + fastest * self._reach_length * dist(q, self._at) <= cap:
+                return True
+            self._put_centre(dq)
+            if self._around(dist(mean, dq)) + ramps + fastest * self._moved() <= cap:
+                return True
+        return self._proves_slower_stop(cap)
+
+    def _proves_slower_stop(self, cap: float) -> bool:
+        """Return whether the tcp keeps below ``cap`` (m/s) in the proposed step and in the stop after it.
+
+        Between any two of the times below each joint's speed is a parabola, which lies in the triangle of its control
+        points (both ends, and where their tangents meet). With the Jacobian of the reference the tcp's velocity is one,
+        too, and nowhere greater than the greatest of its control points, but for what the joints' way d from there
+        changes: m for each rad/s, as above.
+
+        Where that is too coarse, the Jacobian changes with the way to first order. The way is all but straight between
+        two of the times, and so the tcp's velocity is a cubic, in the hull of four control points. What this leaves out
+        is (sum r_i |d_i|) (sum |d_i|) / 2 for each rad/s, and the bend of the way, at most A t^2 / 8 for each joint.
+        """
+        smoother = self._smoother
+        q, dq, ddq, dt = smoother.q_next, smoother.dq_next, smoother.ddq_next, smoother.dt
+        limits = zip(dq, ddq, smoother.acceleration, smoother.jerk, strict=True)
+        phases = np.array([stop_phases(v, a, A, J) for v, a, A, J in limits])
+        jerk, first, second, third = phases.T
+        times = np.concatenate((_PARTS * phases[:, 3].max(), phases[:, 1:].ravel()))
+        times.sort()
+        t = times[:, None]
+        built = np.minimum(t, first)
+        braked = np.minimum(t, third)
+        released = np.maximum(braked - second, 0.0)
+        slopes = ddq + jerk * (built - released)
+        slopes[t >= third] = 0.0
+        ramps = built * (ddq + 0.5 * jerk * built) - 0.5 * jerk * released**2
+        speeds = dq + ramps + (braked - built) * (ddq + jerk * first)
+        widths = (times[1:] - times[:-1])[:, None]
+        control = np.empty((3, len(widths), smoother.n))
+        control[0], control[1], control[2] = speeds[:-1], speeds[:-1] + (0.5 * widths) * slopes[:-1], speeds[1:]
+        greatest = np.abs(control).max(axis=0)
+        total = greatest.sum(axis=1)
+        linear = self._jacobian[:3].T
+        here = np.subtract(q, self._at)
+        way = np.abs(here) + np.cumsum(greatest * widths, axis=0)
+        reached = way @ self._reach_array
+
+        mean = np.subtract(q, smoother.q) / dt  # of the step: what shows when positions are compared
+        mean_total = float(np.abs(mean).sum())
+
+        fastest = np.sqrt(np.square(control @ linear).sum(axis=2).max(axis=0))
+        in_step = hypot(*(mean @ linear).tolist()) + float(reached[0]) * mean_total
+        if max(float((fastest + reached * total).max()), in_step) <= cap:
+            return True
+
+        if self._curvature is None:
+            self._curvature = self._kinematics.curvature(self._jacobian).reshape(smoother.n, -1)
+        places = np.empty_like(speeds)
+        places[0] = here
+        places[1:] = here + np.cumsum(control.sum(axis=0) * (widths / 3.0), axis=0)
+        nodes = linear + (places @ self._curvature).reshape(-1, smoother.n, 3)
+        begun = control[:, :, None] @ nodes[:-1]
+        ended = control[:, :, None] @ nodes[1:]
+        velocities = np.stack((3.0 * begun[0], ended[0] + 2.0 * begun[1], 2.0 * ended[1] + begun[2])) / 3.0
+        fastest = np.sqrt(np.square(velocities[:, :, 0]).sum(axis=2).max(axis=0))
+        left_out = 0.5 * reached * way.sum(axis=1) + self._bend * widths[:, 0] ** 2
+        middle = linear + ((here - 0.5 * dt * mean) @ self._curvature).reshape(smoother.n, 3)
+        in_step = hypot(*(mean @ middle).tolist()) + float(left_out[0]) * mean_total
+        return max(float((fastest + left_out * total).max()), in_step) <= cap
 
     def surely_inside(self, margin: float) -> bool:
         """Would the tcp, stopped now, stay ``margin`` (m) off every face of the workspace? False: not proven."""

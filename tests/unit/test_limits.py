@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from ruckig import ControlInterface, InputParameter, Ruckig, Trajectory
 
-from hal.servo.limits import speed_for, stop_displacement, stop_distance, stop_peak, stop_step
+from hal.servo.limits import speed_for, stop_displacement, stop_distance, stop_peak, stop_phases, stop_step
 
 ACCELERATION = st.floats(0.1, 30.0)
 JERK = st.floats(5.0, 10_000.0)
@@ -45,6 +45,10 @@ def test_a_stop_by_hand_is_the_time_optimal_one(v: float, share: float, A: float
     t = when * trajectory.duration
     expected = [values[0] for values in trajectory.at_time(t)]
     assert stop_step(0.0, v, share * A, A, J, t) == pytest.approx(expected, abs=1e-6)
+    jerk, first, second, third = stop_phases(v, share * A, A, J)
+    assert abs(jerk) == J
+    assert 0.0 <= first <= second <= third
+    assert third == pytest.approx(trajectory.duration, abs=1e-6)
 
 
 @given(ACCELERATION, JERK, st.floats(0.0, 3.0))
