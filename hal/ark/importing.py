@@ -19,7 +19,7 @@ from .items import Work
 from .ledger import Ledger, Row
 from .options import Options
 from .places import Places
-from .reading import Reading, Wrong
+from .reading import Node, Reading, Wrong
 from .sensors import import_camera
 from .simulator import import_simulator
 from .text import Commented, Inline, Remark, yaml_text
@@ -56,6 +56,10 @@ class Imported:
         return texts
 
 
+SECTIONS = ("simulator", "robots", "sensors", "objects")
+"""Of a global file."""
+
+
 def import_ark(path: str | Path, options: Options | None = None) -> Imported:
     """Read Ark's global file ``path`` and what it names, and make a rig of it. Nothing is written.
 
@@ -70,6 +74,7 @@ def import_ark(path: str | Path, options: Options | None = None) -> Imported:
     except Wrong:
         work.reading.raise_any()
         raise AssertionError("wrong, and no problem noted") from None
+    _check_generation(root)
     entries: dict[str, Any] = {}
     with suppress(Wrong):
         entries = import_simulator(root, work.reading, work.ledger)
@@ -112,6 +117,24 @@ def import_ark(path: str | Path, options: Options | None = None) -> Imported:
     imported = Imported(path, entries, rows, models, tuple(work.left_out))
     _check(imported, work.ledger)
     return imported
+
+
+def _check_generation(root: Node) -> None:
+    """Raise ConfigError for a file that is not a global file: the files of Ark since June 2026, or anything else."""
+    if any(section in root.children for section in SECTIONS):
+        return
+    keys = {key for child in root.children.values() for key in child.children}
+    recent = "local" in root.children or "external" in root.children or keys & {"main", "simulator", "n_envs"}
+    if recent:
+        message = (
+            "is of the Ark that hosts.yaml, nodes.yaml and sim_envs.yaml belong to (since June 2026). These files list "
+            "computers, programs and simulators; arms, cameras and objects are in that Ark's Python classes, so there "
+            "is nothing here to make a rig of. Write the rig's file (docs/rig-file.md), or import the "
+            "global_config.yaml of the Ark of 2025"
+        )
+    else:
+        message = f"is not a global file of Ark: it has none of {', '.join(SECTIONS)}"
+    raise ConfigError([Problem(str(root.file), "", message)])
 
 
 def _model_file(rig: Path, robot: str) -> Path:

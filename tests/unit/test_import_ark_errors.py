@@ -200,3 +200,28 @@ def test_sections(tmp_path: Path, section: Any, said: str) -> None:
     source.write_text(yaml.safe_dump({**data, "objects": section}))
     (told,) = problems(source)
     assert said in told
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("hosts.yaml", "local:\n  name: localhost\n"),
+        ("hosts.yaml", "external:\n  lab: {ssh_alias: lab, conda_path: /opt/conda, ssh_tunnel: true}\n"),
+        ("nodes.yaml", "arm:\n  host: localhost\n  conda_env: ark\n  main: lab.arm:main\n  param: {hz: 100}\n"),
+        ("sim_envs.yaml", "bench:\n  n_envs: 2\n  simulator: ark.sims:PybulletSim\n"),
+    ],
+)
+def test_the_files_of_a_newer_ark_are_recognised_and_refused(tmp_path: Path, name: str, text: str) -> None:
+    source = tmp_path / name
+    source.write_text(text)
+    (told,) = problems(source)
+    assert told.startswith(f"{source}: is of the Ark that hosts.yaml, nodes.yaml and sim_envs.yaml belong to")
+    assert "docs/rig-file.md" in told
+
+
+@pytest.mark.parametrize("text", ["network: {registry: 127.0.0.1}\n", "name: table\nconfig: {mass: 1}\n", "{}\n"])
+def test_a_file_without_anything_for_a_rig_is_refused(tmp_path: Path, text: str) -> None:
+    source = tmp_path / "global.yaml"
+    source.write_text(text)
+    (told,) = problems(source)
+    assert "is not a global file of Ark: it has none of simulator, robots, sensors, objects" in told
