@@ -7,10 +7,16 @@ python apps/collect.py --real --config my_rig.yaml --episodes 10 --task "lift th
 from __future__ import annotations
 
 import argparse
+import os
 import sys
 from pathlib import Path
 
 from hal.apps.cli import ACTION_NEEDED, add_driving_options, add_rig_options, rig_options, run_app
+
+NOT_THERE = (
+    "--pad demo reaches to where --seed 0 puts the cube in the first two episodes of a new folder; here it lies "
+    "elsewhere, the hand grasps air, and what it does not lift is saved as a failure"
+)
 
 
 def parser() -> argparse.ArgumentParser:
@@ -19,9 +25,10 @@ def parser() -> argparse.ArgumentParser:
         prog="collect",
         description="Collect demonstrations: everything goes back to where it starts, you drive, and each episode is "
         "saved, marked as a success or a failure, or forgotten.",
-        epilog="--pad demo plays two demonstrations that were made for this program. Ctrl-C stops the arm and ends the "
-        "run; an episode that is being recorded is kept, unmarked. The exit status is 1 when fewer episodes were saved "
-        "than asked for.",
+        epilog="--pad demo plays two demonstrations, made for the places that --seed 0 gives the first two episodes of "
+        "a new folder; one that does not lift the cube is saved as a failure. Ctrl-C stops the arm and ends the run; "
+        "an episode that is being recorded is kept, unmarked. The exit status is 1 when fewer episodes were saved than "
+        "asked for.",
     )
     add_rig_options(made)
     add_driving_options(made)
@@ -34,6 +41,11 @@ def parser() -> argparse.ArgumentParser:
     what.add_argument("--cameras", metavar="NAMES", help="those that are kept, separated by commas (all)")
     what.add_argument("--no-depth", dest="depth", action="store_false", help="leave depth out")
     what.add_argument("--codec", choices=["auto", "h264", "av1"], default="auto", help="of the videos (%(default)s)")
+    what.add_argument(
+        "--success",
+        metavar="MODULE:NAME",
+        help="called with the rig and an observation when an episode is saved as a success; False: it is a failure",
+    )
     what.add_argument("--report", metavar="FILE", help="write how it went, as JSON")
     return made
 
@@ -47,12 +59,13 @@ def _main(args: argparse.Namespace) -> int:
     import hal
     from hal.apps.banner import banner
     from hal.apps.check import may_open
-    from hal.apps.collecting import Collection
+    from hal.apps.collecting import Collection, lifts_cube
     from hal.apps.driving import check_driving, chosen_devices
     from hal.apps.opening import planned
     from hal.apps.report import check_writable
     from hal.config.data_files import data_folder
     from hal.errors import CommandError
+    from hal.policy import found
     from hal.recording import Recorder, recover
     from hal.recording.library import require
 
@@ -69,6 +82,9 @@ def _main(args: argparse.Namespace) -> int:
         raise CommandError(f"--out {args.out} is no folder")
     if args.report:
         check_writable(args.report)
+    if os.getcwd() not in sys.path:
+        sys.path.insert(0, os.getcwd())
+    judge = found(args.success, "--success") if args.success else None
     cameras = None if args.cameras is None else [name.strip() for name in args.cameras.split(",") if name.strip()]
     what = f"dataset  {args.out}: {args.episodes} episode(s) at {args.fps} rows/s"
     plan = planned(args, what, cameras=cameras or ())
@@ -78,16 +94,24 @@ def _main(args: argparse.Namespace) -> int:
     if not may_open(plan):
         return ACTION_NEEDED
     options = rig_options(args)
-    if args.pad == "demo" or (args.pad == "auto" and plan.clock == "lock_step"):  # the tour presses no Cross
+    demo = args.pad == "demo" or (args.pad == "auto" and plan.clock == "lock_step")  # the tour presses no Cross
+    if demo:
         options["pad"] = str(data_folder("config") / "teleop" / "demonstrations.jsonl")
     with hal.open(**options) as rig:
         print(banner(rig), flush=True)
         robot, pad = chosen_devices(rig, args)
         recovered = recover(args.out) if Path(args.out).is_dir() else []
         with Recorder(rig, args.out, args.fps, args.task, args.depth, cameras=cameras, codec=args.codec) as recorder:
-            for note in [*recovered, *recorder.notes]:
+            notes = [*recovered, *recorder.notes]
+            if demo:
+                judge = judge or lifts_cube(rig, robot)
+                if judge is None:
+                    notes.append(f"--pad demo: nothing says whether {robot.name} lifts a cube; see --success")
+                if args.seed or recorder.episodes:
+                    notes.append(NOT_THERE)
+            for note in notes:
                 print(f"  note     {note}")
-            return Collection(rig, robot, pad, recorder, args).run()
+            return Collection(rig, robot, pad, recorder, args, judge).run()
 
 
 if __name__ == "__main__":

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+from collections.abc import Callable
 from concurrent.futures import wait
 from pathlib import Path
 from queue import Empty, SimpleQueue
@@ -17,17 +18,21 @@ from hal.apps.prompts import Prompts
 from hal.apps.taping import Tape
 from hal.console import ACTIONS
 from hal.errors import HalError
+from hal.resetting import stands_in_world
 
 if TYPE_CHECKING:
     from concurrent.futures import Future
 
     from hal.gamepad import Gamepad
+    from hal.observation import Observation
     from hal.recording import Recorder, RecorderStatus
     from hal.rig import Rig
     from hal.robot import Robot
     from hal.types import PadState
 
-__all__ = ["Collection", "seed_of"]
+__all__ = ["Collection", "lifts_cube", "seed_of"]
+
+Judge = Callable[["Rig", "Observation"], bool]
 
 TOO_FEW = 1
 """Exit status."""
@@ -35,6 +40,10 @@ SHOW = 0.2
 """s between two looks at the recorder."""
 ALLOWED = {"ready": ("record", "discard"), "recording": ("finish", "fail", "discard")}
 """What may be pressed when."""
+LIFTED = 0.04
+"""m."""
+JUDGE_TIMEOUT = 0.05
+"""s; the arm is being driven while a picture is waited for."""
 SAVED, DISCARDED, ANEW = "saved", "discarded", "anew"
 """Why a try ended, where another one follows."""
 
@@ -42,8 +51,18 @@ SAVED, DISCARDED, ANEW = "saved", "discarded", "anew"
 class Collection:
     """One run of ``apps/collect.py``."""
 
-    def __init__(self, rig: Rig, robot: Robot, pad: Gamepad, recorder: Recorder, args: argparse.Namespace) -> None:
+    def __init__(
+        self,
+        rig: Rig,
+        robot: Robot,
+        pad: Gamepad,
+        recorder: Recorder,
+        args: argparse.Namespace,
+        judge: Judge | None = None,
+    ) -> None:
+        """``judge(rig, observation)`` is called when a person saves an episode as a success, and may deny it."""
         self.rig, self.robot, self.pad, self.recorder, self.args = rig, robot, pad, recorder, args
+        self._judge = judge
         self.driving = Driving(rig, robot, pad, mapping=args.mapping, speed=args.speed or 1.0, actions=ACTIONS)
         self.tape = Tape(recorder)
         self.phase = ""
@@ -202,14 +221,27 @@ class Collection:
         if action == "discard":
             self._discarding = self.tape.discard()
             return DISCARDED
-        success, seconds = action == "finish", self.recorder.status().seconds
+        success, seconds = self._mark(action), self.recorder.status().seconds
         self.kept.append(Kept(self.number, self._seed, success, self.tape.save(success)))
         if self.rig.lock_step:
             wait([self.kept[-1].status])  # time stands still
-        mark = "a success" if success else "a failure"
+        mark = {True: "a success", False: "a failure", None: "not marked"}[success]
         number, count = self.kept[-1].number, len(self.kept)
         self.driving.event(f"episode {number}: {seconds:.1f} s, {mark}; {count} of {self.args.episodes} in this run")
         return SAVED
+
+    def _mark(self, action: str) -> bool | None:
+        """Return how an episode is marked that a person saves; None where the judge fails."""
+        if action != "finish" or self._judge is None:
+            return action == "finish"
+        try:
+            agrees = bool(self._judge(self.rig, self.rig.observe(timeout=JUDGE_TIMEOUT)))
+        except Exception as error:  # a function of the user's
+            self.driving.event(f"--success raised {type(error).__name__}: {error}; the episode is saved unmarked")
+            return None
+        if not agrees:
+            self.driving.event("--success says that it is no success")
+        return agrees
 
     def _over(self) -> str:
         """Why the run should end, or nothing."""
@@ -306,6 +338,18 @@ class Collection:
             }
             Path(self.args.report).write_text(json.dumps(report, indent=2) + "\n")
         return sum(not one.failure for one in self.kept)
+
+
+def lifts_cube(rig: Rig, robot: Robot) -> Judge | None:
+    """Return what judges the recorded demonstrations: whether the cube is 4 cm higher than where it starts.
+
+    None where the arm is not simulated or the world has no cube.
+    """
+    cubes = [body for body in rig.plan.world.bodies if body.name == "cube"] if rig.plan.world is not None else []
+    if not cubes or not stands_in_world(rig, robot):
+        return None
+    height = cubes[0].position[2] + LIFTED
+    return lambda rig, observation: bool(rig.world.pose("cube").position[2] > height)
 
 
 def seed_of(base: int, number: int, draws: int = 0) -> int:

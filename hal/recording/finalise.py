@@ -8,6 +8,7 @@ starts anew.
 
 from __future__ import annotations
 
+import contextlib
 import shutil
 from pathlib import Path
 from typing import Any
@@ -25,7 +26,7 @@ from .stats import Stats, column_stats, merged, plain
 from .tables import entry_table, new_info, read_tasks, rows_table, tasks_table
 from .video import picture_stats, remux
 
-__all__ = ["CLOSING", "finalise"]
+__all__ = ["CLOSING", "finalise", "keep_mark"]
 
 CLOSING = "closing.json"
 """In the live folder: what was said when the episode was closed."""
@@ -38,6 +39,12 @@ _UNCLOSED: dict[str, Any] = {
     "repeated": {},
     "trouble": "nobody closed it: the program ended, or its writer",
 }
+
+
+def keep_mark(partial: Path, success: bool) -> None:
+    """Write a person's mark into a partial folder, where it outlives the process that writes the episode."""
+    with contextlib.suppress(OSError):  # a full disk, or a folder that was moved: the writer tries once more
+        write_json(partial / CLOSING, {"success": success})
 
 
 def finalise(layout: Layout, partial: Path, *, recovered: bool = False) -> int | None:

@@ -14,6 +14,7 @@ from .about import about_call, about_rig, about_start
 from .columns import features_of
 from .compatible import check_compatible
 from .devices import check_rate, chosen
+from .finalise import keep_mark
 from .index import read_index
 from .layout import Layout, locked
 from .library import require
@@ -210,13 +211,13 @@ class Recorder:
     def save(self, success: bool | None = None, wait: bool = False) -> None:
         """End the episode with the rows until now and make it part of the dataset, in the background unless ``wait``.
 
-        ``success`` is the mark that it gets. Until it is saved ``status().state`` is ``saving``; where that fails,
-        ``status().trouble`` says why, :meth:`wait_saved` raises it, and the next :meth:`start`, or
-        :func:`~hal.recording.recover`, tries it again.
+        ``success`` is the mark that it gets; it is written at once and stays where the writer is killed. Until the
+        episode is saved ``status().state`` is ``saving``; where that fails, ``status().trouble`` says why,
+        :meth:`wait_saved` raises it, and the next :meth:`start`, or :func:`~hal.recording.recover`, tries it again.
         """
         with self._lock:
-            take = self._end()
-            saving = self._saving = Saving(lambda: self._save(take, success))
+            take, partial = self._end(), Layout(self.root).partial(self._episode)
+            saving = self._saving = Saving(lambda: self._save(take, partial, success))
         if wait:
             saving.result()
 
@@ -226,7 +227,9 @@ class Recorder:
         if saving is not None:
             saving.result()
 
-    def _save(self, take: Take, success: bool | None) -> None:
+    def _save(self, take: Take, partial: Path, success: bool | None) -> None:
+        if success is not None:
+            keep_mark(partial, success)
         take.stop()
         self._end_tracks()
         if self._child.request("save", {"closing": take.closing(success)}, _SAVING) is None:

@@ -142,6 +142,47 @@ def test_two_demonstrations_by_one_command(tmp_path: Path, world: hal.Rig) -> No
     check_pictures(tmp_path)
 
 
+@pytest.mark.parametrize("again", [False, True])
+def test_a_demonstration_that_grasps_air_is_a_failure(
+    call: Collect, tmp_path: Path, capsys: pytest.CaptureFixture[str], again: bool
+) -> None:
+    """With another seed, or after other episodes, the cube lies elsewhere than the recorded pad reaches."""
+    if again:
+        assert call(*FAST, "--pad", write_pad(tmp_path, (1.0, CROSS), (2.0, PS), until=3.0), "--episodes", 1) == 0
+    assert call(*FAST, "--pad", "demo", "--episodes", 1, "--seed", 0 if again else 1) == 0
+    last = episodes(tmp_path)[-1]
+    cube = last.columns["observation.object.cube"]
+    assert np.ptp(cube[:, 2]) < 0.02, "it stayed on the table"
+    assert last.success is False
+    out = capsys.readouterr().out
+    assert "grasps air" in out
+    assert "0 succeeded, 1 failed" in out
+
+
+@pytest.mark.parametrize(
+    ("body", "mark", "says"),
+    [
+        ("return True", True, "a success"),
+        (
+            "return rig.world.pose('cube').position[2] > 1.0 and observation",
+            False,
+            "--success says that it is no success",
+        ),
+        ("return 1 / 0", None, "--success raised ZeroDivisionError"),
+    ],
+)
+def test_a_function_judges_what_is_saved_as_a_success(
+    call: Collect, tmp_path: Path, capsys: pytest.CaptureFixture[str], body: str, mark: bool | None, says: str
+) -> None:
+    name = f"judge_{mark}".lower()
+    (tmp_path / f"{name}.py").write_text(f"def check(rig, observation):\n    {body}\n")
+    pad = write_pad(tmp_path, (1.0, CROSS), (2.0, PS), (4.0, CROSS), (5.0, SQUARE), until=6.0)
+    assert call(*FAST, "--pad", pad, "--episodes", 2, "--success", f"{name}:check") == 0
+    assert [episode.success for episode in episodes(tmp_path)] == [mark, False], "a failure stays one"
+    assert says in capsys.readouterr().out
+    assert call(*FAST, "--pad", pad, "--success", f"{name}:nothing") == 2
+
+
 def check_pictures(folder: Path) -> None:
     """Every picture shows what its row says: put up in another world and drawn again, depth does not differ."""
     with hal.open("panda_table", sim=True, clock="lock_step", pad="none", overrides=SMALL) as rig:

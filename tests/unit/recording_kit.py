@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from typing import Any
 
 import pytest
@@ -15,7 +16,7 @@ from recording_layout import check_layout, check_stamps
 
 from hal.recording import Recorder
 
-__all__ = ["CAMERAS", "SIZE", "check_layout", "check_stamps", "drive", "mock_rig", "record", "small"]
+__all__ = ["CAMERAS", "SIZE", "check_layout", "check_stamps", "drive", "kill_writer", "mock_rig", "record", "small"]
 
 CAMERAS = ("scene", "wrist")
 SIZE = (64, 48)
@@ -50,3 +51,13 @@ def record(recorder: Recorder, seconds: float, success: bool | None = True) -> N
     recorder.start(seed=1)
     drive(recorder.rig, seconds)
     recorder.save(success, wait=True)
+
+
+def kill_writer(recorder: Recorder) -> None:
+    """Kill the process that writes the present episode, once some rows are on the disk."""
+    (rows,) = recorder.root.glob("episodes/*.partial/rows.arrow")
+    deadline = time.monotonic() + 30.0
+    while rows.stat().st_size < 20_000 and time.monotonic() < deadline:
+        time.sleep(0.01)
+    recorder._child.process.kill()
+    recorder._child.process.wait()

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from recording_kit import check_layout, drive, mock_rig, record
+from recording_kit import check_layout, drive, kill_writer, mock_rig, record
 
 from hal.errors import ConnectionLost
 from hal.recording import Dataset, Recorder, finalise, layout, recover
@@ -52,6 +52,21 @@ def test_what_a_killed_writer_leaves_becomes_an_episode(out: Path) -> None:
         record(recorder, 0.3)
         assert recorder.notes == []
     check_layout(out)
+
+
+@pytest.mark.parametrize("mark", [True, False, None])
+def test_the_mark_of_a_person_outlives_the_writer(tmp_path: Path, mark: bool | None) -> None:
+    with mock_rig() as rig, Recorder(rig, tmp_path / "out") as recorder:
+        record(recorder, 0.3)
+        recorder.start()
+        drive(rig, 1.0)
+        kill_writer(recorder)
+        with pytest.raises(ConnectionLost):
+            recorder.save(mark, wait=True)
+    recover(tmp_path / "out")
+    episode = Dataset(tmp_path / "out").episodes[1]
+    assert (episode.success, episode.info["recovered"]) == (mark, True)
+    assert check_layout(tmp_path / "out")["total_episodes"] == 2
 
 
 def test_the_next_recording_recovers_by_itself(out: Path) -> None:

@@ -6,7 +6,6 @@ import json
 import os
 import random
 import shutil
-import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -14,7 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 from export_kit import make_recording
-from recording_kit import check_layout, drive, mock_rig, record
+from recording_kit import check_layout, drive, kill_writer, mock_rig, record
 
 from hal.course import Course
 from hal.errors import CommandError, ConnectionLost, DatasetError, DeviceNotFound, HalError
@@ -306,12 +305,7 @@ def torn(tmp_path_factory: pytest.TempPathFactory) -> Path:
     with mock_rig() as rig, Recorder(rig, out) as recorder:
         recorder.start()
         drive(rig, 0.5)
-        (rows,) = out.glob("episodes/*.partial/rows.arrow")
-        deadline = time.monotonic() + 30.0
-        while rows.stat().st_size == 0 and time.monotonic() < deadline:
-            time.sleep(0.01)
-        recorder._child.process.kill()
-        recorder._child.process.wait()
+        kill_writer(recorder)
         with pytest.raises(ConnectionLost):
             recorder.save(wait=True)
     return out
