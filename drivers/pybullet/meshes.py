@@ -21,18 +21,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .shapes import Mesh, joined, unit
-from .simplify import simplified
+from .simplify import coarsened, simplified
 
 __all__ = ["MeshLibrary", "cache_folder", "parse"]
 
-_FORMAT = 7
+_FORMAT = 8
 """Raised whenever the records or the parsing change, so that old cache files are not read."""
 _BESIDE = {".mtl", ".png", ".jpg", ".jpeg", ".bmp", ".tga"}
 """Files in a mesh's folder that may decide its colours."""
 _PACKAGE = {".3mf": "lxml networkx", ".stp": "cascadio", ".step": "cascadio"}
 """Formats for which trimesh wants one more package."""
+_COARSE_SAVES = 0.7
+"""A coarse mesh with a greater share of the triangles is not worth its memory."""
 _CREASE = float(np.cos(np.radians(35)))
 """An edge is sharp where its faces turn by more than this."""
+_FIELDS = tuple(field.name for field in fields(Mesh) if field.name != "coarse")
 _CLOSED_SHARE = 0.9
 """Share of edges with a face on either side from which on a mesh counts as the surface of a solid."""
 
@@ -93,8 +96,15 @@ def parse(path: str) -> list[Mesh]:
     if not meshes:
         raise ValueError("no triangles")
     whole = [joined(group) for group in meshes.values()]
-    lighter = [simplified(mesh) for mesh in whole]
-    return [_welded(a if a is b else _shaded(b)) for a, b in zip(whole, lighter, strict=True)]
+    return [_with_levels(mesh) for mesh in whole]
+
+
+def _with_levels(whole: Mesh) -> Mesh:
+    """Return a mesh as it is drawn in large pictures, and with it, where that saves much, as in small ones."""
+    fine, coarse = (
+        _welded(whole if mesh is whole else _shaded(mesh)) for mesh in (simplified(whole), coarsened(whole))
+    )
+    return replace(fine, coarse=coarse) if len(coarse.faces) < _COARSE_SAVES * len(fine.faces) else fine
 
 
 def _parts(scene: Any) -> Iterator[tuple[NDArray[np.float64], Any]]:
@@ -254,10 +264,11 @@ def _write(path: Path, meshes: list[Mesh]) -> None:
     """Into a temporary file first, so that nobody ever reads half a file."""
     arrays: dict[str, Any] = {"count": np.array(len(meshes))}
     for index, mesh in enumerate(meshes):
-        for field in fields(Mesh):
-            value = getattr(mesh, field.name)
-            if value is not None:
-                arrays[f"{index}.{field.name}"] = np.asarray(value)
+        for name, level in ((f"{index}", mesh), (f"{index}.coarse", mesh.coarse)):
+            for field in _FIELDS if level is not None else ():
+                value = getattr(level, field)
+                if value is not None:
+                    arrays[f"{name}.{field}"] = np.asarray(value)
     path.parent.mkdir(parents=True, exist_ok=True)
     handle, temporary = tempfile.mkstemp(dir=path.parent, suffix=".tmp")
     try:
@@ -271,11 +282,15 @@ def _write(path: Path, meshes: list[Mesh]) -> None:
 
 def _read(path: Path) -> list[Mesh]:
     with np.load(path, allow_pickle=False) as archive:
-        meshes = []
-        for index in range(int(archive["count"])):
-            names = {f.name: f"{index}.{f.name}" for f in fields(Mesh)}
-            values: dict[str, Any] = {name: archive[key] for name, key in names.items() if key in archive}
-            meshes.append(Mesh(**{**values, "material": bool(values["material"]), "closed": bool(values["closed"])}))
-    if any(len(m.faces) and m.faces.max() >= len(m.positions) for m in meshes):
+        return [_read_mesh(archive, f"{index}") for index in range(int(archive["count"]))]
+
+
+def _read_mesh(archive: Any, name: str) -> Mesh:
+    values: dict[str, Any] = {f: archive[f"{name}.{f}"] for f in _FIELDS if f"{name}.{f}" in archive}
+    for field, kind in (("material", bool), ("closed", bool), ("cell", float)):
+        values[field] = kind(values[field])
+    coarse = _read_mesh(archive, f"{name}.coarse") if f"{name}.coarse.faces" in archive else None
+    mesh = Mesh(**values, coarse=coarse)
+    if len(mesh.faces) and mesh.faces.max() >= len(mesh.positions):
         raise ValueError("a face without a vertex")
-    return meshes
+    return mesh

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
 import numpy as np
@@ -41,13 +41,18 @@ class Scene(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Part:
-    """What one draw call draws: the meshes of one link that share a texture, in the frame of the link."""
+    """What one draw call draws: the meshes of one link that share a texture, in the frame of the link.
+
+    A link has parts for large pictures, and others for small ones if any of its meshes is heavy.
+    """
 
     body: int
     """PyBullet's number of the body."""
     link: int
     """-1 is the base."""
     mesh: Mesh
+    coarse: bool
+    """For pictures in which ``mesh.cell`` is small."""
     centre: Array
     """(3,) of a ball around the mesh, m."""
     radius: float
@@ -56,20 +61,27 @@ class Part:
 def parts_of(client: Any, shapes: Sequence[Any], library: MeshLibrary) -> list[Part]:
     """The parts of one body; ``shapes`` is what ``getVisualShapeData`` says of it."""
     groups: dict[Any, list[Mesh]] = {}
+    found: list[tuple[int, int, tuple[float, ...], Array, Mesh]] = []
     for shape in shapes:
         body, link, kind, size, file, position, orientation, rgba = shape[:8]
         if rgba[3] == 0:
             continue
         frame = Pose(position, orientation).matrix()  # in the link's frame, not in that of its centre of mass
         for mesh in _meshes(client, kind, size, file.decode(), library):
-            texture = None if mesh.texture is None else id(mesh.texture)
-            groups.setdefault((body, link, texture, mesh.closed), []).append(mesh.tinted(rgba).moved(frame))
-    return [_part(body, link, joined(meshes)) for (body, link, _, _), meshes in groups.items()]
+            found.append((body, link, rgba, frame, mesh))
+    heavy = {(body, link) for body, link, _, _, mesh in found if mesh.coarse is not None}
+    for body, link, rgba, frame, mesh in found:
+        for coarse in (False, True) if (body, link) in heavy else (False,):
+            drawn = mesh.coarse if coarse and mesh.coarse is not None else mesh
+            texture = None if drawn.texture is None else id(drawn.texture)
+            key = (body, link, coarse, texture, drawn.closed)
+            groups.setdefault(key, []).append(drawn.tinted(rgba).moved(frame))
+    return [_part(body, link, coarse, joined(meshes)) for (body, link, coarse, *_), meshes in groups.items()]
 
 
 def _meshes(client: Any, kind: int, size: Sequence[float], file: str, library: MeshLibrary) -> list[Mesh]:
     if kind == client.GEOM_MESH:
-        return [mesh.scaled(np.asarray(size)) for mesh in library.load(file)]
+        return [_scaled(mesh, np.asarray(size)) for mesh in library.load(file)]
     if kind == client.GEOM_BOX:
         return [box((size[0] / 2, size[1] / 2, size[2] / 2))]
     if kind == client.GEOM_SPHERE:
@@ -81,10 +93,15 @@ def _meshes(client: Any, kind: int, size: Sequence[float], file: str, library: M
     return [plane()] if kind == client.GEOM_PLANE else []
 
 
-def _part(body: int, link: int, mesh: Mesh) -> Part:
+def _scaled(mesh: Mesh, size: Array) -> Mesh:
+    coarse = None if mesh.coarse is None else mesh.coarse.scaled(size)
+    return replace(mesh.scaled(size), coarse=coarse)
+
+
+def _part(body: int, link: int, coarse: bool, mesh: Mesh) -> Part:
     low, high = mesh.positions.min(axis=0), mesh.positions.max(axis=0)
     centre = (low + high).astype(float) / 2
-    return Part(body, link, mesh, centre, float(np.linalg.norm(mesh.positions - centre, axis=1).max()))
+    return Part(body, link, mesh, coarse, centre, float(np.linalg.norm(mesh.positions - centre, axis=1).max()))
 
 
 def link_frames(client: Any, links: Sequence[tuple[int, int]]) -> Array:

@@ -39,6 +39,10 @@ class Mesh:
     """The colours come from the file's materials, which a colour from the URDF replaces; a texture it tints."""
     closed: bool = True
     """A solid's surface: faces that look away are hidden anyway and need not be drawn."""
+    cell: float = 0.0
+    """Details smaller than this were left out, m; 0 where none were."""
+    coarse: Mesh | None = None
+    """The same with fewer triangles, for pictures in which ``coarse.cell`` is small; None where that saves little."""
 
     def scaled(self, scale: tuple[float, float, float] | NDArray[np.float64]) -> Mesh:
         """Stretched along the axes; a mirroring keeps the outside outside."""
@@ -53,6 +57,7 @@ class Mesh:
             positions=(self.positions * factors).astype(np.float32),
             normals=unit(self.normals * inverse).astype(np.float32),
             faces=np.ascontiguousarray(faces),
+            cell=self.cell * float(np.abs(factors).max()),
         )
 
     def moved(self, matrix: NDArray[np.float64]) -> Mesh:
@@ -85,6 +90,8 @@ def joined(meshes: Sequence[Mesh]) -> Mesh:
         colors=np.concatenate([m.colors for m in meshes]),
         faces=np.concatenate([m.faces + np.uint32(k) for m, k in zip(meshes, offsets, strict=True)]),
         uv=None if meshes[0].uv is None else np.concatenate([m.uv for m in meshes if m.uv is not None]),
+        cell=max(m.cell for m in meshes),
+        coarse=None,
     )
 
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from .shapes import Mesh
 
-__all__ = ["simplified"]
+__all__ = ["coarsened", "simplified"]
 
 _HEAVY = 3000
 """Triangles up to which a mesh is drawn as it is."""
@@ -21,29 +21,50 @@ _EDGES = 4.0
 """Size of a cell, in mean edges of the mesh."""
 _SHARE = 1 / 50
 """Greatest size of a cell, as a share of the mesh's diagonal."""
+_COARSE_HEAVY = 600
+_COARSE_SHARE = 1 / 25
+"""The same two for small pictures."""
 
 
 def simplified(mesh: Mesh) -> Mesh:
-    """A heavy mesh with the vertices in each cell of a grid made one; others as they are.
+    """Return a heavy mesh with fewer triangles, with no visible difference in a large picture; others as they are."""
+    if len(mesh.faces) <= _HEAVY:
+        return mesh
+    points = mesh.positions.astype(float)
+    corners = points[mesh.faces]
+    double_area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    mean_edge = np.sqrt(double_area.sum() * 2 / np.sqrt(3) / len(mesh.faces))  # as if all were equilateral
+    return _clustered(mesh, min(_EDGES * mean_edge, _SHARE * float(np.linalg.norm(np.ptp(points, axis=0)))))
+
+
+def coarsened(mesh: Mesh) -> Mesh:
+    """Return a heavy mesh with a third of the triangles of :func:`simplified`, for small pictures; others as they are.
+
+    ``cell`` of the result says how small: see :class:`.shapes.Mesh`.
+    """
+    if len(mesh.faces) <= _COARSE_HEAVY:
+        return mesh
+    return _clustered(mesh, _COARSE_SHARE * float(np.linalg.norm(np.ptp(mesh.positions.astype(float), axis=0))))
+
+
+def _clustered(mesh: Mesh, cell: float) -> Mesh:
+    """Make the vertices of one colour in each cell of a grid one.
 
     The one that stays is that of them which is nearest to the planes of all their triangles (quadrics: Garland and
     Heckbert, 1997; clustering: Lindstrom, 2000), so corners, sharp edges and flat faces stay in place; a curved
     surface moves by about the square of a cell over eight times its radius. Triangles keep the colours of their
     corners; normals want to be computed again.
     """
-    if len(mesh.faces) <= _HEAVY:
+    if cell <= 0:
         return mesh
     points = mesh.positions.astype(float)
     corners = points[mesh.faces]
     across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     double_area = np.linalg.norm(across, axis=1)
-    extent = np.ptp(points, axis=0)
-    mean_edge = np.sqrt(double_area.sum() * 2 / np.sqrt(3) / len(mesh.faces))  # as if all were equilateral
-    cell = min(_EDGES * mean_edge, _SHARE * float(np.linalg.norm(extent)))
-    if cell <= 0:
-        return mesh
     grid = np.floor((points - points.min(axis=0)) / cell).astype(np.int64)
-    _, cluster = np.unique(grid @ np.array([1, 1 << 20, 1 << 40]), return_inverse=True)
+    _, paint = np.unique(mesh.colors, axis=0, return_inverse=True)
+    keys = np.stack([grid @ np.array([1, 1 << 20, 1 << 40]), paint.reshape(-1)], axis=1)
+    _, cluster = np.unique(keys, axis=0, return_inverse=True)
     cluster = cluster.reshape(-1)
     chosen = _nearest_to_planes(points, corners, across, double_area, cluster[mesh.faces], cluster)
 
@@ -60,6 +81,7 @@ def simplified(mesh: Mesh) -> Mesh:
         colors=mesh.colors[each],
         uv=None if mesh.uv is None else mesh.uv[each],
         faces=np.arange(len(each), dtype=np.uint32).reshape(-1, 3),
+        cell=cell,
     )
 
 

