@@ -9,6 +9,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
+from hal.config.urdf import read_urdf as check_urdf
 from hal.errors import ConfigError, Problem
 from hal.packages import mesh_file, near
 
@@ -45,13 +46,12 @@ def read_urdf(path: str, key: str) -> UrdfFacts:
         ConfigError: no such file, no URDF, or meshes that are not there; every one is listed.
     """
     try:
-        root = ElementTree.parse(path).getroot()
+        check_urdf(Path(path))
     except OSError as error:
         raise ConfigError([Problem(path, key, f"cannot be read: {error.strerror}")]) from None
-    except ElementTree.ParseError as error:
-        raise ConfigError([Problem(path, key, f"is not a URDF: {error}")]) from None
-    if root.tag != "robot":
-        raise ConfigError([Problem(path, key, f"is not a URDF: its root is <{root.tag}>, not <robot>")])
+    except ValueError as error:
+        raise ConfigError([Problem(path, key, str(error))]) from None
+    root = ElementTree.parse(path).getroot()
     folder = Path(path).resolve().parent
     names = dict.fromkeys(mesh.get("filename", "") for mesh in root.iter("mesh"))
     missing = [name for name in names if not mesh_file(name, folder).is_file()]

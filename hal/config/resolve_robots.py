@@ -160,6 +160,10 @@ def _check_names(model: RobotModel, urdf: UrdfModel, file: Path, problems: Probl
     with suppress(Unknown):
         if model.base_link is not None:
             _check_link(model.base_link, "base_link", urdf, file, problems)
+            above = [joint.name for joint in urdf.above(model.base_link) if joint.name in model.joints]
+            if above:
+                text = f"{model.base_link!r} moves with the arm's own joints: {', '.join(above)}"
+                problems.add(file, "base_link", text)
     with suppress(Unknown):
         for alias, link in model.links.items():
             _check_link(link, f"links.{alias}", urdf, file, problems)

@@ -1,12 +1,19 @@
-"""A URDF read as plain XML: enough to check names and to fill in limits, without a physics engine."""
+"""A URDF read as plain XML: enough to check it and to fill in limits, without a physics engine.
+
+Everything is checked that makes a library crash or fail with an error of its own: the tree, every number, meshes.
+"""
 
 from __future__ import annotations
 
+import math
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
+
+from ..packages import mesh_file
+from .meshes import check_mesh
 
 __all__ = ["UrdfJoint", "UrdfModel", "read_urdf"]
 
@@ -61,14 +68,21 @@ class UrdfModel:
 
 
 def read_urdf(path: Path) -> UrdfModel:
-    """Read a URDF. Raises ValueError with what is wrong in it, and OSError."""
+    """Read and check a URDF.
+
+    Raises:
+        ValueError: What is wrong in it, or in a mesh that it names.
+        OSError: It cannot be read.
+    """
     try:
         root = ElementTree.parse(path).getroot()
-    except ElementTree.ParseError as error:
+    except (ElementTree.ParseError, LookupError, ValueError) as error:  # an encoding that Python lacks is the latter
         raise ValueError(f"is not valid XML: {error}") from None
     if root.tag != "robot":
         raise ValueError(f"is not a URDF: its root element is <{root.tag}>, not <robot>")
-    links = {element.get("name", ""): element.find("inertial") is not None for element in root.findall("link")}
+    links = {_name(element): element.find("inertial") is not None for element in root.findall("link")}
+    if not links:
+        raise ValueError("has no links")
     joints = {}
     for element in root.findall("joint"):
         joint = _joint(element)
@@ -76,16 +90,103 @@ def read_urdf(path: Path) -> UrdfModel:
         for link in (joint.parent, joint.child):
             if link not in links:
                 raise ValueError(f"joint {joint.name!r} names link {link!r}, which is not there")
-    if not links:
-        raise ValueError("has no links")
+    for kind, names in (("link", links), ("joint", joints)):
+        if len(names) < len(root.findall(kind)):
+            raise ValueError(f"has two {kind}s of one name")
+    _check_tree(links, joints)
+    for element in (*root.findall("link"), *root.findall("joint")):
+        _check_numbers(element)
+    for name in dict.fromkeys(mesh.get("filename", "") for mesh in root.iter("mesh")):
+        _check_mesh(name, path.resolve().parent)
     return UrdfModel(path, MappingProxyType(links), MappingProxyType(joints))
 
 
-def _joint(element: ElementTree.Element) -> UrdfJoint:
+def _name(element: ElementTree.Element) -> str:
     name = element.get("name")
+    if not name:
+        raise ValueError(f"a <{element.tag}> has no name")
+    return name
+
+
+def _check_tree(links: Mapping[str, bool], joints: Mapping[str, UrdfJoint]) -> None:
+    """Every link hangs on one joint, but for one, and all of them on that."""
+    parents: dict[str, UrdfJoint] = {}
+    for joint in joints.values():
+        if joint.child in parents:
+            other = parents[joint.child].name
+            raise ValueError(f"link {joint.child!r} hangs on two joints, {other!r} and {joint.name!r}")
+        parents[joint.child] = joint
+    roots = [link for link in links if link not in parents]
+    if len(roots) > 1:
+        names = ", ".join(map(repr, roots[:6])) + (" ..." if len(roots) > 6 else "")
+        raise ValueError(f"falls apart: {names} hang on no joint, and only the root may")
+    for link in links:
+        place, steps = link, 0
+        while place in parents and steps <= len(links):
+            place, steps = parents[place].parent, steps + 1
+        if place in parents:
+            raise ValueError(f"link {link!r} hangs on itself, through joint {parents[link].name!r}")
+
+
+# Attributes that hold numbers: how many, and the least that each may be.
+_NUMBERS = {
+    "origin": {"xyz": (3, -math.inf), "rpy": (3, -math.inf)},
+    "axis": {"xyz": (3, -math.inf)},
+    "limit": {"lower": (1, -math.inf), "upper": (1, -math.inf), "effort": (1, 0.0), "velocity": (1, 0.0)},
+    "dynamics": {"damping": (1, 0.0), "friction": (1, 0.0)},
+    "mimic": {"multiplier": (1, -math.inf), "offset": (1, -math.inf)},
+    "mass": {"value": (1, 0.0)},
+    "inertia": dict.fromkeys(("ixx", "iyy", "izz"), (1, 0.0)) | dict.fromkeys(("ixy", "ixz", "iyz"), (1, -math.inf)),
+    "mesh": {"scale": (3, -math.inf)},
+    "box": {"size": (3, 0.0)},
+    "cylinder": {"radius": (1, 0.0), "length": (1, 0.0)},
+    "capsule": {"radius": (1, 0.0), "length": (1, 0.0)},
+    "sphere": {"radius": (1, 0.0)},
+    "color": {"rgba": (4, 0.0)},
+}
+
+
+def _check_numbers(owner: ElementTree.Element) -> None:
+    """Check every number in a link or a joint."""
+    place = f"{owner.tag} {owner.get('name')!r}: <"
+    for element in owner.iter():
+        for attribute, (count, least) in _NUMBERS.get(element.tag, {}).items():
+            text = element.get(attribute)
+            if text is None:
+                continue
+            try:
+                values = [float(word) for word in text.split()]
+            except ValueError:
+                raise ValueError(f"{place}{element.tag} {attribute}={text!r}> is no number") from None
+            if len(values) != count:
+                raise ValueError(f"{place}{element.tag} {attribute}={text!r}> must be {count} number(s)")
+            if not all(math.isfinite(value) and value >= least for value in values):
+                must = "finite" if least < 0.0 else "finite and not negative"
+                raise ValueError(f"{place}{element.tag} {attribute}={text!r}> must be {must}")
+            if element.tag == "axis" and owner.get("type") in MOVABLE and math.hypot(*values) < 1e-6:
+                raise ValueError(f"{place}axis xyz={text!r}> is no direction")
+
+
+def _check_mesh(name: str, folder: Path) -> None:
+    """Check a mesh that is there; a driver that needs one reports those that are not.
+
+    Those of installed packages are trusted, as their code is: checking them would take up to a second.
+    """
+    try:
+        file = mesh_file(name, folder)
+        if file.is_file() and not any(part in ("site-packages", "dist-packages") for part in file.parts):
+            check_mesh(file)
+    except ValueError as error:
+        raise ValueError(f"mesh {name}: {error}") from None
+    except OSError as error:
+        raise ValueError(f"mesh {name} cannot be read: {error}") from None
+
+
+def _joint(element: ElementTree.Element) -> UrdfJoint:
+    name = _name(element)
     parent, child, limit = element.find("parent"), element.find("child"), element.find("limit")
-    if name is None or parent is None or child is None:
-        raise ValueError(f"joint {name!r} lacks its name, its parent or its child")
+    if parent is None or child is None:
+        raise ValueError(f"joint {name!r} lacks its parent or its child")
 
     def number(attribute: str) -> float | None:
         text = limit.get(attribute) if limit is not None else None
@@ -95,6 +196,8 @@ def _joint(element: ElementTree.Element) -> UrdfJoint:
             raise ValueError(f"joint {name!r}: {attribute}={text!r} is no number") from None
 
     kind = element.get("type", "")
+    if kind not in (*MOVABLE, "fixed", "floating", "planar"):
+        raise ValueError(f"joint {name!r} has type {kind!r}; types: {', '.join(MOVABLE)}, fixed, floating, planar")
     bounded = kind != "continuous"
     # A URDF's lower and upper limits are 0 where they are left out of a <limit> (the specification says so).
     default = 0.0 if limit is not None else None
