@@ -9,9 +9,13 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
+from .arguments import number
+
 __all__ = ["Clock", "LockStepClock", "RealClock", "Tick"]
 
 _ROUNDING = 1e-9
+_LONGEST = 1e9
+"""s; nobody waits for 30 years."""
 
 
 class Tick(NamedTuple):
@@ -40,16 +44,17 @@ class Clock(ABC):
 
     def sleep(self, seconds: float) -> None:
         """Let ``seconds`` pass."""
-        self.sleep_until(self.now() + seconds)
+        self.sleep_until(self.now() + number("seconds", seconds))
 
     def rate(self, hz: float) -> Iterator[Tick]:
         """Turn for ever, ``hz`` times a second. The first turn comes at once.
 
-        Raises ValueError for a rate that is not positive.
+        Raises:
+            CommandError: The rate is not positive, or not finite.
         """
-        if not hz > 0.0:
-            raise ValueError(f"a rate must be positive, not {hz}")
-        period = 1.0 / hz
+        return self._turns(1.0 / number("a rate", hz, "Hz", least=0.0, above=True, most=1e9))
+
+    def _turns(self, period: float) -> Iterator[Tick]:
         start = self.now()
         turn, missed = 0, 0
         while True:
@@ -71,7 +76,9 @@ class RealClock(Clock):
     def sleep_until(self, t: float) -> None:
         rest = t - time.monotonic()
         if rest > 0.0:
-            time.sleep(rest)
+            time.sleep(rest if rest < _LONGEST else number("t", t, "s on this clock", most=_LONGEST))
+        elif rest != rest:
+            number("t", t, "s on this clock")
 
 
 class LockStepClock(Clock):
@@ -88,6 +95,8 @@ class LockStepClock(Clock):
         return self._now()
 
     def sleep_until(self, t: float) -> None:
+        if not abs(t) < _LONGEST:
+            number("t", t, "s on this clock", most=_LONGEST)
         with self._going:
             while (stop := self._next(t)) is not None:
                 self._advance_to(stop.due)
@@ -98,10 +107,9 @@ class LockStepClock(Clock):
         """Have time stop every ``seconds`` from now on, whoever waits for however long, and ``call`` called there.
 
         It is called by the thread that waits, and what it raises is raised there. The function that comes back ends
-        this; any thread may call it, at any time, more than once. Raises ValueError for a time that is not positive.
+        this; any thread may call it, at any time, more than once. Raises CommandError for a time that is not positive.
         """
-        if not seconds > 0.0:
-            raise ValueError(f"time can stop only after a positive time, not every {seconds} s")
+        number("seconds", seconds, least=0.0, above=True)
         stop = _Stop(self.now(), seconds, call)
         self._stops.append(stop)
 

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import IntEnum
-from math import isfinite
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from .arguments import frozen, vector
 from .errors import CommandError
-from .pose import Pose, frozen
+from .pose import Pose
 
 __all__ = [
     "CartesianTarget",
@@ -27,20 +27,6 @@ __all__ = [
 ]
 
 Array = NDArray[np.float64]
-
-
-def _vector(name: str, values: ArrayLike, size: int | None = None) -> Array:
-    """A read-only vector of finite numbers, or a CommandError that says what was wrong."""
-    try:
-        array = frozen(values)
-    except (TypeError, ValueError) as error:
-        raise CommandError(f"{name} must be numbers: {error}") from None
-    if array.ndim != 1 or (size is not None and array.size != size):
-        raise CommandError(f"{name} must have shape ({size if size is not None else 'n'},), not {array.shape}")
-    # The sum of the squares is finite when all are; where it is not, it may only be too great.
-    if not isfinite(array.dot(array)) and not np.isfinite(array).all():
-        raise CommandError(f"{name} holds a number that is not finite: {array.tolist()}")
-    return array
 
 
 _set = object.__setattr__  # the commands are frozen, also for their own constructors
@@ -69,8 +55,8 @@ class JointTarget:
     dq: Array | None
 
     def __init__(self, q: ArrayLike, dq: ArrayLike | None = None) -> None:
-        _set(self, "q", _vector("q", q))
-        _set(self, "dq", None if dq is None else _vector("dq", dq, self.q.size))
+        _set(self, "q", vector("q", q))
+        _set(self, "dq", None if dq is None else vector("dq", dq, self.q.size))
 
 
 CHUNK_POINTS = 256
@@ -93,10 +79,10 @@ class JointChunk:
     q: Array
 
     def __init__(self, t: ArrayLike, q: ArrayLike) -> None:
-        times = _vector("t", t)
+        times = vector("t", t)
         try:
             points = frozen(q)
-        except (TypeError, ValueError) as error:
+        except (TypeError, ValueError, OverflowError) as error:
             raise CommandError(f"q must be numbers: {error}") from None
         if not 1 <= times.size <= CHUNK_POINTS:
             raise CommandError(f"a chunk has 1 to {CHUNK_POINTS} targets, not {times.size}")
@@ -119,7 +105,7 @@ class JointVelocity:
     dq: Array
 
     def __init__(self, dq: ArrayLike) -> None:
-        _set(self, "dq", _vector("dq", dq))
+        _set(self, "dq", vector("dq", dq))
 
 
 @dataclass(frozen=True, slots=True, eq=False, init=False)
@@ -134,7 +120,7 @@ class JointTorque:
     tau: Array
 
     def __init__(self, tau: ArrayLike) -> None:
-        _set(self, "tau", _vector("tau", tau))
+        _set(self, "tau", vector("tau", tau))
 
 
 @dataclass(frozen=True, slots=True, eq=False, init=False)
@@ -163,8 +149,8 @@ class Twist:
     def __init__(self, linear: ArrayLike, angular: ArrayLike = (0.0, 0.0, 0.0), frame: str = "base") -> None:
         if frame not in ("base", "tcp"):
             raise CommandError(f"frame must be 'base' or 'tcp', not {frame!r}")
-        _set(self, "linear", _vector("linear", linear, 3))
-        _set(self, "angular", _vector("angular", angular, 3))
+        _set(self, "linear", vector("linear", linear, 3))
+        _set(self, "angular", vector("angular", angular, 3))
         _set(self, "frame", frame)
 
 

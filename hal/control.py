@@ -7,8 +7,10 @@ import warnings
 from types import TracebackType
 from typing import TYPE_CHECKING
 
+from .arguments import number
 from .command_checks import CommandChecks
 from .commands import Command, JointChunk, Sent, encode
+from .deadman import Deadman
 from .errors import (
     CommandError,
     ConnectionLost,
@@ -25,7 +27,6 @@ from .types import RobotStatus, Trip
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from .deadman import Deadman
     from .host.records import ServoRecord
     from .robot import Robot
 
@@ -53,6 +54,7 @@ class Control:
         unattended: bool,
         goal: tuple[float, ...] | None = None,
     ) -> None:
+        check_deadman(deadman)
         spec = robot.spec
         if spec.attended and deadman is None and not unattended:
             raise CommandError(
@@ -60,8 +62,7 @@ class Control:
             )
         if deadman is not None and spec.attended and not spec.emulated:
             deadman.check_trust()
-        if not (math.isfinite(rate_hz) and rate_hz > 0.0):
-            raise CommandError(f"rate_hz must be positive, not {rate_hz}")
+        rate_hz = number("rate_hz", rate_hz, "Hz", least=0.0, above=True)
         self._deadline = max(_SHORTEST_DEADLINE, _PERIODS / rate_hz)
         if goal is None and self._deadline > spec.deadline_max:
             slowest = _PERIODS / spec.deadline_max
@@ -279,8 +280,11 @@ class Control:
 
 def _share(name: str, asked: float | None, default: float, most: float, goal: object) -> float:
     """``asked`` or the default, checked against the most that the rig allows."""
-    value = default if asked is None else asked
     most = 1.0 if goal is not None else most
-    if not (math.isfinite(value) and 0.0 < value <= most):
-        raise CommandError(f"{name} must be above 0 and at most {most:g} (the rig's own), not {value}")
-    return value
+    return number(name, default if asked is None else asked, least=0.0, above=True, most=most)
+
+
+def check_deadman(deadman: object) -> None:
+    """Raise CommandError for what is no dead-man, a gamepad for example."""
+    if deadman is not None and not isinstance(deadman, Deadman):
+        raise CommandError(f"deadman must be a dead-man, as pad.hold('l2') returns it, not a {type(deadman).__name__}")

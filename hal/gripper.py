@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import math
 import threading
 from abc import ABC, abstractmethod
 from typing import TYPE_CHECKING, ClassVar, NamedTuple
 
-from .errors import CommandError, ConnectionLost, MotionStopped, NotSupported, RobotFault, StaleStateError
+from .arguments import number
+from .errors import ConnectionLost, MotionStopped, NotSupported, RobotFault, StaleStateError
 from .gripper_motion import GripperMotion, GripperResult
 from .host.gripper_mail import GripperAct, GripperCommand
 from .types import Fault, GripperOutcome, GripperState
@@ -144,7 +144,8 @@ class Gripper:
         if found is None:
             raise StaleStateError(f"the gripper of {self._robot} has not reported a state yet")
         age = self.clock.now() - found.state.stamp.t
-        if age > max_age:
+        if not age <= max_age:
+            number("max_age", max_age, "s")
             if found.lost:
                 why = f": {found.state.fault}" if found.state.fault is not None else ""
                 raise ConnectionLost(f"the gripper of {self._robot} has not answered for {age:.3f} s{why}")
@@ -178,9 +179,8 @@ class Gripper:
 
     def width_of(self, fraction: float) -> float:
         """Width in m of a grip from 0 (open) to 1 (closed). CommandError outside that."""
-        if not 0.0 <= fraction <= 1.0:
-            raise CommandError(f"a grip goes from 0 (open) to 1 (closed), not {fraction}")
-        return (1.0 - fraction) * self.spec.width_max
+        grip = number("a grip, from 0 (open) to 1 (closed),", fraction, least=0.0, most=1.0)
+        return (1.0 - grip) * self.spec.width_max
 
     # Commands that return at once.
 
@@ -202,8 +202,7 @@ class Gripper:
         not there at all is ``MISSED``.
         """
         for name, value in (("inner", inner), ("outer", outer)):
-            if not 0.0 <= value < math.inf:
-                raise CommandError(f"{name} must be a distance in m, 0 or more, not {value}")
+            number(name, value, "m", least=0.0)
         return self._begin(GripperAct.GRASP, *self._checked(width, speed, force), inner, outer)
 
     def start_home(self) -> GripperMotion:
@@ -221,13 +220,11 @@ class Gripper:
     def _checked(self, width: float, speed: float | None, force: float | None) -> tuple[float, float, float]:
         speed = self.spec.speed if speed is None else speed
         force = self.spec.force if force is None else force
-        if not 0.0 <= width <= self.spec.width_max:
-            raise CommandError(f"width must lie in 0..{self.spec.width_max:g} m, not {width}")
-        if not 0.0 < speed <= self.spec.speed:
-            raise CommandError(f"speed must be above 0 and at most {self.spec.speed:g} m/s, not {speed}")
-        if not 0.0 < force < math.inf:
-            raise CommandError(f"force must be positive, not {force}")
-        return width, speed, force
+        return (
+            number("width", width, "m", least=0.0, most=self.spec.width_max),
+            number("speed", speed, "m/s", least=0.0, above=True, most=self.spec.speed),
+            number("force", force, "N", least=0.0, above=True),
+        )
 
     def _begin(self, act: GripperAct, *numbers: float) -> GripperMotion:
         stops = self._host.stops  # before the latch: a stop that comes after this line ends the motion

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from .arguments import vector
 from .errors import CommandError
 from .pose import Pose
 from .quaternion import difference
@@ -224,9 +225,9 @@ class Kinematics:
         """
         from .ik import solve
 
-        seed = self.home if q_seed is None else np.asarray(q_seed, float)
-        if seed.shape != (self.n,) or not np.isfinite(seed).all():
-            raise CommandError(f"q_seed must be {self.n} finite numbers, not {np.asarray(q_seed).tolist()}")
+        if not isinstance(pose, Pose):
+            raise CommandError(f"pose must be a hal.Pose, not a {type(pose).__name__}")
+        seed = self.home if q_seed is None else vector("q_seed", q_seed, self.n)
         return solve(self, pose, seed, position_tolerance, rotation_tolerance, starts)
 
     def reach(self) -> tuple[float, ...]:

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from .commands import JointTarget
-from .control import Control
+from .arguments import number, vector
+from .control import Control, check_deadman
 from .errors import CommandError, MotionStopped
 from .pose import Pose
 from .types import RobotState
@@ -32,9 +33,12 @@ def move_to(
     patience: float,
 ) -> RobotState:
     """See :meth:`hal.robot.Robot.move_to`."""
-    if not patience >= 0.0:
-        raise CommandError(f"patience must be 0 or more, not {patience}")
-    goal = robot.ik(target) if isinstance(target, Pose) else JointTarget(target).q
+    if patience != math.inf:
+        number("patience", patience, "s", least=0.0)
+    if timeout is not None:
+        number("timeout", timeout, "s", least=0.0, above=True)
+    check_deadman(deadman)
+    goal = robot.ik(target) if isinstance(target, Pose) else vector("target", target)
     if goal.size != robot.n:
         raise CommandError(f"{robot.name} has {robot.n} joints; the target has {goal.size}")
     limits = robot.limits

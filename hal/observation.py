@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import TYPE_CHECKING
 
+from .arguments import number, whole
 from .errors import CommandError, DeviceNotFound, StaleStateError
 from .types import Frame, GripperState, RobotState
 
@@ -71,8 +72,14 @@ class Observer:
         self, after: float | None, timeout: float, history: int, cameras: Collection[str] | None
     ) -> Observation:
         """See :meth:`hal.rig.Rig.observe`."""
-        if history < 1:
-            raise CommandError(f"history must be at least 1, not {history}")
+        whole("history", history, least=1)
+        number("timeout", timeout, "s", least=0.0)
+        if after is not None:
+            ahead = number("after", after, "s on rig.clock") - self._rig.clock.now()
+            if ahead > timeout:
+                raise CommandError(f"after is {ahead:g} s in the future, and the timeout is {timeout:g} s")
+        if isinstance(cameras, str):
+            raise CommandError(f"cameras must be a list of names: cameras=[{cameras!r}]")
         names = tuple(self._rig.cameras) if cameras is None else tuple(cameras)
         if unknown := [name for name in names if name not in self._rig.cameras]:
             there = ", ".join(self._rig.cameras) or "none"

@@ -4,21 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from .arguments import frozen, vector
+from .errors import CommandError
+
 __all__ = ["Pose", "frozen", "matrix_to_quaternion", "quaternion_to_matrix", "rpy_to_matrix"]
 
 Array = NDArray[np.float64]
-
-
-def frozen(values: ArrayLike, dtype: Any = np.float64) -> NDArray[Any]:
-    """A read-only copy of ``values`` as an array."""
-    array = np.array(values, dtype=dtype)
-    array.flags.writeable = False
-    return array
 
 
 def quaternion_to_matrix(quaternion: ArrayLike) -> Array:
@@ -81,12 +76,10 @@ class Pose:
     orientation: Array
 
     def __init__(self, position: ArrayLike = (0.0, 0.0, 0.0), orientation: ArrayLike = (0.0, 0.0, 0.0, 1.0)) -> None:
-        p, q = frozen(position), np.array(orientation, float)
-        if p.shape != (3,) or q.shape != (4,):
-            raise ValueError(f"a pose is a position (3,) and a quaternion (4,), not {p.shape} and {q.shape}")
+        p, q = vector("position", position, 3), vector("orientation", orientation, 4)
         norm = float(np.linalg.norm(q))
-        if not np.isfinite(p).all() or not np.isfinite(norm) or norm < 1e-9:
-            raise ValueError("a pose needs finite numbers and a quaternion that is not zero")
+        if not 1e-9 < norm < np.inf:
+            raise CommandError(f"orientation must be a unit quaternion x, y, z, w, not {q.tolist()}")
         object.__setattr__(self, "position", p)
         object.__setattr__(self, "orientation", frozen(q / norm))
 

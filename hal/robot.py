@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .errors import ConnectionLost, NotSupported, StaleStateError
+from .arguments import number, vector
+from .errors import CommandError, ConnectionLost, NotSupported, StaleStateError
 from .pose import Pose, frozen
 from .types import Fault, RobotState, RobotStatus
 
@@ -235,7 +236,8 @@ class Robot:
         if state.status is RobotStatus.LOST:
             reason = f": {state.fault.cause}; {state.fault.remedy}" if state.fault is not None else ""
             raise ConnectionLost(f"{self.name} does not answer{reason} (its last state is {age:.3f} s old)")
-        if age > max_age:
+        if not age <= max_age:
+            number("max_age", max_age, "s")
             raise StaleStateError(f"the newest state of {self.name} is {age:.3f} s old, more than {max_age:g} s")
         return state
 
@@ -263,14 +265,16 @@ class Robot:
 
     def fk(self, q: ArrayLike) -> Pose:
         """Pose of the tcp in the base frame at joint positions ``q`` (n,), rad."""
-        return self.kinematics.pose(np.asarray(q, float))
+        return self.kinematics.pose(vector("q", q, self.n))
 
     def ik(self, pose: Pose, q_seed: ArrayLike | None = None) -> NDArray[np.float64]:
         """Joint positions (n,) in rad that bring the tcp to ``pose`` (base frame), near ``q_seed`` or the present.
 
         Raises Unreachable, with the residual in m and rad, where there are none.
         """
-        seed = self.state().q if q_seed is None else np.asarray(q_seed, float)
+        if not isinstance(pose, Pose):
+            raise CommandError(f"ik takes a hal.Pose of the tcp in the base frame, not a {type(pose).__name__}")
+        seed = self.state().q if q_seed is None else vector("q_seed", q_seed, self.n)
         return self.kinematics.solve(pose, seed)
 
     def control(

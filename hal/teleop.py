@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from .arguments import number
 from .commands import Twist
 from .config.mapping import AxisMapping, TeleopMapping, load_mapping
 from .errors import CommandError
@@ -48,8 +48,7 @@ class Teleop:
         self, robot: Robot, mapping: str | Path | Mapping[str, Any] | TeleopMapping = "default", speed: float = 1.0
     ) -> None:
         """``speed`` scales the mapping's speeds, above 0, at most 1. Raises ConfigError for a bad mapping."""
-        if not (math.isfinite(speed) and 0.0 < speed <= 1.0):
-            raise CommandError(f"speed must be above 0 and at most 1, not {speed}")
+        speed = number("speed", speed, least=0.0, above=True, most=1.0)
         self.robot = robot
         self.mapping = load_mapping(mapping)
         self.speed = speed
@@ -76,12 +75,14 @@ class Teleop:
 
         ``dt`` is the time since the last step, s; the command is a speed, so nothing here depends on it.
         """
+        _check_state(pad)
         twist = self.mapping.twist(pad)
         linear, angular = ([self.speed * value for value in part] for part in (twist[:3], twist[3:]))
         return Twist(linear, angular, frame=self.frame), self._grip(pad)
 
     def home_pressed(self, pad: PadState) -> bool:
         """Was the button that drives the arm home pressed since the last call?"""
+        _check_state(pad)
         button = self.mapping.go_home
         pressed = button is not None and pad.pressed(button)
         fresh, self._was_home = pressed and not self._was_home, pressed
@@ -187,6 +188,11 @@ class Teleop:
         if mapping.go_home is not None and pad.can_hold:
             lines.append(f"home: {mapping.go_home}, with {mapping.deadman} held")
         return lines
+
+
+def _check_state(pad: PadState) -> None:
+    if not isinstance(pad, PadState):
+        raise CommandError(f"pass the pad's state, teleop.step(pad.state(), tick.dt), not a {type(pad).__name__}")
 
 
 def _control(axis: AxisMapping) -> str:

@@ -303,9 +303,9 @@ def test_singular_targets_are_solved(panda: Kinematics) -> None:
 
 def test_bad_seed_and_unknown_link_are_named(panda: Kinematics) -> None:
     pose = panda.pose(panda.home)
-    with pytest.raises(CommandError, match="7 finite numbers"):
+    with pytest.raises(CommandError, match="q_seed (must have shape|holds)"):
         panda.solve(pose, [0.0] * 6)
-    with pytest.raises(CommandError, match="7 finite numbers"):
+    with pytest.raises(CommandError, match="q_seed (must have shape|holds)"):
         panda.solve(pose, [math.nan] * 7)
     with pytest.raises(KeyError, match="panda_hand"):
         panda.link_pose("panda_hnad", panda.home)

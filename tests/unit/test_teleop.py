@@ -46,7 +46,7 @@ def test_speed_scales_the_mapping_and_is_checked(arm: hal.Robot) -> None:
     assert motion.linear == pytest.approx([0.1, 0, 0])
     assert motion.angular == pytest.approx([0, 0, -0.4])
     for bad in (0.0, 1.5, float("nan")):
-        with pytest.raises(CommandError, match="speed must be above 0"):
+        with pytest.raises(CommandError, match="speed must be a positive number"):
             hal.Teleop(arm, speed=bad)
 
 

@@ -1,0 +1,90 @@
+"""Checks of arguments. Each raises a CommandError that says what was passed, and what to pass instead."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from .errors import CommandError
+
+__all__ = ["frozen", "number", "vector", "whole"]
+
+Array = NDArray[np.float64]
+
+
+def frozen(values: ArrayLike, dtype: Any = np.float64) -> NDArray[Any]:
+    """Return a read-only copy of ``values`` as an array."""
+    array = np.array(values, dtype=dtype)
+    array.flags.writeable = False
+    return array
+
+
+def number(
+    name: str, value: Any, unit: str = "", *, least: float = -math.inf, most: float = math.inf, above: bool = False
+) -> float:
+    """Return one finite number from ``least`` to ``most``, as a float.
+
+    Args:
+        name: Of the argument, for the message.
+        value: What was passed.
+        unit: Of the number, for the message.
+        least: The least that it may be.
+        most: The most that it may be; ``math.inf`` itself is allowed nowhere.
+        above: Whether it must be above ``least``, which is then 0, instead of at least that.
+
+    Raises:
+        CommandError: It is no number, not finite, or out of the range.
+    """
+    try:
+        if isinstance(value, (bool, str, bytes)) or np.ndim(value) != 0:
+            raise TypeError
+        found = float(value)
+    except (TypeError, ValueError, OverflowError):
+        raise CommandError(f"{name} must be {_wanted(unit, least, most, above)}, not {_shown(value)}") from None
+    if not math.isfinite(found) or found < least or found > most or (above and found == least):
+        raise CommandError(f"{name} must be {_wanted(unit, least, most, above)}, not {found:g}")
+    return found
+
+
+def whole(name: str, value: Any, *, least: int) -> int:
+    """Return a whole number of at least ``least``. Raises CommandError for anything else."""
+    if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < least:
+        raise CommandError(f"{name} must be a whole number of at least {least}, not {_shown(value)}")
+    return int(value)
+
+
+def vector(name: str, values: Any, size: int | None = None) -> Array:
+    """Return a read-only vector (size,) of finite numbers; None: of any size.
+
+    Raises:
+        CommandError: Another shape, no numbers, or one that is not finite.
+    """
+    try:
+        array = frozen(values)
+    except (TypeError, ValueError, OverflowError) as error:
+        raise CommandError(f"{name} must be numbers: {error}") from None
+    if array.ndim != 1 or (size is not None and array.size != size):
+        raise CommandError(f"{name} must have shape ({size if size is not None else 'n'},), not {array.shape}")
+    # The sum of the squares is finite when all are; where it is not, it may only be too great.
+    if not math.isfinite(array.dot(array)) and not np.isfinite(array).all():
+        raise CommandError(f"{name} holds a number that is not finite: {array.tolist()}")
+    return array
+
+
+def _wanted(unit: str, least: float, most: float, above: bool) -> str:
+    kind = "a positive number" if above and least == 0.0 else "a finite number"
+    low = f" of at least {least:g}" if math.isfinite(least) and not above else ""
+    high = f"{' and' if low else ' of'} at most {most:g}" if math.isfinite(most) else ""
+    return f"{kind}{low}{high}{f' ({unit})' if unit else ''}"
+
+
+def _shown(value: Any) -> str:
+    if isinstance(value, np.ndarray):
+        return f"an array of shape {value.shape}"
+    if isinstance(value, int) and value.bit_length() > 1000:
+        return "a whole number beyond what a float holds"
+    text = repr(value)
+    return text if len(text) <= 80 else f"{text[:77]}..."
