@@ -75,8 +75,8 @@ def main(argv: list[str] | None = None) -> int:
     """Entry point."""
     given = sys.argv[1:] if argv is None else argv
     if given[:1] == ["board"]:
-        return run_app(_print_board, board_parser().parse_args(given[1:]))
-    return run_app(_main, parser().parse_args(given))
+        return run_app(_print_board, board_parser(), given[1:])
+    return run_app(_main, parser(), given)
 
 
 def _board(args: argparse.Namespace) -> Board:

@@ -8,7 +8,7 @@ import os
 import signal
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import Any
 
 __all__ = [
@@ -120,25 +120,60 @@ def interruptible() -> Iterator[None]:
             signal.signal(getattr(signal, name), handler)
 
 
-def run_app(main: Any, args: argparse.Namespace) -> int:
-    """Run ``main(args)``; an error that a person can mend becomes a message, not a traceback."""
+def run_app(main: Any, parser: argparse.ArgumentParser, argv: list[str] | None) -> int:
+    """Parse the command line and run ``main(args)``; an error that a person can fix is a message, not a traceback.
+
+    Returns:
+        The exit status. The output is written by then, or known to be lost.
+    """
     from hal.errors import HalError
 
+    _open_standard_streams()
     link = logging.getLogger("hal.console")
     before, link.disabled = link.disabled, True  # the banner says it
     try:
-        with interruptible():
-            return int(main(args))
+        try:
+            args = parser.parse_args(argv)
+            with interruptible():
+                status = int(main(args))
+        finally:
+            sys.stdout.flush()  # while what fails can still be reported
+        return status
     except HalError as error:
-        print(f"{type(error).__name__}: {error}", file=sys.stderr)
-        return ACTION_NEEDED
-    except BrokenPipeError:  # nobody reads the output any more, as behind "| head"
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # nor may the flush at the end fail
+        return _failed(f"{type(error).__name__}: {error}")
+    except BrokenPipeError:  # nothing reads the output any more, as behind "| head"
+        _discard_output()
         return 1
-    except OSError as error:  # a device or a file that cannot be opened
-        print(f"{type(error).__name__}: {error}", file=sys.stderr)
-        return ACTION_NEEDED
+    except OSError as error:  # a device or a file that cannot be opened, or an output that cannot be written
+        return _failed(f"{type(error).__name__}: {error}")
     except KeyboardInterrupt:
         return 130
     finally:
         link.disabled = before
+
+
+def _failed(message: str) -> int:
+    with suppress(OSError):
+        print(message, file=sys.stderr)
+    try:
+        sys.stdout.flush()
+    except OSError:
+        _discard_output()
+    return ACTION_NEEDED
+
+
+def _discard_output() -> None:
+    """Lead standard output nowhere, so that the interpreter's flush at the end cannot fail either."""
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    with suppress(OSError, ValueError):
+        os.dup2(nowhere, sys.stdout.fileno())
+
+
+def _open_standard_streams() -> None:
+    """Give a program that was started without standard streams, as by a scheduler, ones that lead nowhere."""
+    from hal.host.process import fill_standard_descriptors
+
+    fill_standard_descriptors()
+    for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
+        if getattr(sys, name) is None:
+            setattr(sys, name, open(os.devnull, mode))  # noqa: SIM115  # for as long as the program runs

@@ -61,7 +61,7 @@ def parser() -> argparse.ArgumentParser:
 
 def main(argv: list[str] | None = None) -> int:
     """Entry point."""
-    return run_app(_main, parser().parse_args(argv))
+    return run_app(_main, parser(), argv)
 
 
 def _main(args: argparse.Namespace) -> int:

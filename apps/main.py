@@ -56,16 +56,14 @@ def parser() -> argparse.ArgumentParser:
 
 def main(argv: list[str] | None = None) -> int:
     """Entry point."""
-    words = sys.argv[1:] if argv is None else argv
-    args = parser().parse_args(words)
-    if args.command in PROGRAMS:
-        return int(import_module(f"hal.apps.{args.command.replace('-', '_')}").main(args.arguments))
-    return run_app(_main, args)
+    return run_app(_main, parser(), argv)
 
 
 def _main(args: argparse.Namespace) -> int:
     import hal
 
+    if args.command in PROGRAMS:
+        return int(import_module(f"hal.apps.{args.command.replace('-', '_')}").main(args.arguments))
     if args.version:
         print(f"robot-hal {hal.__version__}")
     elif args.command == "list":

@@ -24,7 +24,7 @@ from typing import Any
 from .. import errors
 from ..errors import ConnectionLost, HalError, Problem
 
-__all__ = ["Channel", "ChannelClosed", "Child", "SharedMemory", "child_main"]
+__all__ = ["Channel", "ChannelClosed", "Child", "SharedMemory", "child_main", "fill_standard_descriptors"]
 
 _BOOT = (
     "import sys, json; fds, path, target = json.loads(sys.argv[1]); "
@@ -42,11 +42,22 @@ class ChannelClosed(ConnectionLost):
     """The other process hung up: for a child, the end of its work."""
 
 
+def fill_standard_descriptors() -> None:
+    """Open descriptors 0 to 2 on the null device where a program was started without them.
+
+    Memory and sockets would get these numbers, and every child that has its own standard streams would lose them.
+    """
+    while (fd := os.open(os.devnull, os.O_RDWR)) <= 2:
+        os.set_inheritable(fd, True)
+    os.close(fd)
+
+
 class SharedMemory:
     """Zeroed memory without a name, shared by passing its descriptor."""
 
     def __init__(self, size: int = 0, fd: int | None = None) -> None:
         if fd is None:
+            fill_standard_descriptors()
             fd = self._create()
             os.ftruncate(fd, max(size, 1))
         self.fd = fd
@@ -151,6 +162,7 @@ class Child:
         self.name = name
         self._asking = threading.Lock()
         self._number = 0
+        fill_standard_descriptors()
         ours, theirs = socket.socketpair()
         self.channel = Channel(ours)
         self._log = tempfile.TemporaryFile()  # noqa: SIM115  # closed by close()
