@@ -191,6 +191,10 @@ class Several:
         return core_schema.no_info_before_validator_function(self.check, handler(source))
 
     def __get_pydantic_json_schema__(self, schema: CoreSchema, handler: GetJsonSchemaHandler) -> dict[str, Any]:
+        return self.json_schema()
+
+    def json_schema(self) -> dict[str, Any]:
+        """Return the JSON schema of the list, or of the one number in its place."""
         item = self.quantity.json_schema()
         size = {"minItems": self.count, "maxItems": self.count} if self.count is not None else {}
         several = {"type": "array", "items": item, "description": self.what, **size}
@@ -270,8 +274,10 @@ class PoseConfig(Strict):
     def __get_pydantic_json_schema__(cls, core_schema: Any, handler: Any) -> dict[str, Any]:
         """Both ways to write it."""
         own = handler(core_schema)
-        seven = {"type": "array", "items": {"type": "number"}, "minItems": 7, "maxItems": 7}
-        return {"description": own.pop("description", ""), "anyOf": [handler.resolve_ref_schema(own), seven]}
+        return {
+            "description": own.pop("description", ""),
+            "anyOf": [handler.resolve_ref_schema(own), _POSE.json_schema()],
+        }
 
     @model_validator(mode="before")
     @classmethod
