@@ -33,6 +33,27 @@ def planned(args: argparse.Namespace, *more: str, cameras: Iterable[str] = ()) -
             raise DeviceNotFound(f"--cameras: this rig has no camera {name!r}{nearest(name, known)}")
     if not args.dry_run:
         return plan
+    _check_everything(plan, args)
     print(f"{plan.source} is in order; it would open:")
     print("\n".join(f"  {line}" for line in [*listing(plan), *plan.warnings, *more]))
     return None
+
+
+def _check_everything(plan: Plan, args: argparse.Namespace) -> None:
+    """Raise what opening the rig would raise, as far as it is known without a device or a process."""
+    from hal import registry
+    from hal.console import Listen
+    from hal.rig import check_opening
+
+    if args.listen is not None:
+        Listen.parse(args.listen).check()
+    console = args.console or args.listen is not None
+    for robot in plan.robots:
+        registry.load(robot.driver, "robot")
+        if robot.gripper is not None:
+            registry.load(robot.gripper.driver, "gripper")
+    for camera in plan.cameras:
+        registry.load(camera.driver, "camera")
+    for chosen in check_opening(plan, args.pad, args.viewer, console):
+        if chosen.spec.driver != "keyboard":
+            registry.load(chosen.spec.driver, "gamepad")(chosen.spec)  # checks its options; opens nothing

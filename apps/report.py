@@ -104,6 +104,8 @@ def check_writable(path: str) -> None:
     """Raise CommandError now rather than after the run when no file can be written there."""
     from hal.errors import CommandError
 
+    if os.path.isdir(path) or (os.path.exists(path) and not os.access(path, os.W_OK)):
+        raise CommandError(f"--report {path}: is a folder, or a file that cannot be written")
     folder = Path(path).resolve().parent
     if not folder.is_dir() or not os.access(folder, os.W_OK):
         raise CommandError(f"--report {path}: the folder {folder} does not exist or cannot be written to")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import socket
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -61,6 +62,18 @@ class Listen(NamedTuple):
         if port and not (port.isascii() and port.isdigit() and int(port) <= _PORTS):
             raise wrong
         return cls(address or LOOPBACK, int(port) if port else PORT, bool(port))
+
+    def check(self) -> None:
+        """Raise CommandError where nothing can listen: at an address of another machine, or at a port that is taken."""
+        port = self.port if self.fixed else 0
+        try:
+            family, kind, protocol, _, place = socket.getaddrinfo(self.address, port, type=socket.SOCK_STREAM)[0]
+            with socket.socket(family, kind, protocol) as probe:
+                probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+                probe.bind(place)
+        except (OSError, UnicodeError) as error:
+            reason = getattr(error, "strerror", None) or error
+            raise CommandError(f"--listen: nothing can listen at {self.address}, port {self.port}: {reason}") from None
 
 
 @dataclass(frozen=True, slots=True)

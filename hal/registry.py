@@ -25,7 +25,7 @@ from typing import Any
 
 from .errors import DeviceNotFound, DriverMissing, NotSupported
 
-__all__ = ["BUILT_IN", "GROUP", "DriverSpec", "driver", "function", "load", "missing", "names"]
+__all__ = ["BUILT_IN", "GROUP", "DriverSpec", "checked", "driver", "function", "load", "missing", "names"]
 
 GROUP = "hal.drivers"
 """The entry-point group."""
@@ -70,9 +70,10 @@ class DriverSpec:
     console: str | None = None
     """A page in a browser that shows a rig and drives it."""
     checks: Mapping[str, str] = field(default_factory=dict)
-    """Kind of device (``robot``, ``gripper``, ``camera``) -> "module:function", which looks at the resolved record of
-    such a device before anything is opened, and yields (key, message) for each thing that is wrong in it; keys are
-    relative to the device's entry in the rig, for example ``real.host``. It must not import the driver's libraries."""
+    """Kind of device (``robot``, ``gripper``, ``camera``, ``gamepad``) -> "module:function", which looks at the
+    resolved record of such a device before anything is opened, and yields (key, message) for each thing that is wrong
+    in it; keys are relative to the device's entry in the rig, for example ``real.host``. It must not import the
+    driver's libraries."""
     emulated: str | None = None
     """"module:function" that says of the options of a real device whether a program stands in for it, which may be
     stepped by ``rig.clock`` (an address on this computer)."""
@@ -145,6 +146,12 @@ def function(name: str, place: str | None) -> Callable[..., Any] | None:
         return None
     found: Callable[..., Any] = _resolve(place, name, driver(name).requires)
     return found
+
+
+def checked(name: str, kind: str, record: object) -> list[tuple[str, str]]:
+    """Return what the driver ``name`` finds wrong in a device's record: (key in its entry of the rig, sentence)."""
+    check = function(name, driver(name).checks.get(kind))
+    return list(check(record)) if check is not None else []
 
 
 def missing(name: str) -> dict[str, str]:

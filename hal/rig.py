@@ -18,7 +18,7 @@ from .camera_place import place_of
 from .clock import Clock, LockStepClock, RealClock
 from .console import Console, Listen
 from .devices import Devices
-from .errors import ConnectionLost, DeviceNotFound, HalError, NotSupported
+from .errors import ConfigError, ConnectionLost, DeviceNotFound, HalError, NotSupported, Problem
 from .gamepad import Gamepad
 from .gripper import Gripper
 from .host.groups import groups_of
@@ -81,6 +81,38 @@ def open_rig(
     return rig
 
 
+def check_opening(plan: Plan, pad: str | None, viewer: str, console: bool) -> list[Chosen]:
+    """Choose the pads, and check what can be checked before a device or a process is opened.
+
+    Args:
+        plan: What is to be opened.
+        pad: As :func:`open_rig` takes it; ``viewer`` and ``console`` likewise.
+
+    Raises:
+        DeviceNotFound: No such pad, or the keyboard of a window that there is none of.
+        NotSupported: A viewer or a console that this rig cannot have, or a recording for a real arm.
+        ConfigError: A recording that cannot be played.
+    """
+    lock_step, window = plan.clock == "lock_step", viewer == "gui"
+    known = {"window": window, "attended": plan.attended, "emulated": plan.emulated, "lock_step": lock_step}
+    pads = [] if pad == "none" else [choose_pad(spec, pad, **known) for spec in plan.pads]
+    wrong = [
+        Problem("--pad", "", message)
+        for chosen in pads
+        if chosen.spec.driver != "keyboard"
+        for _, message in registry.checked(chosen.spec.driver, "gamepad", chosen.spec)
+    ]
+    if wrong:
+        raise ConfigError(wrong)
+    if window and plan.world is None:
+        raise NotSupported("there is no simulated world to look at; leave the viewer out")
+    if lock_step and (console or any(chosen.spec.driver == _CONSOLE for chosen in pads)):
+        raise NotSupported("the console is for real time; in lock-step, time runs as fast as the program lets it")
+    if any(chosen.spec.driver == "keyboard" for chosen in pads) and (not window or plan.attended):
+        raise DeviceNotFound("the keyboard is that of the viewer's window: add --viewer gui")
+    return pads
+
+
 class Rig:
     """Robots, cameras and gamepads by name, one clock, and the simulated world if there is one.
 
@@ -118,15 +150,13 @@ class Rig:
 
     def _open(self, *, pad: str | None, viewer: str, console: bool, listen: Listen, realtime: bool) -> None:
         plan = self.plan
-        pads = self._choose_pads(pad, viewer)
+        pads = check_opening(plan, pad, viewer, console)
         groups = groups_of(plan)
         world_host = self._start_hosts(groups, realtime)
         if console or any(chosen.spec.driver == _CONSOLE for chosen in pads):
             self._start_console(listen, pads)
         if world_host is not None:
             self._open_pictures(world_host, viewer)
-        elif viewer == "gui":
-            raise NotSupported("there is no simulated world to look at; leave the viewer out")
         if viewer == "3d":
             self.viewer3d = registry.load("viser", "viewer3d")(self)
         refused = False
@@ -217,15 +247,7 @@ class Rig:
             if not camera.wait_for_first(_FIRST_FRAME):
                 self.notes.append(f"camera {camera.name} has sent no frame in its first {_FIRST_FRAME:g} s")
 
-    def _choose_pads(self, pad: str | None, viewer: str) -> list[Chosen]:
-        if pad == "none":
-            return []
-        known = {"window": viewer == "gui", "attended": self.attended, "lock_step": self.lock_step}
-        return [choose_pad(spec, pad, **known, emulated=self.emulated) for spec in self.plan.pads]
-
     def _start_console(self, listen: Listen, pads: Sequence[Chosen]) -> None:
-        if self.lock_step:
-            raise NotSupported("the console is for real time; in lock-step, time runs as fast as the program lets it")
         drives = any(chosen.spec.driver == _CONSOLE for chosen in pads)
         others = ", ".join(in_words(chosen.spec.driver) for chosen in pads) or "the program itself"
         self.console = registry.load(_CONSOLE, "console")(self, listen, driven_by=None if drives else others)
@@ -262,8 +284,6 @@ class Rig:
         world = self.plan.world
         if keyboard is not None and world is not None:
             return replace(spec, driver=world.driver), keyboard
-        if self._viewer is None or self.attended:
-            raise DeviceNotFound("the keyboard is that of the viewer's window: add --viewer gui")
         self.notes.append("the window's keyboard cannot be used: playing the recorded tour")
         return tour(spec), self._world_time()
 
@@ -280,12 +300,12 @@ class Rig:
     @property
     def attended(self) -> bool:
         """Does something real move on this rig, so that a person must be there?"""
-        return any(robot.attended for robot in self.plan.robots)
+        return self.plan.attended
 
     @property
     def emulated(self) -> bool:
         """Does a program stand in for everything that counts as real here, so that nothing can be hurt?"""
-        return self.attended and all(robot.emulated for robot in self.plan.robots if robot.attended)
+        return self.plan.emulated
 
     @property
     def has_world(self) -> bool:

@@ -6,4 +6,8 @@ from hal.registry import DriverSpec
 
 __all__ = ["DRIVER"]
 
-DRIVER = DriverSpec(name="playback", gamepad="hal.drivers.playback.pad:PlaybackPad")
+DRIVER = DriverSpec(
+    name="playback",
+    gamepad="hal.drivers.playback.pad:PlaybackPad",
+    checks={"gamepad": "hal.drivers.playback.pad:check"},
+)

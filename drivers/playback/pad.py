@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import MappingProxyType
 from typing import Annotated, Any, ClassVar, cast
@@ -191,3 +191,15 @@ class PlaybackPad(GamepadDriver):
 
     def close(self) -> None:
         self._mapper = None
+
+
+def check(spec: PadSpec) -> Iterator[tuple[str, str]]:
+    """Yield what is wrong with a recorded pad: (key in the pad's entry of the rig, sentence)."""
+    try:
+        PlaybackPad(spec).open()  # reads the recording; there is no device
+    except ConfigError as error:
+        for problem in error.problems:
+            if problem.file == f"gamepads.{spec.name}":
+                yield f"options.{problem.key}", problem.message
+            else:
+                yield "file", ": ".join(filter(None, [problem.file, problem.key, problem.message]))

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from .. import registry
-from ..specs import CameraSpec, GripperSpec, RobotSpec
+from ..specs import CameraSpec, RobotSpec
 from .camera_models import CameraModel
 from .context import Context
 from .data_files import user_path
@@ -55,13 +55,13 @@ def is_emulated(driver: str, options: Mapping[str, Any]) -> bool:
 
 def ask_driver(context: Context, key: str, spec: RobotSpec, config: RobotConfig, model: RobotModel, file: Path) -> None:
     """Note what the drivers of an arm and of its gripper find wrong in their records."""
-    for relative, message in _found(spec.driver, "robot", spec):
+    for relative, message in registry.checked(spec.driver, "robot", spec):
         _note(context, key, "", relative, message, config, model, file)
     gripper, kind = spec.gripper, model.gripper
     if gripper is None or kind is None:
         return
     arms = {f"real.{name}" for name in SHARED if name not in {**kind.real, **config.gripper.real}}
-    for relative, message in _found(gripper.driver, "gripper", gripper):
+    for relative, message in registry.checked(gripper.driver, "gripper", gripper):
         if gripper.driver != spec.driver or relative not in arms:  # what is the arm's was told there
             _note(context, key, "gripper.", relative, message, config.gripper, kind, file)
 
@@ -70,13 +70,8 @@ def ask_camera_driver(
     context: Context, key: str, spec: CameraSpec, config: CameraConfig, model: CameraModel, file: Path
 ) -> None:
     """Note what the driver of a camera finds wrong in its record."""
-    for relative, message in _found(spec.driver, "camera", spec):
+    for relative, message in registry.checked(spec.driver, "camera", spec):
         _note(context, key, "", relative, message, config, model, file)
-
-
-def _found(driver: str, kind: str, spec: RobotSpec | GripperSpec | CameraSpec) -> list[tuple[str, str]]:
-    check = registry.function(driver, registry.driver(driver).checks.get(kind))
-    return list(check(spec)) if check is not None else []
 
 
 def _note(

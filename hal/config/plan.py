@@ -28,3 +28,13 @@ class Plan:
     """What a person should know, though it is not wrong."""
     source: str
     """The rig's file, or ``<dict>``."""
+
+    @property
+    def attended(self) -> bool:
+        """Whether something real moves, so that a person must be there."""
+        return any(robot.attended for robot in self.robots)
+
+    @property
+    def emulated(self) -> bool:
+        """Whether a program stands in for everything that counts as real, so that nothing can be hurt."""
+        return self.attended and all(robot.emulated for robot in self.robots if robot.attended)

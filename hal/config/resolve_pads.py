@@ -7,6 +7,9 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+from .. import registry
+from ..errors import ConfigError
+from ..pads.model import pad_model
 from ..specs import PadSpec
 from .context import Context
 from .data_files import user_path
@@ -39,7 +42,7 @@ def resolve_pad(context: Context, name: str, config: PadConfig) -> PadSpec | Non
     options = dict(config.options)
     if config.file is not None:
         options["file"] = str(_recording(context, config.file))
-    return PadSpec(
+    spec = PadSpec(
         name=name,
         driver=context.driver or config.driver,
         model=model,
@@ -47,6 +50,10 @@ def resolve_pad(context: Context, name: str, config: PadConfig) -> PadSpec | Non
         dead_zone=config.dead_zone,
         options=options,
     )
+    if spec.driver not in CHOSEN_LATER:
+        for relative, message in registry.checked(spec.driver, "gamepad", spec):
+            context.problem(f"{key}.{relative}", message)
+    return spec
 
 
 def _model(context: Context, key: str, config: PadConfig) -> dict[str, Any] | None:
@@ -56,7 +63,14 @@ def _model(context: Context, key: str, config: PadConfig) -> dict[str, Any] | No
     if isinstance(found, str):
         context.problem(f"{key}.model", f"{found}, or auto")
         return None
-    return read_yaml(found, context.problems)
+    data = read_yaml(found, context.problems)
+    if data is not None:
+        try:
+            pad_model(data, str(found))
+        except ConfigError as error:
+            for problem in error.problems:
+                context.problems.add(problem.file, problem.key, problem.message)
+    return data
 
 
 def _recording(context: Context, file: str) -> Path:

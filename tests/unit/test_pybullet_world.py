@@ -474,7 +474,8 @@ class TestBadInput:
             f'<link name="l{k}"><visual><geometry><mesh filename="package://gone/m{k}.obj"/></geometry></visual></link>'
             for k in (1, 2)
         )
-        urdf.write_text(f'<robot name="broken">{links}</robot>')
+        joint = '<joint name="j" type="fixed"><parent link="l1"/><child link="l2"/></joint>'
+        urdf.write_text(f'<robot name="broken">{links}{joint}</robot>')
         body = BodySpec("broken", (0, 0, 0), UPRIGHT, "urdf", urdf=str(urdf))
         with pytest.raises(ConfigError) as error:
             World(world_spec(body))

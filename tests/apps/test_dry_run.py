@@ -1,0 +1,97 @@
+"""``--dry-run`` finds what would fail later, opens nothing, and moves nothing."""
+
+from __future__ import annotations
+
+import json
+import socket
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from hal.apps import teleop
+from hal.config.data_files import find_data
+
+PANDA = "robots: {panda: {model: panda}}\n"
+REAL = "robots: {panda: {model: panda, sim: false, drivers: {real: mock}, real: {}, gripper: {enabled: false}}}\n"
+
+
+def dry_run(folder: Path, rig: str, *options: str) -> int:
+    (folder / "rig.yaml").write_text(rig)
+    return teleop.main(["--config", str(folder / "rig.yaml"), "--dry-run", *options])
+
+
+def bad_model(folder: Path) -> str:
+    (folder / "pad.yaml").write_text("name: mine\nmatch: []\naxes: {left_x: ABS_NOTHING}\nbuttons: {}\n")
+    return PANDA + "gamepads: {pad: {model: pad.yaml}}\n"
+
+
+def bad_recording(folder: Path) -> str:
+    (folder / "tour.jsonl").write_text('{"not": "a recording"}\n')
+    return PANDA + "gamepads: {pad: {driver: playback, file: tour.jsonl}}\n"
+
+
+def wrong_options(folder: Path) -> str:
+    return PANDA + "gamepads: {pad: {driver: evdev, options: {devise: /dev/input/event3}}}\n"
+
+
+def wrong_playback_options(folder: Path) -> str:
+    (folder / "tour.jsonl").write_text(find_data("config", "teleop/tour.jsonl").read_text())
+    return PANDA + "gamepads: {pad: {driver: playback, file: tour.jsonl, options: {lop: true}}}\n"
+
+
+@pytest.mark.parametrize(
+    ("rig", "words"),
+    [
+        (bad_model, "pad.yaml: axes"),
+        (bad_recording, "gamepads.pad.file: "),
+        (wrong_playback_options, "gamepads.pad.options.lop"),
+        (wrong_options, "devise"),
+    ],
+)
+def test_a_pad_of_the_rig_is_checked(
+    rig: Callable[[Path], str], words: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert dry_run(tmp_path, rig(tmp_path)) == 2
+    assert words in capsys.readouterr().err
+
+
+WITH_PAD = PANDA + "gamepads: {pad: {}}\n"
+
+
+@pytest.mark.parametrize(
+    ("rig", "options", "words"),
+    [
+        (WITH_PAD, ["--pad", "{folder}/broken.jsonl"], "broken.jsonl: line 1"),
+        (WITH_PAD, ["--pad", "nothing.jsonl"], "there is no pad"),
+        (WITH_PAD, ["--pad", "keyboard"], "--viewer gui"),
+        (WITH_PAD, ["--pad", "web", "--set", "simulation.clock=lock_step"], "the console is for real time"),
+        (REAL + "gamepads: {pad: {}}\n", ["--pad", "demo"], "cannot hold the dead-man of a real arm"),
+        (REAL + "gamepads: {pad: {}}\n", ["--viewer", "gui", "--pad", "web"], "no simulated world"),
+        (WITH_PAD, ["--listen", "8470"], "--listen takes an address"),
+        (WITH_PAD, ["--listen", "203.0.113.7"], "nothing can listen at 203.0.113.7"),
+        (WITH_PAD, ["--listen", "no.such.host.invalid"], "nothing can listen"),
+        (WITH_PAD, ["--listen", "127.0.0.1:{taken}"], "nothing can listen at 127.0.0.1, port {taken}"),
+        (WITH_PAD, ["--report", "{folder}"], "is a folder"),
+        (WITH_PAD, ["--report", "{folder}/none/run.json"], "does not exist"),
+        (WITH_PAD, ["--robot", "arm"], "no robot 'arm'"),
+        (WITH_PAD, ["--mapping", "nothing"], "there is no mapping"),
+    ],
+)
+def test_an_option_is_checked(
+    rig: str, options: list[str], words: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "broken.jsonl").write_text(json.dumps({"pad": 1}) + "\n")
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = str(taken.getsockname()[1])
+        given = [option.replace("{folder}", str(tmp_path)).replace("{taken}", port) for option in options]
+        assert dry_run(tmp_path, rig, *given) == 2
+    assert words.replace("{taken}", port) in capsys.readouterr().err
+
+
+def test_what_is_in_order_passes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    tour = str(find_data("config", "teleop/tour.jsonl"))
+    options = ["--pad", tour, "--listen", "127.0.0.1", "--report", str(tmp_path / "run.json"), "--console"]
+    assert dry_run(tmp_path, WITH_PAD, *options) == 0
+    assert "is in order" in capsys.readouterr().out
+    assert not (tmp_path / "run.json").exists()
