@@ -77,7 +77,7 @@ def read_urdf(path: Path) -> UrdfModel:
     try:
         root = ElementTree.parse(path).getroot()
     except (ElementTree.ParseError, LookupError, ValueError) as error:  # an encoding that Python lacks is the latter
-        raise ValueError(f"is not valid XML: {error}") from None
+        raise ValueError(f"is not valid XML, so not a URDF: {error}") from None
     if root.tag != "robot":
         raise ValueError(f"is not a URDF: its root element is <{root.tag}>, not <robot>")
     links = {_name(element): element.find("inertial") is not None for element in root.findall("link")}
