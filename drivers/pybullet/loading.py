@@ -28,8 +28,8 @@ FINGER_MASS = 0.1
 URDF."""
 
 
-def load_object(client: Client, spec: BodySpec) -> tuple[Body, list[str]]:
-    """Make an object.
+def load_object(client: Client, spec: BodySpec, drawn: bool = True) -> tuple[Body, list[str]]:
+    """Make an object; its visual meshes are loaded only if it is to be ``drawn``.
 
     Returns:
         The body, and warnings for a person.
@@ -45,7 +45,7 @@ def load_object(client: Client, spec: BodySpec) -> tuple[Body, list[str]]:
     if spec.urdf is None:
         raise ConfigError([Problem("objects", f"{key}.urdf", "is missing, and the shape is urdf")])
     facts = read_urdf(spec.urdf, f"{key}.urdf")
-    number = _load_urdf(client, spec.urdf, f"{key}.urdf", fixed=_is_fixed(spec), scale=spec.scale)
+    number = _load_urdf(client, spec.urdf, f"{key}.urdf", fixed=_is_fixed(spec), scale=spec.scale, drawn=drawn)
     body = _describe(client, spec, number, f"{key}.urdf")
     _couple(client, body, facts.mimics)
     warnings = mend_inertias(client, body, facts.massless)
@@ -54,14 +54,14 @@ def load_object(client: Client, spec: BodySpec) -> tuple[Body, list[str]]:
     return body, warnings
 
 
-def load_robot(client: Client, spec: RobotSpec) -> tuple[Body, list[str]]:
+def load_robot(client: Client, spec: RobotSpec, drawn: bool = True) -> tuple[Body, list[str]]:
     """Make an arm with its base fixed in the world.
 
     Returns and raises as :func:`load_object`; a joint or link that the URDF lacks is a ConfigError too.
     """
     key = f"robots.{spec.name}"
     facts = read_urdf(spec.urdf, f"{key}.urdf")
-    number = _load_urdf(client, spec.urdf, f"{key}.urdf", fixed=True, scale=1.0)
+    number = _load_urdf(client, spec.urdf, f"{key}.urdf", fixed=True, scale=1.0, drawn=drawn)
     body = _describe(client, spec, number, f"{key}.urdf")
     fingers = spec.gripper.joints if spec.gripper else ()
     _check_names(body, spec, fingers, key)
@@ -94,11 +94,13 @@ def load_robot(client: Client, spec: RobotSpec) -> tuple[Body, list[str]]:
     return body, warnings
 
 
-def _load_urdf(client: Client, path: str, key: str, *, fixed: bool, scale: float) -> int:
+def _load_urdf(client: Client, path: str, key: str, *, fixed: bool, scale: float, drawn: bool) -> int:
     number = -1
     with loadable(path) as file, silenced() as chatter:
         try:
             flags = client.URDF_USE_INERTIA_FROM_FILE  # else PyBullet invents inertias from the collision shapes
+            if not drawn:
+                flags |= client.URDF_IGNORE_VISUAL_SHAPES
             number = client.loadURDF(file, useFixedBase=fixed, globalScaling=scale, flags=flags)
         except client.error:
             pass  # said below, with what it printed

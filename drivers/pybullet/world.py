@@ -70,9 +70,18 @@ class World:
     """Edits that change what is drawn beyond poses. Each one that succeeds adds one to :attr:`revision`; mirrors
     replay them (``mirror.request(method, params)``) before they show a snapshot of that revision."""
 
-    def __init__(self, spec: WorldSpec, *, mirror: bool = False, gui: bool = False) -> None:
+    def __init__(self, spec: WorldSpec, *, mirror: bool = False, gui: bool = False, drawn: bool = True) -> None:
+        """Load everything in ``spec``.
+
+        Args:
+            mirror: The world is posed by snapshots and never stepped.
+            gui: Open PyBullet's window.
+            drawn: Something draws this very world. Without it visual meshes are not loaded: for a Panda that takes
+                0.2 s and 75 MB less.
+        """
         self.spec = spec
         self.mirror = mirror
+        self.drawn = drawn
         self.dt = 1.0 / spec.physics_hz
         """One physics step, s."""
         self.steps = 0
@@ -137,9 +146,9 @@ class World:
         if spec.name in self.bodies:
             raise ConfigError([Problem("world", spec.name, "is the name of two things; names are unique in the world")])
         if isinstance(spec, RobotSpec):
-            body, warnings = load_robot(self.client, spec)
+            body, warnings = load_robot(self.client, spec, self.drawn)
         else:
-            body, warnings = load_object(self.client, spec)
+            body, warnings = load_object(self.client, spec, self.drawn)
         self.bodies[spec.name] = body
         self.warnings += warnings
         self._put_home(body)

@@ -128,7 +128,7 @@ def _mirror(spec: WorldSpec, notes: list[str]) -> Any | None:
     try:
         made = registry.load(spec.driver, "world")
         if hasattr(made, "MIRRORED"):
-            return made(spec, mirror=True)
+            return made(spec, mirror=True, drawn=False)
         reason = "its driver has no mirrors"
     except HalError as error:
         reason = str(error)

@@ -37,7 +37,8 @@ class Cycle:
         self._counted_from = 0
         self.world: Any = None
         if spec.world is not None:
-            self.world = registry.load(spec.world.driver, "world")(spec.world)
+            # In real time, a process of its own draws a copy of the world.
+            self.world = registry.load(spec.world.driver, "world")(spec.world, drawn=spec.clock == "lock_step")
         self.arms = {r.name: ArmUnit(r, self.dt, memory.robots[r.name], self.world) for r in spec.robots}
         self._units = tuple(self.arms.values())
         self.grippers: dict[str, GripperUnit] = {}

@@ -82,6 +82,23 @@ class TestStepping:
         assert np.abs(one[-1] - one[0]).max() > 0.01  # something fell
         assert np.array_equal(one, other)
 
+    def test_without_its_visual_meshes_a_world_moves_alike_bit_for_bit(self) -> None:
+        things = world_spec(floor(), cube((0.0, 0.0, 0.5)), mug(), panda())
+        drawn, plain = World(things), World(things, drawn=False)
+        names = {
+            kind: {shape[4] for shape in world.client.getVisualShapeData(world.bodies["panda"].id)}
+            for kind, world in (("drawn", drawn), ("plain", plain))
+        }
+        assert any(b"visual" in name for name in names["drawn"])
+        assert not any(b"visual" in name for name in names["plain"])
+        for world in (drawn, plain):
+            world.set_color("cube", [1.0, 0.0, 0.0, 1.0])
+            for _ in range(240):
+                world.step()
+        assert plain.snapshot() == drawn.snapshot()
+        assert plain.revision == drawn.revision
+        assert plain.aabb("mug") == drawn.aabb("mug")
+
     def test_a_body_falls_as_galileo_says(self) -> None:
         world = World(world_spec(cube((0.0, 0.0, 10.0))))
         world.set_dynamics("cube", linear_damping=0.0)
