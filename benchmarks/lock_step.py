@@ -170,6 +170,13 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=5.0, help="that each row takes (%(default)s)")
     parser.add_argument("--only", choices=ROWS, action="append", help="this row alone; may be repeated")
     args = parser.parse_args()
+    asked = []
+    with hal.open(CONFIG, sim=True, clock="lock_step", overrides=["cameras={}"], pad="none") as rig:
+        for _ in range(500):
+            start = time.perf_counter()
+            rig.world.pose("cube")
+            asked.append(time.perf_counter() - start)
+    print(f"rig.world.pose: {1e6 * statistics.median(asked):.1f} us")
     print(f"{'':34s}{'hal':>12s}{'by hand':>14s}{'ratio':>8s}   policy steps/s, medians")
     for name in args.only or ROWS:
         kind, cameras, every_tick = ROWS[name]
