@@ -100,6 +100,7 @@ def _main(args: argparse.Namespace) -> int:
     import hal
     from hal.apps.banner import banner, invitation, listing
     from hal.apps.check import may_open
+    from hal.apps.opening import check_everything
     from hal.calibration import solve
     from hal.calibration.checks import LEAST_VIEWS
     from hal.calibration.collecting import Collector
@@ -125,6 +126,7 @@ def _main(args: argparse.Namespace) -> int:
     where = f"on {setting.link_name} of" if setting.eye == "in-hand" else "beside"
     task = f"task     camera {setting.camera} {where} {setting.robot}; board of {board}"
     if args.dry_run:
+        check_everything(plan, args)
         print(f"{plan.source} is in order; it would open:")
         print("\n".join(f"  {line}" for line in [*listing(plan), *plan.warnings, task]))
         return 0

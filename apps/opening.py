@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from hal.config.plan import Plan
 
-__all__ = ["planned"]
+__all__ = ["check_everything", "planned"]
 
 
 def planned(args: argparse.Namespace, *more: str, cameras: Iterable[str] = ()) -> Plan | None:
@@ -33,13 +33,13 @@ def planned(args: argparse.Namespace, *more: str, cameras: Iterable[str] = ()) -
             raise DeviceNotFound(f"--cameras: this rig has no camera {name!r}{nearest(name, known)}")
     if not args.dry_run:
         return plan
-    _check_everything(plan, args)
+    check_everything(plan, args)
     print(f"{plan.source} is in order; it would open:")
     print("\n".join(f"  {line}" for line in [*listing(plan), *plan.warnings, *more]))
     return None
 
 
-def _check_everything(plan: Plan, args: argparse.Namespace) -> None:
+def check_everything(plan: Plan, args: argparse.Namespace) -> None:
     """Raise what opening the rig would raise, as far as it is known without a device or a process."""
     from hal import registry
     from hal.console import Listen

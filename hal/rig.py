@@ -89,6 +89,7 @@ def check_opening(plan: Plan, pad: str | None, viewer: str, console: bool) -> li
         pad: As :func:`open_rig` takes it; ``viewer`` and ``console`` likewise.
 
     Raises:
+        DriverMissing: The libraries of a page are not installed.
         DeviceNotFound: No such pad, or the keyboard of a window that there is none of.
         NotSupported: A viewer or a console that this rig cannot have, or a recording for a real arm.
         ConfigError: A recording that cannot be played.
@@ -106,8 +107,12 @@ def check_opening(plan: Plan, pad: str | None, viewer: str, console: bool) -> li
         raise ConfigError(wrong)
     if window and plan.world is None:
         raise NotSupported("there is no simulated world to look at; leave the viewer out")
-    if lock_step and (console or any(chosen.spec.driver == _CONSOLE for chosen in pads)):
-        raise NotSupported("the console is for real time; in lock-step, time runs as fast as the program lets it")
+    if viewer == "3d":
+        registry.load("viser", "viewer3d")
+    if console or any(chosen.spec.driver == _CONSOLE for chosen in pads):
+        if lock_step:
+            raise NotSupported("the console is for real time; in lock-step, time runs as fast as the program lets it")
+        registry.load(_CONSOLE, "console")
     if any(chosen.spec.driver == "keyboard" for chosen in pads) and (not window or plan.attended):
         raise DeviceNotFound("the keyboard is that of the viewer's window: add --viewer gui")
     return pads
