@@ -104,3 +104,15 @@ def test_what_is_right_still_passes(rig: hal.Rig) -> None:
     assert hal.Teleop(arm).step(pad.state(), 0.02)
     assert next(rig.clock.rate(np.float64(50.0))).missed == 0
     assert arm.move_to(arm.home, timeout=30, patience=math.inf).stamp.t > 0.0
+
+
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")  # the name of the argument changes
+@pytest.mark.parametrize("grip", [np.array([0.5]), "closed", NAN, HUGE, True, 1.5, -0.1])
+def test_a_wrong_grip_is_not_sent(grip: Any, rig: hal.Rig) -> None:
+    arm = rig.robots["panda"]
+    with arm.control(unattended=True) as control:
+        width = arm.gripper.state().width_target
+        with pytest.raises(HalError, match="grip"):
+            control.send(None, gripper=grip)
+        rig.clock.sleep(0.05)
+        assert arm.gripper.state().width_target == width
