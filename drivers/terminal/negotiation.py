@@ -11,9 +11,9 @@ from .pings import FLAGS, FOCUS, Pings
 
 __all__ = ["SLOWEST", "leave", "why_not_hold"]
 
-SLOWEST = 0.08
-"""Longest way to the terminal and back, s. With the time between two questions it stays below the 0.15 s of silence
-that the servo's watchdog allows."""
+SLOWEST = 0.06
+"""Longest way to the terminal and back, s. With the time between two questions it stays well below the silence after
+which the servo's watchdog stops the arm (``PAD_SILENCE``)."""
 
 _REPORT = f"\x1b[>{FLAGS}u\x1b[?{FOCUS}h"
 _UNDO = f"\x1b[<u\x1b[?{FOCUS}l"

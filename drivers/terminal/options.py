@@ -22,7 +22,7 @@ class Options(BaseModel):
     mode: Literal["auto", "step"] = "auto"
     """``auto``: keys can be held where the terminal reports releases; ``step``: one step for each press everywhere."""
     step_s: float = Field(0.1, gt=0.0, le=0.1)
-    """How long a step of an axis takes, s. The servo's watchdog ends a step after 0.15 s, whatever happens here."""
+    """How long a step of an axis takes, s. The servo's watchdog ends a step after 0.12 s, whatever happens here."""
     dpad_share: float = Field(0.4, gt=0.0, le=1.0)
     """How far a step pushes the d-pad, share of its travel."""
     stick_share: float = Field(0.5, gt=0.0, le=1.0)

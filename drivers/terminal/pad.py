@@ -34,7 +34,7 @@ class TerminalPad(GamepadDriver):
 
     Either way its silence is noticed, and so it may be the dead-man of a real arm. A step ends by this program's
     clock, needs nothing more from the terminal, and its proof of life is the key press alone: if this program should
-    hang, the servo ends the step when the press is 0.15 s old. A key that is held counts only as long as the terminal
+    hang, the servo ends the step when the press is 0.12 s old. A key that is held counts only as long as the terminal
     answers (:class:`.pings.Pings`), because the release can get lost with the link.
 
     In the background, and while it is stopped by Ctrl-Z, the pad is not connected and the terminal is as it was.

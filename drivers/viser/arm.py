@@ -12,6 +12,7 @@ from viser import SceneApi, SceneNodeHandle, TransformControlsEvent, TransformCo
 from hal.host.gripper_mail import GripperMail
 from hal.host.records import RobotMail
 from hal.pose import Pose
+from hal.servo.watchdog import PAD_SILENCE
 from hal.specs import RobotSpec, WorkspaceSpec
 from hal.types import RobotState, Trip
 
@@ -21,8 +22,6 @@ from .urdf import Joint, UrdfTree, read_tree
 
 __all__ = ["ArmView", "workspace_lines"]
 
-_SILENT = 0.15
-"""A dead-man that gave no sign of life for so long does not count, s."""
 _NEAR = 0.8
 """An open side of a workspace is drawn as far as this from the base, m."""
 _AMBER = (230, 150, 30)
@@ -84,7 +83,7 @@ class ArmView:
     def held(self) -> bool:
         """Is the arm's dead-man held, by a pad that is alive?"""
         deadman = self.mail.get_deadman()
-        return deadman is not None and deadman.held and time.monotonic() - deadman.t_alive < _SILENT
+        return deadman is not None and deadman.held and time.monotonic() - deadman.t_alive < PAD_SILENCE
 
     def look(self) -> None:
         """Read the newest state, and see what becomes of the goal."""

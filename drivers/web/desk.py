@@ -8,7 +8,7 @@ from collections import deque
 from collections.abc import Callable, Mapping
 from typing import Any, Protocol
 
-from hal.servo.watchdog import SILENCE
+from hal.servo.watchdog import PAD_SILENCE
 from hal.types import BUTTONS, STICK_AXES
 
 from .applink import Waiting
@@ -19,7 +19,7 @@ from .padmessage import PadMessage
 
 __all__ = ["App", "Desk", "Page"]
 
-_UNHEARD = f"the connection is too slow to drive, {{}}: a round trip may take {1e3 * SILENCE:g} ms at most"
+_UNHEARD = f"the connection is too slow to drive, {{}}: a round trip may take {1e3 * PAD_SILENCE:g} ms at most"
 _COMPLAINT = 2.0
 """s between two complaints to one page about that."""
 _SAYS = 50

@@ -14,7 +14,7 @@ from hal import registry
 from hal.errors import NotSupported
 from hal.gamepad import GamepadDriver, PadReading
 from hal.pads.choice import tour
-from hal.servo.watchdog import SILENCE
+from hal.servo.watchdog import PAD_SILENCE
 from hal.specs import PadSpec
 from hal.types import AXES, BUTTONS
 
@@ -147,10 +147,10 @@ class WebPad(GamepadDriver):
             return self._begin(now) if wanted else self._end(now)
         if self._tour is None:
             found = self._mail.take(timeout)
-            silent = now - found.t_alive > SILENCE  # the console's process hangs, or is stopped
+            silent = now - found.t_alive > PAD_SILENCE  # the console's process hangs, or is stopped
             return self._tell(found if self._open and not silent else gone(found.t, 0), now)
         page = self._mail.take(0.0)
-        watched = page.connected and now - page.t_alive <= SILENCE
+        watched = page.connected and now - page.t_alive <= PAD_SILENCE
         if page.buttons or not watched or self._tour.finished or self._console.stops != self._stops:
             return self._end(now)
         return self._tell(self._tour.poll(now, timeout), now)

@@ -11,7 +11,7 @@ import math
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
-from hal.servo.watchdog import SILENCE
+from hal.servo.watchdog import PAD_SILENCE
 from hal.types import BUTTONS, STICK_AXES
 
 __all__ = ["ALARMS", "Malformed", "PadMessage", "PadWatch", "Verdict", "number", "pad_message"]
@@ -111,20 +111,20 @@ class PadWatch:
         if message.seen < self._granted:
             return Verdict()  # sent before it was given the lease this time
         claimed = message.seen + message.since
-        if not claimed - now <= SILENCE:
+        if not claimed - now <= PAD_SILENCE:
             return Verdict(self.lose(_AHEAD), dropped=_AHEAD)
         # Messages arrive in the order in which they were sent: what proved it for one proves it for the next.
         alive = max(self._alive, min(now, claimed))
         gap, self._alive = alive - self._alive, alive
-        if not now - alive <= SILENCE:
+        if not now - alive <= PAD_SILENCE:
             return Verdict(self.lose(_LATE), dropped=_LATE)
-        gone = self.lose(_SILENT) if gap > SILENCE else None
+        gone = self.lose(_SILENT) if gap > PAD_SILENCE else None
         self.connected = True
         return Verdict(gone, alive)
 
     def look(self, now: float) -> str | None:
         """Why the pad is gone by now without a message that says so; None where it is not, or was gone before."""
-        return self.lose(_SILENT) if not now - self._alive <= SILENCE else None
+        return self.lose(_SILENT) if not now - self._alive <= PAD_SILENCE else None
 
     def lose(self, why: str) -> str | None:
         """The pad is gone; ``why`` comes back where it was there."""

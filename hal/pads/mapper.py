@@ -16,7 +16,7 @@ __all__ = ["REL_SILENCE", "AxisRange", "PadMapper"]
 REL_SILENCE = 0.1
 """s without an event after which a ``REL_`` axis is at rest: nothing is sent when it is let go of. A cap that is pushed
 reports at the pace of USB, every 8 or 16 ms, so a motion does not stutter when some reports are late. And it is less
-than the 150 ms after which a pad that says nothing at all trips the arm."""
+than the 120 ms after which a pad that says nothing at all trips the arm."""
 _TRIGGERS = ("l2", "r2")
 
 

@@ -8,10 +8,14 @@ from __future__ import annotations
 from ..inbox import CommandRecord, DeadmanRecord, Inbox, Session
 from ..types import Trip
 
-__all__ = ["SILENCE", "Watchdog", "is_alive", "is_timely"]
+__all__ = ["PAD_SILENCE", "SILENCE", "Watchdog", "is_alive", "is_timely"]
 
 SILENCE = 0.150
-"""Longest silence of the dead-man's pad, of the app and of the device, s."""
+"""Longest time from the last sign of life of the dead-man's pad, of the app and of the device to the stop, s."""
+
+PAD_SILENCE = SILENCE - 0.030
+"""A dead-man whose newest sign of life is older than this does not count, s. What is left of :data:`SILENCE` is for a
+servo that runs late on a loaded machine."""
 
 _HARMLESS_AT_REST = (Trip.DEADMAN_LOST, Trip.DEADMAN_SILENT, Trip.APP_SILENT)
 """With a dead-man that is released these are no reason to latch anything."""
@@ -33,8 +37,10 @@ class Watchdog:
     """
 
     def __init__(self, dt: float = 0.0) -> None:
-        """``dt`` is the time between two looks, s: the limit of silence is kept although nobody looks in between."""
+        """``dt`` is the time between two calls of :meth:`update`, s; no silence is longer although it is only seen
+        there."""
         self._silence = SILENCE - dt
+        self._pad_silence = PAD_SILENCE - dt
         self.session: Session | None = None
         self.trip = Trip.NONE
         """Why the stop is latched."""
@@ -121,7 +127,7 @@ class Watchdog:
         if session.deadman:
             if inbox.deadman is None or not inbox.deadman.connected:
                 return Trip.DEADMAN_LOST
-            if not is_alive(now, inbox.deadman.t_alive, self._silence):
+            if not is_alive(now, inbox.deadman.t_alive, self._pad_silence):
                 return Trip.DEADMAN_SILENT
         if not is_alive(now, inbox.t_app, self._silence):
             return Trip.APP_SILENT

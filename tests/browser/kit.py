@@ -22,7 +22,7 @@ from hal.deadman import Deadman
 from hal.host.records import ServoRecord
 from hal.inbox import DeadmanRecord
 from hal.robot import Robot
-from hal.servo.watchdog import SILENCE
+from hal.servo.watchdog import PAD_SILENCE
 
 CHROMIUM = next(
     (found for name in ("chromium", "chromium-browser", "google-chrome") if (found := shutil.which(name))), ""
@@ -105,7 +105,7 @@ class Bench:
         """Called whenever the pad was looked at: notes when that, or the arm, was silent for too long."""
         now = time.monotonic()
         servo = self.arm._mail.peek()
-        if now - self._alive > SILENCE or (servo is not None and now - servo.t_written > MAX_AGE):
+        if now - self._alive > PAD_SILENCE or (servo is not None and now - servo.t_written > MAX_AGE):
             self._silences.append(now)
         self._alive = record.t_alive if record.connected else math.inf
 

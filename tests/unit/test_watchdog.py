@@ -12,6 +12,7 @@ from hal.commands import Kind
 from hal.types import Fault, RobotStatus, Trip
 
 PATIENCE = 0.15
+PAD_PATIENCE = 0.12
 
 
 def held() -> Bench:
@@ -116,7 +117,7 @@ def test_no_deadline_runs_while_the_deadman_is_released() -> None:
 @pytest.mark.parametrize(
     ("break_it", "mend_it", "trip", "patience"),
     [
-        ("pad_alive = False", "pad_alive = True", Trip.DEADMAN_SILENT, PATIENCE),
+        ("pad_alive = False", "pad_alive = True", Trip.DEADMAN_SILENT, PAD_PATIENCE),
         ("app_alive = False", "app_alive = True", Trip.APP_SILENT, PATIENCE),
         ("stops += 1", "stops += 0", Trip.STOP, 0.0),
         ("deadman = b.deadman._replace(connected=False)", "deadman = b.deadman._replace(connected=True)",

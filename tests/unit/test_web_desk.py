@@ -122,7 +122,7 @@ def test_a_late_message_is_no_pad_but_is_answered() -> None:
     beat, complaint, *more = inbox(driver)
     assert beat == {"type": "beat", "t": 100.3}
     assert complaint["type"] == "refused"
-    assert "150 ms" in complaint["why"]
+    assert "120 ms" in complaint["why"]
     assert more == [], "it is told once, not fifty times a second"
     room.pad(driver, 100.3)
     assert room.app.pads() == ["page 1"]

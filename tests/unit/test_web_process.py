@@ -17,7 +17,7 @@ from child_targets import HURRY
 from web_kit import REST, TOKEN, WAIT, App, Page, run
 
 from hal.errors import NotSupported
-from hal.servo.watchdog import SILENCE
+from hal.servo.watchdog import PAD_SILENCE
 from hal.types import Fault, RobotStatus
 
 
@@ -111,7 +111,7 @@ def test_the_lease_between_two_pages(app: App) -> None:
             pad = await app.pad()
             assert (pad["connected"], pad["from"], pad["buttons"]) == (True, "page 1", 64)
             assert pad["axes"] == [0.5, 0, 0, 0, 1, 0, 0, 0]
-            assert pad["t"] - SILENCE <= pad["t_alive"] <= pad["t"] <= time.monotonic()
+            assert pad["t"] - PAD_SILENCE <= pad["t_alive"] <= pad["t"] <= time.monotonic()
             async with Page(app) as second:
                 await second.take()
                 assert (await app.pad())["why"] == "page 2 took control"
@@ -156,7 +156,7 @@ def test_a_page_that_falls_silent_is_a_pad_that_is_gone(app: App) -> None:
             pad = await app.pad()
             lost = await app.pad()
             assert (lost["connected"], lost["why"]) == (False, "its page gave no sign of life")
-            assert lost["t"] - pad["t_alive"] > SILENCE
+            assert lost["t"] - pad["t_alive"] > PAD_SILENCE
 
     run(test)
 
@@ -196,7 +196,7 @@ def test_what_came_while_the_server_stood_still_moves_nothing(app: App) -> None:
             while True:
                 pad = await app.pad()
                 if pad["connected"]:
-                    assert pad["t"] - pad["t_alive"] <= SILENCE
+                    assert pad["t"] - pad["t_alive"] <= PAD_SILENCE
                     if pad["axes"][0] == 0.125:
                         return
 

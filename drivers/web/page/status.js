@@ -2,7 +2,7 @@
 
 import { byId, setData, setText, show } from "./dom.js";
 
-const SILENT = 0.15; // s, as in the servo
+const SILENT = 0.12; // s, as in the servo
 const OLD = 500; // ms without a state until the page says so
 const MOVING = 0.005; // rad/s; slower joints are at rest
 
