@@ -183,7 +183,7 @@ class Driving:
                 motion, grip = self.teleop.step(state, tick.dt)
                 motion = self._towards_goal(motion)
                 try:
-                    control.send(motion, gripper=grip, t_event=state.stamp.t if fresh else 0.0)
+                    control.send(motion, grip=grip, t_event=state.stamp.t if fresh else 0.0)
                     self._resumed()
                 except MotionStopped as stop:
                     self._tripped(stop)

@@ -182,12 +182,39 @@ class Control:
             raise ConnectionLost(f"{self.robot.name} has not reported a state yet")
         return found
 
-    def send(self, command: Command | None, *, gripper: float | None = None, t_event: float = 0.0) -> Sent:
-        """Send a command to the arm and, with ``gripper``, a grip from 0 (open) to 1 (closed).
+    def send(
+        self,
+        command: Command | None,
+        *,
+        grip: float | None = None,
+        width: float | None = None,
+        gripper: float | None = None,
+        t_event: float = 0.0,
+    ) -> Sent:
+        """Send a command to the arm, and optionally a grip or a width to its gripper.
 
-        Returns what was really sent and why it differs. ``t_event`` is the time of the pad event behind it, for
-        latency figures. Raises CommandError (nothing was sent), MotionStopped after a trip, RobotFault.
+        Args:
+            command: Target, chunk, velocity, twist, pose or torque, see :mod:`hal.commands`; None leaves the arm alone.
+            grip: Grip from 0 (open) to 1 (closed); None leaves the gripper alone.
+            width: Distance between the fingers, m, instead of ``grip``.
+            gripper: Former name of ``grip``, deprecated.
+            t_event: Time of the pad event behind the command, s, for latency figures.
+
+        Returns:
+            What was sent, and the reasons for every difference from ``command``.
+
+        Raises:
+            CommandError: For a wrong shape, a non-finite value, a grip or width out of range, or an unreachable first
+                target; nothing is sent.
+            MotionStopped: After a stop, until it is acknowledged (see :meth:`rearm`).
+            RobotFault: While the robot reports a fault.
         """
+        if gripper is not None:
+            warnings.warn(
+                "send(gripper=) is deprecated: pass grip= (0 open to 1 closed) or width= (m)",
+                DeprecationWarning,
+                stacklevel=2,
+            )
         if not self._id:
             raise CommandError("this control session is not open: use it in a 'with' statement")
         servo = self._peek()
@@ -203,7 +230,7 @@ class Control:
                 "the servo refused an earlier command: too far for a first one, too late, or torques and another kind "
                 "of command without a rest in between"
             )
-        width = None if gripper is None else self._width(gripper)
+        target = self._finger_width(grip, width, gripper)
         if command is not None:
             if self._goal is not None:
                 raise CommandError("this session moves to a goal; it takes no commands")
@@ -216,8 +243,8 @@ class Control:
             self.robot._commands += 1
             deadline = float(command.t[-1]) if isinstance(command, JointChunk) else now + self._deadline
             self._mail.put_command(CommandRecord(self.robot._commands, self._id, now, deadline, kind, values, t_event))
-        if width is not None:
-            self._send_width(width, waiting, reasons)
+        if target is not None:
+            self._send_width(target, waiting, reasons)
         return Sent(command, tuple(reasons))
 
     def _check_trip(self, servo: ServoRecord, now: float) -> None:
@@ -260,11 +287,30 @@ class Control:
         self._mail.rearm()
         self._rearmed_at = self._mail.state.seq() + 1
 
-    def _width(self, fraction: float) -> float:
-        """A grip as a width, m; checked before anything is sent, the arm's command included."""
-        if self.robot.gripper is None:
+    def _finger_width(self, grip: float | None, width: float | None, former: float | None) -> float | None:
+        """Return the width (m) that ``send`` asks for, or None; checked before anything is sent."""
+        given = {"grip": grip, "width": width, "gripper": former}
+        asked = {name: value for name, value in given.items() if value is not None}
+        if not asked:
+            return None
+        if len(asked) > 1:
+            raise CommandError(f"pass one of grip= (0 open to 1 closed) and width= (m), not {' and '.join(asked)}")
+        gripper = self.robot.gripper
+        if gripper is None:
             raise NotSupported(f"{self.robot.name} has no gripper")
-        return self.robot.gripper.width_of(fraction)
+        ((name, value),) = asked.items()
+        try:
+            number = float(value)
+        except (TypeError, ValueError, OverflowError):
+            raise CommandError(f"{name} must be one number, not {value!r}") from None
+        if name != "width":
+            return gripper.width_of(number)
+        if not 0.0 <= number <= gripper.width_max:
+            raise CommandError(
+                f"width is the distance between the fingers, 0 to {gripper.width_max:g} m here, not {value}; "
+                "for a share of it pass grip= (0 open to 1 closed)"
+            )
+        return number
 
     def _send_width(self, width: float, waiting: bool, reasons: list[str]) -> None:
         gripper = self.robot.gripper

@@ -211,7 +211,7 @@ class RigEnv(gymnasium.Env[Spaces, NDArray[np.float32]]):
         clock = self.rig.clock
         stopped = ""
         try:
-            self._control.send(command, gripper=grip)
+            self._control.send(command, grip=grip)
         except MotionStopped as stop:
             stopped = str(stop)
         now = clock.now()

@@ -210,7 +210,7 @@ class PolicyRunner:
         if command is not None and first:  # a first target that is far away is refused, as anybody's is
             checks, now = CommandChecks(self.robot), self.rig.clock.now()
             checks.check_first(checks.checked(command, now, []), now, self.robot.state().q_set.tolist())
-        control.send(command, gripper=grip)
+        control.send(command, grip=grip)
 
     def _answer(self, observation: Observation, tally: _Tally) -> tuple[Command | None, float | None]:
         start = time.perf_counter()

@@ -192,4 +192,4 @@ class Player:
     def _grip(self, control: Control) -> None:
         gripper, width = self.robot.gripper, self.course.width_at(self.place)
         if gripper is not None and width is not None:
-            control.send(None, gripper=float(np.clip(1.0 - width / gripper.width_max, 0.0, 1.0)))
+            control.send(None, width=float(np.clip(width, 0.0, gripper.width_max)))

@@ -168,7 +168,7 @@ def _groups(node: Node, ledger: Ledger) -> None:
         if name in ("arm", "gripper"):
             ledger.kept(group.get("joints"), "", f"the {name}'s, in the model")
         else:
-            ledger.nothing(group.get("joints"), "one command has both: control.send(command, gripper=width)")
+            ledger.nothing(group.get("joints"), "one command has both: control.send(command, width=metres)")
         does = "arm.gripper.move(width in m)" if hand else "each command says it: JointTarget, JointVelocity, ..."
         ledger.changed(group.get("control_mode"), "", does)
 

@@ -52,7 +52,7 @@ def drive(out: Path, seconds: float = 60.0) -> Path:
         with arm.control(deadman=pad.hold("l2"), rate_hz=50) as control:
             for tick in rig.clock.rate(50):
                 motion, grip = teleop.step(pad.state(), tick.dt)
-                control.send(motion, gripper=grip)
+                control.send(motion, grip=grip)
                 if pad.finished or tick.elapsed > seconds:
                     break
         recorder.save(success=True, wait=True)
@@ -179,7 +179,7 @@ def drive_two(out: Path, rig_file: Path, arms: tuple[str, ...], info: dict[str, 
         for name in arms:
             with rig.robots[name].control(rate_hz=50) as control:
                 for tick in rig.clock.rate(50):
-                    control.send(hal.Twist([0.0, 0.0, 0.1]), gripper=0.0)
+                    control.send(hal.Twist([0.0, 0.0, 0.1]), grip=0.0)
                     if tick.elapsed > 0.6:
                         break
         recorder.save(wait=True)

@@ -69,7 +69,7 @@ def test_the_tour_turns_the_wrist_works_the_hand_and_lets_go_in_motion() -> None
             held = False
             for tick in rig.clock.rate(50):
                 motion, grip = teleop_.step(pad.state(), tick.dt)
-                control.send(motion, gripper=grip)
+                control.send(motion, grip=grip)
                 state = arm.state()
                 if held and not deadman.held:
                     speeds_at_release.append(abs(state.dq_set).max())

@@ -86,7 +86,7 @@ def test_the_gripper_works_as_any_other(rig: hal.Rig) -> None:
     assert hand.open().width == pytest.approx(hand.width_max, abs=1e-3)
     with arm.control() as control:
         for tick in rig.clock.rate(50):
-            control.send(JointTarget(arm.home), gripper=0.25)
+            control.send(JointTarget(arm.home), grip=0.25)
             if tick.elapsed > 0.5:
                 break
     assert hand.state().width_target == pytest.approx(0.75 * hand.width_max)
@@ -123,7 +123,7 @@ def test_an_arm_does_not_wait_for_a_gripper_that_is_slow_or_dead(rig: hal.Rig) -
             if turn == 50:
                 os.kill(child.pid, signal.SIGKILL)
             before = time.monotonic()
-            control.send(JointVelocity([0.1, 0, 0, 0, 0, 0, 0]), gripper=(turn // 5) % 2)
+            control.send(JointVelocity([0.1, 0, 0, 0, 0, 0, 0]), grip=(turn // 5) % 2)
             slowest, sent = max(slowest, time.monotonic() - before), sent + 1
             if tick.elapsed > 2.0:
                 break

@@ -23,7 +23,7 @@ def drive(steps: int) -> tuple[bytes, bytes]:
         trace, cube = [], []
         with arm.control(rate_hz=50) as control:
             for k, tick in enumerate(rig.clock.rate(50)):
-                control.send(JointTarget(start + 0.2 * np.sin(0.3 * tick.t * np.arange(1, 8))), gripper=(k // 50) % 2)
+                control.send(JointTarget(start + 0.2 * np.sin(0.3 * tick.t * np.arange(1, 8))), grip=(k // 50) % 2)
                 state = arm.state()
                 trace.append(np.concatenate([state.q, state.dq, state.q_set, state.tcp.position]))
                 cube.append(rig.world.pose("cube").position)

@@ -39,7 +39,7 @@ def drive(rig: hal.Rig, seconds: float) -> None:
                 pushes += 1
             try:
                 turning = hal.Twist([0.1, 0.1 * math.sin(3 * tick.elapsed), -0.1], [0.0, 0.0, 0.5])
-                control.send(turning, gripper=min(1.0, tick.elapsed / seconds))
+                control.send(turning, grip=min(1.0, tick.elapsed / seconds))
             except hal.MotionStopped:  # a busy machine, in real time
                 control.rearm()
 

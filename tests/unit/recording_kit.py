@@ -43,7 +43,7 @@ def drive(rig: Rig, seconds: float) -> None:
         for tick in rig.clock.rate(50):
             if tick.elapsed > seconds:
                 break
-            control.send(hal.Twist([0.0, 0.0, 0.05]), gripper=0.5)
+            control.send(hal.Twist([0.0, 0.0, 0.05]), grip=0.5)
 
 
 def record(recorder: Recorder, seconds: float, success: bool | None = True) -> None:

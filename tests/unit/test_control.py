@@ -389,7 +389,7 @@ def test_the_gripper_rests_while_a_stop_is_latched(rig: hal.Rig, arm: hal.Robot)
 def test_a_trip_and_the_end_of_a_session_leave_the_grip_alone(rig: hal.Rig, arm: hal.Robot) -> None:
     with arm.control() as control:
         for _ in turns(rig, 60):
-            control.send(JointVelocity([0.0] * 7), gripper=1.0)
+            control.send(JointVelocity([0.0] * 7), grip=1.0)
         let_pass(rig, 0.5)
         assert control.trip is Trip.COMMAND_LATE
     let_pass(rig, 0.5)
@@ -521,12 +521,56 @@ def test_a_warning_that_is_an_error_does_not_keep_the_arm_from_stopping(rig: hal
         pass
 
 
+@pytest.mark.parametrize(
+    ("asked", "expected"),
+    [({"grip": 0.0}, 0.08), ({"grip": 1}, 0.0), ({"width": 0.0}, 0.0), ({"width": np.float32(0.02)}, 0.02)],
+)
+def test_a_gripper_is_told_a_grip_or_a_width(
+    rig: hal.Rig, arm: hal.Robot, asked: dict[str, float], expected: float
+) -> None:
+    arm.gripper.grip(0.5)
+    with arm.control() as control:
+        for _ in turns(rig, 60):
+            control.send(JointVelocity([0.0] * 7), **asked)
+    assert arm.gripper.state().width_target == pytest.approx(expected, abs=1e-6)
+
+
+def test_the_former_name_of_a_grip_is_deprecated(rig: hal.Rig, arm: hal.Robot) -> None:
+    with arm.control() as control:
+        for _ in turns(rig, 60):
+            with pytest.warns(DeprecationWarning, match="grip="):
+                control.send(JointVelocity([0.0] * 7), gripper=1.0)
+    assert arm.gripper.state().width_target == 0.0
+
+
+@pytest.mark.parametrize(
+    "asked",
+    [
+        {"grip": 0.5, "width": 0.02},
+        {"width": 0.09},
+        {"width": -0.01},
+        {"width": float("nan")},
+        {"width": 40},
+        {"grip": "closed"},
+        {"grip": [0.1, 0.2]},
+        {"width": 10**400},
+    ],
+)
+def test_what_is_no_grip_and_no_width_sends_nothing(rig: hal.Rig, arm: hal.Robot, asked: dict[str, float]) -> None:
+    with arm.control() as control:
+        with pytest.raises(CommandError, match=r"grip|width"):
+            control.send(hal.Twist([0.1, 0.0, 0.0]), **asked)
+        rig.clock.sleep(0.05)
+        assert arm.state().target_seq == 0
+    assert arm.gripper.state().width_target != 0.02
+
+
 @pytest.mark.parametrize("grip", [float("nan"), -0.1, 1.1])
 def test_a_grip_that_cannot_be_sends_nothing_to_the_arm_either(rig: hal.Rig, arm: hal.Robot, grip: float) -> None:
     with arm.control() as control:
         for _ in range(3):
             with pytest.raises(CommandError):
-                control.send(hal.Twist([0.1, 0.0, 0.0]), gripper=grip)
+                control.send(hal.Twist([0.1, 0.0, 0.0]), grip=grip)
             rig.clock.sleep(0.02)
         assert not arm.state().dq_set.any()
         assert arm.state().target_seq == 0

@@ -48,7 +48,7 @@ def test_the_tour_drives_it_in_lock_step() -> None:
         with arm.control(deadman=pad.hold("l2"), rate_hz=50) as control:
             for tick in bench.clock.rate(50):
                 motion, grip = teleop.step(pad.state(), tick.dt)
-                control.send(motion, gripper=grip)
+                control.send(motion, grip=grip)
                 if tick.elapsed > 6.0:
                     break
         assert abs(arm.state().q - start).max() > 0.01

@@ -45,7 +45,7 @@ def two_arms(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
             for tick in rig.clock.rate(50):
                 if tick.elapsed > 0.3:
                     break
-                control.send(hal.Twist([0.0, 0.0, 0.1]), gripper=0.25)
+                control.send(hal.Twist([0.0, 0.0, 0.1]), grip=0.25)
         recorder.save(True, wait=True)
     return Dataset(out)
 

@@ -193,10 +193,10 @@ def test_a_grip_that_is_sent_while_a_stop_is_latched_moves_nothing(rig: hal.Rig,
         control.send(JointVelocity([0.0] * 7))
         rig.clock.sleep(0.02)
         rig.stop()
-        control.send(JointVelocity([0.0] * 7), gripper=1.0)  # the arm's servo has not seen the stop yet
+        control.send(JointVelocity([0.0] * 7), grip=1.0)  # the arm's servo has not seen the stop yet
         rig.clock.sleep(0.02)
         with pytest.raises(MotionStopped):
-            control.send(JointVelocity([0.0] * 7), gripper=1.0)
+            control.send(JointVelocity([0.0] * 7), grip=1.0)
     rig.clock.sleep(0.5)
     assert hand.state().width == pytest.approx(hand.width_max)
 

@@ -84,7 +84,7 @@ def test_an_arm_between_two_samples() -> None:
         arm = rig.robots["panda"]
         with arm.control(rate_hz=50) as control:
             for tick in rig.clock.rate(50):
-                control.send(hal.Twist([0.1, 0.0, 0.0], [0.0, 0.0, 0.5]), gripper=0.5)
+                control.send(hal.Twist([0.1, 0.0, 0.0], [0.0, 0.0, 0.5]), grip=0.5)
                 if tick.elapsed > 0.6:
                     break
             states = arm.states(rig.clock.now() - 0.3)

@@ -15,7 +15,7 @@ def test_pictures_and_states_of_the_same_time_in_real_time() -> None:
         seen = []
         with arm.control(rate_hz=50) as control:
             for tick in rig.clock.rate(50):
-                control.send(hal.Twist([0.1, 0.0, 0.0]), gripper=min(1.0, tick.elapsed))
+                control.send(hal.Twist([0.1, 0.0, 0.0]), grip=min(1.0, tick.elapsed))
                 if tick.elapsed > 0.5:
                     seen.append(rig.observe())
                 if tick.elapsed > 1.0:

@@ -31,7 +31,7 @@ def record(driver: str = "mock", seconds: float = 4.0, cube: hal.Pose | None = N
             rig.world.reset("cube", pose=cube)
         with arm.control(rate_hz=FPS) as control:
             for tick in rig.clock.rate(FPS):
-                control.send(twist(tick.elapsed), gripper=0.0 if tick.elapsed < seconds / 2 else 0.8)
+                control.send(twist(tick.elapsed), grip=0.0 if tick.elapsed < seconds / 2 else 0.8)
                 state, hand = arm.state(), arm.gripper.state()
                 stamps.append(state.stamp.t)
                 rows["setpoint"].append([*state.q_set, hand.width_target])

@@ -227,7 +227,7 @@ def lines() -> list[str]:
                 for tick in rig.clock.rate(RATE_HZ):
                     pad.poll_once(tick.t)
                     motion, grip = teleop.step(pad.state(), tick.dt)
-                    control.send(motion, gripper=grip)
+                    control.send(motion, grip=grip)
                     if next(doing, doing) is doing and tick.t >= until:
                         return
 
