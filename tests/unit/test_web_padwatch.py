@@ -63,7 +63,7 @@ def test_a_gap_between_two_messages_is_a_pad_that_was_gone() -> None:
 def test_no_gap_no_loss() -> None:
     pad = connected()
     for k in range(1, 50):
-        assert pad.take(message(T, 0.149 * k), T + 0.149 * k) == Verdict(None, T + 0.149 * k)
+        assert pad.take(message(T, 0.119 * k), T + 0.119 * k) == Verdict(None, T + 0.119 * k)
 
 
 def test_silence_is_noticed_without_a_message() -> None:
@@ -111,7 +111,7 @@ def test_a_backlog_after_a_stall_counts_only_from_where_it_is_fresh_and_after_a_
     verdicts = [pad.take(message(T, 0.02 * k), now) for k in range(1, 51)]
     fresh = [k for k, verdict in enumerate(verdicts, 1) if verdict.t_alive is not None]
     assert verdicts[0] == Verdict("its messages came late", dropped="its messages came late")
-    assert fresh == list(range(43, 51)), "those of the last 120 ms"
+    assert fresh == list(range(45, 51)), "those of the last 120 ms"
     assert all(verdict.gone is None for verdict in verdicts[1:])
 
 
