@@ -172,7 +172,7 @@ class Teleop:
         """What the controls do, a line each, for people."""
         mapping = self.mapping
         if pad.can_hold:
-            lines = [f"hold {mapping.deadman} to move; let go of it to stop"]
+            lines = [f"hold {mapping.deadman} to move; release it to stop"]
         else:
             lines = [f"each key is one small step, with {mapping.deadman} in it"]
         moves = [

@@ -12,7 +12,7 @@ import pytest
 from PIL import Image
 from web_kit import HEADER, WAIT, App, Page, camera, frame, run
 
-from hal.drivers.web.gallery import compress
+from hal.drivers.web.gallery import compress, smoothed
 from hal.drivers.web.pictures import Credit
 
 SCENE, WRIST = camera("scene"), camera("wrist", 40, 30)
@@ -223,3 +223,28 @@ def test_credit() -> None:
     credit.spend("b", 5)
     credit.drawn("b")
     assert list(credit.due(newest.__getitem__)) == [], "it has the newest one"
+
+
+def test_a_small_picture_has_no_staircases_and_no_lone_pixels_and_is_not_changed_itself() -> None:
+    """A steep edge as it is drawn with one sample a pixel, and a glint."""
+    row, column = np.mgrid[:60, :80]
+    picture = np.where((row > 0.3 * column + 10)[:, :, None], 200, 60).astype(np.uint8).repeat(3, axis=2)
+    picture[5, 60] = 255
+    before = picture.copy()
+    found = smoothed(picture)
+    assert (picture == before).all(), "what others get of this frame stays as it is"
+    steps = np.unique(found[:, 20:60, 0])
+    assert len(steps) > 6, "an edge passes through values in between"
+    assert steps.min() >= 60
+    assert steps.max() <= 200
+    assert found[5, 60].max() < 100, "a lone pixel becomes like those around it"
+    far = abs(row - 0.3 * column - 10) > 8
+    far[3:8, 58:63] = False
+    assert (found[far] == picture[far]).all(), "surfaces stay as they are"
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (2, 5), (3, 3), (48, 64)])
+def test_any_size_and_any_noise_can_be_smoothed(shape: tuple[int, int]) -> None:
+    noise = np.random.default_rng(1).integers(0, 256, (*shape, 3), np.uint8)
+    found = smoothed(noise)
+    assert (found.shape, found.dtype) == (noise.shape, noise.dtype)
