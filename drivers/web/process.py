@@ -4,8 +4,8 @@ It only ever reads the memory that the hosts write, and asks the app for everyth
 neither waits for the other. When it is killed, stopped or too busy, the pad's proof of life grows old, as with a cable
 that is pulled.
 
-It takes 3 % of a processor with two small cameras and a page that drives, and keeps the app's priority: a stop from a
-page is as urgent as the app itself.
+It takes 3 % of a processor with a page that drives, and 2 ms for each small picture that a page is shown. It keeps the
+app's priority: a stop from a page is as urgent as the app itself.
 """
 
 from __future__ import annotations
