@@ -99,7 +99,7 @@ class Session:
         if self.pad.finished:
             return f"{self.pad.describe()} was played to its end"
         if self.end is not None and self.rig.clock.now() >= self.end:
-            return f"finished (--duration {self.args.duration:g})"
+            return f"finished (--duration {self.args.duration})"
         return ""
 
     def _write_report(self, clean: bool) -> None:

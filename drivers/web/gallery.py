@@ -206,7 +206,7 @@ def smoothed(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
     sides = sum(part[row - 1, column - 1] for part in around)
     lone = np.flatnonzero(abs(corners + sides - 8 * light[row, column]) > _LONE * 8 * (high - low))
     mixed[lone] = sum(flat[place[lone] + down * width + right] for down, right in _AROUND) / len(_AROUND)
-    result = picture.copy()
+    result: NDArray[np.uint8] = picture.copy()
     result.reshape(-1, 3)[place] = mixed
     return result
 
