@@ -182,7 +182,7 @@ def test_a_recording_is_steered_from_the_page_and_a_mistake_in_the_app_costs_not
             assert "records nothing" in (await page.next("refused"))["why"], "the program did not ask for any"
             console(rig).on_action(take)
             await page.say(type="action", action="fail")
-            assert "made a mistake" in (await page.next("refused"))["why"]
+            assert "the program failed" in (await page.next("refused"))["why"]
             await page.say(type="action", action="record")
             await until(lambda: asked.qsize() == 2)
             await page.say(type="stop")
