@@ -34,8 +34,9 @@ def planned(args: argparse.Namespace, *more: str, cameras: Iterable[str] = ()) -
     if not args.dry_run:
         return plan
     check_everything(plan, args)
+    notes = [*plan.warnings, *_world_warnings(plan)]
     print(f"{plan.source} is in order; it would open:")
-    print("\n".join(f"  {line}" for line in [*listing(plan), *plan.warnings, *more]))
+    print("\n".join(f"  {line}" for line in [*listing(plan), *(f"note     {note}" for note in notes), *more]))
     return None
 
 
@@ -57,3 +58,20 @@ def check_everything(plan: Plan, args: argparse.Namespace) -> None:
     for chosen in check_opening(plan, args.pad, args.viewer, console):
         if chosen.spec.driver != "keyboard":
             registry.load(chosen.spec.driver, "gamepad")(chosen.spec)  # checks its options; opens nothing
+
+
+def _world_warnings(plan: Plan) -> list[str]:
+    """Load the simulated world, which touches no device, and return its warnings.
+
+    Raises:
+        ConfigError: It cannot be loaded, or arms start inside each other.
+    """
+    from hal import registry
+
+    if plan.world is None:
+        return []
+    world = registry.load(plan.world.driver, "world")(plan.world)
+    try:
+        return list(getattr(world, "warnings", ()))
+    finally:
+        world.close()

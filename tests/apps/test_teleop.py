@@ -92,6 +92,17 @@ def test_dry_run_lists_and_opens_nothing() -> None:
     assert "256x256" in done.stdout
 
 
+def test_dry_run_loads_the_simulated_world() -> None:
+    done = run_here(main, "--sim", "--dry-run")
+    assert "note     panda: impossible <inertia> in panda_link1, " in done.stdout
+    done = run_here(
+        main, "--sim", "--dry-run", "--set", "robots.second={model: panda, base: {position: [-0.5, 0, 0.6]}}"
+    )
+    assert done.returncode == 2
+    assert "robots.second: starts 0." in done.stderr
+    assert "inside robot 'panda'" in done.stderr
+
+
 def test_without_pybullet_one_line_says_what_to_do() -> None:
     """As on Python 3.12 or ARM, where PyBullet has no wheel."""
     code = (
