@@ -1,11 +1,14 @@
 """Time of `import hal` and of `apps/teleop.py --help`, beside an interpreter that does nothing and `import numpy`.
 
+And, in real time and without cameras, that of `hal.open`, and the memory of the process that steps the world.
+
 python benchmarks/start_up.py [--runs 7]
 """
 
 from __future__ import annotations
 
 import argparse
+import resource
 import statistics
 import subprocess
 import sys
@@ -29,6 +32,18 @@ def seconds(arguments: list[str]) -> float:
     return time.perf_counter() - start
 
 
+def host_memory() -> tuple[float, float]:
+    """Return how long `hal.open` takes, s, and how much memory the world's process holds, MB."""
+    import hal
+
+    start = time.perf_counter()
+    with hal.open("panda_table", sim=True, overrides=["cameras={}"], pad="none"):
+        spent = time.perf_counter() - start
+        (child,) = (int(pid) for pid in Path("/proc/thread-self/children").read_text().split())
+        pages = int(Path(f"/proc/{child}/statm").read_text().split()[1])
+    return spent, pages * resource.getpagesize() / 1e6
+
+
 def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description="time until something can be used")
@@ -38,6 +53,8 @@ def main() -> None:
     print(f"{'whole process, s':28s}{'median':>10s}{'min':>10s}{'max':>10s}")
     for name, values in found.items():
         print(f"{name:28s}{statistics.median(values):10.3f}{min(values):10.3f}{max(values):10.3f}")
+    opened, memory = zip(*(host_memory() for _ in range(runs)), strict=True)
+    print(f"hal.open, no cameras: {statistics.median(opened):.2f} s; the world's process: {memory[-1]:.0f} MB")
 
 
 if __name__ == "__main__":
