@@ -39,6 +39,12 @@ def parser() -> argparse.ArgumentParser:
     what.add_argument("--fps", type=int, default=30, metavar="N", help="rows a second (%(default)s)")
     what.add_argument("--seed", type=int, default=0, metavar="N", help="of where objects start (%(default)s)")
     what.add_argument("--cameras", metavar="NAMES", help="those that are kept, separated by commas (all)")
+    what.add_argument(
+        "--streams",
+        default="color,depth",
+        metavar="NAMES",
+        help="of each camera: color, depth, infrared, infrared_right, segmentation (%(default)s)",
+    )
     what.add_argument("--no-depth", dest="depth", action="store_false", help="leave depth out")
     what.add_argument("--codec", choices=["auto", "h264", "av1"], default="auto", help="of the videos (%(default)s)")
     what.add_argument(
@@ -101,7 +107,10 @@ def _main(args: argparse.Namespace) -> int:
         print(banner(rig), flush=True)
         robot, pad = chosen_devices(rig, args)
         recovered = recover(args.out) if Path(args.out).is_dir() else []
-        with Recorder(rig, args.out, args.fps, args.task, args.depth, cameras=cameras, codec=args.codec) as recorder:
+        streams = [name.strip() for name in args.streams.split(",")]
+        with Recorder(
+            rig, args.out, args.fps, args.task, args.depth, cameras=cameras, streams=streams, codec=args.codec
+        ) as recorder:
             notes = [*recovered, *recorder.notes]
             if demo:
                 judge = judge or lifts_cube(rig, robot)

@@ -86,6 +86,7 @@ def _camera(track: CameraTrack) -> dict[str, Any]:
         "K": info.K.tolist(),
         "distortion": info.distortion.tolist(),
         "depth_unit_m": setup.depth_unit,
+        "streams": [*setup.videos.values(), *setup.depths.values()],
         "depth_lossless": setup.depth_lossless if setup.depth_unit is not None else None,
     }
 

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import threading
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from ..errors import ConnectionLost, StaleStateError
-from .columns import CameraSetup
+from .columns import MORE_STREAMS, CameraSetup
 from .depth import unit_for
 
 if TYPE_CHECKING:
@@ -32,7 +32,7 @@ class CameraTrack:
     In real time the camera's own thread brings every frame; in lock-step the present is drawn.
     """
 
-    def __init__(self, camera: Camera, *, depth: bool, lock_step: bool) -> None:
+    def __init__(self, camera: Camera, *, streams: Collection[str], lock_step: bool) -> None:
         self.camera = camera
         self._lost: tuple[float, ConnectionLost] | None = None
         self.repeated = 0
@@ -43,15 +43,17 @@ class CameraTrack:
         self._detach: list[Callable[[], None]] = []
         self._put = -1
         spec, scale = camera.spec, camera.info.depth_scale
-        keeps = depth and "depth" in spec.streams
+        there = [stream for stream in spec.streams if stream in streams]
+        keeps = "depth" in there
         self.setup = CameraSetup(
             camera.name,
             spec.width,
             spec.height,
-            "color" in spec.streams,
+            "color" in there,
             (scale or unit_for(spec.depth_max)) if keeps else None,
             scale is not None,
             -1,
+            tuple(stream for stream in MORE_STREAMS if stream in there),
         )
 
     def begin(self) -> None:
@@ -98,9 +100,8 @@ class CameraTrack:
         if frame.stamp.seq == self._put:
             self.repeated += 1
             return
-        for image, place in ((frame.color, images.color), (frame.depth, images.depth)):
-            if place is None:
-                continue
+        for stream, place in images.items():
+            image = getattr(frame, stream)
             if image is None or image.shape != place.shape:
                 there = "none" if image is None else image.shape
                 raise ValueError(f"camera {self.camera.name} sends pictures of {there}, not {place.shape}")

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import DatasetError, DeviceNotFound
+from ..errors import DatasetError
 from .columns import BOOKKEEPING, STATE
 from .index import read_about, read_index, reading
 from .layout import Layout
@@ -45,20 +45,18 @@ def check_dataset(dataset: Dataset, episodes: Collection[int] | None = None) -> 
                     check()
                 except DatasetError as error:
                     yield error
-                except DeviceNotFound:  # that camera has no such pictures
-                    continue
 
 
 def _checks(episode: Episode, start: int | None) -> Iterator[Callable[[], object]]:
     yield partial(check_rows, episode, start)
     with contextlib.suppress(DatasetError):  # the first check found the same
         for camera in episode.cameras:
-            for read in (episode.frames, episode.depth):
-                yield partial(_read_all, read, camera)
+            for stream in episode.files(camera):
+                yield partial(_read_all, episode, camera, stream)
 
 
-def _read_all(read: Callable[[str], Iterator[Any]], camera: str) -> None:
-    deque(read(camera), maxlen=0)
+def _read_all(episode: Episode, camera: str, stream: str) -> None:
+    deque(episode.pictures(camera, stream), maxlen=0)
 
 
 def check_rows(episode: Episode, start: int | None) -> None:

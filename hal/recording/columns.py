@@ -9,7 +9,9 @@ __all__ = [
     "ACTION",
     "BOOKKEEPING",
     "GRID",
+    "MORE_STREAMS",
     "PAD",
+    "SEGMENTATION",
     "SETPOINT",
     "STATE",
     "TIMES",
@@ -29,6 +31,9 @@ TIMES = "observation.time."
 episode's first row."""
 GRID = f"{TIMES}grid"
 
+SEGMENTATION = "segmentation"
+MORE_STREAMS = ("infrared", "infrared_right", SEGMENTATION)
+"""Streams of a camera that are recorded on request."""
 BOOKKEEPING: dict[str, str] = {
     "timestamp": "float32",
     "frame_index": "int64",
@@ -66,11 +71,25 @@ class CameraSetup(NamedTuple):
     """Does the camera itself measure in that unit?"""
     seq: int
     """Which number of a row counts this camera's frames."""
+    more: Sequence[str] = ()
+    """Streams that are kept besides colour and depth: some of :data:`MORE_STREAMS`."""
+
+    @property
+    def videos(self) -> dict[str, str]:
+        """Names of the videos, each with its stream: ``wrist`` has the colour, ``wrist_infrared`` the infrared."""
+        color = {self.name: "color"} if self.color else {}
+        return color | {f"{self.name}_{stream}": stream for stream in self.more if stream != SEGMENTATION}
+
+    @property
+    def depths(self) -> dict[str, str]:
+        """Names of the files of lossless pictures, each with its stream: depth, segmentation."""
+        depth = {self.name: "depth"} if self.depth_unit is not None else {}
+        return depth | {f"{self.name}_{stream}": stream for stream in self.more if stream == SEGMENTATION}
 
 
-def video_key(camera: str) -> str:
-    """The dataset's key of a camera's video."""
-    return f"observation.images.{camera}"
+def video_key(video: str) -> str:
+    """Return the dataset's key of a video: of a camera's colour, or of ``<camera>_infrared``."""
+    return f"observation.images.{video}"
 
 
 def features_of(
@@ -80,8 +99,8 @@ def features_of(
     found = {column.key: column.feature for column in columns}
     features = {STATE: found.pop(STATE), ACTION: {**found[SETPOINT]}, **found}
     for camera in cameras:
-        if camera.color:
-            features[video_key(camera.name)] = {
+        for name in camera.videos:
+            features[video_key(name)] = {
                 "dtype": "video",
                 "shape": [camera.height, camera.width, 3],
                 "names": ["height", "width", "channels"],

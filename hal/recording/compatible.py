@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from ..errors import CommandError
-from .columns import CameraSetup
+from .columns import SEGMENTATION, CameraSetup
 from .index import check_next, read_about, read_index
 from .layout import Layout
 from .tables import VERSION
@@ -83,6 +83,9 @@ def _depth(old: Mapping[str, Any], new: Sequence[CameraSetup]) -> Iterator[str]:
     for camera in new:
         if camera.name not in old:
             continue
+        kept = SEGMENTATION in old[camera.name].get("streams", ()), SEGMENTATION in camera.more
+        if kept[0] != kept[1]:
+            yield f"segmentation of {camera.name} is kept {'there, and not here' if kept[0] else 'here, and not there'}"
         there, here = old[camera.name].get("depth_unit_m"), camera.depth_unit
         if there is None and here is not None:
             yield f"depth of {camera.name} is not kept there, and is here"

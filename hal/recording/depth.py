@@ -20,7 +20,7 @@ from zlib import crc32
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["DepthFile", "DepthReader", "to_units", "unit_for"]
+__all__ = ["DepthFile", "DepthReader", "numbers_to_units", "to_units", "unit_for"]
 
 _RECORD = struct.Struct("<II")  # length, checksum
 _LEVEL = 1
@@ -45,6 +45,14 @@ def to_units(depth: NDArray[np.float32], unit: float) -> Units:
     return units
 
 
+def numbers_to_units(numbers: NDArray[np.int32]) -> Units:
+    """Return numbers of bodies (H, W), -1 for none, as units. ValueError for a number above 65534."""
+    if numbers.size and not (numbers.min() >= -1 and numbers.max() < _MOST):
+        raise ValueError("a number of a body does not fit into 16 bits")
+    units: Units = (numbers + 1).astype("<u2")
+    return units
+
+
 class DepthFile:
     """Appends pictures to an open, unbuffered file."""
 
@@ -59,7 +67,11 @@ class DepthFile:
 
     def add(self, depth: NDArray[np.float32] | None) -> None:
         """One row's picture (H, W) in m; None for the same one again."""
-        payload = b"" if depth is None else self._compressor.compress(_shuffled(to_units(depth, self._unit)))
+        self.add_units(None if depth is None else to_units(depth, self._unit))
+
+    def add_units(self, units: Units | None) -> None:
+        """One row's picture (H, W) in units of the file; None for the same one again."""
+        payload = b"" if units is None else self._compressor.compress(_shuffled(units))
         _write(self._file, _RECORD.pack(len(payload), crc32(payload)) + payload)
 
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from ..errors import CommandError
 from ..host.groups import groups_of
 from .cameras import CameraTrack
-from .columns import TIMES
+from .columns import MORE_STREAMS, TIMES
 from .sampling import Sampler, movable
 
 if TYPE_CHECKING:
@@ -23,11 +23,16 @@ def check_rate(rig: Rig, fps: int) -> None:
         raise CommandError(f"fps must be at most {steps:g}, the steps of this simulation in a second, not {fps}")
 
 
-def chosen(rig: Rig, cameras: Collection[str] | None, depth: bool) -> tuple[Sampler, list[CameraTrack], list[str]]:
-    """Every arm and pad, and the cameras of these names, else all; and what a person should know of it.
+def chosen(
+    rig: Rig, cameras: Collection[str] | None, streams: Collection[str]
+) -> tuple[Sampler, list[CameraTrack], list[str]]:
+    """Return the sampler of every arm and pad, a track per camera of these names, else of all, and notes for a person.
 
     Raises CommandError for what cannot be recorded, DeviceNotFound, StaleStateError, ConnectionLost.
     """
+    if unknown := [stream for stream in streams if stream not in ("color", "depth", *MORE_STREAMS)]:
+        known = ", ".join(("color", "depth", *MORE_STREAMS))
+        raise CommandError(f"there is no stream {unknown[0]!r}; streams: {known}")
     if not rig.robots:
         raise CommandError("this rig has no arm to record")
     if odd := [name for name in movable(rig) if "/" in name]:
@@ -35,16 +40,22 @@ def chosen(rig: Rig, cameras: Collection[str] | None, depth: bool) -> tuple[Samp
     names = tuple(rig.cameras) if cameras is None else tuple(dict.fromkeys(cameras))
     tracks, notes = [], []
     for name in names:
-        track = CameraTrack(rig.cameras[name], depth=depth, lock_step=rig.lock_step)
+        track = CameraTrack(rig.cameras[name], streams=streams, lock_step=rig.lock_step)
         setup = track.setup
-        if setup.color and (setup.width % 2 or setup.height % 2):
+        if setup.videos and (setup.width % 2 or setup.height % 2):
             size = f"{setup.width}x{setup.height}"
             raise CommandError(f"a video has even sizes: change cameras.{name}.output, which is {size}")
-        if setup.color or setup.depth_unit is not None:
+        if setup.videos or setup.depths:
             tracks.append(track)
-        streams = rig.cameras[name].spec.streams
-        if left := [stream for stream in streams if stream not in ("color", "depth")]:
+        own = rig.cameras[name].spec.streams
+        if left := [stream for stream in own if stream in MORE_STREAMS and stream not in streams]:
             notes.append(f"camera {name}: {', '.join(left)} not recorded")
+        if missing := [stream for stream in streams if stream in MORE_STREAMS and stream not in own]:
+            notes.append(f"camera {name} has no {', '.join(missing)}")
+    for files in ([track.setup.videos for track in tracks], [track.setup.depths for track in tracks]):
+        file_names = [name for each in files for name in each]
+        if double := [name for name in file_names if file_names.count(name) > 1]:
+            raise CommandError(f"two streams would be called {double[0]}: rename a camera")
     sampler = Sampler(rig, [track.camera.name for track in tracks])
     for track in tracks:
         seq = sampler.place_of(f"{TIMES}camera.{track.camera.name}") + 2

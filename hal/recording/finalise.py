@@ -131,17 +131,17 @@ def _prepare(layout: Layout, rest: Rest, recovered: bool) -> list[tuple[str, str
     made.append((final / "data.parquet", layout.data(number)))
     stats: dict[str, Stats] = {key: column_stats(values) for key, values in columns.items()}
     for camera in rest.cameras:
-        if camera.color:
-            live = rest.folder / f"{camera.name}.mp4"
-            remux(live, final / f"{camera.name}.mp4", rows)
-            stats[video_key(camera.name)] = picture_stats(final / f"{camera.name}.mp4", rows, fps).stats()
-            made.append((final / f"{camera.name}.mp4", layout.video(camera.name, number)))
-        if camera.depth_unit is not None:
-            made.append((rest.folder / f"{camera.name}.depth", layout.depth(camera.name, number)))
+        for name in camera.videos:
+            video = final / f"{name}.mp4"
+            remux(rest.folder / video.name, video, rows)
+            stats[video_key(name)] = picture_stats(video, rows, fps).stats()
+            made.append((video, layout.video(name, number)))
+        for name in camera.depths:
+            made.append((rest.folder / f"{name}.depth", layout.depth(name, number)))
     write_json(final / "about.json", _about(rest, number, t_start, recovered))
     made.append((final / "about.json", layout.about(number)))
 
-    videos = [camera.name for camera in rest.cameras if camera.color]
+    videos = [name for camera in rest.cameras for name in camera.videos]
     entry = entry_table(number, rows, start, about["task"], videos, fps, stats)
     pq.write_table(entry, final / "entry.parquet", use_dictionary=False, write_statistics=False)
     made.append((final / "entry.parquet", layout.entry(number)))

@@ -69,6 +69,7 @@ class _Camera(_Model):
     K: Annotated[list[Annotated[list[float], Field(min_length=3, max_length=3)]], Field(min_length=3, max_length=3)]
     distortion: list[float]
     depth_unit_m: Annotated[FiniteFloat, Field(gt=0)] | None = None
+    streams: list[str] = []
 
 
 class _World(_Model):

@@ -2,8 +2,8 @@
 
 about.json          what is known when it begins: features, cameras, encoder, the rig's configuration
 rows.arrow          an Arrow stream, a batch per row
-CAMERA.mp4          a fragmented video
-CAMERA.depth        depth, see :mod:`.depth`
+CAMERA.mp4          a fragmented video of the colour; CAMERA_infrared.mp4 of the infrared
+CAMERA.depth        depth, see :mod:`.depth`; CAMERA_segmentation.depth, numbers of bodies
 reserve             room for the last word, should the disk be full by then
 """
 
@@ -19,12 +19,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .columns import CameraSetup
-from .depth import DepthFile, DepthReader, cut
+from .columns import MORE_STREAMS, SEGMENTATION, CameraSetup
+from .depth import DepthFile, DepthReader, cut, numbers_to_units
 from .index import plain_name
 from .layout import read_json, sync, write_json
 from .ring import Slot
-from .video import Encoder, VideoFile, count_frames, mend
+from .video import Encoder, VideoFile, as_rgb, count_frames, mend
 
 __all__ = ["ABOUT", "RESERVE", "ROWS", "LiveFolder", "Rest", "read_rest"]
 
@@ -52,14 +52,14 @@ class LiveFolder:
         self._rows = pa.ipc.new_stream(self._open(ROWS), self._schema)
         encoder, fps = Encoder(*about["encoder"]), int(about["fps"])
         self._videos = {
-            camera.name: VideoFile(self._open(f"{camera.name}.mp4"), encoder, camera.width, camera.height, fps)
+            name: VideoFile(self._open(f"{name}.mp4"), encoder, camera.width, camera.height, fps)
             for camera in self.cameras
-            if camera.color
+            for name in camera.videos
         }
         self._depths = {
-            camera.name: DepthFile(self._open(f"{camera.name}.depth"), camera.width, camera.height, camera.depth_unit)
+            name: DepthFile(self._open(f"{name}.depth"), camera.width, camera.height, camera.depth_unit or 1.0)
             for camera in self.cameras
-            if camera.depth_unit is not None
+            for name in camera.depths
         }
         self._seen: dict[str, float] = {}
         """Each camera's newest frame."""
@@ -77,12 +77,15 @@ class LiveFolder:
         for camera, images in zip(self.cameras, slot.images, strict=True):
             new = self._seen.get(camera.name) != slot.values[camera.seq]
             self._seen[camera.name] = float(slot.values[camera.seq])
-            if images.color is not None:
+            for name, stream in camera.videos.items():
                 if new:
-                    self._colors[camera.name] = images.color.copy()
-                self._videos[camera.name].add(self._colors[camera.name])
-            if images.depth is not None:
-                self._depths[camera.name].add(images.depth if new else None)
+                    self._colors[name] = as_rgb(images[stream])
+                self._videos[name].add(self._colors[name])
+            for name, stream in camera.depths.items():
+                if stream == SEGMENTATION:
+                    self._depths[name].add_units(numbers_to_units(images[stream]) if new else None)
+                else:
+                    self._depths[name].add(images[stream] if new else None)
         row = self._pa.FixedSizeListArray.from_arrays(self._pa.array(slot.values), len(slot.values))
         self._rows.write_batch(self._pa.record_batch([row], schema=self._schema))
         self.count += 1
@@ -135,25 +138,27 @@ class Rest:
         self.cameras = [CameraSetup(*camera) for camera in self.about["cameras_kept"]]
         for camera in self.cameras:
             plain_name(camera.name)
+            if not set(camera.more) <= set(MORE_STREAMS):
+                raise ValueError(f"{camera.name} has unknown streams: {camera.more}")
         rows = list(_rows(folder / ROWS))
         lengths = [len(rows), *(self._pictures(camera) for camera in self.cameras)]
         self.length = min(lengths)
         self.rows = np.array(rows[: self.length])
         """(rows, numbers)"""
         for camera in self.cameras:
-            if camera.depth_unit is not None and self.length:
-                cut(folder / f"{camera.name}.depth", self.length)
+            for name in camera.depths if self.length else ():
+                cut(folder / f"{name}.depth", self.length)
 
     def _pictures(self, camera: CameraSetup) -> int:
         """Of how many rows this camera's pictures are there."""
         found = []
         try:
-            if camera.color:
-                video = self.folder / f"{camera.name}.mp4"
+            for name in camera.videos:
+                video = self.folder / f"{name}.mp4"
                 mend(video)
                 found.append(count_frames(video))
-            if camera.depth_unit is not None:
-                found.append(len(DepthReader(self.folder / f"{camera.name}.depth")))
+            for name in camera.depths:
+                found.append(len(DepthReader(self.folder / f"{name}.depth")))
         except (FileNotFoundError, ValueError):  # it was killed before there was any
             return 0
         return min(found, default=1 << 62)

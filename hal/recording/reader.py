@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import CommandError, DatasetError, DeviceNotFound
-from .columns import TIMES, video_key
+from .columns import MORE_STREAMS, SEGMENTATION, TIMES, video_key
 from .depth import DepthReader
 from .index import read_about, read_index, reading, repair_command
 from .layout import Layout
@@ -124,32 +124,68 @@ class Episode:
 
     def frames(self, camera: str) -> Iterator[NDArray[np.uint8]]:
         """Return the colour picture (H, W, 3) RGB of every row. DeviceNotFound where none was kept."""
-        path = self.video_file(camera)
-        if path is None:
-            raise self._not_kept(camera, "colour")
-        shape = self._meta["features"][video_key(camera)]["shape"]
-        return self._each(path, read_video(path), tuple(shape))
+        return self.pictures(camera, "color")
 
     def depth(self, camera: str) -> Iterator[NDArray[np.float32]]:
         """Return the depth picture (H, W) of every row, m; 0 for what was not measured. DeviceNotFound where none was
         kept."""
-        path = self._depth_file(camera)
+        return self.pictures(camera, "depth")
+
+    def pictures(self, camera: str, stream: str) -> Iterator[NDArray[Any]]:
+        """Return a stream's picture of every row, of the type and shape that it has in :class:`~hal.types.Frame`.
+
+        Args:
+            camera: Name of the camera.
+            stream: ``color``, ``depth``, ``infrared``, ``infrared_right`` or ``segmentation``. Colour and infrared
+                are kept as video, so their values are off by some units.
+
+        Raises:
+            DeviceNotFound: No such stream was kept.
+            DatasetError: The file is missing, or its first line is damaged. Further damage is raised by the iterator.
+        """
+        path = self.files(camera).get(stream)
         if path is None:
-            raise self._not_kept(camera, "depth")
+            there = ", ".join(self.cameras) or "none"
+            kept = ", ".join(self.files(camera)) or "nothing"
+            raise DeviceNotFound(
+                f"episode {self.number} has no {stream} of a camera {camera!r}, but {kept}; cameras: {there}"
+            )
+        if path.suffix == ".mp4":
+            height, width, _ = self._meta["features"][path.parent.parent.name]["shape"]
+            if stream == "color":
+                return self._each(path, read_video(path), (height, width, 3))
+            return self._each(path, (picture[:, :, 0] for picture in read_video(path)), (height, width))
         with reading(self._layout.root, path, self.number):
             reader = DepthReader(path)
-        return self._each(path, iter(reader), reader.shape)
+        if stream == "depth":
+            return self._each(path, iter(reader), reader.shape)
+        return self._each(path, (units.astype(np.int32) - 1 for units in reader.units()), reader.shape)
+
+    def files(self, camera: str) -> dict[str, Path]:
+        """Return where the pictures of each stream of a camera are; empty for a camera that was not kept."""
+        known, features = self.info["cameras"].get(camera), self._meta["features"]
+        if known is None:
+            return {}
+        videos = {"color": camera} | {stream: f"{camera}_{stream}" for stream in MORE_STREAMS}
+        found = {
+            stream: self._layout.video(name, self.number)
+            for stream, name in videos.items()
+            if video_key(name) in features
+        }
+        if known.get("depth_unit_m") is not None:
+            found["depth"] = self._layout.depth(camera, self.number)
+        if SEGMENTATION in known.get("streams", ()):
+            found[SEGMENTATION] = self._layout.depth(f"{camera}_{SEGMENTATION}", self.number)
+        return found
 
     def check_pictures(self) -> None:
         """Raise DatasetError where a video or depth file is missing or does not have a picture per row.
 
         Pictures are counted and not decoded, which takes milliseconds.
         """
-        for camera in self.cameras:
-            for path, count in ((self.video_file(camera), count_frames), (self._depth_file(camera), _count_depth)):
-                if path is not None:
-                    with reading(self._layout.root, path, self.number):
-                        self._check_count(path, count(path))
+        for path in (path for camera in self.cameras for path in self.files(camera).values()):
+            with reading(self._layout.root, path, self.number):
+                self._check_count(path, count_frames(path) if path.suffix == ".mp4" else len(DepthReader(path)))
 
     def _each(self, path: Path, pictures: Iterator[P], shape: tuple[int, ...]) -> Iterator[P]:
         """Yield one picture per row, each of ``shape``."""
@@ -169,19 +205,6 @@ class Episode:
             found = f"has {count} pictures" if count < self.length else "has more pictures than rows"
             raise self._wrong(path, f"{found}, for {self.length} rows")
 
-    def video_file(self, camera: str) -> Path | None:
-        """Return where a camera's video is; None where none was kept."""
-        kept = camera in self.info["cameras"] and video_key(camera) in self._meta["features"]
-        return self._layout.video(camera, self.number) if kept else None
-
-    def _depth_file(self, camera: str) -> Path | None:
-        kept = self.info["cameras"].get(camera, {}).get("depth_unit_m") is not None
-        return self._layout.depth(camera, self.number) if kept else None
-
-    def _not_kept(self, camera: str, what: str) -> DeviceNotFound:
-        there = ", ".join(self.cameras) or "none"
-        return DeviceNotFound(f"episode {self.number} has no {what} of a camera {camera!r}; cameras: {there}")
-
     def _wrong(self, path: Path, what: str) -> DatasetError:
         return DatasetError(what, file=self._name(path), episode=self.number)
 
@@ -193,10 +216,6 @@ class Episode:
 
     def __repr__(self) -> str:
         return f"<Episode {self.number}: {self.length} rows at {self.fps} Hz, {self.task!r}>"
-
-
-def _count_depth(path: Path) -> int:
-    return len(DepthReader(path))
 
 
 class Dataset:

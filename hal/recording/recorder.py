@@ -60,9 +60,11 @@ class RecorderStatus(NamedTuple):
 class Recorder:
     """Records episodes of ``rig`` into the dataset in the folder ``out``, ``fps`` rows a second.
 
-    ``cameras`` are the names of those that are kept, else all. ``depth=False`` leaves depth out. ``codec`` is ``h264``,
-    ``av1`` or ``auto``. Below ``warn_free`` bytes of free disk :meth:`status` says so, below ``stop_free`` an episode
-    ends. Nothing is written before :meth:`start`. Use it in a ``with`` statement, inside that of the rig.
+    ``cameras`` are the names of those that are kept, else all. ``streams`` are those that are kept of each camera that
+    has them: some of ``color``, ``depth``, ``infrared``, ``infrared_right``, ``segmentation``; ``depth=False`` leaves
+    depth out. ``codec`` is ``h264``, ``av1`` or ``auto``. Below ``warn_free`` bytes of free disk :meth:`status` says
+    so, below ``stop_free`` an episode ends. Nothing is written before :meth:`start`. Use it in a ``with`` statement,
+    inside that of the rig.
 
     Raises DriverMissing, CommandError for whatever would not work later, StaleStateError, ConnectionLost.
     """
@@ -76,6 +78,7 @@ class Recorder:
         depth: bool = True,
         *,
         cameras: Collection[str] | None = None,
+        streams: Collection[str] = ("color", "depth"),
         codec: str = "auto",
         warn_free: int = 5_000_000_000,
         stop_free: int = 1_000_000_000,
@@ -89,7 +92,9 @@ class Recorder:
         self.task = task
         """Of the episodes to come."""
         self.root = Layout(out).root
-        self._sampler, self._tracks, self.notes = chosen(rig, cameras, depth)
+        self._sampler, self._tracks, self.notes = chosen(
+            rig, cameras, [stream for stream in streams if depth or stream != "depth"]
+        )
         """``notes``: what a person should know. What is not kept, what was recovered."""
         self._warn_free = warn_free
         setups = [track.setup for track in self._tracks]

@@ -109,7 +109,7 @@ def _rebuild(layout: Layout) -> int:
         if task != episode.task:
             raise DatasetError(f"the task is {episode.task!r}, and {task!r} in other episodes", episode=episode.number)
         stats = _stats(layout, episode)
-        videos = [camera for camera in episode.cameras if video_key(camera) in stats]
+        videos = [key.removeprefix(video_key("")) for key in stats if key not in episode.columns]
         entry = entry_table(episode.number, episode.length, start, task, videos, episode.fps, stats)
         write_table(layout.entry(episode.number), entry)
         total = {key: merged(total.get(key), found) for key, found in stats.items()}
@@ -149,8 +149,8 @@ def _stats(layout: Layout, episode: Episode) -> dict[str, Stats]:
     rows = episode.length
     stats = {key: column_stats(values.reshape(rows, -1)) for key, values in episode.columns.items()}
     episode.check_pictures()
-    for camera in episode.cameras:
-        if (path := episode.video_file(camera)) is not None:
+    for path in (path for camera in episode.cameras for path in episode.files(camera).values()):
+        if path.suffix == ".mp4":
             with reading(layout.root, path, episode.number):
-                stats[video_key(camera)] = picture_stats(path, rows, episode.fps).stats()
+                stats[path.parent.parent.name] = picture_stats(path, rows, episode.fps).stats()
     return stats

@@ -8,8 +8,8 @@ space, what went wrong) stands beside it, so that nobody has to ask.
 from __future__ import annotations
 
 import struct
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Iterator, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,11 +26,24 @@ _HEAD = 2048
 _ALIGNMENT = 64
 
 
-class Images(NamedTuple):
-    """One camera's pictures, as they lie in a slot; None for what is not kept."""
+Images = dict[str, NDArray[Any]]
+"""One camera's pictures in a slot, by their streams; only those that are kept."""
 
-    color: NDArray[np.uint8] | None
-    depth: NDArray[np.float32] | None
+_TYPES: dict[str, tuple[type[np.generic], tuple[int, ...]]] = {
+    "color": (np.uint8, (3,)),
+    "depth": (np.float32, ()),
+    "infrared": (np.uint8, ()),
+    "infrared_right": (np.uint8, ()),
+    "segmentation": (np.int32, ()),
+}
+"""Type and further dimensions of each stream's pictures."""
+
+
+def _streams(camera: CameraSetup) -> Iterator[tuple[str, type[np.generic], tuple[int, ...]]]:
+    """Yield each stream that is kept, and type and shape of its pictures."""
+    for stream in (*camera.videos.values(), *camera.depths.values()):
+        dtype, more = _TYPES[stream]
+        yield stream, dtype, (camera.height, camera.width, *more)
 
 
 class Slot(NamedTuple):
@@ -53,16 +66,12 @@ class RowRing:
             place += _aligned(values.nbytes)
             images = []
             for camera in cameras:
-                color = depth = None
-                if camera.color:
-                    shape = (camera.height, camera.width, 3)
-                    color = np.frombuffer(buffer, np.uint8, int(np.prod(shape)), place).reshape(shape)
-                    place += _aligned(color.nbytes)
-                if camera.depth_unit is not None:
-                    flat = (camera.height, camera.width)
-                    depth = np.frombuffer(buffer, np.float32, int(np.prod(flat)), place).reshape(flat)
-                    place += _aligned(depth.nbytes)
-                images.append(Images(color, depth))
+                pictures: Images = {}
+                for stream, dtype, shape in _streams(camera):
+                    picture = np.frombuffer(buffer, dtype, int(np.prod(shape)), place).reshape(shape)
+                    pictures[stream] = picture
+                    place += _aligned(picture.nbytes)
+                images.append(pictures)
             self._slots.append(Slot(values, tuple(images)))
 
     @staticmethod
@@ -70,8 +79,8 @@ class RowRing:
         """Bytes that it takes."""
         row = _aligned(8 * width)
         for camera in cameras:
-            pixels = camera.width * camera.height
-            row += _aligned(3 * pixels) * camera.color + _aligned(4 * pixels) * (camera.depth_unit is not None)
+            for _, dtype, shape in _streams(camera):
+                row += _aligned(np.dtype(dtype).itemsize * int(np.prod(shape)))
         return _HEAD + slots * row
 
     def _get(self, place: int) -> int:

@@ -16,7 +16,17 @@ from numpy.typing import NDArray
 from ..errors import CommandError, NotSupported
 from .stats import PictureStats
 
-__all__ = ["Encoder", "VideoFile", "choose_encoder", "count_frames", "mend", "picture_stats", "read_video", "remux"]
+__all__ = [
+    "Encoder",
+    "VideoFile",
+    "as_rgb",
+    "choose_encoder",
+    "count_frames",
+    "mend",
+    "picture_stats",
+    "read_video",
+    "remux",
+]
 
 Picture = NDArray[np.uint8]
 
@@ -93,6 +103,11 @@ class VideoFile:
         """Write what the encoder still holds."""
         self._container.mux(self._stream.encode())
         self._container.close()
+
+
+def as_rgb(picture: Picture) -> Picture:
+    """Return a copy (H, W, 3) of a picture, which may be a grey one (H, W)."""
+    return picture.copy() if picture.ndim == 3 else np.repeat(picture[:, :, None], 3, axis=2)
 
 
 def mend(path: Path) -> None:

@@ -12,10 +12,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from recording_kit import CAMERAS, check_layout, drive, mock_rig, record
+from recording_kit import CAMERAS, check_layout, drive, mock_rig, record, small
 
+import hal
 from hal.errors import CommandError, DeviceNotFound, HalError
-from hal.recording import Dataset, Recorder, recover
+from hal.recording import Dataset, Recorder, recover, repair
+from hal.recording.checking import check_dataset
 
 
 @pytest.fixture(scope="module")
@@ -254,3 +256,45 @@ def test_the_package_imports_without_its_libraries() -> None:
     )
     said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
     assert said.count("pip install 'robot-hal[record]'") == 3
+
+
+def test_infrared_and_segmentation_are_recorded_on_request(tmp_path: Path) -> None:
+    pytest.importorskip("pybullet", reason="pip install 'robot-hal[sim]'")
+    out, streams = tmp_path / "out", "[color, depth, infrared, segmentation]"
+    overrides = [*small(), f"cameras.scene.streams={streams}"]
+    drawn = []
+    with hal.open("panda_table", sim=True, clock="lock_step", pad="none", overrides=overrides) as rig:
+        with Recorder(rig, tmp_path / "plain") as recorder:
+            assert "camera scene: infrared, segmentation not recorded" in recorder.notes
+        with Recorder(rig, out, streams=["color", "infrared", "segmentation"]) as recorder:
+            assert "camera wrist has no infrared, segmentation" in recorder.notes
+            recorder.start()
+            for _ in range(6):
+                drawn.append(rig.cameras["scene"].read())
+                rig.clock.sleep(1 / 30)
+            recorder.save(wait=True)
+        with pytest.raises(CommandError, match="infrared.*segmentation of scene is kept there, and not here"):
+            Recorder(rig, out, streams=["color"])
+        with pytest.raises(CommandError, match="no stream 'thermal'; streams: color, depth, infrared"):
+            Recorder(rig, out, streams=["thermal"])
+    info = check_layout(out)
+    assert info["features"]["observation.images.scene_infrared"]["shape"] == [48, 64, 3]
+    assert "observation.images.wrist_infrared" not in info["features"]
+    episode = Dataset(out).episodes[0]
+    assert list(episode.files("scene")) == ["color", "infrared", "segmentation"]
+    numbers, infrared = (list(episode.pictures("scene", stream)) for stream in ("segmentation", "infrared"))
+    assert len(numbers) == len(infrared) == episode.length
+    assert numbers[0].dtype == np.int32
+    assert np.array_equal(numbers[0], drawn[0].segmentation)
+    assert len(np.unique(numbers[0])) > 3, "several bodies are seen"
+    assert infrared[0].dtype == np.uint8
+    assert np.abs(infrared[0].astype(float) - drawn[0].infrared).mean() < 6.0
+    assert np.ptp(infrared[0]) > 30
+    for camera, stream in (("scene", "depth"), ("wrist", "segmentation"), ("wrist", "infrared")):
+        with pytest.raises(DeviceNotFound, match=f"no {stream} of a camera '{camera}'"):
+            episode.pictures(camera, stream)
+    assert list(check_dataset(Dataset(out))) == []
+    (out / "meta/info.json").unlink()
+    repair(out)
+    assert check_layout(out) == info
+    assert list(check_dataset(Dataset(out))) == []
