@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from .arguments import frozen, vector
 from .errors import CommandError
-from .pose import Pose
+from .pose import Pose, tcp_pose
 
 __all__ = [
     "CartesianTarget",
@@ -125,14 +125,12 @@ class JointTorque:
 
 @dataclass(frozen=True, slots=True, eq=False, init=False)
 class CartesianTarget:
-    """Bring the tcp to ``pose``; inverse kinematics runs in the servo."""
+    """Bring the tcp to ``pose``, which needs an orientation; inverse kinematics runs in the servo."""
 
     pose: Pose
 
     def __init__(self, pose: Pose) -> None:
-        if not isinstance(pose, Pose):
-            raise CommandError(f"pose must be a hal.Pose, not {type(pose).__name__}")
-        _set(self, "pose", pose)
+        _set(self, "pose", tcp_pose("pose", pose))
 
 
 @dataclass(frozen=True, slots=True, eq=False, init=False)

@@ -299,18 +299,9 @@ class Control:
         if gripper is None:
             raise NotSupported(f"{self.robot.name} has no gripper")
         ((name, value),) = asked.items()
-        try:
-            number = float(value)
-        except (TypeError, ValueError, OverflowError):
-            raise CommandError(f"{name} must be one number, not {value!r}") from None
-        if name != "width":
-            return gripper.width_of(number)
-        if not 0.0 <= number <= gripper.width_max:
-            raise CommandError(
-                f"width is the distance between the fingers, 0 to {gripper.width_max:g} m here, not {value}; "
-                "for a share of it pass grip= (0 open to 1 closed)"
-            )
-        return number
+        if name == "width":
+            return number(name, value, "m", least=0.0, most=gripper.width_max)
+        return gripper.width_of(number(name, value))
 
     def _send_width(self, width: float, waiting: bool, reasons: list[str]) -> None:
         gripper = self.robot.gripper

@@ -23,7 +23,8 @@ __all__ = ["move_to"]
 
 def move_to(
     robot: Robot,
-    target: ArrayLike | Pose,
+    target: ArrayLike | Pose | None,
+    position: ArrayLike | None,
     *,
     deadman: Deadman | None,
     unattended: bool,
@@ -38,9 +39,14 @@ def move_to(
     if timeout is not None:
         number("timeout", timeout, "s", least=0.0, above=True)
     check_deadman(deadman)
+    if (target is None) == (position is None):
+        raise CommandError("pass move_to either a target (joint positions or a hal.Pose) or position=")
+    if position is not None:
+        target = Pose(vector("position", position, 3), robot.state().tcp_set.orientation)
     goal = robot.ik(target) if isinstance(target, Pose) else vector("target", target)
     if goal.size != robot.n:
-        raise CommandError(f"{robot.name} has {robot.n} joints; the target has {goal.size}")
+        hint = "; for a position of the tcp pass position=" if goal.size == 3 else ""
+        raise CommandError(f"{robot.name} has {robot.n} joints; the target has {goal.size}{hint}")
     limits = robot.limits
     outside = np.flatnonzero((goal < limits.lower) | (goal > limits.upper))
     if outside.size:

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from .arguments import frozen, vector
 from .errors import CommandError
 
-__all__ = ["Pose", "frozen", "matrix_to_quaternion", "quaternion_to_matrix", "rpy_to_matrix"]
+__all__ = ["Pose", "frozen", "tcp_pose", "matrix_to_quaternion", "quaternion_to_matrix", "rpy_to_matrix"]
 
 Array = NDArray[np.float64]
 
@@ -68,20 +68,36 @@ def rpy_to_matrix(roll: float, pitch: float, yaw: float) -> Array:
     )
 
 
+_UNTURNED = frozen(np.array([0.0, 0.0, 0.0, 1.0]))
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Pose:
-    """A position (3,) in m and an orientation (4,) as a unit quaternion x, y, z, w. Arrays are read-only."""
+    """A position (3,) in m and an orientation (4,) as a unit quaternion x, y, z, w. Arrays are read-only.
+
+    Without an orientation it is not turned, which is what most objects of a scene want. Where a tcp is to go must say
+    how the hand points: there such a pose is a CommandError (see :attr:`has_orientation`).
+    """
 
     position: Array
     orientation: Array
 
-    def __init__(self, position: ArrayLike = (0.0, 0.0, 0.0), orientation: ArrayLike = (0.0, 0.0, 0.0, 1.0)) -> None:
-        p, q = vector("position", position, 3), vector("orientation", orientation, 4)
+    def __init__(self, position: ArrayLike = (0.0, 0.0, 0.0), orientation: ArrayLike | None = None) -> None:
+        p = vector("position", position, 3)
+        object.__setattr__(self, "position", p)
+        if orientation is None:
+            object.__setattr__(self, "orientation", _UNTURNED)
+            return
+        q = vector("orientation", orientation, 4)
         norm = float(np.linalg.norm(q))
         if not 1e-9 < norm < np.inf:
             raise CommandError(f"orientation must be a unit quaternion x, y, z, w, not {q.tolist()}")
-        object.__setattr__(self, "position", p)
         object.__setattr__(self, "orientation", frozen(q / norm))
+
+    @property
+    def has_orientation(self) -> bool:
+        """Whether an orientation was given."""
+        return self.orientation is not _UNTURNED
 
     @classmethod
     def trusted(cls, position: Array, orientation: Array) -> Pose:
@@ -145,3 +161,15 @@ class Pose:
             return "[" + ", ".join(f"{value:.4g}" for value in values) + "]"
 
         return f"Pose({text(self.position)}, {text(self.orientation)})"
+
+
+def tcp_pose(name: str, pose: object) -> Pose:
+    """Return ``pose`` if it says where a tcp is to be and how the hand points there; ``name`` is for the message."""
+    if not isinstance(pose, Pose):
+        raise CommandError(f"{name} must be a hal.Pose, not {type(pose).__name__}")
+    if not pose.has_orientation:
+        raise CommandError(
+            f"{name} has a position and no orientation: pass hal.Pose(position, orientation) with a quaternion "
+            "x, y, z, w, for example arm.state().tcp.orientation; arm.move_to(position=...) keeps the present one"
+        )
+    return pose

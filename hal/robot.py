@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from .arguments import number, vector
-from .errors import CommandError, ConnectionLost, NotSupported, StaleStateError
-from .pose import Pose, frozen
+from .errors import ConnectionLost, NotSupported, StaleStateError
+from .pose import Pose, frozen, tcp_pose
 from .types import Fault, RobotState, RobotStatus
 
 if TYPE_CHECKING:
@@ -272,8 +272,7 @@ class Robot:
 
         Raises Unreachable, with the residual in m and rad, where there are none.
         """
-        if not isinstance(pose, Pose):
-            raise CommandError(f"ik takes a hal.Pose of the tcp in the base frame, not a {type(pose).__name__}")
+        pose = tcp_pose("pose", pose)
         seed = self.state().q if q_seed is None else vector("q_seed", q_seed, self.n)
         return self.kinematics.solve(pose, seed)
 
@@ -298,8 +297,9 @@ class Robot:
 
     def move_to(
         self,
-        target: ArrayLike | Pose,
+        target: ArrayLike | Pose | None = None,
         *,
+        position: ArrayLike | None = None,
         deadman: Deadman | None = None,
         unattended: bool = False,
         speed: float | None = None,
@@ -307,18 +307,34 @@ class Robot:
         timeout: float | None = None,
         patience: float = 60.0,
     ) -> RobotState:
-        """Move to joint positions (n,) or to a tcp pose in the base frame, straight in joint space; blocks.
+        """Move to joint positions or to a tcp pose, straight in joint space; block until the arm is there.
 
-        ``speed`` is a share of the joint speed limits, up to 1 (``move_speed`` of the rig, 0.1, by default); the tcp
-        stays below the rig's ``tcp_speed`` all the same. With a dead-man it waits until that is held, and pauses while
-        it is not, for up to ``patience`` s. Raises CommandError, Unreachable, MotionStopped after a trip or when nobody
-        held the dead-man for so long, and TimeoutError after ``timeout`` s.
+        Args:
+            target: Joint positions (n,) in rad, or a pose of the tcp in the base frame with an orientation.
+            position: Position (3,) of the tcp in the base frame, m, instead of ``target``; its orientation stays as it
+                is.
+            deadman: The arm waits until it is held, and pauses while it is not.
+            unattended: Move an arm that really moves without a dead-man.
+            speed: Share of the joint speed limits, up to 1; the rig's ``move_speed`` (0.1) by default.
+            tcp_speed: Greatest speed of the tcp, m/s; the rig's by default, which it cannot exceed.
+            timeout: After so many seconds the motion ends with TimeoutError; None waits for ever.
+            patience: For how long the dead-man may be released, s.
+
+        Returns:
+            The state on arrival.
+
+        Raises:
+            CommandError: For a target that makes no sense, or that is outside the limits or the workspace.
+            Unreachable: For a pose without joint positions.
+            MotionStopped: After a trip, or when the dead-man was released for longer than ``patience``.
+            TimeoutError: After ``timeout``.
         """
         from .moving import move_to
 
         return move_to(
             self,
             target,
+            position,
             deadman=deadman,
             unattended=unattended,
             speed=speed,

@@ -324,7 +324,7 @@ def test_move_to_blocks_keeps_its_speed_and_checks_its_goal(rig: hal.Rig, arm: h
     with pytest.raises(CommandError, match="7 joints; the target has 3"):
         arm.move_to([0, 0, 0])
     with pytest.raises(hal.Unreachable, match="m, "):
-        arm.move_to(hal.Pose([2.5, 0, 0.5]))
+        arm.move_to(hal.Pose([2.5, 0, 0.5], [1, 0, 0, 0]))
     with pytest.raises(TimeoutError, match="did not reach"):
         arm.move_to(arm.home, timeout=0.2)
     assert arm.state().status is RobotStatus.IDLE
@@ -376,6 +376,29 @@ def test_the_gripper_takes_metres_and_fractions(rig: hal.Rig, arm: hal.Robot) ->
             gripper.start(bad)
     with pytest.raises(CommandError, match="from 0 .open. to 1"):
         gripper.grip(1.5)
+
+
+def test_a_pose_without_orientation_is_no_goal_for_a_hand(arm: hal.Robot) -> None:
+    pose = hal.Pose(arm.state().tcp.position)
+    assert not pose.has_orientation
+    for ask in (arm.move_to, arm.ik, hal.CartesianTarget):
+        with pytest.raises(CommandError, match=r"move_to\(position="):
+            ask(pose)
+    with pytest.raises(CommandError, match="position="):
+        arm.move_to(pose.position)
+    pointing_up = hal.Pose(pose.position, [0, 0, 0, 1])  # said on purpose
+    assert hal.CartesianTarget(pointing_up).pose.has_orientation
+
+
+def test_a_move_to_a_position_keeps_the_orientation(arm: hal.Robot) -> None:
+    before = arm.state().tcp
+    after = arm.move_to(position=before.position + [0.0, 0.1, -0.1], speed=1.0).tcp
+    assert after.distance(hal.Pose(before.position + [0.0, 0.1, -0.1], before.orientation)) == pytest.approx(
+        (0.0, 0.0), abs=1e-4
+    )
+    for wrong in ({}, {"target": arm.home, "position": before.position}, {"position": [0.1, 0.2]}):
+        with pytest.raises(CommandError, match="position"):
+            arm.move_to(**wrong)
 
 
 def test_the_gripper_rests_while_a_stop_is_latched(rig: hal.Rig, arm: hal.Robot) -> None:
