@@ -48,7 +48,8 @@ class Reading(NamedTuple):
     tau: Floats | None = None
     """Joint torques, Nm."""
     q_commanded: Floats | None = None
-    """The set-point that the device says it took last; the servo re-anchors to it when it is not what was sent."""
+    """The set-point that the device says it took last, rad: how the servo notices that one was lost. None where the
+    device cannot say."""
     dq_commanded: Floats | None = None
     tau_ext: Floats | None = None
     wrench_ext: Floats | None = None
@@ -74,6 +75,8 @@ class Setpoint(NamedTuple):
     tau: Floats | None = None
     """Nm, in torque mode only: what to apply on top of what carries the arm's own weight. ``q`` and ``dq`` are then
     what was measured."""
+    q_from: Floats | None = None
+    """Where the device is now, by what the servo knows: the set-point before this one, rad. Only in position mode."""
 
 
 class RobotDriver(ABC):
@@ -90,6 +93,9 @@ class RobotDriver(ABC):
     """True where the device sets the pace: :meth:`wait` blocks until its next cycle (a Franka's state packets)."""
     simulated: ClassVar[bool] = False
     """True where nothing real can move."""
+    repeats: ClassVar[bool] = False
+    """What the device does when a set-point is lost: True where it repeats the last one, False where it extrapolates at
+    constant acceleration (a Franka), or where none can be lost."""
 
     def __init__(self, spec: RobotSpec, world: object | None = None) -> None:
         self.spec = spec
@@ -111,8 +117,13 @@ class RobotDriver(ABC):
         """The newest state; ``now`` is the host's clock, for devices without one. Does not block."""
 
     @abstractmethod
-    def write(self, setpoint: Setpoint) -> None:
-        """Hand over the next set-point."""
+    def write(self, setpoint: Setpoint) -> bool | None:
+        """Hand over the next set-point.
+
+        Returns:
+            False when it was not passed on to the device, for example because a motion has to be started first. The
+            servo then starts from where the next reading says that the device is. Anything else means that it was.
+        """
 
     @abstractmethod
     def halt(self) -> None:

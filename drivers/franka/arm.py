@@ -10,7 +10,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from math import inf
+from math import dist, inf
 from typing import Any, ClassVar
 
 from hal.config.data_files import find_data
@@ -37,6 +37,8 @@ _AVERAGE = 200
 _NO_TORQUE = (0.0,) * 7
 _STILL = 5e-3
 """A motion begins at rest: no set-point faster than this is its first, rad/s (5 rad/s2 within a cycle)."""
+_DRIFT = 1e-6
+"""A controller that integrates velocities is no farther than this from its set-points, rad, unless one was lost."""
 _NOTHING_SHOWN: tuple[Mode | None, Fault | None] = (None, None)
 _CALM = frozenset({Mode.IDLE, Mode.MOVE})
 _BY_HAND = frozenset({Mode.USER_STOPPED, Mode.GUIDING, Mode.OTHER})
@@ -118,28 +120,29 @@ class FrankaArm(RobotDriver):
         seq = round(1e3 * s.t)
         return Reading(now, s.t, seq, s.q, s.dq, s.tau, s.q_d, s.dq_d, s.tau_ext, s.wrench_ext, fault, taken)
 
-    def write(self, setpoint: Setpoint) -> None:
+    def write(self, setpoint: Setpoint) -> bool:
         s, link = self._sample, self._connection.link
         if link is None or s is None:
             raise self._connection.error()
         if self._fault is not None or s.mode not in _CALM:
-            return
+            return False
         kind = self._kind(setpoint)
         if link.motion is None and max(map(abs, setpoint.dq)) > _STILL:
-            return  # the robot ended the last one by itself: the servo comes to rest first
+            return False  # the robot ended the last one by itself: the servo comes to rest first
         try:
             if link.motion is not kind:
                 self._begin(link, kind, s)
-                return
+                return False
             link.send(self._values(kind, setpoint, s))
         except self._connection.troubles as error:
             self._failed(error)
-            return
+            return False
         self.commands += 1
         if not link.owns_loop:
             self.answer_times.add(time.perf_counter() - self._t_received)
         if self.commands > _AVERAGE:
             self.success_min = min(self.success_min, s.success_rate)
+        return True
 
     def _kind(self, setpoint: Setpoint) -> Kind:
         if setpoint.tau is not None:
@@ -151,8 +154,12 @@ class FrankaArm(RobotDriver):
             return setpoint.tau
         if kind is Kind.POSITION:
             return setpoint.q
-        # The velocity that brings the controller's own position to the set-point in one cycle: nothing drifts.
-        return [(q - q_d) * self.spec.rate_hz for q, q_d in zip(setpoint.q, s.q_d, strict=True)]
+        # The velocity that brings the controller's own position to the set-point in one cycle, so that nothing drifts;
+        # a report that is late or noisy is not that position.
+        start = s.q_d
+        if setpoint.q_from is not None and dist(start, setpoint.q_from) > _DRIFT:
+            start = setpoint.q_from
+        return [(q - q_d) * self.spec.rate_hz for q, q_d in zip(setpoint.q, start, strict=True)]
 
     def _begin(self, link: Link, kind: Kind, s: Sample) -> None:
         """Start a motion of this kind; where another one runs, end that first."""

@@ -37,7 +37,7 @@ class ArmUnit:
         self.driver: RobotDriver = registry.load(spec.driver, "robot")(spec, world)
         self.kinematics = Kinematics(spec.kinematics)
         mass_matrix = self.driver.mass_matrix if "torque" in self.driver.modes else None
-        self.servo = Servo(spec, dt, self.kinematics, mass_matrix)
+        self.servo = Servo(spec, dt, self.kinematics, mass_matrix, self.driver.repeats)
         self.reset_statistics()
         self.reading: Reading | None = None
         self.error: ConnectionLost | None = None
@@ -60,6 +60,7 @@ class ArmUnit:
         """Samples of the device that were never seen."""
         self.reanchored = 0
         """How often the device had not taken a set-point."""
+        self.servo.reset_statistics()
         self.driver.reset_statistics()
 
     def open(self, now: float) -> None:
@@ -148,7 +149,8 @@ class ArmUnit:
         if setpoint is None or (self.error is not None and not failed):
             return
         try:
-            self.driver.write(setpoint)
+            if self.driver.write(setpoint) is False:
+                self.servo.withheld()
         except Exception as error:
             self._write_failed = True
             self._lose(error)
@@ -191,6 +193,8 @@ class ArmUnit:
         if self.error is not None:
             lost = self.error.fault or Fault("lost", str(self.error), "see that it is on and connected")
             reading = reading._replace(fault=lost)
+        elif reading.fault is None and self.servo.fault is not None:
+            reading = reading._replace(fault=self.servo.fault)
         tcp, jacobian = self.kinematics.fk_and_jacobian(reading.q)
         servo = ServoRecord(
             RobotStatus.LOST if self.error is not None else report.status,
@@ -227,8 +231,9 @@ class ArmUnit:
         self._session = session.id
 
     def recover(self) -> None:
-        """Clear a fault of the device."""
+        """Clear a fault of the device, or of how it follows its set-points."""
         self.driver.recover()
+        self.servo.recover()
 
     def moved(self) -> None:
         """The arm was put elsewhere (a reset of the simulated world)."""

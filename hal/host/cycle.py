@@ -158,6 +158,7 @@ class Cycle:
                     "peak": unit.audit.peaks(),
                     "latency_s": unit.latency.summary(),
                     "reanchored": unit.reanchored,
+                    **unit.servo.statistics(),
                     "driver": unit.driver.statistics(),
                 }
                 for name, unit in self.arms.items()

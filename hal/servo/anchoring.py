@@ -1,25 +1,65 @@
-"""Does the device follow the set-points it was given? If not, the smoother goes on from what the device says.
+"""Compare what the device reports with what it was given, and correct the smoother where a set-point was lost.
 
-A device that misses a set-point goes on by its own rule (a Franka extrapolates with constant acceleration, others
-repeat the last one) and reports what it took as ``q_commanded``. Going on from our own set-point would then be a jump.
+**A report never moves the set-point by itself.** It only selects what happened, out of a few things that are computed
+from the set-points that were given:
+
+* the device took the set-point, maybe so many cycles ago (*lag*) and with so much *noise*: nothing is done;
+* a set-point was lost, and the device continued by its own rule (at constant acceleration, as a Franka does, or it
+  repeated the last one): the smoother continues from there, as computed here, not as reported;
+* nothing explains the report: it is counted as a mismatch and changes nothing. Too many of those are a fault.
+
+Lag and noise are learned in the first cycles in which the set-point moves. Until then nothing is corrected that a lag
+would explain. A device whose reports come late cannot be corrected in time, so there a lost set-point changes nothing.
 """
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Sequence
+from math import inf
 
 from ..robot import Reading
+from ..types import Fault, Trip
+from .limits import stop_peak
 from .smoothing import JointSmoother
+from .watchdog import SILENCE
 
-__all__ = ["Anchoring"]
+__all__ = ["LATEST", "MISMATCHES", "NOISIEST", "Anchoring"]
 
 Floats = Sequence[float]
 Motion = tuple[Floats, Floats, Floats]
 """Positions, speeds and accelerations, rad, s."""
 
+LATEST = 5
+"""A report may be so many cycles old."""
+
+NOISIEST = 1e-4
+"""Reports may be this far from the set-points, rad: noise, rounding and quantisation together."""
+
+MISMATCHES = 20
+"""More reports than this in :data:`_WINDOW` cycles that nothing explains are a fault."""
+
+_LOSSES = 40
+"""More lost set-points than this in :data:`_WINDOW` cycles are a fault: such a link drives no arm."""
+
+_WINDOW = 100
+"""Cycles."""
+
 _SAME = 2e-7
 """Set-points that differ less are the same, rad. An FR3 reports them in single precision, rounded by 1.2e-7 near pi;
 at 1 kHz what is overlooked looks like a jerk of up to three times this over dt^3, 600 rad/s3."""
+
+_CONTINUED = 4e-7
+"""A device that continued by itself reports to be within this of where that is computed to be, rad: two roundings."""
+
+_DIFFERENCES = 1e-3
+"""Reported speeds this near the differences of the positions are these differences, before they were rounded, rad/s."""
+
+_CLEAR = 4.0
+"""One set-point explains a report when every other one is so many times as far from it."""
+
+_SURE = 4
+"""So many reports in a row that only one lag explains are believed; the same for measured positions."""
 
 _AWAY = 1e-2
 """After a silence, an arm this far from its set-point is taken from where it is, rad (when it cannot say what it
@@ -28,103 +68,387 @@ took)."""
 _MOVES = 0.02
 """Measured speeds below this are noise, rad/s."""
 
+_OVERSHOOT = 5e-3
+"""A device that continued by itself may have come so near to a limit that its stop ends this far beyond, rad."""
+
+_OVERSPEED = 1.01
+"""The same for its speed, as a share of the limit."""
+
 
 class Anchoring:
-    """Compares what the device took with what it was given, and corrects the smoother."""
+    """What one device does with its set-points, as its reports show it; corrects the smoother of one arm."""
 
-    def __init__(self, smoother: JointSmoother) -> None:
+    def __init__(self, smoother: JointSmoother, repeats: bool = False) -> None:
+        """``repeats``: when a set-point is lost, the device repeats the last one instead of extrapolating."""
         self._smoother = smoother
-        self._written = False
-        self._taken: tuple[Floats, Floats, Floats | None] | None = None
-        """Speed and acceleration of our set-point that the device took last, and the speed it reported for it."""
-        self._before: tuple[Floats, Floats | None] | None = None
-        """``q_commanded`` and ``dq_commanded`` of the last reading."""
+        self._repeats = repeats
+        self.fault: Fault | None = None
+        """Set when reports and set-points do not fit each other, until :meth:`recover`."""
         self._seq: int | None = None
         """Number of the last reading."""
-        self._silent = False
+        self._cycle = 0
+        """Readings that were compared so far."""
+        self.reset_statistics()
+        self._relearn()
+        self.forget()
+
+    def reset_statistics(self) -> None:
+        """Count from zero. What was learned stays."""
+        self.mismatches = 0
+        """Reports that nothing explained."""
+
+    def _relearn(self) -> None:
+        self.lag: int | None = None
+        """How many cycles old the reports are; None until that is known."""
+        self.noise = 0.0
+        """Largest difference between a report and the set-point that it shows, rad."""
+        self.measured = False
+        """Whether the device reports measured positions as commanded ones, which say nothing of what it took."""
+        self._tolerance = _SAME
+        self._hint = 0
+        self._hints = 0
+        """The lag that the last readings point to, and how many of them in a row."""
+        self._doubt = 0.0
+        """Largest distance (rad) of these readings from the set-points that they point to."""
+        self._as_measured = 0
+        self._odd: deque[tuple[int, float]] = deque()
+        """Cycle and distance (rad) of the recent mismatches."""
+        self._lost: deque[int] = deque()
+        """Cycles of the recent lost set-points."""
+
+    def recover(self) -> None:
+        """Clear the fault, and learn anew what the device is."""
+        if self.fault is not None:
+            self.fault = None
+            self._relearn()
+
+    def statistics(self) -> dict[str, object]:
+        """What is known of the device, as plain values."""
+        if self.measured:
+            reports = "measured positions"
+        else:
+            reports = "set-points" if self.lag is not None else "not known yet"
+        return {
+            "reports": reports,
+            "report_lag": self.lag,
+            "report_noise": self.noise,
+            "mismatches": self.mismatches,
+        }
 
     def forget(self) -> None:
-        """The smoother was anchored anew; what was written before does not matter any more."""
-        self._written = False
-        self._taken = None
-        self._before = None
+        """The smoother was anchored anew: the device rests where it is, and what was given before does not matter."""
+        smoother = self._smoother
+        q = smoother.q
+        # Newest first; the device may report any of these.
+        self._given: deque[Floats] = deque([q] * (LATEST + 1), LATEST + 1)
+        self._motion: Motion = (q, smoother.dq, smoother.ddq)
+        """What was given last."""
+        self._at: Motion = self._motion
+        """Where the device is, as far as is known: what it took last, or where it continued to."""
+        steps = [smoother.dt * v for v in smoother.dq]
+        self._track: list[Floats] = [[x - k * step for x, step in zip(q, steps, strict=True)] for k in range(3)]
+        """Where it was in the last three cycles, rad; the newest is that of ``_at``."""
+        self._fresh = True
+        """Nothing was given since."""
+        self._starts = False
+        """The set-point that was given last is the first one of a motion that begins at rest."""
+        self._waits = 0
+        """Cycles for which the motion that begins has waited for the device."""
+        self.waiting = False
+        """Whether the set-point is to stay in this cycle."""
+        self._said: Floats = q
+        """What the device reported last, rad."""
+        self._speeds: tuple[Floats | None, Floats | None, Floats | None] = (None, None, None)
+        """The speeds that it reported last, newest first, rad/s."""
         self._silent = False
+        """The device may have stopped anywhere."""
+        self._withheld = False
+        """The driver kept the last set-point back."""
+        self._away = 0
+        """Cycles since the device answered last."""
 
-    def wrote(self) -> None:
-        """The smoother's set-point goes to the device."""
-        self._written = True
+    def gave(self, q: Floats, dq: Floats, ddq: Floats) -> None:
+        """This set-point goes to the device."""
+        _, dq_before, ddq_before = self._motion
+        self._starts = not (any(dq_before) or any(ddq_before))
+        self._given.appendleft(q)
+        self._motion = (q, dq, ddq)
+        self._fresh = False
+
+    def withheld(self) -> None:
+        """The driver did not pass the last set-point on: the device is where it says it is."""
+        self._silent = self._withheld = True
 
     def lose(self) -> None:
-        """The device does not answer, or makes no sense: it may have stopped anywhere."""
-        self._silent = True
+        """The device did not answer in this cycle. It stops by itself when that lasts."""
+        self._away += 1
+        if self._away * self._smoother.dt >= SILENCE:
+            self._silent = True
 
-    def look(self, reading: Reading, sound: bool, sent: Motion | None = None) -> bool:
-        """Compare; True when the smoother was corrected. ``sound``: the reading can be trusted.
+    def look(self, reading: Reading, device: Trip) -> bool:
+        """Compare a reading with what was given. ``device`` is what is wrong with the device.
 
-        ``sent`` is the set-point that the device was given last; the smoother's own when it has not gone on since.
+        Returns:
+            Whether the smoother was corrected.
         """
-        if not sound:
+        self.waiting = False
+        last, self._seq = self._seq, reading.seq
+        if self.fault is not None:
+            self._took()  # nothing else is known
+            return False
+        if device is Trip.FAULT:
             self._silent = True
             return False
-        last, self._seq = self._seq, reading.seq
-        if reading.seq == last or not self._written:  # one that is repeated knows nothing of the last set-point
+        if device is Trip.DEVICE_LOST or reading.seq == last:  # an old reading knows nothing of the last set-point
+            self.lose()
             return False
-        smoother = self._smoother
-        q_sent, dq_sent, ddq_sent = (smoother.q, smoother.dq, smoother.ddq) if sent is None else sent
+        self._away = 0
+        if self._fresh:
+            return False
+        self._cycle += 1
+        if device:  # these numbers say nothing
+            self._took()
+            return False
         if self._silent:
-            self._silent = False
-            return self._resume(reading, q_sent)
+            return self._resume(reading)
         q = reading.q_commanded
-        if q is None:
+        if q is None or self.measured:
             return False
-        corrected = q is not q_sent and _apart(q, q_sent) > _SAME
-        if corrected:
-            cycles = 1 if last is None else max(1, reading.seq - last)  # more where samples were lost
-            dq, ddq = self._device_motion(reading, cycles)
-            smoother.anchor(q, dq, ddq)
+        said, self._said = self._said, q
+        self._speeds = (reading.dq_commanded, *self._speeds[:2])
+        lag = self.lag
+        if self._starts:
+            if not lag and q is not self._given[0] and self._wait(q, said):
+                return True
         else:
-            self._taken = (dq_sent, ddq_sent, reading.dq_commanded)
-        self._before = (q, reading.dq_commanded)
-        return corrected
-
-    def _resume(self, reading: Reading, q_sent: Floats) -> bool:
-        """The first reading after a silence: go on from where the arm is, at the speed that was measured, if any."""
-        self._taken = self._before = None
-        q, allowed = (reading.q, _AWAY) if reading.q_commanded is None else (reading.q_commanded, _SAME)
-        if _apart(q, q_sent) <= allowed:
+            self._waits = 0
+        if lag is not None:
+            sent = self._given[lag]
+            off = 0.0 if q is sent else _apart(q, sent)
+            if off <= self._tolerance:
+                self.noise = max(self.noise, off)
+                self._took()
+                self._hints = self._as_measured = 0
+                return False
+        elif q is self._given[0] is not self._given[1]:  # it hands back what it was given
+            self.lag = 0
+            self._took()
             return False
-        moves = max(map(abs, reading.dq)) > _MOVES
-        self._smoother.anchor(q, reading.dq if moves else None)
+        return self._explain(reading, q, 1 if last is None else max(1, reading.seq - last))
+
+    def _took(self) -> None:
+        """The device has what it was given last."""
+        self._at = motion = self._motion
+        track = self._track
+        self._track = [motion[0], track[0], track[1]]
+
+    def _wait(self, q: Floats, said: Floats) -> bool:
+        """A motion begins, and the device reports that it rests: it lost the set-point, or its reports are late.
+
+        Whichever it was, the smallest step from rest may be repeated, and the motion may begin again from there.
+        """
+        given, track = self._given[0], self._track
+        if self._waits >= LATEST or given == track[0]:
+            return False
+        if _apart(q, said) > min(_SAME, 0.5 * _apart(q, given)) or _apart(q, track[0]) > _SAME:
+            return False
+        self._waits += 1
+        self._smoother.anchor(given)
+        self._motion = (given, self._smoother.dq, self._smoother.ddq)
+        self.waiting = True
         return True
 
-    def _device_motion(self, reading: Reading, cycles: int) -> tuple[Floats, Floats]:
-        """Speed and acceleration to go on with, so that the *device's* sequence keeps the limits.
+    def _explain(self, reading: Reading, q: Floats, cycles: int) -> bool:
+        """A report that is not the set-point at the known lag. ``cycles``: since the last reading."""
+        apart = [_apart(q, sent) for sent in self._given]
+        nearest = min(apart)
+        lag = self.lag
+        if lag is None:
+            explained = nearest <= self._tolerance
+        else:
+            explained = lag > 0
+        if not explained and self._continued(q, cycles, apart):
+            self.lag = 0
+            return self._correct(q)
+        self._took()
+        self._learn(apart, nearest)
+        if lag is None and nearest <= self._tolerance:
+            return False
+        if self.lag == lag:
+            if _apart(q, reading.q) <= _SAME:
+                self._as_measured += 1
+                self.measured = self._as_measured >= _SURE
+            self._mismatch(reading, nearest if lag is None else apart[lag])
+        return False
 
-        A device that repeats its last set-point gets the missed one again, in effect. Otherwise the acceleration is
-        the difference of the last two speeds that the device commanded: with that it will compare ours. As to the
-        speed, some devices report that at the set-point, some the backward difference, which is the speed half a tick
-        earlier; the set-point that was taken last tells which, because there our own speed is known.
+    def _learn(self, apart: Sequence[float], nearest: float) -> None:
+        """Which lag does this report point to, if only one can be meant?"""
+        others = sorted(apart)[1]
+        if nearest > NOISIEST or others < _CLEAR * max(nearest, _SAME):
+            return
+        lag = apart.index(nearest)
+        self._hints = self._hints + 1 if lag == self._hint else 1
+        self._hint = lag
+        self._doubt = max(nearest, self._doubt) if self._hints > 1 else nearest
+        if self._hints >= _SURE:
+            self.lag = lag
+            self.noise = max(self.noise, self._doubt)
+            self._tolerance = max(self._tolerance, min(2.0 * self._doubt, NOISIEST))
+
+    def _mismatch(self, reading: Reading, off: float) -> None:
+        """Nothing explains this report, which is ``off`` (rad) from the set-point."""
+        self.mismatches += 1
+        if self.measured:
+            return
+        odd = self._odd
+        odd.append((self._cycle, off))
+        while odd[0][0] <= self._cycle - _WINDOW:
+            odd.popleft()
+        if len(odd) <= MISMATCHES:
+            return
+        worst = max(distance for _, distance in odd)
+        odd.clear()
+        if worst <= NOISIEST:  # it is only noise, more than was thought
+            self.noise = max(self.noise, worst)
+            self._tolerance = min(2.0 * worst, NOISIEST)
+        else:
+            self._fail(reading.q_commanded, f"{MISMATCHES + 1} of {_WINDOW} reports fit nothing that it was given")
+
+    def _fail(self, told: Floats | None, what: str) -> None:
+        sent = self._given[0]
+        detail = ""
+        if told is not None and len(told) == len(sent):
+            k = max(range(len(sent)), key=lambda i: abs(told[i] - sent[i]))
+            detail = f": joint {k + 1} was sent {sent[k]:.6f} rad and reported {told[k]:.6f} rad"
+        self.fault = Fault(
+            "SETPOINT_MISMATCH",
+            f"the arm does not follow its set-points, by what it reports: {what}{detail}",
+            "check that the arm reports the positions that it was commanded, each joint in its place, at most "
+            f"{LATEST} cycles late and within {NOISIEST:g} rad, and that its network loses nothing",
+        )
+
+    # A set-point was lost.
+
+    def _continued(self, q: Floats, cycles: int, apart: Sequence[float]) -> bool:
+        """Did the device continue by itself, to here? Then this is where it is from now on.
+
+        ``apart``: how far ``q`` is from each of the last set-points, rad.
+        """
+        off = apart[0]
+        limit = max(_CONTINUED if self.lag == 0 else _SAME, self._tolerance)
+        if self._repeats:
+            return _apart(q, self._at[0]) <= min(limit, 0.5 * off)  # with the speed that it had there
+        dt = self._smoother.dt
+        track, exact = self._refined()
+        best = _continued(track, cycles)
+        dq = self._speeds[0]
+        if cycles == 1 and exact and dq is not None:  # speeds tell a small loss from none, and from noise
+            missed = max([abs(x - y - dt * v) for x, y, v in zip(best[0], track[0], dq, strict=True)])
+            took = max([abs(x - y - dt * v) for x, y, v in zip(self._motion[0], track[0], dq, strict=True)])
+            limit = limit if missed <= 0.25 * took else 0.0
+        elif min(apart[1:]) <= self._tolerance:  # the report may be late
+            return False
+        else:
+            limit = min(limit, 0.5 * off)
+        if cycles > 1:  # it may have taken the set-point in the first of these: nothing is given without a reading
+            best = min(best, _continued([self._motion[0], *track], cycles - 1), key=lambda track: _apart(q, track[0]))
+        if _apart(q, best[0]) > limit or _apart(best[0], track[0]) <= _SAME:  # one that rests has begun no motion
+            return False
+        at = self._state(best)
+        if not self._allows(at):
+            return False
+        self._at, self._track = at, best[:3]
+        return True
+
+    def _refined(self) -> tuple[list[Floats], bool]:
+        """Where the device was, newest first, and whether its speeds say so.
+
+        A loss may have been too small to be noticed. Speeds that are the differences of positions are more exact than
+        these, which were rounded.
+        """
+        track, dt = self._track, self._smoother.dt
+        refined = [track[0]]
+        for before, after, dq in zip(track[1:], track, self._speeds[1:], strict=False):
+            if dq is None or max([abs(y - x - dt * v) for x, y, v in zip(before, after, dq, strict=True)]) > (
+                _DIFFERENCES * dt
+            ):
+                return track, False
+            refined.append([x - dt * v for x, v in zip(refined[-1], dq, strict=True)])
+        return refined, True
+
+    def _state(self, track: Sequence[Floats]) -> Motion:
+        """Position, speed and acceleration at the end of positions a cycle apart, newest first.
+
+        Backward differences, as the device takes them: the speed between the last two is that half a cycle earlier.
         """
         smoother = self._smoother
         dt = smoother.dt
-        dq = reading.dq_commanded
-        still: Floats = [0.0] * smoother.n
-        if self._taken is None or self._before is None or reading.q_commanded is None:
-            return (still if dq is None else dq), still
-        own, own_ddq, reported = self._taken
-        q_before, dq_before = self._before
-        if _apart(reading.q_commanded, q_before) <= _SAME:
-            return own, own_ddq
-        if dq is None or dq_before is None or reported is None:
-            return own, still
-        limits = smoother.acceleration
-        ddq = [max(-A, min(A, (v - v0) / (cycles * dt))) for v, v0, A in zip(dq, dq_before, limits, strict=True)]
-        at_point = sum(abs(v - v0) for v, v0 in zip(own, reported, strict=True))
-        half_before = sum(abs(v - 0.5 * dt * a - v0) for v, a, v0 in zip(own, own_ddq, reported, strict=True))
-        if half_before < at_point:
-            dq = [v + 0.5 * dt * a for v, a in zip(dq, ddq, strict=True)]
-        return dq, ddq
+        dq, ddq = [], []
+        for a, b, c, most in zip(*track[:3], smoother.acceleration, strict=True):
+            acceleration = max(-most, min(most, (a - 2.0 * b + c) / (dt * dt)))
+            ddq.append(acceleration)
+            dq.append((a - b) / dt + 0.5 * dt * acceleration)
+        return track[0], dq, ddq
+
+    def _allows(self, at: Motion) -> bool:
+        """Can the arm continue from here inside the limits, or at least not farther outside than it is now?"""
+        smoother = self._smoother
+        for q, v, a, q0, v0, a0, low, high, most, A, J in zip(
+            *at,
+            *self._motion,
+            smoother.lower,
+            smoother.upper,
+            smoother.velocity,
+            smoother.acceleration,
+            smoother.jerk,
+            strict=True,
+        ):
+            if abs(v + 0.5 * a * abs(a) / J) > max(_OVERSPEED * most, abs(v0 + 0.5 * a0 * abs(a0) / J)):
+                return False
+            if q + stop_peak(v, a, A, J) > max(high + _OVERSHOOT, q0 + stop_peak(v0, a0, A, J)):
+                return False
+            if q - stop_peak(-v, -a, A, J) < min(low - _OVERSHOOT, q0 - stop_peak(-v0, -a0, A, J)):
+                return False
+        return True
+
+    def _correct(self, q: Floats) -> bool:
+        """Go on from where the device is; it reported ``q``."""
+        lost = self._lost
+        lost.append(self._cycle)
+        while lost[0] <= self._cycle - _WINDOW:
+            lost.popleft()
+        if len(lost) > _LOSSES:
+            self._at = self._motion
+            self._fail(q, f"it lost {len(lost)} of {_WINDOW}")
+            return False
+        self._smoother.anchor(*self._at)
+        return True
+
+    def _resume(self, reading: Reading) -> bool:
+        """The first reading after a silence: go on from where the arm is, at the speed that was measured, if any."""
+        withheld = self._withheld
+        self._silent = self._withheld = False
+        q_sent = self._motion[0]
+        q, allowed = reading.q_commanded, self._tolerance
+        if q is None or self.measured:
+            q, allowed = reading.q, _AWAY
+        if _apart(q, q_sent) <= allowed:
+            self._took()
+            return False
+        if not withheld:
+            self._mismatch(reading, inf)
+        moves = max(map(abs, reading.dq)) > _MOVES
+        self._smoother.anchor(q, reading.dq if moves else None)
+        self.forget()
+        return True
+
+
+def _continued(track: list[Floats], cycles: int) -> list[Floats]:
+    """Positions a cycle apart, newest first, and so many cycles more at constant acceleration, rad."""
+    for _ in range(min(cycles, MISMATCHES)):
+        track = [[3.0 * (a - b) + c for a, b, c in zip(*track[:3], strict=True)], *track]
+    return track
 
 
 def _apart(a: Floats, b: Floats) -> float:
-    return max(abs(x - y) for x, y in zip(a, b, strict=True))
+    return max([abs(x - y) for x, y in zip(a, b, strict=True)])

@@ -17,9 +17,8 @@ from ..inbox import CommandRecord, Inbox, Session
 from ..kinematics import Kinematics
 from ..robot import Reading, Setpoint
 from ..specs import RobotSpec
-from ..types import Limited, RobotStatus, Trip
+from ..types import Fault, Limited, RobotStatus, Trip
 from .anchoring import Anchoring
-from .anchoring import Motion as Motion3
 from .cartesian import PoseMotion, TwistMotion
 from .chunk import ChunkMotion
 from .envelope import Envelope
@@ -38,7 +37,10 @@ Floats = Sequence[float]
 _NO_TRIP, _UNLIMITED, _FOLLOWING = Trip.NONE, Limited.NONE, RobotStatus.FOLLOWING
 
 _ABSURD = 1e3
-"""Joint positions (rad) and speeds (rad/s) beyond this are a broken reading."""
+"""Joint speeds beyond this are a broken reading, rad/s."""
+
+_BEYOND = 1.0
+"""Joint positions so far beyond the joint's range are a broken reading, rad."""
 
 
 class Servo:
@@ -50,15 +52,25 @@ class Servo:
         dt: float,
         kinematics: Kinematics | None = None,
         mass_matrix: MassMatrix | None = None,
+        repeats: bool = False,
     ) -> None:
-        """``mass_matrix`` is that of a device that takes torques; without it, torques are refused."""
+        """Make the servo of one arm.
+
+        Args:
+            spec: The arm.
+            dt: Seconds between two ticks.
+            kinematics: The arm's, where they are already computed.
+            mass_matrix: Of a device that takes torques; without it, torques are refused.
+            repeats: The device repeats its last set-point when one is lost (see :attr:`.RobotDriver.repeats`).
+        """
         self.spec = spec
         self.kinematics = Kinematics(spec.kinematics) if kinematics is None else kinematics
         self.report = ServoReport()
         self._smoother = smoother = JointSmoother(spec.limits, dt)
         self._envelope = envelope = Envelope(smoother, self.kinematics, spec.workspace)
         self._watchdog = Watchdog(dt)
-        self._anchoring = Anchoring(smoother)
+        self._anchoring = Anchoring(smoother, repeats)
+        self._range = [(x - _BEYOND, y + _BEYOND) for x, y in zip(spec.limits.lower, spec.limits.upper, strict=True)]
         self._torque = TorqueMotion(smoother, envelope, spec.limits, mass_matrix)
         self._motions: dict[Kind, Motion] = {
             Kind.JOINT_TARGET: JointTargetMotion(smoother, envelope),
@@ -88,8 +100,6 @@ class Servo:
         """Are set-points computed ahead in this session?"""
         self._ready: Setpoint | None = None
         """What :meth:`prepare` computed for the next tick."""
-        self._sent: Motion3 | None = None
-        """What the device was given last, while something is ready."""
         self._seen = (0.0, _NO_TRIP, False, False)
         """What the last tick made of the reading: when, what is wrong, was the host late, is there a fault?"""
 
@@ -104,6 +114,8 @@ class Servo:
         for name, values in (("q", q), ("dq", dq)):
             if values is not None and not (len(values) == n and isfinite(sum(map(abs, values)))):
                 raise CommandError(f"cannot anchor to {name} = {list(values)}: {n} finite numbers are due")
+        if not self._is_position(q):
+            raise CommandError(f"cannot anchor to q = {list(q)}: more than {_BEYOND:g} rad beyond the joints' limits")
         self._smoother.anchor(q, dq)
         self._ready = None
         self._torque.active = False
@@ -162,9 +174,7 @@ class Servo:
         torque.see(reading if self._is_known(reading, device) else None)
         if torque.active:
             device = device or self._overruns()
-        elif session is not None and self._anchoring.look(
-            reading, not device, self._sent if ready is not None else None
-        ):
+        elif session is not None and self._anchoring.look(reading, device):
             ready = None
             self._corrected = True
             self._resting = 0
@@ -172,10 +182,34 @@ class Servo:
             self._envelope.limited = Limited.REANCHORED
             if self._motion is not None:
                 self._motion.reanchored()
-        faulty = reading.fault is not None
+        faulty = device is Trip.FAULT
         self._seen = (now, device, late, faulty)
         # What was computed ahead goes out even when something is wrong: the stop begins where it ends.
-        return self._decide(inbox, now, device, late, faulty) if ready is None else ready
+        setpoint = self._decide(inbox, now, device, late, faulty) if ready is None else ready
+        if setpoint is not None and setpoint.tau is None:
+            self._anchoring.gave(setpoint.q, setpoint.dq, setpoint.ddq)
+        return setpoint
+
+    @property
+    def fault(self) -> Fault | None:
+        """Set when what the device reports does not fit its set-points, until :meth:`recover`. The arm is stopped."""
+        return self._anchoring.fault
+
+    def recover(self) -> None:
+        """Clear :attr:`fault`."""
+        self._anchoring.recover()
+
+    def withheld(self) -> None:
+        """The driver did not pass the last set-point on (see :meth:`.RobotDriver.write`)."""
+        self._anchoring.withheld()
+
+    def statistics(self) -> dict[str, object]:
+        """How the device reports its set-points: ``reports``, ``report_lag``, ``report_noise``, ``mismatches``."""
+        return self._anchoring.statistics()
+
+    def reset_statistics(self) -> None:
+        """Count mismatches from zero."""
+        self._anchoring.reset_statistics()
 
     def _decide(self, inbox: Inbox, now: float, device: Trip, late: bool, faulty: bool) -> Setpoint | None:
         """The next set-point, from what the device and the app said."""
@@ -217,7 +251,6 @@ class Servo:
         elif self._session is not None and self._t_tick is not None:
             now, device, late, faulty = self._seen
             smoother = self._smoother
-            self._sent = (smoother.q, smoother.dq, smoother.ddq)
             # Said until the next tick, for whoever looks in between.
             self._envelope.limited = Limited.REANCHORED if self._corrected else _UNLIMITED
             self._ahead = True
@@ -225,14 +258,14 @@ class Servo:
 
     def _judge(self, now: float, reading: Reading) -> Trip:
         """What is wrong with the device."""
-        if reading.fault is not None:
+        if reading.fault is not None or self._anchoring.fault is not None:
             return Trip.FAULT
         smoother = self._smoother
-        if not (self._is_sound(reading.q) and self._is_sound(reading.dq)):
+        if not (self._is_position(reading.q) and self._is_sound(reading.dq)):
             return Trip.BAD_READING
         q, dq = reading.q_commanded, reading.dq_commanded
         # A device that reports the very numbers that it was given needs no second look.
-        if q is not smoother.q and q is not None and not self._is_sound(q):
+        if q is not smoother.q and q is not None and not self._is_position(q):
             return Trip.BAD_READING
         if dq is not smoother.dq and dq is not None and not self._is_sound(dq):
             return Trip.BAD_READING
@@ -242,7 +275,7 @@ class Servo:
 
     def _is_known(self, reading: Reading, device: Trip) -> bool:
         """Does this reading, in which ``device`` is wrong, tell where the arm is and how fast?"""
-        return not device or (device is Trip.FAULT and self._is_sound(reading.q) and self._is_sound(reading.dq))
+        return not device or (device is Trip.FAULT and self._is_position(reading.q) and self._is_sound(reading.dq))
 
     def _overruns(self) -> Trip:
         """Does an arm that follows torques, or is braked by them, run into a limit?"""
@@ -251,6 +284,12 @@ class Servo:
             return _NO_TRIP
         self._envelope.limited |= limit
         return Trip.LIMIT
+
+    def _is_position(self, q: Floats) -> bool:
+        """As many numbers as joints, in the joints' ranges or at least near them."""
+        if len(q) != self._smoother.n:
+            return False
+        return self._smoother.is_free(q) or all(low <= x <= high for x, (low, high) in zip(q, self._range, strict=True))
 
     def _is_sound(self, values: Floats) -> bool:
         """As many numbers as joints, finite and not absurd."""
@@ -295,8 +334,12 @@ class Servo:
         """One tick of motion or of the stop; ``status`` overrides the usual one."""
         smoother, watchdog, report = self._smoother, self._watchdog, self.report
         motion = self._motion if watchdog.allowed else None
+        q_from = smoother.q
         if motion is not None:
-            motion.step(now)
+            if self._anchoring.waiting:
+                self._anchoring.waiting = False  # the next one may be computed ahead, before the device is heard
+            else:
+                motion.step(now)
             self._envelope.note(smoother)
             report.arrived = motion is self._path and self._path.arrived
             usual = _FOLLOWING
@@ -317,8 +360,7 @@ class Servo:
         self._publish()
         if self._torque.active:
             return self._torque.setpoint()
-        self._anchoring.wrote()
-        return Setpoint(smoother.q, smoother.dq, smoother.ddq)
+        return Setpoint(smoother.q, smoother.dq, smoother.ddq, q_from=q_from)
 
     def _at_rest(self) -> bool:
         """Does nothing move, and are positions what holds the arm?"""

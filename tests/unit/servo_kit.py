@@ -13,6 +13,7 @@ from specs import panda
 
 from hal.commands import Kind
 from hal.inbox import CommandRecord, DeadmanRecord, Inbox, Session
+from hal.kinematics import Kinematics
 from hal.robot import Reading, Setpoint
 from hal.servo.audit import SetpointAudit
 from hal.servo.servo import Servo
@@ -58,10 +59,13 @@ class Bench:
         deadman: bool = False,
         move_to: Sequence[float] | None = None,
         begin: bool = True,
+        repeats: bool = False,
+        kinematics: Kinematics | None = None,
     ) -> None:
         self.spec = panda() if spec is None else spec
         self.dt = 1.0 / rate_hz
-        self.servo = Servo(self.spec, self.dt)
+        self.servo = Servo(self.spec, self.dt, kinematics, repeats=repeats)
+        self.repeats = repeats
         self.audit = SetpointAudit(self.spec.limits, self.dt)
         self.now = 50.0
         self.ticks = 0

@@ -2,12 +2,21 @@
 
 from __future__ import annotations
 
+import math
+import os
 import random
+from collections.abc import Sequence
 from typing import Any
 
 import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
 from servo_kit import STILL, Bench, N
+from specs import panda
 
+from hal.commands import Kind
+from hal.kinematics import Kinematics
+from hal.servo.anchoring import LATEST, NOISIEST
 from hal.servo.audit import SetpointAudit
 from hal.types import Fault, Limited, RobotStatus
 
@@ -55,7 +64,7 @@ class Device:
 @pytest.mark.parametrize("loss", [0.0, 0.05])
 @pytest.mark.parametrize("ahead", [False, True], ids=["at once", "computed ahead"])
 def test_a_device_that_misses_set_points(kind: str, loss: float, ahead: bool) -> None:
-    bench = Bench(rate_hz=1000.0)
+    bench = Bench(rate_hz=1000.0, repeats=kind == "repeats")
     bench.prepares = ahead
     device = Device(bench, kind)
     rng = random.Random(4)
@@ -120,3 +129,152 @@ def test_an_old_reading_says_nothing_about_the_last_set_point() -> None:
     bench.drive(0.1)
     assert not bench.limited & Limited.REANCHORED
     assert bench.moving
+
+
+# Devices whose reports are anything but true.
+
+KINDS = (
+    "true", "late", "repeated", "noisy", "quantised", "swapped", "offset", "ahead", "random", "measured", "lossy",
+    "not a number", "elsewhere",
+)  # fmt: skip
+Stretch = tuple[str, int, float, int]
+"""What the device reports, a lag in cycles, an amplitude from 0 to 1, and for how many cycles."""
+STRETCHES = st.lists(
+    st.tuples(st.sampled_from(KINDS), st.integers(0, LATEST), st.floats(0.0, 1.0), st.integers(1, 150)),
+    min_size=1,
+    max_size=5,
+)
+KINEMATICS = Kinematics(panda().kinematics)
+STREAMS = 10_000 if os.environ.get("HAL_SOAK") == "1" else 100
+
+
+class Liar:
+    """A device that takes every set-point and reports something else.
+
+    ``claimed`` is what a reader who knows nothing but the device's rule believes that it did: it took every set-point,
+    except where its report is, to a microradian, what it would say after a loss.
+    """
+
+    def __init__(self, bench: Bench, chance: random.Random) -> None:
+        self.bench, self.chance = bench, chance
+        self.taken: list[list[float]] = [list(bench.q)] * (LATEST + 1)
+        self.claimed: list[list[float]] = [list(bench.q)] * 4
+        self.measured = list(bench.q)
+        self.said: list[float] = list(bench.q)
+
+    def say(self, kind: str, lag: int, size: float) -> None:
+        self.kind = kind
+        chance, q = self.chance, self.taken[-1]
+        self.measured = [x + 0.1 * (y - x) for x, y in zip(self.measured, q, strict=True)]
+        amplitude = 10.0 ** (-9.0 + 8.0 * size)  # 1 nrad to 0.1 rad
+        said = list(q)
+        if kind == "late":
+            said = list(self.taken[-1 - lag])
+        elif kind == "repeated" and chance.random() < size:
+            said = self.said
+        elif kind == "noisy":
+            said = [x + chance.gauss(0.0, amplitude) for x in q]
+        elif kind == "quantised":
+            said = [amplitude * round(x / amplitude) for x in q]
+        elif kind == "swapped":
+            said[lag], said[6] = said[6], said[lag]
+        elif kind == "offset":
+            said = [x + amplitude for x in q]
+        elif kind == "ahead":  # what pulls a servo along that believes it
+            before = self.taken[-2]
+            said = [x + (1.0 + 10.0 * size) * (x - y) for x, y in zip(q, before, strict=True)]
+        elif kind == "random":
+            limits = self.bench.spec.limits
+            said = [chance.uniform(low, high) for low, high in zip(limits.lower, limits.upper, strict=True)]
+        elif kind == "measured":
+            said = list(self.measured)
+        elif kind == "lossy" and chance.random() < 0.6 * size:
+            said = self.after_a_loss()
+        elif kind == "not a number" and chance.random() < size:
+            said[lag] = math.nan
+        elif kind == "elsewhere":
+            said = [x + 89.0 * size for x in q]
+        self.said = said
+        dq = [chance.uniform(-2.0, 2.0) for _ in q] if kind in ("random", "elsewhere") else None
+        self.bench.reading = {"q": self.measured, "q_commanded": list(said), "dq_commanded": dq}
+
+    def after_a_loss(self) -> list[float]:
+        """What a device that did not take the last set-point reports."""
+        if self.bench.repeats:
+            return list(self.claimed[-2])
+        return [3.0 * (a - b) + c for a, b, c in zip(*reversed(self.claimed[-4:-1]), strict=True)]
+
+    def cycle(self) -> bool:
+        """One tick; returns whether a set-point came. The servo may only correct what the device's rule explains."""
+        corrected = self.bench.servo.report.reanchored
+        setpoint = self.bench.tick()
+        if self.bench.servo.report.reanchored > corrected:
+            claim = self.after_a_loss()
+            same = max(abs(x - y) for x, y in zip(self.said, claim, strict=True)) <= NOISIEST
+            if same and claims_losses(self.kind, self.bench.repeats):
+                self.claimed[-1] = claim
+                if self.bench.repeats:
+                    self.claimed.pop()
+        if setpoint is None:
+            return False
+        self.taken.append(list(setpoint.q))
+        self.claimed.append(list(setpoint.q))
+        return True
+
+
+def claims_losses(kind: str, repeats: bool) -> bool:
+    """Whether a device of this kind may report what it would after a loss."""
+    return kind == "lossy" or (repeats and kind in ("late", "repeated"))
+
+
+def peaks_of(bench: Bench, positions: Sequence[Sequence[float]]) -> dict[str, float]:
+    audit = SetpointAudit(bench.spec.limits, bench.dt)
+    for q in positions:
+        audit.add(q)
+    return audit.peaks()
+
+
+@settings(max_examples=STREAMS, deadline=None, suppress_health_check=list(HealthCheck))
+@given(STRETCHES, st.integers(0, 2**32), st.booleans(), st.booleans(), st.sampled_from([240.0, 1000.0]))
+def test_no_report_breaks_a_limit(
+    stretches: list[Stretch], seed: int, ahead: bool, repeats: bool, rate_hz: float
+) -> None:
+    """Whatever a device reports, its set-points stay inside the limits, or a trip or a fault stops the arm.
+
+    The device takes every set-point. Compared, by backward differences, are
+
+    * the set-points that the driver is given, from the first to the last, through faults and stops: position, speed,
+      acceleration and jerk of every joint are at most the limits. So is what the device sees, which is the same;
+    * where a device claims losses by its own rule, which nobody can tell from real ones, the sequence that it claims:
+      the set-points, with its own continuation in the place of each that it claims to have lost (for one that repeats:
+      without these cycles). That is at most the limits, too; its own continuation may exceed them by 1 % of speed, and
+      its stop by a milliradian of position. A correction that nothing of this explains fails the test.
+    """
+    chance = random.Random(seed)
+    bench = Bench(rate_hz=rate_hz, repeats=repeats, kinematics=KINEMATICS)
+    bench.prepares = ahead
+    device = Liar(bench, chance)
+    target, speeds = list(bench.q), [0.0] * N
+    k = 0
+    for kind, lag, size, cycles in stretches:
+        for _ in range(cycles):
+            if k % 10 == 0:
+                if k % 50 == 0:
+                    speeds = [chance.uniform(-1.0, 1.0) * v for v in bench.spec.limits.velocity]
+                if k % 100 < 50:
+                    bench.send(Kind.JOINT_VELOCITY, speeds)
+                else:
+                    bench.target([x + chance.uniform(-0.1, 0.1) for x in bench.servo.report.q_set])
+            if bench.trip and not bench.moving and chance.random() < 0.1:
+                bench.servo.recover()
+                bench.rearms += 1
+            k += 1
+            device.say(kind, lag, size)
+            assert device.cycle()
+    claimed = peaks_of(bench, device.claimed)
+    given_ = peaks_of(bench, device.taken)
+    assert claimed["velocity"] <= 1.01, claimed
+    assert max(claimed["acceleration"], claimed["jerk"]) <= 1.0 + 1e-6, claimed
+    assert claimed["position"] <= 1.01, claimed
+    if not any(claims_losses(kind, repeats) for kind, *_ in stretches):
+        assert max(given_.values()) <= 1.0, given_

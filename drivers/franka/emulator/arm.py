@@ -10,6 +10,7 @@ from hal.drivers.franka.flags import FLAGS
 from hal.drivers.franka.limits import ArmLimits
 
 from .checker import LimitChecker
+from .faults import Reports
 from .journal import Figures, Journal
 from .layouts import CommandPacket
 from .motion import Ending, Motion
@@ -59,6 +60,8 @@ class Arm:
     figures: Figures = field(default_factory=Figures)
     no_move_reply: bool = False
     """A fault: the end of a motion is never told."""
+    reports: Reports = field(default_factory=Reports)
+    """Faults of what the states say was commanded."""
 
     def __post_init__(self) -> None:
         self.checker = LimitChecker(self.limits)
@@ -75,6 +78,8 @@ class Arm:
         self.last_errors: frozenset[int] = frozenset()
         self.motion: Motion | None = None
         self.sample: Sample = at_rest(self.plant.q)
+        self.shown = self.sample
+        """What the state says that it was commanded."""
         self._pending: tuple[int, MoveOptions] | None = None
 
     def place(self, q: Floats | None) -> None:
@@ -128,6 +133,7 @@ class Arm:
             if ending is not None:
                 self._end(ending)
         self._move()
+        self.shown = self.reports.shown(self.sample, self.plant.q, self.plant.dq)
         self.message_id += 1
         self.figures.cycles += 1
         return self._writer.write(self)

@@ -40,6 +40,9 @@ class Executor:
             "silence": self._silence,
             "lose-states": lambda words: server.faults.states.set(words),
             "lose-commands": lambda words: server.faults.commands.set(words),
+            "report-lag": self._report_lag,
+            "report-noise": self._report_noise,
+            "report-measured": self._report_measured,
             "truncate": self._truncate,
             "reflex": self._reflex,
             "user-stop": lambda words: server.arm.user_stop(_switch(words)),
@@ -76,6 +79,22 @@ class Executor:
 
     def _silence(self, words: Words) -> None:
         self._server.faults.silent_until = time.monotonic() + _seconds(words)
+
+    def _report_lag(self, words: Words) -> None:
+        reports = self._server.arm.reports
+        (word,) = _exactly(words, 1)
+        if not 0 <= int(word) <= reports.LATEST:
+            raise ValueError(f"takes 0 to {reports.LATEST} cycles")
+        reports.lag = int(word)
+
+    def _report_noise(self, words: Words) -> None:
+        (word,) = _exactly(words, 1)
+        if not 0.0 <= float(word) <= 1.0:
+            raise ValueError("takes 0 to 1 rad")
+        self._server.arm.reports.noise = float(word)
+
+    def _report_measured(self, words: Words) -> None:
+        self._server.arm.reports.measured = _switch(words)
 
     def _truncate(self, words: Words) -> None:
         self._server.faults.truncate = _switch(words)
@@ -141,6 +160,9 @@ _FAULTS = frozenset(
         "silence",
         "lose-states",
         "lose-commands",
+        "report-lag",
+        "report-noise",
+        "report-measured",
         "truncate",
         "stall",
         "slow-reply",

@@ -6,9 +6,12 @@ They are typed into the emulator's standard input, or sent to its control port (
 from __future__ import annotations
 
 import random
+from collections import deque
 from typing import NamedTuple
 
-__all__ = ["COMMANDS", "Faults", "Loss", "help_text"]
+from .samples import Floats, Sample
+
+__all__ = ["COMMANDS", "Faults", "Loss", "Reports", "help_text"]
 
 
 class Command(NamedTuple):
@@ -22,6 +25,9 @@ COMMANDS = (
     Command("silence S", "send no states for S seconds; the client's library gives up after 1 s"),
     Command("lose-states P | next N", "throw away that share (0..1) of the states, or exactly the next N"),
     Command("lose-commands P | next N", "the same with the commands that come in"),
+    Command("report-lag N", "report q_d, dq_d and ddq_d N cycles late (0 to 10)"),
+    Command("report-noise S", "add noise to the reported q_d: normal, S rad"),
+    Command("report-measured on|off", "report measured positions and speeds as q_d and dq_d"),
     Command("truncate on|off", "send states that are one byte too short"),
     Command("reflex NAME|INDEX", "raise an error flag: a running motion is aborted, recovery is needed"),
     Command("user-stop on|off", "press or release the user stop"),
@@ -75,6 +81,35 @@ class Loss:
             self.next -= 1
             return True
         return self.share > 0.0 and self._random.random() < self.share
+
+
+class Reports:
+    """How the arm reports what it was commanded: truthfully, unless a fault is switched on."""
+
+    LATEST = 10
+    """Cycles."""
+
+    def __init__(self, seed: int = 0) -> None:
+        self._random = random.Random(seed)
+        self._samples: deque[Sample] = deque(maxlen=self.LATEST + 1)
+        self.clear()
+
+    def clear(self) -> None:
+        """Report the truth."""
+        self.lag = 0
+        self.noise = 0.0
+        self.measured = False
+
+    def shown(self, sample: Sample, q: Floats, dq: Floats) -> Sample:
+        """What the state says of this cycle's ``sample``, while the arm is measured at ``q`` (7,), rad, and ``dq``."""
+        self._samples.appendleft(sample)
+        if self.measured:
+            sample = Sample(q, dq, sample.ddq)
+        elif self.lag:
+            sample = self._samples[min(self.lag, len(self._samples) - 1)]
+        if self.noise:
+            sample = sample._replace(q=[x + self._random.gauss(0.0, self.noise) for x in sample.q])
+        return sample
 
 
 class Faults:

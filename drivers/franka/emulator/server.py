@@ -88,6 +88,7 @@ class ArmServer:
             self._end_session("restart")
         self.faults.clear()
         self.arm.no_move_reply = False
+        self.arm.reports.clear()
         self.arm.restart()
         if away > 0.0:
             self.poller.unregister(self._listener)

@@ -35,7 +35,7 @@ class StateWriter:
 
     def write(self, arm: Arm) -> bytearray:
         """The packet as it stands after this cycle. The same buffer every time."""
-        packet, plant, motion, sample = self.packet, arm.plant, arm.motion, arm.sample
+        packet, plant, motion, sample = self.packet, arm.plant, arm.motion, arm.shown
         if arm.settings is not self._settings or arm.settings.changes != self._changes:
             self._write_settings(arm)
         packet.put("message_id", (arm.message_id,))
@@ -58,7 +58,7 @@ class StateWriter:
         return packet.buffer
 
     def _write_poses(self, arm: Arm) -> None:
-        q, q_d = arm.plant.q, arm.sample.q
+        q, q_d = arm.plant.q, arm.shown.q
         self._q, self._q_d = q, q_d
         packet, tip = self.packet, arm.settings.F_T_EE
         pose = arm.plant.body.tip(q, tip)
