@@ -98,6 +98,7 @@ def _robot(spec: RobotSpec, settings: ArmSettings) -> Iterator[Verdict]:
     else:
         yield Verdict("robot", "ok", f"answers; speaks protocol {said['protocol']}, as the model {spec.model!r} needs")
         yield _mode(said["mode"], said["flags"])
+        yield _reports(said["noise"])
 
 
 def _failed(name: str, fault: Fault) -> Verdict:
@@ -115,6 +116,18 @@ def _mode(mode: str, flags: list[str]) -> Verdict:
     if fault is None:
         return Verdict("state", "ok", "ready to move" if mode == "idle" else f"mode {mode!r}")
     return Verdict("state", "warn", fault.cause, fault.remedy)
+
+
+def _reports(noise: float) -> Verdict:
+    """How exactly an arm at rest reports its set-points. How late it does shows only in motion."""
+    from hal.servo.anchoring import NOISIEST
+
+    found = f"reported within {noise:.1g} rad at rest; how late, the first motion shows (rig.statistics())"
+    if noise <= NOISIEST:
+        return Verdict("set-points", "ok", found)
+    return Verdict(
+        "set-points", "fail", found, f"the servo needs {NOISIEST:g} rad; end what moves the arm, then look again"
+    )
 
 
 def _hand(spec: RobotSpec) -> Iterator[Verdict]:

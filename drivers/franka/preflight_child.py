@@ -18,6 +18,9 @@ from .links import link_to
 
 __all__ = ["main"]
 
+_SAMPLES = 50
+"""States, a millisecond apart, in which the noise of an arm at rest is looked for."""
+
 
 def main(channel: Channel, memories: Sequence[SharedMemory], config: dict[str, Any]) -> None:
     """Entry point; ``config`` has the settings' ``host`` and ``arm``. Nothing moves."""
@@ -26,7 +29,10 @@ def main(channel: Channel, memories: Sequence[SharedMemory], config: dict[str, A
 
 
 def _look(host: str, arm: str) -> dict[str, Any]:
-    """``protocol``, ``mode``, ``flags``; or ``missing``, a library; or ``fault``: code, cause and remedy."""
+    """``protocol``, ``mode``, ``flags``, ``noise``; or ``missing``, a library; or ``fault``: code, cause and remedy.
+
+    ``noise`` is by how much the commanded positions differ that an arm at rest reports, rad.
+    """
     try:
         link = link_to(arm)
     except ImportError as error:
@@ -35,6 +41,8 @@ def _look(host: str, arm: str) -> dict[str, Any]:
         link.connect(host)
         sample = link.read()
         found = {"protocol": link.protocol, "mode": sample.mode.name.lower(), "flags": link.errors(FLAGS)}
+        reports = [list(link.read().q_d) for _ in range(_SAMPLES)]
+        found["noise"] = max(max(values) - min(values) for values in zip(*reports, strict=True))
         link.disconnect()
     except link.troubles as error:
         fault = fault_of_exception(error, host=host)

@@ -57,6 +57,8 @@ CASES = (
     Case("silence 2", hal.MotionStopped, "no state", RobotStatus.LOST, 3.0),
     Case("lose-commands 1", hal.RobotFault, "in a row", RobotStatus.FAULT, 1.0, undo="lose-commands 0"),
     Case("truncate on", hal.MotionStopped, "packets", RobotStatus.LOST, 2.0, undo="truncate off", recover=False),
+    Case("report-lag 9", hal.RobotFault, "was sent", RobotStatus.FAULT, 1.0, undo="report-lag 0"),
+    Case("report-noise 0.01", hal.RobotFault, "reported", RobotStatus.FAULT, 1.0, undo="report-noise 0"),
     Case("restart 0.3", hal.MotionStopped, "", RobotStatus.LOST, 3.0, recover=False),
 )
 

@@ -101,6 +101,6 @@ def test_reports_that_fit_nothing_are_a_fault_with_a_name(fr3: Emulator) -> None
     assert "reported" in ended
     assert statistics["mismatches"] > 20
     assert max(statistics["peak"].values()) <= 1.0
-    end, travel, _, ended = drive(fr3)  # nothing is left of it
+    _, travel, _, ended = drive(fr3)  # nothing is left of it
     assert travel > 0.2
     assert not ended
