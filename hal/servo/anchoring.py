@@ -17,6 +17,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Sequence
 from math import inf
+from typing import Any
 
 from ..robot import Reading
 from ..types import Fault, Trip
@@ -65,6 +66,9 @@ _AWAY = 1e-2
 """After a silence, an arm this far from its set-point is taken from where it is, rad (when it cannot say what it
 took)."""
 
+_RESTED = 16
+"""So many readings of an arm that rests are averaged, since a start from a noisy position is a step."""
+
 _MOVES = 0.02
 """Measured speeds below this are noise, rad/s."""
 
@@ -88,6 +92,13 @@ class Anchoring:
         """Number of the last reading."""
         self._cycle = 0
         """Readings that were compared so far."""
+        self._rest: list[float] = []
+        """Where the device holds while nothing is streamed, rad: the mean of its last reports."""
+        self._rested: Floats = ()
+        """The last of these reports."""
+        self._rests = 0
+        self._steps = 0.0
+        """How many reports there were, and the largest difference between two of them in a row, rad."""
         self.reset_statistics()
         self._relearn()
         self.forget()
@@ -122,7 +133,7 @@ class Anchoring:
             self.fault = None
             self._relearn()
 
-    def statistics(self) -> dict[str, object]:
+    def statistics(self) -> dict[str, Any]:
         """What is known of the device, as plain values."""
         if self.measured:
             reports = "measured positions"
@@ -134,6 +145,24 @@ class Anchoring:
             "report_noise": self.noise,
             "mismatches": self.mismatches,
         }
+
+    def rest(self, q: Floats | None) -> None:
+        """Nothing is streamed, and the device reports that it was commanded to ``q``, rad."""
+        if q is None or len(q) != len(self._rest) or not _apart(q, self._rest) <= NOISIEST:
+            self._rest = [] if q is None else list(q)
+            self._rests, self._steps = 1, 0.0
+        else:
+            self._rests = n = min(self._rests + 1, _RESTED)
+            self._rest = [x + (y - x) / n for x, y in zip(self._rest, q, strict=True)]
+            self._steps = max(self._steps, _apart(q, self._rested))
+        self._rested = () if q is None else q
+
+    def start(self, q: Floats) -> Floats:
+        """Where to start from when the device last reported to be at ``q``: without the noise, if it is only noise."""
+        rest = self._rest
+        if len(rest) != len(q) or _apart(q, rest) > min(NOISIEST, 2.0 * self._steps):
+            return q
+        return rest
 
     def forget(self) -> None:
         """The smoother was anchored anew: the device rests where it is, and what was given before does not matter."""
@@ -432,6 +461,8 @@ class Anchoring:
         q, allowed = reading.q_commanded, self._tolerance
         if q is None or self.measured:
             q, allowed = reading.q, _AWAY
+        if withheld:
+            allowed = max(allowed, min(NOISIEST, 2.0 * self._steps))
         if _apart(q, q_sent) <= allowed:
             self._took()
             return False

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from math import hypot, isfinite
+from typing import Any
 
 from ..commands import Kind
 from ..errors import CommandError, ControlTaken
@@ -116,7 +117,7 @@ class Servo:
                 raise CommandError(f"cannot anchor to {name} = {list(values)}: {n} finite numbers are due")
         if not self._is_position(q):
             raise CommandError(f"cannot anchor to q = {list(q)}: more than {_BEYOND:g} rad beyond the joints' limits")
-        self._smoother.anchor(q, dq)
+        self._smoother.anchor(self._anchoring.start(q) if dq is None else q, dq)
         self._ready = None
         self._torque.active = False
         self._anchoring.forget()
@@ -170,6 +171,8 @@ class Servo:
         if ready is None:
             self._envelope.limited = _UNLIMITED
         device = self._judge(now, reading)
+        if session is None:
+            self._anchoring.rest(None if device else reading.q_commanded)
         torque = self._torque
         torque.see(reading if self._is_known(reading, device) else None)
         if torque.active:
@@ -203,7 +206,7 @@ class Servo:
         """The driver did not pass the last set-point on (see :meth:`.RobotDriver.write`)."""
         self._anchoring.withheld()
 
-    def statistics(self) -> dict[str, object]:
+    def statistics(self) -> dict[str, Any]:
         """How the device reports its set-points: ``reports``, ``report_lag``, ``report_noise``, ``mismatches``."""
         return self._anchoring.statistics()
 
