@@ -26,6 +26,7 @@ class Device:
 
     def __init__(self, bench: Bench, kind: str) -> None:
         self.bench = bench
+        self.kind = kind
         self.q: list[float] = list(bench.q)
         self.dq = [0.0] * N
         self.ddq = [0.0] * N
