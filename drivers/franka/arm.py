@@ -39,6 +39,8 @@ _STILL = 5e-3
 """A motion begins at rest: no set-point faster than this is its first, rad/s (5 rad/s2 within a cycle)."""
 _DRIFT = 1e-6
 """A controller that integrates velocities is no farther than this from its set-points, rad, unless one was lost."""
+_NOISE = 1e-4
+"""A set-point this near to where the robot says that it holds is where it holds, rad: the servo knows it better."""
 _NOTHING_SHOWN: tuple[Mode | None, Fault | None] = (None, None)
 _CALM = frozenset({Mode.IDLE, Mode.MOVE})
 _BY_HAND = frozenset({Mode.USER_STOPPED, Mode.GUIDING, Mode.OTHER})
@@ -131,7 +133,7 @@ class FrankaArm(RobotDriver):
             return False  # the robot ended the last one by itself: the servo comes to rest first
         try:
             if link.motion is not kind:
-                self._begin(link, kind, s)
+                self._begin(link, kind, s, setpoint)
                 return False
             link.send(self._values(kind, setpoint, s))
         except self._connection.troubles as error:
@@ -161,12 +163,14 @@ class FrankaArm(RobotDriver):
             start = setpoint.q_from
         return [(q - q_d) * self.spec.rate_hz for q, q_d in zip(setpoint.q, start, strict=True)]
 
-    def _begin(self, link: Link, kind: Kind, s: Sample) -> None:
+    def _begin(self, link: Link, kind: Kind, s: Sample, setpoint: Setpoint) -> None:
         """Start a motion of this kind; where another one runs, end that first."""
         if link.motion is not None:
             link.finish()
         if link.motion is None:  # a library with a loop of its own ends a motion when the cycle returns to it
             self._connection.configure(s)
+            if max([abs(q - q_d) for q, q_d in zip(setpoint.q, s.q_d, strict=True)]) <= _NOISE:
+                link.still = setpoint.q
             link.start(kind)
 
     def mass_matrix(self, q: Sequence[float]) -> Any:

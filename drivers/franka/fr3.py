@@ -50,9 +50,13 @@ class Fr3Link(Link):
 
     def _still(self) -> Floats:
         """The set-point that changes nothing."""
-        return self.state.q_d if self.motion is Kind.POSITION else (0.0,) * 7
+        if self.motion is not Kind.POSITION:
+            return (0.0,) * 7
+        still: Floats = self.state.q_d if self.still is None else self.still
+        return still
 
     def send(self, values: Floats) -> None:
+        self.still = values
         self._control.writeOnce(self._command(values))
 
     def _command(self, values: Floats) -> Any:

@@ -73,6 +73,8 @@ class Link(ABC):
         """What is being streamed."""
         self.state: Any = None
         """The library's record of the newest state."""
+        self.still: Floats | None = None
+        """The position that changes nothing, rad: the last one that was sent. None: what the robot says."""
 
     @abstractmethod
     def connect(self, host: str) -> None:
@@ -100,7 +102,7 @@ class Link(ABC):
 
     def abandon(self) -> None:
         """Forget a motion that has ended by itself, or that cannot be ended in order."""
-        self.motion = None
+        self.motion = self.still = None
 
     def disconnect(self) -> None:
         """Let go of the robot. Idempotent; a motion under way is cancelled."""

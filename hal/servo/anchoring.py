@@ -53,9 +53,6 @@ at 1 kHz what is overlooked looks like a jerk of up to three times this over dt^
 _CONTINUED = 4e-7
 """A device that continued by itself reports to be within this of where that is computed to be, rad: two roundings."""
 
-_DIFFERENCES = 1e-3
-"""Reported speeds this near the differences of the positions are these differences, before they were rounded, rad/s."""
-
 _CLEAR = 4.0
 """One set-point explains a report when every other one is so many times as far from it."""
 
@@ -292,10 +289,7 @@ class Anchoring:
         apart = [_apart(q, sent) for sent in self._given]
         nearest = min(apart)
         lag = self.lag
-        if lag is None:
-            explained = nearest <= self._tolerance
-        else:
-            explained = lag > 0
+        explained = nearest <= self._tolerance if lag is None else lag > 0
         if not explained and self._continued(q, cycles, apart):
             self.lag = 0
             return self._correct(q)
@@ -398,9 +392,7 @@ class Anchoring:
         track, dt = self._track, self._smoother.dt
         refined = [track[0]]
         for before, after, dq in zip(track[1:], track, self._speeds[1:], strict=False):
-            if dq is None or max([abs(y - x - dt * v) for x, y, v in zip(before, after, dq, strict=True)]) > (
-                _DIFFERENCES * dt
-            ):
+            if dq is None or max([abs(y - x - dt * v) for x, y, v in zip(before, after, dq, strict=True)]) > _CONTINUED:
                 return track, False
             refined.append([x - dt * v for x, v in zip(refined[-1], dq, strict=True)])
         return refined, True

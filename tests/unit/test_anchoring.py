@@ -169,6 +169,7 @@ class Liar:
         self.measured = [x + 0.1 * (y - x) for x, y in zip(self.measured, q, strict=True)]
         amplitude = 10.0 ** (-9.0 + 8.0 * size)  # 1 nrad to 0.1 rad
         said = list(q)
+        dq = [chance.uniform(-2.0, 2.0) for _ in q] if kind in ("random", "elsewhere", "late") else None
         if kind == "late":
             said = list(self.taken[-1 - lag])
         elif kind == "repeated" and chance.random() < size:
@@ -189,14 +190,16 @@ class Liar:
             said = [chance.uniform(low, high) for low, high in zip(limits.lower, limits.upper, strict=True)]
         elif kind == "measured":
             said = list(self.measured)
-        elif kind == "lossy" and chance.random() < 0.6 * size:
-            said = self.after_a_loss()
+        elif kind == "lossy":
+            if chance.random() < 0.6 * size:
+                said = self.after_a_loss()
+            if lag % 2:  # some tell their speeds, too
+                dq = [(x - y) / self.bench.dt for x, y in zip(said, self.claimed[-2], strict=True)]
         elif kind == "not a number" and chance.random() < size:
             said[lag] = math.nan
         elif kind == "elsewhere":
             said = [x + 89.0 * size for x in q]
         self.said = said
-        dq = [chance.uniform(-2.0, 2.0) for _ in q] if kind in ("random", "elsewhere") else None
         self.bench.reading = {"q": self.measured, "q_commanded": list(said), "dq_commanded": dq}
 
     def after_a_loss(self) -> list[float]:
@@ -246,8 +249,8 @@ def test_no_report_breaks_a_limit(
       given;
     * a device that does is taken at its word, since nothing tells it from one that loses set-points: what it claims,
       which is every set-point, and in the place of each that it claims to have lost the continuation by its rule (for a
-      device that repeats: without these cycles). The continuation itself is not the servo's: it may exceed a speed by
-      1 %, and end 5 mrad beyond a limit. A correction that the claims do not explain shows as a step.
+      device that repeats: without these cycles). The continuation itself is not the servo's: with it, limits may be
+      exceeded by 1 %. A correction that the claims do not explain shows as a step.
     """
     chance = random.Random(seed)
     bench = Bench(rate_hz=rate_hz, repeats=repeats, kinematics=KINEMATICS)
@@ -272,8 +275,6 @@ def test_no_report_breaks_a_limit(
             assert device.cycle()
     claimed = peaks_of(bench, device.claimed)
     given_ = peaks_of(bench, device.taken)
-    assert claimed["velocity"] <= 1.01, claimed
-    assert max(claimed["acceleration"], claimed["jerk"]) <= 1.0 + 1e-6, claimed
-    assert claimed["position"] <= 1.01, claimed
+    assert max(claimed.values()) <= 1.01, claimed
     if not device.claims:
         assert max(given_.values()) <= 1.0, given_
