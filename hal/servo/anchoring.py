@@ -19,7 +19,7 @@ from collections.abc import Sequence
 from math import inf
 from typing import Any
 
-from ..robot import Reading
+from ..robot import Reading, Setpoint
 from ..types import Fault, Trip
 from .limits import stop_peak
 from .smoothing import JointSmoother
@@ -28,9 +28,6 @@ from .watchdog import SILENCE
 __all__ = ["LATEST", "MISMATCHES", "NOISIEST", "Anchoring"]
 
 Floats = Sequence[float]
-Motion = tuple[Floats, Floats, Floats]
-"""Positions, speeds and accelerations, rad, s."""
-
 LATEST = 5
 """A report may be so many cycles old."""
 
@@ -95,7 +92,7 @@ class Anchoring:
         """The last of these reports."""
         self._rests = 0
         self._steps = 0.0
-        """How many reports there were, and the largest difference between two of them in a row, rad."""
+        """How many reports there were, and how much two of them in a row differ, rad."""
         self.reset_statistics()
         self._relearn()
         self.forget()
@@ -151,13 +148,13 @@ class Anchoring:
         else:
             self._rests = n = min(self._rests + 1, _RESTED)
             self._rest = [x + (y - x) / n for x, y in zip(self._rest, q, strict=True)]
-            self._steps = max(self._steps, _apart(q, self._rested))
+            self._steps = max(0.8 * self._steps, _apart(q, self._rested))  # a few cycles of memory
         self._rested = () if q is None else q
 
     def start(self, q: Floats) -> Floats:
         """Where to start from when the device last reported to be at ``q``: without the noise, if it is only noise."""
         rest = self._rest
-        if len(rest) != len(q) or _apart(q, rest) > min(NOISIEST, 2.0 * self._steps):
+        if len(rest) != len(q) or _apart(q, rest) > min(NOISIEST, 3.0 * self._steps):
             return q
         return rest
 
@@ -167,12 +164,12 @@ class Anchoring:
         q = smoother.q
         # Newest first; the device may report any of these.
         self._given: deque[Floats] = deque([q] * (LATEST + 1), LATEST + 1)
-        self._motion: Motion = (q, smoother.dq, smoother.ddq)
+        self._motion = Setpoint(q, smoother.dq, smoother.ddq)
         """What was given last."""
-        self._at: Motion = self._motion
+        self._at = self._motion
         """Where the device is, as far as is known: what it took last, or where it continued to."""
         steps = [smoother.dt * v for v in smoother.dq]
-        self._track: list[Floats] = [[x - k * step for x, step in zip(q, steps, strict=True)] for k in range(3)]
+        self._track = deque([[x - k * step for x, step in zip(q, steps, strict=True)] for k in range(3)], 3)
         """Where it was in the last three cycles, rad; the newest is that of ``_at``."""
         self._fresh = True
         """Nothing was given since."""
@@ -182,10 +179,9 @@ class Anchoring:
         """Cycles for which the motion that begins has waited for the device."""
         self.waiting = False
         """Whether the set-point is to stay in this cycle."""
-        self._said: Floats = q
-        """What the device reported last, rad."""
-        self._speeds: tuple[Floats | None, Floats | None, Floats | None] = (None, None, None)
-        """The speeds that it reported last, newest first, rad/s."""
+        self._last: Reading | None = None
+        self._before: Reading | None = None
+        """The last reading and the one before."""
         self._silent = False
         """The device may have stopped anywhere."""
         self._withheld = False
@@ -193,12 +189,11 @@ class Anchoring:
         self._away = 0
         """Cycles since the device answered last."""
 
-    def gave(self, q: Floats, dq: Floats, ddq: Floats) -> None:
+    def gave(self, setpoint: Setpoint) -> None:
         """This set-point goes to the device."""
-        _, dq_before, ddq_before = self._motion
-        self._starts = not (any(dq_before) or any(ddq_before))
-        self._given.appendleft(q)
-        self._motion = (q, dq, ddq)
+        before, self._motion = self._motion, setpoint
+        self._starts = not (any(before[1]) or any(before[2]))
+        self._given.appendleft(setpoint[0])
         self._fresh = False
 
     def withheld(self) -> None:
@@ -217,70 +212,76 @@ class Anchoring:
         Returns:
             Whether the smoother was corrected.
         """
-        self.waiting = False
         last, self._seq = self._seq, reading.seq
-        if self.fault is not None:
-            self._took()  # nothing else is known
-            return False
-        if device is Trip.FAULT:
-            self._silent = True
-            return False
-        if device is Trip.DEVICE_LOST or reading.seq == last:  # an old reading knows nothing of the last set-point
-            self.lose()
-            return False
-        self._away = 0
-        if self._fresh:
+        if device or self._fresh or reading.seq == last:
+            self._pass_over(device)
             return False
         self._cycle += 1
-        if device:  # these numbers say nothing
-            self._took()
-            return False
+        self._away = 0
         if self._silent:
             return self._resume(reading)
         q = reading.q_commanded
         if q is None or self.measured:
             return False
-        said, self._said = self._said, q
-        self._speeds = (reading.dq_commanded, *self._speeds[:2])
-        lag = self.lag
+        corrected = self._compare(reading, q, last)
+        self._before, self._last = self._last, reading
+        return corrected
+
+    def _compare(self, reading: Reading, q: Floats, last: int | None) -> bool:
+        lag, given = self.lag, self._given
+        if q is given[0] and lag == 0:
+            self._took()
+            return False
         if self._starts:
-            if not lag and q is not self._given[0] and self._wait(q, said):
+            if not lag and self._wait(q):
                 return True
         else:
             self._waits = 0
         if lag is not None:
-            sent = self._given[lag]
-            off = 0.0 if q is sent else _apart(q, sent)
+            off = _apart(q, given[lag])
             if off <= self._tolerance:
-                self.noise = max(self.noise, off)
+                if off > self.noise:
+                    self.noise = off
                 self._took()
                 self._hints = self._as_measured = 0
                 return False
-        elif q is self._given[0] is not self._given[1]:  # it hands back what it was given
+        elif q is given[0] is not given[1]:  # it hands back what it was given
             self.lag = 0
             self._took()
             return False
         return self._explain(reading, q, 1 if last is None else max(1, reading.seq - last))
 
+    def _pass_over(self, device: Trip) -> None:
+        """A reading that says nothing of the last set-point."""
+        if self._fresh:
+            return
+        if self.fault is not None or device is Trip.BAD_READING:
+            self._cycle += 1
+            self._took()  # nothing else is known
+        elif device is Trip.FAULT:
+            self._silent = True
+        else:
+            self.lose()  # it is an old one
+
     def _took(self) -> None:
         """The device has what it was given last."""
         self._at = motion = self._motion
-        track = self._track
-        self._track = [motion[0], track[0], track[1]]
+        self._track.appendleft(motion[0])
 
-    def _wait(self, q: Floats, said: Floats) -> bool:
+    def _wait(self, q: Floats) -> bool:
         """A motion begins, and the device reports that it rests: it lost the set-point, or its reports are late.
 
         Whichever it was, the smallest step from rest may be repeated, and the motion may begin again from there.
         """
-        given, track = self._given[0], self._track
-        if self._waits >= LATEST or given == track[0]:
+        given, rests = self._given[0], self._track[0]
+        said = None if self._last is None else self._last.q_commanded
+        if self._waits >= LATEST or given == rests:
             return False
-        if _apart(q, said) > min(_SAME, 0.5 * _apart(q, given)) or _apart(q, track[0]) > _SAME:
+        if _apart(q, said or rests) > min(_SAME, 0.5 * _apart(q, given)) or _apart(q, rests) > _SAME:
             return False
         self._waits += 1
         self._smoother.anchor(given)
-        self._motion = (given, self._smoother.dq, self._smoother.ddq)
+        self._motion = Setpoint(given, self._smoother.dq, self._smoother.ddq)
         self.waiting = True
         return True
 
@@ -290,7 +291,7 @@ class Anchoring:
         nearest = min(apart)
         lag = self.lag
         explained = nearest <= self._tolerance if lag is None else lag > 0
-        if not explained and self._continued(q, cycles, apart):
+        if not explained and self._continued(q, reading.dq_commanded, cycles, apart):
             self.lag = 0
             return self._correct(q)
         self._took()
@@ -352,7 +353,7 @@ class Anchoring:
 
     # A set-point was lost.
 
-    def _continued(self, q: Floats, cycles: int, apart: Sequence[float]) -> bool:
+    def _continued(self, q: Floats, dq: Floats | None, cycles: int, apart: Sequence[float]) -> bool:
         """Did the device continue by itself, to here? Then this is where it is from now on.
 
         ``apart``: how far ``q`` is from each of the last set-points, rad.
@@ -364,7 +365,6 @@ class Anchoring:
         dt = self._smoother.dt
         track, exact = self._refined()
         best = _continued(track, cycles)
-        dq = self._speeds[0]
         if cycles == 1 and exact and dq is not None:  # speeds tell a small loss from none, and from noise
             missed = max([abs(x - y - dt * v) for x, y, v in zip(best[0], track[0], dq, strict=True)])
             took = max([abs(x - y - dt * v) for x, y, v in zip(self._motion[0], track[0], dq, strict=True)])
@@ -380,7 +380,8 @@ class Anchoring:
         at = self._state(best)
         if not self._allows(at):
             return False
-        self._at, self._track = at, best[:3]
+        self._at = at
+        self._track.extendleft(reversed(best[:3]))
         return True
 
     def _refined(self) -> tuple[list[Floats], bool]:
@@ -389,15 +390,16 @@ class Anchoring:
         A loss may have been too small to be noticed. Speeds that are the differences of positions are more exact than
         these, which were rounded.
         """
-        track, dt = self._track, self._smoother.dt
+        track, dt = list(self._track), self._smoother.dt
         refined = [track[0]]
-        for before, after, dq in zip(track[1:], track, self._speeds[1:], strict=False):
+        for before, after, reading in zip(track[1:], track, (self._last, self._before), strict=False):
+            dq = None if reading is None else reading.dq_commanded
             if dq is None or max([abs(y - x - dt * v) for x, y, v in zip(before, after, dq, strict=True)]) > _CONTINUED:
                 return track, False
             refined.append([x - dt * v for x, v in zip(refined[-1], dq, strict=True)])
         return refined, True
 
-    def _state(self, track: Sequence[Floats]) -> Motion:
+    def _state(self, track: Sequence[Floats]) -> Setpoint:
         """Position, speed and acceleration at the end of positions a cycle apart, newest first.
 
         Backward differences, as the device takes them: the speed between the last two is that half a cycle earlier.
@@ -409,14 +411,14 @@ class Anchoring:
             acceleration = max(-most, min(most, (a - 2.0 * b + c) / (dt * dt)))
             ddq.append(acceleration)
             dq.append((a - b) / dt + 0.5 * dt * acceleration)
-        return track[0], dq, ddq
+        return Setpoint(track[0], dq, ddq)
 
-    def _allows(self, at: Motion) -> bool:
+    def _allows(self, at: Setpoint) -> bool:
         """Can the arm continue from here inside the limits, or at least not farther outside than it is now?"""
         smoother = self._smoother
         for q, v, a, q0, v0, a0, low, high, most, A, J in zip(
-            *at,
-            *self._motion,
+            *at[:3],
+            *self._motion[:3],
             smoother.lower,
             smoother.upper,
             smoother.velocity,
@@ -442,7 +444,7 @@ class Anchoring:
             self._at = self._motion
             self._fail(q, f"it lost {len(lost)} of {_WINDOW}")
             return False
-        self._smoother.anchor(*self._at)
+        self._smoother.anchor(*self._at[:3])
         return True
 
     def _resume(self, reading: Reading) -> bool:
@@ -454,7 +456,7 @@ class Anchoring:
         if q is None or self.measured:
             q, allowed = reading.q, _AWAY
         if withheld:
-            allowed = max(allowed, min(NOISIEST, 2.0 * self._steps))
+            allowed = max(allowed, min(NOISIEST, 3.0 * self._steps))
         if _apart(q, q_sent) <= allowed:
             self._took()
             return False

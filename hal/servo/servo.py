@@ -9,7 +9,7 @@ that must not follow is brought to rest by the smoother's time-optimal stop and 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from math import hypot, isfinite
+from math import dist, hypot, isfinite
 from typing import Any
 
 from ..commands import Kind
@@ -35,7 +35,7 @@ __all__ = ["Servo", "ServoReport"]
 Floats = Sequence[float]
 
 # Members of an enumeration that every tick names: to find one there takes Python 3.11 0.1 us.
-_NO_TRIP, _UNLIMITED, _FOLLOWING = Trip.NONE, Limited.NONE, RobotStatus.FOLLOWING
+_NO_TRIP, _FAULT, _UNLIMITED, _FOLLOWING = Trip.NONE, Trip.FAULT, Limited.NONE, RobotStatus.FOLLOWING
 
 _ABSURD = 1e3
 """Joint speeds beyond this are a broken reading, rad/s."""
@@ -71,7 +71,11 @@ class Servo:
         self._envelope = envelope = Envelope(smoother, self.kinematics, spec.workspace)
         self._watchdog = Watchdog(dt)
         self._anchoring = Anchoring(smoother, repeats)
-        self._range = [(x - _BEYOND, y + _BEYOND) for x, y in zip(spec.limits.lower, spec.limits.upper, strict=True)]
+        limits = list(zip(spec.limits.lower, spec.limits.upper, strict=True))
+        self._range = [(low - _BEYOND, high + _BEYOND) for low, high in limits]
+        # Positions this near to the middle of their ranges are in them: one distance, not two comparisons a joint.
+        self._middle = [0.5 * (low + high) for low, high in limits]
+        self._radius = min(0.5 * (high - low) for low, high in limits) + _BEYOND
         self._torque = TorqueMotion(smoother, envelope, spec.limits, mass_matrix)
         self._motions: dict[Kind, Motion] = {
             Kind.JOINT_TARGET: JointTargetMotion(smoother, envelope),
@@ -185,12 +189,12 @@ class Servo:
             self._envelope.limited = Limited.REANCHORED
             if self._motion is not None:
                 self._motion.reanchored()
-        faulty = device is Trip.FAULT
+        faulty = device is _FAULT
         self._seen = (now, device, late, faulty)
         # What was computed ahead goes out even when something is wrong: the stop begins where it ends.
         setpoint = self._decide(inbox, now, device, late, faulty) if ready is None else ready
         if setpoint is not None and setpoint.tau is None:
-            self._anchoring.gave(setpoint.q, setpoint.dq, setpoint.ddq)
+            self._anchoring.gave(setpoint)
         return setpoint
 
     @property
@@ -292,7 +296,8 @@ class Servo:
         """As many numbers as joints, in the joints' ranges or at least near them."""
         if len(q) != self._smoother.n:
             return False
-        return self._smoother.is_free(q) or all(low <= x <= high for x, (low, high) in zip(q, self._range, strict=True))
+        near = dist(q, self._middle) <= self._radius
+        return near or all(low <= x <= high for x, (low, high) in zip(q, self._range, strict=True))
 
     def _is_sound(self, values: Floats) -> bool:
         """As many numbers as joints, finite and not absurd."""
@@ -363,7 +368,7 @@ class Servo:
         self._publish()
         if self._torque.active:
             return self._torque.setpoint()
-        return Setpoint(smoother.q, smoother.dq, smoother.ddq, q_from=q_from)
+        return Setpoint(smoother.q, smoother.dq, smoother.ddq, None, q_from)
 
     def _at_rest(self) -> bool:
         """Does nothing move, and are positions what holds the arm?"""

@@ -84,12 +84,23 @@ def test_somebody_who_never_answers(monkeypatch: pytest.MonkeyPatch) -> None:
 @needs_libraries
 def test_an_emulated_fr3_is_in_order(robot: Control) -> None:
     found = checked(rig())
-    assert list(found) == ["route", "robot", "state", "hand", "network"]
+    assert list(found) == ["route", "robot", "state", "set-points", "hand", "network"]
     assert {name: v.level for name, v in found.items() if name != "network"} == dict.fromkeys(
-        ["route", "robot", "state", "hand"], "ok"
+        ["route", "robot", "state", "set-points", "hand"], "ok"
     )
     assert "protocol 10" in found["robot"].found
     assert robot.send("state")["mode"] == "idle", "and it was left alone"
+
+
+@needs_libraries
+def test_set_points_that_are_reported_with_noise(robot: Control) -> None:
+    robot.send("report-noise 0.01")
+    try:
+        found = checked(rig())
+    finally:
+        robot.send("report-noise 0")
+    assert found["set-points"].level == "fail"
+    assert found["state"].level == "ok"
 
 
 @needs_libraries
