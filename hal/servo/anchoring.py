@@ -169,7 +169,9 @@ class Anchoring:
         self._at = self._motion
         """Where the device is, as far as is known: what it took last, or where it continued to."""
         steps = [smoother.dt * v for v in smoother.dq]
-        self._track = deque([[x - k * step for x, step in zip(q, steps, strict=True)] for k in range(3)], 3)
+        self._track: deque[Floats] = deque(
+            [[x - k * step for x, step in zip(q, steps, strict=True)] for k in range(3)], maxlen=3
+        )
         """Where it was in the last three cycles, rad; the newest is that of ``_at``."""
         self._fresh = True
         """Nothing was given since."""
@@ -391,7 +393,7 @@ class Anchoring:
         these, which were rounded.
         """
         track, dt = list(self._track), self._smoother.dt
-        refined = [track[0]]
+        refined: list[Floats] = [track[0]]
         for before, after, reading in zip(track[1:], track, (self._last, self._before), strict=False):
             dq = None if reading is None else reading.dq_commanded
             if dq is None or max([abs(y - x - dt * v) for x, y, v in zip(before, after, dq, strict=True)]) > _CONTINUED:
