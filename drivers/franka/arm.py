@@ -39,8 +39,6 @@ _STILL = 5e-3
 """A motion begins at rest: no set-point faster than this is its first, rad/s (5 rad/s2 within a cycle)."""
 _DRIFT = 1e-6
 """A controller that integrates velocities is no farther than this from its set-points, rad, unless one was lost."""
-_NOISE = 1e-4
-"""A set-point this near to where the robot says that it holds is where it holds, rad: the servo knows it better."""
 _NOTHING_SHOWN: tuple[Mode | None, Fault | None] = (None, None)
 _CALM = frozenset({Mode.IDLE, Mode.MOVE})
 _BY_HAND = frozenset({Mode.USER_STOPPED, Mode.GUIDING, Mode.OTHER})
@@ -169,8 +167,7 @@ class FrankaArm(RobotDriver):
             link.finish()
         if link.motion is None:  # a library with a loop of its own ends a motion when the cycle returns to it
             self._connection.configure(s)
-            if max([abs(q - q_d) for q, q_d in zip(setpoint.q, s.q_d, strict=True)]) <= _NOISE:
-                link.still = setpoint.q
+            link.still = setpoint.q
             link.start(kind)
 
     def mass_matrix(self, q: Sequence[float]) -> Any:

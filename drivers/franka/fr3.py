@@ -15,6 +15,10 @@ from .link import Floats, Kind, Link, Sample
 __all__ = ["Fr3Link"]
 
 
+_NOISE = 4e-6
+"""Set-points that differ less from what the robot reports are better known to the servo, rad: reports have noise."""
+
+
 class Fr3Link(Link):
     """An FR3 (protocol 10)."""
 
@@ -52,8 +56,10 @@ class Fr3Link(Link):
         """The set-point that changes nothing."""
         if self.motion is not Kind.POSITION:
             return (0.0,) * 7
-        still: Floats = self.state.q_d if self.still is None else self.still
-        return still
+        q_d: Floats = self.state.q_d
+        if self.still is None or max([abs(a - b) for a, b in zip(self.still, q_d, strict=True)]) > _NOISE:
+            return q_d
+        return self.still
 
     def send(self, values: Floats) -> None:
         self.still = values

@@ -74,7 +74,7 @@ class Link(ABC):
         self.state: Any = None
         """The library's record of the newest state."""
         self.still: Floats | None = None
-        """The position that changes nothing, rad: the last one that was sent. None: what the robot says."""
+        """Where the arm holds by what its servo knows, rad; None: where the robot says."""
 
     @abstractmethod
     def connect(self, host: str) -> None:

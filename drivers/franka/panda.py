@@ -43,7 +43,7 @@ class PandaLink(Link):
         self._finished = False
 
     def send(self, values: Floats) -> None:
-        self._answer = self.still = values
+        self._answer = values
 
     def finish(self) -> None:
         self._finished = True
@@ -72,7 +72,7 @@ class PandaLink(Link):
         """What the turn left; where it left nothing, stay: where the controller is, without speed or torque."""
         command: Any
         if kind is Kind.POSITION:
-            command = libfranka.JointPositions(state.q_d if self.still is None else self.still)
+            command = libfranka.JointPositions(state.q_d if self._answer is None else self._answer)
         else:
             values = (0.0,) * 7 if self._answer is None or self._finished else self._answer
             command = libfranka.JointVelocities(values) if kind is Kind.VELOCITY else libfranka.Torques(values)
