@@ -92,7 +92,8 @@ export class Cameras {
   /** Show these cameras. @param {any[]} cameras of hello */
   open(cameras) {
     const names = cameras.map((camera) => camera.name);
-    if (names.join("\n") !== this.views.map((view) => view.name).join("\n")) this.#build(cameras, names);
+    const same = names.join("\n") === this.views.map((view) => view.name).join("\n");
+    if (!same || !names.length) this.#build(cameras, names);
     this.pictures.open(names);
   }
 
