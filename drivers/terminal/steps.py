@@ -18,7 +18,7 @@ _QUIET = 0.5
 """After a stop no key counts for so long, s: what was typed before it may still be on its way."""
 _GRIP = 0.1
 """How far a key moves r2, share of its travel."""
-_GRIP_S = 0.1
+_GRIP_S = 0.08
 """How long l2 is pressed for it, s. Half of that r2 stays where it was, so that the gripper is taken over there."""
 _TAP_S = 0.1
 """How long the other buttons are pressed, s."""

@@ -14,7 +14,7 @@ from hal.drivers.terminal.pad import TerminalPad
 from hal.errors import ConfigError, NotSupported
 from hal.gamepad import Gamepad
 from hal.inbox import DeadmanRecord
-from hal.servo.watchdog import SILENCE
+from hal.servo.watchdog import PAD_SILENCE
 from hal.specs import PadSpec
 
 DT = 0.005
@@ -82,11 +82,11 @@ def _terminal(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.parametrize(
     ("key", "axis", "share", "buttons", "longest"),
     [
-        (UP, "dpad_y", 0.4, {"l2"}, 0.1),
-        (DOWN, "dpad_y", -0.4, {"l2"}, 0.1),
-        ("\x1b[C", "dpad_x", 0.4, {"l2"}, 0.1),
-        ("a", "left_x", -0.5, {"l2"}, 0.1),
-        ("I", "right_y", 0.5, {"l2"}, 0.1),  # with Caps Lock
+        (UP, "dpad_y", 0.5, {"l2"}, 0.08),
+        (DOWN, "dpad_y", -0.5, {"l2"}, 0.08),
+        ("\x1b[C", "dpad_x", 0.5, {"l2"}, 0.08),
+        ("a", "left_x", -0.6, {"l2"}, 0.08),
+        ("I", "right_y", 0.6, {"l2"}, 0.08),  # with Caps Lock
         (PAGE_UP, None, 0.0, {"l2", "l1"}, 0.05),
         ("\x1b[6~", None, 0.0, {"l2", "r1"}, 0.05),
     ],
@@ -138,7 +138,7 @@ def test_a_step_proves_life_by_its_key_press_alone(bench) -> None:
     it.run(0.05)
     assert it.deadman.held
     assert it.deadman.record.t_alive == pytest.approx(pressed, abs=DT)
-    assert SILENCE - DT > 0.1, "a step is over before the watchdog would say so"
+    assert PAD_SILENCE - DT > 0.08 + 0.02, "a step is over before the watchdog ends it, with time for a late poll"
     it.run(0.5)
     assert it.deadman.record.t_alive == it.now
 
@@ -278,7 +278,7 @@ def held() -> Iterator[Held]:
 
 
 def fresh(it: Held) -> bool:
-    return time.monotonic() - it.deadman.record.t_alive < SILENCE
+    return time.monotonic() - it.deadman.record.t_alive < PAD_SILENCE
 
 
 def test_keys_are_held_from_press_to_release(held: Held) -> None:
