@@ -37,10 +37,11 @@ def drive(rig: hal.Rig, control: hal.Control, tau: list[float], seconds: float) 
 
 def test_an_arm_floats_turns_and_is_held_after_the_session(rig: hal.Rig) -> None:
     arm = rig.robots["panda"]
+    rig.clock.sleep(0.2)  # in the first steps of a world the motors take over the arm's weight
     start = arm.state().q
     with arm.control(rate_hz=100) as control:
         assert drive(rig, control, NOTHING, 1.0) == []
-        assert np.abs(arm.state().q - start).max() < 2e-3
+        assert np.abs(arm.state().q - start).max() < 1e-4
         drive(rig, control, WRIST, 0.4)
         state = arm.state()
         assert state.status is RobotStatus.FOLLOWING

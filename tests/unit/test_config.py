@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -310,7 +311,7 @@ def test_pads() -> None:
 
 
 def test_playback_files_are_relative_to_the_rig(tmp_path: Path) -> None:
-    (tmp_path / "tour.jsonl").write_text("")
+    shutil.copy(find_data("config", "teleop/tour.jsonl"), tmp_path)
     (tmp_path / "rig.yaml").write_text("gamepads: {pad: {driver: playback, file: tour.jsonl}}")
     assert plan(tmp_path / "rig.yaml").pads[0].options == {"file": str(tmp_path / "tour.jsonl")}
 
