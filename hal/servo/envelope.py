@@ -58,8 +58,8 @@ class Envelope:
         self.limited = Limited.NONE
         self.guard: Guard | None = None if workspace is None else self.stays_inside
         """What a proposed step must satisfy beyond joint limits."""
-        self._too_fast = False
-        """Was the tcp's speed why the guard refused the last step?"""
+        self._refused = Limited.NONE
+        """Why the guard refused a step last."""
         self._tcp = TcpReference(smoother, kinematics, workspace)
 
     def open(self, session: Session) -> None:
@@ -191,13 +191,16 @@ class Envelope:
         now = self.kinematics.fk(smoother.stop_end())
         for x, x_now, low, high in zip(end, now, box.lower, box.upper, strict=False):
             if x > max(high, x_now) + 1e-9 or x < min(low, x_now) - 1e-9:
+                self._refused = Limited.WORKSPACE
                 return False
         return True
 
     def keeps_tcp_speed(self, smoother: JointSmoother) -> bool:
         """Return whether the tcp keeps its speed limit in the proposed step and in a stop after it."""
-        self._too_fast = self.tcp_speed < _UNLIMITED and not self._tcp.surely_stops_slower(self.tcp_speed)
-        return not self._too_fast
+        if self.tcp_speed >= _UNLIMITED or self._tcp.surely_stops_slower(self.tcp_speed):
+            return True
+        self._refused = Limited.TCP_SPEED
+        return False
 
     def allows(self, smoother: JointSmoother) -> bool:
         """`keeps_tcp_speed` and `stays_inside`."""
@@ -208,4 +211,4 @@ class Envelope:
         if smoother.held_back:
             self.limited |= Limited.POSITION
         if smoother.guarded:
-            self.limited |= Limited.TCP_SPEED if self._too_fast else Limited.WORKSPACE
+            self.limited |= self._refused

@@ -21,6 +21,9 @@ _SAMPLE = 0.05
 _SAMPLES = 64
 """The path is looked at every so many rad, at most so many times: planning must fit into a tick."""
 
+_SLOWER = 0.8
+"""After a step that the guard refused, the rest of the path is planned at this share of the speed before."""
+
 _HERE = 1e-9
 """A goal this near needs no motion, rad."""
 
@@ -42,6 +45,8 @@ class PathMotion(Motion):
         self._from: list[float] = []
         self._direction: list[float] = []
         self._planned = False
+        self._share = 1.0
+        """Share of the greatest speed at which the path is planned."""
         self._ruckig = Ruckig(1, smoother.dt)
         self._input = InputParameter(1)
         self._output = OutputParameter(1)
@@ -57,6 +62,7 @@ class PathMotion(Motion):
         inside = [max(low, min(high, x)) for x, low, high in zip(goal, smoother.lower, smoother.upper, strict=True)]
         self._check_workspace(inside)
         self._goal = inside
+        self._share = 1.0
         self.arrived = False
         self._planned = False
 
@@ -96,7 +102,9 @@ class PathMotion(Motion):
         along = self._direction
         q = [x + s * d for x, d in zip(self._from, along, strict=True)]
         if not smoother.adopt(q, [ds * d for d in along], [dds * d for d in along], self.envelope.keeps_tcp_speed):
-            self._planned = False  # stops, and goes on from there
+            # It stops, and goes on more slowly from there: at the same speed the same step might be refused for ever.
+            self._share *= _SLOWER
+            self._planned = False
 
     def _plan(self) -> None:
         smoother, envelope = self.smoother, self.envelope
@@ -116,6 +124,7 @@ class PathMotion(Motion):
         fastest_tcp = envelope.stop_speed(along, self._samples(self._goal))
         if fastest_tcp * speed > envelope.goal_tcp_speed:
             speed = envelope.goal_tcp_speed / fastest_tcp
+        speed *= self._share
         inputs = self._input
         inputs.current_position, inputs.current_velocity, inputs.current_acceleration = [0.0], [0.0], [0.0]
         inputs.target_position = [length]

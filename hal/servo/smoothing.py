@@ -43,6 +43,9 @@ way (seen: 20 s instead of 13)."""
 _EDGE = 1e-9
 """The same for positions, rad."""
 
+_PARTS = (0.5, 0.125, 0.03)
+"""A change of speed that the guard refuses is tried again with these shares of it."""
+
 _STILL = 1e-12
 """Speeds and accelerations below this are rounding errors, rad/s and rad/s2."""
 
@@ -94,7 +97,7 @@ class JointSmoother:
         self.held_back = self._none
         """Joints that the last step stopped because a position limit was near."""
         self.guarded = False
-        """Did the guard turn the last step into a stop?"""
+        """Did the guard refuse the last step as it was first proposed?"""
         self._ruckig = Ruckig(n, dt)
         self._output = OutputParameter(n)
         self._input = InputParameter(n)
@@ -136,8 +139,9 @@ class JointSmoother:
     def follow(self, dq: Floats, guard: Guard | None = None, together: bool = False) -> None:
         """One tick towards the velocities ``dq``, which are cut to the limits.
 
-        A joint that would break the invariant is stopped; with ``together`` all are. A step that the guard refuses
-        becomes a stop of all.
+        A joint that would break the invariant is stopped; with ``together`` all are. Where the guard refuses a step,
+        smaller changes of speed are tried; if it refuses all of them, the step becomes a stop of all joints. Without
+        the smaller ones an arm at rest whose first step is refused would never move.
         """
         if not hypot(*dq) <= self.slowest:
             dq = self._within_speed(dq)
@@ -146,11 +150,21 @@ class JointSmoother:
         self.held_back = self._violations()
         if self.held_back:
             stopped = self._all if together else self.held_back
-            self._propose_velocity([0.0 if i in stopped else v for i, v in enumerate(dq)])
+            dq = [0.0 if i in stopped else v for i, v in enumerate(dq)]
+            self._propose_velocity(dq)
         if guard is not None and not guard(self):
             self.guarded = True
-            self._propose_velocity(self._zeros)
+            if not self._follows_slower(dq, guard):
+                self._propose_velocity(self._zeros)
         self._commit()
+
+    def _follows_slower(self, dq: Floats, guard: Guard) -> bool:
+        """Propose a step that changes the speeds by a part of the way to ``dq``; False when none may be taken."""
+        for part in _PARTS:
+            self._propose_velocity([v0 + part * (v - v0) for v, v0 in zip(dq, self.dq, strict=True)])
+            if not self._violations() and guard(self):
+                return True
+        return False
 
     def reach(self, q: Floats, velocity: Floats, guard: Guard | None = None) -> bool:
         """One tick of the time-optimal motion to rest at ``q``, no faster than ``velocity`` (each > 0).

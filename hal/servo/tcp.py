@@ -195,6 +195,7 @@ class TcpReference:
             self._put_centre(dq)
             if self._around(dist(mean, dq)) + ramps + fastest * self._moved() <= cap:
                 return True
+        self._refresh()
         return self._proves_slower_stop(cap)
 
     def _proves_slower_stop(self, cap: float) -> bool:

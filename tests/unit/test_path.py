@@ -11,7 +11,7 @@ from specs import PANDA_HOME, panda
 
 from hal.errors import CommandError
 from hal.specs import WorkspaceSpec
-from hal.types import RobotStatus, Trip
+from hal.types import Limited, RobotStatus, Trip
 
 STEP = (0.8, 0.5, -0.4, 0.6, 0.3, -0.5, 1.2)
 GOAL = tuple(x + d for x, d in zip(PANDA_HOME, STEP, strict=True))
@@ -49,6 +49,37 @@ def test_the_tcp_keeps_its_speed() -> None:
     tcp = np.array([bench.servo.kinematics.fk(q)[:3] for q in bench.history])
     fastest = np.linalg.norm(np.diff(tcp, axis=0), axis=1).max() / bench.dt
     assert 0.2 < fastest <= 0.25
+
+
+@pytest.mark.parametrize("rate_hz", [240.0, 1000.0])
+@pytest.mark.parametrize("speed", [0.02, 0.1, 0.3])
+def test_the_arm_rests_only_at_the_end_of_a_long_way(rate_hz: float, speed: float) -> None:
+    """All joints move, so that together they are faster than the slowest of them may be by itself."""
+    goal = np.add(PANDA_HOME, [0.8, 0.5, -0.7, 0.6, 0.9, -0.6, 1.0])
+    bench = Bench(rate_hz=rate_hz, speed=speed, tcp_speed=0.25, move_to=goal.tolist())
+    finish(bench, 60.0)
+    fastest = np.abs(np.diff(bench.history, axis=0)).max(axis=1) / bench.dt
+    begun, end = np.flatnonzero(fastest > 1e-4)[[0, -1]]
+    assert fastest[begun:end].min() > 1e-4
+    assert not bench.limited & Limited.TCP_SPEED
+
+
+@pytest.mark.parametrize(
+    ("tcp_speed", "start", "way"),
+    [
+        (0.01, [0.147, -1.018, 0.349, -1.75, 0.296, 2.124, 0.313], [0.0, -0.015, 0.0, -0.005, 0.002, 0.007, 0.0]),
+        (0.02, [-2.465, 1.486, -2.516, -1.198, 0.359, 1.597, 1.701], [0.0, 0.009, 0.0, -0.03, -0.039, 0.0, 0.007]),
+    ],
+)
+def test_a_goal_is_reached_although_the_first_step_is_refused(
+    tcp_speed: float, start: list[float], way: list[float]
+) -> None:
+    bench = Bench(speed=0.3, tcp_speed=tcp_speed, move_to=np.add(start, way).tolist(), begin=False)
+    bench.q = start
+    bench.servo.anchor(start)
+    bench.begin()
+    finish(bench)
+    assert bench.limited & Limited.TCP_SPEED
 
 
 def test_already_there() -> None:

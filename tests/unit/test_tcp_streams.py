@@ -18,6 +18,7 @@ from hal.commands import Kind
 from hal.config import load
 from hal.quaternion import after_rotation
 from hal.specs import RobotSpec, WorkspaceSpec
+from hal.types import Limited
 
 STREAMS = 2500 if os.environ.get("HAL_SOAK") == "1" else 10
 ROUNDING = 1e-6
@@ -48,7 +49,7 @@ class Stream:
 
     def __init__(self, spec: RobotSpec, seed: int) -> None:
         self.random = rng = random.Random(seed)
-        self.tcp_speed = rng.choice((0.25, 0.25, 0.1, 0.5))
+        self.tcp_speed = rng.choice((0.25, 0.25, 0.5, 0.1, 0.02))
         self.bench = Bench(
             spec,
             rate_hz=rng.choice((240.0, 240.0, 1000.0)),
@@ -157,3 +158,34 @@ def test_no_stream_and_no_stop_is_faster_than_the_session_allows(name: str) -> N
     assert not over, f"{len(over)} of {STREAMS} streams over, worst {worst:.3f}: {over[:20]}"
     assert worst > 0.9, "nothing came near the limit"
     assert travelled > 0.05 * STREAMS, "hardly anything moved"
+
+
+@pytest.mark.parametrize(
+    ("kind", "tcp_speed", "start", "values"),
+    [
+        (
+            Kind.TWIST,
+            0.01,
+            [1.416, -0.155, 0.776, -1.987, -1.277, 1.724, 1.392],
+            [-0.149, 0.2184, -0.1418, 0.2085, 0.4513, -0.0536, 0.0],
+        ),
+        (
+            Kind.JOINT_VELOCITY,
+            0.02,
+            [0.274, 0.096, -0.468, -0.992, 1.379, 1.095, -0.489],
+            [-1.5893, 0.0, 0.0906, 0.0, 0.4692, -1.2166, 0.1269],
+        ),
+    ],
+)
+def test_an_arm_whose_first_step_is_refused_starts_more_slowly(
+    kind: Kind, tcp_speed: float, start: list[float], values: list[float]
+) -> None:
+    """The same step would be refused in every tick, and the arm would never move."""
+    bench = Bench(arm("panda"), speed=0.3, tcp_speed=tcp_speed, begin=False)
+    bench.q = start
+    bench.servo.anchor(start)
+    bench.begin()
+    bench.stream(2.0, kind, values)
+    assert np.abs(np.subtract(bench.q, start)).max() > 0.05
+    assert bench.limited & Limited.TCP_SPEED
+    assert not bench.limited & Limited.WORKSPACE
