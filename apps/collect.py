@@ -28,7 +28,7 @@ def parser() -> argparse.ArgumentParser:
         epilog="--pad demo plays two demonstrations, made for the places that --seed 0 gives the first two episodes of "
         "a new folder; one that does not lift the cube is saved as a failure. Ctrl-C stops the arm and ends the run; "
         "an episode that is being recorded is kept, unmarked. The exit status is 1 when fewer episodes were saved than "
-        "asked for.",
+        "asked for; one that is marked a failure counts as saved.",
     )
     add_rig_options(made)
     add_driving_options(made)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import wait
 from pathlib import Path
 from queue import Empty, SimpleQueue
@@ -74,6 +74,8 @@ class Collection:
         """How often other places were wanted for the things of this episode."""
         self._seed = 0
         """Of the episode that is being recorded."""
+        self._began = 0.0
+        """When the recording was asked for, in s since the report's start."""
         self._starting: Future[None] | None = None
         self._discarding: Future[None] | None = None
         self._notes = len(recorder.notes)
@@ -213,6 +215,7 @@ class Collection:
         if action == "record":
             what = {"program": "collect", "robot": self.robot.name, "mapping": self.driving.mapping}
             self._seed = self.seed
+            self._began = self.rig.clock.now() - self.driving.report.start
             self._starting = self.tape.start(self._seed, what | {"speed": self.args.speed or 1.0})
             self._look_at_tape()
             return ""
@@ -237,11 +240,24 @@ class Collection:
         try:
             agrees = bool(self._judge(self.rig, self.rig.observe(timeout=JUDGE_TIMEOUT)))
         except Exception as error:  # a function of the user's
-            self.driving.event(f"--success raised {type(error).__name__}: {error}; the episode is saved unmarked")
+            judge = "--success" if self.args.success else "the check of the recorded demonstration"
+            self.driving.event(f"{judge} raised {type(error).__name__}: {error}; the episode is saved unmarked")
             return None
         if not agrees:
-            self.driving.event("--success says that it is no success")
+            self.driving.event("; ".join(self._denied()))
         return agrees
+
+    def _denied(self) -> Iterator[str]:
+        """Yield why an episode that was saved as a success is a failure."""
+        if self.args.success:
+            yield "--success says that it is no success"
+        else:
+            yield "the cube was not lifted (checked because a recorded demonstration drives)"
+        report = self.driving.report
+        if any(one["t_s"] >= self._began for one in (*report.trips, *report.faults)):
+            yield "the arm was stopped in this episode"
+            if not self.args.success and not self.rig.lock_step:
+                yield "on a busy computer, add --set simulation.clock=lock_step, which does not depend on its speed"
 
     def _over(self) -> str:
         """Why the run should end, or nothing."""

@@ -156,6 +156,8 @@ def test_a_demonstration_that_grasps_air_is_a_failure(
     assert last.success is False
     out = capsys.readouterr().out
     assert "grasps air" in out
+    assert "the cube was not lifted" in out
+    assert "--success" not in out
     assert "0 succeeded, 1 failed" in out
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import pytest
@@ -165,3 +165,27 @@ def test_an_arm_that_is_not_simulated_drives_home_first_while_l2_is_held(
     told = capsys.readouterr().out
     assert "let go of l2, then hold it until the arm is home; then its gripper opens" in told
     assert "put everything where it starts; south (Cross) starts the recording" in told
+
+
+@pytest.mark.parametrize(("clock", "stops"), [("real_time", True), ("lock_step", True), ("lock_step", False)])
+def test_a_stop_is_named_where_a_demonstration_fails(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], clock: Literal["real_time", "lock_step"], stops: bool
+) -> None:
+    pad = write_pad(tmp_path, (1.0, CROSS), (4.0, PS), until=5.0, held=(1.5, 3.5))
+    with (
+        hal.open("panda_table", sim=True, clock=clock, pad=pad, overrides=["cameras={}"]) as rig,
+        Recorder(rig, tmp_path / "data") as recorder,
+    ):
+
+        def stop(view: RecordingView) -> str:
+            if stops and view.seconds > 1.0:
+                rig.stop()
+            return ""
+
+        rig.console = Page(rig, stop)
+        args = parser().parse_args(["--episodes", "1"])
+        assert Collection(rig, rig.robots["panda"], rig.gamepads["pad"], recorder, args, lambda *_: False).run() == 0
+    told = capsys.readouterr().out
+    assert "the cube was not lifted" in told
+    assert ("the arm was stopped in this episode" in told) is stops
+    assert ("--set simulation.clock=lock_step" in told) is (stops and clock == "real_time")
