@@ -21,7 +21,7 @@ PROGRAMS = {
     "teleop": "drive an arm: page in a browser, gamepad, keyboard, recorded tour",
     "check": "check this computer, real arms and cameras before they move; show gamepads",
     "collect": "record demonstrations",
-    "review": "look through a dataset, mark and delete episodes",
+    "review": "look through a dataset, check and repair it",
     "replay": "play a recorded episode again",
     "rollout": "run a policy and count its successes",
     "export": "convert a dataset for training",

@@ -11,11 +11,12 @@ from __future__ import annotations
 import argparse
 import json
 import sys
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from hal.apps.cli import ACTION_NEEDED, run_app
-from hal.errors import CommandError
+from hal.errors import CommandError, DatasetError
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -24,6 +25,11 @@ if TYPE_CHECKING:
     from hal.recording.reader import Dataset, Episode
 
 __all__ = ["main", "parser"]
+
+LEAVE_OUT = (
+    "restore the files of a damaged episode from a copy, or leave it out with hal-export --episodes; "
+    "docs/record.md says how to remove it"
+)
 
 _MARK = {True: "success", False: "failure", None: "-"}
 
@@ -34,7 +40,7 @@ def parser() -> argparse.ArgumentParser:
         prog="review",
         description="Show what was recorded: a dataset in numbers, an episode as a picture or for the rerun viewer.",
         epilog="The dataset is only read, except by --repair. The exit status is 2 when an episode cannot be read or "
-        "--check finds something, else 0.",
+        "repaired, or --check finds something, else 0.",
     )
     made.add_argument("dataset", metavar="DATASET", help="the folder of a recording")
     made.add_argument(
@@ -79,6 +85,8 @@ def _main(args: argparse.Namespace) -> int:
         (episode,) = chosen(dataset, [args.episode], successful_only=False)
         found = summary(dataset, [episode])
     print(as_json(found) if args.json else "\n".join(_table(found)))
+    if args.episode is None:
+        _warn_of_index(dataset, found)
     if args.episode is not None and not found.broken:
         for path in _drawn(args, dataset.root, episode):
             print(f"wrote {path}", file=sys.stderr if args.json else sys.stdout)
@@ -88,26 +96,55 @@ def _main(args: argparse.Namespace) -> int:
 def _check(args: argparse.Namespace, dataset: Dataset) -> int:
     from hal.recording.checking import check_dataset
     from hal.recording.exporters.selection import chosen
+    from hal.recording.index import repair_command
+    from hal.recording.layout import Layout
 
     if args.png or args.rrd:
         raise CommandError("--check draws nothing: leave out --png and --rrd")
     wanted = None if args.episode is None else [args.episode]
     count = len(chosen(dataset, wanted, successful_only=False))
-    found = [str(error) for error in check_dataset(dataset, wanted)]
+    found = list(dict.fromkeys(str(error) for error in check_dataset(dataset, wanted)))
     if args.json:
         print(json.dumps({"path": str(dataset.root), "episodes": count, "wrong": found}, indent=2))
     else:
-        print("\n".join([*found, f"{count} episode{'' if count == 1 else 's'} checked, {len(found)} problem(s)"]))
+        remedy = f"; next: {repair_command(Layout(dataset.root))}" if found else ""
+        end = f"{count} episode{'' if count == 1 else 's'} checked, {len(found)} problem(s){remedy}"
+        print("\n".join([*found, end]))
     return ACTION_NEEDED if found else 0
 
 
 def _repair(args: argparse.Namespace) -> int:
-    from hal.recording import repair
+    from hal.recording import Dataset, repair
+    from hal.recording.exporters.summary import summary
 
     if args.episode is not None or args.png or args.rrd or args.json:
         raise CommandError("--repair is for the whole dataset and takes no other option")
-    print("\n".join(repair(args.dataset) or ["nothing to repair; --check compares every file with the index"]))
-    return 0
+    done, damaged = [], []
+    try:
+        done = repair(args.dataset)
+        with suppress(CommandError):  # there is no episode
+            damaged = summary(Dataset(args.dataset)).broken
+    except DatasetError as error:
+        if error.episode is None:
+            raise
+        damaged = [str(error)]
+    lines = [*done, *(f"cannot be repaired: {line}" for line in damaged)]
+    if damaged:
+        lines.append(LEAVE_OUT)
+    print("\n".join(lines or ["nothing to repair; --check compares every file with the index"]))
+    return ACTION_NEEDED if damaged else 0
+
+
+def _warn_of_index(dataset: Dataset, found: Summary) -> None:
+    """Say what is wrong in ``meta/``, apart from the episodes that cannot be read."""
+    from hal.recording.checking import check_index
+    from hal.recording.index import repair_command
+    from hal.recording.layout import Layout
+
+    layout = Layout(dataset.root)
+    wrong = next((str(error) for error in check_index(layout) if str(error) not in found.broken), None)
+    if wrong is not None:
+        print(f"warning: the index is damaged: {wrong}; rebuild it with: {repair_command(layout)}", file=sys.stderr)
 
 
 def _drawn(args: argparse.Namespace, root: Path, episode: Episode) -> Iterator[Path]:
@@ -151,6 +188,8 @@ def _table(found: Summary) -> Iterator[str]:
         if line.pace is not None and line.pace < SLOW:
             yield f"episode {line.number}: the simulation ran at {line.pace:.2f} of real time; its speeds are too low"
     yield from (f"cannot be read: {line}" for line in found.broken)
+    if found.broken:
+        yield LEAVE_OUT
     if not found.episodes:
         return
     width = max(len(each.name) for each in found.state)

@@ -11,8 +11,11 @@ import sys
 from pathlib import Path
 
 import pytest
+from app_kit import run_here
 from export_kit import make_recording
 from PIL import Image
+
+from hal.apps import export, review
 
 ROOT = Path(__file__).resolve().parents[2]
 needs_rerun = pytest.mark.skipif(
@@ -156,3 +159,45 @@ def test_every_file_is_checked_and_a_lost_index_is_rebuilt(tmp_path: Path) -> No
     assert done.returncode == 2
     assert f"cannot be read: episode 1: {video.relative_to(root)}: " in done.stdout
     assert run(root, "--repair", "--episode", "0").returncode == 2
+
+
+@pytest.mark.parametrize(
+    "file",
+    [
+        "videos/observation.images.wrist/chunk-000/file-002.mp4",
+        "depth/scene/chunk-000/file-002.depth",
+        "data/chunk-000/file-002.parquet",
+        "episodes/000002.json",
+    ],
+)
+def test_a_truncated_episode_is_named_once_and_can_be_left_out(tmp_path: Path, file: str) -> None:
+    root = make_recording(tmp_path / "demo").root
+    damaged = root / file
+    damaged.write_bytes(damaged.read_bytes()[: damaged.stat().st_size // 2])
+    done = run_here(review.main, root, "--repair")
+    assert done.returncode == 2
+    assert f"cannot be repaired: episode 2: {file}: " in done.stdout
+    assert "leave it out with hal-export --episodes" in done.stdout
+    assert "leave it out with hal-export --episodes" in run_here(review.main, root).stdout
+    done = run_here(review.main, root, "--check")
+    assert done.stdout.count(file) == 1
+    assert f"3 episodes checked, 1 problem(s); next: hal-review {root} --repair" in done.stdout
+
+    assert run_here(export.main, root, "--to", "npz", "--episodes", "0-1").returncode == 0
+    for path in [root / "episodes/000002.json", *root.glob("**/chunk-000/file-002.*")]:
+        path.rename(tmp_path / str(path.relative_to(root)).replace("/", "_"))
+    done = run_here(review.main, root, "--repair")
+    assert (done.returncode, done.stdout.split(";")[0]) == (0, "the index was rebuilt from 2 episodes")
+    assert run_here(review.main, root, "--check").stdout == "2 episodes checked, 0 problem(s)\n"
+
+
+@pytest.mark.parametrize("file", ["meta/stats.json", "meta/tasks.parquet"])
+def test_a_damaged_index_is_a_warning(tmp_path: Path, file: str) -> None:
+    root = make_recording(tmp_path / "demo").root
+    assert run_here(review.main, root).stderr == ""
+    (root / file).write_bytes((root / file).read_bytes()[:100])
+    (warning,) = run_here(review.main, root).stderr.splitlines()
+    assert warning.startswith(f"warning: the index is damaged: {file}: cannot be read")
+    assert warning.endswith(f"hal-review {root} --repair")
+    assert run_here(review.main, root, "--repair").returncode == 0
+    assert run_here(review.main, root).stderr == ""
