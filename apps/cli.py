@@ -9,6 +9,7 @@ import signal
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from pathlib import Path
 from typing import Any
 
 __all__ = [
@@ -123,12 +124,15 @@ def interruptible() -> Iterator[None]:
 def run_app(main: Any, parser: argparse.ArgumentParser, argv: list[str] | None) -> int:
     """Parse the command line and run ``main(args)``; an error that a person can fix is a message, not a traceback.
 
+    The parser's ``prog`` is the program's name (``teleop``); its usage shows the command that was typed instead.
+
     Returns:
         The exit status. The output is written by then, or known to be lost.
     """
     from hal.errors import HalError
 
     _open_standard_streams()
+    parser.prog = _typed(parser.prog)
     link = logging.getLogger("hal.console")
     before, link.disabled = link.disabled, True  # the banner says it
     try:
@@ -150,6 +154,15 @@ def run_app(main: Any, parser: argparse.ArgumentParser, argv: list[str] | None) 
         return 130
     finally:
         link.disabled = before
+
+
+def _typed(name: str) -> str:
+    """Return how the program ``name`` was called: ``hal teleop``, ``hal-teleop`` or ``teleop.py``."""
+    command, *rest = name.split()
+    typed = Path(sys.argv[0]).name
+    if typed in ("hal", "main.py") and command != "hal":
+        rest = [command, *rest]
+    return " ".join([typed, *rest])
 
 
 def _failed(message: str) -> int:

@@ -24,7 +24,7 @@ __all__ = ["main", "parser"]
 def parser() -> argparse.ArgumentParser:
     """The command line."""
     made = argparse.ArgumentParser(
-        prog="import_ark",
+        prog="import-ark",
         description="Make a rig's file of Ark's configuration files, and tell what became of every key.",
         epilog="Ark's files are only read. The exit status is 2, and nothing is written, when something is wrong.",
     )

@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 from app_kit import run_here
 
+from hal.apps import teleop
 from hal.apps.main import PROGRAMS, main
 
 if sys.version_info >= (3, 11):
@@ -33,6 +34,29 @@ def test_a_program_gets_its_own_options(name: str, capsys: pytest.CaptureFixture
         main([name, "--help"])
     assert done.value.code == 0
     assert "usage:" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("command", "words", "usage"),
+    [
+        ("/usr/bin/hal", ["collect"], "hal collect"),
+        ("/usr/bin/hal", ["import-ark"], "hal import-ark"),
+        ("/usr/bin/hal", ["calibrate", "board"], "hal calibrate board"),
+        ("/usr/bin/hal", [], "hal"),
+        ("apps/main.py", ["review"], "main.py review"),
+    ],
+)
+def test_usage_names_the_command_that_was_typed(
+    command: str, words: list[str], usage: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sys, "argv", [command])
+    assert run_here(main, *words, "--help").stdout.startswith(f"usage: {usage} [-h]")
+
+
+@pytest.mark.parametrize("command", ["hal-teleop", "teleop.py"])
+def test_usage_of_a_single_program(command: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "argv", [f"/somewhere/{command}"])
+    assert run_here(teleop.main, "--help").stdout.startswith(f"usage: {command} [-h]")
 
 
 def test_it_runs_a_program() -> None:
