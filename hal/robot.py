@@ -95,7 +95,8 @@ class RobotDriver(ABC):
     """True where nothing real can move."""
     repeats: ClassVar[bool] = False
     """What the device does when a set-point is lost: True where it repeats the last one, False where it extrapolates at
-    constant acceleration (a Franka), or where none can be lost."""
+    constant acceleration (a Franka), or where none can be lost. Only what was extrapolated differs from a late
+    report, and is corrected."""
 
     def __init__(self, spec: RobotSpec, world: object | None = None) -> None:
         self.spec = spec

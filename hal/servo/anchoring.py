@@ -4,12 +4,14 @@
 from the set-points that were given:
 
 * the device took the set-point, maybe so many cycles ago (*lag*) and with so much *noise*: nothing is done;
-* a set-point was lost, and the device continued by its own rule (at constant acceleration, as a Franka does, or it
-  repeated the last one): the smoother continues from there, as computed here, not as reported;
+* a set-point was lost, and the device continued at constant acceleration, as a Franka does: the smoother continues from
+  there, as computed here, not as reported;
 * nothing explains the report: it is counted as a mismatch and changes nothing. Too many of those are a fault.
 
-Lag and noise are learned in the first cycles in which the set-point moves. Until then nothing is corrected that a lag
-would explain. A device whose reports come late cannot be corrected in time, so there a lost set-point changes nothing.
+Lag and noise are learned in the first cycles of a session in which the set-point moves. Until then nothing is corrected
+that a lag would explain. Three kinds of lost set-points change nothing: on a device whose reports come late, since a
+correction would come late, too; on one with so much noise that the report does not show a loss clearly; and on one that
+repeats the last set-point, since its report of a loss is the same as a late report.
 """
 
 from __future__ import annotations
@@ -51,7 +53,8 @@ _CONTINUED = 4e-7
 """A device that continued by itself reports to be within this of where that is computed to be, rad: two roundings."""
 
 _CLEAR = 4.0
-"""One set-point explains a report when every other one is so many times as far from it."""
+"""One set-point explains a report when every other one is so many times as far from it. Reports with noise show a lost
+set-point only when they are so many times the tolerance away from what was given."""
 
 _SURE = 4
 """So many reports in a row that only one lag explains are believed; the same for measured positions."""
@@ -62,9 +65,6 @@ took)."""
 
 _RESTED = 16
 """So many readings of an arm that rests are averaged, since a start from a noisy position is a step."""
-
-_MOVES = 0.02
-"""Measured speeds below this are noise, rad/s."""
 
 _OVERSHOOT = 5e-3
 """A device that continued by itself may have come so near to a limit that its stop ends this far beyond, rad."""
@@ -77,7 +77,7 @@ class Anchoring:
     """What one device does with its set-points, as its reports show it; corrects the smoother of one arm."""
 
     def __init__(self, smoother: JointSmoother, repeats: bool = False) -> None:
-        """``repeats``: when a set-point is lost, the device repeats the last one instead of extrapolating."""
+        """``repeats``: a device that loses a set-point repeats the last one; no lost set-point of it is corrected."""
         self._smoother = smoother
         self._repeats = repeats
         self.fault: Fault | None = None
@@ -94,15 +94,16 @@ class Anchoring:
         self._steps = 0.0
         """How many reports there were, and how much two of them in a row differ, rad."""
         self.reset_statistics()
-        self._relearn()
+        self.relearn()
         self.forget()
 
     def reset_statistics(self) -> None:
         """Count from zero. What was learned stays."""
         self.mismatches = 0
-        """Reports that nothing explained."""
+        """Reports that were not the set-point at the known lag, and no lost set-point that was corrected."""
 
-    def _relearn(self) -> None:
+    def relearn(self) -> None:
+        """Learn anew how the device reports: what was learned may have been wrong, or the device another one."""
         self.lag: int | None = None
         """How many cycles old the reports are; None until that is known."""
         self.noise = 0.0
@@ -122,10 +123,9 @@ class Anchoring:
         """Cycles of the recent lost set-points."""
 
     def recover(self) -> None:
-        """Clear the fault, and learn anew what the device is."""
-        if self.fault is not None:
-            self.fault = None
-            self._relearn()
+        """Clear the fault, and learn anew how the device reports."""
+        self.fault = None
+        self.relearn()
 
     def statistics(self) -> dict[str, Any]:
         """What is known of the device, as plain values."""
@@ -304,7 +304,11 @@ class Anchoring:
             if _apart(q, reading.q) <= _SAME:
                 self._as_measured += 1
                 self.measured = self._as_measured >= _SURE
-            self._mismatch(reading, nearest if lag is None else apart[lag])
+            if self._repeats and nearest <= self._tolerance:  # an older set-point: this one is lost, or the report late
+                self.mismatches += 1
+                self._count_lost(q)
+            else:
+                self._mismatch(reading, nearest if lag is None else apart[lag])
         return False
 
     def _learn(self, apart: Sequence[float], nearest: float) -> None:
@@ -361,9 +365,9 @@ class Anchoring:
         ``apart``: how far ``q`` is from each of the last set-points, rad.
         """
         off = apart[0]
+        if self._repeats or (self._tolerance > _CONTINUED and off < _CLEAR * self._tolerance):
+            return False
         limit = max(_CONTINUED if self.lag == 0 else _SAME, self._tolerance)
-        if self._repeats:
-            return _apart(q, self._at[0]) <= min(limit, 0.5 * off)  # with the speed that it had there
         dt = self._smoother.dt
         track, exact = self._refined()
         best = _continued(track, cycles)
@@ -438,19 +442,29 @@ class Anchoring:
 
     def _correct(self, q: Floats) -> bool:
         """Go on from where the device is; it reported ``q``."""
+        if not self._count_lost(q):
+            self._at = self._motion
+            return False
+        self._smoother.anchor(*self._at[:3])
+        return True
+
+    def _count_lost(self, q: Floats) -> bool:
+        """Count a lost set-point after which the device reported ``q``; False when these are too many: a fault."""
         lost = self._lost
         lost.append(self._cycle)
         while lost[0] <= self._cycle - _WINDOW:
             lost.popleft()
         if len(lost) > _LOSSES:
-            self._at = self._motion
-            self._fail(q, f"it lost {len(lost)} of {_WINDOW}")
+            self._fail(q, f"it lost, or reported late, {len(lost)} of {_WINDOW}")
             return False
-        self._smoother.anchor(*self._at[:3])
         return True
 
     def _resume(self, reading: Reading) -> bool:
-        """The first reading after a silence: go on from where the arm is, at the speed that was measured, if any."""
+        """The first reading after a silence: if the arm is not at its set-point, start at rest from where it is.
+
+        The arm stopped by itself, or is doing so. A set-point at rest brakes an arm that still moves, while one that
+        began at a speed in a single bad reading would run away, with the dead-man released as well.
+        """
         withheld = self._withheld
         self._silent = self._withheld = False
         q_sent = self._motion[0]
@@ -464,8 +478,7 @@ class Anchoring:
             return False
         if not withheld:
             self._mismatch(reading, inf)
-        moves = max(map(abs, reading.dq)) > _MOVES
-        self._smoother.anchor(q, reading.dq if moves else None)
+        self._smoother.anchor(q)
         self.forget()
         return True
 

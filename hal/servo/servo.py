@@ -153,6 +153,7 @@ class Servo:
         self.report.arrived = False
         self._forget_goals()
         self._watchdog.begin(session, inbox)
+        self._anchoring.relearn()
         self.report.status = RobotStatus.HOLDING
         self.report.trip = Trip.NONE
 
@@ -203,7 +204,7 @@ class Servo:
         return self._anchoring.fault
 
     def recover(self) -> None:
-        """Clear :attr:`fault`."""
+        """Clear :attr:`fault`, and learn anew how the device reports its set-points."""
         self._anchoring.recover()
 
     def withheld(self) -> None:
