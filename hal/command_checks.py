@@ -20,6 +20,7 @@ from .commands import (
     Twist,
 )
 from .errors import CommandError, NotSupported, Unreachable
+from .pose import Pose
 
 if TYPE_CHECKING:
     from .robot import Robot
@@ -32,6 +33,13 @@ FIRST_STEP_DISTANCE = 0.05
 FIRST_STEP_TURN = 0.2
 """Farthest that a first pose may be from the set-point, m and rad. The servo keeps the same bounds by itself."""
 _JOINTS = {JointTarget: "q", JointVelocity: "dq", JointTorque: "tau"}
+_MEANT: dict[type, str] = {
+    Pose: "hal.CartesianTarget(pose)",
+    np.ndarray: "hal.JointTarget(q)",
+    list: "hal.JointTarget(q)",
+    tuple: "hal.JointTarget(q)",
+}
+"""The command that was probably meant by something that is not a command."""
 
 
 class CommandChecks:
@@ -92,8 +100,9 @@ class CommandChecks:
         elif isinstance(command, (CartesianTarget, Twist)):
             return
         else:
-            hint = "; did you mean hal.JointTarget(q)?" if isinstance(command, (np.ndarray, list, tuple)) else ""
-            raise CommandError(f"{type(command).__name__} is no command{hint}")
+            meant = _MEANT.get(type(command))
+            hint = f"; did you mean {meant}?" if meant else ""
+            raise CommandError(f"{type(command).__name__} is not a command{hint}")
         if count != n:
             raise CommandError(f"{robot.name} has {n} joints; {type(command).__name__} has {count}")
 

@@ -34,6 +34,8 @@ __all__ = ["Control"]
 
 _SHORTEST_DEADLINE = 0.1
 _PERIODS = 2.5
+_MOST_AT_ONCE = 100
+"""So many commands in a row without any time in between are a mistake: a lock-step clock stands still."""
 _REST_LIMIT = 5.0
 
 
@@ -63,6 +65,7 @@ class Control:
         if deadman is not None and spec.attended and not spec.emulated:
             deadman.check_trust()
         rate_hz = number("rate_hz", rate_hz, "Hz", least=0.0, above=True)
+        self._rate_hz = rate_hz
         self._deadline = max(_SHORTEST_DEADLINE, _PERIODS / rate_hz)
         if goal is None and self._deadline > spec.deadline_max:
             slowest = _PERIODS / spec.deadline_max
@@ -81,6 +84,9 @@ class Control:
         self._detach: Callable[[], None] | None = None
         self._grip: float | None = None
         self._refused = 0
+        self._t_sent = -math.inf
+        self._at_once = 0
+        """Commands that were sent at the time of the last one."""
         self._checks = CommandChecks(robot)
 
     # Opening and leaving.
@@ -235,6 +241,7 @@ class Control:
             if self._goal is not None:
                 raise CommandError("this session moves to a goal; it takes no commands")
             command = self._checks.checked(command, now, reasons)
+            self._check_time(now)
             if waiting:
                 reasons.append("the dead-man is not held: the arm does not move")
             elif servo.status is RobotStatus.HOLDING:
@@ -246,6 +253,16 @@ class Control:
         if target is not None:
             self._send_width(target, waiting, reasons)
         return Sent(command, tuple(reasons))
+
+    def _check_time(self, now: float) -> None:
+        """Refuse a loop that never lets the time of a lock-step clock pass: its arm would not move."""
+        self._at_once = self._at_once + 1 if now == self._t_sent else 0
+        self._t_sent = now
+        if self._at_once >= _MOST_AT_ONCE:
+            raise CommandError(
+                f"no time passed while {_MOST_AT_ONCE} commands were sent: with clock='lock_step' it passes only while "
+                "the program waits for it, with rig.clock.rate() or rig.clock.sleep()"
+            )
 
     def _check_trip(self, servo: ServoRecord, now: float) -> None:
         if servo.status is RobotStatus.FAULT:
@@ -263,7 +280,7 @@ class Control:
         self._stopped = servo.trip is Trip.STOP
         self._tell()
         remedy = "release the dead-man and press it again" if self.deadman else "call control.rearm() to go on"
-        raise MotionStopped(trip_text(servo.trip) + self._why_lost(servo), remedy)
+        raise MotionStopped(trip_text(servo.trip) + self._details(servo), remedy)
 
     def _tell(self) -> None:
         """The program is told of a stop; so is the hand on the dead-man, once."""
@@ -271,8 +288,11 @@ class Control:
             self.deadman.alarm()
         self._told = True
 
-    def _why_lost(self, servo: ServoRecord) -> str:
-        """What the driver says of a device that does not answer."""
+    def _details(self, servo: ServoRecord) -> str:
+        """What there is to add to the words for a trip."""
+        if servo.trip is Trip.COMMAND_LATE:
+            longest = f"at most {1e3 * self._deadline:.0f} ms may pass between two at rate_hz={self._rate_hz:g}"
+            return f" ({longest}; for a slower loop pass a lower rate_hz, or send chunks)"
         state = self._mail.get_state() if servo.status is RobotStatus.LOST else None
         return f" ({state.fault.cause})" if state is not None and state.fault is not None else ""
 

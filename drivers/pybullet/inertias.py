@@ -44,4 +44,4 @@ def mend_inertias(client: Client, body: Body, massless: Container[str]) -> list[
     wrong = [name for name in mended if name not in massless]
     if not wrong:
         return []
-    return [f"{body.name}: impossible <inertia> in {listed(wrong)}; that of the collision shape is used"]
+    return [f"{body.name}: inertia computed from the collision shapes, the URDF's is impossible: {listed(wrong)}"]

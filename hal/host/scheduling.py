@@ -98,10 +98,11 @@ def _limit_runaway() -> None:
 
     signal.signal(signal.SIGXCPU, lose_priority)
     allowed = resource.getrlimit(resource.RLIMIT_RTTIME)[1]
-    limits = [1_000_000 * seconds for seconds in RUNAWAY]
+    first, last = (1_000_000 * seconds for seconds in RUNAWAY)
     if allowed != resource.RLIM_INFINITY:
-        limits = [min(limit, allowed) for limit in limits]
-    resource.setrlimit(resource.RLIMIT_RTTIME, (limits[0], limits[1]))
+        last = min(last, allowed)
+        first = min(first, last // 2)  # the signal must come before the end
+    resource.setrlimit(resource.RLIMIT_RTTIME, (first, last))
 
 
 def _shorten_slice() -> None:

@@ -106,7 +106,8 @@ def test_sent_says_what_was_changed(rig: hal.Rig, arm: hal.Robot) -> None:
         (lambda: hal.JointTorque([float("inf")] * 7), "not finite"),
         (lambda: Twist([0.1, 0.0]), r"shape \(3,\), not \(2,\)"),
         (lambda: Twist([0.1, 0.0, float("inf")]), "not finite"),
-        (lambda: "up", "str is no command"),
+        (lambda: "up", "str is not a command"),
+        (lambda: hal.Pose([0.4, 0.0, 0.4]), r"did you mean hal\.CartesianTarget"),
     ],
 )
 def test_a_malformed_command_is_refused_and_nothing_moves(rig: hal.Rig, arm: hal.Robot, make, text: str) -> None:
@@ -153,6 +154,16 @@ def test_a_first_target_far_away_is_refused(rig: hal.Rig, arm: hal.Robot) -> Non
     assert np.array_equal(arm.state().q, arm.home)
 
 
+def test_a_loop_in_which_no_time_passes_is_an_error(rig: hal.Rig, arm: hal.Robot) -> None:
+    velocity = JointVelocity([0.2, 0, 0, 0, 0, 0, 0])
+    with arm.control(rate_hz=50) as control:
+        for _ in turns(rig, 150):
+            control.send(velocity)
+        with pytest.raises(CommandError, match=r"rig\.clock\.rate"):
+            for _ in range(150):
+                control.send(velocity)
+
+
 def test_commands_that_stop_coming_trip_and_rearm_goes_on(rig: hal.Rig, arm: hal.Robot) -> None:
     velocity = JointVelocity([0.2, 0, 0, 0, 0, 0, 0])
     with arm.control(rate_hz=50) as control:
@@ -162,7 +173,7 @@ def test_commands_that_stop_coming_trip_and_rearm_goes_on(rig: hal.Rig, arm: hal
         let_pass(rig, 0.5)
         assert control.trip is Trip.COMMAND_LATE
         assert np.abs(arm.state().dq_set).max() == 0.0
-        with pytest.raises(MotionStopped, match=r"commands stopped coming; call control.rearm"):
+        with pytest.raises(MotionStopped, match=r"commands stopped coming \(at most 100 ms .*; call control.rearm"):
             control.send(velocity)
         stopped = arm.state().q
         control.rearm()

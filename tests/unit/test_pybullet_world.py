@@ -558,7 +558,7 @@ class TestBadInput:
             assert world.warnings == []
         else:
             assert inertia == pytest.approx([1.0 / 600.0] * 3, rel=0.1)
-            assert "impossible <inertia> in box" in world.warnings[0]
+            assert "impossible: box" in world.warnings[0]
 
     def test_close_is_idempotent(self) -> None:
         world = World(world_spec(cube()))
