@@ -273,9 +273,9 @@ class Collection:
             self._wishes(self.pad.state())  # what was pressed before counts no more
         self.phase = phase
         self._warned = self._warned and phase != "resetting"
-        if prompt := self._prompt:
+        if (prompt := self._prompt) or phase == "recording":
             doing = "RECORDING" if phase == "recording" else phase
-            self.driving.event(f"episode {self.number}: {doing}; {prompt}")
+            self.driving.event(f"episode {self.number}: {doing}{prompt and f'; {prompt}'}")
         self._show()
 
     def _show(self) -> None:

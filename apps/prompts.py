@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Collection
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -12,8 +12,6 @@ if TYPE_CHECKING:
 
 __all__ = ["Prompts", "called"]
 
-PAGE = {"record": "Record", "finish": "Save", "fail": "Save as failure", "discard": "Discard"}
-"""What the page's buttons are called."""
 SONY = {"south": "Cross", "east": "Circle", "west": "Square", "north": "Triangle", "home": "PS"}
 
 
@@ -35,16 +33,20 @@ class Prompts:
         place = "put everything where it starts; " if self._drives_home and phase == "ready" else ""
         return f"{place}{self.buttons(actions, mapping, phase)}" if actions else ""
 
-    def buttons(self, actions: Iterable[str], mapping: TeleopMapping, phase: str = "recording") -> str:
+    def buttons(self, actions: Collection[str], mapping: TeleopMapping, phase: str = "recording") -> str:
         """What these actions are done with."""
-        forgets = "forgets it" if self._by_page else f"forgets it, once {mapping.deadman} is let go of"
+        if self._by_page:
+            shuffle = '; "Discard" shuffles the objects' if phase == "ready" and "discard" in actions else ""
+            return f"press Record{shuffle}" if "record" in actions else ""  # the other buttons say what they do
         words = {
             "record": "starts the recording",
             "finish": "saves it as a success",
             "fail": "saves it as a failure",
-            "discard": "puts things elsewhere" if phase == "ready" else forgets,
+            "discard": "puts things elsewhere"
+            if phase == "ready"
+            else f"forgets it, once {mapping.deadman} is let go of",
         }
-        names = PAGE if self._by_page else {action: called(button) for action, button in mapping.actions.items()}
+        names = {action: called(button) for action, button in mapping.actions.items()}
         told = [f"{names[action]} {words[action]}" for action in actions if action in names]
         return ", ".join(told) or ("the page has the buttons" if self._has_page else "this pad has no buttons for it")
 

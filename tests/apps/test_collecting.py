@@ -27,8 +27,8 @@ from hal.recording import Dataset, Recorder
 class Page(Console):
     """The console's page, with somebody before it: ``press`` says what they press when they see a view."""
 
-    def __init__(self, rig: hal.Rig, press: Callable[[RecordingView], str]) -> None:
-        super().__init__(rig, Listen.parse(None), driven_by="pad")
+    def __init__(self, rig: hal.Rig, press: Callable[[RecordingView], str], driven_by: str | None = "pad") -> None:
+        super().__init__(rig, Listen.parse(None), driven_by=driven_by)
         self.views: list[RecordingView] = []
         self._press = press
         self._taken: Callable[[str], None] | None = None
@@ -69,6 +69,7 @@ def collect(
     pad: str,
     *options: str,
     press: Callable[[RecordingView], str] | None = None,
+    by_page: bool = False,
     **disk: int,
 ) -> tuple[int, list[RecordingView]]:
     """A run in simulation, in lock-step: its exit status, and what a page showed. It writes ``folder / "data"``."""
@@ -76,7 +77,7 @@ def collect(
         hal.open("panda_table", sim=True, clock="lock_step", pad=pad, overrides=["cameras={}"]) as rig,
         Recorder(rig, folder / "data", **disk) as recorder,
     ):
-        page = Page(rig, press) if press is not None else None
+        page = Page(rig, press, None if by_page else "pad") if press is not None else None
         rig.console = page
         robot, gamepad = rig.robots["panda"], rig.gamepads["pad"]
         status = Collection(rig, robot, gamepad, recorder, parser().parse_args([*options])).run()
@@ -104,6 +105,21 @@ def test_a_page_has_the_buttons_and_sees_how_it_goes(tmp_path: Path) -> None:
         assert view.actions == possible.get(view.phase, ())
         assert view.seconds == 0.0 or view.phase == "recording"
         assert view.free_bytes > 0
+
+
+def test_who_drives_by_the_page_is_told_no_more_than_its_buttons_say(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    presses = iter(["record", "finish"])
+
+    def press(view: RecordingView) -> str:
+        return next(presses) if view.phase == "ready" or view.seconds > 0.3 else ""
+
+    status, views = collect(tmp_path, write_pad(tmp_path, until=30.0), "--episodes", "1", press=press, by_page=True)
+    assert status == 0
+    assert {view.prompt for view in views if view.phase == "ready"} == {'press Record; "Discard" shuffles the objects'}
+    assert {view.prompt for view in views if view.phase == "recording"} == {""}
+    assert "episode 0: RECORDING\n" in capsys.readouterr().out
 
 
 def test_a_disk_that_fills_up_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
