@@ -155,6 +155,17 @@ def test_every_key_that_drives_is_named_on_a_screen_with_a_keyboard(page: Browse
         page.size(1280, 800)
 
 
+def test_the_keys_of_the_gripper_stand_beside_what_they_do(page: Browser) -> None:
+    top = {name: page.place(f"#gripper {name}")["y"] for name in (".top", ".bottom", ".closing", ".opening")}
+    assert sorted(top, key=top.__getitem__) == [".closing", ".top", ".bottom", ".opening"]
+    assert (page.text("#gripper .closing"), page.text("#gripper .top")) == ("G", "closed")
+    assert (page.text("#gripper .opening"), page.text("#gripper .bottom")) == ("H", "open")
+    for key, code, place in (("g", "KeyG", "100"), ("h", "KeyH", "0")):
+        page.key(code, key, True)
+        wait_for(lambda place=place: page.run("return gripper.ariaValueNow") == place, "the slider to get there")
+        page.key(code, key, False)
+
+
 def test_the_knob_covers_no_label(page: Browser) -> None:
     """Wherever it is pushed, its label lies above it."""
     with page.drag("dpad", 0.0, 1.0):
