@@ -19,7 +19,7 @@ from .padmessage import PadMessage
 
 __all__ = ["App", "Desk", "Page"]
 
-_UNHEARD = f"the connection is too slow to drive, {{}}: a round trip may take {1e3 * PAD_SILENCE:g} ms at most"
+_UNHEARD = f"{{}}: the connection is too slow to drive (a round trip may take {1e3 * PAD_SILENCE:g} ms at most)"
 _COMPLAINT = 2.0
 """s between two complaints to one page about that."""
 _SAYS = 50

@@ -22,9 +22,9 @@ _MASKS = 1 << len(BUTTONS)
 _LONGEST = 1e9
 """ms, and s: more than any clock here shows."""
 
-_AHEAD = "the clock of its page runs ahead"
-_LATE = "its messages came late"
-_SILENT = "its page gave no sign of life"
+_AHEAD = "The page's clock runs ahead"
+_LATE = "The page's messages came late"
+_SILENT = "The page gave no sign of life"
 ALARMS = frozenset((_AHEAD, _LATE, _SILENT))
 """Losses of the pad that nobody intended."""
 

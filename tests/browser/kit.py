@@ -50,10 +50,10 @@ PATIENCE = 20.0
 class Bench:
     """A simulated rig that its console drives, with the teleoperation app's own loop in a thread."""
 
-    def __init__(self, cameras: bool = False, rig: Any = "panda_table", **options: Any) -> None:
+    def __init__(self, cameras: bool = False, rig: Any = "panda_table", listen: str = ":0", **options: Any) -> None:
         self.args = parser().parse_args(["--sim"])
         overrides = [] if cameras else ["cameras={}"]
-        self.rig = hal.open(rig, sim=True, pad="web", listen=":0", overrides=overrides, **options)
+        self.rig = hal.open(rig, sim=True, pad="web", listen=listen, overrides=overrides, **options)
         self.arm: Robot = next(iter(self.rig.robots.values()))
         assert self.rig.console is not None
         self.console = self.rig.console

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from collections.abc import Iterator
 from typing import Any
@@ -51,6 +52,23 @@ def test_a_stop_that_works_alarms_nobody(bench: Bench, page: Browser) -> None:
         assert lines(page, "STOP was sent") == before + 2
 
     undisturbed(bench, page, stop)
+    let_go_of_all(page)
+
+
+def test_who_stopped_is_told_however_late_the_arm_shows_it(
+    bench: Bench, page: Browser, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stop = bench.rig.stop
+
+    def stop_late() -> None:
+        drive_left(bench, page)
+        with monkeypatch.context() as late:
+            late.setattr(bench.rig, "stop", lambda: threading.Timer(0.3, stop).start())
+            page.click("#stop")
+            wait_for(lambda: page.text("#trip-text"), "the stop", BRIEF)
+        assert page.text("#trip-text").startswith("Stopped by STOP (you, ")
+
+    undisturbed(bench, page, stop_late)
     let_go_of_all(page)
 
 

@@ -76,6 +76,8 @@ def test_a_frozen_browser(bench: Bench, moving: Browser) -> None:
     wait_for(lambda: moving.facts.get("connected"), "the page to answer")
     time.sleep(0.5)
     assert stopped(bench), "what the browser still had to say moves nothing"
+    wait_for(lambda: "he page" in moving.text("#trip-text"), "the page to say why")
+    assert "pad" not in moving.text("#trip-text"), "the page is the pad here"
     assert abs(bench.tcp - before).max() < 1e-3
     goes_on_after_release_and_press(bench, moving)
 
@@ -197,4 +199,37 @@ def test_the_app_that_ends_is_told(page: Browser) -> None:
     finally:
         other.close()
     wait_for(lambda: not page.facts.get("connected"), "the page to notice")
-    wait_for(lambda: "ended" in page.text("body").lower(), "the page to say so")
+    wait_for(lambda: "ended" in page.text("#overlay-title"), "the page to say so")
+    assert page.text("#overlay-next") == "", "nothing is tried again: another run has another link"
+    assert page.text("#notice") == "", "what was wrong before does not matter any more"
+
+
+def test_the_link_of_the_next_run_in_the_same_tab(page: Browser) -> None:
+    """Only what stands behind the # differs, so the browser loads nothing."""
+    other = Bench()
+    port = urlsplit(other.link).port
+    try:
+        page.open(other.link)
+        page.wait_driving()
+        page.hold()
+        wait_for(lambda: other.deadman.held, "the dead-man")
+    finally:
+        other.close()
+    wait_for(lambda: "ended" in page.text("#overlay-title"), "the page to say so")
+    other = Bench(listen=f":{port}")
+    try:
+        page.run("window.sameDocument = true")
+        page.chrome.get(other.link)
+        page.wait_driving()
+        assert page.run("return window.sameDocument"), "the browser loaded the page anew"
+        space = {"code": "Space", "key": " ", "windowsVirtualKeyCode": 32}
+        page.cdp("Input.dispatchKeyEvent", type="rawKeyDown", autoRepeat=True, **space)
+        time.sleep(0.5)
+        assert not other.deadman.held, "the press of the run before counts"
+        page.let_go()
+        drive_left(other, page)
+        page.key("ArrowLeft", "ArrowLeft", False)
+        page.let_go()
+        page.chrome.get("about:blank")
+    finally:
+        other.close()

@@ -118,11 +118,13 @@ def test_a_late_message_is_no_pad_but_is_answered() -> None:
     room.now = 100.3
     room.pad(driver, 100.0, 20.0, [1.0] * 8)
     room.pad(driver, 100.0, 40.0, [1.0] * 8)
-    assert room.app.pads() == [("its messages came late",)]
+    assert room.app.pads() == [("The page's messages came late",)]
     beat, complaint, *more = inbox(driver)
     assert beat == {"type": "beat", "t": 100.3}
     assert complaint["type"] == "refused"
-    assert "120 ms" in complaint["why"]
+    assert complaint["why"] == (
+        "The page's messages came late: the connection is too slow to drive (a round trip may take 120 ms at most)"
+    )
     assert more == [], "it is told once, not fifty times a second"
     room.pad(driver, 100.3)
     assert room.app.pads() == ["page 1"]
@@ -133,7 +135,7 @@ def test_a_gap_is_told_before_the_message_that_ends_it() -> None:
     driver = room.driver()
     room.now = 100.5
     room.pad(driver, 100.0, 500.0)
-    assert room.app.pads() == [("its page gave no sign of life",), "page 1"]
+    assert room.app.pads() == [("The page gave no sign of life",), "page 1"]
 
 
 def test_silence_is_told_when_somebody_looks() -> None:
@@ -143,7 +145,7 @@ def test_silence_is_told_when_somebody_looks() -> None:
     assert room.app.news() == []
     room.desk.look(100.2)
     room.desk.look(100.25)
-    assert room.app.pads() == [("its page gave no sign of life",)]
+    assert room.app.pads() == [("The page gave no sign of life",)]
 
 
 @pytest.mark.parametrize("why", ["hidden", "blur", "closing"])

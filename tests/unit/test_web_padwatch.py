@@ -46,17 +46,17 @@ def test_a_clock_that_runs_a_little_ahead_proves_no_more_than_now() -> None:
 def test_a_message_that_was_under_way_for_too_long_is_a_pad_that_is_gone() -> None:
     pad = connected()
     assert pad.take(message(T, 0.020), T + 0.020 + PAD_SILENCE + 1e-6) == Verdict(
-        "its messages came late", dropped="its messages came late"
+        "The page's messages came late", dropped="The page's messages came late"
     )
     assert not pad.connected
-    assert pad.take(message(T, 0.040), T + 1.0) == Verdict(dropped="its messages came late"), "lost once"
+    assert pad.take(message(T, 0.040), T + 1.0) == Verdict(dropped="The page's messages came late"), "lost once"
     assert pad.take(message(T, 1.0), T + 1.0) == Verdict(None, T + 1.0), "and comes back with one that is not late"
     assert pad.connected
 
 
 def test_a_gap_between_two_messages_is_a_pad_that_was_gone() -> None:
     pad = connected()
-    assert pad.take(message(T, 0.25), T + 0.25) == Verdict("its page gave no sign of life", T + 0.25)
+    assert pad.take(message(T, 0.25), T + 0.25) == Verdict("The page gave no sign of life", T + 0.25)
     assert pad.connected
 
 
@@ -71,7 +71,7 @@ def test_silence_is_noticed_without_a_message() -> None:
     assert pad.look(T + 10.0) is None, "there was no pad yet"
     pad = connected()
     assert pad.look(T + PAD_SILENCE - 0.001) is None
-    assert pad.look(T + PAD_SILENCE + 0.001) == "its page gave no sign of life"
+    assert pad.look(T + PAD_SILENCE + 0.001) == "The page gave no sign of life"
     assert pad.look(T + PAD_SILENCE + 0.002) is None
     assert pad.take(message(T, 0.200), T + 0.200) == Verdict(None, T + 0.200)
 
@@ -93,7 +93,7 @@ def test_a_page_whose_clock_jumped_ahead_is_not_believed() -> None:
     """A computer that slept: its browser's clock went on, ours did not."""
     pad = connected()
     assert pad.take(message(T, 3600.0), T + 0.02) == Verdict(
-        "the clock of its page runs ahead", dropped="the clock of its page runs ahead"
+        "The page's clock runs ahead", dropped="The page's clock runs ahead"
     )
     assert not pad.connected
 
@@ -110,7 +110,7 @@ def test_a_backlog_after_a_stall_counts_only_from_where_it_is_fresh_and_after_a_
     now = T + 1.0
     verdicts = [pad.take(message(T, 0.02 * k), now) for k in range(1, 51)]
     fresh = [k for k, verdict in enumerate(verdicts, 1) if verdict.t_alive is not None]
-    assert verdicts[0] == Verdict("its messages came late", dropped="its messages came late")
+    assert verdicts[0] == Verdict("The page's messages came late", dropped="The page's messages came late")
     assert fresh == list(range(45, 51)), "those of the last 120 ms"
     assert all(verdict.gone is None for verdict in verdicts[1:])
 

@@ -155,7 +155,7 @@ def test_a_page_that_falls_silent_is_a_pad_that_is_gone(app: App) -> None:
             await page.drive()
             pad = await app.pad()
             lost = await app.pad()
-            assert (lost["connected"], lost["why"]) == (False, "its page gave no sign of life")
+            assert (lost["connected"], lost["why"]) == (False, "The page gave no sign of life")
             assert lost["t"] - pad["t_alive"] > PAD_SILENCE
 
     run(test)

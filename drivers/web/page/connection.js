@@ -10,7 +10,7 @@ export const TOO_MANY = 4409;
 export const ENDED = 4410;
 
 /** Trying again after these would only fail again. */
-const FINAL = [REFUSED, TOO_MANY];
+const FINAL = [REFUSED, TOO_MANY, ENDED]; // the next run has another link
 
 /**
  * A WebSocket to `path` with the link's token, or null where the token cannot be one.

@@ -48,6 +48,12 @@ export class Lease {
     this.paint();
   }
 
+  /** A link was opened in this page: it may take control as a page that was just loaded. */
+  opened() {
+    this.disconnected();
+    this.#asked = false;
+  }
+
   /** The socket is gone, and the lease with it. */
   disconnected() {
     const had = this.mine;

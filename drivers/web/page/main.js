@@ -155,6 +155,7 @@ connection.lost = (code, reason, retry) => {
     overlay.show(code, reason, retry, { drove: lease.mine, watched, real: isReal(), saved: recording.outcome });
   }
   told = true;
+  show(byId("notice"), false); // of a connection that is gone
   setData(document.documentElement, "connected", null);
   stateAt = -Infinity;
   lease.disconnected();
@@ -204,7 +205,10 @@ addEventListener("mousedown", (event) => {
   event.preventDefault();
   if (document.activeElement instanceof HTMLElement) document.activeElement.blur();
 });
-addEventListener("hashchange", () => connection.open());
+addEventListener("hashchange", () => { // another link: the browser loads nothing when only its token differs
+  lease.opened();
+  connection.open();
+});
 
 /** The link to the program: how quick it is, and whether it speaks at all. */
 function paintLink() {

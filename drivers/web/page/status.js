@@ -4,12 +4,19 @@ import { byId, setData, setText, show } from "./dom.js";
 
 const SILENT = 0.12; // s, as in the servo
 const OLD = 500; // ms without a state until the page says so
+const STOPPING = 1000; // ms; a state that shows a stop comes after the word that STOP was pressed
 const MOVING = 0.005; // rad/s; slower joints are at rest
 
 /** Status of a robot -> its word. @type {Record<string, string>} */
 const WORDS = { idle: "idle", holding: "stopped", tripped: "stopped" };
 /** What holds a motion back -> its word. @type {Record<string, string>} */
 const LIMITS = { speed: "joint speed", "tcp speed": "tool speed" };
+
+/** Trip -> its words where a page is the pad. @type {Record<string, string>} */
+const PAGE_TRIPS = {
+  deadman_silent: "the page in control gave no sign of life",
+  deadman_lost: "the page in control was disconnected",
+};
 
 /** The dead-man in one word. @param {any} deadman of a robot's state */
 export function deadmanWord(deadman) {
@@ -47,11 +54,14 @@ export class Status {
   #loss = { text: "", alarm: false };
   /** Who pressed STOP last, and when; "" where that is unknown. */
   #stopped = "";
+  #stoppedAt = -Infinity; // ms
 
   /** The program said something. @param {any} said @param {Date} at */
   told({ text, loss, stop }, at) {
     if (loss) this.#loss = { text, alarm: loss === "alarm" };
-    if (stop) this.#stopped = `${stop === this.lease.page ? "you" : stop}, ${at.toTimeString().slice(0, 8)}`;
+    if (!stop) return;
+    this.#stopped = `${stop === this.lease.page ? "you" : stop}, ${at.toTimeString().slice(0, 8)}`;
+    this.#stoppedAt = performance.now();
   }
 
   /**
@@ -108,7 +118,7 @@ export class Status {
     const trip = stopped === undefined ? "none" : (robots[stopped].trip ?? "lost");
     const isNew = trip !== "none" && this.trip === "none";
     this.trip = trip;
-    if (trip === "none") this.#stopped = "";
+    if (trip === "none" && performance.now() - this.#stoppedAt > STOPPING) this.#stopped = "";
     if (stopped !== undefined) {
       setText(byId("trip-text"), called(stopped) + this.#why(robots[stopped]));
       setText(byId("trip-remedy"), robots[stopped].lost ? "Arm state unknown." : this.#remedy());
@@ -123,7 +133,8 @@ export class Status {
     if (robot.lost) return `No state of the arm: ${robot.lost}`;
     if (robot.trip === "stop") return `Stopped by STOP${this.#stopped && ` (${this.#stopped})`}`;
     if (robot.trip === "deadman_lost" && this.#loss.text) return sentence(this.#loss.text);
-    return `Stopped: ${robot.trip_text || robot.trip}`;
+    const page = this.lease.rig?.drivable ? PAGE_TRIPS[robot.trip] : "";
+    return `Stopped: ${page || robot.trip_text || robot.trip}`;
   }
 
   /** What to do after a trip. */
