@@ -84,6 +84,8 @@ class TcpReference:
         and each rad/s2 that it begins with."""
         self._per_speed = self._per_acceleration = 0.0
         """Lengths of the columns of these."""
+        self._fastest = [0.0] * smoother.n
+        """Joint speeds (n,), rad/s, up to which these hold."""
         self._slowest = 0.0
         self._step = 0.0
         """Farthest that one tick can move the tcp and the end of its stop, together, m."""
@@ -96,6 +98,7 @@ class TcpReference:
         smoother = self._smoother
         dt = smoother.dt
         self._stops = []
+        self._fastest = []
         self._slowest = min(velocity)
         self._step = 0.0
         self._proof = ()
@@ -108,6 +111,7 @@ class TcpReference:
             steady, worst = stop_displacement(u, 0.0, A, J), stop_displacement(u, A, A, J)
             per_v, per_a = reach * steady / u, reach * (worst - steady) / A
             self._stops.append((cap, per_v, per_a))
+            self._fastest.append(u)
             self._step += reach * u * dt + per_v * A * dt + per_a * min(A, J * dt)
         self._per_speed = hypot(*[per_v for _, per_v, _ in self._stops])
         self._per_acceleration = hypot(*[per_a for _, _, per_a in self._stops])
@@ -182,7 +186,7 @@ class TcpReference:
         smoother = self._smoother
         q, dq, dt = smoother.q, smoother.dq_next, smoother.dt
         speed, acceleration = hypot(*dq), hypot(*smoother.ddq_next)
-        if speed <= self._slowest:
+        if speed <= self._slowest or all(-u <= v <= u for v, u in zip(dq, self._fastest, strict=True)):
             mean = [(x - x0) / dt for x, x0 in zip(smoother.q_next, q, strict=True)]
             step = hypot(*mean)
             # In its stop no joint gets faster than its speed and what its acceleration adds until it is taken back.
