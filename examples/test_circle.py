@@ -9,10 +9,9 @@ import numpy as np
 import pytest
 
 import hal
-from hal.deadman import Deadman
 
 
-def draw_circle(rig: hal.Rig, radius: float = 0.05, seconds: float = 3.0, deadman: Deadman | None = None) -> None:
+def draw_circle(rig: hal.Rig, radius: float = 0.05, seconds: float = 3.0, deadman: hal.Deadman | None = None) -> None:
     """Research code: move the tcp once around a circle, at constant height."""
     arm = rig.robots["panda"]
     rate = 2.0 * np.pi / seconds

@@ -28,6 +28,7 @@ if TYPE_CHECKING:
         Twist,
     )
     from .control import Control
+    from .deadman import Deadman
     from .errors import (
         CommandError,
         ConfigError,
@@ -79,6 +80,7 @@ __all__ = [
     "Control",
     "ControlTaken",
     "DatasetError",
+    "Deadman",
     "DeviceNotFound",
     "DriverMissing",
     "Fault",
@@ -130,6 +132,7 @@ _MODULES = {
         "Twist",
     ),
     "control": ("Control",),
+    "deadman": ("Deadman",),
     "errors": (
         "CommandError",
         "ConfigError",
