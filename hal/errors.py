@@ -45,7 +45,20 @@ __all__ = [
 
 
 class HalError(Exception):
-    """The root: whatever the hal raises on purpose."""
+    """Base class of every error that this package raises on purpose.
+
+    Args:
+        args: The message, as for any exception.
+        code: Stable identifier of this case, in lower_snake_case; None for the class's own ``code``.
+    """
+
+    code: str = "error"
+    """Stable identifier of the case, for programs and tests. The wording of a message may change, its code does not."""
+
+    def __init__(self, *args: object, code: str | None = None) -> None:
+        super().__init__(*args)
+        if code is not None:
+            self.code = code
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,6 +71,8 @@ class Problem:
     """Dotted path of the key, for example ``robots.panda.base.position``."""
     message: str
     """What is wrong and what would be right."""
+    code: str = "invalid"
+    """Stable identifier of the kind of problem, for example ``unknown_key`` or ``missing_file``."""
 
     def __str__(self) -> str:
         place = f"{self.file}: {self.key}" if self.key else self.file
@@ -66,6 +81,8 @@ class Problem:
 
 class ConfigError(HalError, ValueError):
     """A configuration is wrong. ``problems`` holds every problem, not only the first."""
+
+    code = "config"
 
     def __init__(self, problems: Sequence[Problem]) -> None:
         self.problems = tuple(problems)
@@ -77,23 +94,31 @@ class ConfigError(HalError, ValueError):
 class CommandError(HalError, ValueError):
     """A command has the wrong shape, a non-finite number or an impossible value. Nothing was sent."""
 
+    code = "bad_command"
+
 
 class DatasetError(HalError, ValueError):
     """A file of a recording is missing, truncated, damaged, or does not fit the other files."""
+
+    code = "bad_dataset"
 
     file: str | None = None
     """The file, relative to the dataset's folder; None where the error is not about one file."""
     episode: int | None = None
     """Number of the episode; None where the error is about the whole dataset."""
 
-    def __init__(self, message: str, *, file: str | None = None, episode: int | None = None) -> None:
+    def __init__(
+        self, message: str, *, file: str | None = None, episode: int | None = None, code: str | None = None
+    ) -> None:
         place = [] if episode is None else [f"episode {episode}"]
-        super().__init__(": ".join([*place, *([file] if file else []), message]))
+        super().__init__(": ".join([*place, *([file] if file else []), message]), code=code)
         self.file, self.episode = file, episode
 
 
 class Unreachable(HalError, ValueError):
     """No joint position inside the limits reaches the pose."""
+
+    code = "unreachable"
 
     def __init__(
         self, message: str, *, position_error: float, rotation_error: float, q: tuple[float, ...] | None = None
@@ -110,13 +135,19 @@ class Unreachable(HalError, ValueError):
 class DriverMissing(HalError, ImportError):
     """A driver's library is not installed. The message names the command that installs it."""
 
+    code = "driver_missing"
+
 
 class DeviceNotFound(HalError, LookupError):
     """No such device. The message lists those that are there."""
 
+    code = "device_not_found"
+
 
 class ConnectionLost(HalError, ConnectionError):
     """A device, or the process that owned it, does not answer any more."""
+
+    code = "connection_lost"
 
     fault: Fault | None = None
     """Cause and remedy, where the driver knows them."""
@@ -127,12 +158,16 @@ class ConnectionLost(HalError, ConnectionError):
 class StaleStateError(HalError, TimeoutError):
     """The newest state or frame is older than the caller allows."""
 
+    code = "stale_state"
+
 
 class MotionStopped(HalError, RuntimeError):
     """A stop is latched: nothing moves until it is acknowledged (see ``Control.rearm``)."""
 
-    def __init__(self, reason: str, remedy: str = "") -> None:
-        super().__init__(f"{reason}; {remedy}" if remedy else reason)
+    code = "motion_stopped"
+
+    def __init__(self, reason: str, remedy: str = "", *, code: str | None = None) -> None:
+        super().__init__(f"{reason}; {remedy}" if remedy else reason, code=code)
         self.reason = reason
         self.remedy = remedy
 
@@ -140,8 +175,10 @@ class MotionStopped(HalError, RuntimeError):
 class RobotFault(HalError, RuntimeError):
     """The robot reports a fault. ``recover()`` is the user's own act."""
 
-    def __init__(self, cause: str, remedy: str) -> None:
-        super().__init__(f"{cause}; {remedy}" if remedy else cause)
+    code = "robot_fault"
+
+    def __init__(self, cause: str, remedy: str, *, code: str | None = None) -> None:
+        super().__init__(f"{cause}; {remedy}" if remedy else cause, code=code)
         self.cause = cause
         self.remedy = remedy
 
@@ -149,6 +186,10 @@ class RobotFault(HalError, RuntimeError):
 class ControlTaken(HalError, RuntimeError):
     """Another control session owns this arm."""
 
+    code = "control_taken"
+
 
 class NotSupported(HalError, NotImplementedError):
     """This driver, or this rig, cannot do that. The message says what can."""
+
+    code = "not_supported"

@@ -136,7 +136,7 @@ def pack_error(error: BaseException) -> dict[str, Any]:
     known = type(error).__name__ if isinstance(error, HalError) else "HalError"
     text = str(error) if isinstance(error, HalError) else f"{type(error).__name__}: {error}"
     attributes = {key: value for key, value in vars(error).items() if isinstance(value, (str, int, float))}
-    problems = [[p.file, p.key, p.message] for p in getattr(error, "problems", ())]
+    problems = [[p.file, p.key, p.message, p.code] for p in getattr(error, "problems", ())]
     return {"type": known, "text": text, "attributes": attributes, "problems": problems}
 
 

@@ -1,5 +1,6 @@
 """Child processes: start from anywhere, answer, pass errors on, end without leaving anything."""
 
+import json
 import os
 import subprocess
 import sys
@@ -10,8 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from hal.errors import ConfigError, ConnectionLost
-from hal.host.process import Child, SharedMemory
+from hal.errors import ConfigError, ConnectionLost, MotionStopped, Problem
+from hal.host.process import Child, SharedMemory, pack_error, unpack_error
 
 HERE = Path(__file__).parent
 
@@ -145,3 +146,13 @@ def test_ends_when_its_parent_is_killed(tmp_path: Path) -> None:
     while os.path.exists(f"/proc/{pid}") and time.monotonic() < deadline:
         time.sleep(0.01)
     assert not os.path.exists(f"/proc/{pid}")
+
+
+def test_an_error_keeps_its_type_code_and_problems_across_a_process_boundary() -> None:
+    stopped = unpack_error(json.loads(json.dumps(pack_error(MotionStopped("lost", "hold again", code="pad_lost")))))
+    assert isinstance(stopped, MotionStopped)
+    assert (stopped.code, stopped.reason, stopped.remedy) == ("pad_lost", "lost", "hold again")
+    problem = Problem("rig.yaml", "robots.panda", "not known", "unknown_key")
+    config = unpack_error(json.loads(json.dumps(pack_error(ConfigError([problem])))))
+    assert isinstance(config, ConfigError)
+    assert (config.code, config.problems) == ("config", (problem,))
