@@ -137,6 +137,11 @@ class DriverMissing(HalError, ImportError):
 
     code = "driver_missing"
 
+    def __init__(self, *args: object, name: str | None = None, code: str | None = None) -> None:
+        super().__init__(*args, code=code)
+        self.name = name
+        """The library, as for any ImportError; None where there is no single one."""
+
 
 class DeviceNotFound(HalError, LookupError):
     """No such device. The message lists those that are there."""
