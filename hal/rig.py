@@ -10,7 +10,7 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from . import registry
 from .camera import Camera
@@ -23,6 +23,7 @@ from .gamepad import Gamepad
 from .gripper import Gripper
 from .host.groups import groups_of
 from .host.hosts import Host, LocalHost, RemoteHost, SteppedHost
+from .host.process import SharedMemory
 from .observation import Observation, Observer
 from .pads.choice import Chosen, choose_pad, in_words, tour
 from .robot import Robot
@@ -34,7 +35,7 @@ if TYPE_CHECKING:
     from .config.plan import Plan
     from .pictures import Pictures, Viewer, Viewer3D
 
-__all__ = ["Rig", "open_rig"]
+__all__ = ["Rig", "SharedStates", "open_rig"]
 
 _FIRST_FRAME = 5.0
 _CONSOLE = "web"
@@ -116,6 +117,15 @@ def check_opening(plan: Plan, pad: str | None, viewer: str, console: bool) -> li
     if any(chosen.spec.driver == "keyboard" for chosen in pads) and (not window or plan.attended):
         raise DeviceNotFound("the keyboard is that of the viewer's window: add --viewer gui")
     return pads
+
+
+class SharedStates(NamedTuple):
+    """The states of one group of devices, in memory that another process may read; see :meth:`Rig.shared_states`."""
+
+    spec: GroupSpec
+    """The group: its robots, grippers and, where it has one, its simulated world."""
+    memory: SharedMemory
+    """Laid out as :class:`~hal.host.records.GroupMemory` of :attr:`spec`, then the bodies of a simulated world."""
 
 
 class Rig:
@@ -348,6 +358,27 @@ class Rig:
     def statistics(self) -> dict[str, Any]:
         """Per group: ticks, missed ticks, periods (s), and per robot the peaks of its set-points and latencies."""
         return {host.spec.name: host.request("statistics") for host in self._hosts}
+
+    def shared_states(self) -> list[SharedStates]:
+        """Return the memory into which each group of devices publishes its states.
+
+        A program that shows the rig, such as the console, hands it to a process of its own, which reads it there. It is
+        for reading only.
+
+        Returns:
+            One record for each group, in the order in which the groups were started.
+
+        Raises:
+            NotSupported: In lock-step, where states are not shared (``code`` is ``needs_real_time``).
+        """
+        if self.lock_step:
+            raise NotSupported("in lock-step no other process can read the states of a rig", code="needs_real_time")
+        return [SharedStates(host.spec, host.shared) for host in self._hosts if isinstance(host, RemoteHost)]
+
+    @property
+    def stop_count(self) -> int:
+        """Number that grows with every call of :meth:`stop`."""
+        return sum(host.stops for host in self._hosts)
 
     # What it sees and does.
 

@@ -11,8 +11,7 @@ from math import isfinite
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from hal import registry
-from hal.errors import ConnectionLost, DeviceNotFound, DriverMissing, NotSupported
-from hal.host.hosts import RemoteHost
+from hal.errors import ConnectionLost, DeviceNotFound, DriverMissing
 from hal.host.process import Child
 from hal.pictures import Viewer3D
 from hal.pose import Pose
@@ -54,15 +53,10 @@ class ViserViewer(Viewer3D):
 
     def __init__(self, rig: Rig) -> None:
         super().__init__(rig)
-        hosts = [host for host in rig._hosts if isinstance(host, RemoteHost)]
-        if not hosts or len(hosts) != len(rig._hosts):
-            raise NotSupported(
-                "the 3D view needs real time: in lock-step the arms stand still while nobody steps them; "
-                "leave out clock='lock_step', or the viewer"
-            )
+        groups = rig.shared_states()
         for library, command in registry.missing("viser").items():
             raise DriverMissing(f"the 3D view needs {library}; install it with: {command}", name=library)
-        self._robots = frozenset(robot.name for host in hosts for robot in host.spec.robots)
+        self._robots = frozenset(robot.name for group in groups for robot in group.spec.robots)
         self._goals: dict[str, _Said] = {}
         self._cleared = dict.fromkeys(self._robots, 0)
         self._to_clear: set[str] = set()
@@ -75,9 +69,9 @@ class ViserViewer(Viewer3D):
         config = {
             "label": f"robot-hal: {', '.join(sorted(self._robots))}",
             "secret": self._secret,
-            "groups": [to_json(host.spec) for host in hosts],
+            "groups": [to_json(group.spec) for group in groups],
         }
-        self._child = Child("3D viewer", "hal.drivers.viser.process:main", config, [host.shared for host in hosts])
+        self._child = Child("3D viewer", "hal.drivers.viser.process:main", config, [group.memory for group in groups])
 
     def wait_ready(self) -> None:
         ready = self._child.wait_ready()

@@ -12,12 +12,11 @@ from typing import TYPE_CHECKING, Any
 
 from hal.camera import Camera, RawFrame
 from hal.console import Console, DrivingView, Listen, RecordingView
-from hal.errors import HalError, NotSupported
+from hal.errors import HalError
 from hal.gamepad import Gamepad, PadReading
 from hal.host.frames import FrameRing
-from hal.host.hosts import RemoteHost
 from hal.host.process import Child, SharedMemory
-from hal.specs import CameraSpec, to_json
+from hal.specs import CameraSpec, GroupSpec, to_json
 from hal.types import Frame
 
 from .about import about_rig, shown_stream
@@ -57,9 +56,7 @@ class WebConsole(Console):
         self._changed: Callable[[str, str | float], None] | None = None
         self._closed = False
         self._recovering = threading.Lock()
-        hosts = [host for host in rig._hosts if isinstance(host, RemoteHost)]
-        if len(hosts) != len(rig._hosts):
-            raise NotSupported("the console shows a rig in real time only")
+        groups = rig.shared_states()
         self._shown = [_reduced(camera) for camera in rig.plan.cameras if shown_stream(camera)]
         self._frames = SharedMemory(FrameRing.size(self._shown))
         self._ring = FrameRing(self._frames.buffer, self._shown)
@@ -69,10 +66,10 @@ class WebConsole(Console):
             "port_fixed": listen.fixed,
             "token": self._token,
             "names": names(),
-            "hosts": [_host(host) for host in hosts],
+            "hosts": [_about_group(group.spec) for group in groups],
             "cameras": [to_json(camera) for camera in self._shown],
         }
-        memories = [self._frames, *(host.shared for host in hosts)]
+        memories = [self._frames, *(group.memory for group in groups)]
         self._child = Child("console", "hal.drivers.web.process:main", config, memories)
         self._conversation = Conversation(self._child, self._take, self._is_lost)
 
@@ -107,7 +104,7 @@ class WebConsole(Console):
     @property
     def stops(self) -> int:
         """How often ``rig.stop()`` was called, by whomever."""
-        return sum(host.stops for host in self.rig._hosts)
+        return self.rig.stop_count
 
     def subscribe(self) -> PadMail:
         """What the page does with its pad, from now on."""
@@ -266,8 +263,7 @@ def _reduced(camera: CameraSpec) -> CameraSpec:
     return replace(camera, streams=(stream,))
 
 
-def _host(host: RemoteHost) -> dict[str, Any]:
-    spec = host.spec
+def _about_group(spec: GroupSpec) -> dict[str, Any]:
     return {
         "name": spec.name,
         "rate_hz": spec.rate_hz,

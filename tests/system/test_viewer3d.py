@@ -306,6 +306,7 @@ def test_it_ends_with_an_app_that_is_killed() -> None:
 def test_lock_step_has_no_3d_view() -> None:
     with (
         hal.open("panda_table", driver="mock", clock="lock_step", pad="none") as rig,
-        pytest.raises(NotSupported, match="real time"),
+        pytest.raises(NotSupported) as refused,
     ):
         registry.load("viser", "viewer3d")(rig)
+    assert refused.value.code == "needs_real_time"
