@@ -55,8 +55,8 @@ class HalError(Exception):
     code: str = "error"
     """Stable identifier of the case, for programs and tests. The wording of a message may change, its code does not."""
 
-    def __init__(self, *args: object, code: str | None = None) -> None:
-        super().__init__(*args)
+    def __init__(self, *args: object, code: str | None = None, **more: object) -> None:
+        super().__init__(*args, **more)  # such as the `name` of an ImportError
         if code is not None:
             self.code = code
 
