@@ -17,7 +17,7 @@ from pathlib import Path
 
 import hal
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "unit"))
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "kits"))
 from terminal_kit import FarEnd, wait_for
 
 KEYS = {"arrow up": "\x1b[A", "arrow left": "\x1b[D", "Page Up": "\x1b[5~", "J (a turn)": "j"}

@@ -17,7 +17,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "unit"))
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "kits"))
 from specs import PANDA_HOME, box, data, floor, panda, world_spec
 
 from hal.drivers.pybullet.gripper import PyBulletGripper

@@ -1,7 +1,7 @@
 """What the texts of libfranka's exceptions mean, apart from flags and versions.
 
-Each text was seen from the libraries themselves (``tests/unit/test_franka_faults.py`` raises them), in the words of
-libfranka 0.9 (Panda) and 0.21 (FR3).
+Each text was seen from the libraries themselves, in the words of libfranka 0.9 (Panda) and 0.21 (FR3):
+``tests/unit/drivers/franka/test_franka_faults.py`` raises them.
 """
 
 from __future__ import annotations

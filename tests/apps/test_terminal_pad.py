@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "unit"))
+sys.path.insert(0, str(Path(__file__).parents[1] / "kits"))
 from terminal_kit import FarEnd, InTerminal, wait_for
 
 APP = Path(__file__).resolve().parents[2] / "apps" / "teleop.py"

@@ -11,7 +11,7 @@ from hal.drivers.mock.camera import MockCamera
 from hal.specs import BodySpec, GroupSpec, ViewSpec, WorldSpec
 from hal.testing import CameraBench, camera_spec
 
-from ..unit.specs import data
+from ..kits.specs import data
 
 __all__ = ["Studio", "mock_camera", "mock_camera_in_lock_step", "pybullet_camera_in_lock_step"]
 

@@ -1,7 +1,7 @@
 """Pads that were recorded from the real kernel drivers, played to the evdev driver through devices on pipes.
 
 What a pad is stands in its ``.umockdev`` description, what it can do in the head of its ``.jsonl``, and what it said in
-the lines below. umockdev itself plays them in ``tests/unit/test_evdev.py``; it cannot unplug anything.
+the lines below. umockdev itself plays them in ``tests/unit/drivers/evdev/test_evdev.py``; it cannot unplug anything.
 """
 
 from __future__ import annotations

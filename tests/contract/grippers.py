@@ -9,7 +9,7 @@ from hal.drivers.mock.gripper import MockGripper
 from hal.specs import BodySpec, WorldSpec
 from hal.testing import GripperBench, gripper_spec
 
-from ..unit.specs import panda
+from ..kits.specs import panda
 
 __all__ = ["mock_gripper", "pybullet_gripper"]
 

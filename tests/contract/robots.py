@@ -9,7 +9,7 @@ from hal.drivers.mock.robot import MockRobot
 from hal.specs import WorldSpec
 from hal.testing import RobotBench, robot_spec
 
-from ..unit.specs import panda
+from ..kits.specs import panda
 
 __all__ = ["mock_robot", "pybullet_robot", "three_joints"]
 

@@ -54,7 +54,7 @@ def test_edits_of_the_world_are_seen_by_the_cameras(rig: hal.Rig) -> None:
 @pytest.mark.parametrize("refused", [False, True])
 def test_a_refused_real_time_priority_is_noted_in_one_line_with_what_allows_it(refused: bool) -> None:
     program = (
-        f"import sys; sys.path.insert(0, {str(Path(__file__).parents[1] / 'unit')!r})\n"
+        f"import sys; sys.path.insert(0, {str(Path(__file__).parents[1] / 'kits')!r})\n"
         "import hal, child_targets\n"
         f"if {refused}: child_targets.give_up_right()\n"
         "with hal.open('panda_table', sim=True, pad='none', overrides=['cameras={}']) as rig:\n"

@@ -29,7 +29,7 @@ HERE = Path(__file__).parent
 
 
 def start(out: Path, seed: int) -> subprocess.Popen[str]:
-    environment = os.environ | {"PYTHONPATH": str(HERE.parent / "unit")}
+    environment = os.environ | {"PYTHONPATH": str(HERE.parent / "kits")}
     command = [sys.executable, str(HERE / "recording_app.py"), str(out), str(seed)]
     return subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment)
 

@@ -15,7 +15,7 @@ from hal.pads.mapper import REL_SILENCE, AxisRange, PadMapper
 from hal.pads.model import Identity, PadModel, choose_model, pad_model
 from hal.types import BUTTONS, CAP_AXES, STICK_AXES
 
-FOLDER = Path(__file__).parents[2] / "sensors" / "gamepads"
+FOLDER = Path(__file__).parents[3] / "sensors" / "gamepads"
 FILES = sorted(FOLDER.glob("*.yaml"))
 MODELS = {path.stem: pad_model(yaml.safe_load(path.read_text(encoding="utf-8")), str(path)) for path in FILES}
 

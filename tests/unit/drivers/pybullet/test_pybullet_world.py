@@ -112,7 +112,7 @@ class TestStepping:
             "from specs import *; from hal.drivers.pybullet.world import World;"
             "world = World(world_spec(floor(), panda())); world.step(); world.close()"
         )
-        command = [sys.executable, "-c", code, str(Path(__file__).parent)]
+        command = [sys.executable, "-c", code, str(Path(__file__).parents[3] / "kits")]
         done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
         assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
 

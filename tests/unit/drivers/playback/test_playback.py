@@ -18,7 +18,7 @@ from hal.errors import ConfigError, NotSupported
 from hal.gamepad import Gamepad, PadReading
 from hal.specs import PadSpec
 
-ROOT = Path(__file__).parents[2]
+ROOT = Path(__file__).parents[4]
 PADS = ROOT / "tests" / "data" / "pads"
 TOUR = PADS / "tour.jsonl"
 MODELS = tuple(

@@ -27,7 +27,7 @@ from hal.drivers.franka.troubles import TROUBLES
 from hal.host import fault_layout
 from hal.types import Fault
 
-HERE = Path(__file__).parent
+HERE = Path(__file__).parents[3] / "kits"
 HOST = address(6)
 LIBRARIES = {"pylibfranka": 10, "panda_py": 5}
 """Name -> its protocol."""

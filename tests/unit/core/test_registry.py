@@ -14,7 +14,7 @@ from hal.errors import DeviceNotFound, DriverMissing, NotSupported
 from hal.registry import DriverSpec
 from hal.robot import RobotDriver
 
-DRIVERS = Path(__file__).parents[2] / "drivers"
+DRIVERS = Path(__file__).parents[3] / "drivers"
 
 
 @pytest.fixture

@@ -24,7 +24,7 @@ START = Callable[..., Child]
 @pytest.fixture
 def start(monkeypatch: pytest.MonkeyPatch) -> Iterator[START]:
     """Start a child that prepares itself as a host does."""
-    monkeypatch.syspath_prepend(str(Path(__file__).parent))
+    monkeypatch.syspath_prepend(str(Path(__file__).parents[2] / "kits"))
     children: list[Child] = []
 
     def started(realtime: bool = True, refused: bool = False) -> Child:

@@ -14,7 +14,7 @@ import pytest
 from hal.errors import ConfigError, ConnectionLost, MotionStopped, Problem
 from hal.host.process import Child, SharedMemory, pack_error, unpack_error
 
-HERE = Path(__file__).parent
+HERE = Path(__file__).parents[2] / "kits"
 
 
 @pytest.fixture(autouse=True)
