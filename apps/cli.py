@@ -55,9 +55,9 @@ def add_rig_options(parser: argparse.ArgumentParser) -> None:
     rig.add_argument(
         "--pad",
         default="auto",
-        metavar="auto|web|evdev|terminal|keyboard|demo|none|FILE",
-        help="what drives: a page in a browser, a plugged-in pad, the keys of this terminal or of the viewer's window, "
-        "the recorded tour, a recording; %(default)s: a plugged-in pad, else the page",
+        metavar="auto|web|evdev|terminal|demo|none|FILE",
+        help="what drives: a page in a browser, a plugged-in pad, the keys of this terminal, the recorded tour, "
+        "a recording; %(default)s: a plugged-in pad, else the page",
     )
     rig.add_argument(
         "--viewer",

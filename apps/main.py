@@ -18,7 +18,7 @@ from hal.apps.cli import run_app
 __all__ = ["PROGRAMS", "main", "parser"]
 
 PROGRAMS = {
-    "teleop": "drive an arm: page in a browser, gamepad, keyboard, recorded tour",
+    "teleop": "drive an arm: page in a browser, gamepad, terminal, recorded tour",
     "check": "check this computer, real arms and cameras before they move; show gamepads",
     "collect": "record demonstrations",
     "review": "look through a dataset, check and repair it",

@@ -56,8 +56,7 @@ def check_everything(plan: Plan, args: argparse.Namespace) -> None:
     for camera in plan.cameras:
         registry.load(camera.driver, "camera")
     for chosen in check_opening(plan, args.pad, args.viewer, console):
-        if chosen.spec.driver != "keyboard":
-            registry.load(chosen.spec.driver, "gamepad")(chosen.spec)  # checks its options; opens nothing
+        registry.load(chosen.spec.driver, "gamepad")(chosen.spec)  # checks its options; opens nothing
 
 
 def _world_warnings(plan: Plan) -> list[str]:

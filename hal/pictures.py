@@ -56,14 +56,10 @@ class Pictures(Shown):
 
 
 class Viewer(Shown):
-    """A window onto the world. Its keyboard may serve as a gamepad."""
+    """A window onto the world."""
 
     def __init__(self, host: Host) -> None:
         self.host = host
-
-    @abstractmethod
-    def keyboard(self) -> object | None:
-        """Where the driver of the keyboard's gamepad gets its record from; None when the window has none."""
 
 
 class Viewer3D(Shown):

@@ -6,7 +6,6 @@ import atexit
 import contextlib
 import logging
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from types import TracebackType
@@ -25,7 +24,7 @@ from .host.groups import groups_of
 from .host.hosts import Host, LocalHost, RemoteHost, SteppedHost
 from .host.process import SharedMemory
 from .observation import Observation, Observer
-from .pads.choice import Chosen, choose_pad, in_words, tour
+from .pads.choice import Chosen, choose_pad, in_words
 from .robot import Robot
 from .specs import GroupSpec, PadSpec, RobotSpec
 from .stops import StopLatch
@@ -59,7 +58,7 @@ def open_rig(
     ``sim=True`` makes everything simulated, ``sim=False`` sets the rig's flag to real, None leaves the file's flags.
     ``driver="mock"`` puts a mock in the place of every device. ``clock`` is ``real_time`` or ``lock_step``.
     ``overrides`` are ``KEY=VALUE`` for any key of the rig. ``pad`` says what a pad of ``model: auto`` is: ``auto``,
-    ``evdev``, ``web`` (the console), ``terminal``, ``keyboard``, ``demo`` (the recorded tour), the path of a recording,
+    ``evdev``, ``web`` (the console), ``terminal``, ``demo`` (the recorded tour), the path of a recording,
     or ``none`` to open no pad. ``viewer="gui"`` opens a window onto the simulated world, ``viewer="3d"`` a page with
     the arms in three dimensions. ``console=True`` serves the console also where another pad drives; ``listen`` is the
     address, and the port, at which it listens: loopback unless told otherwise. ``realtime=False``
@@ -91,22 +90,21 @@ def check_opening(plan: Plan, pad: str | None, viewer: str, console: bool) -> li
 
     Raises:
         DriverMissing: The libraries of a page are not installed.
-        DeviceNotFound: No such pad, or the keyboard of a window that there is none of.
+        DeviceNotFound: No such pad.
         NotSupported: A viewer or a console that this rig cannot have, or a recording for a real arm.
         ConfigError: A recording that cannot be played.
     """
-    lock_step, window = plan.clock == "lock_step", viewer == "gui"
-    known = {"window": window, "attended": plan.attended, "emulated": plan.emulated, "lock_step": lock_step}
+    lock_step = plan.clock == "lock_step"
+    known = {"attended": plan.attended, "emulated": plan.emulated, "lock_step": lock_step}
     pads = [] if pad == "none" else [choose_pad(spec, pad, **known) for spec in plan.pads]
     wrong = [
         Problem("--pad", "", message)
         for chosen in pads
-        if chosen.spec.driver != "keyboard"
         for _, message in registry.checked(chosen.spec.driver, "gamepad", chosen.spec)
     ]
     if wrong:
         raise ConfigError(wrong)
-    if window and plan.world is None:
+    if viewer == "gui" and plan.world is None:
         raise NotSupported("there is no simulated world to look at; leave the viewer out")
     if viewer == "3d":
         registry.load("viser", "viewer3d")
@@ -114,8 +112,6 @@ def check_opening(plan: Plan, pad: str | None, viewer: str, console: bool) -> li
         if lock_step:
             raise NotSupported("the console is for real time; in lock-step, time runs as fast as the program lets it")
         registry.load(_CONSOLE, "console")
-    if any(chosen.spec.driver == "keyboard" for chosen in pads) and (not window or plan.attended):
-        raise DeviceNotFound("the keyboard is that of the viewer's window: add --viewer gui")
     return pads
 
 
@@ -270,8 +266,8 @@ class Rig:
     def _open_pads(self, pads: Sequence[Chosen]) -> None:
         for chosen in pads:
             self.notes.extend(chosen.notes)
-            spec, source = self._pad_source(chosen.spec)
-            driver = registry.load(spec.driver, "gamepad")(spec, source)
+            spec = chosen.spec
+            driver = registry.load(spec.driver, "gamepad")(spec, self._pad_source(spec))
             gamepad = Gamepad(driver)
             self._devices[spec.name] = driver
             self.gamepads[spec.name] = gamepad
@@ -285,22 +281,13 @@ class Rig:
                 # Without a word a program that waits for a dead-man would just hang. Apps print a banner instead.
                 logging.getLogger("hal.console").warning("drive from a browser: %s", self.console.link)
 
-    def _pad_source(self, spec: PadSpec) -> tuple[PadSpec, object | None]:
-        """The pad with its driver's final name, and where that gets its record from."""
+    def _pad_source(self, spec: PadSpec) -> object | None:
+        """What the driver of this pad is made with, besides its record."""
         if spec.driver == _CONSOLE:
-            return spec, self.console
+            return self.console
         if spec.driver == "terminal":
-            return spec, self.stop
-        if spec.driver == "playback":
-            return spec, self._world_time()
-        if spec.driver != "keyboard":
-            return spec, None
-        keyboard = self._viewer.keyboard() if self._viewer is not None else None
-        world = self.plan.world
-        if keyboard is not None and world is not None:
-            return replace(spec, driver=world.driver), keyboard
-        self.notes.append("the window's keyboard cannot be used: playing the recorded tour")
-        return tour(spec), self._world_time()
+            return self.stop
+        return self._world_time() if spec.driver == "playback" else None
 
     def _world_time(self) -> Callable[[], float] | None:
         """How far a simulated world with arms has come, s, where that is not what the clock shows: in real time."""

@@ -8,7 +8,6 @@ DRIVER = DriverSpec(
     robot="hal.drivers.pybullet.robot:PyBulletRobot",
     gripper="hal.drivers.pybullet.gripper:PyBulletGripper",
     camera="hal.drivers.pybullet.camera:PyBulletCamera",
-    gamepad="hal.drivers.pybullet.keyboard:KeyboardPad",
     pictures="hal.drivers.pybullet.pictures:PyBulletPictures",
     viewer="hal.drivers.pybullet.viewer:PyBulletViewer",
     checks={"camera": "hal.drivers.pybullet.depth_settings:check"},

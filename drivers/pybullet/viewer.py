@@ -1,30 +1,39 @@
-"""A window onto the simulated world, in a process of its own: PyBullet's, whose keyboard may serve as a gamepad."""
+"""A window onto the simulated world: PyBullet's own, in a process of its own that mirrors the world."""
 
 from __future__ import annotations
 
 import os
+import signal
 import time
+from collections.abc import Sequence
 from contextlib import suppress
 from typing import Any
 
 from hal.errors import ConnectionLost, NotSupported
 from hal.host.hosts import SNAPSHOT_CAPACITY, Host, LocalHost, RemoteHost
-from hal.host.mailbox import Mailbox, SeriesBox
-from hal.host.process import Child, SharedMemory
+from hal.host.mailbox import SeriesBox
+from hal.host.process import Channel, Child, SharedMemory
 from hal.pictures import Viewer
-from hal.specs import to_json
+from hal.specs import WorldSpec, from_json, to_json
 
-from .keyboard import LAYOUT, KeyboardSource
-from .viewer_process import HEARTBEAT
+from .mirror import Mirror
+from .world import World
 
-__all__ = ["PyBulletViewer"]
+__all__ = ["PyBulletViewer", "main"]
+
+_NICE = 10
+"""Niceness of the window's process: everything else comes first."""
+_FRAME = 1 / 30
+"""Period at which the world is shown, s."""
+_HANG = 20
+"""PyBullet may hang when its window disappears; the process is killed after so many s without a new picture."""
 
 
 class PyBulletViewer(Viewer):
-    """The window. Closing it ends nothing but the window and its keyboard.
+    """PyBullet's window. Closing it ends only the window.
 
     Raises:
-        NotSupported: there is no display to open it on.
+        NotSupported: There is no display to open the window on.
     """
 
     def __init__(self, host: Host) -> None:
@@ -32,12 +41,9 @@ class PyBulletViewer(Viewer):
         if not os.environ.get("DISPLAY"):
             raise NotSupported(
                 "the window needs a display, and DISPLAY is not set: run it on a desktop, through `ssh -X`, or under "
-                "`xvfb-run`; or use --viewer none"
+                "`xvfb-run`; or use --viewer none",
+                code="no_display",
             )
-        self._beat = SharedMemory(Mailbox.size(HEARTBEAT))
-        self._keys = SharedMemory(Mailbox.size(LAYOUT))
-        self._mailbox = Mailbox(self._keys.buffer, LAYOUT)
-        self._watch: Child | None = None
         self._closed = False
         if isinstance(host, RemoteHost):
             snapshots, offset = host.shared, host.snapshot_offset
@@ -50,11 +56,10 @@ class PyBulletViewer(Viewer):
             "snapshot_offset": offset,
             "snapshot_capacity": SNAPSHOT_CAPACITY,
         }
-        target = "hal.drivers.pybullet.viewer_process:main"
-        self._child = Child("viewer", target, config, [snapshots, self._beat])
+        self._child = Child("viewer", "hal.drivers.pybullet.viewer:main", config, [snapshots])
 
     def _published(self, host: LocalHost) -> SharedMemory:
-        """Lock-step: this process publishes the world while simulated time goes on."""
+        """Publish the world from this process in lock-step, each time that simulated time advances."""
         memory = SharedMemory(SeriesBox.size(SNAPSHOT_CAPACITY))
         box = SeriesBox(memory.buffer, SNAPSHOT_CAPACITY)
         world = host.cycle.world
@@ -68,36 +73,56 @@ class PyBulletViewer(Viewer):
         return memory
 
     def wait_ready(self) -> None:
-        ready = self._child.wait_ready()
-        if ready["window"] is None:
-            self.notes = ("the viewer's window was not found on the display, so its keyboard is not used",)
-            return
-        target = "hal.drivers.pybullet.keyboard_process:main"
-        self._watch = Child("keyboard", target, ready, [self._beat, self._keys])
-        self._watch.wait_ready()
+        try:
+            self._child.wait_ready()
+        except ConnectionLost as error:  # PyBullet ends its process where it finds no X server
+            text = f"the window cannot open on display {os.environ['DISPLAY']}; or use --viewer none ({error})"
+            raise NotSupported(text, code="no_display") from error
 
     def edited(self, method: str, params: dict[str, Any], revision: int) -> None:
-        with suppress(ConnectionLost):  # a window that was closed needs no news
+        with suppress(ConnectionLost):  # the window may have been closed
             self._child.channel.send({"method": method, "params": params, "revision": revision})
-
-    def keyboard(self) -> KeyboardSource | None:
-        if self._watch is None:
-            return None
-        return KeyboardSource(self._mailbox, time.monotonic, self._check)
-
-    def _check(self) -> None:
-        """Raise ConnectionLost when the window is gone."""
-        assert self._watch is not None
-        self._watch.check()
-        self._child.check()
 
     def describe(self) -> str:
         return "PyBullet's window"
 
     def close(self) -> None:
         self._closed = True
-        for child in (self._watch, self._child):
-            if child is not None:
-                child.close()
-        self._beat.close()
-        self._keys.close()
+        self._child.close()
+
+
+def main(channel: Channel, memories: Sequence[SharedMemory], config: dict[str, Any]) -> None:
+    """Run the window's process; ``memories`` holds the snapshots of the world."""
+    os.nice(_NICE)
+    os.environ.setdefault("LP_NUM_THREADS", "1")
+    parent = os.getppid()
+    world = World(from_json(WorldSpec, config["world"]), mirror=True, gui=True)
+    _arrange(world)
+    box = SeriesBox(memories[0].buffer[config["snapshot_offset"] :], config["snapshot_capacity"])
+    channel.send({"ready": {}})
+    mirror = Mirror(world, box)
+    while os.getppid() == parent and world.client.isConnected():
+        signal.alarm(_HANG)
+        due = time.monotonic() + _FRAME
+        try:
+            while (message := channel.poll()) is not None:
+                if message["method"] == "close":
+                    return
+                mirror.edited(message["method"], message["params"], message["revision"])
+            mirror.update()
+        except (ConnectionLost, world.client.error):
+            return  # the app or the window is gone
+        time.sleep(max(0.0, due - time.monotonic()))
+
+
+def _arrange(world: World) -> None:
+    """Show the whole bench, without panels, and without keys or mouse gestures that change the world."""
+    client = world.client
+    for option in ("COV_ENABLE_GUI", "COV_ENABLE_KEYBOARD_SHORTCUTS", "COV_ENABLE_MOUSE_PICKING"):
+        client.configureDebugVisualizer(getattr(client, option), 0)
+    bases = [robot.base_position for robot in world.spec.robots]
+    x, y, z = (sum(axis) / len(bases) for axis in zip(*bases, strict=True)) if bases else (0.0, 0.0, 0.0)
+    client.configureDebugVisualizer(lightPosition=(x + 1.5, y - 1.5, z + 3.0))
+    client.resetDebugVisualizerCamera(
+        cameraDistance=1.3, cameraYaw=60.0, cameraPitch=-26.0, cameraTargetPosition=(x + 0.3, y, z + 0.25)
+    )

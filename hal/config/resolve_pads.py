@@ -9,6 +9,7 @@ from typing import Any
 
 from .. import registry
 from ..errors import ConfigError
+from ..pads.choice import NO_WINDOW_KEYBOARD
 from ..pads.model import pad_model
 from ..specs import PadSpec
 from .context import Context
@@ -20,8 +21,8 @@ from .schema import Unknown
 
 __all__ = ["resolve_pad"]
 
-CHOSEN_LATER = ("auto", "keyboard")
-"""Not names of drivers: what they are depends on what is plugged in and on screen."""
+CHOSEN_LATER = "auto"
+"""Not the name of a driver: the pad is chosen when the rig opens."""
 
 
 def resolve_pad(context: Context, name: str, config: PadConfig) -> PadSpec | None:
@@ -34,7 +35,9 @@ def resolve_pad(context: Context, name: str, config: PadConfig) -> PadSpec | Non
         with suppress(Unknown):
             _check_recording(context, f"{key}.file", config)
         with suppress(Unknown):
-            if config.driver not in CHOSEN_LATER:
+            if config.driver == "keyboard":
+                context.problem(f"{key}.driver", NO_WINDOW_KEYBOARD)
+            elif config.driver != CHOSEN_LATER:
                 context.check_driver(config.driver, "gamepad", f"{key}.driver")
     models = tuple(load_pad_models(context.problems).values())
     if context.problems.found:
@@ -50,7 +53,7 @@ def resolve_pad(context: Context, name: str, config: PadConfig) -> PadSpec | Non
         dead_zone=config.dead_zone,
         options=options,
     )
-    if spec.driver not in CHOSEN_LATER:
+    if spec.driver != CHOSEN_LATER:
         for relative, message in registry.checked(spec.driver, "gamepad", spec):
             context.problem(f"{key}.{relative}", message)
     return spec

@@ -200,7 +200,7 @@ class PadConfig(Strict):
     model: str = "auto"
     """``auto``, a name in ``sensors/gamepads/``, or the path of a file of your own."""
     driver: str = "auto"
-    """``auto``, ``evdev``, ``keyboard``, ``playback`` or another driver."""
+    """``auto``, ``evdev``, ``web``, ``terminal``, ``playback`` or another driver."""
     file: str | None = None
     """The recording that ``playback`` plays."""
     dead_zone: Annotated[float, Quantity("", 0.0, 0.9)] = 0.08

@@ -15,13 +15,14 @@ __all__ = ["KINDS", "TOUR", "Chosen", "check_wanted", "choose_pad", "in_words", 
 
 TOUR = ("config", "teleop/tour.jsonl")
 """The recorded tour, among the data files."""
-KINDS = ("auto", "evdev", "web", "terminal", "keyboard", "demo", "none")
-"""What may be asked for, besides the path of a recording."""
+KINDS = ("auto", "evdev", "web", "terminal", "demo", "none")
+"""Values of ``--pad``, besides the path of a recording."""
+NO_WINDOW_KEYBOARD = "the keyboard of the viewer's window is no pad any more; use web (the console) or terminal"
+"""Message for rigs and options that still name ``keyboard``."""
 _AUTO = "auto"
 _WORDS = {
     "evdev": "a gamepad at the program's computer",
     "terminal": "the terminal of the program",
-    "keyboard": "the keyboard of the viewer's window",
     "playback": "a recording",
 }
 
@@ -30,20 +31,17 @@ class Chosen(NamedTuple):
     """A pad that is going to be opened."""
 
     spec: PadSpec
-    """Its driver is that of a gamepad, or ``keyboard`` for the viewer's window."""
     notes: tuple[str, ...] = ()
     """What a person should know."""
 
 
-def choose_pad(
-    spec: PadSpec, wanted: str | None, *, window: bool, attended: bool, lock_step: bool, emulated: bool = False
-) -> Chosen:
+def choose_pad(spec: PadSpec, wanted: str | None, *, attended: bool, lock_step: bool, emulated: bool = False) -> Chosen:
     """The pad to open. ``wanted`` is one of :data:`KINDS`, the path of a recording, or None, which means ``auto``.
 
     It only matters for a pad whose driver is ``auto`` in the rig. ``auto`` is a pad that is plugged in, else the
-    console, which anybody with a browser can drive from. In lock-step, where nobody could, it is the keyboard of the
-    viewer's ``window``, or the recorded tour. ``attended``: something real moves; ``emulated``: a program stands in for
-    all of that, so that a recording may drive it.
+    console, which anybody with a browser can drive from. In lock-step, where nobody could, it is the recorded tour.
+    ``attended``: something real moves; ``emulated``: a program stands in for all of that, so that a recording may drive
+    it.
 
     Raises DeviceNotFound and NotSupported, with what to do instead.
     """
@@ -51,12 +49,12 @@ def choose_pad(
         return Chosen(spec)
     check_wanted(wanted)
     if wanted in (None, _AUTO):
-        return _first(spec, window, attended and not emulated, lock_step)
+        return _first(spec, attended and not emulated, lock_step)
     if wanted == "evdev":
         pads, notes = _plugged()
         missing = () if pads else ("no gamepad is plugged in yet: plug one in at any time",)
         return Chosen(replace(spec, driver="evdev"), (*notes, *missing))
-    if wanted in ("keyboard", "web", "terminal"):
+    if wanted in ("web", "terminal"):
         return Chosen(replace(spec, driver=wanted))
     if attended and not emulated:
         raise NotSupported("a recording cannot hold the dead-man of a real arm; plug a pad in, or use --pad web")
@@ -65,7 +63,9 @@ def choose_pad(
 
 
 def check_wanted(wanted: str | None) -> None:
-    """Raise DeviceNotFound when ``wanted`` is neither a kind of pad nor a recording that is there."""
+    """Raise DeviceNotFound or NotSupported when ``wanted`` is neither a kind of pad nor an existing recording."""
+    if wanted == "keyboard":
+        raise NotSupported(f"--pad keyboard: {NO_WINDOW_KEYBOARD}", code="no_window_keyboard")
     if wanted is not None and wanted not in KINDS and not Path(wanted).is_file():
         kinds = ", ".join(KINDS)
         raise DeviceNotFound(f"there is no pad {wanted!r}: {kinds}, or the path of a recording (.jsonl)")
@@ -81,14 +81,12 @@ def tour(spec: PadSpec) -> PadSpec:
     return _recording(spec, find_data(*TOUR))
 
 
-def _first(spec: PadSpec, window: bool, attended: bool, lock_step: bool) -> Chosen:
+def _first(spec: PadSpec, attended: bool, lock_step: bool) -> Chosen:
     pads, notes = _plugged()
     if pads:
         return Chosen(replace(spec, driver="evdev"), notes)
     if not lock_step:
         return Chosen(replace(spec, driver="web"), notes)
-    if window:
-        return Chosen(replace(spec, driver="keyboard"), notes)
     if attended:
         text = "no gamepad is plugged in, and a real arm does not move without one: plug one in"
         raise DeviceNotFound("; ".join([text, *notes]))

@@ -64,7 +64,7 @@ WITH_PAD = PANDA + "gamepads: {pad: {}}\n"
     [
         (WITH_PAD, ["--pad", "{folder}/broken.jsonl"], "broken.jsonl: line 1"),
         (WITH_PAD, ["--pad", "nothing.jsonl"], "there is no pad"),
-        (WITH_PAD, ["--pad", "keyboard"], "--viewer gui"),
+        (WITH_PAD, ["--pad", "keyboard"], "terminal"),
         (WITH_PAD, ["--pad", "web", "--set", "simulation.clock=lock_step"], "the console is for real time"),
         (REAL + "gamepads: {pad: {}}\n", ["--pad", "demo"], "cannot hold the dead-man of a real arm"),
         (REAL + "gamepads: {pad: {}}\n", ["--viewer", "gui", "--pad", "web"], "no simulated world"),

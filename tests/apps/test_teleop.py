@@ -126,7 +126,7 @@ def test_without_pybullet_one_line_says_what_to_do() -> None:
         (["--set", "cameras.wrist.output.widht=320"], ["--set", "widht", "did you mean 'width'"]),
         (["--set", "robots.panda.base.position=[1,2]"], ["robots.panda.base.position"]),
         (["--pad", "nothing.jsonl"], ["DeviceNotFound", "nothing.jsonl"]),
-        (["--pad", "keyboard"], ["--viewer gui"]),
+        (["--pad", "keyboard"], ["web", "terminal"]),
         (["--mapping", "defualt"], ["defualt", "default"]),
         (["--robot", "pandas", "--pad", str(TOUR)], ["no robot 'pandas'", "did you mean 'panda'"]),
         (["--speed", "2"], ["--speed must be above 0 and at most 1"]),

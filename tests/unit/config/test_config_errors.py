@@ -210,6 +210,7 @@ def thing(**keys: Any) -> dict[str, Any]:
         # Pads.
         ({"gamepads": {"p": {"driver": "playback"}}}, "gamepads.p.file", ["is missing", "recording"]),
         ({"gamepads": {"p": {"driver": "playback", "file": "no.jsonl"}}}, "gamepads.p.file", ["there is no file"]),
+        ({"gamepads": {"p": {"driver": "keyboard"}}}, "gamepads.p.driver", ["web", "terminal"]),
         ({"gamepads": {"p": {"file": "a.jsonl"}}}, "gamepads.p.file", ["playback"]),
         # Names of devices.
         ({"robots": {"a": ROBOT}, "cameras": {"a": CAMERA}}, "cameras.a", ["robots.a has the same name"]),

@@ -1,4 +1,4 @@
-"""Which pad drives: a plugged-in one, the console, the viewer's keyboard, or a recording."""
+"""Which pad drives: a plugged-in one, the console, or a recording."""
 
 from pathlib import Path
 
@@ -25,32 +25,30 @@ def plug(monkeypatch: pytest.MonkeyPatch):
 
 def choose(
     wanted: str | None = None,
-    window: bool = False,
     attended: bool = False,
     lock_step: bool = False,
     emulated: bool = False,
     spec: PadSpec = AUTO,
 ) -> Chosen:
-    return choose_pad(spec, wanted, window=window, attended=attended, lock_step=lock_step, emulated=emulated)
+    return choose_pad(spec, wanted, attended=attended, lock_step=lock_step, emulated=emulated)
 
 
 @pytest.mark.parametrize("lock_step", [False, True])
 def test_a_plugged_in_pad_comes_first(plug, lock_step: bool) -> None:
     plug("DualShock 4")
-    assert choose(window=True, lock_step=lock_step).spec.driver == "evdev"
+    assert choose(lock_step=lock_step).spec.driver == "evdev"
 
 
 @pytest.mark.parametrize("attended", [False, True])
 def test_then_the_console_in_simulation_and_for_real(plug, attended: bool) -> None:
     plug(notes=("no permission: sudo usermod -aG input me",))
-    chosen = choose(window=True, attended=attended)
+    chosen = choose(attended=attended)
     assert chosen.spec.driver == "web"
     assert "usermod" in chosen.notes[0]
 
 
-def test_in_lock_step_the_keyboard_of_the_window_or_the_recorded_tour(plug) -> None:
+def test_in_lock_step_the_recorded_tour_drives(plug) -> None:
     plug()
-    assert choose(window=True, lock_step=True).spec.driver == "keyboard"
     chosen = choose(lock_step=True)
     assert chosen.spec.driver == "playback"
     assert Path(chosen.spec.options["file"]).name == "tour.jsonl"
@@ -83,7 +81,7 @@ def test_what_was_asked_for(plug, tmp_path: Path) -> None:
     recording = tmp_path / "pad.jsonl"
     recording.touch()
     assert choose(str(recording)).spec.options["file"] == str(recording)
-    for kind in ("evdev", "web", "terminal", "keyboard"):
+    for kind in ("evdev", "web", "terminal"):
         assert choose(kind).spec.driver == kind
     assert Path(choose("demo").spec.options["file"]).name == "tour.jsonl"
     with pytest.raises(DeviceNotFound, match=r"there is no pad 'nothing': auto, evdev, web"):
@@ -101,4 +99,9 @@ def test_a_rig_that_names_its_pad_is_obeyed(plug) -> None:
     plug("DualShock 4")
     named = PadSpec("pad", "playback", None, options={"file": "x.jsonl"})
     assert choose("evdev", spec=named).spec is named
-    assert choose("auto", window=True, spec=PadSpec("pad", "keyboard", None)).spec.driver == "keyboard"
+
+
+def test_the_keyboard_of_the_window_is_refused(plug) -> None:
+    with pytest.raises(NotSupported) as caught:
+        choose("keyboard")
+    assert caught.value.code == "no_window_keyboard"
