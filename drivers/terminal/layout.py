@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from types import MappingProxyType
 from typing import NamedTuple
 
+from hal.pads.keyboard import keyboard_table
 from hal.types import AXES
 
 __all__ = [
@@ -22,32 +23,17 @@ __all__ = [
     "raw",
 ]
 
-AXIS_KEYS: Mapping[str, tuple[str, float]] = MappingProxyType(
-    {
-        "up": ("dpad_y", 1.0),
-        "down": ("dpad_y", -1.0),
-        "right": ("dpad_x", 1.0),
-        "left": ("dpad_x", -1.0),
-        "w": ("left_y", 1.0),
-        "s": ("left_y", -1.0),
-        "d": ("left_x", 1.0),
-        "a": ("left_x", -1.0),
-        "i": ("right_y", 1.0),
-        "k": ("right_y", -1.0),
-        "l": ("right_x", 1.0),
-        "j": ("right_x", -1.0),
-    }
-)
+_TABLE = keyboard_table("terminal")
+AXIS_KEYS = _TABLE.sticks
 """Key -> the axis that it pushes, and which way."""
-SHOULDER_KEYS: Mapping[str, str] = MappingProxyType({"pageup": "l1", "q": "l1", "pagedown": "r1", "e": "r1"})
-"""Key -> the button that it is; these usually move something."""
-BUTTON_KEYS: Mapping[str, str] = MappingProxyType(
-    {"1": "south", "2": "east", "3": "west", "4": "north", "enter": "start", "tab": "select", "home": "home"}
-)
+BUTTON_KEYS = {key: button for key, button in _TABLE.buttons.items() if button not in ("l1", "r1")}
 """Key -> the button that it is; these are what an app gives a meaning."""
-CLOSE, OPEN = "g", "h"
+SHOULDER_KEYS = {key: button for key, button in _TABLE.buttons.items() if button in ("l1", "r1")}
+"""Key -> the button that it is; these usually move something."""
+CLOSE = next(key for key, direction in _TABLE.grip.items() if direction > 0.0)
+OPEN = next(key for key, direction in _TABLE.grip.items() if direction < 0.0)
 """They pull r2, and let it go."""
-STOP_KEYS = ("backspace", "escape")
+STOP_KEYS = _TABLE.stop
 """They stop every arm, also while keys are held. A terminal sends Esc a moment late."""
 
 _KEYS = (
