@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pyrealsense2 as rs
 
-from hal.cropping import Cropping
+from hal.images import Cropping
 from hal.pose import Pose
 from hal.specs import CameraSpec
 

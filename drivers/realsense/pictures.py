@@ -13,7 +13,7 @@ import numpy as np
 import pyrealsense2 as rs
 from numpy.typing import NDArray
 
-from hal.cropping import Cropping
+from hal.images import Cropping
 from hal.specs import CameraSpec
 
 from .ring import Images

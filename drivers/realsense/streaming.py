@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import pyrealsense2 as rs
 
 from hal.camera_driver import CameraTally
-from hal.cropping import Cropping
+from hal.images import Cropping
 from hal.specs import CameraSpec
 
 from .matching import Matcher, Numbering, Taken, Verdict, skew

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ..images import undistort_pixels
 from ..pose import Pose
 from .board import Board
 from .errors import NoView
-from .lens import ideal_pixels
 from .library import opencv
 from .views import Sighting
 
@@ -63,7 +63,10 @@ class Detector:
         if blur > max(3.0, BLURRED * side):
             raise NoView(f"the picture is blurred: edges are {blur:.1f} pixels wide, a square {side:.0f}")
         camera = np.asarray(K, float)
-        pixels = ideal_pixels(pixels, camera, distortion)
+        try:
+            pixels = undistort_pixels(pixels, camera, distortion)
+        except ValueError as reason:
+            raise NoView(str(reason)) from None
         flat = self._on_one_plane(points, pixels)
         if flat.sum() < _MOST * len(flat):
             raise NoView(f"{(~flat).sum()} of its {len(flat)} corners are off a flat board: {_OFF}")

@@ -7,13 +7,13 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, get_args
 
+from ..images import Intrinsics, centre_crop
 from ..pose import Pose
 from ..specs import CameraSpec, DepthSensorSpec, SensorSpec, ViewSpec
 from .camera_models import CameraModel
 from .context import Context
 from .driver_options import ask_camera_driver, options_of
 from .files import nearest
-from .intrinsics import Intrinsics, centre_crop
 from .resolve_streams import Streams, resolve_streams
 from .rigfile import CameraConfig, Output, Stream
 from .schema import Unknown

@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
+from ..images import Intrinsics, from_field_of_view
 from ..specs import SensorSpec
 from .camera_models import CameraModel, Capture
 from .context import Context
 from .files import nearest
-from .intrinsics import Intrinsics, from_field_of_view
 from .rigfile import CameraConfig, Stream, StreamConfig
 
 __all__ = ["Streams", "resolve_streams"]

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from hal.calibration import Board, Eye, Sighting, View
 from hal.calibration.detection import flat_pose
-from hal.calibration.lens import distorted, ideal_pixels
 from hal.calibration.rotations import exponential, inverse
+from hal.images import distort_points, undistort_pixels
 from hal.pose import Pose
 
 BOARD = Board(7, 5, 0.035, 0.027)
@@ -40,7 +40,7 @@ def poses(count: int, seed: int = 0, turns: tuple[float, float, float] = (0.5, 0
 def pixels_of(pose: Array, lens: tuple[float, ...] = (0.0,) * 5, board: Board = BOARD) -> Array:
     """(n, 2) where the camera sees the corners of a board that is there."""
     p = board.corners @ pose[:3, :3].T + pose[:3, 3]
-    seen = distorted(p[:, :2] / p[:, 2:], lens)
+    seen = distort_points(p[:, :2] / p[:, 2:], lens)
     return np.column_stack([seen, np.ones(len(seen))]) @ K[:2].T
 
 
@@ -70,7 +70,7 @@ def views(
     chance, made = np.random.default_rng(seed), []
     for k, pose in enumerate(seen):
         pixels = pixels_of(pose, lens, real_board)
-        pixels = ideal_pixels(pixels + noise_px * chance.normal(size=pixels.shape), believed, lens)
+        pixels = undistort_pixels(pixels + noise_px * chance.normal(size=pixels.shape), believed, lens)
         C, error = flat_pose(BOARD.corners, pixels, believed)
         A = Z @ inverse(pose) @ inverse(X)
         link = (A if eye == "in-hand" else inverse(A)) @ exponential(arm * chance.normal(size=6) * [1, 1, 1, 2, 2, 2])
@@ -85,7 +85,7 @@ def picture(pose: Array, cv2: Any, lens: tuple[float, ...] = (0.0,) * 5, finer: 
     v, u = np.mgrid[-1 : height + 1, -1 : width + 1]
     ideal = np.dstack([u, v]).astype(float)
     if any(lens):  # at every pixel, and in between as if it were straight, which it is to 1e-4 pixels
-        ideal = ideal_pixels(ideal.reshape(-1, 2), K, lens).reshape(ideal.shape)
+        ideal = undistort_pixels(ideal.reshape(-1, 2), K, lens).reshape(ideal.shape)
     fine = cv2.resize(ideal, None, fx=finer, fy=finer, interpolation=cv2.INTER_LINEAR)
     ideal = fine[finer:-finer, finer:-finer].reshape(-1, 2)
     plane = K @ np.column_stack([pose[:3, 0], pose[:3, 1], pose[:3, 3]])

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from hal.camera_info import CameraInfo
-from hal.cropping import Cropping
+from hal.images import Cropping
 from hal.specs import CameraSpec
 
 from .realsense_bench import opened, read_again, read_until_lost, sent, software

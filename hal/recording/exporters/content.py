@@ -10,8 +10,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ...cropping import Cropping
 from ...errors import CommandError, DeviceNotFound
+from ...images import Cropping
 from ..columns import STATE
 from ..reader import Episode
 

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from hal.calibration import CalibrationFailed, NoView, load_board, solve
 from hal.calibration.detection import Detector
-from hal.calibration.lens import distorted, ideal_pixels
 from hal.calibration.rotations import exponential
 from hal.calibration.sampling import looks
 from hal.errors import DriverMissing
@@ -84,21 +83,6 @@ def test_pictures_of_no_use_say_why() -> None:
 
 def test_the_board_that_comes_with_the_hal_is_this_one() -> None:
     assert load_board() == BOARD
-
-
-def test_distortion_and_its_inverse_agree_with_opencv() -> None:
-    chance = np.random.default_rng(0)
-    points = chance.uniform(-0.5, 0.5, (50, 2))
-    ours = np.column_stack([distorted(points, LENS), np.ones(50)]) @ K[:2].T
-    theirs = cv2.projectPoints(np.column_stack([points, np.ones(50)]), np.zeros(3), np.zeros(3), K, np.array(LENS))[0]
-    assert np.abs(ours - theirs.reshape(-1, 2)).max() < 1e-9
-    back = ideal_pixels(ours, K, LENS)
-    assert np.abs(back - np.column_stack([points, np.ones(50)]) @ K[:2].T).max() < 1e-6
-
-
-def test_a_lens_that_cannot_be_undone_is_no_view() -> None:
-    with pytest.raises(NoView, match="distortion"):
-        ideal_pixels([[5000.0, 4000.0]], K, (-2.0, 3.0, 0.0, 0.0, -1.0))
 
 
 def test_without_opencv_the_command_that_installs_it_is_told(monkeypatch: pytest.MonkeyPatch) -> None:

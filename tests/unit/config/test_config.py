@@ -15,10 +15,10 @@ from jsonschema import Draft202012Validator, ValidationError
 
 from hal.config import load
 from hal.config.data_files import find_data, list_data
-from hal.config.intrinsics import centre_crop
 from hal.config.plan import Plan
 from hal.config.rigfile import rig_schema
 from hal.errors import ConfigError
+from hal.images import centre_crop
 from hal.pose import Pose
 from hal.specs import BodySpec, WorldSpec, from_json, to_json
 

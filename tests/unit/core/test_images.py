@@ -1,17 +1,17 @@
-"""The crop and the scaling that every real camera's pictures go through."""
+"""Crop, scaling and lens distortion of images."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
-from hal.cropping import Cropping
+from hal.images import Cropping, distort_points, undistort_pixels
 
 SIZES = [((640, 480), (256, 256)), ((848, 480), (640, 480)), ((640, 480), (640, 480)), ((640, 480), (1280, 960))]
 
 
 def ramp(width: int, height: int) -> np.ndarray:
-    """Each pixel holds its own place: column in the first layer, row in the second (as shares of 255)."""
+    """An image whose pixels hold their own column (red) and row (green), scaled to 255."""
     image = np.zeros((height, width, 3), np.uint8)
     image[..., 0] = np.round(np.linspace(0, 255, width))
     image[..., 1] = np.round(np.linspace(0, 255, height))[:, None]
@@ -19,7 +19,7 @@ def ramp(width: int, height: int) -> np.ndarray:
 
 
 @pytest.mark.parametrize(("size", "output"), SIZES)
-def test_a_ray_meets_the_same_thing_before_and_after(size: tuple[int, int], output: tuple[int, int]) -> None:
+def test_the_camera_matrix_follows_the_image(size: tuple[int, int], output: tuple[int, int]) -> None:
     (width, height), (out_width, out_height) = size, output
     K = np.array([[0.9 * width, 0, (width - 1) / 2 + 3], [0, 0.9 * width, (height - 1) / 2 - 2], [0, 0, 1]])
     cropping = Cropping(width, height, out_width, out_height)
@@ -38,7 +38,7 @@ def test_a_ray_meets_the_same_thing_before_and_after(size: tuple[int, int], outp
 
 
 @pytest.mark.parametrize(("size", "output"), SIZES)
-def test_depth_is_never_a_mean(size: tuple[int, int], output: tuple[int, int]) -> None:
+def test_depth_is_not_averaged(size: tuple[int, int], output: tuple[int, int]) -> None:
     depth = np.ones((size[1], size[0]), np.float32)
     depth[:, ::2] = 3.0
     out = Cropping(*size, *output).depth(depth)
@@ -46,10 +46,29 @@ def test_depth_is_never_a_mean(size: tuple[int, int], output: tuple[int, int]) -
     assert set(np.unique(out)) <= {1.0, 3.0}
 
 
-def test_what_comes_out_is_ones_own() -> None:
+def test_outputs_do_not_share_memory_with_the_input() -> None:
     image = ramp(64, 48)
     for output in ((64, 48), (32, 32)):
         out = Cropping(64, 48, *output).color(image)
         assert not np.shares_memory(out, image)
         out[:] = 0
     assert image.any()
+
+
+LENS = (0.12, -0.25, 0.001, -0.0008, 0.05)
+K = np.array([[614.0, 0.0, 319.5], [0.0, 612.0, 240.5], [0.0, 0.0, 1.0]])
+
+
+def test_distortion_agrees_with_opencv_and_its_inverse_undoes_it() -> None:
+    cv2 = pytest.importorskip("cv2", reason="pip install opencv-python-headless")
+    points = np.random.default_rng(0).uniform(-0.5, 0.5, (50, 2))
+    rays = np.column_stack([points, np.ones(50)])
+    ours = np.column_stack([distort_points(points, LENS), np.ones(50)]) @ K[:2].T
+    theirs = cv2.projectPoints(rays, np.zeros(3), np.zeros(3), K, np.array(LENS))[0]
+    assert np.abs(ours - theirs.reshape(-1, 2)).max() < 1e-9
+    assert np.abs(undistort_pixels(ours, K, LENS) - rays @ K[:2].T).max() < 1e-6
+
+
+def test_a_distortion_without_an_inverse_is_an_error() -> None:
+    with pytest.raises(ValueError, match="distortion"):
+        undistort_pixels([[5000.0, 4000.0]], K, (-2.0, 3.0, 0.0, 0.0, -1.0))
