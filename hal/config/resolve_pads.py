@@ -9,7 +9,6 @@ from typing import Any
 
 from .. import registry
 from ..errors import ConfigError
-from ..pads.choice import NO_WINDOW_KEYBOARD
 from ..pads.model import pad_model
 from ..specs import PadSpec
 from .context import Context
@@ -23,6 +22,9 @@ __all__ = ["resolve_pad"]
 
 CHOSEN_LATER = "auto"
 """Not the name of a driver: the pad is chosen when the rig opens."""
+
+NO_WINDOW_KEYBOARD = "the keyboard of the viewer's window is no pad any more; use web (the console) or terminal"
+"""Message for rigs and options that still name ``keyboard``."""
 
 
 def resolve_pad(context: Context, name: str, config: PadConfig) -> PadSpec | None:

@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 from .. import registry
 from ..config.data_files import find_data
+from ..config.resolve_pads import NO_WINDOW_KEYBOARD
 from ..errors import DeviceNotFound, DriverMissing, NotSupported
 from ..specs import PadSpec
 
@@ -17,8 +18,6 @@ TOUR = ("config", "teleop/tour.jsonl")
 """The recorded tour, among the data files."""
 KINDS = ("auto", "evdev", "web", "terminal", "demo", "none")
 """Values of ``--pad``, besides the path of a recording."""
-NO_WINDOW_KEYBOARD = "the keyboard of the viewer's window is no pad any more; use web (the console) or terminal"
-"""Message for rigs and options that still name ``keyboard``."""
 _AUTO = "auto"
 _WORDS = {
     "evdev": "a gamepad at the program's computer",

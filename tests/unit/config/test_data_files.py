@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import inspect
 import shutil
 import subprocess
 import sys
@@ -10,7 +11,6 @@ from pathlib import Path
 
 import pytest
 
-import hal.config.data_files
 from hal.config.data_files import data_folder, find_data, is_path, list_data
 
 
@@ -48,7 +48,7 @@ def test_an_installed_copy_finds_its_own_data(tmp_path: Path) -> None:
     (package / "data" / "robots" / "only_here.yaml").write_text("x: 1")
     (package / "config").mkdir()
     copy = package / "config" / "data_files.py"
-    shutil.copy(hal.config.data_files.__file__, copy)
+    shutil.copy(inspect.getfile(find_data), copy)
     spec = importlib.util.spec_from_file_location("installed_data_files", copy)
     assert spec is not None
     assert spec.loader is not None
