@@ -6,9 +6,8 @@ from typing import TYPE_CHECKING
 from urllib.parse import urlsplit
 
 if TYPE_CHECKING:
-    from hal.config.plan import Plan
     from hal.rig import Rig
-    from hal.specs import CameraSpec, GripperSpec, RobotSpec
+    from hal.specs import CameraSpec, GripperSpec, Plan, RobotSpec
 
 __all__ = ["banner", "invitation", "listing"]
 

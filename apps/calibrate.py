@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from hal.calibration.collecting import Collector
     from hal.calibration.output import Output
     from hal.calibration.setting import Setting
-    from hal.pose import Pose
+    from hal.geometry import Pose
     from hal.rig import Rig
 
 VIEWS = 20

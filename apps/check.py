@@ -16,8 +16,8 @@ from typing import TYPE_CHECKING
 from hal.apps.cli import ACTION_NEEDED, add_config_options, run_app
 
 if TYPE_CHECKING:
-    from hal.config.plan import Plan
-    from hal.verdict import Verdict
+    from hal.preflight import CheckResult
+    from hal.specs import Plan
 
 __all__ = ["main", "may_open", "parser"]
 
@@ -109,11 +109,11 @@ def may_open(plan: Plan) -> bool:
     return not arms or _fit(_shown(preflight(plan, BRIEFLY, machine=not emulated, cameras=False)))
 
 
-def _fit(verdicts: Sequence[Verdict]) -> bool:
+def _fit(verdicts: Sequence[CheckResult]) -> bool:
     return all(verdict.level != "fail" for verdict in verdicts)
 
 
-def _shown(verdicts: Iterable[Verdict]) -> list[Verdict]:
+def _shown(verdicts: Iterable[CheckResult]) -> list[CheckResult]:
     """Print each as soon as it is known, and below it what to do, once where it is the same for several."""
     found = []
     remedies = set()

@@ -16,9 +16,9 @@ from hal.apps.collected import Kept, summary
 from hal.apps.driving import Driving
 from hal.apps.prompts import Prompts
 from hal.apps.taping import Tape
-from hal.console import ACTIONS
 from hal.errors import HalError
 from hal.resetting import stands_in_world
+from hal.views import ACTIONS
 
 if TYPE_CHECKING:
     from concurrent.futures import Future
@@ -300,7 +300,7 @@ class Collection:
     def _show_pages(self, status: RecorderStatus) -> None:
         if self.rig.console is None:
             return
-        from hal.console import RecordingView
+        from hal.views import RecordingView
 
         succeeded = sum(one.success is True for one in self.kept)
         self.rig.console.show_recording(

@@ -253,7 +253,7 @@ class Driving:
 
     def _towards_goal(self, motion: Twist) -> Twist:
         """Sticks at rest and the handle of the 3D view dragged: there. It moves only while the dead-man is held."""
-        from hal.following import towards
+        from hal.teleop import towards
 
         view, name = self.rig.viewer3d, self.robot.name
         goal = view.goal(name) if view is not None else None

@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from hal.config.mapping import TeleopMapping
-    from hal.config.plan import Plan
     from hal.deadman import Deadman
     from hal.rig import Rig
+    from hal.specs import Plan
 
 __all__ = ["held_by", "needs_holding"]
 

@@ -7,7 +7,7 @@ from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from hal.config.plan import Plan
+    from hal.specs import Plan
 
 __all__ = ["check_everything", "planned"]
 
@@ -43,8 +43,8 @@ def planned(args: argparse.Namespace, *more: str, cameras: Iterable[str] = ()) -
 def check_everything(plan: Plan, args: argparse.Namespace) -> None:
     """Raise what opening the rig would raise, as far as it is known without a device or a process."""
     from hal import registry
-    from hal.console import Listen
     from hal.rig import check_opening
+    from hal.views import Listen
 
     if args.listen is not None:
         Listen.parse(args.listen).check()

@@ -20,8 +20,8 @@ from hal.apps.prompts import called
 if TYPE_CHECKING:
     from hal.config.mapping import TeleopMapping
     from hal.deadman import Deadman
+    from hal.geometry import Pose
     from hal.policy import Outcome
-    from hal.pose import Pose
     from hal.recording import Recorder
     from hal.rig import Rig
     from hal.robot import Robot

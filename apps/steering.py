@@ -37,7 +37,7 @@ class Steering:
             asked: The mapping that the user wants, whatever the pad is.
             speed: Share of the mapping's speeds; the console cannot exceed it.
             actions: Those of the mapping that the app knows.
-            settings: Those of ``hal.console.SETTINGS`` that the console may change.
+            settings: Those of ``hal.views.SETTINGS`` that the console may change.
 
         Raises:
             ConfigError: For a bad mapping.
@@ -89,7 +89,7 @@ class Steering:
 
     def _show(self) -> None:
         """Show on the console's pages which arm is driven, and what the controls do."""
-        from hal.console import DrivingView
+        from hal.views import DrivingView
 
         console, teleop = self._rig.console, self.teleop
         if console is None:

@@ -14,8 +14,8 @@ import numpy as np
 import pinocchio as pin
 
 import hal.config
+from hal.geometry import Pose
 from hal.kinematics import Kinematics
-from hal.pose import Pose
 
 
 def microseconds(call: Callable[[], object], calls: int, repeats: int = 7) -> float:

@@ -22,9 +22,8 @@ from dataclasses import dataclass, field
 
 from ruckig import InputParameter, Ruckig, Synchronization, Trajectory
 
-from hal.commands import Kind
-from hal.inbox import NO_INBOX, CommandRecord, Inbox, Session
-from hal.robot import Reading
+from hal.commands import NO_INBOX, CommandRecord, Inbox, Kind, Session
+from hal.driver import Reading
 from hal.servo.audit import SetpointAudit
 from hal.servo.servo import Servo
 from hal.specs import KinematicsSpec, LimitsSpec, RobotSpec

@@ -25,10 +25,9 @@ import numpy as np
 from ruckig import ControlInterface, InputParameter, OutputParameter, Ruckig, Synchronization
 from servo_streams import PANDA, robot_spec
 
-from hal.commands import Kind
-from hal.inbox import NO_INBOX, CommandRecord, Inbox, Session
+from hal.commands import NO_INBOX, CommandRecord, Inbox, Kind, Session
+from hal.driver import Reading
 from hal.kinematics import Kinematics
-from hal.robot import Reading
 from hal.servo.audit import SetpointAudit
 from hal.servo.servo import Servo
 from hal.specs import RobotSpec, WorkspaceSpec

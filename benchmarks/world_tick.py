@@ -20,11 +20,11 @@ from typing import Any
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "kits"))
 from specs import PANDA_HOME, box, data, floor, panda, world_spec
 
+from hal.driver import Setpoint
 from hal.drivers.pybullet.gripper import PyBulletGripper
 from hal.drivers.pybullet.library import load_pybullet
 from hal.drivers.pybullet.robot import PyBulletRobot
 from hal.drivers.pybullet.world import World
-from hal.robot import Setpoint
 
 TABLE = ((0.5, 0.0, -0.3), (0.4, 0.6, 0.3))
 SMALL = (0.02, 0.02, 0.02)

@@ -16,7 +16,6 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from .camera import Camera
-    from .camera_info import CameraInfo
     from .commands import (
         CartesianTarget,
         Command,
@@ -29,6 +28,7 @@ if TYPE_CHECKING:
     )
     from .control import Control
     from .deadman import Deadman
+    from .driver import CameraInfo
     from .errors import (
         CommandError,
         ConfigError,
@@ -45,10 +45,9 @@ if TYPE_CHECKING:
         Unreachable,
     )
     from .gamepad import Gamepad
-    from .gripper import Gripper
-    from .gripper_motion import GripperMotion, GripperResult
+    from .geometry import Pose
+    from .gripper import Gripper, GripperMotion, GripperResult
     from .observation import Observation
-    from .pose import Pose
     from .rig import Rig, open_rig
     from .robot import Robot
     from .specs import BodySpec
@@ -120,7 +119,7 @@ __all__ = [
 
 _MODULES = {
     "camera": ("Camera",),
-    "camera_info": ("CameraInfo",),
+    "driver": ("CameraInfo",),
     "commands": (
         "CartesianTarget",
         "Command",
@@ -149,10 +148,9 @@ _MODULES = {
         "Unreachable",
     ),
     "gamepad": ("Gamepad",),
-    "gripper": ("Gripper",),
-    "gripper_motion": ("GripperMotion", "GripperResult"),
+    "gripper": ("Gripper", "GripperMotion", "GripperResult"),
     "observation": ("Observation",),
-    "pose": ("Pose",),
+    "geometry": ("Pose",),
     "rig": ("Rig",),
     "robot": ("Robot",),
     "specs": ("BodySpec",),

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .errors import CommandError, DatasetError
-from .pose import Pose
+from .geometry import Pose
 
 if TYPE_CHECKING:
     from .recording import Episode

@@ -6,8 +6,8 @@ import math
 import threading
 from collections.abc import Callable
 
+from .commands import DeadmanRecord
 from .errors import NotSupported
-from .inbox import DeadmanRecord
 
 __all__ = ["Deadman", "Threshold"]
 

@@ -4,21 +4,98 @@ from __future__ import annotations
 
 import math
 import threading
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Mapping
 from types import MappingProxyType
-from typing import TYPE_CHECKING, ClassVar, NamedTuple
+from typing import TYPE_CHECKING
 
-from .deadman import Deadman
+from .deadman import Deadman, Threshold
+from .driver import GamepadDriver, PadReading
 from .errors import DeviceNotFound
-from .pads.controls import HeldControl, without_dead_zone
-from .pads.neutral import NeutralGate
 from .types import AXES, BUTTONS, PadState, Stamp
 
 if TYPE_CHECKING:
-    from .specs import PadSpec
+    pass
 
-__all__ = ["RUMBLE_SECONDS", "RUMBLE_STRONG", "RUMBLE_WEAK", "Gamepad", "GamepadDriver", "PadReading", "Plugged"]
+__all__ = [
+    "Gamepad",
+    "HeldControl",
+    "NeutralGate",
+    "RUMBLE_SECONDS",
+    "RUMBLE_STRONG",
+    "RUMBLE_WEAK",
+    "without_dead_zone",
+]
+
+# [controls.py] What one control of a pad means: an axis without its dead zone, a button or trigger that is held.
+
+
+def without_dead_zone(value: float, zone: float) -> float:
+    """``value`` (-1..1) with the part nearer to 0 than ``zone`` cut out, and the rest stretched to start from 0.
+
+    What is not a number is 0.
+    """
+    if not abs(value) > zone or zone >= 1.0:
+        return 0.0
+    return math.copysign(min(1.0, (abs(value) - zone) / (1.0 - zone)), value)
+
+
+class HeldControl:
+    """Reads one button or trigger of a pad for its dead-man."""
+
+    def __init__(self, control: str, deadman: Deadman) -> None:
+        self.control = control
+        self.deadman = deadman
+        self._threshold = Threshold()
+
+    def update(self, reading: PadReading, *, gate_open: bool) -> None:
+        """Take a reading; before the pad's :class:`~hal.gamepad.NeutralGate` is open nothing counts."""
+        if not gate_open:
+            self._threshold.held = False
+            pressed = True  # so this is no release, which would arm the switch
+        elif self.control in ("l2", "r2") and self.control in reading.axes:
+            pressed = self._threshold.update(reading.axes[self.control])
+        else:
+            pressed = self.control in reading.buttons
+        self.deadman.update(pressed, reading.connected, reading.t_alive)
+
+
+# [neutral.py] Nothing that was held when a pad came (back) may move anything.
+
+
+class NeutralGate:
+    """Lets a pad's controls through once its hands are off it.
+
+    It opens when every axis was near neutral at the same time, triggers let go of included, and shuts again when the
+    pad disconnects. A button that was down at that moment counts only after it was seen up.
+    """
+
+    def __init__(self, near: float = 0.25) -> None:
+        """``near``: share of an axis' travel that counts as neutral; more than a worn stick's drift."""
+        self.near = near
+        self.open = False
+        self._seen_up: frozenset[str] = frozenset()
+        self.waiting_for: tuple[str, ...] = ()
+        """Controls that must be let go of (or, if the pad never spoke of them, moved once), for people."""
+
+    def shut(self) -> None:
+        """The pad is gone."""
+        self.open = False
+        self._seen_up = frozenset()
+        self.waiting_for = ()
+
+    def update(self, axes: Mapping[str, float], buttons: frozenset[str], unknown: Collection[str]) -> frozenset[str]:
+        """Take a reading of a pad that is connected; the buttons that count come back."""
+        if not self.open:
+            away = tuple(name for name in AXES if name in unknown or not abs(axes.get(name, 0.0)) <= self.near)
+            self.open = not away
+            silent = bool(axes) and all(name in unknown for name in axes)
+            self.waiting_for = ("any control: the pad has said nothing yet",) if silent else away
+        if not self.open:
+            return frozenset()
+        self._seen_up |= frozenset(BUTTONS) - buttons
+        self.waiting_for = tuple(name for name in BUTTONS if name not in self._seen_up)
+        return buttons & self._seen_up
+
 
 RUMBLE_STRONG, RUMBLE_WEAK, RUMBLE_SECONDS = 1.0, 0.5, 0.5
 """How a pad rumbles unless told otherwise: shares of what its heavy and its light motor can, and s. A driver that must
@@ -29,103 +106,7 @@ _AFTER_ERROR = 0.2  # s
 _JOIN = 2.0  # s
 
 
-class PadReading(NamedTuple):
-    """What a gamepad driver reports. Canonical names (``hal.types.AXES``, ``BUTTONS``), no dead zone applied yet."""
-
-    t: float
-    """Time of the newest event, on the host's clock, s."""
-    t_alive: float
-    """When the driver last had proof that the pad is there and speaking, s. The dead-man's watchdog looks at this."""
-    t_device: float
-    seq: int
-    """Counts events."""
-    axes: Mapping[str, float]
-    """Sticks -1..1, right and up positive; triggers 0..1. A trigger that is only a button is 0 or 1, or left out."""
-    buttons: frozenset[str]
-    connected: bool
-    unknown: Collection[str] = ()
-    """Axes that the pad has not spoken of yet; they show 0, and nothing counts until they were moved."""
-
-
-class Plugged(NamedTuple):
-    """What a driver could open."""
-
-    pads: tuple[str, ...]
-    """Pads that are there, in words."""
-    notes: tuple[str, ...] = ()
-    """What stands in the way of others, each with the command that mends it."""
-    devices: tuple[str, ...] = ()
-    """What ``options.device`` of a rig calls each of :attr:`pads`, where the driver has such an option."""
-
-
 _NOTHING = PadReading(-math.inf, -math.inf, 0.0, 0, MappingProxyType({}), frozenset(), connected=False)
-
-
-class GamepadDriver(ABC):
-    """One pad. ``poll`` is called for as long as the rig is open, from one thread; a pad that is not plugged in is
-    not an error but a reading with ``connected=False``, and comes back by itself when it is plugged in again.
-    """
-
-    simulated: ClassVar[bool] = False
-    proves_liveness: bool = False
-    """True where silence means that the pad is gone (unplugging is seen, or the pad streams), so that its buttons
-    may serve as a dead-man on a real arm. It may change when another pad is plugged in."""
-
-    def __init__(self, spec: PadSpec, source: object | None = None) -> None:
-        self.spec = spec
-        self.source = source
-        """Where a pad that lives in another process gets its record from; for ``playback``, the world's time."""
-        self.notes: tuple[str, ...] = ()
-        """What a person should know about the pad, each with what mends it."""
-        self.flat: Mapping[str, float] = MappingProxyType({})
-        """Axis -> share of its travel that the pad itself calls neutral."""
-
-    @classmethod
-    def plugged(cls) -> Plugged:
-        """What could be opened at the moment. Quick, opens nothing, and never raises for what is not there."""
-        return Plugged(())
-
-    @abstractmethod
-    def open(self) -> None:
-        """Look for the pad."""
-
-    @abstractmethod
-    def poll(self, now: float, timeout: float) -> PadReading:
-        """The present reading; waits up to ``timeout`` s for news. ``now`` is the time on ``rig.clock``."""
-
-    def describe(self) -> str:
-        """What drives, in words, for the banner."""
-        return type(self).__name__
-
-    def details(self) -> Mapping[str, str]:
-        """What is known of the pad that is plugged in, for a person who has trouble with it: what -> in words."""
-        return {}
-
-    @property
-    def mapping(self) -> str | None:
-        """Teleoperation mapping that is meant for the pad that is plugged in; None where any will do."""
-        return None
-
-    def rumble(self, strong: float, weak: float, seconds: float) -> bool:
-        """Let the pad's motors shake the hand: shares of what they can (0..1), and how long, s. True where they will.
-
-        Returns at once, from whatever thread it is called.
-        """
-        return False
-
-    @property
-    def can_hold(self) -> bool:
-        """Can a control be held down? Where not (a terminal's keys), each press is one small step."""
-        return True
-
-    @property
-    def finished(self) -> bool:
-        """Has it nothing more to say? Only a recording ends."""
-        return False
-
-    @abstractmethod
-    def close(self) -> None:
-        """Let go of the device. Idempotent."""
 
 
 class Gamepad:

@@ -3,91 +3,94 @@
 from __future__ import annotations
 
 import threading
-from abc import ABC, abstractmethod
-from typing import TYPE_CHECKING, ClassVar, NamedTuple
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 from .arguments import number
-from .errors import ConnectionLost, MotionStopped, NotSupported, RobotFault, StaleStateError
-from .gripper_motion import GripperMotion, GripperResult
+from .errors import ConnectionLost, MotionStopped, RobotFault, StaleStateError
 from .host.gripper_mail import GripperAct, GripperCommand
 from .types import Fault, GripperOutcome, GripperState
 
 if TYPE_CHECKING:
     from .clock import Clock
+    from .control import StopLatch
     from .host.hosts import Host
     from .specs import GripperSpec
-    from .stops import StopLatch
 
-__all__ = ["Gripper", "GripperDriver", "GripperMotion", "GripperReading", "GripperResult"]
+__all__ = [
+    "Gripper",
+    "GripperMotion",
+    "GripperResult",
+]
 
+# [gripper_motion.py] A motion of a gripper that was started: is it over, and how did it end?
 
-class GripperReading(NamedTuple):
-    """What a gripper driver reports."""
-
-    t: float
-    t_device: float
-    seq: int
-    width: float
-    """Distance between the fingers, m."""
-    width_target: float
-    """Width of the newest command, m."""
-    moving: bool
-    grasped: bool | None = None
-    force: float | None = None
-    outcome: GripperOutcome | None = None
-    """How the newest command goes, from the return of its call on; None where the driver cannot know, and it is judged
-    by ``moving`` and the width."""
-    fault: Fault | None = None
-    """Why the last command failed, with what to do about it."""
+_SHORTEST_LOOK = 0.01
+_PATIENCE = 2.0
+"""A gripper that is busy may say nothing new for so long, s."""
+_ON_ITS_WAY = (GripperOutcome.NONE, GripperOutcome.RUNNING)
 
 
-class GripperDriver(ABC):
-    """One gripper. ``move``, ``grasp`` and ``home`` start a motion and return at once: a gripper never blocks the arm.
+@dataclass(frozen=True, slots=True)
+class GripperResult:
+    """How a motion ended. True where the fingers did what they were told."""
 
-    The newest command wins; one motion is in flight. Neither ``stop`` nor ``close`` opens the fingers or lets go of
-    what they hold. All calls, ``read`` too, come from one thread and return within a few ms.
-    """
+    outcome: GripperOutcome
+    state: GripperState
+    """The gripper when the end was first seen."""
+    fault: Fault | None
+    """Why it failed, where it did."""
 
-    simulated: ClassVar[bool] = False
+    def __bool__(self) -> bool:
+        return self.outcome is GripperOutcome.DONE
 
-    def __init__(self, spec: GripperSpec, world: object | None = None) -> None:
-        self.spec = spec
-        self.world = world
 
-    @abstractmethod
-    def open(self) -> None:
-        """Connect. Nothing moves."""
+class GripperMotion:
+    """A motion under way. Made by :meth:`hal.gripper.Gripper.start` and its siblings; nothing depends on keeping it."""
 
-    @abstractmethod
-    def read(self, now: float) -> GripperReading:
-        """The newest state."""
+    def __init__(self, gripper: Gripper, seq: int) -> None:
+        self._gripper = gripper
+        self._seq = seq
+        self._result: GripperResult | None = None
 
-    @abstractmethod
-    def move(self, width: float, speed: float, force: float) -> None:
-        """Start towards ``width`` (m) at ``speed`` (m/s), pressing with at most ``force`` (N)."""
+    @property
+    def done(self) -> bool:
+        """Is it over, however it ended? Never waits; raises ConnectionLost or StaleStateError when nobody can tell."""
+        if self._look() is None:
+            self._gripper.state(_PATIENCE)
+        return self._result is not None
 
-    def grasp(self, width: float, speed: float, force: float, inner: float, outer: float) -> None:
-        """Start to close on something of ``width`` (m) at ``speed`` (m/s) and hold it with ``force`` (N).
+    def wait(self, timeout: float = 10.0) -> GripperResult:
+        """Wait until it is over; in lock-step this makes time go on.
 
-        It is held when the fingers end between ``width - inner`` and ``width + outer`` (m). A driver without a grasp of
-        its own closes as far as that, and so presses on what is there.
+        A motion that a newer command or a stop ended is ``STOPPED``. Raises TimeoutError after ``timeout`` s,
+        ConnectionLost when the gripper does not answer, StaleStateError when it says nothing new for 2 s.
         """
-        self.move(max(0.0, width - inner), speed, force)
+        gripper = self._gripper
+        clock = gripper.clock
+        deadline = clock.now() + timeout
+        period = max(_SHORTEST_LOOK, gripper.period)
+        while (result := self._look()) is None:
+            state = gripper.state(_PATIENCE)
+            if clock.now() >= deadline:
+                raise TimeoutError(f"{gripper.name} is still moving after {timeout:g} s: {state}")
+            clock.sleep(period)
+        return result
 
-    def home(self) -> None:  # noqa: B027  # most have nothing to do
-        """Start to find out how far the fingers open. Only some grippers need it, once after they are switched on."""
+    def _look(self) -> GripperResult | None:
+        """The result, once there is one."""
+        state = self._gripper.newest() if self._result is None else None
+        if self._result is None and state is not None:
+            if state.target_seq > self._seq:
+                self._result = GripperResult(GripperOutcome.STOPPED, state, None)
+            elif state.target_seq == self._seq and state.outcome not in _ON_ITS_WAY:
+                failed = state.outcome is GripperOutcome.FAILED
+                self._result = GripperResult(state.outcome, state, state.fault if failed else None)
+        return self._result
 
-    @abstractmethod
-    def stop(self) -> None:
-        """Stay where the fingers are, keep the grip force."""
-
-    def inject(self, **knobs: object) -> None:
-        """Switch faults on or off, for tests. Only drivers that simulate have any."""
-        raise NotSupported(f"driver {type(self).__name__} has no faults to inject")
-
-    @abstractmethod
-    def close(self) -> None:
-        """Let go of the device, not of the object. Idempotent."""
+    def __repr__(self) -> str:
+        how = self._result.outcome if self._result is not None else "not over when it was looked at last"
+        return f"<GripperMotion {self._seq} of {self._gripper.name}: {how}>"
 
 
 class Gripper:
@@ -154,7 +157,7 @@ class Gripper:
 
     def state_at(self, t: float) -> GripperState:
         """The state at ``t`` (s on ``rig.clock``), interpolated; as :meth:`hal.robot.Robot.state_at`."""
-        from .interpolation import gripper_at
+        from .observation import gripper_at
 
         self.check()
         return gripper_at(self._mail.history, t, f"the gripper of {self._robot}")

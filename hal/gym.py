@@ -20,14 +20,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .camera import Camera
-from .command_checks import FIRST_STEP_ANGLE
 from .commands import CartesianTarget, Command, JointTarget, Twist
-from .control import Control
+from .control import FIRST_STEP_ANGLE, Control
 from .deadman import Deadman
 from .errors import CommandError, DriverMissing, MotionStopped, NotSupported
+from .geometry import Pose, after_rotation
 from .observation import Observation
-from .pose import Pose
-from .quaternion import after_rotation
 from .resetting import put_back
 from .rig import Rig, open_rig
 from .robot import Robot
@@ -160,7 +158,7 @@ class RigEnv(gymnasium.Env[Spaces, NDArray[np.float32]]):
 
         Things that have random ranges start at poses drawn from ``np_random``: with the same ``seed`` at the same ones,
         without a seed at the next ones. ``options``: ``q`` (n,) to start from, rad; ``poses``, name of an object ->
-        :class:`~hal.pose.Pose`, in the place of a drawn one. ``info["poses"]`` says where things were put, if any were:
+        :class:`~hal.geometry.Pose`, in the place of a drawn one. ``info["poses"]`` holds the drawn poses, if any:
         name -> (7,), position in m and quaternion xyzw in the world.
 
         Raises MotionStopped after ``rig.stop()``, whoever called it: only a person, or a program that knows better, may

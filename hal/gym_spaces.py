@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from .camera import Camera
 from .errors import CommandError
+from .geometry import Pose
 from .observation import Observation
-from .pose import Pose
 from .robot import Robot
 from .specs import CameraSpec
 

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .errors import Unreachable
-from .pose import Pose
+from .geometry import Pose
 
 if TYPE_CHECKING:
     from .kinematics import Kinematics

@@ -18,8 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from .arguments import vector
 from .errors import CommandError
-from .pose import Pose
-from .quaternion import difference
+from .geometry import Pose, difference
 
 if TYPE_CHECKING:
     from .specs import KinematicsSpec

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .errors import CommandError
-from .pose import Pose
+from .geometry import Pose
 from .specs import BodySpec, RangesSpec
 
 if TYPE_CHECKING:

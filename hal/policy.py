@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any, Protocol, TypeAlias, cast
 
 import numpy as np
 
-from .command_checks import CommandChecks
 from .commands import Command
+from .control import CommandChecks
 from .errors import CommandError, ConnectionLost, MotionStopped, RobotFault, StaleStateError
 from .handover import follows, wait_here
 from .histogram import Histogram

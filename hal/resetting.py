@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from .errors import MotionStopped
+from .geometry import Pose
 from .placement import draw_poses
-from .pose import Pose
 
 if TYPE_CHECKING:
     from .clock import Clock

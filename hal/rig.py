@@ -6,17 +6,16 @@ import atexit
 import contextlib
 import logging
 from collections.abc import Callable, Collection, Mapping, Sequence
+from difflib import get_close_matches
 from functools import partial
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 from . import registry
-from .camera import Camera
-from .camera_place import place_of
+from .camera import Camera, place_of
 from .clock import Clock, LockStepClock, RealClock
-from .console import Console, Listen
-from .devices import Devices
+from .control import StopLatch
 from .errors import ConfigError, ConnectionLost, DeviceNotFound, HalError, NotSupported, Problem
 from .gamepad import Gamepad
 from .gripper import Gripper
@@ -27,14 +26,38 @@ from .observation import Observation, Observer
 from .pads.choice import Chosen, choose_pad, in_words
 from .robot import Robot
 from .specs import GroupSpec, PadSpec, RobotSpec
-from .stops import StopLatch
+from .views import Console, Listen
 from .world import NoWorld, World
 
 if TYPE_CHECKING:
-    from .config.plan import Plan
-    from .pictures import Pictures, Viewer, Viewer3D
+    from .specs import Plan
+    from .views import Pictures, Viewer, Viewer3D
 
-__all__ = ["Rig", "SharedStates", "open_rig"]
+__all__ = [
+    "Devices",
+    "Rig",
+    "SharedStates",
+    "open_rig",
+]
+
+# [devices.py] Devices by name.
+
+T = TypeVar("T")
+
+
+class Devices(dict[str, T]):
+    """Devices by name. A name that is not there raises DeviceNotFound, which lists those that are."""
+
+    def __init__(self, kind: str) -> None:
+        super().__init__()
+        self._kind = kind
+
+    def __missing__(self, name: str) -> T:
+        close = get_close_matches(name, self, n=1)
+        hint = f" (did you mean {close[0]!r}?)" if close else ""
+        there = ", ".join(self) if self else "none"
+        raise DeviceNotFound(f"this rig has no {self._kind} {name!r}{hint}; it has: {there}")
+
 
 _FIRST_FRAME = 5.0
 _CONSOLE = "web"
@@ -196,7 +219,7 @@ class Rig:
             host.request("reset_statistics")  # starting up is not what anybody wants to measure
 
     def _note_refused_priority(self) -> None:
-        from .machine import REALTIME_RIGHT
+        from .preflight import REALTIME_RIGHT
 
         checked = self.attended and not self.emulated  # the check before a real arm has printed the command
         remedy = "hal-check prints what allows it" if checked else f"to allow it: {REALTIME_RIGHT}"
@@ -279,7 +302,7 @@ class Rig:
                 gamepad.start_thread(self.clock.now)
             if spec.driver == _CONSOLE and self.console is not None:
                 # Without a word a program that waits for a dead-man would just hang. Apps print a banner instead.
-                logging.getLogger("hal.console").warning("drive from a browser: %s", self.console.link)
+                logging.getLogger("hal.views").warning("drive from a browser: %s", self.console.link)
 
     def _pad_source(self, spec: PadSpec) -> object | None:
         """What the driver of this pad is made with, besides its record."""

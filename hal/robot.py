@@ -2,179 +2,96 @@
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
+import math
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from .arguments import number, vector
-from .errors import ConnectionLost, NotSupported, StaleStateError
-from .pose import Pose, frozen, tcp_pose
-from .types import Fault, RobotState, RobotStatus
+from .control import Control, check_deadman
+from .errors import CommandError, ConnectionLost, MotionStopped, StaleStateError
+from .geometry import Pose, frozen, tcp_pose
+from .types import RobotState, RobotStatus
 
 if TYPE_CHECKING:
     from .clock import Clock
-    from .control import Control
+    from .control import StopLatch
     from .deadman import Deadman
     from .gripper import Gripper
     from .host.hosts import Host
     from .kinematics import Kinematics
     from .specs import LimitsSpec, RobotSpec
-    from .stops import StopLatch
 
-__all__ = ["Reading", "Robot", "RobotDriver", "Setpoint"]
+__all__ = [
+    "Robot",
+    "move_to",
+]
 
-Floats = Sequence[float]
+# [moving.py] ``move_to``: a session that goes to one place and ends there.
+
+
+def move_to(
+    robot: Robot,
+    target: ArrayLike | Pose | None,
+    position: ArrayLike | None,
+    *,
+    deadman: Deadman | None,
+    unattended: bool,
+    speed: float | None,
+    tcp_speed: float | None,
+    timeout: float | None,
+    patience: float,
+) -> RobotState:
+    """See :meth:`hal.robot.Robot.move_to`."""
+    if patience != math.inf:
+        number("patience", patience, "s", least=0.0)
+    if timeout is not None:
+        number("timeout", timeout, "s", least=0.0, above=True)
+    check_deadman(deadman)
+    if (target is None) == (position is None):
+        raise CommandError("pass move_to either a target (joint positions or a hal.Pose) or position=")
+    if position is not None:
+        target = Pose(vector("position", position, 3), robot.state().tcp_set.orientation)
+    goal = robot.ik(target) if isinstance(target, Pose) else vector("target", target)
+    if goal.size != robot.n:
+        hint = "; for a position of the tcp pass position=" if goal.size == 3 else ""
+        raise CommandError(f"{robot.name} has {robot.n} joints; the target has {goal.size}{hint}")
+    limits = robot.limits
+    outside = np.flatnonzero((goal < limits.lower) | (goal > limits.upper))
+    if outside.size:
+        names = ", ".join(robot.joints[k] for k in outside)
+        raise CommandError(f"the target is outside the position limits of {names}")
+    session = Control(
+        robot,
+        deadman=deadman,
+        rate_hz=50.0,
+        speed=speed,
+        tcp_speed=tcp_speed,
+        unattended=unattended,
+        goal=tuple(goal.tolist()),
+    )
+    clock = robot.clock
+    start = held = clock.now()
+    with session:
+        for _ in clock.rate(50.0):
+            servo = session._peek()
+            session._check_trip(servo, clock.now())
+            if servo.refused and servo.session == session._id:
+                raise CommandError(f"the way to the target leaves the workspace of {robot.name}")
+            if servo.arrived and servo.session == session._id:
+                break
+            if deadman is None or deadman.held:
+                held = clock.now()
+            elif clock.now() - held > patience:
+                raise MotionStopped(f"nobody held the dead-man for {patience:g} s", "call move_to again")
+            if timeout is not None and clock.now() - start > timeout:
+                raise TimeoutError(f"{robot.name} did not reach the target within {timeout:g} s")
+    return robot.state()
+
 
 _NEWS = 0.2
 """Longest wait for a state after a recovery, s."""
-
-
-class Reading(NamedTuple):
-    """What a robot driver reports once per cycle. Plain floats: this is the hot path."""
-
-    t: float
-    """When it was measured, on the host's clock, s."""
-    t_device: float
-    """The same on the device's own clock, s."""
-    seq: int
-    """Counts the device's samples; gaps are lost samples."""
-    q: Floats
-    """Joint positions, rad."""
-    dq: Floats
-    """Joint velocities, rad/s."""
-    tau: Floats | None = None
-    """Joint torques, Nm."""
-    q_commanded: Floats | None = None
-    """The set-point that the device says it took last, rad: how the servo notices that one was lost. None where the
-    device cannot say."""
-    dq_commanded: Floats | None = None
-    tau_ext: Floats | None = None
-    wrench_ext: Floats | None = None
-    fault: Fault | None = None
-    """A fault stops and latches the arm."""
-    tau_commanded: Floats | None = None
-    """In torque mode: the torques that the device says it took last, Nm; none at all before it has changed its mode.
-    The servo goes on from these, as it does from ``q_commanded``."""
-
-
-class Setpoint(NamedTuple):
-    """What the servo writes to a driver once per cycle; every value lies inside the limits, continuously.
-
-    A driver may keep the numbers, and report them as ``q_commanded``, but must not change them.
-    """
-
-    q: Floats
-    """rad"""
-    dq: Floats
-    """rad/s"""
-    ddq: Floats
-    """rad/s2"""
-    tau: Floats | None = None
-    """Nm, in torque mode only: what to apply on top of what carries the arm's own weight. ``q`` and ``dq`` are then
-    what was measured."""
-    q_from: Floats | None = None
-    """Where the device is now, by what the servo knows: the set-point before this one, rad. Only in position mode."""
-
-
-class RobotDriver(ABC):
-    """One arm. It only talks to its device: limits, smoothing, time-outs and stopping stand above it.
-
-    Made by the registry with the arm's :class:`~hal.specs.RobotSpec` and, for a simulated arm, the world it stands
-    in. The calls come from one thread. ``open`` connects and reads; it never moves anything. ``close`` is idempotent
-    and stops safely first. A device that does not answer raises :class:`~hal.errors.ConnectionLost`.
-    """
-
-    modes: ClassVar[frozenset[str]] = frozenset({"position"})
-    """Kinds of set-point the device takes: ``position``, ``velocity``, ``torque``."""
-    paces_itself: ClassVar[bool] = False
-    """True where the device sets the pace: :meth:`wait` blocks until its next cycle (a Franka's state packets)."""
-    simulated: ClassVar[bool] = False
-    """True where nothing real can move."""
-    repeats: ClassVar[bool] = False
-    """What the device does when a set-point is lost: True where it repeats the last one, False where it extrapolates at
-    constant acceleration (a Franka), or where none can be lost. Only what was extrapolated differs from a late
-    report, and is corrected."""
-
-    def __init__(self, spec: RobotSpec, world: object | None = None) -> None:
-        self.spec = spec
-        self.world = world
-
-    @abstractmethod
-    def open(self) -> None:
-        """Connect. Nothing moves."""
-
-    def wait(self) -> None:
-        """Block until the device's next cycle, for a bounded time. Only of drivers that pace themselves.
-
-        Raises nothing: what went wrong is for :meth:`read` to say.
-        """
-        raise NotSupported(f"driver {type(self).__name__} does not pace itself")
-
-    @abstractmethod
-    def read(self, now: float) -> Reading:
-        """The newest state; ``now`` is the host's clock, for devices without one. Does not block."""
-
-    @abstractmethod
-    def write(self, setpoint: Setpoint) -> bool | None:
-        """Hand over the next set-point.
-
-        Returns:
-            False when it was not passed on to the device, for example because a motion has to be started first. The
-            servo then starts from where the next reading says that the device is. Anything else means that it was.
-        """
-
-    @abstractmethod
-    def halt(self) -> None:
-        """End streaming: the device stops and holds by its own means. Idempotent."""
-
-    def recover(self) -> None:  # noqa: B027  # most have nothing to do
-        """Clear a fault, as the user's own act. A driver without faults has nothing to do."""
-
-    @property
-    def wants_loop(self) -> bool:
-        """Does the device's library want to own the loop from now on (see :meth:`loop`)?"""
-        return False
-
-    def loop(self, turn: Callable[[], None]) -> None:
-        """Let the library call ``turn`` (one whole cycle of the group) until the motion is over.
-
-        For libraries that stream set-points only out of a callback of their own: inside a turn, ``wait`` does not
-        block, ``read`` gives the state that the callback was called with and ``write`` keeps what it is to return.
-        """
-        raise NotSupported(f"driver {type(self).__name__} does not own a loop")
-
-    def mass_matrix(self, q: Floats) -> Any:
-        """Joint-space inertia (n, n), kg m2, at joint positions ``q``, rad: numbers in rows, or an array.
-
-        Of drivers that take torques: the servo brakes by it, and bounds what it lets through. Three times too much or
-        too little is still good enough; that of a URDF whose inertias are invented is not.
-        """
-        raise NotSupported(f"driver {type(self).__name__} does not know the arm's inertia")
-
-    def own_tcp(self) -> Floats | None:
-        """Where the device itself says that its tcp was in the last reading: 4x4 by columns, in the base frame, m.
-
-        None where it does not know. It is compared with ours when the arm is opened, and a mismatch is refused.
-        """
-        return None
-
-    def statistics(self) -> dict[str, Any]:
-        """What the driver knows of its connection, as plain numbers and texts, for reports."""
-        return {}
-
-    def reset_statistics(self) -> None:  # noqa: B027
-        """Count from zero."""
-
-    def inject(self, **knobs: object) -> None:
-        """Switch faults on or off, for tests. Only drivers that simulate have any."""
-        raise NotSupported(f"driver {type(self).__name__} has no faults to inject")
-
-    @abstractmethod
-    def close(self) -> None:
-        """Stop safely and let go of the device. Idempotent."""
 
 
 class Robot:
@@ -258,7 +175,7 @@ class Robot:
 
         The last second is kept. Raises StaleStateError for a time that is older, or more than 50 ms in the future.
         """
-        from .interpolation import robot_at
+        from .observation import robot_at
 
         self._host.check()
         return robot_at(self._mail.history, t, self.name)
@@ -341,7 +258,7 @@ class Robot:
             MotionStopped: After a trip, or when the dead-man was released for longer than ``patience``.
             TimeoutError: After ``timeout``.
         """
-        from .moving import move_to
+        # FOLD: import dropped
 
         return move_to(
             self,

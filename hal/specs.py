@@ -20,6 +20,7 @@ __all__ = [
     "KinematicsSpec",
     "LimitsSpec",
     "PadSpec",
+    "Plan",
     "RangesSpec",
     "RobotSpec",
     "SensorSpec",
@@ -322,3 +323,37 @@ def _revive(hint: Any, value: Any) -> Any:
         inner = args[0] if len(args) == 2 and args[1] is Ellipsis else None
         return tuple(_revive(inner or args[k], item) for k, item in enumerate(value))
     return value
+
+
+# [plan.py] What a rig's configuration comes to: every device with its driver, checked, nothing opened.
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What ``hal.open`` opens."""
+
+    sim: bool
+    """The rig's flag."""
+    clock: str
+    """``real_time`` or ``lock_step``."""
+    world: WorldSpec | None
+    """The simulated world, where a device stands in one."""
+    robots: tuple[RobotSpec, ...]
+    cameras: tuple[CameraSpec, ...]
+    pads: tuple[PadSpec, ...]
+    renderer: str
+    """What draws simulated pictures: ``auto``, ``gl`` or ``tiny``."""
+    warnings: tuple[str, ...]
+    """What a person should know, though it is not wrong."""
+    source: str
+    """The rig's file, or ``<dict>``."""
+
+    @property
+    def attended(self) -> bool:
+        """Whether something real moves, so that a person must be there."""
+        return any(robot.attended for robot in self.robots)
+
+    @property
+    def emulated(self) -> bool:
+        """Whether a program stands in for everything that counts as real, so that nothing can be hurt."""
+        return self.attended and all(robot.emulated for robot in self.robots if robot.attended)

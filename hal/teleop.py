@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
+from math import hypot
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -10,6 +11,7 @@ from .arguments import number
 from .commands import Twist
 from .config.mapping import AxisMapping, TeleopMapping, load_mapping
 from .errors import CommandError
+from .geometry import Pose, difference
 from .types import PadState
 
 if TYPE_CHECKING:
@@ -17,7 +19,32 @@ if TYPE_CHECKING:
     from .gripper import Gripper
     from .robot import Robot
 
-__all__ = ["Teleop"]
+__all__ = [
+    "Teleop",
+    "towards",
+]
+
+# [following.py] Going to a pose by speeds: for a goal that a person drags about, and that a limit or a released
+# dead-man holds up.
+
+_GAIN = 4.0
+"""1/s: the share of what is left that is covered per second near the goal. Far slower than the servo brakes, so it
+arrives without overshoot."""
+
+
+def towards(goal: Pose, tcp: Pose, linear: float, angular: float) -> Twist:
+    """The speeds that bring ``tcp`` to ``goal``, both in the base frame: at most ``linear`` m/s and ``angular`` rad/s.
+
+    Straight, and turning about one axis; both slow down towards the end.
+    """
+    left = difference((*tcp.position, *tcp.orientation), (*goal.position, *goal.orientation))
+    return Twist(_capped(left[:3], linear), _capped(left[3:], angular))
+
+
+def _capped(left: Sequence[float], most: float) -> list[float]:
+    distance = hypot(*left)
+    return [min(_GAIN, most / distance) * part for part in left] if distance > 0.0 else [0.0, 0.0, 0.0]
+
 
 _CROSSED = 0.05
 """A trigger this close to the present grip has reached it (share of the travel)."""

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .pose import Pose
+from .geometry import Pose
 
 __all__ = [
     "AXES",

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from .errors import NotSupported
-from .pose import Pose, frozen
+from .geometry import Pose, frozen
 from .specs import BodySpec, to_json
 
 __all__ = ["Contact", "NoWorld", "Poses", "World"]

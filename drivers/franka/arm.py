@@ -14,11 +14,11 @@ from math import dist, inf
 from typing import Any, ClassVar
 
 from hal.config.data_files import find_data
+from hal.driver import Reading, RobotDriver, Setpoint
 from hal.errors import RobotFault
 from hal.histogram import Histogram
 from hal.kinematics import Kinematics
-from hal.machine import has_realtime_kernel
-from hal.robot import Reading, RobotDriver, Setpoint
+from hal.preflight import has_realtime_kernel
 from hal.specs import RobotSpec
 from hal.types import Fault
 

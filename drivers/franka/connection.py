@@ -5,8 +5,8 @@ from __future__ import annotations
 import contextlib
 import time
 
-from hal.claim import Claim
 from hal.errors import ConnectionLost, HalError
+from hal.lock import DeviceLock
 from hal.types import Fault
 
 from .claim import claim_arm
@@ -45,7 +45,7 @@ class Connection:
         """What the library raises of its own."""
         self.found_again = 0
         """How often a lost robot was found."""
-        self._claim: Claim | None = None
+        self._claim: DeviceLock | None = None
         self._configured = False
         self._retry_at = 0.0
 

@@ -8,7 +8,7 @@ import numpy as np
 from pydantic import model_validator
 
 from hal.config.schema import PoseConfig, is_number
-from hal.pose import Pose, matrix_to_quaternion
+from hal.geometry import Pose, matrix_to_quaternion
 
 __all__ = ["Frame"]
 

@@ -6,8 +6,8 @@ import importlib.util
 import math
 import time
 
+from hal.driver import GripperDriver, GripperReading
 from hal.errors import CommandError, ConnectionLost
-from hal.gripper import GripperDriver, GripperReading
 from hal.specs import GripperSpec
 from hal.types import GripperOutcome
 

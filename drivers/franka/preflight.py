@@ -12,9 +12,9 @@ from typing import Any
 from hal import registry
 from hal.errors import ConnectionLost, ControlTaken
 from hal.host.process import Child
+from hal.preflight import CheckResult
 from hal.specs import RobotSpec
 from hal.types import Fault
-from hal.verdict import Verdict
 
 from .claim import claim_arm
 from .faults import ARM_PORT, HAND_PORT, fault_of
@@ -33,13 +33,13 @@ _EMULATOR = "start it in another terminal: python -m hal.drivers.franka.emulator
 _FREE = "end the program that uses this arm, also on other computers; if there is none, restart the robot in Desk"
 
 
-def check(spec: RobotSpec, duration: float) -> Iterator[Verdict]:
+def check(spec: RobotSpec, duration: float) -> Iterator[CheckResult]:
     """Look at one arm; the network is measured for ``duration`` s. Nothing moves, and nothing stays connected."""
     settings = ArmSettings.of(spec)
     try:
         claim = claim_arm(settings.host)
     except ControlTaken as error:
-        yield Verdict("in use", "fail", str(error), "end that program first; nothing else was looked at")
+        yield CheckResult("in use", "fail", str(error), "end that program first; nothing else was looked at")
         return
     try:
         yield from _check(spec, settings, duration)
@@ -47,7 +47,7 @@ def check(spec: RobotSpec, duration: float) -> Iterator[Verdict]:
         claim.release()
 
 
-def _check(spec: RobotSpec, settings: ArmSettings, duration: float) -> Iterator[Verdict]:
+def _check(spec: RobotSpec, settings: ArmSettings, duration: float) -> Iterator[CheckResult]:
     host = settings.host
     address = resolve(host)
     if address is None:
@@ -64,73 +64,77 @@ def _check(spec: RobotSpec, settings: ArmSettings, duration: float) -> Iterator[
     yield _network(address, duration)
 
 
-def _route(host: str, address: str) -> Verdict:
+def _route(host: str, address: str) -> CheckResult:
     route = route_to(address)
     named = address if host == address else f"{host} is {address}"
     if route is None:
-        return Verdict("route", "unknown", f"{named}; Linux does not say how packets go there")
+        return CheckResult("route", "unknown", f"{named}; Linux does not say how packets go there")
     straight = "give a network port of this computer an address beside the robot's, and connect the two directly"
     if route.interface == "lo":
-        return Verdict("route", "ok", f"{named}, this computer: an emulator")
+        return CheckResult("route", "ok", f"{named}, this computer: an emulator")
     if route.gateway is not None:
-        return Verdict("route", "warn", f"{named}, through the router {route.gateway} ({route.interface})", straight)
+        return CheckResult(
+            "route", "warn", f"{named}, through the router {route.gateway} ({route.interface})", straight
+        )
     if route.wireless:
-        return Verdict("route", "warn", f"{named}, by radio ({route.interface})", "use a cable")
-    return Verdict("route", "ok", f"{named}, on the network of {route.interface}")
+        return CheckResult("route", "warn", f"{named}, by radio ({route.interface})", "use a cable")
+    return CheckResult("route", "ok", f"{named}, on the network of {route.interface}")
 
 
-def _robot(spec: RobotSpec, settings: ArmSettings) -> Iterator[Verdict]:
+def _robot(spec: RobotSpec, settings: ArmSettings) -> Iterator[CheckResult]:
     """What the robot says of itself."""
     host = settings.host
     said = _ask(host, settings.arm)
     if said is None:
         found = f"{host}:{ARM_PORT} is open, but nobody answers there: another program may hold the arm"
-        yield Verdict("robot", "fail", found, _FREE)
+        yield CheckResult("robot", "fail", found, _FREE)
         return
     if "missing" in said:
         yield _missing(said["missing"])
     elif "fault" in said:
         fault = Fault(*said["fault"])
         if fault.code == "closed":
-            yield Verdict("robot", "fail", f"{host}:{ARM_PORT} hangs up: another program may hold the arm", _FREE)
+            yield CheckResult("robot", "fail", f"{host}:{ARM_PORT} hangs up: another program may hold the arm", _FREE)
         else:
             yield _failed("robot", fault)
     else:
-        yield Verdict("robot", "ok", f"answers; speaks protocol {said['protocol']}, as the model {spec.model!r} needs")
+        yield CheckResult(
+            "robot", "ok", f"answers; speaks protocol {said['protocol']}, as the model {spec.model!r} needs"
+        )
         yield _mode(said["mode"], said["flags"])
         yield _reports(said["noise"])
 
 
-def _failed(name: str, fault: Fault) -> Verdict:
-    return Verdict(name, "fail", fault.cause, fault.remedy)
+def _failed(name: str, fault: Fault) -> CheckResult:
+    return CheckResult(name, "fail", fault.cause, fault.remedy)
 
 
-def _missing(library: str) -> Verdict:
+def _missing(library: str) -> CheckResult:
     command = registry.missing("franka").get(library, "pip install 'robot-hal[franka]'")
-    return Verdict("library", "fail", f"{library} does not import", command)
+    return CheckResult("library", "fail", f"{library} does not import", command)
 
 
-def _mode(mode: str, flags: list[str]) -> Verdict:
+def _mode(mode: str, flags: list[str]) -> CheckResult:
     """A robot that is stopped is told, and is no reason not to start: the app can clear it."""
     fault = fault_of(flags, mode)
     if fault is None:
-        return Verdict("state", "ok", "ready to move" if mode == "idle" else f"mode {mode!r}")
-    return Verdict("state", "warn", fault.cause, fault.remedy)
+        return CheckResult("state", "ok", "ready to move" if mode == "idle" else f"mode {mode!r}")
+    return CheckResult("state", "warn", fault.cause, fault.remedy)
 
 
-def _reports(noise: float) -> Verdict:
+def _reports(noise: float) -> CheckResult:
     """How exactly an arm at rest reports its set-points. How late it does shows only in motion."""
     from hal.servo.anchoring import NOISIEST
 
     found = f"reported within {noise:.1g} rad at rest; how late, the first motion shows (rig.statistics())"
     if noise <= NOISIEST:
-        return Verdict("set-points", "ok", found)
-    return Verdict(
+        return CheckResult("set-points", "ok", found)
+    return CheckResult(
         "set-points", "fail", found, f"the servo needs {NOISIEST:g} rad; end what moves the arm, then look again"
     )
 
 
-def _hand(spec: RobotSpec) -> Iterator[Verdict]:
+def _hand(spec: RobotSpec) -> Iterator[CheckResult]:
     """Is the hand there, where the rig has it, and what its driver needs?"""
     gripper = spec.gripper
     if gripper is None or gripper.driver != spec.driver:
@@ -140,7 +144,7 @@ def _hand(spec: RobotSpec) -> Iterator[Verdict]:
     host = HandSettings.of(gripper).host
     address = resolve(host)
     if address is not None and knock(address, HAND_PORT) is Answer.OPEN:
-        yield Verdict("hand", "ok", f"answers at port {HAND_PORT}")
+        yield CheckResult("hand", "ok", f"answers at port {HAND_PORT}")
         return
     yield _failed("hand", NO_HAND.fault(f"{host}:{HAND_PORT}"))
 
@@ -158,8 +162,8 @@ def _ask(host: str, arm: str) -> dict[str, Any] | None:
         child.close(0.2)
 
 
-def _network(address: str, duration: float) -> Verdict:
+def _network(address: str, duration: float) -> CheckResult:
     try:
         return judge(measure(address, duration))
     except NotMeasured as error:
-        return Verdict("network", "unknown", f"not measured: {error}", ALLOW)
+        return CheckResult("network", "unknown", f"not measured: {error}", ALLOW)

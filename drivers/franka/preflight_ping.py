@@ -18,7 +18,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from hal.verdict import Verdict
+from hal.preflight import CheckResult
 
 __all__ = ["ALLOW", "NotMeasured", "RoundTrips", "judge", "measure"]
 
@@ -75,17 +75,17 @@ def measure(address: str, duration: float) -> RoundTrips:
         return _by_program(address, duration)
 
 
-def judge(trips: RoundTrips) -> Verdict:
+def judge(trips: RoundTrips) -> CheckResult:
     """Is that good enough for set-points?"""
     if not trips.times:
-        return Verdict("network", "unknown", f"not measured: of {trips.sent} pings none came back")
+        return CheckResult("network", "unknown", f"not measured: of {trips.sent} pings none came back")
     found = f"there and back {trips}"
     if trips.quantile(0.5) >= BUDGET:
-        return Verdict("network", "fail", f"{found}: most set-points would be late", _STRAIGHT)
+        return CheckResult("network", "fail", f"{found}: most set-points would be late", _STRAIGHT)
     if trips.lost or trips.quantile(0.99) > GOOD or trips.times[-1] >= BUDGET:
         found = f"{found}; wanted: p99 below {1e3 * GOOD:.1f} ms, each below {1e3 * BUDGET:.0f} ms, none lost"
-        return Verdict("network", "warn", found, _STRAIGHT)
-    return Verdict("network", "ok", found)
+        return CheckResult("network", "warn", found, _STRAIGHT)
+    return CheckResult("network", "ok", found)
 
 
 def _icmp() -> socket.socket:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from hal.camera import CameraDriver, RawFrame
 from hal.clock import Clock, RealClock
 from hal.errors import CommandError, ConnectionLost
-from hal.pose import Pose
+from hal.geometry import Pose
 from hal.specs import CameraSpec
 
 from .knobs import CameraKnobs, turned

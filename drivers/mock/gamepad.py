@@ -7,8 +7,8 @@ from collections.abc import Iterable, Mapping
 from types import MappingProxyType
 from typing import ClassVar
 
+from hal.driver import GamepadDriver, PadReading
 from hal.errors import CommandError
-from hal.gamepad import GamepadDriver, PadReading
 from hal.specs import PadSpec
 from hal.types import AXES, BUTTONS
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import ClassVar
 
+from hal.driver import GripperDriver, GripperReading
 from hal.errors import ConnectionLost
-from hal.gripper import GripperDriver, GripperReading
 from hal.specs import GripperSpec
 from hal.types import Fault, GripperOutcome
 

@@ -7,8 +7,8 @@ from collections import deque
 from collections.abc import Iterable, Sequence
 from typing import ClassVar
 
+from hal.driver import Reading, RobotDriver, Setpoint
 from hal.errors import CommandError, ConnectionLost
-from hal.robot import Reading, RobotDriver, Setpoint
 from hal.specs import RobotSpec
 from hal.types import Fault
 

@@ -11,8 +11,8 @@ from typing import Annotated, Any, ClassVar, cast
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from hal.driver import GamepadDriver, PadReading
 from hal.errors import ConfigError, ConnectionLost, Problem
-from hal.gamepad import GamepadDriver, PadReading
 from hal.pads.mapper import PadMapper
 from hal.pads.model import PadModel, pad_model, validated
 from hal.specs import PadSpec

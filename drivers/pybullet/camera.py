@@ -8,7 +8,7 @@ from pathlib import PurePath
 from typing import ClassVar, Protocol
 
 from hal.camera import CameraDriver, RawFrame
-from hal.camera_info import CameraInfo, nominal_info
+from hal.driver import CameraInfo, nominal_info
 from hal.errors import ConnectionLost, NotSupported
 from hal.host.frames import FrameRing
 from hal.specs import CameraSpec

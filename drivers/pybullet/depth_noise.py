@@ -24,7 +24,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from hal.camera_place import handed_out
+from hal.camera import handed_out
 from hal.specs import CameraSpec, SensorSpec
 
 from .depth_settings import LidarNoise, StereoNoise, noise_of

@@ -5,10 +5,9 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import NamedTuple
 
-from hal.camera import RawFrame
-from hal.camera_place import handed_out
+from hal.camera import RawFrame, handed_out
 from hal.errors import ConfigError, DeviceNotFound, Problem
-from hal.pose import Pose
+from hal.geometry import Pose
 from hal.specs import CameraSpec
 
 from .depth_noise import depth_noise

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from hal.pose import Pose
+from hal.geometry import Pose
 from hal.specs import CameraSpec
 
 from .gl_target import NEAR, Target, create_context, projection

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import ClassVar
 
+from hal.driver import GripperDriver, GripperReading
 from hal.errors import CommandError, ConfigError, ConnectionLost, Problem
-from hal.gripper import GripperDriver, GripperReading
 from hal.specs import GripperSpec, RobotSpec
 
 from .body import Body

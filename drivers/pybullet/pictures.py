@@ -9,8 +9,8 @@ from hal.errors import NotSupported
 from hal.host.frames import FrameRing
 from hal.host.hosts import SNAPSHOT_CAPACITY, Host, LocalHost, RemoteHost
 from hal.host.process import Child, SharedMemory
-from hal.pictures import Pictures
 from hal.specs import CameraSpec, to_json
+from hal.views import Pictures
 
 from .camera import DirectSource, FrameSource, SharedSource
 from .rendering import Renderer, choose_renderer

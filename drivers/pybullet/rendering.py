@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hal.errors import ConfigError, DriverMissing, Problem
-from hal.pose import Pose
+from hal.geometry import Pose
 from hal.specs import CameraSpec
 
 from .scene import Scene

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any, ClassVar
 
+from hal.driver import Reading, RobotDriver, Setpoint
 from hal.errors import CommandError, ConnectionLost
-from hal.robot import Reading, RobotDriver, Setpoint
 from hal.specs import RobotSpec
 from hal.types import Fault
 

@@ -9,7 +9,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from hal.pose import Pose
+from hal.geometry import Pose
 
 from .meshes import MeshLibrary
 from .shapes import Mesh, box, capsule, cylinder, joined, plane, sphere

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from hal.pose import Pose
+from hal.geometry import Pose
 from hal.specs import CameraSpec
 
 from .rendering import BACKGROUND, Images, Renderer

@@ -13,8 +13,8 @@ from hal.errors import ConnectionLost, NotSupported
 from hal.host.hosts import SNAPSHOT_CAPACITY, Host, LocalHost, RemoteHost
 from hal.host.mailbox import SeriesBox
 from hal.host.process import Channel, Child, SharedMemory
-from hal.pictures import Viewer
 from hal.specs import WorldSpec, from_json, to_json
+from hal.views import Viewer
 
 from .mirror import Mirror
 from .world import World

@@ -6,8 +6,8 @@ from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Any
 
-from hal.camera_info import CameraInfo, StreamInfo
-from hal.pose import Pose, frozen
+from hal.driver import CameraInfo, StreamInfo
+from hal.geometry import Pose, frozen
 
 __all__ = ["info_of"]
 

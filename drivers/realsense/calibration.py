@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import pyrealsense2 as rs
 
+from hal.geometry import Pose
 from hal.images import Cropping
-from hal.pose import Pose
 from hal.specs import CameraSpec
 
 from .lens import lens_of, pose_of

@@ -8,8 +8,7 @@ import threading
 import time
 from contextlib import suppress
 
-from hal.camera_driver import CameraDriver, CameraTally, RawFrame
-from hal.camera_info import CameraInfo
+from hal.driver import CameraDriver, CameraInfo, CameraTally, RawFrame
 from hal.errors import ConnectionLost, DeviceNotFound
 from hal.host.process import Child
 from hal.specs import CameraSpec

@@ -6,8 +6,8 @@ from typing import Any, NamedTuple
 
 import pyrealsense2 as rs
 
-from hal.claim import Claim
 from hal.errors import DeviceNotFound
+from hal.lock import DeviceLock
 
 __all__ = ["Found", "claim_camera", "find", "found_in", "said"]
 
@@ -76,6 +76,6 @@ def find(context: Any, serial: str | None, camera: str = "") -> Found:
     raise DeviceNotFound(f'{who}several are plugged in: {listed}; say which one: real: {{serial: "{found[0].serial}"}}')
 
 
-def claim_camera(serial: str) -> Claim:
+def claim_camera(serial: str) -> DeviceLock:
     """Hold the camera of that serial number for this process. Raises ControlTaken, with the other program's number."""
-    return Claim(f"realsense-{serial}", f"camera {serial}")
+    return DeviceLock(f"realsense-{serial}", f"camera {serial}")

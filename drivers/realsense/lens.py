@@ -17,7 +17,7 @@ import numpy as np
 import pyrealsense2 as rs
 from numpy.typing import NDArray
 
-from hal.pose import Pose
+from hal.geometry import Pose
 
 __all__ = ["Lens", "lens_of", "pose_of"]
 

@@ -6,7 +6,7 @@ import threading
 import time
 from typing import Any
 
-from hal.camera_driver import CameraTally, RawFrame
+from hal.driver import CameraTally, RawFrame
 from hal.errors import ConnectionLost
 from hal.host.process import Child, SharedMemory, unpack_error
 from hal.specs import CameraSpec, to_json

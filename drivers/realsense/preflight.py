@@ -6,10 +6,10 @@ import time
 from collections.abc import Iterator
 from dataclasses import replace
 
-from hal.camera_info import CameraInfo
+from hal.driver import CameraInfo
 from hal.errors import ConnectionLost, ControlTaken, DeviceNotFound, HalError, NotSupported
+from hal.preflight import CheckResult
 from hal.specs import CameraSpec
-from hal.verdict import Verdict
 
 from .camera import RealSenseCamera
 
@@ -29,7 +29,7 @@ _REMEDIES: dict[type[HalError], str] = {
 }
 
 
-def preflight(spec: CameraSpec, duration: float) -> Iterator[Verdict]:
+def preflight(spec: CameraSpec, duration: float) -> Iterator[CheckResult]:
     """Open the camera, watch it for ``duration`` s, close it. Nothing is written: ``record`` is left out."""
     quiet = {name: value for name, value in spec.options.items() if name not in ("record", "overwrite")}
     driver = RealSenseCamera(replace(spec, options=quiet))
@@ -38,25 +38,25 @@ def preflight(spec: CameraSpec, duration: float) -> Iterator[Verdict]:
             driver.open()
         except HalError as error:
             remedy = next((text for kind, text in _REMEDIES.items() if isinstance(error, kind)), "")
-            yield Verdict("camera", "fail", str(error), remedy)
+            yield CheckResult("camera", "fail", str(error), remedy)
             return
         info = driver.info
-        yield Verdict("camera", "ok", f"{info.title}, serial {info.serial}, firmware {info.firmware}")
+        yield CheckResult("camera", "ok", f"{info.title}, serial {info.serial}, firmware {info.firmware}")
         yield _link(info)
         yield _measured(driver, spec, duration)
     finally:
         driver.close()
 
 
-def _link(info: CameraInfo) -> Verdict:
+def _link(info: CameraInfo) -> CheckResult:
     if info.usb is None:
-        return Verdict("USB", "unknown", "it does not say how it is plugged in")
+        return CheckResult("USB", "unknown", "it does not say how it is plugged in")
     if info.usb.startswith("2"):
-        return Verdict("USB", "warn", f"USB {info.usb}: fewer modes, and frames get lost", _CABLE)
-    return Verdict("USB", "ok", f"USB {info.usb}")
+        return CheckResult("USB", "warn", f"USB {info.usb}: fewer modes, and frames get lost", _CABLE)
+    return CheckResult("USB", "ok", f"USB {info.usb}")
 
 
-def _measured(driver: RealSenseCamera, spec: CameraSpec, duration: float) -> Verdict:
+def _measured(driver: RealSenseCamera, spec: CameraSpec, duration: float) -> CheckResult:
     """The rate of the captures, and how many were lost."""
     wanted = min((stream.rate_hz for stream in driver.info.streams.values()), default=spec.rate_hz)
     patience = time.monotonic() + 5.0  # automatic exposure settles first
@@ -66,14 +66,14 @@ def _measured(driver: RealSenseCamera, spec: CameraSpec, duration: float) -> Ver
         while first is None and time.monotonic() < patience:
             first = driver.grab(_GRAB)
         if first is None:
-            return Verdict("pictures", "fail", "none came", _REMEDIES[ConnectionLost])
+            return CheckResult("pictures", "fail", "none came", _REMEDIES[ConnectionLost])
         start, last = time.monotonic(), first
         while time.monotonic() - start < duration:
             frame = driver.grab(_GRAB)
             if frame is not None:
                 frames, last = frames + 1, frame
     except ConnectionLost as error:
-        return Verdict("pictures", "fail", str(error), _REMEDIES[ConnectionLost])
+        return CheckResult("pictures", "fail", str(error), _REMEDIES[ConnectionLost])
     passed = last.t - first.t
     rate = frames / passed if passed > 0.0 else 0.0
     lost = last.seq - first.seq - frames
@@ -82,7 +82,7 @@ def _measured(driver: RealSenseCamera, spec: CameraSpec, duration: float) -> Ver
     if tally.mismatched:
         found += f", {tally.mismatched} sets of pictures that do not belong together"
     if rate < _SLOW * wanted and not lost:
-        return Verdict("pictures", "warn", found, _DARK)
+        return CheckResult("pictures", "warn", found, _DARK)
     if rate < _SLOW * wanted or lost > 0.02 * (frames + lost):
-        return Verdict("pictures", "warn", found, _LOAD)
-    return Verdict("pictures", "ok", found)
+        return CheckResult("pictures", "warn", found, _LOAD)
+    return CheckResult("pictures", "ok", found)

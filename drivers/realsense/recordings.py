@@ -8,8 +8,8 @@ import socket
 from contextlib import suppress
 from pathlib import Path
 
-from hal.claim import Claim
 from hal.errors import ControlTaken, NotSupported
+from hal.lock import DeviceLock
 
 __all__ = ["Recordings"]
 
@@ -70,7 +70,7 @@ class _Writing:
         """Raises ControlTaken, which names both cameras."""
         key = "recording-" + hashlib.sha256(os.path.realpath(path).encode()).hexdigest()[:32]
         try:
-            self._claim = Claim(key, str(path))
+            self._claim = DeviceLock(key, str(path))
         except ControlTaken:
             both = f"camera {camera} is to record to {path}, and {_writer(key)} does so already"
             raise ControlTaken(f"{both}: give each a file of its own") from None

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from hal.camera_driver import CameraTally, RawFrame
+from hal.driver import CameraTally, RawFrame
 from hal.errors import ConnectionLost
 from hal.specs import CameraSpec
 

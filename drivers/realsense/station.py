@@ -10,8 +10,8 @@ from typing import Any
 
 import pyrealsense2 as rs
 
-from hal.claim import Claim
 from hal.errors import ConnectionLost, NotSupported
+from hal.lock import DeviceLock
 from hal.specs import CameraSpec
 
 from . import options
@@ -45,7 +45,7 @@ class Station:
         self._ring = ring
         self._tell = tell
         self._context, self._emulated = self._plug(spec)
-        self._claim: Claim | None = None
+        self._claim: DeviceLock | None = None
         self._recordings: Recordings | None = None
         if self._settings.record is not None:
             self._recordings = Recordings(self._settings.record, spec.name, self._settings.overwrite)
@@ -75,7 +75,7 @@ class Station:
         """Find the camera, set its options, start it and see a first set of pictures; what it is comes back.
 
         ``again``: it was open before. ``first``: a recording would be the first one of the program.
-        Raises what :meth:`hal.camera_driver.CameraDriver.open` raises. A ConnectionLost of a camera that is there,
+        Raises what :meth:`hal.driver.CameraDriver.open` raises. A ConnectionLost of a camera that is there,
         and that nobody else has, has an attribute ``fruitless``.
         """
         self.close()

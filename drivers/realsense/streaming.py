@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import pyrealsense2 as rs
 
-from hal.camera_driver import CameraTally
+from hal.driver import CameraTally
 from hal.images import Cropping
 from hal.specs import CameraSpec
 

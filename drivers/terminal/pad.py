@@ -7,7 +7,7 @@ import signal
 import threading
 import time
 
-from hal.gamepad import GamepadDriver, PadReading
+from hal.driver import GamepadDriver, PadReading
 from hal.pads.model import validated
 from hal.specs import PadSpec
 

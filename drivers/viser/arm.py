@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 from viser import SceneApi, SceneNodeHandle, TransformControlsEvent, TransformControlsHandle
 
+from hal.geometry import Pose
 from hal.host.gripper_mail import GripperMail
 from hal.host.records import RobotMail
-from hal.pose import Pose
 from hal.servo.watchdog import PAD_SILENCE
 from hal.specs import RobotSpec, WorkspaceSpec
 from hal.types import RobotState, Trip

@@ -10,8 +10,8 @@ from viser import SceneApi, SceneNodeHandle
 
 from hal import registry
 from hal.errors import HalError
+from hal.geometry import Pose
 from hal.host.mailbox import SeriesBox
-from hal.pose import Pose
 from hal.specs import BodySpec, WorldSpec, from_json
 
 from .drawing import draw, place, wxyz

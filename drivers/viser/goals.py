@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from math import hypot, inf, isfinite
 from typing import NamedTuple
 
-from hal.pose import Pose
+from hal.geometry import Pose
 
 __all__ = ["FARTHEST", "REACHED_ANGLE", "REACHED_DISTANCE", "UNUSED", "Drag", "Goal", "checked_pose"]
 

@@ -7,9 +7,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
+from hal.geometry import Pose, after_rotation, rotate
 from hal.packages import mesh_file
-from hal.pose import Pose
-from hal.quaternion import after_rotation, rotate
 
 __all__ = ["Joint", "UrdfTree", "Visual", "read_tree"]
 

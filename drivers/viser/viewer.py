@@ -12,10 +12,10 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from hal import registry
 from hal.errors import ConnectionLost, DeviceNotFound, DriverMissing
+from hal.geometry import Pose
 from hal.host.process import Child
-from hal.pictures import Viewer3D
-from hal.pose import Pose
 from hal.specs import to_json
+from hal.views import Viewer3D
 
 from .goals import checked_pose
 

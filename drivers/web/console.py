@@ -11,13 +11,14 @@ from dataclasses import asdict, replace
 from typing import TYPE_CHECKING, Any
 
 from hal.camera import Camera, RawFrame
-from hal.console import Console, DrivingView, Listen, RecordingView
+from hal.driver import PadReading
 from hal.errors import HalError
-from hal.gamepad import Gamepad, PadReading
+from hal.gamepad import Gamepad
 from hal.host.frames import FrameRing
 from hal.host.process import Child, SharedMemory
 from hal.specs import CameraSpec, GroupSpec, to_json
 from hal.types import Frame
+from hal.views import Console, DrivingView, Listen, RecordingView
 
 from .about import about_rig, shown_stream
 from .addresses import is_loopback, link, names, tunnel

@@ -6,7 +6,7 @@ import json
 from collections.abc import Collection, Mapping
 from typing import Any, NamedTuple
 
-from hal.console import ACTIONS, FRAMES, SETTINGS
+from hal.views import ACTIONS, FRAMES, SETTINGS
 
 from .padmessage import Malformed, PadMessage, number, pad_message
 
@@ -71,13 +71,13 @@ class Demo(NamedTuple):
 
 
 class Act(NamedTuple):
-    """Steer a recording: one of ``hal.console.ACTIONS``."""
+    """Steer a recording: one of ``hal.views.ACTIONS``."""
 
     action: str
 
 
 class Setting(NamedTuple):
-    """Change one of ``hal.console.SETTINGS``."""
+    """Change one of ``hal.views.SETTINGS``."""
 
     name: str
     value: str | float

@@ -11,8 +11,8 @@ from types import MappingProxyType
 from typing import Any, Protocol
 
 from hal import registry
+from hal.driver import GamepadDriver, PadReading
 from hal.errors import NotSupported
-from hal.gamepad import GamepadDriver, PadReading
 from hal.pads.choice import tour
 from hal.servo.watchdog import PAD_SILENCE
 from hal.specs import PadSpec

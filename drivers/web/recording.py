@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from hal.console import RecordingView
+from hal.views import RecordingView
 
 __all__ = ["as_message"]
 

@@ -6,10 +6,10 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
+from hal.commands import DeadmanRecord
+from hal.control import trip_text
 from hal.host.gripper_mail import GripperMail
 from hal.host.records import GroupMemory, RobotMail
-from hal.inbox import DeadmanRecord
-from hal.stops import trip_text
 from hal.types import Fault, RobotState, RobotStatus, Trip
 
 __all__ = ["Telemetry", "plain"]

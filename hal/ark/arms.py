@@ -8,7 +8,7 @@ from typing import Any
 
 from ..config.data_files import list_data
 from ..config.files import nearest
-from ..pose import Pose
+from ..geometry import Pose
 from .arm_model import ArmModel, arm_model
 from .items import Item, Work
 from .known import FIXED_LINKS, FRANKAS, JOINT_COUNTS, LINKS, TCP_LINK, KnownArm, franka_with

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from ..config import load
 from ..config.urdf import read_urdf
-from ..pose import Pose
+from ..geometry import Pose
 from ..specs import RobotSpec
 
 __all__ = ["FIXED_LINKS", "FRANKAS", "JOINT_COUNTS", "LINKS", "TCP_LINK", "KnownArm", "franka_with"]

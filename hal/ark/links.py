@@ -7,7 +7,7 @@ from collections.abc import Collection, Iterator
 from pathlib import Path
 
 from ..config.urdf import UrdfJoint, read_urdf
-from ..pose import Pose
+from ..geometry import Pose
 
 __all__ = ["ArkUrdf"]
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-from ..pose import matrix_to_quaternion, rpy_to_matrix
+from ..geometry import matrix_to_quaternion, rpy_to_matrix
 from .ledger import Ledger
 from .reading import Node, Reading
 from .text import Commented

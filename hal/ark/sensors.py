@@ -6,7 +6,7 @@ import math
 from collections.abc import Collection, Mapping
 from typing import Any
 
-from ..pose import Pose, matrix_to_quaternion, quaternion_to_matrix, rpy_to_matrix
+from ..geometry import Pose, matrix_to_quaternion, quaternion_to_matrix, rpy_to_matrix
 from .arms import Arm
 from .items import Item, Work
 from .posing import tidy

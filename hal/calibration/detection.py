@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ..geometry import Pose
 from ..images import undistort_pixels
-from ..pose import Pose
 from .board import Board
 from .errors import NoView
 from .library import opencv

@@ -7,8 +7,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..camera_info import CameraInfo
-from ..pose import Pose
+from ..driver import CameraInfo
+from ..geometry import Pose
 from ..types import Frame
 from .errors import NoView
 

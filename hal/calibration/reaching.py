@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import CommandError, Unreachable
-from ..pose import Pose
+from ..geometry import Pose
 from .views import Eye
 
 if TYPE_CHECKING:

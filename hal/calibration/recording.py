@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import CommandError, Unreachable
-from ..pose import Pose
+from ..geometry import Pose
 from .checks import LEAST_VIEWS
 from .collecting import Collector
 from .errors import CalibrationFailed, NoView

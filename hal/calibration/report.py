@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..pose import Pose
+from ..geometry import Pose
 from .solving import Calibration
 
 __all__ = ["difference_lines", "report_lines"]

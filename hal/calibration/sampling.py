@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from ..pose import Pose
+from ..geometry import Pose
 from .board import Board
 from .rotations import cross
 

@@ -10,13 +10,12 @@ from typing import TypeVar
 from yaml import YAMLError
 
 from ..config.files import nearest, parse_yaml
-from ..config.plan import Plan
 from ..config.rigfile import RigFile
 from ..config.schema import PoseConfig
 from ..config.urdf import read_urdf
 from ..errors import CommandError
-from ..pose import Pose
-from ..specs import RobotSpec
+from ..geometry import Pose
+from ..specs import Plan, RobotSpec
 from .views import Eye
 
 __all__ = ["Setting", "guess_of", "setting_of"]

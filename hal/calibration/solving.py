@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..pose import Pose
+from ..geometry import Pose
 from .checks import LEAST_VIEWS, Doubt, check_count, check_turns, doubt_of
 from .closed_form import start
 from .errors import CalibrationFailed

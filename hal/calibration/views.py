@@ -8,7 +8,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from ..pose import Pose
+from ..geometry import Pose
 
 __all__ = ["Eye", "Sighting", "View", "camera_matrix"]
 

@@ -12,11 +12,11 @@ from typing import Any
 
 from pydantic import PrivateAttr
 
+from ..specs import Plan
 from .context import Context
 from .data_files import data_folder, is_path, list_data, user_path
 from .files import Problems, nearest, read_yaml
 from .overrides import apply_overrides
-from .plan import Plan
 from .resolve import resolve
 from .rigfile import RigFile
 from .validation import validate

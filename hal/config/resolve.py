@@ -11,10 +11,9 @@ from contextlib import suppress
 from typing import TypeVar
 
 from .. import registry
-from ..specs import BodySpec, WorldSpec
+from ..specs import BodySpec, Plan, WorldSpec
 from .context import Context
 from .objects import load_objects
-from .plan import Plan
 from .resolve_cameras import resolve_camera
 from .resolve_pads import resolve_pad
 from .resolve_robots import resolve_robot

@@ -7,8 +7,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, get_args
 
+from ..geometry import Pose
 from ..images import Intrinsics, centre_crop
-from ..pose import Pose
 from ..specs import CameraSpec, DepthSensorSpec, SensorSpec, ViewSpec
 from .camera_models import CameraModel
 from .context import Context

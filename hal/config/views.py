@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydantic import AfterValidator, model_validator
 
-from ..pose import Pose, matrix_to_quaternion, quaternion_to_matrix, rpy_to_matrix
+from ..geometry import Pose, matrix_to_quaternion, quaternion_to_matrix, rpy_to_matrix
 from ..specs import ViewSpec
 from .schema import Degrees, Direction, Distance, Offset, PoseConfig, Position, Quantity, Several, Strict
 

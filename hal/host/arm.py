@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 
 from .. import registry
+from ..commands import Inbox, Session
+from ..driver import Reading, RobotDriver
 from ..errors import ConnectionLost, ControlTaken
+from ..geometry import Pose
 from ..histogram import Histogram
-from ..inbox import Inbox, Session
 from ..kinematics import Kinematics
-from ..pose import Pose
-from ..robot import Reading, RobotDriver
 from ..servo.audit import SetpointAudit
 from ..servo.servo import Servo
 from ..specs import RobotSpec

@@ -10,9 +10,9 @@ from collections.abc import Iterable
 from typing import Any
 
 from .. import registry
+from ..commands import Session
+from ..driver import RobotDriver
 from ..errors import DeviceNotFound, NotSupported
-from ..inbox import Session
-from ..robot import RobotDriver
 from ..specs import GroupSpec
 from .arm import ArmUnit
 from .copies import copies_of

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 from ..camera import RawFrame
-from ..pose import Pose
+from ..geometry import Pose
 from ..specs import CameraSpec
 
 __all__ = ["FrameRing"]

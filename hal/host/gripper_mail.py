@@ -14,7 +14,7 @@ from .mailbox import Mailbox
 from .newest import newest
 
 if TYPE_CHECKING:
-    from ..gripper import GripperReading
+    from ..driver import GripperReading
 
 __all__ = ["GripperAct", "GripperCommand", "GripperMail", "GripperRecord"]
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 import traceback
 
+from ..driver import GripperDriver, GripperReading
 from ..errors import CommandError, ConfigError, ConnectionLost, DriverMissing, HalError, NotSupported, RobotFault
-from ..gripper import GripperDriver, GripperReading
 from ..types import Fault, GripperOutcome
 from .gripper_mail import GripperAct, GripperCommand, GripperMail
 from .records import AppRecord

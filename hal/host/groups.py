@@ -9,7 +9,7 @@ from .. import registry
 from ..specs import GripperSpec, GroupSpec, RobotSpec
 
 if TYPE_CHECKING:
-    from ..config.plan import Plan
+    from ..specs import Plan
 
 __all__ = ["GRIPPER_HZ", "groups_of"]
 

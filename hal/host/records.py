@@ -10,9 +10,8 @@ import threading
 from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from ..commands import CHUNK_POINTS, Kind
-from ..inbox import CommandRecord, DeadmanRecord
-from ..robot import Reading
+from ..commands import CHUNK_POINTS, CommandRecord, DeadmanRecord, Kind
+from ..driver import Reading
 from .gripper_mail import GripperMail
 from .history import History
 from .mailbox import Mailbox, SeriesBox

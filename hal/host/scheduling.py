@@ -11,7 +11,7 @@ import signal
 import struct
 import sys
 
-from ..machine import may_lock_memory
+from ..preflight import may_lock_memory
 
 __all__ = ["describe", "is_realtime", "prepare_process", "yield_to_others"]
 

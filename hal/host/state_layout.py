@@ -14,8 +14,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..pose import Pose
-from ..robot import Reading
+from ..driver import Reading
+from ..geometry import Pose
 from ..types import Limited, RobotState, RobotStatus, Stamp, Trip
 from . import fault_layout
 

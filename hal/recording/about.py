@@ -17,7 +17,7 @@ from ..errors import CommandError
 from .cameras import CameraTrack
 
 if TYPE_CHECKING:
-    from ..pose import Pose
+    from ..geometry import Pose
     from ..rig import Rig
 
 __all__ = ["about_call", "about_rig", "about_start"]

@@ -11,7 +11,7 @@ from ..types import AXES, BUTTONS, Frame, GripperState, PadState, RobotState, St
 from .columns import GRID, PAD, SETPOINT, STATE, TIMES, Column
 
 if TYPE_CHECKING:
-    from ..pose import Pose
+    from ..geometry import Pose
     from ..rig import Rig
     from ..robot import Robot
 

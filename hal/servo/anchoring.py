@@ -21,7 +21,7 @@ from collections.abc import Sequence
 from math import inf
 from typing import Any
 
-from ..robot import Reading, Setpoint
+from ..driver import Reading, Setpoint
 from ..types import Fault, Trip
 from .limits import stop_peak
 from .smoothing import JointSmoother

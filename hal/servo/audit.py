@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from ..robot import Setpoint
+from ..driver import Setpoint
 from ..specs import LimitsSpec
 
 __all__ = ["SetpointAudit"]

@@ -9,8 +9,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from math import hypot, isfinite
 
-from ..inbox import CommandRecord
-from ..quaternion import after_rotation, difference, rotate
+from ..commands import CommandRecord
+from ..geometry import after_rotation, difference, rotate
 from ..types import Limited
 from .envelope import Envelope
 from .limits import speed_for

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from itertools import pairwise
 from math import isfinite
 
-from ..inbox import CommandRecord
+from ..commands import CommandRecord
 from .envelope import Envelope
 from .motions import FIRST_JOINT_STEP, JointTargetMotion
 from .smoothing import JointSmoother

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..inbox import Session
+from ..commands import Session
 from ..kinematics import Kinematics, Pose7
 from ..specs import WorkspaceSpec
 from ..types import Limited

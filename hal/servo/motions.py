@@ -10,7 +10,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from math import isfinite
 
-from ..inbox import CommandRecord
+from ..commands import CommandRecord
 from ..types import Limited
 from .envelope import Envelope
 from .limits import speed_for

@@ -7,8 +7,8 @@ from math import ceil
 
 from ruckig import InputParameter, OutputParameter, Result, Ruckig, RuckigError
 
+from ..commands import CommandRecord
 from ..errors import CommandError
-from ..inbox import CommandRecord
 from .envelope import Envelope
 from .motions import Motion
 from .smoothing import JointSmoother

@@ -12,11 +12,10 @@ from collections.abc import Sequence
 from math import dist, hypot, isfinite
 from typing import Any
 
-from ..commands import Kind
+from ..commands import CommandRecord, Inbox, Kind, Session
+from ..driver import Reading, Setpoint
 from ..errors import CommandError, ControlTaken
-from ..inbox import CommandRecord, Inbox, Session
 from ..kinematics import Kinematics
-from ..robot import Reading, Setpoint
 from ..specs import RobotSpec
 from ..types import Fault, Limited, RobotStatus, Trip
 from .anchoring import Anchoring

@@ -10,8 +10,8 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from ..inbox import CommandRecord
-from ..robot import Reading, Setpoint
+from ..commands import CommandRecord
+from ..driver import Reading, Setpoint
 from ..specs import LimitsSpec
 from ..types import Limited
 from .envelope import Envelope

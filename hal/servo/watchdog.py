@@ -5,7 +5,7 @@ Every comparison is written so that a number that is not finite counts as the ba
 
 from __future__ import annotations
 
-from ..inbox import CommandRecord, DeadmanRecord, Inbox, Session
+from ..commands import CommandRecord, DeadmanRecord, Inbox, Session
 from ..types import Trip
 
 __all__ = ["PAD_SILENCE", "SILENCE", "Watchdog", "is_alive", "is_timely"]

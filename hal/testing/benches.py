@@ -7,11 +7,8 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
-from ..camera_driver import CameraDriver
 from ..clock import Clock, RealClock
-from ..gamepad import GamepadDriver
-from ..gripper import GripperDriver
-from ..robot import RobotDriver
+from ..driver import CameraDriver, GamepadDriver, GripperDriver, RobotDriver
 from ..specs import Floats
 
 __all__ = ["Bench", "CameraBench", "GripperBench", "PadBench", "RobotBench"]

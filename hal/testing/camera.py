@@ -8,7 +8,7 @@ import time
 import numpy as np
 import pytest
 
-from ..camera_driver import RawFrame
+from ..driver import RawFrame
 from ..errors import CommandError, ConnectionLost, HalError, NotSupported
 from .benches import CameraBench
 from .contract import Contract, needs

@@ -9,8 +9,9 @@ import time
 
 import pytest
 
+from ..driver import PadReading
 from ..errors import HalError
-from ..gamepad import Gamepad, PadReading
+from ..gamepad import Gamepad
 from ..types import AXES, BUTTONS
 from .benches import PadBench
 from .contract import Contract, needs

@@ -9,8 +9,8 @@ import time
 
 import pytest
 
+from ..driver import GripperReading
 from ..errors import CommandError, ConnectionLost, HalError, NotSupported
-from ..gripper import GripperReading
 from .benches import GripperBench
 from .contract import Contract, needs
 from .grasping import GraspChecks

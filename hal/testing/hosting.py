@@ -10,6 +10,7 @@ from unittest.mock import patch
 
 from .. import registry
 from ..clock import LockStepClock
+from ..control import StopLatch
 from ..gripper import Gripper
 from ..host.arm import ArmUnit
 from ..host.gripper_unit import GripperUnit
@@ -17,7 +18,6 @@ from ..host.hosts import Host
 from ..host.records import AppRecord, GroupMemory
 from ..robot import Robot
 from ..specs import GroupSpec, RobotSpec
-from ..stops import StopLatch
 from ..types import GripperState, RobotState
 from .benches import GripperBench, RobotBench
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..robot import Reading, Setpoint
+from ..driver import Reading, Setpoint
 from .benches import RobotBench
 
 __all__ = ["MIDDLE", "RISE", "STEEPEST", "STILL", "cycles", "drive", "ramp", "settle"]

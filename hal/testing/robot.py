@@ -10,8 +10,8 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
+from ..driver import Setpoint
 from ..errors import CommandError, ConnectionLost, HalError, NotSupported, StaleStateError
-from ..robot import Setpoint
 from .benches import RobotBench
 from .contract import Contract, needs
 from .hosting import Hosted

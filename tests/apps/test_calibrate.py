@@ -14,7 +14,7 @@ from app_kit import Done, run_here
 from hal.apps.calibrate import main
 from hal.config import load
 from hal.config.data_files import find_data
-from hal.pose import Pose
+from hal.geometry import Pose
 
 pytest.importorskip("cv2", reason="pip install opencv-python-headless")
 

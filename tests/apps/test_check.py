@@ -94,7 +94,7 @@ def test_the_command_that_grants_real_time_rights_is_shown_once(monkeypatch: pyt
         raise PermissionError
 
     monkeypatch.setattr("os.sched_setscheduler", refuse)
-    monkeypatch.setattr("hal.machine.may_lock_memory", lambda _: False)
+    monkeypatch.setattr("hal.preflight.may_lock_memory", lambda _: False)
     done = run_here(check, "--sim")
     assert done.stdout.count("WARN      scheduling") == 1
     assert "only" in done.stdout

@@ -19,9 +19,9 @@ import hal
 from hal.apps.collect import parser
 from hal.apps.collecting import Collection
 from hal.camera import Camera
-from hal.console import Console, DrivingView, Listen, RecordingView
 from hal.drivers.mock.gamepad import MockPad
 from hal.recording import Dataset, Recorder
+from hal.views import Console, DrivingView, Listen, RecordingView
 
 
 class Page(Console):

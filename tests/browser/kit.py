@@ -18,9 +18,9 @@ import pytest
 
 import hal
 from hal.apps.teleop import Session, parser
+from hal.commands import DeadmanRecord
 from hal.deadman import Deadman
 from hal.host.records import ServoRecord
-from hal.inbox import DeadmanRecord
 from hal.robot import Robot
 from hal.servo.watchdog import PAD_SILENCE
 

@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import pytest
 
-from hal.console import ACTIONS, RecordingView
+from hal.views import ACTIONS, RecordingView
 
 from .kit import Bench, Browser, wait_for
 

@@ -170,7 +170,7 @@ def test_a_page_without_control_resets_nothing(bench: Bench, page: Browser) -> N
 
 def test_a_program_that_offers_nothing_has_no_selector(bench: Bench, page: Browser) -> None:
     """An arm that cannot be chosen is not offered: then the page in control shows the one that it drives."""
-    from hal.console import DrivingView
+    from hal.views import DrivingView
 
     try:
         bench.console.show_driving(DrivingView("right"))
@@ -184,7 +184,7 @@ def test_a_program_that_offers_nothing_has_no_selector(bench: Bench, page: Brows
 
 
 def test_what_a_driving_view_must_be() -> None:
-    from hal.console import DrivingView
+    from hal.views import DrivingView
 
     for wrong in ({"speed": 0.0}, {"speed": float("nan")}, {"speed": 0.5, "speed_max": 0.4}, {"frame": "world"}):
         with pytest.raises(hal.CommandError):

@@ -7,8 +7,8 @@ from typing import Any
 
 import pytest
 
-from hal.console import ACTIONS
 from hal.types import BUTTONS, PadState
+from hal.views import ACTIONS
 
 from .kit import Bench, Browser, wait_for
 

@@ -11,8 +11,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from hal.driver import Reading, RobotDriver, Setpoint
 from hal.host.process import Channel, Child, pack_error
-from hal.robot import Reading, RobotDriver, Setpoint
 from hal.specs import RobotSpec, from_json, to_json
 from hal.types import Fault
 

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from hal.calibration import Board, Eye, Sighting, View
 from hal.calibration.detection import flat_pose
 from hal.calibration.rotations import exponential, inverse
+from hal.geometry import Pose
 from hal.images import distort_points, undistort_pixels
-from hal.pose import Pose
 
 BOARD = Board(7, 5, 0.035, 0.027)
 SIZE = (640, 480)

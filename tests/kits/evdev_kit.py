@@ -13,10 +13,10 @@ from typing import Any
 
 import yaml
 
+from hal.driver import PadReading
 from hal.drivers.evdev.node import Event
 from hal.drivers.evdev.pad import EvdevPad
 from hal.drivers.evdev.system import NodeInfo
-from hal.gamepad import PadReading
 from hal.pads.codes import ABS, EV_ABS, EV_REL, EV_SYN, KEY, SYN_REPORT
 from hal.pads.mapper import AxisRange
 from hal.pads.model import Identity

@@ -11,7 +11,7 @@ from specs import data
 from hal.drivers.pybullet.rendering import Renderer
 from hal.drivers.pybullet.world import World
 from hal.errors import DriverMissing
-from hal.pose import Pose
+from hal.geometry import Pose
 from hal.specs import BodySpec, CameraSpec, RobotSpec, ViewSpec, WorldSpec
 
 STREAMS = ("color", "depth", "segmentation")

@@ -11,10 +11,9 @@ from typing import Any
 
 from specs import panda
 
-from hal.commands import Kind
-from hal.inbox import CommandRecord, DeadmanRecord, Inbox, Session
+from hal.commands import CommandRecord, DeadmanRecord, Inbox, Kind, Session
+from hal.driver import Reading, Setpoint
 from hal.kinematics import Kinematics
-from hal.robot import Reading, Setpoint
 from hal.servo.audit import SetpointAudit
 from hal.servo.servo import Servo
 from hal.specs import LimitsSpec, RobotSpec

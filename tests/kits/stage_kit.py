@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from recording_kit import CAMERAS
 
 import hal
-from hal.pose import Pose
+from hal.geometry import Pose
 from hal.recording import Episode
 
 __all__ = ["ROUNDED", "Likeness", "Scene", "Stage", "at_row", "at_time"]

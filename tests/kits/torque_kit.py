@@ -10,12 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 from specs import panda, world_spec
 
-from hal.commands import Kind
+from hal.commands import CommandRecord, DeadmanRecord, Inbox, Kind, Session
+from hal.driver import Reading, Setpoint
 from hal.drivers.mock.robot import MockRobot
 from hal.drivers.pybullet.robot import PyBulletRobot
 from hal.drivers.pybullet.world import World
-from hal.inbox import CommandRecord, DeadmanRecord, Inbox, Session
-from hal.robot import Reading, Setpoint
 from hal.servo.audit import SetpointAudit
 from hal.servo.servo import Servo
 from hal.specs import RobotSpec, WorkspaceSpec

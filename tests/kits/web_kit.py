@@ -13,12 +13,11 @@ import aiohttp
 import numpy as np
 
 from hal.camera import RawFrame
-from hal.gripper import GripperReading
+from hal.commands import DeadmanRecord
+from hal.driver import GripperReading, Reading
 from hal.host.frames import FrameRing
 from hal.host.process import Child, SharedMemory
 from hal.host.records import GroupMemory, ServoRecord
-from hal.inbox import DeadmanRecord
-from hal.robot import Reading
 from hal.specs import CameraSpec, to_json
 from hal.types import Limited, RobotStatus, Trip
 

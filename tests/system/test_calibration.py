@@ -26,7 +26,7 @@ from hal.calibration.rotations import exponential
 from hal.calibration.setting import setting_of
 from hal.config import load
 from hal.deadman import Deadman
-from hal.pose import Pose
+from hal.geometry import Pose
 
 pytest.importorskip("cv2", reason="pip install opencv-python-headless")
 

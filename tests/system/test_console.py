@@ -17,7 +17,7 @@ import pytest
 from web_kit import REST, Page, run
 
 import hal
-from hal.console import RecordingView
+from hal.views import RecordingView
 
 L2, PRESSED = 1 << 6, [0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0]
 WAIT = 20.0

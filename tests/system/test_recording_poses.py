@@ -14,7 +14,7 @@ from recording_kit import CAMERAS, check_layout, check_stamps, small
 from stage_kit import ROUNDED, Likeness, Scene, Stage, at_row, at_time
 
 import hal
-from hal.pose import Pose
+from hal.geometry import Pose
 from hal.recording import Dataset, Episode, Recorder
 
 pytestmark = pytest.mark.slow

@@ -7,10 +7,10 @@ import time
 from collections.abc import Callable
 from typing import Any
 
+from hal.driver import GripperReading
 from hal.drivers.franka.emulator.hand import HandServer
 from hal.drivers.franka.hand import FrankaHand
 from hal.errors import ConnectionLost
-from hal.gripper import GripperReading
 from hal.specs import GripperSpec
 from hal.types import GripperOutcome
 

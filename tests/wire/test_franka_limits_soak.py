@@ -13,13 +13,12 @@ import random
 import numpy as np
 import pytest
 
-from hal.commands import Kind
+from hal.commands import CommandRecord, Inbox, Kind, Session
 from hal.config import load
+from hal.driver import Reading, Setpoint
 from hal.drivers.franka.emulator.checker import LimitChecker
 from hal.drivers.franka.emulator.samples import Sample, at_rest, by_position, extrapolated
 from hal.drivers.franka.limits import LIMITS
-from hal.inbox import CommandRecord, Inbox, Session
-from hal.robot import Reading, Setpoint
 from hal.servo.servo import Servo
 from hal.specs import RobotSpec
 

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import hal
-from hal.pose import Pose
+from hal.geometry import Pose
 
 from .franka_kit import Emulator
 from .rig_kit import arm_of, rig_of

@@ -11,9 +11,9 @@ import pytest
 
 import hal
 from hal.config import load
+from hal.driver import Setpoint
 from hal.drivers.franka.arm import FrankaArm
 from hal.drivers.franka.link import Kind, Link, Mode, Sample
-from hal.robot import Setpoint
 from hal.types import RobotStatus
 
 from .franka_kit import Emulator

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 import hal
-from hal.pose import Pose
+from hal.geometry import Pose
 
 from .calm_tour import write_tour
 from .franka_kit import Emulator

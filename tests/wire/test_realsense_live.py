@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hal.camera_info import CameraInfo
+from hal.driver import CameraInfo
 from hal.images import Cropping
 from hal.specs import CameraSpec
 

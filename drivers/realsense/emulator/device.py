@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hal.pose import Pose, quaternion_to_matrix
+from hal.geometry import Pose, quaternion_to_matrix
 
 from .figures import Lens, Mode, Stream
 from .library import load_realsense

@@ -5,7 +5,7 @@ from __future__ import annotations
 import zlib
 from typing import NamedTuple
 
-from hal.pose import Pose
+from hal.geometry import Pose
 from hal.specs import CameraSpec
 
 __all__ = ["COLOR_FORMATS", "SIZES", "Lens", "Mode", "Stream", "serial_of", "streams_of", "title_of"]

@@ -10,7 +10,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from hal.pose import Pose, quaternion_to_matrix
+from hal.geometry import Pose, quaternion_to_matrix
 
 from .figures import Lens
 

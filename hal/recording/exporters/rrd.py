@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import DriverMissing
-from ...pose import Pose
+from ...geometry import Pose
 from ...types import RobotStatus, Trip
 from ..columns import SETPOINT, STATE
 from ..reader import Episode

@@ -29,11 +29,12 @@ import yaml
 import hal
 from hal.apps.collecting import seed_of
 from hal.config.data_files import find_data
-from hal.gamepad import Gamepad, GamepadDriver, PadReading
+from hal.driver import GamepadDriver, PadReading
+from hal.gamepad import Gamepad
+from hal.geometry import quaternion_to_matrix
 from hal.pads.codes import ABS, EV_ABS, EV_KEY, KEY
 from hal.pads.mapper import AxisRange, PadMapper
 from hal.pads.model import pad_model
-from hal.pose import quaternion_to_matrix
 from hal.resetting import put_back
 from hal.specs import PadSpec
 

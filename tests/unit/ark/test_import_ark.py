@@ -17,7 +17,7 @@ from hal.ark.ledger import summary, table
 from hal.ark.reading import Reading
 from hal.config import load
 from hal.config.data_files import list_data
-from hal.pose import Pose
+from hal.geometry import Pose
 
 
 def saved(result: Imported, path: Path) -> Path:

@@ -17,7 +17,7 @@ from hal.ark import Options
 from hal.ark.links import ArkUrdf
 from hal.config import load
 from hal.config.files import parse_yaml
-from hal.pose import Pose
+from hal.geometry import Pose
 
 HOME = [0, -0.785, 0, -2.356, 0, 1.571, 0.785]
 OTHER = [0.1, -0.5, 0, -2.0, 0, 1.5, 0.7]

@@ -12,7 +12,7 @@ from ark_kit import BALL, DATA, PANDA, changed, imported, row, write
 
 import hal
 from hal.ark import Options, import_ark
-from hal.pose import Pose
+from hal.geometry import Pose
 
 MUG = DATA / "tutorial" / "config" / "objects" / "mug" / "model.urdf"
 

@@ -14,7 +14,7 @@ from hal.calibration.detection import Detector
 from hal.calibration.rotations import exponential
 from hal.calibration.sampling import looks
 from hal.errors import DriverMissing
-from hal.pose import Pose
+from hal.geometry import Pose
 
 cv2 = pytest.importorskip("cv2", reason="pip install opencv-python-headless")
 NO_LENS = (0.0,) * 5

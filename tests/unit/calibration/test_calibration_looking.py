@@ -9,8 +9,8 @@ import pytest
 
 from hal.calibration import NoView
 from hal.calibration.looking import look_of
-from hal.camera_info import CameraInfo, StreamInfo
-from hal.pose import Pose
+from hal.driver import CameraInfo, StreamInfo
+from hal.geometry import Pose
 from hal.types import Frame, Stamp
 
 K, K_INFRARED = np.diag([600.0, 600.0, 1.0]), np.diag([400.0, 400.0, 1.0])

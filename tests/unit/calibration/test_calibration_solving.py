@@ -12,7 +12,7 @@ from calibration_kit import BOARD, CAMERA, LENS, K, Z, degrees, poses, views
 from hal.calibration import CalibrationFailed, Eye, View, solve
 from hal.calibration.report import difference_lines, report_lines
 from hal.calibration.rotations import exponential, inverse
-from hal.pose import Pose
+from hal.geometry import Pose
 
 EYES: tuple[Eye, ...] = ("in-hand", "to-hand")
 SEEDS = range(5 if os.environ.get("HAL_SOAK") == "1" else 2)

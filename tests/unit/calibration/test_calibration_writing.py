@@ -14,7 +14,7 @@ from hal.calibration.writing import backup, replaced, write
 from hal.config import load
 from hal.config.data_files import find_data
 from hal.errors import CommandError, ConfigError
-from hal.pose import Pose
+from hal.geometry import Pose
 
 VALUE = "[0.1, 0.2, 0.3, 0, 0, 0, 1]"
 HAND = f"{{robot: arm, link: hand, pose: {VALUE}}}"

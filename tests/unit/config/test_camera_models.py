@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 import yaml
 
-from hal.camera_info import nominal_info
 from hal.config import load
 from hal.config.data_files import find_data, list_data
+from hal.driver import nominal_info
 from hal.errors import ConfigError, Problem
 from hal.specs import CameraSpec, from_json, to_json
 

@@ -15,12 +15,11 @@ from jsonschema import Draft202012Validator, ValidationError
 
 from hal.config import load
 from hal.config.data_files import find_data, list_data
-from hal.config.plan import Plan
 from hal.config.rigfile import rig_schema
 from hal.errors import ConfigError
+from hal.geometry import Pose
 from hal.images import centre_crop
-from hal.pose import Pose
-from hal.specs import BodySpec, WorldSpec, from_json, to_json
+from hal.specs import BodySpec, Plan, WorldSpec, from_json, to_json
 
 MIXED: dict[str, Any] = {
     "robots": {"one": {"model": "panda"}, "two": {"model": "panda", "sim": True, "base": {"position": [0, 1, 0]}}},

@@ -11,8 +11,8 @@ import pytest
 
 import hal
 from hal.camera import Camera
-from hal.camera_driver import CameraDriver, RawFrame
 from hal.clock import RealClock
+from hal.driver import CameraDriver, RawFrame
 from hal.errors import ConnectionLost, DeviceNotFound, StaleStateError
 from hal.specs import CameraSpec
 

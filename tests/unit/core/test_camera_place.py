@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 
 import hal
-from hal.camera import Camera, CameraDriver, RawFrame
-from hal.camera_info import CameraInfo, nominal_info
-from hal.camera_place import place_of
+from hal.camera import Camera, CameraDriver, RawFrame, place_of
+from hal.driver import CameraInfo, nominal_info
 
 
 def difference(a: hal.Pose, b: hal.Pose) -> tuple[float, float]:

@@ -6,9 +6,9 @@ import socket
 
 import pytest
 
-from hal.console import PORT, Listen
 from hal.drivers.web.addresses import is_loopback, link, names, tunnel
 from hal.errors import CommandError
+from hal.views import PORT, Listen
 
 
 @pytest.mark.parametrize(

@@ -7,9 +7,9 @@ import threading
 
 import pytest
 
+from hal.commands import DeadmanRecord
 from hal.deadman import Deadman, Threshold
 from hal.errors import NotSupported
-from hal.inbox import DeadmanRecord
 
 
 def test_a_trigger_is_held_from_the_press_threshold_until_below_the_release_threshold() -> None:

@@ -8,8 +8,9 @@ from collections.abc import Callable, Iterator
 
 import pytest
 
+from hal.driver import GamepadDriver, PadReading
 from hal.errors import DeviceNotFound, NotSupported
-from hal.gamepad import Gamepad, GamepadDriver, PadReading
+from hal.gamepad import Gamepad
 from hal.specs import PadSpec
 from hal.types import AXES, PadState
 

@@ -8,8 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from hal.machine import check_machine, has_realtime_kernel
-from hal.verdict import Verdict
+from hal.preflight import CheckResult, check_machine, has_realtime_kernel
 
 pytestmark = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="needs Linux")
 
@@ -26,7 +25,7 @@ def write(root: Path, **files: str) -> Path:
     return root
 
 
-def verdict(root: Path, name: str) -> Verdict:
+def verdict(root: Path, name: str) -> CheckResult:
     return next(v for v in check_machine(root) if v.name == name)
 
 

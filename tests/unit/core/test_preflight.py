@@ -10,16 +10,14 @@ from types import ModuleType
 import pytest
 
 from hal.config import load
-from hal.config.plan import Plan
 from hal.errors import DriverMissing
-from hal.preflight import preflight, real_arms
+from hal.preflight import CheckResult, preflight, real_arms
 from hal.registry import DriverSpec
-from hal.specs import CameraSpec, RobotSpec
-from hal.verdict import Verdict
+from hal.specs import CameraSpec, Plan, RobotSpec
 
 
-def check(spec: RobotSpec, duration: float) -> Iterator[Verdict]:
-    yield Verdict("link", "ok", f"{spec.name} for {duration:g} s")
+def check(spec: RobotSpec, duration: float) -> Iterator[CheckResult]:
+    yield CheckResult("link", "ok", f"{spec.name} for {duration:g} s")
     if spec.options.get("broken"):
         raise DriverMissing("no library; pip install it")
 
@@ -34,7 +32,7 @@ def plan(monkeypatch: pytest.MonkeyPatch) -> Plan:
     return replace(plan, robots=tuple(replace(r, driver="checked_driver:DRIVER", attended=True) for r in plan.robots))
 
 
-def of_arms(plan: Plan) -> list[Verdict]:
+def of_arms(plan: Plan) -> list[CheckResult]:
     return [v for v in preflight(plan, 0.25) if ":" in v.name]
 
 
@@ -45,7 +43,7 @@ def test_a_simulated_rig_has_only_the_machine_to_check() -> None:
 
 
 def test_an_arm_is_checked_by_its_driver_under_its_own_name(plan: Plan) -> None:
-    assert of_arms(plan) == [Verdict("panda: link", "ok", "panda for 0.25 s")]
+    assert of_arms(plan) == [CheckResult("panda: link", "ok", "panda for 0.25 s")]
 
 
 def test_an_emulated_arm_is_checked_too(plan: Plan) -> None:
@@ -73,8 +71,8 @@ def test_a_driver_that_is_not_there_is_a_failure(plan: Plan) -> None:
 
 
 def test_a_camera_is_checked_by_its_driver_unless_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
-    def look(spec: CameraSpec, duration: float) -> Iterator[Verdict]:
-        yield Verdict("rate", "ok", f"{spec.rate_hz:g} Hz over {duration:g} s")
+    def look(spec: CameraSpec, duration: float) -> Iterator[CheckResult]:
+        yield CheckResult("rate", "ok", f"{spec.rate_hz:g} Hz over {duration:g} s")
 
     module = ModuleType("checked_camera")
     vars(module).update(look=look, DRIVER=DriverSpec("checked_camera", camera_preflight="checked_camera:look"))
@@ -82,5 +80,5 @@ def test_a_camera_is_checked_by_its_driver_unless_left_out(monkeypatch: pytest.M
     plan = load("panda_table", sim=True).resolve()
     first, *others = plan.cameras
     plan = replace(plan, cameras=(replace(first, driver="checked_camera:DRIVER"), *others))
-    assert of_arms(plan) == [Verdict(f"{first.name}: rate", "ok", "30 Hz over 0.25 s")]
+    assert of_arms(plan) == [CheckResult(f"{first.name}: rate", "ok", "30 Hz over 0.25 s")]
     assert [v for v in preflight(plan, 0.25, cameras=False) if ":" in v.name] == []

@@ -10,9 +10,9 @@ from pathlib import Path
 import pytest
 
 from hal import registry
+from hal.driver import RobotDriver
 from hal.errors import DeviceNotFound, DriverMissing, NotSupported
 from hal.registry import DriverSpec
-from hal.robot import RobotDriver
 
 DRIVERS = Path(__file__).parents[3] / "drivers"
 

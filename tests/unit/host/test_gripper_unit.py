@@ -6,8 +6,8 @@ from typing import Any
 
 import pytest
 
+from hal.driver import GripperDriver, GripperReading
 from hal.errors import CommandError, ConnectionLost, RobotFault
-from hal.gripper import GripperDriver, GripperReading
 from hal.host.gripper_mail import GripperAct, GripperCommand, GripperMail, GripperRecord
 from hal.host.gripper_unit import GripperUnit
 from hal.host.records import AppRecord

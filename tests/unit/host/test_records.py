@@ -6,12 +6,10 @@ import math
 
 import pytest
 
-from hal.commands import Kind
-from hal.gripper import GripperReading
+from hal.commands import CommandRecord, DeadmanRecord, Kind
+from hal.driver import GripperReading, Reading
 from hal.host.gripper_mail import GripperAct, GripperCommand, GripperMail
 from hal.host.records import GroupMemory, RobotMail, ServoRecord
-from hal.inbox import CommandRecord, DeadmanRecord
-from hal.robot import Reading
 from hal.types import Fault, GripperOutcome, Limited, RobotStatus, Trip
 
 N = 6

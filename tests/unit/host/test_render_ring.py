@@ -11,8 +11,8 @@ import pytest
 from pictures_kit import STREAMS, camera
 
 from hal.camera import RawFrame
+from hal.geometry import Pose
 from hal.host.frames import FrameRing
-from hal.pose import Pose
 from hal.specs import CameraSpec
 
 WIDE = camera(64, 48, name="wide", streams=("color", "depth", "infrared", "segmentation"))

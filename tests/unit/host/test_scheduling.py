@@ -13,7 +13,7 @@ import pytest
 import hal
 from hal.host.process import Child
 from hal.host.scheduling import describe, is_realtime
-from hal.machine import check_machine, may_lock_memory
+from hal.preflight import check_machine, may_lock_memory
 
 pytestmark = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="needs Linux")
 

@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 
 from hal.errors import CommandError, Unreachable
+from hal.geometry import Pose, quaternion_to_matrix
 from hal.kinematics import NEAR_SINGULAR, Kinematics
-from hal.pose import Pose, quaternion_to_matrix
 from hal.specs import KinematicsSpec
 
 pybullet = pytest.importorskip("pybullet", reason="needs pybullet (pip install pybullet)")

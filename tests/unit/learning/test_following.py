@@ -7,9 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hal.following import towards
-from hal.pose import Pose
-from hal.quaternion import after_rotation
+from hal.geometry import Pose, after_rotation
+from hal.teleop import towards
 
 numbers = st.floats(-1.0, 1.0)
 poses = st.builds(

@@ -4,8 +4,8 @@ from pathlib import Path
 
 import pytest
 
+from hal.driver import Plugged
 from hal.errors import DeviceNotFound, NotSupported
-from hal.gamepad import Plugged
 from hal.pads.choice import Chosen, choose_pad
 from hal.specs import PadSpec
 

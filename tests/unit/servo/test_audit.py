@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import pytest
 
-from hal.robot import Setpoint
+from hal.driver import Setpoint
 from hal.servo.audit import SetpointAudit
 from hal.specs import LimitsSpec
 

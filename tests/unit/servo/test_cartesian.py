@@ -13,8 +13,7 @@ from servo_kit import Bench, tightened
 from specs import panda
 
 from hal.commands import Kind
-from hal.pose import Pose, quaternion_to_matrix
-from hal.quaternion import after_rotation, difference, rotate
+from hal.geometry import Pose, after_rotation, difference, quaternion_to_matrix, rotate
 from hal.specs import WorkspaceSpec
 from hal.types import Limited, RobotStatus
 

@@ -9,9 +9,8 @@ import pytest
 from servo_kit import STILL, Bench, N, load_streams
 from specs import PANDA_HOME, panda
 
-from hal.commands import Kind
+from hal.commands import Kind, Session
 from hal.errors import CommandError, ControlTaken
-from hal.inbox import Session
 from hal.specs import WorkspaceSpec
 from hal.types import Limited, RobotStatus, Trip
 

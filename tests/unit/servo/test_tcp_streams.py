@@ -16,7 +16,7 @@ from servo_kit import Bench, tightened
 
 from hal.commands import Kind
 from hal.config import load
-from hal.quaternion import after_rotation
+from hal.geometry import after_rotation
 from hal.specs import RobotSpec, WorkspaceSpec
 from hal.types import Limited
 

@@ -14,10 +14,9 @@ from servo_kit import Bench
 from specs import panda
 from torque_kit import NOTHING, Driven, N, one, wheels
 
-from hal.commands import Kind
+from hal.commands import Kind, Session
+from hal.driver import Reading, Setpoint
 from hal.drivers.mock.robot import MockRobot
-from hal.inbox import Session
-from hal.robot import Reading, Setpoint
 from hal.servo.servo import Servo
 from hal.specs import WorkspaceSpec
 from hal.types import Fault, Limited, RobotStatus, Trip

@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 from specs import panda
 
-from hal.inbox import Session
+from hal.commands import Session
 from hal.kinematics import Kinematics
 from hal.servo.envelope import Envelope
 from hal.servo.smoothing import JointSmoother

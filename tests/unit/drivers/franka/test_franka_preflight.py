@@ -19,8 +19,8 @@ from hal.drivers.franka.fault_texts import FLAG_TEXTS
 from hal.drivers.franka.preflight import check
 from hal.drivers.franka.preflight_network import Answer, Route, knock, resolve, route_to
 from hal.drivers.franka.preflight_ping import NotMeasured, RoundTrips, judge, measure
+from hal.preflight import CheckResult
 from hal.specs import RobotSpec
-from hal.verdict import Verdict
 
 HOST, EMPTY, MUTE = address(1), address(2), address(3)
 BRIEF = 0.05
@@ -36,7 +36,7 @@ def rig(host: str = HOST, *overrides: str) -> RobotSpec:
     return load("franka_emulator", overrides=[f"robots.arm.real.host={host}", *overrides]).resolve().robots[0]
 
 
-def checked(spec: RobotSpec) -> dict[str, Verdict]:
+def checked(spec: RobotSpec) -> dict[str, CheckResult]:
     return {verdict.name: verdict for verdict in check(spec, BRIEF)}
 
 

@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 
 from hal.clock import LockStepClock, RealClock
+from hal.driver import Setpoint
 from hal.drivers.mock.camera import STEP, MockCamera, read_picture
 from hal.drivers.mock.gamepad import MockPad
 from hal.drivers.mock.gripper import MockGripper
 from hal.drivers.mock.robot import MockRobot
 from hal.errors import CommandError, ConnectionLost
-from hal.robot import Setpoint
 from hal.specs import CameraSpec, GripperSpec, PadSpec, RobotSpec
 from hal.types import GripperOutcome
 

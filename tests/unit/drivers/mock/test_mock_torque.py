@@ -7,8 +7,8 @@ from math import exp
 import numpy as np
 import pytest
 
+from hal.driver import Setpoint
 from hal.drivers.mock.robot import FRICTION, INERTIA, KEEP_UP, MockRobot
-from hal.robot import Setpoint
 from hal.specs import RobotSpec
 
 HERE = (0.1, -0.2, 0.3)  # robot_spec.initial

@@ -11,11 +11,12 @@ from typing import Any
 import pytest
 import yaml
 
+from hal.driver import PadReading
 from hal.drivers.playback import convert as converter
 from hal.drivers.playback.pad import PlaybackPad
 from hal.drivers.playback.recording import dump, load
 from hal.errors import ConfigError, NotSupported
-from hal.gamepad import Gamepad, PadReading
+from hal.gamepad import Gamepad
 from hal.specs import PadSpec
 
 ROOT = Path(__file__).parents[4]

@@ -12,7 +12,7 @@ import hal
 from hal.config import load
 from hal.drivers.pybullet.world import World
 from hal.errors import CommandError, ConfigError
-from hal.pose import Pose
+from hal.geometry import Pose
 from hal.specs import BodySpec, WorldSpec, from_json, to_json
 
 IN_HAND = Pose([0.03, 0.0, 0.19], [0.5, 0.5, 0.5, 0.5])

@@ -8,13 +8,12 @@ import numpy as np
 import pytest
 from specs import PANDA_HOME, box, cube, data, floor, iiwa, panda, world_spec
 
+from hal.driver import GripperReading, Setpoint
 from hal.drivers.pybullet.gripper import PyBulletGripper
 from hal.drivers.pybullet.robot import PyBulletRobot
 from hal.drivers.pybullet.world import World
 from hal.errors import CommandError, ConfigError
-from hal.gripper import GripperReading
-from hal.pose import Pose
-from hal.robot import Setpoint
+from hal.geometry import Pose
 from hal.specs import GripperSpec
 
 FINGERS = ("panda_finger_joint1", "panda_finger_joint2")

@@ -11,10 +11,10 @@ import pytest
 from numpy.typing import NDArray
 from specs import IIWA_HOME, PANDA_HOME, box, cube, floor, iiwa, panda, world_spec
 
+from hal.driver import Reading, Setpoint
 from hal.drivers.pybullet.robot import PyBulletRobot
 from hal.drivers.pybullet.world import World
 from hal.errors import CommandError, ConfigError, ConnectionLost
-from hal.robot import Reading, Setpoint
 from hal.specs import BodySpec, RobotSpec
 
 ZERO = (0.0,) * 7

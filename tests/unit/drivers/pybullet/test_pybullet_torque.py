@@ -10,10 +10,10 @@ import pytest
 from specs import PANDA_HOME, box, iiwa, panda, world_spec
 from torque_kit import NOTHING, N, one, simulated
 
+from hal.driver import Setpoint
 from hal.drivers.pybullet.robot import PyBulletRobot
 from hal.drivers.pybullet.world import World
 from hal.kinematics import Kinematics
-from hal.robot import Setpoint
 from hal.specs import BodySpec
 from hal.types import Limited, RobotStatus, Trip
 

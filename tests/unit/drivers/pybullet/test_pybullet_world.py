@@ -17,7 +17,7 @@ from specs import IIWA_HOME, PANDA_HOME, box, cube, data, floor, iiwa, panda, wo
 
 from hal.drivers.pybullet.world import World
 from hal.errors import CommandError, ConfigError, DeviceNotFound, NotSupported
-from hal.pose import Pose
+from hal.geometry import Pose
 from hal.specs import BodySpec, to_json
 
 UPRIGHT = (0.0, 0.0, 0.0, 1.0)

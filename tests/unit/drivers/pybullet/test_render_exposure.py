@@ -22,9 +22,9 @@ from hal.drivers.pybullet.rendering import Images, Renderer
 from hal.drivers.pybullet.tiny import TinyRenderer
 from hal.drivers.pybullet.world import World
 from hal.errors import ConnectionLost
+from hal.geometry import Pose
 from hal.host.frames import FrameRing
 from hal.host.mailbox import SeriesBox
-from hal.pose import Pose
 from hal.specs import BodySpec, CameraSpec
 from hal.types import Frame
 

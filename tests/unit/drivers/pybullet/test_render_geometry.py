@@ -14,7 +14,7 @@ from specs import data, panda
 from hal.drivers.pybullet.meshes import MeshLibrary
 from hal.drivers.pybullet.rendering import Images
 from hal.drivers.pybullet.scene import parts_of
-from hal.pose import Pose
+from hal.geometry import Pose
 from hal.specs import BodySpec, CameraSpec
 
 BOTH = pytest.mark.parametrize("name", ["gl", "tiny"])

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from hal.camera_driver import CameraTally
+from hal.driver import CameraTally
 from hal.drivers.realsense.ring import SLOTS, PictureRing
 from hal.errors import ConnectionLost
 from hal.specs import CameraSpec

@@ -10,10 +10,10 @@ from typing import Any
 import pytest
 from terminal_kit import FarEnd, wait_for
 
+from hal.commands import DeadmanRecord
 from hal.drivers.terminal.pad import TerminalPad
 from hal.errors import ConfigError, NotSupported
 from hal.gamepad import Gamepad
-from hal.inbox import DeadmanRecord
 from hal.servo.watchdog import PAD_SILENCE
 from hal.specs import PadSpec
 

@@ -14,7 +14,7 @@ from specs import data, panda
 
 from hal.drivers.viser.meshes import glb
 from hal.drivers.viser.urdf import Visual, read_tree
-from hal.pose import Pose
+from hal.geometry import Pose
 from hal.specs import WorkspaceSpec
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from hal.drivers.viser.goals import FARTHEST, UNUSED, Drag, checked_pose
-from hal.pose import Pose
+from hal.geometry import Pose
 
 LEVEL = (0.0, 0.0, 0.0, 1.0)
 HERE, THERE = (0.3, 0.0, 0.5), (0.4, 0.0, 0.5)

@@ -9,8 +9,8 @@ import pytest
 from specs import PANDA_HOME, data, panda
 
 from hal.drivers.viser.urdf import read_tree
+from hal.geometry import Pose
 from hal.kinematics import Kinematics
-from hal.pose import Pose
 from hal.specs import KinematicsSpec
 
 SMALL = """

@@ -9,9 +9,10 @@ import pytest
 
 from hal.config.files import Problems
 from hal.config.models import load_pad_models
+from hal.driver import PadReading
 from hal.drivers.web.pad import PadMail, WebPad, gone, reading
 from hal.errors import NotSupported
-from hal.gamepad import Gamepad, PadReading
+from hal.gamepad import Gamepad
 from hal.specs import PadSpec
 from hal.types import AXES, BUTTONS
 

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from hal.console import ACTIONS, PHASES, RecordingView
 from hal.drivers.web.recording import as_message
 from hal.errors import CommandError
+from hal.views import ACTIONS, PHASES, RecordingView
 
 VIEW = RecordingView(
     phase="recording",

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import pytest
 
+from hal.driver import GripperReading, Reading
 from hal.drivers.web.telemetry import Telemetry
-from hal.gripper import GripperReading
 from hal.host.records import GroupMemory, ServoRecord
-from hal.robot import Reading
 from hal.types import Limited, RobotStatus, Trip
 
 ARM = {"name": "arm", "rate_hz": 240.0, "joints": [["arm", 3]], "grippers": [], "gripper_of": {"arm": "arm.gripper"}}

@@ -9,13 +9,13 @@ import time
 
 from .errors import ControlTaken
 
-__all__ = ["Claim"]
+__all__ = ["DeviceLock"]
 
 _LONGEST = 100
 """Characters of a socket's name, of the 108 bytes that Linux has for it."""
 
 
-class Claim:
+class DeviceLock:
     """Holds something for this process, by a socket in Linux's abstract name space: nothing is left behind.
 
     Devices mostly refuse a second user by themselves, but late, and cannot say who the first one is.
