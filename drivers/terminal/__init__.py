@@ -1,4 +1,4 @@
-"""The keys of the terminal that a program runs in as a gamepad, also over ssh."""
+"""The keys of the terminal in which a program runs, as a gamepad, also over ssh."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A terminal as a device: its settings changed and put back, bytes in and out, never in anybody's way."""
+"""A terminal as a device: its settings, changed and restored, and bytes in and out without blocking."""
 
 from __future__ import annotations
 
@@ -25,18 +25,22 @@ _GUARDIAN_ENDS = 2.0  # s
 
 
 class Terminal:
-    """Keys one by one and without echo from :meth:`enter` to :meth:`leave`; Ctrl-C and Ctrl-Z stay what they are.
+    """A terminal that gives keys one by one, without echo, from :meth:`enter` to :meth:`leave`.
 
-    It has a file description of its own, so that nothing here ever changes how the program's standard input and
-    output behave, and never waits for a terminal that takes nothing. A process of its own (:mod:`.guardian`) puts the
-    settings back should this one be killed.
+    Ctrl-C and Ctrl-Z keep their meaning. The terminal is opened anew, so that nothing here changes how the program's
+    standard input and output behave, and writing never waits for a terminal that takes nothing. A process of its own
+    (:mod:`.guardian`) restores the settings if this one is killed.
     """
 
     def __init__(self, path: str | None = None) -> None:
-        """The terminal at ``path``, or the program's own. Raises NotSupported where there is none."""
+        """Open the terminal at ``path``; None for the program's own.
+
+        Raises:
+            NotSupported: There is none (code ``no_terminal``).
+        """
         self.fd = _open(path)
         self.entered = False
-        """Are the settings ours?"""
+        """Whether the settings are changed at present."""
         self._undo: dict[str, Any] | None = None
         self._guardian = subprocess.Popen(
             [sys.executable, "-I", "-S", guardian.__file__, str(self.fd)],
@@ -49,62 +53,64 @@ class Terminal:
         )
 
     def in_foreground(self) -> bool:
-        """May this program read? Who reads in the background is stopped by the kernel. OSError when it is gone."""
+        """Whether this program may read: the kernel stops a reader in the background. OSError when it is gone."""
         try:
             return os.tcgetpgrp(self.fd) == os.getpgrp()
         except OSError as error:
-            if error.errno == errno.ENOTTY:  # the terminal of another session: nobody's foreground
+            if error.errno == errno.ENOTTY:  # the terminal of another session: it has no foreground here
                 return True
             raise
 
     def enter(self) -> None:
-        """Take the terminal over. Raises OSError when it is gone. What was typed before is thrown away."""
-        with _undisturbed():
+        """Take the terminal over, and drop what was typed before. Raises OSError when it is gone."""
+        with _without_job_control():
             try:
                 before = guardian.settings(self.fd)
                 attributes = termios.tcgetattr(self.fd)
                 attributes[3] &= ~(termios.ECHO | termios.ICANON)
                 attributes[6][termios.VMIN], attributes[6][termios.VTIME] = 1, 0
-                # The guardian must know before anything changes.
-                self._keep({"before": before, "ours": [*attributes[:6], _as_json(attributes[6])], "write": ""})
+                # The guardian gets this before anything changes.
+                self._send_to_guardian(
+                    {"before": before, "ours": [*attributes[:6], _as_json(attributes[6])], "write": ""}
+                )
                 termios.tcsetattr(self.fd, termios.TCSANOW, attributes)
                 termios.tcflush(self.fd, termios.TCIFLUSH)
-                self._keep({"before": before, "ours": guardian.settings(self.fd), "write": ""})
+                self._send_to_guardian({"before": before, "ours": guardian.settings(self.fd), "write": ""})
             except termios.error as error:
                 raise OSError(*error.args) from None
         self.entered = True
 
     def undo_with(self, text: str) -> None:
-        """What must be written when the terminal is left, whoever leaves it."""
+        """Set the text that is written when the terminal is left, here or by the guardian."""
         if self._undo is not None:
-            self._keep({**self._undo, "write": text})
+            self._send_to_guardian({**self._undo, "write": text})
 
     def leave(self) -> None:
-        """Put everything back. Idempotent; never raises."""
+        """Restore the settings. Idempotent; never raises."""
         self.entered = False
         if self._undo is not None:
-            with _undisturbed():
+            with _without_job_control():
                 guardian.restore(self.fd, self._undo)
-            self._keep(None)
+            self._send_to_guardian(None)
 
-    def _keep(self, undo: dict[str, Any] | None) -> None:
+    def _send_to_guardian(self, undo: dict[str, Any] | None) -> None:
         self._undo = undo
         pipe = self._guardian.stdin
         assert pipe is not None
-        with contextlib.suppress(OSError, ValueError):  # it was killed, or let go of
+        with contextlib.suppress(OSError, ValueError):  # it was killed, or is closed
             pipe.write(json.dumps(undo).encode() + b"\n")
             pipe.flush()
 
     def read(self, timeout: float) -> bytes:
-        """What was typed; waits up to ``timeout`` s for it. OSError when the terminal is gone."""
-        poller = select.poll()  # a new one each time: Ctrl-Z makes another thread read what is left
+        """Return what was typed, after at most ``timeout`` s. Raises OSError when the terminal is gone."""
+        poller = select.poll()  # a new one each time: after Ctrl-Z another thread reads the rest
         poller.register(self.fd, select.POLLIN)
         if not poller.poll(1e3 * timeout):
             return b""
-        with _undisturbed():
+        with _without_job_control():
             try:
                 data = os.read(self.fd, 65536)
-            except BlockingIOError:  # somebody else was faster
+            except BlockingIOError:  # another reader was faster
                 return b""
             except OSError:
                 if self.in_foreground():
@@ -115,12 +121,12 @@ class Terminal:
         return data
 
     def write(self, data: bytes) -> None:
-        """Say something to the terminal, or lose it where the terminal takes nothing. OSError when it is gone."""
-        with _undisturbed(), contextlib.suppress(BlockingIOError):
+        """Write to the terminal; data that it does not take is lost. Raises OSError when it is gone."""
+        with _without_job_control(), contextlib.suppress(BlockingIOError):
             os.write(self.fd, data)
 
     def close(self) -> None:
-        """Leave, and let go of it. Idempotent."""
+        """Restore the settings and close the terminal. Idempotent."""
         self.leave()
         pipe = self._guardian.stdin
         assert pipe is not None
@@ -141,18 +147,20 @@ def _open(path: str | None) -> int:
     if path is None:
         with contextlib.suppress(OSError):
             names.insert(0, os.ttyname(0))
-    why = "there is none"
+    reason = "there is none"
     for name in names:
         try:
             fd = os.open(name, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK | os.O_CLOEXEC)
         except OSError as error:
-            why = str(error)
+            reason = str(error)
             continue
         if os.isatty(fd):
             return fd
         os.close(fd)
-        why = f"{name} is no terminal"
-    raise NotSupported(f"no terminal to read keys from ({why}): start the program in one, over ssh with ssh -t")
+        reason = f"{name} is not a terminal"
+    raise NotSupported(
+        f"no terminal to read keys from ({reason}): start the program in one, over ssh with ssh -t", code="no_terminal"
+    )
 
 
 def _as_json(characters: list[Any]) -> list[Any]:
@@ -160,8 +168,8 @@ def _as_json(characters: list[Any]) -> list[Any]:
 
 
 @contextlib.contextmanager
-def _undisturbed() -> Iterator[None]:
-    """Job control must not stop this thread: should the program be in the background after all, reading fails."""
+def _without_job_control() -> Iterator[None]:
+    """Block job-control signals: reading or writing in the background fails instead of suspending the program."""
     before = signal.pthread_sigmask(signal.SIG_BLOCK, _JOB_CONTROL)
     try:
         yield

@@ -1,9 +1,9 @@
-"""Puts a terminal back in order when the program that changed it cannot: it was killed, or left by os._exit.
+"""Restores a terminal when the program that changed it cannot: it was killed, or ended by os._exit.
 
 Run as a program, by the file's path, it is a process in a session of its own, out of reach of the terminal's signals.
-It holds the terminal and one end of a pipe, on which the program writes, as a line of JSON, what is to be undone; the
-newest line counts. When the pipe closes, for whatever reason, that is undone, and the guardian ends. It needs nothing
-but the standard library and starts without ``site``, so it is there in a few milliseconds.
+It holds the terminal and one end of a pipe, into which the program writes what is to be undone, as a line of JSON; the
+newest line counts. When the pipe closes, for whatever reason, the guardian undoes that and ends. It needs only the
+standard library and starts without ``site``, so it is ready in a few milliseconds.
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ from typing import Any
 
 __all__ = ["restore", "settings"]
 
-_LONGEST_WRITE = 1.0  # s; a terminal that takes nothing (Ctrl-S, a link that is cut) must keep nobody waiting
+_LONGEST_WRITE = 1.0  # s; a terminal that takes nothing (Ctrl-S, a cut link) must not block
 
 
 def settings(fd: int) -> list[Any]:
-    """The terminal's settings, as JSON knows them."""
+    """Return the settings of the terminal, as JSON."""
     *flags, characters = termios.tcgetattr(fd)
     return [*flags, [c if isinstance(c, int) else c.decode("latin-1") for c in characters]]
 
@@ -30,8 +30,8 @@ def settings(fd: int) -> list[Any]:
 def restore(fd: int, undo: dict[str, Any]) -> None:
     """Write the text ``undo["write"]``, and go from settings ``undo["ours"]`` back to ``undo["before"]``.
 
-    Settings that somebody else, a shell for one, has changed since are left alone. Never raises: a terminal that is
-    gone needs nothing. Input that nobody has read is thrown away: it was not meant for the shell.
+    Settings that another program, such as a shell, has changed since are left alone. Unread input is dropped, because
+    it was not meant for the shell. Never raises: a terminal that is gone needs nothing.
     """
     try:
         termios.tcflush(fd, termios.TCIFLUSH)

@@ -1,4 +1,4 @@
-"""The app in a terminal, driven by its keys: one step for each press, keys that are held, a link that is cut."""
+"""The teleoperation app driven by the keys of its terminal: steps, held keys, a cut link."""
 
 from __future__ import annotations
 
@@ -38,12 +38,12 @@ class App(InTerminal):
             raise
 
     def tcp(self) -> np.ndarray:
-        """Position of the tcp as the app shows it, mm."""
+        """Return the position of the tcp that the app shows, mm."""
         found = re.findall(rb"tcp +(-?[0-9.]+) +(-?[0-9.]+) +(-?[0-9.]+) m", self.far.screen)
         return 1e3 * np.array([float(number) for number in found[-1]])
 
     def at_rest(self) -> np.ndarray:
-        """Where it is, mm, as soon as the app has shown the same place five times."""
+        """Return the tcp's position, mm, once the app has shown the same place five times."""
         seen: list[np.ndarray] = []
         shown = -1
         deadline = time.monotonic() + 30.0
@@ -66,7 +66,7 @@ def app(*, kitty: bool) -> Iterator[tuple[FarEnd, App]]:
         yield far, it
 
 
-def test_one_key_press_is_one_step_and_backspace_stops() -> None:
+def test_each_key_press_is_one_step_and_backspace_stops() -> None:
     with app(kitty=False) as (far, it):
         it.shows("one small step for each press")
         place = it.at_rest()
@@ -98,20 +98,20 @@ def test_one_key_press_is_one_step_and_backspace_stops() -> None:
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP, signal.SIGKILL])
-def test_the_terminal_is_put_back_when_the_app_is_ended(number: signal.Signals) -> None:
+def test_terminal_is_restored_when_the_app_is_killed(number: signal.Signals) -> None:
     with app(kitty=True) as (_, it):
         it.process.send_signal(number)
         assert it.process.wait(30) == (-number if number is signal.SIGKILL else 0)
         it.is_put_back()
 
 
-def test_a_link_that_is_cut_while_a_key_is_held_trips() -> None:
+def test_cut_link_trips_the_arm_while_a_key_is_held() -> None:
     with app(kitty=True) as (far, it):
         it.shows("held down")
         start = it.at_rest()
         far.type(SPACE + "\x1b[A")
         wait_for(lambda: it.moved(start), "driving")
-        far.silent = True  # from here on no release, and no answer, comes through
+        far.silent = True  # no release and no reply arrives any more
         it.shows("STOPPED", 5.0)
         it.shows("no sign of life")
         stopped = it.at_rest()

@@ -1,4 +1,4 @@
-"""The other end of a pseudo-terminal: what a terminal's program and the person in front of it do."""
+"""The far end of a pseudo-terminal: a terminal emulator and the keys of its user."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _QUERY = re.compile(rb"\x1b\[([<>=?]?)([0-9;]*)(\$p|[uhlc])")
 
 
 def wait_for(condition: Callable[[], bool], what: str, timeout: float = 20.0) -> None:
-    """Until it holds; AssertionError when it does not within ``timeout`` s."""
+    """Wait until ``condition`` holds; AssertionError after ``timeout`` s."""
     deadline = time.monotonic() + timeout
     while not condition():
         assert time.monotonic() < deadline, f"{what} did not happen within {timeout:g} s"
@@ -32,9 +32,9 @@ def wait_for(condition: Callable[[], bool], what: str, timeout: float = 20.0) ->
 
 
 class FarEnd:
-    """A terminal. ``kitty`` ones speak the Kitty keyboard protocol; all answer what they are.
+    """A terminal that answers queries from a thread of its own.
 
-    It answers from a thread of its own. ``silent`` makes it answer nothing any more, as a link does that was cut.
+    ``kitty`` terminals speak the Kitty keyboard protocol. ``silent`` stops all replies, as a cut link does.
     """
 
     def __init__(self, *, kitty: bool = False, reports_focus: bool = True, answers: bool = True, delay: float = 0.0):
@@ -45,7 +45,7 @@ class FarEnd:
         self.flags = [0]
         """The stack of keyboard modes."""
         self.focus = False
-        """Is the focus reported?"""
+        """Whether the focus is reported."""
         self.screen = b""
         """Everything that was written to it."""
         self._seen = 0
@@ -58,13 +58,13 @@ class FarEnd:
         os.write(self.master, text.encode() if isinstance(text, str) else text)
 
     def put(self, text: str | bytes) -> None:
-        """Press keys where nobody reads meanwhile: they have reached the near end when this returns."""
+        """Press keys, and wait until they have reached the near end; nothing may read meanwhile."""
         before = self.unread()
         self.type(text)
         wait_for(lambda: self.unread() > before, "typing")
 
     def unread(self) -> int:
-        """How many bytes wait for a reader."""
+        """Return how many bytes are unread."""
         return int(struct.unpack("i", ioctl(self.slave, termios.FIONREAD, b"\0" * 4))[0])
 
     @property
@@ -77,7 +77,7 @@ class FarEnd:
 
     @property
     def raw(self) -> bool:
-        """Key by key, no echo?"""
+        """Whether keys are given one by one, without echo."""
         return not termios.tcgetattr(self.slave)[3] & (termios.ICANON | termios.ECHO)
 
     def _run(self) -> None:
@@ -119,7 +119,7 @@ class FarEnd:
         return ""
 
     def hang_up(self) -> None:
-        """The window is closed."""
+        """Close the terminal's window."""
         self._ending.set()
         self._thread.join(2.0)
         os.close(self.master)
@@ -141,7 +141,7 @@ class FarEnd:
 
 
 class InTerminal:
-    """A program that runs in a terminal of its own, as a shell starts it: in the foreground, in control."""
+    """A program in the foreground of a terminal that it controls, as a shell starts it."""
 
     def __init__(self, far: FarEnd, command: list[str]) -> None:
         self.far = far
@@ -161,7 +161,7 @@ class InTerminal:
         )
 
     def shows(self, text: str, timeout: float = 30.0) -> None:
-        """Wait until the screen shows it."""
+        """Wait until the screen shows ``text``."""
 
         def condition() -> bool:
             return text.encode() in self.far.screen
@@ -172,7 +172,7 @@ class InTerminal:
             raise AssertionError(f"{error}; it shows {self.far.screen[-2000:]!r}") from None
 
     def tells(self, pattern: str, timeout: float = 30.0) -> str:
-        """What the pattern's group is, as soon as the screen shows it."""
+        """Return the group of ``pattern`` as soon as the screen shows it."""
         wait_for(
             lambda: re.search(pattern, self.far.screen.decode()) is not None, f"{pattern!r} on the screen", timeout
         )
@@ -181,7 +181,7 @@ class InTerminal:
         return found[1]
 
     def holders(self) -> list[str]:
-        """Command lines of the processes that hold this terminal, except for the test's own."""
+        """Return the command lines of the processes that have this terminal open, without the test's own."""
         found = []
         for process in Path("/proc").iterdir():
             if process.name.isdigit() and int(process.name) != os.getpid():
@@ -191,11 +191,11 @@ class InTerminal:
         return found
 
     def is_put_back(self) -> None:
-        """Wait until nobody holds the terminal any more, and it is as it was before."""
-        wait_for(lambda: not self.holders(), "letting go of the terminal")
-        wait_for(lambda: self.far.flags == [0] and not self.far.focus, "taking back what was asked of the terminal")
+        """Wait until no process has the terminal open and its settings are as before."""
+        wait_for(lambda: not self.holders(), "closing of the terminal")
+        wait_for(lambda: self.far.flags == [0] and not self.far.focus, "resetting the terminal")
         assert self.far.settings == self.before
-        assert self.far.unread() == 0, "nothing is left for the shell to read"
+        assert self.far.unread() == 0, "no input is left for the shell"
 
     def close(self) -> None:
         if self.process.poll() is None:

@@ -1,4 +1,4 @@
-"""However a program ends or is stopped, its terminal is as it was before."""
+"""The terminal is restored however the program ends or is stopped."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ finally:
 
 
 QUESTION = b"\x1b[?u\x1b[c"
-"""What every terminal is asked first."""
+"""The first query to a terminal."""
 
 
 def program(far: FarEnd, folder: Path, ending: str = "") -> InTerminal:
@@ -55,7 +55,7 @@ def program(far: FarEnd, folder: Path, ending: str = "") -> InTerminal:
         "os.kill(os.getpid(), signal.SIGKILL)",
     ],
 )
-def test_a_program_that_ends(tmp_path: Path, kitty: bool, ending: str) -> None:
+def test_terminal_is_restored_when_the_program_ends(tmp_path: Path, kitty: bool, ending: str) -> None:
     with FarEnd(kitty=kitty) as far, program(far, tmp_path, f"{ending}; sys.exit()") as it:
         it.shows("ready")
         it.process.wait(20)
@@ -63,7 +63,7 @@ def test_a_program_that_ends(tmp_path: Path, kitty: bool, ending: str) -> None:
 
 
 @pytest.mark.parametrize("kitty", [False, True])
-def test_ctrl_c(tmp_path: Path, kitty: bool) -> None:
+def test_terminal_is_restored_after_ctrl_c(tmp_path: Path, kitty: bool) -> None:
     with FarEnd(kitty=kitty) as far, program(far, tmp_path) as it:
         it.shows("ready")
         far.type("\x1b[99;5u" if kitty else "\x03")
@@ -72,7 +72,7 @@ def test_ctrl_c(tmp_path: Path, kitty: bool) -> None:
         it.is_put_back()
 
 
-def test_ctrl_c_counts_also_while_the_terminal_is_being_asked_what_it_can(tmp_path: Path) -> None:
+def test_ctrl_c_counts_while_the_terminal_is_queried(tmp_path: Path) -> None:
     with FarEnd(kitty=True, delay=0.2) as far, program(far, tmp_path) as it:
         wait_for(lambda: far.flags[-1] == 15, "reporting keys")
         far.type("\x1b[99;5u")
@@ -82,7 +82,7 @@ def test_ctrl_c_counts_also_while_the_terminal_is_being_asked_what_it_can(tmp_pa
 
 
 @pytest.mark.parametrize("kitty", [False, True])
-def test_a_program_that_is_killed_while_it_stands_still(tmp_path: Path, kitty: bool) -> None:
+def test_terminal_is_restored_when_a_suspended_program_is_killed(tmp_path: Path, kitty: bool) -> None:
     with FarEnd(kitty=kitty) as far, program(far, tmp_path) as it:
         it.shows("ready")
         it.process.send_signal(signal.SIGSTOP)
@@ -91,7 +91,7 @@ def test_a_program_that_is_killed_while_it_stands_still(tmp_path: Path, kitty: b
         it.is_put_back()
 
 
-def test_settings_that_a_shell_has_changed_since_are_left_alone(tmp_path: Path) -> None:
+def test_settings_that_a_shell_changed_are_left_alone(tmp_path: Path) -> None:
     with FarEnd() as far, program(far, tmp_path) as it:
         it.shows("ready")
         it.process.send_signal(signal.SIGSTOP)
@@ -101,21 +101,21 @@ def test_settings_that_a_shell_has_changed_since_are_left_alone(tmp_path: Path) 
         far.settings = attributes
         it.process.kill()
         it.process.wait(20)
-        wait_for(lambda: not it.holders(), "letting go of the terminal")
+        wait_for(lambda: not it.holders(), "closing of the terminal")
         assert far.settings == attributes
 
 
-def test_a_closed_window_leaves_nobody_behind(tmp_path: Path) -> None:
+def test_closed_window_ends_the_program_and_the_guardian(tmp_path: Path) -> None:
     with FarEnd(kitty=True) as far, program(far, tmp_path) as it:
         it.shows("ready")
         far.hang_up()
         it.process.wait(20)
-        wait_for(lambda: not it.holders(), "letting go of the terminal")
+        wait_for(lambda: not it.holders(), "closing of the terminal")
 
 
 @pytest.mark.parametrize("kitty", [False, True])
 @pytest.mark.parametrize("shell", ["bash --norc -i", "dash -i"])
-def test_ctrl_z_and_fg(tmp_path: Path, kitty: bool, shell: str) -> None:
+def test_ctrl_z_gives_the_terminal_back_until_fg(tmp_path: Path, kitty: bool, shell: str) -> None:
     name = shell.split()[0]
     if shutil.which(name) is None:
         pytest.skip(f"needs {name}: sudo apt install {name}")
@@ -148,11 +148,11 @@ def test_ctrl_z_and_fg(tmp_path: Path, kitty: bool, shell: str) -> None:
 
 
 def state(pid: int) -> str:
-    """R, S, T and so on."""
+    """Return the state of a process: R, S, T and so on."""
     return Path(f"/proc/{pid}/stat").read_text().rpartition(") ")[2][0]
 
 
-def test_in_the_background_it_neither_reads_nor_stops_nor_touches_the_terminal(tmp_path: Path) -> None:
+def test_program_in_the_background_leaves_the_terminal_alone(tmp_path: Path) -> None:
     if shutil.which("bash") is None:
         pytest.skip("needs bash: sudo apt install bash")
     script = tmp_path / "program.py"
@@ -168,5 +168,5 @@ def test_in_the_background_it_neither_reads_nor_stops_nor_touches_the_terminal(t
         wait_for(lambda: far.flags[-1] == 15, "taking the terminal over")
         os.kill(int(it.tells(r"pid (\d+)\D")), signal.SIGKILL)
         wait_for(lambda: far.flags == [0], "giving the terminal back")
-        far.type("\x15echo $((20 + 4))\n")  # an answer that was on its way may have reached the shell: Ctrl-U
+        far.type("\x15echo $((20 + 4))\n")  # Ctrl-U: a late reply may have reached the shell
         it.shows("24")

@@ -1,4 +1,4 @@
-"""Bytes from a terminal, made into keys and answers: whatever comes, in whatever pieces."""
+"""Bytes from a terminal as keys and replies, in pieces of any size."""
 
 import pytest
 from hypothesis import given
@@ -36,7 +36,7 @@ def parsed(*pieces: bytes) -> list[Key | Answer]:
         # Answers.
         (b"\x1b[?15u\x1b[?62;22c", [Answer("?u", (15,)), Answer("?c", (62, 22))]),
         (b"\x1b[?1004;1$y\x1b[I\x1b[O", [Answer("?$y", (1004, 1)), Answer("I"), Answer("O")]),
-        # What means nothing.
+        # Sequences without a meaning here.
         (b"\x1b[12;40R\x1b[99~\x1b[>1;2c\x1b[<0;3;5M\x1b[3;1:9u\x01\xc3\xa4", []),
         (b"\x7f\x08\x1b[127u", [Key("backspace"), Key("backspace"), Key("backspace")]),
         (b"\x1b[" + b"1" * 1000 + b"uw", [Key("1")] * 953 + [Key("u"), Key("w")]),
@@ -45,22 +45,22 @@ def parsed(*pieces: bytes) -> list[Key | Answer]:
         (b"\x1b\x1b\x1b[A", [Key("escape"), Key("escape"), Key("up")]),
     ],
 )
-def test_what_is_typed(data: bytes, events: list[Key | Answer]) -> None:
+def test_bytes_become_keys_and_replies(data: bytes, events: list[Key | Answer]) -> None:
     assert parsed(data) == events
     assert parsed(*(bytes([byte]) for byte in data)) == events, "byte by byte"
 
 
 @pytest.mark.parametrize("begun", [b"\x1b", b"\x1b[", b"\x1b[1;"])
-def test_what_is_not_finished_in_time_is_esc(begun: bytes) -> None:
+def test_unfinished_sequence_becomes_esc(begun: bytes) -> None:
     parser = KeyParser()
     assert parser.feed(begun, 5.0) == []
-    assert parser.feed(b"", 5.05) == [], "the rest may still come"
+    assert parser.feed(b"", 5.05) == [], "the rest may still arrive"
     assert parser.feed(b"", 5.2) == [Key("escape")]
     assert parser.feed(b"w", 5.3) == [Key("w")]
 
 
 @given(st.lists(st.binary(max_size=40) | st.sampled_from([b"\x1b", b"\x1b[", b"\x1b[?", b"\x1bO", b"u"]), max_size=30))
-def test_nothing_makes_it_fail_or_grow(pieces: list[bytes]) -> None:
+def test_arbitrary_bytes_neither_fail_nor_accumulate(pieces: list[bytes]) -> None:
     parser = KeyParser()
     for piece in pieces:
         parser.feed(piece, 0.0)
