@@ -1,183 +1,202 @@
-"""The console: the app's side of the page in a browser. The server is a process of its own (:mod:`.process`)."""
+"""The console: the app's side of the page in a browser. The server is a process of its own (:mod:`.process`).
+
+:class:`WebConsole` is what a rig has as ``rig.console``; :class:`ProcessChannel` is its connection to that process,
+which never makes the app wait.
+"""
 
 from __future__ import annotations
 
+import contextlib
 import secrets
 import sys
 import threading
 import time
-from collections.abc import Callable, Mapping
+import traceback
+from collections import deque
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, replace
 from typing import TYPE_CHECKING, Any
 
 from hal.camera import Camera, RawFrame
 from hal.driver import PadReading
-from hal.errors import HalError
+from hal.errors import ConnectionLost, HalError
 from hal.gamepad import Gamepad
 from hal.host.frames import FrameRing
-from hal.host.process import Child, SharedMemory
-from hal.specs import CameraSpec, GroupSpec, to_json
+from hal.host.process import Channel, Child, SharedMemory
+from hal.specs import CameraSpec, GroupSpec, RobotSpec, to_json
 from hal.types import Frame
 from hal.views import Console, DrivingView, Listen, RecordingView
 
-from .about import about_rig, shown_stream
-from .addresses import is_loopback, link, names, tunnel
-from .conversation import Conversation
-from .messages import HANDS
-from .pad import PadMail, WebPad, gone, reading
-from .padmessage import ALARMS
-from .recording import as_message
+from .auth import host_names, is_loopback, page_link, ssh_tunnel
+from .messages import ALARMS
+from .pad import PadQueue, WebPad, lost_reading, pad_reading
 
 if TYPE_CHECKING:
     from hal.rig import Rig
 
-__all__ = ["WebConsole"]
+__all__ = ["ProcessChannel", "WebConsole", "recording_message"]
 
 _TOKEN_BYTES = 18
+_STREAMS = ("color", "infrared", "depth")
+"""A page shows the first of these streams that a camera has."""
+_MAX_LINE = 300
+"""Characters of a line; a page shows no more."""
+_CHECK_PERIOD = 0.5
+"""Time between two checks whether the channel is closed, in s."""
+_SEND_TIME = 10.0
+"""A process that reads nothing for so long is given up, in s."""
+_MAX_MESSAGES = 256
+"""Messages that may wait for the process; of more the oldest are dropped."""
+_CLOSE_TIME = 2.0
+"""Time for the process to end by itself, in s; it gives its pages one of them."""
 
 
 class WebConsole(Console):
-    """What an app tells its pages, and what it does for them.
+    """The console of a rig: shows the rig's state on pages, and carries out what pages request.
 
-    A console that does not listen (stopped, swapped out) holds up neither a camera nor the app: :mod:`.conversation`.
+    A console's process that does not read (stopped, swapped out) delays neither a camera nor the app.
     """
 
     def __init__(self, rig: Rig, listen: Listen, *, driven_by: str | None) -> None:
+        """Start the process; the arguments are those of :class:`~hal.views.Console`.
+
+        Raises:
+            NotSupported: In lock-step, where nobody could drive (``needs_real_time``).
+        """
         super().__init__(rig, listen, driven_by=driven_by)
-        self._mails: list[PadMail] = []
+        self._queues: list[PadQueue] = []
         self._driver: str | None = None
         self._token = secrets.token_urlsafe(_TOKEN_BYTES)
         self._address, self._port = listen.address, listen.port
         self._watched: frozenset[str] = frozenset()
         self._waiting: tuple[str, ...] = ()
         self._loss = ("", "")
-        """Why the pad was lost last, and whether that is an alarm; forgotten once it is back."""
+        """Reason for losing the pad last, and ``alarm`` or ``calm``; empty again once the pad is back."""
         self._detach: list[Any] = []
-        self._taken: Callable[[str], None] | None = None
-        self._changed: Callable[[str, str | float], None] | None = None
+        self._action_handler: Callable[[str], None] | None = None
+        self._setting_handler: Callable[[str, str | float], None] | None = None
         self._closed = False
         self._recovering = threading.Lock()
         groups = rig.shared_states()
-        self._shown = [_reduced(camera) for camera in rig.plan.cameras if shown_stream(camera)]
+        self._shown = [_with_shown_stream(camera) for camera in rig.plan.cameras if _shown_stream(camera)]
         self._frames = SharedMemory(FrameRing.size(self._shown))
         self._ring = FrameRing(self._frames.buffer, self._shown)
         config = {
-            "rig": about_rig(rig, self._shown, driven_by),
+            "rig": _rig_message(rig, self._shown, driven_by),
             "listen": [listen.address, listen.port],
             "port_fixed": listen.fixed,
             "token": self._token,
-            "names": names(),
-            "hosts": [_about_group(group.spec) for group in groups],
+            "names": host_names(),
+            "hosts": [_group_message(group.spec) for group in groups],
             "cameras": [to_json(camera) for camera in self._shown],
         }
         memories = [self._frames, *(group.memory for group in groups)]
         self._child = Child("console", "hal.drivers.web.process:main", config, memories)
-        self._conversation = Conversation(self._child, self._take, self._is_lost)
+        self._channel = ProcessChannel(self._child, self._receive, self._process_lost)
 
     def wait_ready(self) -> None:
         ready = self._child.wait_ready()
         self._address, self._port = str(ready["address"]), int(ready["port"])
         self.notes = self._warnings()
-        self._conversation.start()
+        self._channel.start()
 
     def _warnings(self) -> tuple[str, ...]:
         if is_loopback(self._address):
             return ()
-        text = f"the console listens on {self._address}: whoever has the link, and whoever can listen in, "
+        text = f"the console listens on {self._address}: anyone who has the link, or can read the network traffic, "
         text += "can drive the REAL ARM" if self.rig.attended and not self.rig.emulated else "can drive"
-        return (text + "; nothing on the way is encrypted (an ssh tunnel is: leave --listen out)",)
-
-    # What it is.
+        return (text + "; nothing is encrypted (with an ssh tunnel it is: leave --listen out)",)
 
     @property
     def link(self) -> str:
-        return link(self._address, self._port, self._token)
+        return page_link(self._address, self._port, self._token)
 
     @property
     def tunnel(self) -> str:
-        return tunnel(self._address, self._port) if is_loopback(self._address) else ""
+        return ssh_tunnel(self._address, self._port) if is_loopback(self._address) else ""
+
+    # The pad's side, see PadSource.
 
     @property
     def driver(self) -> str | None:
-        """The page that drives, by its name; None where none does."""
+        """Name of the page in control; None if there is none."""
         return self._driver
 
     @property
-    def stops(self) -> int:
-        """How often ``rig.stop()`` was called, by whomever."""
+    def stop_count(self) -> int:
+        """Number that grows with every ``rig.stop()``."""
         return self.rig.stop_count
 
-    def subscribe(self) -> PadMail:
-        """What the page does with its pad, from now on."""
-        mail = PadMail()
-        self._mails.append(mail)
-        return mail
-
-    def _put(self, found: PadReading) -> None:
-        for mail in self._mails:
-            mail.put(found)
-
-    # What it tells.
-
-    def say(self, text: str) -> None:
-        self._conversation.tell("say", t=time.monotonic(), text=text)
-
-    def explain(self, labels: Mapping[str, Any]) -> None:
-        self._conversation.tell("labels", labels=dict(labels))
-
-    def show_driving(self, view: DrivingView) -> None:
-        self._conversation.tell("driving", view=asdict(view))
+    def subscribe(self) -> PadQueue:
+        """Return a queue that gets every reading of the page's pad from now on."""
+        queue = PadQueue()
+        self._queues.append(queue)
+        return queue
 
     def show_playing(self, on: bool) -> None:
-        """Tell the pages whether the recorded tour is being played."""
-        self._conversation.tell("playing", on=on)
+        """Show on the pages whether the recorded tour is playing."""
+        self._channel.send("playing", on=on)
         if not on:
-            self._say_loss("the tour has ended")
+            self._report_loss("the tour has ended")
+
+    def _put_reading(self, found: PadReading) -> None:
+        for queue in self._queues:
+            queue.put(found)
+
+    # What pages show.
+
+    def say(self, text: str) -> None:
+        self._channel.send("say", t=time.monotonic(), text=text)
+
+    def explain(self, labels: Mapping[str, Any]) -> None:
+        self._channel.send("labels", labels=dict(labels))
+
+    def show_driving(self, view: DrivingView) -> None:
+        self._channel.send("driving", view=asdict(view))
 
     def show_recording(self, view: RecordingView) -> None:
-        self._conversation.tell_newest("recording", t=time.monotonic(), view=as_message(view))
+        self._channel.send_newest("recording", t=time.monotonic(), view=recording_message(view))
 
     def show(self, camera: Camera) -> None:
-        """Show this camera's frames to whoever watches it."""
         spec = next((spec for spec in self._shown if spec.name == camera.name), None)
         if spec is not None:
-            self._detach.append(camera.on_frame(lambda frame: self._take_frame(spec, frame)))
+            self._detach.append(camera.on_frame(lambda frame: self._show_frame(spec, frame)))
 
-    def _take_frame(self, spec: CameraSpec, frame: Frame) -> None:
+    def _show_frame(self, spec: CameraSpec, frame: Frame) -> None:
         if spec.name not in self._watched:
             return
         stamp = frame.stamp
         layers = {name: getattr(frame, name) for name in spec.streams}
         raw = RawFrame(stamp.t, stamp.t_device, stamp.seq, None, None, None, None, None)._replace(**layers)
         self._ring.put(spec.name, raw)
-        self._conversation.show(spec.name)
+        self._channel.send_frame(spec.name)
 
-    # What it hears.
+    # What pages request.
 
     def on_action(self, taken: Callable[[str], None]) -> None:
-        self._taken = taken
+        self._action_handler = taken
 
     def on_setting(self, changed: Callable[[str, str | float], None]) -> None:
-        self._changed = changed
+        self._setting_handler = changed
 
-    def _is_lost(self) -> None:
+    def _process_lost(self) -> None:
         self._driver = None
-        self._put(gone(time.monotonic(), 0))
+        self._put_reading(lost_reading(time.monotonic(), 0))
         print("the console has ended: no page can drive or stop any more; start the program again", file=sys.stderr)
 
-    def _take(self, message: dict[str, Any]) -> None:
+    def _receive(self, message: dict[str, Any]) -> None:
         if "pad" in message:
             pad = message["pad"]
-            self._put(reading(pad, 0))
+            self._put_reading(pad_reading(pad, 0))
             if not pad["connected"]:
-                self._say_loss(str(pad["why"]))
+                self._report_loss(str(pad["why"]))
             else:
                 self._loss = ("", "")
-            self._say_what_is_waited_for()
+            self._send_waiting_controls()
         elif "stop" in message:
             self.rig.stop()
             page = message["stop"]
-            self._conversation.tell("say", t=time.monotonic(), text=f"STOP was pressed on {page}", stop=page)
+            self._channel.send("say", t=time.monotonic(), text=f"STOP was pressed on {page}", stop=page)
         elif "driver" in message:
             self._driver = message["driver"]
         elif "watched" in message:
@@ -185,23 +204,23 @@ class WebConsole(Console):
         elif "recover" in message:
             self._start_recovery(str(message["recover"]), str(message["page"]))
         elif "demo" in message:
-            self._play(bool(message["demo"]), str(message["page"]))
+            self._play_tour(bool(message["demo"]), str(message["page"]))
         elif "action" in message:
-            self._act(str(message["action"]), str(message["page"]))
-        elif "setting" in message and self._changed is not None:
-            self._changed(str(message["setting"]), message["value"])
+            self._handle_action(str(message["action"]), str(message["page"]))
+        elif "setting" in message and self._setting_handler is not None:
+            self._setting_handler(str(message["setting"]), message["value"])
 
-    def _say_loss(self, why: str) -> None:
-        """Tell the pages why the pad was lost, and whether that was somebody's intention."""
-        loss = "alarm" if why in ALARMS or why == HANDS else "calm"
+    def _report_loss(self, why: str) -> None:
+        """Show on the pages why the pad was lost, once, and whether somebody intended that (calm) or not (alarm)."""
+        loss = "alarm" if why in ALARMS else "calm"
         if (why, loss) != self._loss:
-            self._conversation.tell("say", t=time.monotonic(), text=why, loss=loss)
+            self._channel.send("say", t=time.monotonic(), text=why, loss=loss)
         self._loss = (why, loss)
 
     def _start_recovery(self, robot: str, page: str) -> None:
-        """One at a time, in a thread of its own: it may take long, and the pad must be heard meanwhile."""
+        """Recover a robot in a thread of its own, one at a time: it may take long, and pad messages must not wait."""
         if not self._recovering.acquire(blocking=False):
-            self._conversation.tell("refused", page=page, why="a robot is already being recovered")
+            self._refuse(page, "a robot is already being recovered")
             return
         try:
             threading.Thread(target=self._recover, args=(robot, page), name="hal-console-recover", daemon=True).start()
@@ -213,40 +232,43 @@ class WebConsole(Console):
         try:
             self.rig.robots[robot].recover()
         except (HalError, OSError) as error:
-            self._conversation.tell("refused", page=page, why=str(error))
+            self._refuse(page, str(error))
         else:
             self.say(f"{robot} recovered by {page}: release the dead-man, then hold it again")
         finally:
             self._recovering.release()
 
-    def _play(self, on: bool, page: str) -> None:
+    def _play_tour(self, on: bool, page: str) -> None:
         pad = self._pad()
         if pad is None or (self.rig.attended and not self.rig.emulated):
-            self._conversation.tell("refused", page=page, why="the tour plays in simulation only")
+            self._refuse(page, "the tour plays in simulation only")
             return
         assert isinstance(pad.driver, WebPad)
         pad.driver.play(on)
 
-    def _act(self, action: str, page: str) -> None:
-        if self._taken is None:
-            self._conversation.tell("refused", page=page, why="this program records nothing")
+    def _handle_action(self, action: str, page: str) -> None:
+        if self._action_handler is None:
+            self._refuse(page, "this program records nothing")
             return
         try:
-            self._taken(action)
+            self._action_handler(action)
         except Exception:
-            why = f"the program failed at {action!r}: see its own output"
-            self._conversation.tell("refused", page=page, why=why)
-            raise  # to be printed by whoever brought the message
+            self._refuse(page, f"the program failed at {action!r}: see its own output")
+            raise  # printed by the channel
+
+    def _refuse(self, page: str, why: str) -> None:
+        self._channel.send("refused", page=page, why=why)
 
     def _pad(self) -> Gamepad | None:
         return next((pad for pad in self.rig.gamepads.values() if isinstance(pad.driver, WebPad)), None)
 
-    def _say_what_is_waited_for(self) -> None:
+    def _send_waiting_controls(self) -> None:
+        """Send the names of the controls that must be released first, if they changed."""
         pad = self._pad()
         waiting = pad.waiting_for if pad is not None else ()
         if waiting != self._waiting:
             self._waiting = waiting
-            self._conversation.tell("waiting", controls=list(waiting))
+            self._channel.send("waiting", controls=list(waiting))
 
     def close(self) -> None:
         if self._closed:
@@ -254,17 +276,175 @@ class WebConsole(Console):
         self._closed = True
         for detach in self._detach:
             detach()
-        self._conversation.close()
+        self._channel.close()
         self._frames.close()
 
 
-def _reduced(camera: CameraSpec) -> CameraSpec:
-    stream = shown_stream(camera)
+class ProcessChannel:
+    """The channel to the console's process, for an app that must never wait for it: one thread for each direction.
+
+    If either direction breaks, the process is killed and ``lost`` is called once: a page must never look alive while
+    its stop does not arrive.
+    """
+
+    def __init__(self, child: Child, receive: Callable[[dict[str, Any]], None], lost: Callable[[], None]) -> None:
+        """``receive`` is called with every message of the process, in the receiving thread."""
+        self._child = child
+        self._receive = receive
+        self._lost = lost
+        self._changed = threading.Condition()
+        self._messages: deque[dict[str, Any]] = deque(maxlen=_MAX_MESSAGES)
+        self._newest: dict[str, dict[str, Any]] = {}
+        self._frames: dict[str, None] = {}
+        self._over = False
+        self._threads = [
+            threading.Thread(target=self._receive_all, name="hal-console-receive", daemon=True),
+            threading.Thread(target=self._send_all, name="hal-console-send", daemon=True),
+        ]
+
+    def start(self) -> None:
+        """Start both threads, which have the channel from now on."""
+        for thread in self._threads:
+            thread.start()
+
+    def send(self, method: str, **more: Any) -> None:
+        """Queue a message; never waits."""
+        with self._changed:
+            self._messages.append({"method": method, **more})
+            self._changed.notify()
+
+    def send_newest(self, method: str, **more: Any) -> None:
+        """Queue a message that replaces one of the same method that still waits."""
+        with self._changed:
+            self._newest[method] = {"method": method, **more}
+            self._changed.notify()
+
+    def send_frame(self, camera: str) -> None:
+        """Announce a new picture of this camera. Two that wait become one, and other messages come first."""
+        with self._changed:
+            self._frames[camera] = None
+            self._changed.notify()
+
+    def _next(self) -> dict[str, Any] | None:
+        with self._changed:
+            self._changed.wait_for(lambda: self._messages or self._newest or self._frames or self._over)
+            if self._over:
+                return None
+            if self._messages:
+                return self._messages.popleft()
+            if self._newest:
+                return self._newest.pop(next(iter(self._newest)))
+            camera = next(iter(self._frames))
+            del self._frames[camera]
+            return {"method": "frame", "camera": camera}
+
+    def _send_all(self) -> None:
+        channel = Channel(self._child.channel.sock.dup())  # with a timeout of its own
+        try:
+            while (message := self._next()) is not None:
+                channel.send(message, _SEND_TIME)
+        except ConnectionLost:
+            self._break()
+        finally:
+            channel.close()
+
+    def _receive_all(self) -> None:
+        try:
+            while not self._over:
+                message = self._child.channel.receive(_CHECK_PERIOD)
+                if message is not None:
+                    self._receive_safely(message)
+        except (ConnectionLost, OSError, ValueError):
+            pass
+        finally:
+            self._break()
+
+    def _receive_safely(self, message: dict[str, Any]) -> None:
+        try:
+            self._receive(message)
+        except Exception:  # an error in one message must not block the next one, which may be a stop
+            traceback.print_exc(file=sys.stderr)
+
+    def _break(self) -> None:
+        with self._changed:
+            if self._over:
+                return
+            self._over = True
+            self._changed.notify_all()
+        self._child.process.kill()
+        self._lost()
+
+    def close(self) -> None:
+        """End the process, within a few seconds whatever it does. Idempotent."""
+        with self._changed:
+            self._over = True
+            self._changed.notify_all()
+        self._child.close(_CLOSE_TIME)
+        for thread in self._threads:
+            with contextlib.suppress(RuntimeError):  # it was never started
+                thread.join(timeout=1.0)
+
+
+# What the process and its pages get as JSON.
+
+
+def _shown_stream(camera: CameraSpec) -> str | None:
+    return next((stream for stream in _STREAMS if stream in camera.streams), None)
+
+
+def _with_shown_stream(camera: CameraSpec) -> CameraSpec:
+    stream = _shown_stream(camera)
     assert stream is not None
     return replace(camera, streams=(stream,))
 
 
-def _about_group(spec: GroupSpec) -> dict[str, Any]:
+def _rig_message(rig: Rig, cameras: Sequence[CameraSpec], driven_by: str | None) -> dict[str, Any]:
+    """Return everything that does not change while the rig is open."""
+    return {
+        "source": rig.plan.source,
+        "sim": rig.plan.sim,
+        "attended": rig.attended,
+        "emulated": rig.emulated,
+        "drivable": driven_by is None,
+        "driven_by": driven_by,
+        "demo": driven_by is None and (rig.emulated or not rig.attended),
+        "pad_may_hold": not rig.attended or _accepts_silent_pads(rig),
+        "robots": [_robot_message(robot) for robot in rig.plan.robots],
+        "cameras": [
+            {
+                "name": camera.name,
+                "width": camera.width,
+                "height": camera.height,
+                "rate_hz": camera.rate_hz,
+                "driver": camera.driver,
+                "shows": camera.streams[0],
+            }
+            for camera in cameras
+        ],
+    }
+
+
+def _robot_message(robot: RobotSpec) -> dict[str, Any]:
+    return {
+        "name": robot.name,
+        "model": robot.model,
+        "real": robot.attended,
+        "driver": robot.driver,
+        "rate_hz": robot.rate_hz,
+        "joints": list(robot.joints),
+        "lower": list(robot.limits.lower),
+        "upper": list(robot.limits.upper),
+        "velocity": list(robot.limits.velocity),
+        "width_max": robot.gripper.width_max if robot.gripper is not None else None,
+    }
+
+
+def _accepts_silent_pads(rig: Rig) -> bool:
+    ours = [pad for pad in rig.plan.pads if pad.driver in ("auto", "web")]
+    return any(pad.options.get("accept_silent_pad") is True for pad in ours)
+
+
+def _group_message(spec: GroupSpec) -> dict[str, Any]:
     return {
         "name": spec.name,
         "rate_hz": spec.rate_hz,
@@ -272,3 +452,33 @@ def _about_group(spec: GroupSpec) -> dict[str, Any]:
         "grippers": [gripper.name for gripper in spec.grippers],
         "gripper_of": {robot.name: robot.gripper.name for robot in spec.robots if robot.gripper is not None},
     }
+
+
+def recording_message(view: RecordingView) -> dict[str, Any]:
+    """Return a recording's view as JSON; its numbers may be numpy's.
+
+    Raises:
+        TypeError, ValueError: A field that must be a number is not one.
+    """
+    return {
+        "phase": view.phase,
+        "prompt": _line(view.prompt),
+        "task": _line(view.task),
+        "episode": int(view.episode),
+        "saved": int(view.saved),
+        "wanted": int(view.wanted),
+        "succeeded": int(view.succeeded),
+        "failed": int(view.failed),
+        "discarded": int(view.discarded),
+        "seconds": round(float(view.seconds), 2),
+        "frames": int(view.frames),
+        "dropped": int(view.dropped),
+        "free_bytes": int(view.free_bytes),
+        "trouble": _line(view.trouble),
+        "actions": list(view.actions),
+    }
+
+
+def _line(text: str) -> str:
+    line = " ".join(text.split())
+    return line if len(line) <= _MAX_LINE else line[: _MAX_LINE - 1] + "…"

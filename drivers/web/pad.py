@@ -18,24 +18,24 @@ from hal.servo.watchdog import PAD_SILENCE
 from hal.specs import PadSpec
 from hal.types import AXES, BUTTONS
 
-__all__ = ["PadMail", "PadSource", "WebPad", "gone", "reading"]
+__all__ = ["PadQueue", "PadSource", "WebPad", "lost_reading", "pad_reading"]
 
 _RELEASED: Mapping[str, float] = MappingProxyType(dict.fromkeys(AXES, 0.0))
-_GONE = 0.05
-"""A pad that was lost stays lost for at least so long, s, so that every servo sees it: a window that has the focus back
-at once, or another page that takes over, would otherwise look like a mere release."""
-_WAITING = 64
-"""Messages that may wait for the app: 1.3 s of a pad that speaks 50 times a second."""
+_LOST_TIME = 0.05
+"""A pad that was lost stays lost for at least so long, in s, so that every servo sees it: a window that gets the focus
+back at once, or another page that takes control, would otherwise look like a mere release."""
+_MAX_WAITING = 64
+"""Readings that may wait for the app: 1.3 s of a pad that sends 50 a second."""
 
 
-def reading(message: Mapping[str, Any], seq: int) -> PadReading:
-    """What the console's process says of the page's pad. It has checked the numbers.
+def pad_reading(message: Mapping[str, Any], seq: int) -> PadReading:
+    """Return the reading in a message of the console's process, which has checked the numbers.
 
-    An event counts from when the page was provably alive, which is the earliest that it can have happened: latencies
-    are never too short.
+    The reading has the time at which the page was provably in this state, which is the earliest at which an event can
+    have happened: latencies are never too short.
     """
     if not message["connected"]:
-        return gone(float(message["t"]), seq)
+        return lost_reading(float(message["t"]), seq)
     t = float(message["t_alive"])
     mask = int(message["buttons"])
     return PadReading(
@@ -49,81 +49,81 @@ def reading(message: Mapping[str, Any], seq: int) -> PadReading:
     )
 
 
-def gone(t: float, seq: int) -> PadReading:
-    """No page drives."""
+def lost_reading(t: float, seq: int) -> PadReading:
+    """Return the reading of a pad without a page, at ``t`` (s)."""
     return PadReading(t, -math.inf, t, seq, _RELEASED, frozenset(), connected=False)
 
 
-class PadMail:
-    """Readings on their way from the thread that hears the page to the thread that polls the pad.
+class PadQueue:
+    """Readings on their way from the thread that receives them to the thread that polls the pad.
 
-    Each is handed out, in order, so that no press and no interruption is missed. Should the app be so late that too
-    many wait, they count as an interruption: only the newest is kept, with a lost pad before it.
+    Each is handed out once, in order, so that no press and no interruption is missed. If the app is so late that too
+    many wait, only the newest is kept, with a lost pad before it.
     """
 
     def __init__(self) -> None:
-        self._news = threading.Condition()
+        self._changed = threading.Condition()
         self._waiting: deque[PadReading] = deque()
-        self._last = gone(-math.inf, 0)
+        self._last = lost_reading(-math.inf, 0)
 
     def put(self, new: PadReading) -> None:
-        """Hand in the next one."""
-        with self._news:
-            if len(self._waiting) >= _WAITING:
+        """Add a reading."""
+        with self._changed:
+            if len(self._waiting) >= _MAX_WAITING:
                 self._waiting.clear()
-                self._waiting.append(gone(new.t, new.seq))
+                self._waiting.append(lost_reading(new.t, new.seq))
             self._waiting.append(new)
-            self._news.notify()
+            self._changed.notify()
 
-    def take(self, timeout: float) -> PadReading:
-        """The next one; after ``timeout`` s without any, the last one again."""
-        with self._news:
-            if self._news.wait_for(lambda: self._waiting, timeout):
+    def pop(self, timeout: float) -> PadReading:
+        """Return the next reading; after ``timeout`` s without one, the last one again."""
+        with self._changed:
+            if self._changed.wait_for(lambda: self._waiting, timeout):
                 self._last = self._waiting.popleft()
             return self._last
 
 
 class PadSource(Protocol):
-    """What :class:`WebPad` asks of the console."""
+    """The part of the console that :class:`WebPad` uses."""
 
-    def subscribe(self) -> PadMail:
-        """What the page does with its pad, from now on; each pad of a rig that is the page's has a mail of its own."""
+    def subscribe(self) -> PadQueue:
+        """Return a queue that gets every reading from now on; each web pad of a rig has its own."""
 
     @property
     def driver(self) -> str | None:
-        """The page that drives."""
+        """Name of the page in control; None if there is none."""
 
     @property
-    def stops(self) -> int:
-        """How often ``rig.stop()`` was called."""
+    def stop_count(self) -> int:
+        """Number that grows with every ``rig.stop()``."""
 
     def show_playing(self, on: bool) -> None:
-        """Tell the pages whether the recorded tour is being played."""
+        """Show on the pages whether the recorded tour is playing."""
 
 
 class WebPad(GamepadDriver):
-    """The page that holds the lease; ``source`` is a :class:`PadSource`, the rig's console.
+    """The pad of the page in control; ``source`` is a :class:`PadSource`, the rig's console.
 
-    Its main thread sends the whole pad 50 times a second, and each message proves when it was alive at the latest
-    (:mod:`.padmessage`), so silence is noticed: a frozen browser, a hidden tab and a cut cable all let the arm stop.
-    That the *person* is there is proven by a finger on the dead-man alone, as with every pad.
+    The page's main thread sends the whole pad 50 times a second, and each message proves when the page was alive at the
+    latest (:class:`~.session.PadWatch`), so silence is noticed: a frozen browser, a hidden tab and a cut cable all stop
+    the arm. That the *person* is there is proven by the finger on the dead-man alone, as with every pad.
 
-    In simulation, a page may ask for the recorded tour; it is played in the place of the page's pad until it ends, the
-    page is gone, its person touches a button, or somebody stops the arms.
+    In simulation, a page may start the recorded tour. It replaces the page's pad until it ends, the page is gone, a
+    button is pressed on the page, or the arms are stopped.
     """
 
     proves_liveness = True
 
     def __init__(self, spec: PadSpec, source: object | None = None) -> None:
         super().__init__(spec, source)
-        self._mail = PadMail()
-        self._told = gone(-math.inf, 0)
-        self._gone_until = -math.inf
+        self._queue = PadQueue()
+        self._reported = lost_reading(-math.inf, 0)
+        self._lost_until = -math.inf
         self._tour: GamepadDriver | None = None
-        self._stops = 0
-        """Calls of ``rig.stop()`` when the tour began: one more ends it, for nobody is there to acknowledge it."""
+        self._stop_count = 0
+        """Stop count when the tour began. A further stop ends the tour, because nobody is there to acknowledge it."""
         self._wanted: bool | None = None
-        """Somebody asked for the tour, or for its end."""
+        """Whether to start (True) or end the tour in the next poll; None for neither."""
         self._open = False
 
     @property
@@ -133,57 +133,59 @@ class WebPad(GamepadDriver):
 
     def open(self) -> None:
         if not hasattr(self.source, "subscribe"):
-            raise NotSupported("the page drives a rig that was opened with its console: pad='web'")
-        self._mail = self._console.subscribe()
+            raise NotSupported("the web pad needs the rig's console: open the rig with pad='web'", code="no_console")
+        self._queue = self._console.subscribe()
         self._open = True
 
     def play(self, on: bool) -> None:
-        """Play the recorded tour, or end it; in the next poll. Only for rigs on which nothing real moves."""
+        """Start the recorded tour, or end it, in the next poll. Only for rigs on which nothing real moves."""
         self._wanted = on
 
     def poll(self, now: float, timeout: float) -> PadReading:
         wanted, self._wanted = self._wanted, None
         if wanted is not None and wanted != (self._tour is not None):
-            return self._begin(now) if wanted else self._end(now)
+            return self._start_tour(now) if wanted else self._end_tour(now)
         if self._tour is None:
-            found = self._mail.take(timeout)
+            found = self._queue.pop(timeout)
             silent = now - found.t_alive > PAD_SILENCE  # the console's process hangs, or is stopped
-            return self._tell(found if self._open and not silent else gone(found.t, 0), now)
-        page = self._mail.take(0.0)
+            return self._report(found if self._open and not silent else lost_reading(found.t, 0), now)
+        page = self._queue.pop(0.0)
         watched = page.connected and now - page.t_alive <= PAD_SILENCE
-        if page.buttons or not watched or self._tour.finished or self._console.stops != self._stops:
-            return self._end(now)
-        return self._tell(self._tour.poll(now, timeout), now)
+        if page.buttons or not watched or self._tour.finished or self._console.stop_count != self._stop_count:
+            return self._end_tour(now)
+        return self._report(self._tour.poll(now, timeout), now)
 
-    def _begin(self, now: float) -> PadReading:
-        self._tour = registry.load("playback", "gamepad")(replace(tour(self.spec), name=self.spec.name), None)
+    # At both ends of the tour the pad is lost for a moment: nothing held on one pad moves the arm with the other.
+
+    def _start_tour(self, now: float) -> PadReading:
+        recorded = tour(self.spec)
+        self._tour = registry.load(recorded.driver, "gamepad")(replace(recorded, name=self.spec.name), None)
         self._tour.open()
-        self._stops = self._console.stops
+        self._stop_count = self._console.stop_count
         self._console.show_playing(True)
-        return self._tell(gone(now, 0), now)
+        return self._report(lost_reading(now, 0), now)
 
-    def _end(self, now: float) -> PadReading:
-        """Between the tour and the page the pad is gone for a moment: nothing that is held on one moves the other."""
+    def _end_tour(self, now: float) -> PadReading:
         if self._tour is not None:
             self._tour.close()
             self._tour = None
         self._console.show_playing(False)
-        return self._tell(gone(now, 0), now)
+        return self._report(lost_reading(now, 0), now)
 
-    def _tell(self, found: PadReading, now: float) -> PadReading:
-        """Only a change of the controls is an event; what the page repeats proves that it is alive."""
-        last = self._told
+    def _report(self, found: PadReading, now: float) -> PadReading:
+        """Return ``found`` as the next reading: a change of the controls is an event, a repetition a sign of life."""
+        last = self._reported
         if not found.connected and last.connected:
-            self._gone_until = now + _GONE
-        elif found.connected and now < self._gone_until:
-            found = gone(found.t, 0)
+            self._lost_until = now + _LOST_TIME
+        elif found.connected and now < self._lost_until:
+            found = lost_reading(found.t, 0)
         same = (found.axes, found.buttons, found.connected) == (last.axes, last.buttons, last.connected)
         if same:
-            self._told = last._replace(t_alive=max(last.t_alive, found.t_alive))
+            self._reported = last._replace(t_alive=max(last.t_alive, found.t_alive))
         else:
             t = max(last.t, found.t)
-            self._told = found._replace(t=t, t_device=t, seq=last.seq + 1)
-        return self._told
+            self._reported = found._replace(t=t, t_device=t, seq=last.seq + 1)
+        return self._reported
 
     def describe(self) -> str:
         page = self._console.driver

@@ -1,25 +1,44 @@
-"""The HTTP side: which addresses there are, who may ask for them, and the headers of every answer."""
+"""The server in the console's process: HTTP routes, the live socket, the channel to the app, and the one loop.
+
+:class:`ConsoleServer` puts the parts together. :func:`make_app` has the routes and the headers of every answer,
+:class:`LiveSockets` is ``/live`` (pad, requests and stops from the page; states, notes and beats to it), and
+:class:`AppChannel` is the channel to the app inside the event loop.
+"""
 
 from __future__ import annotations
 
+import asyncio
 import errno
+import os
 import socket
 import time
-from collections.abc import Awaitable, Callable
+import traceback
+from collections.abc import Awaitable, Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 from aiohttp import web
 
-from hal.errors import DriverMissing, NotSupported
+from hal.errors import ConnectionLost, DriverMissing, NotSupported
+from hal.host.frames import FrameRing
+from hal.host.process import Channel, SharedMemory
+from hal.specs import CameraSpec, from_json
 
-from .gatekeeper import Gatekeeper
-from .live import Live
-from .pictures import Pictures
-from .sockets import VISITORS
-from .visitors import Visitors
+from .auth import Authenticator
+from .messages import MalformedMessage, StopRequest, encode, parse
+from .pictures import PictureCache, PictureSockets
+from .session import AppQueue, WebPage, WebSession
+from .sockets import CONNECTIONS, ConnectionLimit, PageSocket, PageSockets
+from .telemetry import Telemetry
 
-__all__ = ["listening", "make_app", "read_page"]
+__all__ = ["ConsoleServer", "make_app", "open_listener", "read_page_files"]
 
+_STATE_PERIOD = 0.05
+"""Time between two states, in s."""
+_KERNEL_BYTES = 4096
+"""Bytes that the kernel may keep for the app: a few pad messages, so that one that was stopped soon gets the newest."""
+_BACKLOG = 64
+_MORE_PORTS = 20
 _PAGE = Path(__file__).parent / "page"
 _INDEX = "index.html"
 _TYPES = {
@@ -37,18 +56,198 @@ _POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' blob: data:; "
     "connect-src 'self' ws://{host}; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
 )
-_BACKLOG = 64
-_MORE_PORTS = 20
 
-File = tuple[bytes, str]
-"""What a file of the page holds, and its content type."""
+PageFile = tuple[bytes, str]
+"""Content of a file of the page, and its content type."""
 Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 
 
-def read_page(folder: Path = _PAGE) -> dict[str, File]:
-    """The files of the page, by name: the only ones that are ever served. DriverMissing where they are not."""
+class ConsoleServer:
+    """Serves pages until the app closes it, the app is gone, or an unexpected error occurs."""
+
+    def __init__(self, channel: Channel, memories: Sequence[SharedMemory], config: dict[str, Any]) -> None:
+        """Listen and prepare; the arguments are those of :func:`~.process.main`."""
+        self._channel = channel
+        address, port = config["listen"]
+        self._address = str(address)
+        self._socket = open_listener(self._address, int(port), fixed=bool(config["port_fixed"]))
+        cameras = [from_json(CameraSpec, camera) for camera in config["cameras"]]
+        pictures, *hosts = [memory.buffer for memory in memories]
+        auth = Authenticator(config["token"], self._address, config["names"])
+        self._telemetry = Telemetry(config["hosts"], hosts)
+        self._cache = PictureCache(cameras, FrameRing(pictures, cameras))
+        self._app_channel = AppChannel(channel, self._receive_from_app)
+        self._session = WebSession(config["rig"], self._app_channel)
+        self._live = LiveSockets(auth, self._session)
+        self._pictures = PictureSockets(auth, self._cache, self._send_watched)
+        self._connections = ConnectionLimit()
+        self._app = make_app(auth, self._connections, self._live, self._pictures, read_page_files())
+        self._parent = os.getppid()
+
+    async def run(self) -> None:
+        """Serve until the end."""
+        runner = web.AppRunner(self._app, access_log=None, handle_signals=False)
+        await runner.setup()
+        assert runner.server is not None
+        self._channel.send({"ready": {"address": self._address, "port": self._socket.getsockname()[1]}})
+        self._app_channel.start()
+        accepting = asyncio.ensure_future(self._connections.accept_all(self._socket, runner.server))
+        sending = asyncio.ensure_future(self._send_states())
+        ended = asyncio.ensure_future(self._app_channel.ended.wait())
+        done, _ = await asyncio.wait((accepting, sending, ended), return_when=asyncio.FIRST_COMPLETED)
+        accepting.cancel()
+        self._socket.close()
+        await asyncio.gather(self._live.close(), self._pictures.close())
+        for task in done:
+            task.result()  # raises the error that ended it
+
+    def _receive_from_app(self, message: dict[str, Any]) -> None:
+        method = message["method"]
+        if method == "frame":
+            self._pictures.frame_arrived(message["camera"], time.monotonic())
+        elif method == "close":
+            self._app_channel.ended.set()
+        else:
+            self._session.receive_from_app(message)
+
+    def _send_watched(self, cameras: list[str]) -> None:
+        self._app_channel.queue.put_watched(cameras)
+        self._app_channel.flush()
+
+    async def _send_states(self) -> None:
+        """Send a state every period while the app's process lives; missed periods are left out."""
+        due = time.monotonic()
+        while os.getppid() == self._parent:
+            now = time.monotonic()
+            self._session.check_pad(now)
+            self._live.abort_stuck(now)
+            self._pictures.abort_stuck(now)
+            self._connections.close_idle(now)
+            if self._session.pages:
+                self._session.send_state(
+                    {"t": now, **self._telemetry.snapshot(now), "cameras": self._cache.report(now)}
+                )
+            due = max(due + _STATE_PERIOD, now)
+            await asyncio.sleep(due - now)
+
+
+class AppChannel:
+    """Both directions of the channel to the app; nothing here ever waits, whatever the app does.
+
+    To send, put a message into :attr:`queue`, then call :meth:`flush`.
+    """
+
+    def __init__(self, channel: Channel, receive: Callable[[dict[str, Any]], None]) -> None:
+        """``receive`` is called with every message of the app, in the loop's thread."""
+        self.queue = AppQueue()
+        self.ended = asyncio.Event()
+        """Set when the app is gone."""
+        self._channel = channel
+        self._receive = receive
+        self._unsent = b""
+        self._writing = False
+        self._loop: asyncio.AbstractEventLoop | None = None
+
+    def start(self) -> None:
+        """Read and write the channel in the running loop from now on."""
+        sock = self._channel.sock
+        sock.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _KERNEL_BYTES)
+        sock.setblocking(False)
+        self._loop = asyncio.get_running_loop()
+        self._loop.add_reader(sock, self._read)
+        self.flush()
+
+    def _read(self) -> None:
+        try:
+            while (message := self._channel.poll()) is not None:
+                self._receive_safely(message)
+        except ConnectionLost:
+            self._end()
+
+    def _receive_safely(self, message: dict[str, Any]) -> None:
+        try:
+            self._receive(message)
+        except Exception:  # a message that cannot be passed on must not block the next one, nor a stop
+            traceback.print_exc()
+
+    def flush(self) -> None:
+        """Send what waits, as far as the app takes it; the rest follows when it does."""
+        if self._loop is None or self.ended.is_set():
+            return
+        try:
+            while self._fill():
+                self._unsent = self._unsent[self._channel.sock.send(self._unsent) :]
+            self._write_later(False)
+        except BlockingIOError:
+            self._write_later(True)
+        except OSError:
+            self._end()
+
+    def _fill(self) -> bool:
+        """Return whether there is something to send."""
+        if not self._unsent:
+            message = self.queue.pop()
+            if message is not None:
+                self._unsent = encode(message).encode() + b"\n"
+        return bool(self._unsent)
+
+    def _write_later(self, later: bool) -> None:
+        assert self._loop is not None
+        if later != self._writing:
+            self._writing = later
+            if later:
+                self._loop.add_writer(self._channel.sock, self.flush)
+            else:
+                self._loop.remove_writer(self._channel.sock)
+
+    def _end(self) -> None:
+        if self._loop is not None:
+            self._loop.remove_reader(self._channel.sock)
+            self._write_later(False)
+        self.ended.set()
+
+
+class LiveSockets(PageSockets):
+    """``/live``: connects the sockets of pages with the session."""
+
+    def __init__(self, auth: Authenticator, session: WebSession) -> None:
+        super().__init__(auth)
+        self._session = session
+
+    async def serve(self, sock: PageSocket) -> None:
+        page = self._session.open_page(overflow=sock.abort)
+        sending = asyncio.ensure_future(page.queue.pump(sock.send))
+        try:
+            reason = await sock.receive_all(lambda text: self._receive(page, text))
+            if reason is not None:
+                self._session.close_page(page)
+                await sock.drain(lambda text: self._receive_stop(page, text))
+                await sock.close(reason)
+        finally:
+            self._session.close_page(page)
+            sending.cancel()
+
+    def _receive(self, page: WebPage, text: str | None) -> None:
+        if text is None:
+            raise MalformedMessage("not text")
+        self._session.receive(page, text)
+
+    def _receive_stop(self, page: WebPage, text: str | None) -> None:
+        """Handle stops only: a stop counts however much else the page has sent."""
+        if text is not None and isinstance(parse(text), StopRequest):
+            self._session.stop(page)
+
+
+def read_page_files(folder: Path = _PAGE) -> dict[str, PageFile]:
+    """Return the files of the page by name; no other file is ever served.
+
+    Raises:
+        DriverMissing: The folder has no page (``code`` is ``page_missing``).
+    """
     if not (folder / _INDEX).is_file():
-        raise DriverMissing(f"the console's page is not there: no {folder / _INDEX}; install the project again")
+        raise DriverMissing(
+            f"the console's page is missing: no {folder / _INDEX}; install the project again", code="page_missing"
+        )
     return {
         path.name: (path.read_bytes(), _TYPES[path.suffix])
         for path in sorted(folder.iterdir())
@@ -57,24 +256,28 @@ def read_page(folder: Path = _PAGE) -> dict[str, File]:
 
 
 def make_app(
-    gatekeeper: Gatekeeper, visitors: Visitors, live: Live, pictures: Pictures, files: dict[str, File]
+    auth: Authenticator,
+    connections: ConnectionLimit,
+    live: LiveSockets,
+    pictures: PictureSockets,
+    files: dict[str, PageFile],
 ) -> web.Application:
-    """The server's application."""
+    """Return the application: its routes, the checks of every request, the headers of every answer."""
 
     @web.middleware
     async def check(request: web.Request, handler: Handler) -> web.StreamResponse:
-        visitors.asked(request.transport, time.monotonic())
+        connections.note_request(request.transport, time.monotonic())
         host = request.headers.get("Host")
-        if not gatekeeper.knows_host(host):
+        if not auth.is_known_host(host):
             raise web.HTTPMisdirectedRequest(text="this server has another name; open the link that it printed\n")
-        if "Upgrade" in request.headers and not gatekeeper.is_own_page(request.headers.get("Origin"), host):
+        if "Upgrade" in request.headers and not auth.is_own_origin(request.headers.get("Origin"), host):
             raise web.HTTPForbidden(text="this page was not served by this server\n")
         return await handler(request)
 
     async def add_headers(request: web.Request, response: web.StreamResponse) -> None:
         response.headers.update(_HEADERS)
         host = request.headers.get("Host")
-        if gatekeeper.knows_host(host):
+        if auth.is_known_host(host):
             response.headers["Content-Security-Policy"] = _POLICY.format(host=host)
 
     async def serve_file(request: web.Request) -> web.StreamResponse:
@@ -85,7 +288,7 @@ def make_app(
         return web.Response(body=body, headers={"Content-Type": content_type})
 
     app = web.Application(middlewares=[check])
-    app[VISITORS] = visitors
+    app[CONNECTIONS] = connections
     app.on_response_prepare.append(add_headers)
     app.router.add_get("/", serve_file)
     app.router.add_get("/page/{name}", serve_file)
@@ -94,23 +297,32 @@ def make_app(
     return app
 
 
-def listening(address: str, port: int, *, fixed: bool) -> socket.socket:
-    """A socket that listens on ``address``; on the next free one of 20 ports where this one is taken, unless ``fixed``.
+def open_listener(address: str, port: int, *, fixed: bool) -> socket.socket:
+    """Return a socket that listens at an address.
 
-    Port 0 is any free one. Raises NotSupported where there is none.
+    Args:
+        address: Address of an interface of this machine.
+        port: Preferred port; if it is taken, the next free one of 20. 0 is any free one.
+        fixed: Use no other port than ``port``.
+
+    Raises:
+        NotSupported: No port is free (``port_taken``), or the address is not one of this machine's (``bad_address``).
     """
     last = port if fixed or port == 0 else min(port + _MORE_PORTS, 65535)
     for number in range(port, last + 1):
         try:
             return _listen(address, number)
         except OSError as error:
-            if error.errno == errno.EADDRINUSE and number < last:
+            taken = error.errno == errno.EADDRINUSE
+            if taken and number < last:
                 continue
             which = f"port {number}" if number == port else f"any of the ports {port} to {number}"
             reason = error.strerror or str(error)
-            if isinstance(error, socket.gaierror) or error.errno == errno.EADDRNOTAVAIL:
+            foreign = isinstance(error, socket.gaierror) or error.errno == errno.EADDRNOTAVAIL
+            if foreign:
                 reason += f"; is {address} an address of this machine?"
-            raise NotSupported(f"the console cannot listen on {which} of {address}: {reason}") from None
+            code = "port_taken" if taken else "bad_address" if foreign else "cannot_listen"
+            raise NotSupported(f"the console cannot listen on {which} of {address}: {reason}", code=code) from None
     raise AssertionError("unreachable: the last port returns or raises")
 
 

@@ -1,4 +1,4 @@
-"""What both WebSockets of a page have in common: how they open, what they may send, how they are closed."""
+"""The WebSockets of pages, and the limits that protect them: how they open, what they may send, how they close."""
 
 from __future__ import annotations
 
@@ -7,24 +7,19 @@ import contextlib
 import socket
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 from aiohttp import WSMsgType, web
 
-from .allowance import Allowance
-from .gatekeeper import PROTOCOL, Gatekeeper
-from .messages import LONGEST
-from .visitors import Visitors
+from .auth import PROTOCOL, Authenticator
+from .messages import MAX_BYTES
 
-__all__ = ["VISITORS", "Sockets", "Wire"]
+__all__ = ["CONNECTIONS", "ConnectionLimit", "PageSocket", "PageSockets", "RateLimit"]
 
-VISITORS = web.AppKey("visitors", Visitors)
-"""Where the application keeps those that are no pages."""
-
-Reason = tuple[int, bytes]
-"""Why a socket is closed: a code of RFC 6455's private range, and words."""
-Hear = Callable[[str | None], None]
-"""Takes one message; None for one that is no text. Raises ValueError where it is malformed."""
+CloseReason = tuple[int, bytes]
+"""Why a socket is closed: a code of RFC 6455's private range, and a text."""
+Handle = Callable[[str | None], None]
+"""Handles one message, None for one that is not text. Raises ValueError if it is malformed."""
 
 _TOO_MANY_MALFORMED = (4400, b"too many messages that make no sense")
 _WRONG_TOKEN = (4403, b"the token in the link is not that of this run")
@@ -32,41 +27,149 @@ _TOO_MANY_MESSAGES = (4408, b"too many messages")
 _TOO_MANY_PAGES = (4409, b"too many pages are open")
 _APP_CLOSES = (4410, b"the app has ended")
 
-_PAGES = 16
-_REFUSED = 16
-"""Sockets with a wrong token that are told so at the same time. More of them are not opened at all."""
-_PING = 10.0
-"""s of silence after which a page is asked whether it is still there."""
-_GOODBYE = 1.0
-"""s that a page may take to answer a close, and for which one that said too much is still listened to."""
+MAX_MESSAGES = 400
+"""Messages that a page may send in one second. A page that drives sends 50, and one more for each change of the pad."""
+MAX_MALFORMED = 100
+"""Malformed messages that a page may send in all."""
+_MAX_PAGES = 16
+_MAX_REFUSED = 16
+"""Sockets with a wrong token that are open at the same time to report that. More of them are not opened."""
+_PING_AFTER = 10.0
+"""Time without a message after which a page is sent a ping, in s."""
+_CLOSE_TIME = 1.0
+"""Time for answering a close, and for which a page that sent too much is still read, in s."""
 _LAST_WORDS = 0.05
-"""s after which such a page has said all that it had to say."""
-_PATIENCE = 10.0
-"""s that a page may take for one message."""
-_UNSENT = 16384
-"""Bytes that the kernel keeps for a page that does not take them. More would only grow old there."""
+"""Time without a message after which such a page is no longer read, in s."""
+_SEND_TIME = 10.0
+"""Longest time that a page may take for one message, in s."""
+_UNSENT_BYTES = 16384
+"""Bytes that the kernel keeps for a page that does not read. More would only grow old there."""
+_MAX_CONNECTIONS = 128
+"""Connections that are not a page's socket. Sixteen pages that load at the same time have 96."""
+_IDLE_TIME = 5.0
+"""Time for which such a connection stays without a whole request, in s."""
+_RETRY_AFTER = 0.1
+"""Time until the next try if the machine has no descriptor or no memory for another connection, in s."""
 
 
-class Wire:
-    """The open socket of one page."""
+class RateLimit:
+    """Counts the messages of one socket."""
+
+    def __init__(self) -> None:
+        self._second = 0.0
+        self._messages = 0
+        self._malformed = 0
+
+    def allows_message(self, now: float) -> bool:
+        """Count a message at ``now`` (s); False if there were too many within a second."""
+        if not 0.0 <= now - self._second < 1.0:
+            self._second, self._messages = now, 0
+        self._messages += 1
+        return self._messages <= MAX_MESSAGES
+
+    def allows_malformed(self) -> bool:
+        """Count a malformed message; False if there were too many."""
+        self._malformed += 1
+        return self._malformed <= MAX_MALFORMED
+
+
+class ConnectionLimit:
+    """Accepts connections, and closes the oldest idle ones above a limit; the sockets of pages do not count.
+
+    Anybody on this machine can connect, so a new connection is never refused because others are idle: it has sent its
+    request before it becomes the oldest.
+    """
+
+    def __init__(self, most: int = _MAX_CONNECTIONS, idle_time: float = _IDLE_TIME) -> None:
+        """``most`` connections at the same time, each for ``idle_time`` s without a request."""
+        self._most = most
+        self._idle_time = idle_time
+        self._since: dict[asyncio.Transport, float] = {}
+        """Time of the connection or of its last request, s, monotonic; the oldest first."""
+
+    async def accept_all(self, sock: socket.socket, server: Callable[[], asyncio.Protocol]) -> None:
+        """Accept connections to ``sock`` until cancelled.
+
+        One at a time, in turn with everything else: the messages of pages are read in between.
+        """
+        loop = asyncio.get_running_loop()
+        while True:
+            try:
+                connection, _ = await loop.sock_accept(sock)
+            except OSError:
+                self._abort_oldest()
+                await asyncio.sleep(_RETRY_AFTER)
+                continue
+            try:
+                transport, _ = await loop.connect_accepted_socket(server, connection)
+            except OSError:
+                connection.close()  # it was closed meanwhile
+            else:
+                self._add(transport, time.monotonic())
+
+    def _add(self, transport: asyncio.Transport, now: float) -> None:
+        if len(self._since) >= self._most:
+            for known in [known for known in self._since if _is_closed(known)]:
+                del self._since[known]
+        if len(self._since) >= self._most:
+            self._abort_oldest()
+        self._since[transport] = now
+
+    def note_request(self, transport: asyncio.BaseTransport | None, now: float) -> None:
+        """Note that a connection has sent the headers of a request at ``now`` (s, monotonic)."""
+        if isinstance(transport, asyncio.Transport) and self._since.pop(transport, None) is not None:
+            self._since[transport] = now
+
+    @contextlib.contextmanager
+    def exempt(self, transport: asyncio.Transport) -> Iterator[None]:
+        """Do not count a connection within the block; afterwards it has as long as a new one."""
+        self._since.pop(transport, None)
+        try:
+            yield
+        finally:
+            self._since[transport] = time.monotonic()
+
+    def close_idle(self, now: float) -> None:
+        """Abort the connections that were idle for too long at ``now`` (s, monotonic); to be called regularly."""
+        while self._since and now - next(iter(self._since.values())) > self._idle_time:
+            self._abort_oldest()
+
+    def _abort_oldest(self) -> None:
+        if self._since:
+            oldest = next(iter(self._since))
+            del self._since[oldest]
+            oldest.abort()  # not close(), which waits until what was sent is read
+
+
+def _is_closed(transport: asyncio.Transport) -> bool:
+    # One that is closing keeps its descriptor while there is something left to send.
+    return bool(transport.get_extra_info("socket").fileno() < 0)
+
+
+CONNECTIONS = web.AppKey("connections", ConnectionLimit)
+"""Key of the application's :class:`ConnectionLimit`."""
+
+
+class PageSocket:
+    """The open WebSocket of one page."""
 
     def __init__(self, ws: web.WebSocketResponse, transport: asyncio.Transport) -> None:
         self._ws = ws
         self._transport = transport
         self._sending_since: float | None = None
-        self._tune()
+        self._minimise_buffers()
 
-    def _tune(self) -> None:
-        """Nothing is to wait in buffers: neither small messages for larger ones, nor old states for a slow page."""
+    def _minimise_buffers(self) -> None:
+        """Let nothing wait in buffers: neither small messages for larger ones, nor old states for a slow page."""
         self._transport.set_write_buffer_limits(high=0)
         sock = self._transport.get_extra_info("socket")
-        with contextlib.suppress(OSError):  # it may be gone again
+        with contextlib.suppress(OSError):  # it may be closed already
             sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             if hasattr(socket, "TCP_NOTSENT_LOWAT"):
-                sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NOTSENT_LOWAT, _UNSENT)
+                sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NOTSENT_LOWAT, _UNSENT_BYTES)
 
     async def send(self, message: str | bytes) -> None:
-        """Send a message; returns when the kernel has taken it. ConnectionError when the page is gone."""
+        """Send a message; returns when the kernel has taken it. ConnectionError if the page is gone."""
         self._sending_since = time.monotonic()
         if isinstance(message, str):
             await self._ws.send_str(message)
@@ -75,77 +178,77 @@ class Wire:
         self._sending_since = None
 
     def is_stuck(self, now: float) -> bool:
-        """Has the page taken nothing for too long? ``now`` in s, monotonic."""
-        return self._sending_since is not None and now - self._sending_since > _PATIENCE
+        """Whether the page has read nothing for too long at ``now`` (s, monotonic)."""
+        return self._sending_since is not None and now - self._sending_since > _SEND_TIME
 
-    def cut(self) -> None:
-        """Break the connection."""
+    def abort(self) -> None:
+        """Break the connection without a close."""
         self._transport.abort()
 
-    async def listen(self, hear: Hear) -> Reason | None:
-        """Hand over every message until the page is gone, or has said too much: then why it is to be closed."""
-        allowance = Allowance()
+    async def receive_all(self, handle: Handle) -> CloseReason | None:
+        """Handle every message until the page is gone; returns the reason for closing if it has sent too much."""
+        limit = RateLimit()
         async for message in self._ws:
             if message.type is WSMsgType.ERROR:
                 break
             try:
-                hear(message.data if message.type is WSMsgType.TEXT else None)
+                handle(message.data if message.type is WSMsgType.TEXT else None)
             except ValueError:
-                if not allowance.may_err():
+                if not limit.allows_malformed():
                     return _TOO_MANY_MALFORMED
-            if not allowance.may_go_on(time.monotonic()):
+            if not limit.allows_message(time.monotonic()):
                 return _TOO_MANY_MESSAGES
         return None
 
-    async def drain(self, hear: Hear) -> None:
-        """Hand over what a page that is about to be closed has sent already, and sends within a moment."""
-        end = time.monotonic() + _GOODBYE
+    async def drain(self, handle: Handle) -> None:
+        """Handle what a page that is about to be closed has sent already, and sends within a moment."""
+        end = time.monotonic() + _CLOSE_TIME
         with contextlib.suppress(asyncio.TimeoutError):
             while time.monotonic() < end:
                 message = await self._ws.receive(timeout=_LAST_WORDS)
                 if message.type not in (WSMsgType.TEXT, WSMsgType.BINARY):
                     return
                 with contextlib.suppress(ValueError):
-                    hear(message.data if message.type is WSMsgType.TEXT else None)
+                    handle(message.data if message.type is WSMsgType.TEXT else None)
 
-    async def close(self, reason: Reason) -> None:
-        """Close with this code and these words."""
+    async def close(self, reason: CloseReason) -> None:
+        """Close with this code and text."""
         await _close(self._ws, reason)
 
 
-class Sockets(ABC):
+class PageSockets(ABC):
     """The WebSockets of one kind, one for each page."""
 
-    def __init__(self, gatekeeper: Gatekeeper) -> None:
-        self._gatekeeper = gatekeeper
-        self._wires: set[Wire] = set()
+    def __init__(self, auth: Authenticator) -> None:
+        self._auth = auth
+        self._sockets: set[PageSocket] = set()
         self._refused = 0
 
     @abstractmethod
-    async def serve(self, wire: Wire) -> None:
+    async def serve(self, sock: PageSocket) -> None:
         """Serve one page until it is gone."""
 
     async def handle(self, request: web.Request) -> web.StreamResponse:
-        """A page's request for a socket, from its opening to its end."""
-        if not self._gatekeeper.admits(request.headers.get("Sec-WebSocket-Protocol")):
+        """Handle a page's request for a socket, from its opening to its end."""
+        if not self._auth.is_valid_token(request.headers.get("Sec-WebSocket-Protocol")):
             return await self._refuse(request)
-        ws = await _open(request, heartbeat=_PING)
+        ws = await _open(request, heartbeat=_PING_AFTER)
         transport = request.transport
-        if len(self._wires) >= _PAGES:
+        if len(self._sockets) >= _MAX_PAGES:
             await _close(ws, _TOO_MANY_PAGES)
         elif transport is not None:
-            wire = Wire(ws, transport)
-            self._wires.add(wire)
+            sock = PageSocket(ws, transport)
+            self._sockets.add(sock)
             try:
-                with request.app[VISITORS].staying(transport):
-                    await self.serve(wire)
+                with request.app[CONNECTIONS].exempt(transport):
+                    await self.serve(sock)
             finally:
-                self._wires.discard(wire)
+                self._sockets.discard(sock)
         return ws
 
     async def _refuse(self, request: web.Request) -> web.WebSocketResponse:
-        """Say why: a page learns it from the code of a socket's end only, not from the answer to its handshake."""
-        if self._refused >= _REFUSED:
+        # A page learns the reason from a socket's close code only, not from the answer to its handshake.
+        if self._refused >= _MAX_REFUSED:
             raise web.HTTPForbidden(text="too many come with a wrong token\n")
         self._refused += 1
         try:
@@ -155,36 +258,36 @@ class Sockets(ABC):
             self._refused -= 1
         return ws
 
-    def drop_the_stuck(self, now: float) -> None:
-        """Cut off every page that does not take what it is sent; ``now`` in s, monotonic."""
-        for wire in self._wires:
-            if wire.is_stuck(now):
-                wire.cut()
+    def abort_stuck(self, now: float) -> None:
+        """Abort every page that does not read what it is sent; ``now`` in s, monotonic."""
+        for sock in self._sockets:
+            if sock.is_stuck(now):
+                sock.abort()
 
     async def close(self) -> None:
-        """The app ends: say so to every page."""
-        if self._wires:
-            goodbyes = [asyncio.ensure_future(wire.close(_APP_CLOSES)) for wire in self._wires]
-            await asyncio.wait(goodbyes, timeout=_GOODBYE)
+        """Close every page's socket because the app ends."""
+        if self._sockets:
+            closing = [asyncio.ensure_future(sock.close(_APP_CLOSES)) for sock in self._sockets]
+            await asyncio.wait(closing, timeout=_CLOSE_TIME)
 
 
 async def _open(request: web.Request, heartbeat: float | None = None) -> web.WebSocketResponse:
     ws = web.WebSocketResponse(
         protocols=(PROTOCOL,),
         heartbeat=heartbeat,
-        timeout=_GOODBYE,
+        timeout=_CLOSE_TIME,
         compress=False,
-        max_msg_size=LONGEST + 1,  # it refuses this many
+        max_msg_size=MAX_BYTES + 1,  # it refuses this many
         writer_limit=1,  # every send waits until the kernel has taken it
     )
     try:
         await ws.prepare(request)
-    except (ConnectionError, ValueError):  # it is gone again, or its key is no ASCII
+    except (ConnectionError, ValueError):  # the page is gone, or its key is not ASCII
         raise web.HTTPBadRequest(text="this is no handshake of a WebSocket\n") from None
     return ws
 
 
-async def _close(ws: web.WebSocketResponse, reason: Reason) -> None:
+async def _close(ws: web.WebSocketResponse, reason: CloseReason) -> None:
     code, text = reason
     with contextlib.suppress(ConnectionError):
         await ws.close(code=code, message=text)

@@ -1,4 +1,4 @@
-"""How the rig is, for the pages: out of the memory that the hosts write, without asking anybody."""
+"""The state of the rig for the pages, read from the memory that the hosts publish into."""
 
 from __future__ import annotations
 
@@ -12,25 +12,25 @@ from hal.host.gripper_mail import GripperMail
 from hal.host.records import GroupMemory, RobotMail
 from hal.types import Fault, RobotState, RobotStatus, Trip
 
-__all__ = ["Telemetry", "plain"]
+__all__ = ["Telemetry", "rounded"]
 
 _MAX_AGE = 0.1
-"""A state older than this is not shown as one, s: as ``robot.state()``."""
+"""A state older than this is not shown, in s; the same limit as that of ``robot.state()``."""
 _GRIPPER_MAX_AGE = 0.5
-"""The same for a gripper, s: as ``gripper.state()``."""
+"""The same for a gripper, in s; as ``gripper.state()``."""
 _DIGITS = 5
 
 
-def plain(value: float) -> float | None:
-    """A number for a page: 10 um, 10 urad; None for what is not finite."""
+def rounded(value: float) -> float | None:
+    """Return a number rounded for a page, to 10 um or 10 urad; None if it is not finite."""
     return round(value, _DIGITS) if math.isfinite(value) else None
 
 
 class Telemetry:
-    """Reads the mailboxes of every group."""
+    """Reads the mailboxes of every group; writes nothing and waits for no one."""
 
     def __init__(self, hosts: Sequence[Mapping[str, Any]], memories: Sequence[memoryview]) -> None:
-        """``hosts`` as in the process's configuration, and the memory of each."""
+        """Open the memory of each of ``hosts``, which are as in the process's configuration."""
         self._hosts = hosts
         self._groups = [
             GroupMemory(memory, [(str(name), int(n)) for name, n in host["joints"]], host["grippers"])
@@ -40,7 +40,7 @@ class Telemetry:
         self._grippers = {str(arm): mails[name] for host in hosts for arm, name in host["gripper_of"].items()}
 
     def snapshot(self, now: float) -> dict[str, Any]:
-        """All robots and hosts as JSON; ``now`` in s, on the hosts' clock."""
+        """Return the state of all robots and hosts as JSON; ``now`` in s, on the hosts' clock."""
         robots: dict[str, Any] = {}
         hosts: dict[str, Any] = {}
         for host, group in zip(self._hosts, self._groups, strict=True):
@@ -49,7 +49,7 @@ class Telemetry:
                 "rate_hz": host["rate_hz"],
                 "ticks": record.ticks,
                 "missed": record.missed,
-                "silent": plain(now - record.t) if record.ticks or record.ready else None,
+                "silent": rounded(now - record.t) if record.ticks or record.ready else None,
             }
             for name, mail in group.robots.items():
                 robots[name] = _robot(mail, self._grippers.get(name), now)
@@ -59,16 +59,16 @@ class Telemetry:
 def _robot(mail: RobotMail, gripper: GripperMail | None, now: float) -> dict[str, Any]:
     state = mail.get_state()
     if state is None:
-        return {"lost": "it has not reported a state yet"}
+        return {"lost": "no state received yet"}
     age = now - state.stamp.t
     if state.status is RobotStatus.LOST:
         reason = f": {state.fault.cause}" if state.fault is not None else ""
-        return {"lost": f"it does not answer{reason} (its last state is {age:.1f} s old)"}
+        return {"lost": f"it does not answer{reason} (last state {age:.1f} s old)"}
     if not age <= _MAX_AGE:
-        return {"lost": f"its newest state is {age:.1f} s old"}
+        return {"lost": f"last state {age:.1f} s old"}
     return {
         "t": state.stamp.t,
-        "age": plain(age),
+        "age": rounded(age),
         "status": str(state.status),
         "trip": str(state.trip),
         "trip_text": trip_text(state.trip) if state.trip is not Trip.NONE else "",
@@ -92,14 +92,14 @@ def _fault(fault: Fault | None) -> dict[str, str] | None:
 
 
 def _gripper(mail: GripperMail | None, now: float) -> dict[str, Any] | None:
-    """None where there is none, or where it says nothing: its process may be gone while the arm goes on."""
+    """Return None if there is no gripper, or no recent state: its process may be gone while the arm still runs."""
     record = mail.get() if mail is not None else None
     if record is None or not now - record.state.stamp.t <= _GRIPPER_MAX_AGE:
         return None
     state = record.state
     return {
-        "width": plain(state.width),
-        "width_target": plain(state.width_target),
+        "width": rounded(state.width),
+        "width_target": rounded(state.width_target),
         "moving": state.moving,
         "grasped": state.grasped,
     }
@@ -108,9 +108,9 @@ def _gripper(mail: GripperMail | None, now: float) -> dict[str, Any] | None:
 def _deadman(record: DeadmanRecord | None, now: float) -> dict[str, Any] | None:
     if record is None:
         return None
-    return {"held": record.held, "connected": record.connected, "age": plain(now - record.t_alive)}
+    return {"held": record.held, "connected": record.connected, "age": rounded(now - record.t_alive)}
 
 
 def _list(values: Any) -> list[float | None]:
     numbers: Iterable[float] = values.tolist()
-    return [plain(value) for value in numbers]
+    return [rounded(value) for value in numbers]

@@ -64,17 +64,17 @@ def playback_pad() -> Iterator[PadBench]:
 @contextmanager
 def web_pad() -> Iterator[PadBench]:
     """The page of the console; every 10 ms it says how its pad stands."""
-    from hal.drivers.web.pad import PadMail, WebPad, reading
+    from hal.drivers.web.pad import PadQueue, WebPad, pad_reading
     from hal.types import AXES
 
     class Page:
-        mail = PadMail()
+        queue = PadQueue()
         driver = "page 1"
-        stops = 0
+        stop_count = 0
         there, frozen, mask = True, False, 0
 
-        def subscribe(self) -> PadMail:
-            return self.mail
+        def subscribe(self) -> PadQueue:
+            return self.queue
 
         def show_playing(self, on: bool) -> None:
             """No recording is played here."""
@@ -83,7 +83,7 @@ def web_pad() -> Iterator[PadBench]:
             now, axes = bench.now, [0.0] * len(AXES)
             message = {"connected": self.there, "t": now, "t_alive": now, "axes": axes, "buttons": self.mask}
             if not self.frozen:
-                self.mail.put(reading(message, 0))
+                self.queue.put(pad_reading(message, 0))
 
     page = Page()
     driver = WebPad(pad_spec(driver="web"), page)

@@ -39,14 +39,14 @@ HURRY = 2.5
 
 def impatient_console(channel, memories, config):
     """The console's process, with less patience."""
-    from hal.drivers.web import process, service, sockets, visitors
+    from hal.drivers.web import process, server, sockets
 
-    class Visitors(visitors.Visitors):
-        def __init__(self):  # the service's way to make them
-            super().__init__(patience=visitors._PATIENCE / HURRY)
+    class ConnectionLimit(sockets.ConnectionLimit):
+        def __init__(self):  # as the server makes it
+            super().__init__(idle_time=sockets._IDLE_TIME / HURRY)
 
-    service.Visitors = Visitors
-    sockets._PATIENCE /= HURRY
+    server.ConnectionLimit = ConnectionLimit
+    sockets._SEND_TIME /= HURRY
     process.main(channel, memories, config)
 
 

@@ -6,7 +6,7 @@ import socket
 
 import pytest
 
-from hal.drivers.web.addresses import is_loopback, link, names, tunnel
+from hal.drivers.web.auth import host_names, is_loopback, page_link, ssh_tunnel
 from hal.errors import CommandError
 from hal.views import PORT, Listen
 
@@ -36,14 +36,14 @@ def test_what_may_not(text: str) -> None:
 
 
 def test_the_token_stands_in_the_fragment() -> None:
-    assert link("127.0.0.1", 8470, "secret") == "http://127.0.0.1:8470/#secret"
-    assert link("::1", 8470, "secret") == "http://[::1]:8470/#secret"
-    assert link("0.0.0.0", 80, "secret") == f"http://{socket.gethostname()}:80/#secret"
+    assert page_link("127.0.0.1", 8470, "secret") == "http://127.0.0.1:8470/#secret"
+    assert page_link("::1", 8470, "secret") == "http://[::1]:8470/#secret"
+    assert page_link("0.0.0.0", 80, "secret") == f"http://{socket.gethostname()}:80/#secret"
 
 
 def test_a_tunnel_keeps_the_port_so_that_the_link_stays_the_same() -> None:
-    assert "-L 8470:127.0.0.1:8470 " in tunnel("127.0.0.1", 8470)
-    assert "-L 8470:[::1]:8470 " in tunnel("::1", 8470)
+    assert "-L 8470:127.0.0.1:8470 " in ssh_tunnel("127.0.0.1", 8470)
+    assert "-L 8470:[::1]:8470 " in ssh_tunnel("::1", 8470)
 
 
 def test_loopback() -> None:
@@ -55,4 +55,4 @@ def test_loopback() -> None:
 
 
 def test_the_machine_knows_its_names() -> None:
-    assert socket.gethostname().lower() in names()
+    assert socket.gethostname().lower() in host_names()

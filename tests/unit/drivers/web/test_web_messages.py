@@ -9,23 +9,23 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hal.drivers.web.allowance import MALFORMED, MESSAGES, Allowance
 from hal.drivers.web.messages import (
-    LONGEST,
-    Act,
-    Away,
-    Demo,
-    Drawn,
-    Malformed,
-    Recover,
-    Setting,
-    Stop,
-    Take,
-    Watch,
+    MAX_BYTES,
+    ControlRequest,
+    MalformedMessage,
+    PadMessage,
+    PageLeft,
+    PictureDrawn,
+    RecordingRequest,
+    RecoverRequest,
+    SettingRequest,
+    StopRequest,
+    TourRequest,
+    WatchRequest,
     encode,
     parse,
 )
-from hal.drivers.web.padmessage import PadMessage
+from hal.drivers.web.sockets import MAX_MALFORMED, MAX_MESSAGES, RateLimit
 
 PAD = {"type": "pad", "seen": 12.5, "since": 20.0, "axes": [0.0, -1, 0.25, 1, 1, 0.0, -1.0, 1], "buttons": 64}
 
@@ -38,23 +38,23 @@ def take(text: str) -> object:
     ("message", "record"),
     [
         (PAD, PadMessage(12.5, 0.02, (0.0, -1.0, 0.25, 1.0, 1.0, 0.0, -1.0, 1.0), 64)),
-        ({"type": "away", "why": "hidden"}, Away("the page was hidden")),
-        ({"type": "lease", "take": True}, Take(True)),
-        ({"type": "lease", "take": False}, Take(False)),
-        ({"type": "stop"}, Stop()),
-        ({"type": "recover", "robot": "panda"}, Recover("panda")),
-        ({"type": "demo", "play": True}, Demo(True)),
-        ({"type": "action", "action": "record"}, Act("record")),
-        ({"type": "action", "action": "finish"}, Act("finish")),
-        ({"type": "action", "action": "fail"}, Act("fail")),
-        ({"type": "action", "action": "discard"}, Act("discard")),
-        ({"type": "setting", "name": "robot", "value": "panda"}, Setting("robot", "panda")),
-        ({"type": "setting", "name": "speed", "value": 0.25}, Setting("speed", 0.25)),
-        ({"type": "setting", "name": "frame", "value": "tcp"}, Setting("frame", "tcp")),
-        ({"type": "setting", "name": "scene", "value": "reset"}, Setting("scene", "reset")),
-        ({"type": "watch", "cameras": ["wrist", "wrist", "scene"]}, Watch(("wrist", "scene"))),
-        ({"type": "watch", "cameras": []}, Watch(())),
-        ({"type": "drawn", "camera": "scene"}, Drawn("scene")),
+        ({"type": "away", "why": "hidden"}, PageLeft("the page was hidden")),
+        ({"type": "lease", "take": True}, ControlRequest(True)),
+        ({"type": "lease", "take": False}, ControlRequest(False)),
+        ({"type": "stop"}, StopRequest()),
+        ({"type": "recover", "robot": "panda"}, RecoverRequest("panda")),
+        ({"type": "demo", "play": True}, TourRequest(True)),
+        ({"type": "action", "action": "record"}, RecordingRequest("record")),
+        ({"type": "action", "action": "finish"}, RecordingRequest("finish")),
+        ({"type": "action", "action": "fail"}, RecordingRequest("fail")),
+        ({"type": "action", "action": "discard"}, RecordingRequest("discard")),
+        ({"type": "setting", "name": "robot", "value": "panda"}, SettingRequest("robot", "panda")),
+        ({"type": "setting", "name": "speed", "value": 0.25}, SettingRequest("speed", 0.25)),
+        ({"type": "setting", "name": "frame", "value": "tcp"}, SettingRequest("frame", "tcp")),
+        ({"type": "setting", "name": "scene", "value": "reset"}, SettingRequest("scene", "reset")),
+        ({"type": "watch", "cameras": ["wrist", "wrist", "scene"]}, WatchRequest(("wrist", "scene"))),
+        ({"type": "watch", "cameras": []}, WatchRequest(())),
+        ({"type": "drawn", "camera": "scene"}, PictureDrawn("scene")),
     ],
 )
 def test_what_a_page_may_say(message: dict[str, Any], record: object) -> None:
@@ -142,12 +142,12 @@ def with_axis(value: str) -> str:
         '{"type":"watch","cameras":["scene","attic"]}',
         '{"type":"watch","cameras":[["scene"]]}',
         '{"type":"drawn","camera":0}',
-        "[" * LONGEST,
-        '{"a":' * (LONGEST // 5),
+        "[" * MAX_BYTES,
+        '{"a":' * (MAX_BYTES // 5),
     ],
 )
 def test_what_it_may_not(text: str) -> None:
-    with pytest.raises(Malformed):
+    with pytest.raises(MalformedMessage):
         take(text)
 
 
@@ -162,7 +162,7 @@ JSON = st.recursive(
 def test_whatever_comes_it_is_a_record_or_malformed(text: str) -> None:
     try:
         record = take(text)
-    except Malformed:
+    except MalformedMessage:
         return
     assert record is not None
 
@@ -171,7 +171,7 @@ def test_whatever_comes_it_is_a_record_or_malformed(text: str) -> None:
 def test_a_pad_with_one_field_of_anything_is_sound_or_malformed(value: object, key: str) -> None:
     try:
         record = take(json.dumps({**PAD, key: value}))
-    except Malformed:
+    except MalformedMessage:
         return
     if isinstance(record, PadMessage):
         assert len(record.axes) == 8
@@ -185,14 +185,14 @@ def test_nothing_that_is_no_number_is_ever_sent() -> None:
 
 
 def test_an_allowance_is_one_of_a_second() -> None:
-    allowance = Allowance()
-    assert all(allowance.may_go_on(5.0 + k * 1e-3) for k in range(MESSAGES))
-    assert not allowance.may_go_on(5.5)
-    assert allowance.may_go_on(6.0)
-    assert all(Allowance().may_go_on(7.0 + 0.02 * k) for k in range(10 * MESSAGES))
+    allowance = RateLimit()
+    assert all(allowance.allows_message(5.0 + k * 1e-3) for k in range(MAX_MESSAGES))
+    assert not allowance.allows_message(5.5)
+    assert allowance.allows_message(6.0)
+    assert all(RateLimit().allows_message(7.0 + 0.02 * k) for k in range(10 * MAX_MESSAGES))
 
 
 def test_mistakes_are_counted_for_ever() -> None:
-    allowance = Allowance()
-    assert all(allowance.may_err() for _ in range(MALFORMED))
-    assert not allowance.may_err()
+    allowance = RateLimit()
+    assert all(allowance.allows_malformed() for _ in range(MAX_MALFORMED))
+    assert not allowance.allows_malformed()

@@ -12,8 +12,7 @@ import pytest
 from PIL import Image
 from web_kit import HEADER, WAIT, App, Page, camera, frame, run
 
-from hal.drivers.web.gallery import compress, smoothed
-from hal.drivers.web.pictures import Credit
+from hal.drivers.web.pictures import PictureCredit, compress, smoothed
 
 SCENE, WRIST = camera("scene"), camera("wrist", 40, 30)
 LARGE = camera("large", 640, 480)
@@ -207,7 +206,7 @@ def test_colours_are_not_swapped() -> None:
 
 def test_credit() -> None:
     newest = {"a": 0, "b": 3}
-    credit = Credit()
+    credit = PictureCredit()
     assert list(credit.due(newest.__getitem__)) == []
     credit.watch(("a", "b"))
     assert list(credit.due(newest.__getitem__)) == ["b"]
@@ -216,12 +215,12 @@ def test_credit() -> None:
     assert list(credit.due(newest.__getitem__)) == []
     credit.watch(("b",))
     assert list(credit.due(newest.__getitem__)) == [], "asking again for the same gives no credit"
-    credit.drawn("b")
-    credit.drawn("b")
-    credit.drawn("a")
+    credit.give_back("b")
+    credit.give_back("b")
+    credit.give_back("a")
     assert list(credit.due(newest.__getitem__)) == ["b"]
     credit.spend("b", 5)
-    credit.drawn("b")
+    credit.give_back("b")
     assert list(credit.due(newest.__getitem__)) == [], "it has the newest one"
 
 

@@ -16,6 +16,7 @@ import pytest
 from child_targets import HURRY
 from web_kit import REST, TOKEN, WAIT, App, Page, run
 
+from hal.drivers.web.messages import PAGE_SILENT
 from hal.errors import NotSupported
 from hal.servo.watchdog import PAD_SILENCE
 from hal.types import Fault, RobotStatus
@@ -155,7 +156,7 @@ def test_a_page_that_falls_silent_is_a_pad_that_is_gone(app: App) -> None:
             await page.drive()
             pad = await app.pad()
             lost = await app.pad()
-            assert (lost["connected"], lost["why"]) == (False, "The page gave no sign of life")
+            assert (lost["connected"], lost["why"]) == (False, PAGE_SILENT)
             assert lost["t"] - pad["t_alive"] > PAD_SILENCE
 
     run(test)
@@ -229,7 +230,7 @@ def test_states(app: App) -> None:
     async def test() -> None:
         async with Page(app) as page:
             arm = (await page.next("state"))["robots"]["arm"]
-            assert arm == {"lost": "it has not reported a state yet"}
+            assert arm == {"lost": "no state received yet"}
             app.put_state(time.monotonic(), q=0.123456789, fault=Fault("e1", "the button is pressed", "release it"))
             state = await page.next("state")
             while "lost" in state["robots"]["arm"]:
@@ -374,13 +375,15 @@ def test_the_app_is_gone(app: App) -> None:
 def test_a_port_that_is_taken() -> None:
     with App() as first, App(listen=["127.0.0.1", first.port]) as second:
         assert first.port < second.port <= first.port + 20
-        with pytest.raises(NotSupported, match=rf"port {first.port} of 127.0.0.1: Address already in use"):
+        with pytest.raises(NotSupported) as taken:
             App(listen=["127.0.0.1", first.port], port_fixed=True)
+        assert taken.value.code == "port_taken"
 
 
 def test_an_address_of_another_machine() -> None:
-    with pytest.raises(NotSupported, match=r"is 192.0.2.1 an address of this machine\?"):
+    with pytest.raises(NotSupported) as refused:
         App(listen=["192.0.2.1", 0])
+    assert refused.value.code == "bad_address"
 
 
 def test_ipv6() -> None:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from hal.drivers.web.recording import as_message
+from hal.drivers.web.console import recording_message
 from hal.errors import CommandError
 from hal.views import ACTIONS, PHASES, RecordingView
 
@@ -33,7 +33,7 @@ VIEW = RecordingView(
 
 
 def test_a_view_reaches_the_pages_whole() -> None:
-    message = as_message(VIEW)
+    message = recording_message(VIEW)
     assert message.keys() == set(RecordingView.__slots__)
     assert message | {"seconds": 12.345, "actions": VIEW.actions} == {
         name: getattr(VIEW, name) for name in RecordingView.__slots__
@@ -43,12 +43,12 @@ def test_a_view_reaches_the_pages_whole() -> None:
 
 def test_numbers_may_be_numpys() -> None:
     view = replace(VIEW, frames=np.int64(3), free_bytes=np.uint64(1 << 40), seconds=np.float32(0.5))  # type: ignore[arg-type]
-    message = json.loads(json.dumps(as_message(view)))
+    message = json.loads(json.dumps(recording_message(view)))
     assert (message["frames"], message["free_bytes"], message["seconds"]) == (3, 1 << 40, 0.5)
 
 
 def test_words_are_one_line_and_not_endless() -> None:
-    message = as_message(replace(VIEW, prompt="two\nlines  of it", trouble="no space left " * 1000))
+    message = recording_message(replace(VIEW, prompt="two\nlines  of it", trouble="no space left " * 1000))
     assert message["prompt"] == "two lines of it"
     assert len(message["trouble"]) == 300
 

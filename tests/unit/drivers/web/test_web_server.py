@@ -9,7 +9,7 @@ import aiohttp
 import pytest
 from web_kit import TOKEN, WAIT, App, Page, run
 
-from hal.drivers.web.server import read_page
+from hal.drivers.web.server import read_page_files
 from hal.errors import DriverMissing
 
 
@@ -111,7 +111,7 @@ def test_every_answer_has_its_headers(server: App, path: str, method: str, host:
 
 def test_the_page_is_served(server: App) -> None:
     async def test() -> None:
-        files = read_page()
+        files = read_page_files()
         assert "index.html" in files
         async with aiohttp.ClientSession() as session:
             for name, (body, kind) in files.items():
@@ -128,7 +128,7 @@ def test_only_files_of_a_page_are_read(tmp_path: Path) -> None:
     for name in ("index.html", "pad.js", "page.css", "icon.svg", "icon.png", "__init__.py", "notes.txt", ".hidden"):
         (tmp_path / name).write_text(name)
     (tmp_path / "folder.js").mkdir()
-    files = read_page(tmp_path)
+    files = read_page_files(tmp_path)
     assert sorted(files) == ["index.html", "pad.js", "page.css"]
     assert files["pad.js"] == (b"pad.js", "text/javascript; charset=utf-8")
 
@@ -136,8 +136,9 @@ def test_only_files_of_a_page_are_read(tmp_path: Path) -> None:
 def test_without_its_page_it_does_not_start(tmp_path: Path) -> None:
     (tmp_path / "pad.js").write_text("")
     for folder in (tmp_path, tmp_path / "nowhere"):
-        with pytest.raises(DriverMissing, match=r"index\.html; install the project again"):
-            read_page(folder)
+        with pytest.raises(DriverMissing) as missing:
+            read_page_files(folder)
+        assert missing.value.code == "page_missing"
 
 
 def test_too_many_pages(app: App) -> None:

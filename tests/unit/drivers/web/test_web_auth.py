@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from hal.drivers.web.gatekeeper import Gatekeeper
+from hal.drivers.web.auth import Authenticator
 
 TOKEN = "Zm9v-Y_mFy"
 
@@ -42,8 +42,8 @@ TOKEN = "Zm9v-Y_mFy"
 )
 def test_hosts(host: str | None, on_loopback: bool, outside: bool) -> None:
     names = ["Bench", "bench.local"]
-    assert Gatekeeper(TOKEN, "127.0.0.1", names).knows_host(host) is on_loopback
-    assert Gatekeeper(TOKEN, "0.0.0.0", names).knows_host(host) is outside
+    assert Authenticator(TOKEN, "127.0.0.1", names).is_known_host(host) is on_loopback
+    assert Authenticator(TOKEN, "0.0.0.0", names).is_known_host(host) is outside
 
 
 @pytest.mark.parametrize(
@@ -62,8 +62,8 @@ def test_hosts(host: str | None, on_loopback: bool, outside: bool) -> None:
     ],
 )
 def test_origins(origin: str | None, own: bool) -> None:
-    assert Gatekeeper(TOKEN, "127.0.0.1", []).is_own_page(origin, "127.0.0.1:8470") is own
-    assert not Gatekeeper(TOKEN, "127.0.0.1", []).is_own_page(origin, None)
+    assert Authenticator(TOKEN, "127.0.0.1", []).is_own_origin(origin, "127.0.0.1:8470") is own
+    assert not Authenticator(TOKEN, "127.0.0.1", []).is_own_origin(origin, None)
 
 
 @pytest.mark.parametrize(
@@ -85,4 +85,4 @@ def test_origins(origin: str | None, own: bool) -> None:
     ],
 )
 def test_tokens(offered: str | None, admitted: bool) -> None:
-    assert Gatekeeper(TOKEN, "127.0.0.1", []).admits(offered) is admitted
+    assert Authenticator(TOKEN, "127.0.0.1", []).is_valid_token(offered) is admitted

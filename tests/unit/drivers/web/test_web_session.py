@@ -7,10 +7,8 @@ from typing import Any
 
 import pytest
 
-from hal.drivers.web.applink import Waiting
-from hal.drivers.web.desk import Desk, Page
-from hal.drivers.web.outbox import Outbox
-from hal.drivers.web.padmessage import Malformed
+from hal.drivers.web.messages import MESSAGES_LATE, PAGE_SILENT, MalformedMessage
+from hal.drivers.web.session import AppQueue, SendQueue, WebPage, WebSession
 
 RIG: dict[str, Any] = {
     "drivable": True,
@@ -25,12 +23,12 @@ class App:
     """Reads at once, unless told not to."""
 
     def __init__(self) -> None:
-        self.waiting = Waiting()
+        self.queue = AppQueue()
         self.told: list[dict[str, Any]] = []
         self.reads = True
 
     def flush(self) -> None:
-        while self.reads and (message := self.waiting.take()) is not None:
+        while self.reads and (message := self.queue.pop()) is not None:
             self.told.append(message)
 
     def news(self) -> list[dict[str, Any]]:
@@ -50,15 +48,15 @@ class Room:
     def __init__(self, **rig: Any) -> None:
         self.now = 100.0
         self.app = App()
-        self.desk = Desk({**RIG, **rig}, self.app, lambda: self.now)
+        self.session = WebSession({**RIG, **rig}, self.app, lambda: self.now)
         self.cut: list[int] = []
 
-    def page(self) -> Page:
+    def page(self) -> WebPage:
         """A page that opens."""
-        number = len(self.desk.pages) + 1
-        return self.desk.open(lambda: self.cut.append(number))
+        number = len(self.session.pages) + 1
+        return self.session.open_page(lambda: self.cut.append(number))
 
-    def driver(self) -> Page:
+    def driver(self) -> WebPage:
         """A page that opens and drives, with its pad there."""
         page = self.page()
         self.say(page, type="lease", take=True)
@@ -67,26 +65,26 @@ class Room:
         inbox(page)
         return page
 
-    def say(self, page: Page, **message: Any) -> None:
-        self.desk.received(page, json.dumps(message))
+    def say(self, page: WebPage, **message: Any) -> None:
+        self.session.receive(page, json.dumps(message))
 
-    def pad(self, page: Page, seen: float, since: float = 0.0, axes: list[float] | None = None) -> None:
+    def pad(self, page: WebPage, seen: float, since: float = 0.0, axes: list[float] | None = None) -> None:
         axes = [0.0] * 8 if axes is None else axes
         self.say(page, type="pad", seen=seen, since=since, axes=axes, buttons=0)
 
 
-def inbox(page: Page) -> list[dict[str, Any]]:
+def inbox(page: WebPage) -> list[dict[str, Any]]:
     """Everything that waits for a page."""
-    return [json.loads(text) for text in iter(page.outbox.take, None)]
+    return [json.loads(text) for text in iter(page.queue.pop, None)]
 
 
 def test_a_page_that_opens_is_told_everything_in_order() -> None:
     room = Room()
     room.driver()
-    room.desk.heard({"method": "labels", "labels": {"deadman": "l2", "controls": {}}})
+    room.session.receive_from_app({"method": "labels", "labels": {"deadman": "l2", "controls": {}}})
     for k in range(60):
-        room.desk.heard({"method": "say", "t": float(k), "text": f"word {k}"})
-    room.desk.heard({"method": "waiting", "controls": ["r2"]})
+        room.session.receive_from_app({"method": "say", "t": float(k), "text": f"word {k}"})
+    room.session.receive_from_app({"method": "waiting", "controls": ["r2"]})
     told = inbox(room.page())
     hello, labels, lease, pad, *says = told
     assert (hello["type"], hello["page"], hello["name"], hello["rig"]) == ("hello", 2, "page 2", RIG)
@@ -118,13 +116,11 @@ def test_a_late_message_is_no_pad_but_is_answered() -> None:
     room.now = 100.3
     room.pad(driver, 100.0, 20.0, [1.0] * 8)
     room.pad(driver, 100.0, 40.0, [1.0] * 8)
-    assert room.app.pads() == [("The page's messages came late",)]
+    assert room.app.pads() == [(MESSAGES_LATE,)]
     beat, complaint, *more = inbox(driver)
     assert beat == {"type": "beat", "t": 100.3}
     assert complaint["type"] == "refused"
-    assert complaint["why"] == (
-        "The page's messages came late: the connection is too slow to drive (a round trip may take 120 ms at most)"
-    )
+    assert complaint["why"].startswith(MESSAGES_LATE)
     assert more == [], "it is told once, not fifty times a second"
     room.pad(driver, 100.3)
     assert room.app.pads() == ["page 1"]
@@ -135,17 +131,17 @@ def test_a_gap_is_told_before_the_message_that_ends_it() -> None:
     driver = room.driver()
     room.now = 100.5
     room.pad(driver, 100.0, 500.0)
-    assert room.app.pads() == [("The page gave no sign of life",), "page 1"]
+    assert room.app.pads() == [(PAGE_SILENT,), "page 1"]
 
 
 def test_silence_is_told_when_somebody_looks() -> None:
     room = Room()
     room.driver()
-    room.desk.look(100.1)
+    room.session.check_pad(100.1)
     assert room.app.news() == []
-    room.desk.look(100.2)
-    room.desk.look(100.25)
-    assert room.app.pads() == [("The page gave no sign of life",)]
+    room.session.check_pad(100.2)
+    room.session.check_pad(100.25)
+    assert room.app.pads() == [(PAGE_SILENT,)]
 
 
 @pytest.mark.parametrize("why", ["hidden", "blur", "closing"])
@@ -211,8 +207,8 @@ def test_nobody_drives_after_the_driver_let_go_or_left(how: str) -> None:
     if how == "let go":
         room.say(driver, type="lease", take=False)
     else:
-        room.desk.leave(driver)
-        room.desk.leave(driver)
+        room.session.close_page(driver)
+        room.session.close_page(driver)
     gone, free = room.app.news()
     assert not gone["pad"]["connected"]
     assert gone["pad"]["why"] == ("page 1 released control" if how == "let go" else "the page in control was closed")
@@ -271,7 +267,7 @@ def test_anybody_stops_only_the_driver_recovers_and_plays() -> None:
 def test_malformed_here(message: dict[str, Any]) -> None:
     room = Room()
     driver = room.driver()
-    with pytest.raises(Malformed):
+    with pytest.raises(MalformedMessage):
         room.say(driver, **message)
     assert (room.app.news(), inbox(driver)) == ([], [])
 
@@ -280,11 +276,11 @@ def test_what_the_app_says_reaches_the_pages_that_it_is_for() -> None:
     room = Room()
     first, second = room.page(), room.page()
     inbox(first), inbox(second)
-    room.desk.heard({"method": "refused", "page": "page 2", "why": "it is too late"})
-    room.desk.heard({"method": "refused", "page": "page 9", "why": "gone"})
-    room.desk.heard({"method": "playing", "on": True})
-    room.desk.heard({"method": "say", "t": 1.0, "text": "home"})
-    room.desk.show({"t": 100.0})
+    room.session.receive_from_app({"method": "refused", "page": "page 2", "why": "it is too late"})
+    room.session.receive_from_app({"method": "refused", "page": "page 9", "why": "gone"})
+    room.session.receive_from_app({"method": "playing", "on": True})
+    room.session.receive_from_app({"method": "say", "t": 1.0, "text": "home"})
+    room.session.send_state({"t": 100.0})
     say, state = {"type": "say", "t": 1.0, "text": "home"}, {"type": "state", "t": 100.0, "pages": 2, "playing": True}
     assert inbox(first) == [say, state]
     assert inbox(second) == [{"type": "refused", "why": "it is too late"}, say, state]
@@ -303,7 +299,7 @@ def test_every_page_is_shown_the_newest_of_a_recording_and_so_is_one_that_opens_
     page = room.page()
     assert "recording" not in {message["type"] for message in inbox(page)}, "there is none"
     for k in range(1000):
-        room.desk.heard(recording(k, "finish"))
+        room.session.receive_from_app(recording(k, "finish"))
     newest = {"type": "recording", "t": 999.0, "phase": "recording", "frames": 999, "actions": ["finish"]}
     assert inbox(page) == [newest], "a slow page misses what is outdated, and nothing else"
     assert room.cut == []
@@ -316,7 +312,7 @@ def test_only_the_page_that_drives_steers_a_recording_and_only_to_what_is_possib
     inbox(other)
     room.say(driver, type="action", action="record")
     assert [message["why"] for message in inbox(driver)] == ["this program records nothing"]
-    room.desk.heard(recording(1, "finish", "discard"))
+    room.session.receive_from_app(recording(1, "finish", "discard"))
     inbox(driver), inbox(other)
     room.say(other, type="action", action="finish")
     room.say(driver, type="action", action="record")
@@ -326,7 +322,7 @@ def test_only_the_page_that_drives_steers_a_recording_and_only_to_what_is_possib
     room.say(driver, type="action", action="finish")
     assert room.app.news() == [{"action": "finish", "page": "page 1"}]
     assert inbox(driver) == []
-    room.desk.heard(recording(2))
+    room.session.receive_from_app(recording(2))
     room.say(driver, type="action", action="finish")
     assert room.app.news() == [], "twice is once"
 
@@ -334,12 +330,12 @@ def test_only_the_page_that_drives_steers_a_recording_and_only_to_what_is_possib
 def test_a_view_with_a_number_that_is_none_changes_nothing() -> None:
     room = Room()
     page = room.page()
-    room.desk.heard(recording(1, "finish"))
+    room.session.receive_from_app(recording(1, "finish"))
     newest = inbox(page)[-1]
     wrong = recording(2, "record")
     wrong["view"]["seconds"] = float("nan")
     with pytest.raises(ValueError, match="JSON"):
-        room.desk.heard(wrong)
+        room.session.receive_from_app(wrong)
     assert inbox(page) == []
     assert inbox(room.page())[-1] == newest
 
@@ -348,7 +344,7 @@ def test_only_the_page_in_control_sets_only_what_the_program_offers() -> None:
     room = Room()
     driver, other = room.driver(), room.page()
     view = {"robot": "panda", "speed": 0.5, "speed_max": 1.0, "frame": "base", "settings": ["speed"]}
-    room.desk.heard({"method": "driving", "view": view})
+    room.session.receive_from_app({"method": "driving", "view": view})
     assert inbox(driver) == [{"type": "driving", **view}]
     assert {"type": "driving", **view} in inbox(room.page()), "a page that opens later sees it, too"
     inbox(other)
@@ -383,11 +379,11 @@ def test_an_app_that_reads_again_hears_of_every_loss_and_the_newest_pad() -> Non
 
 
 def test_a_loss_outdates_the_pad_before_it() -> None:
-    waiting = Waiting()
-    waiting.pad(1.0, 1.0, (1.0,), 0, "page 1")
-    waiting.gone(2.0, "it was hidden")
-    assert waiting.take() == {"pad": {"connected": False, "t": 2.0, "why": "it was hidden"}}
-    assert waiting.take() is None
+    queue = AppQueue()
+    queue.put_pad(1.0, 1.0, (1.0,), 0, "page 1")
+    queue.put_pad_lost(2.0, "it was hidden")
+    assert queue.pop() == {"pad": {"connected": False, "t": 2.0, "why": "it was hidden"}}
+    assert queue.pop() is None
 
 
 def test_wishes_that_nobody_hears_are_refused() -> None:
@@ -409,20 +405,20 @@ def test_wishes_that_nobody_hears_are_refused() -> None:
 
 
 def test_beats_first_then_notes_in_order_then_the_newest_of_the_rest() -> None:
-    outbox = Outbox(lambda: None)
+    queue = SendQueue(lambda: None)
     for k in range(3):
-        outbox.newest("state", f"state {k}")
-        outbox.newest("recording", f"recording {k}")
-        outbox.note(f"note {k}")
-        outbox.beat(f"beat {k}")
-    assert list(iter(outbox.take, None)) == ["beat 2", "note 0", "note 1", "note 2", "state 2", "recording 2"]
+        queue.put_newest("state", f"state {k}")
+        queue.put_newest("recording", f"recording {k}")
+        queue.put_note(f"note {k}")
+        queue.put_beat(f"beat {k}")
+    assert list(iter(queue.pop, None)) == ["beat 2", "note 0", "note 1", "note 2", "state 2", "recording 2"]
 
 
 def test_a_page_that_misses_a_note_is_cut_off() -> None:
     room = Room()
     slow, other = room.page(), room.page()
     for k in range(300):
-        room.desk.heard({"method": "say", "t": 0.0, "text": f"word {k}"})
+        room.session.receive_from_app({"method": "say", "t": 0.0, "text": f"word {k}"})
         inbox(other)
     assert set(room.cut) == {1}
     assert len(inbox(slow)) <= 256

@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hal.drivers.web.lease import Lease
-from hal.drivers.web.padmessage import Malformed, PadMessage, PadWatch, Verdict
+from hal.drivers.web.messages import CLOCK_AHEAD, MESSAGES_LATE, PAGE_SILENT, MalformedMessage, PadMessage
+from hal.drivers.web.session import DriveLease, PadVerdict, PadWatch
 from hal.servo.watchdog import PAD_SILENCE
 
 T = 100.0
@@ -26,93 +26,91 @@ def watch(granted: float = T) -> PadWatch:
 def connected(now: float = T) -> PadWatch:
     """A watch over a pad that spoke just now."""
     found = watch()
-    assert found.take(message(T, now - T), now) == Verdict(None, now)
+    assert found.judge(message(T, now - T), now) == PadVerdict(None, now)
     return found
 
 
 def test_a_message_counts_from_the_time_that_it_proves() -> None:
     pad = watch()
     assert not pad.connected
-    assert pad.take(message(T, 0.010), T + 0.030) == Verdict(None, T + 0.010)
+    assert pad.judge(message(T, 0.010), T + 0.030) == PadVerdict(None, T + 0.010)
     assert pad.connected
     pad.stamp(T + 0.030)
-    assert pad.take(message(T + 0.030, 0.005), T + 0.050) == Verdict(None, T + 0.035)
+    assert pad.judge(message(T + 0.030, 0.005), T + 0.050) == PadVerdict(None, T + 0.035)
 
 
 def test_a_clock_that_runs_a_little_ahead_proves_no_more_than_now() -> None:
-    assert watch().take(message(T, 0.050), T + 0.020) == Verdict(None, T + 0.020)
+    assert watch().judge(message(T, 0.050), T + 0.020) == PadVerdict(None, T + 0.020)
 
 
 def test_a_message_that_was_under_way_for_too_long_is_a_pad_that_is_gone() -> None:
     pad = connected()
-    assert pad.take(message(T, 0.020), T + 0.020 + PAD_SILENCE + 1e-6) == Verdict(
-        "The page's messages came late", dropped="The page's messages came late"
+    assert pad.judge(message(T, 0.020), T + 0.020 + PAD_SILENCE + 1e-6) == PadVerdict(
+        MESSAGES_LATE, dropped=MESSAGES_LATE
     )
     assert not pad.connected
-    assert pad.take(message(T, 0.040), T + 1.0) == Verdict(dropped="The page's messages came late"), "lost once"
-    assert pad.take(message(T, 1.0), T + 1.0) == Verdict(None, T + 1.0), "and comes back with one that is not late"
+    assert pad.judge(message(T, 0.040), T + 1.0) == PadVerdict(dropped=MESSAGES_LATE), "lost once"
+    assert pad.judge(message(T, 1.0), T + 1.0) == PadVerdict(None, T + 1.0), "and comes back with one that is not late"
     assert pad.connected
 
 
 def test_a_gap_between_two_messages_is_a_pad_that_was_gone() -> None:
     pad = connected()
-    assert pad.take(message(T, 0.25), T + 0.25) == Verdict("The page gave no sign of life", T + 0.25)
+    assert pad.judge(message(T, 0.25), T + 0.25) == PadVerdict(PAGE_SILENT, T + 0.25)
     assert pad.connected
 
 
 def test_no_gap_no_loss() -> None:
     pad = connected()
     for k in range(1, 50):
-        assert pad.take(message(T, 0.119 * k), T + 0.119 * k) == Verdict(None, T + 0.119 * k)
+        assert pad.judge(message(T, 0.119 * k), T + 0.119 * k) == PadVerdict(None, T + 0.119 * k)
 
 
 def test_silence_is_noticed_without_a_message() -> None:
     pad = watch()
-    assert pad.look(T + 10.0) is None, "there was no pad yet"
+    assert pad.check_silence(T + 10.0) is None, "there was no pad yet"
     pad = connected()
-    assert pad.look(T + PAD_SILENCE - 0.001) is None
-    assert pad.look(T + PAD_SILENCE + 0.001) == "The page gave no sign of life"
-    assert pad.look(T + PAD_SILENCE + 0.002) is None
-    assert pad.take(message(T, 0.200), T + 0.200) == Verdict(None, T + 0.200)
+    assert pad.check_silence(T + PAD_SILENCE - 0.001) is None
+    assert pad.check_silence(T + PAD_SILENCE + 0.001) == PAGE_SILENT
+    assert pad.check_silence(T + PAD_SILENCE + 0.002) is None
+    assert pad.judge(message(T, 0.200), T + 0.200) == PadVerdict(None, T + 0.200)
 
 
 def test_a_stamp_that_was_never_sent_is_malformed() -> None:
     pad = connected()
-    with pytest.raises(Malformed):
-        pad.take(message(T + 0.001, 0.0), T + 0.002)
+    with pytest.raises(MalformedMessage):
+        pad.judge(message(T + 0.001, 0.0), T + 0.002)
     assert pad.connected
     pad.stamp(T + 0.001)
-    assert pad.take(message(T + 0.001, 0.0), T + 0.002).t_alive == T + 0.001
+    assert pad.judge(message(T + 0.001, 0.0), T + 0.002).t_alive == T + 0.001
 
 
 def test_a_stamp_from_before_the_lease_does_not_count() -> None:
-    assert watch().take(message(T - 0.01, 0.02), T + 0.01) == Verdict(None, None)
+    assert watch().judge(message(T - 0.01, 0.02), T + 0.01) == PadVerdict(None, None)
 
 
 def test_a_page_whose_clock_jumped_ahead_is_not_believed() -> None:
     """A computer that slept: its browser's clock went on, ours did not."""
     pad = connected()
-    assert pad.take(message(T, 3600.0), T + 0.02) == Verdict(
-        "The page's clock runs ahead", dropped="The page's clock runs ahead"
-    )
+    assert pad.judge(message(T, 3600.0), T + 0.02) == PadVerdict(CLOCK_AHEAD, dropped=CLOCK_AHEAD)
     assert not pad.connected
 
 
 def test_going_away_is_told_once() -> None:
     pad = connected()
-    assert pad.lose("the page was hidden") == "the page was hidden"
-    assert pad.lose("the page was hidden") is None
+    assert pad.disconnect("the page was hidden") == "the page was hidden"
+    assert pad.disconnect("the page was hidden") is None
 
 
 def test_a_backlog_after_a_stall_counts_only_from_where_it_is_fresh_and_after_a_loss() -> None:
     """One second without a network, then everything at once."""
     pad = connected()
     now = T + 1.0
-    verdicts = [pad.take(message(T, 0.02 * k), now) for k in range(1, 51)]
+    verdicts = [pad.judge(message(T, 0.02 * k), now) for k in range(1, 51)]
     fresh = [k for k, verdict in enumerate(verdicts, 1) if verdict.t_alive is not None]
-    assert verdicts[0] == Verdict("The page's messages came late", dropped="The page's messages came late")
+    assert verdicts[0] == PadVerdict(MESSAGES_LATE, dropped=MESSAGES_LATE)
     assert fresh == list(range(45, 51)), "those of the last 120 ms"
-    assert all(verdict.gone is None for verdict in verdicts[1:])
+    assert all(verdict.lost is None for verdict in verdicts[1:])
 
 
 @given(st.randoms(use_true_random=False), st.floats(0.0, 0.4), st.floats(0.0, 0.4))
@@ -133,7 +131,7 @@ def test_whatever_the_network_does_what_counts_was_said_within_the_limit(
         arriving = max(arriving, page + up * chance.random() ** 4)
         now = arriving
         before = pad.connected
-        verdict = pad.take(message(seen, page - seen_at), now)
+        verdict = pad.judge(message(seen, page - seen_at), now)
         beat = pad.stamp(now)
         beats.append((beat, max([now + down * chance.random() ** 4, *(at for _, at in beats)])))
         if verdict.t_alive is None:
@@ -141,7 +139,7 @@ def test_whatever_the_network_does_what_counts_was_said_within_the_limit(
         assert now - PAD_SILENCE <= verdict.t_alive <= now
         assert verdict.t_alive <= page + 1e-9, "never later than it was said"
         assert verdict.t_alive >= last_alive, "time does not go back"
-        if before and verdict.gone is None:
+        if before and verdict.lost is None:
             assert verdict.t_alive - last_alive <= PAD_SILENCE
             assert page - last_said <= 2 * PAD_SILENCE
         last_alive, last_said = verdict.t_alive, page
@@ -151,33 +149,33 @@ def test_whatever_the_network_does_what_counts_was_said_within_the_limit(
 
 
 def test_one_page_drives_and_whoever_takes_it_has_it() -> None:
-    lease = Lease()
+    lease = DriveLease()
     assert lease.driver is None
     assert lease.watch_of("page 1") is None
-    first = lease.take("page 1", T)
+    first = lease.grant("page 1", T)
     assert first == (None, "page 1", T, "")
-    assert lease.take("page 1", T + 1) is None
+    assert lease.grant("page 1", T + 1) is None
     mine = lease.watch_of("page 1")
     assert mine is not None
     assert lease.watch_of("page 2") is None
-    assert lease.take("page 2", T + 2) == ("page 1", "page 2", T + 2, "page 2 took control")
+    assert lease.grant("page 2", T + 2) == ("page 1", "page 2", T + 2, "page 2 took control")
     assert lease.watch_of("page 1") is None
-    assert lease.let_go("page 1", T + 3, "it is gone") is None, "not its own any more"
-    assert lease.let_go("page 2", T + 4, "it is gone") == ("page 2", None, T + 4, "it is gone")
+    assert lease.release("page 1", T + 3, "it is gone") is None, "not its own any more"
+    assert lease.release("page 2", T + 4, "it is gone") == ("page 2", None, T + 4, "it is gone")
     assert (lease.driver, lease.watch) == (None, None)
 
 
 def test_a_lease_that_comes_back_knows_nothing_of_the_time_before() -> None:
-    lease = Lease()
-    lease.take("page 1", T)
+    lease = DriveLease()
+    lease.grant("page 1", T)
     before = lease.watch
     assert before is not None
-    before.take(message(T, 0.01), T + 0.01)
-    lease.let_go("page 1", T + 0.02, "")
-    lease.take("page 1", T + 0.03)
+    before.judge(message(T, 0.01), T + 0.01)
+    lease.release("page 1", T + 0.02, "")
+    lease.grant("page 1", T + 0.03)
     now = lease.watch
     assert now is not None
     assert now is not before
     assert not now.connected
-    assert now.take(message(T, 0.04), T + 0.04) == Verdict(None, None), "sent with a stamp of the last time"
-    assert now.take(message(T + 0.03, 0.01), T + 0.04) == Verdict(None, T + 0.04)
+    assert now.judge(message(T, 0.04), T + 0.04) == PadVerdict(None, None), "sent with a stamp of the last time"
+    assert now.judge(message(T + 0.03, 0.01), T + 0.04) == PadVerdict(None, T + 0.04)

@@ -18,7 +18,7 @@ import pytest
 from child_targets import HURRY
 from web_kit import WAIT, App, Page, run
 
-from hal.drivers.web.logs import Bound
+from hal.drivers.web.process import LogLimit
 from hal.errors import HalError
 from hal.host.process import Child
 
@@ -124,7 +124,7 @@ def test_nor_is_a_handshake_that_makes_none(app: App, key: bytes) -> None:
 def test_what_libraries_complain_of_is_bounded() -> None:
     written = io.StringIO()
     handler = logging.StreamHandler(written)
-    handler.addFilter(Bound(3))
+    handler.addFilter(LogLimit(3))
     for k in range(1000):
         try:
             raise OSError(f"no more files, {k}")
@@ -134,7 +134,7 @@ def test_what_libraries_complain_of_is_bounded() -> None:
     lines = written.getvalue().splitlines()
     assert lines[0] == "said 0"
     assert "OSError: no more files, 2" in lines
-    assert lines[-1] == "there is more of this kind: it is left out"
+    assert lines[-1] == "further records of this kind are not shown"
     assert not any("3" in line for line in lines)
 
 

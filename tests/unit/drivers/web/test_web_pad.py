@@ -10,7 +10,7 @@ import pytest
 from hal.config.files import Problems
 from hal.config.models import load_pad_models
 from hal.driver import PadReading
-from hal.drivers.web.pad import PadMail, WebPad, gone, reading
+from hal.drivers.web.pad import PadQueue, WebPad, lost_reading, pad_reading
 from hal.errors import NotSupported
 from hal.gamepad import Gamepad
 from hal.specs import PadSpec
@@ -24,13 +24,13 @@ class Page:
     """The console as a pad sees it, with a page that does what a test says."""
 
     def __init__(self) -> None:
-        self.mail = PadMail()
+        self.queue = PadQueue()
         self.driver: str | None = "page 1"
         self.playing: list[bool] = []
-        self.stops = 0
+        self.stop_count = 0
 
-    def subscribe(self) -> PadMail:
-        return self.mail
+    def subscribe(self) -> PadQueue:
+        return self.queue
 
     def show_playing(self, on: bool) -> None:
         self.playing.append(on)
@@ -38,10 +38,10 @@ class Page:
     def send(self, t: float, mask: int = 0, **axes: float) -> None:
         values = [axes.get(name, 1.0 if name == "l2" and mask & L2 else 0.0) for name in AXES]
         message = {"connected": True, "t": t, "t_alive": t - 0.001, "axes": values, "buttons": mask}
-        self.mail.put(reading(message, 0))
+        self.queue.put(pad_reading(message, 0))
 
     def leave(self, t: float) -> None:
-        self.mail.put(reading({"connected": False, "t": t, "why": "hidden"}, 0))
+        self.queue.put(pad_reading({"connected": False, "t": t, "why": "hidden"}, 0))
 
 
 @pytest.fixture
@@ -164,7 +164,7 @@ def test_a_stop_and_a_silent_page_end_the_tour(page: Page, pad: WebPad, end: str
     page.send(1.1)
     assert pad.poll(1.1, 0.0).connected
     if end == "stop":
-        page.stops += 1
+        page.stop_count += 1
         page.send(1.2)
     assert pad.poll(1.2 if end == "stop" else 1.3, 0.0).connected is False
     page.send(2.0)
@@ -195,11 +195,12 @@ def test_the_tour_ends_when_its_page_goes_and_when_it_is_over(page: Page, pad: W
 
 
 def test_a_rig_without_a_console_says_so() -> None:
-    with pytest.raises(NotSupported, match="console"):
+    with pytest.raises(NotSupported) as refused:
         WebPad(PadSpec("pad", "web", None)).open()
+    assert refused.value.code == "no_console"
 
 
 def test_a_lost_pad_has_nothing_pressed() -> None:
-    lost = gone(3.0, 7)
+    lost = lost_reading(3.0, 7)
     assert (lost.connected, lost.buttons, set(lost.axes.values())) == (False, frozenset(), {0.0})
     assert lost.t_alive == -math.inf

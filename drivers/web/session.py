@@ -1,0 +1,525 @@
+"""The rules of the console, without any socket: which page drives, whose pad counts, what the app and pages are sent.
+
+The parts, from the inside out: :class:`PadWatch` decides whether a pad message is recent enough to count,
+:class:`DriveLease` which page is in control, :class:`AppQueue` and :class:`SendQueue` hold what waits to be sent to the
+app and to one page, and :class:`WebSession` connects them.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import math
+import time
+from collections import deque
+from collections.abc import Awaitable, Callable, Mapping
+from typing import Any, NamedTuple, Protocol
+
+from hal.servo.watchdog import PAD_SILENCE
+from hal.types import BUTTONS, STICK_AXES
+
+from .messages import (
+    CLOCK_AHEAD,
+    MESSAGES_LATE,
+    PAGE_CLOSED,
+    PAGE_SILENT,
+    ControlRequest,
+    MalformedMessage,
+    PadMessage,
+    PageLeft,
+    RecordingRequest,
+    RecoverRequest,
+    SettingRequest,
+    StopRequest,
+    TourRequest,
+    encode,
+    parse,
+)
+
+__all__ = [
+    "AppQueue",
+    "DriveLease",
+    "LeaseChange",
+    "PadVerdict",
+    "PadWatch",
+    "SendQueue",
+    "WebPage",
+    "WebSession",
+]
+
+_MAX_REQUESTS = 16
+"""Requests of pages that may wait for the app."""
+_MAX_NOTES = 256
+"""Messages that must not be left out and may wait for one page."""
+_TOO_SLOW = f"{{}}: the connection is too slow to drive (a round trip may take {1e3 * PAD_SILENCE:g} ms at most)"
+_COMPLAINT_PERIOD = 2.0
+"""Shortest time between two complaints to one page about that, in s."""
+_KEPT_LINES = 50
+"""Newest lines of the app that a page gets when it opens."""
+
+
+# Whether a pad message counts.
+
+
+class PadVerdict(NamedTuple):
+    """What a pad message means."""
+
+    lost: str | None = None
+    """Why the pad was lost before or with this message; None if it was not, or had been lost already."""
+    t_alive: float | None = None
+    """Time at which the page provably was in this state, in s; None if the message does not count."""
+    dropped: str | None = None
+    """Why the message does not count, for the page's user; None if there is nothing to report."""
+
+
+class PadWatch:
+    """Decides which pad messages of the page in control count, from the moment at which it was given control.
+
+    A message may wait in buffers for long before it arrives, so its arrival proves nothing. The server therefore sends
+    its own clock's time with every answer. The page repeats the newest one (``seen``) and how long ago, by its own
+    clock, that came (``since``): at ``seen + since`` the page was in the state that the message describes, however late
+    the message is read.
+
+    Pure: all times are arguments. The pad is :attr:`connected` from a message that counts until something disconnects
+    it; its reader must then see it released before it counts again.
+    """
+
+    def __init__(self, granted: float) -> None:
+        """``granted`` is the time stamp of the message that gives the page control, in s."""
+        self._granted = granted
+        self._stamp = granted
+        self._alive = -math.inf
+        self.connected = False
+
+    def stamp(self, now: float) -> float:
+        """Note that the time ``now`` is sent to the page, which may repeat it from now on. Returns ``now``."""
+        self._stamp = now
+        return now
+
+    def judge(self, message: PadMessage, now: float) -> PadVerdict:
+        """Decide whether the page's next message, read at ``now``, counts.
+
+        Raises:
+            MalformedMessage: It repeats a stamp that was not sent yet.
+        """
+        if message.seen > self._stamp:
+            raise MalformedMessage("a stamp that was never sent")
+        if message.seen < self._granted:
+            return PadVerdict()  # sent before the page was given control this time
+        claimed = message.seen + message.since
+        if not claimed - now <= PAD_SILENCE:
+            return PadVerdict(self.disconnect(CLOCK_AHEAD), dropped=CLOCK_AHEAD)
+        # Messages arrive in the order in which they were sent: what one proves, the next one proves too.
+        alive = max(self._alive, min(now, claimed))
+        gap, self._alive = alive - self._alive, alive
+        if not now - alive <= PAD_SILENCE:
+            return PadVerdict(self.disconnect(MESSAGES_LATE), dropped=MESSAGES_LATE)
+        lost = self.disconnect(PAGE_SILENT) if gap > PAD_SILENCE else None
+        self.connected = True
+        return PadVerdict(lost, alive)
+
+    def check_silence(self, now: float) -> str | None:
+        """Disconnect the pad if its page has been silent for too long; returns the reason if it was connected."""
+        return self.disconnect(PAGE_SILENT) if not now - self._alive <= PAD_SILENCE else None
+
+    def disconnect(self, why: str) -> str | None:
+        """Disconnect the pad; returns ``why`` if it was connected."""
+        was, self.connected = self.connected, False
+        return why if was else None
+
+
+# Who drives.
+
+
+class LeaseChange(NamedTuple):
+    """Control passed from one page to another, or to none."""
+
+    before: str | None
+    """Name of the page that was in control."""
+    driver: str | None
+    """Name of the page that is in control now."""
+    t: float
+    """Time of the change, in s."""
+    why: str
+    """The reason, for people; empty if no page lost control."""
+
+
+class DriveLease:
+    """The right to drive: one page at a time. Pages have names that are never used twice.
+
+    Each grant makes a new :class:`PadWatch`, so that messages of a page without control, or of its last time in
+    control, do not count.
+    """
+
+    def __init__(self) -> None:
+        self.driver: str | None = None
+        self.watch: PadWatch | None = None
+        """Judges the pad of :attr:`driver`; None while no page is in control."""
+        self.why = ""
+        """Reason of the newest change."""
+
+    def grant(self, page: str, now: float) -> LeaseChange | None:
+        """Give control to ``page``, whichever page has it. None if that page has it already."""
+        if page == self.driver:
+            return None
+        return self._change(page, now, f"{page} took control" if self.driver is not None else "")
+
+    def release(self, page: str, now: float, why: str) -> LeaseChange | None:
+        """End the control of ``page``. None if it is not in control."""
+        return self._change(None, now, why) if page == self.driver else None
+
+    def watch_of(self, page: str) -> PadWatch | None:
+        """Return the watch of this page's pad; None if it is not in control."""
+        return self.watch if page == self.driver else None
+
+    def _change(self, driver: str | None, now: float, why: str) -> LeaseChange:
+        before, self.driver, self.why = self.driver, driver, why
+        self.watch = PadWatch(now) if driver is not None else None
+        return LeaseChange(before, driver, now, why)
+
+
+# What waits to be sent.
+
+
+class AppQueue:
+    """Messages for the app: of each kind the newest, and a few requests, however long the app does not read."""
+
+    def __init__(self) -> None:
+        self._stop: dict[str, Any] | None = None
+        self._lost: dict[str, Any] | None = None
+        self._pad: dict[str, Any] | None = None
+        self._driver: dict[str, Any] | None = None
+        self._watched: dict[str, Any] | None = None
+        self._requests: deque[dict[str, Any]] = deque()
+
+    def put_pad(self, t: float, t_alive: float, axes: tuple[float, ...], buttons: int, page: str) -> None:
+        """Replace the state of the pad; the arguments are those of a :class:`PadMessage` and its verdict."""
+        pad = {"connected": True, "t": t, "t_alive": t_alive, "axes": axes, "buttons": buttons, "from": page}
+        self._pad = {"pad": pad}
+
+    def put_pad_lost(self, t: float, why: str) -> None:
+        """Report a lost pad. The app gets this before the next state of a pad, however many of either it missed."""
+        self._pad = None
+        self._lost = {"pad": {"connected": False, "t": t, "why": why}}
+
+    def put_stop(self, page: str) -> None:
+        """Request a stop of every arm; two that wait become one."""
+        self._stop = {"stop": page}
+
+    def put_driver(self, page: str | None) -> None:
+        """Replace the name of the page in control."""
+        self._driver = {"driver": page}
+
+    def put_watched(self, cameras: list[str]) -> None:
+        """Replace the list of the cameras that pages show."""
+        self._watched = {"watched": cameras}
+
+    def put_request(self, message: dict[str, Any]) -> bool:
+        """Add another request of a page. False if too many wait; then it is dropped."""
+        if len(self._requests) >= _MAX_REQUESTS:
+            return False
+        self._requests.append(message)
+        return True
+
+    def pop(self) -> dict[str, Any] | None:
+        """Remove and return the most urgent message; None if there is none."""
+        for name in ("_stop", "_lost", "_driver", "_pad"):
+            message: dict[str, Any] | None = getattr(self, name)
+            if message is not None:
+                setattr(self, name, None)
+                return message
+        if self._requests:
+            return self._requests.popleft()
+        message, self._watched = self._watched, None
+        return message
+
+
+class SendQueue:
+    """Messages for one page, a bounded number: the newest beat first, then notes in order, then the newest of the rest.
+
+    Only :meth:`pump` waits for the page, so a page that is slow or frozen delays no other.
+    """
+
+    def __init__(self, overflow: Callable[[], None]) -> None:
+        """``overflow`` is called when a note is lost: the page must be disconnected."""
+        self._overflow = overflow
+        self._beat: str | None = None
+        self._notes: deque[str] = deque()
+        self._newest: dict[str, str] = {}
+        self._changed = asyncio.Event()
+
+    def put_beat(self, text: str) -> None:
+        """Replace the answer to a pad message."""
+        self._beat = text
+        self._changed.set()
+
+    def put_note(self, text: str) -> None:
+        """Add a message that must not be left out."""
+        if len(self._notes) >= _MAX_NOTES:
+            self._overflow()
+            return
+        self._notes.append(text)
+        self._changed.set()
+
+    def put_newest(self, kind: str, text: str) -> None:
+        """Replace the message of this kind."""
+        self._newest[kind] = text
+        self._changed.set()
+
+    def pop(self) -> str | None:
+        """Remove and return the message that is sent next; None if there is none."""
+        if self._beat is not None:
+            text, self._beat = self._beat, None
+            return text
+        if self._notes:
+            return self._notes.popleft()
+        return self._newest.pop(next(iter(self._newest))) if self._newest else None
+
+    async def pump(self, send: Callable[[str], Awaitable[None]]) -> None:
+        """Send every message until the connection breaks or the task is cancelled. ``send`` waits for a slow page."""
+        try:
+            while True:
+                await self._changed.wait()
+                self._changed.clear()
+                while (text := self.pop()) is not None:
+                    await send(text)
+        except ConnectionError:
+            pass  # the reader of the page's socket notices it too
+
+
+class AppSink(Protocol):
+    """The way to the app, as the session uses it: see :class:`~.server.AppChannel`."""
+
+    queue: AppQueue
+
+    def flush(self) -> None:
+        """Send what waits in :attr:`queue`."""
+
+
+class WebPage:
+    """A page that is open in a browser."""
+
+    def __init__(self, number: int, overflow: Callable[[], None]) -> None:
+        self.number = number
+        self.name = f"page {number}"
+        self.queue = SendQueue(overflow)
+        self.complained = -math.inf
+        """Time of the last complaint that its pad messages come late, in s."""
+
+
+class WebSession:
+    """Every open page, the one in control, and the newest view of everything that the app shows. One thread."""
+
+    def __init__(self, rig: Mapping[str, Any], app: AppSink, clock: Callable[[], float] = time.monotonic) -> None:
+        self._rig = rig
+        self._robots = frozenset(robot["name"] for robot in rig["robots"])
+        self._app = app
+        self._clock = clock
+        self._opened = 0
+        self._lease = DriveLease()
+        self._labels: str | None = None
+        self._lines: deque[str] = deque(maxlen=_KEPT_LINES)
+        self._waiting_for: list[str] = []
+        self._recording: str | None = None
+        self._driving: str | None = None
+        self._settings: frozenset[str] = frozenset()
+        self._actions: frozenset[str] = frozenset()
+        self.pages: dict[str, WebPage] = {}
+        self.playing = False
+
+    # Pages open and close.
+
+    def open_page(self, overflow: Callable[[], None]) -> WebPage:
+        """Add a page. ``overflow`` is called when it reads so slowly that it missed a message."""
+        self._opened += 1
+        page = WebPage(self._opened, overflow)
+        self.pages[page.name] = page
+        page.queue.put_note(self._hello(page))
+        if self._labels is not None:
+            page.queue.put_note(self._labels)
+        if self._driving is not None:
+            page.queue.put_note(self._driving)
+        self._send_lease(page, self._clock())
+        page.queue.put_note(self._waiting_message())
+        for text in self._lines:
+            page.queue.put_note(text)
+        if self._recording is not None:
+            page.queue.put_newest("recording", self._recording)
+        return page
+
+    def _hello(self, page: WebPage) -> str:
+        hello = {"type": "hello", "page": page.number, "name": page.name, "axes": STICK_AXES, "buttons": BUTTONS}
+        return encode(hello | {"rig": self._rig})
+
+    def close_page(self, page: WebPage) -> None:
+        """Remove a page and end its control. Idempotent."""
+        if self.pages.pop(page.name, None) is not None:
+            self._apply(self._lease.release(page.name, self._clock(), PAGE_CLOSED))
+
+    # Messages of pages.
+
+    def receive(self, page: WebPage, text: str) -> None:
+        """Handle a message of a page.
+
+        Raises:
+            MalformedMessage: It is not one that this socket accepts; nothing of it was applied.
+        """
+        message = parse(text, self._robots)
+        if isinstance(message, PadMessage):
+            self._receive_pad(page, message)
+        elif isinstance(message, StopRequest):
+            self.stop(page)
+        elif isinstance(message, PageLeft):
+            self._disconnect_pad(page, message.why)
+        elif isinstance(message, ControlRequest):
+            self._take_or_release(page, message.take)
+        elif isinstance(message, RecoverRequest):
+            self._request(page, {"recover": message.robot, "page": page.name}, "clear a fault")
+        elif isinstance(message, TourRequest):
+            self._play_tour(page, message.play)
+        elif isinstance(message, RecordingRequest):
+            self._steer_recording(page, message.action)
+        elif isinstance(message, SettingRequest):
+            self._change_setting(page, message)
+        else:
+            raise MalformedMessage("not on this socket")
+
+    def stop(self, page: WebPage) -> None:
+        """Request a stop of every arm; every page may, in control or not."""
+        self._app.queue.put_stop(page.name)
+        self._app.flush()
+
+    def _receive_pad(self, page: WebPage, message: PadMessage) -> None:
+        watch = self._lease.watch_of(page.name)
+        if watch is None:
+            return  # it was on its way when the page lost control
+        now = self._clock()
+        verdict = watch.judge(message, now)
+        if verdict.lost is not None:
+            self._app.queue.put_pad_lost(now, verdict.lost)
+        if verdict.dropped is not None and not now - page.complained < _COMPLAINT_PERIOD:
+            page.complained = now
+            self._refuse(page, _TOO_SLOW.format(verdict.dropped))
+        if verdict.t_alive is not None:
+            self._app.queue.put_pad(now, verdict.t_alive, message.axes, message.buttons, page.name)
+        self._app.flush()
+        page.queue.put_beat(encode({"type": "beat", "t": watch.stamp(now)}))
+
+    def _disconnect_pad(self, page: WebPage, why: str) -> None:
+        watch = self._lease.watch_of(page.name)
+        if watch is not None and watch.disconnect(why) is not None:
+            self._app.queue.put_pad_lost(self._clock(), why)
+            self._app.flush()
+
+    def _take_or_release(self, page: WebPage, take: bool) -> None:
+        now = self._clock()
+        if not take:
+            self._apply(self._lease.release(page.name, now, f"{page.name} released control"))
+        elif not self._rig["drivable"]:
+            self._refuse(page, f"a page cannot drive this rig: {self._rig['driven_by']} drives it")
+        else:
+            self._apply(self._lease.grant(page.name, now))
+
+    def _play_tour(self, page: WebPage, play: bool) -> None:
+        if not self._rig["demo"]:
+            self._refuse(page, "this rig has no recorded tour to play")
+        else:
+            self._request(page, {"demo": play, "page": page.name}, "play the tour")
+
+    def _steer_recording(self, page: WebPage, action: str) -> None:
+        if self._lease.driver == page.name and action not in self._actions:
+            self._refuse(page, "that cannot be done now" if self._recording else "this program records nothing")
+        else:
+            self._request(page, {"action": action, "page": page.name}, "steer the recording")
+
+    def _change_setting(self, page: WebPage, setting: SettingRequest) -> None:
+        if self._lease.driver == page.name and setting.name not in self._settings:
+            self._refuse(page, f"this program does not let a page set the {setting.name}")
+        else:
+            message = {"setting": setting.name, "value": setting.value, "page": page.name}
+            self._request(page, message, "change settings")
+
+    def _request(self, page: WebPage, message: dict[str, Any], what: str) -> None:
+        if self._lease.driver != page.name:
+            self._refuse(page, f"only the page in control may {what}")
+        elif not self._app.queue.put_request(message):
+            self._refuse(page, "the program does not answer")
+        else:
+            self._app.flush()
+
+    # Changes of control.
+
+    def _apply(self, change: LeaseChange | None) -> None:
+        if change is None:
+            return
+        if change.before is not None:
+            self._app.queue.put_pad_lost(change.t, change.why)
+        self._app.queue.put_driver(change.driver)
+        self._app.flush()
+        for page in self.pages.values():
+            self._send_lease(page, change.t)
+
+    def _send_lease(self, page: WebPage, t: float) -> None:
+        you = self._lease.driver == page.name
+        lease = {"type": "lease", "driver": self._lease.driver, "you": you, "t": t, "why": self._lease.why}
+        page.queue.put_note(encode(lease))
+
+    # Messages to pages.
+
+    def receive_from_app(self, message: Mapping[str, Any]) -> None:
+        """Pass a message of the app on to the pages that it is for, and keep it for those that open later."""
+        method = message["method"]
+        if method == "labels":
+            self._labels = self._send_all({"type": "labels", **message["labels"]})
+        elif method == "say":
+            line = {"type": "say", "t": message["t"], "text": message["text"]}
+            line |= {name: message[name] for name in ("loss", "stop") if name in message}
+            self._lines.append(self._send_all(line))
+        elif method == "waiting":
+            self._waiting_for = list(message["controls"])
+            self._send_text_to_all(self._waiting_message())
+        elif method == "playing":
+            self.playing = bool(message["on"])
+        elif method == "driving":
+            self._settings = frozenset(message["view"]["settings"])
+            self._driving = self._send_all({"type": "driving", **message["view"]})
+        elif method == "recording":
+            self._show_recording(message["t"], message["view"])
+        elif method == "refused":
+            page = self.pages.get(message["page"])
+            if page is not None:
+                self._refuse(page, message["why"])
+
+    def _show_recording(self, t: float, view: Mapping[str, Any]) -> None:
+        self._recording = encode({"type": "recording", "t": t, **view})
+        self._actions = frozenset(view["actions"])
+        for page in self.pages.values():
+            page.queue.put_newest("recording", self._recording)
+
+    def _waiting_message(self) -> str:
+        return encode({"type": "pad", "waiting": self._waiting_for})
+
+    def _refuse(self, page: WebPage, why: str) -> None:
+        page.queue.put_note(encode({"type": "refused", "why": why}))
+
+    def _send_all(self, message: dict[str, Any]) -> str:
+        text = encode(message)
+        self._send_text_to_all(text)
+        return text
+
+    def _send_text_to_all(self, text: str) -> None:
+        for page in self.pages.values():
+            page.queue.put_note(text)
+
+    def send_state(self, state: dict[str, Any]) -> None:
+        """Send the state of the rig to every page; a page that is slow gets the newest one only."""
+        text = encode({"type": "state", **state, "pages": len(self.pages), "playing": self.playing})
+        for page in self.pages.values():
+            page.queue.put_newest("state", text)
+
+    def check_pad(self, now: float) -> None:
+        """Report the pad as lost if the page in control has been silent for too long; to be called regularly."""
+        watch = self._lease.watch
+        why = watch.check_silence(now) if watch is not None else None
+        if why is not None:
+            self._app.queue.put_pad_lost(now, why)
+            self._app.flush()
