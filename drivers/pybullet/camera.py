@@ -10,7 +10,7 @@ from typing import ClassVar, Protocol
 from hal.camera import CameraDriver, RawFrame
 from hal.driver import CameraInfo, nominal_info
 from hal.errors import ConnectionLost, NotSupported
-from hal.host.frames import FrameRing
+from hal.host.ring import FrameRing
 from hal.specs import CameraSpec
 
 from .depth_settings import noise_of
@@ -92,14 +92,13 @@ class DirectSource:
 class SharedSource:
     """Real time: the newest picture of the process that draws. ``check`` raises when that process is gone."""
 
-    def __init__(self, ring: FrameRing, spec: CameraSpec, check: Callable[[], None]) -> None:
+    def __init__(self, ring: FrameRing, check: Callable[[], None]) -> None:
         self._ring = ring
-        self._spec = spec
         self._check = check
         self._seq = 0
 
     def grab(self, timeout: float) -> RawFrame | None:
-        frame = self._ring.take(self._spec.name, self._seq, timeout)
+        frame = self._ring.wait(self._seq, timeout)
         if frame is None:
             self._check()
         else:

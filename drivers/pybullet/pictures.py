@@ -6,9 +6,9 @@ from collections.abc import Sequence
 from typing import Any
 
 from hal.errors import NotSupported
-from hal.host.frames import FrameRing
 from hal.host.hosts import SNAPSHOT_CAPACITY, Host, LocalHost, RemoteHost
 from hal.host.process import Child, SharedMemory
+from hal.host.ring import frame_rings, frame_rings_size
 from hal.specs import CameraSpec, to_json
 from hal.views import Pictures
 
@@ -30,8 +30,8 @@ class PyBulletPictures(Pictures):
             self._renderer = choose_renderer(host.cycle.world, renderer)
             self._description = self._renderer.description
         elif isinstance(host, RemoteHost):
-            self._memory = SharedMemory(FrameRing.size(cameras))
-            self._ring = FrameRing(self._memory.buffer, cameras)
+            self._memory = SharedMemory(frame_rings_size(cameras))
+            self._rings = frame_rings(self._memory.buffer, cameras)
             config = {
                 "world": to_json(host.spec.world),
                 "cameras": [to_json(camera) for camera in cameras],
@@ -53,14 +53,14 @@ class PyBulletPictures(Pictures):
     def source(self, camera: str) -> FrameSource:
         spec = self.cameras[camera]
         if self._child is not None:
-            return SharedSource(self._ring, spec, self._child.check)
+            return SharedSource(self._rings[camera], self._child.check)
         assert isinstance(self.host, LocalHost)
         assert self._renderer is not None
         return DirectSource(self.host.cycle.world, self._renderer, spec, self.host.now)
 
     def edited(self, method: str, params: dict[str, Any], revision: int) -> None:
         if self._child is not None:  # in lock-step the renderer looks at the very world that was edited
-            self._child.channel.send({"method": method, "params": params, "revision": revision})
+            self._child.notify("edited", {"method": method, "params": params, "revision": revision})
 
     def describe(self) -> str:
         return self._description

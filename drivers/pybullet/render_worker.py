@@ -6,16 +6,14 @@ physics nor the app ever waits for a picture.
 
 from __future__ import annotations
 
-import os
 import time
 import warnings
 from collections.abc import Sequence
 from typing import Any
 
-from hal.errors import ConnectionLost
-from hal.host.frames import FrameRing
 from hal.host.mailbox import SeriesBox
-from hal.host.process import Channel, SharedMemory
+from hal.host.process import Channel, SharedMemory, serve
+from hal.host.ring import FrameRing, frame_rings
 from hal.host.scheduling import yield_to_others
 from hal.specs import CameraSpec, WorldSpec, from_json
 
@@ -35,11 +33,13 @@ _IDLE = 0.001
 class RenderWorker:
     """Draws each camera's picture at its rate, staggered, whenever the world has gone on since the last one."""
 
-    def __init__(self, mirror: Mirror, renderer: Renderer, cameras: Sequence[CameraSpec], ring: FrameRing) -> None:
+    def __init__(
+        self, mirror: Mirror, renderer: Renderer, cameras: Sequence[CameraSpec], rings: dict[str, FrameRing]
+    ) -> None:
         self._mirror = mirror
         self._renderer = renderer
         self._cameras = cameras
-        self._ring = ring
+        self._rings = rings
         for camera in cameras:
             check_view(mirror.world, camera)
         self._exposures = {camera.name: Exposure(camera) for camera in cameras}
@@ -65,7 +65,7 @@ class RenderWorker:
                 self._numbers[camera.name] += 1
                 number = self._numbers[camera.name]
                 frame = self._exposures[camera.name].take(self._mirror.world, self._renderer, t, t, number)
-                self._ring.put(camera.name, frame)
+                self._rings[camera.name].write(frame)
                 self._shown[camera.name] = t
                 period = 1.0 / camera.rate_hz
                 late = time.monotonic() - self._due[camera.name]
@@ -76,24 +76,20 @@ class RenderWorker:
 def main(channel: Channel, memories: Sequence[SharedMemory], config: dict[str, Any]) -> None:
     """Entry point of the child process; ``memories`` are that of the world's host and that of the pictures."""
     yield_to_others(_NICE)
-    parent = os.getppid()
     world = World(from_json(WorldSpec, config["world"]), mirror=True)
     cameras = [from_json(CameraSpec, camera) for camera in config["cameras"]]
     renderer = choose_renderer(world, config["renderer"])
     snapshots = SeriesBox(memories[0].buffer[config["snapshot_offset"] :], config["snapshot_capacity"])
     mirror = Mirror(world, snapshots)
-    worker = RenderWorker(mirror, renderer, cameras, FrameRing(memories[1].buffer, cameras))
+    worker = RenderWorker(mirror, renderer, cameras, frame_rings(memories[1].buffer, cameras))
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         worker.warm_up()
     notes = list(dict.fromkeys(str(warning.message) for warning in caught))
     channel.send({"ready": {"renderer": renderer.description, "notes": notes}})
-    while os.getppid() == parent:
-        try:
-            while (message := channel.poll()) is not None:
-                if message["method"] == "close":
-                    return
-                mirror.edited(message["method"], message["params"], message["revision"])
-        except ConnectionLost:
-            return
+
+    def draw() -> float:
         time.sleep(min(_IDLE * 5, max(0.0, worker.run_once() - time.monotonic())))
+        return 0.0
+
+    serve(channel, {"edited": mirror.edited}, draw)

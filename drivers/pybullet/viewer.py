@@ -12,7 +12,7 @@ from typing import Any
 from hal.errors import ConnectionLost, NotSupported
 from hal.host.hosts import SNAPSHOT_CAPACITY, Host, LocalHost, RemoteHost
 from hal.host.mailbox import SeriesBox
-from hal.host.process import Channel, Child, SharedMemory
+from hal.host.process import Channel, Child, SharedMemory, serve
 from hal.specs import WorldSpec, from_json, to_json
 from hal.views import Viewer
 
@@ -81,7 +81,7 @@ class PyBulletViewer(Viewer):
 
     def edited(self, method: str, params: dict[str, Any], revision: int) -> None:
         with suppress(ConnectionLost):  # the window may have been closed
-            self._child.channel.send({"method": method, "params": params, "revision": revision})
+            self._child.notify("edited", {"method": method, "params": params, "revision": revision})
 
     def describe(self) -> str:
         return "PyBullet's window"
@@ -95,24 +95,24 @@ def main(channel: Channel, memories: Sequence[SharedMemory], config: dict[str, A
     """Run the window's process; ``memories`` holds the snapshots of the world."""
     os.nice(_NICE)
     os.environ.setdefault("LP_NUM_THREADS", "1")
-    parent = os.getppid()
     world = World(from_json(WorldSpec, config["world"]), mirror=True, gui=True)
     _arrange(world)
     box = SeriesBox(memories[0].buffer[config["snapshot_offset"] :], config["snapshot_capacity"])
     channel.send({"ready": {}})
     mirror = Mirror(world, box)
-    while os.getppid() == parent and world.client.isConnected():
+
+    def show() -> float | None:
+        if not world.client.isConnected():
+            return None
         signal.alarm(_HANG)
         due = time.monotonic() + _FRAME
         try:
-            while (message := channel.poll()) is not None:
-                if message["method"] == "close":
-                    return
-                mirror.edited(message["method"], message["params"], message["revision"])
             mirror.update()
-        except (ConnectionLost, world.client.error):
-            return  # the app or the window is gone
-        time.sleep(max(0.0, due - time.monotonic()))
+        except world.client.error:
+            return None  # the window was closed
+        return max(0.0, due - time.monotonic())
+
+    serve(channel, {"edited": mirror.edited}, show)
 
 
 def _arrange(world: World) -> None:

@@ -77,14 +77,16 @@ class Page:
         self.put_back()
         self.stop.set()
 
-    def told(self, method: str, params: dict[str, Any]) -> None:
-        """What the app says."""
-        if method == "clear":
-            for arm in self.arms:
-                if arm.spec.name == params["robot"]:
-                    arm.drag.clear()
-        elif method == "edited" and self.bodies is not None:
-            self.bodies.edited(params["method"], params["params"], params["revision"])
+    def clear_goal(self, robot: str) -> None:
+        """Put the handle of this arm back to the arm."""
+        for arm in self.arms:
+            if arm.spec.name == robot:
+                arm.drag.clear()
+
+    def edited(self, method: str, params: dict[str, Any], revision: int) -> None:
+        """Note an edit of the simulated world, to be shown with the snapshot of its revision."""
+        if self.bodies is not None:
+            self.bodies.edited(method, params, revision)
 
     def update(self) -> None:
         """Look at the arms, and show them where somebody looks."""

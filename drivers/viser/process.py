@@ -5,17 +5,16 @@ Nothing here writes into that memory, so nothing that a page does, or that goes 
 
 from __future__ import annotations
 
-import os
 import time
 from collections.abc import Sequence
 from typing import Any
 
-from hal.errors import ConnectionLost
-from hal.host.process import Channel, SharedMemory
+from hal.host.process import Channel, SharedMemory, serve
 from hal.host.scheduling import yield_to_others
 from hal.specs import GroupSpec, from_json
 
-from .guard import HOST, serve
+from .guard import HOST
+from .guard import serve as open_page
 from .page import Page
 
 __all__ = ["PORT", "main"]
@@ -35,23 +34,18 @@ _REPEAT = 0.1
 def main(channel: Channel, memories: Sequence[SharedMemory], config: dict[str, Any]) -> None:
     """Entry point of the child process; ``memories`` are those of the hosts, in the order of ``config["groups"]``."""
     yield_to_others(_NICE)
-    parent = os.getppid()
-    server = serve(PORT, config["label"], config["secret"])
+    server = open_page(PORT, config["label"], config["secret"])
     page = Page(server, [from_json(GroupSpec, group) for group in config["groups"]], memories)
     channel.send({"ready": {"address": f"http://{HOST}:{server.get_port()}", "notes": page.notes}})
     teller = Teller(channel, page)
-    while os.getppid() == parent:
+
+    def update() -> float:
         due = time.monotonic() + (_FRAME if page.watched else _IDLE)
-        try:
-            while (message := channel.poll()) is not None:
-                if message["method"] == "close":
-                    return
-                page.told(message["method"], message["params"])
-            page.update()
-            teller.tell()
-        except ConnectionLost:
-            return  # the app is gone
-        time.sleep(max(0.0, due - time.monotonic()))
+        page.update()
+        teller.tell()
+        return max(0.0, due - time.monotonic())
+
+    serve(channel, {"clear": page.clear_goal, "edited": page.edited}, update)
 
 
 class Teller:

@@ -115,7 +115,7 @@ class ViserViewer(Viewer3D):
         try:
             while not self._closed.is_set():
                 for method, params in self._news():
-                    channel.send({"method": method, "params": params})
+                    self._child.notify(method, params)
                 message = channel.receive(_LOOK)
                 if message is None:
                     continue

@@ -21,8 +21,8 @@ from hal.camera import Camera, RawFrame
 from hal.driver import PadReading
 from hal.errors import ConnectionLost, HalError
 from hal.gamepad import Gamepad
-from hal.host.frames import FrameRing
 from hal.host.process import Channel, Child, SharedMemory
+from hal.host.ring import frame_rings, frame_rings_size
 from hal.specs import CameraSpec, GroupSpec, RobotSpec, to_json
 from hal.types import Frame
 from hal.views import Console, DrivingView, Listen, RecordingView
@@ -79,8 +79,8 @@ class WebConsole(Console):
         self._recovering = threading.Lock()
         groups = rig.shared_states()
         self._shown = [_with_shown_stream(camera) for camera in rig.plan.cameras if _shown_stream(camera)]
-        self._frames = SharedMemory(FrameRing.size(self._shown))
-        self._ring = FrameRing(self._frames.buffer, self._shown)
+        self._frames = SharedMemory(frame_rings_size(self._shown))
+        self._rings = frame_rings(self._frames.buffer, self._shown)
         config = {
             "rig": _rig_message(rig, self._shown, driven_by),
             "listen": [listen.address, listen.port],
@@ -168,7 +168,7 @@ class WebConsole(Console):
         stamp = frame.stamp
         layers = {name: getattr(frame, name) for name in spec.streams}
         raw = RawFrame(stamp.t, stamp.t_device, stamp.seq, None, None, None, None, None)._replace(**layers)
-        self._ring.put(spec.name, raw)
+        self._rings[spec.name].write(raw)
         self._channel.send_frame(spec.name)
 
     # What pages request.

@@ -19,7 +19,7 @@ import simplejpeg
 from numpy.typing import NDArray
 
 from hal.camera import RawFrame
-from hal.host.frames import FrameRing
+from hal.host.ring import FrameRing
 from hal.specs import CameraSpec
 
 from .auth import Authenticator
@@ -59,8 +59,8 @@ class JpegPicture(NamedTuple):
 class PictureCache:
     """The newest picture of every camera that a page watches. One thread, that of the event loop."""
 
-    def __init__(self, cameras: Sequence[CameraSpec], ring: FrameRing) -> None:
-        self._ring = ring
+    def __init__(self, cameras: Sequence[CameraSpec], rings: dict[str, FrameRing]) -> None:
+        self._rings = rings
         self._feeds = {spec.name: _CameraFeed(spec) for spec in cameras}
         self._compressor = ThreadPoolExecutor(1, "hal-console-jpeg")
 
@@ -89,7 +89,7 @@ class PictureCache:
         feed = self._feeds.get(camera)
         if feed is None or not feed.watched:
             return False
-        frame = self._ring.take(camera, feed.seq, 0.0)
+        frame = self._rings[camera].wait(feed.seq, 0.0)
         if frame is not None:
             feed.put(frame, now)
         return frame is not None

@@ -20,8 +20,8 @@ from typing import Any
 from aiohttp import web
 
 from hal.errors import ConnectionLost, DriverMissing, NotSupported
-from hal.host.frames import FrameRing
 from hal.host.process import Channel, SharedMemory
+from hal.host.ring import frame_rings
 from hal.specs import CameraSpec, from_json
 
 from .auth import Authenticator
@@ -75,7 +75,7 @@ class ConsoleServer:
         pictures, *hosts = [memory.buffer for memory in memories]
         auth = Authenticator(config["token"], self._address, config["names"])
         self._telemetry = Telemetry(config["hosts"], hosts)
-        self._cache = PictureCache(cameras, FrameRing(pictures, cameras))
+        self._cache = PictureCache(cameras, frame_rings(pictures, cameras))
         self._app_channel = AppChannel(channel, self._receive_from_app)
         self._session = WebSession(config["rig"], self._app_channel)
         self._live = LiveSockets(auth, self._session)

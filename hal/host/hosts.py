@@ -164,6 +164,7 @@ class RemoteHost(Host):
         memories = [self.shared, *(other.shared for other in others)]
         self.child = Child(spec.name, "hal.host.main:main", config, memories)
         self._stops = 0
+        self._asking = threading.Lock()
         self._writing = threading.RLock()  # a signal handler may call stop() in the middle of stop()
         self._closed = threading.Event()
         self._beat()
@@ -183,7 +184,8 @@ class RemoteHost(Host):
             self._beat()
 
     def request(self, method: str, params: dict[str, Any] | None = None) -> Any:
-        return self.child.request(method, params)
+        with self._asking:  # one at a time: no other request runs in the middle of the cycles of an "advance"
+            return self.child.request(method, params)
 
     @property
     def stops(self) -> int:

@@ -1,8 +1,11 @@
 """Child processes that start alike from a script, a notebook, standard input, the REPL and any thread.
 
 A child is a fresh, isolated interpreter (``Popen``, never multiprocessing), in a session of its own so that Ctrl-C and
-Ctrl-Z of the terminal do not reach it. What it shares with the app are memory that has no name and one socket, both
-passed by descriptor: nothing can be left behind, whoever is killed.
+Ctrl-Z of the terminal do not reach it. It shares with the app memory that has no name and one socket, both passed by
+descriptor: nothing can be left behind, whichever process is killed.
+
+The app's side is :class:`Child`: it starts the process, sends requests and ends it. The child's side is a function that
+reports when it is ready and then calls :func:`serve`.
 """
 
 from __future__ import annotations
@@ -18,13 +21,23 @@ import tempfile
 import threading
 import time
 import traceback
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from .. import errors
-from ..errors import ConnectionLost, HalError, Problem
+from ..errors import ConnectionLost, HalError, NotSupported, Problem
 
-__all__ = ["Channel", "ChannelClosed", "Child", "SharedMemory", "child_main", "fill_standard_descriptors"]
+__all__ = [
+    "Channel",
+    "ChannelClosed",
+    "Child",
+    "SharedMemory",
+    "child_main",
+    "fill_standard_descriptors",
+    "pack_error",
+    "serve",
+    "unpack_error",
+]
 
 _BOOT = (
     "import sys, json; fds, path, target = json.loads(sys.argv[1]); "
@@ -34,18 +47,24 @@ _BOOT = (
 START_TIMEOUT = 60.0
 """Longest time that a child may take to get ready, s: reading a large mesh for the first time takes a while."""
 REQUEST_TIMEOUT = 30.0
-GOODBYE = 0.5
-"""A child that does not take the word that it should end within so long, s, is stopped or hangs."""
+"""Longest time that an answer may take, s, unless a request names another."""
+_GOODBYE = 0.5
+"""A child that does not take the message that ends it within so long, s, is stopped or hangs."""
+_SLICE = 0.2
+"""s that a thread waits for an answer before it checks that the child is alive."""
+_IDLE = 0.5
+"""s that :func:`serve` waits for a message before it checks that the app is alive."""
 
 
 class ChannelClosed(ConnectionLost):
-    """The other process hung up: for a child, the end of its work."""
+    """The other process closed the connection; a child then ends."""
 
 
 def fill_standard_descriptors() -> None:
     """Open descriptors 0 to 2 on the null device where a program was started without them.
 
-    Memory and sockets would get these numbers, and every child that has its own standard streams would lose them.
+    Otherwise memory and sockets would get these numbers, and every child that has its own standard streams would lose
+    them.
     """
     while (fd := os.open(os.devnull, os.O_RDWR)) <= 2:
         os.set_inheritable(fd, True)
@@ -56,6 +75,7 @@ class SharedMemory:
     """Zeroed memory without a name, shared by passing its descriptor."""
 
     def __init__(self, size: int = 0, fd: int | None = None) -> None:
+        """Create ``size`` bytes, or map those behind the descriptor ``fd``."""
         if fd is None:
             fill_standard_descriptors()
             fd = self._create()
@@ -73,46 +93,71 @@ class SharedMemory:
             return os.dup(file.fileno())
 
     def close(self) -> None:
-        """Close the descriptor. The map itself goes when the last view of it does."""
+        """Close the descriptor. The map is freed with the last view of it."""
         if self.fd >= 0:
             os.close(self.fd)
             self.fd = -1
 
 
 class Channel:
-    """Messages (JSON, one a line) over a socket, both ways."""
+    """Messages (JSON, one per line) over a socket, both ways. One thread receives; any thread sends."""
 
     def __init__(self, sock: socket.socket) -> None:
         self.sock = sock
+        self._out = sock.dup()  # has a time limit of its own
         self._pending = b""
         self._sending = threading.Lock()
 
     def send(self, message: Any, timeout: float = REQUEST_TIMEOUT) -> None:
-        """Send one message. ConnectionLost when the other side is gone, or does not take it within ``timeout`` s."""
+        """Send one message.
+
+        Raises:
+            ChannelClosed: If the other process is gone, or does not take the message within ``timeout`` s.
+        """
         data = json.dumps(message).encode() + b"\n"
         try:
             with self._sending:
-                self.sock.settimeout(timeout)
-                self.sock.sendall(data)
+                self._out.settimeout(timeout)
+                self._out.sendall(data)
         except OSError as error:
             raise ChannelClosed(f"the other process is gone: {error}") from None
 
+    def send_if_free(self, message: Any) -> bool:
+        """Send one short message unless the other process is behind; never waits. Returns whether it was sent.
+
+        Raises:
+            ChannelClosed: If the other process is gone.
+        """
+        data = json.dumps(message).encode() + b"\n"
+        try:
+            with self._sending:
+                self._out.settimeout(0.0)
+                sent = self._out.send(data)
+                if sent < len(data):  # the other side must not see half a message
+                    self._out.settimeout(REQUEST_TIMEOUT)
+                    self._out.sendall(data[sent:])
+        except BlockingIOError:
+            return False
+        except OSError as error:
+            raise ChannelClosed(f"the other process is gone: {error}") from None
+        return True
+
     def poll(self) -> Any | None:
-        """A message if one is there; never waits. ConnectionLost when the other side is gone."""
-        return self._take(0.0)
+        """Return a message if there is one; never waits. Raises ChannelClosed if the other process is gone."""
+        return self._receive_line(0.0)
 
     def receive(self, timeout: float) -> Any | None:
-        """The next message; None when none came within ``timeout`` s."""
+        """Return the next message; None if none came within ``timeout`` s. Raises ChannelClosed like :meth:`poll`."""
         deadline = time.monotonic() + timeout
         while True:
-            message = self._take(max(0.0, deadline - time.monotonic()))
+            message = self._receive_line(max(0.0, deadline - time.monotonic()))
             if message is not None or time.monotonic() >= deadline:
                 return message
 
-    def _take(self, timeout: float) -> Any | None:
+    def _receive_line(self, timeout: float) -> Any | None:
         if b"\n" not in self._pending:
-            self.sock.settimeout(timeout)
             try:
+                self.sock.settimeout(timeout)
                 data = self.sock.recv(1 << 20)
             except (BlockingIOError, TimeoutError):
                 return None
@@ -127,12 +172,13 @@ class Channel:
         return json.loads(line)
 
     def close(self) -> None:
-        """Hang up. Idempotent."""
+        """Close the connection. Idempotent."""
         self.sock.close()
+        self._out.close()
 
 
 def pack_error(error: BaseException) -> dict[str, Any]:
-    """An error as JSON, so that the app can raise the same one."""
+    """Return an error as plain data, from which :func:`unpack_error` makes the same error in the other process."""
     known = type(error).__name__ if isinstance(error, HalError) else "HalError"
     text = str(error) if isinstance(error, HalError) else f"{type(error).__name__}: {error}"
     attributes = {key: value for key, value in vars(error).items() if isinstance(value, (str, int, float))}
@@ -141,7 +187,7 @@ def pack_error(error: BaseException) -> dict[str, Any]:
 
 
 def unpack_error(data: dict[str, Any]) -> HalError:
-    """The error that :func:`pack_error` packed."""
+    """Return the error that :func:`pack_error` packed."""
     cls = getattr(errors, data["type"], HalError)
     error: HalError = cls.__new__(cls)
     Exception.__init__(error, data["text"])
@@ -152,16 +198,35 @@ def unpack_error(data: dict[str, Any]) -> HalError:
 
 
 class Child:
-    """A process that serves requests and shares memory with this one.
+    """A process that answers requests and shares memory with this one. Any thread may call any method."""
 
-    ``target`` names a function ``module:function`` that is called there with (channel, memories, configuration). It
-    says ``{"ready": ...}`` when it is; the value is kept in :attr:`ready`.
-    """
+    def __init__(
+        self,
+        name: str,
+        target: str,
+        config: Any,
+        memories: Sequence[SharedMemory] = (),
+        on_message: Callable[[dict[str, Any]], None] | None = None,
+    ) -> None:
+        """Start the process.
 
-    def __init__(self, name: str, target: str, config: Any, memories: Sequence[SharedMemory] = ()) -> None:
+        Args:
+            name: For error messages.
+            target: ``module:function``, called in the child with (channel, memories, config). It sends
+                ``{"ready": value}`` when it is; the value is kept in :attr:`ready`.
+            config: Plain data (JSON).
+            memories: Memory that both processes map.
+            on_message: Called with every message that is no answer, from the thread that happens to receive it, which
+                is one in :meth:`request` or :meth:`listen`. Without it such messages are dropped.
+        """
         self.name = name
-        self._asking = threading.Lock()
+        self._on_message = on_message
+        self._listening = threading.Lock()
+        self._numbering = threading.Lock()
         self._number = 0
+        self._answers: dict[int | None, dict[str, Any]] = {}
+        """By the number of the request; ``ready`` and a failure of the process have none."""
+        self._waiting: set[int | None] = set()
         fill_standard_descriptors()
         ours, theirs = socket.socketpair()
         self.channel = Channel(ours)
@@ -185,46 +250,106 @@ class Child:
             raise
 
     @property
+    def is_alive(self) -> bool:
+        """Whether the process runs."""
+        return self.process.poll() is None
+
+    @property
     def busy(self) -> bool:
-        """Is a request of this process on its way?"""
-        return self._asking.locked()
+        """Whether a request of this process waits for its answer."""
+        return bool(self._waiting)
 
     def wait_ready(self, timeout: float = START_TIMEOUT) -> Any:
-        """Wait until the child is ready; raises the error that it met while it started."""
-        self.ready = self._answer(timeout, "get ready")["ready"]
+        """Wait until the child is ready, and return what it reports. Raises the error that stopped its start."""
+        self.ready = self._wait_answer(None, timeout, "get ready")["ready"]
         return self.ready
 
     def check(self) -> None:
-        """Raise ConnectionLost, with the last lines that it printed, when the child is not alive."""
+        """Raise ConnectionLost, with the last lines that the child printed, if it has ended."""
         status = self.process.poll()
         if status is not None:
-            raise ConnectionLost(f"the {self.name} process ended (status {status}){self._tail()}")
+            raise ConnectionLost(f"the {self.name} process ended (status {status}){self._tail()}", code="process_ended")
 
     def request(self, method: str, params: dict[str, Any] | None = None, timeout: float = REQUEST_TIMEOUT) -> Any:
-        """Ask for something and wait for the answer; an error there is raised here."""
-        with self._asking:
-            self.check()
-            self._number += 1
-            self.channel.send({"id": self._number, "method": method, "params": params or {}})
-            return self._answer(timeout, f"answer {method!r}", self._number)["result"]
+        """Send a request and return its answer.
 
-    def _answer(self, timeout: float, what: str, number: int | None = None) -> dict[str, Any]:
-        deadline = time.monotonic() + timeout
-        while True:
-            try:
-                message = self.channel.receive(min(0.2, max(0.0, deadline - time.monotonic())))
-            except ConnectionLost:
-                self._wait_end(1.0)
-                self.check()
-                raise
-            if message is not None and message.get("id", number) == number:
-                if "error" in message:
-                    raise unpack_error(message["error"])
-                return dict(message)
+        Raises:
+            ConnectionLost: With code ``process_ended`` if the child has ended, ``process_silent`` if no answer came
+                within ``timeout`` s.
+            HalError: Whatever the child's method raised.
+        """
+        with self._numbering:
+            self._number = number = self._number + 1
+            self._waiting.add(number)
+        try:
+            self.check()
+            self.channel.send({"id": number, "method": method, "params": params or {}}, timeout)
+            return self._wait_answer(number, timeout, f"answer {method!r}")["result"]
+        finally:
+            self._waiting.discard(number)
+            self._answers.pop(number, None)
+
+    def notify(self, method: str, params: dict[str, Any] | None = None, timeout: float = REQUEST_TIMEOUT) -> None:
+        """Send a message that has no answer. Raises ChannelClosed if the child does not take it in ``timeout`` s."""
+        self.channel.send({"method": method, "params": params or {}}, timeout)
+
+    def listen(self, timeout: float) -> bool:
+        """Receive one message and pass it to ``on_message``, or to the request that waits for it.
+
+        Returns:
+            Whether one came within ``timeout`` s. False, too, if another thread receives all that time.
+
+        Raises:
+            ConnectionLost: If the child has ended.
+        """
+        return self._listen(timeout, None)
+
+    def _listen(self, timeout: float, until: tuple[int | None, ...] | None) -> bool:
+        """Receive one message, unless an answer to one of ``until`` is here already."""
+        if not self._listening.acquire(timeout=max(timeout, 1e-3)):
+            return False
+        try:
+            if until is not None and any(number in self._answers for number in until):
+                return True
+            message = self.channel.receive(timeout)
             if message is None:
                 self.check()
-                if time.monotonic() >= deadline:
-                    raise ConnectionLost(f"the {self.name} process did not {what} within {timeout:g} s{self._tail()}")
+                return False
+            self._sort(message)
+        except ChannelClosed:
+            self._wait_end(1.0)
+            self.check()
+            raise
+        finally:
+            self._listening.release()
+        return True
+
+    def _sort(self, message: dict[str, Any]) -> None:
+        """Keep an answer for its request; pass everything else on."""
+        number = message.get("id")
+        if number is not None:
+            if number in self._waiting:
+                self._answers[number] = message
+        elif "ready" in message or "error" in message:
+            self._answers[None] = message
+        elif self._on_message is not None:
+            self._on_message(message)
+
+    def _wait_answer(self, number: int | None, timeout: float, task: str) -> dict[str, Any]:
+        deadline = time.monotonic() + timeout
+        while True:
+            answer = self._answers.pop(number, None)
+            if answer is None and number is not None and "error" in self._answers.get(None, ()):
+                answer = self._answers[None]  # the process failed
+            if answer is not None:
+                if "error" in answer:
+                    raise unpack_error(answer["error"])
+                return answer
+            left = deadline - time.monotonic()
+            if not self._listen(min(_SLICE, max(0.0, left)), (number, None)) and left <= 0.0:
+                raise ConnectionLost(
+                    f"the {self.name} process did not {task} within {timeout:g} s{self._tail()}", code="process_silent"
+                )
 
     def _wait_end(self, timeout: float) -> bool:
         try:
@@ -234,18 +359,19 @@ class Child:
         return True
 
     def _tail(self) -> str:
+        """Return the last lines that the child printed, for an error message."""
         if self._log.closed:
             return ""
         self._log.seek(0, os.SEEK_END)
         self._log.seek(max(0, self._log.tell() - 2000))
         lines = self._log.read().decode(errors="replace").strip().splitlines()[-8:]
-        return "; it said:\n    " + "\n    ".join(lines) if lines else ""
+        return "; its last output:\n    " + "\n    ".join(lines) if lines else ""
 
     def close(self, timeout: float = 5.0) -> None:
-        """Ask the child to stop and end, and wait for it; end it by force when it does not. Idempotent."""
+        """Make the child end, and wait for it; kill it if it has not ended within ``timeout`` s. Idempotent."""
         try:
-            if self.process.poll() is None:
-                self.channel.send({"id": 0, "method": "close", "params": {}}, GOODBYE)
+            if self.is_alive:
+                self.channel.send({"id": 0, "method": "close", "params": {}}, _GOODBYE)
         except ConnectionLost:
             pass
         if not self._wait_end(timeout):
@@ -255,8 +381,62 @@ class Child:
         self._log.close()
 
 
+def serve(
+    channel: Channel,
+    methods: Mapping[str, Callable[..., Any]],
+    between: Callable[[], float | None] | None = None,
+    timeout: float = REQUEST_TIMEOUT,
+) -> None:
+    """Serve the app's requests, in a child, until the app closes this process or is gone.
+
+    A message ``{"id": n, "method": name, "params": {...}}`` calls ``methods[name](**params)``; the result of that call,
+    or its error, is sent back. A message without ``id`` has no answer; an error in it ends this function.
+
+    Args:
+        channel: The connection to the app.
+        methods: By their names.
+        between: Called when no message waits; returns the longest time to wait for the next one, s, or None to end.
+        timeout: An app that does not take an answer for so long, s, counts as gone.
+    """
+    parent = os.getppid()
+    try:
+        while os.getppid() == parent:
+            wait = _IDLE if between is None else between()
+            if wait is None:
+                return
+            message = channel.receive(wait)
+            while message is not None:
+                if message["method"] == "close":
+                    return
+                _serve_message(channel, methods, message, timeout)
+                message = channel.poll()
+    except ChannelClosed:
+        return
+
+
+def _serve_message(
+    channel: Channel, methods: Mapping[str, Callable[..., Any]], message: dict[str, Any], timeout: float
+) -> None:
+    name, number = message["method"], message.get("id")
+    try:
+        if name not in methods:
+            raise NotSupported(f"no request {name!r}", code="no_such_request")
+        answer = {"result": methods[name](**message["params"])}
+    except Exception as error:
+        if number is None:
+            raise
+        answer = {"error": pack_error(error)}
+    if number is not None:
+        channel.send({"id": number, **answer}, timeout)
+
+
 def child_main(target: str, fds: Sequence[int]) -> None:
-    """What runs in the child: call the target, report an error that it raises, end without interpreter tear-down."""
+    """Run a child: call the target, report an error that it raises, end without interpreter tear-down.
+
+    Args:
+        target: ``module:function``.
+        fds: Descriptors of the socket and of the memories.
+    """
     channel = Channel(socket.socket(fileno=fds[0]))
     status = 0
     try:

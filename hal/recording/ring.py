@@ -1,49 +1,25 @@
-"""Rows on their way from the app to the process that writes them: a bounded queue in memory that both share.
-
-A slot holds one row of numbers, and the pictures that are new in it. The app fills a free slot and counts it; the
-writer uses it in place and counts it, too. Neither ever waits for the other here. What the writer has to say (free
-space, what went wrong) stands beside it, so that nobody has to ask.
-"""
+"""Rows on their way from the app to the process that writes them, with what that process reports back."""
 
 from __future__ import annotations
 
-import struct
-from collections.abc import Iterator, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import DTypeLike, NDArray
 
+from ..host.mailbox import Mailbox
+from ..host.ring import STREAM_TYPES, ArrayRing, Images
 from .columns import CameraSetup
 
 __all__ = ["Images", "RowRing", "Slot"]
 
-_NUMBER = struct.Struct("<Q")
-_SPACE = struct.Struct("<d")
-_WRITTEN, _READ, _FREE, _TROUBLE = 0, 8, 16, 24
+_STATUS = "dH2000s"  # free space in bytes, length of the trouble's text, the text
 _TEXT = 2000
-_HEAD = 2048
-_ALIGNMENT = 64
+_VALUES = -1, ""
+"""Key of a row's numbers; a picture's is the index of its camera, and its stream."""
 
-
-Images = dict[str, NDArray[Any]]
-"""One camera's pictures in a slot, by their streams; only those that are kept."""
-
-_TYPES: dict[str, tuple[type[np.generic], tuple[int, ...]]] = {
-    "color": (np.uint8, (3,)),
-    "depth": (np.float32, ()),
-    "infrared": (np.uint8, ()),
-    "infrared_right": (np.uint8, ()),
-    "segmentation": (np.int32, ()),
-}
-"""Type and further dimensions of each stream's pictures."""
-
-
-def _streams(camera: CameraSetup) -> Iterator[tuple[str, type[np.generic], tuple[int, ...]]]:
-    """Yield each stream that is kept, and type and shape of its pictures."""
-    for stream in (*camera.videos.values(), *camera.depths.values()):
-        dtype, more = _TYPES[stream]
-        yield stream, dtype, (camera.height, camera.width, *more)
+_Key = tuple[int, str]
 
 
 class Slot(NamedTuple):
@@ -51,93 +27,94 @@ class Slot(NamedTuple):
 
     values: NDArray[np.float64]
     images: tuple[Images, ...]
-    """In the order of the cameras."""
+    """In the order of the cameras; a picture that is not new keeps what the slot held before."""
 
 
 class RowRing:
-    """Rows of ``width`` numbers and the pictures of ``cameras``, in ``buffer``: :meth:`size` bytes, zeros at first."""
+    """A queue of rows, each of ``width`` numbers and the pictures of ``cameras``; the writer uses them in place."""
 
     def __init__(self, buffer: memoryview, width: int, cameras: Sequence[CameraSetup], slots: int) -> None:
-        self._buffer = buffer
-        self._slots = []
-        place = _HEAD
-        for _ in range(slots):
-            values = np.frombuffer(buffer, np.float64, width, place)
-            place += _aligned(values.nbytes)
-            images = []
-            for camera in cameras:
-                pictures: Images = {}
-                for stream, dtype, shape in _streams(camera):
-                    picture = np.frombuffer(buffer, dtype, int(np.prod(shape)), place).reshape(shape)
-                    pictures[stream] = picture
-                    place += _aligned(picture.nbytes)
-                images.append(pictures)
-            self._slots.append(Slot(values, tuple(images)))
+        """Lay the queue out in ``buffer``, which has :meth:`size` bytes and starts as zeros."""
+        self._status = Mailbox(buffer, _STATUS)
+        self._report: tuple[float, str] = (0.0, "")
+        self._ring = ArrayRing(buffer[_status_size() :], _arrays(width, cameras), slots)
+        indices = range(len(cameras))
+        self._slots = {
+            id(slot): Slot(
+                slot[_VALUES],
+                tuple({stream: a for (k, stream), a in slot.items() if k == camera} for camera in indices),
+            )
+            for slot in self._ring.slots
+        }
 
     @staticmethod
     def size(width: int, cameras: Sequence[CameraSetup], slots: int) -> int:
-        """Bytes that it takes."""
-        row = _aligned(8 * width)
-        for camera in cameras:
-            for _, dtype, shape in _streams(camera):
-                row += _aligned(np.dtype(dtype).itemsize * int(np.prod(shape)))
-        return _HEAD + slots * row
-
-    def _get(self, place: int) -> int:
-        return int(_NUMBER.unpack_from(self._buffer, place)[0])
+        """Return the number of bytes that the queue needs."""
+        return _status_size() + ArrayRing.bytes_of(_arrays(width, cameras), slots)
 
     # The app's side.
 
     @property
     def waiting(self) -> int:
         """Rows that the writer has not used yet."""
-        return self._get(_WRITTEN) - self._get(_READ)
+        return self._ring.waiting
 
     @property
     def full(self) -> bool:
-        """Is there no free slot?"""
-        return self.waiting >= len(self._slots)
+        """Whether there is no free slot."""
+        return self._ring.is_full
 
     def next(self) -> Slot:
-        """The free slot to be filled, once it is known that there is one."""
-        return self._slots[self._get(_WRITTEN) % len(self._slots)]
+        """Return the free slot to be filled; call it only if the ring is not full."""
+        return self._slots[id(self._ring.open_slot())]
 
     def announce(self) -> None:
-        """It is filled."""
-        _NUMBER.pack_into(self._buffer, _WRITTEN, self._get(_WRITTEN) + 1)
+        """Publish the slot that was filled."""
+        self._ring.publish()
 
     @property
     def free_bytes(self) -> int:
-        """Free space on the disk, as the writer saw it last; 0 before."""
-        return int(_SPACE.unpack_from(self._buffer, _FREE)[0])
+        """Free space on the disk, as the writer found it last; 0 before."""
+        found = self._status.read()
+        return int(found[1][0]) if found is not None else 0
 
     @property
     def trouble(self) -> str:
-        """Why the writer writes no more; empty while it does."""
-        length = min(_TEXT, self._get(_TROUBLE))
-        start = _TROUBLE + _NUMBER.size
-        return bytes(self._buffer[start : start + length]).decode(errors="replace")
+        """Why the writer has stopped writing; empty while it writes."""
+        found = self._status.read()
+        return found[1][2][: found[1][1]].decode(errors="replace") if found is not None else ""
 
     # The writer's side.
 
     def oldest(self) -> Slot | None:
-        """The next row to be used; None where there is none."""
-        return self._slots[self._get(_READ) % len(self._slots)] if self.waiting else None
+        """Return the next row to be written; None if there is none."""
+        slot = self._ring.oldest()
+        return None if slot is None else self._slots[id(slot)]
 
     def used(self) -> None:
-        """Its slot is free again."""
-        _NUMBER.pack_into(self._buffer, _READ, self._get(_READ) + 1)
+        """Free the slot of the oldest row."""
+        self._ring.release_oldest()
 
     def say(self, free_bytes: int | None = None, trouble: str | None = None) -> None:
-        """Tell the app."""
-        if free_bytes is not None:
-            _SPACE.pack_into(self._buffer, _FREE, float(free_bytes))
-        if trouble is not None:
-            text = trouble.encode()[:_TEXT]
-            start = _TROUBLE + _NUMBER.size
-            self._buffer[start : start + len(text)] = text
-            _NUMBER.pack_into(self._buffer, _TROUBLE, len(text))
+        """Report free space, trouble or both to the app; what is None stays as it was."""
+        free, text = self._report
+        self._report = free, text = (
+            free if free_bytes is None else float(free_bytes),
+            text if trouble is None else trouble,
+        )
+        data = text.encode()[:_TEXT]
+        self._status.write(free, len(data), data)
 
 
-def _aligned(size: int) -> int:
-    return -(-size // _ALIGNMENT) * _ALIGNMENT
+def _status_size() -> int:
+    return -(-Mailbox.size(_STATUS) // 64) * 64  # the arrays stay aligned
+
+
+def _arrays(width: int, cameras: Sequence[CameraSetup]) -> dict[_Key, tuple[tuple[int, ...], DTypeLike]]:
+    """Return shape and type of everything in a row."""
+    arrays: dict[_Key, tuple[tuple[int, ...], DTypeLike]] = {_VALUES: ((width,), np.float64)}
+    for index, camera in enumerate(cameras):
+        for stream in (*camera.videos.values(), *camera.depths.values()):
+            dtype, more = STREAM_TYPES[stream]
+            arrays[index, stream] = (camera.height, camera.width, *more), dtype
+    return arrays

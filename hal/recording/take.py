@@ -116,7 +116,7 @@ class Take:
         for track, images in zip(self._tracks, slot.images, strict=True):
             track.fill(frames[track.camera.name], images)
         self._ring.announce()
-        self._child.channel.send({"method": "row"}, _WORD)
+        self._child.notify("row", timeout=_WORD)
         self.frames += 1
         self.seconds = t - self.grid.start_time
         self.gaps.over()

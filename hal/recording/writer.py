@@ -9,12 +9,12 @@ from __future__ import annotations
 import contextlib
 import os
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 from ..errors import CommandError, HalError
-from ..host.process import Channel, ChannelClosed, SharedMemory, pack_error
+from ..host.process import Channel, SharedMemory, serve
 from ..host.scheduling import yield_to_others
 from .columns import CameraSetup
 from .compatible import check_compatible
@@ -53,29 +53,24 @@ class Writer:
         self._lock = contextlib.ExitStack()
 
     def run(self) -> None:
-        """Until the app closes it or is gone."""
+        """Serve until the app closes this process or is gone, then write the rows that still wait."""
+        methods: dict[str, Callable[..., Any]] = {
+            "begin": self._do_begin,
+            "save": self._do_save,
+            "discard": self._do_discard,
+            "row": lambda: None,  # only wakes this process
+        }
         try:
-            while True:
-                message = self.channel.receive(_WAIT)
-                self.drain()
-                if message is None or message["method"] == "row":
-                    continue
-                if message["method"] == "close":
-                    return
-                self._serve(message)
-        except ChannelClosed:
+            serve(self.channel, methods, self._drain_and_wait)
             self.drain()
         finally:
             if self.live is not None:
                 self.live.close()
             self._lock.close()
 
-    def _serve(self, message: dict[str, Any]) -> None:
-        try:
-            answer = {"result": getattr(self, f"_do_{message['method']}")(**message["params"])}
-        except Exception as error:
-            answer = {"error": pack_error(error)}
-        self.channel.send({"id": message["id"], **answer})
+    def _drain_and_wait(self) -> float:
+        self.drain()
+        return _WAIT
 
     # Rows.
 
@@ -115,6 +110,7 @@ class Writer:
     # What the app asks for.
 
     def _do_begin(self, about: dict[str, Any]) -> dict[str, Any]:
+        self.drain()
         if self.live is not None:  # the app gave up in the middle of a start
             self._closed()
         try:
@@ -144,6 +140,7 @@ class Writer:
         return {"episode": number, "notes": notes}
 
     def _do_save(self, closing: dict[str, Any]) -> int | None:
+        self.drain()
         live = self._closed()
         try:
             (live.folder / RESERVE).unlink(missing_ok=True)
@@ -154,6 +151,7 @@ class Writer:
             raise HalError(f"the episode cannot be finished now: {error}; {stays}") from error
 
     def _do_discard(self) -> None:
+        self.drain()
         live = self._closed()
         if live.folder.exists():
             self.layout.remove(live.folder)

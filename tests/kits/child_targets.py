@@ -4,7 +4,7 @@ import os
 import time
 
 from hal.errors import ConfigError, ConnectionLost, Problem
-from hal.host.process import pack_error
+from hal.host.process import serve
 
 
 def echo(channel, memories, config):
@@ -16,21 +16,22 @@ def echo(channel, memories, config):
     if memories:
         memories[0].buffer[0:5] = b"hello"
     channel.send({"ready": {"pid": os.getpid(), "path": config.get("x")}})
-    while True:
-        message = channel.receive(1.0)
-        if message is None:
-            if os.getppid() == 1:
-                return
-            continue
-        if message["method"] == "close":
-            return
-        if message["method"] == "die":
-            print("these are my last words")
-            os._exit(3)
-        if message["method"] == "fail":
-            channel.send({"id": message["id"], "error": pack_error(ConnectionLost("the arm is gone"))})
-        else:
-            channel.send({"id": message["id"], "result": message["params"]})
+
+    def fail():
+        raise ConnectionLost("the arm is gone", code="arm_gone")
+
+    def die():
+        print("these are my last words")
+        os._exit(3)
+
+    def news(count):
+        for number in range(count):
+            channel.send({"news": number})
+
+    def sleep(seconds):
+        time.sleep(seconds)
+
+    serve(channel, {"say": lambda **params: params, "fail": fail, "die": die, "news": news, "sleep": sleep})
 
 
 HURRY = 2.5

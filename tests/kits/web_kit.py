@@ -15,9 +15,9 @@ import numpy as np
 from hal.camera import RawFrame
 from hal.commands import DeadmanRecord
 from hal.driver import GripperReading, Reading
-from hal.host.frames import FrameRing
 from hal.host.process import Child, SharedMemory
 from hal.host.records import GroupMemory, ServoRecord
+from hal.host.ring import frame_rings, frame_rings_size
 from hal.specs import CameraSpec, to_json
 from hal.types import Limited, RobotStatus, Trip
 
@@ -77,8 +77,8 @@ class App:
         **config: Any,
     ) -> None:
         self.cameras = {spec.name: spec for spec in cameras}
-        self.ring_memory = SharedMemory(FrameRing.size(cameras))
-        self.ring = FrameRing(self.ring_memory.buffer, cameras)
+        self.ring_memory = SharedMemory(frame_rings_size(cameras))
+        self.rings = frame_rings(self.ring_memory.buffer, cameras)
         self.host_memory = SharedMemory(GroupMemory.size(JOINTS, GRIPPERS))
         self.group = GroupMemory(self.host_memory.buffer, JOINTS, GRIPPERS)
         known = {"source": "test", "sim": True, "attended": False, "drivable": True, "driven_by": None, "demo": True}
@@ -125,7 +125,7 @@ class App:
 
     def show(self, camera: str, value: float, t: float | None = None) -> None:
         """A new picture of one colour."""
-        self.ring.put(camera, frame(self.cameras[camera], value, t))
+        self.rings[camera].write(frame(self.cameras[camera], value, t))
         self.send("frame", camera=camera)
 
     async def next(self, wanted: Callable[[dict[str, Any]], bool] = lambda message: True) -> dict[str, Any]:

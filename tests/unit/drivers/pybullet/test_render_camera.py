@@ -17,8 +17,8 @@ from hal.drivers.pybullet.rendering import choose_renderer
 from hal.drivers.pybullet.tiny import TinyRenderer
 from hal.drivers.pybullet.world import World
 from hal.errors import ConfigError, ConnectionLost, DriverMissing, NotSupported
-from hal.host.frames import FrameRing
 from hal.host.mailbox import SeriesBox
+from hal.host.ring import frame_rings, frame_rings_size
 from hal.specs import BodySpec, ViewSpec, to_json
 
 STILL = (0.0, 0.0, 0.0, 1.0)
@@ -104,11 +104,11 @@ class Bench:
         self.box = SeriesBox(memoryview(bytearray(SeriesBox.size(256))), 256)
         self.spec = camera(80, 60, view=FROM_ABOVE, rate_hz=10000.0)
         specs = [self.spec]
-        buffer = memoryview(bytearray(FrameRing.size(specs)))
+        buffer = memoryview(bytearray(frame_rings_size(specs)))
         mirror_world = World(self.world.spec, mirror=True)
         self.mirror = Mirror(mirror_world, self.box)
-        self.worker = RenderWorker(self.mirror, TinyRenderer(mirror_world), specs, FrameRing(buffer, specs))
-        self.source = SharedSource(FrameRing(buffer, specs), self.spec, lambda: None)
+        self.worker = RenderWorker(self.mirror, TinyRenderer(mirror_world), specs, frame_rings(buffer, specs))
+        self.source = SharedSource(frame_rings(buffer, specs)[self.spec.name], lambda: None)
         self.t = 0.0
 
     def publish(self) -> None:
@@ -199,9 +199,9 @@ class TestWorker:
             raise ConnectionLost("the renderer process ended")
 
         specs = [bench.spec]
-        ring = FrameRing(memoryview(bytearray(FrameRing.size(specs))), specs)
+        ring = frame_rings(memoryview(bytearray(frame_rings_size(specs))), specs)[bench.spec.name]
         with pytest.raises(ConnectionLost):
-            SharedSource(ring, bench.spec, gone).grab(0.0)
+            SharedSource(ring, gone).grab(0.0)
 
 
 class TestChoice:

@@ -23,8 +23,8 @@ from hal.drivers.pybullet.tiny import TinyRenderer
 from hal.drivers.pybullet.world import World
 from hal.errors import ConnectionLost
 from hal.geometry import Pose
-from hal.host.frames import FrameRing
 from hal.host.mailbox import SeriesBox
+from hal.host.ring import FrameRing, frame_rings
 from hal.specs import BodySpec, CameraSpec
 from hal.types import Frame
 
@@ -221,10 +221,10 @@ def test_frames_come_at_the_rate_that_was_asked_for(rate: float, monkeypatch: py
     )
     assert spec.rate_hz == rate
     snapshots = SeriesBox(memoryview(bytearray(SeriesBox.size(256))), 256)
-    buffer = memoryview(bytearray(FrameRing.size([spec])))
+    buffer = memoryview(bytearray(FrameRing.size(spec)))
     mirrored = World(scene.spec, mirror=True)
-    worker = RenderWorker(Mirror(mirrored, snapshots), Counting(), [spec], FrameRing(buffer, [spec]))
-    driver = PyBulletCamera(spec, SharedSource(FrameRing(buffer, [spec]), spec, lambda: None))
+    worker = RenderWorker(Mirror(mirrored, snapshots), Counting(), [spec], frame_rings(buffer, [spec]))
+    driver = PyBulletCamera(spec, SharedSource(FrameRing(buffer, spec), lambda: None))
     driver.open()
     frames = []
     for k in range(960):  # 4 s of a world at 240 Hz
