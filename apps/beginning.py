@@ -19,7 +19,7 @@ class Beginning:
     """
 
     def __init__(self, driving: Driving) -> None:
-        from hal.resetting import stands_in_world
+        from hal.learning.episode import stands_in_world
 
         self._driving = driving
         self._rig, self._robot = driving.rig, driving.robot
@@ -45,7 +45,7 @@ class Beginning:
         """Was everything put back? Not where the dead-man was let go of."""
         import numpy as np
 
-        from hal.resetting import put_back
+        from hal.learning.episode import put_back
 
         deadman = self._driving.deadman
         options: dict[str, Any] = {"deadman": deadman, "since": since, "patience": LET_GO, "hand": False}

@@ -71,7 +71,7 @@ def _main(args: argparse.Namespace) -> int:
     from hal.apps.report import check_writable
     from hal.config.data_files import data_folder
     from hal.errors import CommandError
-    from hal.policy import found
+    from hal.learning.policy import found
     from hal.recording import Recorder, recover
     from hal.recording.library import require
 

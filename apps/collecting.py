@@ -17,7 +17,7 @@ from hal.apps.driving import Driving
 from hal.apps.prompts import Prompts
 from hal.apps.taping import Tape
 from hal.errors import HalError
-from hal.resetting import stands_in_world
+from hal.learning.episode import stands_in_world
 from hal.views import ACTIONS
 
 if TYPE_CHECKING:

@@ -18,8 +18,8 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from hal.deadman import Deadman
+    from hal.learning.replay import Player
     from hal.recording import Episode
-    from hal.replaying import Player
     from hal.rig import Rig
     from hal.robot import Robot
 
@@ -93,7 +93,7 @@ def _main(args: argparse.Namespace) -> int:
 
 def _driven(rig: Rig, episode: Episode) -> str:
     """The arm that the recording says was driven, else the first of the rig that is in it, else the first."""
-    from hal.course import arms_of
+    from hal.learning.replay import arms_of
 
     driven = str(episode.info.get("info", {}).get("robot"))
     recorded = arms_of(episode)
@@ -104,8 +104,8 @@ def _driven(rig: Rig, episode: Episode) -> str:
 
 def _replayed(robot: Robot, episode: Episode) -> Iterator[str]:
     """Which arm moves, which others of the recording do not, and what is damaged but not needed."""
-    from hal.course import moved_besides
     from hal.errors import DatasetError
+    from hal.learning.replay import moved_besides
 
     yield f"replays  {robot.name}"
     try:
@@ -123,12 +123,11 @@ class Replay:
         self, rig: Rig, robot: Robot, episode: Episode, args: argparse.Namespace, deadman: Deadman | None, button: str
     ) -> None:
         from hal.apps.status import StatusLine
-        from hal.course import Course
-        from hal.replaying import Player
+        from hal.learning.replay import Player, RecordedTrajectory
 
         self.rig, self.robot, self.episode, self.args, self.button = rig, robot, episode, args, button
         self.line = StatusLine()
-        course = Course.of(episode, robot)
+        course = RecordedTrajectory.of(episode, robot)
         self.player = Player(
             rig, robot, course, speed=args.speed, deadman=deadman, unattended=args.unattended or not button
         )

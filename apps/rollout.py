@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from hal.config.mapping import TeleopMapping
     from hal.deadman import Deadman
     from hal.geometry import Pose
-    from hal.policy import Outcome
+    from hal.learning.policy import Outcome
     from hal.recording import Recorder
     from hal.rig import Rig
     from hal.robot import Robot
@@ -76,7 +76,7 @@ def _main(args: argparse.Namespace) -> int:
     from hal.apps.opening import planned
     from hal.apps.report import check_writable
     from hal.errors import CommandError
-    from hal.policy import found
+    from hal.learning.policy import found
 
     for name in ("rate", "episodes", "seconds", "history"):
         if not getattr(args, name) > 0:
@@ -132,7 +132,7 @@ class Run:
     ) -> None:
         """``mapping`` says what the pad's controls are, where somebody holds one."""
         from hal.apps.status import StatusLine
-        from hal.policy import PolicyRunner, found, load_policy
+        from hal.learning.policy import PolicyRunner, found, load_policy
 
         self.rig, self.robot, self.args, self.recorder = rig, robot, args, recorder
         self.deadman = deadman
@@ -219,7 +219,7 @@ class Run:
         """Everything back to where it starts: a real arm drives home, things with random ranges as the seed says."""
         import numpy as np
 
-        from hal.resetting import put_back, stands_in_world
+        from hal.learning.episode import put_back, stands_in_world
 
         rig, robot = self.rig, self.robot
         if not stands_in_world(rig, robot):

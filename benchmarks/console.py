@@ -44,7 +44,7 @@ def percentiles(values: list[float]) -> str:
 
 def start(runs: int) -> None:
     """From the command to a link that answers, in a fresh process, and what of it is imports."""
-    imports = "import hal, hal.rig, hal.config, hal.kinematics, pinocchio, ruckig, pydantic, pybullet"
+    imports = "import hal, hal.rig, hal.config, hal.kinematics.arm, pinocchio, ruckig, pydantic, pybullet"
     begun = time.monotonic()
     subprocess.run([sys.executable, "-c", imports], check=True, stdout=subprocess.DEVNULL)
     print(f"imports alone: {time.monotonic() - begun:.2f} s")

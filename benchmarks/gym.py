@@ -25,7 +25,7 @@ import gymnasium
 import numpy as np
 
 import hal
-from hal.gym import RigEnv
+from hal.learning.gym import RigEnv
 
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 from lock_step import CONFIG, POLICY_HZ, rate, raw

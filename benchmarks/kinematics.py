@@ -15,7 +15,7 @@ import pinocchio as pin
 
 import hal.config
 from hal.geometry import Pose
-from hal.kinematics import Kinematics
+from hal.kinematics.arm import Kinematics
 
 
 def microseconds(call: Callable[[], object], calls: int, repeats: int = 7) -> float:

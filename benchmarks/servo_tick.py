@@ -27,7 +27,7 @@ from servo_streams import PANDA, robot_spec
 
 from hal.commands import NO_INBOX, CommandRecord, Inbox, Kind, Session
 from hal.driver import Reading
-from hal.kinematics import Kinematics
+from hal.kinematics.arm import Kinematics
 from hal.servo.audit import SetpointAudit
 from hal.servo.servo import Servo
 from hal.specs import RobotSpec, WorkspaceSpec

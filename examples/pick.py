@@ -10,7 +10,7 @@ import sys
 import numpy as np
 
 import hal
-from hal.resetting import put_back
+from hal.learning.episode import put_back
 
 WIDTH = 0.03
 """Of the cube between the fingers, m."""

@@ -404,7 +404,7 @@ class Moving:
     """A camera on an arm's link: by the arm's state at the time of the picture."""
 
     def __init__(self, robot: Robot, view: ViewSpec, pose: Pose) -> None:
-        from .kinematics import Kinematics
+        from .kinematics.arm import Kinematics
 
         self._robot = robot
         self._link = str(view.link)

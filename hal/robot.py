@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from .deadman import Deadman
     from .gripper import Gripper
     from .host.hosts import Host
-    from .kinematics import Kinematics
+    from .kinematics.arm import Kinematics
     from .specs import LimitsSpec, RobotSpec
 
 __all__ = [
@@ -144,7 +144,7 @@ class Robot:
     def kinematics(self) -> Kinematics:
         """Forward and inverse kinematics of this arm."""
         if self._kinematics is None:
-            from .kinematics import Kinematics
+            from .kinematics.arm import Kinematics
 
             self._kinematics = Kinematics(self.spec.kinematics)
         return self._kinematics

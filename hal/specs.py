@@ -167,7 +167,7 @@ class BodySpec:
     ``orientation`` are then in the frame of the link."""
     link: str | None = None
     random: RangesSpec | None = None
-    """Where :func:`hal.placement.draw_poses` may put it, if it is one of the rig's own things."""
+    """Where :func:`hal.learning.episode.draw_poses` may put it, if it is one of the rig's own things."""
 
 
 @dataclass(frozen=True)

@@ -15,8 +15,7 @@ from hal.config.files import Problems
 from hal.config.models import load_pad_models
 from hal.driver import GamepadDriver, PadReading, Plugged
 from hal.errors import NotSupported
-from hal.pads.guess import guess_model, guess_warning
-from hal.pads.model import PadModel, choose_model, pad_model, validated
+from hal.pads.model import PadModel, choose_model, guess_model, guess_warning, pad_model, validated
 from hal.specs import PadSpec
 from hal.types import AXES
 

@@ -17,7 +17,7 @@ from hal.config.data_files import find_data
 from hal.driver import Reading, RobotDriver, Setpoint
 from hal.errors import RobotFault
 from hal.histogram import Histogram
-from hal.kinematics import Kinematics
+from hal.kinematics.arm import Kinematics
 from hal.preflight import has_realtime_kernel
 from hal.specs import RobotSpec
 from hal.types import Fault

@@ -14,9 +14,8 @@ from typing import Annotated, Any, Literal, TypeVar
 import numpy as np
 from pydantic import BaseModel, BeforeValidator, Field, model_validator
 
-from hal.config.files import Problems
+from hal.config.files import Problems, validate
 from hal.config.schema import Offset, Size, Strict, describe, is_number
-from hal.config.validation import validate
 from hal.errors import ConfigError
 from hal.specs import Floats, GripperSpec, RobotSpec
 

@@ -7,9 +7,8 @@ from typing import Any
 
 from pydantic import Field
 
-from hal.config.files import Problems
+from hal.config.files import Problems, validate
 from hal.config.schema import Flag, Strict, describe
-from hal.config.validation import validate
 from hal.errors import ConfigError
 from hal.specs import CameraSpec
 

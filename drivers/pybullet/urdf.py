@@ -9,9 +9,9 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from hal.config.urdf import read_urdf as check_urdf
 from hal.errors import ConfigError, Problem
-from hal.packages import mesh_file, near
+from hal.kinematics.urdf import mesh_file, near
+from hal.kinematics.urdf import read_urdf as check_urdf
 
 __all__ = ["Mimic", "UrdfFacts", "loadable", "read_urdf"]
 

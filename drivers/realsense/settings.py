@@ -11,9 +11,8 @@ from typing import Annotated, Any
 
 from pydantic import BeforeValidator, Field, model_validator
 
-from hal.config.files import Problems
+from hal.config.files import Problems, validate
 from hal.config.schema import Flag, Quantity, Seconds, Strict, describe, is_number
-from hal.config.validation import validate
 from hal.errors import CommandError, ConfigError
 from hal.specs import CameraSpec
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from hal.geometry import Pose, after_rotation, rotate
-from hal.packages import mesh_file
+from hal.kinematics.urdf import mesh_file
 
 __all__ = ["Joint", "UrdfTree", "Visual", "read_tree"]
 

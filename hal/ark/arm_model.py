@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from ..config.urdf import UrdfJoint
+from ..kinematics.urdf import UrdfJoint
 from .ledger import Ledger
 from .links import ArkUrdf
 from .reading import Node, Reading

@@ -5,8 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 
 from ..config import load
-from ..config.urdf import read_urdf
 from ..geometry import Pose
+from ..kinematics.urdf import read_urdf
 from ..specs import RobotSpec
 
 __all__ = ["FIXED_LINKS", "FRANKAS", "JOINT_COUNTS", "LINKS", "TCP_LINK", "KnownArm", "franka_with"]

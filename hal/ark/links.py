@@ -6,8 +6,8 @@ import xml.etree.ElementTree as ElementTree
 from collections.abc import Collection, Iterator
 from pathlib import Path
 
-from ..config.urdf import UrdfJoint, read_urdf
 from ..geometry import Pose
+from ..kinematics.urdf import UrdfJoint, read_urdf
 
 __all__ = ["ArkUrdf"]
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from ..packages import package_folder
+from ..kinematics.urdf import package_folder
 
 __all__ = ["Places", "PackageFile"]
 

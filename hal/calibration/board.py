@@ -11,9 +11,8 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from ..config.data_files import data_folder, is_path, user_path
-from ..config.files import Problems, read_yaml
+from ..config.files import Problems, read_yaml, validate
 from ..config.schema import Pixels, Size, Strict
-from ..config.validation import validate
 from ..errors import CommandError
 from .library import opencv
 

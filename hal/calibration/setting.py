@@ -12,9 +12,9 @@ from yaml import YAMLError
 from ..config.files import nearest, parse_yaml
 from ..config.rigfile import RigFile
 from ..config.schema import PoseConfig
-from ..config.urdf import read_urdf
 from ..errors import CommandError
 from ..geometry import Pose
+from ..kinematics.urdf import read_urdf
 from ..specs import Plan, RobotSpec
 from .views import Eye
 

@@ -2,22 +2,69 @@
 
 from __future__ import annotations
 
+import os
+import platform
+import sys
+from collections.abc import Collection, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from .. import registry
 from ..errors import HalError
-from .camera_models import CameraModel
-from .files import Problems, read_yaml
-from .models import GripperModel, RobotModel, find_model
-from .rigfile import CameraConfig, Device, RigFile, RobotConfig
+from ..kinematics.urdf import UrdfModel, package_folder
+from ..specs import CameraSpec, RobotSpec
+from .data_files import user_path
+from .files import Problems, nearest, read_yaml, validate, with_holes
+from .models import CameraModel, GripperModel, RobotModel, UrdfSource, find_model
+from .rigfile import CameraConfig, Device, GripperConfig, RigFile, RobotConfig
 from .schema import Unknown
-from .urdf import UrdfModel
-from .validation import validate, with_holes
 
-__all__ = ["Context"]
+__all__ = [
+    "Context",
+    "SHARED",
+    "ask_camera_driver",
+    "ask_driver",
+    "is_emulated",
+    "locate_urdf",
+    "options_of",
+]
+
+# [sources.py] Where URDFs come from: a file of the user's, or one inside an installed Python package.
+
+_HAS_WHEEL = sys.version_info < (3, 12) and (sys.platform, platform.machine()) == ("linux", "x86_64")
+_NO_WHEEL = (
+    f"PyBullet has no wheel for Python {platform.python_version()} on {platform.machine()}: use Python 3.11 on x86-64 "
+    "Linux (uv venv --seed --python 3.11 .venv, then install again), or build it (C++ compiler): pip install pybullet"
+)
+INSTALL = {
+    "pybullet_data": "pip install pybullet" if _HAS_WHEEL else _NO_WHEEL,
+    "example_robot_data": "pip install example-robot-data",
+    "airo_models": "pip install airo-models",
+}
+"""The command that brings a package, where it is not simply its name."""
+
+
+def locate_urdf(source: UrdfSource, base: Path, file: Path | str, key: str, problems: Problems) -> Path | None:
+    """Absolute path of a URDF; None, and a problem noted, where it is not there. Imports nothing."""
+    if source.package is None:
+        path = user_path(source.path, base)
+    else:
+        folder = package_folder(source.package)
+        if folder is None:
+            command = INSTALL.get(source.package, f"pip install {source.package.replace('_', '-')}")
+            message = f"package {source.package!r} is not installed; {command}"
+            if all(problem.message != message for problem in problems.found):  # robot and objects may share a package
+                problems.add(file, f"{key}.package", message)
+            return None
+        path = user_path(source.path, folder)
+    if not os.path.isfile(path):
+        there = [p.name for p in path.parent.glob("*.urdf")] if path.parent.is_dir() else []
+        problems.add(file, key, f"there is no file {path}{nearest(path.name, there) if there else ''}")
+        return None
+    return path
+
 
 Model = TypeVar("Model", RobotModel, CameraModel)
 HasDrivers = RobotModel | CameraModel | GripperModel
@@ -116,3 +163,93 @@ class Context:
     def problem(self, key: str, message: str) -> None:
         """Note a problem in the rig's file."""
         self.problems.add(self.source, key, message)
+
+
+# [driver_options.py] What only one driver needs: its options in the rig and the model, and what that driver says
+# of them.
+
+Config = RobotConfig | GripperConfig | CameraConfig
+DrivenModel = RobotModel | GripperModel | CameraModel
+
+SHARED = ("host",)
+"""Options of a real arm that its gripper has too, unless it has its own."""
+
+
+def options_of(
+    config: Config, model: DrivenModel, simulated: bool, driver: str, base: Path | None = None, file: Path | None = None
+) -> dict[str, Any]:
+    """The rig's options for this driver, on top of the model's. The latter are for the model's own driver only.
+
+    Those that are paths become absolute: ``base`` is the folder of the rig's file, ``file`` that of the model.
+    """
+    own = model.drivers.sim if simulated else model.drivers.real
+    of_model = (model.simulated if simulated else model.real) if driver == own else {}
+    of_rig = config.simulated if simulated else config.real
+    if base is not None and file is not None and driver:
+        paths = registry.driver(driver).path_options
+        of_model, of_rig = _absolute(of_model, paths, file.parent), _absolute(of_rig, paths, base)
+    return {**of_model, **of_rig}
+
+
+def _absolute(options: Mapping[str, Any], paths: Collection[str], folder: Path) -> dict[str, Any]:
+    """What is no text is left as it is: the driver's own check says what is wrong with it."""
+    return {
+        name: str(user_path(value, folder)) if name in paths and isinstance(value, str) else value
+        for name, value in options.items()
+    }
+
+
+def is_emulated(driver: str, options: Mapping[str, Any]) -> bool:
+    """Does the driver say that a program stands in for the real device with these options?"""
+    found = registry.function(driver, registry.driver(driver).emulated)
+    return found is not None and bool(found(options))
+
+
+def ask_driver(context: Context, key: str, spec: RobotSpec, config: RobotConfig, model: RobotModel, file: Path) -> None:
+    """Note what the drivers of an arm and of its gripper find wrong in their records."""
+    for relative, message in registry.checked(spec.driver, "robot", spec):
+        _note(context, key, "", relative, message, config, model, file)
+    gripper, kind = spec.gripper, model.gripper
+    if gripper is None or kind is None:
+        return
+    arms = {f"real.{name}" for name in SHARED if name not in {**kind.real, **config.gripper.real}}
+    for relative, message in registry.checked(gripper.driver, "gripper", gripper):
+        if gripper.driver != spec.driver or relative not in arms:  # what is the arm's was told there
+            _note(context, key, "gripper.", relative, message, config.gripper, kind, file)
+
+
+def ask_camera_driver(
+    context: Context, key: str, spec: CameraSpec, config: CameraConfig, model: CameraModel, file: Path
+) -> None:
+    """Note what the driver of a camera finds wrong in its record."""
+    for relative, message in registry.checked(spec.driver, "camera", spec):
+        _note(context, key, "", relative, message, config, model, file)
+
+
+def _note(
+    context: Context,
+    key: str,
+    part: str,
+    relative: str,
+    message: str,
+    config: Config,
+    model: DrivenModel,
+    file: Path,
+) -> None:
+    """In the rig's file, unless what is wrong stands in the model's. ``relative`` is a key of the device's entry."""
+    section, _, rest = relative.partition(".")
+    name = rest.partition(".")[0]
+    in_model = False
+    if section in ("real", "simulated"):
+        in_model = name in getattr(model, section) and name not in getattr(config, section)
+    elif section == "limits" and isinstance(model, RobotModel) and isinstance(config, RobotConfig):
+        given = config.limits.model_fields_set
+        in_model = name not in given if name else not given
+        if in_model and name in model.real_limits.model_fields_set and not context.simulated(config):
+            relative = f"real_{relative}"
+    elif section in ("capture", "depth", "field_of_view") and isinstance(config, CameraConfig):
+        in_model = getattr(config, section) is None
+    if in_model:
+        context.problems.add(file, f"{part}{relative}", message)
+    else:
+        context.problem(f"{key}.{part}{relative}", message)

@@ -15,11 +15,9 @@ from pydantic import PrivateAttr
 from ..specs import Plan
 from .context import Context
 from .data_files import data_folder, is_path, list_data, user_path
-from .files import Problems, nearest, read_yaml
-from .overrides import apply_overrides
+from .files import Problems, apply_overrides, nearest, read_yaml, validate
 from .resolve import resolve
 from .rigfile import RigFile
-from .validation import validate
 
 __all__ = ["RigConfig", "load"]
 

@@ -14,9 +14,8 @@ from pydantic import Field, field_validator, model_validator
 
 from ..types import AXES, BUTTONS, PadState
 from .data_files import data_folder, is_path, list_data, user_path
-from .files import Problems, nearest, read_yaml
+from .files import Problems, nearest, read_yaml, validate
 from .schema import Flag, Quantity, Strict
-from .validation import validate
 
 __all__ = ["AxisMapping", "DirectionsMapping", "GripperMapping", "TeleopMapping", "TurnsMapping", "load_mapping"]
 

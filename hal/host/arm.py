@@ -14,7 +14,7 @@ from ..driver import Reading, RobotDriver
 from ..errors import ConnectionLost, ControlTaken
 from ..geometry import Pose
 from ..histogram import Histogram
-from ..kinematics import Kinematics
+from ..kinematics.arm import Kinematics
 from ..servo.audit import SetpointAudit
 from ..servo.servo import Servo
 from ..specs import RobotSpec

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 from .. import registry
 from ..config.data_files import find_data
-from ..config.resolve_pads import NO_WINDOW_KEYBOARD
+from ..config.resolve import NO_WINDOW_KEYBOARD
 from ..errors import DeviceNotFound, DriverMissing, NotSupported
 from ..specs import PadSpec
 

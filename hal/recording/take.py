@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 from ..errors import HalError, StaleStateError
-from ..resetting import stands_in_world
+from ..learning.episode import stands_in_world
 from .cameras import CameraTrack
 from .gaps import Gaps
 from .grid import Grid, LockStepGrid, RealTimeGrid

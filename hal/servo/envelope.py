@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..commands import Session
-from ..kinematics import Kinematics, Pose7
+from ..kinematics.arm import Kinematics, Pose7
 from ..specs import WorkspaceSpec
 from ..types import Limited
 from .limits import speed_for

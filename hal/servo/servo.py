@@ -15,7 +15,7 @@ from typing import Any
 from ..commands import CommandRecord, Inbox, Kind, Session
 from ..driver import Reading, Setpoint
 from ..errors import CommandError, ControlTaken
-from ..kinematics import Kinematics
+from ..kinematics.arm import Kinematics
 from ..specs import RobotSpec
 from ..types import Fault, Limited, RobotStatus, Trip
 from .anchoring import Anchoring

@@ -25,7 +25,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..kinematics import Kinematics, Pose7
+from ..kinematics.arm import Kinematics, Pose7
 from ..specs import WorkspaceSpec
 from .limits import stop_displacement, stop_phases
 from .smoothing import JointSmoother

@@ -25,9 +25,9 @@ from stage_kit import ROUNDED, Stage, at_row
 
 import hal
 from hal.apps import collect
-from hal.gym import RigEnv
+from hal.learning.episode import put_back
+from hal.learning.gym import RigEnv
 from hal.recording import Dataset, Episode
-from hal.resetting import put_back
 
 ROOT = Path(__file__).resolve().parents[2]
 APP = ROOT / "apps" / "collect.py"

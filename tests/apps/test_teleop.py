@@ -107,7 +107,7 @@ def test_without_pybullet_one_line_says_what_to_do() -> None:
     """As on Python 3.12 or ARM, where PyBullet has no wheel."""
     code = (
         "import platform, sys; platform.machine = lambda: 'aarch64'\n"
-        "import hal.config.sources; hal.config.sources.package_folder = lambda name: None\n"
+        "import hal.config.context; hal.config.context.package_folder = lambda name: None\n"
         "from hal.apps.teleop import main; sys.exit(main(['--sim']))\n"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)

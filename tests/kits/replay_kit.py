@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import hal
-from hal.course import Course
+from hal.learning.replay import RecordedTrajectory
 
 __all__ = ["BARE", "FPS", "Recorded", "course_of", "opened"]
 
@@ -32,5 +32,5 @@ def opened(driver: str, **options: Any) -> hal.Rig:
     return hal.open("panda_table", **{"overrides": BARE, "pad": "none", **kind, **options})
 
 
-def course_of(episode: Recorded, robot: hal.Robot) -> Course:
-    return Course.of(episode, robot)  # type: ignore[arg-type]
+def course_of(episode: Recorded, robot: hal.Robot) -> RecordedTrajectory:
+    return RecordedTrajectory.of(episode, robot)  # type: ignore[arg-type]

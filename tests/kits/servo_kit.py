@@ -13,7 +13,7 @@ from specs import panda
 
 from hal.commands import CommandRecord, DeadmanRecord, Inbox, Kind, Session
 from hal.driver import Reading, Setpoint
-from hal.kinematics import Kinematics
+from hal.kinematics.arm import Kinematics
 from hal.servo.audit import SetpointAudit
 from hal.servo.servo import Servo
 from hal.specs import LimitsSpec, RobotSpec

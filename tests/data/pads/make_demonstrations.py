@@ -32,10 +32,10 @@ from hal.config.data_files import find_data
 from hal.driver import GamepadDriver, PadReading
 from hal.gamepad import Gamepad
 from hal.geometry import quaternion_to_matrix
+from hal.learning.episode import put_back
 from hal.pads.codes import ABS, EV_ABS, EV_KEY, KEY
 from hal.pads.mapper import AxisRange, PadMapper
 from hal.pads.model import pad_model
-from hal.resetting import put_back
 from hal.specs import PadSpec
 
 FILE = Path(__file__).resolve().parents[3] / "config" / "teleop" / "demonstrations.jsonl"

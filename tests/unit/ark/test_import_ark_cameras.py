@@ -16,7 +16,7 @@ from pybullet_utils.bullet_client import BulletClient
 from hal.ark import Options
 from hal.config import load
 from hal.geometry import Pose
-from hal.kinematics import Kinematics
+from hal.kinematics.arm import Kinematics
 
 XARM = Path(pybullet_data.getDataPath(), "xarm", "xarm6_robot.urdf")
 

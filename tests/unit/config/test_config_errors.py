@@ -15,10 +15,9 @@ from pydantic import BaseModel
 
 from hal.calibration.board import BoardConfig
 from hal.config import load
-from hal.config.camera_models import CameraModel
 from hal.config.data_files import find_data
 from hal.config.mapping import TeleopMapping
-from hal.config.models import RobotModel
+from hal.config.models import CameraModel, RobotModel
 from hal.config.objects import ObjectConfig
 from hal.config.rigfile import RigFile
 from hal.errors import ConfigError, Problem

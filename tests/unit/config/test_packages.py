@@ -10,7 +10,7 @@ from specs import data, world_spec
 
 from hal.drivers.pybullet.world import World
 from hal.errors import ConfigError
-from hal.packages import mesh_file, package_folder
+from hal.kinematics.urdf import mesh_file, package_folder
 from hal.specs import BodySpec
 
 CUBE = """

@@ -13,9 +13,8 @@ from pathlib import Path
 import pytest
 
 from hal.config import load
-from hal.config.meshes import check_mesh
-from hal.config.urdf import read_urdf
 from hal.errors import ConfigError
+from hal.kinematics.urdf import check_mesh, read_urdf
 
 MUTATIONS = int(os.environ.get("HAL_FUZZ_COUNT", "300"))
 """Number of mutated URDFs and meshes; a longer run is asked for by the environment."""

@@ -15,7 +15,7 @@ from hal.config import load
 from hal.config.data_files import find_data
 from hal.drivers.franka.limits import FR3, LIMITS
 from hal.drivers.franka.settings import check_arm
-from hal.kinematics import Kinematics
+from hal.kinematics.arm import Kinematics
 from hal.specs import RobotSpec
 
 URDF = find_data("robots", "fr3.urdf")

@@ -14,7 +14,7 @@ import pytest
 
 from hal.errors import CommandError, Unreachable
 from hal.geometry import Pose, quaternion_to_matrix
-from hal.kinematics import NEAR_SINGULAR, Kinematics
+from hal.kinematics.arm import NEAR_SINGULAR, Kinematics
 from hal.specs import KinematicsSpec
 
 pybullet = pytest.importorskip("pybullet", reason="needs pybullet (pip install pybullet)")

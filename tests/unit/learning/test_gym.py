@@ -16,7 +16,7 @@ gymnasium = pytest.importorskip("gymnasium", reason="pip install 'robot-hal[gym]
 
 from gymnasium.utils.env_checker import check_env  # noqa: E402
 
-from hal.gym import RigEnv  # noqa: E402
+from hal.learning.gym import RigEnv  # noqa: E402
 
 BARE = ("cameras={}",)
 
@@ -275,7 +275,7 @@ def test_in_real_time_every_observation_is_a_fresh_one() -> None:
     """Another system handed out the same observation again in 96 to 98 of 100 steps."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(
-            "hal.gym.RigEnv._open",
+            "hal.learning.gym.RigEnv._open",
             staticmethod(lambda *a: hal.open("panda_table", driver="mock", clock="real_time", pad="none")),
         )
         env = RigEnv(action="twist", rate_hz=20.0)

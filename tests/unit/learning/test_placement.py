@@ -12,8 +12,7 @@ import pytest
 
 import hal
 from hal import Pose
-from hal.placement import draw_poses
-from hal.resetting import put_back
+from hal.learning.episode import draw_poses, put_back
 
 TABLE = {"name": "table", "shape": "box", "half_extents": [0.5, 0.5, 0.3], "position": [0, 0, 0.3]}
 FAR = {"arm": {"model": "panda", "base": [0, -2, 0, 0, 0, 0, 1]}}

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import hal
-from hal.policy import PolicyRunner, load_policy
+from hal.learning.policy import PolicyRunner, load_policy
 
 Rig = hal.Rig
 UP = hal.Twist([0.0, 0.0, 0.05])

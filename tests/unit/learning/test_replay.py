@@ -11,9 +11,7 @@ import pytest
 from replay_kit import BARE, FPS, Recorded, course_of, opened
 
 import hal
-from hal.course import Course, arms_of, moved_besides
-from hal.deviation import Deviation
-from hal.replaying import Player
+from hal.learning.replay import Deviation, Player, RecordedTrajectory, arms_of, moved_besides
 
 
 def twist(t: float) -> hal.Twist:
@@ -184,7 +182,7 @@ def test_what_cannot_be_replayed_is_refused_with_the_reason(episode: Recorded) -
             q[k, j] = value
             return q
 
-        wrong: list[tuple[Course, str]] = [
+        wrong: list[tuple[RecordedTrajectory, str]] = [
             (replace(good, model="fr3"), "model fr3"),
             (replace(good, joints=("a", "b")), "joints a, b"),
             (replace(good, q_set=moved(20, 3, 0.5)), "panda_joint4 goes through .* its limits here"),
@@ -256,7 +254,7 @@ def test_the_deviation_is_what_it_says() -> None:
 
 
 def test_every_stretch_is_monotone_and_its_two_ways_agree() -> None:
-    from hal.replaying import Stretch
+    from hal.learning.replay import Stretch
 
     stretch = Stretch(t=10.0, s=2.0, speed=0.5)
     times: Callable[[float], float] = stretch.time

@@ -12,8 +12,8 @@ import hal
 from hal.apps.collect import parser
 from hal.apps.collecting import Collection
 from hal.drivers.mock.gamepad import MockPad
+from hal.learning.episode import put_back
 from hal.recording import Dataset, Recorder
-from hal.resetting import put_back
 
 AWAY = np.array([0.3, 0.0, 0.0, 0.0, 0.0, 0.0, 0.2])
 

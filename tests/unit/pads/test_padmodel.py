@@ -10,9 +10,8 @@ import yaml
 
 from hal.errors import ConfigError
 from hal.pads.codes import ABS, BUS_BLUETOOTH, BUS_USB, EV_ABS, EV_KEY, EV_MSC, EV_REL, KEY, REL
-from hal.pads.guess import guess_model, guess_warning
 from hal.pads.mapper import REL_SILENCE, AxisRange, PadMapper
-from hal.pads.model import Identity, PadModel, choose_model, pad_model
+from hal.pads.model import Identity, PadModel, choose_model, guess_model, guess_warning, pad_model
 from hal.types import BUTTONS, CAP_AXES, STICK_AXES
 
 FOLDER = Path(__file__).parents[3] / "sensors" / "gamepads"

@@ -15,8 +15,8 @@ import pytest
 from export_kit import make_recording
 from recording_kit import check_layout, drive, kill_writer, mock_rig, record
 
-from hal.course import Course
 from hal.errors import CommandError, ConnectionLost, DatasetError, DeviceNotFound, HalError
+from hal.learning.replay import RecordedTrajectory
 from hal.recording import Dataset, Episode, Recorder, recover, repair
 from hal.recording.checking import check_dataset, check_rows
 from hal.recording.exporters import export
@@ -77,7 +77,7 @@ def exported(episode: Episode, folder: Path, rig: Rig) -> Arrays:
 
 def replayed(episode: Episode, folder: Path, rig: Rig) -> Arrays:
     check_rows(episode, None)
-    course = Course.of(episode, rig.robots["panda"])
+    course = RecordedTrajectory.of(episode, rig.robots["panda"])
     assert course.width is not None
     return {"t": course.t, "q_set": course.q_set, "width": course.width}
 

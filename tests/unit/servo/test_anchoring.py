@@ -15,7 +15,7 @@ from servo_kit import STILL, Bench, N
 from specs import panda
 
 from hal.commands import Kind
-from hal.kinematics import Kinematics
+from hal.kinematics.arm import Kinematics
 from hal.servo.anchoring import LATEST
 from hal.servo.audit import SetpointAudit
 from hal.types import Fault, Limited, RobotStatus

@@ -12,7 +12,7 @@ from servo_kit import Bench
 from specs import PANDA_HOME, data, panda
 
 from hal.commands import Kind
-from hal.kinematics import NEAR_SINGULAR, Kinematics
+from hal.kinematics.arm import NEAR_SINGULAR, Kinematics
 from hal.servo.servo import Servo
 from hal.servo.smoothing import JointSmoother
 from hal.servo.tcp import TcpReference

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from specs import panda
 
 from hal.commands import Session
-from hal.kinematics import Kinematics
+from hal.kinematics.arm import Kinematics
 from hal.servo.envelope import Envelope
 from hal.servo.smoothing import JointSmoother
 from hal.servo.torque_bounds import RATE, ArmInMotion, Inertia, TorqueBounds

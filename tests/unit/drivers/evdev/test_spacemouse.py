@@ -18,9 +18,8 @@ from hal.config.mapping import load_mapping
 from hal.drivers.evdev.pad import EvdevPad
 from hal.gamepad import Gamepad
 from hal.pads.codes import ABS, BUS_USB, EV_ABS, EV_KEY, EV_REL, EV_SYN, KEY, REL, SYN_DROPPED
-from hal.pads.guess import guess_model
 from hal.pads.mapper import REL_SILENCE, AxisRange
-from hal.pads.model import Identity
+from hal.pads.model import Identity, guess_model
 from hal.servo.watchdog import SILENCE
 from hal.types import CAP_AXES
 

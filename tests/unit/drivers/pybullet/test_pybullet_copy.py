@@ -12,7 +12,7 @@ from specs import PANDA_HOME, box, cube, floor, panda, world_spec
 
 from hal.drivers.pybullet.world import World
 from hal.errors import CommandError, DeviceNotFound, NotSupported
-from hal.kinematics import Kinematics
+from hal.kinematics.arm import Kinematics
 
 REST = [0.0] * 7
 JOINTS = tuple(f"panda_joint{k}" for k in range(1, 8))

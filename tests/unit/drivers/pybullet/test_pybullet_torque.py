@@ -13,7 +13,7 @@ from torque_kit import NOTHING, N, one, simulated
 from hal.driver import Setpoint
 from hal.drivers.pybullet.robot import PyBulletRobot
 from hal.drivers.pybullet.world import World
-from hal.kinematics import Kinematics
+from hal.kinematics.arm import Kinematics
 from hal.specs import BodySpec
 from hal.types import Limited, RobotStatus, Trip
 

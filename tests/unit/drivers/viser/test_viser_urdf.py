@@ -10,7 +10,7 @@ from specs import PANDA_HOME, data, panda
 
 from hal.drivers.viser.urdf import read_tree
 from hal.geometry import Pose
-from hal.kinematics import Kinematics
+from hal.kinematics.arm import Kinematics
 from hal.specs import KinematicsSpec
 
 SMALL = """

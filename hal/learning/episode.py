@@ -1,4 +1,4 @@
-"""Where things start in an episode: poses drawn from the random ranges that the rig gives them."""
+"""Before an episode: everything back to where it starts."""
 
 from __future__ import annotations
 
@@ -7,17 +7,26 @@ from itertools import product
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from .errors import CommandError
-from .geometry import Pose
-from .specs import BodySpec, RangesSpec
+from ..errors import CommandError, MotionStopped
+from ..geometry import Pose
+from ..specs import BodySpec, RangesSpec
 
 if TYPE_CHECKING:
-    from .rig import Rig
-    from .world import World
+    from ..clock import Clock
+    from ..deadman import Deadman
+    from ..rig import Rig
+    from ..robot import Robot
+    from ..world import World
 
-__all__ = ["draw_poses"]
+__all__ = [
+    "draw_poses",
+    "put_back",
+    "stands_in_world",
+]
+
+# [placement.py] Where things start in an episode: poses drawn from the random ranges that the rig gives them.
 
 Array = NDArray[np.float64]
 
@@ -202,3 +211,72 @@ def _solid(world: World, name: str) -> _Box | _Plane | None:
 
 def _box_around(points: Array) -> _Box:
     return _Box(points.min(axis=0), points.max(axis=0))
+
+
+_LOOKS_HZ = 50.0
+"""At the dead-man."""
+
+
+def stands_in_world(rig: Rig, robot: Robot) -> bool:
+    """Is this arm a part of the simulated world, and no copy of a real one? Then it need not drive to be elsewhere."""
+    world = rig.plan.world
+    return world is not None and robot.spec.driver == world.driver
+
+
+def put_back(
+    rig: Rig,
+    robot: Robot,
+    q: ArrayLike | None = None,
+    *,
+    poses: Mapping[str, Pose] | None = None,
+    random: np.random.Generator | None = None,
+    deadman: Deadman | None = None,
+    unattended: bool = False,
+    since: int | None = None,
+    patience: float = 60.0,
+    hand: bool = True,
+) -> dict[str, Pose]:
+    """A simulated world as it began, and the arm at ``q`` (n,), rad. Returns where things are that began elsewhere.
+
+    With ``random``, objects with random ranges are placed at poses drawn from it (:func:`draw_poses`);
+    those named in ``poses`` are put there instead. On a real bench nobody puts things anywhere.
+
+    An arm of that world is put there (where it began, without ``q``). Any other arm **drives**, as ``move_to`` does,
+    and then opens its gripper, which drops what it holds, unless ``hand`` is False; without ``q`` it drives home. With
+    a dead-man that takes a new press: more than ``since`` in all, or than there were at this call. What is held for
+    something else, or after a stop, drives nobody home.
+
+    Raises what ``move_to`` raises: MotionStopped, too, as long as nobody has acknowledged ``rig.stop()``, and when the
+    dead-man was not pressed, or held, for ``patience`` s.
+    """
+    inside = stands_in_world(rig, robot)
+    if not inside:  # first: on its way its copy would push what is put there
+        if deadman is not None:
+            _wait_for_press(rig.clock, deadman, deadman.record.presses if since is None else since, patience)
+        target = robot.home if q is None else np.asarray(q, float)
+        robot.move_to(target, deadman=deadman, unattended=unattended, patience=patience)
+        if hand and robot.gripper is not None:
+            robot.gripper.open()
+    if not rig.has_world:
+        return {}
+    rig.world.reset()
+    put = dict(poses or {})
+    for name, pose in put.items():
+        rig.world.reset(name, pose=pose)
+    if random is not None:
+        drawn = draw_poses(rig, random, given=put)
+        for name, pose in drawn.items():
+            rig.world.reset(name, pose=pose)
+        put |= drawn
+    if inside:
+        rig.world.reset(robot.name, q=robot.spec.initial if q is None else np.asarray(q, float))
+    return put
+
+
+def _wait_for_press(clock: Clock, deadman: Deadman, since: int, patience: float) -> None:
+    for tick in clock.rate(_LOOKS_HZ):
+        record = deadman.record
+        if record.held and record.presses > since:
+            return
+        if tick.elapsed > patience:
+            raise MotionStopped(f"nobody pressed the dead-man for {patience:g} s", "let go of it, and hold it")

@@ -16,12 +16,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .arguments import vector
-from .errors import CommandError
-from .geometry import Pose, difference
+from ..arguments import vector
+from ..errors import CommandError
+from ..geometry import Pose, difference
 
 if TYPE_CHECKING:
-    from .specs import KinematicsSpec
+    from ..specs import KinematicsSpec
 
 __all__ = ["Kinematics", "Pose7"]
 

@@ -12,22 +12,53 @@ from typing import TYPE_CHECKING, Any, Protocol, TypeAlias, cast
 
 import numpy as np
 
-from .commands import Command
-from .control import CommandChecks
-from .errors import CommandError, ConnectionLost, MotionStopped, RobotFault, StaleStateError
-from .handover import follows, wait_here
-from .histogram import Histogram
-from .observation import Observation
+from ..commands import Command, JointChunk, JointTarget
+from ..control import CommandChecks
+from ..errors import CommandError, ConnectionLost, MotionStopped, RobotFault, StaleStateError
+from ..histogram import Histogram
+from ..observation import Observation
+from ..types import RobotStatus
 
 if TYPE_CHECKING:
     from collections.abc import Collection
 
-    from .control import Control
-    from .deadman import Deadman
-    from .rig import Rig
-    from .robot import Robot
+    from ..control import Control
+    from ..deadman import Deadman
+    from ..rig import Rig
+    from ..robot import Robot
 
-__all__ = ["Answer", "Outcome", "Policy", "PolicyRunner", "found", "load_policy"]
+__all__ = [
+    "Answer",
+    "Outcome",
+    "Policy",
+    "PolicyRunner",
+    "follows",
+    "found",
+    "load_policy",
+    "wait_here",
+]
+
+# [handover.py] From a person's hand to a program's: when may a program's motion begin, or go on after a pause?
+
+
+def follows(control: Control) -> bool:
+    """Does the arm follow commands now? Until it does, it is told to stay where it is; call it once a turn.
+
+    A command that was sent before the servo has seen a new press of the dead-man does not count. Nothing of a motion
+    that has a beginning is lost so, for it is sent only when this is True. Raises what ``control.send`` raises.
+    """
+    held = control.deadman is None or control.deadman.held
+    if held and control.status is RobotStatus.FOLLOWING:
+        return True
+    control.send(JointTarget(control.robot.state().q_set))
+    return False
+
+
+def wait_here(control: Control, seconds: float) -> None:
+    """Stay, for up to so many s (3 at most): until a motion that is not known yet begins. Later than that is a trip."""
+    now, q_set = control.robot.clock.now(), control.robot.state().q_set
+    control.send(JointChunk([now, now + seconds], [q_set, q_set]))
+
 
 Answer: TypeAlias = "Command | tuple[Command | None, float | None] | None"
 """A command; or a command and a grip from 0 (open) to 1 (closed), either of which may be None. None goes on with the

@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from .errors import Unreachable
-from .geometry import Pose
+from ..errors import Unreachable
+from ..geometry import Pose
 
 if TYPE_CHECKING:
-    from .kinematics import Kinematics
+    from .arm import Kinematics
 
 __all__ = ["solve"]
 
@@ -42,7 +42,7 @@ class _Result(NamedTuple):
 def solve(
     kinematics: Kinematics, pose: Pose, seed: Array, position_tolerance: float, rotation_tolerance: float, starts: int
 ) -> Array:
-    """See :meth:`hal.kinematics.Kinematics.solve`."""
+    """See :meth:`hal.kinematics.arm.Kinematics.solve`."""
     target = np.concatenate([pose.position, pose.orientation])
     closest: _Result | None = None
     found: list[Array] = []
