@@ -1,4 +1,4 @@
-"""A gamepad that is plugged in (Linux)."""
+"""A gamepad that is plugged in (Linux), through python-evdev."""
 
 from __future__ import annotations
 

@@ -1,37 +1,386 @@
-"""When to look for pads: as soon as the system says that something changed, or now and then."""
+"""The input devices of this machine: what is plugged in, an opened device, and when to look again.
+
+:class:`LinuxInput` lists devices from sysfs, which needs no permission and opens nothing. :class:`EvdevNode` is one
+opened device on python-evdev. :class:`DeviceFinder` looks as soon as the kernel reports a change, or periodically.
+"""
 
 from __future__ import annotations
 
 import contextlib
+import ctypes
+import fcntl
+import os
 import select
+import struct
 import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple, Protocol
 
-from .node import Node
-from .system import InputSystem, NodeInfo
-from .watch import Watch
+from hal.errors import DriverMissing
+from hal.pads.codes import ABS, EV_ABS, EV_FF, EV_KEY, EV_REL, FF_RUMBLE, KEY, REL
+from hal.pads.mapper import AxisRange
+from hal.pads.model import Identity
 
-__all__ = ["Finder"]
+__all__ = [
+    "DeviceFinder",
+    "EvdevNode",
+    "Event",
+    "FolderWatch",
+    "InputSystem",
+    "LinuxInput",
+    "Node",
+    "NodeInfo",
+    "evdev_module",
+    "lock_device",
+    "permission_note",
+]
 
-_RESCAN = 0.2  # s between two looks where nobody says that something changed
-_RESCAN_WATCHED = 2.0  # s, where somebody does
+
+class NodeInfo(NamedTuple):
+    """One input device that is not opened."""
+
+    path: str
+    identity: Identity
+    uniq: str
+    """Serial number or address of the pad, the same for all its devices; empty where it has none."""
+    parent: str
+    """The hardware behind the device, the same for all devices of one pad."""
+    is_pad: bool
+    """Whether it has the buttons and sticks of a gamepad, or the six axes and buttons of a SpaceMouse. A pad's motion
+    sensor and touchpad are devices of their own."""
+    is_joystick: bool = False
+    """Whether it has the buttons of a joystick. Some gamepads have (Logitech's in D mode), and so have steering wheels:
+    it is a pad only where a model knows it, or the rig names it."""
+
+    def belongs_to(self, other: NodeInfo) -> bool:
+        """Whether the two are parts of the same pad."""
+        if self.uniq and other.uniq:
+            return self.uniq == other.uniq
+        return bool(self.parent) and self.parent == other.parent
+
+    def describe(self) -> str:
+        """Return the name, the bus and the path for the user."""
+        bus = {"usb": "USB", "bluetooth": "Bluetooth"}.get(self.identity.bus_name, f"bus {self.identity.bus}")
+        return f"{self.identity.name} ({bus}, {self.path})"
 
 
-class Finder:
-    """Looks at what is plugged in, and no more often than it must."""
+def permission_note(info: NodeInfo) -> str:
+    """Return the note for a pad that may not be read, with the command that allows it."""
+    return f"{info.describe()} may not be read; to allow it: sudo usermod -aG input $USER, then log out and in"
+
+
+class Event(NamedTuple):
+    """One input event."""
+
+    kind: int
+    code: int
+    value: int
+    t: float
+    """When it happened, on the monotonic clock, s."""
+    t_device: float
+    """The kernel's stamp, s."""
+
+
+class Node(Protocol):
+    """An opened input device as the driver needs it. Calls raise OSError when the device is gone."""
+
+    path: str
+    axes: dict[int, AxisRange]
+    """Event code -> range that the device reports."""
+    keys: frozenset[int]
+    """Event codes of its buttons."""
+    rels: frozenset[int]
+    """Event codes of its relative axes."""
+    can_rumble: bool
+    """Whether it has motors, and may be written to."""
+
+    def fileno(self) -> int:
+        """Descriptor that is readable when there are events, and when the device is gone."""
+
+    def read(self) -> Sequence[Event]:
+        """Return every waiting event, oldest first; never blocks."""
+
+    def snapshot(self) -> tuple[dict[int, int], list[int]]:
+        """Return the kernel's present state: axis code -> value, and the codes of the pressed buttons."""
+
+    def claim(self) -> bool:
+        """Lock the device for one gamepad, across programs, until it is closed; False where it is locked already.
+
+        Two gamepads on one device would be one thumb on two dead-man switches.
+        """
+
+    def close(self) -> None:
+        """Close the device. Idempotent."""
+
+
+class InputSystem(Protocol):
+    """A source of input devices."""
+
+    def nodes(self) -> list[NodeInfo]:
+        """Return all present devices in the order of their numbers. Takes some ms on a computer with many."""
+
+    def fingerprint(self) -> object:
+        """Return a value that differs after a device came or went, or its permissions changed. Cheap."""
+
+    def open(self, path: str) -> Node:
+        """Open a device. Raises OSError."""
+
+
+# Devices through python-evdev and sysfs.
+
+_EVIOCSCLOCKID = 0x400445A0  # _IOW('E', 0xa0, int), linux/input.h
+_READS = 32  # most reads in one go; each brings up to 64 events
+_WORD = 8 * struct.calcsize("l")  # sysfs prints bitmaps as words of this many bits, the highest first
+_SIX_AXES = ("X", "Y", "Z", "RX", "RY", "RZ")
+
+
+def evdev_module() -> Any:
+    """Return python-evdev. Raises DriverMissing, with the command that installs it."""
+    try:
+        import evdev
+    except ImportError as error:
+        remedy = "install it with: pip install evdev-binary"
+        raise DriverMissing(f"gamepads need python-evdev, which does not import ({error}); {remedy}") from error
+    return evdev
+
+
+def lock_device(fd: int) -> bool:
+    """Lock a device until ``fd`` is closed; False where another opening of it has the lock, in any program."""
+    try:
+        fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    return True
+
+
+class EvdevNode:
+    """A :class:`Node` on python-evdev."""
+
+    def __init__(self, path: str) -> None:
+        """Open the device at ``path``.
+
+        Raises:
+            OSError: There is no such device, or it may not be read.
+            DriverMissing: python-evdev is not installed.
+        """
+        self.path = path
+        self._device: Any = evdev_module().InputDevice(path)
+        capabilities: dict[int, list[Any]] = self._device.capabilities()
+        self.axes = {code: AxisRange(info.min, info.max, info.flat) for code, info in capabilities.get(EV_ABS, ())}
+        self.keys = frozenset(capabilities.get(EV_KEY, ()))
+        self.rels = frozenset(capabilities.get(EV_REL, ()))
+        writable = fcntl.fcntl(self._device.fd, fcntl.F_GETFL) & os.O_ACCMODE == os.O_RDWR
+        self.can_rumble = writable and FF_RUMBLE in capabilities.get(EV_FF, ())
+        try:  # stamp events with the clock of everything else here
+            fcntl.ioctl(self._device.fd, _EVIOCSCLOCKID, struct.pack("i", time.CLOCK_MONOTONIC))
+            self._monotonic = True
+        except OSError:
+            self._monotonic = False
+
+    def fileno(self) -> int:
+        return int(self._device.fd)
+
+    def read(self) -> Sequence[Event]:
+        found: list[Any] = []
+        for _ in range(_READS):
+            try:
+                batch = list(self._device.read())
+            except BlockingIOError:
+                break
+            found += batch
+        now = time.monotonic()
+        return [
+            Event(event.type, event.code, event.value, min(stamp, now) if self._monotonic else now, stamp)
+            for event in found
+            for stamp in (event.sec + event.usec * 1e-6,)
+        ]
+
+    def snapshot(self) -> tuple[dict[int, int], list[int]]:
+        values = {code: int(self._device.absinfo(code).value) for code in self.axes}
+        return values, [int(code) for code in self._device.active_keys()]
+
+    def claim(self) -> bool:
+        return lock_device(self._device.fd)
+
+    def close(self) -> None:
+        self._device.close()
+
+
+class LinuxInput:
+    """The :class:`InputSystem` of this machine."""
+
+    def __init__(self, sysfs: Path = Path("/sys/class/input"), devices: Path = Path("/dev/input")) -> None:
+        self._sysfs = sysfs
+        self._devices = devices
+
+    def nodes(self) -> list[NodeInfo]:
+        found = []
+        for name in sorted(self._event_names(self._sysfs), key=lambda name: int(name[5:])):
+            device = self._sysfs / name / "device"
+            parent = os.path.realpath(device / "device")
+            identity = Identity(
+                name=_text(device / "name"),
+                vendor=_hex(device / "id" / "vendor"),
+                product=_hex(device / "id" / "product"),
+                bus=_hex(device / "id" / "bustype"),
+                driver=_kernel_driver(parent),
+            )
+            is_pad, is_joystick = _classify(device / "capabilities")
+            uniq = _text(device / "uniq")
+            found.append(NodeInfo(str(self._devices / name), identity, uniq, parent, is_pad, is_joystick))
+        return found
+
+    def fingerprint(self) -> object:
+        marks = []
+        for name in sorted(self._event_names(self._devices)):
+            try:
+                status = os.stat(self._devices / name)
+            except OSError:
+                continue
+            marks.append((name, status.st_ino, status.st_ctime_ns))
+        return tuple(marks)
+
+    def open(self, path: str) -> Node:
+        return EvdevNode(path)
+
+    @staticmethod
+    def _event_names(folder: Path) -> list[str]:
+        try:
+            return [name for name in os.listdir(folder) if name.startswith("event") and name[5:].isdigit()]
+        except OSError:
+            return []  # no input devices at all, as in a container
+
+
+def _text(path: Path) -> str:
+    try:
+        return path.read_text(encoding="utf-8", errors="replace").strip()
+    except OSError:
+        return ""
+
+
+def _hex(path: Path) -> int:
+    try:
+        return int(_text(path), 16)
+    except ValueError:
+        return 0
+
+
+def _classify(capabilities: Path) -> tuple[bool, bool]:
+    """Return :attr:`NodeInfo.is_pad` and :attr:`NodeInfo.is_joystick`, from the events that the device can send."""
+    key, rel, axes = (_bits(capabilities / name) for name in ("key", "rel", "abs"))
+
+    def has(bits: int, *codes: int) -> bool:
+        return all(bits >> code & 1 for code in codes)
+
+    sticks = has(axes, ABS["ABS_X"])
+    if has(key, KEY["BTN_SOUTH"]):
+        return sticks, False
+    six = has(rel, *(REL[f"REL_{n}"] for n in _SIX_AXES)) or has(axes, *(ABS[f"ABS_{n}"] for n in _SIX_AXES))
+    return six and has(key, KEY["BTN_0"]), sticks and has(key, KEY["BTN_TRIGGER"])
+
+
+def _bits(path: Path) -> int:
+    """Return a bitmap of sysfs as one number."""
+    whole = 0
+    for word in _text(path).split():
+        whole = whole << _WORD | int(word, 16)
+    return whole
+
+
+def _kernel_driver(parent: str) -> str:
+    try:
+        return os.path.basename(os.readlink(os.path.join(parent, "driver")))
+    except OSError:
+        return ""
+
+
+# When to look for devices.
+
+# From the kernel's include/uapi/linux/inotify.h.
+_ATTRIB, _MOVED_FROM, _MOVED_TO, _CREATE, _DELETE = 0x04, 0x40, 0x80, 0x100, 0x200
+_DELETE_SELF, _MOVE_SELF, _IGNORED = 0x400, 0x800, 0x8000
+_ONLYDIR = 0x01000000
+_INOTIFY_EVENT = struct.Struct("iIII")  # watch, mask, cookie, length of the name that follows
+
+_RESCAN = 0.2
+"""Time between two looks without a watch, s."""
+_RESCAN_WATCHED = 2.0
+"""Time between two looks with a watch, s."""
+
+
+class FolderWatch:
+    """Changes in a folder, ``/dev/input``, through the kernel's inotify.
+
+    udev sets the permissions of a new device a moment after the kernel has made it; that is a change of its own.
+    """
+
+    def __init__(self, folder: str = "/dev/input") -> None:
+        """Begin to watch. Raises OSError: no such folder, or the user has no inotify watches left."""
+        libc = ctypes.CDLL(None, use_errno=True)
+        try:
+            begin, add = libc.inotify_init1, libc.inotify_add_watch
+        except AttributeError:
+            raise OSError("the C library has no inotify") from None
+        self._fd = _checked(begin(os.O_NONBLOCK | os.O_CLOEXEC), folder)
+        mask = _ATTRIB | _MOVED_FROM | _MOVED_TO | _CREATE | _DELETE | _DELETE_SELF | _MOVE_SELF | _ONLYDIR
+        try:
+            _checked(add(self._fd, os.fsencode(folder), mask), folder)
+        except OSError:
+            self.close()
+            raise
+
+    def fileno(self) -> int:
+        """Descriptor that is readable after a change."""
+        return self._fd
+
+    def changed(self) -> bool:
+        """Whether anything changed since the last call. Never blocks. Raises OSError when the folder is gone."""
+        found = False
+        while True:
+            try:
+                data = os.read(self._fd, 65536)
+            except BlockingIOError:
+                return found
+            found = True
+            at = 0
+            while at < len(data):
+                _, mask, _, length = _INOTIFY_EVENT.unpack_from(data, at)
+                if mask & (_DELETE_SELF | _MOVE_SELF | _IGNORED):
+                    raise OSError("the watched folder is gone")
+                at += _INOTIFY_EVENT.size + length
+
+    def close(self) -> None:
+        """Stop watching. Idempotent."""
+        fd, self._fd = self._fd, -1
+        if fd >= 0:
+            with contextlib.suppress(OSError):
+                os.close(fd)
+
+
+def _checked(result: int, folder: str) -> int:
+    if result < 0:
+        number = ctypes.get_errno()
+        raise OSError(number, os.strerror(number), folder)
+    return result
+
+
+class DeviceFinder:
+    """Lists the devices of an input system, no more often than needed."""
 
     def __init__(self, system: InputSystem, *, watched: bool) -> None:
-        """``watched``: the devices are those of this machine, so the kernel's inotify can tell of changes."""
+        """Make a finder for ``system``; ``watched`` if inotify reports its changes: its devices are this machine's."""
         self._system = system
         self._watched = watched
-        self._watch: Watch | None = None
+        self._watch: FolderWatch | None = None
         self._seen: object = None
         self._next = 0.0
 
-    def look(self) -> list[NodeInfo] | None:
-        """What is plugged in; None where that is what it was at the last look."""
+    def scan(self) -> list[NodeInfo] | None:
+        """Return the devices that are plugged in; None where nothing changed since the last scan."""
         if self._watched and self._watch is None:
-            with contextlib.suppress(OSError):  # no input devices at all, or too many watches: then without
-                self._watch = Watch()
+            with contextlib.suppress(OSError):  # no input devices at all, or too many watches: scan periodically
+                self._watch = FolderWatch()
         self._next = time.monotonic() + (_RESCAN if self._watch is None else _RESCAN_WATCHED)
         mark = self._system.fingerprint()
         if mark == self._seen:
@@ -40,16 +389,16 @@ class Finder:
         return self._system.nodes()
 
     def forget(self) -> None:
-        """The next look, which is soon, counts whatever it finds."""
+        """Make the next scan, which is due soon, return the devices in any case."""
         self._seen = None
         self._next = min(self._next, time.monotonic() + _RESCAN)
 
     def due(self) -> bool:
-        """Is it time for a look?"""
+        """Whether it is time for a scan."""
         return self._changed() or time.monotonic() >= self._next
 
     def wait(self, timeout: float) -> bool:
-        """Wait for a change for up to ``timeout`` s; was there one?"""
+        """Wait up to ``timeout`` s for a change; True if there was one."""
         if self._watch is None:
             time.sleep(timeout)
             return False
@@ -62,7 +411,7 @@ class Finder:
             return False
         try:
             return self._watch.changed()
-        except OSError:  # the folder is gone, with the last device; it comes back with the next
+        except OSError:  # the folder is gone with the last device; it comes back with the next
             self._watch.close()
             self._watch = None
             return True

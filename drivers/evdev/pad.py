@@ -1,4 +1,4 @@
-"""A gamepad that is plugged in, through the kernel's input events."""
+"""The gamepad driver: a pad that is plugged in, through the kernel's input events."""
 
 from __future__ import annotations
 
@@ -19,48 +19,46 @@ from hal.pads.model import PadModel, choose_model, guess_model, guess_warning, p
 from hal.specs import PadSpec
 from hal.types import AXES
 
-from .finder import Finder
-from .link import Link
-from .node import Node, evdev_module
-from .system import InputSystem, LinuxInput, NodeInfo, permission_note
+from .finder import DeviceFinder, InputSystem, LinuxInput, Node, NodeInfo, evdev_module, permission_note
+from .link import PadLink
 
 __all__ = ["EvdevPad"]
 
 _RELEASED = MappingProxyType(dict.fromkeys(AXES, 0.0))
 
 
-class Options(BaseModel):
-    """What a rig may say under ``options:`` of its pad."""
+class EvdevOptions(BaseModel):
+    """Options of an evdev pad in a rig (``gamepads.<name>.options``)."""
 
     model_config = ConfigDict(extra="forbid")
 
     device: str | None = None
     """Only this device, for example ``/dev/input/event3``."""
     name: str | None = None
-    """Only a pad with this in its name, in any case of letters."""
+    """Only a pad whose name contains this, in upper or lower case."""
     accept_silent_pad: bool = False
-    """Let a wireless pad that falls silent without a sign be the dead-man of a real arm."""
+    """Accept a wireless pad, whose loss may go unnoticed, as the dead-man of a real arm."""
 
 
 class EvdevPad(GamepadDriver):
-    """The first pad that is plugged in, or that the options name; one that is unplugged may come back at any time.
+    """The first pad that is plugged in, or the one that the options name. It may be unplugged and come back
 
-    Pads are told from other devices by what they can send, and take the model of ``spec.models`` that matches best, or
-    are guessed with a warning in ``notes``. With ``spec.model`` only a pad that it matches is taken, unless the options
-    name one.
+    Pads are recognised by the events that they can send. Each gets the model of ``spec.models`` that matches best, or
+    a guessed one with a warning in ``notes``. With ``spec.model`` only a pad that matches it is used, unless the
+    options name one.
     """
 
     def __init__(self, spec: PadSpec, source: object | None = None, *, system: InputSystem | None = None) -> None:
         super().__init__(spec, source)
         place = f"gamepads.{spec.name}"
-        self._options = validated(Options, spec.options, place)
+        self._options = validated(EvdevOptions, spec.options, place)
         chosen = (spec.model,) if spec.model is not None else spec.models
         self._models = tuple(pad_model(data, f"{place}, model {data.get('name')}") for data in chosen)
-        self._finder: Finder | None = Finder(system, watched=False) if system is not None else None
+        self._finder: DeviceFinder | None = DeviceFinder(system, watched=False) if system is not None else None
         self._is_open = False
-        self._link: Link | None = None
+        self._link: PadLink | None = None
         self._rumble: tuple[float, float, float] | None = None
-        """What the motors shall do, said in any thread. The one that polls does it, for it alone closes the device."""
+        """The wanted rumble, set by any thread. The polling thread plays it, because only that closes the device."""
         self._seq = 0
         self._last = PadReading(-math.inf, -math.inf, 0.0, 0, _RELEASED, frozenset(), connected=False)
 
@@ -79,30 +77,36 @@ class EvdevPad(GamepadDriver):
         )
 
     def open(self) -> None:
-        """Raises NotSupported anywhere but on Linux, and DriverMissing."""
+        """Look for the pad; one that is not there may come later.
+
+        Raises:
+            NotSupported: This is not Linux.
+            DriverMissing: python-evdev is not installed.
+        """
         if self._finder is None:
             if sys.platform != "linux":
-                raise NotSupported("the evdev driver reads gamepads on Linux only")
+                raise NotSupported("the evdev driver reads gamepads on Linux only", code="linux_only")
             evdev_module()
-            self._finder = Finder(LinuxInput(), watched=True)
+            self._finder = DeviceFinder(LinuxInput(), watched=True)
         self._is_open = True
-        self._look(self._finder)
+        self._scan(self._finder)
 
     def poll(self, now: float, timeout: float) -> PadReading:
+        """See :meth:`GamepadDriver.poll`."""
         finder = self._finder
         if finder is None or not self._is_open:
             return self._last
         if (self._link is None or self._link.lacks_motion or self._link.lacks_touch) and finder.due():
-            self._look(finder)
+            self._scan(finder)
         if self._link is None:
             if timeout > 0.0 and finder.wait(timeout):
-                self._look(finder)
+                self._scan(finder)
             return self._last
         try:
             self._link.poll(now, timeout)
-            self._play(self._link)
+            self._play_rumble(self._link)
         except OSError:
-            return self._lose(now)
+            return self._handle_loss(now)
         link = self._link
         self.proves_liveness = link.proves_liveness
         self._last = PadReading(
@@ -117,7 +121,7 @@ class EvdevPad(GamepadDriver):
         )
         return self._last
 
-    def _lose(self, t: float) -> PadReading:
+    def _handle_loss(self, t: float) -> PadReading:
         if self._link is not None:
             self._seq += self._link.events + 1
             self._drop_link()
@@ -136,11 +140,11 @@ class EvdevPad(GamepadDriver):
         self._rumble = None
         self.proves_liveness = False
 
-    # Looking for it.
+    # Finding the pad and its parts.
 
-    def _look(self, finder: Finder) -> None:
-        """Open the pad, its motion sensor or its touchpad, if something changed since the last look."""
-        nodes = finder.look()
+    def _scan(self, finder: DeviceFinder) -> None:
+        """Open the pad, its motion sensor and its touchpad, if the devices changed since the last scan."""
+        nodes = finder.scan()
         if nodes is None:
             return
         if self._link is None:
@@ -151,11 +155,11 @@ class EvdevPad(GamepadDriver):
         if link is not None and link.lacks_touch:
             self._find_part(finder, link, link.model.touch_node, nodes)
 
-    def _find_pad(self, finder: Finder, nodes: list[NodeInfo]) -> None:
+    def _find_pad(self, finder: DeviceFinder, nodes: list[NodeInfo]) -> None:
         pads = [info for info in nodes if info.is_pad or info.is_joystick]
         wanted = [info for info in pads if self._wanted(info)]
         others = ", ".join(info.describe() for info in pads if info.is_pad)
-        self.notes = (f"not the pad that the rig asks for: {others}",) if others and not wanted else ()
+        self.notes = (f"not the pad that the rig names: {others}",) if others and not wanted else ()
         for info in wanted:
             self._connect(finder, info)
             if self._link is not None:
@@ -170,7 +174,7 @@ class EvdevPad(GamepadDriver):
             return True
         return choose_model(self._models, info.identity) is not None
 
-    def _connect(self, finder: Finder, info: NodeInfo) -> None:
+    def _connect(self, finder: DeviceFinder, info: NodeInfo) -> None:
         node = self._try_open(finder, info)
         if node is None:
             return
@@ -178,7 +182,7 @@ class EvdevPad(GamepadDriver):
             node.close()
             self.notes = (
                 *self.notes,
-                f"{info.describe()} is taken: by another gamepad of this rig, or another program",
+                f"{info.describe()} is in use by another gamepad of this rig, or by another program",
             )
             return
         found = choose_model(self._models, info.identity)
@@ -189,7 +193,7 @@ class EvdevPad(GamepadDriver):
         else:
             model, rule = self._guessed(info, node), None
         try:
-            self._link = Link(info, node, model, rule)
+            self._link = PadLink(info, node, model, rule)
         except OSError:  # unplugged again already
             node.close()
             return
@@ -200,8 +204,8 @@ class EvdevPad(GamepadDriver):
         self.notes = (*self.notes, guess_warning(model))
         return model
 
-    def _find_part(self, finder: Finder, link: Link, ending: str | None, nodes: list[NodeInfo]) -> None:
-        """Another device of the same pad."""
+    def _find_part(self, finder: DeviceFinder, link: PadLink, ending: str | None, nodes: list[NodeInfo]) -> None:
+        """Open another device of the same pad: the one whose name has that ``ending``."""
         for info in nodes:
             if info.identity.name.endswith(ending or "") and info.belongs_to(link.info) and not info.is_pad:
                 part = self._try_open(finder, info, quiet=ending == link.model.touch_node)
@@ -209,17 +213,17 @@ class EvdevPad(GamepadDriver):
                     continue
                 try:
                     if ending == link.model.motion_node:
-                        link.listen_to(part)
+                        link.add_motion(part)
                     else:
-                        link.take_touch(part)
-                except OSError:  # unplugged again already; so will be the pad
+                        link.add_touch(part)
+                except OSError:  # unplugged again already; the pad follows
                     part.close()
                 return
 
-    def _try_open(self, finder: Finder, info: NodeInfo, *, quiet: bool = False) -> Node | None:
-        """None where it went away, or may not be read: udev sets the permissions a moment after it appears.
+    def _try_open(self, finder: DeviceFinder, info: NodeInfo, *, quiet: bool = False) -> Node | None:
+        """Open a device; None where it is gone, or may not be read (udev sets the permissions a moment later).
 
-        ``quiet``: nobody needs to know, for a desktop keeps touchpads to itself.
+        ``quiet`` adds no note where it may not be read: a desktop keeps touchpads to itself.
         """
         try:
             return finder.open(info)
@@ -231,17 +235,17 @@ class EvdevPad(GamepadDriver):
             finder.forget()
         return None
 
-    # The rest.
+    # Rumble, description and end.
 
     def rumble(self, strong: float, weak: float, seconds: float) -> bool:
-        """The next poll turns the motors, at most 10 ms later in a rig."""
+        """Turn the motors in the next poll, at most 10 ms later in a rig. See :meth:`GamepadDriver.rumble`."""
         link = self._link
         if link is None or not link.can_rumble or seconds <= 0.0:
             return False
         self._rumble = strong, weak, seconds
         return True
 
-    def _play(self, link: Link) -> None:
+    def _play_rumble(self, link: PadLink) -> None:
         wanted, self._rumble = self._rumble, None
         if wanted is not None:
             link.rumble(*wanted)

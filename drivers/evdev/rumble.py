@@ -1,4 +1,4 @@
-"""A pad's motors."""
+"""The motors of a gamepad, through the kernel's force-feedback effects."""
 
 from __future__ import annotations
 
@@ -22,29 +22,36 @@ _SIZE = _AT + struct.calcsize(f"@{_UNION}")
 _EVIOCSFF = 1 << 30 | _SIZE << 16 | ord("E") << 8 | 0x80  # _IOW('E', 0x80, struct ff_effect)
 _EVENT = struct.Struct("@llHHi")
 _FULL = 0xFFFF
-_LONGEST = 10.0  # s
+_LONGEST = 10.0
+"""Longest rumble, s."""
 
 
 class Rumble:
-    """The motors of one open device, which must be writable.
+    """The motors of one open, writable device.
 
-    The kernel must be told of an effect before it is played. That may take long: where the pad lives in another
-    program, as long as that takes to answer. So it is done once, when the pad is plugged in, in a thread of its own;
-    playing is then one write. Only a rumble of another strength or length than the last one is told anew. (An effect
-    that is played several times would pause in between: the kernel stops the motors after each.)
+    An effect must be uploaded to the kernel before it is played. That may take long: where another program makes the
+    pad, as long as that program takes to answer. So the default effect is uploaded once, in a thread of its own, when
+    the pad is plugged in; playing it is one write. Only a rumble of another strength or length than the last one is
+    uploaded again. (An effect with a repeat count would pause in between: the kernel stops the motors after each.)
     """
 
     def __init__(self, fd: int, strong: float, weak: float) -> None:
-        """``fd`` stays the caller's. The shares (0..1) are those of the first effect, :data:`RUMBLE_SECONDS` long."""
+        """Upload the first effect, :data:`RUMBLE_SECONDS` long, in the background.
+
+        Args:
+            fd: Descriptor of the device; it stays the caller's.
+            strong: Share (0..1) of the heavy motor's strength.
+            weak: The same for the light motor.
+        """
         self._fd = fd
         self._effect = -1
         self._ready: tuple[float, float, float] | None = None
         self._busy = threading.Lock()
         self._closed = False
-        self._prepare((strong, weak, RUMBLE_SECONDS), play=False)
+        self._upload((strong, weak, RUMBLE_SECONDS), play=False)
 
     def play(self, strong: float, weak: float, seconds: float) -> bool:
-        """Turn the motors, each at its share (0..1) of what it can. False where that cannot be done now.
+        """Turn the motors, each at a share (0..1) of its strength; False where an upload is still under way.
 
         Raises OSError when the device is gone.
         """
@@ -52,27 +59,27 @@ class Rumble:
         if self._closed or self._busy.locked():
             return False
         if self._ready == wanted:
-            _play(self._fd, self._effect)
+            _play_effect(self._fd, self._effect)
             return True
-        return self._prepare(wanted, play=True)
+        return self._upload(wanted, play=True)
 
-    def _prepare(self, wanted: tuple[float, float, float], *, play: bool) -> bool:
-        """Tell the kernel of the effect, in the background, and play it once."""
+    def _upload(self, wanted: tuple[float, float, float], *, play: bool) -> bool:
+        """Upload an effect in the background, and play it once."""
         if not self._busy.acquire(blocking=False):
             return False
         try:
-            fd = os.dup(self._fd)  # the caller may close his in the meantime; effects belong to what both have open
+            fd = os.dup(self._fd)  # the caller may close its own meanwhile; effects belong to what both have open
         except OSError:
             self._busy.release()
             return False
 
         def work() -> None:
             try:
-                self._effect = _upload(fd, self._effect, *wanted)
+                self._effect = _upload_effect(fd, self._effect, *wanted)
                 self._ready = wanted
                 if play:
-                    _play(fd, self._effect)
-            except OSError:  # the pad is gone, or has no room for an effect: then it does not rumble
+                    _play_effect(fd, self._effect)
+            except OSError:  # the pad is gone, or has no room for an effect: it does not rumble
                 self._ready = None
             finally:
                 os.close(fd)
@@ -82,19 +89,19 @@ class Rumble:
         return True
 
     def wait(self, timeout: float) -> bool:
-        """Until an effect is ready to be played, at most ``timeout`` s; for tests."""
+        """Wait at most ``timeout`` s for an upload to end; True if an effect is ready. For tests."""
         end = time.monotonic() + timeout
         while self._busy.locked() and time.monotonic() < end:
             time.sleep(0.005)
         return self._ready is not None
 
     def close(self) -> None:
-        """No more. The kernel stops the motors when the device is closed. Idempotent."""
+        """Play nothing more. The kernel stops the motors when the device is closed. Idempotent."""
         self._closed = True
 
 
-def _upload(fd: int, effect: int, strong: float, weak: float, seconds: float) -> int:
-    """Make the effect, or change it; its number comes back. ``fcntl.ioctl`` lets other threads run meanwhile."""
+def _upload_effect(fd: int, effect: int, strong: float, weak: float, seconds: float) -> int:
+    """Make or change an effect; return its number. Other threads run meanwhile: ``fcntl.ioctl`` releases the GIL."""
     data = bytearray(_SIZE)
     struct.pack_into(f"@{_HEAD}", data, 0, FF_RUMBLE, effect, 0, 0, 0, max(1, round(seconds * 1000)), 0)
     struct.pack_into("@HH", data, _AT, round(strong * _FULL), round(weak * _FULL))
@@ -103,5 +110,5 @@ def _upload(fd: int, effect: int, strong: float, weak: float, seconds: float) ->
     return number
 
 
-def _play(fd: int, effect: int) -> None:
+def _play_effect(fd: int, effect: int) -> None:
     os.write(fd, _EVENT.pack(0, 0, EV_FF, effect, 1))

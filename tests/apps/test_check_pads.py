@@ -141,7 +141,7 @@ def test_the_pads_of_a_rig_are_chosen_by_its_options(folder: Path) -> None:
     assert "DualShock 4" in done.stdout
     done = run(folder, "--duration", "0.5", "--set", "gamepads.pad.options.name=nobody")
     assert done.returncode == 2
-    assert "not the pad that the rig asks for: Sony Computer Entertainment Wireless Controller" in done.stdout
+    assert "Sony Computer Entertainment Wireless Controller" in done.stdout
     assert "DualShock 4" not in done.stdout
     done = run(folder, "--duration", "0.3", "--set", "gamepads.pad.driver=web")
     assert done.returncode == 2

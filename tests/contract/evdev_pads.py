@@ -1,7 +1,7 @@
-"""Pads that were recorded from the real kernel drivers, played to the evdev driver through devices on pipes.
+"""Pads recorded from the real kernel drivers, played to the evdev driver through devices on pipes.
 
-What a pad is stands in its ``.umockdev`` description, what it can do in the head of its ``.jsonl``, and what it said in
-the lines below. umockdev itself plays them in ``tests/unit/drivers/evdev/test_evdev.py``; it cannot unplug anything.
+The identity of a pad is in its ``.umockdev`` description, its ranges in the head of its ``.jsonl``, its events in the
+lines below. umockdev itself plays them in ``tests/unit/drivers/evdev/test_evdev.py``; it cannot unplug anything.
 """
 
 from __future__ import annotations
@@ -19,9 +19,8 @@ from typing import Any
 
 import yaml
 
-from hal.drivers.evdev.node import Event
+from hal.drivers.evdev.finder import Event, NodeInfo
 from hal.drivers.evdev.pad import EvdevPad
-from hal.drivers.evdev.system import NodeInfo
 from hal.pads.codes import ABS, EV_ABS, EV_KEY, EV_MSC, EV_SYN, KEY, SYN_REPORT
 from hal.pads.mapper import AxisRange
 from hal.pads.model import Identity
@@ -36,7 +35,7 @@ MOTION = " Motion Sensors"
 SOUTH = KEY["BTN_SOUTH"]
 STICKS = {ABS[name] for name in ("ABS_X", "ABS_Y", "ABS_RX", "ABS_RY")}
 DRIVERS = {"ds4": ("sony", 0), "dualsense": ("playstation", 128)}
-"""Kernel's driver, and what it shows of the sticks before the first report: hid-sony, full left and up."""
+"""Kernel driver, and its value of the sticks before the first report: hid-sony, full left and up."""
 
 
 class PipeNode:
@@ -46,23 +45,23 @@ class PipeNode:
     can_rumble = False
 
     def __init__(self, path: str, axes: dict[int, AxisRange], keys: Sequence[int] = (), shown: int = 0) -> None:
-        """``shown``: what the kernel shows of the sticks before the first report."""
+        """``shown`` is the kernel's value of the sticks before the first report."""
         self.path, self.axes, self.keys, self.shown = path, axes, frozenset(keys), shown
         self.held: list[int] = []
-        """Buttons that are down already when it is plugged in."""
+        """Buttons that are pressed when it is plugged in."""
         self._waiting: list[Event] = []
         self._reader, self._writer = os.pipe()
         os.set_blocking(self._writer, False)
         self._gone = False
 
     def send(self, *events: tuple[int, int, int]) -> None:
-        """One report."""
+        """Send one report."""
         t = time.monotonic()
         self._waiting += [Event(*event, t, t) for event in (*events, (EV_SYN, SYN_REPORT, 0))]
         os.write(self._writer, b".")
 
     def unplug(self) -> None:
-        """The kernel hangs up."""
+        """Hang up."""
         self._gone = True
         os.close(self._writer)
 
@@ -84,7 +83,7 @@ class PipeNode:
         return True
 
     def close(self) -> None:
-        """The bench lets go of the pipe."""
+        """Nothing: the bench closes the pipe."""
 
     def dispose(self) -> None:
         for fd in (self._reader,) if self._gone else (self._reader, self._writer):
@@ -97,7 +96,7 @@ def _event(line: dict[str, Any]) -> tuple[int, int, int]:
 
 
 class RecordedPad:
-    """A pad with its motion sensor, on a plug: the input system of the driver."""
+    """A pad with its motion sensor that can be unplugged: the input system of the driver."""
 
     def __init__(self, name: str, motion: bool) -> None:
         head, *lines = [json.loads(line) for line in (PADS / f"{name}.jsonl").read_text().splitlines()]
@@ -120,28 +119,28 @@ class RecordedPad:
         self._changes = 0
         self.plug()
 
-    # The hand.
+    # The user.
 
     def press(self) -> None:
-        """What was recorded from the beginning until south is down, report by report."""
+        """Play the recording from the beginning until south is down, report by report."""
         at = self._events.index((EV_KEY, SOUTH, 1)) + 1
         self._coming, self._down = deque(self._events[:at]), True
 
     def release(self) -> None:
-        """What was recorded next, until south is up."""
+        """Play the rest of the recording until south is up."""
         at = self._events.index((EV_KEY, SOUTH, 1)) + 1
         end = self._events.index((EV_KEY, SOUTH, 0)) + 1
         self._coming, self._down = deque(self._events[at:end]), False
 
-    def go_on(self) -> None:
-        """One cycle: the next report, and the motion sensor, which speaks all the time."""
+    def play_cycle(self) -> None:
+        """Send the next report, and one of the motion sensor, which streams all the time."""
         if self._coming and self._plugged:
             self._plugged[self._pad.path][1].send(self._coming.popleft())
         if self._motion.path in self._plugged and self.beats:
             self._plugged[self._motion.path][1].send((EV_MSC, 5, 1))
 
     def plug(self) -> None:
-        """With whatever is pressed now."""
+        """Plug it in, with the buttons that are pressed now."""
         node = PipeNode(self._pad.path, self._axes, self._keys, self._shown)
         node.held = [SOUTH] if self._down else []
         self._plugged = {node.path: (self._pad, node)}
@@ -183,7 +182,7 @@ def recorded_pad(name: str, *, motion: bool) -> Iterator[PadBench]:
         driver=driver,
         real_time=True,
         patience=5.0,
-        advance=pad.go_on,
+        advance=pad.play_cycle,
         press=pad.press,
         release=pad.release,
         lose=pad.unplug,

@@ -1,4 +1,4 @@
-"""An input system with a hand on the plugs, for the evdev driver."""
+"""A fake input system whose devices a test plugs in and out, for the evdev driver."""
 
 from __future__ import annotations
 
@@ -14,10 +14,9 @@ from typing import Any
 import yaml
 
 from hal.driver import PadReading
-from hal.drivers.evdev.node import Event
+from hal.drivers.evdev.finder import Event, NodeInfo
 from hal.drivers.evdev.pad import EvdevPad
-from hal.drivers.evdev.system import NodeInfo
-from hal.pads.codes import ABS, EV_ABS, EV_REL, EV_SYN, KEY, SYN_REPORT
+from hal.pads.codes import ABS, BUS_USB, EV_ABS, EV_REL, EV_SYN, KEY, SYN_REPORT
 from hal.pads.mapper import AxisRange
 from hal.pads.model import Identity
 from hal.specs import PadSpec
@@ -30,6 +29,7 @@ STICKS = ("ABS_X", "ABS_Y", "ABS_RX", "ABS_RY")
 AXES = {ABS[name]: AxisRange(0, 255, 15) for name in (*STICKS, "ABS_Z", "ABS_RZ")}
 AXES |= {ABS[name]: AxisRange(-1, 1) for name in ("ABS_HAT0X", "ABS_HAT0Y")}
 REST = [(EV_ABS, ABS[name], 128) for name in STICKS]
+DS4 = Identity("Wireless Controller", 0x054C, 0x09CC, BUS_USB, "playstation")
 
 
 class FakeNode:
@@ -47,7 +47,7 @@ class FakeNode:
         self.down: list[int] = []
         self.gone = False
         self.speaks = True
-        """Does it report how it stands as soon as it is opened? Until a pad does, nothing is known of it."""
+        """Whether it reports its state as soon as it is opened."""
         self.open_ends = 0
         self._claimed, self._refused = False, 0
         self._waiting: list[Event] = []
@@ -62,7 +62,7 @@ class FakeNode:
         os.write(self._writer, b".")
 
     def unplug(self, *, hang_up: bool) -> None:
-        """The kernel hangs up; a reader that comes before it looked sees ENODEV."""
+        """Unplug it: by a hang-up, or as a reader sees it that comes first, by ENODEV."""
         if hang_up:
             self._ends[1].close()
         else:
@@ -70,7 +70,7 @@ class FakeNode:
             os.write(self._writer, b".")
 
     def written(self) -> bytes:
-        """What was written to the device since."""
+        """Return what was written to the device since the last call."""
         try:
             return os.read(self._writer, 65536)
         except BlockingIOError:
@@ -97,19 +97,19 @@ class FakeNode:
 
     def close(self) -> None:
         self.open_ends -= 1
-        if self._refused:  # whoever was refused closes it first
+        if self._refused:  # the refused opening closes it first
             self._refused -= 1
         else:
             self._claimed = False
 
     def dispose(self) -> None:
-        """The test is over."""
+        """Close its descriptors at the end of the test."""
         for end in self._ends:
             end.close()
 
 
 class FakeInput:
-    """The driver's input system."""
+    """An :class:`~hal.drivers.evdev.finder.InputSystem` in memory."""
 
     def __init__(self) -> None:
         self.plugged: dict[str, tuple[NodeInfo, FakeNode]] = {}
@@ -119,7 +119,7 @@ class FakeInput:
         self.made: list[FakeNode] = []
 
     def plug(self, identity: Identity, *, number: int = 3, uniq: str = "aa:bb", pad: bool = True) -> FakeNode:
-        """A gamepad with the usual controls, or a device that is none."""
+        """Plug in a gamepad with the usual controls, or another device."""
         axes = AXES if pad else {ABS["ABS_RX"]: AxisRange(-32768, 32767)}
         node = FakeNode(f"/dev/input/event{number}", axes, [KEY["BTN_SOUTH"]] if pad else [])
         return self.put(node, identity, uniq=uniq, pad=pad)
@@ -127,7 +127,7 @@ class FakeInput:
     def put(
         self, node: FakeNode, identity: Identity, *, uniq: str = "aa:bb", pad: bool = True, joystick: bool = False
     ) -> FakeNode:
-        """Plug in a device of the test's own."""
+        """Plug in a device that the test made."""
         self.plugged[node.path] = NodeInfo(node.path, identity, uniq, f"/sys/{uniq}", pad, joystick), node
         self.made.append(node)
         self.changes += 1
@@ -170,7 +170,7 @@ MakePad = Callable[..., EvdevPad]
 
 @contextmanager
 def pads_on(system: FakeInput) -> Iterator[MakePad]:
-    """Makes open pads on that system: ``make(model, **options)``."""
+    """Yield a function that opens pads on ``system``: ``make(model, **options)``."""
     made: list[EvdevPad] = []
 
     def make(model: dict[str, Any] | None = None, **options: object) -> EvdevPad:
@@ -193,8 +193,8 @@ def poll(pad: EvdevPad) -> PadReading:
 
 
 def poll_until(pad: EvdevPad, true: Callable[[PadReading], bool], limit: float = 10.0) -> PadReading:
-    """Poll until a reading is as it should be; the driver looks for pads only a few times a second."""
+    """Poll until a reading is as wanted; the driver scans for pads a few times a second."""
     end = time.monotonic() + limit
     while not true(reading := pad.poll(time.monotonic(), 0.01)):
-        assert time.monotonic() < end, f"it did not happen; the last reading is {reading}"
+        assert time.monotonic() < end, f"the last reading is {reading}"
     return reading

@@ -1,9 +1,9 @@
-"""Reads the pad that is plugged in with the evdev driver and prints what it says, for the tests under umockdev-run.
+"""Read the pad that is plugged in with the evdev driver and print its readings, for the tests under umockdev-run.
 
     python read_pad.py EVENTS
 
-Ends when EVENTS events came, or after 20 s. The recording starts to play before this program is up, so events arrive
-together; they are handed to the driver report by report, for every one of them to be seen.
+Ends after EVENTS events, or after 20 s. The recording starts to play before this program is up, so events arrive
+together; they are passed to the driver report by report, so that every report is a reading.
 """
 
 from __future__ import annotations
@@ -16,15 +16,14 @@ from pathlib import Path
 
 import yaml
 
-from hal.drivers.evdev.node import EvdevNode, Event
+from hal.drivers.evdev.finder import EvdevNode, Event, LinuxInput
 from hal.drivers.evdev.pad import EvdevPad
-from hal.drivers.evdev.system import LinuxInput
 from hal.pads.codes import EV_SYN
 from hal.specs import PadSpec
 
 
 class ReportByReport(EvdevNode):
-    """Hands out one report per call, and nothing at the first call."""
+    """Gives one report per call, and nothing at the first call."""
 
     def __init__(self, path: str) -> None:
         super().__init__(path)
@@ -43,7 +42,7 @@ class ReportByReport(EvdevNode):
 
 
 class System(LinuxInput):
-    """This machine's input devices, or what umockdev shows of them."""
+    """The input devices of this machine, or those that umockdev shows."""
 
     node: ReportByReport
 
@@ -53,7 +52,7 @@ class System(LinuxInput):
 
 
 def main(expected: int) -> None:
-    """One JSON object per reading that differs from the one before; first of all, what was found."""
+    """Print the pad that was found, then one JSON object for each reading that differs from the one before."""
     folder = Path(__file__).parents[3] / "sensors" / "gamepads"
     models = tuple(yaml.safe_load(path.read_text(encoding="utf-8")) for path in sorted(folder.glob("*.yaml")))
     system = System()

@@ -1,4 +1,4 @@
-"""The motors of a pad: told once, then played with one write, and never in anybody's way."""
+"""The motors of a pad: the effect is uploaded once and played with one write, without blocking a caller."""
 
 from __future__ import annotations
 
@@ -16,20 +16,18 @@ import pytest
 if sys.platform != "linux":
     pytest.skip("evdev is Linux only", allow_module_level=True)
 
-from evdev_kit import FakeInput, MakePad, pads_on, poll, poll_until
+from evdev_kit import DS4, FakeInput, MakePad, poll, poll_until
 
 from hal.drivers.evdev.pad import EvdevPad
 from hal.drivers.evdev.rumble import Rumble
 from hal.gamepad import RUMBLE_SECONDS, RUMBLE_STRONG, RUMBLE_WEAK, Gamepad
-from hal.pads.codes import BUS_USB, EV_FF, FF_RUMBLE
-from hal.pads.model import Identity
+from hal.pads.codes import EV_FF, FF_RUMBLE
 
-DS4 = Identity("Wireless Controller", 0x054C, 0x09CC, BUS_USB, "playstation")
 EVENT = struct.Struct("@llHHi")
 
 
 class Kernel:
-    """What takes effects and play events: it notes the first, and lets the test read the second."""
+    """Takes effects, which it records, and play events, which the test reads."""
 
     def __init__(self) -> None:
         self.reader, self.writer = os.pipe()
@@ -59,7 +57,7 @@ class Kernel:
         return 0
 
     def played(self) -> list[tuple[int, int, int]]:
-        """Type, number and count of every event that was written since."""
+        """Return type, number and count of every event since the last call."""
         try:
             data = os.read(self.reader, 65536)
         except BlockingIOError:
@@ -87,8 +85,8 @@ def until(true: Callable[[], object], limit: float = 10.0) -> None:
         time.sleep(0.002)
 
 
-def test_the_structure_is_the_kernels(kernel: Kernel, monkeypatch: pytest.MonkeyPatch) -> None:
-    """sizeof(struct ff_effect) as python-evdev has it too."""
+def test_effect_has_the_layout_of_the_kernel(kernel: Kernel, monkeypatch: pytest.MonkeyPatch) -> None:
+    """python-evdev has the same sizeof(struct ff_effect)."""
     evdev_ff = pytest.importorskip("evdev.ff", reason="needs python-evdev: pip install evdev-binary")
     import ctypes
 
@@ -104,7 +102,7 @@ def test_the_structure_is_the_kernels(kernel: Kernel, monkeypatch: pytest.Monkey
     assert evdev_ff.Effect.u.offset == 16
 
 
-def test_the_effect_is_made_once_and_playing_it_is_one_write(kernel: Kernel) -> None:
+def test_effect_is_uploaded_once_and_played_with_one_write(kernel: Kernel) -> None:
     rumble = Rumble(kernel.writer, 1.0, 0.5)
     assert rumble.wait(10.0)
     assert kernel.effects == [(FF_RUMBLE, -1, 0xFFFF, 0x8000)]
@@ -115,7 +113,7 @@ def test_the_effect_is_made_once_and_playing_it_is_one_write(kernel: Kernel) -> 
     assert len(kernel.effects) == 1
 
 
-def test_another_strength_or_length_changes_the_same_effect_and_then_plays_it(kernel: Kernel) -> None:
+def test_other_strength_or_length_changes_the_effect_and_plays_it(kernel: Kernel) -> None:
     rumble = Rumble(kernel.writer, 1.0, 0.5)
     assert rumble.wait(10.0)
     assert rumble.play(0.0, 1.0, RUMBLE_SECONDS)
@@ -128,8 +126,8 @@ def test_another_strength_or_length_changes_the_same_effect_and_then_plays_it(ke
     assert kernel.played() == [(EV_FF, 5, 1)]
 
 
-def test_a_kernel_that_does_not_answer_holds_nobody_up(kernel: Kernel) -> None:
-    """A pad that another program makes may take half a minute to take an effect."""
+def test_slow_upload_blocks_no_caller(kernel: Kernel) -> None:
+    """A pad that another program makes may take half a minute for an upload."""
     kernel.answer.clear()
     start = time.monotonic()
     rumble = Rumble(kernel.writer, 1.0, 0.5)
@@ -140,7 +138,7 @@ def test_a_kernel_that_does_not_answer_holds_nobody_up(kernel: Kernel) -> None:
     assert rumble.play(1.0, 0.5, RUMBLE_SECONDS)
 
 
-def test_a_pad_that_takes_no_effect_does_not_rumble_and_that_is_no_error(kernel: Kernel) -> None:
+def test_pad_without_room_for_an_effect_does_not_rumble(kernel: Kernel) -> None:
     kernel.error = OSError(28, "no room for another effect")
     rumble = Rumble(kernel.writer, 1.0, 0.5)
     assert not rumble.wait(10.0)
@@ -152,18 +150,7 @@ def test_a_pad_that_takes_no_effect_does_not_rumble_and_that_is_no_error(kernel:
 # Behind the driver.
 
 
-@pytest.fixture
-def system() -> FakeInput:
-    return FakeInput()
-
-
-@pytest.fixture
-def make_pad(system: FakeInput) -> Iterator[MakePad]:
-    with pads_on(system) as make:
-        yield make
-
-
-def test_a_rumble_is_played_by_the_thread_that_polls(system: FakeInput, make_pad: MakePad, kernel: Kernel) -> None:
+def test_polling_thread_plays_the_rumble(system: FakeInput, make_pad: MakePad, kernel: Kernel) -> None:
     node = system.plug(DS4)
     node.can_rumble = True
     pad = make_pad()
@@ -175,7 +162,7 @@ def test_a_rumble_is_played_by_the_thread_that_polls(system: FakeInput, make_pad
         caller = threading.Thread(target=lambda: asked.append(Gamepad(pad).rumble()))
         caller.start()
         caller.join(10.0)
-        assert node.written() == b"", "not from the caller's thread: the device may be closed meanwhile"
+        assert node.written() == b"", "not in the caller's thread"
         poll(pad)
         return node.written()
 
@@ -184,15 +171,15 @@ def test_a_rumble_is_played_by_the_thread_that_polls(system: FakeInput, make_pad
     assert Gamepad(pad).rumble()
     poll(pad)
     assert EVENT.unpack(node.written())[2:] == (EV_FF, 5, 1)
-    assert len(kernel.effects) == 1, "nothing is uploaded when it matters"
+    assert len(kernel.effects) == 1, "nothing is uploaded to play it"
 
 
-def test_who_polls_a_dead_man_waits_for_no_motor(system: FakeInput, make_pad: MakePad, kernel: Kernel) -> None:
+def test_poll_does_not_wait_for_an_upload(system: FakeInput, make_pad: MakePad, kernel: Kernel) -> None:
     node = system.plug(DS4)
     node.can_rumble = True
     pad = make_pad()
     until(lambda: kernel.effects)
-    kernel.answer.clear()  # another strength is told anew, and the kernel does not answer for 10 s
+    kernel.answer.clear()  # the kernel does not answer the next upload for 10 s
 
     def told() -> bool:
         began = time.monotonic()
@@ -206,12 +193,12 @@ def test_who_polls_a_dead_man_waits_for_no_motor(system: FakeInput, make_pad: Ma
         began = time.monotonic()
         assert poll(pad).connected
         assert time.monotonic() - began < 2.0
-    assert len(kernel.effects) == 1, "it is still being told"
+    assert len(kernel.effects) == 1, "the upload is under way"
     kernel.answer.set()
     until(lambda: len(kernel.effects) == 2)
 
 
-def test_a_pad_that_is_read_only_or_not_there_does_not_rumble(system: FakeInput, make_pad: MakePad) -> None:
+def test_read_only_or_absent_pad_does_not_rumble(system: FakeInput, make_pad: MakePad) -> None:
     pad = make_pad()
     assert not Gamepad(pad).rumble()
     node = system.plug(DS4)
@@ -223,9 +210,7 @@ def test_a_pad_that_is_read_only_or_not_there_does_not_rumble(system: FakeInput,
     assert not Gamepad(pad).rumble()
 
 
-def test_a_rumble_for_a_pad_that_went_is_not_played_by_the_next(
-    system: FakeInput, make_pad: MakePad, kernel: Kernel
-) -> None:
+def test_rumble_of_an_unplugged_pad_is_dropped(system: FakeInput, make_pad: MakePad, kernel: Kernel) -> None:
     node = system.plug(DS4)
     node.can_rumble = True
     pad: EvdevPad = make_pad()
@@ -236,6 +221,6 @@ def test_a_rumble_for_a_pad_that_went_is_not_played_by_the_next(
 
 
 @pytest.mark.parametrize("seconds", [0.0, -1.0, math.nan])
-def test_no_time_no_rumble(system: FakeInput, make_pad: MakePad, kernel: Kernel, seconds: float) -> None:
+def test_rumble_needs_a_positive_duration(system: FakeInput, make_pad: MakePad, kernel: Kernel, seconds: float) -> None:
     system.plug(DS4).can_rumble = True
     assert not Gamepad(make_pad()).rumble(seconds=seconds)

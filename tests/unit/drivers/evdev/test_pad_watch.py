@@ -1,4 +1,4 @@
-"""Being told of devices that come and go, instead of looking for them."""
+"""Changes of input devices through inotify, and periodic scans without it."""
 
 from __future__ import annotations
 
@@ -14,26 +14,20 @@ import pytest
 if sys.platform != "linux":
     pytest.skip("inotify is Linux only", allow_module_level=True)
 
-from evdev_kit import FakeInput, FakeNode
+from evdev_kit import DS4, FakeInput, FakeNode
 
 from hal.drivers.evdev import finder as finder_module
-from hal.drivers.evdev.finder import Finder
-from hal.drivers.evdev.system import LinuxInput
-from hal.drivers.evdev.watch import Watch
-from hal.pads.codes import BUS_USB
-from hal.pads.model import Identity
-
-DS4 = Identity("Wireless Controller", 0x054C, 0x09CC, BUS_USB, "playstation")
+from hal.drivers.evdev.finder import DeviceFinder, FolderWatch, LinuxInput
 
 
 @pytest.fixture
 def watch(tmp_path: Path):
-    made = Watch(str(tmp_path))
+    made = FolderWatch(str(tmp_path))
     yield made
     made.close()
 
 
-def readable(watch: Watch) -> bool:
+def readable(watch: FolderWatch) -> bool:
     return bool(select.select([watch.fileno()], [], [], 0.0)[0])
 
 
@@ -46,9 +40,9 @@ def readable(watch: Watch) -> bool:
         lambda folder: (folder / "event0").rename(folder / "event7"),
     ],
 )
-def test_it_tells_of_every_change_that_matters(tmp_path: Path, change: Callable[[Path], None]) -> None:
+def test_watch_reports_every_relevant_change(tmp_path: Path, change: Callable[[Path], None]) -> None:
     (tmp_path / "event0").touch()
-    watch = Watch(str(tmp_path))
+    watch = FolderWatch(str(tmp_path))
     try:
         assert (readable(watch), watch.changed()) == (False, False)
         change(tmp_path)
@@ -59,7 +53,7 @@ def test_it_tells_of_every_change_that_matters(tmp_path: Path, change: Callable[
         watch.close()
 
 
-def test_reading_and_writing_a_device_is_no_change(tmp_path: Path, watch: Watch) -> None:
+def test_watch_ignores_reads_and_writes(tmp_path: Path, watch: FolderWatch) -> None:
     (tmp_path / "event0").write_text("x")
     assert watch.changed()
     with (tmp_path / "event0").open("r+") as file:
@@ -68,29 +62,29 @@ def test_reading_and_writing_a_device_is_no_change(tmp_path: Path, watch: Watch)
     assert not watch.changed()
 
 
-def test_a_folder_that_goes_ends_it(tmp_path: Path) -> None:
+def test_watch_ends_with_its_folder(tmp_path: Path) -> None:
     folder = tmp_path / "input"
     folder.mkdir()
-    watch = Watch(str(folder))
+    watch = FolderWatch(str(folder))
     folder.rmdir()
-    with pytest.raises(OSError, match="gone"):
+    with pytest.raises(OSError):  # noqa: PT011
         watch.changed()
     watch.close()
     watch.close()
 
 
-def test_no_folder_no_watch(tmp_path: Path) -> None:
+def test_watch_needs_a_folder(tmp_path: Path) -> None:
     before = len(os.listdir("/proc/self/fd"))
     with pytest.raises(FileNotFoundError):
-        Watch(str(tmp_path / "input"))
+        FolderWatch(str(tmp_path / "input"))
     (tmp_path / "file").touch()
     with pytest.raises(NotADirectoryError):
-        Watch(str(tmp_path / "file"))
+        FolderWatch(str(tmp_path / "file"))
     assert len(os.listdir("/proc/self/fd")) == before, "nothing stays open"
 
 
 class Machine(LinuxInput):
-    """This machine's input devices, in a folder of the test's."""
+    """The input devices of this machine, in a folder of the test."""
 
     def __init__(self, folder: Path) -> None:
         super().__init__(folder / "sys", folder / "dev")
@@ -100,7 +94,7 @@ class Machine(LinuxInput):
 def machine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     (tmp_path / "dev").mkdir()
     (tmp_path / "sys").mkdir()
-    monkeypatch.setattr(finder_module, "Watch", lambda: Watch(str(tmp_path / "dev")))
+    monkeypatch.setattr(finder_module, "FolderWatch", lambda: FolderWatch(str(tmp_path / "dev")))
     return tmp_path
 
 
@@ -109,59 +103,57 @@ def plug(machine: Path) -> None:
     (machine / "dev" / "event0").touch()
 
 
-def test_a_device_that_is_plugged_in_ends_the_wait_and_is_found(machine: Path) -> None:
-    finder = Finder(Machine(machine), watched=True)
-    assert finder.look() == []
+def test_plugging_in_ends_the_wait(machine: Path) -> None:
+    finder = DeviceFinder(Machine(machine), watched=True)
+    assert finder.scan() == []
     assert not finder.due(), "nothing changed"
     assert not finder.wait(0.0)
     plug(machine)
     start = time.monotonic()
     assert finder.wait(60.0)
-    assert time.monotonic() - start < 30.0, "not because the time was over"
-    found = finder.look()
+    assert time.monotonic() - start < 30.0, "before the time-out"
+    found = finder.scan()
     assert found is not None
     assert [info.path for info in found] == [str(machine / "dev" / "event0")]
     (machine / "dev" / "event0").chmod(0o640)
     assert finder.due(), "its permissions changed"
-    assert finder.look() is not None
+    assert finder.scan() is not None
     finder.close()
 
 
-def test_a_folder_that_comes_and_goes_is_looked_at_all_the_same(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_folder_may_come_and_go(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """As in a container, or with the last device: no /dev/input at all."""
     (tmp_path / "sys").mkdir()
-    monkeypatch.setattr(finder_module, "Watch", lambda: Watch(str(tmp_path / "dev")))
-    finder = Finder(Machine(tmp_path), watched=True)
-    assert finder.look() == []
+    monkeypatch.setattr(finder_module, "FolderWatch", lambda: FolderWatch(str(tmp_path / "dev")))
+    finder = DeviceFinder(Machine(tmp_path), watched=True)
+    assert finder.scan() == []
     (tmp_path / "dev").mkdir()
     plug(tmp_path)
     until_found(finder)
     (tmp_path / "dev" / "event0").unlink()
     (tmp_path / "dev").rmdir()
     assert finder.due()
-    assert finder.look() is not None
+    assert finder.scan() is not None
     finder.close()
 
 
-def test_without_a_watch_it_looks_now_and_then(machine: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def refuse() -> Watch:
+def test_devices_are_scanned_periodically_without_a_watch(machine: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse() -> FolderWatch:
         raise OSError(24, "the user's watches are used up")
 
-    monkeypatch.setattr(finder_module, "Watch", refuse)
-    finder = Finder(Machine(machine), watched=True)
-    assert finder.look() == []
+    monkeypatch.setattr(finder_module, "FolderWatch", refuse)
+    finder = DeviceFinder(Machine(machine), watched=True)
+    assert finder.scan() == []
     plug(machine)
     until_found(finder)
     finder.close()
 
 
-def test_another_systems_devices_are_not_watched_for(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(finder_module, "Watch", lambda: pytest.fail("a watch of this machine"))
+def test_devices_of_another_system_are_not_watched(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(finder_module, "FolderWatch", lambda: pytest.fail("a watch of this machine"))
     system = FakeInput()
-    finder = Finder(system, watched=False)
-    assert finder.look() == []
+    finder = DeviceFinder(system, watched=False)
+    assert finder.scan() == []
     node = FakeNode("/dev/input/event3", {}, [])
     system.put(node, DS4)
     until_found(finder)
@@ -169,8 +161,8 @@ def test_another_systems_devices_are_not_watched_for(monkeypatch: pytest.MonkeyP
     node.dispose()
 
 
-def until_found(finder: Finder, limit: float = 10.0) -> None:
+def until_found(finder: DeviceFinder, limit: float = 10.0) -> None:
     end = time.monotonic() + limit
-    while not (finder.due() and finder.look()):
-        assert time.monotonic() < end, "it was not looked for"
+    while not (finder.due() and finder.scan()):
+        assert time.monotonic() < end, "it was not found"
         finder.wait(0.01)
