@@ -26,12 +26,12 @@ from child_targets import give_up_right
 
 import hal
 from hal.histogram import Histogram
-from hal.host.pacer import Pacer
+from hal.host.main import PeriodicPace
 
 
 def bare(rate_hz: float, seconds: float) -> float:
     """Share of ticks that a loop with nothing to do misses in this process."""
-    pacer, end = Pacer(1.0 / rate_hz), time.monotonic() + seconds
+    pacer, end = PeriodicPace(1.0 / rate_hz), time.monotonic() + seconds
     turns = 0
     while time.monotonic() < end:
         pacer.wait()

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from .arguments import number
 from .errors import ConnectionLost, MotionStopped, RobotFault, StaleStateError
-from .host.gripper_mail import GripperAct, GripperCommand
+from .host.records import GripperAct, GripperCommand
 from .types import Fault, GripperOutcome, GripperState
 
 if TYPE_CHECKING:

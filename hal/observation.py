@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from .arguments import number, whole
 from .errors import CommandError, DeviceNotFound, StaleStateError
 from .geometry import Pose, after_rotation, difference
-from .host.history import History
+from .host.memory import History
 from .types import Frame, GripperState, RobotState, Stamp
 
 if TYPE_CHECKING:

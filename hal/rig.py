@@ -19,8 +19,7 @@ from .control import StopLatch
 from .errors import ConfigError, ConnectionLost, DeviceNotFound, HalError, NotSupported, Problem
 from .gamepad import Gamepad
 from .gripper import Gripper
-from .host.groups import groups_of
-from .host.hosts import Host, LocalHost, RemoteHost, SteppedHost
+from .host.hosts import Host, LocalHost, RemoteHost, SteppedHost, groups_of
 from .host.process import SharedMemory
 from .observation import Observation, Observer
 from .pads.choice import Chosen, choose_pad, in_words

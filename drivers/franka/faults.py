@@ -19,7 +19,7 @@ __all__ = ["ARM_PORT", "HAND_PORT", "fault_of", "fault_of_exception", "flags_in"
 ARM_PORT, HAND_PORT = 1337, 1338
 """The client libraries know no others."""
 _CODE, _CAUSE = 48, 160
-"""Bytes that a fault's code and cause may have (``hal/host/fault_layout.py``)."""
+"""Bytes that a fault's code and cause may have (``hal/host/records.py``)."""
 _ALL = 0.995
 """A success rate above this says nothing: it was looked at before the packets went missing."""
 _CALM = ("idle", "move")

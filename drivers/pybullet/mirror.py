@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from hal.host.mailbox import SeriesBox
+from hal.host.memory import SeriesBox
 
 from .world import World
 

@@ -11,7 +11,7 @@ import warnings
 from collections.abc import Sequence
 from typing import Any
 
-from hal.host.mailbox import SeriesBox
+from hal.host.memory import SeriesBox
 from hal.host.process import Channel, SharedMemory, serve
 from hal.host.ring import FrameRing, frame_rings
 from hal.host.scheduling import yield_to_others

@@ -11,7 +11,7 @@ from typing import Any
 
 from hal.errors import ConnectionLost, NotSupported
 from hal.host.hosts import SNAPSHOT_CAPACITY, Host, LocalHost, RemoteHost
-from hal.host.mailbox import SeriesBox
+from hal.host.memory import SeriesBox
 from hal.host.process import Channel, Child, SharedMemory, serve
 from hal.specs import WorldSpec, from_json, to_json
 from hal.views import Viewer

@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 from viser import SceneApi, SceneNodeHandle, TransformControlsEvent, TransformControlsHandle
 
 from hal.geometry import Pose
-from hal.host.gripper_mail import GripperMail
-from hal.host.records import RobotMail
+from hal.host.records import GripperMail, RobotMail
 from hal.servo.watchdog import PAD_SILENCE
 from hal.specs import RobotSpec, WorkspaceSpec
 from hal.types import RobotState, Trip

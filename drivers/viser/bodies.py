@@ -11,7 +11,7 @@ from viser import SceneApi, SceneNodeHandle
 from hal import registry
 from hal.errors import HalError
 from hal.geometry import Pose
-from hal.host.mailbox import SeriesBox
+from hal.host.memory import SeriesBox
 from hal.specs import BodySpec, WorldSpec, from_json
 
 from .drawing import draw, place, wxyz

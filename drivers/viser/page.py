@@ -12,7 +12,7 @@ from viser import ClientHandle, ViserServer
 
 from hal.errors import HalError
 from hal.host.hosts import SNAPSHOT_CAPACITY
-from hal.host.mailbox import SeriesBox
+from hal.host.memory import SeriesBox
 from hal.host.process import SharedMemory
 from hal.host.records import GroupMemory
 from hal.specs import GroupSpec, WorldSpec

@@ -8,8 +8,7 @@ from typing import Any
 
 from hal.commands import DeadmanRecord
 from hal.control import trip_text
-from hal.host.gripper_mail import GripperMail
-from hal.host.records import GroupMemory, RobotMail
+from hal.host.records import GripperMail, GroupMemory, RobotMail
 from hal.types import Fault, RobotState, RobotStatus, Trip
 
 __all__ = ["Telemetry", "rounded"]

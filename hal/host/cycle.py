@@ -6,20 +6,295 @@ lock-step (:mod:`hal.host.hosts`).
 
 from __future__ import annotations
 
+import math
+import traceback
 from collections.abc import Iterable
 from typing import Any
 
-from .. import registry
-from ..commands import Session
-from ..driver import RobotDriver
-from ..errors import DeviceNotFound, NotSupported
-from ..specs import GroupSpec
-from .arm import ArmUnit
-from .copies import copies_of
-from .gripper_unit import GripperUnit
-from .records import AppRecord, GroupMemory
+import numpy as np
 
-__all__ = ["Cycle"]
+from .. import registry
+from ..commands import Inbox, Session
+from ..driver import Reading, RobotDriver
+from ..errors import ConnectionLost, ControlTaken, DeviceNotFound, NotSupported
+from ..geometry import Pose
+from ..histogram import Histogram
+from ..kinematics.arm import Kinematics
+from ..servo.audit import SetpointAudit
+from ..servo.servo import Servo
+from ..specs import GroupSpec, RobotSpec
+from ..types import Fault, RobotStatus
+from .gripper_unit import GripperUnit
+from .records import AppRecord, GripperMail, GroupMemory, Marks, RobotMail, ServoRecord
+
+__all__ = [
+    "ArmUnit",
+    "Cycle",
+    "RobotMirror",
+    "mirrors_of",
+]
+
+# [copies.py] The stand-ins of real arms in a simulated world, so that simulated cameras see them and objects feel
+# them.
+
+
+class RobotMirror:
+    """One arm that another group moves, followed by the newest state that it published."""
+
+    def __init__(self, name: str, mail: RobotMail, hand: GripperMail | None) -> None:
+        self.name = name
+        self._mail = mail
+        self._hand = hand
+
+    def follow(self, world: Any) -> None:
+        """Put the copy where the arm is. One that has not said anything yet stays where the rig's file puts it."""
+        state = self._mail.get_state()
+        if state is None:
+            return
+        hand = self._hand.get() if self._hand is not None else None
+        world.follow(self.name, state.q, state.dq, hand.state.width if hand is not None else None)
+
+
+def mirrors_of(group: GroupSpec, memories: Iterable[GroupMemory]) -> tuple[RobotMirror, ...]:
+    """Copies of the arms that stand in this group's world and are moved by others, found in the others' memories."""
+    if group.world is None:
+        return ()
+    robots: dict[str, RobotMail] = {}
+    hands: dict[str, GripperMail] = {}
+    for memory in memories:
+        robots |= memory.robots
+        hands |= memory.grippers
+    own = {robot.name for robot in group.robots}
+    others = [robot for robot in group.world.robots if robot.name not in own and robot.name in robots]
+    return tuple(RobotMirror(robot.name, robots[robot.name], _hand_of(robot, hands)) for robot in others)
+
+
+def _hand_of(robot: RobotSpec, hands: dict[str, GripperMail]) -> GripperMail | None:
+    return hands.get(robot.gripper.name) if robot.gripper is not None else None
+
+
+# [arm.py] One arm in a group's cycle: its driver, its servo and its mailboxes.
+
+TCP_APART, TCP_TURNED = 0.002, 0.02
+"""By how much a device's own tcp may differ from the model's, m and rad."""
+
+
+class ArmUnit:
+    """An arm with everything that belongs to it: driver, servo, mailboxes."""
+
+    def __init__(self, spec: RobotSpec, dt: float, mail: RobotMail, world: object | None) -> None:
+        self.spec = spec
+        self.dt = dt
+        self.mail = mail
+        self.driver: RobotDriver = registry.load(spec.driver, "robot")(spec, world)
+        self.kinematics = Kinematics(spec.kinematics)
+        mass_matrix = self.driver.mass_matrix if "torque" in self.driver.modes else None
+        self.servo = Servo(spec, dt, self.kinematics, mass_matrix, self.driver.repeats)
+        self.reset_statistics()
+        self.reading: Reading | None = None
+        self.error: ConnectionLost | None = None
+        """Why the device counts as lost."""
+        self._write_failed = False
+        self._sound: Reading | None = None
+        self._setpoint: Any = None
+        self._latest_target = 0
+        self._reanchored = 0
+        self._prepared: Inbox | None = None
+        """The inbox that the next set-point was computed from."""
+        self._t_written = 0.0
+        self._session = 0
+
+    def reset_statistics(self) -> None:
+        """Measure from now on: peaks of the set-points, latencies."""
+        self.audit = SetpointAudit(self.spec.limits, self.dt)
+        self.latency = Histogram(1e-4, 5000)
+        self.lost_cycles = 0
+        """Samples of the device that were never seen."""
+        self.reanchored = 0
+        """How often the device had not taken a set-point."""
+        self.servo.reset_statistics()
+        self.driver.reset_statistics()
+
+    def open(self, now: float) -> None:
+        """Connect to the arm and read it once. Nothing moves."""
+        self.driver.open()
+        if self.driver.paces_itself:
+            self.driver.wait()
+        self.reading = self.driver.read(now)
+        self._compare_tcp()
+        self._anchor()
+
+    def _compare_tcp(self) -> None:
+        """A device that knows where its tcp is must agree with the model, or every Cartesian motion would be wrong."""
+        theirs = self.driver.own_tcp()
+        if theirs is None or self.reading is None:
+            return
+        device = Pose.from_matrix(np.array(theirs, float).reshape(4, 4).T)
+        distance, angle = self.kinematics.pose(self.reading.q).distance(device)
+        if distance > TCP_APART or angle > TCP_TURNED:
+            raise ConnectionLost(
+                f"{self.spec.name}: the arm and model {self.spec.model!r} do not mean the same tool centre point: they "
+                f"are {1e3 * distance:.1f} mm and {angle:.3f} rad apart; mend the arm's end effector or the model's tcp"
+            )
+
+    def _anchor(self) -> None:
+        """The set-point is where the device holds."""
+        assert self.reading is not None
+        commanded = self.reading.q_commanded
+        self.servo.anchor(commanded if commanded is not None else self.reading.q)
+        self.audit.reset()
+
+    # Per cycle.
+
+    def read(self, now: float) -> None:
+        """Ask the device. One that took no set-point stays lost for a whole cycle, though it answers again."""
+        before = self.reading
+        try:
+            self.reading = reading = self.driver.read(now)
+            if self.error is not None and not self._write_failed:
+                self._compare_tcp()  # whoever comes back may have another tool
+                self.error = None
+        except Exception as error:
+            self._lose(error)
+            return
+        if self.driver.paces_itself and before is not None and reading.seq > before.seq + 1:
+            self.lost_cycles += reading.seq - before.seq - 1
+
+    def _lose(self, error: Exception) -> None:
+        """A driver that fails, in whatever way, is a device that does not answer."""
+        if isinstance(error, ConnectionLost):
+            self.error = error
+            return
+        if self.error is None:
+            traceback.print_exception(error)  # into the process's log: this is a mistake in a driver
+        self.error = ConnectionLost(f"{self.spec.name}: {type(error).__name__}: {error}")
+
+    def tick(self, now: float, app: AppRecord, late: bool = False) -> None:
+        """Compute the next set-point."""
+        marks = self.mail.get_marks()
+        if self._session and marks.ended == self._session:  # the app says so in memory: that waits for no answer
+            self.servo.end()
+        if self.error is not None or self.reading is None:
+            self._prepared = None
+            self._setpoint = self.servo.lost(now)
+            return
+        inbox, self._prepared = self._prepared or self._inbox(app, marks), None
+        self._setpoint = self.servo.tick(now, self.reading, inbox, late)
+        if self.servo.report.reanchored != self._reanchored:
+            self._reanchored = self.servo.report.reanchored
+            self.reanchored += 1
+            self.audit.reset()  # the device's own set-points lie in between
+
+    def prepare(self, app: AppRecord) -> None:
+        """A device that sets the pace waits for its answer: compute the next one before it asks."""
+        if self._setpoint is not None and self.driver.paces_itself:
+            self._prepared = self._inbox(app, self.mail.get_marks())
+            self.servo.prepare(self._prepared)
+
+    def _inbox(self, app: AppRecord, marks: Marks) -> Inbox:
+        return Inbox(self.mail.get_command(), self.mail.get_deadman(), app.stops, marks.rearms, app.t)
+
+    def write(self, now: float) -> None:
+        """Hand it to the device."""
+        setpoint = self._setpoint
+        failed, self._write_failed = self._write_failed, False
+        if setpoint is None or (self.error is not None and not failed):
+            return
+        try:
+            if self.driver.write(setpoint) is False:
+                self.servo.withheld()
+        except Exception as error:
+            self._write_failed = True
+            self._lose(error)
+            return
+        self._t_written = now
+        self.audit.take(setpoint)
+
+    def finish_session(self) -> bool:
+        """After the last set-point of a session: hand the arm back to its own hold. True while none is open."""
+        if self._setpoint is None and self._session and self.servo.report.status in (
+            RobotStatus.IDLE, RobotStatus.LOST, RobotStatus.FAULT,
+        ) and not self.servo.active:  # fmt: skip
+            self._session = 0
+            try:
+                if self.error is None:
+                    self.driver.halt()
+            except Exception as error:
+                self._lose(error)
+        return self._session == 0
+
+    def note_latency(self, clock_now: float) -> None:
+        """Time from a pad's event to the set-point that follows it, once per command."""
+        target = self.servo.report.target_seq
+        if target == self._latest_target:
+            return
+        self._latest_target = target
+        command = self.mail.get_command()
+        if command is not None and command.seq == target and command.t_event > 0.0:
+            ahead = self.dt if self.driver.paces_itself else 0.0  # it is written in the next cycle
+            self.latency.add(clock_now + ahead - command.t_event)
+
+    def publish(self, now: float) -> None:
+        """Tell the app: what the servo does, with the newest reading that makes sense."""
+        reading, report = self.reading, self.servo.report
+        if reading is not None and self._makes_sense(reading):
+            self._sound = reading
+        reading = self._sound
+        if reading is None:
+            return
+        if self.error is not None:
+            lost = self.error.fault or Fault("lost", str(self.error), "see that it is on and connected")
+            reading = reading._replace(fault=lost)
+        elif reading.fault is None and self.servo.fault is not None:
+            reading = reading._replace(fault=self.servo.fault)
+        tcp, jacobian = self.kinematics.fk_and_jacobian(reading.q)
+        servo = ServoRecord(
+            RobotStatus.LOST if self.error is not None else report.status,
+            report.trip,
+            report.limited,
+            report.target_seq,
+            self._session,
+            report.arrived,
+            report.refused,
+            self._t_written,
+            report.t_stop,
+            report.q_set,
+            report.dq_set,
+        )
+        self.mail.put_state(reading, servo, tcp, self.kinematics.fk(report.q_set), jacobian.dot(reading.dq).tolist())
+
+    def _makes_sense(self, reading: Reading) -> bool:
+        n = len(self.spec.joints)
+        return len(reading.q) == len(reading.dq) == n and math.isfinite(math.hypot(*reading.q, *reading.dq))
+
+    # Requests.
+
+    def begin(self, session: Session, app: AppRecord) -> None:
+        """Open a control session. Raises ControlTaken while another one is open, ConnectionLost without an arm."""
+        marks = self.mail.get_marks()
+        if marks.ended == session.id:
+            return  # the app gave up while this request was on its way
+        if self._session:
+            raise ControlTaken(f"{self.spec.name} is under the control of session {self._session}")
+        if self.error is not None:
+            raise self.error
+        self._anchor()
+        self.servo.begin(session, self._inbox(app, marks))
+        self._session = session.id
+
+    def recover(self) -> None:
+        """Clear a fault of the device, or of how it follows its set-points."""
+        self.driver.recover()
+        self.servo.recover()
+
+    def moved(self) -> None:
+        """The arm was put elsewhere (a reset of the simulated world)."""
+        self.reading = self.driver.read(self.reading.t if self.reading else 0.0)
+        self._anchor()
+
+    def close(self) -> None:
+        """Let go of the device."""
+        self.driver.close()
 
 
 class Cycle:
@@ -29,7 +304,7 @@ class Cycle:
         """``others``: memories of the rig's other groups, whose arms have copies in this group's world."""
         self.spec = spec
         self.memory = memory
-        self._copies = copies_of(spec, others)
+        self._copies = mirrors_of(spec, others)
         self.dt = 1.0 / spec.rate_hz
         self.ticks = 0
         self.t = 0.0

@@ -8,8 +8,7 @@ import traceback
 from ..driver import GripperDriver, GripperReading
 from ..errors import CommandError, ConfigError, ConnectionLost, DriverMissing, HalError, NotSupported, RobotFault
 from ..types import Fault, GripperOutcome
-from .gripper_mail import GripperAct, GripperCommand, GripperMail
-from .records import AppRecord
+from .records import AppRecord, GripperAct, GripperCommand, GripperMail
 
 __all__ = ["AT_WIDTH", "GripperUnit"]
 

@@ -11,20 +11,201 @@ import math
 import os
 import signal
 import time
-from collections.abc import Sequence
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from ..errors import ConnectionLost
+from ..histogram import Histogram
 from ..specs import GroupSpec, from_json
 from .cycle import Cycle
-from .mailbox import SeriesBox
-from .pace import DevicePace, Pace, Steps, Suspension
-from .pacer import Pacer
+from .memory import SeriesBox
 from .process import Channel, SharedMemory, pack_error
-from .records import GroupMemory
+from .records import AppRecord, GroupMemory
 from .scheduling import describe, is_realtime, prepare_process
 
-__all__ = ["main"]
+__all__ = [
+    "DevicePace",
+    "Pace",
+    "PeriodicPace",
+    "StepPace",
+    "SuspensionWatch",
+    "main",
+]
+
+# [pace.py] What sets the pace of a group's cycle in its own process: time, a device, or the app that steps it.
+
+_ASLEEP = 0.1
+"""A computer that slept for longer than this, s, was suspended."""
+
+
+class Pace(ABC):
+    """When the next cycle begins."""
+
+    def __init__(self) -> None:
+        self.periods = Histogram(2e-5, 5000)
+        """Time between two cycles, s."""
+        self._last = 0.0
+
+    @property
+    def missed(self) -> int:
+        """Cycles that were skipped."""
+        return 0
+
+    @property
+    def pausing(self) -> bool:
+        """Does time stand still until somebody asks for more?"""
+        return False
+
+    @abstractmethod
+    def wait(self) -> float:
+        """Block until the next cycle; returns its time on the group's clock, s."""
+
+    def now(self) -> float:
+        """The group's clock, s."""
+        return time.monotonic()
+
+    def heard(self, app: AppRecord) -> AppRecord:
+        """The app's newest word, with its heartbeat on the group's clock."""
+        return app
+
+    def run_free(self) -> None:  # noqa: B027  # most do not wait for the app
+        """The app is done: go on without it."""
+
+    def restart(self) -> None:
+        """Go on from now, counting nothing as missed: after work for which the group's time was paused."""
+        self._last = 0.0
+
+    def reset_statistics(self) -> None:
+        """Count from zero."""
+        self.periods = Histogram(2e-5, 5000)
+
+    def _note(self, now: float) -> None:
+        if self._last:
+            self.periods.add(now - self._last)
+        self._last = now
+
+
+class DevicePace(Pace):
+    """A device's own cycle (a Franka's state packets)."""
+
+    def __init__(self, cycle: Cycle) -> None:
+        super().__init__()
+        self._cycle = cycle
+
+    @property
+    def missed(self) -> int:
+        """Cycles of the device of which nothing was seen."""
+        return self._cycle.lost_cycles
+
+    def wait(self) -> float:
+        self._cycle.wait()
+        now = time.monotonic()
+        self._note(now)
+        return now
+
+    def restart(self) -> None:
+        """A device does not pause."""
+
+
+class StepPace(Pace):
+    """Lock-step: so many cycles as the app asks for, then time stands still."""
+
+    def __init__(self, cycle: Cycle, attend: Callable[[float], None]) -> None:
+        """``attend(timeout)`` serves a request of the app, if one comes."""
+        super().__init__()
+        self._cycle = cycle
+        self._attend = attend
+        self._granted = 0
+        self._free = False
+
+    def grant(self, cycles: int) -> None:
+        """The app asks for so many."""
+        self._granted += cycles
+
+    @property
+    def pausing(self) -> bool:
+        return self._granted <= 0 and not self._free
+
+    def now(self) -> float:
+        return self._cycle.ticks * self._cycle.dt
+
+    def wait(self) -> float:
+        while self.pausing:
+            self._attend(0.05)
+        self._granted -= 1
+        if self._cycle.paces_itself:
+            self._cycle.wait()
+        return (self._cycle.ticks + 1) * self._cycle.dt
+
+    def heard(self, app: AppRecord) -> AppRecord:
+        """An app that steps is there by definition."""
+        return AppRecord((self._cycle.ticks + 1) * self._cycle.dt, app.stops)
+
+    def run_free(self) -> None:
+        self._free = True
+
+
+class SuspensionWatch:
+    """Notices that the computer was suspended, in which its monotonic clock stands still."""
+
+    def __init__(self) -> None:
+        self._clock = getattr(time, "CLOCK_BOOTTIME", None)
+        self._asleep = self._slept()
+
+    def _slept(self) -> float:
+        """How long it was suspended since it was started, s; 0 where the system cannot say."""
+        return time.clock_gettime(self._clock) - time.monotonic() if self._clock is not None else 0.0
+
+    def ended(self) -> bool:
+        """Was it suspended since the last call?"""
+        before, self._asleep = self._asleep, self._slept()
+        return self._asleep - before > _ASLEEP
+
+
+# [pacer.py] A periodic loop against absolute deadlines: what came too late is skipped and counted, never caught
+# up.
+
+
+class PeriodicPace(Pace):
+    """Wakes its caller every ``period`` s."""
+
+    def __init__(self, period: float) -> None:
+        super().__init__()
+        self.period = period
+        self._missed = 0
+        self._next = time.monotonic() + period
+
+    @property
+    def missed(self) -> int:
+        """Periods that were skipped."""
+        return self._missed
+
+    def wait(self) -> float:
+        """Sleep until the next deadline; returns the time of waking, s."""
+        now = time.monotonic()
+        if now < self._next:
+            time.sleep(self._next - now)
+            now = time.monotonic()
+        late = int((now - self._next) / self.period)
+        if late > 0:
+            self._missed += late
+            self._next += late * self.period
+        self._next += self.period
+        self._note(now)
+        return now
+
+    def restart(self) -> None:
+        """What took less than a period was no pause: many of those would slow time down, and no count would show it."""
+        paused = int((time.monotonic() - self._next) / self.period)
+        if paused > 0:
+            super().restart()
+            self._next += paused * self.period
+
+    def reset_statistics(self) -> None:
+        super().reset_statistics()
+        self._missed = 0
+
 
 APP_GONE = 30.0
 """An app that is there but has given no sign of life for so long is taken for gone, s. Its arms stopped long before."""
@@ -62,14 +243,14 @@ class HostProcess:
         self._give_up_at = math.inf
         self._owed: int | None = None
         """Number of the request that is answered when time stands still again."""
-        self._suspension = Suspension() if self.cycle.attended else None
+        self._suspension = SuspensionWatch() if self.cycle.attended else None
         self.pace: Pace
         if spec.clock == "lock_step":
-            self.pace = Steps(self.cycle, self._attend)
+            self.pace = StepPace(self.cycle, self._attend)
         elif self.cycle.paces_itself:
             self.pace = DevicePace(self.cycle)
         else:
-            self.pace = Pacer(self.cycle.dt)
+            self.pace = PeriodicPace(self.cycle.dt)
 
     def run(self) -> None:
         """Open, cycle, stop, close."""
@@ -175,7 +356,7 @@ class HostProcess:
         if method == "close":
             self.closing = True
             return
-        if method == "advance" and isinstance(self.pace, Steps):
+        if method == "advance" and isinstance(self.pace, StepPace):
             self.pace.grant(message["params"]["cycles"])
             self._owed = message["id"]
             return

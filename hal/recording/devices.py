@@ -6,7 +6,7 @@ from collections.abc import Collection
 from typing import TYPE_CHECKING
 
 from ..errors import CommandError
-from ..host.groups import groups_of
+from ..host.hosts import groups_of
 from .cameras import CameraTrack
 from .columns import MORE_STREAMS, TIMES
 from .sampling import Sampler, movable

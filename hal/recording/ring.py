@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from ..host.mailbox import Mailbox
+from ..host.memory import Mailbox
 from ..host.ring import STREAM_TYPES, ArrayRing, Images
 from .columns import CameraSetup
 

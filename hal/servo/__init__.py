@@ -6,7 +6,6 @@ took the last one, ``torque`` and ``torque_bounds`` drive an arm by torques, and
 driver was given whether the limits were kept.
 """
 
-from .report import ServoReport
-from .servo import Servo
+from .servo import Servo, ServoReport
 
 __all__ = ["Servo", "ServoReport"]

@@ -23,8 +23,7 @@ from typing import Any
 
 from ..driver import Reading, Setpoint
 from ..types import Fault, Trip
-from .limits import stop_peak
-from .smoothing import JointSmoother
+from .smoothing import JointSmoother, stop_peak
 from .watchdog import SILENCE
 
 __all__ = ["LATEST", "MISMATCHES", "NOISIEST", "Anchoring"]

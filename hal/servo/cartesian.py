@@ -13,9 +13,8 @@ from ..commands import CommandRecord
 from ..geometry import after_rotation, difference, rotate
 from ..types import Limited
 from .envelope import Envelope
-from .limits import speed_for
-from .motions import Motion
-from .smoothing import JointSmoother
+from .joint import ServoMotion
+from .smoothing import JointSmoother, speed_for
 
 __all__ = ["PoseMotion", "TwistMotion"]
 
@@ -49,7 +48,7 @@ _BRAKE = (0.8, 0.5)
 """Shares of acceleration and jerk with which a pose's approach brakes."""
 
 
-class _CartesianMotion(Motion):
+class _CartesianMotion(ServoMotion):
     """What twists and poses share."""
 
     def _follow_twist(self, twist: list[float]) -> None:

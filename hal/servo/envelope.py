@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from math import hypot
-from typing import TYPE_CHECKING
+from itertools import chain
+from math import dist, hypot, inf, sqrt
+from operator import mul
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -12,16 +14,311 @@ from ..commands import Session
 from ..kinematics.arm import Kinematics, Pose7
 from ..specs import WorkspaceSpec
 from ..types import Limited
-from .limits import speed_for
-from .smoothing import Guard, JointSmoother
-from .tcp import TcpReference
+from .smoothing import Guard, JointSmoother, speed_for, stop_displacement, stop_phases
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-__all__ = ["Envelope"]
+__all__ = [
+    "Envelope",
+    "TcpReference",
+]
+
+# [tcp.py] Bounds on where the tcp is, on its speed and on that of its stops, without computing the kinematics in
+# every tick.
+#
+# Forward kinematics and a Jacobian in every tick would cost more than all the rest of it. Most ticks need
+# neither: the
+# tcp is nowhere near a face of the workspace or its greatest speed, and a bound that costs a few multiplications
+# proves
+# it. Only where the bound does not are they computed.
+#
+# Every bound rests on `Kinematics.reach`, r: joint i at 1 rad/s moves the tcp at r_i m/s at most, wherever the
+# arm is,
+# and turning joint j by x rad changes each column of the linear Jacobian J by r_j |x| at most. With dq the joint
+# speeds,
+# and d = q - q_reference the distance of the joints from where the tcp was computed:
+#
+# * |tcp(q) - tcp(q_reference)| <= m, where m = sum r_i |d_i| <= |r| |d|;
+# * |J(q) dq| <= sum r_i |dq_i|;
+# * |J(q) dq| <= |J(q_reference) dq| + m sum |dq_i| <= (|J(q_reference)| + |r| |d| sqrt(n)) |dq|.
+#
+# The looser forms are products of lengths, which cost one call each; the sharper ones are tried where those fail.
+#
 
 Floats = Sequence[float]
+
+_SAME = 2e-3
+"""The Jacobian is computed anew when the tcp may have moved this far, m: it errs by 2 mm/s per rad/s."""
+
+_PARTS = np.linspace(0.0, 1.0, 9)
+"""A stop is looked at in at least these parts of its duration."""
+
+
+class TcpReference:
+    """The tcp at a joint position nearby."""
+
+    def __init__(self, smoother: JointSmoother, kinematics: Kinematics, workspace: WorkspaceSpec | None) -> None:
+        self._smoother = smoother
+        self._kinematics = kinematics
+        self._workspace = workspace
+        self._reach = kinematics.reach()
+        self._reach_length = hypot(*self._reach)
+        self._root = sqrt(smoother.n)
+        self._spread = self._reach_length * self._root
+        limits = list(zip(smoother.acceleration, smoother.jerk, strict=True))
+        self._overrun = max([0.5 * A / J for A, J in limits])
+        """What a joint's acceleration adds to its speed until it is taken back, at most: rad/s for each rad/s2."""
+        self._overrun_tcp = max([0.5 * r / J for r, (_, J) in zip(self._reach, limits, strict=True)])
+        """The same for the tcp: m/s for each (rad/s2)^2."""
+        self._reach_array = np.array(self._reach)
+        self._accelerations = np.array(smoother.acceleration)
+        self._bend = sum(map(mul, self._reach, smoother.acceleration)) / 8.0
+        self._at: Floats = [inf] * smoother.n
+        """Joint positions of the reference; infinitely far before the first look."""
+        self._pose: Pose7 = (inf,) * 7
+        self._jacobian: Any = None
+        self._rows: list[list[float]] = []
+        """The linear Jacobian there, (3, n)."""
+        self._curvature: Any = None
+        """How they change with each joint, (n, 3 n); None until it is asked for."""
+        self._centre: Floats = (0.0,) * smoother.n
+        self._centre_speed = self._centre_length = 0.0
+        """Joint speeds, rad/s, and the greatest speed of the tcp there, m/s, for any shares from 0 to 1 of them;
+        the length of these speeds."""
+        self._stretch = inf
+        """The tcp's speed there for joint speeds of length 1 is no greater (it is the Jacobian's Frobenius norm)."""
+        self._clearance = inf
+        """Distance of the tcp there from the nearest face of the workspace, m; negative outside."""
+        self._stops: list[tuple[float, float, float]] = []
+        """Per joint, its greatest speed, rad/s, and how far its stop moves the tcp at most: so many m for each rad/s
+        and each rad/s2 that it begins with."""
+        self._per_speed = self._per_acceleration = 0.0
+        """Lengths of the columns of these."""
+        self._fastest = [0.0] * smoother.n
+        """Joint speeds (n,), rad/s, up to which these hold."""
+        self._slowest = 0.0
+        self._step = 0.0
+        """Farthest that one tick can move the tcp and the end of its stop, together, m."""
+        self._proof: Floats = ()
+        """The set-point from which the next step was proven to be inside, with this margin, m."""
+        self._margin = 0.0
+
+    def open(self, velocity: Floats) -> None:
+        """A session begins whose joints keep below ``velocity`` (n,), rad/s."""
+        smoother = self._smoother
+        dt = smoother.dt
+        self._stops = []
+        self._fastest = []
+        self._slowest = min(velocity)
+        self._step = 0.0
+        self._proof = ()
+        # The way f(v, a) of a stop grows with the speed v and the acceleration a that it begins with, and is convex in
+        # each, so f(v, a) <= f(v, 0) + (f(v, A) - f(v, 0)) a / A, where f(v, 0) <= f(u, 0) v / u for any u >= v, and
+        # the difference grows with v. Here u lies a tick's acceleration beyond the session's speed, so that the bound
+        # holds for the next tick's state as well.
+        for reach, cap, A, J in zip(self._reach, velocity, smoother.acceleration, smoother.jerk, strict=True):
+            u = cap + A * dt
+            steady, worst = stop_displacement(u, 0.0, A, J), stop_displacement(u, A, A, J)
+            per_v, per_a = reach * steady / u, reach * (worst - steady) / A
+            self._stops.append((cap, per_v, per_a))
+            self._fastest.append(u)
+            self._step += reach * u * dt + per_v * A * dt + per_a * min(A, J * dt)
+        self._per_speed = hypot(*[per_v for _, per_v, _ in self._stops])
+        self._per_acceleration = hypot(*[per_a for _, _, per_a in self._stops])
+
+    def here(self) -> tuple[Pose7, NDArray[np.float64]]:
+        """Pose of the tcp and its Jacobian (6, n) at the set-point, which becomes the reference."""
+        if self._at is not self._smoother.q:
+            self._look()
+        return self._pose, self._jacobian
+
+    def _look(self) -> None:
+        q = self._smoother.q
+        if self._centre_length:
+            self._centre_speed += self._spread * dist(q, self._at) * self._centre_length
+        pose, jacobian = self._kinematics.fk_and_jacobian(q)
+        self._at, self._pose, self._jacobian = q, pose, jacobian
+        self._rows = jacobian[:3].tolist()
+        self._curvature = None
+        self._stretch = hypot(*chain.from_iterable(self._rows))
+        box = self._workspace
+        if box is not None:
+            sides = zip(pose, box.lower, box.upper, strict=False)
+            self._clearance = min([min(x - low, high - x) for x, low, high in sides])
+
+    def velocity(self, dq: Floats) -> list[float]:
+        """Linear velocity (3,) in m/s of the tcp when the joints of the set-point move so, along the base's axes."""
+        self._refresh()
+        return [sum(map(mul, row, dq)) for row in self._rows]
+
+    def surely_slower(self, dq: Floats, cap: float) -> bool:
+        """Return whether the tcp surely keeps below ``cap`` (m/s) while each joint changes its speed by itself, in
+        whatever order, between the present one, ``dq`` and rest. False: not proven."""
+        smoother = self._smoother
+        now = smoother.dq
+        speed = self._root * hypot(*dq, *now)
+        near = self._around(dist(dq, self._centre), dist(now, self._centre))
+        if near + speed * self._reach_length * dist(smoother.q, self._at) <= cap:
+            return True
+        self._put_centre(dq)
+        return self._around(0.0, dist(now, dq)) + speed * self._moved() <= cap
+
+    def _around(self, *distances: float) -> float:
+        """Greatest speed of the tcp (m/s) at the reference when each joint moves at any share of its speed at the
+        centre, plus what it may be away from there: in all, joint speeds of these lengths (rad/s)."""
+        return self._centre_speed + self._stretch * hypot(*distances)
+
+    def _put_centre(self, dq: Floats) -> None:
+        """Compute the tcp's greatest speed for all shares of the joint speeds ``dq``."""
+        self._refresh()
+        axes = []
+        for row in self._rows:
+            parts = list(map(mul, row, dq))
+            axes.append(0.5 * (sum(map(abs, parts)) + abs(sum(parts))))  # the greater of the axis' two directions
+        self._centre, self._centre_speed, self._centre_length = dq, hypot(*axes), hypot(*dq)
+
+    def stop_speed(self, dq: Floats, linear: NDArray[np.float64] | None = None) -> float:
+        """Greatest speed of the tcp (m/s) in a stop from these steady joint speeds, the ramps of braking left out.
+
+        Each joint slows down evenly, so that the tcp is fastest at the start or when one of the joints comes to rest.
+        ``linear`` holds transposed linear Jacobians (..., n, 3); without it, that of the set-point counts.
+        """
+        if linear is None:
+            self._refresh()
+            linear = self._jacobian[:3].T
+        speeds = np.abs(dq)
+        ends = np.append(speeds / self._accelerations, 0.0)
+        slowed = np.copysign(np.maximum(speeds - ends[:, None] * self._accelerations, 0.0), dq)
+        return sqrt(np.square(slowed @ linear).sum(axis=-1).max())
+
+    def surely_stops_slower(self, cap: float) -> bool:
+        """Return whether the tcp surely keeps below ``cap`` (m/s) in the proposed step and in the stop after it."""
+        smoother = self._smoother
+        q, dq, dt = smoother.q, smoother.dq_next, smoother.dt
+        speed, acceleration = hypot(*dq), hypot(*smoother.ddq_next)
+        if speed <= self._slowest or all(-u <= v <= u for v, u in zip(dq, self._fastest, strict=True)):
+            mean = [(x - x0) / dt for x, x0 in zip(smoother.q_next, q, strict=True)]
+            step = hypot(*mean)
+            # In its stop no joint gets faster than its speed and what its acceleration adds until it is taken back.
+            fastest = self._root * max(speed + self._overrun * acceleration, step)
+            way = self._reach_length * step * dt + self._per_speed * speed + self._per_acceleration * acceleration
+            ramps = self._overrun_tcp * acceleration * acceleration + fastest * way
+            near = self._around(max(dist(dq, self._centre), dist(mean, self._centre)))
+            if near + ramps + fastest * self._reach_length * dist(q, self._at) <= cap:
+                return True
+            self._put_centre(dq)
+            if self._around(dist(mean, dq)) + ramps + fastest * self._moved() <= cap:
+                return True
+        self._refresh()
+        return self._proves_slower_stop(cap)
+
+    def _proves_slower_stop(self, cap: float) -> bool:
+        """Return whether the tcp keeps below ``cap`` (m/s) in the proposed step and in the stop after it.
+
+        Between any two of the times below each joint's speed is a parabola, which lies in the triangle of its control
+        points (both ends, and where their tangents meet). With the Jacobian of the reference the tcp's velocity is one,
+        too, and nowhere greater than the greatest of its control points, but for what the joints' way d from there
+        changes: m for each rad/s, as above.
+
+        Where that is too coarse, the Jacobian changes with the way to first order. The way is all but straight between
+        two of the times, and so the tcp's velocity is a cubic, in the hull of four control points. What this leaves out
+        is (sum r_i |d_i|) (sum |d_i|) / 2 for each rad/s, and the bend of the way, at most A t^2 / 8 for each joint.
+        """
+        smoother = self._smoother
+        q, dq, ddq, dt = smoother.q_next, smoother.dq_next, smoother.ddq_next, smoother.dt
+        limits = zip(dq, ddq, smoother.acceleration, smoother.jerk, strict=True)
+        phases = np.array([stop_phases(v, a, A, J) for v, a, A, J in limits])
+        jerk, first, second, third = phases.T
+        times = np.concatenate((_PARTS * phases[:, 3].max(), phases[:, 1:].ravel()))
+        times.sort()
+        t = times[:, None]
+        built = np.minimum(t, first)
+        braked = np.minimum(t, third)
+        released = np.maximum(braked - second, 0.0)
+        slopes = ddq + jerk * (built - released)
+        slopes[t >= third] = 0.0
+        ramps = built * (ddq + 0.5 * jerk * built) - 0.5 * jerk * released**2
+        speeds = dq + ramps + (braked - built) * (ddq + jerk * first)
+        widths = (times[1:] - times[:-1])[:, None]
+        control = np.empty((3, len(widths), smoother.n))
+        control[0], control[1], control[2] = speeds[:-1], speeds[:-1] + (0.5 * widths) * slopes[:-1], speeds[1:]
+        greatest = np.abs(control).max(axis=0)
+        total = greatest.sum(axis=1)
+        linear = self._jacobian[:3].T
+        here = np.subtract(q, self._at)
+        way = np.abs(here) + np.cumsum(greatest * widths, axis=0)
+        reached = way @ self._reach_array
+
+        mean = np.subtract(q, smoother.q) / dt  # of the step: what shows when positions are compared
+        mean_total = float(np.abs(mean).sum())
+
+        fastest = np.sqrt(np.square(control @ linear).sum(axis=2).max(axis=0))
+        in_step = hypot(*(mean @ linear).tolist()) + float(reached[0]) * mean_total
+        if max(float((fastest + reached * total).max()), in_step) <= cap:
+            return True
+
+        if self._curvature is None:
+            self._curvature = self._kinematics.curvature(self._jacobian).reshape(smoother.n, -1)
+        places = np.empty_like(speeds)
+        places[0] = here
+        places[1:] = here + np.cumsum(control.sum(axis=0) * (widths / 3.0), axis=0)
+        nodes = linear + (places @ self._curvature).reshape(-1, smoother.n, 3)
+        begun = control[:, :, None] @ nodes[:-1]
+        ended = control[:, :, None] @ nodes[1:]
+        velocities = np.stack((3.0 * begun[0], ended[0] + 2.0 * begun[1], 2.0 * ended[1] + begun[2])) / 3.0
+        fastest = np.sqrt(np.square(velocities[:, :, 0]).sum(axis=2).max(axis=0))
+        left_out = 0.5 * reached * way.sum(axis=1) + self._bend * widths[:, 0] ** 2
+        middle = linear + ((here - 0.5 * dt * mean) @ self._curvature).reshape(smoother.n, 3)
+        in_step = hypot(*(mean @ middle).tolist()) + float(left_out[0]) * mean_total
+        return max(float((fastest + left_out * total).max()), in_step) <= cap
+
+    def surely_inside(self, margin: float) -> bool:
+        """Would the tcp, stopped now, stay ``margin`` (m) off every face of the workspace? False: not proven."""
+        margin = max(margin, self._step)
+        if self._proof is self._smoother.q and margin <= self._margin:
+            return True
+        proven = self._proves_inside(margin) or (self._refresh() and self._proves_inside(margin))
+        self._proof, self._margin = (self._smoother.q, margin) if proven else ((), 0.0)
+        return proven
+
+    def surely_stays_inside(self) -> bool:
+        """Does a stop after the step that is proposed end inside the workspace? False: not proven."""
+        return self.surely_inside(0.0)
+
+    def _proves_inside(self, margin: float) -> bool:
+        # Clearance where the reference is, less the way from there and that of the stop.
+        left = self._clearance - margin
+        if not left > 0.0:
+            return False
+        smoother = self._smoother
+        speed = hypot(*smoother.dq)
+        if speed <= self._slowest:
+            stop = self._per_speed * speed + self._per_acceleration * hypot(*smoother.ddq)
+            if self._reach_length * dist(smoother.q, self._at) + stop < left:
+                return True
+        for v, a, (cap, per_v, per_a) in zip(smoother.dq, smoother.ddq, self._stops, strict=True):
+            if not -cap <= v <= cap:
+                return False
+            left -= per_v * abs(v) + per_a * abs(a)
+        return self._moved() < left
+
+    def _moved(self) -> float:
+        """Greatest distance in m between the tcp at the set-point and that of the reference."""
+        if self._at is self._smoother.q:
+            return 0.0
+        total = 0.0
+        for reach, x, at in zip(self._reach, self._smoother.q, self._at, strict=True):
+            total += reach * abs(x - at)
+        return total
+
+    def _refresh(self) -> bool:
+        """Look again where the set-point is, unless the reference is as good as there; True when it did."""
+        if self._moved() <= _SAME:
+            return False
+        self._look()
+        return True
+
 
 _TCP_SHARE = 0.97
 """Share of the tcp speed that goals use, for what the stale Jacobian and joints that change speed one by one add."""

@@ -9,6 +9,7 @@ that must not follow is brought to rest by the smoother's time-optimal stop and 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from math import dist, hypot, isfinite
 from typing import Any
 
@@ -20,18 +21,46 @@ from ..specs import RobotSpec
 from ..types import Fault, Limited, RobotStatus, Trip
 from .anchoring import Anchoring
 from .cartesian import PoseMotion, TwistMotion
-from .chunk import ChunkMotion
 from .envelope import Envelope
-from .motions import JointTargetMotion, JointVelocityMotion, Motion
-from .path import PathMotion
-from .report import ServoReport
+from .joint import ChunkMotion, JointTargetMotion, JointVelocityMotion, PathMotion, ServoMotion
 from .smoothing import JointSmoother
 from .torque import MassMatrix, TorqueMotion
 from .watchdog import SILENCE, Watchdog, is_alive, is_timely
 
-__all__ = ["Servo", "ServoReport"]
+__all__ = [
+    "Servo",
+    "ServoReport",
+]
+
+# [report.py] What a servo tells about its last tick.
 
 Floats = Sequence[float]
+
+
+@dataclass(slots=True)
+class ServoReport:
+    """What the servo did in its last tick."""
+
+    status: RobotStatus = RobotStatus.IDLE
+    trip: Trip = Trip.NONE
+    limited: Limited = Limited.NONE
+    target_seq: int = 0
+    """Number of the command that the set-point follows; 0 before the first one of a session."""
+    refused: int = 0
+    """Number of the newest command of this session that was refused; 0 for none."""
+    q_set: Floats = ()
+    """rad"""
+    dq_set: Floats = ()
+    ddq_set: Floats = ()
+    reanchored: int = 0
+    """How often the device had not taken a set-point, since the servo was made."""
+    arrived: bool = False
+    """Is ``move_to`` done?"""
+    t_trip: float = 0.0
+    """When the stop was latched, s."""
+    t_stop: float = 0.0
+    """When the last braking began, s."""
+
 
 # Members of an enumeration that every tick names: to find one there takes Python 3.11 0.1 us.
 _NO_TRIP, _FAULT, _UNLIMITED, _FOLLOWING = Trip.NONE, Trip.FAULT, Limited.NONE, RobotStatus.FOLLOWING
@@ -76,7 +105,7 @@ class Servo:
         self._middle = [0.5 * (low + high) for low, high in limits]
         self._radius = min(0.5 * (high - low) for low, high in limits) + _BEYOND
         self._torque = TorqueMotion(smoother, envelope, spec.limits, mass_matrix)
-        self._motions: dict[Kind, Motion] = {
+        self._motions: dict[Kind, ServoMotion] = {
             Kind.JOINT_TARGET: JointTargetMotion(smoother, envelope),
             Kind.JOINT_CHUNK: ChunkMotion(smoother, envelope),
             Kind.JOINT_VELOCITY: JointVelocityMotion(smoother, envelope),
@@ -86,7 +115,7 @@ class Servo:
         }
         self._path = PathMotion(smoother, envelope)
         self._session: Session | None = None
-        self._motion: Motion | None = None
+        self._motion: ServoMotion | None = None
         """What moves the arm now; None until the first command."""
         self._anchored = False
         self._ending = False

@@ -8,21 +8,303 @@ arm is measured to be at rest it is held where it is, by positions again.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any
+from math import hypot, isfinite, sqrt
+from operator import mul
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
 
 from ..commands import CommandRecord
 from ..driver import Reading, Setpoint
 from ..specs import LimitsSpec
 from ..types import Limited
 from .envelope import Envelope
-from .motions import Motion
+from .joint import ServoMotion
 from .smoothing import JointSmoother
-from .torque_bounds import RATE, ArmInMotion, Inertia, TorqueBounds
 from .watchdog import SILENCE
 
-__all__ = ["MassMatrix", "TorqueMotion"]
+__all__ = [
+    "ArmInMotion",
+    "Inertia",
+    "MassMatrix",
+    "RATE",
+    "TorqueBounds",
+    "TorqueMotion",
+]
 
+# [torque_bounds.py] What bounds an arm that is driven by torques: how great they may be, what brakes it, and when
+# it has gone too far.
+#
+# Torques know no speed and no place, so both are predicted from the arm's inertia. With M the joint-space inertia
+# where
+# the arm is, torques tau that are taken away from now on as fast as their rate R allows still add
+#
+#     dv = M^-1 (tau T + tau |tau| / (2 R))
+#
+# to the joint speeds; T is the time until a torque that was just computed can be followed by a lower one. What an
+# obstacle or a hand does to the arm is in none of this; it shows in the measured speeds.
+#
+
+Array = NDArray[np.float64]
 Floats = Sequence[float]
+
+RATE = 990.0
+"""Greatest rate of every torque, Nm/s: the 1000 of a Franka's interface, less what rounding might add."""
+
+_SHARE = 0.9
+"""Share of the session's speeds that torques may lead to; a joint that is faster is braked. The rest is for what the
+prediction leaves out: a load that the inertia does not know of, torques that change before they are gone."""
+
+_COUPLED = 0.95
+"""The same for what the joints do to each other. It is more, so that a joint which coasts at its speed does not take
+the torques of all others away."""
+
+_LAG = 2.0
+"""Ticks until a torque can be followed by a lower one: it acts for one, and what it did is measured after that."""
+
+_DECAY = 40.0
+"""The brake takes this share of each joint's speed away, 1/s: rest from 0.65 rad/s in some 0.13 s. Measured in the
+simulation: with 30, an inertia that is told ten times too great still brakes; with 50, hardly."""
+
+_STABLE = 0.25
+"""And no more than this share of it per tick: the arm then comes to rest without turning back, also where the measured
+speed is a tick older than the torque."""
+
+_UNWIND = 1.6 * RATE
+"""Twice the rate at which the brake may have to be let go, Nm/s: less than it can be, so that it is never late."""
+
+_INSIDE = 1.0 - 1e-9
+"""Share of the torque limits that brakes, so that rounding never shows as a violation."""
+
+_UNLIMITED = 100.0
+"""From this tcp speed on nothing is looked at, m/s."""
+
+_SLACK = 5e-3
+"""An arm that begins outside a limit may not go farther out than this, rad and m."""
+
+
+_RUNAWAY = 1.5
+"""Times its limit of speed: an arm that is braked gets there when its inertia is nothing like what it is told to be."""
+
+
+class Inertia:
+    """What it takes to change an arm's joint speeds, at one place."""
+
+    def __init__(self, mass_matrix: Any, n: int) -> None:
+        """``mass_matrix`` (n, n), kg m2. Raises ValueError when it is not that of an arm."""
+        self.mass: Array = np.array(mass_matrix, float)
+        if self.mass.shape != (n, n) or not (min(self.mass.diagonal().tolist()) > 0.0 and isfinite(self.mass.sum())):
+            raise ValueError(f"not the inertia of an arm with {n} joints: {self.mass.tolist()}")
+        self.inverse: Any = np.linalg.inv(self.mass)  # its LinAlgError is a ValueError
+        self.alone: list[float] = (1.0 / self.inverse.diagonal()).tolist()
+        """(n,) inertia of each joint when the others are free, kg m2"""
+
+    def added(self, tau: Floats, lag: float) -> list[float]:
+        """(n,) what torques still add to the joint speeds although they are taken away from now on, rad/s."""
+        added: list[float] = self.inverse.dot(self.impulses(tau, lag)).tolist()
+        return added
+
+    @staticmethod
+    def impulses(tau: Floats, lag: float) -> list[float]:
+        """(n,) Nms: the same torques, over the time that it takes to be rid of them."""
+        return [x * (lag + abs(x) * (0.5 / RATE)) for x in tau]
+
+    def momentum(self, dq: Floats) -> list[float]:
+        """(n,) kg m2/s"""
+        momentum: list[float] = self.mass.dot(dq).tolist()
+        return momentum
+
+
+class ArmInMotion(NamedTuple):
+    """An arm as it was measured."""
+
+    q: Floats
+    """(n,) rad"""
+    dq: Floats
+    """(n,) rad/s"""
+    inertia: Inertia
+
+
+class TorqueBounds:
+    """The bounds of one arm, under the terms of the session that the envelope knows."""
+
+    def __init__(self, limits: LimitsSpec, dt: float, envelope: Envelope) -> None:
+        assert limits.torque is not None
+        self._limits = limits
+        self._torque = limits.torque
+        self._envelope = envelope
+        self._kinematics = envelope.kinematics
+        self._reach = self._kinematics.reach()
+        self._step = RATE * dt
+        self._lag = _LAG * dt
+        self._decay = min(_DECAY, _STABLE / dt)
+        self._ranges = list(zip(limits.lower, limits.upper, strict=True))
+        """Where the joints may be in this session, rad."""
+        self._box: list[tuple[float, float]] = []
+        """Where the tcp may be, m; empty for anywhere."""
+
+    def begin(self, q: Floats) -> None:
+        """A session opens, with the arm at ``q``: outside a limit it may only come back in."""
+        self._ranges = _around(self._limits.lower, self._limits.upper, q)
+        workspace = self._envelope.workspace
+        if workspace is not None:
+            self._box = _around(workspace.lower, workspace.upper, self._kinematics.fk(q)[:3])
+
+    # How great.
+
+    def allowed(self, wanted: list[float], arm: ArmInMotion) -> list[float]:
+        """The torques (n,) to go for, Nm, when ``wanted`` is commanded.
+
+        They keep the torque limits, and are only as great as the arm could be rid of before it is faster than the
+        session allows. First each joint is looked at by itself, as though the others were free; what they do to each
+        other, and to the tcp, makes all torques smaller alike.
+        """
+        envelope = self._envelope
+        tau = [max(-limit, min(limit, x)) for x, limit in zip(wanted, self._torque, strict=True)]
+        if tau != wanted:
+            envelope.limited |= Limited.TORQUE
+        most, coupled = [_SHARE * v for v in envelope.velocity], [_COUPLED * v for v in envelope.velocity]
+        slowed = list(map(self._slowed, tau, arm.dq, arm.inertia.alone, most, self._torque))
+        added = arm.inertia.added(slowed, self._lag)
+        share = min(map(_share, arm.dq, added, coupled))
+        if share < 1.0 or slowed != tau:
+            envelope.limited |= Limited.SPEED
+        tcp_share = self._tcp_share(arm, added)
+        if tcp_share < 1.0:
+            envelope.limited |= Limited.TCP_SPEED
+        share = min(share, tcp_share)
+        return slowed if share == 1.0 else [share * x for x in slowed]
+
+    def _slowed(self, tau: float, v: float, inertia: float, most: float, limit: float) -> float:
+        """Not more than what leaves this joint at ``most`` rad/s: inertia (most - v) = tau T + tau^2 / (2 R).
+
+        One that is faster is braked, at least.
+        """
+        if abs(v) > most:
+            brake = min(limit, self._decay * inertia * (abs(v) - most))
+            return min(tau, -brake) if v > 0.0 else max(tau, brake)
+        lag = self._lag
+        room = most - v if tau > 0.0 else most + v
+        greatest = RATE * (sqrt(lag * lag + 2.0 / RATE * inertia * room) - lag)
+        return max(-greatest, min(greatest, tau))
+
+    def _tcp_share(self, arm: ArmInMotion, added: list[float]) -> float:
+        """The greatest share (0..1) of what torques add that leaves the tcp below its speed, or slows it to that.
+
+        With a the tcp's velocity and b what they add to it, the greater root of |a + s b| = cap.
+        """
+        cap = _SHARE * self._envelope.tcp_speed
+        if self._surely_slower([abs(v) + abs(dv) for v, dv in zip(arm.dq, added, strict=True)], cap):
+            return 1.0
+        jacobian = self._kinematics.jacobian(arm.q)[:3]
+        a, b = jacobian.dot(arm.dq), jacobian.dot(added)
+        bb, ab, rest = float(b.dot(b)), float(a.dot(b)), cap * cap - float(a.dot(a))
+        if bb + 2.0 * ab <= rest or bb == 0.0:
+            return 1.0
+        return max(0.0, min(1.0, (sqrt(max(0.0, ab * ab + bb * rest)) - ab) / bb))
+
+    def _surely_slower(self, speeds: Floats, cap: float) -> bool:
+        """Does the tcp keep below ``cap`` wherever the arm is, when its joints are no faster than ``speeds`` (>= 0)?"""
+        return cap >= _UNLIMITED or sum(map(mul, self._reach, speeds)) <= cap
+
+    def towards(self, tau: Floats, goal: Floats) -> list[float]:
+        """One tick from ``tau`` towards ``goal``, each torque as fast as it may change."""
+        step = self._step
+        return [old + max(-step, min(step, new - old)) for old, new in zip(tau, goal, strict=True)]
+
+    # What brakes.
+
+    def brake(self, tau: Floats, arm: ArmInMotion, share: float) -> tuple[list[float], float]:
+        """One tick of braking, and how much of the brake is on now; ``share`` is how much was (0..1).
+
+        The brake is -g M dq, which takes the same share g of every joint's speed away: the arm goes on along its way
+        until it rests. It never adds energy as long as its torques are not cut one by one, so g is cut instead, and all
+        of them grow in proportion. What drove the arm goes first, and each torque by itself: a rest of it that is
+        little for a shoulder is much for a wrist. (Torques of -D dq with a D for each joint brake longer, since each
+        joint has the others to push; and a D that suits the torque limits makes a wrist of little inertia swing.)
+        """
+        step = self._step
+        goal, _ = self._braking(arm, arm.dq)
+        more = 1.0 - share
+        rests = []
+        for x, brake in zip(tau, goal, strict=True):
+            before = x - share * brake
+            rest = before - max(-step, min(step, before))
+            rests.append(rest)
+            left = step - abs(before - rest)
+            if left < more * abs(brake):
+                more = left / abs(brake)
+        share += more
+        return [rest + share * brake for rest, brake in zip(rests, goal, strict=True)], share
+
+    def release(self, tau: Floats) -> list[float]:
+        """One tick towards no torque: what is left when the speeds are not known."""
+        return self.towards(tau, [0.0] * len(tau))
+
+    def _braking(self, arm: ArmInMotion, dq: Floats) -> tuple[list[float], float]:
+        """The torques that brake these speeds, Nm, and the share of the speed that they take away, 1/s."""
+        momentum = arm.inertia.momentum(dq)
+        share = self._decay
+        for p, most in zip(map(abs, momentum), self._torque, strict=True):
+            if share * p > _INSIDE * most:
+                share = _INSIDE * most / p
+            # A torque sqrt(2 r p) that takes away its own p falls at the rate r.
+            if share * share * p > _UNWIND:
+                share = sqrt(_UNWIND / p)
+        return [-share * p for p in momentum], share
+
+    # What is too far.
+
+    def overrun(self, tau: Floats, arm: ArmInMotion) -> Limited | None:
+        """What the arm runs into: its measured speed is above the session's, or a stop that begins now would end
+        beyond a limit of position or a face of the workspace. ``tau`` is what drives it, Nm.
+        """
+        envelope, dq = self._envelope, arm.dq
+        speeds = [abs(v) for v in dq]
+        if any(v > most for v, most in zip(speeds, envelope.velocity, strict=True)):
+            return Limited.SPEED
+        if not self._surely_slower(speeds, envelope.tcp_speed):
+            velocity = self._kinematics.jacobian(arm.q)[:3].dot(dq).tolist()
+            if hypot(*velocity) > envelope.tcp_speed:
+                return Limited.TCP_SPEED
+        fastest = [v + dv for v, dv in zip(dq, arm.inertia.added(tau, self._lag), strict=True)]
+        goal, share = self._braking(arm, fastest)
+        # The lag and the ramp at the full speed; then the speed dies away, at this share at first, later no slower.
+        ramp = (max(map(abs, tau)) + max(map(abs, goal))) / RATE
+        seconds = self._lag + ramp + 1.0 / share
+        if not _stays_within(self._ranges, arm.q, dq, fastest, seconds):
+            return Limited.POSITION
+        if self._box:
+            pose, jacobian = self._kinematics.fk_and_jacobian(arm.q)
+            now, then = jacobian[:3].dot(dq).tolist(), jacobian[:3].dot(fastest).tolist()
+            if not _stays_within(self._box, pose[:3], now, then, seconds):
+                return Limited.WORKSPACE
+        return None
+
+    def is_runaway(self, arm: ArmInMotion) -> bool:
+        """Is a joint so much faster than it may ever be that torques must not go on with it?"""
+        return any(abs(v) > _RUNAWAY * most for v, most in zip(arm.dq, self._limits.velocity, strict=True))
+
+
+def _share(v: float, added: float, most: float) -> float:
+    """The greatest share (0..1) of ``added`` that leaves a joint at ``most`` rad/s, or does not make it faster."""
+    room = most - v if added > 0.0 else most + v
+    return 1.0 if abs(added) <= max(0.0, room) else max(0.0, room / abs(added))
+
+
+def _around(lower: Floats, upper: Floats, at: Floats) -> list[tuple[float, float]]:
+    """The ranges from ``lower`` to ``upper``, made wider where ``at`` lies outside or at their very edge."""
+    return [(min(low, x - _SLACK), max(high, x + _SLACK)) for low, high, x in zip(lower, upper, at, strict=True)]
+
+
+def _stays_within(ranges: Sequence[tuple[float, float]], at: Floats, v: Floats, w: Floats, seconds: float) -> bool:
+    """Does what moves no faster than between the velocities ``v`` and ``w`` stay within these ranges for so long?"""
+    for (low, high), x, v0, v1 in zip(ranges, at, v, w, strict=True):
+        if x + seconds * max(v0, v1, 0.0) > high or x + seconds * min(v0, v1, 0.0) < low:
+            return False
+    return True
+
 
 MassMatrix = Callable[[Floats], Any]
 """Joint-space inertia (n, n), kg m2, at joint positions (n,), rad: as numbers in rows, or an array."""
@@ -41,7 +323,7 @@ BRAKE_LIMIT = 0.5
 of, or is being pushed. Positions brake it further."""
 
 
-class TorqueMotion(Motion):
+class TorqueMotion(ServoMotion):
     """Follow torques, and brake by torques. ``active`` from the first command until the arm is at rest again.
 
     The servo tells it every reading (:meth:`see`), moves it by :meth:`step` or :meth:`brake`, and writes what

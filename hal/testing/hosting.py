@@ -12,7 +12,7 @@ from .. import registry
 from ..clock import LockStepClock
 from ..control import StopLatch
 from ..gripper import Gripper
-from ..host.arm import ArmUnit
+from ..host.cycle import ArmUnit
 from ..host.gripper_unit import GripperUnit
 from ..host.hosts import Host
 from ..host.records import AppRecord, GroupMemory

@@ -8,9 +8,8 @@ import pytest
 
 from hal.driver import GripperDriver, GripperReading
 from hal.errors import CommandError, ConnectionLost, RobotFault
-from hal.host.gripper_mail import GripperAct, GripperCommand, GripperMail, GripperRecord
 from hal.host.gripper_unit import GripperUnit
-from hal.host.records import AppRecord
+from hal.host.records import AppRecord, GripperAct, GripperCommand, GripperMail, GripperRecord
 from hal.specs import GripperSpec
 from hal.types import Fault, GripperOutcome
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from hal.config import load
-from hal.host.groups import GRIPPER_HZ, groups_of
+from hal.host.hosts import GRIPPER_HZ, groups_of
 from hal.specs import GroupSpec, from_json, to_json
 
 

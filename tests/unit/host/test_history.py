@@ -11,8 +11,7 @@ import pytest
 
 import hal
 from hal.errors import StaleStateError
-from hal.host.history import History
-from hal.host.mailbox import Mailbox
+from hal.host.memory import History, Mailbox
 from hal.types import Stamp
 
 

@@ -5,7 +5,7 @@ import threading
 
 import pytest
 
-from hal.host.mailbox import Mailbox, SeriesBox
+from hal.host.memory import Mailbox, SeriesBox
 from hal.host.process import SharedMemory
 
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 import pytest
 
-from hal.host.pace import DevicePace, Steps, Suspension
+from hal.host.main import DevicePace, StepPace, SuspensionWatch
 from hal.host.records import AppRecord
 
 
@@ -33,7 +33,7 @@ def test_steps_wait_for_the_app_and_go_as_far_as_it_says() -> None:
         asked.append(timeout)
         steps.grant(2)
 
-    steps = Steps(cycle, attend)  # type: ignore[arg-type]
+    steps = StepPace(cycle, attend)  # type: ignore[arg-type]
     assert steps.pausing
     for expected in (0.01, 0.02):
         assert steps.wait() == pytest.approx(expected)
@@ -47,14 +47,14 @@ def test_steps_wait_for_the_app_and_go_as_far_as_it_says() -> None:
 
 def test_steps_tell_the_app_is_there_at_the_time_of_the_step() -> None:
     cycle = FakeCycle(ticks=9)
-    steps = Steps(cycle, lambda timeout: None)  # type: ignore[arg-type]
+    steps = StepPace(cycle, lambda timeout: None)  # type: ignore[arg-type]
     assert steps.heard(AppRecord(12345.0, 3)) == AppRecord(pytest.approx(0.1), 3)
     assert steps.now() == pytest.approx(0.09)
 
 
 def test_steps_of_a_device_read_it_once_each() -> None:
     cycle = FakeCycle(paces_itself=True)
-    steps = Steps(cycle, lambda timeout: None)  # type: ignore[arg-type]
+    steps = StepPace(cycle, lambda timeout: None)  # type: ignore[arg-type]
     steps.grant(3)
     for _ in range(3):
         steps.wait()
@@ -63,7 +63,7 @@ def test_steps_of_a_device_read_it_once_each() -> None:
 
 
 def test_without_the_app_steps_go_on_by_themselves() -> None:
-    steps = Steps(FakeCycle(), lambda timeout: None)  # type: ignore[arg-type]
+    steps = StepPace(FakeCycle(), lambda timeout: None)  # type: ignore[arg-type]
     steps.run_free()
     assert not steps.pausing
     assert steps.wait() > 0.0
@@ -84,7 +84,7 @@ def test_a_suspension_is_noticed_once(monkeypatch: pytest.MonkeyPatch) -> None:
     asleep = [100.0]
     monkeypatch.setattr(time, "CLOCK_BOOTTIME", 7, raising=False)
     monkeypatch.setattr(time, "clock_gettime", lambda clock: time.monotonic() + asleep[0])
-    suspension = Suspension()
+    suspension = SuspensionWatch()
     assert not suspension.ended()
     asleep[0] += 60.0
     assert suspension.ended()
@@ -93,5 +93,5 @@ def test_a_suspension_is_noticed_once(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_where_the_system_cannot_say_nothing_was_suspended(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delattr(time, "CLOCK_BOOTTIME", raising=False)
-    suspension = Suspension()
+    suspension = SuspensionWatch()
     assert not suspension.ended()

@@ -6,8 +6,8 @@ from types import SimpleNamespace
 
 import pytest
 
-from hal.host import pacer
-from hal.host.pacer import Pacer
+from hal.host import main
+from hal.host.main import PeriodicPace
 
 PERIOD = 0.004
 
@@ -28,12 +28,12 @@ class Time:
 @pytest.fixture
 def time(monkeypatch: pytest.MonkeyPatch) -> Time:
     made = Time()
-    monkeypatch.setattr(pacer, "time", SimpleNamespace(monotonic=made.monotonic, sleep=made.go_on))
+    monkeypatch.setattr(main, "time", SimpleNamespace(monotonic=made.monotonic, sleep=made.go_on))
     return made
 
 
 def test_work_that_fits_delays_nothing(time: Time) -> None:
-    pace = Pacer(PERIOD)
+    pace = PeriodicPace(PERIOD)
     for turn in range(1, 501):
         assert pace.wait() == pytest.approx(100.0 + turn * PERIOD)
         time.go_on(0.9 * PERIOD)
@@ -41,7 +41,7 @@ def test_work_that_fits_delays_nothing(time: Time) -> None:
 
 
 def test_cycles_that_come_too_late_are_skipped_and_counted(time: Time) -> None:
-    pace = Pacer(PERIOD)
+    pace = PeriodicPace(PERIOD)
     pace.wait()
     time.go_on(3.5 * PERIOD)
     assert pace.wait() == pytest.approx(100.0 + 4.5 * PERIOD), "at once"
@@ -52,7 +52,7 @@ def test_cycles_that_come_too_late_are_skipped_and_counted(time: Time) -> None:
 
 @pytest.mark.parametrize("request_s", [0.2 * PERIOD, 1.3 * PERIOD])
 def test_requests_do_not_slow_the_pace(time: Time, request_s: float) -> None:
-    pace = Pacer(PERIOD)
+    pace = PeriodicPace(PERIOD)
     for turn in range(500):
         pace.wait()
         if turn % 8 == 0:
@@ -63,7 +63,7 @@ def test_requests_do_not_slow_the_pace(time: Time, request_s: float) -> None:
 
 
 def test_a_request_that_takes_long_is_a_pause(time: Time) -> None:
-    pace = Pacer(PERIOD)
+    pace = PeriodicPace(PERIOD)
     pace.wait()
     time.go_on(100.5 * PERIOD)
     pace.restart()

@@ -8,8 +8,7 @@ import pytest
 
 from hal.commands import CommandRecord, DeadmanRecord, Kind
 from hal.driver import GripperReading, Reading
-from hal.host.gripper_mail import GripperAct, GripperCommand, GripperMail
-from hal.host.records import GroupMemory, RobotMail, ServoRecord
+from hal.host.records import GripperAct, GripperCommand, GripperMail, GroupMemory, RobotMail, ServoRecord
 from hal.types import Fault, GripperOutcome, Limited, RobotStatus, Trip
 
 N = 6

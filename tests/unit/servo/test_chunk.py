@@ -13,7 +13,7 @@ from specs import PANDA_HOME
 import hal
 from hal.commands import CHUNK_AHEAD, CHUNK_POINTS, Kind
 from hal.errors import CommandError, MotionStopped
-from hal.servo.chunk import slope
+from hal.servo.joint import slope
 from hal.types import Trip
 
 

@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from ruckig import ControlInterface, InputParameter, Ruckig, Trajectory
 
-from hal.servo.limits import speed_for, stop_displacement, stop_distance, stop_peak, stop_phases, stop_step
+from hal.servo.smoothing import speed_for, stop_displacement, stop_distance, stop_peak, stop_phases, stop_step
 
 ACCELERATION = st.floats(0.1, 30.0)
 JERK = st.floats(5.0, 10_000.0)

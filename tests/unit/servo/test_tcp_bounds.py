@@ -13,9 +13,9 @@ from specs import PANDA_HOME, data, panda
 
 from hal.commands import Kind
 from hal.kinematics.arm import NEAR_SINGULAR, Kinematics
+from hal.servo.envelope import TcpReference
 from hal.servo.servo import Servo
 from hal.servo.smoothing import JointSmoother
-from hal.servo.tcp import TcpReference
 from hal.specs import KinematicsSpec, LimitsSpec, WorkspaceSpec
 
 Array = np.ndarray[Any, np.dtype[np.float64]]

@@ -24,7 +24,7 @@ from hal.drivers.franka.faults import (
 )
 from hal.drivers.franka.flags import FLAGS
 from hal.drivers.franka.troubles import TROUBLES
-from hal.host import fault_layout
+from hal.host import records
 from hal.types import Fault
 
 HERE = Path(__file__).parents[3] / "kits"
@@ -35,7 +35,7 @@ LIBRARIES = {"pylibfranka": 10, "panda_py": 5}
 
 def fits(fault: Fault) -> bool:
     """Does it reach a program whole?"""
-    return fault_layout.fault_of(*fault_layout.fault_values(fault)) == fault
+    return records.fault_of(*records.fault_values(fault)) == fault
 
 
 # Flags and modes.

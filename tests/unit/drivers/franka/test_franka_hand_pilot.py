@@ -448,7 +448,7 @@ def test_whatever_is_asked_in_whatever_order_it_comes_to_an_end(seed):
     ids=lambda fault: fault.code,
 )
 def test_faults_fit_into_a_state(fault):
-    """The bytes that hal/host/fault_layout.py has for them."""
+    """The bytes that hal/host/records.py has for them."""
     for text, size in zip((fault.code, fault.cause, fault.remedy), (48, 160, 240), strict=True):
         assert len(text.encode()) <= size
 

@@ -17,7 +17,7 @@ from hal.drivers.pybullet.rendering import choose_renderer
 from hal.drivers.pybullet.tiny import TinyRenderer
 from hal.drivers.pybullet.world import World
 from hal.errors import ConfigError, ConnectionLost, DriverMissing, NotSupported
-from hal.host.mailbox import SeriesBox
+from hal.host.memory import SeriesBox
 from hal.host.ring import frame_rings, frame_rings_size
 from hal.specs import BodySpec, ViewSpec, to_json
 

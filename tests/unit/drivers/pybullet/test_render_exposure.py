@@ -23,7 +23,7 @@ from hal.drivers.pybullet.tiny import TinyRenderer
 from hal.drivers.pybullet.world import World
 from hal.errors import ConnectionLost
 from hal.geometry import Pose
-from hal.host.mailbox import SeriesBox
+from hal.host.memory import SeriesBox
 from hal.host.ring import FrameRing, frame_rings
 from hal.specs import BodySpec, CameraSpec
 from hal.types import Frame

@@ -10,11 +10,19 @@ from __future__ import annotations
 
 import struct
 from array import array
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Callable, Sequence
+from typing import Any, Generic, Protocol, TypeVar
 from zlib import crc32
 
-__all__ = ["Mailbox", "SeriesBox"]
+from ..types import Stamp
+
+__all__ = [
+    "History",
+    "Mailbox",
+    "Newest",
+    "SeriesBox",
+    "newest",
+]
 
 _HEADER = 8  # bytes: the announced number, in the machine's own order; nobody else reads this memory
 _SLOT = struct.Struct("<QQ")  # number, checksum
@@ -168,3 +176,92 @@ class SeriesBox(_Slots):
                 self._record = (t, revision, array("d", payload[_SERIES.size :]))
                 break
         return (self._seen, *self._record) if self._seen else None
+
+
+# [newest.py] The newest record of a mailbox, decoded once.
+
+Raw = TypeVar("Raw")
+Record = TypeVar("Record")
+
+
+class Newest(Generic[Raw, Record]):
+    """Most looks at a mailbox find nothing new: those cost one comparison."""
+
+    __slots__ = ("_decode", "_known", "_read", "_seq")
+
+    def __init__(
+        self, seq: Callable[[], int], read: Callable[[], tuple[int, Raw] | None], decode: Callable[[Raw], Record]
+    ) -> None:
+        self._seq = seq
+        self._read = read
+        self._decode = decode
+        self._known: tuple[int, Record | None] = (0, None)  # its number, and itself; replaced together
+
+    def get(self) -> Record | None:
+        """None before the first one."""
+        known = self._known
+        if self._seq() != known[0]:
+            found = self._read()
+            if found is not None and found[0] != known[0]:
+                self._known = known = (found[0], self._decode(found[1]))
+        return known[1]
+
+
+def newest(box: Mailbox, decode: Callable[[tuple[Any, ...]], Record]) -> Callable[[], Record | None]:
+    """A function that gives the newest record of ``box``."""
+    return Newest(box.seq, box.read, decode).get
+
+
+# [history.py] What a device said in the last seconds, out of a mailbox with many slots.
+
+_T = struct.Struct("<d")
+
+
+class Stamped(Protocol):
+    """A record that bears a stamp."""
+
+    @property
+    def stamp(self) -> Stamp: ...
+
+
+State = TypeVar("State", bound=Stamped)
+
+
+class History(Generic[State]):
+    """States whose records begin with their time, s. Costs the writer nothing, and never makes it wait."""
+
+    def __init__(self, box: Mailbox, decode: Callable[[bytes], State]) -> None:
+        self._box = box
+        self._decode = decode
+
+    def since(self, t: float) -> list[State]:
+        """Every state that is newer than ``t``, oldest first, as far back as they are kept."""
+        newest = self._box.seq()
+        first = self._first_after(t, newest)
+        found = (self._box.bytes_at(number) for number in range(first, newest + 1))
+        return [self._decode(record) for record in found if record is not None]
+
+    def around(self, t: float) -> tuple[State, State] | None:
+        """The last state at or before ``t`` and the first one after it, or the newest twice where there is none after.
+
+        None where ``t`` is older than what is kept, and before the first state.
+        """
+        newest = self._box.seq()
+        after = self._first_after(t, newest)
+        before = self._box.bytes_at(after - 1)
+        if before is None or _T.unpack_from(before)[0] > t:
+            return None
+        later = self._box.bytes_at(after) if after <= newest else before
+        return None if later is None else (self._decode(before), self._decode(later))
+
+    def _first_after(self, t: float, newest: int) -> int:
+        """Number of the first state that is newer than ``t``; ``newest + 1`` where none is."""
+        low, high = min(self._box.oldest, newest + 1), newest + 1
+        while low < high:
+            middle = (low + high) // 2
+            record = self._box.bytes_at(middle)
+            if record is None or _T.unpack_from(record)[0] <= t:  # gone meanwhile: it was old
+                low = middle + 1
+            else:
+                high = middle
+        return low

@@ -1,0 +1,484 @@
+"""Commands in joint space, made into one tick of motion each: targets, velocities, and the path of ``move_to``.
+
+A motion is told its newest command (``accept``) and asked once per tick to move the smoother (``step``). It keeps no
+set-point of its own: after a stop or a re-anchoring it is made to forget (``start``) and goes on from where the arm is.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from bisect import bisect_left, bisect_right
+from collections.abc import Sequence
+from itertools import pairwise
+from math import ceil, isfinite
+
+from ruckig import InputParameter, OutputParameter, Result, Ruckig, RuckigError
+
+from ..commands import CommandRecord
+from ..errors import CommandError
+from ..types import Limited
+from .envelope import Envelope
+from .smoothing import JointSmoother, speed_for
+
+__all__ = [
+    "ChunkMotion",
+    "JointTargetMotion",
+    "JointVelocityMotion",
+    "PathMotion",
+    "ServoMotion",
+    "slope",
+]
+
+Floats = Sequence[float]
+
+
+class ServoMotion(ABC):
+    """How one kind of command moves the arm."""
+
+    size: int
+    """Number of values that a command of this kind has."""
+
+    def __init__(self, smoother: JointSmoother, envelope: Envelope) -> None:
+        self.smoother = smoother
+        self.envelope = envelope
+        self._wanted: list[float] | None = None
+        """Joint speeds of the last tick's goal (n,), rad/s, while goals change in proportion."""
+
+    def start(self) -> None:
+        """Forget every command; the next one is the first."""
+        self._wanted = None
+
+    def usable(self, values: Floats) -> bool:
+        """Can this command be followed at all? (As many values as ``size``, all finite.)"""
+        return len(values) == self.size and isfinite(sum(map(abs, values)))
+
+    def reanchored(self) -> None:
+        """The set-point is elsewhere than the last step left it; the newest command stays."""
+        self._wanted = None
+
+    def too_far(self, values: Floats) -> bool:
+        """Is this first target farther from the set-point than a stream may begin?"""
+        return False
+
+    @abstractmethod
+    def accept(self, command: CommandRecord) -> None:
+        """Follow this command from now on; it is ``usable``."""
+
+    @abstractmethod
+    def step(self, now: float) -> None:
+        """Advance the smoother by one tick."""
+
+    def _follow(self, dq: list[float], together: bool = False) -> None:
+        """One tick towards these joint speeds (n,), no faster than the tcp may go.
+
+        With ``together``, and where the tcp is near its greatest speed, all joints change speed in proportion. Left to
+        themselves, those with acceleration to spare would run ahead: the tcp would leave its line, and on the way from
+        one permitted speed to another it could be too fast.
+        """
+        smoother, envelope = self.smoother, self.envelope
+        dq, fast = envelope.cap_tcp(dq)
+        if together or fast:
+            self._wanted = dq = envelope.in_proportion(dq, smoother.dq if self._wanted is None else self._wanted)
+        else:
+            self._wanted = None
+        smoother.follow(dq, envelope.guard, together)
+        if smoother.held_back or smoother.guarded:
+            self._wanted = None
+
+    def _follow_each(self, dq: list[float]) -> None:
+        """The same, but first each joint is capped by itself."""
+        envelope = self.envelope
+        if envelope.lets_pass(dq):
+            self._wanted = None
+            self.smoother.follow(dq, envelope.guard)
+        else:
+            self._follow(envelope.cap_joints(dq))
+
+
+class JointVelocityMotion(ServoMotion):
+    """Move the joints at given velocities; each is capped by itself."""
+
+    def __init__(self, smoother: JointSmoother, envelope: Envelope) -> None:
+        super().__init__(smoother, envelope)
+        self.size = smoother.n
+        self._dq: list[float] = []
+
+    def start(self) -> None:
+        super().start()
+        self._dq = [0.0] * self.size
+
+    def accept(self, command: CommandRecord) -> None:
+        self._dq = list(command.values)
+
+    def step(self, now: float) -> None:
+        self._follow_each(self._dq)
+
+
+class JointTargetMotion(ServoMotion):
+    """Follow a stream of joint targets, or go to one that is held.
+
+    A moving target is followed at its own speed plus a correction of the error: smooth, since the speed changes little
+    from tick to tick. That would creep into a target that stands still, so one that is held is reached by Ruckig's
+    time-optimal motion instead. A target without speed counts as held when it is repeated, when the one before had a
+    speed or was held itself, and when it is too far for any arm to follow as a stream. So a stream of bare positions,
+    even at 10 Hz, is smoothed and not reached one by one.
+    """
+
+    def __init__(self, smoother: JointSmoother, envelope: Envelope) -> None:
+        super().__init__(smoother, envelope)
+        self.size = 2 * smoother.n
+        self._command: CommandRecord | None = None
+        self._q: list[float] = []
+        self._dq: list[float] = []
+        self._direct = False
+        """Go there directly (True), or follow as a stream."""
+        self._still = True
+        """Did the target stand still before the newest command?"""
+        self._inside = True
+        """Is the target inside the position limits, now and until the deadline?"""
+        self._stream_braking = _braking(smoother, *_STREAM)
+        self._direct_braking = _braking(smoother, *_DIRECT)
+
+    def start(self) -> None:
+        super().start()
+        self._command = None
+        self._q, self._dq = [], []
+        self._still = True
+        self._direct = False
+
+    def too_far(self, values: Floats) -> bool:
+        return any(abs(x - y) > FIRST_JOINT_STEP for x, y in zip(values, self.smoother.q, strict=False))
+
+    def accept(self, command: CommandRecord) -> None:
+        n = self.smoother.n
+        q, dq = list(command.values[:n]), list(command.values[n:])
+        before = self._command
+        moving = any(dq)
+        same = before is not None and q == self._q
+        halts = any(self._dq) or self._still
+        self._direct = not moving and (same or halts or self._is_jump(command.t, q))
+        self._still = not moving and (same or before is None)
+        self._command, self._q, self._dq = command, q, dq
+        # It moves along a straight line: inside at both ends is inside.
+        self._inside = self._is_inside(q, dq, 0.0) and (
+            not moving or self._is_inside(q, dq, command.deadline - command.t)
+        )
+
+    def step(self, now: float) -> None:
+        assert self._command is not None
+        age = max(0.0, min(now, self._command.deadline) - self._command.t)
+        smoother, envelope = self.smoother, self.envelope
+        q, dq = self._q, self._dq
+        if not self._inside:
+            q, dq = self._into_limits([x + v * age for x, v in zip(q, dq, strict=True)], dq)
+            age = 0.0
+        if self._direct and smoother.reach(q, envelope.velocity, envelope.allows):
+            self._wanted = None
+            return
+        self._follow_each(self._approach(q, dq, age))
+
+    def _approach(self, q: list[float], dq: list[float], age: float) -> list[float]:
+        """The speed of the target, ``age`` s on, plus what closes the error and can still brake before it is closed."""
+        smoother = self.smoother
+        braking = self._direct_braking if self._direct else self._stream_braking
+        ahead = 2.0 * smoother.dt
+        twice_ahead = ahead + ahead
+        goal = []
+        for x, v, x_set, v_set, (A, J, b, c) in zip(q, dq, smoother.q, smoother.dq, braking, strict=True):
+            error = x + v * age - x_set
+            distance = abs(error)
+            speed = _GAIN * error
+            # Not always can that be braked on the way; mostly it can, with room to spare (see _braking).
+            if distance * (b * distance + c) + twice_ahead * abs(v_set - v) > 0.0:
+                closing = v_set - v if error > 0.0 else v - v_set
+                most = speed_for(distance - ahead * max(0.0, closing), A, J)
+                if abs(speed) > most:
+                    speed = most if error > 0.0 else -most
+            goal.append(v + speed)
+        return goal
+
+    def _is_inside(self, q: list[float], dq: list[float], age: float) -> bool:
+        """Is the target, ``age`` s on, inside the position limits?"""
+        limits = zip(q, dq, self.smoother.lower, self.smoother.upper, strict=True)
+        return all(low <= x + v * age <= high for x, v, low, high in limits)
+
+    def _into_limits(self, q: list[float], dq: list[float]) -> tuple[list[float], list[float]]:
+        """The target, and its speed, cut to the position limits."""
+        lower, upper = self.smoother.lower, self.smoother.upper
+        inside = [max(low, min(high, x)) for x, low, high in zip(q, lower, upper, strict=True)]
+        if any(abs(x - y) > 1e-6 for x, y in zip(q, inside, strict=True)):
+            self.envelope.limited |= Limited.POSITION
+        return inside, [v if x == y else 0.0 for x, y, v in zip(q, inside, dq, strict=True)]
+
+    def _is_jump(self, t: float, q: list[float]) -> bool:
+        """Is the new target farther from the last one than the joints could have followed meanwhile?"""
+        before = self._command
+        if before is None:
+            return True
+        period = max(0.0, t - before.t)
+        state = zip(q, self._q, self._dq, self.envelope.velocity, strict=True)
+        return any(abs(x - x0 - v0 * period) > _JUMP + limit * period for x, x0, v0, limit in state)
+
+
+FIRST_JOINT_STEP = 0.1
+"""A first joint target farther than this from the set-point is refused, rad."""
+
+_GAIN = 8.0
+"""Speed per error of a followed target, 1/s. Measured at 50 Hz targets: rms error 0.8 mrad, no chatter."""
+
+_JUMP = 0.05
+"""A step of a stream beyond what the joint speed allows counts as a jump from here on, rad."""
+
+_STREAM = (0.8, 0.5)
+_DIRECT = (0.9, 0.7)
+"""Shares of acceleration and jerk with which a target's approach brakes."""
+
+
+def _braking(smoother: JointSmoother, share: float, jerk_share: float) -> list[tuple[float, float, float, float]]:
+    """Per joint: A and J, these shares of acceleration and jerk, then b and c of a quick test.
+
+    A stop from speed s is no longer than s (s/A + A/J) / 2, whether its braking reaches A or not (`stop_distance`, and
+    the inequality of the means). So a joint that approaches over the distance d at s = _GAIN d stops within a way w of
+    it when s (s/A + A/J) <= 2 w, that is d (b d + c) + 2 (d - w) <= 0.
+    """
+    limits = [(share * a, jerk_share * j) for a, j in zip(smoother.acceleration, smoother.jerk, strict=True)]
+    return [(A, J, _GAIN * _GAIN / A, _GAIN * A / J - 2.0) for A, J in limits]
+
+
+# [chunk.py] Joint targets with times: action chunks, interpolated.
+
+_SAME = 1e-6
+"""Targets this near in time are one, s: plans on one grid differ by rounding."""
+
+
+class ChunkMotion(JointTargetMotion):
+    """Follow joint targets that are due at given times.
+
+    In between it goes along cubics whose slopes make them monotone (Fritsch and Butland 1984, "A method for
+    constructing local monotone piecewise cubic interpolants"): no target is passed by. A new chunk replaces the rest of
+    the old one from its own first time on, so the two are joined by such a cubic as well.
+    """
+
+    def __init__(self, smoother: JointSmoother, envelope: Envelope) -> None:
+        super().__init__(smoother, envelope)
+        self._times: list[float] = []
+        self._points: list[list[float]] = []
+
+    def start(self) -> None:
+        super().start()
+        self._times, self._points = [], []
+
+    def usable(self, values: Floats) -> bool:
+        count, rest = divmod(len(values), self.smoother.n + 1)
+        times = values[:count]
+        rising = all(a < b for a, b in pairwise(times))
+        return rest == 0 and count > 0 and rising and isfinite(sum(map(abs, values)))
+
+    def too_far(self, values: Floats) -> bool:
+        times, points = self._split(values)
+        k = bisect_right(times, 0.0)
+        due = points[min(k, len(times) - 1)]
+        if 0 < k < len(times):
+            s = -times[k - 1] / (times[k] - times[k - 1])
+            due = [a + s * (b - a) for a, b in zip(points[k - 1], due, strict=True)]
+        return any(abs(x - y) > FIRST_JOINT_STEP for x, y in zip(due, self.smoother.q, strict=True))
+
+    def accept(self, command: CommandRecord) -> None:
+        ahead, points = self._split(command.values)
+        times = [command.t + age for age in ahead]
+        kept = bisect_left(self._times, times[0] - _SAME)
+        begin = max(0, bisect_right(self._times, command.t) - 2)  # what led to the present slope, and no more
+        self._times = self._times[begin:kept] + times
+        self._points = self._points[begin:kept] + points
+        if self._times[0] > command.t:  # the first chunk is yet to begin: go there from here
+            self._times.insert(0, command.t)
+            self._points.insert(0, list(self.smoother.q))
+        self._command = command
+
+    def step(self, now: float) -> None:
+        q, dq = self._into_limits(*self._due(now))
+        self._follow_each(self._approach(q, dq, 0.0))
+
+    def _split(self, values: Floats) -> tuple[list[float], list[list[float]]]:
+        """Times and points of a command that is ``usable``."""
+        n = self.smoother.n
+        count = len(values) // (n + 1)
+        return list(values[:count]), [list(values[k : k + n]) for k in range(count, len(values), n)]
+
+    def _due(self, now: float) -> tuple[list[float], list[float]]:
+        """Where the arm is to be at ``now``, rad, and how fast, rad/s."""
+        times, points = self._times, self._points
+        k = bisect_right(times, now)
+        if k == len(times):
+            return points[-1], [0.0] * self.smoother.n
+        if k == 0:
+            return points[0], [0.0] * self.smoother.n
+        width = times[k] - times[k - 1]
+        s = (now - times[k - 1]) / width
+        before, after = self._slopes(k - 1), self._slopes(k)
+        q, dq = [], []
+        for x0, x1, v0, v1 in zip(points[k - 1], points[k], before, after, strict=True):
+            # Hermite: x0 + s (a + s (b + s c)), with v0 and v1 per width.
+            a, rise = v0 * width, x1 - x0
+            b = 3.0 * rise - 2.0 * a - v1 * width
+            c = a + v1 * width - 2.0 * rise
+            q.append(x0 + s * (a + s * (b + s * c)))
+            dq.append((a + s * (2.0 * b + s * 3.0 * c)) / width)
+        return q, dq
+
+    def _slopes(self, k: int) -> list[float]:
+        """Speed of each joint at target ``k``, rad/s."""
+        times, points = self._times, self._points
+        if k == 0 or k == len(times) - 1:  # at rest before the first; the last may be the end
+            return [0.0] * self.smoother.n
+        h0, h1 = times[k] - times[k - 1], times[k + 1] - times[k]
+        around = zip(points[k - 1], points[k], points[k + 1], strict=True)
+        return [slope((x - before) / h0, (after - x) / h1, h0, h1) for before, x, after in around]
+
+
+def slope(d0: float, d1: float, h0: float, h1: float) -> float:
+    """Slope at a point between secants ``d0`` and ``d1`` over the widths ``h0`` and ``h1``: their weighted harmonic
+    mean, 0 where they differ in sign (Fritsch and Butland's formula, in Brodlie's weighting)."""
+    if d0 * d1 <= 0.0:
+        return 0.0
+    share = (h0 + 2.0 * h1) / (3.0 * (h0 + h1))
+    return d0 * d1 / (share * d1 + (1.0 - share) * d0)
+
+
+# [path.py] The motion of ``move_to``: a straight line in joint space, run by one number.
+
+_SAMPLE = 0.05
+_SAMPLES = 64
+"""The path is looked at every so many rad, at most so many times: planning must fit into a tick."""
+
+_SLOWER = 0.8
+"""After a step that the guard refused, the rest of the path is planned at this share of the speed before."""
+
+_HERE = 1e-9
+"""A goal this near needs no motion, rad."""
+
+
+class PathMotion(ServoMotion):
+    """From where the arm rests along ``q0 + (s / length) (goal - q0)``, s running from 0 to length in rad.
+
+    Each joint's limits, seen along the path, bound s; so do the session's speed and the tcp's. Ruckig's time-optimal s
+    then makes every joint start and arrive together. A set-point on the way lies between start and goal, and so does
+    the end of every stop: joint limits need no further check.
+    """
+
+    size = 0
+
+    def __init__(self, smoother: JointSmoother, envelope: Envelope) -> None:
+        super().__init__(smoother, envelope)
+        self.arrived = False
+        self._goal: Floats = ()
+        self._from: list[float] = []
+        self._direction: list[float] = []
+        self._planned = False
+        self._share = 1.0
+        """Share of the greatest speed at which the path is planned."""
+        self._ruckig = Ruckig(1, smoother.dt)
+        self._input = InputParameter(1)
+        self._output = OutputParameter(1)
+
+    def aim(self, goal: Floats) -> None:
+        """Take a new goal (n,), rad. CommandError, and nothing changes, when the arm may not go there."""
+        smoother = self.smoother
+        if len(goal) != smoother.n:
+            raise CommandError(f"move_to needs {smoother.n} joint positions, not {len(goal)}")
+        for i, (x, low, high) in enumerate(zip(goal, smoother.lower, smoother.upper, strict=True)):
+            if not low - 1e-6 <= x <= high + 1e-6:
+                raise CommandError(f"joint {i} of the goal is {x:.4f} rad; its limits are {low:.4f} to {high:.4f}")
+        inside = [max(low, min(high, x)) for x, low, high in zip(goal, smoother.lower, smoother.upper, strict=True)]
+        self._check_workspace(inside)
+        self._goal = inside
+        self._share = 1.0
+        self.arrived = False
+        self._planned = False
+
+    def start(self) -> None:
+        self._planned = False
+
+    def reanchored(self) -> None:
+        self._planned = False
+
+    def accept(self, command: CommandRecord) -> None:
+        raise CommandError("a move_to session takes no commands")
+
+    def step(self, now: float) -> None:
+        smoother = self.smoother
+        if not self._planned:
+            if not smoother.at_rest():
+                smoother.stop()
+                return
+            self._plan()
+        if self.arrived:
+            smoother.stop()
+            return
+        inputs, output = self._input, self._output
+        try:
+            result = self._ruckig.update(inputs, output)
+        except RuckigError:  # never seen; the same goal can be reached joint by joint
+            if not smoother.reach(self._goal, self.envelope.velocity, self.envelope.allows):
+                smoother.stop()
+            self._planned = False
+            return
+        output.pass_to_input(inputs)
+        if result == Result.Finished:
+            self.arrived = True
+            smoother.adopt(self._goal, [0.0] * smoother.n, [0.0] * smoother.n)
+            return
+        s, ds, dds = output.new_position[0], output.new_velocity[0], output.new_acceleration[0]
+        along = self._direction
+        q = [x + s * d for x, d in zip(self._from, along, strict=True)]
+        if not smoother.adopt(q, [ds * d for d in along], [dds * d for d in along], self.envelope.keeps_tcp_speed):
+            # It stops, and goes on more slowly from there: at the same speed the same step might be refused for ever.
+            self._share *= _SLOWER
+            self._planned = False
+
+    def _plan(self) -> None:
+        smoother, envelope = self.smoother, self.envelope
+        self._planned = True
+        self._from = list(smoother.q)
+        delta = [goal - x for goal, x in zip(self._goal, self._from, strict=True)]
+        length = max(map(abs, delta))
+        self.arrived = length < _HERE
+        if self.arrived:
+            return
+        self._direction = along = [d / length for d in delta]
+
+        def slowest(limits: Floats) -> float:
+            return min(limit / abs(d) for limit, d in zip(limits, along, strict=True) if d)
+
+        speed = slowest(envelope.velocity)
+        fastest_tcp = envelope.stop_speed(along, self._samples(self._goal))
+        if fastest_tcp * speed > envelope.goal_tcp_speed:
+            speed = envelope.goal_tcp_speed / fastest_tcp
+        speed *= self._share
+        inputs = self._input
+        inputs.current_position, inputs.current_velocity, inputs.current_acceleration = [0.0], [0.0], [0.0]
+        inputs.target_position = [length]
+        inputs.max_velocity = [speed]
+        inputs.max_acceleration = [slowest(smoother.acceleration)]
+        inputs.max_jerk = [slowest(smoother.jerk)]
+        self._ruckig.reset()
+
+    def _samples(self, goal: Floats) -> list[list[float]]:
+        start = self.smoother.q
+        count = min(_SAMPLES, 1 + ceil(max(abs(b - a) for a, b in zip(start, goal, strict=True)) / _SAMPLE))
+        return [[a + k / count * (b - a) for a, b in zip(start, goal, strict=True)] for k in range(count + 1)]
+
+    def _check_workspace(self, goal: Floats) -> None:
+        """The tcp must stay inside the workspace on its way, or come back in from where it starts."""
+        box = self.envelope.workspace
+        if box is None:
+            return
+        fk = self.envelope.kinematics.fk
+        before = fk(self.smoother.q)
+        for q in self._samples(goal):
+            at = fk(q)
+            for x, x0, low, high, axis in zip(at, before, box.lower, box.upper, "xyz", strict=False):
+                if x > max(high, x0) + 1e-6 or x < min(low, x0) - 1e-6:
+                    raise CommandError(
+                        f"the way there leaves the workspace: {axis} = {x:.3f} m, allowed {low:.3f} to {high:.3f}"
+                    )
