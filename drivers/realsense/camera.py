@@ -1,4 +1,4 @@
-"""The driver of a RealSense camera: the app's side. The library itself is in another process, see :mod:`.process`."""
+"""The camera driver in the app's process. The vendor's library runs in a process of its own, see :mod:`.process`."""
 
 from __future__ import annotations
 
@@ -6,54 +6,66 @@ import importlib.util
 import logging
 import threading
 import time
+from collections.abc import Mapping
 from contextlib import suppress
+from types import MappingProxyType
+from typing import Any
 
-from hal.driver import CameraDriver, CameraInfo, CameraTally, RawFrame
+from hal.camera_driver import CameraDriver, CameraTally, RawFrame
+from hal.camera_info import CameraInfo, StreamInfo
 from hal.errors import ConnectionLost, DeviceNotFound
-from hal.host.process import Child
-from hal.specs import CameraSpec
+from hal.host.process import Child, SharedMemory, unpack_error
+from hal.pose import Pose, frozen
+from hal.specs import CameraSpec, to_json
 
-from .about import info_of
-from .link import CameraLink
-from .settings import RealSenseSettings
-from .stamps import SYSTEM
+from .options import RealSenseSettings
+from .ring import PictureRing
 
 __all__ = ["RealSenseCamera"]
 
-if importlib.util.find_spec("pyrealsense2") is None:  # the app's process does without it, its own does not
+if importlib.util.find_spec("pyrealsense2") is None:  # this process does without it, the camera's own does not
     raise ModuleNotFoundError("No module named 'pyrealsense2'", name="pyrealsense2")
 
 _LOG = logging.getLogger("hal.realsense")
 _OPEN = 12.0
-"""s to find a camera, start it and see its first pictures. The library gives up after 15 s on its own."""
+"""s to find a camera, start it and receive its first frames. The library itself gives up after 15 s."""
 _SHUT = 2.0
-"""s to stop it. A library that takes longer hangs, and is ended with its process."""
+"""s to stop it. A library that takes longer hangs, and is killed with its process."""
 _ANSWER = 5.0
+"""s for the answer to any other request."""
 _FORCE = 0.2
-"""s that a process has to end by itself which is not trusted any more."""
+"""s that a process which no longer works gets to end by itself."""
 _MARGIN = 2.0
-"""s beyond a stall after which the process itself must hang, for it tells of every stall."""
+"""s beyond a stall after which the process itself must hang, because it reports every stall."""
 _PLAYED_STALL = 10.0
-"""s; a recording may hold a pause."""
+"""s; a recording may contain a pause."""
 _ATTEMPTS = 3
-"""How often the first ``open`` tries to start a camera that is there and sends nothing."""
-_FRUITLESS = 2
-"""So many starts without a picture, one after the other, are answered with a reset, once until pictures come."""
+"""Number of tries of the first ``open`` to start a camera that is connected and sends nothing."""
+_RESET_AFTER = 2
+"""Starts in a row without a frame after which the camera is reset, once until frames arrive."""
 _RESTART = 10.0
 """s for a camera to come back after a reset."""
 _PAUSE = 0.5
+"""s between two attempts to start."""
+_READY = 30.0
+"""s for the process to start and to import the library."""
+_SLICE = 0.05
+"""s that one thread listens before another one has a turn."""
+_PATIENCE = 1.0
+"""s for a process to end by itself."""
 
 
 class RealSenseCamera(CameraDriver):
-    """A RealSense: on USB, played from a recording, or in software; ``real:`` says which (:mod:`.settings`).
+    """A RealSense on USB, a recording, or an emulated camera, as ``real:`` of the rig file selects.
 
-    Faults of a camera in software: :class:`.emulator.knobs.Knobs`.
+    The options are those of :class:`.options.RealSenseSettings`. The faults that ``inject`` takes, for an emulated
+    camera, are the fields of :class:`.emulator.camera.CameraFaults`.
     """
 
     def __init__(self, spec: CameraSpec, source: object | None = None) -> None:
-        """Raises ConfigError."""
+        """Check the options; raises ConfigError."""
         super().__init__(spec, source)
-        self._settings = RealSenseSettings.of(spec)
+        self._settings = RealSenseSettings.from_spec(spec)
         played = self._settings.play is not None
         self.on_demand = played and not self._settings.paced
         self._silence = max(self._settings.stall_s, _PLAYED_STALL if played else 0.0, 3.0 / spec.rate_hz) + _MARGIN
@@ -63,17 +75,18 @@ class RealSenseCamera(CameraDriver):
         self._closings = 0
         self._is_closed = False
         self._lost = False
-        """Was the camera lost, so that whoever closes it now opens it again?"""
+        """Whether the camera was lost, so that a ``close`` is followed by another ``open``."""
         self._tally_before = CameraTally()
-        self._fruitless = 0
+        self._failed_starts = 0
+        """Starts in a row without a frame."""
         self._was_reset = False
         self._starts = self._sessions = 0
-        self._ended = ""
-        """Why no more pictures will come, ever."""
+        self._ended: ConnectionLost | None = None
+        """Why no frame will ever come again; None while some may."""
 
     @classmethod
     def plugged(cls) -> tuple[str, ...]:
-        """The cameras that are plugged in, each with title, serial number and link. Takes half a second."""
+        """Return the connected cameras, each with title, serial number and USB link. Takes half a second."""
         child = Child("list of cameras", "hal.drivers.realsense.process:list_plugged", {})
         try:
             return tuple(child.wait_ready(_OPEN))
@@ -86,20 +99,21 @@ class RealSenseCamera(CameraDriver):
 
     def open(self) -> None:
         self._is_closed = False
-        if self._ended:
-            raise self._over(self._ended)
+        if self._ended is not None:
+            raise _copy(self._ended)
         attempts = 1 if self._sessions else _ATTEMPTS
         for attempt in range(attempts):
             try:
                 self._start()
                 return
             except ConnectionLost as error:
-                if not hasattr(error, "fruitless"):
+                if error.code != "no_frames":
                     raise
-                self._fruitless += 1
+                self._failed_starts += 1
                 reset = self._reset_if_due()
                 if attempt == attempts - 1:
-                    raise ConnectionLost(f"{error}; {reset}" if reset else str(error)) from None
+                    text = f"{error}; {reset}" if reset else str(error)
+                    raise ConnectionLost(text, code="no_frames") from None
                 _LOG.warning("camera %s: %s; %s", self.spec.name, error, reset or "trying again")
                 time.sleep(_PAUSE)
             except DeviceNotFound:
@@ -108,33 +122,37 @@ class RealSenseCamera(CameraDriver):
                 raise
 
     def _start(self) -> None:
-        link = self._linked()
+        """Start the camera in its process, and take over its description."""
+        link = self._connect()
         began = time.monotonic()
         try:
-            said = link.ask("open", _OPEN, again=self._sessions > 0, first=self._starts == 0)
+            opened = link.request("open", _OPEN, again=self._sessions > 0, first=self._starts == 0)
             self._starts += 1
         except ConnectionLost as error:
             self._lost = self._sessions > 0
             self._starts += 1
-            if not hasattr(error, "fruitless"):
+            if error.code != "no_frames":
                 self._drop(link)
                 if time.monotonic() - began >= _OPEN:
-                    vars(error)["fruitless"] = True
+                    error.code = "no_frames"
             raise
         except BaseException:
-            self._lost = self._sessions > 0  # then it may be plugged in again
+            self._lost = self._sessions > 0  # it may be connected again later
             raise
-        link.begin(said["before"])
-        self._info = info_of(said)
+        link.start_session(opened["before"])
+        self._info = _info_from(opened)
         self._sessions += 1
         self._lost = False
-        self._say(said["notes"], said["residual"])
+        self._log_opened(opened["notes"], opened["residual"])
 
-    def _linked(self) -> CameraLink:
-        """The camera's process. Another thread may close the camera meanwhile: then it is ended, and none is begun."""
+    def _connect(self) -> CameraLink:
+        """Return the link to the camera's process; start one if there is none.
+
+        Raises ConnectionLost if another thread closes the camera meanwhile; the new process is then ended.
+        """
         with self._lock:
             link, closings = self._link, self._closings
-        if link is not None and link.alive:
+        if link is not None and link.is_alive:
             return link
         if link is not None:
             self._drop(link)
@@ -145,41 +163,44 @@ class RealSenseCamera(CameraDriver):
             if closings == self._closings:
                 self._link = link
                 return link
-        link.end(_FORCE)
-        raise ConnectionLost(f"camera {self.spec.name} was closed while it was opened")
+        link.close(_FORCE)
+        raise ConnectionLost(f"camera {self.spec.name} was closed while it was being opened", code="closed")
 
-    def _say(self, notes: list[str], residual: float) -> None:
+    def _log_opened(self, notes: list[str], residual: float) -> None:
+        """Log what the user should know about the camera that was opened."""
         for note in notes:
             _LOG.info("camera %s: %s", self.spec.name, note)
         assert self._info is not None
         if self._info.usb and self._info.usb.startswith("2"):
             _LOG.warning(
-                "camera %s is on USB %s, where it has fewer modes and loses frames: try a USB 3 port and cable",
+                "camera %s is on USB %s, which has fewer modes and loses frames: use a USB 3 port and cable",
                 self.spec.name,
                 self._info.usb,
             )
-        if self._info.clock == SYSTEM and self._sessions == 1:
+        if self._info.clock == "system" and self._sessions == 1:
             _LOG.warning(
-                "camera %s: its frames carry no metadata, as with a kernel without RealSense's patches: pictures are "
-                "matched by their arrival, and stamps are late by each frame's own way (docs/realsense.md, Clocks)",
+                "camera %s: its frames carry no metadata, as with a kernel without RealSense's patches: frames are "
+                "matched by their arrival, and stamps include each frame's transfer time (docs/realsense.md, Clocks)",
                 self.spec.name,
             )
         if residual > 0.1:
             _LOG.warning(
-                "camera %s: OpenCV's distortion misses the camera's own by up to %.2f pixels", self.spec.name, residual
+                "camera %s: OpenCV's distortion differs from the camera's own by up to %.2f pixels",
+                self.spec.name,
+                residual,
             )
 
     def _reset_if_due(self) -> str:
-        """Have a camera restart that is there and sends nothing; what was done comes back in words, if anything."""
-        if self._fruitless < _FRUITLESS or self._was_reset or not self._settings.is_real:
+        """Reset a camera that is connected and sends nothing, if it is time; return a description, empty if not."""
+        if self._failed_starts < _RESET_AFTER or self._was_reset or not self._settings.is_real:
             return ""
         self._was_reset = True
         with suppress(ConnectionLost, DeviceNotFound):
-            return str(self._linked().ask("reset", _ANSWER))
+            return str(self._connect().request("reset", _ANSWER))
         return ""
 
     def _await_return(self) -> bool:
-        """After a reset: wait until the camera is there again."""
+        """Wait after a reset until the camera is connected again and started; False if it does not come back."""
         deadline = time.monotonic() + _RESTART
         while time.monotonic() < deadline:
             time.sleep(_PAUSE)
@@ -192,43 +213,40 @@ class RealSenseCamera(CameraDriver):
 
     def grab(self, timeout: float) -> RawFrame | None:
         link = self._link
-        if self._ended or link is None:
-            raise self._over(self._ended or f"camera {self.spec.name} is not open")
+        if self._ended is not None:
+            raise _copy(self._ended)
+        if link is None:
+            raise ConnectionLost(f"camera {self.spec.name} is not open", code="not_open")
         try:
-            frame = link.take(timeout, self.on_demand)
+            frame = link.next_frame(timeout, self.on_demand)
         except ConnectionLost:
             self._lost = True
             self._drop(link)
             raise
-        tally, before = link.tally, self._tally_before
-        self.tally = CameraTally(before.repeated + tally.repeated, before.mismatched + tally.mismatched)
+        self.tally = self._total_tally(link)
         if frame is not None:
-            self._fruitless, self._was_reset = 0, False
+            self._failed_starts, self._was_reset = 0, False
             return frame
-        if link.lost:
+        if link.lost is not None:
             self._lost = True
-            if link.is_final:
-                self._ended = f"{link.lost}; open the rig anew to play it again"
-            raise self._over(self._ended or link.lost)
-        if link.quiet > self._silence:
+            if link.lost.final:
+                self._ended = link.lost
+            raise _copy(link.lost)
+        if link.silence > self._silence:
             self._lost = True
             self._drop(link)
-            raise ConnectionLost(f"the process with the library said nothing for {link.quiet:.1f} s: it hangs")
+            text = f"the camera's process has been silent for {link.silence:.1f} s: the library hangs in it"
+            raise ConnectionLost(text, code="process_hangs")
         return None
-
-    def _over(self, text: str) -> ConnectionLost:
-        lost = ConnectionLost(text)
-        lost.final = bool(self._ended)
-        return lost
 
     def inject(self, **knobs: object) -> None:
         link = self._link
         if link is None:
-            raise ConnectionLost(f"camera {self.spec.name} is not open")
-        link.ask("inject", _ANSWER, **knobs)
+            raise ConnectionLost(f"camera {self.spec.name} is not open", code="not_open")
+        link.request("inject", _ANSWER, **knobs)
 
     def close(self) -> None:
-        """Stop. The process of a lost camera is kept for the next ``open``; a second ``close`` ends it, too."""
+        """Stop. The process of a lost camera is kept for the next ``open``; a second ``close`` ends it as well."""
         with self._lock:
             self._closings += 1
             again, self._is_closed = self._is_closed, True
@@ -236,19 +254,194 @@ class RealSenseCamera(CameraDriver):
         if link is None:
             return
         if again or not self._lost:
-            self._drop(link, _SHUT)  # for good
+            self._drop(link, _SHUT)
             return
         try:
-            link.ask("shut", _SHUT)
+            link.request("shut", _SHUT)
         except ConnectionLost:
             self._drop(link)
 
     def _drop(self, link: CameraLink, patience: float = _FORCE) -> None:
-        """End the process, by force where it does not end in time."""
+        """End the process; kill it if it does not end within ``patience`` s."""
         with self._lock:
             if self._link is not link:
                 return
             self._link = None
+        self._tally_before = self._total_tally(link)
+        link.close(patience)
+
+    def _total_tally(self, link: CameraLink) -> CameraTally:
         tally, before = link.tally, self._tally_before
-        self._tally_before = CameraTally(before.repeated + tally.repeated, before.mismatched + tally.mismatched)
-        link.end(patience)
+        return CameraTally(before.repeated + tally.repeated, before.mismatched + tally.mismatched)
+
+
+class CameraLink:
+    """The app's end of the process with one camera: requests with time limits, frames, and a bounded ``close``.
+
+    All methods may be called from any thread. Starts the process; raises DriverMissing if the library is missing.
+    """
+
+    def __init__(self, spec: CameraSpec) -> None:
+        self._memory = SharedMemory(PictureRing.size(spec))
+        self._ring = PictureRing(self._memory.buffer, spec)
+        self._child = Child(
+            f"camera {spec.name}", "hal.drivers.realsense.process:main", {"spec": to_json(spec)}, [self._memory]
+        )
+        self._listening = threading.Lock()
+        self._requesting = threading.Lock()
+        self._taking = threading.Lock()
+        self._number = 0
+        self._answers: dict[int, dict[str, Any]] = {}
+        self._after = 0
+        """Number of the last frame that was taken."""
+        self._silence = 0.0
+        self.lost: ConnectionLost | None = None
+        """The loss of the camera that the process reported; None while the camera works."""
+        try:
+            self._child.wait_ready(_READY)
+        except BaseException:
+            self.close()
+            raise
+
+    @property
+    def is_alive(self) -> bool:
+        """Whether the process runs."""
+        return self._child.process.poll() is None
+
+    @property
+    def silence(self) -> float:
+        """Time spent waiting for frames since the process last sent anything, s."""
+        return self._silence
+
+    @property
+    def tally(self) -> CameraTally:
+        """Counts of frame sets that were not handed out since the process started."""
+        return self._ring.tally
+
+    def request(self, method: str, timeout: float, **params: Any) -> Any:
+        """Send a request and return its answer.
+
+        Args:
+            method: One of the requests that :mod:`.process` serves.
+            timeout: Time limit, s.
+            params: Arguments of the request.
+
+        Raises:
+            ConnectionLost: If the process has ended, or does not answer in time (it hangs, and must be ended).
+            HalError: The error that the request raised in the process.
+        """
+        with self._requesting:
+            self._number += 1
+            number = self._number
+            self._child.check()
+            self._child.channel.send({"id": number, "method": method, "params": params}, timeout)
+        deadline = time.monotonic() + timeout
+        while number not in self._answers:
+            self._listen(min(_SLICE, max(0.0, deadline - time.monotonic())))
+            if time.monotonic() > deadline and number not in self._answers:
+                text = f"the camera's process did not answer {method!r} within {timeout:g} s: the library hangs in it"
+                raise ConnectionLost(text, code="process_hangs")
+        answer = self._answers.pop(number)
+        if "error" in answer:
+            raise unpack_error(answer["error"])
+        return answer["result"]
+
+    def start_session(self, before: int) -> None:
+        """Skip the frames up to number ``before``, which belong to an earlier session."""
+        self._after, self._silence, self.lost = before, 0.0, None
+
+    def next_frame(self, timeout: float, every: bool) -> RawFrame | None:
+        """Return the newest frame that was not taken yet.
+
+        Args:
+            timeout: Time to wait for one, s.
+            every: Return every frame in turn instead of the newest. Its time is then the present, because it may have
+                waited in the ring for minutes.
+
+        Returns:
+            The frame; None if none arrived in time.
+
+        Raises:
+            ConnectionLost: If the process has ended.
+        """
+        deadline = time.monotonic() + timeout
+        listened = False
+        while True:
+            with self._taking:  # otherwise two threads could take one frame, and the slower one step back to it
+                taken = self._ring.take(self._after, every)
+                if taken is not None:
+                    self._after, frame = taken
+                    self._silence = 0.0
+                    return frame._replace(t=time.monotonic()) if every else frame
+            now = time.monotonic()
+            if self.lost is not None or (listened and now >= deadline):
+                return None
+            if self._listen(min(_SLICE, max(0.0, deadline - now))):
+                self._silence = 0.0
+            else:
+                self._silence += min(time.monotonic() - now, 2.0 * _SLICE)
+            listened = True
+
+    def _listen(self, timeout: float) -> bool:
+        """Receive and file one message, in whichever thread waits for one; False if none came."""
+        if not self._listening.acquire(timeout=max(timeout, 1e-3)):
+            return False
+        try:
+            message = self._child.channel.receive(timeout)
+        except ConnectionLost:
+            self._child.process.wait(_PATIENCE)
+            self._child.check()
+            raise
+        finally:
+            self._listening.release()
+        if message is None:
+            self._child.check()
+            return False
+        if "id" in message:
+            self._answers[message["id"]] = message
+        elif "lost" in message:
+            lost = unpack_error(message["lost"])
+            assert isinstance(lost, ConnectionLost)
+            self.lost = lost
+        return True
+
+    def close(self, timeout: float = _PATIENCE) -> None:
+        """End the process; kill it if it does not end within ``timeout`` s. Idempotent."""
+        self._child.close(timeout)
+        self._memory.close()
+
+
+def _copy(error: ConnectionLost) -> ConnectionLost:
+    """Return a new error for another ``raise``, without the first one's traceback."""
+    copied = ConnectionLost(str(error), code=error.code)
+    copied.final = error.final
+    return copied
+
+
+def _info_from(opened: Mapping[str, Any]) -> CameraInfo:
+    """Return the camera's record, from the plain data of :meth:`.device.RealSenseDevice.open`."""
+    streams = {
+        name: StreamInfo(
+            format=stream["format"],
+            width=stream["width"],
+            height=stream["height"],
+            rate_hz=stream["rate_hz"],
+            K=frozen(stream["K"]),
+            distortion=frozen(stream["distortion"]),
+            T_color_stream=Pose(*stream["T_color_stream"]),
+        )
+        for name, stream in opened["streams"].items()
+    }
+    return CameraInfo(
+        title=opened["title"],
+        K=frozen(opened["K"]),
+        distortion=frozen(opened["distortion"]),
+        K_infrared=frozen(opened["K_infrared"]) if opened["K_infrared"] is not None else None,
+        clock=opened["clock"],
+        serial=opened["serial"],
+        firmware=opened["firmware"],
+        usb=opened["usb"],
+        depth_scale=opened["depth_scale"],
+        streams=MappingProxyType(streams),
+        options=MappingProxyType(dict(opened["options"])),
+    )

@@ -1,89 +1,95 @@
-"""The thread that is the camera's firmware: takes pictures on time, and sends them as they are streamed."""
+"""The emulated camera's firmware: a thread that sends frames on time, and the same frames written to a recording."""
 
 from __future__ import annotations
 
+import sqlite3
 import threading
 import time
 from collections import deque
+from collections.abc import Collection
+from contextlib import closing
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
+from hal.errors import CommandError
 from hal.specs import CameraSpec
 
-from .device import Device
-from .figures import Mode, streams_of
-from .knobs import Knobs
-from .number import draw_number
-from .options import Emulation
-from .pictures import Pictures
-from .scene import PHASES
+from .device import EmulatedDevice, load_realsense
+from .pictures import PHASES, EmulatedImages, StreamMode, draw_number, make_serial, make_streams, make_title
+from .settings import CameraFaults, Emulation
 
-__all__ = ["Feeder", "Sent"]
+__all__ = ["FrameFeeder", "SentFrames", "write_recording"]
 
-_IDLE = 0.02  # s between two looks whether somebody streams
-_WRAP = 2**32 * 1e-6  # s after which the sensor's clock begins anew
-_KEPT = 256  # how many of the newest pictures it can be asked about
+_IDLE = 0.02
+"""s between two checks whether a stream is on."""
+_WRAP = 2**32 * 1e-6
+"""s after which the sensor's clock wraps."""
+_KEPT = 256
+"""Number of the newest frame sets whose times are kept."""
 _ORDER = ("depth", "infrared", "infrared_right", "color")
 
 
-class Sent(NamedTuple):
-    """When a set of pictures went out."""
+class SentFrames(NamedTuple):
+    """Times of one frame set."""
 
     number: int
     stamp: float
     """When it was taken, on the clock of its stamps, s."""
     t: float
-    """Just before its last picture was handed to the library, on the host's monotonic clock, s."""
+    """Just before its last frame was handed to the library, on the host's monotonic clock, s."""
 
 
-class Feeder:
-    """Feeds whatever :class:`Device` is plugged in; without one, and while nobody streams, it rests.
+class FrameFeeder:
+    """The thread that feeds an :class:`~.device.EmulatedDevice`; it rests without one, and while no stream is on.
 
-    Numbers begin with 1 when streaming begins. They count the pictures of the fastest stream; a slower one has fewer.
+    Frame numbers start with 1 when streaming starts. They count the frames of the fastest stream; a slower one has
+    fewer.
     """
 
     def __init__(self, spec: CameraSpec, emulation: Emulation) -> None:
+        """Start the thread."""
         self.emulation = emulation
-        self.streams = streams_of(spec)
-        self.pictures = Pictures(self.streams, emulation.pattern, emulation.seed)
-        self.modes: dict[str, Mode] = {}
-        """Those of the streams that are on."""
+        self.streams = make_streams(spec)
+        self.images = EmulatedImages(self.streams, emulation.pattern, emulation.seed)
+        self.modes: dict[str, StreamMode] = {}
+        """Modes of the streams that are on."""
         self.late = 0
-        """How many pictures were taken more than a period late, because this thread was held up."""
-        self.sent: deque[Sent] = deque(maxlen=_KEPT)
-        self.knobs = Knobs()
-        self._device: Device | None = None
+        """Number of frame sets that were taken more than a period late, because this thread was held up."""
+        self.sent: deque[SentFrames] = deque(maxlen=_KEPT)
+        self.faults = CameraFaults()
+        self._device: EmulatedDevice | None = None
         self._lock = threading.Lock()
-        self._end = threading.Event()
-        self._chance = np.random.default_rng(emulation.seed)
-        self._made = time.monotonic()
+        self._stopped = threading.Event()
+        self._random = np.random.default_rng(emulation.seed)
+        self._created = time.monotonic()
         self._thread = threading.Thread(target=self._run, name="realsense-emulator", daemon=True)
         self._thread.start()
 
-    def plug(self, device: Device | None) -> None:
-        """Feed this one from now on; None for none. Once this returns nothing is sent to the last one any more."""
+    def set_device(self, device: EmulatedDevice | None) -> None:
+        """Feed another device from now on, or none. When this returns, nothing more is sent to the last one."""
         with self._lock:
             self._device = device
 
-    def end(self) -> None:
+    def stop(self) -> None:
         """Stop the thread. Idempotent."""
-        self._end.set()
+        self._stopped.set()
         if self._thread is not threading.current_thread():
             self._thread.join(timeout=5.0)
 
     def _run(self) -> None:
         tick, due = 0, 0.0
-        while not self._end.is_set():
-            if self._look():
+        while not self._stopped.is_set():
+            if self._update_modes():
                 due = time.monotonic()
             if not self.modes:
                 tick = 0
-                self._end.wait(_IDLE)
+                self._stopped.wait(_IDLE)
                 continue
             period = 1.0 / max(mode.rate for mode in self.modes.values())
             due += period
-            if self._end.wait(max(0.0, due - time.monotonic())):
+            if self._stopped.wait(max(0.0, due - time.monotonic())):
                 return
             if time.monotonic() - due > period:
                 self.late += 1
@@ -93,62 +99,62 @@ class Feeder:
                 if self._device is not None:
                     self._send(self._device, tick, due)
 
-    def _look(self) -> bool:
-        """Which streams are on now? True where those are others than before; their pictures are ready then."""
+    def _update_modes(self) -> bool:
+        """Read which streams are on, and prepare their images; return whether they have changed."""
         with self._lock:
             modes = self._device.streaming() if self._device is not None else {}
         if modes == self.modes:
             return False
         for name, mode in modes.items():
-            self.pictures.prepare(name, mode)
+            self.images.prepare(name, mode)
         self.modes = modes
         return True
 
-    def _send(self, device: Device, tick: int, taken: float) -> None:
-        """Send what was taken at that time: each sensor's pictures together."""
+    def _send(self, device: EmulatedDevice, tick: int, taken: float) -> None:
+        """Send the frames of one capture time, those of each sensor together."""
         fastest = max(mode.rate for mode in self.modes.values())
         due = {
             name: tick * mode.rate // fastest
             for name in _ORDER
             if (mode := self.modes.get(name)) and tick * mode.rate // fastest != (tick - 1) * mode.rate // fastest
         }
-        due = {name: number for name, number in due.items() if not self._lost(name, number)}
+        due = {name: number for name, number in due.items() if not self._is_lost(name, number)}
         last, delayed = next(reversed(due), None), 0.0
         for name, number in due.items():
             if name in ("color", next(iter(due))) and self.emulation.arrival_jitter:
-                delay = max(delayed, self.emulation.arrival_jitter * self._chance.random())
+                delay = max(delayed, self.emulation.arrival_jitter * self._random.random())
                 time.sleep(delay - delayed)
                 delayed = delay
             mode = self.modes[name]
-            picture = self.pictures.prepare(name, mode)[number % PHASES]
-            draw_number(picture, mode.format, number)
+            image = self.images.prepare(name, mode)[number % PHASES]
+            draw_number(image, mode.format, number)
             stamp, domain = self._stamp(device, name, taken)
             number += self.emulation.color_ahead if name == "color" else 0
             if self.emulation.metadata:
-                device.note(name, self._metadata(mode, number, taken))
+                device.set_metadata(name, self._metadata(mode, number, taken))
             if name == last:
-                self.sent.append(Sent(due[name], stamp / 1e3, time.monotonic()))
-            device.push(name, mode, picture, number, stamp, domain)
+                self.sent.append(SentFrames(due[name], stamp / 1e3, time.monotonic()))
+            device.push(name, mode, image, number, stamp, domain)
 
-    def _lost(self, name: str, number: int) -> bool:
-        knobs = self.knobs
-        dropped = knobs.drop > 0 and number % knobs.drop == 0 and knobs.drop_stream in (None, name)
-        return knobs.freeze or dropped
+    def _is_lost(self, name: str, number: int) -> bool:
+        faults = self.faults
+        dropped = faults.drop > 0 and number % faults.drop == 0 and faults.drop_stream in (None, name)
+        return faults.freeze or dropped
 
-    def _stamp(self, device: Device, name: str, taken: float) -> tuple[float, str]:
-        """ms, and whose."""
-        later = self.knobs.skew if name == "color" else 0.0
+    def _stamp(self, device: EmulatedDevice, name: str, taken: float) -> tuple[float, str]:
+        """Return the stamp of a frame, ms, and its clock."""
+        later = self.faults.skew if name == "color" else 0.0
         if self.emulation.clock == "system":
             return 1e3 * (time.time() + later), "system_time"
-        if device.takes_global_time(name):
+        if device.uses_global_time(name):
             return 1e3 * (taken + time.time() - time.monotonic() + later), "global_time"
         return 1e3 * self._sensor_time(taken + later), "hardware_clock"
 
     def _sensor_time(self, t: float) -> float:
-        passed = (t - self._made) * (1.0 + 1e-6 * self.emulation.drift_ppm)
+        passed = (t - self._created) * (1.0 + 1e-6 * self.emulation.drift_ppm)
         return (self.emulation.clock_at + passed) % _WRAP
 
-    def _metadata(self, mode: Mode, number: int, taken: float) -> dict[str, int]:
+    def _metadata(self, mode: StreamMode, number: int, taken: float) -> dict[str, int]:
         microseconds = round(1e6 * self._sensor_time(taken))
         return {
             "frame_counter": number,
@@ -157,3 +163,88 @@ class Feeder:
             "sensor_timestamp": microseconds,
             "time_of_arrival": round(1e3 * time.time()),
         }
+
+
+def write_recording(
+    path: str | Path,
+    spec: CameraSpec,
+    frames: int,
+    *,
+    metadata: bool = True,
+    pattern: str = "test",
+    seed: int = 0,
+    lost: Collection[int] = (),
+) -> None:
+    """Write a recording of an emulated camera, at once, with the times of a live one.
+
+    Args:
+        path: New file that ends in ``.db3``.
+        spec: The camera's record; its ``streams`` are recorded.
+        frames: The frame numbers are 1 to ``frames``; the images are those of :meth:`.SoftwareCamera.expected`.
+        metadata: Whether frames carry metadata. Without, the library plays them badly matched.
+        pattern: As :attr:`.Emulation.pattern`.
+        seed: As :attr:`.Emulation.seed`.
+        lost: Frame numbers that are left out.
+
+    Raises:
+        CommandError: If the file exists or has another suffix.
+        DriverMissing: If librealsense is not installed.
+    """
+    path = Path(path)
+    if path.suffix != ".db3" or path.exists():
+        raise CommandError(f"a recording needs the name of a new file that ends in .db3, not {path}")
+    numbers = [number for number in range(1, frames + 1) if number not in lost]
+    _record(path, spec, numbers, metadata, EmulatedImages(make_streams(spec), pattern, seed))
+    _set_times(path, numbers, spec.rate_hz)
+
+
+def _record(path: Path, spec: CameraSpec, numbers: list[int], metadata: bool, images: EmulatedImages) -> None:
+    """Record frames. The library writes in a thread of its own, and finishes when the last reference to recorder and
+    sensors goes: at the end of this function."""
+    rs = load_realsense()
+    device = EmulatedDevice(
+        make_streams(spec),
+        title=make_title(spec),
+        serial=make_serial(spec),
+        usb="3.2",
+        port="recorded",
+        global_time=False,
+    )
+    recorder = rs.recorder(str(path), device.native)
+    sensors = list(recorder.query_sensors())
+    modes = {name: stream.mode for name, stream in make_streams(spec).items() if name in spec.streams}
+    running = []
+    for sensor in sensors:
+        profiles = [profile for profile in sensor.get_stream_profiles() if device.identify(profile) in modes.items()]
+        if profiles:
+            sensor.open(profiles)
+            sensor.start(rs.frame_queue(1))
+            running.append(sensor)
+    for number in numbers:
+        stamp = 1e3 * (1000.0 + number / spec.rate_hz)
+        for name, mode in modes.items():
+            if metadata:
+                values = {
+                    "frame_counter": number,
+                    "actual_fps": 1000 * mode.rate,
+                    "frame_timestamp": round(1e3 * stamp),
+                }
+                device.set_metadata(name, values)
+            device.push(name, mode, images.expected(name, mode, number), number, stamp, "hardware_clock")
+    for sensor in running:
+        sensor.stop()
+        sensor.close()
+
+
+def _set_times(path: Path, numbers: list[int], rate_hz: float) -> None:
+    """Set the arrival times of frames that were pushed at once: the file is a database of messages."""
+    with closing(sqlite3.connect(path)) as database, database:
+        topics = [key for (key,) in database.execute("SELECT id FROM topics WHERE name LIKE '%/image/%' ORDER BY id")]
+        for place, topic in enumerate(topics):
+            rows = [
+                key for (key,) in database.execute("SELECT id FROM messages WHERE topic_id=? ORDER BY id", (topic,))
+            ]
+            if len(rows) != len(numbers):
+                raise OSError(f"{path}: {len(rows)} frames were written, not {len(numbers)}")
+            times = [round(1e9 * (number - numbers[0]) / rate_hz) + place for number in numbers]
+            database.executemany("UPDATE messages SET timestamp=? WHERE id=?", zip(times, rows, strict=True))

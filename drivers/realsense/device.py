@@ -1,0 +1,402 @@
+"""One RealSense in its own process: finding it, opening and closing it, and the files that it records to.
+
+Runs in the process of :mod:`.process`, and is the only part that touches librealsense together with
+:mod:`.pipeline`, :mod:`.streaming` and :mod:`.options`.
+"""
+
+from __future__ import annotations
+
+import gc
+import hashlib
+import os
+import socket
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import pyrealsense2 as rs
+
+from hal.claim import Claim
+from hal.errors import ConnectionLost, ControlTaken, DeviceNotFound, NotSupported
+from hal.specs import CameraSpec
+
+from .options import RealSenseSettings, apply_options, find_sensors, has_auto_exposure, read_options
+from .pipeline import FramePipeline, LivePipeline, PlaybackPipeline, choose_profiles, describe_optics
+from .ring import PictureRing
+from .streaming import FrameStreamer
+
+__all__ = ["ConnectedCamera", "RealSenseDevice", "RecordingFiles", "find_camera", "find_cameras", "lock_camera"]
+
+_FIRST_SET = 3.0
+"""s that a camera may take to send its first frame set after a start."""
+_RESTART_WARM_UP = 0.3
+"""s of warm-up where the camera was open before: its exposure was settled a moment ago."""
+_SOCKET_NAMES = "/proc/net/unix"
+_LONGEST = 48
+"""Characters of a camera's name that fit into a socket's name."""
+
+
+class RealSenseDevice:
+    """The library's objects for one camera: a context for as long as the process lives, one pipeline at a time.
+
+    Nothing of the library is shared with another camera: each has its own process and its own context.
+    """
+
+    def __init__(self, spec: CameraSpec, ring: PictureRing, notify: Callable[[dict[str, Any]], None]) -> None:
+        """Create the library's context, with the emulated camera in it if the rig selects one.
+
+        Args:
+            spec: The camera's record.
+            ring: Where frames are written to.
+            notify: Called with news (``frame``: a number; ``lost``: a packed error) from the streaming thread.
+        """
+        self._spec = spec
+        self._settings = RealSenseSettings.from_spec(spec)
+        self._ring = ring
+        self._notify = notify
+        self._context: Any
+        self._emulated: Any = None
+        if self._settings.emulated is None:
+            self._context = rs.context()
+        else:
+            from .emulator import SoftwareCamera, emulated_context
+
+            self._context, self._emulated = emulated_context(), SoftwareCamera(spec, **self._settings.emulated)
+            self._emulated.attach(self._context)
+        self._lock: Claim | None = None
+        self._recordings: RecordingFiles | None = None
+        if self._settings.record is not None:
+            self._recordings = RecordingFiles(self._settings.record, spec.name, self._settings.overwrite)
+        self._pipeline: FramePipeline | None = None
+        self._streamer: FrameStreamer | None = None
+        self._played = ""
+        """The recording that the context holds."""
+        self._on_removal: Callable[[Any], None] | None = None
+        self._context.set_devices_changed_callback(self._devices_changed)
+
+    @property
+    def is_open(self) -> bool:
+        """Whether it streams, or did until its camera was lost."""
+        return self._streamer is not None
+
+    def open(self, *, again: bool = False, first: bool = True) -> dict[str, Any]:
+        """Find the camera, set its options, start it and wait for a first frame set.
+
+        Args:
+            again: The camera was open before, so that its exposure has settled.
+            first: A recording made now is the first one of the program.
+
+        Returns:
+            The camera's description as plain data: the fields of :class:`~hal.camera_info.CameraInfo`, ``notes`` (what
+            was changed beyond the rig file), ``before`` (number of the last frame of an earlier session) and
+            ``residual`` (pixels, see :class:`.pipeline.LensModel`).
+
+        Raises:
+            HalError: As :meth:`hal.camera_driver.CameraDriver.open`. A ConnectionLost of a camera that is connected
+                and not in use has the code ``no_frames``.
+        """
+        self.close()
+        try:
+            return self._open(again, first)
+        except BaseException:
+            self.close()
+            raise
+
+    def _open(self, again: bool, first: bool) -> dict[str, Any]:
+        camera = self._find()
+        profiles = choose_profiles(camera.device, self._spec)
+        sensors = find_sensors(camera.device)
+        notes: tuple[str, ...] = ()
+        if not self._played:
+            notes = apply_options(sensors, self._settings.options)
+        settles = not self._played and has_auto_exposure(sensors)
+        option_values = read_options(sensors)
+        self._pipeline = self._start(camera, profiles, first)
+        warm_up = min(self._settings.warm_up_s, _RESTART_WARM_UP) if again else self._settings.warm_up_s
+        self._streamer = FrameStreamer(
+            self._spec,
+            profiles,
+            self._pipeline,
+            self._ring,
+            self._notify,
+            stall=self._settings.stall_s,
+            warm_up=warm_up if settles else 0.0,
+            every=self._settings.play is not None and not self._settings.paced,
+        )
+        started = self._streamer.wait_for_start(_FIRST_SET)
+        if started is None:
+            lost = self._streamer.lost
+            if lost is not None or self._played:
+                text = f"{camera}: {lost or 'it contains nothing that can be played'}"
+                raise ConnectionLost(text, code=lost.code if lost is not None else "unplayable")
+            raise ConnectionLost(f"{camera} was started and sent nothing within {_FIRST_SET:g} s", code="no_frames")
+        return {
+            "title": camera.title,
+            "serial": camera.serial,
+            "firmware": camera.firmware,
+            "usb": camera.usb,
+            "clock": started.clock,
+            "options": option_values,
+            "notes": list(notes),
+            "before": started.before,
+            **describe_optics(self._spec, camera.device, profiles, self._streamer.cropping),
+        }
+
+    def _find(self) -> ConnectedCamera:
+        settings = self._settings
+        if settings.play is not None:
+            return self._load(settings.play)
+        if self._emulated is not None:
+            return find_camera(self._context, self._emulated.serial, self._spec.name)
+        camera = find_camera(self._context, settings.serial, self._spec.name)
+        self._lock = lock_camera(camera.serial)
+        return camera
+
+    def _load(self, file: str) -> ConnectedCamera:
+        if not Path(file).is_file():
+            raise NotSupported(f"there is no recording {file}", code="missing_file")
+        try:
+            device = self._context.load_device(file)
+        except RuntimeError as error:
+            raise NotSupported(f"{file} is not a recording that can be played: {error}", code="unplayable") from None
+        self._played = file
+        return _describe(device, _read_info(device, rs.camera_info.serial_number) or "unknown")
+
+    def _start(self, camera: ConnectedCamera, profiles: dict[str, Any], first: bool) -> FramePipeline:
+        settings = self._settings
+        if self._played:
+            return PlaybackPipeline(self._context, self._played, profiles, repeat=settings.repeat, paced=settings.paced)
+        record = self._recordings.next_file(first) if self._recordings is not None else None
+        pipeline = LivePipeline(self._context, camera.device, camera.serial, profiles, record)
+        self._on_removal = pipeline.handle_removal
+        return pipeline
+
+    def _devices_changed(self, change: Any) -> None:
+        """Runs in a thread of the library."""
+        on_removal = self._on_removal
+        if on_removal is not None:
+            on_removal(change)
+
+    def reset(self) -> str:
+        """Reset the camera, as if it were unplugged for some seconds; return a description of the result."""
+        self.close()
+        camera = self._find()
+        try:
+            camera.device.hardware_reset()
+        except RuntimeError as error:  # "not implemented" by an emulated camera
+            return f"{camera} could not be reset: {error}"
+        finally:
+            self._release()
+        return f"{camera} was reset, and will be back in some seconds"
+
+    def inject(self, **faults: Any) -> None:
+        """Set faults of an emulated camera (:class:`.emulator.camera.CameraFaults`).
+
+        Raises:
+            NotSupported: For a real camera or a recording.
+            CommandError: For an unknown fault or a wrong value.
+        """
+        if self._emulated is None:
+            raise NotSupported("only an emulated camera takes faults (real: {emulated: true})", code="not_emulated")
+        self._emulated.inject(**faults)
+
+    def close(self) -> None:
+        """Stop streaming and release the camera. Idempotent; an emulated one stays plugged in."""
+        self._on_removal = None
+        if self._streamer is not None:
+            self._streamer.stop()
+            self._streamer = None
+        if self._pipeline is not None:
+            with suppress(RuntimeError):  # a camera that is unplugged cannot be stopped
+                self._pipeline.stop()
+            self._pipeline = None
+        self._release()
+
+    def _release(self) -> None:
+        if self._played:
+            with suppress(RuntimeError):
+                self._context.unload_device(self._played)
+            self._played = ""
+        if self._lock is not None:
+            self._lock.release()
+            self._lock = None
+        gc.collect()  # the library closes what it holds open with the last of its objects
+
+    def dispose(self) -> None:
+        """Close, release the recording files, and unplug the emulated camera. Idempotent."""
+        self.close()
+        if self._recordings is not None:
+            self._recordings.close()
+        if self._emulated is not None:
+            self._emulated.close()
+            self._emulated = None
+
+
+class ConnectedCamera(NamedTuple):
+    """A camera that is connected to this computer."""
+
+    device: Any
+    """``rs2::device``"""
+    title: str
+    serial: str
+    firmware: str | None
+    usb: str | None
+
+    def __str__(self) -> str:
+        link = f", USB {self.usb}" if self.usb else ""
+        return f"{self.title} (serial {self.serial}{link})"
+
+
+def find_cameras(context: Any) -> list[ConnectedCamera]:
+    """Return the cameras of a context (``rs2::context``), without those that report no serial number."""
+    found = []
+    for device in context.query_devices():
+        serial = _read_info(device, rs.camera_info.serial_number)
+        if serial:
+            found.append(_describe(device, serial))
+    return found
+
+
+def find_camera(context: Any, serial: str | None, name: str = "") -> ConnectedCamera:
+    """Return the camera with a serial number, or the only one that is connected.
+
+    The connected cameras are listed first because the library, if it is to start a camera that is not connected, waits
+    for 15 s.
+
+    Args:
+        context: ``rs2::context``.
+        serial: Serial number; None for the only camera.
+        name: The camera's name in the rig, for the error.
+
+    Raises:
+        DeviceNotFound: If there is no such camera, or several for ``serial=None``; lists those that are connected.
+    """
+    who = f"camera {name}: " if name else ""
+    found = find_cameras(context)
+    listed = ", ".join(map(str, found)) or "no RealSense"
+    if serial is not None:
+        for camera in found:
+            if camera.serial == serial:
+                return camera
+        raise DeviceNotFound(f"{who}there is no RealSense with serial {serial}; connected: {listed}")
+    if len(found) == 1:
+        return found[0]
+    if not found:
+        raise DeviceNotFound(f"{who}no RealSense is connected; check the cable and use a USB 3 port")
+    text = f'{who}several cameras are connected: {listed}; select one with real: {{serial: "{found[0].serial}"}}'
+    raise DeviceNotFound(text, code="several_devices")
+
+
+def lock_camera(serial: str) -> Claim:
+    """Lock the camera with that serial number for this process.
+
+    Raises:
+        ControlTaken: If another program has it; names that program's process.
+    """
+    return Claim(f"realsense-{serial}", f"camera {serial}")
+
+
+def _describe(device: Any, serial: str) -> ConnectedCamera:
+    return ConnectedCamera(
+        device,
+        _read_info(device, rs.camera_info.name) or "a RealSense",
+        serial,
+        _read_info(device, rs.camera_info.firmware_version),
+        _read_info(device, rs.camera_info.usb_type_descriptor),
+    )
+
+
+def _read_info(device: Any, key: Any) -> str | None:
+    """Return one text of a device's description; None if it has none."""
+    try:
+        return str(device.get_info(key)) if device.supports(key) else None
+    except RuntimeError:  # it is being unplugged
+        return None
+
+
+class RecordingFiles:
+    """Files to record to: the one given for a program's first recording, and numbered ones for those that follow.
+
+    Every file is locked before anything is done to it, until :meth:`close` or the end of the process: two cameras with
+    one file would otherwise delete each other's recording.
+    """
+
+    def __init__(self, path: str, camera: str, overwrite: bool) -> None:
+        """Create the list of files; nothing is written.
+
+        Args:
+            path: The file of the first recording.
+            camera: Name of the camera, for the error of another camera that records to the same file.
+            overwrite: Whether that file may exist already, and is then deleted.
+        """
+        self._path = Path(path)
+        self._camera = camera
+        self._overwrite = overwrite
+        self._locks: dict[Path, _FileLock] = {}
+
+    def next_file(self, first: bool) -> str:
+        """Lock and return the file for a new recording.
+
+        Args:
+            first: It is the first recording of the program.
+
+        Raises:
+            NotSupported: If the first file exists and must not be overwritten, or if its folder is missing.
+            ControlTaken: While another camera records to it.
+        """
+        path = self._path
+        if not path.parent.is_dir():
+            raise NotSupported(f"there is no folder {path.parent} for the recording", code="missing_folder")
+        self._acquire(path)
+        if first and self._overwrite:
+            path.unlink(missing_ok=True)
+        elif first and path.exists():
+            raise NotSupported(f"{path} exists: move it, or set real: {{overwrite: true}}", code="file_exists")
+        number = 2
+        while path.exists():
+            path = self._path.with_name(f"{self._path.stem}-{number}{self._path.suffix}")
+            number += 1
+        self._acquire(path)
+        return str(path)
+
+    def _acquire(self, path: Path) -> None:
+        if path not in self._locks:
+            self._locks[path] = _FileLock(path, self._camera)
+
+    def close(self) -> None:
+        """Release all files. Idempotent."""
+        for lock in self._locks.values():
+            lock.release()
+        self._locks.clear()
+
+
+class _FileLock:
+    """A lock on one file, and a socket whose name contains the name of the camera that records to it."""
+
+    def __init__(self, path: Path, camera: str) -> None:
+        """Acquire the lock; raises ControlTaken, which names both cameras."""
+        key = "recording-" + hashlib.sha256(os.path.realpath(path).encode()).hexdigest()[:32]
+        try:
+            self._lock = Claim(key, str(path))
+        except ControlTaken:
+            text = f"camera {camera} is to record to {path}, which {_find_writer(key)} records to: use two files"
+            raise ControlTaken(text, code="recording_in_use") from None
+        self._name = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+        with suppress(OSError):  # it only serves the error's text
+            self._name.bind(f"\0hal-{key}-{camera[:_LONGEST]}")
+
+    def release(self) -> None:
+        self._name.close()
+        self._lock.release()
+
+
+def _find_writer(key: str) -> str:
+    """Return the name of the camera that holds a file's lock."""
+    mark = f"@hal-{key}-"
+    with suppress(OSError), open(_SOCKET_NAMES, encoding="utf-8", errors="replace") as names:
+        for line in names:
+            _, found, camera = line.rstrip("\n").partition(mark)
+            if found:
+                return f"camera {camera}"
+    return "another camera"
