@@ -300,6 +300,7 @@ class Camera:
         lost.__cause__ = error
         lost.fault = getattr(error, "fault", None)
         lost.final = getattr(error, "final", False)
+        lost.code = getattr(error, "code", lost.code)
         with self._news:
             first, self._error = self._error is None, lost
             self._news.notify_all()

@@ -55,15 +55,7 @@ class RealSenseDevice:
         self._settings = RealSenseSettings.from_spec(spec)
         self._ring = ring
         self._notify = notify
-        self._context: Any
-        self._emulated: Any = None
-        if self._settings.emulated is None:
-            self._context = rs.context()
-        else:
-            from .emulator import SoftwareCamera, emulated_context
-
-            self._context, self._emulated = emulated_context(), SoftwareCamera(spec, **self._settings.emulated)
-            self._emulated.attach(self._context)
+        self._context, self._emulated = self._create_context(spec)
         self._lock: Claim | None = None
         self._recordings: RecordingFiles | None = None
         if self._settings.record is not None:
@@ -74,6 +66,16 @@ class RealSenseDevice:
         """The recording that the context holds."""
         self._on_removal: Callable[[Any], None] | None = None
         self._context.set_devices_changed_callback(self._devices_changed)
+
+    def _create_context(self, spec: CameraSpec) -> tuple[Any, Any]:
+        """Return the library's context, and the emulated camera in it; None for the latter if the camera is real."""
+        if self._settings.emulated is None:
+            return rs.context(), None
+        from .emulator import SoftwareCamera, emulated_context
+
+        context, emulated = emulated_context(), SoftwareCamera(spec, **self._settings.emulated)
+        emulated.attach(context)
+        return context, emulated
 
     @property
     def is_open(self) -> bool:

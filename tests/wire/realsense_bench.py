@@ -1,4 +1,4 @@
-"""RealSense cameras without any hardware, for tests: in software, and as recordings."""
+"""RealSense cameras without hardware, for tests: emulated ones, and recordings."""
 
 from __future__ import annotations
 
@@ -20,8 +20,7 @@ pytest.importorskip("pyrealsense2", reason="needs pyrealsense2: pip install 'rob
 
 from hal.drivers.realsense.camera import RealSenseCamera
 from hal.drivers.realsense.emulator import write_recording
-from hal.drivers.realsense.emulator.figures import streams_of
-from hal.drivers.realsense.emulator.pictures import Pictures
+from hal.drivers.realsense.emulator.pictures import EmulatedImages, make_streams
 
 SIZE = (640, 480)
 
@@ -36,7 +35,7 @@ def spec(
     formats: dict[str, str] | None = None,
     **options: Any,
 ) -> CameraSpec:
-    """A camera whose streams all have one size; colour and depth unless told otherwise."""
+    """Return a camera whose streams all have one size; by default colour and depth."""
     streams = streams or ("color", "depth")
     K = ((600.0, 0.0, (size[0] - 1) / 2), (0.0, 600.0, (size[1] - 1) / 2), (0.0, 0.0, 1.0))
     width, height = output or size
@@ -67,7 +66,7 @@ def spec(
 
 @contextmanager
 def opened(camera: CameraSpec) -> Iterator[Camera]:
-    """The public camera, as a rig in real time has it."""
+    """Open the public camera, as a rig in real time does."""
     it = Camera(RealSenseCamera(camera), RealClock(), threaded=True)
     it.open()
     try:
@@ -77,25 +76,25 @@ def opened(camera: CameraSpec) -> Iterator[Camera]:
 
 
 def software(*streams: str, emulated: Any = True, warm_up_s: float = 0.0, **changes: Any) -> CameraSpec:
-    """A camera in software."""
+    """Return an emulated camera."""
     return spec(*streams, emulated=emulated, warm_up_s=warm_up_s, **changes)
 
 
 def recording(folder: Path, camera: CameraSpec, frames: int = 40, **how: Any) -> str:
-    """A file with the pictures of that camera, those from number 2 on."""
+    """Write a recording of a camera; the library plays it from frame 2 on."""
     file = folder / f"{camera.name}.db3"
     write_recording(file, camera, frames, **how)
     return str(file)
 
 
 def sent(camera: CameraSpec, stream: str, number: int, pattern: str = "test") -> Any:
-    """Exactly what the camera in software, or the recording, has as that picture of a stream."""
-    streams = streams_of(camera)
-    return Pictures(streams, pattern, 0).expected(stream, streams[stream].mode, number)
+    """Return exactly what the emulated camera, or the recording, has as a frame of a stream."""
+    streams = make_streams(camera)
+    return EmulatedImages(streams, pattern, 0).expected(stream, streams[stream].mode, number)
 
 
 def wait_until(holds: Callable[[], bool], seconds: float) -> float:
-    """How long that took; fails where it took too long."""
+    """Wait until a condition holds, and return how long that took, s; fail if it takes too long."""
     began = time.monotonic()
     while not holds():
         assert time.monotonic() - began < seconds, f"not within {seconds} s"
@@ -104,7 +103,7 @@ def wait_until(holds: Callable[[], bool], seconds: float) -> float:
 
 
 def read_until_lost(camera: Camera, seconds: float) -> ConnectionLost:
-    """The error with which the camera says that it is gone."""
+    """Read until the camera is lost, and return the error."""
     deadline = time.monotonic() + seconds
     while time.monotonic() < deadline:
         try:
@@ -115,6 +114,6 @@ def read_until_lost(camera: Camera, seconds: float) -> ConnectionLost:
 
 
 def read_again(camera: Camera, seconds: float) -> Frame:
-    """The first frame of a camera that was lost."""
+    """Return the first frame of a camera that was lost."""
     wait_until(lambda: camera.connected, seconds)
     return camera.read(timeout=seconds)

@@ -1,4 +1,4 @@
-"""The vendor's library as a client of an emulated RealSense, and nothing of ours between the two."""
+"""The vendor's library as a client of an emulated RealSense, without the driver."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ STREAMS = {"depth": ("depth", 0), "color": ("color", 0), "infrared": ("infrared"
 
 
 class Picture(NamedTuple):
-    """One picture of a set, copied."""
+    """One frame of a set, copied."""
 
     number: int
     stamp: float
@@ -31,7 +31,7 @@ class Picture(NamedTuple):
 
 
 class Client:
-    """A pipeline on a camera. The context outlives it, as it must."""
+    """A pipeline on a camera. The context must outlive it."""
 
     def __init__(self, context: Any, serial: str, *streams: str, color: str = "rgb8", **mode: int) -> None:
         self.pipeline = rs.pipeline(context)
@@ -46,7 +46,7 @@ class Client:
         self.profile = self.pipeline.start(config)
 
     def set(self, timeout: float = PATIENCE) -> dict[str, Picture]:
-        """The next set of pictures, with all streams in it."""
+        """Return the next frame set with all streams in it."""
         deadline = time.monotonic() + timeout
         while time.monotonic() < deadline:
             arrived, frames = self.pipeline.try_wait_for_frames(200)
@@ -55,7 +55,7 @@ class Client:
         raise AssertionError(f"no set of {self.streams} within {timeout} s")
 
     def whole(self) -> dict[str, Picture]:
-        """The next set whose pictures all have the same number: sensors do not begin at once."""
+        """Return the next set whose frames all have the same number: sensors do not start at the same time."""
         for _ in range(30):
             found = self.set()
             if len({picture.number for picture in found.values()}) == 1:
@@ -63,7 +63,7 @@ class Client:
         raise AssertionError("30 sets and none that belongs together")
 
     def silent(self, seconds: float) -> bool:
-        """Does nothing new come for so long? What was on its way is not counted."""
+        """Return whether nothing new arrives for that long, apart from what was on its way."""
         while self.pipeline.poll_for_frames():
             pass
         arrived, _ = self.pipeline.try_wait_for_frames(round(1e3 * seconds))
@@ -74,7 +74,7 @@ class Client:
 
 
 def pictures(frames: Any, streams: tuple[str, ...]) -> dict[str, Picture]:
-    """Those of a set that are wanted, by the names of a rig's file."""
+    """Return the wanted frames of a set, by the stream names of a rig file."""
     found = {}
     for frame in frames:
         kind = (frame.profile.stream_type().name, frame.profile.stream_index())
@@ -89,11 +89,11 @@ def pictures(frames: Any, streams: tuple[str, ...]) -> dict[str, Picture]:
 def played(
     path: Path, *, paced: bool = False, streams: tuple[str, ...] = ("depth", "color", "infrared")
 ) -> Iterator[dict[str, Picture]]:
-    """Every set of a recording to its end; the first one or two may come before their last stream is started."""
+    """Play a recording to its end; the first one or two sets may come before their last stream is started."""
     context = rs.context()
     device = context.load_device(str(path))
     pipeline = rs.pipeline(context)
-    pipeline.set_device(device)  # told the file's name, it would open the file once more, and not know of this:
+    pipeline.set_device(device)  # with the file's name it would open the file again, without this:
     device.set_real_time(paced)
     pipeline.start(rs.config())
     try:
@@ -107,12 +107,12 @@ def played(
 
 
 def listed(context: Any) -> list[str]:
-    """Serial numbers of what is plugged in."""
+    """Return the serial numbers of the connected cameras."""
     return [device.get_info(rs.camera_info.serial_number) for device in context.query_devices()]
 
 
 class Bench:
-    """A camera in a context that notes what is announced."""
+    """A camera in a context, and the announcements of the context."""
 
     def __init__(self, spec: CameraSpec = VGA, context: Any = None, **options: Any) -> None:
         self.context = context if context is not None else emulated_context()
@@ -128,9 +128,9 @@ class Bench:
         self.announced.append((came, [change.was_removed(device) for device in self.watched]))
 
     def client(self, *streams: str, **options: Any) -> Client:
-        """A pipeline on this camera."""
+        """Start a pipeline on this camera."""
         return Client(self.context, self.camera.serial, *streams, **options)
 
     def close(self) -> None:
-        """Take the camera away."""
+        """Remove the camera."""
         self.camera.close()

@@ -1,4 +1,4 @@
-"""What stands in for a RealSense, seen through the vendor's unmodified library."""
+"""The emulated RealSense, seen through the vendor's unmodified library."""
 
 from __future__ import annotations
 
@@ -38,27 +38,27 @@ def bench() -> Iterator[Bench]:
 
 
 def differing(camera: SoftwareCamera, found: dict[str, Picture], number: int) -> list[str]:
-    """Streams of a set whose pixels are not exactly those of that number."""
+    """Return the streams of a set whose pixels are not exactly those of a frame number."""
     expected = camera.expected(number)
     return [name for name, picture in found.items() if not np.array_equal(picture.pixels, expected[name])]
 
 
 def wait_until_idle(camera: SoftwareCamera) -> None:
-    """Until it has seen that nobody streams any more."""
+    """Wait until the camera has noticed that no stream is on."""
     deadline = time.monotonic() + 5.0
     while camera.streaming:
-        assert time.monotonic() < deadline, "it goes on for a client that stopped"
+        assert time.monotonic() < deadline, "it continues for a client that stopped"
         time.sleep(0.005)
 
 
-# What it says of itself.
+# Description.
 
 
-def test_it_is_listed_as_a_d435_with_all_that_tells_cameras_apart(bench: Bench) -> None:
+def test_it_is_listed_as_a_d435(bench: Bench) -> None:
     (device,) = bench.context.query_devices()
     info = rs.camera_info
-    said = {key: device.get_info(getattr(info, key)) for key in ("name", "product_line", "usb_type_descriptor")}
-    assert said == {"name": "Intel RealSense D435 (emulated)", "product_line": "D400", "usb_type_descriptor": "3.2"}
+    found = {key: device.get_info(getattr(info, key)) for key in ("name", "product_line", "usb_type_descriptor")}
+    assert found == {"name": "Intel RealSense D435 (emulated)", "product_line": "D400", "usb_type_descriptor": "3.2"}
     assert device.get_info(info.serial_number) == bench.camera.serial
     assert len(bench.camera.serial) == 12
     assert device.get_info(info.firmware_version)
@@ -66,7 +66,7 @@ def test_it_is_listed_as_a_d435_with_all_that_tells_cameras_apart(bench: Bench) 
     assert bench.announced == [([bench.camera.serial], [])]
 
 
-def test_calibration_and_units_are_those_of_the_spec() -> None:
+def test_calibration_and_units_follow_the_spec() -> None:
     turned = (0.0, float(np.sin(0.01)), 0.0, float(np.cos(0.01)))
     K = ((400.0, 0.0, 321.0), (0.0, 401.0, 238.5), (0.0, 0.0, 1.0))
     sensors = {
@@ -91,7 +91,7 @@ def test_calibration_and_units_are_those_of_the_spec() -> None:
     bench.close()
 
 
-def test_options_have_ranges_and_keep_what_they_are_set_to(bench: Bench) -> None:
+def test_options_have_ranges_and_keep_their_values(bench: Bench) -> None:
     color = bench.context.query_devices()[0].sensors[1]
     assert color.get_option_range(rs.option.white_balance).max == 6500
     color.set_option(rs.option.exposure, 200)
@@ -100,10 +100,10 @@ def test_options_have_ranges_and_keep_what_they_are_set_to(bench: Bench) -> None
         color.set_option(rs.option.exposure, 1e9)
 
 
-# Pictures.
+# Images.
 
 
-def test_sets_are_matched_and_exact_to_the_last_bit(bench: Bench) -> None:
+def test_sets_are_matched_and_exact_to_the_bit(bench: Bench) -> None:
     client = bench.client("depth", "color", "infrared", "infrared_right")
     numbers = []
     client.whole()
@@ -118,7 +118,7 @@ def test_sets_are_matched_and_exact_to_the_last_bit(bench: Bench) -> None:
 
 
 @pytest.mark.parametrize("format", ["rgb8", "bgr8", "rgba8", "bgra8", "yuyv", "uyvy"])
-def test_colour_comes_in_every_format(bench: Bench, format: str) -> None:
+def test_every_color_format(bench: Bench, format: str) -> None:
     client = bench.client("color", color=format)
     found = client.set()
     assert differing(bench.camera, found, found["color"].number) == []
@@ -126,8 +126,8 @@ def test_colour_comes_in_every_format(bench: Bench, format: str) -> None:
     client.stop()
 
 
-def test_packed_colour_is_the_same_picture(bench: Bench) -> None:
-    """The library's own conversion gives back the colours, but for what two pixels share."""
+def test_packed_color_is_the_same_image(bench: Bench) -> None:
+    """The library's own conversion restores the colours, apart from what two pixels share."""
     client = bench.client("color", color="yuyv")
     client.set()
     arrived, frames = client.pipeline.try_wait_for_frames(5000)
@@ -140,7 +140,7 @@ def test_packed_colour_is_the_same_picture(bench: Bench) -> None:
     client.stop()
 
 
-def test_other_modes_than_that_of_the_spec(bench: Bench) -> None:
+def test_modes_other_than_that_of_the_spec(bench: Bench) -> None:
     client = bench.client("depth", "color", width=848, height=480, rate=60)
     first = client.whole()
     number = first["depth"].number
@@ -151,7 +151,7 @@ def test_other_modes_than_that_of_the_spec(bench: Bench) -> None:
         bench.client("depth", width=641)
 
 
-def test_without_its_metadata_the_library_mixes_pictures_of_two_moments() -> None:
+def test_without_metadata_the_library_mixes_frames_of_two_moments() -> None:
     bench = Bench(metadata=False)
     client = bench.client()
     numbers = [{picture.number for picture in client.set().values()} for _ in range(40)]
@@ -171,7 +171,7 @@ def test_a_seed_tells_two_cameras_apart() -> None:
 
 
 @pytest.mark.parametrize("number", [0, 1, 12345, 2**24 - 1])
-def test_a_number_is_read_from_a_crop_that_was_scaled(bench: Bench, number: int) -> None:
+def test_the_number_can_be_read_from_a_scaled_crop(bench: Bench, number: int) -> None:
     color = bench.camera.expected(number)["color"]
     square = color[:, 80:560]
     assert read_number(square) == read_number(square[::2, ::2]) == number
@@ -183,7 +183,7 @@ def test_a_number_is_read_from_a_crop_that_was_scaled(bench: Bench, number: int)
 # The scene.
 
 
-def test_depth_aligned_to_colour_is_the_truth_to_two_millimetres() -> None:
+def test_depth_aligned_to_color_is_within_two_millimetres() -> None:
     bench = Bench(pattern="scene")
     client = bench.client("depth", "color")
     client.whole()
@@ -196,13 +196,13 @@ def test_depth_aligned_to_colour_is_the_truth_to_two_millimetres() -> None:
     both = measured > 0.0
     both[:20] = False  # the number
     error = np.abs(measured - truth)[both]
-    # A pixel aligned shows its neighbour's depth: on the slanted table that is some mm, at the box's edges more.
+    # An aligned pixel has its neighbour's depth: on the slanted table that is some mm off, at the box's edges more.
     assert both.mean() > 0.9
     assert np.median(error) < 0.002
     assert np.percentile(error, 90) < 0.006
     box = bench.camera.expected(aligned.get_frame_number())["color"]
     reds = (box[..., 0].astype(int) - box[..., 2] > 100) | (box[..., 2].astype(int) - box[..., 0] > 100)
-    assert reds.sum() > 2000, "the box is to be seen"
+    assert reds.sum() > 2000, "the box is visible"
     client.stop()
     bench.close()
 
@@ -214,10 +214,10 @@ def test_the_box_moves(bench: Bench) -> None:
     scene.close()
 
 
-# What goes wrong.
+# Faults.
 
 
-def test_a_restart_counts_from_one_again(bench: Bench) -> None:
+def test_a_restart_counts_from_one(bench: Bench) -> None:
     for _ in range(3):
         client = bench.client()
         number = client.whole()["depth"].number
@@ -228,18 +228,18 @@ def test_a_restart_counts_from_one_again(bench: Bench) -> None:
         wait_until_idle(bench.camera)
 
 
-def test_stalled_it_is_listed_and_silent(bench: Bench) -> None:
+def test_a_stalled_camera_is_listed_and_silent(bench: Bench) -> None:
     client = bench.client()
     before = client.whole()["depth"].number
     bench.camera.stall(True)
     assert client.silent(0.4)
     assert listed(bench.context) == [bench.camera.serial]
     bench.camera.stall(False)
-    assert client.whole()["depth"].number > before + 3, "it went on taking pictures"
+    assert client.whole()["depth"].number > before + 3, "it continued to take frames"
     client.stop()
 
 
-def test_lost_pictures_leave_gaps_in_the_numbers(bench: Bench) -> None:
+def test_lost_frames_leave_gaps_in_the_numbers(bench: Bench) -> None:
     bench.camera.drop(every=3)
     client = bench.client()
     numbers = [client.whole()["depth"].number for _ in range(12)]
@@ -247,8 +247,8 @@ def test_lost_pictures_leave_gaps_in_the_numbers(bench: Bench) -> None:
     client.stop()
 
 
-def test_one_stream_alone_may_lose_pictures(bench: Bench) -> None:
-    """What the library makes of it, sets of two moments or only half as many, depends on the machine's mood."""
+def test_one_stream_alone_may_lose_frames(bench: Bench) -> None:
+    """How the library combines the rest (sets of two moments, or half as many) varies from run to run."""
     bench.camera.drop(every=2, stream="color")
     for stream, has_even in (("color", False), ("depth", True)):
         client = bench.client(stream)
@@ -257,7 +257,7 @@ def test_one_stream_alone_may_lose_pictures(bench: Bench) -> None:
         client.stop()
 
 
-def test_unplugged_it_is_gone_announced_and_its_pipeline_dead_and_replugged_it_is_back(bench: Bench) -> None:
+def test_unplugging_is_announced_and_ends_the_pipeline_and_replugging_brings_it_back(bench: Bench) -> None:
     camera = bench.camera
     bench.watched = list(bench.context.query_devices())
     client = bench.client()
@@ -267,7 +267,7 @@ def test_unplugged_it_is_gone_announced_and_its_pipeline_dead_and_replugged_it_i
     assert listed(bench.context) == []
     assert client.silent(0.3)
     camera.unplug()
-    assert len(bench.announced) == 2, "a second time nothing happens"
+    assert len(bench.announced) == 2, "unplug is idempotent"
     camera.replug()
     assert bench.announced[2:] == [([camera.serial], [False])]
     assert listed(bench.context) == [camera.serial]
@@ -294,7 +294,7 @@ def test_in_a_plain_context_an_unplugged_camera_cannot_be_found_by_its_number() 
     bench.close()
 
 
-def test_one_camera_does_not_mind_that_another_is_unplugged() -> None:
+def test_unplugging_one_camera_does_not_affect_another() -> None:
     context = emulated_context()
     one, other = (Bench(replace(VGA, name=name), context, seed=7 * k) for k, name in enumerate(("left", "right")))
     clients = [bench.client() for bench in (one, other)]
@@ -310,7 +310,7 @@ def test_one_camera_does_not_mind_that_another_is_unplugged() -> None:
     other.close()
 
 
-def test_plugging_in_again_and_again_leaves_nothing_behind(bench: Bench) -> None:
+def test_repeated_replugging_leaks_no_thread(bench: Bench) -> None:
     def once() -> int:
         client = bench.client("depth")
         client.set()
@@ -327,7 +327,7 @@ def test_plugging_in_again_and_again_leaves_nothing_behind(bench: Bench) -> None
 
 
 @pytest.mark.parametrize("clock", ["hardware", "global", "system"])
-def test_stamps_go_by_the_clock_that_they_are_said_to(clock: str) -> None:
+def test_stamps_are_on_the_reported_clock(clock: str) -> None:
     bench = Bench(clock=clock)
     client = bench.client()
     client.whole()
@@ -346,7 +346,7 @@ def test_stamps_go_by_the_clock_that_they_are_said_to(clock: str) -> None:
     bench.close()
 
 
-def test_colour_may_be_taken_later_than_depth(bench: Bench) -> None:
+def test_skew_stamps_color_later_than_depth(bench: Bench) -> None:
     bench.camera.skew(0.004)
     client = bench.client()
     found = client.whole()
@@ -355,7 +355,7 @@ def test_colour_may_be_taken_later_than_depth(bench: Bench) -> None:
     client.stop()
 
 
-def test_each_sensor_may_count_for_itself() -> None:
+def test_color_numbers_may_be_ahead() -> None:
     bench = Bench(color_ahead=40)
     client = bench.client()
     found = [client.set() for _ in range(15)][-1]
@@ -365,7 +365,7 @@ def test_each_sensor_may_count_for_itself() -> None:
     bench.close()
 
 
-def test_the_sensors_clock_begins_anew_after_32_bits_of_microseconds() -> None:
+def test_the_sensor_clock_wraps_after_32_bits_of_microseconds() -> None:
     bench = Bench(clock_at=2**32 * 1e-6 - 1.5)
     client = bench.client("depth")
     stamps = []
@@ -399,7 +399,7 @@ def test_jitter_delays_the_arrival_and_not_the_stamp() -> None:
 # Recordings.
 
 
-def test_a_recording_plays_to_the_last_pixel(tmp_path: Path) -> None:
+def test_a_recording_plays_exactly(tmp_path: Path) -> None:
     path = tmp_path / "some.db3"
     write_recording(path, VGA, 40)
     reference = SoftwareCamera(VGA)
@@ -413,7 +413,7 @@ def test_a_recording_plays_to_the_last_pixel(tmp_path: Path) -> None:
     reference.close()
 
 
-def test_a_recording_bears_the_calibration_and_its_own_pace(tmp_path: Path) -> None:
+def test_a_recording_has_the_calibration_and_its_own_rate(tmp_path: Path) -> None:
     path = tmp_path / "some.db3"
     write_recording(path, VGA, 31, pattern="scene")
     context = rs.context()
@@ -432,53 +432,49 @@ def test_a_recording_bears_the_calibration_and_its_own_pace(tmp_path: Path) -> N
     assert time.monotonic() - began > 0.9
 
 
-def test_a_recording_without_metadata_mixes_pictures(tmp_path: Path) -> None:
+def test_a_recording_without_metadata_mixes_frames(tmp_path: Path) -> None:
     path = tmp_path / "bare.db3"
     write_recording(path, VGA, 40, metadata=False)
     assert any(len({picture.number for picture in found.values()}) > 1 for found in played(path))
 
 
-def test_a_recording_may_have_gaps_and_no_file_is_overwritten(tmp_path: Path) -> None:
+def test_a_recording_may_have_gaps_and_overwrites_no_file(tmp_path: Path) -> None:
     path = tmp_path / "gaps.db3"
     write_recording(path, replace(VGA, streams=("depth",)), 20, lost=(7, 8, 15))
     numbers = [found["depth"].number for found in played(path, streams=("depth",))]
     assert numbers == [n for n in range(numbers[0], 21) if n not in (7, 8, 15)]
     assert numbers[0] <= 3
     for name in ("gaps.db3", "other.bag"):
-        with pytest.raises(CommandError, match="ends in .db3"):
+        with pytest.raises(CommandError):
             write_recording(tmp_path / name, VGA, 1)
 
 
-# Its edges.
+# Wrong options.
 
 
 @pytest.mark.parametrize(
-    ("options", "text"),
+    "options",
     [
-        ({"patern": "test"}, "did you mean 'pattern'"),
-        ({"pattern": "noise"}, "test, scene"),
-        ({"arrival_jitter": float("nan")}, "arrival_jitter"),
-        ({"seed": -1}, "0 or more"),
-        ({"metadata": 1}, "bool"),
-        ({"clock_at": -1.0}, "clock_at"),
+        {"patern": "test"},
+        {"pattern": "noise"},
+        {"arrival_jitter": float("nan")},
+        {"seed": -1},
+        {"metadata": 1},
+        {"clock_at": -1.0},
     ],
 )
-def test_an_option_that_cannot_be_is_refused(options: dict[str, object], text: str) -> None:
-    with pytest.raises(CommandError, match=text):
+def test_a_wrong_option_is_refused(options: dict[str, object]) -> None:
+    with pytest.raises(CommandError):
         SoftwareCamera(VGA, **options)
-    with pytest.raises(CommandError, match=text):
-        Emulation.of(options)
+    with pytest.raises(CommandError):
+        Emulation.from_options(options)
 
 
-def test_a_knob_that_cannot_be_is_refused_and_changes_nothing(bench: Bench) -> None:
-    for knobs, text in (
-        ({"disconect": True}, "disconnect"),
-        ({"drop": -1}, "count"),
-        ({"skew": None}, "in s"),
-        ({"freeze": 1}, "True"),
-    ):
-        with pytest.raises(CommandError, match=text):
-            bench.camera.inject(**knobs)
+def test_a_wrong_fault_is_refused_and_changes_nothing(bench: Bench) -> None:
+    faults: dict[str, object]
+    for faults in ({"disconect": True}, {"drop": -1}, {"skew": None}, {"freeze": 1}):
+        with pytest.raises(CommandError):
+            bench.camera.inject(**faults)
     assert bench.camera.plugged
     client = Client(bench.context, bench.camera.serial)
     client.whole()
@@ -510,7 +506,7 @@ def test_a_program_may_end_while_it_streams(end: str) -> None:
     assert (done.returncode, done.stdout, done.stderr) == (0, "True\n", "")
 
 
-def test_without_the_library_its_remedy_is_named() -> None:
+def test_without_the_library_the_error_names_its_package() -> None:
     done = run(
         """
         import sys
@@ -522,7 +518,7 @@ def test_without_the_library_its_remedy_is_named() -> None:
             try:
                 call()
             except DriverMissing as error:
-                print("pip install 'robot-hal[realsense]'" in str(error))
+                print(error.name)
         """
     )
-    assert done.stdout == "True\nTrue\n", done.stderr
+    assert done.stdout == "pyrealsense2\n" * 2, done.stderr

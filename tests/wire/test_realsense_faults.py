@@ -1,4 +1,4 @@
-"""What goes wrong with a RealSense: unplugged, silent, hung, misspelt, taken; and how it comes back."""
+"""Faults of a RealSense and the recovery from them: unplugged, silent, hung, in use, wrong options."""
 
 from __future__ import annotations
 
@@ -17,47 +17,41 @@ from hal.errors import CommandError, ConnectionLost, ControlTaken, DeviceNotFoun
 
 from .realsense_bench import RealSenseCamera, opened, read_again, read_until_lost, software, spec, wait_until
 
-from hal.drivers.realsense.devices import claim_camera, find  # isort: skip  # needs the library
+from hal.drivers.realsense.device import RealSenseDevice, find_camera, lock_camera  # isort: skip  # needs the library
 from hal.drivers.realsense.emulator import SoftwareCamera, emulated_context  # isort: skip
-from hal.drivers.realsense.options import apply, sensors_of  # isort: skip
+from hal.drivers.realsense.options import apply_options, find_sensors  # isort: skip
 from hal.drivers.realsense.ring import PictureRing  # isort: skip
-from hal.drivers.realsense.station import Station  # isort: skip
 
 
-def test_unplugged_and_plugged_in_again_the_same_camera_works() -> None:
+def test_a_camera_works_again_after_it_was_unplugged() -> None:
     with opened(software()) as cam:
         news: list[ConnectionLost | None] = []
         cam.on_connection(news.append)
         before = cam.read(timeout=5.0)
         cam.inject(disconnect=True)
         error = read_until_lost(cam, 2.0)
-        assert "unplugged" in str(error)
-        told = float(str(error).split("last frame is of ")[1].split(" s,")[0])
-        assert before.stamp.t - 1e-3 <= told <= before.stamp.t + 1.0
+        lost_at = time.monotonic()
+        assert error.code == "unplugged"
         with pytest.raises(ConnectionLost):
             cam.latest()
         time.sleep(0.5)
         assert not cam.connected
-        with pytest.raises(ConnectionLost, match="no RealSense with serial"):
+        with pytest.raises(ConnectionLost) as caught:
             cam.read()
+        assert caught.value.code == "device_not_found"
         cam.inject(disconnect=False)
         again = read_again(cam, 5.0)
         assert again.stamp.seq > before.stamp.seq
-        assert again.stamp.t > error_time(error)
+        assert again.stamp.t > lost_at
         assert cam.counts().reconnects == 1
         assert [type(item) for item in news] == [ConnectionLost, type(None)]
-
-
-def error_time(error: ConnectionLost) -> float:
-    """When the camera was lost, by its words."""
-    return float(str(error).split("now is ")[1].split(" s)")[0])
 
 
 def test_a_silent_camera_is_lost_and_comes_back() -> None:
     with opened(software(stall_s=0.5)) as cam:
         cam.read(timeout=5.0)
         cam.inject(freeze=True)
-        assert "stalled: nothing came" in str(read_until_lost(cam, 3.0))
+        assert read_until_lost(cam, 3.0).code == "stalled"
         cam.inject(freeze=False)
         read_again(cam, 15.0)
 
@@ -66,31 +60,31 @@ def test_one_silent_stream_is_named() -> None:
     with opened(software(stall_s=0.5)) as cam:
         cam.read(timeout=5.0)
         cam.inject(drop=1, drop_stream="color")
-        assert "color sent nothing" in str(read_until_lost(cam, 3.0))
+        assert "color" in str(read_until_lost(cam, 3.0))
         assert cam.counts().mismatched > 0
 
 
 def process_of(cam: object) -> int:
-    """Of the library."""
+    """Return the number of the process with the library."""
     return int(cam._driver._link._child.process.pid)  # type: ignore[attr-defined]
 
 
-def test_a_process_that_hangs_is_ended_and_another_one_takes_over() -> None:
+def test_a_process_that_hangs_is_killed_and_replaced() -> None:
     with opened(software(stall_s=0.3)) as cam:
         cam.read(timeout=5.0)
         pid = process_of(cam)
         os.kill(pid, signal.SIGSTOP)
-        assert "hangs" in str(read_until_lost(cam, 8.0))
+        assert read_until_lost(cam, 8.0).code == "process_hangs"
         read_again(cam, 15.0)
         assert process_of(cam) != pid
         assert not os.path.exists(f"/proc/{pid}")
 
 
-def test_a_process_that_dies_takes_nobody_with_it() -> None:
+def test_a_process_that_dies_is_replaced() -> None:
     with opened(software()) as cam:
         cam.read(timeout=5.0)
         os.kill(process_of(cam), signal.SIGKILL)
-        assert "process ended" in str(read_until_lost(cam, 5.0))
+        read_until_lost(cam, 5.0)
         read_again(cam, 15.0)
 
 
@@ -126,7 +120,7 @@ def test_a_lost_camera_that_is_closed_for_good_leaves_no_process() -> None:
         while True:
             driver.grab(1.0)
     driver.close()
-    assert os.path.exists(f"/proc/{pid}"), "the camera in software is in it, and may be plugged in again"
+    assert os.path.exists(f"/proc/{pid}"), "the emulated camera is in it, and may be plugged in again"
     with pytest.raises(DeviceNotFound):
         driver.open()
     driver.close()
@@ -135,82 +129,82 @@ def test_a_lost_camera_that_is_closed_for_good_leaves_no_process() -> None:
     assert not os.path.exists(f"/proc/{pid}")
 
 
-def test_a_camera_that_is_closed_while_it_is_looked_for_leaves_no_process() -> None:
+def test_a_camera_that_is_closed_during_a_reconnect_leaves_no_process() -> None:
     with opened(software()) as cam:
         cam.read(timeout=5.0)
         pid = process_of(cam)
         cam.inject(disconnect=True)
         read_until_lost(cam, 3.0)
-        time.sleep(0.5)  # meanwhile it is closed and opened in vain
+        time.sleep(0.5)  # meanwhile it is closed and opened without success
     wait_until(lambda: not os.path.exists(f"/proc/{pid}"), 2.0)
 
 
-def test_without_a_camera_the_error_comes_at_once() -> None:
-    for options, words in (({}, "no RealSense is plugged in"), ({"serial": "0123"}, "no RealSense with serial 0123")):
+def test_without_a_camera_open_fails_at_once() -> None:
+    for options in ({}, {"serial": "0123"}):
         driver = RealSenseCamera(spec(**options))
-        driver.open_began = time.monotonic()  # type: ignore[attr-defined]
         try:
-            with pytest.raises(DeviceNotFound, match=words):
+            with pytest.raises(DeviceNotFound):
                 driver.open()
             began = time.monotonic()
-            with pytest.raises(DeviceNotFound, match=words):  # the process is there by now
+            with pytest.raises(DeviceNotFound):  # the process runs by now
                 driver.open()
             assert time.monotonic() - began < 1.0, "the library would have waited for 15 s"
         finally:
             driver.close()
 
 
-def test_the_error_lists_what_is_plugged_in() -> None:
+def test_the_error_lists_the_connected_cameras() -> None:
     context = emulated_context()
     cameras = [SoftwareCamera(software(name=name)) for name in ("left", "right")]
     try:
         for camera in cameras:
             camera.attach(context)
-        with pytest.raises(DeviceNotFound, match="serial 42; plugged in: .*D435.*USB 3.2.*D435") as caught:
-            find(context, "42")
-        assert all(camera.serial in str(caught.value) for camera in cameras)
-        with pytest.raises(DeviceNotFound, match=r'several .* say which one: real: {serial: "9\d{11}"}'):
-            find(context, None)
-        assert find(context, cameras[1].serial).serial == cameras[1].serial
+        for serial, code in (("42", "device_not_found"), (None, "several_devices")):
+            with pytest.raises(DeviceNotFound) as caught:
+                find_camera(context, serial)
+            assert caught.value.code == code
+            assert all(camera.serial in str(caught.value) for camera in cameras)
+        assert find_camera(context, cameras[1].serial).serial == cameras[1].serial
         cameras[0].unplug()
-        assert find(context, None).serial == cameras[1].serial
+        assert find_camera(context, None).serial == cameras[1].serial
     finally:
         for camera in cameras:
             camera.close()
 
 
-def test_a_camera_that_another_program_has_is_refused_with_its_number() -> None:
-    claim = claim_camera("test-refused")
-    with pytest.raises(ControlTaken, match=rf"another program on this computer \(process {os.getppid()}\)"):
-        claim_camera("test-refused")
-    claim.release()
-    claim_camera("test-refused").release()
+def test_a_locked_camera_is_refused_and_its_process_named() -> None:
+    lock = lock_camera("test-refused")
+    with pytest.raises(ControlTaken, match=rf"process {os.getppid()}\b"):
+        lock_camera("test-refused")
+    lock.release()
+    lock_camera("test-refused").release()
 
 
-def test_an_open_camera_is_held_against_other_programs(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The whole way of a real one, but for the wire: the library lists it, and nothing says that it is in software."""
+def test_an_open_camera_is_locked_against_other_programs(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The path of a real camera except the wire: the library lists it, and the driver does not know it is emulated."""
     camera = spec(serial="900000000042", warm_up_s=0.0)
     context, plugged = emulated_context(), SoftwareCamera(camera, serial="900000000042")
     plugged.attach(context)
-    monkeypatch.setattr(Station, "_plug", lambda self, spec: (context, None))
-    station = Station(camera, PictureRing(memoryview(bytearray(PictureRing.size(camera))), camera), lambda news: None)
+    monkeypatch.setattr(RealSenseDevice, "_create_context", lambda self, spec: (context, None))
+    ring = PictureRing(memoryview(bytearray(PictureRing.size(camera))), camera)
+    device = RealSenseDevice(camera, ring, lambda news: None)
     try:
-        other = claim_camera(plugged.serial)
-        with pytest.raises(ControlTaken, match=f"camera {plugged.serial} is in use by another program"):
-            station.open()
-        other.release()
-        assert station.open()["serial"] == plugged.serial
+        other = lock_camera(plugged.serial)
         with pytest.raises(ControlTaken):
-            claim_camera(plugged.serial)
-        station.close()
-        claim_camera(plugged.serial).release()
+            device.open()
+        other.release()
+        assert device.open()["serial"] == plugged.serial
+        with pytest.raises(ControlTaken):
+            lock_camera(plugged.serial)
+        device.close()
+        lock_camera(plugged.serial).release()
     finally:
-        station.end()
+        device.dispose()
         plugged.close()
 
 
 class _Stubborn:
-    """A sensor that takes every value and keeps its own."""
+    """A sensor that accepts every value and keeps its own."""
 
     def __init__(self, sensor: Any) -> None:
         self._sensor = sensor
@@ -219,19 +213,20 @@ class _Stubborn:
         return getattr(self._sensor, name)
 
     def set_option(self, option: Any, value: float) -> None:
-        """Nothing comes of it."""
+        """Do nothing."""
 
 
 def test_an_option_that_the_camera_does_not_keep_is_an_error() -> None:
     context, plugged = emulated_context(), SoftwareCamera(software())
     plugged.attach(context)
     try:
-        sensors = sensors_of(find(context, plugged.serial).device)
-        assert apply(sensors, {"laser_power": 120}) == ()
+        sensors = find_sensors(find_camera(context, plugged.serial).device)
+        assert apply_options(sensors, {"laser_power": 120}) == ()
         stubborn = {name: _Stubborn(sensor) for name, sensor in sensors.items()}
-        assert apply(stubborn, {"laser_power": 120}) == ()
-        with pytest.raises(NotSupported, match="keeps 120 for option depth.laser_power, not 180"):
-            apply(stubborn, {"laser_power": 180})
+        assert apply_options(stubborn, {"laser_power": 120}) == ()
+        with pytest.raises(NotSupported) as caught:
+            apply_options(stubborn, {"laser_power": 180})
+        assert caught.value.code == "option_rejected"
     finally:
         plugged.close()
 
@@ -239,31 +234,33 @@ def test_an_option_that_the_camera_does_not_keep_is_an_error() -> None:
 def test_options_are_set_and_read_back() -> None:
     options = {"depth": {"exposure": 4000, "gain": 32}, "laser_power": 120, "white_balance": 5000}
     with opened(software(options=options)) as cam:
-        told = cam.info.options
-        assert (told["depth.exposure"], told["depth.gain"]) == (4000.0, 32.0)
-        assert (told["depth.laser_power"], told["color.white_balance"]) == (120.0, 5000.0)
-        assert told["depth.enable_auto_exposure"] == 0.0, "what is set by hand is not automatic"
-        assert told["color.enable_auto_white_balance"] == 0.0
-        assert told["color.enable_auto_exposure"] == 1.0
+        values = cam.info.options
+        assert (values["depth.exposure"], values["depth.gain"]) == (4000.0, 32.0)
+        assert (values["depth.laser_power"], values["color.white_balance"]) == (120.0, 5000.0)
+        assert values["depth.enable_auto_exposure"] == 0.0, "a manual value switches its automatic off"
+        assert values["color.enable_auto_white_balance"] == 0.0
+        assert values["color.enable_auto_exposure"] == 1.0
 
 
 @pytest.mark.parametrize(
-    ("options", "words"),
+    ("options", "code"),
     [
-        ({"exposure": 100}, "both have 'exposure'"),
-        ({"laser_powr": 100}, r"did you mean 'laser_power'.*\n(.*\n)*.*depth.laser_power: 0 to 360, now 150"),
-        ({"laser_power": 1000}, "depth.laser_power must be 0 to 360, not 1000"),
-        ({"color": {"laser_power": 1}}, "no option 'laser_power'"),
-        ({"depth_units": 0.001}, "can only be read"),
-        ({"color": {"exposure": 100, "enable_auto_exposure": True}}, "must be false"),
-        ({"laser_power": "full"}, "no value 'full'"),
+        ({"exposure": 100}, "ambiguous_option"),
+        ({"laser_powr": 100}, "unknown_option"),
+        ({"laser_power": 1000}, "option_out_of_range"),
+        ({"color": {"laser_power": 1}}, "unknown_option"),
+        ({"depth_units": 0.001}, "option_read_only"),
+        ({"color": {"exposure": 100, "enable_auto_exposure": True}}, "option_conflict"),
+        ({"laser_power": "full"}, "unknown_option_value"),
     ],
 )
-def test_a_wrong_option_is_answered_with_what_there_is(options: dict[str, object], words: str) -> None:
+def test_a_wrong_option_is_refused(options: dict[str, object], code: str) -> None:
     driver = RealSenseCamera(software(options=options))
     try:
-        with pytest.raises(NotSupported, match=words):
+        with pytest.raises(NotSupported) as caught:
             driver.open()
+        assert caught.value.code == code
+        assert ("depth.laser_power: 0 to 360" in str(caught.value)) == ("laser_powr" in options), "lists what there is"
     finally:
         driver.close()
 
@@ -274,15 +271,15 @@ def test_a_preset_has_a_name() -> None:
 
 
 def test_unknown_faults_are_refused_and_real_cameras_have_none() -> None:
-    with opened(software()) as cam, pytest.raises(CommandError, match="freeze"):
+    with opened(software()) as cam, pytest.raises(CommandError):
         cam.inject(freez=True)
     driver = RealSenseCamera(spec())
-    with pytest.raises(ConnectionLost, match="not open"):
+    with pytest.raises(ConnectionLost):
         driver.inject(freeze=True)
 
 
-def test_the_app_goes_on_while_a_camera_is_looked_for() -> None:
-    """The library keeps the interpreter to itself while it starts: that must not be the app's."""
+def test_the_app_is_not_blocked_during_a_reconnect() -> None:
+    """The library holds the interpreter's lock while it starts, so it must not run in the app's process."""
     turns, longest, ending = 0, 0.0, threading.Event()
 
     def count() -> None:
@@ -307,7 +304,7 @@ def test_the_app_goes_on_while_a_camera_is_looked_for() -> None:
     assert longest < 0.15, "a dead-man that is silent for so long stops the arm"
 
 
-def test_a_program_that_forgets_to_close_ends_well() -> None:
+def test_a_program_that_does_not_close_leaves_no_process() -> None:
     program = textwrap.dedent(
         """
         from tests.wire.realsense_bench import RealSenseCamera, software
@@ -324,12 +321,12 @@ def test_a_program_that_forgets_to_close_ends_well() -> None:
     wait_until(lambda: not os.path.exists(f"/proc/{pid}"), 3.0)
 
 
-def test_before_the_first_picture_automatic_exposure_settles() -> None:
+def test_automatic_exposure_settles_before_the_first_frame() -> None:
     with opened(software(warm_up_s=0.5)) as cam:
         frame = cam.read(timeout=5.0)
         assert frame.stamp.seq >= 10
     with opened(software(warm_up_s=0.5, options={"color": {"exposure": 100}, "depth": {"exposure": 100}})) as cam:
-        assert cam.read(timeout=5.0).stamp.seq < 10, "nothing is automatic"
+        assert cam.read(timeout=5.0).stamp.seq < 10, "no exposure is automatic"
 
 
 def test_latest_never_waits() -> None:

@@ -13,7 +13,7 @@ from hal.drivers.realsense.ring import SLOTS, PictureRing
 from hal.errors import ConnectionLost
 from hal.specs import CameraSpec
 
-from .test_realsense_settings import camera
+from .test_realsense_options import camera
 
 
 @pytest.fixture

@@ -1,4 +1,4 @@
-"""The library's lenses, in OpenCV's terms."""
+"""Conversion of the library's intrinsics and extrinsics."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ import pytest
 
 rs = pytest.importorskip("pyrealsense2", reason="needs pyrealsense2: pip install 'robot-hal[realsense]'")
 
-from hal.drivers.realsense.lens import lens_of, pose_of  # noqa: E402
+from hal.drivers.realsense.pipeline import convert_extrinsics, convert_intrinsics  # noqa: E402
 
 D455 = [-0.0567, 0.0669, 0.0004, -0.0006, -0.0212]
-"""Distortion of a colour sensor of that kind, about."""
+"""Distortion of a D455's colour sensor, roughly."""
 
 
 def intrinsics(model: Any, coefficients: list[float]) -> Any:
@@ -23,7 +23,7 @@ def intrinsics(model: Any, coefficients: list[float]) -> Any:
 
 
 def projected(rays: np.ndarray, K: np.ndarray, distortion: np.ndarray) -> np.ndarray:
-    """OpenCV's documented formula, written down once more."""
+    """OpenCV's documented formula."""
     x, y = rays[:, 0] / rays[:, 2], rays[:, 1] / rays[:, 2]
     k1, k2, p1, p2, k3 = distortion
     r2 = x * x + y * y
@@ -46,11 +46,11 @@ PIXELS = [[u, v] for u in (0.0, 17.0, 300.5, 636.5, 900.0, 1279.0) for v in (0.0
         ("inverse_brown_conrady", D455, 0.05),
     ],
 )
-def test_a_ray_of_the_library_meets_the_same_pixel_by_opencvs_formula(
+def test_the_librarys_rays_project_to_the_same_pixels_with_opencv(
     model: str, coefficients: list[float], bound: float
 ) -> None:
     camera = intrinsics(getattr(rs.distortion, model), coefficients)
-    lens = lens_of(camera)
+    lens = convert_intrinsics(camera)
     rays = np.array([rs.rs2_deproject_pixel_to_point(camera, pixel, 1.3) for pixel in PIXELS])
     misses = np.hypot(*(projected(rays, lens.K, lens.distortion) - PIXELS).T)
     assert misses.max() <= bound
@@ -58,26 +58,26 @@ def test_a_ray_of_the_library_meets_the_same_pixel_by_opencvs_formula(
     assert (lens.distortion == 0.0).all() == (not any(coefficients))
 
 
-def test_what_the_library_only_takes_from_rays_to_pixels() -> None:
+def test_a_model_that_the_library_only_projects() -> None:
     camera = intrinsics(rs.distortion.modified_brown_conrady, D455)
-    lens = lens_of(camera)
+    lens = convert_intrinsics(camera)
     rays = np.array([[x, y, 1.0] for x in (-0.9, -0.4, 0.0, 0.3, 0.9) for y in (-0.5, 0.0, 0.2, 0.5)])
     pixels = np.array([rs.rs2_project_point_to_pixel(camera, ray.tolist()) for ray in rays])
     assert np.hypot(*(projected(rays, lens.K, lens.distortion) - pixels).T).max() <= 0.05
     straight = np.hypot(*(projected(rays, lens.K, np.zeros(5)) - pixels).T)
-    assert straight.max() > 5.0, "else there is nothing to fit"
+    assert straight.max() > 5.0, "the distortion matters"
 
 
-def test_the_centre_of_the_first_pixel_is_zero() -> None:
+def test_pixel_zero_is_the_centre_of_the_first_pixel() -> None:
     """A point on the optical axis is seen at the principal point, and no half pixel is added."""
     camera = intrinsics(rs.distortion.none, [0.0] * 5)
     assert rs.rs2_project_point_to_pixel(camera, [0.0, 0.0, 1.0]) == pytest.approx([636.5, 363.25])
-    assert lens_of(camera).K[0, 2] == 636.5
+    assert convert_intrinsics(camera).K[0, 2] == 636.5
 
 
-def test_extrinsics_are_the_pose_of_the_first_in_the_second() -> None:
+def test_extrinsics_become_the_pose_of_the_first_in_the_second() -> None:
     made = rs.extrinsics()
     made.rotation = [0.0, 1.0, 0.0, -1.0, 0.0, 0.0, 0.0, 0.0, 1.0]
     made.translation = [0.1, 0.2, 0.3]
     point = [1.0, 2.0, 3.0]
-    assert np.allclose(pose_of(made).transform(point), rs.rs2_transform_point_to_point(made, point))
+    assert np.allclose(convert_extrinsics(made).transform(point), rs.rs2_transform_point_to_point(made, point))

@@ -1,0 +1,131 @@
+"""What a rig file may set for a RealSense; the check needs no library."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from hal.config import load
+from hal.drivers.realsense.options import RealSenseSettings, problems
+from hal.errors import ConfigError
+from hal.specs import CameraSpec, SensorSpec
+
+K = ((600.0, 0.0, 319.5), (0.0, 600.0, 239.5), (0.0, 0.0, 1.0))
+
+
+def camera(**options: Any) -> CameraSpec:
+    return CameraSpec(
+        name="wrist",
+        model="realsense_d435",
+        driver="realsense",
+        capture_width=640,
+        capture_height=480,
+        width=640,
+        height=480,
+        rate_hz=30.0,
+        K=K,
+        distortion=(0.0,) * 5,
+        depth_min=0.2,
+        depth_max=5.0,
+        streams=("color", "depth"),
+        view=None,
+        options=options,
+    )
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {},
+        {"serial": "0123456789"},
+        {"options": {"laser_power": 150, "depth": {"exposure": 8500, "enable_auto_exposure": False}}},
+        {"options": {"visual_preset": "high_accuracy"}, "warm_up_s": 0, "stall_s": 0.5},
+        {"record": "today.db3", "overwrite": True},
+        {"emulated": True},
+        {"emulated": {"pattern": "scene", "drift_ppm": 20.0}},
+        {"emulated": False, "serial": None},
+    ],
+)
+def test_valid_options(options: dict[str, Any]) -> None:
+    assert list(problems(camera(**options))) == []
+    RealSenseSettings.from_spec(camera(**options))
+
+
+def test_options_of_a_recording(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("HOME", str(tmp_path))
+    options = {"play": "~/today.db3", "repeat": False, "paced": False}
+    assert [key for key, _ in problems(camera(**options))] == ["real.play"]
+    (tmp_path / "today.db3").touch()
+    assert list(problems(camera(**options))) == []
+    assert RealSenseSettings.from_spec(camera(**options)).play == str(tmp_path / "today.db3")
+
+
+def test_the_folder_of_a_recording_must_exist(tmp_path: Path) -> None:
+    assert list(problems(camera(record=str(tmp_path / "today.db3")))) == []
+    found = problems(camera(record=str(tmp_path / "none" / "today.db3")))
+    assert [key for key, _ in found] == ["real.record"]
+
+
+@pytest.mark.parametrize(
+    ("options", "key"),
+    [
+        ({"serial": 123456789}, "real.serial"),
+        ({"serial": ""}, "real.serial"),
+        ({"serail": "1"}, "real.serail"),
+        ({"record": "today.bag"}, "real.record"),
+        ({"play": "today"}, "real.play"),
+        ({"play": "a.db3", "record": "b.db3"}, "real"),
+        ({"play": "a.db3", "emulated": True}, "real"),
+        ({"play": "a.db3", "options": {"laser_power": 150}}, "real"),
+        ({"paced": False}, "real"),
+        ({"repeat": True, "emulated": True}, "real"),
+        ({"overwrite": True}, "real"),
+        ({"stall_s": 0}, "real.stall_s"),
+        ({"warm_up_s": -1}, "real.warm_up_s"),
+        ({"options": [1]}, "real.options"),
+        ({"options": {"gain": None}}, "real.options"),
+        ({"options": {"color": 3}}, "real.options"),
+        ({"options": {"depth": {"gain": [1]}}}, "real.options"),
+        ({"emulated": {"patern": "test"}}, "real.emulated"),
+        ({"emulated": "yes"}, "real.emulated"),
+        ({"paced": "no"}, "real.paced"),
+    ],
+)
+def test_wrong_options(options: dict[str, Any], key: str) -> None:
+    assert [place for place, _ in problems(camera(**options))] == [key]
+    with pytest.raises(ConfigError) as caught:
+        RealSenseSettings.from_spec(camera(**options))
+    assert {problem.file for problem in caught.value.problems} == {"cameras.wrist.real"}
+
+
+def test_streams_and_formats_must_be_known() -> None:
+    wrong = replace(
+        camera(),
+        streams=("color", "segmentation"),
+        sensors={"color": SensorSpec(640, 480, 30.0, K, "y16")},
+    )
+    assert {key for key, _ in problems(wrong)} == {"streams.segmentation", "streams.color.format"}
+
+
+@pytest.mark.parametrize("align", ["color", "depth"])
+def test_the_stream_to_align_to_must_be_on(align: str) -> None:
+    other = "depth" if align == "color" else "color"
+    pose = {"position": [0, 0, 1], "orientation": [0, 0, 0, 1]}
+    wrong = {"sim": False, "model": "realsense_d435", "streams": [other], "align": align, "pose": pose}
+    with pytest.raises(ConfigError) as caught:
+        load({"cameras": {"wrist": wrong}}).resolve()
+    assert [problem.key for problem in caught.value.problems] == ["cameras.wrist.align"]
+
+
+def test_the_check_needs_no_library() -> None:
+    program = (
+        "import sys; sys.modules['pyrealsense2'] = None\n"
+        "from hal.drivers.realsense import options\n"
+        "assert list(options.FORMATS) == ['color', 'depth', 'infrared', 'infrared_right']"
+    )
+    subprocess.run([sys.executable, "-c", program], check=True, timeout=60)
