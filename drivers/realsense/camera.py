@@ -11,11 +11,10 @@ from contextlib import suppress
 from types import MappingProxyType
 from typing import Any
 
-from hal.camera_driver import CameraDriver, CameraTally, RawFrame
-from hal.camera_info import CameraInfo, StreamInfo
+from hal.driver import CameraDriver, CameraInfo, CameraTally, RawFrame, StreamInfo
 from hal.errors import ConnectionLost, DeviceNotFound
+from hal.geometry import Pose, frozen
 from hal.host.process import Child, SharedMemory, unpack_error
-from hal.pose import Pose, frozen
 from hal.specs import CameraSpec, to_json
 
 from .options import RealSenseSettings

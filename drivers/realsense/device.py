@@ -17,8 +17,8 @@ from typing import Any, NamedTuple
 
 import pyrealsense2 as rs
 
-from hal.claim import Claim
 from hal.errors import ConnectionLost, ControlTaken, DeviceNotFound, NotSupported
+from hal.lock import DeviceLock
 from hal.specs import CameraSpec
 
 from .options import RealSenseSettings, apply_options, find_sensors, has_auto_exposure, read_options
@@ -56,7 +56,7 @@ class RealSenseDevice:
         self._ring = ring
         self._notify = notify
         self._context, self._emulated = self._create_context(spec)
-        self._lock: Claim | None = None
+        self._lock: DeviceLock | None = None
         self._recordings: RecordingFiles | None = None
         if self._settings.record is not None:
             self._recordings = RecordingFiles(self._settings.record, spec.name, self._settings.overwrite)
@@ -90,12 +90,12 @@ class RealSenseDevice:
             first: A recording made now is the first one of the program.
 
         Returns:
-            The camera's description as plain data: the fields of :class:`~hal.camera_info.CameraInfo`, ``notes`` (what
+            The camera's description as plain data: the fields of :class:`~hal.driver.CameraInfo`, ``notes`` (what
             was changed beyond the rig file), ``before`` (number of the last frame of an earlier session) and
             ``residual`` (pixels, see :class:`.pipeline.LensModel`).
 
         Raises:
-            HalError: As :meth:`hal.camera_driver.CameraDriver.open`. A ConnectionLost of a camera that is connected
+            HalError: As :meth:`hal.driver.CameraDriver.open`. A ConnectionLost of a camera that is connected
                 and not in use has the code ``no_frames``.
         """
         self.close()
@@ -290,13 +290,13 @@ def find_camera(context: Any, serial: str | None, name: str = "") -> ConnectedCa
     raise DeviceNotFound(text, code="several_devices")
 
 
-def lock_camera(serial: str) -> Claim:
+def lock_camera(serial: str) -> DeviceLock:
     """Lock the camera with that serial number for this process.
 
     Raises:
         ControlTaken: If another program has it; names that program's process.
     """
-    return Claim(f"realsense-{serial}", f"camera {serial}")
+    return DeviceLock(f"realsense-{serial}", f"camera {serial}")
 
 
 def _describe(device: Any, serial: str) -> ConnectedCamera:
@@ -380,7 +380,7 @@ class _FileLock:
         """Acquire the lock; raises ControlTaken, which names both cameras."""
         key = "recording-" + hashlib.sha256(os.path.realpath(path).encode()).hexdigest()[:32]
         try:
-            self._lock = Claim(key, str(path))
+            self._lock = DeviceLock(key, str(path))
         except ControlTaken:
             text = f"camera {camera} is to record to {path}, which {_find_writer(key)} records to: use two files"
             raise ControlTaken(text, code="recording_in_use") from None

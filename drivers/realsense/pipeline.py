@@ -14,8 +14,8 @@ import pyrealsense2 as rs
 from numpy.typing import NDArray
 
 from hal.errors import ConnectionLost, ControlTaken, NotSupported
+from hal.geometry import Pose
 from hal.images import Cropping
-from hal.pose import Pose
 from hal.specs import CameraSpec, SensorSpec
 
 from .options import FORMATS
@@ -284,7 +284,7 @@ def describe_optics(
 
     Returns:
         ``streams``, ``K``, ``distortion``, ``K_infrared`` and ``depth_scale`` of
-        :class:`~hal.camera_info.CameraInfo`, and ``residual``: the largest of all streams (:class:`LensModel`), pixels.
+        :class:`~hal.driver.CameraInfo`, and ``residual``: the largest of all streams (:class:`LensModel`), pixels.
     """
     color = profiles.get("color") or _any_color_profile(device)
     streams, lenses = {}, {}

@@ -6,10 +6,10 @@ import time
 from collections.abc import Iterator
 from dataclasses import replace
 
-from hal.camera_info import CameraInfo
+from hal.driver import CameraInfo
 from hal.errors import ConnectionLost, ControlTaken, DeviceNotFound, HalError, NotSupported
+from hal.preflight import CheckResult
 from hal.specs import CameraSpec
-from hal.verdict import Verdict
 
 from .camera import RealSenseCamera
 
@@ -32,7 +32,7 @@ _REMEDIES: dict[type[HalError], str] = {
 }
 
 
-def preflight(spec: CameraSpec, duration: float) -> Iterator[Verdict]:
+def preflight(spec: CameraSpec, duration: float) -> Iterator[CheckResult]:
     """Open the camera, measure its frames, and close it. Nothing is recorded: ``record`` is ignored.
 
     Args:
@@ -49,25 +49,25 @@ def preflight(spec: CameraSpec, duration: float) -> Iterator[Verdict]:
             driver.open()
         except HalError as error:
             remedy = next((text for kind, text in _REMEDIES.items() if isinstance(error, kind)), "")
-            yield Verdict("camera", "fail", str(error), remedy)
+            yield CheckResult("camera", "fail", str(error), remedy)
             return
         info = driver.info
-        yield Verdict("camera", "ok", f"{info.title}, serial {info.serial}, firmware {info.firmware}")
+        yield CheckResult("camera", "ok", f"{info.title}, serial {info.serial}, firmware {info.firmware}")
         yield _check_link(info)
         yield _check_frames(driver, spec, duration)
     finally:
         driver.close()
 
 
-def _check_link(info: CameraInfo) -> Verdict:
+def _check_link(info: CameraInfo) -> CheckResult:
     if info.usb is None:
-        return Verdict("USB", "unknown", "the camera does not report its USB version")
+        return CheckResult("USB", "unknown", "the camera does not report its USB version")
     if info.usb.startswith("2"):
-        return Verdict("USB", "warn", f"USB {info.usb}: fewer modes, and frames get lost", _CABLE)
-    return Verdict("USB", "ok", f"USB {info.usb}")
+        return CheckResult("USB", "warn", f"USB {info.usb}: fewer modes, and frames get lost", _CABLE)
+    return CheckResult("USB", "ok", f"USB {info.usb}")
 
 
-def _check_frames(driver: RealSenseCamera, spec: CameraSpec, duration: float) -> Verdict:
+def _check_frames(driver: RealSenseCamera, spec: CameraSpec, duration: float) -> CheckResult:
     """Measure the rate of the captures, and the share that is lost."""
     nominal = min((stream.rate_hz for stream in driver.info.streams.values()), default=spec.rate_hz)
     deadline = time.monotonic() + _SETTLE
@@ -77,14 +77,14 @@ def _check_frames(driver: RealSenseCamera, spec: CameraSpec, duration: float) ->
         while first is None and time.monotonic() < deadline:
             first = driver.grab(_GRAB)
         if first is None:
-            return Verdict("frames", "fail", "no frame arrived", _REMEDIES[ConnectionLost])
+            return CheckResult("frames", "fail", "no frame arrived", _REMEDIES[ConnectionLost])
         start, last = time.monotonic(), first
         while time.monotonic() - start < duration:
             frame = driver.grab(_GRAB)
             if frame is not None:
                 frames, last = frames + 1, frame
     except ConnectionLost as error:
-        return Verdict("frames", "fail", str(error), _REMEDIES[ConnectionLost])
+        return CheckResult("frames", "fail", str(error), _REMEDIES[ConnectionLost])
     passed = last.t - first.t
     rate = frames / passed if passed > 0.0 else 0.0
     lost = last.seq - first.seq - frames
@@ -92,7 +92,7 @@ def _check_frames(driver: RealSenseCamera, spec: CameraSpec, duration: float) ->
     if driver.tally.mismatched:
         found += f", {driver.tally.mismatched} frame sets that do not match"
     if rate < _SLOW * nominal and not lost:
-        return Verdict("frames", "warn", found, _DARK)
+        return CheckResult("frames", "warn", found, _DARK)
     if rate < _SLOW * nominal or lost > 0.02 * (frames + lost):
-        return Verdict("frames", "warn", found, _LOAD)
-    return Verdict("frames", "ok", found)
+        return CheckResult("frames", "warn", found, _LOAD)
+    return CheckResult("frames", "ok", found)

@@ -18,7 +18,7 @@ import numpy as np
 import pyrealsense2 as rs
 from numpy.typing import NDArray
 
-from hal.camera_driver import CameraTally
+from hal.driver import CameraTally
 from hal.errors import ConnectionLost
 from hal.host.process import pack_error
 from hal.images import Cropping

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hal.errors import DriverMissing
-from hal.pose import Pose, quaternion_to_matrix
+from hal.geometry import Pose, quaternion_to_matrix
 
 from .pictures import DEPTH_UNIT, EmulatedStream, PinholeLens, StreamMode
 

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from hal.pose import Pose, quaternion_to_matrix
+from hal.geometry import Pose, quaternion_to_matrix
 from hal.specs import CameraSpec
 
 __all__ = [
