@@ -12,7 +12,7 @@ import pytest
 
 from hal.camera import Camera
 from hal.clock import RealClock
-from hal.errors import ConnectionLost
+from hal.errors import ConnectionLost, HalError
 from hal.specs import CameraSpec, SensorSpec
 from hal.types import Frame
 
@@ -73,6 +73,17 @@ def opened(camera: CameraSpec) -> Iterator[Camera]:
         yield it
     finally:
         it.close()
+
+
+def open_error(camera: CameraSpec) -> HalError:
+    """Return the error with which a camera does not open."""
+    driver = RealSenseCamera(camera)
+    try:
+        with pytest.raises(HalError) as caught:
+            driver.open()
+        return caught.value
+    finally:
+        driver.close()
 
 
 def software(*streams: str, emulated: Any = True, warm_up_s: float = 0.0, **changes: Any) -> CameraSpec:
