@@ -14,9 +14,8 @@ from typing import Annotated, Any, NamedTuple, TypeAlias
 
 from pydantic import BeforeValidator, Field, model_validator
 
-from hal.config.files import Problems
+from hal.config.files import Problems, validate
 from hal.config.schema import Flag, Quantity, Seconds, Strict, describe, is_number
-from hal.config.validation import validate
 from hal.errors import CommandError, ConfigError, NotSupported
 from hal.specs import CameraSpec
 
