@@ -11,7 +11,7 @@ import argparse
 import sys
 from typing import TYPE_CHECKING
 
-from hal.apps.cli import ACTION_NEEDED, add_rig_options, rig_options, run_app
+from hal.apps._common import ACTION_NEEDED, add_rig_options, rig_options, run_app
 
 if TYPE_CHECKING:
     from hal.calibration import Board, Calibration
@@ -98,9 +98,8 @@ def _print_board(args: argparse.Namespace) -> int:
 
 def _main(args: argparse.Namespace) -> int:
     import hal
-    from hal.apps.banner import banner, invitation, listing
+    from hal.apps._common import banner, check_everything, invitation, listing
     from hal.apps.check import may_open
-    from hal.apps.opening import check_everything
     from hal.calibration import solve
     from hal.calibration.checks import LEAST_VIEWS
     from hal.calibration.collecting import Collector

@@ -11,7 +11,7 @@ import os
 import sys
 from pathlib import Path
 
-from hal.apps.cli import ACTION_NEEDED, add_driving_options, add_rig_options, rig_options, run_app
+from hal.apps._common import ACTION_NEEDED, add_driving_options, add_rig_options, rig_options, run_app
 
 NOT_THERE = (
     "--pad demo reaches to where --seed 0 puts the cube in the first two episodes of a new folder; here it lies "
@@ -63,17 +63,15 @@ def main(argv: list[str] | None = None) -> int:
 
 def _main(args: argparse.Namespace) -> int:
     import hal
-    from hal.apps.banner import banner
+    from hal.apps._common import banner, check_writable, planned
     from hal.apps.check import may_open
-    from hal.apps.collecting import Collection, lifts_cube
+    from hal.apps.collecting import DemonstrationSession, lifts_cube
     from hal.apps.driving import check_driving, chosen_devices
-    from hal.apps.opening import planned
-    from hal.apps.report import check_writable
     from hal.config.data_files import data_folder
     from hal.errors import CommandError
     from hal.learning.policy import found
     from hal.recording import Recorder, recover
-    from hal.recording.library import require
+    from hal.recording.layout import require
 
     check_driving(args)
     if args.episodes < 1:
@@ -120,7 +118,7 @@ def _main(args: argparse.Namespace) -> int:
                     notes.append(NOT_THERE)
             for note in notes:
                 print(f"  note     {note}")
-            return Collection(rig, robot, pad, recorder, args, judge).run()
+            return DemonstrationSession(rig, robot, pad, recorder, args, judge).run()
 
 
 if __name__ == "__main__":

@@ -4,25 +4,21 @@ from __future__ import annotations
 
 import argparse
 import json
-from collections.abc import Callable, Iterator
-from concurrent.futures import wait
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor, wait
+from dataclasses import dataclass
 from pathlib import Path
 from queue import Empty, SimpleQueue
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, TypeVar
 
-from hal.apps.beginning import Beginning
-from hal.apps.cli import ACTION_NEEDED
-from hal.apps.collected import Kept, summary
-from hal.apps.driving import Driving
-from hal.apps.prompts import Prompts
-from hal.apps.taping import Tape
+from hal.apps._common import ACTION_NEEDED
+from hal.apps.driving import Beginning, Driving
 from hal.errors import HalError
 from hal.learning.episode import stands_in_world
 from hal.views import ACTIONS
 
 if TYPE_CHECKING:
-    from concurrent.futures import Future
-
+    from hal.config.mapping import TeleopMapping
     from hal.gamepad import Gamepad
     from hal.observation import Observation
     from hal.recording import Recorder, RecorderStatus
@@ -30,7 +26,164 @@ if TYPE_CHECKING:
     from hal.robot import Robot
     from hal.types import PadState
 
-__all__ = ["Collection", "lifts_cube", "seed_of"]
+__all__ = [
+    "DemonstrationSession",
+    "Kept",
+    "Prompts",
+    "Tape",
+    "called",
+    "lifts_cube",
+    "seed_of",
+    "summary",
+]
+
+# [taping.py] A recorder for a program whose loop must not wait.
+
+T = TypeVar("T")
+
+
+class Tape:
+    """What takes long is done one after the other in a thread of its own; in lock-step at once, as time stands still.
+
+    :meth:`start` and :meth:`discard` come back with a future, which has the error where there was one.
+    """
+
+    def __init__(self, recorder: Recorder) -> None:
+        self.recorder = recorder
+        self._at_once = recorder.rig.lock_step
+        self._thread = ThreadPoolExecutor(1, "hal-tape")
+
+    def start(self, seed: int, info: Mapping[str, Any]) -> Future[None]:
+        """Begin an episode, once the last one is saved."""
+        return self._do(lambda: self.recorder.start(seed=seed, info=info))
+
+    def save(self, success: bool | None) -> Future[RecorderStatus]:
+        """End it now, and keep it; how many rows it has is known when that is done, later in any case.
+
+        Raises CommandError where none is being recorded.
+        """
+        self.recorder.save(success)
+        return self._thread.submit(self._saved)
+
+    def _saved(self) -> RecorderStatus:
+        self.recorder.wait_saved()
+        return self.recorder.status()
+
+    def discard(self) -> Future[None]:
+        """Forget it."""
+        return self._do(self.recorder.discard)
+
+    def _do(self, what: Callable[[], T]) -> Future[T]:
+        if not self._at_once:
+            return self._thread.submit(what)
+        done: Future[T] = Future()
+        try:
+            done.set_result(what())
+        except Exception as error:
+            done.set_exception(error)
+        return done
+
+    def keep(self) -> Future[RecorderStatus] | None:
+        """End what is still being recorded and keep it, unmarked; None where nothing is."""
+        self._do(lambda: None).result()  # a start that was under way is over
+        return self.save(None) if self.recorder.status().state == "recording" else None
+
+    def close(self) -> None:
+        """Wait for all of that. May be called again where that was interrupted."""
+        self._thread.shutdown()
+        self.recorder.close()
+
+
+# [prompts.py] What a person who collects demonstrations is told to do, in the words of what they drive with.
+
+SONY = {"south": "Cross", "east": "Circle", "west": "Square", "north": "Triangle", "home": "PS"}
+
+
+class Prompts:
+    """One line for each moment."""
+
+    def __init__(self, rig: Rig, robot: Robot, drives_home: bool) -> None:
+        """``drives_home``: is the arm one that drives to where an episode starts, and nobody puts things back?"""
+        self._by_page = rig.console is not None and rig.console.driven_by is None
+        self._has_page = rig.console is not None
+        self._drives_home = drives_home
+        self._has_gripper = robot.gripper is not None
+
+    def now(self, phase: str, actions: tuple[str, ...], mapping: TeleopMapping) -> str:
+        """What a person should do in this phase, in which ``actions`` are possible; nothing where they only wait."""
+        if phase == "resetting":
+            then = "; then its gripper opens" if self._has_gripper else ""
+            return f"let go of {mapping.deadman}, then hold it until the arm is home{then}" if self._drives_home else ""
+        place = "put everything where it starts; " if self._drives_home and phase == "ready" else ""
+        return f"{place}{self.buttons(actions, mapping, phase)}" if actions else ""
+
+    def buttons(self, actions: Collection[str], mapping: TeleopMapping, phase: str = "recording") -> str:
+        """What these actions are done with."""
+        if self._by_page:
+            shuffle = '; "Discard" shuffles the objects' if phase == "ready" and "discard" in actions else ""
+            return f"press Record{shuffle}" if "record" in actions else ""  # the other buttons say what they do
+        words = {
+            "record": "starts the recording",
+            "finish": "saves it as a success",
+            "fail": "saves it as a failure",
+            "discard": "puts things elsewhere"
+            if phase == "ready"
+            else f"forgets it, once {mapping.deadman} is let go of",
+        }
+        names = {action: called(button) for action, button in mapping.actions.items()}
+        told = [f"{names[action]} {words[action]}" for action in actions if action in names]
+        return ", ".join(told) or ("the page has the buttons" if self._has_page else "this pad has no buttons for it")
+
+
+def called(button: str) -> str:
+    """A button's name, with that on the tutorial's pad."""
+    return f"{button} ({SONY[button]})" if button in SONY else button
+
+
+# [collected.py] What a run of ``apps/collect.py`` has collected.
+
+
+@dataclass(frozen=True, slots=True)
+class Kept:
+    """An episode that is being saved, or is."""
+
+    number: int
+    seed: int
+    success: bool | None
+    """None where nobody said: the run ended while it was recorded."""
+    status: Future[RecorderStatus]
+    """The recorder's, once it is saved."""
+
+    @property
+    def failure(self) -> str:
+        """Why it could not be saved; nothing as long as that is not so."""
+        return str(self.status.exception()) if self.status.done() and self.status.exception() is not None else ""
+
+    def as_json(self) -> dict[str, Any]:
+        """For a report, once it is saved or failed."""
+        said = {"number": self.number, "seed": self.seed, "success": self.success, "failure": self.failure}
+        return said if self.failure else said | self.status.result()._asdict()
+
+
+def summary(kept: Sequence[Kept], root: Path, discarded: int, ended: str) -> Iterator[str]:
+    """How it went, for people, when everything is saved or failed; ``ended`` is why it ended early."""
+    saved = [one for one in kept if not one.failure]
+    for one in kept:
+        if one.failure:
+            yield f"NOT SAVED: episode {one.number}: {one.failure}"
+    if ended:
+        yield f"ended: {ended}"
+    found = [one.status.result() for one in saved]
+    rows, seconds = sum(status.frames for status in found), sum(status.seconds for status in found)
+    dropped, marks = sum(status.dropped for status in found), [one.success for one in saved]
+    unmarked = f", {marks.count(None)} not marked" if None in marks else ""
+    yield (
+        f"{len(saved)} episode(s) saved in {root}: {rows} rows, {seconds:.1f} s, {dropped} dropped; "
+        f"{marks.count(True)} succeeded, {marks.count(False)} failed{unmarked}, {discarded} forgotten"
+    )
+    if saved:
+        yield f"look at them: hal-review {root}"
+
 
 Judge = Callable[["Rig", "Observation"], bool]
 
@@ -48,7 +201,7 @@ SAVED, DISCARDED, ANEW = "saved", "discarded", "anew"
 """Why a try ended, where another one follows."""
 
 
-class Collection:
+class DemonstrationSession:
     """One run of ``apps/collect.py``."""
 
     def __init__(
@@ -93,7 +246,7 @@ class Collection:
 
     def run(self) -> int:
         """All episodes, or until Ctrl-C or the end of a recorded pad; then everything is saved, and told."""
-        from hal.apps.banner import invitation
+        from hal.apps._common import invitation
 
         ended, failed = "", False
         self._check_buttons()

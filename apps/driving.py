@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable
-from typing import TYPE_CHECKING, TypeVar
+from functools import partial
+from typing import TYPE_CHECKING, Any, TypeVar
 
-from hal.apps.status import StatusLine
+from hal.apps._common import StatusLine
+from hal.errors import HalError, MotionStopped
 
 if TYPE_CHECKING:
     from hal.commands import Twist
@@ -18,7 +20,109 @@ if TYPE_CHECKING:
     from hal.teleop import Teleop
     from hal.types import PadState
 
-__all__ = ["Driving", "check_driving", "chosen_devices"]
+__all__ = [
+    "Beginning",
+    "Driving",
+    "Steering",
+    "check_driving",
+    "chosen_devices",
+]
+
+# [steering.py] What the controls of a pad do in an app: the mapping that was asked for, or the one that the pad
+# is meant for.
+
+
+class Steering:
+    """The mapping of a pad, which changes with the pad: a SpaceMouse may be plugged in where a gamepad was before."""
+
+    teleop: Teleop
+    deadman: Deadman
+    mapping = ""
+
+    def __init__(
+        self,
+        rig: Rig,
+        robot: Robot,
+        pad: Gamepad,
+        asked: str | None,
+        speed: float,
+        actions: tuple[str, ...] = (),
+        settings: tuple[str, ...] = (),
+    ) -> None:
+        """Use the mapping that is due now.
+
+        Args:
+            asked: The mapping that the user wants, whatever the pad is.
+            speed: Share of the mapping's speeds; the console cannot exceed it.
+            actions: Those of the mapping that the app knows.
+            settings: Those of ``hal.views.SETTINGS`` that the console may change.
+
+        Raises:
+            ConfigError: For a bad mapping.
+        """
+        self._rig, self._robot, self._pad, self._asked = rig, robot, pad, asked
+        self._speed = self._speed_max = speed
+        self._actions, self._settings = actions, settings
+        self.take()
+
+    def _wanted(self) -> str:
+        """While no pad is there, the one before."""
+        if self._asked or (self.mapping and not self._pad.state().connected):
+            return self._asked or self.mapping
+        return self._pad.mapping or "default"
+
+    @property
+    def is_due(self) -> bool:
+        """Was a pad plugged in that is meant for another mapping?"""
+        return self._wanted() != self.mapping
+
+    def distrust(self) -> str:
+        """Why that pad may not drive this arm; nothing where it may."""
+        spec = self._robot.spec
+        return (self._pad.distrust() or "") if spec.attended and not spec.emulated else ""
+
+    def take(self) -> None:
+        """Use the mapping that is due. Its dead-man must be released and pressed before it counts."""
+        import hal
+
+        self.mapping = self._wanted()
+        self.teleop = hal.Teleop(self._robot, mapping=self.mapping, speed=self._speed)
+        self.deadman = self._pad.hold(self.teleop.mapping.deadman)
+        self._show()
+
+    def drive(self, robot: Robot) -> None:
+        """Drive this arm from the next session on."""
+        self._robot = robot
+        self.take()
+
+    def set_speed(self, speed: float) -> None:
+        """Drive at this share of the mapping's speeds, or at the greatest one that is allowed."""
+        self._speed = self.teleop.speed = min(speed, self._speed_max)
+        self._show()
+
+    def set_frame(self, frame: str) -> None:
+        """Move along the axes of the arm's base, or of its tool."""
+        self.teleop.frame = "tcp" if frame == "tcp" else "base"
+        self._show()
+
+    def _show(self) -> None:
+        """Show on the console's pages which arm is driven, and what the controls do."""
+        from hal.views import DrivingView
+
+        console, teleop = self._rig.console, self.teleop
+        if console is None:
+            return
+        console.explain(teleop.labels(actions=("home", *self._actions)))
+        view = DrivingView(self._robot.name, teleop.speed, self._speed_max, teleop.frame, self._settings)
+        console.show_driving(view)
+
+    def help(self) -> str:
+        """For people, some lines."""
+        about = self.teleop.mapping.description
+        drives = [f"drives {self._robot.name}"] if len(self._rig.robots) > 1 else []
+        lines = [*drives, f"mapping {self.mapping}{': ' if about else ''}{about}", *self.teleop.help(self._pad)]
+        return "\n".join(f"  {line}" for line in lines)
+
 
 RATE_HZ = 50.0
 STALE = 2.0
@@ -37,7 +141,7 @@ Look = Callable[["PadState"], str]
 
 
 def check_driving(args: argparse.Namespace) -> None:
-    """Raise what is wrong with the options of :func:`~hal.apps.cli.add_driving_options` before anything is opened."""
+    """Check the options of :func:`~hal.apps._common.add_driving_options` before anything is opened."""
     from hal.config.mapping import load_mapping
     from hal.errors import CommandError
     from hal.pads.choice import check_wanted
@@ -85,8 +189,8 @@ class Driving:
     ) -> None:
         """``actions`` are those of the mapping that the app knows. ``adjustable``: a page of the console may choose the
         arm, the speed and the frame, and reset a simulated scene."""
-        from hal.apps.report import RunReport
-        from hal.apps.steering import Steering
+        from hal.apps._common import RunReport
+        # FOLD: import dropped
 
         self.rig, self.robot, self.pad = rig, robot, pad
         self.report = RunReport(rig, robot)
@@ -345,3 +449,61 @@ class Driving:
             )
 
         self.line.update(text)
+
+
+# [beginning.py] How an episode begins where a person drives: everything goes back to where it starts, and a real
+# arm drives home.
+
+
+class Beginning:
+    """The arm moves only for a press of the dead-man that was made for this.
+
+    Neither the one that drove the episode before, nor one that is still held after a stop, drives it home.
+    """
+
+    def __init__(self, driving: Driving) -> None:
+        from hal.learning.episode import stands_in_world
+
+        self._driving = driving
+        self._rig, self._robot = driving.rig, driving.robot
+        self.drives_home = not stands_in_world(self._rig, self._robot)
+        """Has the arm to drive? A simulated one is put there."""
+
+    def put_back(self, seed: int, goes_on: Callable[[], bool]) -> bool:
+        """Until it is done, or ``goes_on()``, asked again and again, says no. ``seed``: of where things go."""
+        presses = self._driving.deadman.record.presses
+        while goes_on():
+            record = self._driving.deadman.record
+            if not self.drives_home or (record.held and record.presses > presses):
+                if self._driving.guarded(partial(self._reset, seed, presses)):
+                    self._open_hand()
+                    return True
+                presses = self._driving.deadman.record.presses  # whatever stopped it: a new press, then
+            else:
+                self._driving.take_other_pad()
+                self._rig.clock.sleep(AGAIN)
+        return False
+
+    def _reset(self, seed: int, since: int) -> bool:
+        """Was everything put back? Not where the dead-man was let go of."""
+        import numpy as np
+
+        from hal.learning.episode import put_back
+
+        deadman = self._driving.deadman
+        options: dict[str, Any] = {"deadman": deadman, "since": since, "patience": LET_GO, "hand": False}
+        try:
+            put_back(self._rig, self._robot, random=np.random.default_rng(seed), **options)
+        except MotionStopped:
+            if deadman.held or not deadman.connected or not self.drives_home:
+                raise
+            return False
+        return True
+
+    def _open_hand(self) -> None:
+        """At home. The arm goes on without one that cannot."""
+        if self.drives_home and self._robot.gripper is not None:
+            try:
+                self._robot.gripper.open()
+            except (HalError, OSError) as trouble:
+                self._driving.event(f"GRIPPER: {trouble}")

@@ -14,7 +14,7 @@ import time
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
-from hal.apps.cli import run_app
+from hal.apps._common import run_app
 
 if TYPE_CHECKING:
     from hal.recording.exporters import Progress

@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from hal.apps.cli import run_app
+from hal.apps._common import run_app
 
 if TYPE_CHECKING:
     from hal.ark import Imported, Options
@@ -125,7 +125,7 @@ def _report(imported: Imported) -> list[str]:
 
 def _write(texts: dict[Path, str], path: Path) -> None:
     """Write the rig's file ``path`` and the others, and tell what the rig has."""
-    from hal.apps.banner import listing
+    from hal.apps._common import listing
     from hal.config import load
 
     for file, text in texts.items():

@@ -13,7 +13,7 @@ import sys
 from importlib import import_module
 from pathlib import Path
 
-from hal.apps.cli import run_app
+from hal.apps._common import run_app
 
 __all__ = ["PROGRAMS", "main", "parser"]
 

@@ -12,7 +12,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from hal.apps.cli import ACTION_NEEDED, add_rig_options, rig_options, run_app
+from hal.apps._common import ACTION_NEEDED, add_rig_options, rig_options, run_app
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -57,11 +57,8 @@ def main(argv: list[str] | None = None) -> int:
 
 def _main(args: argparse.Namespace) -> int:
     import hal
-    from hal.apps.banner import banner, invitation
+    from hal.apps._common import banner, check_writable, held_by, invitation, needs_holding, planned
     from hal.apps.check import may_open
-    from hal.apps.holding import held_by, needs_holding
-    from hal.apps.opening import planned
-    from hal.apps.report import check_writable
     from hal.errors import CommandError
     from hal.recording import Dataset
     from hal.recording.checking import check_rows
@@ -122,7 +119,7 @@ class Replay:
     def __init__(
         self, rig: Rig, robot: Robot, episode: Episode, args: argparse.Namespace, deadman: Deadman | None, button: str
     ) -> None:
-        from hal.apps.status import StatusLine
+        from hal.apps._common import StatusLine
         from hal.learning.replay import Player, RecordedTrajectory
 
         self.rig, self.robot, self.episode, self.args, self.button = rig, robot, episode, args, button

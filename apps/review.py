@@ -15,14 +15,14 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from hal.apps.cli import ACTION_NEEDED, run_app
+from hal.apps._common import ACTION_NEEDED, run_app
 from hal.errors import CommandError, DatasetError
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from hal.recording.exporters.summary import Spread, Summary
-    from hal.recording.reader import Dataset, Episode
+    from hal.recording.dataset import Dataset, Episode
+    from hal.recording.review import Spread, Summary
 
 __all__ = ["main", "parser"]
 
@@ -69,8 +69,8 @@ def main(argv: list[str] | None = None) -> int:
 
 def _main(args: argparse.Namespace) -> int:
     from hal.recording import Dataset
-    from hal.recording.exporters.selection import chosen
-    from hal.recording.exporters.summary import as_json, summary
+    from hal.recording.exporters.content import chosen
+    from hal.recording.review import as_json, summary
 
     if args.repair:
         return _repair(args)
@@ -94,9 +94,8 @@ def _main(args: argparse.Namespace) -> int:
 
 
 def _check(args: argparse.Namespace, dataset: Dataset) -> int:
-    from hal.recording.checking import check_dataset
-    from hal.recording.exporters.selection import chosen
-    from hal.recording.index import repair_command
+    from hal.recording.checking import check_dataset, repair_command
+    from hal.recording.exporters.content import chosen
     from hal.recording.layout import Layout
 
     if args.png or args.rrd:
@@ -115,7 +114,7 @@ def _check(args: argparse.Namespace, dataset: Dataset) -> int:
 
 def _repair(args: argparse.Namespace) -> int:
     from hal.recording import Dataset, repair
-    from hal.recording.exporters.summary import summary
+    from hal.recording.review import summary
 
     if args.episode is not None or args.png or args.rrd or args.json:
         raise CommandError("--repair is for the whole dataset and takes no other option")
@@ -137,8 +136,7 @@ def _repair(args: argparse.Namespace) -> int:
 
 def _warn_of_index(dataset: Dataset, found: Summary) -> None:
     """Say what is wrong in ``meta/``, apart from the episodes that cannot be read."""
-    from hal.recording.checking import check_index
-    from hal.recording.index import repair_command
+    from hal.recording.checking import check_index, repair_command
     from hal.recording.layout import Layout
 
     layout = Layout(dataset.root)
@@ -159,7 +157,7 @@ def _drawn(args: argparse.Namespace, root: Path, episode: Episode) -> Iterator[P
             write_rrd(episode, new)
         yield path
     if args.png or not args.rrd:
-        from hal.recording.exporters.sheet import draw_sheet
+        from hal.recording.review import draw_sheet
 
         beside = root.with_name(f"{root.name}_episode_{episode.number:06d}.png")
         path = Path(args.png or beside).expanduser().absolute()
@@ -170,7 +168,7 @@ def _drawn(args: argparse.Namespace, root: Path, episode: Episode) -> Iterator[P
 
 def _table(found: Summary) -> Iterator[str]:
     """The numbers, line by line."""
-    from hal.recording.pace import SLOW
+    from hal.recording.layout import SLOW
 
     count = len(found.episodes)
     many = f"{count} episode{'' if count == 1 else 's'}"

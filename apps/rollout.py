@@ -14,8 +14,8 @@ import traceback
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from hal.apps.cli import ACTION_NEEDED, add_rig_options, rig_options, run_app
-from hal.apps.prompts import called
+from hal.apps._common import ACTION_NEEDED, add_rig_options, rig_options, run_app
+from hal.apps.collecting import called
 
 if TYPE_CHECKING:
     from hal.config.mapping import TeleopMapping
@@ -70,11 +70,8 @@ def main(argv: list[str] | None = None) -> int:
 
 def _main(args: argparse.Namespace) -> int:
     import hal
-    from hal.apps.banner import banner, invitation
+    from hal.apps._common import banner, check_writable, held_by, invitation, needs_holding, planned
     from hal.apps.check import may_open
-    from hal.apps.holding import held_by, needs_holding
-    from hal.apps.opening import planned
-    from hal.apps.report import check_writable
     from hal.errors import CommandError
     from hal.learning.policy import found
 
@@ -131,7 +128,7 @@ class Run:
         mapping: TeleopMapping | None,
     ) -> None:
         """``mapping`` says what the pad's controls are, where somebody holds one."""
-        from hal.apps.status import StatusLine
+        from hal.apps._common import StatusLine
         from hal.learning.policy import PolicyRunner, found, load_policy
 
         self.rig, self.robot, self.args, self.recorder = rig, robot, args, recorder

@@ -10,7 +10,7 @@ import argparse
 import sys
 from typing import TYPE_CHECKING
 
-from hal.apps.cli import ACTION_NEEDED, add_driving_options, add_rig_options, rig_options, run_app
+from hal.apps._common import ACTION_NEEDED, add_driving_options, add_rig_options, rig_options, run_app
 
 if TYPE_CHECKING:
     from hal.gamepad import Gamepad
@@ -40,17 +40,16 @@ def main(argv: list[str] | None = None) -> int:
 
 def _main(args: argparse.Namespace) -> int:
     import hal
-    from hal.apps.banner import banner
+    from hal.apps._common import banner, planned
     from hal.apps.check import may_open
     from hal.apps.driving import check_driving, chosen_devices
-    from hal.apps.opening import planned
     from hal.errors import CommandError
 
     check_driving(args)
     if args.duration is not None and not args.duration > 0.0:
         raise CommandError(f"--duration must be positive, not {args.duration:g}")
     if args.report:
-        from hal.apps.report import check_writable
+        from hal.apps._common import check_writable
 
         check_writable(args.report)
     plan = planned(args)
@@ -75,7 +74,7 @@ class Session:
 
     def run(self) -> int:
         """Drive until the time is over, the recording ends or Ctrl-C; then stop, report, close."""
-        from hal.apps.banner import invitation
+        from hal.apps._common import invitation
 
         driving, clean = self.driving, False
         try:

@@ -21,9 +21,9 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from .reader import Dataset, Episode
+    from .dataset import Dataset, Episode
+    from .finish import recover, repair
     from .recorder import Recorder, RecorderStatus
-    from .recovery import recover, repair
 
 __all__ = ["Dataset", "Episode", "Recorder", "RecorderStatus", "recover", "repair"]
 

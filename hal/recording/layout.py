@@ -4,19 +4,333 @@ from __future__ import annotations
 
 import contextlib
 import fcntl
+import importlib.util
 import json
 import math
+import operator
 import os
+import platform
 import shutil
+import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from dataclasses import asdict
+from datetime import datetime, timezone
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
-from ..errors import CommandError
-from .columns import video_key
+from ..errors import CommandError, DriverMissing
+from .sampling import CameraTrack
 
-__all__ = ["LIST", "Layout", "locked", "read_json", "sync", "write_json"]
+if TYPE_CHECKING:
+    from ..geometry import Pose
+    from ..rig import Rig
+
+__all__ = [
+    "ACTION",
+    "BOOKKEEPING",
+    "CameraSetup",
+    "Column",
+    "GRID",
+    "LIST",
+    "Layout",
+    "MORE_STREAMS",
+    "PAD",
+    "Pace",
+    "SEGMENTATION",
+    "SETPOINT",
+    "SLOW",
+    "STATE",
+    "TIMES",
+    "about_call",
+    "about_rig",
+    "about_start",
+    "features_of",
+    "locked",
+    "read_json",
+    "require",
+    "simulated_pace",
+    "sync",
+    "video_key",
+    "write_json",
+]
+
+# [columns.py] The columns of a recording: one row of plain numbers per grid time, and how a dataset announces
+# them.
+
+STATE = "observation.state"
+SETPOINT = "observation.setpoint"
+ACTION = "action"
+PAD = "observation.pad"
+"""No ``action.pad``: LeRobot takes every column whose name begins with ``action`` for an action."""
+TIMES = "observation.time."
+"""What stands first in these columns is a time, s: on the rig's clock while it is recorded, in the dataset since the
+episode's first row."""
+GRID = f"{TIMES}grid"
+
+SEGMENTATION = "segmentation"
+MORE_STREAMS = ("infrared", "infrared_right", SEGMENTATION)
+"""Streams of a camera that are recorded on request."""
+BOOKKEEPING: dict[str, str] = {
+    "timestamp": "float32",
+    "frame_index": "int64",
+    "episode_index": "int64",
+    "index": "int64",
+    "task_index": "int64",
+}
+"""Columns that every LeRobotDataset has, with their types."""
+
+
+class Column(NamedTuple):
+    """One column of the dataset: ``len(names)`` numbers in every row."""
+
+    key: str
+    dtype: str
+    """``float32``, ``float64`` or ``int64``, on disk; while a row is on its way, every number is a double."""
+    names: tuple[str, ...]
+
+    @property
+    def feature(self) -> dict[str, Any]:
+        """As ``meta/info.json`` says it."""
+        return {"dtype": self.dtype, "shape": [len(self.names)], "names": list(self.names)}
+
+
+class CameraSetup(NamedTuple):
+    """How the pictures of one camera are kept."""
+
+    name: str
+    width: int
+    height: int
+    color: bool
+    depth_unit: float | None
+    """Metres in one unit of the stored depth; None where no depth is kept."""
+    depth_lossless: bool
+    """Does the camera itself measure in that unit?"""
+    seq: int
+    """Which number of a row counts this camera's frames."""
+    more: Sequence[str] = ()
+    """Streams that are kept besides colour and depth: some of :data:`MORE_STREAMS`."""
+
+    @property
+    def videos(self) -> dict[str, str]:
+        """Names of the videos, each with its stream: ``wrist`` has the colour, ``wrist_infrared`` the infrared."""
+        color = {self.name: "color"} if self.color else {}
+        return color | {f"{self.name}_{stream}": stream for stream in self.more if stream != SEGMENTATION}
+
+    @property
+    def depths(self) -> dict[str, str]:
+        """Names of the files of lossless pictures, each with its stream: depth, segmentation."""
+        depth = {self.name: "depth"} if self.depth_unit is not None else {}
+        return depth | {f"{self.name}_{stream}": stream for stream in self.more if stream == SEGMENTATION}
+
+
+def video_key(video: str) -> str:
+    """Return the dataset's key of a video: of a camera's colour, or of ``<camera>_infrared``."""
+    return f"observation.images.{video}"
+
+
+def features_of(
+    columns: Sequence[Column], cameras: Sequence[CameraSetup], fps: int, video: dict[str, Any]
+) -> dict[str, dict[str, Any]]:
+    """``features`` of ``meta/info.json``; ``video`` is what the encoder says of itself."""
+    found = {column.key: column.feature for column in columns}
+    features = {STATE: found.pop(STATE), ACTION: {**found[SETPOINT]}, **found}
+    for camera in cameras:
+        for name in camera.videos:
+            features[video_key(name)] = {
+                "dtype": "video",
+                "shape": [camera.height, camera.width, 3],
+                "names": ["height", "width", "channels"],
+                "info": {
+                    "video.height": camera.height,
+                    "video.width": camera.width,
+                    **video,
+                    "video.is_depth_map": False,
+                    "video.fps": fps,
+                    "video.channels": 3,
+                    "has_audio": False,
+                },
+            }
+    features |= {key: {"dtype": dtype, "shape": [1], "names": None} for key, dtype in BOOKKEEPING.items()}
+    return features
+
+
+# [library.py] The libraries that recording needs, and what to say where they are missing.
+
+_LIBRARIES = ("pyarrow", "av", "zstandard")
+
+
+def require() -> None:
+    """Raise DriverMissing, with the command that installs them, where a library is missing. Imports none of them."""
+    missing = [name for name in _LIBRARIES if importlib.util.find_spec(name) is None]
+    if missing:
+        raise DriverMissing(
+            f"recordings need {', '.join(missing)}; install with: pip install 'robot-hal[record]'", name=missing[0]
+        )
+
+
+# [pace.py] Does the time of an arm's own clock pass as fast as that of the rig? A simulation that cannot keep up
+# is slower.
+
+SLOW = 0.97
+"""Of real time: below it, speeds in a recording are noticeably too low."""
+_ENOUGH = 2.0
+"""s of an episode before anything is said."""
+_CHANGED = 0.02
+"""By less the number that a person was told is not corrected."""
+_ROBOT = f"{TIMES}robot."
+
+
+class Pace:
+    """That of each arm, over the rows of one episode so far."""
+
+    def __init__(self, columns: Iterable[Sequence[Any]], simulated: Collection[str] = ()) -> None:
+        """``columns`` (key, type, names) are those of a row; ``simulated`` are the arms in a simulated world."""
+        self._places: dict[str, int] = {}
+        self._simulated = simulated
+        self._told = 1.0
+        place = 0
+        for key, _, names in columns:
+            if key.startswith(_ROBOT):
+                self._places[key.removeprefix(_ROBOT)] = place
+            place += len(names)
+        self._last: dict[str, tuple[float, float]] = {}
+        self._passed: dict[str, tuple[float, float]] = {}
+        """s on the rig's clock, and on the arm's own, while both went on."""
+
+    def add(self, row: Sequence[float]) -> None:
+        """One more row. An arm whose clock is not known, or begins anew, is left out as long as that is so."""
+        for name, place in self._places.items():
+            now = float(row[place]), float(row[place + 1])
+            before, self._last[name] = self._last.get(name, now), now
+            t, own = now[0] - before[0], now[1] - before[1]
+            if t > 0.0 and own >= 0.0:  # false for NaN, too
+                sums = self._passed.get(name, (0.0, 0.0))
+                self._passed[name] = sums[0] + t, sums[1] + own
+
+    def as_json(self) -> dict[str, float]:
+        """By the arms' names; those are missing whose own clock is not known."""
+        return {name: round(own / t, 4) for name, (t, own) in self._passed.items() if math.isfinite(own)}
+
+    @property
+    def trouble(self) -> str:
+        """What a person should know of a simulation that is too slow; empty where it keeps up."""
+        found = [
+            own / t
+            for name, (t, own) in self._passed.items()
+            if name in self._simulated and t >= _ENOUGH and own < t * SLOW
+        ]
+        if not found:
+            self._told = 1.0
+            return ""
+        if self._told == 1.0 or abs(min(found) - self._told) >= _CHANGED:
+            self._told = min(found)
+        return (
+            f"the simulation runs at {self._told:.2f} of real time: speeds in this recording are too low; fewer or "
+            "smaller cameras help"
+        )
+
+
+def simulated_pace(info: Mapping[str, Any]) -> float | None:
+    """The slowest arm of a simulated world in an episode's own file; None where there is none, or it is not known."""
+    resolved = info.get("rig", {}).get("resolved", {})
+    driver = (resolved.get("world") or {}).get("driver")
+    simulated = {robot["name"] for robot in resolved.get("robots", ()) if driver and robot["driver"] == driver}
+    found = [float(pace) for name, pace in (info.get("pace") or {}).items() if name in simulated]
+    return min(found, default=None)
+
+
+# [about.py] What an episode's own file says besides its rows: where they come from, and with what they were made.
+
+_PACKAGES = (
+    "robot-hal",
+    "numpy",
+    "ruckig",
+    "pin",
+    "pybullet",
+    "pylibfranka",
+    "pyrealsense2",
+    "pyarrow",
+    "av",
+    "zstandard",
+)
+
+
+def about_rig(rig: Rig) -> dict[str, Any]:
+    """The rig's configuration, as it was written and as it came out, and the versions of what ran it."""
+    plan = rig.plan
+    resolved = asdict(plan)
+    for pad in resolved["pads"]:
+        del pad["models"]  # all pads that are known, not those that are here
+    written = None
+    if Path(plan.source).is_file():
+        written = Path(plan.source).read_text(encoding="utf-8")
+    return {
+        "rig": {"source": plan.source, "written": written, "resolved": resolved, "renderer": rig.renderer},
+        "versions": {"python": platform.python_version(), "system": platform.platform(), **_versions()},
+        "program": sys.argv[0],
+    }
+
+
+def _versions() -> dict[str, str]:
+    found = {}
+    for package in _PACKAGES:
+        try:
+            found[package] = version(package)
+        except PackageNotFoundError:
+            continue
+    return found
+
+
+def about_start(rig: Rig, tracks: Iterable[CameraTrack]) -> dict[str, Any]:
+    """What is so when an episode begins."""
+    objects = {}
+    if rig.has_world:
+        seen = rig.world.poses().poses
+        objects = {name: _pose(pose) for name, pose in seen.items() if name not in rig.robots}
+    return {
+        "started": datetime.now(timezone.utc).isoformat(timespec="milliseconds"),
+        "clock": rig.plan.clock,
+        "objects_at_start": objects,
+        "cameras": {track.camera.name: _camera(track) for track in tracks},
+    }
+
+
+def _camera(track: CameraTrack) -> dict[str, Any]:
+    info, setup = track.camera.info, track.setup
+    return {
+        "title": info.title,
+        "serial": info.serial,
+        "firmware": info.firmware,
+        "clock": info.clock,
+        "K": info.K.tolist(),
+        "distortion": info.distortion.tolist(),
+        "depth_unit_m": setup.depth_unit,
+        "streams": [*setup.videos.values(), *setup.depths.values()],
+        "depth_lossless": setup.depth_lossless if setup.depth_unit is not None else None,
+    }
+
+
+def _pose(pose: Pose) -> list[float]:
+    return [*pose.position.tolist(), *pose.orientation.tolist()]
+
+
+def about_call(task: str, seed: int | None, info: Mapping[str, Any] | None) -> dict[str, Any]:
+    """What a caller wants to have kept with an episode. CommandError for what the files cannot hold."""
+    try:
+        task.encode()
+    except (AttributeError, UnicodeEncodeError) as error:
+        raise CommandError(f"the task must be a text, not {task!r}: {error}") from None
+    try:
+        number = None if seed is None else operator.index(seed)
+    except TypeError:
+        raise CommandError(f"the seed must be a whole number, not {seed!r}") from None
+    try:
+        return {"task": task, "seed": number, "info": json.loads(json.dumps(dict(info or {}), allow_nan=False))}
+    except (TypeError, ValueError) as error:
+        raise CommandError(f"info must be plain numbers, texts, lists and dicts: {error}") from None
+
 
 CHUNK = 1000
 """Files in a folder."""

@@ -19,12 +19,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .columns import MORE_STREAMS, SEGMENTATION, CameraSetup
-from .depth import DepthFile, DepthReader, cut, numbers_to_units
-from .index import plain_name
-from .layout import read_json, sync, write_json
+from .checking import plain_name
+from .codecs import DepthFile, DepthReader, Encoder, VideoFile, as_rgb, count_frames, cut, mend, numbers_to_units
+from .layout import MORE_STREAMS, SEGMENTATION, CameraSetup, read_json, sync, write_json
 from .ring import Slot
-from .video import Encoder, VideoFile, as_rgb, count_frames, mend
 
 __all__ = ["ABOUT", "RESERVE", "ROWS", "LiveFolder", "Rest", "read_rest"]
 

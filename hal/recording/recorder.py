@@ -2,31 +2,276 @@
 
 from __future__ import annotations
 
+import logging
 import threading
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from ..errors import CommandError, ConnectionLost
+from ..errors import CommandError, ConnectionLost, HalError, StaleStateError
+from ..host.hosts import groups_of
 from ..host.process import Child, SharedMemory
-from .about import about_call, about_rig, about_start
-from .columns import features_of
-from .compatible import check_compatible
-from .devices import check_rate, chosen
-from .finalise import keep_mark
-from .index import read_index
-from .layout import Layout, locked
-from .library import require
+from ..learning.episode import stands_in_world
+from .checking import read_index
+from .codecs import Encoder
+from .dataset import check_compatible
+from .finish import keep_mark
+from .layout import MORE_STREAMS, TIMES, Layout, Pace, about_call, about_rig, about_start, features_of, locked, require
 from .ring import RowRing
-from .saving import Saving
-from .take import Take
-from .video import Encoder
+from .sampling import CameraTrack, Grid, LockStepGrid, RealTimeGrid, Sampler, movable
 
 if TYPE_CHECKING:
     from ..rig import Rig
+    from .sampling import Moment
 
-__all__ = ["Recorder", "RecorderStatus"]
+__all__ = [
+    "EpisodeRecorder",
+    "Gaps",
+    "Recorder",
+    "RecorderStatus",
+    "Saving",
+    "check_rate",
+    "chosen",
+]
+
+# [saving.py] An episode that is being finished in the background.
+
+_LOG = logging.getLogger("hal.recording")
+
+
+class Saving:
+    """Runs ``work`` in a thread of its own, which a program that ends waits for; a failure is kept, and logged."""
+
+    def __init__(self, work: Callable[[], None]) -> None:
+        self.error: Exception | None = None
+        self._work = work
+        self._thread = threading.Thread(target=self._run, name="hal-recorder-save")
+        self._thread.start()
+
+    def _run(self) -> None:
+        try:
+            self._work()
+        except Exception as error:
+            self.error = error
+            _LOG.warning("%s", error)
+
+    @property
+    def done(self) -> bool:
+        """Is it over, well or not?"""
+        return not self._thread.is_alive()
+
+    def wait(self) -> None:
+        """Return when it is over."""
+        self._thread.join()
+
+    def result(self) -> None:
+        """The same; raises what went wrong."""
+        self.wait()
+        if self.error is not None:
+            raise self.error
+
+
+# [gaps.py] Grid times of which there is no row, and why.
+
+
+class Gaps:
+    """Those of one episode; neighbours with one reason are one gap."""
+
+    def __init__(self, fps: int) -> None:
+        self.rows = 0
+        """Rows that are missing."""
+        self.lasting = 0.0
+        """How long there has been no row now, s."""
+        self.why = ""
+        """The newest reason."""
+        self._fps = fps
+        self._found: list[dict[str, Any]] = []
+        self._open = False
+
+    def add(self, t: float, why: str) -> None:
+        """No row at ``t``, s since the episode's first one."""
+        self.rows += 1
+        self.lasting += 1.0 / self._fps
+        self.why = why
+        if not self._open:
+            self._found.append({"from_s": round(t, 6), "rows": 0, "why": why})
+            self._open = True
+        self._found[-1]["rows"] += 1
+        self._found[-1]["to_s"] = round(t, 6)
+
+    def over(self) -> None:
+        """There is a row again."""
+        self._open = False
+        self.lasting = 0.0
+
+    def as_json(self) -> list[dict[str, Any]]:
+        """As the episode's file lists them."""
+        return self._found
+
+
+# [take.py] One episode while it is recorded: every grid time becomes a row for the writer, or a gap with a
+# reason.
+
+_HOPELESS = 1.0
+"""s without a single row after which an episode takes no more."""
+_PATIENCE = 30.0
+"""s that a lock-step recording waits for a slow writer; time stands still meanwhile."""
+_STEP = 0.001
+_WORD = 1.0
+"""s that the writer may take to hear of a row; it reads such words in between two rows."""
+
+
+class EpisodeRecorder:
+    """Looks on from :meth:`start` to :meth:`end`."""
+
+    def __init__(
+        self, rig: Rig, fps: int, sampler: Sampler, tracks: Sequence[CameraTrack], ring: RowRing, child: Child
+    ) -> None:
+        self.frames = 0
+        """Rows so far."""
+        self.seconds = 0.0
+        """From the first row to the newest one."""
+        self.trouble = ""
+        """Why there are no more rows; empty while there are."""
+        self.gaps = Gaps(fps)
+        in_world = {robot.name for robot in rig.robots.values() if stands_in_world(rig, robot)}
+        self.pace = Pace(() if rig.lock_step else sampler.columns, in_world)
+        self._lock_step = rig.lock_step
+        self._sampler = sampler
+        self._tracks = tracks
+        self._ring = ring
+        self._child = child
+        kind = LockStepGrid if rig.lock_step else RealTimeGrid
+        self.grid: Grid = kind(rig.clock, fps, self._look, self._make)
+
+    def start(self) -> None:
+        """The first row is one of the present."""
+        self.grid.start()
+
+    def end(self) -> None:
+        """No rows of later times, and nothing is looked at any more; those that are due are still made. Idempotent."""
+        self.grid.end()
+
+    def stop(self) -> None:
+        """The same; returns when the writer has been handed every row."""
+        self.grid.stop()
+
+    def closing(self, success: bool | None) -> dict[str, Any]:
+        """What is known of the episode at its end."""
+        return {
+            "success": success,
+            "recovered": False,
+            "dropped": self.gaps.rows,
+            "late": self.grid.late,
+            "gaps": self.gaps.as_json(),
+            "repeated": {track.camera.name: track.repeated for track in self._tracks},
+            "trouble": self.trouble,
+        }
+
+    def _look(self) -> Moment | Exception:
+        try:
+            return self._sampler.look()
+        except Exception as error:  # the row, when it is made, says so
+            return error
+
+    def _make(self, t: float, moment: Moment | Exception) -> bool:
+        """The row of one grid time. False where the episode cannot go on."""
+        try:
+            if isinstance(moment, Exception):
+                raise moment
+            self._child.check()
+            self.trouble = self._ring.trouble
+            why = self.trouble or self._put(t, moment)
+        except (HalError, ValueError) as error:
+            why = self.trouble = str(error)
+        except Exception as error:  # nothing of a recording may be lost without a word
+            why = self.trouble = f"{type(error).__name__}: {error}"
+        if why:
+            self.gaps.add(t - self.grid.start_time, why)
+            if self.gaps.lasting > _HOPELESS:
+                self.trouble = why
+        return not self.trouble
+
+    def _put(self, t: float, moment: Moment) -> str:
+        """Hand a row to the writer; why that cannot be, or nothing."""
+        try:
+            frames = {track.camera.name: track.frame(t) for track in self._tracks}
+            values = self._sampler.row(t, moment, frames)
+        except StaleStateError as error:
+            return str(error)
+        if self._ring.full and not (self._lock_step and self._wait_for_slot()):
+            return "the writer cannot keep up: the processor or the disk is too slow"
+        slot = self._ring.next()
+        slot.values[:] = values
+        self.pace.add(values)
+        for track, images in zip(self._tracks, slot.images, strict=True):
+            track.fill(frames[track.camera.name], images)
+        self._ring.announce()
+        self._child.notify("row", timeout=_WORD)
+        self.frames += 1
+        self.seconds = t - self.grid.start_time
+        self.gaps.over()
+        return ""
+
+    def _wait_for_slot(self) -> bool:
+        pause = threading.Event()
+        for _ in range(round(_PATIENCE / _STEP)):
+            if not self._ring.full or self._ring.trouble:
+                break
+            self._child.check()
+            pause.wait(_STEP)
+        return not self._ring.full
+
+
+# [devices.py] Which devices of a rig are recorded, and whether they can be.
+
+
+def check_rate(rig: Rig, fps: int) -> None:
+    """Raise CommandError where a simulation in lock-step makes fewer steps than rows are wanted."""
+    if rig.lock_step and fps > (steps := groups_of(rig.plan)[0].rate_hz):
+        raise CommandError(f"fps must be at most {steps:g}, the steps of this simulation in a second, not {fps}")
+
+
+def chosen(
+    rig: Rig, cameras: Collection[str] | None, streams: Collection[str]
+) -> tuple[Sampler, list[CameraTrack], list[str]]:
+    """Return the sampler of every arm and pad, a track per camera of these names, else of all, and notes for a person.
+
+    Raises CommandError for what cannot be recorded, DeviceNotFound, StaleStateError, ConnectionLost.
+    """
+    if unknown := [stream for stream in streams if stream not in ("color", "depth", *MORE_STREAMS)]:
+        known = ", ".join(("color", "depth", *MORE_STREAMS))
+        raise CommandError(f"there is no stream {unknown[0]!r}; streams: {known}")
+    if not rig.robots:
+        raise CommandError("this rig has no arm to record")
+    if odd := [name for name in movable(rig) if "/" in name]:
+        raise CommandError(f"an object's name becomes that of a column, which has no slash: {odd[0]!r}")
+    names = tuple(rig.cameras) if cameras is None else tuple(dict.fromkeys(cameras))
+    tracks, notes = [], []
+    for name in names:
+        track = CameraTrack(rig.cameras[name], streams=streams, lock_step=rig.lock_step)
+        setup = track.setup
+        if setup.videos and (setup.width % 2 or setup.height % 2):
+            size = f"{setup.width}x{setup.height}"
+            raise CommandError(f"a video has even sizes: change cameras.{name}.output, which is {size}")
+        if setup.videos or setup.depths:
+            tracks.append(track)
+        own = rig.cameras[name].spec.streams
+        if left := [stream for stream in own if stream in MORE_STREAMS and stream not in streams]:
+            notes.append(f"camera {name}: {', '.join(left)} not recorded")
+        if missing := [stream for stream in streams if stream in MORE_STREAMS and stream not in own]:
+            notes.append(f"camera {name} has no {', '.join(missing)}")
+    for files in ([track.setup.videos for track in tracks], [track.setup.depths for track in tracks]):
+        file_names = [name for each in files for name in each]
+        if double := [name for name in file_names if file_names.count(name) > 1]:
+            raise CommandError(f"two streams would be called {double[0]}: rename a camera")
+    sampler = Sampler(rig, [track.camera.name for track in tracks])
+    for track in tracks:
+        seq = sampler.place_of(f"{TIMES}camera.{track.camera.name}") + 2
+        track.setup = track.setup._replace(seq=seq)
+    return sampler, tracks, notes
+
 
 _QUEUE = 0.6
 """s of rows that may wait for the writer."""
@@ -131,7 +376,7 @@ class Recorder:
             self._memory.close()
             raise
         self._lock = threading.RLock()
-        self._take: Take | None = None
+        self._take: EpisodeRecorder | None = None
         """The present episode, or the last one."""
         self._open = False
         """Is it being recorded?"""
@@ -187,7 +432,7 @@ class Recorder:
                 begun = self._child.request("begin", {"about": about}, _SAVING)
                 self.notes.extend(begun["notes"])
                 self._episode = begun["episode"]
-                take = Take(self.rig, self.fps, self._sampler, self._tracks, self._ring, self._child)
+                take = EpisodeRecorder(self.rig, self.fps, self._sampler, self._tracks, self._ring, self._child)
                 take.start()
             except BaseException:
                 if take is not None:
@@ -232,7 +477,7 @@ class Recorder:
         if saving is not None:
             saving.result()
 
-    def _save(self, take: Take, partial: Path, success: bool | None) -> None:
+    def _save(self, take: EpisodeRecorder, partial: Path, success: bool | None) -> None:
         if success is not None:
             keep_mark(partial, success)
         take.stop()
@@ -254,7 +499,7 @@ class Recorder:
                     if (partial := layout.partial(self._episode)).exists():
                         layout.remove(partial)
 
-    def _end(self) -> Take:
+    def _end(self) -> EpisodeRecorder:
         """The episode that is open ends here and now, whatever is still to be done with it."""
         if self._take is None or not self._open:
             raise CommandError("no episode is being recorded: call start first")

@@ -10,7 +10,7 @@ from numpy.typing import DTypeLike, NDArray
 
 from ..host.memory import Mailbox
 from ..host.ring import STREAM_TYPES, ArrayRing, Images
-from .columns import CameraSetup
+from .layout import CameraSetup
 
 __all__ = ["Images", "RowRing", "Slot"]
 

@@ -3,19 +3,258 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping
+import threading
+from abc import ABC, abstractmethod
+from collections import deque
+from collections.abc import Callable, Collection, Iterable, Mapping
 from typing import TYPE_CHECKING, NamedTuple
 
-from ..errors import DeviceNotFound, StaleStateError
+import numpy as np
+
+from ..clock import LockStepClock
+from ..errors import ConnectionLost, DeviceNotFound, StaleStateError
 from ..types import AXES, BUTTONS, Frame, GripperState, PadState, RobotState, Stamp
-from .columns import GRID, PAD, SETPOINT, STATE, TIMES, Column
+from .codecs import unit_for
+from .layout import GRID, MORE_STREAMS, PAD, SETPOINT, STATE, TIMES, CameraSetup, Column
 
 if TYPE_CHECKING:
+    from ..camera import Camera
+    from ..clock import Clock
     from ..geometry import Pose
     from ..rig import Rig
     from ..robot import Robot
+    from .ring import Images
 
-__all__ = ["Moment", "Sampler", "movable"]
+__all__ = [
+    "CameraTrack",
+    "Grid",
+    "LAG",
+    "LockStepGrid",
+    "Moment",
+    "RealTimeGrid",
+    "Sampler",
+    "movable",
+]
+
+# [grid.py] When rows are due, and who makes them: a thread in real time, the clock itself in lock-step.
+
+LAG = 0.1
+"""s after its time that a row is made in real time: by then the picture that was taken at that time has arrived."""
+_LATE = 1.0
+"""A row that came later than so many periods counts as late. Nothing is missing in it: states have a history."""
+
+Look = Callable[[], "Moment | Exception"]
+"""Looks at what has no history; an error is one more thing that was seen."""
+Make = Callable[[float, "Moment | Exception"], bool]
+"""Makes the row of a time; False where no more are wanted."""
+
+
+class Grid(ABC):
+    """Calls ``look`` at each grid time, and ``make`` once what belongs to that time is known."""
+
+    def __init__(self, clock: Clock, fps: int, look: Look, make: Make) -> None:
+        self._clock = clock
+        self._period = 1.0 / fps
+        self._look = look
+        self._make = make
+        self.start_time = clock.now()
+        """Of the first row, s on the clock."""
+        self.late = 0
+        """Grid times that were noticed more than a period late."""
+
+    @abstractmethod
+    def start(self) -> None:
+        """Begin with a row of the present."""
+
+    @abstractmethod
+    def end(self) -> None:
+        """No further grid times, and nothing is looked at any more once this returns. Idempotent."""
+
+    @abstractmethod
+    def stop(self) -> None:
+        """The same; returns when all rows are made."""
+
+
+class RealTimeGrid(Grid):
+    """A thread of its own, which nothing that moves ever waits for."""
+
+    def __init__(self, clock: Clock, fps: int, look: Look, make: Make) -> None:
+        super().__init__(clock, fps, look, make)
+        self._number = 0
+        """Of the next row."""
+        self._waiting: deque[tuple[float, Moment | Exception]] = deque()
+        self._ending = threading.Event()
+        self._looking = threading.Lock()
+        self._thread = threading.Thread(target=self._run, name="hal-recorder", daemon=True)
+
+    def start(self) -> None:
+        self._notice()  # here and now: whatever comes next, there is a first row
+        self._thread.start()
+
+    def end(self) -> None:
+        self._ending.set()
+        with self._looking:  # a look that is under way is let end
+            pass
+
+    def stop(self) -> None:
+        self.end()
+        if self._thread.is_alive() and self._thread is not threading.current_thread():
+            self._thread.join()
+
+    def _due(self) -> float:
+        return self.start_time + self._number * self._period
+
+    def _notice(self) -> None:
+        """Look, where a row is due."""
+        with self._looking:
+            now = self._clock.now()
+            if self._ending.is_set() or self._due() > now:
+                return
+            moment = self._look()
+        while self._due() <= now:
+            self.late += now - self._due() > _LATE * self._period
+            self._waiting.append((self._due(), moment))
+            self._number += 1
+
+    def _run(self) -> None:
+        waiting = self._waiting
+        while True:
+            self._notice()
+            while waiting and waiting[0][0] + LAG <= self._clock.now():
+                if not self._make(*waiting.popleft()):
+                    return
+            if self._ending.is_set():
+                if not waiting:
+                    return
+                self._clock.sleep_until(waiting[0][0] + LAG)
+            else:
+                next_row = waiting[0][0] + LAG if waiting else self._due()
+                self._ending.wait(max(0.0, min(next_row, self._due()) - self._clock.now()))
+
+
+class LockStepGrid(Grid):
+    """Rows exactly at their times: the clock stops there, whoever waits for however long."""
+
+    def __init__(self, clock: Clock, fps: int, look: Look, make: Make) -> None:
+        super().__init__(clock, fps, look, make)
+        assert isinstance(clock, LockStepClock)
+        self._stepped = clock
+        self._wanted = True
+        self._taking = threading.RLock()
+        """Held while a row is made: another thread may end this meanwhile."""
+        self._detach: Callable[[], None] = lambda: None
+
+    def start(self) -> None:
+        self._take()
+        if self._wanted:
+            self._detach = self._stepped.every(self._period, self._take)
+
+    def end(self) -> None:
+        self._wanted = False
+        self._detach()
+        with self._taking:  # a row that is under way is made
+            pass
+
+    def stop(self) -> None:
+        self.end()
+
+    def _take(self) -> None:
+        with self._taking:
+            if self._wanted and not self._make(self._clock.now(), self._look()):
+                self._wanted = False
+                self._detach()
+
+
+# [cameras.py] The pictures of one camera, kept until the rows that show them are made.
+
+_KEEP = 0.5
+"""s of pictures that are kept for rows which are made late."""
+_SILENT = 1.0
+"""A camera that has sent nothing for so long is as good as lost, s."""
+
+
+class CameraTrack:
+    """Finds the picture of a row: the newest one that was taken at its time or before.
+
+    In real time the camera's own thread brings every frame; in lock-step the present is drawn.
+    """
+
+    def __init__(self, camera: Camera, *, streams: Collection[str], lock_step: bool) -> None:
+        self.camera = camera
+        self._lost: tuple[float, ConnectionLost] | None = None
+        self.repeated = 0
+        """Rows that show the same picture as the one before."""
+        self._lock_step = lock_step
+        self._lock = threading.Lock()
+        self._frames: deque[Frame] = deque(maxlen=max(4, round(_KEEP * camera.spec.rate_hz)))
+        self._detach: list[Callable[[], None]] = []
+        self._put = -1
+        spec, scale = camera.spec, camera.info.depth_scale
+        there = [stream for stream in spec.streams if stream in streams]
+        keeps = "depth" in there
+        self.setup = CameraSetup(
+            camera.name,
+            spec.width,
+            spec.height,
+            "color" in there,
+            (scale or unit_for(spec.depth_max)) if keeps else None,
+            scale is not None,
+            -1,
+            tuple(stream for stream in MORE_STREAMS if stream in there),
+        )
+
+    def begin(self) -> None:
+        """A new episode. StaleStateError, ConnectionLost where the camera has no picture now."""
+        self._lost, self.repeated, self._put = None, 0, -1
+        with self._lock:
+            self._frames.clear()
+        if not self._lock_step:  # from here on nothing is missed, also not that it is lost
+            self._detach = [self.camera.on_frame(self._keep), self.camera.on_connection(self._hear)]
+        first = self.camera.latest(max_age=_SILENT)
+        with self._lock:
+            if not self._frames or first.stamp.seq < self._frames[0].stamp.seq:
+                self._frames.appendleft(first)
+
+    def end(self) -> None:
+        """It is over. Idempotent."""
+        for detach in self._detach:
+            detach()
+        self._detach = []
+
+    def _keep(self, frame: Frame) -> None:
+        with self._lock:
+            self._frames.append(frame)
+
+    def _hear(self, lost: ConnectionLost | None) -> None:
+        if lost is not None and self._lost is None:
+            self._lost = self.camera.clock.now(), lost
+
+    def frame(self, t: float) -> Frame:
+        """The picture of a row that was due at ``t``, s. ConnectionLost, StaleStateError where there is none."""
+        if self._lock_step:
+            return self.camera.latest()
+        if self._lost is not None and t > self._lost[0]:
+            raise self._lost[1]
+        with self._lock:
+            known = tuple(self._frames)
+        found = next((frame for frame in reversed(known) if frame.stamp.t <= t), known[0])
+        if t - found.stamp.t > _SILENT:
+            raise StaleStateError(f"camera {self.camera.name} has sent no picture for {t - found.stamp.t:.1f} s")
+        return found
+
+    def fill(self, frame: Frame, images: Images) -> None:
+        """Copy what is new into a slot. ValueError for a picture of another size."""
+        if frame.stamp.seq == self._put:
+            self.repeated += 1
+            return
+        for stream, place in images.items():
+            image = getattr(frame, stream)
+            if image is None or image.shape != place.shape:
+                there = "none" if image is None else image.shape
+                raise ValueError(f"camera {self.camera.name} sends pictures of {there}, not {place.shape}")
+            np.copyto(place, image)
+        self._put = frame.stamp.seq
+
 
 _POSE = ("x", "y", "z", "qx", "qy", "qz", "qw")
 _TWIST = ("vx", "vy", "vz", "wx", "wy", "wz")

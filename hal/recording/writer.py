@@ -16,16 +16,13 @@ from typing import Any
 from ..errors import CommandError, HalError
 from ..host.process import Channel, SharedMemory, serve
 from ..host.scheduling import yield_to_others
-from .columns import CameraSetup
-from .compatible import check_compatible
-from .finalise import CLOSING, finalise
-from .index import check_next, read_index
-from .layout import Layout, locked, write_json
-from .library import require
+from .checking import check_next, read_index
+from .codecs import choose_encoder
+from .dataset import check_compatible
+from .finish import CLOSING, finalise, recover_all
+from .layout import CameraSetup, Layout, locked, require, write_json
 from .live import RESERVE, LiveFolder
-from .recovery import recover_all
 from .ring import RowRing
-from .video import choose_encoder
 
 __all__ = ["free_bytes", "main"]
 

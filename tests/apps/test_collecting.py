@@ -17,7 +17,7 @@ from collect_kit import CROSS, PS, seed_of, write_pad
 
 import hal
 from hal.apps.collect import parser
-from hal.apps.collecting import Collection
+from hal.apps.collecting import DemonstrationSession
 from hal.camera import Camera
 from hal.drivers.mock.gamepad import MockPad
 from hal.recording import Dataset, Recorder
@@ -80,7 +80,7 @@ def collect(
         page = Page(rig, press, None if by_page else "pad") if press is not None else None
         rig.console = page
         robot, gamepad = rig.robots["panda"], rig.gamepads["pad"]
-        status = Collection(rig, robot, gamepad, recorder, parser().parse_args([*options])).run()
+        status = DemonstrationSession(rig, robot, gamepad, recorder, parser().parse_args([*options])).run()
         return status, page.views if page is not None else []
 
 
@@ -151,7 +151,7 @@ def test_an_arm_that_is_not_simulated_drives_home_first_while_l2_is_held(
         arm, hand = rig.robots["panda"], rig.driver("pad")
         assert isinstance(hand, MockPad)
         arm.move_to(arm.home + 0.05)
-        run = Collection(rig, arm, rig.gamepads["pad"], recorder, parser().parse_args(["--episodes", "1"]))
+        run = DemonstrationSession(rig, arm, rig.gamepads["pad"], recorder, parser().parse_args(["--episodes", "1"]))
 
         def until(true: Callable[[], object]) -> Iterator[None]:
             end = time.monotonic() + 60.0
@@ -200,7 +200,10 @@ def test_a_stop_is_named_where_a_demonstration_fails(
 
         rig.console = Page(rig, stop)
         args = parser().parse_args(["--episodes", "1"])
-        assert Collection(rig, rig.robots["panda"], rig.gamepads["pad"], recorder, args, lambda *_: False).run() == 0
+        assert (
+            DemonstrationSession(rig, rig.robots["panda"], rig.gamepads["pad"], recorder, args, lambda *_: False).run()
+            == 0
+        )
     told = capsys.readouterr().out
     assert "the cube was not lifted" in told
     assert ("the arm was stopped in this episode" in told) is stops

@@ -16,11 +16,9 @@ from pathlib import Path
 from typing import NamedTuple
 
 from ...errors import CommandError
-from ..reader import Dataset
-from .content import EpisodeContent
-from .job import Job, Progress
-from .output import fresh
-from .selection import chosen
+from ..dataset import Dataset
+from .content import EpisodeContent, chosen
+from .output import Job, Progress, fresh
 
 __all__ = ["KINDS", "Exported", "Kind", "Progress", "default_path", "export"]
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass
 from functools import cached_property
@@ -12,10 +13,56 @@ from numpy.typing import NDArray
 
 from ...errors import CommandError, DeviceNotFound
 from ...images import Cropping
-from ..columns import STATE
-from ..reader import Episode
+from ..dataset import Dataset, Episode
+from ..layout import STATE
 
-__all__ = ["Arm", "EpisodeContent", "Pictures"]
+__all__ = [
+    "Arm",
+    "CAMERA",
+    "EpisodeContent",
+    "GRIPPER_CAMERA",
+    "Pictures",
+    "chosen",
+    "episode_numbers",
+    "observations",
+    "picture_name",
+    "roles",
+    "with_channel",
+]
+
+# [selection.py] Which episodes.
+
+_PART = re.compile(r"\s*(\d+)\s*(?:-\s*(\d+)\s*)?")
+
+
+def episode_numbers(text: str) -> list[int]:
+    """Numbers out of a text such as ``0,3-5``. CommandError for anything else."""
+    found: list[int] = []
+    for part in text.split(","):
+        match = _PART.fullmatch(part)
+        if match is None:
+            raise CommandError(f"episodes are numbers and ranges such as 0,3-5, not {text!r}")
+        first = int(match[1])
+        last = first if match[2] is None else int(match[2])
+        if last < first or last - first > 1_000_000:
+            raise CommandError(f"{part.strip()} is no range of episodes")
+        found.extend(range(first, last + 1))
+    return found
+
+
+def chosen(dataset: Dataset, wanted: str | Collection[int] | None, *, successful_only: bool) -> tuple[Episode, ...]:
+    """Those episodes, each once, in the dataset's order. CommandError where there are none."""
+    there = range(len(dataset.episodes))
+    numbers = there if wanted is None else set(episode_numbers(wanted) if isinstance(wanted, str) else wanted)
+    if unknown := sorted(set(numbers) - set(there)):
+        raise CommandError(f"there is no episode {unknown[0]} in {dataset.root}; there are {len(there)}, from 0 on")
+    found = [dataset.episodes[number] for number in sorted(numbers)]
+    if successful_only:
+        found = [episode for episode in found if episode.success]
+    if not found:
+        raise CommandError("none of these episodes is marked a success" if successful_only else "no episode was chosen")
+    return tuple(found)
+
 
 _ARM_TIME = "observation.time.robot."
 _OBJECT = "observation.object."
@@ -196,3 +243,76 @@ class EpisodeContent:
             "seed": episode.info.get("seed"),
             "started": episode.info.get("started"),
         }
+
+
+# [observations.py] The numbers that a policy looks at, under the names that robomimic and diffusion policy use
+# for them.
+
+_OF_AN_ARM = {
+    "joint_vel": "observation.velocity",
+    "joint_effort": "observation.effort",
+    "eef_vel": "observation.twist",
+}
+
+
+def observations(content: EpisodeContent) -> dict[str, NDArray[Any]]:
+    """``robot0_joint_pos``, ``robot0_eef_pos`` and so on, each (rows, n), SI units, quaternions xyzw; a second arm is
+    ``robot1``. ``object`` has the poses of all objects of a simulation, one after the other."""
+    found: dict[str, NDArray[Any]] = {}
+    for k, arm in enumerate(content.arms):
+        lead = f"robot{k}_"
+        found[lead + "joint_pos"] = content.of(arm, "observation.state")
+        pose = content.of(arm, "observation.tcp")
+        found[lead + "eef_pos"], found[lead + "eef_quat"] = pose[:, :3], pose[:, 3:]
+        for name, key in _OF_AN_ARM.items():
+            if content.has(key) and (values := content.of(arm, key)).shape[1]:
+                found[lead + name] = values
+        if (width := content.width(arm)) is not None:
+            found[lead + "gripper_width"] = width[:, None]
+    if objects := content.objects:
+        found["object"] = np.concatenate(list(objects.values()), axis=1)
+    return found
+
+
+def picture_name(stream: Pictures) -> str:
+    """``wrist_image`` or ``wrist_depth``."""
+    return f"{stream.camera}_{'image' if stream.what == 'rgb' else 'depth'}"
+
+
+def with_channel(picture: NDArray[Any]) -> NDArray[Any]:
+    """Channels last, for depth too: (H, W, 3) or (H, W, 1)."""
+    return picture if picture.ndim == 3 else picture[:, :, None]
+
+
+# [roles.py] Which camera is *the camera*, and which one the gripper's.
+
+CAMERA, GRIPPER_CAMERA = "camera", "gripper_camera"
+
+
+def roles(content: EpisodeContent, camera: str | None = None, gripper_camera: str | None = None) -> dict[str, str]:
+    """What each camera of an episode is called in an export.
+
+    Unless told otherwise, the first one on an arm is ``gripper_camera``, the first one that is not on an arm is
+    ``camera``, and all others keep their names. CommandError for a name that is not there, or where two would be called
+    the same.
+    """
+    there = content.cameras
+    for name in (camera, gripper_camera):
+        if name is not None and name not in there:
+            raise CommandError(f"there is no camera {name} in this export; cameras: {', '.join(there) or 'none'}")
+    if camera is not None and camera == gripper_camera:
+        raise CommandError(f"{camera} cannot be both the camera and the gripper's")
+    carried = _carried(content)
+    free = [name for name in there if name not in (camera, gripper_camera)]
+    gripper_camera = gripper_camera or next((name for name in free if name in carried), None)
+    camera = camera or next((name for name in free if name not in carried), None)
+    found = {name: CAMERA if name == camera else GRIPPER_CAMERA if name == gripper_camera else name for name in there}
+    if len(set(found.values())) < len(found):
+        raise CommandError("two cameras would be called the same; choose with --camera and --gripper-camera")
+    return found
+
+
+def _carried(content: EpisodeContent) -> set[str]:
+    """Cameras that an arm carries, by the rig's configuration."""
+    cameras = content.episode.info["rig"]["resolved"]["cameras"]
+    return {spec["name"] for spec in cameras if (spec["view"] or {}).get("robot") is not None}

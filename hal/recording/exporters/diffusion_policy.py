@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator
 from contextlib import ExitStack
 from pathlib import Path
@@ -10,13 +11,94 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..columns import ACTION
-from .content import EpisodeContent
-from .job import Job
-from .observations import observations, picture_name, with_channel
-from .zarr_folder import GROUP, ZarrArray, make_group
+from ..layout import ACTION
+from .content import EpisodeContent, observations, picture_name, with_channel
+from .output import Job
 
-__all__ = ["is_one", "write"]
+__all__ = [
+    "GROUP",
+    "ZarrArray",
+    "is_one",
+    "make_group",
+    "write",
+]
+
+# [zarr_folder.py] Arrays as a folder in the zarr format, version 2: read by every zarr library, old and new, and
+# written without any.
+#
+# An array is a JSON file (``.zarray``) and a file per chunk; a group is a folder with another JSON file. Chunks
+# are
+# compressed with zstd, and numbers of several bytes have their bytes sorted first, which both halves what they
+# take.
+#
+
+GROUP, _ARRAY, _ATTRIBUTES = ".zgroup", ".zarray", ".zattrs"
+_VERSION = 2
+_LEVEL = 3
+_CHUNK = 2_000_000
+"""Bytes, before they are compressed."""
+
+
+def make_group(folder: Path, attributes: dict[str, Any] | None = None) -> Path:
+    """A group, with what is to be known of it."""
+    folder.mkdir()
+    _write_json(folder / GROUP, {"zarr_format": _VERSION})
+    if attributes:
+        _write_json(folder / _ATTRIBUTES, attributes)
+    return folder
+
+
+class ZarrArray:
+    """An array (rows, ...) that grows row by row, and is whole when it is closed."""
+
+    def __init__(self, folder: Path, shape: tuple[int, ...], dtype: np.dtype[Any], rows: int) -> None:
+        """``shape`` is that of one row, ``rows`` how many will come: a chunk is never longer."""
+        import zstandard
+
+        folder.mkdir()
+        self._folder = folder
+        self._dtype = np.dtype(dtype).newbyteorder("<")
+        size = int(np.prod(shape, dtype=np.int64)) * self._dtype.itemsize
+        self._length = max(1, min(rows, _CHUNK // max(1, size)))
+        self._chunk = np.zeros((self._length, *shape), self._dtype)
+        self._rows = 0
+        self._compressor = zstandard.ZstdCompressor(level=_LEVEL)
+
+    def add(self, values: NDArray[Any]) -> None:
+        """One row more."""
+        place = self._rows % self._length
+        self._chunk[place] = values
+        self._rows += 1
+        if place == self._length - 1:
+            self._write_chunk()
+
+    def close(self) -> None:
+        """Write the rest, and say what is there."""
+        if rest := self._rows % self._length:
+            self._chunk[rest:] = 0
+            self._write_chunk()
+        shuffle = [{"id": "shuffle", "elementsize": self._dtype.itemsize}] if self._dtype.itemsize > 1 else None
+        head = {
+            "zarr_format": _VERSION,
+            "shape": [self._rows, *self._chunk.shape[1:]],
+            "chunks": list(self._chunk.shape),
+            "dtype": self._dtype.str,
+            "compressor": {"id": "zstd", "level": _LEVEL},
+            "filters": shuffle,
+            "fill_value": 0,
+            "order": "C",
+        }
+        _write_json(self._folder / _ARRAY, head)
+
+    def _write_chunk(self) -> None:
+        number = (self._rows - 1) // self._length
+        name = ".".join([str(number), *("0" for _ in self._chunk.shape[1:])])
+        plain = self._chunk.view(np.uint8).reshape(-1, self._dtype.itemsize)
+        (self._folder / name).write_bytes(self._compressor.compress(np.ascontiguousarray(plain.T).data))
+
+
+def _write_json(path: Path, data: Any) -> None:
+    path.write_text(json.dumps(data, indent=1) + "\n", encoding="utf-8")
 
 
 def is_one(path: Path) -> bool:

@@ -16,10 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import CommandError
-from ..columns import ACTION
-from .content import EpisodeContent
-from .job import Job
-from .roles import roles
+from ..layout import ACTION
+from .content import EpisodeContent, roles
+from .output import Job
 
 __all__ = ["is_one", "write"]
 

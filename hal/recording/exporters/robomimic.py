@@ -10,10 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import DriverMissing
-from ..columns import ACTION
-from .content import EpisodeContent, Pictures
-from .job import Job
-from .observations import observations, picture_name, with_channel
+from ..layout import ACTION
+from .content import EpisodeContent, Pictures, observations, picture_name, with_channel
+from .output import Job
 
 __all__ = ["is_one", "write"]
 

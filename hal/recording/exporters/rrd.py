@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from ...errors import DriverMissing
 from ...geometry import Pose
 from ...types import RobotStatus, Trip
-from ..columns import SETPOINT, STATE
-from ..reader import Episode
+from ..dataset import Episode
+from ..layout import SETPOINT, STATE
 from .content import Arm, EpisodeContent, Pictures
 
 __all__ = ["write_rrd"]

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 import hal
-from hal.apps.banner import banner, listing
+from hal.apps._common import banner, listing
 from hal.config import load
 
 

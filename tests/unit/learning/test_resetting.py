@@ -10,7 +10,7 @@ import pytest
 
 import hal
 from hal.apps.collect import parser
-from hal.apps.collecting import Collection
+from hal.apps.collecting import DemonstrationSession
 from hal.drivers.mock.gamepad import MockPad
 from hal.learning.episode import put_back
 from hal.recording import Dataset, Recorder
@@ -86,7 +86,9 @@ def test_without_a_hand_to_open(rig: hal.Rig) -> None:
 
 def collect(rig: hal.Rig, folder: Path, *options: str) -> int:
     with Recorder(rig, folder) as recorder:
-        run = Collection(rig, rig.robots["panda"], rig.gamepads["pad"], recorder, parser().parse_args([*options]))
+        run = DemonstrationSession(
+            rig, rig.robots["panda"], rig.gamepads["pad"], recorder, parser().parse_args([*options])
+        )
         return run.run()
 
 

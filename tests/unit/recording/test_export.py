@@ -17,8 +17,8 @@ import hal
 from hal.errors import CommandError, DatasetError
 from hal.recording import Dataset, Recorder
 from hal.recording.exporters import default_path, export
+from hal.recording.exporters.content import episode_numbers
 from hal.recording.exporters.output import fresh
-from hal.recording.exporters.selection import episode_numbers
 
 
 @pytest.fixture(scope="module")

@@ -197,12 +197,12 @@ def test_zarr_is_a_replay_buffer(dataset: Dataset, tmp_path: Path) -> None:
 def test_zarr_chunks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, rows: int, dtype: type) -> None:
     """Whole chunks, a part of one, and one alone."""
     zarr = pytest.importorskip("zarr", reason="pip install zarr")
-    from hal.recording.exporters import zarr_folder
+    from hal.recording.exporters import diffusion_policy
 
     values = np.random.default_rng(0).integers(0, 200, (rows, 5, 4, 3)).astype(dtype)
-    monkeypatch.setattr(zarr_folder, "_CHUNK", 3 * values[0].nbytes)
-    group = zarr_folder.make_group(tmp_path / "group", {"unit": "m"})
-    array = zarr_folder.ZarrArray(group / "values", values.shape[1:], values.dtype, rows)
+    monkeypatch.setattr(diffusion_policy, "_CHUNK", 3 * values[0].nbytes)
+    group = diffusion_policy.make_group(tmp_path / "group", {"unit": "m"})
+    array = diffusion_policy.ZarrArray(group / "values", values.shape[1:], values.dtype, rows)
     for value in values:
         array.add(value)
     array.close()

@@ -9,11 +9,8 @@ import numpy as np
 import pytest
 from export_kit import make_recording
 
-from hal.recording import Dataset
-from hal.recording.exporters import canvas
-from hal.recording.exporters.canvas import Canvas, ticks
-from hal.recording.exporters.sheet import draw_sheet
-from hal.recording.exporters.summary import as_json, summary
+from hal.recording import Dataset, review
+from hal.recording.review import Canvas, as_json, draw_sheet, summary, ticks
 
 RED, BLUE, ORANGE, PINK = (215, 60, 50), (0, 90, 181), (240, 140, 30), (250, 205, 200)
 
@@ -109,7 +106,7 @@ def test_a_curve_goes_through_its_points() -> None:
     assert tuple(image[2, 2]) == RED
     assert tuple(image[40, 90]) == (255, 255, 255)
     assert image[30:46, 58:72].min() < 100, "a word is there"
-    assert canvas.Canvas.length("xx") > canvas.Canvas.length("x") > 0
+    assert review.Canvas.length("xx") > review.Canvas.length("x") > 0
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,7 @@ import pytest
 from recording_kit import check_layout, drive, kill_writer, mock_rig, record
 
 from hal.errors import ConnectionLost
-from hal.recording import Dataset, Recorder, finalise, layout, recover
+from hal.recording import Dataset, Recorder, finish, layout, recover
 from hal.recording.live import Rest
 
 
@@ -125,7 +125,7 @@ def test_it_may_be_killed_at_every_step_of_finishing(
         return step
 
     monkeypatch.setattr(layout, "sync", counted(layout.sync))
-    monkeypatch.setattr(finalise, "sync", counted(finalise.sync))
+    monkeypatch.setattr(finish, "sync", counted(finish.sync))
     monkeypatch.setattr(Path, "replace", counted(Path.replace))
     monkeypatch.setattr(Path, "rename", counted(Path.rename))
     monkeypatch.setattr(shutil, "rmtree", counted(shutil.rmtree))

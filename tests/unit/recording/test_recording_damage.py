@@ -20,9 +20,8 @@ from hal.learning.replay import RecordedTrajectory
 from hal.recording import Dataset, Episode, Recorder, recover, repair
 from hal.recording.checking import check_dataset, check_rows
 from hal.recording.exporters import export
-from hal.recording.exporters.sheet import draw_sheet
-from hal.recording.exporters.summary import summary
-from hal.recording.tables import read_tasks
+from hal.recording.finish import read_tasks
+from hal.recording.review import draw_sheet, summary
 from hal.rig import Rig
 
 FLIPS = int(os.environ.get("HAL_TEST_FLIPS", "60"))

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 pytest.importorskip("zstandard", reason="pip install 'robot-hal[record]'")
 
-from hal.recording.depth import DepthFile, DepthReader, cut, to_units, unit_for
+from hal.recording.codecs import DepthFile, DepthReader, cut, to_units, unit_for
 
 
 def pictures(count: int) -> list[NDArray[np.float32]]:

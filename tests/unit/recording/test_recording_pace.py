@@ -11,7 +11,7 @@ import pytest
 from recording_kit import mock_rig, record
 
 from hal.recording import Dataset, Recorder
-from hal.recording.pace import Pace, simulated_pace
+from hal.recording.layout import Pace, simulated_pace
 
 COLUMNS = [
     ("observation.time.grid", "float64", ("t",)),

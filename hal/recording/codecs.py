@@ -1,0 +1,433 @@
+"""Colour pictures as video: what encodes them, how a video that was cut off is mended, how it is read."""
+
+from __future__ import annotations
+
+import io
+import json
+import math
+import os
+import struct
+from collections.abc import Iterator, Mapping
+from fractions import Fraction
+from pathlib import Path
+from typing import Any, NamedTuple
+from zlib import crc32
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import CommandError, NotSupported
+
+__all__ = [
+    "DepthFile",
+    "DepthReader",
+    "Encoder",
+    "PictureStats",
+    "Stats",
+    "VideoFile",
+    "as_rgb",
+    "choose_encoder",
+    "column_stats",
+    "count_frames",
+    "mend",
+    "merged",
+    "numbers_to_units",
+    "picture_stats",
+    "plain",
+    "read_video",
+    "remux",
+    "to_units",
+    "unit_for",
+]
+
+# [depth.py] Depth pictures in a file of their own, without loss: zstd over differences of neighbours, low and
+# high bytes apart.
+#
+# A file is one line of JSON (size, unit), then a record per row of the episode: length and checksum of what
+# follows, and
+# that. A record of no length says that the row shows the same picture as the one before. Records are appended and
+# flushed
+# one by one, so a program that is killed leaves whole ones, and at most half of one, which is cut off.
+#
+
+_RECORD = struct.Struct("<II")  # length, checksum
+_LEVEL = 1
+_MOST = 65535
+_LINE, _SIDE = 4096, 16384
+"""Bytes of the first line, and pixels of a side, at most: a damaged file must not ask for all memory."""
+_UNITS = (0.0001, 0.00025, 0.0005, 0.001, 0.002, 0.005, 0.01)
+
+Units = NDArray[np.uint16]
+
+
+def unit_for(depth_max: float) -> float:
+    """The finest unit, in m, in which 16 bits reach as far as a simulated camera sees."""
+    return next((unit for unit in _UNITS if depth_max <= _MOST * unit), depth_max / _MOST)
+
+
+def to_units(depth: NDArray[np.float32], unit: float) -> Units:
+    """Metres in whole units, rounded to the nearest one; 0 for what was not measured, or does not fit."""
+    whole = np.rint(depth / np.float32(unit))
+    whole[~((whole >= 0.0) & (whole <= _MOST))] = 0.0  # what is not a number, too
+    units: Units = whole.astype("<u2")
+    return units
+
+
+def numbers_to_units(numbers: NDArray[np.int32]) -> Units:
+    """Return numbers of bodies (H, W), -1 for none, as units. ValueError for a number above 65534."""
+    if numbers.size and not (numbers.min() >= -1 and numbers.max() < _MOST):
+        raise ValueError("a number of a body does not fit into 16 bits")
+    units: Units = (numbers + 1).astype("<u2")
+    return units
+
+
+class DepthFile:
+    """Appends pictures to an open, unbuffered file."""
+
+    def __init__(self, file: io.RawIOBase, width: int, height: int, unit: float) -> None:
+        import zstandard
+
+        self._compressor = zstandard.ZstdCompressor(level=_LEVEL)
+        self._file = file
+        head = {"format": "delta, byte shuffle, zstd", "width": width, "height": height, "unit_m": unit}
+        _write(file, json.dumps(head).encode() + b"\n")
+        self._unit = unit
+
+    def add(self, depth: NDArray[np.float32] | None) -> None:
+        """One row's picture (H, W) in m; None for the same one again."""
+        self.add_units(None if depth is None else to_units(depth, self._unit))
+
+    def add_units(self, units: Units | None) -> None:
+        """One row's picture (H, W) in units of the file; None for the same one again."""
+        payload = b"" if units is None else self._compressor.compress(_shuffled(units))
+        _write(self._file, _RECORD.pack(len(payload), crc32(payload)) + payload)
+
+
+class DepthReader:
+    """The whole records of a file; reads them one by one."""
+
+    def __init__(self, path: str | Path) -> None:
+        self.path = Path(path)
+        with self.path.open("rb") as file:
+            head: dict[str, Any] = json.loads(file.readline(_LINE))
+            self.shape = (int(head["height"]), int(head["width"]))
+            self.unit = float(head["unit_m"])
+            if not (all(1 <= side <= _SIDE for side in self.shape) and 0.0 < self.unit < math.inf):
+                raise ValueError(f"its first line is damaged: {head}")
+            self._places = list(_records(file, self.path.stat().st_size))
+
+    def __len__(self) -> int:
+        return len(self._places)
+
+    def end_of(self, count: int) -> int:
+        """Where the first ``count`` records end in the file, bytes."""
+        if count == 0:
+            with self.path.open("rb") as file:
+                return len(file.readline())
+        start, length = self._places[count - 1]
+        return start + length
+
+    def units(self) -> Iterator[Units]:
+        """Yield every row's picture (H, W), in units of :attr:`unit` m. ValueError for a damaged one."""
+        import zstandard
+
+        expand = zstandard.ZstdDecompressor()
+        picture = np.zeros(self.shape, "<u2")
+        with self.path.open("rb") as file:
+            for k, (start, length) in enumerate(self._places):
+                if length:
+                    file.seek(start - _RECORD.size)
+                    _, check = _RECORD.unpack(file.read(_RECORD.size))
+                    data = file.read(length)
+                    if crc32(data) != check or zstandard.frame_content_size(data) != picture.nbytes:
+                        raise ValueError(f"picture {k} is damaged")
+                    picture = _unshuffled(expand.decompress(data), self.shape)
+                yield picture
+
+    def __iter__(self) -> Iterator[NDArray[np.float32]]:
+        """Every row's picture (H, W) in m; 0 where nothing was measured."""
+        unit = np.float32(self.unit)
+        return (units.astype(np.float32) * unit for units in self.units())
+
+
+def _records(file: io.BufferedReader, size: int) -> Iterator[tuple[int, int]]:
+    """Start and length of each whole record, from where the file stands."""
+    while True:
+        head = file.read(_RECORD.size)
+        if len(head) < _RECORD.size:
+            return
+        length, check = _RECORD.unpack(head)
+        start = file.tell()
+        if start + length > size:
+            return
+        last = start + length == size
+        if last and crc32(file.read(length)) != check:
+            return
+        file.seek(start + length)
+        yield start, length
+
+
+def _shuffled(units: Units) -> bytes:
+    steps = units.copy()
+    steps[:, 1:] -= units[:, :-1]
+    return np.ascontiguousarray(steps.view(np.uint8).reshape(-1, 2).T).tobytes()
+
+
+def _unshuffled(data: bytes, shape: tuple[int, int]) -> Units:
+    steps = np.ascontiguousarray(np.frombuffer(data, np.uint8).reshape(2, -1).T).view("<u2").reshape(shape)
+    units: Units = np.cumsum(steps, axis=1, dtype=np.uint16)
+    return units
+
+
+def _write(file: io.RawIOBase, data: bytes) -> None:
+    """All of it: an unbuffered file may take only a part. OSError when the disk is full."""
+    rest = memoryview(data)
+    while rest:
+        written = file.write(rest)
+        rest = rest[written or 0 :]
+
+
+def cut(path: Path, count: int) -> None:
+    """Leave the first ``count`` records."""
+    os.truncate(path, DepthReader(path).end_of(count))
+
+
+# [stats.py] Statistics of columns and pictures, as a LeRobotDataset keeps them: for training to normalise by.
+
+Stats = dict[str, NDArray[Any]]
+"""``min``, ``max``, ``mean``, ``std``, ``q01`` ... ``q99``, each of the column's shape, and ``count`` (1,)."""
+
+_QUANTILES = {"q01": 0.01, "q10": 0.10, "q50": 0.50, "q90": 0.90, "q99": 0.99}
+_LEVELS = 256
+_FINE = 120
+"""Rows of pixels of a picture that count, at least: as good for statistics as all of them, and far quicker."""
+
+
+def column_stats(values: NDArray[Any]) -> Stats:
+    """Of a column (rows, n). What was not known (NaN) is left out; where nothing was, NaN stays."""
+    table = np.asarray(values, np.float64)
+    known = np.isfinite(table)
+    found: Stats = {key: np.full(table.shape[1], np.nan) for key in ("min", "max", "mean", "std", *_QUANTILES)}
+    for k in range(table.shape[1]):
+        numbers = table[known[:, k], k]
+        if numbers.size:
+            found["min"][k], found["max"][k] = numbers.min(), numbers.max()
+            found["mean"][k], found["std"][k] = numbers.mean(), numbers.std()
+            for key, value in zip(_QUANTILES, np.quantile(numbers, list(_QUANTILES.values())), strict=True):
+                found[key][k] = value
+    return found | {"count": np.array([len(table)], np.int64)}
+
+
+class PictureStats:
+    """Of pictures, by a histogram of each colour."""
+
+    def __init__(self) -> None:
+        self._seen = np.zeros((3, _LEVELS), np.int64)
+        self._pictures = 0
+
+    def add(self, picture: NDArray[np.uint8]) -> None:
+        """One picture (H, W, 3) RGB."""
+        step = max(1, min(picture.shape[:2]) // _FINE)
+        for k in range(3):
+            self._seen[k] += np.bincount(picture[::step, ::step, k].ravel(), minlength=_LEVELS)
+        self._pictures += 1
+
+    def stats(self) -> Stats:
+        """Colours in 0..1, each of shape (3, 1, 1); ``count`` are the pictures that were looked at."""
+        levels = np.arange(_LEVELS) / (_LEVELS - 1)
+        total = np.maximum(1, self._seen.sum(axis=1))
+        mean = self._seen @ levels / total
+        std = np.sqrt(np.maximum(0.0, self._seen @ levels**2 / total - mean**2))
+        there = self._seen > 0
+        share = np.cumsum(self._seen, axis=1) / total[:, None]
+        found = {
+            "min": levels[there.argmax(axis=1)],
+            "max": levels[_LEVELS - 1 - there[:, ::-1].argmax(axis=1)],
+            "mean": mean,
+            "std": std,
+            **{key: levels[(share >= level).argmax(axis=1)] for key, level in _QUANTILES.items()},
+        }
+        return {key: value.reshape(3, 1, 1) for key, value in found.items()} | {"count": np.array([self._pictures])}
+
+
+def merged(old: Mapping[str, Any] | None, new: Stats) -> Stats:
+    """Statistics of both together. Exact but for the quantiles, which are averaged by how much each part counts."""
+    if not old:
+        return new
+    before = {key: np.asarray(value, np.float64) for key, value in old.items()}
+    n, m = float(before["count"][0]), float(new["count"][0])
+    weights = np.array([n, m]) / max(1.0, n + m)
+
+    def average(a: NDArray[Any], b: NDArray[Any]) -> NDArray[Any]:
+        both = weights[0] * a + weights[1] * b
+        return np.where(np.isnan(a), b, np.where(np.isnan(b), a, both))
+
+    mean = average(before["mean"], new["mean"])
+    square = average(before["std"] ** 2 + before["mean"] ** 2, new["std"] ** 2 + new["mean"] ** 2)
+    return {
+        "min": np.fmin(before["min"], new["min"]),
+        "max": np.fmax(before["max"], new["max"]),
+        "mean": mean,
+        "std": np.sqrt(np.maximum(0.0, square - mean**2)),
+        **{key: average(before[key], new[key]) for key in _QUANTILES},
+        "count": np.array([int(n + m)]),
+    }
+
+
+def plain(stats: Mapping[str, Stats]) -> dict[str, dict[str, list[Any]]]:
+    """Return the statistics of each column as lists, ready for JSON.
+
+    A column of which a number was never known in any row has none: JSON has no NaN, and a made-up number would mislead.
+    """
+    complete = {key: found for key, found in stats.items() if all(np.isfinite(each).all() for each in found.values())}
+    return {key: {name: each.tolist() for name, each in found.items()} for key, found in complete.items()}
+
+
+Picture = NDArray[np.uint8]
+
+_LIVE = {"movflags": "frag_keyframe+empty_moov+default_base_moof", "flush_packets": "1"}
+"""In fragments, each written as soon as it is whole: a file that ends anywhere can be read up to its last fragment."""
+_SAMPLES = 50
+"""Pictures of a video that are looked at, at least."""
+_BOX = struct.Struct(">I4s")
+
+
+class Encoder(NamedTuple):
+    """What compresses."""
+
+    library: str
+    """FFmpeg's name of it."""
+    codec: str
+    """As ``info.json`` names what comes out."""
+    options: dict[str, str]
+
+    @property
+    def feature(self) -> dict[str, Any]:
+        """For ``info`` of a video in ``info.json``."""
+        return {"video.codec": self.codec, "video.pix_fmt": "yuv420p"}
+
+
+# Every second picture stands for itself (g = 2), so any picture is found at once, as people train on them in random
+# order. No picture refers to a later one (bf = 0, pred-struct = 1): it is on disk soon, and readers do not see the
+# first one late.
+_ENCODERS = (
+    Encoder("libx264", "h264", {"preset": "veryfast", "crf": "23", "g": "2", "bf": "0"}),
+    Encoder("libsvtav1", "av1", {"preset": "12", "crf": "30", "g": "2", "svtav1-params": "lp=1:pred-struct=1"}),
+)
+
+
+def choose_encoder(codec: str) -> Encoder:
+    """``h264``, ``av1``, or ``auto`` for the first of them that is there.
+
+    Raises CommandError for another word, NotSupported where this build of PyAV cannot encode it.
+    """
+    import av
+
+    known = [encoder.codec for encoder in _ENCODERS]
+    if codec not in ("auto", *known):
+        raise CommandError(f"codec must be auto, {' or '.join(known)}, not {codec!r}")
+    for encoder in _ENCODERS:
+        if codec in ("auto", encoder.codec) and encoder.library in av.codecs_available:
+            return encoder
+    raise NotSupported(f"this build of PyAV cannot encode {codec}; install one of PyPI's: pip install av")
+
+
+class VideoFile:
+    """Appends pictures to an open, unbuffered file."""
+
+    def __init__(self, file: io.RawIOBase, encoder: Encoder, width: int, height: int, fps: int) -> None:
+        import av
+
+        self._av = av
+        self._container = av.open(file, "w", format="mp4", options=_LIVE)
+        stream: Any = self._container.add_stream(encoder.library, rate=fps, options=encoder.options)
+        stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
+        stream.thread_count = 1  # more would hold pictures back
+        self._stream = stream
+        self._period = Fraction(1, fps)
+        self._count = 0
+
+    def add(self, picture: Picture) -> None:
+        """One row's picture (H, W, 3) RGB."""
+        frame = self._av.VideoFrame.from_ndarray(picture, format="rgb24")
+        frame.pts, frame.time_base = self._count, self._period
+        self._count += 1
+        self._container.mux(self._stream.encode(frame))
+
+    def close(self) -> None:
+        """Write what the encoder still holds."""
+        self._container.mux(self._stream.encode())
+        self._container.close()
+
+
+def as_rgb(picture: Picture) -> Picture:
+    """Return a copy (H, W, 3) of a picture, which may be a grey one (H, W)."""
+    return picture.copy() if picture.ndim == 3 else np.repeat(picture[:, :, None], 3, axis=2)
+
+
+def mend(path: Path) -> None:
+    """Cut a live file off behind its last whole fragment."""
+    size, place, whole = path.stat().st_size, 0, 0
+    with path.open("rb") as file:
+        while place + _BOX.size <= size:
+            file.seek(place)
+            length, kind = _BOX.unpack(file.read(_BOX.size))
+            if length < _BOX.size or place + length > size:
+                break
+            place += length
+            if kind in (b"moov", b"mdat"):
+                whole = place
+    os.truncate(path, whole)
+
+
+def count_frames(path: Path) -> int:
+    """Return how many pictures a video holds, without decoding them."""
+    import av
+
+    if path.stat().st_size == 0:
+        return 0
+    with av.open(str(path)) as container:
+        return sum(1 for packet in container.demux(video=0) if packet.size)
+
+
+def remux(source: Path, target: Path, length: int) -> None:
+    """Write the first ``length`` pictures of a live file as a plain one, without encoding them anew."""
+    import av
+
+    with av.open(str(source)) as live, av.open(str(target), "w", options={"movflags": "faststart"}) as plain:
+        read = live.streams.video[0]
+        write = plain.add_stream_from_template(read, opaque=True)  # what is read is written, whatever encoded it
+        packets = (packet for packet in live.demux(read) if packet.size)
+        for _, packet in zip(range(length), packets, strict=False):
+            packet.stream = write
+            plain.mux(packet)
+
+
+def picture_stats(path: Path, length: int, fps: int) -> PictureStats:
+    """Return statistics of a picture per second, or of more in a short video. Only key frames are decoded."""
+    import av
+
+    stats = PictureStats()
+    every = max(1, min(fps, length // _SAMPLES))
+    with av.open(str(path)) as container:
+        stream = container.streams.video[0]
+        stream.thread_count = 1
+        due = 0
+        for count, packet in enumerate(packet for packet in container.demux(stream) if packet.size):
+            if packet.is_keyframe and count >= due:
+                due = count + every
+                for frame in stream.codec_context.decode(packet):
+                    stats.add(frame.to_ndarray(format="rgb24"))
+        for frame in stream.codec_context.decode(None):
+            stats.add(frame.to_ndarray(format="rgb24"))
+    return stats
+
+
+def read_video(path: Path) -> Iterator[Picture]:
+    """Every picture (H, W, 3) RGB, in order."""
+    import av
+
+    with av.open(str(path)) as container:
+        container.streams.video[0].thread_type = "AUTO"
+        for frame in container.decode(video=0):
+            yield frame.to_ndarray(format="rgb24")

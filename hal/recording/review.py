@@ -1,0 +1,529 @@
+"""One episode on one sheet: pictures in time, what the arms did when, every joint as commanded and as measured."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import asdict, dataclass, field
+from itertools import pairwise
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image, ImageDraw, ImageFont
+
+from ..errors import DatasetError
+from ..types import Limited, RobotStatus, Trip
+from .dataset import Dataset, Episode
+from .exporters.content import Arm, EpisodeContent, Pictures
+from .layout import ACTION, SETPOINT, STATE, simulated_pace
+
+__all__ = [
+    "BLACK",
+    "Canvas",
+    "Colour",
+    "EpisodeLine",
+    "GREY",
+    "LIGHT",
+    "Spread",
+    "Summary",
+    "Timing",
+    "as_json",
+    "draw_sheet",
+    "summary",
+    "ticks",
+]
+
+# [canvas.py] A picture to draw curves and words on, with nothing but Pillow.
+
+Colour = tuple[int, int, int]
+BLACK: Colour = (30, 30, 30)
+GREY: Colour = (120, 120, 120)
+LIGHT: Colour = (225, 225, 225)
+_FINE = 3
+"""Shapes are drawn so many times larger, and scaled down, so that slanted lines are smooth."""
+
+
+class Canvas:
+    """White. Places are in pixels from the upper left corner."""
+
+    def __init__(self, width: int, height: int) -> None:
+        self.width, self.height = width, height
+        self._fine = Image.new("RGB", (width * _FINE, height * _FINE), "white")
+        self._draw = ImageDraw.Draw(self._fine)
+        self._words: list[tuple[float, float, str, int, Colour, str]] = []
+        self._photos: list[tuple[int, int, Image.Image]] = []
+
+    def line(self, points: Sequence[tuple[float, float]], colour: Colour, width: float = 1.0) -> None:
+        """From point to point."""
+        if len(points) > 1:
+            fine = [(x * _FINE, y * _FINE) for x, y in points]
+            self._draw.line(fine, fill=colour, width=round(width * _FINE), joint="curve")
+
+    def box(self, x: float, y: float, width: float, height: float, colour: Colour) -> None:
+        """A filled rectangle, one pixel wide at least."""
+        right, bottom = x + max(1.0, width), y + max(1.0, height)
+        self._draw.rectangle((x * _FINE, y * _FINE, right * _FINE - 1, bottom * _FINE - 1), fill=colour)
+
+    def text(self, x: float, y: float, words: str, size: int = 13, colour: Colour = BLACK, anchor: str = "la") -> None:
+        """Words; ``anchor`` is Pillow's: left, middle or right, then ascender, middle or baseline."""
+        self._words.append((x, y, words, size, colour, anchor))
+
+    def photo(self, x: int, y: int, picture: NDArray[np.uint8], width: int, height: int) -> None:
+        """A picture (H, W, 3) RGB, scaled."""
+        image = Image.fromarray(picture).resize((width, height), Image.Resampling.BOX)
+        self._photos.append((x, y, image))
+
+    @staticmethod
+    def length(words: str, size: int = 13) -> float:
+        """How wide these words are."""
+        return float(_font(size).getlength(words))
+
+    def finished(self) -> Image.Image:
+        """The picture."""
+        image = self._fine.resize((self.width, self.height), Image.Resampling.BOX)
+        for left, top, photo in self._photos:
+            image.paste(photo, (left, top))
+        draw = ImageDraw.Draw(image)
+        for x, y, words, size, colour, anchor in self._words:
+            draw.text((x, y), words, fill=colour, font=_font(size), anchor=anchor)
+        return image
+
+
+def _font(size: int) -> Any:
+    return ImageFont.load_default(size)
+
+
+def ticks(low: float, high: float, most: int) -> list[float]:
+    """Round numbers in a range, at most so many."""
+    span = high - low
+    for exponent in range(-9, 10):
+        for mantissa in (1.0, 2.0, 5.0):
+            step = mantissa * 10.0**exponent
+            if span / step <= most - 1:
+                first = int(np.ceil(low / step - 1e-9))
+                last = int(np.floor(high / step + 1e-9))
+                return [k * step for k in range(first, last + 1)]
+    return [low, high]
+
+
+# [summary.py] What a dataset is like, in numbers: how much, how well it went, how the joints moved, how even the
+# times are.
+
+_WATCHED = ("robot.", "gripper.", "camera.")
+"""Sources that measure all the time; a pad speaks when it is touched."""
+
+
+@dataclass(frozen=True)
+class Spread:
+    """One number of a column, over all rows: rad, or m of a gripper's width."""
+
+    name: str
+    min: float
+    max: float
+    mean: float
+    std: float
+
+
+@dataclass(frozen=True)
+class Timing:
+    """How even the true times of a source are, ms."""
+
+    source: str
+    period: float
+    """Mean time between two samples that differ."""
+    jitter: float
+    """Standard deviation of that."""
+    longest: float
+    age: float
+    """How old a sample was when its row was due, on average."""
+    oldest: float
+    repeated: int
+    """Rows with the same sample as the row before."""
+
+
+@dataclass(frozen=True)
+class EpisodeLine:
+    """One episode."""
+
+    number: int
+    rows: int
+    seconds: float
+    success: bool | None
+    dropped: int
+    trips: int
+    """How often a stop was latched in it."""
+    task: str
+    trouble: str
+    pace: float | None
+    """How fast a simulation's time passed, as a share of real time; None in lock-step, and without one."""
+
+
+@dataclass(frozen=True)
+class Summary:
+    """All of a dataset, or of the episodes that were asked for."""
+
+    path: str
+    fps: int
+    robot_type: str
+    episodes: list[EpisodeLine]
+    rows: int
+    seconds: float
+    successes: int
+    failures: int
+    unmarked: int
+    dropped: int
+    bytes: int
+    state: list[Spread]
+    action: list[Spread]
+    timing: list[Timing]
+    broken: list[str] = field(default_factory=list)
+    """Episodes that cannot be read, and why."""
+
+
+def summary(dataset: Dataset, episodes: Iterable[Episode] | None = None) -> Summary:
+    """Read every row of these episodes, else of all. Pictures are counted, not decoded."""
+    lines: list[EpisodeLine] = []
+    broken: list[str] = []
+    states, actions = _Moments(), _Moments()
+    names: list[str] = []
+    times: dict[str, _Times] = {}
+    for episode in dataset.episodes if episodes is None else episodes:
+        try:
+            line, columns, stamps = _line(episode), episode.columns, episode.stamps
+            parts = columns[STATE], columns[ACTION]
+            episode.check_pictures()
+        except DatasetError as error:
+            broken.append(str(error))
+            continue
+        lines.append(line)
+        names = episode.names(STATE)
+        states.add(parts[0])
+        actions.add(parts[1])
+        for source, stamp in stamps.items():
+            if source.startswith(_WATCHED):
+                times.setdefault(source, _Times()).add(stamp, stamps["grid"])
+    return Summary(
+        path=str(dataset.root),
+        fps=dataset.fps,
+        robot_type=str(dataset.info.get("robot_type")),
+        episodes=lines,
+        rows=sum(line.rows for line in lines),
+        seconds=sum(line.seconds for line in lines),
+        successes=sum(line.success is True for line in lines),
+        failures=sum(line.success is False for line in lines),
+        unmarked=sum(line.success is None for line in lines),
+        dropped=sum(line.dropped for line in lines),
+        bytes=_bytes(dataset.root),
+        state=states.spreads(names),
+        action=actions.spreads(names),
+        timing=[found.timing(source) for source, found in times.items()],
+        broken=broken,
+    )
+
+
+def as_json(found: Summary) -> str:
+    """As one JSON object; what is not known is null."""
+
+    def plain(value: Any) -> Any:
+        if isinstance(value, float):
+            return value if math.isfinite(value) else None
+        if isinstance(value, dict):
+            return {key: plain(each) for key, each in value.items()}
+        if isinstance(value, list):
+            return [plain(each) for each in value]
+        return value
+
+    return json.dumps(plain(asdict(found)), indent=2)
+
+
+def _line(episode: Episode) -> EpisodeLine:
+    status, names = episode.columns["observation.status"], episode.names("observation.status")
+    trips = 0
+    for k, name in enumerate(names):
+        if name.split(".")[-1] == "trip":
+            tripped = status[:, k] != 0
+            trips += int(tripped[0]) + int(np.sum(tripped[1:] & ~tripped[:-1]))
+    return EpisodeLine(
+        number=episode.number,
+        rows=episode.length,
+        seconds=float(np.ptp(episode.stamps["grid"])) + 1.0 / episode.fps,
+        success=episode.success,
+        dropped=int(episode.info.get("dropped") or 0),
+        trips=trips,
+        task=episode.task,
+        trouble=str(episode.info.get("trouble") or ("recovered" if episode.info.get("recovered") else "")),
+        pace=simulated_pace(episode.info),
+    )
+
+
+def _bytes(folder: Path) -> int:
+    return sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())
+
+
+class _Moments:
+    """Least, most, mean and spread of columns that come in parts. What was not known (NaN) does not count."""
+
+    def __init__(self) -> None:
+        self._parts: list[NDArray[np.float64]] = []
+
+    def add(self, values: NDArray[Any]) -> None:
+        self._parts.append(np.asarray(values, np.float64))
+
+    def spreads(self, names: list[str]) -> list[Spread]:
+        if not self._parts:
+            return []
+        table = np.concatenate(self._parts)
+        return [Spread(name, *_of(table[:, k])) for k, name in enumerate(names)]
+
+
+def _of(values: NDArray[np.float64]) -> Iterator[float]:
+    known = values[np.isfinite(values)]
+    for measure in (np.min, np.max, np.mean, np.std):
+        yield float(measure(known)) if known.size else math.nan
+
+
+class _Times:
+    """Of one source."""
+
+    def __init__(self) -> None:
+        self._periods: list[NDArray[np.float64]] = []
+        self._ages: list[NDArray[np.float64]] = []
+        self._repeated = 0
+
+    def add(self, stamps: NDArray[np.float64], grid: NDArray[np.float64]) -> None:
+        known = np.isfinite(stamps)
+        steps = np.diff(stamps[known])
+        self._repeated += int(np.sum(steps == 0.0))
+        self._periods.append(steps[steps != 0.0])
+        self._ages.append((grid - stamps)[known])
+
+    def timing(self, source: str) -> Timing:
+        periods, ages = np.concatenate(self._periods) * 1e3, np.concatenate(self._ages) * 1e3
+        _, longest, period, jitter = _of(periods)
+        _, oldest, age, _ = _of(ages)
+        return Timing(source, period, jitter, longest, age, oldest, self._repeated)
+
+
+_WIDTH, _MARGIN = 1600, 40
+_INSIDE = _WIDTH - 2 * _MARGIN
+_PHOTOS, _BETWEEN = 8, 6
+_STRIP, _PANEL, _LEFT, _GUTTER = 18, 118, 52, 36
+_MEASURED: Colour = (0, 90, 181)
+_COMMANDED: Colour = (240, 140, 30)
+_STOPPED: Colour = (250, 205, 200)
+_HELD_BACK: Colour = (255, 241, 190)
+_MISSING: Colour = (215, 205, 235)
+_STATUS: dict[RobotStatus, Colour] = {
+    RobotStatus.IDLE: (215, 215, 215),
+    RobotStatus.FOLLOWING: (95, 175, 105),
+    RobotStatus.STOPPING: (240, 180, 70),
+    RobotStatus.HOLDING: (150, 190, 225),
+    RobotStatus.TRIPPED: (215, 60, 50),
+    RobotStatus.FAULT: (150, 30, 90),
+    RobotStatus.LOST: (60, 60, 60),
+}
+
+
+class _Curve(NamedTuple):
+    title: str
+    measured: NDArray[np.float64]
+    commanded: NDArray[np.float64]
+    least: float
+    """The axis spans no less, so that noise does not look like motion."""
+    arm: Arm
+
+
+class _Run(NamedTuple):
+    """Neighbouring rows with one value."""
+
+    start: float
+    end: float
+    value: int
+
+
+def draw_sheet(episode: Episode) -> Image.Image:
+    """The sheet, 1600 pixels wide. Errors are those of reading the episode."""
+    content = EpisodeContent(episode)
+    streams = [stream for stream in content.pictures if stream.what == "rgb"]
+    curves = list(_curves(content))
+    photo = (_INSIDE - (_PHOTOS - 1) * _BETWEEN) // _PHOTOS
+    heights = [round(photo * stream.shape[0] / stream.shape[1]) for stream in streams]
+    rows = (len(curves) + 1) // 2
+    height = 96 + sum(each + 30 for each in heights) + 70 + len(content.arms) * 44 + rows * (_PANEL + 40) + 20
+    canvas = Canvas(_WIDTH, height)
+    y = _title(canvas, content)
+    for stream, each in zip(streams, heights, strict=True):
+        y = _photos(canvas, content, stream, y, photo, each)
+    y = _statuses(canvas, content, y)
+    _panels(canvas, content, curves, y)
+    return canvas.finished()
+
+
+def _title(canvas: Canvas, content: EpisodeContent) -> float:
+    episode = content.episode
+    info = episode.info
+    mark = {True: "success", False: "failure", None: "not marked"}[episode.success]
+    canvas.text(_MARGIN, 22, f"Episode {episode.number}: {episode.task or 'no task given'} ({mark})", 24)
+    seed = "" if info.get("seed") is None else f", seed {info['seed']}"
+    dropped = f", {info['dropped']} rows dropped" if info.get("dropped") else ""
+    length = f"{content.rows} rows at {episode.fps} Hz, {_end(content):.1f} s"
+    facts = f"{length}, {info.get('robot_type')}{seed}{dropped}, started {info.get('started')}"
+    canvas.text(_MARGIN, 56, facts, 14, GREY)
+    if info.get("trouble"):
+        canvas.text(_MARGIN, 76, str(info["trouble"])[:180], 14, _STATUS[RobotStatus.TRIPPED])
+    return 104
+
+
+def _photos(canvas: Canvas, content: EpisodeContent, stream: Pictures, y: float, width: int, height: int) -> float:
+    """Pictures evenly in time, the first and the last among them."""
+    shown = np.unique(np.linspace(0, content.rows - 1, _PHOTOS).round().astype(int)).tolist()
+    canvas.text(_MARGIN, y, stream.camera, 14)
+    place = 0
+    for k, picture in enumerate(stream):
+        if k in shown:
+            x = _MARGIN + place * (width + _BETWEEN)
+            canvas.photo(x, round(y) + 18, picture, width, height)
+            canvas.text(x + width, y + 16, f"{content.grid[k]:.2f} s", 12, GREY, "rs")
+            place += 1
+    return y + height + 30
+
+
+# What the arms did when.
+
+
+def _statuses(canvas: Canvas, content: EpisodeContent, y: float) -> float:
+    y = _legend(canvas, content, y) + 6
+    for arm in content.arms:
+        status = content.of(arm, "observation.status").astype(int)
+        canvas.text(_MARGIN, y, arm.name, 14)
+        for run in _runs(content, status[:, 0]):
+            x, width = _span(content, run)
+            canvas.box(x, y + 18, width, _STRIP, _STATUS[RobotStatus(run.value)])
+        free = 0.0
+        for run in _runs(content, status[:, 1]):
+            if run.value:
+                x, _ = _span(content, run)
+                words = f"{Trip(run.value)} at {run.start:.2f} s"
+                x = max(x, free)
+                canvas.text(x, y + 14, words, 12, _STATUS[RobotStatus.TRIPPED], "ls")
+                free = x + canvas.length(words, 12) + 12
+        y += 44
+    return y + 8
+
+
+def _legend(canvas: Canvas, content: EpisodeContent, y: float) -> float:
+    x: float = _MARGIN
+    there = {int(value) for arm in content.arms for value in content.of(arm, "observation.status")[:, 0]}
+    limited = Limited(0)
+    for arm in content.arms:
+        limited |= Limited(int(np.bitwise_or.reduce(_limits(content, arm))))
+    items = [(_COMMANDED, "commanded"), (_MEASURED, "measured")]
+    items += [(_STATUS[status], str(status)) for status in RobotStatus if status in there]
+    items += [(_STOPPED, "stop latched")] if any(_trips(content, arm).any() for arm in content.arms) else []
+    items += [(_HELD_BACK, f"held back by the servo ({limited})")] if limited else []
+    items += [(_MISSING, "rows dropped")] if content.episode.info.get("gaps") else []
+    for colour, words in items:
+        canvas.box(x, y + 2, 14, 11, colour)
+        canvas.text(x + 20, y, words, 13)
+        x += 20 + canvas.length(words) + 22
+    return y + 20
+
+
+def _limits(content: EpisodeContent, arm: Arm) -> NDArray[np.int64]:
+    return content.of(arm, "observation.status")[:, 2].astype(np.int64)
+
+
+def _trips(content: EpisodeContent, arm: Arm) -> NDArray[np.int64]:
+    return content.of(arm, "observation.status")[:, 1].astype(np.int64)
+
+
+def _runs(content: EpisodeContent, values: NDArray[np.int64]) -> Iterator[_Run]:
+    """Each lasts until the next one begins."""
+    edges = [0, *(np.flatnonzero(np.diff(values)) + 1).tolist(), len(values)]
+    times = [*content.grid.tolist(), _end(content)]
+    for first, after in pairwise(edges):
+        yield _Run(times[first], times[after], int(values[first]))
+
+
+def _end(content: EpisodeContent) -> float:
+    return float(content.grid[-1]) + 1.0 / content.episode.fps
+
+
+def _span(content: EpisodeContent, run: _Run, left: float = _MARGIN, width: float = _INSIDE) -> tuple[float, float]:
+    """Where a run begins, and how wide it is, on an axis from ``left`` on."""
+    scale = width / _end(content)
+    return left + run.start * scale, (run.end - run.start) * scale
+
+
+# Joints and grippers.
+
+
+def _curves(content: EpisodeContent) -> Iterator[_Curve]:
+    for arm in content.arms:
+        lead = f"{arm.name}: " if arm.lead else ""
+        measured, commanded = content.of(arm, STATE), content.of(arm, SETPOINT)
+        for k, joint in enumerate(content.joints(arm)):
+            yield _Curve(f"{lead}{joint}, rad", measured[:, k], commanded[:, k], 0.02, arm)
+        width, target = content.width(arm), content.width(arm, SETPOINT)
+        if width is not None and target is not None:
+            yield _Curve(f"{lead}gripper, mm", width * 1e3, target * 1e3, 2.0, arm)
+
+
+def _panels(canvas: Canvas, content: EpisodeContent, curves: list[_Curve], y: float) -> None:
+    column = (_INSIDE - _GUTTER) / 2
+    for k, curve in enumerate(curves):
+        left = _MARGIN + (k % 2) * (column + _GUTTER) + _LEFT
+        _panel(canvas, content, curve, left, y + (k // 2) * (_PANEL + 40) + 16, column - _LEFT)
+
+
+def _panel(canvas: Canvas, content: EpisodeContent, curve: _Curve, left: float, top: float, width: float) -> None:
+    canvas.text(left, top - 4, curve.title, 13, BLACK, "ls")
+    canvas.box(left, top, width, _PANEL, (250, 250, 250))
+    for flags, colour in ((_limits(content, curve.arm), _HELD_BACK), (_trips(content, curve.arm), _STOPPED)):
+        for run in _runs(content, (flags != 0).astype(np.int64)):
+            if run.value:
+                x, wide = _span(content, run, left, width)
+                canvas.box(x, top, wide, _PANEL, colour)
+    for gap in content.episode.info.get("gaps") or ():
+        x, wide = _span(content, _Run(gap["from_s"], gap["to_s"] + 1.0 / content.episode.fps, 1), left, width)
+        canvas.box(x, top, wide, _PANEL, _MISSING)
+    low, high = _range(curve)
+
+    def at(t: float, value: float) -> tuple[float, float]:
+        return left + t * width / _end(content), top + _PANEL * (high - value) / (high - low)
+
+    for tick in ticks(low, high, 5):
+        _, y = at(0.0, tick)
+        canvas.line([(left, y), (left + width, y)], LIGHT)
+        canvas.text(left - 6, y, f"{tick:.4g}", 11, GREY, "rm")
+    for tick in ticks(0.0, _end(content), 12):
+        x, _ = at(tick, low)
+        canvas.line([(x, top), (x, top + _PANEL)], LIGHT)
+        canvas.text(x, top + _PANEL + 3, f"{tick:g} s", 11, GREY, "ma")
+    for values, colour, thick in ((curve.commanded, _COMMANDED, 3.0), (curve.measured, _MEASURED, 1.4)):
+        for part in _known(values):
+            canvas.line([at(float(content.grid[k]), float(values[k])) for k in part], colour, thick)
+
+
+def _range(curve: _Curve) -> tuple[float, float]:
+    both = np.concatenate([curve.measured, curve.commanded])
+    known = both[np.isfinite(both)]
+    low, high = (float(known.min()), float(known.max())) if known.size else (0.0, 0.0)
+    middle, half = (low + high) / 2, max(high - low, curve.least) * 0.55
+    return middle - half, middle + half
+
+
+def _known(values: NDArray[np.float64]) -> Iterator[list[int]]:
+    """Stretches of rows that hold a number."""
+    part: list[int] = []
+    for k, known in enumerate(np.isfinite(values).tolist()):
+        if known:
+            part.append(k)
+        elif part:
+            yield part
+            part = []
+    if part:
+        yield part
