@@ -1,10 +1,17 @@
-"""For all tests: what a skip means, and plain specs to make drivers from."""
+"""Test tiers, the meaning of a skip, and plain specs to make drivers from.
+
+Every test carries the marker of its folder: ``unit``, ``contract``, ``lock_step``, ``wire``, ``system``, ``browser``,
+``apps``, ``docs`` or ``packaging``. The first three are the fast tier, which carries ``fast`` as well, and is what
+``pytest`` runs, in parallel where pytest-xdist is installed. ``pytest -m all`` runs everything, and a file or folder
+named on the command line runs whatever its tier. See ``pytest --markers``.
+"""
 
 from __future__ import annotations
 
 import os
 import signal
 from collections.abc import Generator
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -13,13 +20,102 @@ from hal import testing
 from hal.specs import CameraSpec, GripperSpec, PadSpec, RobotSpec
 
 STRICT = os.environ.get("HAL_TEST_STRICT", "") not in ("", "0")
+TESTS = Path(__file__).resolve().parent
+
+FAST = {
+    "unit": "one part of the package at a time",
+    "contract": "every driver against the contract of its kind (hal.testing)",
+    "lock_step": "whole rigs in simulation, in lock-step",
+}
+OTHERS = {
+    "wire": "drivers against emulated devices, through the vendors' client libraries",
+    "system": "whole rigs in real time: processes, and faults at run time",
+    "browser": "the console's page in a browser",
+    "apps": "the command-line programs",
+    "docs": "the code that the documents and examples show",
+    "packaging": "what an installation holds",
+}
+MARKERS = {
+    "all": "every test: 'pytest -m all' runs everything",
+    "fast": "tests of the fast tier (unit, contract and lock_step, without the slow ones): what 'pytest' runs",
+    "slow": "takes more than a few seconds, or needs the machine to itself; never in the fast tier",
+}
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """A program inherits which signals are ignored: after ``nohup``, or ``&`` in a script, no Ctrl-C would end one."""
+    """Register the markers, and give signals that the shell ignores their effect back.
+
+    A program inherits which signals are ignored: after ``nohup``, or ``&`` in a script, no Ctrl-C would end one.
+    """
+    for name, text in {**MARKERS, **FAST, **OTHERS}.items():
+        config.addinivalue_line("markers", f"{name}: {text}")
     for number in (signal.SIGINT, signal.SIGHUP):
         if signal.getsignal(number) is signal.SIG_IGN:
             signal.signal(number, lambda *_: None)  # as before for pytest itself; an app begins with the default
+
+
+# Tiers.
+
+
+def _tier(path: Path) -> str | None:
+    """Return the folder of ``tests/`` that a path is in; None outside of these folders."""
+    inside = path.relative_to(TESTS).parts if path.is_relative_to(TESTS) else ()
+    return inside[0] if inside and (inside[0] in FAST or inside[0] in OTHERS) else None
+
+
+def _named(config: pytest.Config) -> list[Path]:
+    """Return what the command line names that runs whatever its tier: any file, and folders outside the fast tier."""
+    paths = [(config.invocation_params.dir / argument.split("::")[0]).resolve() for argument in config.args]
+    return [path for path in paths if path.is_file() or _tier(path) in OTHERS]
+
+
+def _touches(path: Path, named: list[Path]) -> bool:
+    """Whether a path is named, or is in a named folder, or is a folder with something named in it."""
+    return any(path == one or one in path.parents or path in one.parents for one in named)
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_cmdline_main(config: pytest.Config) -> None:
+    """Run the fast tier in parallel, unless -n, -s, --pdb or a file on the command line speaks against it."""
+    if "PYTEST_XDIST_WORKER" in os.environ:
+        return  # a worker runs this as well, and starts none itself
+    option = config.option
+    plain = option.markexpr in ("", "fast") and option.capture != "no" and not option.collectonly
+    if plain and not _named(config) and getattr(option, "numprocesses", 0) is None:
+        option.numprocesses = "auto"
+        option.maxprocesses = option.maxprocesses or 8
+        option.dist = "loadscope" if option.dist == "no" else option.dist  # what a module shares is made once
+
+
+def pytest_report_header(config: pytest.Config) -> str | None:
+    """Say when only the fast tier runs."""
+    return None if config.option.markexpr else "tests: the fast tier and what is named; 'pytest -m all' runs everything"
+
+
+def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
+    """Without -m, do not even import what is outside the fast tier."""
+    if config.option.markexpr or _tier(collection_path) not in OTHERS:
+        return None
+    return None if _touches(collection_path, _named(config)) else True
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Mark every test by its folder, and without -m leave the slow ones out, unless their file is named."""
+    named = _named(config)
+    kept, left = [], []
+    for item in items:
+        tier = _tier(item.path)
+        slow = item.get_closest_marker("slow") is not None
+        for name in ["all", *([tier] if tier else []), *(["fast"] if tier in FAST and not slow else [])]:
+            item.add_marker(name)
+        (left if slow and not config.option.markexpr and not _touches(item.path, named) else kept).append(item)
+    if left:
+        items[:] = kept
+        config.hook.pytest_deselected(items=left)
+
+
+# Skips.
 
 
 @pytest.hookimpl(wrapper=True)
@@ -42,6 +138,9 @@ def _strict(report: Any) -> Any:
     return report
 
 
+# Specs.
+
+
 @pytest.fixture
 def robot_spec() -> RobotSpec:
     """An arm of three joints for drivers that need no URDF."""
@@ -50,7 +149,7 @@ def robot_spec() -> RobotSpec:
 
 @pytest.fixture
 def gripper_spec() -> GripperSpec:
-    """A hand that opens to 80 mm at 0.1 m/s."""
+    """A gripper that opens to 80 mm at 0.1 m/s."""
     return testing.gripper_spec()
 
 

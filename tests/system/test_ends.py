@@ -4,10 +4,8 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
+import observer
 import pytest
-
-sys.path.insert(0, str(Path(__file__).parent))
-from observer import Watched
 
 from hal.types import RobotStatus, Trip
 
@@ -17,12 +15,19 @@ pytestmark = [
 ]
 
 
-@pytest.fixture
-def watch(tmp_path: Path) -> Iterator[object]:
-    watched: list[Watched] = []
+MOTION = "hal.JointVelocity(velocity)"
+TORQUE = "hal.JointTorque([5.0] + [0.0] * 6)"
 
-    def start(ending: str = "") -> Watched:
-        watched.append(Watched(tmp_path, ending))
+
+@pytest.fixture
+def watch(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[object]:
+    """Start an app whose arm moves, by velocities or by torques; it is ended after the test."""
+    assert MOTION in observer.APP
+    watched: list[observer.Watched] = []
+
+    def start(ending: str = "", command: str = MOTION) -> observer.Watched:
+        monkeypatch.setattr(observer, "APP", observer.APP.replace(MOTION, command))
+        watched.append(observer.Watched(tmp_path, ending))
         return watched[-1]
 
     yield start
@@ -30,18 +35,19 @@ def watch(tmp_path: Path) -> Iterator[object]:
         app.close()
 
 
+@pytest.mark.parametrize("command", [MOTION, TORQUE], ids=["motion", "torque"])
 @pytest.mark.parametrize("how", ["kill -9", "SIGTERM", "Ctrl-C", "closed terminal"])
-def test_an_app_that_ends(watch, how: str) -> None:
-    app = watch()
+def test_an_app_that_ends(watch, how: str, command: str) -> None:
+    app = watch(command=command)
     assert app.speed() > 0.1, "the arm moves before"
     app.end(how)
     app.wait_for(app.at_rest)
     app.wait_for(app.nobody_left)
 
 
-@pytest.mark.parametrize("how", ["SIGSTOP", "Ctrl-Z"])
-def test_an_app_that_is_stopped_but_still_there(watch, how: str) -> None:
-    app = watch()
+@pytest.mark.parametrize(("how", "command"), [("SIGSTOP", MOTION), ("Ctrl-Z", MOTION), ("SIGSTOP", TORQUE)])
+def test_an_app_that_is_stopped_but_still_there(watch, how: str, command: str) -> None:
+    app = watch(command=command)
     assert app.speed() > 0.1
     app.end(how)
     app.wait_for(app.at_rest)

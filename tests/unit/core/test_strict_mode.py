@@ -45,17 +45,7 @@ def test_a_module_that_skips_itself(tmp_path: Path, strict: str, code: int) -> N
 def _run(folder: Path, test: str, strict: str) -> subprocess.CompletedProcess[str]:
     (folder / "conftest.py").write_text(CONFTEST.read_text())
     (folder / "test_skips.py").write_text(test)
-    command = [
-        sys.executable,
-        "-m",
-        "pytest",
-        "-q",
-        "-ra",
-        "-p",
-        "no:cacheprovider",
-        "--rootdir",
-        str(folder),
-        str(folder),
-    ]
+    options = ["-q", "-ra", "-p", "no:cacheprovider", "-p", "no:xdist", "--rootdir", str(folder)]
+    command = [sys.executable, "-m", "pytest", *options, str(folder)]
     environment = os.environ | {"HAL_TEST_STRICT": strict}
     return subprocess.run(command, capture_output=True, text=True, timeout=60, env=environment, cwd=folder)

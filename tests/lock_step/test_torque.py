@@ -1,15 +1,9 @@
 """Torques through everything: the public interface, the host, the servo and the simulated physics."""
 
-import sys
 from collections.abc import Iterator
-from pathlib import Path
 
 import numpy as np
 import pytest
-
-sys.path.insert(0, str(Path(__file__).parent))
-import observer
-from observer import Watched
 
 import hal
 from hal import JointTarget, JointTorque, MotionStopped, RobotStatus, Trip
@@ -107,39 +101,3 @@ def test_a_released_deadman_brakes_it() -> None:
             rig.clock.sleep(0.3)
             assert control.status is RobotStatus.HOLDING
             assert np.abs(arm.state().dq).max() == 0.0
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="reads /proc")
-class TestEnds:
-    @pytest.fixture
-    def watch(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[object]:
-        told = "hal.JointVelocity(velocity)"
-        assert told in observer.APP
-        monkeypatch.setattr(observer, "APP", observer.APP.replace(told, "hal.JointTorque([5.0] + [0.0] * 6)"))
-        watched: list[Watched] = []
-
-        def start(ending: str = "") -> Watched:
-            watched.append(Watched(tmp_path, ending))
-            return watched[-1]
-
-        yield start
-        for app in watched:
-            app.close()
-
-    @pytest.mark.parametrize("how", ["kill -9", "SIGTERM", "Ctrl-C"])
-    def test_an_app_that_ends(self, watch, how: str) -> None:
-        app = watch()
-        assert app.speed() > 0.1, "the arm moves before"
-        app.end(how)
-        app.wait_for(app.at_rest)
-        app.wait_for(app.nobody_left)
-
-    def test_an_app_that_is_stopped(self, watch) -> None:
-        app = watch()
-        assert app.speed() > 0.1
-        app.end("SIGSTOP")
-        app.wait_for(app.at_rest)
-        servo = app.servo()
-        assert servo.status is RobotStatus.TRIPPED
-        assert servo.trip in (Trip.APP_SILENT, Trip.COMMAND_LATE)
