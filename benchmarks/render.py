@@ -19,11 +19,10 @@ from dataclasses import replace
 from pathlib import Path
 
 from hal.config import load
-from hal.drivers.pybullet.camera import camera_pose
-from hal.drivers.pybullet.gl import GLRenderer
-from hal.drivers.pybullet.rendering import Renderer
-from hal.drivers.pybullet.tiny import TinyRenderer
-from hal.drivers.pybullet.world import World
+from hal.drivers.pybullet.camera import TinyRenderer
+from hal.drivers.pybullet.exposure import camera_pose
+from hal.drivers.pybullet.renderer import GLRenderer, Renderer
+from hal.drivers.pybullet.world import PyBulletWorld
 from hal.specs import CameraSpec
 
 SIZES = ((256, 256), (640, 480), (1280, 720))
@@ -44,7 +43,7 @@ def sized(camera: CameraSpec, width: int, height: int) -> CameraSpec:
     return replace(camera, width=width, height=height, K=K, streams=("color", "depth"))
 
 
-def timed(renderer: Renderer, world: World, camera: CameraSpec) -> float:
+def timed(renderer: Renderer, world: PyBulletWorld, camera: CameraSpec) -> float:
     """One frame, ms."""
     start = time.perf_counter()
     renderer.render(camera, camera_pose(world, camera))
@@ -69,7 +68,7 @@ def main() -> None:
 
     plan = load(arguments.config, sim=True).resolve()
     assert plan.world is not None
-    world = World(plan.world)
+    world = PyBulletWorld(plan.world)
     renderers: dict[str, Renderer] = {"OpenGL": GLRenderer(world), "PyBullet's own": TinyRenderer(world)}
     print(f"{renderers['OpenGL'].description}; RGB-D, median ms per frame, and their ratio")
     print(f"{'camera':10} {'size':>10} {'OpenGL':>10} {'own':>10} {'ratio':>7}")

@@ -21,10 +21,10 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "kits"))
 from specs import PANDA_HOME, box, data, floor, panda, world_spec
 
 from hal.driver import Setpoint
+from hal.drivers.pybullet.engine import load_pybullet
 from hal.drivers.pybullet.gripper import PyBulletGripper
-from hal.drivers.pybullet.library import load_pybullet
 from hal.drivers.pybullet.robot import PyBulletRobot
-from hal.drivers.pybullet.world import World
+from hal.drivers.pybullet.world import PyBulletWorld
 
 TABLE = ((0.5, 0.0, -0.3), (0.4, 0.6, 0.3))
 SMALL = (0.02, 0.02, 0.02)
@@ -43,8 +43,8 @@ def motion(t: float) -> tuple[list[float], list[float]]:
 def ours(count: int, hz: float) -> tuple[Any, dict[str, Callable[[], object]]]:
     arm = panda()
     cubes = [box(f"cube{k}", place, SMALL, mass=0.1) for k, place in enumerate(cube_places(count))]
-    world = World(world_spec(box("table", *TABLE), floor(), *cubes, arm, physics_hz=hz))
-    mirror = World(world.spec, mirror=True)
+    world = PyBulletWorld(world_spec(box("table", *TABLE), floor(), *cubes, arm, physics_hz=hz))
+    mirror = PyBulletWorld(world.spec, mirror=True)
     assert arm.gripper is not None
     driver, gripper = PyBulletRobot(arm, world), PyBulletGripper(arm.gripper, world)
     driver.open()

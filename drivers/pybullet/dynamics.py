@@ -1,17 +1,23 @@
-"""Mass, friction and damping of a link: read, set, read back, and put back."""
+"""Mass, friction and damping of links, and contacts between bodies."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 from hal.errors import CommandError, NotSupported
 
-from .body import Body
-from .library import Client
+from .engine import Body, PyBulletClient
 
-__all__ = ["read_dynamics", "write_dynamics"]
+__all__ = [
+    "bounding_box",
+    "deepest_overlap",
+    "find_contacts",
+    "forget_contacts",
+    "read_dynamics",
+    "write_dynamics",
+]
 
 # Name here -> name of PyBullet's argument, place in getDynamicsInfo.
 _SCALARS = {
@@ -27,18 +33,20 @@ _CONTACT = ("contact_stiffness", "contact_damping")
 _DAMPING = ("linear_damping", "angular_damping")
 _NAMES = (*_SCALARS, "inertia", *_DAMPING)
 _HARD = 1e9
-"""N/m; no solver can tell it from rigid."""
+"""Stiffness of a rigid contact, N/m."""
 _DEFAULT_ERP = 0.2
 """Share of a contact's depth that PyBullet takes away per step where no stiffness is set."""
+FAR = 1000.0
+"""Distance from the origin where bodies touch nothing, m."""
 
 
-def read_dynamics(client: Client, body: Body, link: int) -> dict[str, Any]:
-    """What PyBullet holds for a link.
+def read_dynamics(client: PyBulletClient, body: Body, link: int) -> dict[str, Any]:
+    """Return the dynamics of a link.
 
     ``mass`` kg; ``inertia`` (3,) kg m2 about the principal axes; ``lateral_friction``, ``rolling_friction``,
     ``spinning_friction`` and ``restitution``, without units; ``contact_stiffness`` N/m and ``contact_damping`` Ns/m,
     None where contacts are as hard as the solver can make them; ``linear_damping`` and ``angular_damping`` 1/s, of the
-    whole body (PyBullet does not give these two back: they are what was set last).
+    whole body (PyBullet does not report these two: they are the values that were set last).
     """
     info = client.getDynamicsInfo(body.id, link)
     values: dict[str, Any] = {name: float(info[place]) for name, (_, place) in _SCALARS.items()}
@@ -49,28 +57,34 @@ def read_dynamics(client: Client, body: Body, link: int) -> dict[str, Any]:
     return values
 
 
-def write_dynamics(client: Client, body: Body, link: int, values: Mapping[str, Any], dt: float) -> dict[str, Any]:
+def write_dynamics(
+    client: PyBulletClient, body: Body, link: int, values: Mapping[str, Any], dt: float
+) -> dict[str, Any]:
     """Set some of the values of :func:`read_dynamics` and check that PyBullet took them.
 
-    A new mass scales the inertia with it unless an inertia is given (PyBullet alone would replace what the URDF says
+    A new mass scales the inertia with it unless an inertia is given (PyBullet alone would replace the URDF's inertia
     by that of the collision shape).
 
     Args:
-        dt: the physics step, s.
+        client: The world.
+        body: The body.
+        link: Index of the link.
+        values: New values by name.
+        dt: The physics step, s.
 
     Returns:
-        What to pass here to put everything back.
+        The previous values, to be passed here to restore them.
 
     Raises:
-        CommandError: an unknown name, a number that cannot be, or a mass that would turn what moves into what does
-            not, or the other way round. Nothing was set.
+        CommandError: An unknown name, an impossible number, or a mass that would make a fixed body movable or the
+            reverse. Nothing was set.
         NotSupported: PyBullet did not take a value.
     """
     wanted = _checked(body, link, values)
     before = read_dynamics(client, body, link)
     if "mass" in wanted:
         if (wanted["mass"] > 0.0) != (before["mass"] > 0.0):
-            raise CommandError(f"the mass of {body.name!r} cannot change between 0 (stands still) and more")
+            raise CommandError(f"the mass of {body.name!r} cannot change between 0 (fixed) and more")
         scale = wanted["mass"] / before["mass"] if before["mass"] > 0.0 else 0.0
         wanted.setdefault("inertia", [value * scale for value in before["inertia"]])
     if any(name in wanted for name in _CONTACT):  # PyBullet takes the two only together
@@ -91,7 +105,7 @@ def _checked(body: Body, link: int, values: Mapping[str, Any]) -> dict[str, Any]
     wanted: dict[str, Any] = {}
     for name, value in values.items():
         if name not in _NAMES:
-            raise CommandError(f"{name!r} is no property of a link; properties: {', '.join(_NAMES)}")
+            raise CommandError(f"unknown property {name!r} of a link; properties: {', '.join(_NAMES)}")
         if value is None and name in _CONTACT:
             wanted[name] = None
             continue
@@ -105,7 +119,9 @@ def _checked(body: Body, link: int, values: Mapping[str, Any]) -> dict[str, Any]
     return wanted
 
 
-def _apply(client: Client, body: Body, link: int, wanted: dict[str, Any], before: dict[str, Any], dt: float) -> None:
+def _apply(
+    client: PyBulletClient, body: Body, link: int, wanted: dict[str, Any], before: dict[str, Any], dt: float
+) -> None:
     arguments = {_SCALARS[n][0]: v for n, v in wanted.items() if n in _SCALARS and n not in _CONTACT}
     if "inertia" in wanted:
         arguments["localInertiaDiagonal"] = wanted["inertia"]
@@ -136,3 +152,65 @@ def _same(a: Any, b: Any) -> bool:
     if a is None or b is None:
         return a is b
     return math.isclose(a, b, rel_tol=1e-9, abs_tol=1e-12)
+
+
+# --- contacts -------------------------------------------------------------------------------------------------------
+
+
+def find_contacts(
+    client: PyBulletClient, bodies: Iterable[Body], a: Body | None, b: Body | None
+) -> list[dict[str, Any]]:
+    """Return the contacts of the last step, as :meth:`.world.PyBulletWorld.contacts` does; None stands for any body."""
+    chosen = {key: body.id for key, body in (("bodyA", a), ("bodyB", b)) if body is not None}
+    by_id = {body.id: body for body in bodies}
+    found = []
+    for contact in client.getContactPoints(**chosen):
+        one, other = by_id[contact[1]], by_id[contact[2]]
+        found.append(
+            {
+                "a": one.name,
+                "b": other.name,
+                "link_a": one.link_names[contact[3]],
+                "link_b": other.link_names[contact[4]],
+                "position": list(contact[6]),
+                "normal": list(contact[7]),
+                "distance": contact[8],
+                "force": contact[9],
+            }
+        )
+    return found
+
+
+def deepest_overlap(client: PyBulletClient, a: Body, b: Body) -> tuple[float, str, str]:
+    """Return how deep two bodies overlap, m, 0 where they are apart, and by which link of each."""
+    points = client.getClosestPoints(a.id, b.id, distance=0.0)
+    if not points:
+        return 0.0, "", ""
+    deepest = min(points, key=lambda point: point[8])
+    return max(0.0, -deepest[8]), a.link_names[deepest[3]], b.link_names[deepest[4]]
+
+
+def bounding_box(client: PyBulletClient, body: Body) -> tuple[list[float], list[float]]:
+    """Return the lower and upper corner (3,) m of the box along the world's axes around all links of a body."""
+    corners = [client.getAABB(body.id, link) for link in body.links.values()]
+    lower = [min(corner[0][axis] for corner in corners) for axis in range(3)]
+    upper = [max(corner[1][axis] for corner in corners) for axis in range(3)]
+    return lower, upper
+
+
+def forget_contacts(client: PyBulletClient, bodies: Iterable[Body]) -> None:
+    """Move bodies far away and back, so that the solver forgets their contacts.
+
+    The solver starts from the forces of the previous step, and a lasting contact may keep the friction and the
+    stiffness of its first step. Without these, the steps after a reset repeat those after the start bit for bit, and
+    new dynamics act at once.
+    """
+    taken = []
+    for place, body in enumerate(bodies, start=1):
+        if body.moves:
+            taken.append((body.id, client.getBasePositionAndOrientation(body.id), client.getBaseVelocity(body.id)))
+            client.resetBasePositionAndOrientation(body.id, (FAR * place, 0.0, FAR), (0.0, 0.0, 0.0, 1.0))
+    client.performCollisionDetection()
+    for number, pose, velocity in taken:
+        client.resetBasePositionAndOrientation(number, *pose)
+        client.resetBaseVelocity(number, *velocity)

@@ -8,57 +8,59 @@ from hal.driver import GripperDriver, GripperReading
 from hal.errors import CommandError, ConfigError, ConnectionLost, Problem
 from hal.specs import GripperSpec, RobotSpec
 
-from .body import Body
+from .engine import Body
 from .motors import position_gain
-from .world import World
+from .world import PyBulletWorld
 
 __all__ = ["PyBulletGripper"]
 
 AT_TARGET = 0.001
-"""m: a width this close to the target is there."""
+"""Tolerance of the target width, m."""
 SLOW = 0.002
-"""m/s: fingers that are this slow at their target have arrived."""
+"""Speed below which fingers at their target have arrived, m/s."""
 STILL = 0.0005
-"""m: a width that stays within this of one value stands still. Pressed on a hard, crooked thing, the joints of the
-fingers chatter at up to 20 mm/s while the width moves by 0.1 mm, so their speed does not tell."""
+"""A width that changes by less than this, m, counts as standing still. Pressed on a hard, uneven object, the joints of
+the fingers oscillate at up to 20 mm/s while the width moves by 0.1 mm, so their speed is no criterion."""
 SETTLE = 0.1
-"""s of standing still after which a motion has ended, wherever it is. Slow motions take longer."""
+"""Time of standing still after which a motion has ended at any width, s. Slow motions take longer."""
 BLOCKED = 0.25
-"""Share of the commanded speed: fingers that are slower, long after the command, are held up by something."""
+"""Share of the commanded speed below which fingers, long after the command, count as blocked."""
 PRESSING = 0.5
-"""Share of the commanded force from which on the fingers press on something."""
+"""Share of the commanded force from which on the fingers count as pressing on something."""
 
 
 class PyBulletGripper(GripperDriver):
-    """A view of the fingers of one robot in a :class:`~hal.drivers.pybullet.world.World`.
+    """The driver of the fingers of one robot in a :class:`~hal.drivers.pybullet.world.PyBulletWorld`.
 
     Each finger is driven by a position motor whose force is the grip force, so a grasp needs no code per step: on an
     object the motors press with that force, from both sides, until the next command. Positive joint positions open.
 
-    To hold a thing of mass m, friction needs ``2 mu force >= m (g + a)``, with ``mu`` the product of the frictions of
-    finger and thing (PyBullet's rule): 20 N for the 2 kg cube on the Panda's fingers (1.0 and 0.5) at rest.
+    To hold an object of mass m, friction needs ``2 mu force >= m (g + a)``, with ``mu`` the product of the frictions of
+    finger and object (PyBullet's rule): 20 N for the 2 kg cube on the Panda's fingers (1.0 and 0.5) at rest.
     """
 
     simulated: ClassVar[bool] = True
 
     def __init__(self, spec: GripperSpec, world: object | None = None) -> None:
         super().__init__(spec, world)
-        if not isinstance(world, World):
-            raise CommandError(f"{spec.name}: a simulated gripper needs the world that it stands in, not {world!r}")
+        if not isinstance(world, PyBulletWorld):
+            raise CommandError(
+                f"{spec.name}: a simulated gripper needs its simulated world, not {world!r}", code="world_missing"
+            )
         self._world = world
         self._open = False
         self._target = self._aim = spec.width_max
         self._force = spec.force
         self._stood = self._stood_since = 0.0
-        """The width, m, that the fingers have stayed near, and since when, s."""
+        """Width, m, near which the fingers have stayed, and since when, s."""
         self._settle = SETTLE
         self._resting = True
         self._seen = 0.0
-        """When the width was looked at last, s."""
+        """When the width was read last, s."""
         self._speed = spec.speed
 
     def open(self) -> None:
-        """Find the fingers in the world."""
+        """Find the fingers in the world; raises ConfigError when they belong to no robot."""
         self._body = _owner(self.spec, self._world)
         self._joints = [self._body.joints[name] for name in self.spec.joints]
         self._read = self._world.client.getJointStates
@@ -68,7 +70,7 @@ class PyBulletGripper(GripperDriver):
         self._open = True
 
     def read(self, now: float) -> GripperReading:
-        """The fingers as the last physics step left them; ``force`` is what the weaker motor pressed with, N."""
+        """Return the fingers after the last physics step; ``force`` is that of the weaker motor, N."""
         self._expect_open()
         width, speed, force, load = self._width()
         moving = not self._at_rest(width, speed)
@@ -87,7 +89,7 @@ class PyBulletGripper(GripperDriver):
         )
 
     def move(self, width: float, speed: float, force: float) -> None:
-        """Start towards ``width``, cut to what the gripper can do; the newest command wins."""
+        """Start a motion to ``width``, clipped to the gripper's range; the newest command wins."""
         self._target = self._aim = min(max(width, 0.0), self.spec.width_max)
         self._start(speed, force)
 
@@ -109,13 +111,13 @@ class PyBulletGripper(GripperDriver):
         self._drive(self._speed)
 
     def _at_rest(self, width: float, speed: float) -> bool:
-        """Whether the fingers have arrived, or stand still elsewhere. Call it for every new width."""
+        """Return whether the fingers have arrived, or stand still elsewhere. To be called for every new width."""
         t = self._world.t
         unseen, self._seen = t - self._seen, t
         stood_long = t - self._stood_since >= self._settle
         if abs(width - self._stood) > STILL:
             if unseen < self._settle:
-                self._resting = self._resting and stood_long  # what creeps has stood long at every place
+                self._resting = self._resting and stood_long  # a creeping finger has stood long at every place
             else:  # in lock-step nothing is read while a program sleeps
                 self._resting = abs(speed) <= BLOCKED * self._speed
             self._stood, self._stood_since = width, t
@@ -124,7 +126,7 @@ class PyBulletGripper(GripperDriver):
         return self._resting or (abs(width - self._aim) <= AT_TARGET and abs(speed) <= SLOW)
 
     def stop(self) -> None:
-        """Stay where the fingers are. On an object, they go on pressing."""
+        """Stop the fingers where they are; on an object, they continue to press."""
         self._expect_open()
         width, speed, force, _ = self._width()
         if force >= PRESSING * self._force and (abs(speed) <= SLOW or self._at_rest(width, speed)):
@@ -133,7 +135,7 @@ class PyBulletGripper(GripperDriver):
         self._drive(self.spec.speed)
 
     def close(self) -> None:
-        """The motors hold, or press, for as long as the world lasts."""
+        """Disconnect; the motors hold, or press, for as long as the world exists."""
         if self._open:
             self._world.off_reset(self._body.name, self._was_reset)
         self._open = False
@@ -154,8 +156,8 @@ class PyBulletGripper(GripperDriver):
             )
 
     def _width(self) -> tuple[float, float, float, float]:
-        """Width in m, its speed in m/s (positive opens), the force of the weaker motor in N (positive closes), and the
-        greatest force of a motor, either way.
+        """Return the width, m, its speed, m/s (positive opens), the force of the weaker motor, N (positive closes), and
+        the greatest force of a motor in either direction, N.
         """
         widths, speeds, _, forces = zip(*self._read(self._body.id, self._joints), strict=True)
         share = 2.0 / len(widths)
@@ -167,8 +169,8 @@ class PyBulletGripper(GripperDriver):
         self._force = self.spec.force
 
 
-def _owner(spec: GripperSpec, world: World) -> Body:
-    """The one robot in the world that has this gripper."""
+def _owner(spec: GripperSpec, world: PyBulletWorld) -> Body:
+    """Return the only robot in the world that has this gripper."""
     owners = [body for body in world.bodies.values() if isinstance(body.spec, RobotSpec) and body.spec.gripper == spec]
     if len(owners) != 1 or not spec.joints:
         message = f"{len(owners)} robots have it" if spec.joints else "names no finger joints"

@@ -1,41 +1,46 @@
-"""From the records of a rig to bodies in PyBullet."""
+"""Load the arms and objects of a rig into PyBullet, and correct what their URDF files leave out or get wrong."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Container, Sequence
 
 from hal.errors import ConfigError, Problem
 from hal.specs import BodySpec, RobotSpec
 
-from .body import Body
-from .inertias import mend_inertias
-from .library import Client, silenced
-from .motors import Gear
+from .engine import Body, Gear, PyBulletClient, listed, silenced
 from .transforms import Transform, compose, inverse
 from .urdf import Mimic, loadable, read_urdf
-from .values import listed
 
-__all__ = ["load_object", "load_robot"]
+__all__ = [
+    "fix_inertias",
+    "load_object",
+    "load_robot",
+]
 
 PLANE = (5.0, 5.0)
-"""Half extents of the part of an endless plane that is drawn, m."""
+"""Half extents of the part of an infinite plane that is drawn, m."""
 UNKNOWN_EFFORT = 200.0
-"""Nm or N for a joint whose limit is given nowhere (a URDF's effort of 0 means unknown, not powerless)."""
+"""Effort, Nm or N, of a joint without a limit (a URDF's effort of 0 means unknown, not powerless)."""
 UNKNOWN_SPEED = 2.0
-"""rad/s or m/s, likewise."""
+"""Speed, rad/s or m/s, of a joint without a limit."""
 FINGER_MASS = 0.1
-"""kg, at least: the solver lets a finger of 29 g press with no more than 26 N. What drives it moves along, and is in no
-URDF."""
+"""Least mass of a finger, kg: the solver lets one of 29 g press with no more than 26 N. The drive that moves with it is
+in no URDF."""
 
 
-def load_object(client: Client, spec: BodySpec, drawn: bool = True) -> tuple[Body, list[str]]:
-    """Make an object; its visual meshes are loaded only if it is to be ``drawn``.
+def load_object(client: PyBulletClient, spec: BodySpec, drawn: bool = True) -> tuple[Body, list[str]]:
+    """Load an object.
+
+    Args:
+        client: The world.
+        spec: The object's record.
+        drawn: Load its visual meshes too.
 
     Returns:
-        The body, and warnings for a person.
+        The body, and warnings for the user.
 
     Raises:
-        ConfigError: its file is missing or broken, or a size that its shape needs.
+        ConfigError: Its file is missing or broken, or a size that its shape needs is missing.
     """
     key = f"objects.{spec.name}"
     if spec.shape != "urdf":
@@ -48,16 +53,16 @@ def load_object(client: Client, spec: BodySpec, drawn: bool = True) -> tuple[Bod
     number = _load_urdf(client, spec.urdf, f"{key}.urdf", fixed=_is_fixed(spec), scale=spec.scale, drawn=drawn)
     body = _describe(client, spec, number, f"{key}.urdf")
     _couple(client, body, facts.mimics)
-    warnings = mend_inertias(client, body, facts.massless)
+    warnings = fix_inertias(client, body, facts.massless)
     if facts.massless:
         warnings.append(f"{spec.name}: no <inertial> in {listed(facts.massless)}; PyBullet takes 1 kg for each")
     return body, warnings
 
 
-def load_robot(client: Client, spec: RobotSpec, drawn: bool = True) -> tuple[Body, list[str]]:
-    """Make an arm with its base fixed in the world.
+def load_robot(client: PyBulletClient, spec: RobotSpec, drawn: bool = True) -> tuple[Body, list[str]]:
+    """Load an arm, with its base fixed in the world.
 
-    Returns and raises as :func:`load_object`; a joint or link that the URDF lacks is a ConfigError too.
+    Takes, returns and raises the same as :func:`load_object`; a joint or link that the URDF lacks is a ConfigError too.
     """
     key = f"robots.{spec.name}"
     facts = read_urdf(spec.urdf, f"{key}.urdf")
@@ -66,7 +71,7 @@ def load_robot(client: Client, spec: RobotSpec, drawn: bool = True) -> tuple[Bod
     fingers = spec.gripper.joints if spec.gripper else ()
     _check_names(body, spec, fingers, key)
 
-    warnings = mend_inertias(client, body, facts.massless)
+    warnings = fix_inertias(client, body, facts.massless)
     without_effort: list[str] = []
     limits = spec.limits
     for joint in body.movable:
@@ -94,23 +99,23 @@ def load_robot(client: Client, spec: RobotSpec, drawn: bool = True) -> tuple[Bod
     return body, warnings
 
 
-def _load_urdf(client: Client, path: str, key: str, *, fixed: bool, scale: float, drawn: bool) -> int:
+def _load_urdf(client: PyBulletClient, path: str, key: str, *, fixed: bool, scale: float, drawn: bool) -> int:
     number = -1
-    with loadable(path) as file, silenced() as chatter:
+    with loadable(path) as file, silenced() as captured:
         try:
             flags = client.URDF_USE_INERTIA_FROM_FILE  # else PyBullet invents inertias from the collision shapes
             if not drawn:
                 flags |= client.URDF_IGNORE_VISUAL_SHAPES
             number = client.loadURDF(file, useFixedBase=fixed, globalScaling=scale, flags=flags)
         except client.error:
-            pass  # said below, with what it printed
+            pass  # reported below, with what PyBullet printed
     if number < 0:
-        said = " ".join(chatter.text.split())
-        raise ConfigError([Problem(path, key, f"PyBullet cannot load it. {said}".strip())])
+        printed = " ".join(captured.text.split())
+        raise ConfigError([Problem(path, key, f"PyBullet cannot load it. {printed}".strip())])
     return number
 
 
-def _make_shape(client: Client, spec: BodySpec, key: str) -> int:
+def _make_shape(client: PyBulletClient, spec: BodySpec, key: str) -> int:
     def need(name: str) -> float:
         value = getattr(spec, name)
         if value is None:
@@ -128,7 +133,7 @@ def _make_shape(client: Client, spec: BodySpec, key: str) -> int:
         kind = client.GEOM_CYLINDER if spec.shape == "cylinder" else client.GEOM_CAPSULE
         solid = {"shapeType": kind, "radius": need("radius"), "height": need("length")}
         drawn = {"shapeType": kind, "radius": need("radius"), "length": need("length")}
-    elif spec.shape == "plane":  # endless to touch; drawn as a thin box whose upper face is the plane
+    elif spec.shape == "plane":  # infinite in contacts; drawn as a thin box whose upper face is the plane
         x, y = (spec.half_extents or (*PLANE, 0.0))[:2]
         solid = {"shapeType": client.GEOM_PLANE, "planeNormal": (0.0, 0.0, 1.0)}
         drawn = {"shapeType": client.GEOM_BOX, "halfExtents": (x, y, 0.005)}
@@ -146,12 +151,12 @@ def _make_shape(client: Client, spec: BodySpec, key: str) -> int:
 
 
 def _is_fixed(spec: BodySpec) -> bool:
-    """Does physics leave its base where it is? What an arm carries is put where it belongs instead."""
+    """Return whether physics leaves the base of this object alone; an object attached to an arm is placed instead."""
     return spec.fixed or spec.shape == "plane" or spec.robot is not None
 
 
-def _describe(client: Client, spec: BodySpec | RobotSpec, number: int, key: str) -> Body:
-    """Names, indices and frames as PyBullet loaded them."""
+def _describe(client: PyBulletClient, spec: BodySpec | RobotSpec, number: int, key: str) -> Body:
+    """Return a body with its names, indices and frames as PyBullet loaded them."""
     links = {client.getBodyInfo(number)[0].decode(): -1}
     joints: dict[str, int] = {}
     movable: list[int] = []
@@ -184,7 +189,7 @@ def _describe(client: Client, spec: BodySpec | RobotSpec, number: int, key: str)
 
 
 def _check_names(body: Body, spec: RobotSpec, fingers: Sequence[str], key: str) -> None:
-    """Every joint and link that the record names must be there, and move where it has to."""
+    """Raise ConfigError unless every joint that the record names exists and is movable, and its base link exists."""
     moving = {name for name, joint in body.joints.items() if joint in body.movable}
     problems = [
         Problem(spec.urdf, f"{key}.{where}", f"has no movable joint {name!r}; movable: {', '.join(sorted(moving))}")
@@ -200,8 +205,8 @@ def _check_names(body: Body, spec: RobotSpec, fingers: Sequence[str], key: str) 
         raise ConfigError(problems)
 
 
-def _root_pose(client: Client, body: Body, spec: RobotSpec) -> Transform:
-    """Where the URDF's root must stand for the arm's base link to stand where the rig says."""
+def _root_pose(client: PyBulletClient, body: Body, spec: RobotSpec) -> Transform:
+    """Return the pose of the URDF's root that puts the arm's base link where the rig has it."""
     link = body.links[spec.kinematics.base_link] if spec.kinematics.base_link else -1
     if link == -1:
         return (tuple(spec.base_position), tuple(spec.base_orientation))
@@ -210,11 +215,50 @@ def _root_pose(client: Client, body: Body, spec: RobotSpec) -> Transform:
     return compose((spec.base_position, spec.base_orientation), inverse((state[4], state[5])))
 
 
-def _couple(client: Client, body: Body, mimics: Sequence[Mimic]) -> None:
-    """Make joints follow each other as ``<mimic>`` says, which PyBullet reads and ignores."""
+def _couple(client: PyBulletClient, body: Body, mimics: Sequence[Mimic]) -> None:
+    """Couple joints that have a ``<mimic>``, which PyBullet ignores."""
     for mimic in mimics:
         if mimic.joint not in body.joints or mimic.of not in body.joints or mimic.multiplier == 0.0:
             continue
         follower, leader = body.joints[mimic.joint], body.joints[mimic.of]
         effort = max(body.efforts.get(leader, 0.0), body.efforts.get(follower, 0.0), 100.0)
         body.gears.append(Gear(client, body.id, leader, follower, mimic.multiplier, effort))
+
+
+def fix_inertias(client: PyBulletClient, body: Body, massless: Container[str]) -> list[str]:
+    """Replace impossible inertias of links, which are common in URDF files, by those of their collision shapes.
+
+    The mass of a link lies inside the box around its collision shape. If all of it were in the corners, the inertia
+    would be three times that of a uniform box, which is what PyBullet computes for a shape; no body has more.
+    Placeholders such as 0.1 kg m2 for a finger of 0.1 kg break this bound by orders of magnitude; a wrist with them
+    needs more torque than it has to keep its own acceleration limits. Links without a shape, or with a possible
+    inertia, keep the file's.
+
+    Args:
+        client: The world.
+        body: The body whose links are checked.
+        massless: Links without an inertia in the file; no warning is given for them.
+
+    Returns:
+        Warnings for the user.
+    """
+    fixed_links = []
+    for name, link in body.links.items():
+        mass, _, given = client.getDynamicsInfo(body.id, link)[:3]
+        if mass <= 0.0:
+            if any(given):
+                client.changeDynamics(body.id, link, localInertiaDiagonal=(0.0, 0.0, 0.0))
+                fixed_links.append(name)
+            continue
+        if not client.getCollisionShapeData(body.id, link):
+            continue
+        client.changeDynamics(body.id, link, mass=mass)  # PyBullet then computes the inertia of the shape
+        of_shape = client.getDynamicsInfo(body.id, link)[2]
+        if all(value <= 3.0 * greatest for value, greatest in zip(sorted(given), sorted(of_shape), strict=True)):
+            client.changeDynamics(body.id, link, localInertiaDiagonal=given)
+        else:
+            fixed_links.append(name)
+    wrong = [name for name in fixed_links if name not in massless]
+    if not wrong:
+        return []
+    return [f"{body.name}: inertia computed from the collision shapes, the URDF's is impossible: {listed(wrong)}"]

@@ -1,7 +1,8 @@
-"""Mesh files as triangles, parsed once: what was parsed is kept in the user's cache folder.
+"""Mesh files as triangles, with fewer triangles where a file has far more than a picture can show.
 
-Parsing the meshes of one arm takes a second or two, reading them back some milliseconds. A cache that is missing,
-broken or not writable costs only that time.
+Parsing the meshes of one arm takes a second or two, reading them back some milliseconds: parsed meshes are kept in the
+user's cache folder. A cache that is missing, broken or not writable only costs that time. Drawing without a graphics
+card costs time per triangle, and the meshes of an arm are tessellated to a tenth of a millimetre.
 """
 
 from __future__ import annotations
@@ -20,34 +21,47 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .shapes import Mesh, joined, unit
-from .simplify import coarsened, simplified
+from .scene import Mesh, joined, unit
 
-__all__ = ["MeshLibrary", "cache_folder", "parse"]
+__all__ = ["MeshLibrary", "cache_folder", "coarsened", "parse", "simplified"]
 
 _FORMAT = 8
-"""Raised whenever the records or the parsing change, so that old cache files are not read."""
+"""Version of the cache files; increase it whenever the records or the parsing change."""
 _BESIDE = {".mtl", ".png", ".jpg", ".jpeg", ".bmp", ".tga"}
 """Files in a mesh's folder that may decide its colours."""
 _PACKAGE = {".3mf": "lxml networkx", ".stp": "cascadio", ".step": "cascadio"}
-"""Formats for which trimesh wants one more package."""
+"""Packages that trimesh needs for a format."""
 _COARSE_SAVES = 0.7
-"""A coarse mesh with a greater share of the triangles is not worth its memory."""
+"""Share of the triangles above which a coarse mesh is not worth its memory."""
 _CREASE = float(np.cos(np.radians(35)))
 """An edge is sharp where its faces turn by more than this."""
 _FIELDS = tuple(field.name for field in fields(Mesh) if field.name != "coarse")
 _CLOSED_SHARE = 0.9
-"""Share of edges with a face on either side from which on a mesh counts as the surface of a solid."""
+"""Share of edges with a face on either side above which a mesh counts as the surface of a solid."""
+_HEAVY = 3000
+"""Number of triangles up to which a mesh is drawn unchanged."""
+_EDGES = 4.0
+"""Size of a cell, in mean edges of the mesh."""
+_SHARE = 1 / 50
+"""Greatest size of a cell, as a share of the mesh's diagonal."""
+_COARSE_HEAVY = 600
+_COARSE_SHARE = 1 / 25
+"""The same two limits for small pictures."""
 
 
 def cache_folder() -> Path:
-    """``$XDG_CACHE_HOME/robot-hal/meshes``, by default under ``~/.cache``."""
+    """Return ``$XDG_CACHE_HOME/robot-hal/meshes``, by default under ``~/.cache``."""
     root = os.environ.get("XDG_CACHE_HOME") or os.path.join(os.path.expanduser("~"), ".cache")
     return Path(root) / "robot-hal" / "meshes"
 
 
 class MeshLibrary:
-    """Meshes by file, from memory, from the cache folder or parsed, in this order."""
+    """Meshes by file, from memory, from the cache folder or parsed, in this order.
+
+    Args:
+        folder: The cache folder; None for :func:`cache_folder`.
+        parser: Parses a file; None for :func:`parse`.
+    """
 
     def __init__(self, folder: Path | None = None, parser: Callable[[str], list[Mesh]] | None = None) -> None:
         self._folder = cache_folder() if folder is None else folder
@@ -55,7 +69,7 @@ class MeshLibrary:
         self._known: dict[str, list[Mesh]] = {}
 
     def load(self, path: str) -> list[Mesh]:
-        """The meshes in a file, one per texture. Empty, with a warning, when the file cannot be read."""
+        """Return the meshes in a file, one per texture; none, with a warning, when the file cannot be read."""
         if path not in self._known:
             self._known[path] = self._load(path)
         return self._known[path]
@@ -81,175 +95,8 @@ class MeshLibrary:
         return meshes
 
 
-def parse(path: str) -> list[Mesh]:
-    """The meshes in a file, one per texture, with the colours of its materials."""
-    import trimesh  # half a second, and not needed when everything is in the cache
-
-    loaded = trimesh.load(path, process=False)
-    metres = np.diag([trimesh.units.unit_conversion(loaded.units or "meters", "meters")] * 3 + [1.0])
-    meshes: dict[Any, list[Mesh]] = {}
-    for matrix, part in _parts(loaded) if isinstance(loaded, trimesh.Scene) else [(np.eye(4), loaded)]:
-        if isinstance(part, trimesh.Trimesh) and len(part.faces):
-            mesh = _part(part).moved(metres @ matrix)
-            look = None if mesh.texture is None else (mesh.texture.shape, mesh.texture.tobytes())
-            meshes.setdefault((look, mesh.material), []).append(mesh)
-    if not meshes:
-        raise ValueError("no triangles")
-    whole = [joined(group) for group in meshes.values()]
-    return [_with_levels(mesh) for mesh in whole]
-
-
-def _with_levels(whole: Mesh) -> Mesh:
-    """Return a mesh as it is drawn in large pictures, and with it, where that saves much, as in small ones."""
-    fine, coarse = (
-        _welded(whole if mesh is whole else _shaded(mesh)) for mesh in (simplified(whole), coarsened(whole))
-    )
-    return replace(fine, coarse=coarse) if len(coarse.faces) < _COARSE_SAVES * len(fine.faces) else fine
-
-
-def _parts(scene: Any) -> Iterator[tuple[NDArray[np.float64], Any]]:
-    for node in scene.graph.nodes_geometry:
-        matrix, name = scene.graph[node]
-        yield matrix, scene.geometry[name]
-
-
-def _part(part: Any) -> Mesh:
-    """One part of a file: one material, perhaps with a texture."""
-    positions = np.asarray(part.vertices, np.float32)
-    faces = np.asarray(part.faces, np.uint32)
-    colors = np.full((len(positions), 4), 255, np.uint8)
-    # trimesh computes missing normals only with scipy; those that the file brought are in its cache.
-    normals = (
-        np.asarray(part.vertex_normals, np.float32) if "vertex_normals" in part._cache else np.empty((0, 3), np.float32)
-    )
-    mesh = Mesh(positions, normals, colors, faces)
-    visual = part.visual
-    material = getattr(visual, "material", None)
-    if not getattr(material, "kwargs", True):
-        material = None  # trimesh's stand-in for a material file that is not there
-    uv = getattr(visual, "uv", None)
-    image = getattr(material, "image", None) or getattr(material, "baseColorTexture", None)
-    if visual.kind == "vertex":
-        mesh = replace(mesh, colors=np.asarray(visual.vertex_colors, np.uint8))
-    elif image is not None and uv is not None:
-        texture = np.asarray(image.convert("RGB"), np.uint8)
-        mesh = _painted(replace(mesh, uv=np.asarray(uv, np.float32), texture=texture, material=False))
-    elif material is not None:
-        colors[:] = np.asarray(material.main_color, np.uint8)
-    return _shaded(mesh) if not len(normals) or _faceted(mesh) else mesh
-
-
-def _faceted(mesh: Mesh) -> bool:
-    """Did the file give each triangle its own normal? That is three vertices a triangle, and looks worse."""
-    normals = mesh.normals[mesh.faces]
-    return bool(np.mean(np.ptp(normals, axis=1).max(axis=1) < 1e-3) > 0.9)
-
-
-def _shaded(mesh: Mesh) -> Mesh:
-    """With normals of its own: smooth over the surface, but not over edges sharper than the crease angle."""
-    corners = mesh.positions.astype(float)[mesh.faces]
-    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])  # as long as twice the area
-    facing = unit(across)
-    _, point = np.unique(_rows(mesh.positions), return_inverse=True)
-    point = point.reshape(-1)[mesh.faces].reshape(-1)  # of each corner; three corners a face
-    mine, other = _pairs(point)
-    alike = np.einsum("ni,ni->n", facing[mine // 3], facing[other // 3]) > _CREASE
-    normals = np.stack([np.bincount(mine[alike], across[other[alike] // 3, k], len(point)) for k in range(3)], axis=1)
-    flat = np.repeat(facing, 3, axis=0)
-    lost = np.linalg.norm(normals, axis=1) == 0
-    normals[lost] = flat[lost]
-    each = mesh.faces.reshape(-1)
-    return replace(
-        mesh,
-        positions=mesh.positions[each],
-        normals=unit(normals).astype(np.float32),
-        colors=mesh.colors[each],
-        uv=None if mesh.uv is None else mesh.uv[each],
-        faces=np.arange(len(each), dtype=np.uint32).reshape(-1, 3),
-    )
-
-
-def _pairs(point: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """All pairs of corners at one point, each with itself too."""
-    order = np.argsort(point, kind="stable")
-    starts = np.flatnonzero(np.diff(point[order], prepend=-1))
-    sizes = np.diff(starts, append=len(point))
-    start, size = np.repeat(starts, sizes), np.repeat(sizes, sizes)  # of each corner's group
-    mine = np.repeat(np.arange(len(point)), size)
-    step = np.arange(len(mine)) - np.repeat(np.cumsum(size) - size, size)
-    return order[mine], order[start[mine] + step]
-
-
-def _painted(mesh: Mesh) -> Mesh:
-    """The texture turned into vertex colours where those say the same: fewer vertices, draws and samples.
-
-    They do where a texture is a palette, or finer triangles than its detail: there the colour in a triangle is what
-    its corners interpolate to.
-    """
-    assert mesh.uv is not None
-    assert mesh.texture is not None
-    corners = mesh.uv[mesh.faces]
-    weights = np.array([(a, b, 4 - a - b) for a in range(5) for b in range(5 - a)]) / 4
-    inside = _sample(mesh.texture, np.einsum("wc,fci->fwi", weights, corners)).astype(float)
-    blend = np.einsum("wc,fci->fwi", weights, _sample(mesh.texture, corners).astype(float))
-    agree = (np.abs(inside - blend).max(axis=(1, 2)) <= 16) & (np.ptp(corners, axis=1).max(axis=1) < 1)
-    if agree.mean() < 0.9:
-        return mesh
-    vertex = np.concatenate([_sample(mesh.texture, mesh.uv), np.full((len(mesh.uv), 1), 255, np.uint8)], axis=1)
-    return replace(mesh, colors=vertex, uv=None, texture=None)
-
-
-def _sample(texture: NDArray[np.uint8], uv: NDArray[np.float32]) -> NDArray[np.uint8]:
-    height, width = texture.shape[:2]
-    column = np.floor(np.mod(uv[..., 0], 1.0) * width).astype(int) % width
-    row = np.floor((1 - np.mod(uv[..., 1], 1.0)) * height).astype(int) % height
-    colors: NDArray[np.uint8] = texture[row, column]
-    return colors
-
-
-def _welded(mesh: Mesh) -> Mesh:
-    """Equal vertices made one: the renderer's work is per vertex, and files often repeat them for every triangle."""
-    columns = [mesh.positions, np.round(mesh.normals * 50), mesh.colors.astype(np.float32)]
-    if mesh.uv is not None:
-        columns.append(mesh.uv)
-    _, first, inverse = np.unique(_rows(*columns), return_index=True, return_inverse=True)
-    faces = inverse.reshape(-1)[mesh.faces]
-    # In the order of their use: a software renderer remembers the vertices that it met last.
-    used, order = np.unique(faces, return_index=True)
-    used = used[np.argsort(order)]
-    place = np.empty(len(first), np.uint32)
-    place[used] = np.arange(len(used), dtype=np.uint32)
-    first = first[used]
-    return replace(
-        mesh,
-        positions=mesh.positions[first],
-        normals=mesh.normals[first],
-        colors=mesh.colors[first],
-        uv=None if mesh.uv is None else mesh.uv[first],
-        faces=place[faces],
-        closed=_closed(mesh),
-    )
-
-
-def _rows(*columns: NDArray[Any]) -> NDArray[Any]:
-    """Each row as one item, to compare rows whole."""
-    table = np.ascontiguousarray(np.concatenate(columns, axis=1, dtype=np.float32) + 0)  # + 0: no negative zero
-    return table.view([("", f"V{table.shape[1] * 4}")]).reshape(-1)
-
-
-def _closed(mesh: Mesh) -> bool:
-    """Does the mesh enclose a volume, with its faces turned outwards?"""
-    _, corner = np.unique(_rows(mesh.positions), return_inverse=True)
-    faces = corner.reshape(-1)[mesh.faces].astype(np.int64)
-    edges = faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
-    there, back = edges[:, 0] * len(corner) + edges[:, 1], edges[:, 1] * len(corner) + edges[:, 0]
-    points = mesh.positions.astype(float)[mesh.faces]
-    volume = np.einsum("ij,ij->i", points[:, 0], np.cross(points[:, 1], points[:, 2])).sum()
-    return bool(np.isin(there, back).mean() >= _CLOSED_SHARE and volume > 0)
-
-
 def _key(path: str) -> str:
-    """Changes whenever the mesh, or a material or picture in its folder, does."""
+    """Return a name that changes whenever the mesh, or a material or picture in its folder, does."""
     file = Path(path)
     state = file.stat()
     beside = max(
@@ -261,7 +108,7 @@ def _key(path: str) -> str:
 
 
 def _write(path: Path, meshes: list[Mesh]) -> None:
-    """Into a temporary file first, so that nobody ever reads half a file."""
+    """Write into a temporary file first, so that half a file is never read."""
     arrays: dict[str, Any] = {"count": np.array(len(meshes))}
     for index, mesh in enumerate(meshes):
         for name, level in ((f"{index}", mesh), (f"{index}.coarse", mesh.coarse)):
@@ -294,3 +141,274 @@ def _read_mesh(archive: Any, name: str) -> Mesh:
     if len(mesh.faces) and mesh.faces.max() >= len(mesh.positions):
         raise ValueError("a face without a vertex")
     return mesh
+
+
+# --- mesh files -------------------------------------------------------------------------------------------------------
+
+
+def parse(path: str) -> list[Mesh]:
+    """Parse a mesh file.
+
+    Args:
+        path: A file in any format that trimesh reads.
+
+    Returns:
+        One mesh per texture, in m, with the colours of the file's materials.
+
+    Raises:
+        ValueError: The file has no triangles.
+    """
+    import trimesh  # half a second, and not needed when everything is in the cache
+
+    loaded = trimesh.load(path, process=False)
+    metres = np.diag([trimesh.units.unit_conversion(loaded.units or "meters", "meters")] * 3 + [1.0])
+    meshes: dict[Any, list[Mesh]] = {}
+    for matrix, part in _parts(loaded) if isinstance(loaded, trimesh.Scene) else [(np.eye(4), loaded)]:
+        if isinstance(part, trimesh.Trimesh) and len(part.faces):
+            mesh = _part(part).moved(metres @ matrix)
+            look = None if mesh.texture is None else (mesh.texture.shape, mesh.texture.tobytes())
+            meshes.setdefault((look, mesh.material), []).append(mesh)
+    if not meshes:
+        raise ValueError("no triangles")
+    whole = [joined(group) for group in meshes.values()]
+    return [_with_levels(mesh) for mesh in whole]
+
+
+def _with_levels(whole: Mesh) -> Mesh:
+    """Return a mesh for large pictures, with a coarse one for small pictures where that saves much."""
+    fine, coarse = (
+        _welded(whole if mesh is whole else _shaded(mesh)) for mesh in (simplified(whole), coarsened(whole))
+    )
+    return replace(fine, coarse=coarse) if len(coarse.faces) < _COARSE_SAVES * len(fine.faces) else fine
+
+
+def _parts(scene: Any) -> Iterator[tuple[NDArray[np.float64], Any]]:
+    for node in scene.graph.nodes_geometry:
+        matrix, name = scene.graph[node]
+        yield matrix, scene.geometry[name]
+
+
+def _part(part: Any) -> Mesh:
+    """Return one part of a file, which has one material, perhaps with a texture."""
+    positions = np.asarray(part.vertices, np.float32)
+    faces = np.asarray(part.faces, np.uint32)
+    colors = np.full((len(positions), 4), 255, np.uint8)
+    # trimesh computes missing normals only with scipy; those of the file are in its cache.
+    normals = (
+        np.asarray(part.vertex_normals, np.float32) if "vertex_normals" in part._cache else np.empty((0, 3), np.float32)
+    )
+    mesh = Mesh(positions, normals, colors, faces)
+    visual = part.visual
+    material = getattr(visual, "material", None)
+    if not getattr(material, "kwargs", True):
+        material = None  # trimesh's substitute for a missing material file
+    uv = getattr(visual, "uv", None)
+    image = getattr(material, "image", None) or getattr(material, "baseColorTexture", None)
+    if visual.kind == "vertex":
+        mesh = replace(mesh, colors=np.asarray(visual.vertex_colors, np.uint8))
+    elif image is not None and uv is not None:
+        texture = np.asarray(image.convert("RGB"), np.uint8)
+        mesh = _painted(replace(mesh, uv=np.asarray(uv, np.float32), texture=texture, material=False))
+    elif material is not None:
+        colors[:] = np.asarray(material.main_color, np.uint8)
+    return _shaded(mesh) if not len(normals) or _faceted(mesh) else mesh
+
+
+def _faceted(mesh: Mesh) -> bool:
+    """Return whether each triangle has its own normal: three vertices per triangle, and a faceted look."""
+    normals = mesh.normals[mesh.faces]
+    return bool(np.mean(np.ptp(normals, axis=1).max(axis=1) < 1e-3) > 0.9)
+
+
+def _shaded(mesh: Mesh) -> Mesh:
+    """Return the mesh with computed normals: smooth, except over edges sharper than the crease angle."""
+    corners = mesh.positions.astype(float)[mesh.faces]
+    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])  # as long as twice the area
+    facing = unit(across)
+    _, point = np.unique(_rows(mesh.positions), return_inverse=True)
+    point = point.reshape(-1)[mesh.faces].reshape(-1)  # of each corner; three corners a face
+    mine, other = _pairs(point)
+    alike = np.einsum("ni,ni->n", facing[mine // 3], facing[other // 3]) > _CREASE
+    normals = np.stack([np.bincount(mine[alike], across[other[alike] // 3, k], len(point)) for k in range(3)], axis=1)
+    flat = np.repeat(facing, 3, axis=0)
+    lost = np.linalg.norm(normals, axis=1) == 0
+    normals[lost] = flat[lost]
+    each = mesh.faces.reshape(-1)
+    return replace(
+        mesh,
+        positions=mesh.positions[each],
+        normals=unit(normals).astype(np.float32),
+        colors=mesh.colors[each],
+        uv=None if mesh.uv is None else mesh.uv[each],
+        faces=np.arange(len(each), dtype=np.uint32).reshape(-1, 3),
+    )
+
+
+def _pairs(point: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return all pairs of corners at the same point, including each with itself."""
+    order = np.argsort(point, kind="stable")
+    starts = np.flatnonzero(np.diff(point[order], prepend=-1))
+    sizes = np.diff(starts, append=len(point))
+    start, size = np.repeat(starts, sizes), np.repeat(sizes, sizes)  # of each corner's group
+    mine = np.repeat(np.arange(len(point)), size)
+    step = np.arange(len(mine)) - np.repeat(np.cumsum(size) - size, size)
+    return order[mine], order[start[mine] + step]
+
+
+def _painted(mesh: Mesh) -> Mesh:
+    """Replace the texture by vertex colours where both look the same: fewer vertices, draws and samples.
+
+    They do where the texture is a palette, or where triangles are finer than its details: there the colour inside a
+    triangle is the interpolation of its corners.
+    """
+    assert mesh.uv is not None
+    assert mesh.texture is not None
+    corners = mesh.uv[mesh.faces]
+    weights = np.array([(a, b, 4 - a - b) for a in range(5) for b in range(5 - a)]) / 4
+    inside = _sample(mesh.texture, np.einsum("wc,fci->fwi", weights, corners)).astype(float)
+    blend = np.einsum("wc,fci->fwi", weights, _sample(mesh.texture, corners).astype(float))
+    agree = (np.abs(inside - blend).max(axis=(1, 2)) <= 16) & (np.ptp(corners, axis=1).max(axis=1) < 1)
+    if agree.mean() < 0.9:
+        return mesh
+    vertex = np.concatenate([_sample(mesh.texture, mesh.uv), np.full((len(mesh.uv), 1), 255, np.uint8)], axis=1)
+    return replace(mesh, colors=vertex, uv=None, texture=None)
+
+
+def _sample(texture: NDArray[np.uint8], uv: NDArray[np.float32]) -> NDArray[np.uint8]:
+    height, width = texture.shape[:2]
+    column = np.floor(np.mod(uv[..., 0], 1.0) * width).astype(int) % width
+    row = np.floor((1 - np.mod(uv[..., 1], 1.0)) * height).astype(int) % height
+    colors: NDArray[np.uint8] = texture[row, column]
+    return colors
+
+
+def _welded(mesh: Mesh) -> Mesh:
+    """Merge equal vertices: the renderer's work is per vertex, and files often repeat them for every triangle."""
+    columns = [mesh.positions, np.round(mesh.normals * 50), mesh.colors.astype(np.float32)]
+    if mesh.uv is not None:
+        columns.append(mesh.uv)
+    _, first, inverse = np.unique(_rows(*columns), return_index=True, return_inverse=True)
+    faces = inverse.reshape(-1)[mesh.faces]
+    # In the order of their use: a software renderer caches the vertices that it used last.
+    used, order = np.unique(faces, return_index=True)
+    used = used[np.argsort(order)]
+    place = np.empty(len(first), np.uint32)
+    place[used] = np.arange(len(used), dtype=np.uint32)
+    first = first[used]
+    return replace(
+        mesh,
+        positions=mesh.positions[first],
+        normals=mesh.normals[first],
+        colors=mesh.colors[first],
+        uv=None if mesh.uv is None else mesh.uv[first],
+        faces=place[faces],
+        closed=_closed(mesh),
+    )
+
+
+def _rows(*columns: NDArray[Any]) -> NDArray[Any]:
+    """Return each row as one item, to compare whole rows."""
+    table = np.ascontiguousarray(np.concatenate(columns, axis=1, dtype=np.float32) + 0)  # + 0: no negative zero
+    return table.view([("", f"V{table.shape[1] * 4}")]).reshape(-1)
+
+
+def _closed(mesh: Mesh) -> bool:
+    """Return whether the mesh encloses a volume, with its faces turned outwards."""
+    _, corner = np.unique(_rows(mesh.positions), return_inverse=True)
+    faces = corner.reshape(-1)[mesh.faces].astype(np.int64)
+    edges = faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
+    there, back = edges[:, 0] * len(corner) + edges[:, 1], edges[:, 1] * len(corner) + edges[:, 0]
+    points = mesh.positions.astype(float)[mesh.faces]
+    volume = np.einsum("ij,ij->i", points[:, 0], np.cross(points[:, 1], points[:, 2])).sum()
+    return bool(np.isin(there, back).mean() >= _CLOSED_SHARE and volume > 0)
+
+
+# --- fewer triangles --------------------------------------------------------------------------------------------------
+
+
+def simplified(mesh: Mesh) -> Mesh:
+    """Return a heavy mesh with fewer triangles, with no visible difference in a large picture; others as they are."""
+    if len(mesh.faces) <= _HEAVY:
+        return mesh
+    points = mesh.positions.astype(float)
+    corners = points[mesh.faces]
+    double_area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    mean_edge = np.sqrt(double_area.sum() * 2 / np.sqrt(3) / len(mesh.faces))  # as if all were equilateral
+    return _clustered(mesh, min(_EDGES * mean_edge, _SHARE * float(np.linalg.norm(np.ptp(points, axis=0)))))
+
+
+def coarsened(mesh: Mesh) -> Mesh:
+    """Return a heavy mesh with a third of the triangles of :func:`simplified`, for small pictures; others as they are.
+
+    ``cell`` of the result is the size of the omitted details: see :class:`.scene.Mesh`.
+    """
+    if len(mesh.faces) <= _COARSE_HEAVY:
+        return mesh
+    return _clustered(mesh, _COARSE_SHARE * float(np.linalg.norm(np.ptp(mesh.positions.astype(float), axis=0))))
+
+
+def _clustered(mesh: Mesh, cell: float) -> Mesh:
+    """Merge the vertices of one colour in each cell of a grid.
+
+    The one that is kept is the nearest to the planes of all their triangles (quadrics: Garland and Heckbert, 1997;
+    clustering: Lindstrom, 2000), so corners, sharp edges and flat faces stay in place; a curved surface moves by about
+    the square of a cell over eight times its radius. Triangles keep the colours of their corners; normals must be
+    computed again.
+    """
+    if cell <= 0:
+        return mesh
+    points = mesh.positions.astype(float)
+    corners = points[mesh.faces]
+    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    double_area = np.linalg.norm(across, axis=1)
+    grid = np.floor((points - points.min(axis=0)) / cell).astype(np.int64)
+    _, paint = np.unique(mesh.colors, axis=0, return_inverse=True)
+    keys = np.stack([grid @ np.array([1, 1 << 20, 1 << 40]), paint.reshape(-1)], axis=1)
+    _, cluster = np.unique(keys, axis=0, return_inverse=True)
+    cluster = cluster.reshape(-1)
+    chosen = _nearest_to_planes(points, corners, across, double_area, cluster[mesh.faces], cluster)
+
+    faces = cluster[mesh.faces]
+    solid = (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])
+    first = np.argmin(faces, axis=1)[:, None]
+    turned = np.take_along_axis(faces, (first + np.arange(3)) % 3, axis=1)  # the same triangle, written one way
+    solid[solid] = _first_of_each(turned[solid])
+    each = mesh.faces[solid].reshape(-1)
+    return replace(
+        mesh,
+        positions=mesh.positions[chosen[faces[solid].reshape(-1)]],
+        normals=mesh.normals[each],
+        colors=mesh.colors[each],
+        uv=None if mesh.uv is None else mesh.uv[each],
+        faces=np.arange(len(each), dtype=np.uint32).reshape(-1, 3),
+        cell=cell,
+    )
+
+
+def _nearest_to_planes(
+    points: NDArray[np.float64],
+    corners: NDArray[np.float64],
+    across: NDArray[np.float64],
+    double_area: NDArray[np.float64],
+    face_clusters: NDArray[np.int64],
+    cluster: NDArray[np.int64],
+) -> NDArray[np.int64]:
+    """Return the vertex of each cluster with the least sum of squared distances to its triangles' planes."""
+    unit = across / np.where(double_area == 0, 1, double_area)[:, None]
+    planes = np.concatenate([unit, -np.einsum("fi,fi->f", unit, corners[:, 0])[:, None]], axis=1)
+    quadrics = np.einsum("f,fi,fj->fij", double_area, planes, planes).reshape(-1, 16)
+    count = cluster.max() + 1
+    total = np.stack([np.bincount(face_clusters.reshape(-1), np.repeat(q, 3), count) for q in quadrics.T], axis=1)
+    homogeneous = np.concatenate([points, np.ones((len(points), 1))], axis=1)
+    cost = np.einsum("vi,vij,vj->v", homogeneous, total.reshape(-1, 4, 4)[cluster], homogeneous)
+    order = np.lexsort((cost, cluster))
+    starts = np.flatnonzero(np.diff(cluster[order], prepend=-1))
+    chosen: NDArray[np.int64] = order[starts]
+    return chosen
+
+
+def _first_of_each(faces: NDArray[np.int64]) -> NDArray[np.bool_]:
+    _, first = np.unique(faces, axis=0, return_index=True)
+    keep = np.zeros(len(faces), bool)
+    keep[first] = True
+    return keep

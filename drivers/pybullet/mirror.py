@@ -1,4 +1,4 @@
-"""A copy of the world that follows the one which is stepped, in whatever process."""
+"""A copy of the world, in the process that draws it, that follows the world that is stepped."""
 
 from __future__ import annotations
 
@@ -6,15 +6,20 @@ from typing import Any
 
 from hal.host.memory import SeriesBox
 
-from .world import World
+from .world import PyBulletWorld
 
-__all__ = ["Mirror"]
+__all__ = ["WorldMirror"]
 
 
-class Mirror:
-    """Poses ``world``, made with ``mirror=True``, by the snapshots that the stepped world's process publishes."""
+class WorldMirror:
+    """Poses a world by the snapshots and the edits of the world that is stepped.
 
-    def __init__(self, world: World, snapshots: SeriesBox) -> None:
+    Args:
+        world: The copy, made with ``mirror=True``.
+        snapshots: Where the stepped world's process publishes its snapshots.
+    """
+
+    def __init__(self, world: PyBulletWorld, snapshots: SeriesBox) -> None:
         self.world = world
         self._snapshots = snapshots
         self._edits: dict[int, tuple[str, dict[str, Any]]] = {}
@@ -22,14 +27,15 @@ class Mirror:
         self._t: float | None = None
 
     def edited(self, method: str, params: dict[str, Any], revision: int) -> None:
-        """Note an edit; it is done before the first snapshot of its revision is shown. Any order will do."""
+        """Note an edit; it is made before the first snapshot of its revision is shown. They may come in any order."""
         self._edits[revision] = (method, params)
 
     def update(self) -> float | None:
-        """Show the newest snapshot; returns its time, s.
+        """Show the newest snapshot.
 
-        None before the first one, and while an edit that it includes is still on its way: snapshots come through
-        memory and may overtake edits, which come through a socket.
+        Returns:
+            Its time, s. None before the first one, and while an edit that it includes has not arrived: snapshots come
+            through memory and may overtake edits, which come through a socket.
         """
         record = self._snapshots.read()
         if record is None:

@@ -1,148 +1,312 @@
-"""What there is to draw in a world: the visual shapes of its bodies as meshes, and where their links are."""
+"""What there is to draw in a world: triangle meshes, primitive shapes, and the visual shapes of its bodies.
+
+Nothing here depends on a physics engine: a world that is drawn implements :class:`RenderScene`.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hal.geometry import Pose
 
-from .meshes import MeshLibrary
-from .shapes import Mesh, box, capsule, cylinder, joined, plane, sphere
-
-__all__ = ["Part", "Scene", "link_frames", "parts_of"]
+__all__ = [
+    "DrawnPart",
+    "Mesh",
+    "RenderScene",
+    "Visual",
+    "box",
+    "capsule",
+    "cylinder",
+    "joined",
+    "parts_of",
+    "plane",
+    "sphere",
+    "unit",
+]
 
 Array = NDArray[np.float64]
+Points = NDArray[np.float32]
+
+_SEGMENTS = 48
+"""Segments of a circle. A chord then leaves the circle by 0.2 % of its radius."""
+_PLANE_HALF = 50.0
+"""Half the side of the square that is drawn for an infinite plane, m."""
 
 
 class SceneBody(Protocol):
-    """A body of a world, as far as drawing goes (:class:`.body.Body`)."""
+    """A body of a world, as the renderer sees it."""
 
     @property
-    def id(self) -> int: ...
-    @property
-    def index(self) -> int: ...
-
-
-class Scene(Protocol):
-    """A world, as far as drawing goes (:class:`.world.World`)."""
+    def id(self) -> int:
+        """Number by which the physics engine names it."""
 
     @property
-    def client(self) -> Any: ...
+    def index(self) -> int:
+        """Value of its pixels in segmentation images."""
+
+
+class Visual(NamedTuple):
+    """A visual shape of a link."""
+
+    link: int
+    """-1 is the base."""
+    kind: str
+    """``mesh``, ``box``, ``sphere``, ``cylinder``, ``capsule`` or ``plane``."""
+    size: tuple[float, ...]
+    """Scale (3,) of a mesh; sides (3,) of a box; radius of a sphere; radius and length of a cylinder or capsule; m."""
+    file: str
+    """Path of a mesh."""
+    position: tuple[float, ...]
+    """(3,) m in the frame of the link (not of its centre of mass)."""
+    orientation: tuple[float, ...]
+    """(4,) xyzw."""
+    rgba: tuple[float, ...]
+
+
+class RenderScene(Protocol):
+    """A world, as the renderer sees it."""
+
     @property
     def bodies(self) -> Mapping[str, SceneBody]: ...
     @property
-    def revision(self) -> int: ...
+    def revision(self) -> int:
+        """Changes whenever bodies or their visual shapes do."""
+
+    def visuals(self, body: int) -> tuple[Visual, ...]:
+        """Return the visual shapes of the body with this id."""
+
+    def link_frames(self, links: Sequence[tuple[int, int]]) -> Array:
+        """Return the poses (N, 4, 4) in the world of the frames of links, each given as (body id, link)."""
 
 
 @dataclass(frozen=True, eq=False)
-class Part:
+class Mesh:
+    """Triangles with one texture. Outward faces are counter-clockwise."""
+
+    positions: Points
+    """(V, 3) m."""
+    normals: Points
+    """(V, 3) unit vectors."""
+    colors: NDArray[np.uint8]
+    """(V, 4) RGBA; multiplied with the texture where there is one."""
+    faces: NDArray[np.uint32]
+    """(F, 3) indices of vertices."""
+    uv: Points | None = None
+    """(V, 2) texture coordinates, (0, 0) at the lower left."""
+    texture: NDArray[np.uint8] | None = None
+    """(H, W, 3) RGB, first row at the top."""
+    material: bool = True
+    """Whether the colours come from the file's materials, which a colour from the URDF replaces; a texture it tints."""
+    closed: bool = True
+    """Whether this is the surface of a solid: faces that point away are hidden anyway and need not be drawn."""
+    cell: float = 0.0
+    """Size of the largest details that were left out, m; 0 where none were."""
+    coarse: Mesh | None = None
+    """The same with fewer triangles, for pictures in which ``coarse.cell`` is small; None where that saves little."""
+
+    def scaled(self, scale: tuple[float, ...] | NDArray[np.float64]) -> Mesh:
+        """Return the mesh stretched along the axes by ``scale`` (3,); mirroring keeps faces turned outwards."""
+        factors = np.asarray(scale, np.float32)
+        if np.all(factors == 1):
+            return self
+        with np.errstate(divide="ignore"):
+            inverse = np.where(factors == 0, 0, 1 / factors)
+        faces = self.faces[:, ::-1] if np.prod(factors) < 0 else self.faces
+        return replace(
+            self,
+            positions=(self.positions * factors).astype(np.float32),
+            normals=unit(self.normals * inverse).astype(np.float32),
+            faces=np.ascontiguousarray(faces),
+            cell=self.cell * float(np.abs(factors).max()),
+        )
+
+    def moved(self, matrix: Array) -> Mesh:
+        """Return the mesh in the frame in which ``matrix`` (4, 4), which may scale and mirror, gives its pose."""
+        linear, translation = matrix[:3, :3], matrix[:3, 3]
+        faces = self.faces[:, ::-1] if np.linalg.det(linear) < 0 else self.faces
+        return replace(
+            self,
+            positions=(self.positions @ linear.T + translation).astype(np.float32),
+            normals=unit(self.normals @ np.linalg.inv(linear)).astype(np.float32),
+            faces=np.ascontiguousarray(faces),
+        )
+
+    def tinted(self, rgba: tuple[float, ...]) -> Mesh:
+        """Return the mesh in the colour that the URDF gives; white leaves the file's own colours."""
+        tint = np.asarray(rgba, float)
+        if np.all(tint == 1):
+            return self
+        base = np.full(len(self.colors) * 4, 255.0).reshape(-1, 4) if self.material else self.colors.astype(float)
+        return replace(self, colors=np.clip(base * tint + 0.5, 0, 255).astype(np.uint8))
+
+
+def joined(meshes: Sequence[Mesh]) -> Mesh:
+    """Join meshes that share a texture."""
+    offsets = np.cumsum([0] + [len(m.positions) for m in meshes[:-1]])
+    return replace(
+        meshes[0],
+        positions=np.concatenate([m.positions for m in meshes]),
+        normals=np.concatenate([m.normals for m in meshes]),
+        colors=np.concatenate([m.colors for m in meshes]),
+        faces=np.concatenate([m.faces + np.uint32(k) for m, k in zip(meshes, offsets, strict=True)]),
+        uv=None if meshes[0].uv is None else np.concatenate([m.uv for m in meshes if m.uv is not None]),
+        cell=max(m.cell for m in meshes),
+        coarse=None,
+    )
+
+
+def unit(vectors: NDArray[Any]) -> NDArray[Any]:
+    """Return vectors (N, 3) at length 1; a zero vector stays zero."""
+    lengths = np.linalg.norm(vectors, axis=1, keepdims=True)
+    result: NDArray[Any] = vectors / np.where(lengths == 0, 1, lengths)
+    return result
+
+
+# --- primitive shapes ------------------------------------------------------------------------------------------------
+# trimesh.creation has them too, but importing trimesh takes longer than everything else that a renderer needs to start.
+
+
+def box(half_extents: tuple[float, float, float]) -> Mesh:
+    """Return a box around the origin; half its sides in m."""
+    corners: list[Array] = []
+    normals: list[Array] = []
+    faces: list[list[int]] = []
+    for axis in range(3):
+        for side in (1.0, -1.0):
+            normal, across = side * np.eye(3)[axis], np.eye(3)[axis - 1]
+            along = np.cross(normal, across)
+            first = len(corners)
+            corners += [normal + a * across + b * along for a, b in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
+            normals += [normal] * 4
+            faces += [[first, first + 1, first + 2], [first, first + 2, first + 3]]
+    return _white(np.array(corners) * np.asarray(half_extents), np.array(normals), np.array(faces))
+
+
+def sphere(radius: float) -> Mesh:
+    """Return a sphere around the origin; radius in m."""
+    angle = np.linspace(-np.pi / 2, np.pi / 2, _SEGMENTS // 2 + 1)
+    ring = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    return _revolved(radius * ring, ring)
+
+
+def cylinder(radius: float, length: float) -> Mesh:
+    """Return a cylinder along z, centred at the origin; m."""
+    h = length / 2
+    profile = [(0, -h), (radius, -h), (radius, -h), (radius, h), (radius, h), (0, h)]
+    normals = [(0, -1), (0, -1), (1, 0), (1, 0), (0, 1), (0, 1)]
+    return _revolved(np.array(profile, float), np.array(normals, float))
+
+
+def capsule(radius: float, length: float) -> Mesh:
+    """Return a cylinder of ``length`` along z with a half sphere on either end; m."""
+    angle = np.linspace(0, np.pi / 2, _SEGMENTS // 4 + 1)
+    cap = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    upper = radius * cap + (0, length / 2)
+    mirror = np.array([1, -1])
+    return _revolved(np.concatenate([(upper * mirror)[::-1], upper]), np.concatenate([(cap * mirror)[::-1], cap]))
+
+
+def plane() -> Mesh:
+    """Return a large square in z = 0 that faces up."""
+    h = _PLANE_HALF
+    positions = np.array([[-h, -h, 0], [h, -h, 0], [h, h, 0], [-h, h, 0]])
+    return _white(positions, np.tile([0.0, 0, 1], (4, 1)), np.array([[0, 1, 2], [0, 2, 3]]), closed=False)
+
+
+def _revolved(profile: Array, normals: Array) -> Mesh:
+    """Return the surface of revolution around z of a profile (P, 2) of radius and height, from bottom to top."""
+    angle = np.linspace(0, 2 * np.pi, _SEGMENTS + 1)
+    circle = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+
+    def around(points: Array) -> Array:
+        ring = points[:, None, :1] * circle[None]
+        height = np.broadcast_to(points[:, None, 1:], (*ring.shape[:2], 1))
+        rows: Array = np.concatenate([ring, height], axis=2).reshape(-1, 3)
+        return rows
+
+    row = _SEGMENTS + 1
+    lower = (np.arange(len(profile) - 1)[:, None] * row + np.arange(_SEGMENTS)).reshape(-1)
+    quads = np.stack([lower, lower + 1, lower + row + 1, lower, lower + row + 1, lower + row], axis=1)
+    positions, faces = around(profile), quads.reshape(-1, 3)
+    corners = positions[faces]
+    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    return _white(positions, around(normals), faces[area > 1e-9 * area.max()])
+
+
+def _white(positions: Array, normals: Array, faces: NDArray[np.int64], closed: bool = True) -> Mesh:
+    white = np.full((len(positions), 4), 255, np.uint8)
+    return Mesh(positions.astype(np.float32), normals.astype(np.float32), white, faces.astype(np.uint32), closed=closed)
+
+
+# --- parts of a body -------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class DrawnPart:
     """What one draw call draws: the meshes of one link that share a texture, in the frame of the link.
 
     A link has parts for large pictures, and others for small ones if any of its meshes is heavy.
     """
 
     body: int
-    """PyBullet's number of the body."""
+    """The body's id."""
     link: int
     """-1 is the base."""
     mesh: Mesh
     coarse: bool
-    """For pictures in which ``mesh.cell`` is small."""
+    """Whether it is for pictures in which ``mesh.cell`` is small."""
     centre: Array
-    """(3,) of a ball around the mesh, m."""
+    """(3,) centre of a ball around the mesh, m."""
     radius: float
+    """Radius of that ball, m."""
 
 
-def parts_of(client: Any, shapes: Sequence[Any], library: MeshLibrary) -> list[Part]:
-    """The parts of one body; ``shapes`` is what ``getVisualShapeData`` says of it."""
+def parts_of(body: int, visuals: Sequence[Visual], load_mesh: Callable[[str], Sequence[Mesh]]) -> list[DrawnPart]:
+    """Return the parts of one body.
+
+    Args:
+        body: The body's id.
+        visuals: Its visual shapes.
+        load_mesh: Returns the meshes in a file, for example :meth:`.meshes.MeshLibrary.load`.
+    """
+    found: list[tuple[Visual, Array, Mesh]] = []
+    for visual in visuals:
+        if visual.rgba[3] != 0:
+            frame = Pose(visual.position, visual.orientation).matrix()
+            found += [(visual, frame, mesh) for mesh in _meshes_of(visual, load_mesh)]
+    heavy = {visual.link for visual, _, mesh in found if mesh.coarse is not None}
     groups: dict[Any, list[Mesh]] = {}
-    found: list[tuple[int, int, tuple[float, ...], Array, Mesh]] = []
-    for shape in shapes:
-        body, link, kind, size, file, position, orientation, rgba = shape[:8]
-        if rgba[3] == 0:
-            continue
-        frame = Pose(position, orientation).matrix()  # in the link's frame, not in that of its centre of mass
-        for mesh in _meshes(client, kind, size, file.decode(), library):
-            found.append((body, link, rgba, frame, mesh))
-    heavy = {(body, link) for body, link, _, _, mesh in found if mesh.coarse is not None}
-    for body, link, rgba, frame, mesh in found:
-        for coarse in (False, True) if (body, link) in heavy else (False,):
+    for visual, frame, mesh in found:
+        for coarse in (False, True) if visual.link in heavy else (False,):
             drawn = mesh.coarse if coarse and mesh.coarse is not None else mesh
             texture = None if drawn.texture is None else id(drawn.texture)
-            key = (body, link, coarse, texture, drawn.closed)
-            groups.setdefault(key, []).append(drawn.tinted(rgba).moved(frame))
-    return [_part(body, link, coarse, joined(meshes)) for (body, link, coarse, *_), meshes in groups.items()]
+            key = (visual.link, coarse, texture, drawn.closed)
+            groups.setdefault(key, []).append(drawn.tinted(visual.rgba).moved(frame))
+    return [_part(body, link, coarse, joined(meshes)) for (link, coarse, *_), meshes in groups.items()]
 
 
-def _meshes(client: Any, kind: int, size: Sequence[float], file: str, library: MeshLibrary) -> list[Mesh]:
-    if kind == client.GEOM_MESH:
-        return [_scaled(mesh, np.asarray(size)) for mesh in library.load(file)]
-    if kind == client.GEOM_BOX:
+def _meshes_of(visual: Visual, load_mesh: Callable[[str], Sequence[Mesh]]) -> list[Mesh]:
+    size = visual.size
+    if visual.kind == "mesh":
+        return [
+            replace(mesh.scaled(size), coarse=None if mesh.coarse is None else mesh.coarse.scaled(size))
+            for mesh in load_mesh(visual.file)
+        ]
+    if visual.kind == "box":
         return [box((size[0] / 2, size[1] / 2, size[2] / 2))]
-    if kind == client.GEOM_SPHERE:
+    if visual.kind == "plane":
+        return [plane()]
+    if visual.kind == "sphere":
         return [sphere(size[0])]
-    if kind == client.GEOM_CYLINDER:
-        return [cylinder(size[1], size[0])]
-    if kind == client.GEOM_CAPSULE:
-        return [capsule(size[1], size[0])]
-    return [plane()] if kind == client.GEOM_PLANE else []
+    return [(cylinder if visual.kind == "cylinder" else capsule)(size[0], size[1])]
 
 
-def _scaled(mesh: Mesh, size: Array) -> Mesh:
-    coarse = None if mesh.coarse is None else mesh.coarse.scaled(size)
-    return replace(mesh.scaled(size), coarse=coarse)
-
-
-def _part(body: int, link: int, coarse: bool, mesh: Mesh) -> Part:
+def _part(body: int, link: int, coarse: bool, mesh: Mesh) -> DrawnPart:
     low, high = mesh.positions.min(axis=0), mesh.positions.max(axis=0)
     centre = (low + high).astype(float) / 2
-    return Part(body, link, mesh, coarse, centre, float(np.linalg.norm(mesh.positions - centre, axis=1).max()))
-
-
-def link_frames(client: Any, links: Sequence[tuple[int, int]]) -> Array:
-    """Poses (N, 4, 4) in the world of the frames of links, each given as (body, link); those of one body together."""
-    wanted: dict[int, list[int]] = {}
-    for body, link in links:
-        wanted.setdefault(body, []).append(link)
-    frames: list[tuple[float, ...]] = []
-    for body, numbers in wanted.items():
-        moving = [link for link in numbers if link >= 0]
-        states = iter(client.getLinkStates(body, moving, computeForwardKinematics=1) if moving else ())
-        for link in numbers:
-            if link >= 0:
-                state = next(states)
-                frames.append((*state[4], *state[5]))
-            else:  # PyBullet gives the base by its centre of mass
-                inertial = client.getDynamicsInfo(body, -1)[3:5]
-                centre = client.getBasePositionAndOrientation(body)
-                position, orientation = client.multiplyTransforms(*centre, *client.invertTransform(*inertial))
-                frames.append((*position, *orientation))
-    return _matrices(np.array(frames).reshape(-1, 7))
-
-
-def _matrices(poses: Array) -> Array:
-    x, y, z, w = poses[:, 3:].T
-    matrices = np.zeros((len(poses), 4, 4))
-    matrices[:, 0, 0], matrices[:, 0, 1], matrices[:, 0, 2] = (
-        1 - 2 * (y * y + z * z),
-        2 * (x * y - z * w),
-        2 * (x * z + y * w),
-    )
-    matrices[:, 1, 0], matrices[:, 1, 1], matrices[:, 1, 2] = (
-        2 * (x * y + z * w),
-        1 - 2 * (x * x + z * z),
-        2 * (y * z - x * w),
-    )
-    matrices[:, 2, 0], matrices[:, 2, 1], matrices[:, 2, 2] = (
-        2 * (x * z - y * w),
-        2 * (y * z + x * w),
-        1 - 2 * (x * x + y * y),
-    )
-    matrices[:, :3, 3] = poses[:, :3]
-    matrices[:, 3, 3] = 1
-    return matrices
+    return DrawnPart(body, link, mesh, coarse, centre, float(np.linalg.norm(mesh.positions - centre, axis=1).max()))

@@ -16,8 +16,8 @@ from hal.host.process import Channel, Child, SharedMemory, serve
 from hal.specs import WorldSpec, from_json, to_json
 from hal.views import Viewer
 
-from .mirror import Mirror
-from .world import World
+from .mirror import WorldMirror
+from .world import PyBulletWorld
 
 __all__ = ["PyBulletViewer", "main"]
 
@@ -95,11 +95,11 @@ def main(channel: Channel, memories: Sequence[SharedMemory], config: dict[str, A
     """Run the window's process; ``memories`` holds the snapshots of the world."""
     os.nice(_NICE)
     os.environ.setdefault("LP_NUM_THREADS", "1")
-    world = World(from_json(WorldSpec, config["world"]), mirror=True, gui=True)
+    world = PyBulletWorld(from_json(WorldSpec, config["world"]), mirror=True, gui=True)
     _arrange(world)
     box = SeriesBox(memories[0].buffer[config["snapshot_offset"] :], config["snapshot_capacity"])
     channel.send({"ready": {}})
-    mirror = Mirror(world, box)
+    mirror = WorldMirror(world, box)
 
     def show() -> float | None:
         if not world.client.isConnected():
@@ -115,7 +115,7 @@ def main(channel: Channel, memories: Sequence[SharedMemory], config: dict[str, A
     serve(channel, {"edited": mirror.edited}, show)
 
 
-def _arrange(world: World) -> None:
+def _arrange(world: PyBulletWorld) -> None:
     """Show the whole bench, without panels, and without keys or mouse gestures that change the world."""
     client = world.client
     for option in ("COV_ENABLE_GUI", "COV_ENABLE_KEYBOARD_SHORTCUTS", "COV_ENABLE_MOUSE_PICKING"):

@@ -1,33 +1,47 @@
 """The simulated world of a rig: one PyBullet client that simulated arms, grippers and cameras are views of.
 
 The same class is the world that is stepped and each of its mirrors (the renderer's, the viewer's). A mirror is made
-from the same record and never stepped: it replays the edits of :data:`World.MIRRORED` in their order, which keeps the
-order of the bodies the same, and :meth:`World.show` poses it by a :meth:`World.snapshot` of that revision.
+from the same record and never stepped: it replays the edits of :attr:`PyBulletWorld.MIRRORED` in their order, which
+keeps the order of the bodies the same, and :meth:`PyBulletWorld.show` poses it by a :meth:`PyBulletWorld.snapshot` of
+that revision.
 """
 
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from itertools import combinations
 from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
 
 from hal.errors import CommandError, ConfigError, DeviceNotFound, NotSupported, Problem
 from hal.specs import BodySpec, RobotSpec, WorldSpec
 
-from .arm_copy import ArmCopy
-from .body import Body
-from .carrying import Carried
-from .contacts import bounding_box, deepest_overlap, find_contacts, forget_contacts
-from .dynamics import read_dynamics, write_dynamics
-from .library import Client
+from .attachments import AttachedObjects, MirroredArm
+from .dynamics import bounding_box, deepest_overlap, find_contacts, forget_contacts, read_dynamics, write_dynamics
+from .engine import (
+    Body,
+    PyBulletClient,
+    body_spec,
+    joint_positions,
+    link_frames,
+    nearest,
+    numbers,
+    pose_json,
+    transform,
+    visuals_of,
+)
 from .loading import load_object, load_robot
 from .motors import hold
-from .picture import Picture
+from .scene import Visual
 from .transforms import Transform
-from .values import body_spec, joint_positions, nearest, numbers, pose_json, transform
 
-__all__ = ["World"]
+__all__ = [
+    "PyBulletWorld",
+    "SnapshotLayout",
+]
 
 ENGINE: dict[str, Any] = {
     "deterministicOverlappingPairs": 1,
@@ -36,7 +50,7 @@ ENGINE: dict[str, Any] = {
 }
 """Settings of PyBullet's solver.
 
-Each group of things that touch is solved by itself: PyBullet solves small groups together, which gives the same numbers
+Each group of bodies that touch is solved by itself: PyBullet solves small groups together, which gives the same numbers
 and makes every group wait for the slowest. The solver iterates at most 100 times: with PyBullet's 50, fingers that
 grasp with 70 N reach half of it, and fast arms are 0.2 % over their speed limits."""
 RESIDUAL = {"fine": 1e-7, "coarse": 3e-6}
@@ -45,18 +59,25 @@ RESIDUAL = {"fine": 1e-7, "coarse": 3e-6}
 "fine" is PyBullet's own, and needed while fingers move slowly or hold something. With "coarse" a step takes a tenth
 less time, and a Panda follows a swing within 0.056 mrad instead of 0.041."""
 OVERLAP = 0.005
-"""m: two arms that start deeper in each other are refused."""
+"""Depth, m, from which on two arms that overlap at the start are refused."""
 
 
-class World:
-    """Everything that stands in one simulation.
+class PyBulletWorld:
+    """One simulation and all bodies in it.
 
-    Public methods whose names are in :attr:`REQUESTS` are the questions and edits of ``rig.world``; they take and give
-    plain numbers, lists and dicts, so that they can travel (:meth:`request`). Poses are dicts of ``position`` (3,) m
-    and ``orientation`` (4,) xyzw, of a link's own frame, in the world.
+    Public methods whose names are in :attr:`REQUESTS` are the queries and edits of ``rig.world``; they take and return
+    plain numbers, lists and dicts, so that they can be sent as JSON (:meth:`request`). Poses are dicts of ``position``
+    (3,) m and ``orientation`` (4,) xyzw, of a link's own frame, in the world.
+
+    Args:
+        spec: The record of the world.
+        mirror: The world is posed by snapshots and never stepped.
+        gui: Open PyBullet's window.
+        drawn: Load visual meshes, because this very world is drawn. Without them loading a Panda takes 0.2 s and 75 MB
+            less.
 
     Raises:
-        ConfigError: something in the record cannot be loaded; lists every such thing.
+        ConfigError: Something in the record cannot be loaded; lists every problem.
         DriverMissing: PyBullet is not installed, or its window cannot open.
     """
 
@@ -71,14 +92,6 @@ class World:
     replay them (``mirror.request(method, params)``) before they show a snapshot of that revision."""
 
     def __init__(self, spec: WorldSpec, *, mirror: bool = False, gui: bool = False, drawn: bool = True) -> None:
-        """Load everything in ``spec``.
-
-        Args:
-            mirror: The world is posed by snapshots and never stepped.
-            gui: Open PyBullet's window.
-            drawn: Something draws this very world. Without it visual meshes are not loaded: for a Panda that takes
-                0.2 s and 75 MB less.
-        """
         self.spec = spec
         self.mirror = mirror
         self.drawn = drawn
@@ -89,13 +102,13 @@ class World:
         self._changes = 0
         self.bodies: dict[str, Body] = {}
         self.warnings: list[str] = []
-        """What a person should know about the files that were loaded."""
-        self.client = Client(gui=gui)
+        """Warnings for the user about the files that were loaded."""
+        self.client = PyBulletClient(gui=gui)
         self._on_reset: dict[str, list[Callable[[], None]]] = {}
-        self._copies: dict[str, ArmCopy] = {}
-        """Of arms that other drivers move."""
+        self._mirrored: dict[str, MirroredArm] = {}
+        """Mirrors of arms that other drivers move."""
         self._handling = {robot.name for robot in spec.robots if robot.gripper is not None}
-        """Robots whose fingers move or hold something, as far as is known."""
+        """Robots whose fingers may move or hold something."""
         try:
             self.client.setTimeStep(self.dt)
             self.client.setGravity(*spec.gravity)
@@ -119,19 +132,19 @@ class World:
         if problems:
             raise ConfigError(problems)
         try:
-            self._carried = Carried(self.client, self.bodies)
-        except ConfigError:  # something is attached to what is not there
+            self._attached = AttachedObjects(self.client, self.bodies)
+        except ConfigError:  # something is attached to a missing arm or link
             for spec in specs:
                 self.client.removeBody(self.bodies.pop(spec.name).id)
             self._arrange()
             raise
         self._arrange()
-        self._carried.leave_physics(self.bodies[spec.name] for spec in specs)
-        self._carried.follow()
+        self._attached.leave_physics(self.bodies[spec.name] for spec in specs)
+        self._attached.follow()
 
     def _check_overlaps(self) -> None:
-        """Refuse arms that start inside each other: the solver would throw them apart."""
-        robots = [body for body in self.bodies.values() if body.is_robot and body.name not in self._copies]
+        """Refuse arms that overlap at the start: the solver would throw them apart."""
+        robots = [body for body in self.bodies.values() if body.is_robot and body.name not in self._mirrored]
         problems = []
         for a, b in combinations(robots, 2):
             depth, link_a, link_b = deepest_overlap(self.client, a, b)
@@ -144,7 +157,7 @@ class World:
 
     def _place(self, spec: BodySpec | RobotSpec) -> Body:
         if spec.name in self.bodies:
-            raise ConfigError([Problem("world", spec.name, "is the name of two things; names are unique in the world")])
+            raise ConfigError([Problem("world", spec.name, "names two bodies; names must be unique in the world")])
         if isinstance(spec, RobotSpec):
             body, warnings = load_robot(self.client, spec, self.drawn)
         else:
@@ -153,7 +166,7 @@ class World:
         self.warnings += warnings
         self._put_home(body)
         if isinstance(spec, RobotSpec) and spec.driver != self.spec.driver:
-            self._copies[spec.name] = ArmCopy(self.client, body, self.dt)
+            self._mirrored[spec.name] = MirroredArm(self.client, body, self.dt)
         return body
 
     @property
@@ -168,33 +181,40 @@ class World:
 
     @property
     def version(self) -> tuple[int, int]:
-        """Differs from an earlier one if anything may look different since: after a step, an edit or a reset."""
+        """Changes whenever anything may look different: after a step, an edit or a reset."""
         return self.steps, self._changes
 
     def step(self) -> None:
-        """One physics step."""
+        """Make one physics step."""
         if self.mirror:
             raise NotSupported("a mirror is posed by show(), never stepped")
-        for copy in self._copies.values():
-            copy.prepare_step()
+        for arm in self._mirrored.values():
+            arm.prepare_step()
         self._step()
-        self._carried.follow()
+        self._attached.follow()
         self.steps += 1
 
     def close(self) -> None:
-        """Let go of PyBullet. Idempotent."""
+        """Delete the world. Idempotent."""
         self.bodies = {}
-        self._copies = {}
+        self._mirrored = {}
         self.client.close()
 
-    # --- requests: rig.world -------------------------------------------------------------------------------------
+    # --- requests of rig.world -----------------------------------------------------------------------------------
 
     def request(self, method: str, params: Mapping[str, Any]) -> Any:
-        """Call one of :attr:`REQUESTS` by name: JSON in, JSON out.
+        """Call one of :attr:`REQUESTS` by name.
+
+        Args:
+            method: Name of the method.
+            params: Its arguments, as JSON.
+
+        Returns:
+            Its result, as JSON.
 
         Raises:
-            DeviceNotFound: no body or link of that name; lists those that are there.
-            CommandError: no such method, arguments that it does not take, or impossible numbers.
+            DeviceNotFound: No body or link of that name; lists the existing ones.
+            CommandError: No such method, arguments that it does not take, or impossible numbers.
         """
         if method not in self.REQUESTS:
             raise CommandError(f"the world has no request {method!r}; requests: {', '.join(sorted(self.REQUESTS))}")
@@ -209,16 +229,16 @@ class World:
             raise
 
     def names(self) -> list[str]:
-        """Names of everything, objects first, in the order in which they came."""
+        """Return the names of all bodies, objects first, in the order in which they were added."""
         return list(self.bodies)
 
     def describe(self, name: str) -> dict[str, Any]:
-        """``index`` (its number in segmentation images), ``robot`` (is it one?), ``links`` and ``joints`` by name."""
+        """Return ``index`` (in segmentation images), ``robot`` (a bool), and the names of ``links`` and ``joints``."""
         body = self.body(name)
         return {"index": body.index, "robot": body.is_robot, "links": list(body.links), "joints": list(body.joints)}
 
     def pose(self, name: str, link: str | None = None) -> dict[str, list[float]]:
-        """The pose of a link's frame in the world; of the base link when none is named."""
+        """Return the pose of a link's frame in the world; of the base link when none is named."""
         body = self.body(name)
         index = self.link(body, link)
         if index == -1:
@@ -227,48 +247,48 @@ class World:
         return pose_json((state[4], state[5]))
 
     def poses(self, names: Sequence[str] | None = None) -> dict[str, Any]:
-        """``poses`` by name of the base links of many bodies, None: of all; and ``t``, the simulated time, s."""
+        """Return ``poses`` of base links by name, of all bodies for None, and ``t``, the simulated time, s."""
         found = self.bodies.values() if names is None else [self.body(name) for name in names]
         return {"t": self.t, "poses": {body.name: pose_json(body.base_pose(self.client)) for body in found}}
 
     def set_pose(self, name: str, pose: Mapping[str, Sequence[float]]) -> None:
-        """Put an object's base link there, at rest, whatever is in the way; its joints keep their positions."""
+        """Place an object's base link there, at rest, without a check for overlaps; its joints keep their positions."""
         body = self.body(name)
         if body.is_robot:
-            raise CommandError(f"{name!r} is a robot: its servo moves it, and reset() puts it back")
+            raise CommandError(f"{name!r} is a robot: its servo moves it, and reset() puts it back", code="is_robot")
         if body.carried:
-            raise CommandError(f"{name!r} is attached to an arm: it goes where that goes")
+            raise CommandError(f"{name!r} is attached to an arm: it follows that arm", code="is_attached")
         self._set_base(body, transform(pose))
 
     def velocity(self, name: str) -> list[list[float]]:
-        """Linear (3,) m/s of the base link's centre of mass and angular (3,) rad/s, along the world's axes."""
+        """Return the velocity in the world: linear (3,) m/s of the base link's centre of mass, angular (3,) rad/s."""
         return [list(part) for part in self.client.getBaseVelocity(self.body(name).id)]
 
     def set_velocity(
         self, name: str, linear: Sequence[float] = (0.0, 0.0, 0.0), angular: Sequence[float] = (0.0, 0.0, 0.0)
     ) -> None:
-        """Give a body that moves freely a velocity, as :meth:`velocity` means it."""
+        """Set the velocity, as :meth:`velocity` returns it, of a body with a free base."""
         body = self.body(name)
         if not body.floating:
-            raise CommandError(f"the base of {name!r} is fixed: it has no velocity to set")
+            raise CommandError(f"the base of {name!r} is fixed: it has no velocity to set", code="base_fixed")
         self.client.resetBaseVelocity(body.id, numbers("linear", linear, 3), numbers("angular", angular, 3))
 
     def dynamics(self, name: str, link: str | None = None) -> dict[str, Any]:
-        """Mass, inertia, frictions, restitution, contact stiffness and damping, damping (:func:`read_dynamics`)."""
+        """Return mass, inertia, friction, restitution, stiffness and damping: :func:`.dynamics.read_dynamics`."""
         body = self.body(name)
         return read_dynamics(self.client, body, self.link(body, link))
 
     def set_dynamics(self, name: str, link: str | None = None, **values: Any) -> dict[str, Any]:
-        """Set some of :meth:`dynamics`; returns what to pass here to put it all back (:func:`write_dynamics`)."""
+        """Set some values of :meth:`dynamics` and return the previous ones: :func:`.dynamics.write_dynamics`."""
         body = self.body(name)
         before = write_dynamics(self.client, body, self.link(body, link), values, self.dt)
         forget_contacts(self.client, [body])
         return before
 
     def contacts(self, a: str | None = None, b: str | None = None) -> list[dict[str, Any]]:
-        """Where bodies touched in the last step: all, those of ``a``, or those between ``a`` and ``b``.
+        """Return the contacts of the last step: all, those of ``a``, or those between ``a`` and ``b``.
 
-        Each a dict of ``a``, ``b``, ``link_a``, ``link_b``, ``position`` (3,) m on ``b``, ``normal`` (3,) from ``b``
+        Each is a dict of ``a``, ``b``, ``link_a``, ``link_b``, ``position`` (3,) m on ``b``, ``normal`` (3,) from ``b``
         towards ``a``, ``distance`` m, negative where they overlap, and ``force`` N along the normal.
         """
         if a is None:
@@ -277,32 +297,32 @@ class World:
         return find_contacts(self.client, self.bodies.values(), first, second)
 
     def aabb(self, name: str) -> dict[str, list[float]]:
-        """``lower`` and ``upper`` (3,) m: the box along the world's axes that holds the whole body.
+        """Return ``lower`` and ``upper`` (3,) m, the corners of the box along the world's axes around the body.
 
-        It is PyBullet's, so it may be larger by a collision margin (mm).
+        It may be larger by PyBullet's collision margin (mm).
         """
         lower, upper = bounding_box(self.client, self.body(name))
         return {"lower": lower, "upper": upper}
 
     def add(self, spec: Mapping[str, Any] | BodySpec) -> int:
-        """Put an object into the world; returns the new revision."""
+        """Add an object and return the new revision."""
         record = spec if isinstance(spec, BodySpec) else body_spec(spec)
         self._load([record])
         return self._edited()
 
     def remove(self, name: str) -> int:
-        """Take an object out of the world; returns the new revision. Robots stay."""
+        """Remove an object, not a robot, and return the new revision."""
         body = self.body(name)
         if body.is_robot:
-            raise CommandError(f"{name!r} is a robot: robots stay in the world")
+            raise CommandError(f"{name!r} is a robot: robots stay in the world", code="is_robot")
         self.client.removeBody(body.id)
         del self.bodies[name]
-        self._carried = Carried(self.client, self.bodies)
+        self._attached = AttachedObjects(self.client, self.bodies)
         self._arrange()
         return self._edited()
 
     def set_color(self, name: str, rgba: Sequence[float]) -> int:
-        """Paint all links of a body (red, green, blue, alpha in 0..1); returns the new revision."""
+        """Set the colour of all links of a body (red, green, blue, alpha in 0..1) and return the new revision."""
         body = self.body(name)
         color = numbers("rgba", rgba, 4)
         if not all(0.0 <= value <= 1.0 for value in color):
@@ -322,80 +342,80 @@ class World:
         pose: Mapping[str, Sequence[float]] | None = None,
         q: Sequence[float] | None = None,
     ) -> None:
-        """Put one thing, or everything, back: at rest, where the rig says it starts, or where these arguments say.
+        """Reset one body, or all, at rest, to their initial state in the rig or to these arguments.
 
-        An arm holds there and its gripper is open. The copy of a real arm stays where that arm is. What was added or
-        removed, painted or given other dynamics stays so, and simulated time goes on.
+        An arm holds its position and its gripper is open. The mirror of a real arm stays where that arm is. Added and
+        removed bodies, colours and dynamics are kept, and simulated time continues.
 
         Args:
-            name: of the body; None means all.
-            pose: an object's base link in the world; only with a name.
-            q: joint positions in rad or m; only with a name. Of an arm: those of its joints, or of its joints and
-                fingers; of an object: those of all its movable joints.
+            name: The body; None for all.
+            pose: Pose of an object's base link in the world; only with a name.
+            q: Joint positions, rad or m; only with a name. For an arm, those of its joints, or of its joints and
+                fingers; for an object, those of all its movable joints.
         """
         if name is None:
             if pose is not None or q is not None:
-                raise CommandError("reset with a pose or with q needs the name of what they are for")
+                raise CommandError("reset with a pose or with q needs the name of a body", code="name_missing")
             everything = list(self.bodies.values())
             forget_contacts(self.client, everything)
             for body in everything:
-                if body.name not in self._copies:
+                if body.name not in self._mirrored:
                     self._put_home(body)
-            self._carried.follow()
+            self._attached.follow()
             return
         body = self.body(name)
-        if name in self._copies:
-            raise CommandError(f"{name!r} stands where the real arm is; move that")
+        if name in self._mirrored:
+            raise CommandError(f"{name!r} mirrors a real arm; move that", code="is_mirrored")
         if pose is not None and body.is_robot:
-            raise CommandError(f"{name!r} is a robot: its base stays where the rig says")
+            raise CommandError(f"{name!r} is a robot: its base is fixed by the rig", code="is_robot")
         if pose is not None and body.carried:
-            raise CommandError(f"{name!r} is attached to an arm: it goes where that goes")
+            raise CommandError(f"{name!r} is attached to an arm: it follows that arm", code="is_attached")
         base = body.base if pose is None else transform(pose)
         joints = body.home if q is None else {**body.home, **joint_positions(body, q)}
         forget_contacts(self.client, [body])
         self._put(body, base, joints)
-        self._carried.follow()
+        self._attached.follow()
 
     # --- for drivers, the renderer and the viewer ----------------------------------------------------------------
 
     def follow(self, name: str, q: Sequence[float], dq: Sequence[float], width: float | None = None) -> None:
-        """Put the copy of a real arm where that arm is. For every step anew; one that is not told anything stays.
+        """Place the mirror of a real arm where that arm is; to be called for every step, else the mirror stays.
 
         Args:
-            name: of an arm that another driver moves.
+            name: An arm that another driver moves.
             q: (n,) rad.
-            dq: (n,) rad/s, which it goes on with during the next step.
-            width: of its gripper, m; None where nobody knows.
+            dq: (n,) rad/s, its speeds during the next step.
+            width: Width of its gripper, m; None where it is unknown.
 
         Raises:
-            DeviceNotFound: no such body.
-            CommandError: the arm is a simulated one, or the numbers are not n finite ones. The copy stays.
+            DeviceNotFound: No such body.
+            CommandError: The arm is simulated, or the numbers are not n finite ones. The mirror stays.
         """
-        copy = self._copies.get(name)
-        if copy is None:
+        arm = self._mirrored.get(name)
+        if arm is None:
             self.body(name)
-            raise CommandError(f"{name!r} is not the copy of a real arm")
-        copy.follow(q, dq, width)
+            raise CommandError(f"{name!r} is not the mirror of a real arm", code="not_mirrored")
+        arm.follow(q, dq, width)
         self._changes += 1
 
     def body(self, name: str) -> Body:
-        """The body of that name, or a DeviceNotFound that lists all."""
+        """Return the body of that name; raises DeviceNotFound, which lists all."""
         if name not in self.bodies:
-            raise DeviceNotFound(f"the world has no body {name!r}{nearest(name, self.bodies)}")
+            raise DeviceNotFound(f"the world has no body {name!r}{nearest(name, self.bodies)}", code="unknown_body")
         return self.bodies[name]
 
     def link(self, body: Body, name: str | None) -> int:
-        """Index of a link by name; of the base link for None."""
+        """Return the index of a link by name, that of the base link for None; raises DeviceNotFound."""
         if name is None:
             return -1
         if name not in body.links:
-            raise DeviceNotFound(f"{body.name!r} has no link {name!r}{nearest(name, body.links)}")
+            raise DeviceNotFound(f"{body.name!r} has no link {name!r}{nearest(name, body.links)}", code="unknown_link")
         return body.links[name]
 
     def handle(self, name: str, active: bool) -> None:
-        """Say whether a robot's fingers move or hold something, which is computed with more care.
+        """Report whether a robot's fingers move or hold something, which takes a finer solution.
 
-        Fingers that stand still with nothing between them need no gear: each motor holds its own.
+        Fingers that stand still with nothing between them need no coupling: each motor holds its own finger.
         """
         if active == (name in self._handling):
             return
@@ -411,30 +431,38 @@ class World:
         self.client.setPhysicsEngineParameter(solverResidualThreshold=RESIDUAL["fine" if self._handling else "coarse"])
 
     def on_reset(self, name: str, callback: Callable[[], None]) -> None:
-        """Have ``callback`` called whenever the robot of that name was put somewhere by a reset."""
+        """Call ``callback`` after each reset of the robot of that name."""
         self._on_reset.setdefault(name, []).append(callback)
 
     def off_reset(self, name: str, callback: Callable[[], None]) -> None:
-        """The end of :meth:`on_reset`."""
+        """Remove a callback of :meth:`on_reset`."""
         self._on_reset[name].remove(callback)
 
     def snapshot(self) -> list[float]:
-        """Where everything is now: what :meth:`show` of a mirror at the same :attr:`revision` takes."""
-        return self._picture.take()
+        """Return the state of all bodies, for :meth:`show` of a mirror at the same :attr:`revision`."""
+        return self._layout.read()
 
     def show(self, snapshot: Sequence[float]) -> None:
-        """Put every body where a snapshot of the same revision says.
+        """Place every body as in a snapshot of the same revision.
 
         Raises:
-            ValueError: it was taken from a world with other bodies.
+            ValueError: It was taken from a world with other bodies.
         """
-        self._picture.show(snapshot)
+        self._layout.apply(snapshot)
+
+    def visuals(self, body: int) -> tuple[Visual, ...]:
+        """Return the visual shapes of the body with PyBullet's number ``body``."""
+        return visuals_of(self.client, body)
+
+    def link_frames(self, links: Sequence[tuple[int, int]]) -> NDArray[np.float64]:
+        """Return the poses (N, 4, 4) of links, each given as (PyBullet's number of the body, link)."""
+        return link_frames(self.client, links)
 
     def _arrange(self) -> None:
-        """Number the bodies and look again at what stands still, after bodies came, went or were moved by hand."""
+        """Number the bodies and read the fixed ones again, after bodies were added, removed or placed."""
         for index, body in enumerate(self.bodies.values()):
             body.index = index
-        self._picture = Picture(self.client, self.bodies.values())
+        self._layout = SnapshotLayout(self.client, self.bodies.values())
 
     def _put_home(self, body: Body) -> None:
         self._put(body, body.base, body.home)
@@ -457,3 +485,56 @@ class World:
             self.client.resetBaseVelocity(body.id, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
         else:
             self._arrange()
+
+
+class SnapshotLayout:
+    """Reads and applies snapshots: the state of a set of bodies as one list of numbers.
+
+    First the poses (7) of all bodies with a fixed base, then of each other body, in order, the pose (7) of its base if
+    that is free or attached to an arm, and its joint positions. Poses are PyBullet's own, of the centre of mass.
+
+    Fixed bases are read once, by the constructor: make a new layout when one was moved.
+    """
+
+    def __init__(self, client: PyBulletClient, bodies: Iterable[Body]) -> None:
+        everything = list(bodies)
+        self._client = client
+        self._still = [body.id for body in everything if not body.roams]
+        self._still_values: list[float] = []
+        for number in self._still:
+            position, orientation = client.getBasePositionAndOrientation(number)
+            self._still_values += [*position, *orientation]
+        self._moving = [(body.id, body.roams, body.movable) for body in everything if body.moves]
+        self.size = len(self._still_values) + sum(7 * roams + len(joints) for _, roams, joints in self._moving)
+
+    def read(self) -> list[float]:
+        """Return the present snapshot."""
+        values = self._still_values.copy()
+        pose_of, joints_of = self._client.getBasePositionAndOrientation, self._client.getJointStates
+        for number, roams, movable in self._moving:
+            if roams:
+                position, orientation = pose_of(number)
+                values += position
+                values += orientation
+            if movable:
+                values += [state[0] for state in joints_of(number, movable)]
+        return values
+
+    def apply(self, snapshot: Sequence[float]) -> None:
+        """Place all bodies as in a snapshot; raises ValueError when it is one of other bodies."""
+        values = list(snapshot)
+        if len(values) != self.size:
+            raise ValueError(f"a snapshot of {len(values)} numbers does not fit a world of {self.size}")
+        put, put_joints = self._client.resetBasePositionAndOrientation, self._client.resetJointStatesMultiDof
+        place = len(self._still_values)
+        if values[:place] != self._still_values:
+            for k, number in enumerate(self._still):
+                put(number, values[7 * k : 7 * k + 3], values[7 * k + 3 : 7 * k + 7])
+            self._still_values = values[:place]
+        for number, roams, movable in self._moving:
+            if roams:
+                put(number, values[place : place + 3], values[place + 3 : place + 7])
+                place += 7
+            if movable:
+                put_joints(number, movable, [[value] for value in values[place : place + len(movable)]])
+                place += len(movable)

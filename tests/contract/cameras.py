@@ -56,12 +56,11 @@ def mock_camera_in_lock_step() -> Iterator[CameraBench]:
 def pybullet_camera_in_lock_step() -> Iterator[CameraBench]:
     """The caller's thread draws the present state of the world."""
     data("plane.urdf")
-    from hal.drivers.pybullet.camera import DirectSource, PyBulletCamera
-    from hal.drivers.pybullet.tiny import TinyRenderer
-    from hal.drivers.pybullet.world import World
+    from hal.drivers.pybullet.camera import DirectSource, PyBulletCamera, TinyRenderer
+    from hal.drivers.pybullet.world import PyBulletWorld
 
     spec = camera_spec(driver="pybullet", view=FROM_ABOVE)
-    world = World(WORLD)
+    world = PyBulletWorld(WORLD)
     driver = PyBulletCamera(spec, DirectSource(world, TinyRenderer(world), spec, lambda: bench.now))
     clock = LockStepClock(lambda: bench.now, lambda t: None)
     bench = CameraBench(driver=driver, clock=clock, dt=world.dt, advance=world.step)
@@ -75,7 +74,7 @@ class Studio:
 
     def __init__(self) -> None:
         data("plane.urdf")
-        from hal.drivers.pybullet.pictures import PyBulletPictures
+        from hal.drivers.pybullet.camera import PyBulletPictures
         from hal.host.hosts import RemoteHost
 
         self.spec = camera_spec(driver="pybullet", view=FROM_ABOVE)

@@ -31,11 +31,11 @@ def mock_gripper() -> Iterator[GripperBench]:
 def pybullet_gripper() -> Iterator[GripperBench]:
     from hal.drivers.pybullet.gripper import PyBulletGripper
     from hal.drivers.pybullet.robot import PyBulletRobot
-    from hal.drivers.pybullet.world import World
+    from hal.drivers.pybullet.world import PyBulletWorld
 
     spec = panda(driver="pybullet")
     assert spec.gripper is not None
-    world = World(WorldSpec("pybullet", 240.0, (0.0, 0.0, -9.81), (), (spec,)))
+    world = PyBulletWorld(WorldSpec("pybullet", 240.0, (0.0, 0.0, -9.81), (), (spec,)))
     arm = PyBulletRobot(spec, world)
     arm.open()
     driver = PyBulletGripper(spec.gripper, world)

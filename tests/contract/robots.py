@@ -42,10 +42,10 @@ def three_joints() -> Iterator[RobotBench]:
 @contextmanager
 def pybullet_robot() -> Iterator[RobotBench]:
     from hal.drivers.pybullet.robot import PyBulletRobot
-    from hal.drivers.pybullet.world import World
+    from hal.drivers.pybullet.world import PyBulletWorld
 
     spec = panda(driver="pybullet")
-    world = World(WorldSpec("pybullet", 240.0, (0.0, 0.0, -9.81), (), (spec,)))
+    world = PyBulletWorld(WorldSpec("pybullet", 240.0, (0.0, 0.0, -9.81), (), (spec,)))
     driver = PyBulletRobot(spec, world)
     yield RobotBench(
         driver=driver,

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from specs import data
 
-from hal.drivers.pybullet.rendering import Renderer
-from hal.drivers.pybullet.world import World
+from hal.drivers.pybullet.renderer import Renderer
+from hal.drivers.pybullet.world import PyBulletWorld
 from hal.errors import DriverMissing
 from hal.geometry import Pose
 from hal.specs import BodySpec, CameraSpec, RobotSpec, ViewSpec, WorldSpec
@@ -37,10 +37,10 @@ COLLADA = """<?xml version="1.0" encoding="utf-8"?>
 """The corner of a cube with sides of 2 cm, three times as high."""
 
 
-def world(*bodies: BodySpec, robots: tuple[RobotSpec, ...] = (), **changes: Any) -> World:
+def world(*bodies: BodySpec, robots: tuple[RobotSpec, ...] = (), **changes: Any) -> PyBulletWorld:
     """A world that the caller closes."""
     data("plane.urdf")  # skips where PyBullet is not installed
-    return World(WorldSpec("pybullet", 240.0, (0.0, 0.0, -9.81), bodies, robots), **changes)
+    return PyBulletWorld(WorldSpec("pybullet", 240.0, (0.0, 0.0, -9.81), bodies, robots), **changes)
 
 
 def box(
@@ -90,13 +90,13 @@ def look_at(eye: tuple[float, ...], target: tuple[float, ...], up: tuple[float, 
     return Pose.from_matrix(matrix)
 
 
-def renderer(name: str, scene: World) -> Renderer:
+def renderer(name: str, scene: PyBulletWorld) -> Renderer:
     """A renderer by name; skips the test where there is no OpenGL."""
     if name == "tiny":
-        from hal.drivers.pybullet.tiny import TinyRenderer
+        from hal.drivers.pybullet.camera import TinyRenderer
 
         return TinyRenderer(scene)
-    from hal.drivers.pybullet.gl import GLRenderer
+    from hal.drivers.pybullet.renderer import GLRenderer
 
     try:
         return GLRenderer(scene)

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from hal.drivers.pybullet.library import load_pybullet
+from hal.drivers.pybullet.engine import load_pybullet
 from hal.errors import DriverMissing
 from hal.specs import BodySpec, GripperSpec, KinematicsSpec, LimitsSpec, RobotSpec, WorldSpec
 

@@ -14,7 +14,7 @@ from hal.commands import CommandRecord, DeadmanRecord, Inbox, Kind, Session
 from hal.driver import Reading, Setpoint
 from hal.drivers.mock.robot import MockRobot
 from hal.drivers.pybullet.robot import PyBulletRobot
-from hal.drivers.pybullet.world import World
+from hal.drivers.pybullet.world import PyBulletWorld
 from hal.servo.audit import SetpointAudit
 from hal.servo.servo import Servo
 from hal.specs import RobotSpec, WorkspaceSpec
@@ -30,7 +30,7 @@ class Driven:
     def __init__(
         self,
         driver: Any,
-        world: World | None = None,
+        world: PyBulletWorld | None = None,
         *,
         rate_hz: float = 240.0,
         speed: float = 0.3,
@@ -176,7 +176,7 @@ def simulated(initial: Sequence[float] | None = None, box: WorkspaceSpec | None 
     spec = replace(panda(), rate_hz=rate_hz, workspace=box)
     if initial is not None:
         spec = replace(spec, initial=tuple(initial))
-    world = World(world_spec(spec, physics_hz=rate_hz))
+    world = PyBulletWorld(world_spec(spec, physics_hz=rate_hz))
     for _ in range(60):
         world.step()
     return Driven(PyBulletRobot(spec, world), world, **how)

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from specs import data, world_spec
 
-from hal.drivers.pybullet.world import World
+from hal.drivers.pybullet.world import PyBulletWorld
 from hal.errors import ConfigError
 from hal.kinematics.urdf import mesh_file, package_folder
 from hal.specs import BodySpec
@@ -80,7 +80,7 @@ def test_an_absolute_path_stays_one(tmp_path: Path) -> None:
 
 def test_the_simulation_draws_a_mesh_out_of_a_package(package: Path, tmp_path: Path) -> None:
     data("")
-    world = World(world_spec(thing(tmp_path, "package://lab_meshes/parts/cube.obj")))
+    world = PyBulletWorld(world_spec(thing(tmp_path, "package://lab_meshes/parts/cube.obj")))
     (shape,) = world.client.getVisualShapeData(world.body("thing").id)
     assert Path(shape[4].decode()) == package / "parts" / "cube.obj"
     world.close()
@@ -89,4 +89,4 @@ def test_the_simulation_draws_a_mesh_out_of_a_package(package: Path, tmp_path: P
 def test_a_mesh_that_is_in_no_package_is_told(package: Path, tmp_path: Path) -> None:
     data("")
     with pytest.raises(ConfigError, match=r"thing.urdf.*names a mesh that is not there: package://lab_meshes/ball.obj"):
-        World(world_spec(thing(tmp_path, "package://lab_meshes/ball.obj")))
+        PyBulletWorld(world_spec(thing(tmp_path, "package://lab_meshes/ball.obj")))

@@ -207,7 +207,7 @@ def mutated(text: str, source: random.Random) -> str:
 
 def fuzz(folder: Path, count: int) -> None:
     """Load ``count`` mutated arms as objects, and print how many a simulation took and how many were refused."""
-    from hal.drivers.pybullet.world import World
+    from hal.drivers.pybullet.world import PyBulletWorld
     from hal.specs import BodySpec, WorldSpec
 
     loaded = refused = 0
@@ -220,7 +220,7 @@ def fuzz(folder: Path, count: int) -> None:
         print(f"seed {seed}", file=sys.stderr, flush=True)
         body = BodySpec("it", (0.0, 0.0, 1.0), upright, "urdf", urdf=str(path))
         try:
-            world = World(WorldSpec("pybullet", 240.0, (0.0, 0.0, -9.81), (body,), ()))
+            world = PyBulletWorld(WorldSpec("pybullet", 240.0, (0.0, 0.0, -9.81), (body,), ()))
         except ConfigError:
             refused += 1
             continue

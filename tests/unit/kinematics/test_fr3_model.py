@@ -67,12 +67,12 @@ def test_the_kinematics_are_those_of_the_table() -> None:
 
 
 def test_every_link_stands_where_that_of_pybullets_panda_does() -> None:
-    from hal.drivers.pybullet.world import World
+    from hal.drivers.pybullet.world import PyBulletWorld
 
     panda = load("franka", overrides=["robots.arm.model=panda"]).resolve().robots[0]
     apart = np.array([0.0, 2.0, 0.0])
     base = tuple(np.add(panda.base_position, apart).tolist())
-    world = World(world_spec(replace(fr3(), name="fr3"), replace(panda, name="panda", base_position=base)))
+    world = PyBulletWorld(world_spec(replace(fr3(), name="fr3"), replace(panda, name="panda", base_position=base)))
     assert not [warning for warning in world.warnings if "fr3" in warning]
     links = [*(f"link{k}" for k in range(9)), "hand", "leftfinger", "rightfinger"]
     for q in random_positions(20):
@@ -88,11 +88,11 @@ def test_every_link_stands_where_that_of_pybullets_panda_does() -> None:
 
 
 def test_pybullet_says_nothing_about_it() -> None:
-    from hal.drivers.pybullet.library import Client, silenced
+    from hal.drivers.pybullet.engine import PyBulletClient, silenced
     from hal.drivers.pybullet.urdf import loadable
 
     data("")
-    client = Client()
+    client = PyBulletClient()
     with loadable(str(URDF)) as file, silenced() as chatter:
         body = client.loadURDF(file, useFixedBase=True, flags=client.URDF_USE_INERTIA_FROM_FILE)
     assert chatter.text == ""
@@ -173,11 +173,11 @@ def test_a_panda_that_goes_on_by_itself_for_19_cycles_stays_below_its_own_speed_
 
 def test_the_simulated_hand_presses_as_hard_as_it_is_told() -> None:
     from hal.drivers.pybullet.gripper import PyBulletGripper
-    from hal.drivers.pybullet.world import World
+    from hal.drivers.pybullet.world import PyBulletWorld
 
     arm = replace(fr3(), base_position=(0.0, 0.0, 0.0))
     here = tuple(Kinematics(arm.kinematics).fk(arm.home)[:3])
-    world = World(world_spec(cube(here), arm))
+    world = PyBulletWorld(world_spec(cube(here), arm))
     assert arm.gripper is not None
     hand = PyBulletGripper(arm.gripper, world)
     hand.open()

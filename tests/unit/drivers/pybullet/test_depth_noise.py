@@ -10,7 +10,7 @@ import pytest
 
 from hal.config import load
 from hal.drivers.pybullet.camera import PyBulletCamera
-from hal.drivers.pybullet.depth_noise import DepthNoise, depth_noise
+from hal.drivers.pybullet.exposure import DepthNoise, depth_noise
 from hal.errors import ConfigError
 from hal.specs import CameraSpec
 

@@ -13,7 +13,7 @@ from specs import IIWA_HOME, PANDA_HOME, box, cube, floor, iiwa, panda, world_sp
 
 from hal.driver import Reading, Setpoint
 from hal.drivers.pybullet.robot import PyBulletRobot
-from hal.drivers.pybullet.world import World
+from hal.drivers.pybullet.world import PyBulletWorld
 from hal.errors import CommandError, ConfigError, ConnectionLost
 from hal.specs import BodySpec, RobotSpec
 
@@ -21,9 +21,9 @@ ZERO = (0.0,) * 7
 DIRECTION = np.array([1.0, 0.5, -1.0, 0.5, 1.0, 0.5, 1.0])
 
 
-def opened(spec: RobotSpec | None = None, *others: BodySpec, hz: float = 240.0) -> tuple[World, PyBulletRobot]:
+def opened(spec: RobotSpec | None = None, *others: BodySpec, hz: float = 240.0) -> tuple[PyBulletWorld, PyBulletRobot]:
     arm = spec or panda()
-    world = World(world_spec(*others, arm, physics_hz=hz))
+    world = PyBulletWorld(world_spec(*others, arm, physics_hz=hz))
     driver = PyBulletRobot(arm, world)
     driver.open()
     return world, driver
@@ -37,7 +37,9 @@ def swing(t: float, home: NDArray[np.float64]) -> Setpoint:
     return Setpoint(q.tolist(), dq.tolist(), ZERO)
 
 
-def follow(world: World, driver: PyBulletRobot, seconds: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def follow(
+    world: PyBulletWorld, driver: PyBulletRobot, seconds: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Swing; the errors (ticks, 7) of the readings against the set-points before them, and the speeds."""
     home = np.array(driver.spec.initial)
     errors, speeds = [], []
@@ -134,7 +136,7 @@ ONE_JOINT = """<robot name="arm">
 <limit lower="-2" upper="2" effort="0" velocity="0"/></joint></robot>"""
 
 
-def weld_weight(world: World) -> None:
+def weld_weight(world: PyBulletWorld) -> None:
     """2 kg, as the cube has, fixed below the hand."""
     hand = world.pose("panda", "panda_hand")
     x, y, z = hand["position"]
@@ -225,7 +227,7 @@ class TestReadings:
         assert reading.dq_commanded == [0.0] * 7
 
     def test_opening_moves_nothing(self) -> None:
-        world = World(world_spec(panda()))
+        world = PyBulletWorld(world_spec(panda()))
         before = world.snapshot()
         driver = PyBulletRobot(panda(), world)
         driver.open()
@@ -234,7 +236,7 @@ class TestReadings:
 
     def test_two_arms_do_not_disturb_each_other(self) -> None:
         left, right = panda("left"), iiwa("right", base_position=(0.0, 1.5, 0.0))
-        world = World(world_spec(floor(), left, right))
+        world = PyBulletWorld(world_spec(floor(), left, right))
         one, other = PyBulletRobot(left, world), PyBulletRobot(right, world)
         one.open()
         other.open()
@@ -283,8 +285,9 @@ class TestFaults:
 
     def test_an_unknown_fault_is_refused(self) -> None:
         _, driver = opened()
-        with pytest.raises(CommandError, match="freeze"):
+        with pytest.raises(CommandError) as caught:
             driver.inject(explode=True)
+        assert caught.value.code == "unknown_fault"
 
 
 def moved(one: Reading, other: Reading) -> bool:
@@ -292,10 +295,11 @@ def moved(one: Reading, other: Reading) -> bool:
 
 
 def test_a_world_is_needed() -> None:
-    with pytest.raises(CommandError, match="world"):
+    with pytest.raises(CommandError) as caught:
         PyBulletRobot(panda(), None)
+    assert caught.value.code == "world_missing"
 
 
 def test_a_joint_that_the_urdf_lacks() -> None:
     with pytest.raises(ConfigError, match="panda_jiont7"):
-        World(world_spec(panda(joints=(*panda().joints[:6], "panda_jiont7"))))
+        PyBulletWorld(world_spec(panda(joints=(*panda().joints[:6], "panda_jiont7"))))

@@ -12,8 +12,8 @@ from torque_kit import NOTHING, N, one, simulated
 
 from hal.driver import Setpoint
 from hal.drivers.pybullet.robot import PyBulletRobot
-from hal.drivers.pybullet.world import World
-from hal.kinematics.arm import Kinematics
+from hal.drivers.pybullet.world import PyBulletWorld
+from hal.kinematics import Kinematics
 from hal.specs import BodySpec
 from hal.types import Limited, RobotStatus, Trip
 
@@ -21,12 +21,12 @@ STIFFNESS = np.array([0.0, 200.0, 200.0, 200.0, 20.0, 20.0, 2.0])  # Nm per rad,
 RATES = pytest.mark.parametrize("rate_hz", [240.0, 1000.0])
 
 
-def opened(*others: BodySpec, torque: tuple[float, ...] | None = None) -> tuple[World, PyBulletRobot]:
+def opened(*others: BodySpec, torque: tuple[float, ...] | None = None) -> tuple[PyBulletWorld, PyBulletRobot]:
     """An arm that follows set-points by itself, without a servo."""
     spec = panda()
     if torque is not None:
         spec = replace(spec, limits=replace(spec.limits, torque=torque))
-    world = World(world_spec(spec, *others))
+    world = PyBulletWorld(world_spec(spec, *others))
     driver = PyBulletRobot(spec, world)
     driver.open()
     for _ in range(60):
@@ -199,7 +199,7 @@ class TestDriver:
 
     def test_where_the_urdf_is_right_it_says_the_same(self) -> None:
         spec = iiwa()
-        world = World(world_spec(spec))
+        world = PyBulletWorld(world_spec(spec))
         driver = PyBulletRobot(spec, world)
         driver.open()
         rng = np.random.default_rng(0)

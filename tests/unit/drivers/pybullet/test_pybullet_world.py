@@ -15,7 +15,7 @@ import pytest
 from numpy.typing import NDArray
 from specs import IIWA_HOME, PANDA_HOME, box, cube, data, floor, iiwa, panda, world_spec
 
-from hal.drivers.pybullet.world import World
+from hal.drivers.pybullet.world import PyBulletWorld
 from hal.errors import CommandError, ConfigError, DeviceNotFound, NotSupported
 from hal.geometry import Pose
 from hal.specs import BodySpec, to_json
@@ -23,7 +23,7 @@ from hal.specs import BodySpec, to_json
 UPRIGHT = (0.0, 0.0, 0.0, 1.0)
 
 
-def run(world: World, steps: int) -> NDArray[np.float64]:
+def run(world: PyBulletWorld, steps: int) -> NDArray[np.float64]:
     """Step, and give every snapshot on the way (steps, n)."""
     seen = []
     for _ in range(steps):
@@ -32,7 +32,7 @@ def run(world: World, steps: int) -> NDArray[np.float64]:
     return np.array(seen)
 
 
-def pose(world: World, name: str, link: str | None = None) -> Pose:
+def pose(world: PyBulletWorld, name: str, link: str | None = None) -> Pose:
     answer = world.pose(name, link)
     return Pose(answer["position"], answer["orientation"])
 
@@ -43,9 +43,9 @@ def mug(**changes: object) -> BodySpec:
     return BodySpec("mug", (0.3, 0.4, 0.1), UPRIGHT, "urdf", **values)  # type: ignore[arg-type]
 
 
-def scene() -> World:
+def scene() -> PyBulletWorld:
     """Floor, a stack of two boxes that touch at the start, a URDF object, two different arms."""
-    return World(
+    return PyBulletWorld(
         world_spec(
             floor(),
             cube((0.5, -0.2, 0.03)),
@@ -58,14 +58,14 @@ def scene() -> World:
 
 
 @pytest.fixture(scope="module")
-def one_scene() -> Iterator[World]:
+def one_scene() -> Iterator[PyBulletWorld]:
     world = scene()
     yield world
     world.close()
 
 
 @pytest.fixture
-def lasting(one_scene: World) -> World:
+def lasting(one_scene: PyBulletWorld) -> PyBulletWorld:
     """The scene for tests that leave its bodies and their dynamics as they were: loading it is most of a test."""
     one_scene.reset()
     return one_scene
@@ -73,7 +73,7 @@ def lasting(one_scene: World) -> World:
 
 class TestStepping:
     def test_time_is_the_number_of_steps(self) -> None:
-        world = World(world_spec(cube()))
+        world = PyBulletWorld(world_spec(cube()))
         run(world, 240)
         assert world.t == 240 * world.dt == 1.0
 
@@ -84,7 +84,7 @@ class TestStepping:
 
     def test_without_its_visual_meshes_a_world_moves_alike_bit_for_bit(self) -> None:
         things = world_spec(floor(), cube((0.0, 0.0, 0.5)), mug(), panda())
-        drawn, plain = World(things), World(things, drawn=False)
+        drawn, plain = PyBulletWorld(things), PyBulletWorld(things, drawn=False)
         names = {
             kind: {shape[4] for shape in world.client.getVisualShapeData(world.bodies["panda"].id)}
             for kind, world in (("drawn", drawn), ("plain", plain))
@@ -100,7 +100,7 @@ class TestStepping:
         assert plain.aabb("mug") == drawn.aabb("mug")
 
     def test_a_body_falls_as_galileo_says(self) -> None:
-        world = World(world_spec(cube((0.0, 0.0, 10.0))))
+        world = PyBulletWorld(world_spec(cube((0.0, 0.0, 10.0))))
         world.set_dynamics("cube", linear_damping=0.0)
         run(world, 240)
         n, dt = 240, world.dt
@@ -109,8 +109,8 @@ class TestStepping:
     def test_importing_and_loading_print_nothing(self) -> None:
         code = (
             "import sys; sys.path.insert(0, sys.argv[1]);"
-            "from specs import *; from hal.drivers.pybullet.world import World;"
-            "world = World(world_spec(floor(), panda())); world.step(); world.close()"
+            "from specs import *; from hal.drivers.pybullet.world import PyBulletWorld;"
+            "world = PyBulletWorld(world_spec(floor(), panda())); world.step(); world.close()"
         )
         command = [sys.executable, "-c", code, str(Path(__file__).parents[3] / "kits")]
         done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
@@ -128,7 +128,7 @@ class TestBodies:
     def test_an_arm_stands_where_its_base_link_should(self) -> None:
         base = Pose((-0.55, 0.1, 0.6), (0.0, 0.0, math.sin(0.3), math.cos(0.3)))
         spec = panda(base_position=tuple(base.position), base_orientation=tuple(base.orientation))
-        world = World(world_spec(spec))
+        world = PyBulletWorld(world_spec(spec))
         distance, angle = pose(world, "panda").distance(base)
         assert distance < 1e-12
         assert angle < 1e-7
@@ -142,10 +142,10 @@ class TestBodies:
 
         spec = panda(base_position=(0.0, 0.0, 1.0))
         spec = replace(spec, kinematics=replace(spec.kinematics, base_link="panda_link1"))
-        world = World(world_spec(replace(spec, initial=(0.0, *PANDA_HOME[1:]))))
+        world = PyBulletWorld(world_spec(replace(spec, initial=(0.0, *PANDA_HOME[1:]))))
         assert np.allclose(pose(world, "panda", "panda_link1").position, (0.0, 0.0, 1.0), atol=1e-6)
 
-    def test_two_different_arms_stand_beside_each_other(self, lasting: World) -> None:
+    def test_two_different_arms_stand_beside_each_other(self, lasting: PyBulletWorld) -> None:
         world = lasting
         run(world, 240)
         for name, home in (("panda", PANDA_HOME), ("iiwa", IIWA_HOME)):
@@ -166,7 +166,7 @@ class TestBodies:
     def test_shapes_have_their_size_and_rest_on_the_floor(
         self, spec: BodySpec, half: tuple[float, float, float]
     ) -> None:
-        world = World(world_spec(floor(), spec))
+        world = PyBulletWorld(world_spec(floor(), spec))
         aabb = world.aabb("it")
         assert np.allclose(aabb["lower"], np.subtract((0.0, 0.0, 1.0), half), atol=0.002)
         assert np.allclose(aabb["upper"], np.add((0.0, 0.0, 1.0), half), atol=0.002)
@@ -174,14 +174,16 @@ class TestBodies:
         assert pose(world, "it").position[2] == pytest.approx(half[2], abs=0.005)
 
     def test_without_mass_or_fixed_it_stays_in_the_air(self) -> None:
-        world = World(world_spec(box("wall", (0, 0, 1), (0.1, 0.1, 0.1)), mug(fixed=True), cube()))
+        world = PyBulletWorld(world_spec(box("wall", (0, 0, 1), (0.1, 0.1, 0.1)), mug(fixed=True), cube()))
         before = [pose(world, name) for name in ("wall", "mug", "cube")]
         run(world, 100)
         after = [pose(world, name) for name in ("wall", "mug", "cube")]
         assert [a == b for a, b in zip(before, after, strict=True)] == [True, True, False]
 
     def test_without_collision_it_falls_through(self) -> None:
-        world = World(world_spec(floor(), box("ghost", (0, 0, 0.2), (0.1, 0.1, 0.1), mass=1.0, collision=False)))
+        world = PyBulletWorld(
+            world_spec(floor(), box("ghost", (0, 0, 0.2), (0.1, 0.1, 0.1), mass=1.0, collision=False))
+        )
         run(world, 240)
         assert pose(world, "ghost").position[2] < -1.0
 
@@ -194,7 +196,7 @@ class TestBodies:
         )
         there = Pose((1.0, 2.0, 3.0), (0.0, math.sin(0.4), 0.0, math.cos(0.4)))
         spec = BodySpec("it", tuple(there.position), tuple(there.orientation), "urdf", urdf=str(urdf))
-        world = World(world_spec(spec))
+        world = PyBulletWorld(world_spec(spec))
         assert pose(world, "it").distance(there) == pytest.approx((0.0, 0.0), abs=1e-7)
         elsewhere = Pose((0.0, 0.0, 1.0), (0.0, 0.0, 1.0, 0.0))
         world.set_pose("it", {"position": [0.0, 0.0, 1.0], "orientation": [0.0, 0.0, 1.0, 0.0]})
@@ -224,12 +226,12 @@ class TestRequests:
             ("reset", {}),
             ("remove", {"name": "new"}),
         ]
-        assert {method for method, _ in requests} == World.REQUESTS
+        assert {method for method, _ in requests} == PyBulletWorld.REQUESTS
         for method, params in requests:
             json.dumps(world.request(method, json.loads(json.dumps(params))))
 
     def test_edits_count_revisions_and_others_do_not(self) -> None:
-        world = World(world_spec(floor()))
+        world = PyBulletWorld(world_spec(floor()))
         assert world.request("add", {"spec": to_json(cube())}) == 1
         assert world.request("set_color", {"name": "cube", "rgba": [1, 0, 0, 1]}) == 2
         world.request("set_pose", {"name": "cube", "pose": {"position": [0, 0, 1]}})
@@ -237,25 +239,28 @@ class TestRequests:
         assert world.request("remove", {"name": "cube"}) == world.revision == 3
 
     def test_pose_and_velocity_of_a_body(self) -> None:
-        world = World(world_spec(cube()))
+        world = PyBulletWorld(world_spec(cube()))
         world.set_velocity("cube", (1.0, 2.0, 3.0), (0.1, 0.2, 0.3))
         assert world.velocity("cube") == [[1.0, 2.0, 3.0], [0.1, 0.2, 0.3]]
         world.set_pose("cube", {"position": [1.0, 2.0, 3.0]})
         assert pose(world, "cube").position.tolist() == [1.0, 2.0, 3.0]
         assert world.velocity("cube") == [[0.0, 0.0, 0.0], [0.0, 0.0, 0.0]]
 
-    def test_poses_of_many_bodies_at_once(self, lasting: World) -> None:
+    def test_poses_of_many_bodies_at_once(self, lasting: PyBulletWorld) -> None:
         world = lasting
         run(world, 20)
         seen = world.poses()
         assert seen["t"] == world.t
         assert seen["poses"] == {name: world.pose(name) for name in world.names()}
         assert list(world.poses(["mug", "cube"])["poses"]) == ["mug", "cube"]
-        with pytest.raises(DeviceNotFound, match="did you mean 'cube'"):
+        with pytest.raises(DeviceNotFound) as caught:
             world.poses(["mug", "cub"])
+        assert caught.value.code == "unknown_body"
 
     def test_contacts_carry_the_weight(self) -> None:
-        world = World(world_spec(floor(), cube((0.0, 0.0, 0.03)), box("far", (3, 3, 0.1), (0.1, 0.1, 0.1), mass=1.0)))
+        world = PyBulletWorld(
+            world_spec(floor(), cube((0.0, 0.0, 0.03)), box("far", (3, 3, 0.1), (0.1, 0.1, 0.1), mass=1.0))
+        )
         run(world, 240)
         contacts = world.contacts("cube")
         assert {(contact["a"], contact["b"]) for contact in contacts} == {("cube", "floor")}
@@ -285,7 +290,7 @@ class TestReset:
         run(world, 100)
         assert np.array_equal(run_after_reset(world), first)
 
-    def test_one_thing_leaves_the_others(self, lasting: World) -> None:
+    def test_one_thing_leaves_the_others(self, lasting: PyBulletWorld) -> None:
         world = lasting
         run(world, 100)
         lid = pose(world, "lid")
@@ -293,7 +298,7 @@ class TestReset:
         assert pose(world, "mug").position == pytest.approx([0.3, 0.4, 0.1])
         assert pose(world, "lid") == lid
 
-    def test_to_given_values(self, lasting: World) -> None:
+    def test_to_given_values(self, lasting: PyBulletWorld) -> None:
         world = lasting
         world.reset("cube", pose={"position": [0.0, -0.5, 0.03]})
         assert pose(world, "cube").position.tolist() == [0.0, -0.5, 0.03]
@@ -305,17 +310,20 @@ class TestReset:
         states = world.client.getJointStates(body.id, [body.joints[name] for name in names])
         assert [state[0] for state in states] == pytest.approx(q, abs=1e-3)
 
-    def test_what_cannot_be_is_refused(self, lasting: World) -> None:
+    def test_what_cannot_be_is_refused(self, lasting: PyBulletWorld) -> None:
         world = lasting
-        with pytest.raises(CommandError, match="7 numbers, not 3"):
+        with pytest.raises(CommandError) as caught:
             world.reset("panda", q=[0.0, 0.0, 0.0])
-        with pytest.raises(CommandError, match="robot"):
+        assert caught.value.code == "wrong_size"
+        with pytest.raises(CommandError) as caught:
             world.reset("panda", pose={"position": [0, 0, 0]})
-        with pytest.raises(CommandError, match="name"):
+        assert caught.value.code == "is_robot"
+        with pytest.raises(CommandError) as caught:
             world.reset(q=[0.0] * 7)
+        assert caught.value.code == "name_missing"
 
 
-def run_after_reset(world: World) -> NDArray[np.float64]:
+def run_after_reset(world: PyBulletWorld) -> NDArray[np.float64]:
     world.reset()
     return run(world, 300)
 
@@ -334,7 +342,7 @@ class TestDynamics:
             ("angular_damping", 0.2),
         ],
     )
-    def test_each_value_is_taken_and_put_back(self, lasting: World, name: str, value: object) -> None:
+    def test_each_value_is_taken_and_put_back(self, lasting: PyBulletWorld, name: str, value: object) -> None:
         world = lasting
         for body, link in (("cube", None), ("panda", "panda_leftfinger")):
             original = world.dynamics(body, link)
@@ -344,7 +352,7 @@ class TestDynamics:
             world.set_dynamics(body, link, **before)
             assert world.dynamics(body, link) == original
 
-    def test_all_frictions_at_once_do_not_disturb_each_other(self, lasting: World) -> None:
+    def test_all_frictions_at_once_do_not_disturb_each_other(self, lasting: PyBulletWorld) -> None:
         world = lasting
         values = {"lateral_friction": 0.7, "rolling_friction": 0.01, "spinning_friction": 0.02}
         before = world.set_dynamics("cube", **values)
@@ -352,7 +360,7 @@ class TestDynamics:
         world.set_dynamics("cube", **before)
         assert {name: held[name] for name in values} == values
 
-    def test_a_new_mass_keeps_the_shape_of_the_inertia(self, lasting: World) -> None:
+    def test_a_new_mass_keeps_the_shape_of_the_inertia(self, lasting: PyBulletWorld) -> None:
         world = lasting
         mass = world.dynamics("panda", "panda_link3")["mass"]
         before = world.set_dynamics("panda", "panda_link3", mass=2.0 * mass)
@@ -362,7 +370,7 @@ class TestDynamics:
 
     def test_soft_contacts_sink_in_and_hard_ones_come_back(self) -> None:
         """Four corners on springs of k N/m give way by m g / 4k, and PyBullet itself cannot forget a stiffness."""
-        world = World(world_spec(floor(), cube((0.0, 0.0, 0.03))))
+        world = PyBulletWorld(world_spec(floor(), cube((0.0, 0.0, 0.03))))
         run(world, 240)
         hard = pose(world, "cube").position[2]
         before = world.set_dynamics("cube", contact_stiffness=1000.0, contact_damping=50.0)
@@ -377,7 +385,7 @@ class TestDynamics:
     def test_friction_acts_at_once(self) -> None:
         """A cube that slides stops after v^2 / (2 mu g), with mu the product of both frictions."""
         for friction in (0.4, 0.8):
-            world = World(world_spec(floor(), cube((0.0, 0.0, 0.03))))
+            world = PyBulletWorld(world_spec(floor(), cube((0.0, 0.0, 0.03))))
             run(world, 60)
             world.set_velocity("cube", (1.0, 0.0, 0.0))
             before = world.set_dynamics("cube", lateral_friction=friction)
@@ -399,7 +407,9 @@ class TestDynamics:
             {"contact_stiffness": 100.0},
         ],
     )
-    def test_what_cannot_be_is_refused_and_changes_nothing(self, lasting: World, values: dict[str, object]) -> None:
+    def test_what_cannot_be_is_refused_and_changes_nothing(
+        self, lasting: PyBulletWorld, values: dict[str, object]
+    ) -> None:
         world = lasting
         original = world.dynamics("cube")
         with pytest.raises(CommandError):
@@ -408,7 +418,7 @@ class TestDynamics:
 
 
 class TestMirror:
-    def assert_same(self, world: World, mirror: World) -> None:
+    def assert_same(self, world: PyBulletWorld, mirror: PyBulletWorld) -> None:
         assert mirror.names() == world.names()
         for name in world.names():
             assert mirror.describe(name) == world.describe(name)
@@ -419,7 +429,7 @@ class TestMirror:
 
     def test_shows_every_link_where_it_is(self) -> None:
         world = scene()
-        mirror = World(world.spec, mirror=True)
+        mirror = PyBulletWorld(world.spec, mirror=True)
         before = pose(mirror, "panda", "panda_hand")
         world.reset("panda", q=[0.5, -0.5, 0.2, -2.0, 0.1, 1.5, 0.5])
         run(world, 60)
@@ -429,7 +439,7 @@ class TestMirror:
 
     def test_follows_edits_and_things_that_stand_still_but_were_moved(self) -> None:
         world = scene()
-        mirror = World(world.spec, mirror=True)
+        mirror = PyBulletWorld(world.spec, mirror=True)
         edits: list[tuple[str, dict[str, object]]] = [
             ("add", {"spec": to_json(box("wall", (1, 1, 1), (0.1, 0.1, 0.1)))}),
             ("remove", {"name": "lid"}),
@@ -445,21 +455,23 @@ class TestMirror:
 
     def test_refuses_other_bodies_and_to_be_stepped(self) -> None:
         world = scene()
-        mirror = World(world.spec, mirror=True)
+        mirror = PyBulletWorld(world.spec, mirror=True)
         world.add(box("wall", (1, 1, 1), (0.1, 0.1, 0.1)))
-        with pytest.raises(ValueError, match="does not fit"):
+        with pytest.raises(ValueError, match="snapshot"):
             mirror.show(world.snapshot())
         with pytest.raises(NotSupported):
             mirror.step()
 
 
 class TestBadInput:
-    def test_unknown_names_list_what_is_there(self, lasting: World) -> None:
+    def test_unknown_names_list_what_is_there(self, lasting: PyBulletWorld) -> None:
         world = lasting
-        with pytest.raises(DeviceNotFound, match="did you mean 'cube'.*floor, cube, lid"):
+        with pytest.raises(DeviceNotFound) as caught:
             world.pose("cub")
-        with pytest.raises(DeviceNotFound, match="did you mean 'panda_hand'"):
+        assert caught.value.code == "unknown_body"
+        with pytest.raises(DeviceNotFound) as caught:
             world.pose("panda", "panda_hnd")
+        assert caught.value.code == "unknown_link"
 
     @pytest.mark.parametrize(
         ("method", "params"),
@@ -477,7 +489,9 @@ class TestBadInput:
             ("add", {"spec": {"name": "what"}}),
         ],
     )
-    def test_impossible_requests_are_refused(self, lasting: World, method: str, params: dict[str, object]) -> None:
+    def test_impossible_requests_are_refused(
+        self, lasting: PyBulletWorld, method: str, params: dict[str, object]
+    ) -> None:
         world = lasting
         before = world.snapshot()
         with pytest.raises(CommandError):
@@ -495,7 +509,7 @@ class TestBadInput:
         urdf.write_text(f'<robot name="broken">{links}{joint}</robot>')
         body = BodySpec("broken", (0, 0, 0), UPRIGHT, "urdf", urdf=str(urdf))
         with pytest.raises(ConfigError) as error:
-            World(world_spec(body))
+            PyBulletWorld(world_spec(body))
         assert [problem.file for problem in error.value.problems] == [str(urdf)] * 2
         assert "m1.obj" in str(error.value)
         assert "m2.obj" in str(error.value)
@@ -512,7 +526,7 @@ class TestBadInput:
             cube(),
         ]
         with pytest.raises(ConfigError) as error:
-            World(world_spec(*bodies, panda(joints=(*panda().joints[:6], "panda_jiont7"))))
+            PyBulletWorld(world_spec(*bodies, panda(joints=(*panda().joints[:6], "panda_jiont7"))))
         said = [str(problem) for problem in error.value.problems]
         assert len(said) == 6
         for expected in ("nowhere.urdf", "not a URDF", "radius", "dodecahedron", "unique", "panda_jiont7"):
@@ -520,15 +534,17 @@ class TestBadInput:
 
     def test_arms_that_start_inside_each_other_are_refused_by_name(self) -> None:
         apart = panda("right", base_position=(0.0, 0.4, 0.0))
-        World(world_spec(panda("left"), apart)).close()
+        PyBulletWorld(world_spec(panda("left"), apart)).close()
         for right in (panda("right"), replace(apart, initial=(-1.57, *PANDA_HOME[1:]))):
             with pytest.raises(ConfigError) as error:
-                World(world_spec(panda("left"), right))
+                PyBulletWorld(world_spec(panda("left"), right))
             (problem,) = error.value.problems
             assert problem.key == "robots.right"
             assert "'left'" in problem.message
-        World(world_spec(panda("left"), replace(panda("right"), driver="franka"))).close()  # a copy of a real arm
-        World(world_spec(panda("left"), panda("right")), mirror=True).close()
+        PyBulletWorld(
+            world_spec(panda("left"), replace(panda("right"), driver="franka"))
+        ).close()  # a copy of a real arm
+        PyBulletWorld(world_spec(panda("left"), panda("right")), mirror=True).close()
 
     def test_a_link_without_mass_is_told(self, tmp_path: Path) -> None:
         urdf = tmp_path / "massless.urdf"
@@ -536,7 +552,7 @@ class TestBadInput:
             '<robot name="massless"><link name="shell"><collision><geometry><sphere radius="0.1"/></geometry>'
             "</collision></link></robot>"
         )
-        world = World(world_spec(BodySpec("it", (0, 0, 1), UPRIGHT, "urdf", urdf=str(urdf))))
+        world = PyBulletWorld(world_spec(BodySpec("it", (0, 0, 1), UPRIGHT, "urdf", urdf=str(urdf))))
         assert len(world.warnings) == 1
         assert "shell" in world.warnings[0]
         assert "1 kg" in world.warnings[0]
@@ -550,7 +566,7 @@ class TestBadInput:
             f'izz="{given}" ixy="0" ixz="0" iyz="0"/></inertial><collision><geometry><box size="0.1 0.1 0.1"/>'
             "</geometry></collision></link></robot>"
         )
-        world = World(world_spec(BodySpec("it", (0, 0, 1), UPRIGHT, "urdf", urdf=str(urdf))))
+        world = PyBulletWorld(world_spec(BodySpec("it", (0, 0, 1), UPRIGHT, "urdf", urdf=str(urdf))))
         inertia = world.dynamics("it")["inertia"]
         assert world.dynamics("it")["mass"] == 1.0
         if kept:
@@ -561,6 +577,6 @@ class TestBadInput:
             assert "impossible: box" in world.warnings[0]
 
     def test_close_is_idempotent(self) -> None:
-        world = World(world_spec(cube()))
+        world = PyBulletWorld(world_spec(cube()))
         world.close()
         world.close()

@@ -12,7 +12,7 @@ from pictures_kit import box, camera, look_at, rays, renderer, world
 from specs import data, panda
 
 from hal.drivers.pybullet.meshes import MeshLibrary
-from hal.drivers.pybullet.rendering import Images
+from hal.drivers.pybullet.renderer import RenderedImages
 from hal.drivers.pybullet.scene import parts_of
 from hal.geometry import Pose
 from hal.specs import BodySpec, CameraSpec
@@ -23,7 +23,7 @@ TILTED = Pose.from_rpy((0.0, 0.0, 0.0), (0.15, 0.2, 0.1))
 
 
 @contextmanager
-def picture(name: str, *bodies: BodySpec, spec: CameraSpec, pose: Pose) -> Iterator[Images]:
+def picture(name: str, *bodies: BodySpec, spec: CameraSpec, pose: Pose) -> Iterator[RenderedImages]:
     with closing(world(*bodies)) as scene, closing(renderer(name, scene)) as draws:
         yield draws.render(spec, pose)
 
@@ -157,7 +157,7 @@ def test_only_what_is_streamed_is_computed(name: str, streams: tuple[str, ...]) 
     with closing(world(wall)) as scene, closing(renderer(name, scene)) as draws:
         images = draws.render(camera(80, 60, streams=streams), Pose())
         everything = draws.render(camera(80, 60, streams=("color", "depth", "infrared", "segmentation")), Pose())
-    for stream in Images._fields:
+    for stream in RenderedImages._fields:
         image, whole = getattr(images, stream), getattr(everything, stream)
         assert (image is not None) == (stream in streams)
         assert image is None or np.array_equal(image, whole)
@@ -199,12 +199,10 @@ def test_a_small_picture_is_drawn_with_a_third_of_the_triangles_and_hardly_diffe
     pose = look_at((1.5, -0.8, 0.9), (0.2, 0.0, 0.35))
     small, large = camera(256, 256), camera(1280, 960)
     with closing(world(robots=(panda(),))) as scene, closing(renderer("gl", scene)) as draws:
-        from hal.drivers.pybullet import gl
-
         fast, same = draws.render(small, pose), draws.render(large, pose)
-        monkeypatch.setattr(gl, "_COARSE_PIXELS", 0.0)
+        monkeypatch.setattr("hal.drivers.pybullet.renderer._COARSE_PIXELS", 0.0)
         full, whole = draws.render(small, pose), draws.render(large, pose)
-        parts = parts_of(scene.client, scene.client.getVisualShapeData(scene.bodies["panda"].id), MeshLibrary())
+        parts = parts_of(0, scene.visuals(scene.bodies["panda"].id), MeshLibrary().load)
     heavy = {part.link for part in parts if part.coarse}
     triangles = [sum(len(p.mesh.faces) for p in parts if p.link in heavy and p.coarse == k) for k in (True, False)]
     assert triangles[0] < 0.4 * triangles[1]

@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 from pictures_kit import COLLADA
 
-from hal.drivers.pybullet.meshes import MeshLibrary, cache_folder, parse
-from hal.drivers.pybullet.shapes import Mesh, box, capsule, cylinder, sphere
-from hal.drivers.pybullet.simplify import simplified
+from hal.drivers.pybullet.meshes import MeshLibrary, cache_folder, parse, simplified
+from hal.drivers.pybullet.scene import Mesh, box, capsule, cylinder, sphere
 
 CUBE = """\
 mtllib cube.mtl

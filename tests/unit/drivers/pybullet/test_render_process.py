@@ -12,8 +12,7 @@ from pictures_kit import box, camera, look_at
 from specs import data, world_spec
 
 from hal.camera import RawFrame
-from hal.drivers.pybullet.camera import PyBulletCamera
-from hal.drivers.pybullet.pictures import PyBulletPictures
+from hal.drivers.pybullet.camera import PyBulletCamera, PyBulletPictures
 from hal.errors import ConnectionLost
 from hal.host.hosts import RemoteHost
 from hal.specs import GroupSpec, ViewSpec
@@ -63,7 +62,7 @@ def test_pictures_edits_and_the_death_of_the_renderer() -> None:
 
         assert pictures._child is not None
         os.kill(pictures._child.process.pid, signal.SIGKILL)
-        with pytest.raises(ConnectionLost, match="renderer"):
+        with pytest.raises(ConnectionLost):
             newest(drivers[0], time.monotonic())
     finally:
         pictures.close()

@@ -1,0 +1,150 @@
+"""Bodies that are placed rather than simulated: mirrors of real arms, and objects attached to links of arms."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+
+from hal.errors import ConfigError, Problem
+from hal.specs import BodySpec, RobotSpec
+
+from .engine import Body, PyBulletClient, nearest, numbers
+from .motors import position_gain
+from .transforms import compose
+
+__all__ = [
+    "AttachedObjects",
+    "MirroredArm",
+]
+
+
+class AttachedObjects:
+    """Keeps objects that are attached to a link of an arm, such as a board in a gripper, at that link.
+
+    They take no part in the physics: they have no weight and touch nothing.
+
+    Raises:
+        ConfigError: An object is attached to a missing arm or link, or to something else than an arm; lists all.
+    """
+
+    def __init__(self, client: PyBulletClient, bodies: Mapping[str, Body]) -> None:
+        self._client = client
+        self._places: list[tuple[Body, Body, int]] = []
+        problems: list[Problem] = []
+        for body in bodies.values():
+            spec = body.spec
+            if not isinstance(spec, BodySpec) or spec.robot is None:
+                continue
+            arms = [name for name, other in bodies.items() if other.is_robot]
+            key = f"objects.{body.name}.attached"
+            if spec.robot not in arms:
+                problems.append(Problem("objects", f"{key}.robot", f"no arm {spec.robot!r}{nearest(spec.robot, arms)}"))
+                continue
+            arm = bodies[spec.robot]
+            if spec.link is not None and spec.link not in arm.links:
+                text = f"robot {spec.robot!r} has no link {spec.link!r}{nearest(spec.link, arm.links)}"
+                problems.append(Problem("objects", f"{key}.link", text))
+                continue
+            self._places.append((body, arm, -1 if spec.link is None else arm.links[spec.link]))
+        if problems:
+            raise ConfigError(problems)
+
+    def leave_physics(self, bodies: Iterable[Body]) -> None:
+        """Disable the contacts of those of these bodies that are attached."""
+        for body in bodies:
+            if body.carried:
+                for link in body.links.values():
+                    self._client.setCollisionFilterGroupMask(body.id, link, 0, 0)
+
+    def follow(self) -> None:
+        """Place every attached object at its link."""
+        client = self._client
+        for body, arm, link in self._places:
+            if link == -1:
+                here = arm.base_pose(client)
+            else:
+                state = client.getLinkState(arm.id, link, computeForwardKinematics=True)
+                here = (state[4], state[5])
+            body.set_base_pose(client, compose(here, body.base))
+
+
+STRENGTH = 10.0
+"""Torques of the mirror's motors, as a multiple of the arm's: nothing in the world stops it or makes it sag."""
+
+
+class MirroredArm:
+    """Places a body by the states that a real arm reports, before each physics step.
+
+    Its joints take the arm's positions, and the arm's speeds during the step, so they push what they touch as the arm
+    would. Its fingers are driven to the arm's width with the force of its grip: on an object that exists only in the
+    simulation they close until they touch it, and hold it.
+    """
+
+    def __init__(self, client: PyBulletClient, body: Body, dt: float) -> None:
+        spec = body.spec
+        assert isinstance(spec, RobotSpec)
+        gripper = spec.gripper
+        self._client = client
+        self._body = body
+        self._joints = [body.joints[name] for name in spec.joints]
+        self._torques = [STRENGTH * body.efforts[joint] for joint in self._joints]
+        self._fingers = [body.joints[name] for name in gripper.joints] if gripper else []
+        self._grip = [gripper.force if gripper else 0.0] * len(self._fingers)
+        self._gains = [position_gain(dt)] * len(self._joints)
+        self._fresh = False
+        """Whether a state of the arm has arrived since the last step."""
+        self._following = False
+        self._placed = False
+        """Whether its fingers have been placed at the arm's width once."""
+        self._hold()
+
+    def follow(self, q: Sequence[float], dq: Sequence[float], width: float | None) -> None:
+        """Take the state of the arm: see :meth:`.world.PyBulletWorld.follow`."""
+        name, count = self._body.name, len(self._joints)
+        positions, speeds = numbers(f"q of {name!r}", q, count), numbers(f"dq of {name!r}", dq, count)
+        if width is not None and self._fingers:
+            self._follow_width(numbers(f"the width of {name!r}", [width])[0] / 2.0)
+        client = self._client
+        client.resetJointStatesMultiDof(self._body.id, self._joints, _singly(positions), _singly(speeds))
+        client.setJointMotorControlArray(
+            self._body.id, self._joints, client.VELOCITY_CONTROL, targetVelocities=speeds, forces=self._torques
+        )
+        self._fresh = self._following = True
+
+    def _follow_width(self, half: float) -> None:
+        client, count = self._client, len(self._fingers)
+        if not self._placed:
+            client.resetJointStatesMultiDof(self._body.id, self._fingers, [[half]] * count, [[0.0]] * count)
+            self._placed = True
+        client.setJointMotorControlArray(
+            self._body.id,
+            self._fingers,
+            client.POSITION_CONTROL,
+            targetPositions=[half] * count,
+            forces=self._grip,
+            positionGains=[1.0] * count,
+            velocityGains=[1.0] * count,
+        )
+
+    def prepare_step(self) -> None:
+        """Prepare the next physics step: without a new state since the last one the mirror stays where it is."""
+        if self._following and not self._fresh:
+            self._hold()
+            self._following = False
+        self._fresh = False
+
+    def _hold(self) -> None:
+        client = self._client
+        client.setJointMotorControlArray(
+            self._body.id,
+            self._joints,
+            client.POSITION_CONTROL,
+            targetPositions=[state[0] for state in client.getJointStates(self._body.id, self._joints)],
+            forces=self._torques,
+            positionGains=self._gains,
+            velocityGains=[1.0] * len(self._joints),
+        )
+
+
+def _singly(values: Iterable[float]) -> list[list[float]]:
+    """Return each value in a list of its own, as PyBullet takes those of joints with several degrees of freedom."""
+    return [[value] for value in values]

@@ -1,0 +1,481 @@
+"""Drawing: the interface of a renderer, and the one that draws with OpenGL.
+
+OpenGL draws without a window, on a graphics card or, with Mesa's llvmpipe, without one. Nothing here depends on a
+physics engine: what is drawn is a :class:`.scene.RenderScene`.
+"""
+
+from __future__ import annotations
+
+import os
+import threading
+from abc import ABC, abstractmethod
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import DTypeLike, NDArray
+
+from hal.errors import DriverMissing
+from hal.geometry import Pose
+from hal.specs import CameraSpec
+
+from .meshes import MeshLibrary
+from .scene import DrawnPart, RenderScene, Visual, parts_of
+
+__all__ = ["BACKGROUND", "LUMINANCE", "GLRenderer", "RenderedImages", "Renderer", "create_context"]
+
+Array = NDArray[np.float64]
+
+BACKGROUND = (0.72, 0.76, 0.80)
+"""Colour of the background."""
+LUMINANCE = (0.299, 0.587, 0.114)
+"""Weights of red, green and blue (ITU-R BT.601)."""
+_NEAR, _FAR = 0.01, 100.0
+"""Range of what is drawn, m. A camera's own range only blanks its depth."""
+_REMEDY = "apt install libegl1 libgl1-mesa-dri"
+_KEY_LIGHT = np.array([-0.35, 0.45, 0.82])
+"""Direction towards the light, in the world."""
+
+
+_COARSE_PIXELS = 6.0
+"""A link is drawn coarsely where the omitted details are smaller than so many pixels: a whole arm in a picture of
+256 x 256 from 1 m on, in one of 640 x 480 from 2.5 m on."""
+
+
+class RenderedImages(NamedTuple):
+    """One picture of the world; None for streams that the camera does not have. Upright, aligned pixel by pixel."""
+
+    color: NDArray[np.uint8] | None
+    """(H, W, 3) RGB."""
+    depth: NDArray[np.float32] | None
+    """(H, W) m along the optical axis; 0 where nothing is within the camera's range."""
+    infrared: NDArray[np.uint8] | None
+    """(H, W): the luminance."""
+    segmentation: NDArray[np.int32] | None
+    """(H, W) ``index`` of the body, -1 for the background."""
+
+
+class Renderer(ABC):
+    """Draws the present state of one world. Calls may come from any thread, one at a time."""
+
+    description: str
+    """The renderer in one line, for a banner."""
+
+    @abstractmethod
+    def render(self, camera: CameraSpec, T_world_camera: Pose) -> RenderedImages:
+        """Draw a picture with the pinhole model ``camera.K``, without distortion.
+
+        Args:
+            camera: Its K, size, range and streams; only what it streams is computed.
+            T_world_camera: Pose of the optical frame (x right, y down, z forward).
+        """
+
+    def close(self) -> None:  # noqa: B027  # not every renderer holds something
+        """Release the graphics memory. Idempotent."""
+
+
+class _Drawable(NamedTuple):
+    """A part on the graphics card."""
+
+    part: DrawnPart
+    vertices: Any
+    indices: Any
+    layout: tuple[str, ...]
+    texture: Any
+    arrays: dict[tuple[str, ...], Any]
+    """Its vertex array for each set of streams."""
+
+
+class _Body(NamedTuple):
+    visuals: tuple[Visual, ...]
+    """The visual shapes that it was built from; when they change, it is built again."""
+    number: int
+    """Its value in segmentation images."""
+    drawables: tuple[_Drawable, ...]
+
+
+class GLRenderer(Renderer):
+    """Draws with moderngl on EGL.
+
+    The shader writes depth in metres, so it is as exact as a float and needs no conversion. The picture is drawn with
+    its first row first, so nothing is flipped either.
+
+    Args:
+        scene: What is drawn.
+        library: Where its meshes come from; None for one with the user's cache.
+
+    Raises:
+        DriverMissing: moderngl, EGL or a graphics driver is missing; names the command that installs it.
+    """
+
+    def __init__(self, scene: RenderScene, library: MeshLibrary | None = None) -> None:
+        self._scene = scene
+        self._library = library or MeshLibrary()
+        self._lock = threading.Lock()
+        self._context = create_context()
+        self.description = f"OpenGL on {self._context.info['GL_RENDERER']}"
+        self._context.__exit__(None, None, None)  # current in no thread, so that any thread may draw
+        self._bodies: dict[int, _Body] = {}
+        self._revision: int | None = None
+        self._drawables: list[_Drawable] = []
+        self._links: list[tuple[int, int]] = []
+        self._link_of: NDArray[np.int64] = np.empty(0, int)
+        self._balls: Array = np.empty((0, 5))
+        self._coarse: NDArray[np.bool_] = np.empty(0, bool)
+        self._cells: Array = np.empty(0)
+        """Size of the details that the coarse parts of each link leave out, m; infinite where it has none."""
+        self._textures: dict[int, tuple[Any, Any]] = {}
+        self._targets: dict[tuple[int, int, tuple[str, ...]], _Target] = {}
+        self._programs: dict[tuple[str, ...], Any] = {}
+
+    def render(self, camera: CameraSpec, T_world_camera: Pose) -> RenderedImages:
+        with self._lock, self._context:
+            if self._revision != self._scene.revision:
+                self._build()
+            return self._draw(camera, T_world_camera)
+
+    def close(self) -> None:
+        with self._lock:
+            if self._context is not None:
+                self._context.release()
+                self._context = None
+
+    def _build(self) -> None:
+        """Bring the graphics card's meshes up to date with the world's bodies."""
+        present: dict[int, _Body] = {}
+        for body in self._scene.bodies.values():
+            visuals = self._scene.visuals(body.id)
+            known = self._bodies.pop(body.id, None)
+            if known and known.visuals == visuals:
+                present[body.id] = known._replace(number=body.index)
+                continue
+            _release(known)
+            parts = parts_of(body.id, visuals, self._library.load)
+            present[body.id] = _Body(visuals, body.index, tuple(self._upload(part) for part in parts))
+        for gone in self._bodies.values():
+            _release(gone)
+        self._bodies = present
+        self._drawables = [drawable for body in present.values() for drawable in body.drawables]
+        parts = [drawable.part for drawable in self._drawables]
+        places = [(part.body, part.link) for part in parts]
+        self._links = list(dict.fromkeys(places))
+        self._link_of = np.array([self._links.index(place) for place in places], int)
+        self._balls = np.array([[*part.centre, 1.0, part.radius] for part in parts]).reshape(-1, 5)
+        self._coarse = np.array([part.coarse for part in parts], bool)
+        self._cells = np.full(len(self._links), np.inf)
+        for link, cell in zip(self._link_of[self._coarse], (p.mesh.cell for p in parts if p.coarse), strict=True):
+            self._cells[link] = cell if np.isinf(self._cells[link]) else max(cell, self._cells[link])
+        self._revision = self._scene.revision
+
+    def _upload(self, part: DrawnPart) -> _Drawable:
+        mesh = part.mesh
+        columns: list[NDArray[Any]] = [mesh.positions, mesh.normals, mesh.colors]
+        layout: tuple[str, ...] = ("3f4 3f4 4f1", "position", "normal", "color")
+        texture = None
+        if mesh.texture is not None and mesh.uv is not None:
+            columns.append(mesh.uv)
+            layout = ("3f4 3f4 4f1 2f4", "position", "normal", "color", "uv")
+            texture = self._texture(mesh.texture)
+        rows = np.concatenate([np.ascontiguousarray(c).view(np.uint8).reshape(len(c), -1) for c in columns], axis=1)
+        vertices = self._context.buffer(rows.tobytes())
+        indices = self._context.buffer(np.ascontiguousarray(mesh.faces, np.uint32).tobytes())
+        return _Drawable(part, vertices, indices, layout, texture, {})
+
+    def _texture(self, image: NDArray[np.uint8]) -> Any:
+        if id(image) not in self._textures:
+            height, width = image.shape[:2]
+            texture = self._context.texture((width, height), 3, image[::-1].tobytes(), alignment=1)
+            texture.build_mipmaps()
+            self._textures[id(image)] = (texture, image)  # the image is kept, so that its id stays its own
+        return self._textures[id(image)][0]
+
+    def _draw(self, camera: CameraSpec, T_world_camera: Pose) -> RenderedImages:
+        streams = tuple(name for name in _OUTPUTS if name in camera.streams)
+        target = self._target(camera.width, camera.height, streams)
+        T_camera_world = np.linalg.inv(T_world_camera.matrix())
+        frames = self._scene.link_frames(self._links)
+        model_view = (T_camera_world @ frames)[self._link_of]
+        to_clip = _projection(camera)
+        # Large distances are multiplied here in double precision, not in the shader.
+        transforms = np.stack([to_clip @ model_view, model_view], axis=1)
+        packed = np.ascontiguousarray(transforms.transpose(0, 1, 3, 2), np.float32).reshape(-1, 32)
+
+        target.clear()
+        for key, value in (
+            ("key_light", T_camera_world[:3, :3] @ (_KEY_LIGHT / np.linalg.norm(_KEY_LIGHT))),
+            ("up", T_camera_world[:3, 2]),
+            ("range", (camera.depth_min, camera.depth_max)),
+        ):
+            self._set(streams, key, value)
+        for number in self._visible(camera, model_view):
+            drawable = self._drawables[number]
+            program = self._program(streams, drawable.texture is not None)
+            matrices = packed[number]
+            program["model_view_projection"].write(matrices[:16])
+            if "model_view" in program:
+                program["model_view"].write(matrices[16:])
+            if "body" in program:
+                program["body"].value = float(self._bodies[drawable.part.body].number)
+            if drawable.texture is not None:
+                drawable.texture.use(0)
+            self._context.enable_only(
+                self._context.DEPTH_TEST | (self._context.CULL_FACE if drawable.part.mesh.closed else 0)
+            )
+            self._array(drawable, streams, program).render()
+        return target.read()
+
+    def _set(self, streams: tuple[str, ...], key: str, value: Any) -> None:
+        for textured in (False, True):
+            program = self._program(streams, textured)
+            if key in program:
+                program[key].value = tuple(float(v) for v in value)
+
+    def _visible(self, camera: CameraSpec, model_view: Array) -> Iterator[int]:
+        """Yield the drawables that the picture may show, nearest first, so that hidden pixels are not shaded."""
+        centres = np.einsum("nij,nj->ni", model_view[:, :3], self._balls[:, :4])
+        radii = self._balls[:, 4]
+        K = np.array(camera.K)
+        corners = np.array([[-0.5, -0.5, 1], [camera.width - 0.5, -0.5, 1], [-0.5, camera.height - 0.5, 1]])
+        corners = np.concatenate([corners, [[camera.width - 0.5, camera.height - 0.5, 1]]])
+        rays = corners @ np.linalg.inv(K).T  # upper left, upper right, lower left, lower right
+        planes = np.cross(rays[[0, 1, 3, 2]], rays[[1, 3, 2, 0]])  # point inwards
+        planes /= np.linalg.norm(planes, axis=1, keepdims=True)
+        inside = (centres @ planes.T >= -radii[:, None]).all(axis=1) & (centres[:, 2] + radii > _NEAR)
+        # The nearest point of each link selects its coarse parts or the others.
+        nearest = np.full(len(self._links), np.inf)
+        np.minimum.at(nearest, self._link_of, centres[:, 2] - radii)
+        coarse = self._cells * K[0, 0] <= _COARSE_PIXELS * nearest
+        numbers = np.flatnonzero(inside & (self._coarse == coarse[self._link_of]))
+        return iter(numbers[np.argsort(centres[numbers, 2] - radii[numbers])].tolist())
+
+    def _target(self, width: int, height: int, streams: tuple[str, ...]) -> _Target:
+        key = (width, height, streams)
+        if key not in self._targets:
+            self._targets[key] = _Target(self._context, width, height, streams)
+        return self._targets[key]
+
+    def _program(self, streams: tuple[str, ...], textured: bool) -> Any:
+        key = (*streams, "textured") if textured else streams
+        if key not in self._programs:
+            defines = "".join(f"#define {name.upper()}\n" for name in key)
+            outputs = "".join(
+                f"layout(location = {place}) out {_OUTPUTS[name].type} out_{name};\n"
+                for place, name in enumerate(streams)
+            )
+            self._programs[key] = self._context.program(
+                vertex_shader=f"#version 330\n{defines}{_VERTEX}",
+                fragment_shader=f"#version 330\n{defines}{outputs}{_FRAGMENT}",
+            )
+        return self._programs[key]
+
+    def _array(self, drawable: _Drawable, streams: tuple[str, ...], program: Any) -> Any:
+        if streams not in drawable.arrays:
+            content = [(drawable.vertices, *drawable.layout)]
+            drawable.arrays[streams] = self._context.vertex_array(
+                program, content, index_buffer=drawable.indices, skip_errors=True
+            )
+        return drawable.arrays[streams]
+
+
+def _release(body: _Body | None) -> None:
+    for drawable in body.drawables if body else ():
+        for array in drawable.arrays.values():
+            array.release()
+        drawable.vertices.release()
+        drawable.indices.release()
+
+
+# --- where OpenGL draws to --------------------------------------------------------------------------------------------
+
+
+def create_context() -> Any:
+    """Return an OpenGL context, current in the calling thread; raises DriverMissing, which names the remedy."""
+    try:
+        import moderngl
+    except ImportError as error:
+        raise DriverMissing(f"{error}; pip install moderngl") from error
+    options: dict[str, Any] = {"standalone": True, "backend": "egl"}
+    try:
+        with _one_thread():
+            context: Any = moderngl.create_context(require=330, **options)
+    except Exception as error:  # glcontext raises bare Exceptions
+        raise DriverMissing(f"{error}; {_REMEDY}") from error
+    context.front_face = "cw"  # the picture is drawn upside down, which turns every triangle over
+    return context
+
+
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    """Limit Mesa's software renderer, while it starts, to one thread; more would compete with the servo's process."""
+    name = "LP_NUM_THREADS"
+    before = os.environ.get(name)
+    os.environ.setdefault(name, "1")
+    try:
+        yield
+    finally:
+        if before is None:
+            del os.environ[name]
+
+
+class _Target:
+    """Framebuffers for pictures of one size and one set of streams."""
+
+    def __init__(self, context: Any, width: int, height: int, streams: tuple[str, ...]) -> None:
+        self._streams = streams
+        self._shape = (height, width)
+        depth = context.depth_renderbuffer((width, height))
+        layers = [context.texture((width, height), _OUTPUTS[s].components, dtype=_OUTPUTS[s].dtype) for s in streams]
+        # A framebuffer for each layer too: a clear fills all layers of a framebuffer with one colour.
+        self._depth = context.framebuffer([], depth)
+        self._all = context.framebuffer(layers, depth)
+        self._each = [context.framebuffer([layer]) for layer in layers]
+
+    def clear(self) -> None:
+        for name, layer in zip(self._streams, self._each, strict=True):
+            layer.clear(*_OUTPUTS[name].background)
+        self._depth.clear(depth=1.0)
+        self._all.use()
+
+    def read(self) -> RenderedImages:
+        found: dict[str, NDArray[Any]] = {}
+        for place, name in enumerate(self._streams):
+            output = _OUTPUTS[name]
+            image = np.empty((*self._shape, 3) if name == "color" else self._shape, output.array)
+            self._all.read_into(
+                image,
+                components=image.shape[2] if image.ndim == 3 else 1,
+                attachment=place,
+                alignment=1,
+                dtype=output.dtype,
+            )
+            found[name] = image
+        segmentation = found.get("segmentation")
+        return RenderedImages(
+            found.get("color"),
+            found.get("depth"),
+            found.get("infrared"),
+            None if segmentation is None else segmentation.astype(np.int32),
+        )
+
+
+def _projection(camera: CameraSpec) -> NDArray[np.float64]:
+    """Return the projection (4, 4) from the camera's frame to clip space, with the rows of the picture upwards.
+
+    The centre of pixel (u, v) lies at ((u + 0.5) 2 / W - 1, (v + 0.5) 2 / H - 1).
+    """
+    width, height = camera.width, camera.height
+    K = np.array(camera.K)
+    matrix = np.zeros((4, 4))
+    matrix[0, :3] = (K[0] + [0, 0, 0.5]) * 2 / width - [0, 0, 1]
+    matrix[1, :3] = (K[1] + [0, 0, 0.5]) * 2 / height - [0, 0, 1]
+    matrix[2, 2:] = (_FAR + _NEAR) / (_FAR - _NEAR), -2 * _FAR * _NEAR / (_FAR - _NEAR)
+    matrix[3, 2] = 1
+    return matrix
+
+
+# --- shaders: one source, of which each set of streams compiles what it needs -----------------------------------------
+
+
+class _Output(NamedTuple):
+    """Layer of one stream."""
+
+    type: str
+    components: int
+    dtype: str
+    array: DTypeLike
+    background: tuple[float, float, float, float]
+
+
+_GREY = sum(weight * value for weight, value in zip(LUMINANCE, BACKGROUND, strict=True))
+
+_OUTPUTS = {
+    "color": _Output("vec4", 4, "f1", np.uint8, (*BACKGROUND, 1.0)),
+    "depth": _Output("float", 1, "f4", np.float32, (0.0, 0.0, 0.0, 0.0)),
+    "infrared": _Output("float", 1, "f1", np.uint8, (_GREY, _GREY, _GREY, _GREY)),
+    # A float holds every whole number below 2^24; an integer layer cannot be cleared to -1 through moderngl.
+    "segmentation": _Output("float", 1, "f4", np.float32, (-1.0, -1.0, -1.0, -1.0)),
+}
+"""How each stream is drawn; their order is that of the layers."""
+
+_VERTEX = """
+#if defined(COLOR) || defined(INFRARED)
+#define LIT
+#endif
+uniform mat4 model_view_projection;
+in vec3 position;
+#ifdef LIT
+uniform mat4 model_view;
+in vec3 normal;
+in vec4 color;
+out vec3 to_eye;
+out vec3 facing;
+out vec3 paint;
+#ifdef TEXTURED
+in vec2 uv;
+out vec2 place;
+#endif
+#endif
+void main() {
+    gl_Position = model_view_projection * vec4(position, 1.0);
+#ifdef LIT
+    to_eye = -(model_view * vec4(position, 1.0)).xyz;
+    facing = mat3(model_view) * normal;
+    paint = color.rgb;
+#ifdef TEXTURED
+    place = uv;
+#endif
+#endif
+}
+"""
+
+_FRAGMENT = """
+#if defined(COLOR) || defined(INFRARED)
+#define LIT
+#endif
+#ifdef LIT
+uniform vec3 key_light;
+uniform vec3 up;
+in vec3 to_eye;
+in vec3 facing;
+in vec3 paint;
+#ifdef TEXTURED
+uniform sampler2D picture;
+in vec2 place;
+#endif
+#endif
+#ifdef DEPTH
+uniform vec2 range;
+#endif
+#ifdef SEGMENTATION
+uniform float body;
+#endif
+void main() {
+#ifdef LIT
+    vec3 n = normalize(facing) * (gl_FrontFacing ? 1.0 : -1.0);
+    vec3 eye = normalize(to_eye);
+    vec3 base = paint;
+#ifdef TEXTURED
+    base *= texture(picture, place).rgb;
+#endif
+    vec3 ambient = mix(vec3(0.34, 0.32, 0.31), vec3(0.52, 0.54, 0.57), 0.5 + 0.5 * dot(n, up));
+    float key = 0.36 * max(dot(n, key_light), 0.0);
+    float head = 0.12 * max(dot(n, eye), 0.0);
+    float gloss = 0.05 * pow(max(dot(n, normalize(key_light + eye)), 0.0), 24.0);
+    vec3 seen = base * (ambient + key + head) + gloss;
+#endif
+#ifdef COLOR
+    out_color = vec4(seen, 1.0);
+#endif
+#ifdef INFRARED
+    out_infrared = dot(seen, vec3(0.299, 0.587, 0.114));
+#endif
+#ifdef DEPTH
+    float z = 1.0 / gl_FragCoord.w;
+    out_depth = z >= range.x && z <= range.y ? z : 0.0;
+#endif
+#ifdef SEGMENTATION
+    out_segmentation = body;
+#endif
+}
+"""
