@@ -23,6 +23,7 @@ from hal.errors import ConnectionLost, HalError
 from hal.gamepad import Gamepad
 from hal.host.process import Channel, Child, SharedMemory
 from hal.host.ring import frame_rings, frame_rings_size
+from hal.pads.keyboard import keyboard_table
 from hal.specs import CameraSpec, GroupSpec, RobotSpec, to_json
 from hal.types import Frame
 from hal.views import Console, DrivingView, Listen, RecordingView
@@ -87,6 +88,7 @@ class WebConsole(Console):
             "port_fixed": listen.fixed,
             "token": self._token,
             "names": host_names(),
+            "keyboard": keyboard_table("browser")._asdict(),
             "hosts": [_group_message(group.spec) for group in groups],
             "cameras": [to_json(camera) for camera in self._shown],
         }
@@ -339,7 +341,7 @@ class ProcessChannel:
             return {"method": "frame", "camera": camera}
 
     def _send_all(self) -> None:
-        channel = Channel(self._child.channel.sock.dup())  # with a timeout of its own
+        channel = Channel(self._child.channel.sock.dup())  # its own lock: a message that waits must not delay the close
         try:
             while (message := self._next()) is not None:
                 channel.send(message, _SEND_TIME)

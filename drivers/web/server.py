@@ -9,11 +9,12 @@ from __future__ import annotations
 
 import asyncio
 import errno
+import json
 import os
 import socket
 import time
 import traceback
-from collections.abc import Awaitable, Callable, Sequence
+from collections.abc import Awaitable, Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -31,7 +32,7 @@ from .session import AppQueue, WebPage, WebSession
 from .sockets import CONNECTIONS, ConnectionLimit, PageSocket, PageSockets
 from .telemetry import Telemetry
 
-__all__ = ["ConsoleServer", "make_app", "open_listener", "read_page_files"]
+__all__ = ["ConsoleServer", "keys_module", "make_app", "open_listener", "read_page_files"]
 
 _STATE_PERIOD = 0.05
 """Time between two states, in s."""
@@ -81,7 +82,8 @@ class ConsoleServer:
         self._live = LiveSockets(auth, self._session)
         self._pictures = PictureSockets(auth, self._cache, self._send_watched)
         self._connections = ConnectionLimit()
-        self._app = make_app(auth, self._connections, self._live, self._pictures, read_page_files())
+        files = read_page_files() | {"keys.js": keys_module(config["keyboard"])}
+        self._app = make_app(auth, self._connections, self._live, self._pictures, files)
         self._parent = os.getppid()
 
     async def run(self) -> None:
@@ -253,6 +255,11 @@ def read_page_files(folder: Path = _PAGE) -> dict[str, PageFile]:
         for path in sorted(folder.iterdir())
         if path.suffix in _TYPES and path.is_file()
     }
+
+
+def keys_module(table: Mapping[str, Any]) -> PageFile:
+    """Return ``keys.js``, the module of the page with the table of keys, a ``hal.pads.keyboard.KeyboardTable``."""
+    return f"export const KEYS = {json.dumps(table)};\n".encode(), _TYPES[".js"]
 
 
 def make_app(

@@ -88,7 +88,8 @@ def test_trouble_and_rows_that_are_lacking_stand_out(bench: Bench, page: Browser
 
 def test_a_program_that_falls_silent_while_it_records_is_told(bench: Bench, page: Browser) -> None:
     show(bench, page, RUNNING)
-    wait_for(lambda: "no news" in page.text("#recording-phase"), "the page to doubt it")
+    lamp = "return document.querySelector('#recording-lamp').dataset.tone"
+    wait_for(lambda: page.run(lamp) == "alarm", "the page to doubt it")
     show(bench, page, replace(RUNNING, frames=400))
     assert page.text("#recording-phase") == "recording"
 

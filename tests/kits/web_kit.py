@@ -18,6 +18,7 @@ from hal.driver import GripperReading, Reading
 from hal.host.process import Child, SharedMemory
 from hal.host.records import GroupMemory, ServoRecord
 from hal.host.ring import frame_rings, frame_rings_size
+from hal.pads.keyboard import keyboard_table
 from hal.specs import CameraSpec, to_json
 from hal.types import Limited, RobotStatus, Trip
 
@@ -88,6 +89,7 @@ class App:
             "port_fixed": False,
             "token": TOKEN,
             "names": ["testbench"],
+            "keyboard": keyboard_table("browser")._asdict(),
             "hosts": [
                 {
                     "name": "group",

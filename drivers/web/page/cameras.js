@@ -1,9 +1,96 @@
-// What the cameras see: one large, the others small beside it.
+// The pictures of the cameras: the socket that brings them, and the panel with one large and the others small.
 
+import { socketTo, tokenOfPage } from "./connection.js";
 import { byId, choose, make, segments, setData, setText, show } from "./dom.js";
-import { Pictures } from "./pictures.js";
 
-const SILENT = 500; // ms without a new picture, at least, until a camera counts as silent
+const HEADER = 20; // bytes before the JPEG
+const RETRY = 1000; // ms until the next try
+const SMOOTH = /** @type {const} */ ("high");
+const JPEG = "image/jpeg";
+
+/**
+ * @typedef {object} Picture
+ * @property {number} camera place in the rig's list
+ * @property {ImageBitmap} bitmap
+ * @property {number} taken when it was captured, ms on performance.now()
+ */
+
+/** The socket with the pictures. */
+class Pictures {
+  constructor() {
+    /** Called to draw a picture; its bitmap is closed afterwards. @type {(picture: Picture) => void} */
+    this.came = () => {};
+    /** Returns the device pixels, across and up, at which a camera is shown; null: unknown. @type {(camera: number) => number[] | null} */
+    this.sizeOf = () => null;
+    /** @type {string[]} */
+    this.cameras = [];
+    /** @type {string[]} */
+    this.watched = [];
+  }
+
+  /** @type {WebSocket | null} */ #socket = null;
+  #timer = 0;
+
+  /** Connect, or connect again; `cameras`: their names in the rig's order. @param {string[]} cameras */
+  open(cameras) {
+    this.close();
+    this.cameras = cameras;
+    const socket = cameras.length ? socketTo("/pictures", tokenOfPage()) : null;
+    if (!socket) return;
+    this.#socket = socket;
+    socket.binaryType = "arraybuffer";
+    socket.onopen = () => this.#request();
+    socket.onmessage = (event) => this.#take(socket, event.data);
+    socket.onclose = () => {
+      this.#socket = null;
+      this.#timer = setTimeout(() => this.open(cameras), RETRY);
+    };
+  }
+
+  close() {
+    clearTimeout(this.#timer);
+    const socket = this.#socket;
+    this.#socket = null;
+    if (!socket) return;
+    socket.onopen = socket.onmessage = socket.onclose = null;
+    socket.close();
+  }
+
+  /** Request the pictures of these cameras only. @param {string[]} names */
+  watch(names) {
+    this.watched = names;
+    this.#request();
+  }
+
+  #request() {
+    if (this.#socket?.readyState === WebSocket.OPEN) {
+      this.#socket.send(JSON.stringify({ type: "watch", cameras: this.watched }));
+    }
+  }
+
+  /** @param {WebSocket} socket @param {ArrayBuffer} data */
+  async #take(socket, data) {
+    if (!(data instanceof ArrayBuffer) || data.byteLength <= HEADER) return;
+    const arrived = performance.now();
+    const view = new DataView(data);
+    const camera = view.getUint8(0);
+    const taken = arrived - 1000 * view.getFloat32(16, true);
+    try {
+      const size = this.sizeOf(camera);
+      const resize = size && { resizeWidth: size[0], resizeHeight: size[1], resizeQuality: SMOOTH };
+      const bitmap = await createImageBitmap(new Blob([new Uint8Array(data, HEADER)], { type: JPEG }), resize ?? {});
+      if (socket === this.#socket) this.came({ camera, bitmap, taken });
+      bitmap.close();
+    } catch {
+      // A broken picture is not shown; the next one may be complete.
+    }
+    if (socket.readyState === WebSocket.OPEN && camera < this.cameras.length) {
+      socket.send(JSON.stringify({ type: "drawn", camera: this.cameras[camera] }));
+    }
+  }
+}
+
+const SILENT = 500; // ms without a new picture after which a camera counts as silent, at least
 const PERIODS = 5; // and this many of its own periods
 const WINDOW = 2000; // ms over which the rate is counted
 
@@ -45,7 +132,7 @@ class View {
     return across < 1 ? null : [across, across / this.shape].map((one) => Math.max(1, Math.round(one)));
   }
 
-  /** @param {import("./pictures.js").Picture} picture */
+  /** @param {Picture} picture */
   draw({ bitmap, taken }) {
     if (this.canvas.width !== bitmap.width || this.canvas.height !== bitmap.height) {
       this.canvas.width = bitmap.width;
@@ -59,7 +146,7 @@ class View {
     this.mark(now);
   }
 
-  /** Say how fresh the picture is; one that is old must not look live. @param {number} now */
+  /** Show how old the picture is; one that is old must not look live. @param {number} now */
   mark(now) {
     while (this.#drawn.length && now - this.#drawn[0] > WINDOW) this.#drawn.shift();
     const age = now - this.#taken;
@@ -76,6 +163,7 @@ class View {
   }
 }
 
+/** The panel of all cameras. */
 export class Cameras {
   constructor() {
     this.pictures = new Pictures();
@@ -89,7 +177,7 @@ export class Cameras {
     new ResizeObserver(() => this.#place()).observe(byId("cameras"));
   }
 
-  /** Show these cameras. @param {any[]} cameras of hello */
+  /** Lay out the panel and connect. @param {any[]} cameras of hello */
   open(cameras) {
     const names = cameras.map((camera) => camera.name);
     const same = names.join("\n") === this.views.map((view) => view.name).join("\n");

@@ -1,19 +1,22 @@
-// The socket to the program: opened again after a loss, unless that is of no use.
+// The connection to the program: the live socket, which is opened again after a loss, and the overlay without one.
+
+import { byId, setText, show } from "./dom.js";
 
 const FIRST = 500; // ms until the first new try
 const LONGEST = 5000;
 const GROWTH = 1.7;
-const SILENCE = 2000; // ms; the program speaks 20 times a second
+const SILENCE = 2000; // ms; the program sends 20 states a second
 
-export const REFUSED = 4403;
-export const TOO_MANY = 4409;
-export const ENDED = 4410;
+// Close codes of the server.
+const REFUSED = 4403;
+const TOO_MANY = 4409;
+const ENDED = 4410;
 
-/** Trying again after these would only fail again. */
-const FINAL = [REFUSED, TOO_MANY, ENDED]; // the next run has another link
+/** Codes after which another try would only fail again: the next run has another link. */
+const FINAL = [REFUSED, TOO_MANY, ENDED];
 
 /**
- * A WebSocket to `path` with the link's token, or null where the token cannot be one.
+ * Open a WebSocket to `path` with the link's token; null if the token cannot be one.
  * @param {string} path @param {string} token
  */
 export function socketTo(path, token) {
@@ -22,11 +25,11 @@ export function socketTo(path, token) {
   try {
     return new WebSocket(`${scheme}//${location.host}${path}`, ["hal.v1", token]);
   } catch {
-    return null; // not made of the letters that a token has
+    return null; // it has characters that a token cannot have
   }
 }
 
-/** The token in the page's address: it stands behind the #, which browsers never send. */
+/** Return the token in the page's address. It follows the #, which browsers never send. */
 export function tokenOfPage() {
   return location.hash.slice(1);
 }
@@ -34,11 +37,11 @@ export function tokenOfPage() {
 /**
  * The live socket.
  *
- * `heard` gets every message; `lost` gets the close code and the time until the next try, ms, or null for none.
+ * `heard` gets every message; `lost` gets the close code, its reason, and the time until the next try (ms, or null for none).
  */
 export class Connection {
   constructor() {
-    /** Is a socket open on which the program has said hello? */
+    /** Whether a socket is open on which the program has sent its hello. */
     this.connected = false;
     /** @type {(message: any) => void} */
     this.heard = () => {};
@@ -52,12 +55,12 @@ export class Connection {
   #heardAt = 0;
   #timer = 0;
 
-  /** Bytes that were handed over, and have not left yet. */
+  /** Bytes that were handed to the browser and are not sent yet. */
   get buffered() {
     return this.#socket?.bufferedAmount ?? 0;
   }
 
-  /** Connect now, whatever was before. */
+  /** Connect now, and drop any connection before. */
   open() {
     clearTimeout(this.#timer);
     this.#drop();
@@ -69,7 +72,7 @@ export class Connection {
     socket.onclose = (event) => this.#end(event.code, event.reason);
   }
 
-  /** Send, if there is somebody to send to. @param {object} message @returns {boolean} */
+  /** Send a message; returns false if there is no connection. @param {object} message @returns {boolean} */
   send(message) {
     if (!this.#socket || this.#socket.readyState !== WebSocket.OPEN) return false;
     this.#socket.send(JSON.stringify(message));
@@ -84,12 +87,12 @@ export class Connection {
     this.heard(message);
   }
 
-  /** The connection is of use: the next loss is a new one. */
+  /** Note that the connection works: the next loss starts with short waits again. */
   proved() {
     this.#wait = FIRST;
   }
 
-  /** A link that was cut tells nobody: what is silent for long is gone. */
+  /** Give up a connection that has been silent for too long: a cut link closes no socket. */
   #watch() {
     const patience = this.connected ? SILENCE : 2 * LONGEST;
     if (this.#socket && performance.now() - this.#heardAt > patience) this.#end(1006, "");
@@ -113,4 +116,72 @@ export class Connection {
     socket.onmessage = socket.onclose = null;
     socket.close();
   }
+}
+
+/** Close code -> title and advice of the overlay. @type {Record<number, [string, string]>} */
+const ENDINGS = {
+  [REFUSED]: [
+    "this link is not valid",
+    "Use the newest link in the terminal.",
+  ],
+  [TOO_MANY]: ["too many pages are open", "Close one of the others, then try again."],
+  [ENDED]: [
+    "the program has ended",
+    "Start it again and open the new link that it prints.",
+  ],
+};
+
+/** The cover of the page while there is no connection: nothing on it is live then. */
+export class Overlay {
+  /** @param {() => void} again */
+  constructor(again) {
+    byId("again").addEventListener("click", again);
+  }
+
+  hide() {
+    show(byId("overlay"), false);
+  }
+
+  /**
+   * @param {number} code the socket's close code @param {string} reason
+   * @param {number | null} retry ms until the next try
+   * @param {{drove: boolean, watched: boolean, real: boolean, saved: number | null}} before what this page did until
+   *   now; `saved`: number of episodes if a recording was done
+   */
+  show(code, reason, retry, { drove, watched, real, saved }) {
+    const lost = [lostTitle(drove, watched), lostText(drove, watched, real)];
+    const [title, text] = saved === null ? ENDINGS[code] ?? lost : finished(saved, real && code !== ENDED);
+    setText(byId("overlay-title"), title);
+    setText(byId("overlay-text"), text);
+    const closed = code >= 4400 && !(code in ENDINGS) && reason ? `Closed by the program: ${reason}. ` : "";
+    setText(byId("overlay-next"), closed + (retry === null || saved !== null ? "" : "Reconnecting..."));
+    show(byId("again"), code === TOO_MANY);
+    show(byId("overlay"), true);
+  }
+}
+
+/**
+ * Return title and text for a program that ended after its recording was done.
+ * @param {number} saved episodes @param {boolean} doubtful whether a real arm may still be driven
+ */
+function finished(saved, doubtful) {
+  const own = doubtful ? " Use the robot's own stop if the arm moves." : "";
+  return [
+    `the program has finished: ${saved} episode${saved === 1 ? "" : "s"} saved`,
+    `Start it again and open the new link that it prints.${own}`,
+  ];
+}
+
+/** @param {boolean} drove @param {boolean} watched */
+function lostTitle(drove, watched) {
+  if (drove) return "connection lost: the arm has been stopped";
+  return watched ? "connection lost: nothing here is live" : "no connection to the program";
+}
+
+/** @param {boolean} drove @param {boolean} watched @param {boolean} real */
+function lostText(drove, watched, real) {
+  const own = real ? " Use the robot's own stop if it moves." : "";
+  if (drove) return `The arm stops when the connection is lost.${own}`;
+  if (watched) return `STOP does not reach the arm from here.${own}`;
+  return "Check that the program is running, and that this is the newest link in the terminal.";
 }

@@ -1,4 +1,4 @@
-// Touching the document only where something changed, so that painting stays cheap.
+// Helpers for the document: elements, presses of fingers and mouse, light or dark theme.
 
 /** @param {string} id @returns {any} the element; throws where there is none */
 export function byId(id) {
@@ -10,7 +10,7 @@ export function byId(id) {
 /** @type {WeakMap<Element, string>} */
 const shown = new WeakMap();
 
-/** Write a text, if it is another one than before. @param {Element} element @param {string} text */
+/** Set a text, if it differs from the present one; painting stays cheap. @param {Element} element @param {string} text */
 export function setText(element, text) {
   if (shown.get(element) === text) return;
   shown.set(element, text);
@@ -46,7 +46,7 @@ export function make(tag, className = "", text = "") {
 }
 
 /**
- * A row of small buttons of which one is chosen.
+ * Fill an element with a row of small buttons of which one is chosen.
  * @param {HTMLElement} place @param {string[]} names @param {(name: string) => void} choose
  */
 export function segments(place, names, choose) {
@@ -59,7 +59,120 @@ export function segments(place, names, choose) {
   place.hidden = names.length < 2;
 }
 
-/** Mark the chosen one. @param {HTMLElement} place @param {string} name */
+/** Mark the chosen button of such a row. @param {HTMLElement} place @param {string} name */
 export function choose(place, name) {
   for (const button of place.children) setAttribute(button, "aria-pressed", String(button.textContent === name));
+}
+
+/**
+ * @typedef {object} Handlers
+ * @property {(event: PointerEvent) => boolean | void} down returns `false` if this press does not count
+ * @property {(event: PointerEvent) => void} [move]
+ * @property {() => void} up the last finger was lifted, cancelled, or is forgotten
+ */
+
+const LEFT = 1; // of PointerEvent.buttons
+
+/**
+ * Follow the presses on an element until each ends, in whichever way.
+ *
+ * A control that drives captures the pointer, so that sliding off it neither releases it nor presses its neighbour. A
+ * pointer that is cancelled or lost counts as released. So does a mouse with a second button down: browsers report only
+ * the release of the last one, and the press may be over by then.
+ *
+ * @param {HTMLElement} element
+ * @param {Handlers} handlers
+ * @returns {() => void} a function that forgets all presses; they count again only after a new one
+ */
+export function onPress(element, { down, move, up }) {
+  /** @type {Set<number>} */
+  const pointers = new Set();
+
+  /** @param {number} pointer */
+  function end(pointer) {
+    if (pointers.delete(pointer) && !pointers.size) up();
+  }
+
+  element.addEventListener("pointerdown", (event) => {
+    if (event.pointerType === "mouse" && event.button !== 0) return;
+    if (down(event) === false) return;
+    pointers.add(event.pointerId);
+    element.setPointerCapture(event.pointerId);
+  });
+  element.addEventListener("pointermove", (event) => {
+    if (event.pointerType === "mouse" && event.buttons !== LEFT) end(event.pointerId);
+    else if (pointers.has(event.pointerId)) move?.(event);
+  });
+  for (const type of /** @type {const} */ (["pointerup", "pointercancel", "lostpointercapture"])) {
+    element.addEventListener(type, (event) => end(event.pointerId));
+  }
+  const noMagnifier = (/** @type {TouchEvent} */ event) => event.cancelable && event.preventDefault();
+  element.addEventListener("touchstart", noMagnifier, { passive: false });
+
+  return () => {
+    if (!pointers.size) return;
+    pointers.clear();
+    up();
+  };
+}
+
+/**
+ * Call a function when a press ends on the element; sliding off it cancels. Unlike a click this works with a second
+ * finger, while the first one holds the dead-man. Needs `touch-action: none`.
+ *
+ * @param {HTMLElement} element @param {() => void} act
+ */
+export function onTap(element, act) {
+  let pointer = NaN;
+  element.addEventListener("pointerdown", (event) => {
+    if (event.pointerType === "mouse" && event.button !== 0) return;
+    pointer = event.pointerId;
+    element.setPointerCapture(pointer); // or it may end elsewhere without an event
+  });
+  element.addEventListener("pointerup", (event) => {
+    if (event.pointerId !== pointer) return;
+    pointer = NaN;
+    const { left, right, top, bottom } = element.getBoundingClientRect();
+    const { clientX: x, clientY: y } = event;
+    if (left <= x && x <= right && top <= y && y <= bottom) act();
+  });
+  element.addEventListener("pointercancel", () => (pointer = NaN));
+  element.addEventListener("click", (event) => event.detail === 0 && act()); // from the keyboard or an assistive tool
+}
+
+const KEY = "hal-console-theme";
+
+/** Return the theme that was chosen on this browser. @returns {string | null} */
+function remembered() {
+  try {
+    return localStorage.getItem(KEY);
+  } catch {
+    return null; // a browser may forbid it
+  }
+}
+
+/** Keep the theme for the next time. @param {string} theme */
+function remember(theme) {
+  try {
+    localStorage.setItem(KEY, theme);
+  } catch {
+    // Then it lasts as long as the page is open.
+  }
+}
+
+/** Follow the system's theme until the button is pressed. @param {() => void} changed called at every change */
+export function openTheme(changed) {
+  const root = document.documentElement;
+  const known = remembered();
+  if (known === "light" || known === "dark") {
+    root.dataset.theme = known;
+    changed(); // what was drawn before has the other theme's colours
+  }
+  byId("theme").addEventListener("click", () => {
+    const dark = matchMedia("(prefers-color-scheme: dark)").matches;
+    const now = root.dataset.theme ?? (dark ? "dark" : "light");
+    root.dataset.theme = now === "dark" ? "light" : "dark";
+    remember(root.dataset.theme);
+    changed();
+  });
 }

@@ -1,9 +1,9 @@
-// A gamepad that the browser knows (its Gamepad API).
+// A gamepad that the browser offers (Gamepad API) as a source of the pad.
 
 import { byId, setData, setText } from "./dom.js";
-import { AXIS, BIT } from "./names.js";
+import { AXIS, BIT } from "./pad.js";
 
-const NEAR = 0.25; // what counts as let go of, share of the travel
+const NEAR = 0.25; // share of the travel up to which a control counts as released
 const BUTTON_ORDER = [
   "south", "east", "west", "north", "l1", "r1", "l2", "r2", "select", "start", "l3", "r3", null, null, null, null,
   "home", "touchpad",
@@ -11,8 +11,8 @@ const BUTTON_ORDER = [
 const [UP, DOWN, LEFT, RIGHT] = [12, 13, 14, 15];
 
 /**
- * Only pads with the standard mapping: of others nobody knows which button is which. A pad counts after all of it was
- * let go of once, for browsers show a pad only when a button on it is pressed.
+ * Only pads with the standard mapping are used: of others it is unknown which button is which. A pad counts after all
+ * of it was released once, because browsers show a pad only when a button on it is pressed.
  */
 export class BrowserGamepad {
   /** @param {import("./pad.js").Pad} pad @param {(text: string) => void} lost */
@@ -20,24 +20,24 @@ export class BrowserGamepad {
     this.pad = pad;
     this.lost = lost;
     this.source = pad.source();
-    /** May its dead-man count by itself? Not on a real arm: a wireless pad that dies keeps its last state here. */
+    /** Whether its dead-man counts by itself. Not on a real arm: a wireless pad that dies keeps its last state here. */
     this.mayHold = true;
     pad.released.push(() => (this.#free = false));
     addEventListener("gamepadconnected", () => this.describe());
-    addEventListener("gamepaddisconnected", () => this.look());
+    addEventListener("gamepaddisconnected", () => this.read());
     setInterval(() => this.describe(), 1000);
   }
 
   /** @type {number | null} */ #index = null;
   #free = false;
 
-  /** Does the dead-man of a gamepad count? */
+  /** Whether the dead-man of a gamepad counts. */
   get holds() {
     return this.#index !== null && this.mayHold;
   }
 
-  /** Take the present state. */
-  look() {
+  /** Read the present state. */
+  read() {
     const found = this.#admit();
     if (!found) {
       if (this.#index !== null) this.#lose();
@@ -49,7 +49,7 @@ export class BrowserGamepad {
     this.pad.update();
   }
 
-  /** Tell a person what there is. */
+  /** Show which gamepad there is. */
   describe() {
     setText(byId("gamepad"), this.#words());
     setData(document.documentElement, "gamepad", this.#index === null ? null : "");
@@ -69,7 +69,7 @@ export class BrowserGamepad {
     return "No gamepad detected. Plug one in and press one of its buttons.";
   }
 
-  /** The pad, if there is one; whether it counts by now stands in #free. @returns {Gamepad | null} */
+  /** Return the gamepad, if there is one; #free is whether it counts by now. @returns {Gamepad | null} */
   #admit() {
     const found = this.#find();
     if (!found) return null;
@@ -106,7 +106,7 @@ function read(found, source) {
   const value = (/** @type {number} */ place) => found.buttons[place]?.value ?? 0;
   const { axes } = source;
   axes[AXIS.left_x] = leftX;
-  axes[AXIS.left_y] = -leftY; // the browser's point down
+  axes[AXIS.left_y] = -leftY; // the browser's axes point down
   axes[AXIS.right_x] = rightX;
   axes[AXIS.right_y] = -rightY;
   axes[AXIS.l2] = value(6);

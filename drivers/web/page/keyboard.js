@@ -1,19 +1,21 @@
-// The keyboard as a pad.
+// The keyboard as a source of the pad.
+//
+// The server makes keys.js out of sensors/keyboard.yaml, the one table of keys, which the terminal uses too.
 
-import { AXIS, BIT, SLOWER } from "./names.js";
-import { AXIS_KEYS, BUTTON_KEYS, GRIP_KEYS, HOLD_KEY, HOME_KEY, SLOW_KEYS, STOP_KEYS } from "./names.js";
+import { KEYS } from "./keys.js";
+import { AXIS, BIT } from "./pad.js";
 
-const GRIP_SPEED = 1; // full travels of the slider per second
 const USED = new Set([
-  HOLD_KEY, HOME_KEY, ...Object.keys(AXIS_KEYS), ...Object.keys(BUTTON_KEYS), ...Object.keys(GRIP_KEYS), ...SLOW_KEYS,
+  ...KEYS.hold, ...KEYS.go_home, ...KEYS.slow,
+  ...[KEYS.sticks, KEYS.buttons, KEYS.grip].flatMap((keys) => Object.keys(keys)),
 ]);
 
-/** @param {EventTarget | null} target */
+/** Whether the key belongs to a field for text. @param {EventTarget | null} target */
 function isTyping(target) {
   return target instanceof Element && target.closest("input, textarea, select, [contenteditable]") !== null;
 }
 
-/** Enter belongs to what was reached with Tab. @param {KeyboardEvent} event */
+/** Whether the key is Enter on an element that was reached with Tab. @param {KeyboardEvent} event */
 function isActivation(event) {
   const active = document.activeElement;
   return event.key === "Enter" && active !== null && active.matches("button, summary, a");
@@ -22,7 +24,7 @@ function isActivation(event) {
 export class Keyboard {
   /**
    * @param {import("./pad.js").Pad} pad
-   * @param {() => boolean} enabled does this page drive?
+   * @param {() => boolean} enabled whether this page drives
    * @param {() => void} stop
    */
   constructor(pad, enabled, stop) {
@@ -32,33 +34,33 @@ export class Keyboard {
     this.source = pad.source();
     pad.released.push(() => this.#down.clear());
     addEventListener("keydown", (event) => this.#pressed(event));
-    addEventListener("keyup", (event) => this.#let(event));
+    addEventListener("keyup", (event) => this.#released(event));
   }
 
   /** Keys that were pressed while this page drove. @type {Set<string>} */
   #down = new Set();
-  /** Keys whose press was ours, so that their repetition scrolls nothing. @type {Set<string>} */
+  /** Keys whose press was used here, so that their repetition scrolls nothing. @type {Set<string>} */
   #ours = new Set();
 
-  /** Is a key of the pad down? */
+  /** Whether a key of the pad is down. */
   get holds() {
     return this.#down.size > 0;
   }
 
-  /** Move the gripper's slider by as long as its keys are held. @param {number} dt s */
-  look(dt) {
+  /** Move the gripper's slider while its keys are held. @param {number} dt time since the last call, s */
+  moveGrip(dt) {
     let way = 0;
-    for (const [key, sign] of Object.entries(GRIP_KEYS)) if (this.#down.has(key)) way += sign;
-    if (way) this.pad.setGrip(this.pad.grip + way * GRIP_SPEED * dt);
+    for (const [key, sign] of Object.entries(KEYS.grip)) if (this.#down.has(key)) way += sign;
+    if (way) this.pad.setGrip(this.pad.grip + way * KEYS.grip_speed * dt);
   }
 
   /** @param {KeyboardEvent} event */
   #pressed(event) {
     const key = event.code;
     if (event.repeat && isActivation(event)) event.preventDefault(); // one press is one click
-    const stop = STOP_KEYS.includes(key) || (key === HOLD_KEY && document.activeElement?.id === "stop");
+    const stop = KEYS.stop.includes(key) || (KEYS.hold.includes(key) && document.activeElement?.id === "stop");
     if (stop) return this.#stopped(event);
-    if (event.key === "Meta") return this.#releaseAll(); // its system swallows the releases of other keys
+    if (event.key === "Meta") return this.#releaseAll(); // the system swallows the releases of other keys
     if (!USED.has(key) || event.ctrlKey || event.metaKey || event.altKey) return;
     if (event.repeat) {
       if (this.#ours.has(key)) event.preventDefault();
@@ -73,16 +75,16 @@ export class Keyboard {
 
   /** Esc or Backspace, or Space on the button that was reached with Tab. @param {KeyboardEvent} event */
   #stopped(event) {
-    if (event.code === HOLD_KEY) {
+    if (KEYS.hold.includes(event.code)) {
       event.preventDefault();
-      this.#ours.add(HOLD_KEY);
+      this.#ours.add(event.code);
     }
     if (!event.repeat) this.stop();
   }
 
   /** @param {KeyboardEvent} event */
-  #let(event) {
-    if (this.#ours.delete(event.code)) event.preventDefault(); // or Space would click the button that has the focus
+  #released(event) {
+    if (this.#ours.delete(event.code)) event.preventDefault(); // or Space would click the focused button
     if (this.#down.delete(event.code)) this.#apply();
   }
 
@@ -92,15 +94,16 @@ export class Keyboard {
   }
 
   #apply() {
-    const reach = SLOW_KEYS.some((key) => this.#down.has(key)) ? SLOWER : 1;
+    const isDown = (/** @type {string} */ key) => this.#down.has(key);
+    const reach = KEYS.slow.some(isDown) ? KEYS.slow_share : 1;
     this.source.clear();
-    for (const [key, [axis, way]] of Object.entries(AXIS_KEYS)) {
+    for (const [key, [axis, way]] of Object.entries(KEYS.sticks)) {
       if (this.#down.has(key)) this.source.axes[AXIS[axis]] += way * reach;
     }
-    for (const [key, button] of Object.entries(BUTTON_KEYS)) {
+    for (const [key, button] of Object.entries(KEYS.buttons)) {
       if (this.#down.has(key)) this.source.mask |= BIT[button];
     }
-    this.pad.hold("key", this.#down.has(HOLD_KEY));
-    this.pad.goHome("key", this.#down.has(HOME_KEY));
+    this.pad.hold("key", KEYS.hold.some(isDown));
+    this.pad.goHome("key", KEYS.go_home.some(isDown));
   }
 }

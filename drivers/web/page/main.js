@@ -1,24 +1,17 @@
-// The console's page: opens the parts and passes messages between them.
+// Start of the console's page: makes the parts and passes messages between them.
 
+import { ArmPanel } from "./arm.js";
 import { Cameras } from "./cameras.js";
-import { Connection } from "./connection.js";
-import { byId, setAttribute, setData, setText, show } from "./dom.js";
-import { Drive } from "./drive.js";
-import { Facts } from "./facts.js";
+import { Connection, Overlay } from "./connection.js";
+import { Lease, Settings } from "./control.js";
+import { Controls } from "./controls.js";
+import { Heartbeat, Presence, ReleaseWatch } from "./deadman.js";
+import { byId, openTheme, setAttribute, setData, setText, show } from "./dom.js";
 import { BrowserGamepad } from "./gamepad.js";
-import { Hands } from "./hands.js";
-import { Heartbeat } from "./heartbeat.js";
 import { Keyboard } from "./keyboard.js";
-import { Lease } from "./lease.js";
-import { Log } from "./log.js";
-import { Overlay } from "./overlay.js";
 import { Pad } from "./pad.js";
-import { Presence } from "./presence.js";
 import { Recording } from "./recording.js";
-import { Settings } from "./settings.js";
-import { Status } from "./status.js";
-import { Stopping } from "./stopping.js";
-import { openTheme } from "./theme.js";
+import { Log, Status, Stopping } from "./status.js";
 
 const REPAINT = 100; // ms
 const COARSE = matchMedia("(hover: none) and (pointer: coarse)"); // fingers, and no keyboard
@@ -30,17 +23,17 @@ const lease = new Lease(connection);
 const heartbeat = new Heartbeat(pad, connection, () => lease.mine && connection.connected && presence.check());
 const log = new Log();
 const status = new Status(connection, lease);
-const facts = new Facts();
+const panel = new ArmPanel();
 const cameras = new Cameras();
 const recording = new Recording(connection, lease);
-const settings = new Settings(connection, lease, facts, () => pad.held, (text) => status.notice(text));
+const settings = new Settings(connection, lease, panel, () => pad.held, (text) => status.notice(text));
 const overlay = new Overlay(() => connection.open());
 const mayDrive = () => lease.mine && presence.present;
-const drive = new Drive(pad, mayDrive);
+const controls = new Controls(pad, mayDrive);
 const stopping = new Stopping(connection, log);
 const stop = () => stopping.stop();
 const keyboard = new Keyboard(pad, mayDrive, stop);
-const hands = new Hands(pad, keyboard);
+const releases = new ReleaseWatch(pad, keyboard);
 const gamepad = new BrowserGamepad(pad, (text) => log.add(text));
 
 /** @type {any} */
@@ -48,21 +41,21 @@ let hello = null;
 /** @type {any} */
 let state = null;
 let stateAt = -Infinity;
-let told = false;
+let shown = false;
 
 const silence = () => performance.now() - stateAt;
 const isReal = () => hello !== null && (!hello.rig.sim || hello.rig.robots.some((/** @type {any} */ one) => one.real));
 
-/** A rig's name: that of its file. @param {string} source */
-const called = (source) => source.replace(/^.*[/\\]/, "").replace(/\.ya?ml$/, "");
+/** Return a rig's name: that of its file. @param {string} source */
+const rigName = (source) => source.replace(/^.*[/\\]/, "").replace(/\.ya?ml$/, "");
 
-/** Message type -> what to do with it. @type {Record<string, (message: any) => void>} */
-const HEARD = {
+/** Message type -> its handler. @type {Record<string, (message: any) => void>} */
+const HANDLERS = {
   hello(message) {
     hello = message;
     const { rig } = hello;
     log.clear();
-    setText(byId("rig"), called(rig.source));
+    setText(byId("rig"), rigName(rig.source));
     byId("rig").title = rig.source;
     setText(byId("kind"), rig.emulated ? "EMULATED ARM" : isReal() ? "REAL ARM" : "SIMULATION");
     show(byId("kind"), true);
@@ -70,11 +63,11 @@ const HEARD = {
     setData(document.documentElement, "connected", "");
     show(byId("demo"), rig.demo);
     gamepad.mayHold = rig.pad_may_hold;
-    drive.paint();
+    controls.paint();
     status.waiting = [];
     lease.hello(hello);
     recording.forget();
-    facts.open(rig.robots);
+    panel.open(rig.robots);
     settings.open(rig);
     cameras.open(rig.cameras);
     gamepad.describe();
@@ -88,7 +81,7 @@ const HEARD = {
     advise();
   },
   labels(message) {
-    drive.explain(message);
+    controls.explain(message);
     recording.explain(message);
     settings.explain(message);
     paintSettings();
@@ -107,23 +100,23 @@ const HEARD = {
   state(message) {
     state = message;
     stateAt = performance.now();
-    stopping.heard(state);
+    stopping.addState(state);
     connection.proved();
     overlay.hide();
     log.synchronise(state.t);
-    recording.look(state.t);
-    facts.take(state);
-    status.show(state.robots, settings.robot || facts.name, 0);
+    recording.setTime(state.t);
+    panel.addState(state);
+    status.show(state.robots, settings.robot || panel.name, 0);
     setText(byId("demo"), state.playing ? "End tour" : "Play tour");
     advise();
   },
   pad(message) {
     status.waiting = message.waiting;
-    if (status.waiting.includes("r2")) drive.letGoOfGrip();
+    if (status.waiting.includes("r2")) controls.releaseGrip();
     advise();
   },
   say(message) {
-    status.told(message, log.add(message.text, message.t));
+    status.addMessage(message, log.add(message.text, message.t));
   },
   refused(message) {
     log.add(message.why);
@@ -141,21 +134,21 @@ function advise() {
 }
 
 function retitle() {
-  const title = `${recording.title}${lease.mine ? "driving " : ""}${hello ? called(hello.rig.source) : "console"}`;
+  const title = `${recording.title}${lease.mine ? "driving " : ""}${hello ? rigName(hello.rig.source) : "console"}`;
   if (document.title !== title) document.title = title;
   setAttribute(byId("demo"), "aria-disabled", String(!lease.mine));
   byId("demo").title = lease.mine ? "" : "Only the page in control can do that";
 }
 
-connection.heard = (message) => HEARD[message.type]?.(message);
+connection.heard = (message) => HANDLERS[message.type]?.(message);
 
 connection.lost = (code, reason, retry) => {
   const watched = document.documentElement.dataset.connected !== undefined;
-  if (watched || code >= 4400 || !told) { // a further try that fails must not hide that the arm was stopped
+  if (watched || code >= 4400 || !shown) { // a failed retry must not hide that the arm was stopped
     overlay.show(code, reason, retry, { drove: lease.mine, watched, real: isReal(), saved: recording.outcome });
   }
-  told = true;
-  show(byId("notice"), false); // of a connection that is gone
+  shown = true;
+  show(byId("notice"), false); // it was for the connection that is gone
   setData(document.documentElement, "connected", null);
   stateAt = -Infinity;
   lease.disconnected();
@@ -164,8 +157,8 @@ connection.lost = (code, reason, retry) => {
   retitle();
 };
 
-drive.ways = () => (gamepad.holds ? `Space or ${pad.deadman.toUpperCase()}` : "Space");
-status.hold = () => (COARSE.matches ? "the button" : gamepad.holds ? pad.deadman.toUpperCase() : "Space");
+controls.holdKeys = () => (gamepad.holds ? `Space or ${pad.deadman.toUpperCase()}` : "Space");
+status.holdName = () => (COARSE.matches ? "the button" : gamepad.holds ? pad.deadman.toUpperCase() : "Space");
 
 lease.granted = (t) => {
   pad.reset();
@@ -174,7 +167,7 @@ lease.granted = (t) => {
 lease.ended = () => pad.reset();
 
 presence.left = (why) => {
-  if (lease.mine) heartbeat.away(why);
+  if (lease.mine) heartbeat.leave(why);
   pad.reset();
   advise();
 };
@@ -183,38 +176,38 @@ presence.came = () => {
   advise();
 };
 
-hands.lost = (why) => {
+releases.lost = (why) => {
   log.add(why);
-  heartbeat.away("hands");
+  heartbeat.leave("hands");
   pad.reset();
 };
 
-heartbeat.before.push((dt) => hands.look(dt), (dt) => keyboard.look(dt), () => gamepad.look());
+heartbeat.before.push((dt) => releases.check(dt), (dt) => keyboard.moveGrip(dt), () => gamepad.read());
 heartbeat.stalled = (ms) => log.add(`this page hung for ${Math.round(ms)} ms`);
 pad.changed.push(() => advise());
 
-// A finger on STOP counts at once; a click without a pointer comes from the keyboard or an aid.
+// A finger on STOP counts at once; a click without a pointer comes from the keyboard or an assistive tool.
 byId("stop").addEventListener("pointerdown", stop);
 byId("stop").addEventListener("click", (/** @type {MouseEvent} */ event) => event.detail === 0 && stop());
 byId("demo").addEventListener("click", () => {
   if (lease.mine) connection.send({ type: "demo", play: !state?.playing });
 });
-// A click leaves the focus alone, or Enter, which is the pad's start, would click the button once more.
+// A click does not move the focus, or Enter, which is the pad's start, would click the button once more.
 addEventListener("mousedown", (event) => {
   if (!(event.target instanceof Element) || !event.target.closest("button, summary")) return;
   event.preventDefault();
   if (document.activeElement instanceof HTMLElement) document.activeElement.blur();
 });
 addEventListener("hashchange", () => { // another link: the browser loads nothing when only its token differs
-  lease.opened();
+  lease.linkOpened();
   connection.open();
 });
 
-/** The link to the program: how quick it is, and whether it speaks at all. */
+/** Show the connection to the program and its round trip. */
 function paintLink() {
-  const quick = lease.mine && heartbeat.roundTrip !== null ? ` ${heartbeat.roundTrip.toFixed(0)} ms` : "";
+  const roundTrip = lease.mine && heartbeat.roundTrip !== null ? ` ${heartbeat.roundTrip.toFixed(0)} ms` : "";
   const alive = connection.connected && silence() < 500;
-  setText(byId("link"), alive ? `connected${quick}` : connection.connected ? "no news" : "not connected");
+  setText(byId("link"), alive ? `connected${roundTrip}` : connection.connected ? "no data" : "not connected");
   setData(byId("link-lamp"), "tone", alive ? "on" : "alarm");
 }
 
@@ -225,17 +218,17 @@ setInterval(() => {
   if (!state) return;
   const pages = state.pages;
   setText(byId("pages"), `${pages} page${pages === 1 ? "" : "s"}`);
-  status.show(state.robots, settings.robot || facts.name, silence());
-  drive.mark(facts.closed(state));
-  facts.paint(state, silence());
+  status.show(state.robots, settings.robot || panel.name, silence());
+  controls.mark(panel.closed(state));
+  panel.paint(state, silence());
 }, REPAINT);
 
 byId("legend").open = matchMedia("(min-width: 1100px) and (min-height: 1000px)").matches;
-openTheme(() => facts.plot.restyle());
+openTheme(() => panel.plot.restyle());
 heartbeat.start();
 connection.open();
 
-/** For tests: how the page stands. */
+/** The state of the page, for tests. */
 Object.defineProperty(window, "halConsole", {
   value: Object.freeze({
     get connected() { return connection.connected; },

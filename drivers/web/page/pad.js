@@ -1,17 +1,81 @@
-// One pad out of everything that a person may use at once: fingers on the page, keys, a gamepad.
+// One pad out of everything that may drive at the same time: fingers on the page, keys, a gamepad.
 
-import { AXES, AXIS, BIT } from "./names.js";
-import { Taps } from "./taps.js";
+/** Axes in the order in which they are sent. Sticks and d-pad are -1..1 (right and up positive), l2 and r2 are 0..1. */
+export const AXES = ["left_x", "left_y", "right_x", "right_y", "l2", "r2", "dpad_x", "dpad_y"];
+
+/** Buttons; bit k of a mask is button k. */
+export const BUTTONS = [
+  "south", "east", "west", "north", "l1", "r1", "l2", "r2", "select", "start", "l3", "r3", "home", "touchpad",
+];
+
+/** Name of an axis -> its place. */
+export const AXIS = Object.fromEntries(AXES.map((name, place) => [name, place]));
+
+/** Name of a button -> its bit, as a number with only that bit set. */
+export const BIT = Object.fromEntries(BUTTONS.map((name, place) => [name, 1 << place]));
+
+/** Meanings of a button that moves nothing: it steers a recording. */
+export const ACTIONS = ["record", "finish", "fail", "discard"];
+
+/** Name of a disc -> its two axes, across and up. */
+export const DISCS = { dpad: ["dpad_x", "dpad_y"], left: ["left_x", "left_y"], right: ["right_x", "right_y"] };
+
+const SHORTEST = 80; // ms; an app reads the pad 50 times a second, and a tap on a trackpad may be shorter
+
+/** Prolongs short presses of buttons that move nothing, so that the app sees them. */
+class Taps {
+  /** @param {() => void} ended called when a prolonged press is over */
+  constructor(ended) {
+    this.ended = ended;
+  }
+
+  #pressed = 0;
+  /** Bit of a button that was pressed a moment ago -> the timer that ends that. @type {Map<number, number>} */
+  #young = new Map();
+
+  /**
+   * @param {number} pressed mask of the buttons that are down
+   * @param {number} may mask of those that may be prolonged; one that no longer may is released at once
+   * @returns {number} mask of the buttons that count as pressed
+   */
+  prolong(pressed, may) {
+    const fresh = pressed & ~this.#pressed & may;
+    this.#pressed = pressed;
+    for (const bit of this.#young.keys()) if (!(bit & may)) this.#end(bit);
+    for (let rest = fresh; rest; rest &= rest - 1) this.#start(rest & -rest);
+    return [...this.#young.keys()].reduce((mask, bit) => mask | bit, pressed);
+  }
+
+  /** Release everything that is prolonged. */
+  forget() {
+    for (const bit of this.#young.keys()) this.#end(bit);
+  }
+
+  /** @param {number} bit */
+  #start(bit) {
+    this.#end(bit);
+    this.#young.set(bit, setTimeout(() => {
+      this.#young.delete(bit);
+      this.ended();
+    }, SHORTEST));
+  }
+
+  /** @param {number} bit */
+  #end(bit) {
+    clearTimeout(this.#young.get(bit));
+    this.#young.delete(bit);
+  }
+}
 
 const TRIGGERS = [AXIS.l2, AXIS.r2];
 const PRESSED = 0.5;
 
-/** What one way of driving pushes and presses at the moment. */
+/** What one input device pushes and presses at the moment. */
 export class Source {
   constructor() {
     this.axes = AXES.map(() => 0);
     this.mask = 0;
-    /** May its dead-man count by itself? */
+    /** Whether its dead-man counts by itself. */
     this.mayHold = true;
   }
 
@@ -22,18 +86,18 @@ export class Source {
 }
 
 /**
- * Sticks add up, triggers count at their farthest, a button is pressed when any of them presses it.
+ * The merged pad: sticks add up, of triggers the farthest counts, a button is pressed when any source presses it.
  *
- * Home counts only while the dead-man is held, and is let go of with it. A press that moves nothing may be prolonged;
- * one of the dead-man, or of anything that moves the arm, never is.
+ * Home counts only while the dead-man is held, and is released with it. A press that moves nothing may be prolonged; one
+ * of the dead-man, or of anything that moves the arm, never is.
  */
 export class Pad {
   constructor() {
     this.axes = AXES.map(() => 0);
     this.mask = 0;
-    /** Is the dead-man pressed here? What the servo makes of it stands in its state. */
+    /** Whether the dead-man is pressed here; whether the servo received that is in its state. */
     this.held = false;
-    /** Place of the gripper's slider, 0 open .. 1 closed; it stays where it is. */
+    /** Position of the gripper's slider, 0 open .. 1 closed; it stays where it is. */
     this.grip = 0;
     this.deadman = "l2";
     /** @type {string | null} */
@@ -43,9 +107,9 @@ export class Pad {
     this.#holding = new Set();
     this.#homing = new Set();
     this.#taps = new Taps(() => this.update());
-    /** Called after every change; `edge`: something was pressed or let go of. @type {((edge: boolean) => void)[]} */
+    /** Called after every change; `edge`: something was pressed or released. @type {((edge: boolean) => void)[]} */
     this.changed = [];
-    /** Called by reset(): forget whatever is held. @type {(() => void)[]} */
+    /** Called by reset() to forget whatever is held. @type {(() => void)[]} */
     this.released = [];
   }
 
@@ -56,13 +120,13 @@ export class Pad {
   #moveless = 0;
   #moving = 0;
 
-  /** Is something pushed that may move the arm? The gripper's slider stays where it is, and does not count. */
+  /** Whether something is pushed that may move the arm. The gripper's slider does not count: it stays where it is. */
   get pushed() {
     const sticks = this.axes.some((value, place) => value !== 0 && !TRIGGERS.includes(place));
     return sticks || (this.mask & this.#moving) !== 0;
   }
 
-  /** A further way of driving. */
+  /** Return a further source. */
   source() {
     const made = new Source();
     this.sources.push(made);
@@ -90,7 +154,7 @@ export class Pad {
   }
 
   /**
-   * What the app calls its dead-man and its way home, which buttons move nothing, and which controls move the arm.
+   * Set which controls are the dead-man and the way home, which buttons move nothing, and which controls move the arm.
    * @param {string} deadman @param {string | null} home @param {string[]} moveless @param {string[]} moving
    */
   explain(deadman, home, moveless, moving) {
@@ -103,7 +167,7 @@ export class Pad {
     else this.update();
   }
 
-  /** Everything neutral and let go of, the gripper's slider included. */
+  /** Release everything, the gripper's slider included. */
   reset() {
     this.#holding.clear();
     this.#homing.clear();
@@ -114,7 +178,7 @@ export class Pad {
     this.update();
   }
 
-  /** Merge the sources anew; tells whoever listens where that changes something. */
+  /** Merge the sources again; calls `changed` if the result differs. */
   update() {
     const axes = AXES.map(() => 0);
     let mask = 0;
@@ -128,11 +192,11 @@ export class Pad {
     const held = (mask & BIT[this.deadman]) !== 0;
     if (!held) this.#homing.clear();
     if (this.home && this.#homing.size) mask |= BIT[this.home];
-    this.#take(axes, this.#taps.look(mask, this.#prolonged(held)), held);
+    this.#take(axes, this.#taps.prolong(mask, this.#prolonged(held)), held);
   }
 
   /**
-   * Mask of the buttons of which a short press is prolonged: also of the way home, but never beyond the dead-man.
+   * Return the mask of the buttons of which a short press is prolonged: also the way home, but not beyond the dead-man.
    * @param {boolean} held
    */
   #prolonged(held) {
@@ -140,7 +204,7 @@ export class Pad {
     return held ? this.#moveless | home : this.#moveless & ~home;
   }
 
-  /** @param {number[]} axes @param {Source} source @returns {number} the buttons that count */
+  /** @param {number[]} axes @param {Source} source @returns {number} mask of its buttons that count */
   #add(axes, source) {
     const dropped = source.mayHold ? null : this.deadman;
     AXES.forEach((name, place) => {

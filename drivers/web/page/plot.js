@@ -1,13 +1,29 @@
-// Target against measured, over the last seconds: one joint large, or all of them one below the other.
+// The plot of target and measured joint positions over the last seconds: one joint large, or all below each other.
 
 import { byId, setText } from "./dom.js";
-import { shortened, signed } from "./joints.js";
+
+/** Return a joint's name without the beginning that all of them share. @param {string} name @param {string[]} all */
+export function shortened(name, all) {
+  let same = all.length > 1 ? name.length : 0;
+  for (const other of all) while (!other.startsWith(name.slice(0, same))) same -= 1;
+  while (same > 0 && /\d/.test(name[same - 1])) same -= 1; // never cut a number in two
+  const rest = name.slice(same);
+  return /^\d/.test(rest) ? `J${rest}` : rest;
+}
+
+/** Format a number so that its sign always takes the same room. @param {number} value @param {number} digits */
+export function signed(value, digits) {
+  if (typeof value !== "number") return "–";
+  const text = Math.abs(value).toFixed(digits);
+  return (value < 0 && Number(text) !== 0 ? "−" : "\u2007") + text;
+}
 
 const SPAN = 20; // s
 const CAPACITY = 512; // samples; 20 a second come
-const GAP = 0.3; // s between two samples from which on no line joins them
-const SMALLEST = 0.02; // rad; what is smaller than this is not blown up to the full height
+const GAP = 0.3; // s between two samples above which no line joins them
+const SMALLEST = 0.02; // rad; a smaller range is not enlarged to the full height
 
+/** Ring of samples and the canvas that shows it. */
 export class Plot {
   constructor() {
     this.canvas = byId("plot");
@@ -32,7 +48,7 @@ export class Plot {
   #colours = { measured: "", target: "", quiet: "" };
   #font = "";
 
-  /** Start anew with these joints. @param {string[]} names */
+  /** Clear the plot for these joints. @param {string[]} names */
   open(names) {
     this.names = names.map((name) => shortened(name, names));
     this.#q = names.map(() => new Float32Array(CAPACITY));
@@ -62,7 +78,7 @@ export class Plot {
     this.#count += 1;
   }
 
-  /** Take the colours of the page as it looks now. */
+  /** Read the colours of the present theme. */
   restyle() {
     const panel = byId("plotting");
     const colour = (/** @type {string} */ part) => getComputedStyle(panel.querySelector(part)).color;
@@ -92,7 +108,7 @@ export class Plot {
     this.#ruler(floor, width);
   }
 
-  /** Samples from the left edge on. */
+  /** Yield the places of the samples in view, the oldest first. */
   *#places() {
     const newest = this.#times[(this.#count - 1) % CAPACITY];
     for (let k = Math.max(0, this.#count - CAPACITY); k < this.#count; k += 1) {

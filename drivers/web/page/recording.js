@@ -1,15 +1,14 @@
-// The panel of a program that records demonstrations: how it goes, and the buttons that steer it.
+// The panel of a program that records demonstrations: its progress, and the buttons that steer it.
 
-import { byId, setAttribute, setData, setText, show } from "./dom.js";
-import { LEGEND } from "./names.js";
-import { onTap } from "./press.js";
+import { byId, onTap, setAttribute, setData, setText, show } from "./dom.js";
+import { KEYS } from "./keys.js";
 
-const OLD = 10; // s; a program that records says so more often, unless it is driving the arm home
+const OLD = 10; // s; a program that records sends views more often
 
 /** Phase -> tone of its lamp. @type {Record<string, string>} */
 const TONES = { ready: "on", recording: "record" };
 
-/** Fact of the panel -> its words. @type {Record<string, (view: any) => string>} */
+/** Field of the panel -> its text. @type {Record<string, (view: any) => string>} */
 const FACTS = {
   episode: ({ saved, wanted }) => (wanted ? `${Math.min(saved + 1, wanted)} of ${wanted}` : String(saved + 1)),
   seconds: ({ seconds }) => `${seconds.toFixed(1)} s`,
@@ -21,60 +20,61 @@ const FACTS = {
   free: ({ free_bytes: bytes }) => `${(bytes / 1e9).toFixed(1)} GB`,
 };
 
-/** Write a text of which there may be more than room. @param {HTMLElement} element @param {string} text */
-function tell(element, text) {
+/** Set a text that may be cut off, with the whole of it as a tooltip. @param {HTMLElement} element @param {string} text */
+function setLongText(element, text) {
   setText(element, text);
   if (element.title !== text) element.title = text;
 }
 
+/** The panel; hidden until the program shows a recording. */
 export class Recording {
-  /** @param {import("./connection.js").Connection} connection @param {import("./lease.js").Lease} lease */
+  /** @param {import("./connection.js").Connection} connection @param {import("./control.js").Lease} lease */
   constructor(connection, lease) {
     this.connection = connection;
     this.lease = lease;
-    /** What the program showed last; null: it records nothing. @type {any} */
+    /** Newest view of the program; null: it records nothing. @type {any} */
     this.view = null;
     /** @type {HTMLElement[]} */
     this.buttons = [...byId("recording").querySelectorAll("[data-action]")];
-    for (const button of this.buttons) onTap(button, () => this.#ask(button.dataset.action));
+    for (const button of this.buttons) onTap(button, () => this.#request(button.dataset.action));
   }
 
   /** s since the newest view. */
   #age = 0;
 
-  /** For the page's title: empty while nothing is recorded. */
+  /** Beginning of the page's title; empty while nothing is recorded. */
   get title() {
     return this.view?.phase === "recording" ? `REC ${Math.floor(this.view.seconds)} s ` : "";
   }
 
-  /** Episodes that a program saved which said last that it is done; null: it has not said so. @type {number | null} */
+  /** Number of saved episodes if the program is done, else null. @type {number | null} */
   get outcome() {
     return this.view?.phase === "done" ? this.view.saved : null;
   }
 
-  /** The program shows how it goes. @param {any} view */
+  /** Show a new view of the program. @param {any} view */
   heard(view) {
     this.view = view;
     this.#age = 0;
     this.paint();
   }
 
-  /** It is the app's time `t` now, s. @param {number} t */
-  look(t) {
+  /** Note the time of the app's clock. @param {number} t s */
+  setTime(t) {
     if (this.view) this.#age = t - this.view.t;
   }
 
-  /** Another program, or none: it may record nothing. */
+  /** Hide the panel: another program may record nothing. */
   forget() {
     this.view = null;
     this.paint();
   }
 
-  /** Write on every button which one of the pad does the same. @param {any} labels */
+  /** Label every button with the button of the pad, and the key, that do the same. @param {any} labels */
   explain({ controls }) {
     for (const button of this.buttons) {
       const same = Object.keys(controls).find((name) => controls[name].join() === button.dataset.action);
-      const key = LEGEND.find(([, control]) => control === same)?.[0];
+      const key = KEYS.legend.find(([, control]) => control === same)?.[0];
       const note = /** @type {Element} */ (button.querySelector("small"));
       setText(/** @type {Element} */ (note.querySelector("span")), same ?? "");
       setText(/** @type {Element} */ (note.querySelector("kbd")), key ?? "");
@@ -84,7 +84,7 @@ export class Recording {
   }
 
   /** @param {string | undefined} action */
-  #ask(action) {
+  #request(action) {
     if (this.#may(action)) this.connection.send({ type: "action", action });
   }
 
@@ -93,7 +93,7 @@ export class Recording {
     return this.lease.mine && this.view !== null && this.view.actions.includes(action);
   }
 
-  /** Show it; also when the lease changes hands, and ten times a second. */
+  /** Show the view; also when control changes, and ten times a second. */
   paint() {
     const { view } = this;
     show(byId("recording"), view !== null);
@@ -102,10 +102,10 @@ export class Recording {
     if (!view) return;
     const { phase, prompt, task, trouble, saved, wanted } = view;
     const lost = this.#lost(view);
-    setText(byId("recording-phase"), lost ? `no news for ${Math.floor(this.#age)} s` : phase);
+    setText(byId("recording-phase"), lost ? `no update for ${Math.floor(this.#age)} s` : phase);
     setData(byId("recording-lamp"), "tone", lost || trouble ? "alarm" : TONES[phase] ?? "calm");
-    tell(byId("recording-prompt"), prompt);
-    tell(byId("recording-task"), task);
+    setLongText(byId("recording-prompt"), prompt);
+    setLongText(byId("recording-task"), task);
     setText(byId("recording-number"), `dataset episode ${view.episode}`);
     const progress = byId("recording-progress");
     show(progress, wanted > 0);
@@ -114,17 +114,17 @@ export class Recording {
     setText(byId("recording-saved"), wanted ? `${saved} of ${wanted} saved` : `${saved} saved`);
     for (const [name, words] of Object.entries(FACTS)) setText(byId(`recording-${name}`), words(view));
     setData(byId("recording-dropped"), "tone", view.dropped > 0 ? "alarm" : null);
-    tell(byId("recording-trouble").firstElementChild, trouble);
+    setLongText(byId("recording-trouble").firstElementChild, trouble);
     show(byId("recording-trouble"), trouble !== "");
     this.#paintButtons();
   }
 
-  /** Nobody may take an episode for recorded that the program no longer speaks of. @param {any} view */
+  /** Whether the program sent no view for too long while it records: the episode may be lost. @param {any} view */
   #lost(view) {
     return view.phase === "recording" && this.#age > OLD;
   }
 
-  /** The sign in the header, in view wherever the panel is. @param {any} view */
+  /** Show the sign in the header, which is in view wherever the panel is. @param {any} view */
   #sign(view) {
     const records = view?.phase === "recording";
     show(byId("rec-lamp"), view !== null); // it keeps its place, so that nothing moves when it lights up

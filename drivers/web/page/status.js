@@ -1,32 +1,32 @@
-// What matters at once: what the arm does, the dead-man as the servo sees it, stops and faults.
+// What matters at once: the state of the arm and of the dead-man, stops and faults, the confirmation of STOP, the log.
 
-import { byId, setData, setText, show } from "./dom.js";
+import { byId, make, setData, setText, show } from "./dom.js";
 
 const SILENT = 0.12; // s, as in the servo
 const OLD = 500; // ms without a state until the page says so
-const STOPPING = 1000; // ms; a state that shows a stop comes after the word that STOP was pressed
+const STOPPING = 1000; // ms within which a state shows the stop after the message that STOP was pressed
 const MOVING = 0.005; // rad/s; slower joints are at rest
 
-/** Status of a robot -> its word. @type {Record<string, string>} */
+/** Status of a robot -> label. @type {Record<string, string>} */
 const WORDS = { idle: "idle", holding: "stopped", tripped: "stopped" };
-/** What holds a motion back -> its word. @type {Record<string, string>} */
+/** What limits a motion -> label. @type {Record<string, string>} */
 const LIMITS = { speed: "joint speed", "tcp speed": "tool speed" };
 
-/** Trip -> its words where a page is the pad. @type {Record<string, string>} */
+/** Trip -> text, where a page is the pad. @type {Record<string, string>} */
 const PAGE_TRIPS = {
   deadman_silent: "the page in control gave no sign of life",
   deadman_lost: "the page in control was disconnected",
 };
 
-/** The dead-man in one word. @param {any} deadman of a robot's state */
-export function deadmanWord(deadman) {
+/** Return the state of the dead-man in one word. @param {any} deadman of a robot's state */
+function deadmanWord(deadman) {
   if (!deadman) return "none";
   if (!deadman.connected) return "no pad";
   if (deadman.age > SILENT) return "silent";
   return deadman.held ? "held" : "released";
 }
 
-/** A text as a sentence. @param {string} text */
+/** Return a text with a capital letter. @param {string} text */
 const sentence = (text) => `${text[0].toUpperCase()}${text.slice(1)}`;
 
 /** @param {any} robot */
@@ -34,8 +34,9 @@ function isMoving(robot) {
   return robot.dq?.some((/** @type {number} */ speed) => Math.abs(speed) > MOVING) ?? false;
 }
 
+/** The lamps of the header, the banners, and the line beside the button to hold. */
 export class Status {
-  /** @param {import("./connection.js").Connection} connection @param {import("./lease.js").Lease} lease */
+  /** @param {import("./connection.js").Connection} connection @param {import("./control.js").Lease} lease */
   constructor(connection, lease) {
     this.lease = lease;
     this.waiting = /** @type {string[]} */ ([]);
@@ -44,20 +45,20 @@ export class Status {
     this.status = "unknown";
     this.moving = false;
     this.trip = "none";
-    /** What a person holds: "Space", "L2" or "the button". */
-    this.hold = () => "Space";
+    /** Name of what is held: "Space", "L2" or "the button". */
+    this.holdName = () => "Space";
     byId("recover").addEventListener("click", () => connection.send({ type: "recover", robot: this.faulty }));
   }
 
   #noticeTimer = 0;
-  /** Why the pad was lost last, and whether nobody intended that. */
+  /** Why the pad was lost last, and whether that was unintended. */
   #loss = { text: "", alarm: false };
-  /** Who pressed STOP last, and when; "" where that is unknown. */
+  /** Who pressed STOP last, and when; "" if unknown. */
   #stopped = "";
   #stoppedAt = -Infinity; // ms
 
-  /** The program said something. @param {any} said @param {Date} at */
-  told({ text, loss, stop }, at) {
+  /** Note a message of the program. @param {any} message @param {Date} at */
+  addMessage({ text, loss, stop }, at) {
     if (loss) this.#loss = { text, alarm: loss === "alarm" };
     if (!stop) return;
     this.#stopped = `${stop === this.lease.page ? "you" : stop}, ${at.toTimeString().slice(0, 8)}`;
@@ -71,7 +72,7 @@ export class Status {
   show(robots, name, silent) {
     const robot = robots[name];
     const fresh = robot !== undefined && !robot.lost && silent < OLD;
-    this.status = fresh ? robot.status : silent < OLD ? "lost" : "no news";
+    this.status = fresh ? robot.status : silent < OLD ? "lost" : "no data";
     this.moving = fresh && isMoving(robot);
     this.deadman = fresh ? deadmanWord(robot.deadman) : "unknown";
     setText(byId("deadman"), this.deadman);
@@ -93,13 +94,13 @@ export class Status {
     return this.status === "following" ? "on" : "calm";
   }
 
-  /** Was the pad lost by somebody's intention? Then nothing is wrong. */
+  /** Whether the pad was lost on purpose; then nothing is wrong. */
   get #calm() {
     return this.trip === "deadman_lost" && this.#loss.text !== "" && !this.#loss.alarm;
   }
 
   /**
-   * Faults and losses of every arm, stops of the one that is driven.
+   * Show faults and losses of every arm, and stops of the one that is driven.
    * @param {any} robots @param {string} name
    */
   #banners(robots, name) {
@@ -128,7 +129,7 @@ export class Status {
     show(byId("trip"), stopped !== undefined);
   }
 
-  /** Why an arm stands, in words. @param {any} robot */
+  /** Return why an arm is stopped. @param {any} robot */
   #why(robot) {
     if (robot.lost) return `No state of the arm: ${robot.lost}`;
     if (robot.trip === "stop") return `Stopped by STOP${this.#stopped && ` (${this.#stopped})`}`;
@@ -137,17 +138,17 @@ export class Status {
     return `Stopped: ${page || robot.trip_text || robot.trip}`;
   }
 
-  /** What to do after a trip. */
+  /** Return what to do after a trip. */
   #remedy() {
     if (!this.lease.mine) return "The page in control can continue.";
-    const again = this.deadman === "held" ? `release ${this.hold()}, then hold it again` : `hold ${this.hold()} to continue`;
+    const again = this.deadman === "held" ? `release ${this.holdName()}, then hold it again` : `hold ${this.holdName()} to continue`;
     if (this.trip === "device_lost") return `When the robot answers again, ${again}.`;
     return `${sentence(again)}.`;
   }
 
   /**
-   * The line beside the button to hold: what a person should do next.
-   * @param {boolean} present @param {boolean} held @param {boolean} pushed is something pushed that moves the arm?
+   * Show what to do next, beside the button to hold.
+   * @param {boolean} present @param {boolean} held @param {boolean} pushed whether something is pushed that moves the arm
    * @param {boolean} playing
    */
   advise(present, held, pushed, playing) {
@@ -159,10 +160,10 @@ export class Status {
 
   /** @param {boolean} present @param {boolean} held @param {boolean} pushed @param {boolean} playing */
   #advice(present, held, pushed, playing) {
-    const hold = this.hold();
+    const hold = this.holdName();
     if (!this.lease.mine) {
       const free = this.lease.rig?.drivable && this.lease.driver === null;
-      return free ? 'Press "Take control" to drive.' : `${this.lease.words}.`;
+      return free ? 'Press "Take control" to drive.' : `${this.lease.text}.`;
     }
     if (!present) return "Click this page to continue.";
     if (this.waiting.length) return `Release first: ${this.waiting.join(", ")}`;
@@ -176,7 +177,7 @@ export class Status {
     return this.moving ? "Moving" : "Ready";
   }
 
-  /** A short note. @param {string} text */
+  /** Show a short note for some seconds. @param {string} text */
   notice(text) {
     setText(byId("notice-text"), sentence(text));
     show(byId("notice"), true);
@@ -185,7 +186,126 @@ export class Status {
   }
 }
 
-/** Does a stop keep an arm where it is? A fault has a banner of its own. @param {any} robot */
+/** Whether a stop holds an arm. A fault has its own banner. @param {any} robot */
 function isTripped(robot) {
   return robot.trip !== undefined && robot.trip !== "none" && !robot.fault;
+}
+
+const PATIENCE = 500; // ms until a stop that no state confirms has failed
+const FLASH = 400; // ms that the button shows that it was pressed
+const STOPPED = ["idle", "tripped", "fault"]; // statuses in which nothing moves before something is pressed or cleared
+
+/** STOP: sent at once, and unconfirmed until the state of every arm shows it. */
+export class Stopping {
+  /** @param {import("./connection.js").Connection} connection @param {import("./status.js").Log} log */
+  constructor(connection, log) {
+    this.connection = connection;
+    this.log = log;
+    byId("alarm-close").addEventListener("click", () => this.#settle());
+  }
+
+  /** Time from which states may confirm the stop, s on the app's clock; null: none is open. @type {number | null} */
+  #asked = null;
+  #timer = 0;
+  /** What still moves or does not answer. */
+  #doubt = "";
+  /** The newest state's time, s on the app's clock, and when it came, ms. */
+  #t = -Infinity;
+  #cameAt = 0;
+
+  /** Stop every arm. */
+  stop() {
+    const sent = this.connection.send({ type: "stop" });
+    this.#asked ??= this.#t + (performance.now() - this.#cameAt) / 1000;
+    if (!sent) {
+      this.log.add("STOP could not be sent: not connected");
+      this.#alarm("STOP does not reach the arm", "There is no connection to the program.");
+      return;
+    }
+    this.log.add("STOP was sent");
+    setData(byId("stop"), "sent", "");
+    setTimeout(() => setData(byId("stop"), "sent", null), FLASH);
+    this.#doubt = "The program does not answer.";
+    this.#timer ||= setTimeout(() => this.#fail(), PATIENCE);
+  }
+
+  /** Check whether a state confirms the stop. @param {any} state */
+  addState(state) {
+    this.#t = state.t;
+    this.#cameAt = performance.now();
+    if (this.#asked === null || state.t < this.#asked) return;
+    this.#doubt = doubts(state.robots);
+    if (this.#doubt) return;
+    if (!byId("alarm").hidden) this.log.add("all arms have stopped");
+    this.#settle();
+  }
+
+  #fail() {
+    this.#timer = 0;
+    this.log.add(`STOP was not confirmed: ${this.#doubt}`);
+    this.#alarm("STOP was not confirmed", this.#doubt);
+  }
+
+  /** @param {string} title @param {string} text */
+  #alarm(title, text) {
+    setText(byId("alarm-title"), `${title}: use the robot's own stop`);
+    setText(byId("alarm-text"), text);
+    const { bottom } = byId("stop").parentElement.getBoundingClientRect();
+    byId("alarm").style.top = `${bottom + 8}px`; // never over the button
+    show(byId("alarm"), true);
+  }
+
+  #settle() {
+    clearTimeout(this.#timer);
+    this.#timer = 0;
+    this.#asked = null;
+    show(byId("alarm"), false);
+  }
+}
+
+/** Return which arms may still move; "" for none. @param {Record<string, any>} robots of a state */
+function doubts(robots) {
+  const words = Object.entries(robots).map(([name, robot]) => {
+    if (robot.lost) return `${name} does not answer.`;
+    return STOPPED.includes(robot.status) ? "" : `${name} is ${robot.status}.`;
+  });
+  return words.filter(Boolean).join(" ");
+}
+
+const MAX_LINES = 200;
+
+/** The messages of the program, with the time of day. */
+export class Log {
+  constructor() {
+    this.list = byId("log");
+    /** From the app's clock to the time of day, s; null while unknown. @type {number | null} */
+    this.shift = null;
+  }
+
+  /** Note that the app's clock is at `t` s now. @param {number} t */
+  synchronise(t) {
+    const shift = Date.now() / 1000 - t;
+    const jumped = this.shift === null || Math.abs(shift - this.shift) > 1;
+    if (jumped || shift < Number(this.shift)) this.shift = shift; // the fastest message is the most exact
+  }
+
+  /** Add a line. @param {string} text @param {number | null} [t] on the app's clock, s; null: now @returns {Date} its time */
+  add(text, t = null) {
+    const at = t === null || this.shift === null ? new Date() : new Date(1000 * (t + this.shift));
+    const line = make("li");
+    const time = make("time", "", at.toTimeString().slice(0, 8));
+    time.dateTime = at.toISOString();
+    line.append(time, make("span", "", text));
+    const atEnd = this.list.scrollHeight - this.list.scrollTop - this.list.clientHeight < 40;
+    this.list.append(line);
+    while (this.list.childElementCount > MAX_LINES) this.list.firstElementChild.remove();
+    if (atEnd) this.list.scrollTop = this.list.scrollHeight;
+    return at;
+  }
+
+  /** Clear the log for a new socket: the program sends its last lines again. */
+  clear() {
+    this.list.replaceChildren();
+    this.shift = null;
+  }
 }

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -11,6 +12,7 @@ from web_kit import TOKEN, WAIT, App, Page, run
 
 from hal.drivers.web.server import read_page_files
 from hal.errors import DriverMissing
+from hal.pads.keyboard import keyboard_table
 
 
 @pytest.fixture(scope="module")
@@ -120,8 +122,22 @@ def test_the_page_is_served(server: App) -> None:
                     assert await answer.read() == body
             async with session.get(server.url + "/") as answer:
                 assert await answer.read() == files["index.html"][0]
+            async with session.get(server.url + "/page/keys.js") as answer:
+                assert (await answer.text()).startswith('export const KEYS = {"hold": ["Space"], ')
 
     run(test)
+
+
+def test_the_page_names_the_keys_of_the_table() -> None:
+    """The buttons' shortcuts are static text in index.html; the keys themselves come from sensors/keyboard.yaml."""
+    page = read_page_files()["index.html"][0].decode()
+    found = dict(re.findall(r'data-button="(\w+)" aria-keyshortcuts="([^"]+)"', page))
+    wanted: dict[str, list[str]] = {}
+    for key, control in keyboard_table("browser").buttons.items():
+        wanted.setdefault(control, []).append(key.removeprefix("Key").removeprefix("Digit"))
+    assert {control: sorted(keys.split()) for control, keys in found.items()} == {
+        control: sorted(keys) for control, keys in wanted.items()
+    }
 
 
 def test_only_files_of_a_page_are_read(tmp_path: Path) -> None:

@@ -1,13 +1,91 @@
-// The panel of an arm: joints, tcp, gripper, how its servo keeps time, and how old all that is.
+// The panel of an arm: joints, tool, gripper, timing of its servo, and the age of all that.
 
-import { byId, choose, segments, setData, setText } from "./dom.js";
-import { Joints, signed } from "./joints.js";
-import { Plot } from "./plot.js";
+import { byId, choose, make, segments, setData, setText } from "./dom.js";
+import { Plot, shortened, signed } from "./plot.js";
+
+/** The bar of one joint: measured and target position between its limits. */
+class JointBar {
+  /** @param {string} name @param {number} lower @param {number} upper @param {() => void} clicked */
+  constructor(name, lower, upper, clicked) {
+    this.lower = lower;
+    this.span = upper - lower || 1;
+    this.element = make("li");
+    const button = make("button");
+    button.type = "button";
+    button.addEventListener("click", clicked);
+    this.measured = make("i", "measured");
+    this.target = make("i", "target");
+    this.value = make("span", "value");
+    const track = make("span", "track");
+    track.append(this.measured, this.target);
+    button.append(make("span", "name", name), track, this.value);
+    button.title = `${name}: ${lower.toFixed(3)} to ${upper.toFixed(3)} rad`;
+    this.element.append(button);
+    this.button = button;
+  }
+
+  /** @param {number} q @param {number} set */
+  show(q, set) {
+    this.#move(this.measured, q);
+    this.#move(this.target, set);
+    setText(this.value, signed(q, 3));
+    const share = (q - this.lower) / this.span;
+    setData(this.element, "near", share < 0.03 || share > 0.97 ? "" : null);
+  }
+
+  /** @param {HTMLElement} mark @param {number} value rad */
+  #move(mark, value) {
+    const share = Math.min(1, Math.max(0, (value - this.lower) / this.span));
+    const at = `translateX(${(100 * share).toFixed(1)}%)`;
+    if (mark.dataset.at === at) return;
+    mark.dataset.at = at;
+    mark.style.transform = at;
+  }
+}
+
+/** The bars of all joints. */
+class Joints {
+  /** @param {(joint: number | null) => void} chosen called with the joint to plot, null for all */
+  constructor(chosen) {
+    this.chosen = chosen;
+    /** @type {JointBar[]} */
+    this.rows = [];
+    /** @type {number | null} */
+    this.joint = null;
+  }
+
+  /** Lay out the bars of an arm. @param {any} robot of hello */
+  open(robot) {
+    this.rows = robot.joints.map((/** @type {string} */ name, /** @type {number} */ k) => {
+      return new JointBar(shortened(name, robot.joints), robot.lower[k], robot.upper[k], () => this.#choose(k));
+    });
+    this.rows.forEach((row, k) => (row.button.dataset.joint = String(k)));
+    byId("joints").replaceChildren(...this.rows.map((row) => row.element));
+    this.joint = null;
+    this.#mark();
+  }
+
+  /** @param {any} robot of a state */
+  show(robot) {
+    this.rows.forEach((row, k) => row.show(robot.q[k], robot.q_set[k]));
+  }
+
+  /** @param {number} joint */
+  #choose(joint) {
+    this.joint = this.joint === joint ? null : joint;
+    this.#mark();
+    this.chosen(this.joint);
+  }
+
+  #mark() {
+    this.rows.forEach((row, k) => row.button.setAttribute("aria-pressed", String(k === this.joint)));
+  }
+}
 
 const WINDOW = 2; // s over which the servo's rate is counted
 const OLD = 500; // ms
 
-/** Counts a host's ticks. */
+/** Measures the rate of a host's ticks. */
 class Rate {
   /** @type {[number, number][]} */ #seen = [];
 
@@ -22,7 +100,8 @@ class Rate {
   }
 }
 
-export class Facts {
+/** The whole panel. */
+export class ArmPanel {
   constructor() {
     this.plot = new Plot();
     this.joints = new Joints((joint) => this.plot.choose(joint));
@@ -33,7 +112,7 @@ export class Facts {
     this.rates = new Map();
     /** @type {Map<string, number | null>} */
     this.measured = new Map();
-    /** An arm was chosen by hand. @type {(name: string) => void} */
+    /** Called with the name of an arm that was clicked. @type {(name: string) => void} */
     this.picked = () => {};
   }
 
@@ -62,8 +141,8 @@ export class Facts {
     this.plot.open(robot.joints);
   }
 
-  /** Remember what the plot and the rates need, of every state. @param {any} state */
-  take(state) {
+  /** Add a state to the plot and to the rates. @param {any} state */
+  addState(state) {
     const robot = state.robots[this.name];
     if (robot && !robot.lost) this.plot.add(state.t, robot.q, robot.q_set);
     for (const [name, host] of Object.entries(state.hosts ?? {})) {
@@ -73,14 +152,14 @@ export class Facts {
     }
   }
 
-  /** How far the gripper is closed, 0..1, or null. @param {any} state */
+  /** Return how far the gripper is closed, 0..1, or null. @param {any} state */
   closed(state) {
     const gripper = state?.robots[this.name]?.gripper;
     if (!gripper || !this.#gripMax || typeof gripper.width !== "number") return null;
     return Math.min(1, Math.max(0, 1 - gripper.width / this.#gripMax));
   }
 
-  /** Ten times a second. @param {any} state @param {number} silent ms since it came */
+  /** Show a state; ten times a second. @param {any} state @param {number} silent ms since it came */
   paint(state, silent) {
     const robot = state.robots[this.name];
     const there = robot && !robot.lost;
@@ -91,7 +170,7 @@ export class Facts {
       setText(byId("tcp"), `x ${signed(x, 3)}  y ${signed(y, 3)}  z ${signed(z, 3)} m`);
       const [roll, pitch, yaw] = angles(turn).map((angle) => signed(angle, 1));
       setText(byId("turned"), `${roll}  ${pitch}  ${yaw} °`);
-      setText(byId("width"), gripperWords(robot.gripper));
+      setText(byId("width"), gripperText(robot.gripper));
     }
     const known = there && Number.isFinite(silent);
     setText(byId("age"), known ? `${Math.round(1000 * robot.age + silent)} ms old` : (robot?.lost ?? "none"));
@@ -112,8 +191,8 @@ export class Facts {
   }
 }
 
-/** Roll, pitch and yaw in degrees. @param {number[]} quaternion x, y, z, w */
-export function angles([x, y, z, w]) {
+/** Return roll, pitch and yaw in degrees. @param {number[]} quaternion x, y, z, w */
+function angles([x, y, z, w]) {
   const roll = Math.atan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y));
   const pitch = Math.asin(Math.min(1, Math.max(-1, 2 * (w * y - z * x))));
   const yaw = Math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z));
@@ -121,7 +200,7 @@ export function angles([x, y, z, w]) {
 }
 
 /** @param {any} gripper of a robot's state */
-function gripperWords(gripper) {
+function gripperText(gripper) {
   if (!gripper) return "none";
   const mm = (/** @type {number} */ width) => (1000 * width).toFixed(1);
   const target = Math.abs(gripper.width - gripper.width_target) > 5e-4 ? ` (target ${mm(gripper.width_target)})` : "";
