@@ -1,4 +1,4 @@
-"""A gamepad replayed from a recording."""
+"""A gamepad that plays a recording."""
 
 from __future__ import annotations
 

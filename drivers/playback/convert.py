@@ -1,9 +1,9 @@
-"""Turn an evemu recording (``.events``) of a pad into a file for playback.
+"""Convert an evemu recording (``.events``) of a pad to a file for playback.
 
     python -m hal.drivers.playback.convert ds4.events --ioctl ds4.ioctl --model dualshock4 --output ds4.jsonl
 
-The axes' ranges come from ``A:`` lines, where the recording has its device's description, or from umockdev's
-``.ioctl`` file, where ``umockdev-record`` made it.
+The ranges of the axes come from the ``A:`` lines of a recording that has the description of its device, or from the
+``.ioctl`` file that ``umockdev-record`` writes.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from hal.errors import ConfigError, HalError, Problem
 from hal.pads.codes import ABS_NAME, EV_ABS, EV_KEY, KEY_NAME
 from hal.pads.mapper import AxisRange
 
-from .recording import RecordedEvent, Recording, dump
+from .pad import PadRecording, RecordedEvent, dump_recording
 
 __all__ = ["convert", "main"]
 
@@ -28,10 +28,17 @@ _RANGE = re.compile(r"A: ([0-9a-fA-F]{2}) (-?\d+) (-?\d+) (-?\d+) (-?\d+)")
 _IOCTL = re.compile(r"EVIOCGABS(?:\((\d+)\))? 0 ([0-9a-fA-F]{48})")
 
 
-def convert(events: Path, ioctl: Path | None = None, *, model: str, about: str = "") -> Recording:
-    """Read a recording of evemu. Events that no pad model can mean (SYN, MSC) are left out.
+def convert(events: Path, ioctl: Path | None = None, *, model: str, about: str = "") -> PadRecording:
+    """Read a recording of evemu, without the events that no pad model uses (SYN, MSC).
 
-    Raises ConfigError for lines that are no events, and where nothing says what the axes' numbers mean.
+    Args:
+        events: The ``.events`` file.
+        ioctl: The ``.ioctl`` file of the same device; None where ``events`` has ``A:`` lines.
+        model: Name of the pad's model.
+        about: Where the recording comes from.
+
+    Raises:
+        ConfigError: A line is not an event, or the range of an axis is missing.
     """
     found: list[tuple[float, int, int, int]] = []
     ranges: dict[int, AxisRange] = {}
@@ -42,7 +49,7 @@ def convert(events: Path, ioctl: Path | None = None, *, model: str, about: str =
             if match:
                 found.append((float(match[1]), int(match[2], 16), int(match[3], 16), int(match[4])))
             else:
-                problems.append(Problem(str(events), f"line {number}", f"is no event: {line}"))
+                problems.append(Problem(str(events), f"line {number}", f"is not an event: {line}"))
         elif match := _RANGE.match(line):
             ranges[int(match[1], 16)] = AxisRange(int(match[2]), int(match[3]), int(match[5]))
     if ioctl is not None:
@@ -53,14 +60,14 @@ def convert(events: Path, ioctl: Path | None = None, *, model: str, about: str =
         if (kind == EV_KEY and code in KEY_NAME) or (kind == EV_ABS and code in ABS_NAME)
     ]
     for code in sorted({code for _, kind, code, _ in wanted if kind == EV_ABS} - set(ranges)):
-        problems.append(Problem(str(events), ABS_NAME[code], "nothing says its range; name the .ioctl file too"))
+        problems.append(Problem(str(events), ABS_NAME[code], "has no range; name the .ioctl file too"))
     if not wanted and not problems:
-        problems.append(Problem(str(events), "", "holds no event of a pad"))
+        problems.append(Problem(str(events), "", "has no event of a pad"))
     if problems:
         raise ConfigError(problems)
     start = wanted[0][0]
     known = {code: span for code, span in ranges.items() if code in ABS_NAME}
-    return Recording(model, known, tuple(RecordedEvent(t - start, *rest) for t, *rest in wanted), about)
+    return PadRecording(model, known, tuple(RecordedEvent(t - start, *rest) for t, *rest in wanted), about)
 
 
 def _lines(path: Path) -> list[str]:
@@ -71,7 +78,7 @@ def _lines(path: Path) -> list[str]:
 
 
 def _ioctl_ranges(lines: Iterable[str]) -> dict[int, AxisRange]:
-    """Ranges from the answers to EVIOCGABS: struct input_absinfo of linux/input.h, six 32-bit numbers."""
+    """Return the ranges in answers to EVIOCGABS: struct input_absinfo of linux/input.h, six 32-bit numbers."""
     ranges = {}
     for line in lines:
         if match := _IOCTL.match(line):
@@ -81,7 +88,7 @@ def _ioctl_ranges(lines: Iterable[str]) -> dict[int, AxisRange]:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """The command line. Returns the exit status."""
+    """Run the command line; return the exit status."""
     parser = argparse.ArgumentParser(prog="hal.drivers.playback.convert", description="evemu -> playback")
     parser.add_argument("events", type=Path, help="the recording")
     parser.add_argument("--ioctl", type=Path, help="umockdev's .ioctl file of the same device")
@@ -90,7 +97,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--output", type=Path, help="file to write; standard output when left out")
     given = parser.parse_args(arguments)
     try:
-        text = dump(convert(given.events, given.ioctl, model=given.model, about=given.about))
+        text = dump_recording(convert(given.events, given.ioctl, model=given.model, about=given.about))
     except HalError as error:
         print(error, file=sys.stderr)
         return 2

@@ -1,71 +1,82 @@
-"""A pad that plays a recording on the time of what it drives, with faults on request."""
+"""A gamepad that plays a recording, and the file format of recordings.
+
+A recording is text with one JSON object per line, a header and then events::
+
+    {"format": "hal-pad-events", "version": 1, "model": "dualshock4", "ranges": {"ABS_X": [0, 255, 15]}}
+    {"t": 0.25, "type": "abs", "code": "ABS_X", "value": 140}
+    {"t": 0.30, "type": "key", "code": "BTN_SOUTH", "value": 1}
+
+``model`` is the name of a pad model, or a whole model for a pad that has none. ``ranges`` are the minimum, the maximum
+and, optionally, the flat of each axis, as the pad reported them. ``about`` (optional) tells where the recording comes
+from. Events are in the order of their times, in seconds from the start.
+"""
 
 from __future__ import annotations
 
+import json
 import math
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
-from typing import Annotated, Any, ClassVar, cast
+from typing import Annotated, Any, ClassVar, NamedTuple, cast
 
 from pydantic import BaseModel, ConfigDict, Field
 
 from hal.driver import GamepadDriver, PadReading
 from hal.errors import ConfigError, ConnectionLost, Problem
-from hal.pads.mapper import PadMapper
+from hal.pads.codes import ABS, ABS_NAME, EV_ABS, EV_KEY, KEY, KEY_NAME
+from hal.pads.mapper import AxisRange, PadMapper
 from hal.pads.model import PadModel, pad_model, validated
 from hal.specs import PadSpec
 
-from .recording import Recording, load
-
-__all__ = ["PlaybackPad"]
+__all__ = ["PadRecording", "PlaybackPad", "RecordedEvent", "check", "dump_recording", "load_recording"]
 
 Seconds = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
 
-_LOOK = 0.002
-"""Shortest time between two looks at a world that the recording waits for, s."""
+_WORLD_POLL = 0.002
+"""Shortest time between two polls while the recording waits for the simulated world, s."""
 
 
-class Options(BaseModel):
-    """What a rig may say under ``options:`` of a recorded pad. Times are seconds from the first poll."""
+class PlaybackOptions(BaseModel):
+    """Options of a recorded pad in a rig (``gamepads.<name>.options``). Times are in seconds from the first poll."""
 
     model_config = ConfigDict(extra="forbid")
 
     file: Path
-    """The recording; :mod:`.recording` describes the format."""
+    """The recording."""
     loop: bool = False
-    """Begin again at the end, with everything released in between."""
+    """Repeat the recording, with all controls released in between."""
     freeze_at: Seconds | None = None
-    """From then on the pad says nothing more and stays connected: what is held stays held, ``t_alive`` stops."""
+    """From then on the pad is silent but connected: controls stay as they are, and ``t_alive`` stops."""
     disconnect_at: Seconds | None = None
-    """Then it is unplugged,"""
+    """When the pad is unplugged."""
     reconnect_at: Seconds | None = None
-    """and then plugged in again, with whatever the recording holds at that time."""
+    """When it is plugged in again, with the controls as recorded for that time."""
 
 
 class PlaybackPad(GamepadDriver):
     """Plays ``options.file`` from the first poll on. After the end the pad is released, connected and alive.
 
-    ``source`` says how far the simulated world has come, s; None where that is what the clock shows. A world that
-    cannot keep up with the clock skips steps, and whoever looks at it presses a button for longer. So the recording
-    waits for it: what it does to an arm is the same, however busy the computer is.
+    ``source`` returns the time of the simulated world, s; None where that is the clock's. A world that is slower than
+    the clock would see a button pressed for a shorter time, so the recording waits for it: its effect on an arm is the
+    same, however busy the computer is.
 
-    Nobody holds a recording, so it never counts as the dead-man of a real arm.
+    A recording is never accepted as the dead-man of a real arm.
     """
 
     simulated: ClassVar[bool] = True
 
     def __init__(self, spec: PadSpec, source: object | None = None) -> None:
-        """Raises ConfigError for wrong options."""
+        """Check the options; raises ConfigError."""
         super().__init__(spec, source)
         self._world = cast("Callable[[], float] | None", source)
         self._lead = 0.0
-        """World's time less the clock's at the first poll, s."""
+        """World's time minus the clock's at the first poll, s."""
         self._behind = 0.0
-        """By how much the world fell behind the clock since then, s."""
-        self._options = validated(Options, spec.options, f"gamepads.{spec.name}")
-        self._recording = Recording("", {}, ())
+        """How far the world has fallen behind the clock since then, s."""
+        self._options = validated(PlaybackOptions, spec.options, f"gamepads.{spec.name}")
+        self._recording = PadRecording("", {}, ())
         self._mapper: PadMapper | None = None
         self._t0: float | None = None
         self._next = 0
@@ -75,16 +86,16 @@ class PlaybackPad(GamepadDriver):
         self._last: PadReading | None = None
 
     def open(self) -> None:
-        """Raises ConfigError, which lists every bad line of the file."""
-        self._recording = load(self._options.file)
-        self._mapper = PadMapper(self._model(), self._recording.ranges)
+        """Read the recording. Raises ConfigError, which lists every bad line."""
+        self._recording = load_recording(self._options.file)
+        self._mapper = PadMapper(self._find_model(), self._recording.ranges)
         self.flat = self._mapper.flat
         self._t0 = None
         self._next = self._round = 0
         self._behind = 0.0
-        self._begin()
+        self._mapper.release()
 
-    def _model(self) -> PadModel:
+    def _find_model(self) -> PadModel:
         file, wanted = str(self._options.file), self._recording.model
         if not isinstance(wanted, str):
             return pad_model(wanted, f"{file}, line 1: model")
@@ -93,21 +104,28 @@ class PlaybackPad(GamepadDriver):
             if data.get("name") == wanted:
                 return pad_model(data, f"model {wanted}")
         names = ", ".join(str(data.get("name")) for data in known)
-        raise ConfigError([Problem(file, "line 1", f"there is no pad model {wanted!r}; models: {names or 'none'}")])
+        message = f"unknown pad model {wanted!r}; models: {names or 'none'}"
+        raise ConfigError([Problem(file, "line 1", message, code="unknown_model")])
 
     def poll(self, now: float, timeout: float) -> PadReading:
-        if self._mapper is None:
-            raise ConnectionLost(f"the recording {self._options.file.name} is not open")
+        """See :meth:`GamepadDriver.poll`."""
+        mapper = self._mapper
+        if mapper is None:
+            raise ConnectionLost(f"the recording {self._options.file.name} is not open", code="not_open")
         if self._t0 is None:
             self._t0 = self._t_event = now
             self._lead = self._world() - now if self._world is not None else 0.0
         played = self._played_by(now)
         if timeout > 0.0:
-            now += self._wait(timeout if self._frozen(played) else min(timeout, self._rest(played)))
+            begun = time.monotonic()
+            wait = timeout if self._frozen(played) else min(timeout, self._time_to_next(played))
+            if wait > 0.0:
+                time.sleep(wait)
+            now += time.monotonic() - begun
             played = self._played_by(now)
         if self._frozen(played) and self._last is not None:
             return self._last
-        self._play(played)
+        self._feed_due_events(mapper, played)
         connected = self._connected(played)
         last_alive = self._last.t_alive if self._last is not None else -math.inf
         self._last = PadReading(
@@ -115,86 +133,70 @@ class PlaybackPad(GamepadDriver):
             t_alive=now if connected else last_alive,
             t_device=self._t_device,
             seq=self._played,
-            axes=MappingProxyType(dict(self._mapper.axes if connected else dict.fromkeys(self._mapper.axes, 0.0))),
-            buttons=self._mapper.buttons if connected else frozenset(),
+            axes=MappingProxyType(dict(mapper.axes if connected else dict.fromkeys(mapper.axes, 0.0))),
+            buttons=mapper.buttons if connected else frozenset(),
             connected=connected,
         )
         return self._last
 
-    @staticmethod
-    def _wait(seconds: float) -> float:
-        """Sleep, and say how long it took, s."""
-        start = time.monotonic()
-        if seconds > 0.0:
-            time.sleep(seconds)
-        return time.monotonic() - start
-
     def _played_by(self, now: float) -> float:
-        """The time up to which the recording is due: on the rig's clock, less what the world fell behind, s."""
+        """Return the time up to which the recording is due: the clock's, less the delay of the world, s."""
         if self._world is not None:
             self._behind = max(self._behind, now + self._lead - self._world())
         return now - self._behind
 
-    def _rest(self, played: float) -> float:
-        """Time to the next event, s."""
-        rest = self._due() - played
-        return rest if self._world is None else max(rest, _LOOK)
+    def _time_to_next(self, played: float) -> float:
+        rest = self._next_due() - played
+        return rest if self._world is None else max(rest, _WORLD_POLL)
 
-    def _start(self) -> float:
-        """When the present round began, on the rig's clock as far as the world has kept up, s."""
-        assert self._t0 is not None
-        return self._t0 + self._round * self._recording.duration
-
-    def _due(self) -> float:
-        """When the next event is due, likewise, s."""
-        events = self._recording.events
-        return self._start() + events[self._next].t if self._next < len(events) else math.inf
-
-    def _play(self, now: float) -> None:
-        """Feed every event that is due."""
-        assert self._mapper is not None
+    def _next_due(self) -> float:
+        """Return when the next event is due, on the clock less the delay of the world, s."""
         assert self._t0 is not None
         events = self._recording.events
-        while (due := self._due()) <= now:
+        start = self._t0 + self._round * self._recording.duration
+        return start + events[self._next].t if self._next < len(events) else math.inf
+
+    def _feed_due_events(self, mapper: PadMapper, played: float) -> None:
+        assert self._t0 is not None
+        events = self._recording.events
+        while (due := self._next_due()) <= played:
             event = events[self._next]
-            self._mapper.feed(event.kind, event.code, event.value)
+            mapper.feed(event.kind, event.code, event.value)
             self._next += 1
             self._played += 1
             self._t_event, self._t_device = due + self._behind, due - self._t0
             if self._next == len(events):
-                self._begin()
+                mapper.release()
                 if self._options.loop and self._recording.duration > 0.0:
                     self._round += 1
                     self._next = 0
 
-    def _begin(self) -> None:
-        """Everything released, as at the start and after the end."""
-        assert self._mapper is not None
-        self._mapper.release()
-
-    def _frozen(self, now: float) -> bool:
+    def _frozen(self, played: float) -> bool:
         at = self._options.freeze_at
-        return at is not None and self._t0 is not None and now - self._t0 >= at
+        return at is not None and self._t0 is not None and played - self._t0 >= at
 
-    def _connected(self, now: float) -> bool:
+    def _connected(self, played: float) -> bool:
         off, on = self._options.disconnect_at, self._options.reconnect_at
-        if off is None or self._t0 is None or now - self._t0 < off:
+        if off is None or self._t0 is None or played - self._t0 < off:
             return True
-        return on is not None and now - self._t0 >= max(on, off)
+        return on is not None and played - self._t0 >= max(on, off)
 
     @property
     def finished(self) -> bool:
+        """Whether the recording has ended; never where it loops."""
         return self._mapper is not None and not self._options.loop and self._next >= len(self._recording.events)
 
     def describe(self) -> str:
-        return f"the recording {self._options.file.name}"
+        """See :meth:`GamepadDriver.describe`."""
+        return f"replaying {self._options.file.name}"
 
     def close(self) -> None:
+        """Close the recording. Idempotent."""
         self._mapper = None
 
 
 def check(spec: PadSpec) -> Iterator[tuple[str, str]]:
-    """Yield what is wrong with a recorded pad: (key in the pad's entry of the rig, sentence)."""
+    """Yield (key in the pad's entry of the rig, message) for each problem of a recorded pad."""
     try:
         PlaybackPad(spec).open()  # reads the recording; there is no device
     except ConfigError as error:
@@ -203,3 +205,152 @@ def check(spec: PadSpec) -> Iterator[tuple[str, str]]:
                 yield f"options.{problem.key}", problem.message
             else:
                 yield "file", ": ".join(filter(None, [problem.file, problem.key, problem.message]))
+
+
+# The file format.
+
+_FORMAT, _VERSION = "hal-pad-events", 1
+_EVENT_TYPES = {"abs": (EV_ABS, ABS), "key": (EV_KEY, KEY)}
+
+
+class RecordedEvent(NamedTuple):
+    """One event, in the kernel's numbers."""
+
+    t: float
+    """Seconds from the start."""
+    kind: int
+    code: int
+    value: int
+
+
+class PadRecording(NamedTuple):
+    """The content of a recording."""
+
+    model: str | Mapping[str, Any]
+    """Name of a pad model, or the model itself."""
+    ranges: Mapping[int, AxisRange]
+    """Axis code -> range that the pad reported."""
+    events: Sequence[RecordedEvent]
+    about: str = ""
+
+    @property
+    def duration(self) -> float:
+        """Time of the last event, s."""
+        return self.events[-1].t if self.events else 0.0
+
+
+def dump_recording(recording: PadRecording) -> str:
+    """Return the text of a recording's file."""
+    header: dict[str, Any] = {"format": _FORMAT, "version": _VERSION, "model": recording.model}
+    header["ranges"] = {ABS_NAME[code]: [*span] for code, span in recording.ranges.items()}
+    if recording.about:
+        header["about"] = recording.about
+    lines = [json.dumps(header)]
+    for event in recording.events:
+        kind, code = ("abs", ABS_NAME[event.code]) if event.kind == EV_ABS else ("key", KEY_NAME[event.code])
+        lines.append(json.dumps({"t": round(event.t, 6), "type": kind, "code": code, "value": event.value}))
+    return "\n".join(lines) + "\n"
+
+
+def load_recording(path: Path) -> PadRecording:
+    """Read a recording.
+
+    Raises:
+        ConfigError: The file cannot be read, or lines of it are wrong; lists every bad line with its number.
+    """
+    try:
+        text = path.read_text(encoding="utf-8")
+    except OSError as error:
+        raise ConfigError([Problem(str(path), "", f"cannot be read: {error.strerror}", code="unreadable")]) from None
+    except UnicodeDecodeError:
+        message = "is not a text file; a pad's recording is JSON lines"
+        raise ConfigError([Problem(str(path), "", message, code="unreadable")]) from None
+    parser = _RecordingParser(str(path))
+    recording = parser.parse(text.splitlines())
+    if parser.problems:
+        raise ConfigError(parser.problems)
+    return recording
+
+
+class _RecordingParser:
+    """Parses the lines of a file, and collects every problem instead of stopping at the first."""
+
+    def __init__(self, file: str) -> None:
+        self.file = file
+        self.problems: list[Problem] = []
+
+    def _add_problem(self, line: int, message: str) -> None:
+        self.problems.append(Problem(self.file, f"line {line}", message))
+
+    def parse(self, lines: Sequence[str]) -> PadRecording:
+        objects = [
+            (number, found)
+            for number, line in enumerate(lines, 1)
+            if line.strip() and (found := self._object(number, line)) is not None
+        ]
+        if not objects:
+            if not self.problems:
+                self._add_problem(1, "the file is empty; its first line is a header")
+            return PadRecording("", {}, ())
+        if objects[0][0] != 1 and any(problem.key == "line 1" for problem in self.problems):
+            return PadRecording("", {}, ())  # the header itself does not parse: what follows has no meaning
+        model, ranges, about = self._header(*objects[0])
+        return PadRecording(model, ranges, tuple(self._events(objects[1:], ranges)), about)
+
+    def _object(self, number: int, line: str) -> dict[str, Any] | None:
+        try:
+            found = json.loads(line)
+        except json.JSONDecodeError as error:
+            self._add_problem(number, f"is not JSON: {error.msg} at column {error.colno}")
+            return None
+        if not isinstance(found, dict):
+            self._add_problem(number, "must be an object in braces")
+            return None
+        return found
+
+    def _header(self, number: int, header: dict[str, Any]) -> tuple[str | dict[str, Any], dict[int, AxisRange], str]:
+        if header.get("format") != _FORMAT:
+            self._add_problem(number, f'the first line must be a header with "format": "{_FORMAT}"')
+        elif header.get("version") != _VERSION:
+            self._add_problem(number, f"unknown version {header.get('version')!r}; the present one is {_VERSION}")
+        model = header.get("model")
+        if not isinstance(model, (str, dict)):
+            self._add_problem(number, '"model" must be the name of a pad model, or a model')
+            model = ""
+        ranges: dict[int, AxisRange] = {}
+        given = header.get("ranges")
+        for name, span in given.items() if isinstance(given, dict) else ():
+            whole = isinstance(span, list) and len(span) in (2, 3) and all(type(item) is int for item in span)
+            if name not in ABS:
+                self._add_problem(number, f"ranges: {name!r} is not an event code of an axis")
+            elif not whole or span[0] >= span[1]:
+                self._add_problem(number, f"ranges: {name} must be [minimum, maximum] or [minimum, maximum, flat]")
+            else:
+                ranges[ABS[name]] = AxisRange(*span)
+        if not isinstance(given, dict):
+            self._add_problem(number, '"ranges" must give the range of each axis: {"ABS_X": [0, 255], ...}')
+        return model, ranges, str(header.get("about", ""))
+
+    def _events(
+        self, objects: Iterable[tuple[int, dict[str, Any]]], ranges: Mapping[int, AxisRange]
+    ) -> Iterator[RecordedEvent]:
+        latest = 0.0
+        for number, found in objects:
+            t, value = found.get("t"), found.get("value")
+            kind, name = str(found.get("type")), str(found.get("code"))
+            if not isinstance(t, (int, float)) or isinstance(t, bool) or not math.isfinite(t) or t < 0.0:
+                self._add_problem(number, f'"t" must be seconds from the start, not {t!r}')
+            elif kind not in _EVENT_TYPES:
+                self._add_problem(number, f'"type" must be "abs" or "key", not {kind!r}')
+            elif name not in _EVENT_TYPES[kind][1]:
+                self._add_problem(number, f'"code" {name!r} is not an event code of type {kind}')
+            elif type(value) is not int:
+                self._add_problem(number, f'"value" must be a whole number, not {value!r}')
+            elif t < latest:
+                self._add_problem(number, f"goes back in time, from {latest:g} s to {t:g} s")
+            elif kind == "abs" and ranges and ABS[name] not in ranges:
+                self._add_problem(number, f"{name} has no range in the header")
+            else:
+                latest = t
+                event_type, codes = _EVENT_TYPES[kind]
+                yield RecordedEvent(float(t), event_type, codes[name], value)

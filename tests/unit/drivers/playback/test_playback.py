@@ -1,4 +1,4 @@
-"""The recorded pad: the file's format, its clock, its faults, and the conversion of evemu recordings."""
+"""The recorded pad: file format, clock, faults, and the conversion of evemu recordings."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import yaml
 
+from hal.config.files import Problems
+from hal.config.models import load_pad_models
 from hal.driver import PadReading
 from hal.drivers.playback import convert as converter
-from hal.drivers.playback.pad import PlaybackPad
-from hal.drivers.playback.recording import dump, load
+from hal.drivers.playback.pad import PlaybackPad, dump_recording, load_recording
 from hal.errors import ConfigError, NotSupported
 from hal.gamepad import Gamepad
 from hal.specs import PadSpec
@@ -22,9 +22,7 @@ from hal.specs import PadSpec
 ROOT = Path(__file__).parents[4]
 PADS = ROOT / "tests" / "data" / "pads"
 TOUR = PADS / "tour.jsonl"
-MODELS = tuple(
-    yaml.safe_load(path.read_text(encoding="utf-8")) for path in sorted((ROOT / "sensors" / "gamepads").glob("*.yaml"))
-)
+MODELS = tuple(load_pad_models(Problems()).values())
 HEADER: dict[str, Any] = {
     "format": "hal-pad-events",
     "version": 1,
@@ -37,7 +35,7 @@ Write = Callable[..., Path]
 
 @pytest.fixture
 def write(tmp_path: Path) -> Write:
-    """A recording of (t, code, value)."""
+    """Return a function that writes a recording of (t, code, value)."""
 
     def write(*events: tuple[float, str, int], **header: object) -> Path:
         lines = [json.dumps({**HEADER, **header})]
@@ -57,7 +55,7 @@ def player(path: Path, **options: object) -> PlaybackPad:
     return pad
 
 
-def test_events_come_when_they_are_due_on_the_rigs_clock(write: Write) -> None:
+def test_events_are_played_on_the_clock_of_the_rig(write: Write) -> None:
     pad = player(write((0.0, "ABS_X", 255), (0.5, "BTN_SOUTH", 1), (1.0, "BTN_SOUTH", 0), (1.5, "ABS_X", 128)))
     first = pad.poll(100.0, 0.0)
     assert (first.axes["left_x"], first.buttons, first.t) == (1.0, frozenset(), 100.0)
@@ -68,7 +66,7 @@ def test_events_come_when_they_are_due_on_the_rigs_clock(write: Write) -> None:
     assert pad.poll(101.0, 0.0).buttons == frozenset()
 
 
-def test_it_waits_for_a_simulated_world_that_falls_behind_the_clock(write: Write) -> None:
+def test_recording_waits_for_a_slow_simulated_world(write: Write) -> None:
     path, came = write((0.0, "ABS_X", 128), (0.5, "BTN_SOUTH", 1), (1.0, "BTN_SOUTH", 0)), 7.0
     pad = PlaybackPad(PadSpec("pad", "playback", None, MODELS, options={"file": str(path)}), source=lambda: came)
     pad.open()
@@ -80,39 +78,39 @@ def test_it_waits_for_a_simulated_world_that_falls_behind_the_clock(write: Write
     came = 7.6
     pressed = pad.poll(105.3, 0.0)
     assert pressed.buttons == {"south"}
-    assert (pressed.t, pressed.t_device) == (pytest.approx(105.2), 0.5), "4.7 s of the clock were no time of the world"
+    assert (pressed.t, pressed.t_device) == (pytest.approx(105.2), 0.5), "the world is 4.7 s behind the clock"
     came = 7.9
     assert pad.poll(105.6, 0.0).buttons == {"south"}
     came = 8.1
     assert pad.poll(105.8, 0.0).buttons == frozenset()
 
 
-def test_after_the_end_the_pad_is_released_connected_and_alive(write: Write) -> None:
+def test_pad_is_released_connected_and_alive_after_the_end(write: Write) -> None:
     pad = player(write((0.0, "ABS_X", 255), (0.1, "BTN_SOUTH", 1)))
     assert pad.poll(0.0, 0.0).axes["left_x"] == 1.0
     end = pad.poll(5.0, 0.0)
     assert (end.axes["left_x"], end.buttons, end.connected, end.t_alive, end.seq) == (0.0, frozenset(), True, 5.0, 2)
 
 
-def test_a_loop_begins_again(write: Write) -> None:
+def test_loop_repeats(write: Write) -> None:
     pad = player(write((0.0, "BTN_SOUTH", 1), (0.4, "BTN_SOUTH", 0), (1.0, "ABS_X", 128)), loop=True)
     seen = [bool(pad.poll(k * 0.3, 0.0).buttons) for k in range(8)]  # 0, 0.3, 0.6, 0.9, 0.2, 0.5, 0.8, 0.1
     assert seen == [True, True, False, False, True, False, False, True]
 
 
-def test_a_loop_of_events_at_one_instant_ends(write: Write) -> None:
+def test_loop_of_zero_duration_ends(write: Write) -> None:
     pad = player(write((0.0, "BTN_SOUTH", 1)), loop=True)
     assert pad.poll(0.0, 0.0).seq == 1
 
 
-def test_waiting_ends_with_the_next_event(write: Write) -> None:
+def test_poll_returns_with_the_next_event(write: Write) -> None:
     pad = player(write((0.0, "ABS_X", 128), (0.01, "BTN_SOUTH", 1), (0.5, "BTN_SOUTH", 0)))
     pad.poll(0.0, 0.0)
     reading = pad.poll(0.0, 60.0)
     assert reading.buttons == {"south"}
 
 
-def test_a_frozen_pad_repeats_itself_and_gives_no_sign_of_life(write: Write) -> None:
+def test_frozen_pad_repeats_its_reading_without_proof_of_life(write: Write) -> None:
     pad = player(write((0.0, "ABS_X", 255), (2.0, "ABS_X", 128)), freeze_at=1.0)
     pad.poll(0.0, 0.0)
     before = pad.poll(0.99, 0.0)
@@ -121,7 +119,7 @@ def test_a_frozen_pad_repeats_itself_and_gives_no_sign_of_life(write: Write) -> 
     assert (before.connected, before.axes["left_x"], before.t_alive) == (True, 1.0, 0.99)
 
 
-def test_a_pad_is_unplugged_and_comes_back_with_what_is_held_by_then(write: Write) -> None:
+def test_pad_comes_back_with_the_controls_of_that_time(write: Write) -> None:
     events = ((0.0, "BTN_SOUTH", 1), (0.5, "ABS_X", 255), (9.0, "BTN_SOUTH", 0))
     pad = player(write(*events), disconnect_at=1.0, reconnect_at=2.0)
     pad.poll(0.0, 0.0)
@@ -132,19 +130,19 @@ def test_a_pad_is_unplugged_and_comes_back_with_what_is_held_by_then(write: Writ
     assert (back.connected, back.buttons, back.axes["left_x"], back.t_alive) == (True, {"south"}, 1.0, 2.0)
 
 
-def test_a_recording_is_no_dead_man_for_a_real_arm(write: Write) -> None:
+def test_recording_is_not_a_deadman_of_a_real_arm(write: Write) -> None:
     pad = Gamepad(player(write((0.0, "ABS_X", 128))))
-    with pytest.raises(NotSupported, match="nobody holds it"):
+    with pytest.raises(NotSupported):
         pad.hold("l2").check_trust()
 
 
-def test_it_may_bring_its_own_model(write: Write) -> None:
+def test_recording_may_contain_its_model(write: Write) -> None:
     model = {"name": "own", "title": "Own", "axes": {"ABS_X": "-right_y"}, "buttons": {}}
     pad = player(write((0.0, "ABS_X", 0), (1.0, "ABS_X", 0), model=model))
     assert pad.poll(0.0, 0.0).axes["right_y"] == 1.0
 
 
-def test_every_bad_line_is_reported_with_its_number(tmp_path: Path) -> None:
+def test_every_bad_line_is_a_problem_with_its_number(tmp_path: Path) -> None:
     path = tmp_path / "bad.jsonl"
     lines = [
         json.dumps({**HEADER, "version": 2, "ranges": {"ABS_X": [5, 5], "ABS_Q": [0, 1]}}),
@@ -161,41 +159,44 @@ def test_every_bad_line_is_reported_with_its_number(tmp_path: Path) -> None:
     ]
     path.write_text("\n".join(lines), encoding="utf-8")
     with pytest.raises(ConfigError) as caught:
-        load(path)
+        load_recording(path)
     keys = [problem.key for problem in caught.value.problems]
     assert sorted(keys) == sorted(["line 1"] * 3 + [f"line {number}" for number in (2, 3, 4, 5, 6, 7, 9, 11)])
     assert {problem.file for problem in caught.value.problems} == {str(path)}
 
 
 @pytest.mark.parametrize("text", ["", "\n\n", "hello", '{"format": "else"}', "\x00\xff"])
-def test_a_file_that_is_no_recording_is_refused(tmp_path: Path, text: str) -> None:
+def test_other_files_are_refused(tmp_path: Path, text: str) -> None:
     path = tmp_path / "bad.jsonl"
     path.write_text(text, encoding="latin-1")
-    with pytest.raises(ConfigError, match="bad.jsonl"):
-        load(path)
+    with pytest.raises(ConfigError) as caught:
+        load_recording(path)
+    assert {problem.file for problem in caught.value.problems} == {str(path)}
 
 
-def test_what_is_missing_or_unknown_is_named(write: Write, tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match="cannot be read"):
-        player(tmp_path / "nowhere.jsonl")
-    with pytest.raises(ConfigError, match="no pad model 'wheel'; models: .*dualsense, dualshock4"):
-        player(write(model="wheel"))
-    with pytest.raises(ConfigError, match="freez_at"):
-        player(write(), freez_at=1.0)
-    with pytest.raises(ConfigError, match="file"):
-        PlaybackPad(PadSpec("pad", "playback", None, MODELS))
+def test_missing_files_unknown_models_and_wrong_options_are_refused(write: Write, tmp_path: Path) -> None:
+    wrong: list[tuple[Callable[[], object], str, str]] = [
+        (lambda: player(tmp_path / "nowhere.jsonl"), "unreadable", ""),
+        (lambda: player(write(model="wheel")), "unknown_model", "line 1"),
+        (lambda: player(write(), freez_at=1.0), "invalid", "freez_at"),
+        (lambda: PlaybackPad(PadSpec("pad", "playback", None, MODELS)), "invalid", "file"),
+    ]
+    for make, code, key in wrong:
+        with pytest.raises(ConfigError) as caught:
+            make()
+        assert [(problem.code, problem.key) for problem in caught.value.problems] == [(code, key)]
 
 
 @pytest.mark.parametrize(("name", "model", "events"), [("ds4", "dualshock4", 38), ("dualsense", "dualsense", 34)])
-def test_an_evemu_recording_converts_and_reads_back(name: str, model: str, events: int) -> None:
+def test_evemu_recording_converts_and_reads_back(name: str, model: str, events: int) -> None:
     recording = converter.convert(PADS / f"{name}.events", PADS / f"{name}.ioctl", model=model)
     assert len(recording.events) == events
     assert recording.events[0].t == 0.0
-    stored = load(PADS / f"{name}.jsonl")
-    assert dump(recording._replace(about=stored.about)) == (PADS / f"{name}.jsonl").read_text()
+    stored = load_recording(PADS / f"{name}.jsonl")
+    assert dump_recording(recording._replace(about=stored.about)) == (PADS / f"{name}.jsonl").read_text()
 
 
-def test_evemus_own_description_gives_the_ranges_too(tmp_path: Path) -> None:
+def test_ranges_come_from_the_description_in_the_recording(tmp_path: Path) -> None:
     path = tmp_path / "own.events"
     path.write_text(
         "# EVEMU 1.3\nN: pad\nA: 00 -512 511 0 16 0\nE: 10.5 0003 0000 511\nE: 10.6 0000 0000 0\n", encoding="utf-8"
@@ -205,16 +206,16 @@ def test_evemus_own_description_gives_the_ranges_too(tmp_path: Path) -> None:
     assert len(recording.events) == 1
 
 
-def test_the_converters_mistakes_are_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_converter_reports_every_problem(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "bad.events"
     path.write_text("E: nonsense\nE: 1.0 0003 0000 1\n", encoding="utf-8")
     assert converter.main([str(path), "--model", "dualshock4"]) == 2
     printed = capsys.readouterr().err
     assert "line 1" in printed
-    assert "ABS_X: nothing says its range" in printed
+    assert "ABS_X" in printed
 
 
-def test_the_converter_writes_a_file_that_plays(tmp_path: Path) -> None:
+def test_converted_file_plays(tmp_path: Path) -> None:
     out = tmp_path / "out.jsonl"
     given = [
         str(PADS / "ds4.events"),
@@ -236,7 +237,7 @@ def test_the_converter_writes_a_file_that_plays(tmp_path: Path) -> None:
 # The tour.
 
 
-def test_the_tour_is_what_its_script_writes() -> None:
+def test_tour_is_the_output_of_its_script() -> None:
     script = runpy.run_path(str(PADS / "make_tour.py"))
     assert TOUR.read_text(encoding="utf-8") == "\n".join(script["lines"]()) + "\n"
 
@@ -247,8 +248,8 @@ def tour() -> list[tuple[float, PadReading]]:
     return [(k * 0.01, pad.poll(k * 0.01, 0.0)) for k in range(1400)]
 
 
-def test_the_tour_drives_far_enough_and_turns_the_wrist(tour: list[tuple[float, PadReading]]) -> None:
-    """With the default mapping, at 0.1 m/s and 0.3 rad/s, counted only while the dead-man is squeezed."""
+def test_tour_moves_and_turns_the_tool(tour: list[tuple[float, PadReading]]) -> None:
+    """With the default mapping, at 0.1 m/s and 0.3 rad/s, counted while the dead-man is held."""
     driven = turned = 0.0
     for _, reading in tour:
         if reading.axes["l2"] > 0.5:
@@ -259,7 +260,7 @@ def test_the_tour_drives_far_enough_and_turns_the_wrist(tour: list[tuple[float, 
     assert turned > 0.5
 
 
-def test_the_tour_lets_go_of_the_dead_man_in_mid_motion_closes_the_hand_and_ends_released(
+def test_tour_releases_the_deadman_while_moving_closes_the_gripper_and_ends_released(
     tour: list[tuple[float, PadReading]],
 ) -> None:
     pad = Gamepad(player(TOUR))
