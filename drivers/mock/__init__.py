@@ -1,6 +1,6 @@
-"""Devices that exist only in memory, with fault knobs: for the unit tests of people who write research code.
+"""Devices in memory with fault injection, for unit tests of research code.
 
-Everything is deterministic, and time is only what the caller says it is. See ``docs/unit-tests.md``.
+Everything is deterministic, and time is what the caller passes. See ``docs/unit-tests.md``.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ __all__ = ["DRIVER"]
 DRIVER = DriverSpec(
     name="mock",
     robot="hal.drivers.mock.robot:MockRobot",
-    gripper="hal.drivers.mock.gripper:MockGripper",
+    gripper="hal.drivers.mock.robot:MockGripper",
     camera="hal.drivers.mock.camera:MockCamera",
     gamepad="hal.drivers.mock.gamepad:MockPad",
 )

@@ -1,4 +1,4 @@
-"""A camera in memory, whose pictures say which frame they are."""
+"""A camera in memory whose pictures contain their own number and time."""
 
 from __future__ import annotations
 
@@ -15,43 +15,46 @@ from hal.errors import CommandError, ConnectionLost
 from hal.geometry import Pose
 from hal.specs import CameraSpec
 
-from .knobs import CameraKnobs, turned
+from .faults import CameraFaults, with_faults
 
-__all__ = ["PLANE", "SQUARE", "STEP", "MockCamera", "Written", "read_picture"]
+__all__ = ["PLANE", "SQUARE", "STEP", "MockCamera", "PictureStamp", "read_picture"]
 
 PLANE = 1.0
 """Distance of the background from the camera, m (or the camera's farthest depth, where that is nearer)."""
 SQUARE = 16
 """Edge of the square that moves over the picture, pixels; it is 0.1 m nearer than the background."""
 STEP = 4
-"""How far the square moves from frame to frame, pixels."""
-_HEAD = 12  # bytes of a picture that hold its number and its time
+"""Motion of the square from frame to frame, pixels."""
+_HEAD = 12  # bytes of a picture that contain its number and its time
 
 
-class Written(NamedTuple):
-    """What a mock picture says about itself."""
+class PictureStamp(NamedTuple):
+    """Number and time that are written into a mock picture."""
 
     seq: int
     t: float
     """s, to a microsecond."""
 
 
-def read_picture(color: NDArray[np.uint8]) -> Written:
-    """Which frame a mock picture is: its number and its time, written into its first four pixels.
+def read_picture(color: NDArray[np.uint8]) -> PictureStamp:
+    """Return the number and the time that are written into the first four pixels of a mock picture.
 
-    Lets a test prove that a picture went unharmed, and unmixed, through whatever handles it (no lossy compression).
+    With it a test proves that a picture was neither changed nor confused with another one (without lossy compression).
+
+    Args:
+        color: (H, W, 3) RGB picture of a :class:`MockCamera`.
     """
     head = np.ascontiguousarray(color).reshape(-1)[:_HEAD].tobytes()
-    return Written(int.from_bytes(head[:4], "little"), int.from_bytes(head[4:], "little", signed=True) / 1e6)
+    return PictureStamp(int.from_bytes(head[:4], "little"), int.from_bytes(head[4:], "little", signed=True) / 1e6)
 
 
 class MockCamera(CameraDriver):
-    """A camera in memory that looks at a plane, with a bright square moving to the right before it.
+    """A camera in memory that sees a plane, with a bright square in front of it that moves to the right.
 
     ``source`` is the rig's clock. In real time, frames come at the camera's rate, counted from ``open``. In lock-step
-    each ``grab`` is a new frame of the present time, at once; without a clock, one of a period later than the last.
-    The frame's number and time stand in the colour picture, see :func:`read_picture`. In the segmentation the square
-    is body 0. Faults: :class:`~hal.drivers.mock.knobs.CameraKnobs`.
+    each ``grab`` immediately returns a new frame of the present time; without a clock, one that is a period later than
+    the last. The colour picture contains the frame's number and time, see :func:`read_picture`. In the segmentation
+    the square is body 0. Faults: :class:`~hal.drivers.mock.faults.CameraFaults`.
     """
 
     simulated: ClassVar[bool] = True
@@ -60,18 +63,18 @@ class MockCamera(CameraDriver):
         super().__init__(spec, source)
         if spec.width * spec.height * 3 < _HEAD:
             raise CommandError(f"camera {spec.name!r}: a mock picture needs 4 pixels, not {spec.width}x{spec.height}")
-        self.knobs = CameraKnobs()
+        self.faults = CameraFaults()
         self.is_open = False
         self._clock = source if isinstance(source, Clock) else None
         self._waits = isinstance(source, RealClock)
         self._t_open = 0.0
-        self._last = 0  # number of the newest frame handed out
+        self._last = 0  # number of the newest delivered frame
         self._view = None
-        if spec.view is not None and spec.view.robot is None:  # an attached camera goes where its arm goes
+        if spec.view is not None and spec.view.robot is None:  # an attached camera moves with its arm
             self._view = Pose(spec.view.position, spec.view.orientation)
 
     def open(self) -> None:
-        self._answer()
+        self._expect_connected()
         if self.is_open:
             return
         self.is_open = True
@@ -83,41 +86,41 @@ class MockCamera(CameraDriver):
             raise ConnectionLost(f"camera {self.spec.name!r} is not open")
         deadline = time.monotonic() + (timeout if self._waits else 0.0)
         while True:
-            self._answer()
+            self._expect_connected()
             seq = self._newest()
             if seq > self._last:
-                return self._take(seq)
+                return self._capture(seq)
             rest = deadline - time.monotonic()
             if rest <= 0.0:
                 return None
             time.sleep(min(rest, 0.25 / self.spec.rate_hz))
 
     def _newest(self) -> int:
-        """Number of the newest frame that may be handed out; the first is 1."""
-        if self.knobs.freeze:
+        """Return the number of the newest frame that may be delivered; the first is 1."""
+        if self.faults.freeze:
             return self._last
         if self._clock is None or not self._waits:
             seq = self._last + 1
             if self._lost(seq):
                 seq += 1
         else:
-            age = self._clock.now() - self._t_open - self.knobs.delay_s
+            age = self._clock.now() - self._t_open - self.faults.delay_s
             seq = max(0, math.floor(age * self.spec.rate_hz + 1e-6) + 1)  # the 1e-6 absorbs the rounding of a period
         return self._last if self._lost(seq) else seq
 
     def _lost(self, seq: int) -> bool:
-        return self.knobs.drop > 0 and seq % self.knobs.drop == 0
+        return self.faults.drop > 0 and seq % self.faults.drop == 0
 
-    def _take(self, seq: int) -> RawFrame:
+    def _capture(self, seq: int) -> RawFrame:
         t = self._t_open + (seq - 1) / self.spec.rate_hz
         if self._clock is not None and not self._waits:
-            t = self._clock.now() - self.knobs.delay_s
+            t = self._clock.now() - self.faults.delay_s
         self._last = seq
         color, depth, infrared, segmentation = self._draw(seq, t)
         wanted = self.spec.streams
-        if self.knobs.garbage == "shape":
+        if self.faults.garbage == "shape":
             color, depth, infrared, segmentation = color[:-1], depth[:-1], infrared[:-1], segmentation[:-1]
-        elif self.knobs.garbage == "nan":
+        elif self.faults.garbage == "nan":
             depth = np.full_like(depth, np.nan)
         return RawFrame(
             t=t,
@@ -152,20 +155,25 @@ class MockCamera(CameraDriver):
         color.reshape(-1)[:_HEAD] = np.frombuffer(head, np.uint8)
         return color, depth, infrared, segmentation
 
-    def inject(self, **knobs: object) -> None:
-        """Turn knobs (:class:`~hal.drivers.mock.knobs.CameraKnobs`); those not named stay as they are.
+    def inject(self, **faults: object) -> None:
+        """Set faults; those that are not named stay as they are.
 
-        Raises CommandError for a knob that does not exist, or a value that it cannot have.
+        Args:
+            faults: Fields of :class:`~hal.drivers.mock.faults.CameraFaults` with their new values.
+
+        Raises:
+            CommandError: There is no such fault (code ``unknown_fault``), or it cannot have that value
+                (``bad_fault_value``); nothing changes.
         """
-        self.knobs = turned(self.knobs, knobs)
+        self.faults = with_faults(self.faults, faults)
 
     def clear(self) -> None:
-        """Turn every knob back to harmless."""
-        self.knobs = CameraKnobs()
+        """Remove every fault."""
+        self.faults = CameraFaults()
 
     def close(self) -> None:
         self.is_open = False
 
-    def _answer(self) -> None:
-        if self.knobs.disconnect:
-            raise ConnectionLost(f"camera {self.spec.name!r} does not answer (the mock's knob 'disconnect')")
+    def _expect_connected(self) -> None:
+        if self.faults.disconnect:
+            raise ConnectionLost(f"camera {self.spec.name!r} does not answer (the mock's fault 'disconnect')")

@@ -1,4 +1,4 @@
-"""A gamepad in memory, held by a test instead of a hand."""
+"""A gamepad in memory, operated by a test."""
 
 from __future__ import annotations
 
@@ -12,20 +12,20 @@ from hal.errors import CommandError
 from hal.specs import PadSpec
 from hal.types import AXES, BUTTONS
 
-from .knobs import PadKnobs, turned
+from .faults import PadFaults, with_faults
 
 __all__ = ["MockPad"]
 
 _TRIGGERS = ("l2", "r2")
-_TRIGGER_PRESSED = 0.1  # a trigger is also a button; it counts as pressed from this travel on
+_TRIGGER_PRESSED = 0.1  # travel from which on a trigger, which is also a button, counts as pressed
 
 
 class MockPad(GamepadDriver):
     """A pad whose sticks and buttons a test moves: ``press``, ``release``, ``stick``, ``set``.
 
-    A change becomes an event at the next ``poll``, with that poll's time. The triggers are axis and button in one, as
-    on a real pad: pressing ``l2`` pulls its axis to 1, and pulling its axis presses it. They may be moved from
-    another thread than that of ``poll``. Faults: :class:`~hal.drivers.mock.knobs.PadKnobs`.
+    A change becomes an event at the next ``poll``, with that poll's time. Triggers are axis and button in one, as on a
+    real pad: pressing ``l2`` moves its axis to 1, and moving its axis presses it. Any thread may move them. Faults:
+    :class:`~hal.drivers.mock.faults.PadFaults`.
     """
 
     simulated: ClassVar[bool] = True
@@ -33,12 +33,12 @@ class MockPad(GamepadDriver):
 
     def __init__(self, spec: PadSpec, source: object | None = None) -> None:
         super().__init__(spec, source)
-        self.knobs = PadKnobs()
+        self.faults = PadFaults()
         self.is_open = False
         self.meant_for: str | None = None
-        """The mapping that this pad asks for."""
+        """Value of :attr:`mapping`."""
         self.rumbles: list[tuple[float, float, float]] = []
-        """How its motors were turned: shares of the heavy and the light one, s."""
+        """Every call of ``rumble``: shares of the heavy and the light motor, and s."""
         self._axes = dict.fromkeys(AXES, 0.0)
         self._buttons: frozenset[str] = frozenset()
         self._lock = threading.Lock()
@@ -46,24 +46,30 @@ class MockPad(GamepadDriver):
         self._t_first: float | None = None
         self._reading: PadReading | None = None
 
-    # What the hand does.
+    # Operating it.
 
     def press(self, *buttons: str) -> None:
-        """Press buttons (of ``hal.types.BUTTONS``) and keep them pressed. CommandError for a name that no pad has."""
-        self._hold(buttons, True)
+        """Press buttons (of ``hal.types.BUTTONS``) and keep them pressed. Raises CommandError for another name."""
+        self._set_buttons(buttons, True)
 
     def release(self, *buttons: str) -> None:
-        """Let go of buttons. CommandError for a name that no pad has."""
-        self._hold(buttons, False)
+        """Release buttons. Raises CommandError for another name."""
+        self._set_buttons(buttons, False)
 
     def stick(self, axis: str, value: float) -> None:
-        """Move one axis (of ``hal.types.AXES``): -1..1, triggers 0..1. CommandError for anything else."""
+        """Move one axis (of ``hal.types.AXES``): -1..1, triggers 0..1. Raises CommandError for anything else."""
         self.set(axes={axis: value})
 
     def set(self, axes: Mapping[str, float] | None = None, buttons: Iterable[str] | None = None) -> None:
-        """Move the named axes, and press exactly these buttons; what is None stays as it is.
+        """Move the named axes, and press exactly the given buttons.
 
-        Raises CommandError for a name that no pad has or a value out of range; then nothing changes.
+        Args:
+            axes: Axis -> value; None leaves the axes as they are.
+            buttons: All pressed buttons; None leaves the buttons as they are.
+
+        Raises:
+            CommandError: Unknown name (code ``unknown_control``), or value out of range (``out_of_range``); nothing
+                changes.
         """
         wanted = None if buttons is None else frozenset(buttons)
         _check(axes or {}, wanted or frozenset())
@@ -78,14 +84,14 @@ class MockPad(GamepadDriver):
                     self._buttons = self._buttons | {name} if pressed else self._buttons - {name}
         self._news.set()
 
-    def _hold(self, buttons: tuple[str, ...], pressed: bool) -> None:
+    def _set_buttons(self, buttons: tuple[str, ...], pressed: bool) -> None:
         _check({}, buttons)
         with self._lock:
             self._buttons = self._buttons.union(buttons) if pressed else self._buttons.difference(buttons)
             self._axes.update({name: float(pressed) for name in _TRIGGERS if name in buttons})
         self._news.set()
 
-    # The driver.
+    # As a driver.
 
     def open(self) -> None:
         self.is_open = True
@@ -97,11 +103,11 @@ class MockPad(GamepadDriver):
         if self._t_first is None:
             self._t_first = now
         last = self._reading
-        if self.knobs.freeze and last is not None:
+        if self.faults.freeze and last is not None:
             return last
         with self._lock:
             axes, buttons = dict(self._axes), self._buttons
-        connected = self.is_open and not self.knobs.disconnect
+        connected = self.is_open and not self.faults.disconnect
         if not connected:
             axes, buttons = dict.fromkeys(AXES, 0.0), frozenset()
         changed = last is None or (last.axes, last.buttons, last.connected) != (axes, buttons, connected)
@@ -128,17 +134,22 @@ class MockPad(GamepadDriver):
     def describe(self) -> str:
         return "a mock pad"
 
-    def inject(self, **knobs: object) -> None:
-        """Turn knobs (:class:`~hal.drivers.mock.knobs.PadKnobs`); those not named stay as they are.
+    def inject(self, **faults: object) -> None:
+        """Set faults; those that are not named stay as they are.
 
-        Raises CommandError for a knob that does not exist, or a value that it cannot have.
+        Args:
+            faults: Fields of :class:`~hal.drivers.mock.faults.PadFaults` with their new values.
+
+        Raises:
+            CommandError: There is no such fault (code ``unknown_fault``), or it cannot have that value
+                (``bad_fault_value``); nothing changes.
         """
-        self.knobs = turned(self.knobs, knobs)
+        self.faults = with_faults(self.faults, faults)
         self._news.set()
 
     def clear(self) -> None:
-        """Turn every knob back to harmless: the pad is plugged in and speaks."""
-        self.knobs = PadKnobs()
+        """Remove every fault: the pad is plugged in and sends."""
+        self.faults = PadFaults()
         self._news.set()
 
     def close(self) -> None:
@@ -148,10 +159,10 @@ class MockPad(GamepadDriver):
 def _check(axes: Mapping[str, float], buttons: Iterable[str]) -> None:
     for name in buttons:
         if name not in BUTTONS:
-            raise CommandError(f"{name!r} is no button; buttons: {', '.join(BUTTONS)}")
+            raise CommandError(f"unknown button {name!r}; buttons: {', '.join(BUTTONS)}", code="unknown_control")
     for name, value in axes.items():
         if name not in AXES:
-            raise CommandError(f"{name!r} is no axis; axes: {', '.join(AXES)}")
+            raise CommandError(f"unknown axis {name!r}; axes: {', '.join(AXES)}", code="unknown_control")
         lowest = 0.0 if name in _TRIGGERS else -1.0
         if not lowest <= value <= 1.0:
-            raise CommandError(f"{name} goes from {lowest:g} to 1, not {value!r}")
+            raise CommandError(f"{name} is from {lowest:g} to 1, not {value!r}", code="out_of_range")

@@ -1,4 +1,8 @@
-"""An ideal arm: it is where the newest set-point says, unless a knob is turned. Torques drive it like seven wheels."""
+"""An ideal arm and gripper in memory.
+
+The arm is where the newest set-point is, and torques drive each of its joints like a wheel with friction. The gripper
+moves at its speed, and may have an object between its fingers.
+"""
 
 from __future__ import annotations
 
@@ -7,33 +11,33 @@ from collections import deque
 from collections.abc import Iterable, Sequence
 from typing import ClassVar
 
-from hal.driver import Reading, RobotDriver, Setpoint
+from hal.driver import GripperDriver, GripperReading, Reading, RobotDriver, Setpoint
 from hal.errors import CommandError, ConnectionLost
-from hal.specs import RobotSpec
-from hal.types import Fault
+from hal.specs import GripperSpec, RobotSpec
+from hal.types import Fault, GripperOutcome
 
-from .knobs import RobotKnobs, turned
+from .faults import GripperFaults, RobotFaults, with_faults
 
-__all__ = ["FRICTION", "INERTIA", "LOG_LENGTH", "MockRobot"]
+__all__ = ["FRICTION", "INERTIA", "KEEP_UP", "LOG_LENGTH", "MockGripper", "MockRobot"]
 
 LOG_LENGTH = 100_000
-"""How many set-points ``MockRobot.log`` keeps: 100 s of the fastest arm."""
+"""Number of set-points that ``MockRobot.log`` keeps: 100 s of the fastest arm."""
 INERTIA = 1.0
-"""Of every joint that is driven by torques, kg m2."""
+"""Inertia of every joint that is driven by torques, kg m2."""
 FRICTION = 1.0
-"""Of the same, Nm per rad/s."""
+"""Friction of the same, Nm per rad/s."""
 KEEP_UP = 0.020
-"""For how long the last torques are kept up without new ones, s: as long as a Franka does."""
+"""How long the last torques act without new ones, s: as on a Franka."""
 
 
 class MockRobot(RobotDriver):
     """An arm in memory. A set-point written after ``read(t)`` is where the arm is at the next ``read``.
 
-    Set-points with torques drive every joint by itself: a wheel of ``INERTIA`` with ``FRICTION``, and no weight.
-    Without new ones for ``KEEP_UP`` seconds it stands still.
+    Set-points with torques drive each joint separately: a wheel of ``INERTIA`` with ``FRICTION``, without gravity.
+    Without new ones for ``KEEP_UP`` seconds the arm stands still.
 
     Time is only the ``now`` of ``read``; the device's own clock starts with the first reading. Closing and opening
-    again keeps the position, as a real arm's joints do. Faults: :class:`~hal.drivers.mock.knobs.RobotKnobs`.
+    again keeps the position, as a real arm's joints do. Faults: :class:`~hal.drivers.mock.faults.RobotFaults`.
     """
 
     modes: ClassVar[frozenset[str]] = frozenset({"position", "torque"})
@@ -42,24 +46,24 @@ class MockRobot(RobotDriver):
 
     def __init__(self, spec: RobotSpec, world: object | None = None) -> None:
         super().__init__(spec, world)
-        self.knobs = RobotKnobs()
+        self.faults = RobotFaults()
         self.log: deque[Setpoint] = deque(maxlen=LOG_LENGTH)
-        """Every set-point written, oldest first, also those that a knob made the arm ignore."""
+        """Every set-point written, oldest first, also those that the arm ignored because of a fault."""
         self.is_open = False
         zeros = (0.0,) * len(spec.joints)
-        self._follows = Setpoint(spec.initial, zeros, zeros)  # where the arm is
-        self._commanded = self._follows  # what it took last
-        self._pending: deque[tuple[float, Setpoint]] = deque()  # what it took and does not follow yet, with its time
+        self._follows = Setpoint(spec.initial, zeros, zeros)  # present position
+        self._commanded = self._follows  # newest accepted set-point
+        self._pending: deque[tuple[float, Setpoint]] = deque()  # accepted, with the time from which on each is followed
         self._written = 0
         self._now = -math.inf
         self._t_driven = -math.inf
-        """When the torques came that drive it."""
+        """Time of the torques that drive the arm, s."""
         self._t_first: float | None = None
         self._reading: Reading | None = None
         self._seq = 0
 
     def open(self) -> None:
-        self._answer()
+        self._expect_connected()
         self.is_open = True
 
     def read(self, now: float) -> Reading:
@@ -68,14 +72,14 @@ class MockRobot(RobotDriver):
             self._t_first = now
         moved = self._follow(now, now - self._now)
         self._now = now
-        if self.knobs.freeze and self._reading is not None:
+        if self.faults.freeze and self._reading is not None:
             return self._reading
         self._seq += 1
         self._reading = self._report(now, now - self._t_first, moved)
         return self._reading
 
     def _follow(self, now: float, dt: float) -> bool:
-        """Go to the newest set-point that is due; False when there was none, so that it stands still."""
+        """Move to the newest set-point that is due; False when there was none, so that the arm stands still."""
         due = None
         while self._pending and self._pending[0][0] <= now:
             self._t_driven, due = self._pending.popleft()
@@ -92,25 +96,25 @@ class MockRobot(RobotDriver):
         return due is not None
 
     def _driven(self, tau: Sequence[float], dt: float) -> Setpoint:
-        """Where torques bring it in ``dt`` seconds, and how fast it is then."""
+        """Return position and velocity after torques acted for ``dt`` seconds."""
         dq = [(INERTIA * v + dt * x) / (INERTIA + dt * FRICTION) for v, x in zip(self._follows.dq, tau, strict=True)]
         q = [x + dt * v for x, v in zip(self._follows.q, dq, strict=True)]
         return Setpoint(q, dq, (0.0,) * len(q), tau)
 
     def mass_matrix(self, q: Sequence[float]) -> list[list[float]]:
-        """Joint-space inertia (n, n), kg m2."""
+        """Return the joint-space inertia (n, n), kg m2. See :meth:`RobotDriver.mass_matrix`."""
         return [[INERTIA * float(i == k) for k in range(len(q))] for i in range(len(q))]
 
     def _report(self, t: float, t_device: float, moved: bool) -> Reading:
-        knobs, n = self.knobs, len(self.spec.joints)
+        faults, n = self.faults, len(self.spec.joints)
         q = tuple(position + error for position, error in zip(self._follows.q, self._following_error(), strict=True))
-        # An arm that got no new set-point is at rest at the last one.
+        # Without a new set-point the arm is at rest at the last one.
         dq = tuple(self._follows.dq) if moved else (0.0,) * n
-        if knobs.garbage == "short":
+        if faults.garbage == "short":
             q, dq = q[:-1], dq[:-1]
-        elif knobs.garbage is not None:
-            q = (float(knobs.garbage), *q[1:])
-        fault = None if knobs.fault is None else Fault("mock", knobs.fault, "call recover() on the arm")
+        elif faults.garbage is not None:
+            q = (float(faults.garbage), *q[1:])
+        fault = None if faults.fault is None else Fault("mock", faults.fault, "call recover() on the arm")
         return Reading(
             t,
             t_device,
@@ -119,8 +123,8 @@ class MockRobot(RobotDriver):
             dq,
             q_commanded=self._commanded.q,
             dq_commanded=self._commanded.dq,
-            tau_ext=knobs.tau_ext,
-            wrench_ext=knobs.wrench_ext,
+            tau_ext=faults.tau_ext,
+            wrench_ext=faults.wrench_ext,
             fault=fault,
             tau_commanded=self._commanded.tau,
         )
@@ -129,18 +133,18 @@ class MockRobot(RobotDriver):
         self._expect_open()
         self.log.append(setpoint)
         self._written += 1
-        dropped = self.knobs.drop and self._written % self.knobs.drop == 0
-        if dropped or self.knobs.fault is not None:
+        dropped = self.faults.drop and self._written % self.faults.drop == 0
+        if dropped or self.faults.fault is not None:
             return
         self._commanded = setpoint
-        self._pending.append((self._now + self.knobs.delay_s, setpoint))
+        self._pending.append((self._now + self.faults.delay_s, setpoint))
 
     def halt(self) -> None:
         self._expect_open()
         self._hold()
 
     def _hold(self) -> None:
-        """Stay here, whatever was still to be followed."""
+        """Stop here, and drop the set-points that are not followed yet."""
         zeros = (0.0,) * len(self.spec.joints)
         self._pending.clear()
         self._follows = self._commanded = Setpoint(self._follows.q, zeros, zeros)
@@ -149,27 +153,34 @@ class MockRobot(RobotDriver):
         self._expect_open()
         self.inject(fault=None)
 
-    def inject(self, **knobs: object) -> None:
-        """Turn knobs (:class:`~hal.drivers.mock.knobs.RobotKnobs`); those not named stay as they are.
+    def inject(self, **faults: object) -> None:
+        """Set faults; those that are not named stay as they are.
 
-        Raises CommandError for a knob that does not exist, or a value that it cannot have.
+        Args:
+            faults: Fields of :class:`~hal.drivers.mock.faults.RobotFaults` with their new values.
+
+        Raises:
+            CommandError: There is no such fault (code ``unknown_fault``), or it cannot have that value
+                (``bad_fault_value``); nothing changes.
         """
         sizes = {"following_error": len(self.spec.joints), "tau_ext": len(self.spec.joints), "wrench_ext": 6}
-        for name, value in knobs.items():
+        for name, value in faults.items():
             if name in sizes and isinstance(value, Iterable):
-                knobs[name] = numbers = tuple(float(number) for number in value)
+                faults[name] = numbers = tuple(float(number) for number in value)
                 if len(numbers) != sizes[name]:
-                    raise CommandError(f"{name} must have {sizes[name]} numbers, not {len(numbers)}")
-        new = turned(self.knobs, knobs)
-        if "drop" in knobs:
+                    raise CommandError(
+                        f"{name} must have {sizes[name]} numbers, not {len(numbers)}", code="bad_fault_value"
+                    )
+        new = with_faults(self.faults, faults)
+        if "drop" in faults:
             self._written = 0
-        if (new.fault is not None and self.knobs.fault is None) or (new.disconnect and not self.knobs.disconnect):
+        if (new.fault is not None and self.faults.fault is None) or (new.disconnect and not self.faults.disconnect):
             self._hold()
-        self.knobs = new
+        self.faults = new
 
     def clear(self) -> None:
-        """Turn every knob back to harmless."""
-        self.knobs = RobotKnobs()
+        """Remove every fault."""
+        self.faults = RobotFaults()
 
     def close(self) -> None:
         if self.is_open:
@@ -177,14 +188,147 @@ class MockRobot(RobotDriver):
         self.is_open = False
 
     def _following_error(self) -> Sequence[float]:
-        error = self.knobs.following_error
+        error = self.faults.following_error
         return error if isinstance(error, Sequence) else (error,) * len(self.spec.joints)
 
-    def _answer(self) -> None:
-        if self.knobs.disconnect:
-            raise ConnectionLost(f"arm {self.spec.name!r} does not answer (the mock's knob 'disconnect')")
+    def _expect_connected(self) -> None:
+        if self.faults.disconnect:
+            raise ConnectionLost(f"arm {self.spec.name!r} does not answer (the mock's fault 'disconnect')")
 
     def _expect_open(self) -> None:
-        self._answer()
+        self._expect_connected()
         if not self.is_open:
             raise ConnectionLost(f"arm {self.spec.name!r} is not open")
+
+
+class MockGripper(GripperDriver):
+    """A gripper in memory, open at the start. Time is only the ``now`` of ``read``.
+
+    Widths and speeds are clamped to the gripper's range, as by a gripper's own controller. Faults, and an object to
+    hold: :class:`~hal.drivers.mock.faults.GripperFaults`.
+    """
+
+    simulated: ClassVar[bool] = True
+
+    def __init__(self, spec: GripperSpec, world: object | None = None) -> None:
+        super().__init__(spec, world)
+        self.faults = GripperFaults()
+        self.log: list[tuple[float, float, float]] = []
+        """Every ``move`` and ``grasp``: width in m, speed in m/s, force in N."""
+        self.homed = 0
+        """Number of calls of ``home``."""
+        self.is_open = False
+        self._width = self._target = self._aim = spec.width_max
+        self._speed = 0.0
+        self._force = 0.0
+        self._stopped = True
+        self._fault: Fault | None = None
+        self._t: float | None = None
+        self._t_first: float | None = None
+        self._reading: GripperReading | None = None
+        self._seq = 0
+
+    def open(self) -> None:
+        self._expect_connected()
+        self.is_open = True
+
+    def read(self, now: float) -> GripperReading:
+        self._expect_open()
+        if self._t is None or self._t_first is None:
+            self._t = self._t_first = now
+        self._advance(now - self._t)
+        self._t = now
+        if self.faults.freeze and self._reading is not None:
+            return self._reading
+        self._seq += 1
+        grasped = self._pressing()
+        self._reading = GripperReading(
+            t=now,
+            t_device=now - self._t_first,
+            seq=self._seq,
+            width=self._width if self.faults.garbage is None else float(self.faults.garbage),
+            width_target=self._target,
+            moving=not self._stopped and self._width != self._goal() and not self.faults.stuck,
+            grasped=grasped,
+            force=self._force if grasped else 0.0,
+            outcome=None if self._fault is None else GripperOutcome.FAILED,
+            fault=self._fault,
+        )
+        return self._reading
+
+    def _goal(self) -> float:
+        """Return the width at which the motion ends: the commanded one, or that of an object in between."""
+        block = self.faults.object_width
+        return max(self._aim, block) if block is not None and self._width >= block else self._aim
+
+    def _pressing(self) -> bool:
+        return self.faults.object_width is not None and self._aim < self.faults.object_width == self._width
+
+    def _advance(self, dt: float) -> None:
+        if self._stopped or self.faults.stuck:
+            return
+        rest = self._goal() - self._width
+        step = self._speed * dt
+        self._width = self._goal() if abs(rest) <= step else self._width + (step if rest > 0 else -step)
+
+    def move(self, width: float, speed: float, force: float) -> None:
+        self._expect_open()
+        self.log.append((width, speed, force))
+        width = min(max(width, 0.0), self.spec.width_max)
+        self._start(width, width, speed, force)
+
+    def grasp(self, width: float, speed: float, force: float, inner: float, outer: float) -> None:
+        """Close until an object, or the other finger, stops the fingers."""
+        self._expect_open()
+        self.log.append((width, speed, force))
+        self._start(min(max(width, 0.0), self.spec.width_max), 0.0, speed, force)
+
+    def home(self) -> None:
+        """Open completely."""
+        self._expect_open()
+        self.homed += 1
+        self._start(self.spec.width_max, self.spec.width_max, self.spec.speed, self.spec.force)
+
+    def _start(self, target: float, aim: float, speed: float, force: float) -> None:
+        failure = self.faults.fail
+        self._fault = None if failure is None else Fault("mock", failure, "set the fault 'fail' back to None")
+        if failure is not None:
+            self._stopped = True
+            return
+        self._target, self._aim = target, aim
+        self._speed = min(speed, self.spec.speed)
+        self._force = force
+        self._stopped = False
+
+    def stop(self) -> None:
+        self._expect_open()
+        self._stopped = True
+
+    def inject(self, **faults: object) -> None:
+        """Set faults; those that are not named stay as they are.
+
+        Args:
+            faults: Fields of :class:`~hal.drivers.mock.faults.GripperFaults` with their new values.
+
+        Raises:
+            CommandError: There is no such fault (code ``unknown_fault``), or it cannot have that value
+                (``bad_fault_value``); nothing changes.
+        """
+        self.faults = with_faults(self.faults, faults)
+
+    def clear(self) -> None:
+        """Remove every fault, and the object."""
+        self.faults = GripperFaults()
+
+    def close(self) -> None:
+        self._stopped = True
+        self.is_open = False
+
+    def _expect_connected(self) -> None:
+        if self.faults.disconnect:
+            raise ConnectionLost(f"gripper {self.spec.name!r} does not answer (the mock's fault 'disconnect')")
+
+    def _expect_open(self) -> None:
+        self._expect_connected()
+        if not self.is_open:
+            raise ConnectionLost(f"gripper {self.spec.name!r} is not open")

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from hal.drivers.mock.gripper import MockGripper
+from hal.drivers.mock.robot import MockGripper
 from hal.specs import BodySpec, WorldSpec
 from hal.testing import GripperBench, gripper_spec
 

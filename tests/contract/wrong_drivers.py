@@ -11,8 +11,7 @@ import pytest
 from hal.clock import RealClock
 from hal.drivers.mock.camera import MockCamera
 from hal.drivers.mock.gamepad import MockPad
-from hal.drivers.mock.gripper import MockGripper
-from hal.drivers.mock.robot import MockRobot
+from hal.drivers.mock.robot import MockGripper, MockRobot
 from hal.testing import (
     CameraBench,
     CameraContract,

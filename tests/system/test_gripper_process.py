@@ -20,7 +20,7 @@ pytestmark = pytest.mark.slow
 DRIVER = """
 import time
 
-from hal.drivers.mock.gripper import MockGripper
+from hal.drivers.mock.robot import MockGripper
 from hal.errors import ConnectionLost
 from hal.registry import DriverSpec
 

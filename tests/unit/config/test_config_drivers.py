@@ -18,7 +18,7 @@ from hal.specs import RobotSpec
 LAB = """
 from hal.registry import DriverSpec
 
-PLACES = {"robot": "hal.drivers.mock.robot:MockRobot", "gripper": "hal.drivers.mock.gripper:MockGripper"}
+PLACES = {"robot": "hal.drivers.mock.robot:MockRobot", "gripper": "hal.drivers.mock.robot:MockGripper"}
 DRIVER = DriverSpec(
     name="lab", **PLACES,
     checks={"robot": "lab_driver:check_arm", "gripper": "lab_driver:check_hand"}, emulated="lab_driver:emulated",

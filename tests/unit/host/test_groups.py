@@ -17,7 +17,7 @@ def apart(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
     monkeypatch.syspath_prepend(tmp_path)
     (tmp_path / "lab_apart.py").write_text(
         "from hal.registry import DriverSpec\n"
-        "MOCK = 'hal.drivers.mock.gripper:MockGripper'\n"
+        "MOCK = 'hal.drivers.mock.robot:MockGripper'\n"
         "HAND = DriverSpec('hand', gripper=MOCK, own_process=frozenset({'gripper'}))\n"
     )
     return ["robots.panda.gripper.drivers={sim: 'lab_apart:HAND'}"]

@@ -1,4 +1,4 @@
-"""The mock devices: ideal without a knob turned, and wrong in exactly the way that a knob says."""
+"""The mock devices: ideal without faults, and with a fault wrong exactly as it describes."""
 
 from __future__ import annotations
 
@@ -13,8 +13,7 @@ from hal.clock import LockStepClock, RealClock
 from hal.driver import Setpoint
 from hal.drivers.mock.camera import STEP, MockCamera, read_picture
 from hal.drivers.mock.gamepad import MockPad
-from hal.drivers.mock.gripper import MockGripper
-from hal.drivers.mock.robot import MockRobot
+from hal.drivers.mock.robot import MockGripper, MockRobot
 from hal.errors import CommandError, ConnectionLost
 from hal.specs import CameraSpec, GripperSpec, PadSpec, RobotSpec
 from hal.types import GripperOutcome
@@ -36,11 +35,11 @@ def arm(robot_spec: RobotSpec) -> MockRobot:
 
 
 @pytest.fixture
-def hand(gripper_spec: GripperSpec) -> MockGripper:
-    hand = MockGripper(gripper_spec)
-    hand.open()
-    hand.read(0.0)
-    return hand
+def gripper(gripper_spec: GripperSpec) -> MockGripper:
+    gripper = MockGripper(gripper_spec)
+    gripper.open()
+    gripper.read(0.0)
+    return gripper
 
 
 @pytest.fixture
@@ -71,7 +70,7 @@ def test_robot_is_where_the_last_set_point_was(arm: MockRobot) -> None:
     assert second.seq == first.seq + 1
     assert second.t_device == pytest.approx(0.01)
     third = arm.read(5.02)
-    assert (third.q, third.dq) == ((0.4,) * 3, ZERO), "an arm that gets no new set-point rests at the last one"
+    assert (third.q, third.dq) == ((0.4,) * 3, ZERO), "at rest without a new set-point"
 
 
 def test_robot_logs_every_set_point(arm: MockRobot) -> None:
@@ -91,7 +90,7 @@ def test_robot_delay(arm: MockRobot) -> None:
         arm.write(at(float(k + 1)))
     # Written after the reading at 0.00 s, due at 0.025 s: seen first at 0.03 s.
     assert qs == [0.1, 0.1, 0.1, 1.0, 2.0, 3.0]
-    assert arm.read(0.06).q_commanded == (6.0,) * 3, "what the arm took is not delayed"
+    assert arm.read(0.06).q_commanded == (6.0,) * 3, "the commanded position is not delayed"
 
 
 def test_robot_drop(arm: MockRobot) -> None:
@@ -110,7 +109,7 @@ def test_robot_freeze(arm: MockRobot) -> None:
     assert arm.read(0.01) is before
     arm.inject(freeze=False)
     after = arm.read(0.02)
-    assert after.q == (0.4,) * 3, "the arm went on while its readings stood still"
+    assert after.q == (0.4,) * 3, "the arm moved while its readings stood still"
     assert after.seq == before.seq + 1
 
 
@@ -134,7 +133,7 @@ def test_robot_disconnect(arm: MockRobot) -> None:
     arm.inject(disconnect=True)
     calls: list[Callable[[], object]] = [arm.open, lambda: arm.read(0.1), lambda: arm.write(at(1.0)), arm.halt]
     for call in calls:
-        with pytest.raises(ConnectionLost, match="'arm' does not answer"):
+        with pytest.raises(ConnectionLost):
             call()
     arm.close()
     arm.inject(disconnect=False)
@@ -161,15 +160,15 @@ def test_robot_fault(arm: MockRobot) -> None:
     reading = arm.read(0.02)
     assert reading.fault is not None
     assert reading.fault.cause == "joint 2 is too hot"
-    assert "recover" in reading.fault.remedy
-    assert reading.q == reading.q_commanded == (0.4,) * 3, "a faulted arm takes no set-points"
+    assert reading.fault.remedy
+    assert reading.q == reading.q_commanded == (0.4,) * 3, "a faulted arm ignores set-points"
     arm.recover()
     arm.write(at(0.5))
     reading = arm.read(0.03)
     assert (reading.fault, reading.q) == (None, (0.5,) * 3)
 
 
-def test_robot_reports_the_forces_it_is_told(arm: MockRobot) -> None:
+def test_robot_reports_injected_forces(arm: MockRobot) -> None:
     assert arm.read(0.0).tau_ext is None
     arm.inject(tau_ext=(1.0, 2.0, 3.0), wrench_ext=(0.0, 0.0, -5.0, 0.0, 0.0, 0.0))
     reading = arm.read(0.1)
@@ -186,150 +185,151 @@ def test_robot_halt_drops_what_was_still_due(arm: MockRobot) -> None:
     assert arm.read(1.1).q_commanded == HERE
 
 
-# Knobs.
+# Faults.
 
 
 @pytest.mark.parametrize(
-    ("knobs", "message"),
+    ("faults", "code"),
     [
-        ({"frezee": True}, "did you mean 'freeze'.*knobs: delay_s, drop"),
-        ({"freeze": 1}, "freeze must be True or False"),
-        ({"drop": -1}, "drop must be a count"),
-        ({"drop": 1.5}, "drop must be a count"),
-        ({"delay_s": -0.1}, "delay_s must be seconds"),
-        ({"garbage": "noise"}, "garbage must be one of nan, inf, short"),
-        ({"following_error": (0.1, 0.1)}, "following_error must have 3 numbers, not 2"),
-        ({"wrench_ext": (0.1, 0.1)}, "wrench_ext must have 6 numbers, not 2"),
+        ({"frezee": True}, "unknown_fault"),
+        ({"freeze": 1}, "bad_fault_value"),
+        ({"drop": -1}, "bad_fault_value"),
+        ({"drop": 1.5}, "bad_fault_value"),
+        ({"delay_s": -0.1}, "bad_fault_value"),
+        ({"garbage": "noise"}, "bad_fault_value"),
+        ({"following_error": (0.1, 0.1)}, "bad_fault_value"),
+        ({"wrench_ext": (0.1, 0.1)}, "bad_fault_value"),
     ],
 )
-def test_a_wrong_knob_is_refused_and_changes_nothing(arm: MockRobot, knobs: dict[str, object], message: str) -> None:
-    before = arm.knobs
-    with pytest.raises(CommandError, match=message):
-        arm.inject(delay_s=0.5, **knobs) if "delay_s" not in knobs else arm.inject(**knobs)
-    assert arm.knobs == before
+def test_wrong_fault_is_refused_and_changes_nothing(arm: MockRobot, faults: dict[str, object], code: str) -> None:
+    before = arm.faults
+    with pytest.raises(CommandError) as caught:
+        arm.inject(**{"delay_s": 0.5, **faults})
+    assert caught.value.code == code
+    assert arm.faults == before
 
 
-def test_knobs_that_are_not_named_stay(arm: MockRobot) -> None:
+def test_faults_that_are_not_named_stay(arm: MockRobot) -> None:
     arm.inject(drop=3)
     arm.inject(delay_s=0.1)
-    assert (arm.knobs.drop, arm.knobs.delay_s) == (3, 0.1)
+    assert (arm.faults.drop, arm.faults.delay_s) == (3, 0.1)
 
 
 # Gripper.
 
 
-def test_gripper_moves_at_its_speed(hand: MockGripper) -> None:
-    assert hand.read(0.0).width == 0.08
-    hand.move(0.02, 0.1, 10.0)
-    half_way = hand.read(0.3)
+def test_gripper_moves_at_its_speed(gripper: MockGripper) -> None:
+    assert gripper.read(0.0).width == 0.08
+    gripper.move(0.02, 0.1, 10.0)
+    half_way = gripper.read(0.3)
     assert (half_way.width, half_way.moving, half_way.width_target) == (pytest.approx(0.05), True, 0.02)
-    there = hand.read(0.7)
+    there = gripper.read(0.7)
     assert (there.width, there.moving, there.grasped) == (0.02, False, False)
-    hand.move(0.04, 0.1, 10.0)
-    assert hand.read(0.8).width == pytest.approx(0.03)
+    gripper.move(0.04, 0.1, 10.0)
+    assert gripper.read(0.8).width == pytest.approx(0.03)
 
 
-def test_gripper_brings_commands_into_its_range(hand: MockGripper) -> None:
-    hand.move(-1.0, 99.0, 10.0)
-    assert hand.read(0.1).width == pytest.approx(0.07), "no faster than its greatest speed"
-    assert hand.read(10.0).width == 0.0
-    hand.move(1.0, 0.1, 10.0)
-    assert hand.read(20.0).width == 0.08
+def test_gripper_clamps_commands(gripper: MockGripper) -> None:
+    gripper.move(-1.0, 99.0, 10.0)
+    assert gripper.read(0.1).width == pytest.approx(0.07), "at its greatest speed"
+    assert gripper.read(10.0).width == 0.0
+    gripper.move(1.0, 0.1, 10.0)
+    assert gripper.read(20.0).width == 0.08
 
 
-def test_gripper_the_newest_command_wins(hand: MockGripper) -> None:
-    hand.move(0.0, 0.1, 10.0)
-    hand.read(0.1)
-    hand.move(0.08, 0.1, 10.0)
-    assert hand.read(0.2).width == 0.08
+def test_gripper_follows_the_newest_command(gripper: MockGripper) -> None:
+    gripper.move(0.0, 0.1, 10.0)
+    gripper.read(0.1)
+    gripper.move(0.08, 0.1, 10.0)
+    assert gripper.read(0.2).width == 0.08
 
 
-def test_gripper_holds_an_object_and_keeps_it_through_stop_and_close(hand: MockGripper) -> None:
-    hand.inject(object_width=0.03)
-    hand.move(0.0, 0.1, 15.0)
-    assert hand.read(0.1).grasped is False
-    held = hand.read(1.0)
+def test_gripper_holds_an_object_and_keeps_it_through_stop_and_close(gripper: MockGripper) -> None:
+    gripper.inject(object_width=0.03)
+    gripper.move(0.0, 0.1, 15.0)
+    assert gripper.read(0.1).grasped is False
+    held = gripper.read(1.0)
     assert (held.width, held.moving, held.grasped, held.force) == (0.03, False, True, 15.0)
-    hand.stop()
-    assert hand.read(2.0).grasped is True
-    hand.close()
-    hand.open()
-    assert (hand.read(3.0).width, hand.read(3.1).grasped) == (0.03, True)
-    hand.move(0.08, 0.1, 15.0)
-    assert hand.read(4.0)[3:7] == (0.08, 0.08, False, False)
+    gripper.stop()
+    assert gripper.read(2.0).grasped is True
+    gripper.close()
+    gripper.open()
+    assert (gripper.read(3.0).width, gripper.read(3.1).grasped) == (0.03, True)
+    gripper.move(0.08, 0.1, 15.0)
+    assert gripper.read(4.0)[3:7] == (0.08, 0.08, False, False)
 
 
-def test_gripper_closes_on_when_the_object_slips_out(hand: MockGripper) -> None:
-    hand.inject(object_width=0.03)
-    hand.move(0.0, 0.1, 15.0)
-    assert hand.read(1.0).grasped is True
-    hand.inject(object_width=None)
-    assert hand.read(1.1).width == pytest.approx(0.02)
-    assert hand.read(1.1).grasped is False
+def test_gripper_closes_further_when_the_object_slips_out(gripper: MockGripper) -> None:
+    gripper.inject(object_width=0.03)
+    gripper.move(0.0, 0.1, 15.0)
+    assert gripper.read(1.0).grasped is True
+    gripper.inject(object_width=None)
+    assert gripper.read(1.1).width == pytest.approx(0.02)
+    assert gripper.read(1.1).grasped is False
 
 
-def test_gripper_stop_stays(hand: MockGripper) -> None:
-    hand.move(0.0, 0.1, 10.0)
-    hand.read(0.2)
-    hand.stop()
-    still = hand.read(9.0)
+def test_gripper_stop_stays(gripper: MockGripper) -> None:
+    gripper.move(0.0, 0.1, 10.0)
+    gripper.read(0.2)
+    gripper.stop()
+    still = gripper.read(9.0)
     assert (still.width, still.moving) == (pytest.approx(0.06), False)
 
 
-def test_gripper_grasps_what_is_there_and_closes_where_nothing_is(hand: MockGripper) -> None:
-    hand.grasp(0.03, 0.1, 15.0, 0.005, 0.005)
-    closed = hand.read(2.0)
+def test_gripper_grasps_an_object_or_closes_completely(gripper: MockGripper) -> None:
+    gripper.grasp(0.03, 0.1, 15.0, 0.005, 0.005)
+    closed = gripper.read(2.0)
     assert (closed.width, closed.width_target, closed.grasped) == (0.0, 0.03, False)
-    hand.move(0.08, 0.1, 15.0)
-    hand.read(4.0)
-    hand.inject(object_width=0.03)
-    hand.grasp(0.03, 0.1, 15.0, 0.005, 0.005)
-    held = hand.read(6.0)
+    gripper.move(0.08, 0.1, 15.0)
+    gripper.read(4.0)
+    gripper.inject(object_width=0.03)
+    gripper.grasp(0.03, 0.1, 15.0, 0.005, 0.005)
+    held = gripper.read(6.0)
     assert (held.width, held.grasped, held.force) == (0.03, True, 15.0)
-    assert hand.log[-1] == (0.03, 0.1, 15.0)
+    assert gripper.log[-1] == (0.03, 0.1, 15.0)
 
 
-def test_gripper_homing_opens_it(hand: MockGripper) -> None:
-    hand.move(0.02, 0.1, 15.0)
-    hand.read(2.0)
-    hand.home()
-    assert hand.read(2.1).moving
-    assert (hand.read(4.0).width, hand.homed) == (0.08, 1)
+def test_gripper_homing_opens(gripper: MockGripper) -> None:
+    gripper.move(0.02, 0.1, 15.0)
+    gripper.read(2.0)
+    gripper.home()
+    assert gripper.read(2.1).moving
+    assert (gripper.read(4.0).width, gripper.homed) == (0.08, 1)
 
 
-def test_gripper_that_fails_says_why_and_does_not_move(hand: MockGripper) -> None:
-    hand.inject(fail="it is too hot")
-    hand.move(0.02, 0.1, 15.0)
-    failed = hand.read(2.0)
+def test_failing_gripper_reports_its_fault_and_does_not_move(gripper: MockGripper) -> None:
+    gripper.inject(fail="it is too hot")
+    gripper.move(0.02, 0.1, 15.0)
+    failed = gripper.read(2.0)
     assert (failed.width, failed.moving, failed.outcome) == (0.08, False, GripperOutcome.FAILED)
     assert failed.fault is not None
     assert failed.fault.cause == "it is too hot"
-    hand.inject(fail=None)
-    hand.move(0.02, 0.1, 15.0)
-    assert (hand.read(4.0).width, hand.read(4.1).outcome) == (0.02, None)
+    gripper.inject(fail=None)
+    gripper.move(0.02, 0.1, 15.0)
+    assert (gripper.read(4.0).width, gripper.read(4.1).outcome) == (0.02, None)
 
 
-def test_gripper_knobs(hand: MockGripper) -> None:
-    hand.inject(stuck=True)
-    hand.move(0.0, 0.1, 10.0)
-    assert hand.read(1.0).width == 0.08
-    hand.inject(stuck=False, freeze=True)
-    frozen = hand.read(1.2)
-    assert frozen is hand.read(1.3)
-    hand.inject(freeze=False)
-    assert hand.read(1.4).width == pytest.approx(0.04)
-    hand.inject(garbage="nan")
-    assert math.isnan(hand.read(1.5).width)
-    hand.inject(disconnect=True)
+def test_gripper_faults(gripper: MockGripper) -> None:
+    gripper.inject(stuck=True)
+    gripper.move(0.0, 0.1, 10.0)
+    assert gripper.read(1.0).width == 0.08
+    gripper.inject(stuck=False, freeze=True)
+    frozen = gripper.read(1.2)
+    assert frozen is gripper.read(1.3)
+    gripper.inject(freeze=False)
+    assert gripper.read(1.4).width == pytest.approx(0.04)
+    gripper.inject(garbage="nan")
+    assert math.isnan(gripper.read(1.5).width)
+    gripper.inject(disconnect=True)
     with pytest.raises(ConnectionLost):
-        hand.move(0.0, 0.1, 10.0)
-    hand.close()
+        gripper.move(0.0, 0.1, 10.0)
+    gripper.close()
 
 
 # Camera.
 
 
-def test_camera_pictures_say_which_frame_they_are(camera: MockCamera) -> None:
+def test_camera_pictures_contain_their_number_and_time(camera: MockCamera) -> None:
     frames = [camera.grab(0.0) for _ in range(3)]
     for k, frame in enumerate(frames, start=1):
         assert frame is not None
@@ -358,7 +358,7 @@ def test_camera_streams_agree_and_the_square_moves(camera: MockCamera) -> None:
     assert lefts[1] == lefts[0] + STEP
 
 
-def test_camera_gives_only_the_streams_asked_for(camera_spec: CameraSpec) -> None:
+def test_camera_delivers_only_the_wanted_streams(camera_spec: CameraSpec) -> None:
     camera = MockCamera(replace(camera_spec, streams=("depth",)))
     camera.open()
     frame = camera.grab(0.0)
@@ -403,7 +403,7 @@ def test_camera_in_real_time_keeps_its_rate(camera_spec: CameraSpec) -> None:
     assert seen == list(range(1, 61))
 
 
-def test_camera_knobs(camera: MockCamera) -> None:
+def test_camera_faults(camera: MockCamera) -> None:
     camera.inject(drop=3)
     assert [camera.grab(0.0).seq for _ in range(4)] == [1, 2, 4, 5]  # type: ignore[union-attr]
     camera.inject(drop=0, freeze=True)
@@ -428,7 +428,7 @@ def test_camera_knobs(camera: MockCamera) -> None:
 # Pad.
 
 
-def test_pad_events_get_the_time_of_the_poll_that_sees_them(pad: MockPad) -> None:
+def test_pad_events_have_the_time_of_their_poll(pad: MockPad) -> None:
     rest = pad.poll(1.0, 0.0)
     assert (rest.connected, rest.buttons, rest.t, rest.t_alive) == (True, frozenset(), 0.0, 1.0)
     pad.press("south", "l1")
@@ -440,7 +440,7 @@ def test_pad_events_get_the_time_of_the_poll_that_sees_them(pad: MockPad) -> Non
     pad.release("l1")
     released = pad.poll(3.0, 0.0)
     assert (released.buttons, released.seq) == ({"south"}, rest.seq + 2)
-    assert pad.poll(4.0, 0.0)[:2] == (3.0, 4.0), "no news: the event keeps its time, the pad is still alive"
+    assert pad.poll(4.0, 0.0)[:2] == (3.0, 4.0), "the event keeps its time, the pad is alive"
 
 
 def test_pad_triggers_are_axis_and_button_in_one(pad: MockPad) -> None:
@@ -455,7 +455,7 @@ def test_pad_triggers_are_axis_and_button_in_one(pad: MockPad) -> None:
     assert (reading.buttons, reading.axes["left_y"], reading.axes["r2"]) == ({"east"}, 1.0, 0.0)
 
 
-def test_pad_freeze_keeps_what_was_pressed_and_shows_no_life(pad: MockPad) -> None:
+def test_frozen_pad_keeps_its_buttons_without_proof_of_life(pad: MockPad) -> None:
     pad.press("l2")
     pad.poll(1.0, 0.0)
     pad.inject(freeze=True)
@@ -487,7 +487,7 @@ def test_pad_disconnect_and_replug(pad: MockPad) -> None:
         lambda pad: pad.stick("left_x", float("nan")),
     ],
 )
-def test_pad_refuses_what_no_pad_can_do(pad: MockPad, move: Callable[[MockPad], None]) -> None:
+def test_pad_refuses_unknown_controls_and_values(pad: MockPad, move: Callable[[MockPad], None]) -> None:
     with pytest.raises(CommandError):
         move(pad)
     assert pad.poll(1.0, 0.0).buttons == frozenset()

@@ -1,4 +1,4 @@
-"""The mock arm as seven wheels: what torques make of it."""
+"""The mock arm driven by torques, as wheels with friction."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def drive(arm: MockRobot, tau: tuple[float, ...], ticks: int, start: int = 0) ->
         arm.write(Setpoint(reading.q, reading.dq, ZERO, tau))
 
 
-def test_a_torque_turns_a_wheel_with_friction(arm: MockRobot) -> None:
+def test_torque_turns_a_wheel_with_friction(arm: MockRobot) -> None:
     drive(arm, (2.0, 0.0, -1.0), 500)
     reading = arm.read(0.5)
     rate = FRICTION / INERTIA
@@ -40,13 +40,13 @@ def test_a_torque_turns_a_wheel_with_friction(arm: MockRobot) -> None:
     assert np.subtract(reading.q, HERE) == pytest.approx((way, 0.0, -0.5 * way), rel=5e-3)
 
 
-def test_the_first_step_is_that_of_its_inertia(arm: MockRobot) -> None:
+def test_first_step_is_that_of_the_inertia(arm: MockRobot) -> None:
     drive(arm, (2.0, 0.0, 0.0), 1)
     momentum = np.array(arm.mass_matrix(HERE)) @ arm.read(DT).dq
     assert momentum == pytest.approx((2.0 * DT, 0.0, 0.0), rel=2e-3)
 
 
-def test_torques_that_stop_coming_are_kept_up_for_a_while_and_then_it_stands(arm: MockRobot) -> None:
+def test_arm_stops_when_torques_stop_coming(arm: MockRobot) -> None:
     drive(arm, (2.0, 0.0, 0.0), 100)
     speeds = [arm.read((100 + k) * DT).dq[0] for k in range(60)]
     kept_up = round(KEEP_UP / DT)
@@ -56,7 +56,7 @@ def test_torques_that_stop_coming_are_kept_up_for_a_while_and_then_it_stands(arm
     assert arm.read(0.2).q == arm.read(0.3).q
 
 
-def test_a_torque_that_is_dropped_is_the_one_before(arm: MockRobot) -> None:
+def test_dropped_torque_repeats_the_one_before(arm: MockRobot) -> None:
     drive(arm, (2.0, 0.0, 0.0), 100)
     arm.inject(drop=1)
     drive(arm, (-50.0, 0.0, 0.0), 5, start=100)
@@ -64,7 +64,7 @@ def test_a_torque_that_is_dropped_is_the_one_before(arm: MockRobot) -> None:
 
 
 @pytest.mark.parametrize("how", ["halt", "fault", "position"])
-def test_what_ends_them_leaves_it_where_it_is(arm: MockRobot, how: str) -> None:
+def test_arm_stays_where_torques_end(arm: MockRobot, how: str) -> None:
     drive(arm, (2.0, 0.0, 0.0), 100)
     q = arm.read(0.1).q
     if how == "halt":

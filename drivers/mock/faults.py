@@ -1,0 +1,117 @@
+"""The faults that mock devices can have: one frozen record per kind of device; by default there are none."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+from difflib import get_close_matches
+from typing import TypeVar
+
+from hal.errors import CommandError
+
+__all__ = ["CameraFaults", "GripperFaults", "PadFaults", "RobotFaults", "with_faults"]
+
+
+@dataclass(frozen=True)
+class RobotFaults:
+    """Faults of :class:`~hal.drivers.mock.robot.MockRobot`."""
+
+    delay_s: float = 0.0
+    """Delay with which the arm follows each set-point, s. The commanded position that it reports is not delayed."""
+    drop: int = 0
+    """Every n-th set-point is lost: the arm keeps the one before, and reports that as ``q_commanded``. 0 for never."""
+    freeze: bool = False
+    """Readings repeat, with their stamps and number, while the arm still follows its set-points."""
+    following_error: float | Sequence[float] = 0.0
+    """Measured minus commanded position, rad: one number for all joints, or one for each."""
+    disconnect: bool = False
+    """Every call except ``close`` raises ConnectionLost, and the arm stops where it is."""
+    garbage: str | None = None
+    """Invalid readings: ``nan``, ``inf``, or ``short`` (one joint too few)."""
+    fault: str | None = None
+    """The arm reports a fault with this cause and ignores set-points, until ``recover()``."""
+    tau_ext: Sequence[float] | None = None
+    """External torques to report, Nm."""
+    wrench_ext: Sequence[float] | None = None
+    """External force and torque to report, N and Nm."""
+
+
+@dataclass(frozen=True)
+class GripperFaults:
+    """Faults of :class:`~hal.drivers.mock.robot.MockGripper`, and an object between its fingers."""
+
+    object_width: float | None = None
+    """Width of a rigid object between the fingers, m; closing fingers stop there. None for no object."""
+    freeze: bool = False
+    """Readings repeat while the fingers move on."""
+    stuck: bool = False
+    """The fingers do not move."""
+    fail: str | None = None
+    """Commands are accepted, move nothing, and end as ``FAILED`` with a fault of this cause."""
+    disconnect: bool = False
+    """Every call except ``close`` raises ConnectionLost."""
+    garbage: str | None = None
+    """An invalid width: ``nan`` or ``inf``."""
+
+
+@dataclass(frozen=True)
+class CameraFaults:
+    """Faults of :class:`~hal.drivers.mock.camera.MockCamera`."""
+
+    delay_s: float = 0.0
+    """Delay between a frame's capture and its delivery, s."""
+    drop: int = 0
+    """Every n-th frame is lost, which leaves a gap in the sequence numbers. 0 for never."""
+    freeze: bool = False
+    """No new frames, although the camera is connected."""
+    disconnect: bool = False
+    """Every call except ``close`` raises ConnectionLost."""
+    garbage: str | None = None
+    """Invalid pictures: ``shape`` (one row too few) or ``nan`` (depth of NaN only)."""
+
+
+@dataclass(frozen=True)
+class PadFaults:
+    """Faults of :class:`~hal.drivers.mock.gamepad.MockPad`."""
+
+    freeze: bool = False
+    """The pad stays connected and silent: ``t_alive`` stops, and pressed buttons stay pressed."""
+    disconnect: bool = False
+    """The pad is unplugged: readings with ``connected=False``, sticks centred and no button pressed."""
+
+
+_GARBAGE = {RobotFaults: ("nan", "inf", "short"), GripperFaults: ("nan", "inf"), CameraFaults: ("shape", "nan")}
+
+_F = TypeVar("_F", RobotFaults, GripperFaults, CameraFaults, PadFaults)
+
+
+def with_faults(present: _F, changes: Mapping[str, object]) -> _F:
+    """Return ``present`` with ``changes`` made.
+
+    Raises:
+        CommandError: There is no such fault (code ``unknown_fault``), or it cannot have that value
+            (``bad_fault_value``).
+    """
+    known = [f.name for f in fields(present)]
+    for name, value in changes.items():
+        if name not in known:
+            close = get_close_matches(name, known, n=1)
+            hint = f" (did you mean {close[0]!r}?)" if close else ""
+            raise CommandError(f"unknown fault {name!r}{hint}; faults: {', '.join(known)}", code="unknown_fault")
+        expected = _expected(name, value, _GARBAGE.get(type(present), ()))
+        if expected is not None:
+            raise CommandError(f"{name} must be {expected}, not {value!r}", code="bad_fault_value")
+    return replace(present, **changes)  # type: ignore[arg-type]
+
+
+def _expected(name: str, value: object, garbage: Sequence[str]) -> str | None:
+    """Return what the fault's value must be; None where ``value`` is right."""
+    if name == "garbage" and value is not None and value not in garbage:
+        return f"one of {', '.join(garbage)} or None"
+    if name in ("freeze", "disconnect", "stuck") and not isinstance(value, bool):
+        return "True or False"
+    if name == "drop" and not (type(value) is int and value >= 0):
+        return "a count, 0 for never"
+    if name == "delay_s" and not (isinstance(value, (int, float)) and 0 <= value < float("inf")):
+        return "seconds, 0 or more"
+    return None
