@@ -94,8 +94,9 @@ def _main(args: argparse.Namespace) -> int:
 
 
 def _check(args: argparse.Namespace, dataset: Dataset) -> int:
-    from hal.recording.checking import check_dataset, repair_command
+    from hal.recording.checking import check_dataset
     from hal.recording.exporters.content import chosen
+    from hal.recording.index import repair_command
     from hal.recording.layout import Layout
 
     if args.png or args.rrd:
@@ -136,7 +137,8 @@ def _repair(args: argparse.Namespace) -> int:
 
 def _warn_of_index(dataset: Dataset, found: Summary) -> None:
     """Say what is wrong in ``meta/``, apart from the episodes that cannot be read."""
-    from hal.recording.checking import check_index, repair_command
+    from hal.recording.checking import check_index
+    from hal.recording.index import repair_command
     from hal.recording.layout import Layout
 
     layout = Layout(dataset.root)

@@ -28,12 +28,12 @@ if TYPE_CHECKING:
 __all__ = ["Dataset", "Episode", "Recorder", "RecorderStatus", "recover", "repair"]
 
 _HOME = {
-    "Dataset": "reader",
-    "Episode": "reader",
+    "Dataset": "dataset",
+    "Episode": "dataset",
     "Recorder": "recorder",
     "RecorderStatus": "recorder",
-    "recover": "recovery",
-    "repair": "recovery",
+    "recover": "finish",
+    "repair": "finish",
 }
 
 

@@ -12,10 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import CommandError, DatasetError, DeviceNotFound
-from .checking import check_next, read_about, read_index, reading, repair_command
 from .codecs import DepthReader, count_frames, read_video
-from .finish import VERSION
-from .layout import MORE_STREAMS, SEGMENTATION, TIMES, CameraSetup, Layout, require, video_key
+from .index import check_next, read_about, read_index, reading, repair_command
+from .layout import MORE_STREAMS, SEGMENTATION, TIMES, VERSION, CameraSetup, Layout, require, video_key
 
 __all__ = [
     "Dataset",

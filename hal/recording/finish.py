@@ -19,9 +19,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import CommandError, DatasetError, HalError
-from .checking import check_index, check_next, check_rows, read_about, read_index, reading, validated_info
+from .checking import check_index, check_rows
 from .codecs import Stats, column_stats, merged, picture_stats, plain, remux
 from .dataset import Episode
+from .index import _TASK, check_next, read_about, read_index, read_tasks, reading, validated_info
 from .layout import (
     ACTION,
     CHUNK,
@@ -30,6 +31,7 @@ from .layout import (
     SETPOINT,
     STATE,
     TIMES,
+    VERSION,
     Layout,
     Pace,
     locked,
@@ -43,13 +45,10 @@ from .live import Rest, read_rest
 
 __all__ = [
     "CLOSING",
-    "VERSION",
     "entry_table",
     "finalise",
     "keep_mark",
     "new_info",
-    "read_entry",
-    "read_tasks",
     "recover",
     "recover_all",
     "repair",
@@ -59,9 +58,6 @@ __all__ = [
 ]
 
 # [tables.py] The tables of a LeRobotDataset v3.0: rows, episodes, tasks, and what ``info.json`` says of them.
-
-VERSION = "v3.0"
-_TASK = "__index_level_0__"
 
 
 def new_info(features: Mapping[str, Any], fps: int, robot_type: str) -> dict[str, Any]:
@@ -136,25 +132,6 @@ def write_table(path: Path, table: Any) -> None:
     sync(beside)
     beside.replace(path)
     sync(path.parent)
-
-
-def read_entry(path: Path) -> dict[str, Any]:
-    """Return the one row of an episode's :func:`entry_table`. ValueError where there is not one."""
-    import pyarrow.parquet as pq
-
-    (row,) = pq.ParquetFile(path).read().to_pylist()
-    return dict(row)
-
-
-def read_tasks(path: Path) -> list[str]:
-    """All tasks, by their number."""
-    if not path.exists():
-        return []
-    import pyarrow.parquet as pq
-
-    table = pq.ParquetFile(path).read()
-    numbered = sorted(zip(table["task_index"].to_pylist(), table[_TASK].to_pylist(), strict=True))
-    return [text for _, text in numbered]
 
 
 def tasks_table(tasks: list[str]) -> Any:

@@ -21,11 +21,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from ..errors import CommandError, DriverMissing
-from .sampling import CameraTrack
 
 if TYPE_CHECKING:
     from ..geometry import Pose
     from ..rig import Rig
+    from .sampling import CameraTrack
 
 __all__ = [
     "ACTION",
@@ -43,6 +43,7 @@ __all__ = [
     "SLOW",
     "STATE",
     "TIMES",
+    "VERSION",
     "about_call",
     "about_rig",
     "about_start",
@@ -498,3 +499,6 @@ def _finite(data: Any) -> Any:
     if isinstance(data, (list, tuple)):
         return [_finite(value) for value in data]
     return data
+
+
+VERSION = "v3.0"

@@ -19,8 +19,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .checking import plain_name
 from .codecs import DepthFile, DepthReader, Encoder, VideoFile, as_rgb, count_frames, cut, mend, numbers_to_units
+from .index import plain_name
 from .layout import MORE_STREAMS, SEGMENTATION, CameraSetup, read_json, sync, write_json
 from .ring import Slot
 

@@ -13,10 +13,10 @@ from ..errors import CommandError, ConnectionLost, HalError, StaleStateError
 from ..host.hosts import groups_of
 from ..host.process import Child, SharedMemory
 from ..learning.episode import stands_in_world
-from .checking import read_index
 from .codecs import Encoder
 from .dataset import check_compatible
 from .finish import keep_mark
+from .index import read_index
 from .layout import MORE_STREAMS, TIMES, Layout, Pace, about_call, about_rig, about_start, features_of, locked, require
 from .ring import RowRing
 from .sampling import CameraTrack, Grid, LockStepGrid, RealTimeGrid, Sampler, movable

@@ -16,10 +16,10 @@ from typing import Any
 from ..errors import CommandError, HalError
 from ..host.process import Channel, SharedMemory, serve
 from ..host.scheduling import yield_to_others
-from .checking import check_next, read_index
 from .codecs import choose_encoder
 from .dataset import check_compatible
 from .finish import CLOSING, finalise, recover_all
+from .index import check_next, read_index
 from .layout import CameraSetup, Layout, locked, require, write_json
 from .live import RESERVE, LiveFolder
 from .ring import RowRing

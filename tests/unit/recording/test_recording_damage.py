@@ -20,7 +20,7 @@ from hal.learning.replay import RecordedTrajectory
 from hal.recording import Dataset, Episode, Recorder, recover, repair
 from hal.recording.checking import check_dataset, check_rows
 from hal.recording.exporters import export
-from hal.recording.finish import read_tasks
+from hal.recording.index import read_tasks
 from hal.recording.review import draw_sheet, summary
 from hal.rig import Rig
 
