@@ -1,4 +1,4 @@
-"""Where is my camera? On the hand or beside the arm, found out with a printed board.
+"""Calibrate a camera on the hand or beside the arm, with a printed board.
 
 python apps/calibrate.py board --out board.pdf
 python apps/calibrate.py --sim --config panda_calibration --camera wrist --auto
@@ -8,16 +8,14 @@ python apps/calibrate.py --real --config my_rig.yaml --camera wrist --auto
 from __future__ import annotations
 
 import argparse
+import math
 import sys
 from typing import TYPE_CHECKING
 
 from hal.apps._common import ACTION_NEEDED, add_rig_options, rig_options, run_app
 
 if TYPE_CHECKING:
-    from hal.calibration import Board, Calibration
-    from hal.calibration.collecting import Collector
-    from hal.calibration.output import Output
-    from hal.calibration.setting import Setting
+    from hal.calibration import Board, Calibration, CalibrationSetup, Collector, RigFileOutput
     from hal.geometry import Pose
     from hal.rig import Rig
 
@@ -25,54 +23,60 @@ VIEWS = 20
 
 
 def parser() -> argparse.ArgumentParser:
-    """The command line."""
+    """Return the parser of ``calibrate``."""
     made = argparse.ArgumentParser(
         prog="calibrate",
-        description="Find out where a camera is, on the hand or beside the arm, with a printed board.",
-        epilog="The board comes first: calibrate board --out board.pdf. Ctrl-C stops the arm.",
+        description="Calibrate a camera on the hand or beside the arm, with a printed board.",
+        epilog="To print the board: calibrate board --out board.pdf. Ctrl-C stops the arm.",
     )
     add_rig_options(made)
-    what = made.add_argument_group("what")
-    what.add_argument("--camera", metavar="NAME", help="which camera, where the rig has several")
-    what.add_argument("--robot", metavar="NAME", help="which arm, where the rig has several")
-    what.add_argument("--eye", choices=["in-hand", "to-hand"], help="camera on the arm, or beside it (as the rig says)")
-    what.add_argument(
-        "--link", metavar="LINK", help="what carries the camera or the board (as the rig says, or the tcp's)"
+    task = made.add_argument_group("task")
+    task.add_argument("--camera", metavar="NAME", help="camera (default: the rig's only one)")
+    task.add_argument("--robot", metavar="NAME", help="arm (default: the one that carries the camera, or the only one)")
+    task.add_argument(
+        "--eye", choices=["in-hand", "to-hand"], help="camera on the arm, or beside it (default: from the rig file)"
     )
-    add_board_options(what)
-    how = made.add_argument_group("how")
-    mode = how.add_mutually_exclusive_group()
-    mode.add_argument("--auto", action="store_true", help="the arm goes from view to view by itself")
-    mode.add_argument("--record", action="store_true", help="a person does, with a pad or by guiding it (the default)")
-    how.add_argument("--views", type=int, default=VIEWS, metavar="N", help="how many, with --auto (%(default)s)")
-    how.add_argument("--unattended", action="store_true", help="with --auto: move a real arm without a dead-man")
-    how.add_argument(
-        "--guess", metavar="[x,y,z,qx,qy,qz,qw]", help="with --auto: where the camera is, roughly (as the rig says)"
+    task.add_argument(
+        "--link", metavar="LINK", help="link that carries the camera or the board (default: from the rig file, or tcp)"
     )
-    how.add_argument("--mapping", default="default", metavar="FILE", help="what the pad's controls do (%(default)s)")
+    add_board_options(task)
+    views = made.add_argument_group("views")
+    mode = views.add_mutually_exclusive_group()
+    mode.add_argument("--auto", action="store_true", help="the arm moves from view to view by itself")
+    mode.add_argument("--record", action="store_true", help="drive it with a gamepad or guide it by hand (default)")
+    views.add_argument("--views", type=int, default=VIEWS, metavar="N", help="with --auto: how many (%(default)s)")
+    views.add_argument(
+        "--unattended", action="store_true", help="with --auto: move a real arm without a dead-man control"
+    )
+    views.add_argument(
+        "--guess",
+        metavar="[x,y,z,qx,qy,qz,qw]",
+        help="with --auto: approximate pose of the camera (default: from the rig file)",
+    )
+    views.add_argument("--mapping", default="default", metavar="FILE", help="gamepad mapping (%(default)s)")
     result = made.add_argument_group("result")
-    result.add_argument("--compare", action="store_true", help="only show how far off the rig's file is; write nothing")
-    result.add_argument("--out", metavar="FILE", help="write the rig there instead of over its own file")
-    result.add_argument("--yes", action="store_true", help="write without asking, unless the answer is doubtful")
+    result.add_argument("--compare", action="store_true", help="show the difference from the rig file; write nothing")
+    result.add_argument("--out", metavar="FILE", help="write a copy of the rig file instead of changing it")
+    result.add_argument("--yes", action="store_true", help="write without confirmation, unless the result is doubtful")
     return made
 
 
 def add_board_options(group: argparse._ActionsContainer) -> None:
-    """Which board."""
-    group.add_argument("--board", default="charuco_board", metavar="FILE", help="the board's file (%(default)s)")
-    group.add_argument("--square", type=float, metavar="M", help="side of a square as measured on the paper, m")
+    """Add the options that choose a board."""
+    group.add_argument("--board", default="charuco_board", metavar="FILE", help="board file (%(default)s)")
+    group.add_argument("--square", type=float, metavar="M", help="side of a printed square as measured, m")
 
 
 def board_parser() -> argparse.ArgumentParser:
-    """The command line of ``calibrate board``."""
-    made = argparse.ArgumentParser(prog="calibrate board", description="Write a board to print, to scale.")
+    """Return the parser of ``calibrate board``."""
+    made = argparse.ArgumentParser(prog="calibrate board", description="Write a page with the board, to scale.")
     add_board_options(made)
-    made.add_argument("--out", required=True, metavar="FILE", help="a .pdf or a .png")
+    made.add_argument("--out", required=True, metavar="FILE", help=".pdf or .png to write")
     return made
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Entry point."""
+    """Run the program; return its exit status."""
     given = sys.argv[1:] if argv is None else argv
     if given[:1] == ["board"]:
         return run_app(_print_board, board_parser(), given[1:])
@@ -87,72 +91,65 @@ def _board(args: argparse.Namespace) -> Board:
 
 
 def _print_board(args: argparse.Namespace) -> int:
-    from hal.calibration.printing import print_board
+    from hal.calibration import print_board
 
     board = _board(args)
     width, height = print_board(board, args.out)
-    print(f"{args.out}: {board}, on {1e3 * width:.0f} x {1e3 * height:.0f} mm. Print it at 100 %, glue it to something")
-    print("flat, measure a square with a calliper and say --square if it is not what was asked for.")
+    print(f"{args.out}: {board}, on {1e3 * width:.0f} x {1e3 * height:.0f} mm. Print at 100 %, glue onto a flat plate,")
+    print("and measure a square with a calliper; if it differs, add --square when calibrating.")
     return 0
 
 
 def _main(args: argparse.Namespace) -> int:
     import hal
+    from hal import calibration
     from hal.apps._common import banner, check_everything, invitation, listing
     from hal.apps.check import may_open
-    from hal.calibration import solve
-    from hal.calibration.checks import LEAST_VIEWS
-    from hal.calibration.collecting import Collector
-    from hal.calibration.detection import Detector
-    from hal.calibration.output import Output
-    from hal.calibration.report import difference_lines, report_lines
-    from hal.calibration.setting import guess_of, setting_of
     from hal.config import load
     from hal.config.mapping import load_mapping
     from hal.errors import CommandError
     from hal.pads.choice import check_wanted
 
-    if args.views < LEAST_VIEWS:
-        raise CommandError(f"--views must be at least {LEAST_VIEWS}, not {args.views}")
+    if args.views < calibration.LEAST_VIEWS:
+        raise CommandError(f"--views must be at least {calibration.LEAST_VIEWS}, not {args.views}")
     load_mapping(args.mapping)
     check_wanted(args.pad)
     config = load(args.config, sim=args.sim, overrides=args.overrides)
     plan = config.resolve()
-    setting = setting_of(config, plan, args.camera, args.robot, args.eye, args.link)
-    guess = guess_of(setting, args.guess) if args.auto else None
+    setup = calibration.find_setup(config, plan, args.camera, args.robot, args.eye, args.link)
+    guess = calibration.initial_guess(setup, args.guess) if args.auto else None
     board = _board(args)
-    output = None if args.compare else Output.of(plan.source, args.out, setting.camera)
-    where = f"on {setting.link_name} of" if setting.eye == "in-hand" else "beside"
-    task = f"task     camera {setting.camera} {where} {setting.robot}; board of {board}"
+    output = None if args.compare else calibration.RigFileOutput.of(plan.source, args.out, setup.camera)
+    where = f"on {setup.link_name} of" if setup.eye == "in-hand" else "beside"
+    task = f"task     camera {setup.camera} {where} {setup.robot}; board of {board}"
     if args.dry_run:
         check_everything(plan, args)
-        print(f"{plan.source} is in order; it would open:")
+        print(f"{plan.source} is valid; it would open:")
         print("\n".join(f"  {line}" for line in [*listing(plan), *plan.warnings, task]))
         return 0
     if not may_open(plan):
         return ACTION_NEEDED
     with hal.open(**rig_options(args)) as rig:
         print(f"{banner(rig)}\n  {task}\n{invitation(rig)}", flush=True)
-        collector = Collector(rig, setting, Detector(board))
+        collector = calibration.Collector(rig, setup, calibration.Detector(board))
         try:
             _collect(args, rig, collector, guess)
         except (hal.MotionStopped, hal.RobotFault, hal.ConnectionLost, hal.StaleStateError, KeyboardInterrupt) as end:
-            print(f"ended: {str(end) or 'Ctrl-C'}. Going on with {len(collector.views)} views", flush=True)
-    found = solve(collector.views, setting.eye)
-    print("\n".join(["", *report_lines(found), "", *difference_lines(setting.known, found.camera, setting.frame)]))
+            print(f"ended: {str(end) or 'Ctrl-C'}. Continuing with {len(collector.views)} views", flush=True)
+    found = calibration.solve(collector.views, setup.eye)
+    print("\n".join(["", *report_lines(found), "", *difference_lines(setup.known, found.camera, setup.frame)]))
     if output is None:
-        print("" if args.compare else f"not written: {plan.source} comes with the hal; --out my_rig.yaml writes a copy")
+        print("" if args.compare else f"not written: {plan.source} is built in; --out my_rig.yaml writes a copy")
         return 0
-    return _write(args, output, setting, found)
+    return _write(args, output, setup, found)
 
 
 def _collect(args: argparse.Namespace, rig: Rig, collector: Collector, guess: Pose | None) -> None:
-    """Views, by the arm itself or by a person."""
+    """Take the views: automatically with a guess, else by hand."""
     import hal
-    from hal.calibration.byhand import PadDriver, enter
-    from hal.calibration.recording import drive, take_and_tell
+    from hal.calibration import ManualDrive, add_view, collect_views, wait_for_enter
 
-    def say(text: str) -> None:
+    def report(text: str) -> None:
         print(f"  {text}", flush=True)
         rig.say(text)
 
@@ -162,29 +159,66 @@ def _collect(args: argparse.Namespace, rig: Rig, collector: Collector, guess: Po
         deadman = None if pad is None or args.unattended else pad.hold(teleop.mapping.deadman)
         if deadman is not None:
             print(f"  hold {teleop.mapping.deadman}: the arm moves only while it is held", flush=True)
-        drive(collector, guess, args.views, say, deadman=deadman, unattended=args.unattended)
+        collect_views(collector, guess, args.views, report, deadman=deadman, unattended=args.unattended)
         return
-    wait = enter
+    wait = wait_for_enter
     if pad is not None:
-        driver = PadDriver(rig, collector.robot, pad, teleop, say)
+        driver = ManualDrive(rig, collector.robot, pad, teleop, report)
         print("\n".join(f"  {line}" for line in driver.help()), flush=True)
         wait = driver.wait
     while wait():
-        take_and_tell(collector, say)
+        add_view(collector, report)
 
 
-def _write(args: argparse.Namespace, output: Output, setting: Setting, found: Calibration) -> int:
-    """Into the rig's file, if that is wanted. Raises CalibrationFailed for a doubtful answer and nobody to ask."""
+def report_lines(found: Calibration) -> list[str]:
+    """Return a table for a terminal: the residuals of every view, their rms, the uncertainty and the warnings."""
+    lines = ["view            corners     board differs       without it, the result moves"]
+    for one in found.residuals:
+        influence = ""
+        if one.influence is not None:
+            influence = f"{1e3 * one.influence[0]:6.2f} mm {math.degrees(one.influence[1]):6.3f} deg"
+        off = f"{one.px:6.2f} px {1e3 * one.distance:7.2f} mm {math.degrees(one.angle):6.3f} deg"
+        lines.append(f"{one.name:14s}{off}   {influence if one.used else 'left out'}")
+    px, distance, angle = found.rms()
+    lines.append(f"{'rms':14s}{px:6.2f} px {1e3 * distance:7.2f} mm {math.degrees(angle):6.3f} deg")
+    std = found.uncertainty
+    lines.append(
+        f"standard deviation of the camera's pose: {1e3 * std.position:.2f} mm and {math.degrees(std.rotation):.3f} "
+        f"degrees ({len(found.used)} views)"
+    )
+    return [*lines, *(f"WARNING: {text}" for text in found.warnings)]
+
+
+def difference_lines(old: Pose | None, new: Pose, frame: str) -> list[str]:
+    """Return the new pose, and its difference from the one in the rig's file if there is one, for a terminal."""
+
+    def numbers(pose: Pose) -> str:
+        position = " ".join(f"{1e3 * value:9.2f}" for value in pose.position)
+        return f"{position} mm  {' '.join(f'{value:9.5f}' for value in pose.orientation)}"
+
+    lines = [f"{'new':12s}{numbers(new)}   in {frame}"]
+    if old is not None:
+        distance, angle = old.distance(new)
+        lines.insert(0, f"{'rig file':12s}{numbers(old)}")
+        lines.append(f"{'difference':12s}{1e3 * distance:.2f} mm and {math.degrees(angle):.3f} degrees")
+    return lines
+
+
+def _write(args: argparse.Namespace, output: RigFileOutput, setup: CalibrationSetup, found: Calibration) -> int:
+    """Write the result to the rig's file after confirmation; raise CalibrationFailed for a doubtful one with --yes."""
     from hal.calibration import CalibrationFailed
 
-    key, value = setting.entry(found.camera)
-    print(f"\ncameras.{setting.camera} of {output.path}:\n  {key}: {value}", flush=True)
-    if args.yes and found.doubtful:
-        why = "; ".join(found.doubtful)
-        raise CalibrationFailed(f"not written, for --yes writes no doubtful answer (without it you are asked): {why}")
+    key, value = setup.entry(found.camera)
+    print(f"\ncameras.{setup.camera} of {output.path}:\n  {key}: {value}", flush=True)
+    if args.yes and found.doubts:
+        raise CalibrationFailed(
+            f"not written: a doubtful result is not written with --yes, run without it to confirm: "
+            f"{'; '.join(found.doubts)}",
+            code="not_confirmed",
+        )
     if not args.yes:
         try:
-            answer = input("Write it all the same? [y/N] " if found.doubtful else "Write it? [y/N] ")
+            answer = input("Write it despite the warning? [y/N] " if found.doubts else "Write it? [y/N] ")
         except EOFError:
             answer = ""
         if not answer.strip().lower().startswith("y"):

@@ -1,39 +1,65 @@
-"""Where is my camera? Its pose on the hand, or beside the arm, from pictures of a printed board.
+"""Hand-eye calibration: the pose of a camera on the hand or beside the arm, from images of a printed board.
 
-One file, one question:
+Everything that a program needs is here; the modules behind it are loaded when they are first used, so importing this
+package needs neither OpenCV nor SciPy::
 
-``board``       what is printed?
-``printing``    how does it come onto paper, to scale?
-``looking``     which picture is it, and of which sensor?
-``detection``   where are the board's corners in this picture, and is the picture good enough?
-``lens``        where would a camera without distortion see them?
-``views``       what belongs to one picture, and what is solved for?
-``closed_form`` where is the camera, roughly, from nothing but the views?
-``refinement``  and exactly, by the pixels of all corners of all views?
-``checks``      could these views tell it at all?
-``solving``     all of that in order, bad views thrown out, with residuals and uncertainty
-``sampling``    from where should the board be looked at?
-``reaching``    how does the arm get there?
-``collecting``  one view of the arm at rest
-``recording``   views from an arm that goes there by itself, or that a person drives
-``writing``     the answer, in the rig's file
+    setup = find_setup(config, config.resolve(), camera="wrist")
+    collector = Collector(rig, setup, Detector(load_board()))
+    collect_views(collector, setup.known, 20, print)
+    result = solve(collector.views, setup.eye)
+
+``board`` is the printed board, ``detection`` finds it in an image, ``collecting`` moves the arm and takes the views,
+``solving`` computes the pose from them, and ``setup`` reads the rig's file and writes the result into it.
 """
 
 from __future__ import annotations
 
-from .board import Board, load_board
-from .errors import CalibrationFailed, NoView
-from .solving import Calibration, solve
-from .views import Eye, Sighting, View
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
 
-__all__ = [
-    "Board",
-    "Calibration",
-    "CalibrationFailed",
-    "Eye",
-    "NoView",
-    "Sighting",
-    "View",
-    "load_board",
-    "solve",
-]
+if TYPE_CHECKING:
+    from .board import Board as Board
+    from .board import load_board as load_board
+    from .board import print_board as print_board
+    from .collecting import Collector as Collector
+    from .collecting import ManualDrive as ManualDrive
+    from .collecting import add_view as add_view
+    from .collecting import collect_views as collect_views
+    from .collecting import wait_for_enter as wait_for_enter
+    from .detection import BoardDetection as BoardDetection
+    from .detection import Detector as Detector
+    from .detection import NoView as NoView
+    from .setup import CalibrationSetup as CalibrationSetup
+    from .setup import RigFileOutput as RigFileOutput
+    from .setup import find_setup as find_setup
+    from .setup import initial_guess as initial_guess
+    from .solving import LEAST_VIEWS as LEAST_VIEWS
+    from .solving import Calibration as Calibration
+    from .solving import CalibrationFailed as CalibrationFailed
+    from .solving import Eye as Eye
+    from .solving import Uncertainty as Uncertainty
+    from .solving import View as View
+    from .solving import solve as solve
+
+_MODULES = {
+    "board": ("Board", "load_board", "print_board"),
+    "collecting": ("Collector", "ManualDrive", "add_view", "collect_views", "wait_for_enter"),
+    "detection": ("BoardDetection", "Detector", "NoView"),
+    "setup": ("CalibrationSetup", "RigFileOutput", "find_setup", "initial_guess"),
+    "solving": ("LEAST_VIEWS", "Calibration", "CalibrationFailed", "Eye", "Uncertainty", "View", "solve"),
+}
+_HOME = {name: module for module, names in _MODULES.items() for name in names}
+
+__all__ = sorted(_HOME)  # pyright: ignore[reportUnsupportedDunderAll]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOME:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    value = getattr(import_module(f"{__name__}.{_HOME[name]}"), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *_HOME})

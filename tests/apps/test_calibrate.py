@@ -66,7 +66,7 @@ def test_the_answer_stands_in_the_rig(tmp_path: Path, name: str) -> None:
     assert (tmp_path / "rig.yaml.bak").read_text() == before
     now = path.read_text()
     assert [line for line in before.splitlines() if "#" in line and line not in now] == []
-    assert re.search(r"differ +by [\d.]+ mm and [\d.]+ degrees", done.stdout)
+    assert re.search(r"difference +[\d.]+ mm and [\d.]+ degrees", done.stdout)
     assert re.search(r"rms +[\d.]+ px +[\d.]+ mm +[\d.]+ deg", done.stdout)
     assert len(re.findall(r"^view \d+ .*px.*mm.*deg", done.stdout, re.MULTILINE)) == 12
 
@@ -79,7 +79,7 @@ def test_in_real_time_with_the_board_in_the_hand_it_only_compares(tmp_path: Path
         "--sim", "--config", str(path), "--auto", "--views", "6", "--compare", "--set", "robots.panda.move_speed=0.3"
     )
     assert done.returncode == 0, done.stderr
-    found = re.search(r"differ +by ([\d.]+) mm and ([\d.]+) degrees", done.stdout)
+    found = re.search(r"difference +([\d.]+) mm and ([\d.]+) degrees", done.stdout)
     assert found is not None
     assert float(found[1]) <= 2.0
     assert float(found[2]) <= 0.3
@@ -110,15 +110,15 @@ def test_a_doubtful_answer_is_written_by_a_person_only(
     before = path.read_bytes()
     wrong = ["--square", "0.0343"]  # 2 % too small
     done = calibrate("--sim", "--config", str(path), "--auto", "--views", "8", *wrong, *extra, *STEPPED, answer=answer)
-    assert "WARNING: by the arm's own measure" in done.stdout
+    assert "WARNING: " in done.stdout
     assert (path.read_bytes() != before) is written
     if written:
         assert done.returncode == 0, done.stderr
-        assert "Write it all the same? [y/N]" in done.stdout
+        assert "Write it despite the warning? [y/N]" in done.stdout
     else:
         assert done.returncode == 2
-        assert re.search(r"not written, for --yes writes no doubtful answer.*by the arm's own measure", done.stderr)
-        assert [entry.name for entry in tmp_path.iterdir()] == ["rig.yaml"], "no copy, no rest"
+        assert "--square" in done.stderr
+        assert [entry.name for entry in tmp_path.iterdir()] == ["rig.yaml"]
 
 
 def test_by_hand_with_enter_and_too_few_views_nothing_is_written(tmp_path: Path) -> None:
@@ -128,8 +128,8 @@ def test_by_hand_with_enter_and_too_few_views_nothing_is_written(tmp_path: Path)
     assert "Traceback" not in done.stderr
     assert done.returncode == 2
     assert "view 1: 24 corners" in done.stdout
-    assert "no view: 0 mm and 0.0 degrees from view 1: too near" in done.stdout
-    assert "CalibrationFailed: it takes at least 6 views" in done.stderr
+    assert "rejected: too similar to view 1" in done.stdout
+    assert "CalibrationFailed: at least 6 views" in done.stderr
     assert path.read_bytes() == before
 
 
@@ -151,11 +151,11 @@ def test_dry_run_opens_nothing_and_says_what_would_be_found_out() -> None:
 @pytest.mark.parametrize(
     ("arguments", "texts"),
     [
-        (["--config", "panda_table"], ["which camera", "scene", "wrist"]),
+        (["--config", "panda_table"], ["--camera", "scene", "wrist"]),
         (["--camera", "wirst"], ["did you mean 'wrist'"]),
         (["--views", "3"], ["--views must be at least 6"]),
         (["--board", "chess"], ["charuco_board"]),
-        (["--square", "35"], ["in metres"]),
+        (["--square", "35"], ["metres"]),
         (["--auto", "--guess", "[1, 2]"], ["--guess must be"]),
         (["--auto", "--link", "panda_link7"], ["--guess"]),
         (["--out", "/nowhere/rig.yaml"], ["no folder /nowhere"]),

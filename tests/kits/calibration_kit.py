@@ -1,4 +1,4 @@
-"""Views of a board that was never there, from poses that the tests know, and pictures of it."""
+"""Synthetic views and images of a board from known poses."""
 
 from __future__ import annotations
 
@@ -7,19 +7,19 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hal.calibration import Board, Eye, Sighting, View
+from hal.calibration import Board, BoardDetection, Eye, View
 from hal.calibration.detection import flat_pose
-from hal.calibration.rotations import exponential, inverse
+from hal.calibration.solving import inverse, motion
 from hal.geometry import Pose
 from hal.images import distort_points, undistort_pixels
 
 BOARD = Board(7, 5, 0.035, 0.027)
 SIZE = (640, 480)
 K = np.array([[614.0, 0.0, 319.5], [0.0, 612.0, 240.5], [0.0, 0.0, 1.0]])
-X = exponential(np.array([0.05, -0.02, 0.06, 0.1, -0.2, 1.5]))
-"""Where the camera is: in the link's frame, or in the world."""
-Z = exponential(np.array([0.5, 0.1, 0.02, 3.0, 0.1, 0.3]))
-"""Where the board is: in the world, or in the link's frame."""
+X = motion(np.array([0.05, -0.02, 0.06, 0.1, -0.2, 1.5]))
+"""Pose of the camera: in the link's frame, or in the world."""
+Z = motion(np.array([0.5, 0.1, 0.02, 3.0, 0.1, 0.3]))
+"""Pose of the board: in the world, or in the link's frame."""
 CAMERA = Pose.from_matrix(X)
 LENS = (0.12, -0.25, 0.001, -0.0008, 0.05)
 
@@ -27,10 +27,10 @@ Array = NDArray[np.float64]
 
 
 def poses(count: int, seed: int = 0, turns: tuple[float, float, float] = (0.5, 0.5, 0.5)) -> list[Array]:
-    """Of the board in the camera's frame: facing it, turned by up to ``turns`` rad about each of its axes."""
+    """Poses of the board in the camera's frame: facing it, turned by up to ``turns`` rad about each of its axes."""
     chance, found = np.random.default_rng(seed), []
     for _ in range(count):
-        pose = exponential(np.array([0.0, 0.0, 0.0, *(chance.uniform(-1.0, 1.0, 3) * turns)]))
+        pose = motion(np.array([0.0, 0.0, 0.0, *(chance.uniform(-1.0, 1.0, 3) * turns)]))
         middle = np.array([*chance.uniform(-0.04, 0.04, 2), chance.uniform(0.4, 0.6)])
         pose[:3, 3] = middle - pose[:3, :3] @ BOARD.centre
         found.append(pose)
@@ -38,7 +38,7 @@ def poses(count: int, seed: int = 0, turns: tuple[float, float, float] = (0.5, 0
 
 
 def pixels_of(pose: Array, lens: tuple[float, ...] = (0.0,) * 5, board: Board = BOARD) -> Array:
-    """(n, 2) where the camera sees the corners of a board that is there."""
+    """Pixels (n, 2) at which the camera sees the corners of a board at ``pose``."""
     p = board.corners @ pose[:3, :3].T + pose[:3, 3]
     seen = distort_points(p[:, :2] / p[:, 2:], lens)
     return np.column_stack([seen, np.ones(len(seen))]) @ K[:2].T
@@ -55,17 +55,17 @@ def views(
     real_board: Board = BOARD,
     seed: int = 1,
 ) -> list[View]:
-    """What an arm would report and a detector find.
+    """The views that an arm and a detector would produce.
 
     Args:
-        eye: what the camera is on.
-        seen: the board in the camera's frame, in each view.
-        noise_px: of each corner's coordinates, standard deviation.
-        arm: by how much the arm is elsewhere than it says, m along and twice as many rad about each axis.
-        lens: the lens's distortion, which is known.
-        believed: the K that the camera says it has.
-        real_board: as it really is; it is always taken for ``BOARD``.
-        seed: of all chance.
+        eye: Where the camera is.
+        seen: The board in the camera's frame, in each view.
+        noise_px: Of each corner's coordinates, standard deviation.
+        arm: Error of the arm's pose, standard deviation: m along, and twice as many rad about each axis.
+        lens: The known distortion.
+        believed: The K that the camera reports.
+        real_board: The true board; ``BOARD`` is the assumed one.
+        seed: Of the noise.
     """
     chance, made = np.random.default_rng(seed), []
     for k, pose in enumerate(seen):
@@ -73,13 +73,15 @@ def views(
         pixels = undistort_pixels(pixels + noise_px * chance.normal(size=pixels.shape), believed, lens)
         C, error = flat_pose(BOARD.corners, pixels, believed)
         A = Z @ inverse(pose) @ inverse(X)
-        link = (A if eye == "in-hand" else inverse(A)) @ exponential(arm * chance.normal(size=6) * [1, 1, 1, 2, 2, 2])
-        made.append(View(f"view {k}", Pose.from_matrix(link), Sighting(BOARD.corners, pixels, believed, C, error)))
+        link = (A if eye == "in-hand" else inverse(A)) @ motion(arm * chance.normal(size=6) * [1, 1, 1, 2, 2, 2])
+        made.append(
+            View(f"view {k}", Pose.from_matrix(link), BoardDetection(BOARD.corners, pixels, believed, C, error))
+        )
     return made
 
 
 def picture(pose: Array, cv2: Any, lens: tuple[float, ...] = (0.0,) * 5, finer: int = 4) -> NDArray[np.uint8]:
-    """A grey picture (480, 640) of the board on a grey ground, smooth at its edges as a camera's is."""
+    """A grey image (480, 640) of the board on a grey ground, with smooth edges as a camera's."""
     scale, width, height = 20.0, *SIZE
     paper = np.pad(BOARD.picture(scale), int(10 * scale), constant_values=255)
     v, u = np.mgrid[-1 : height + 1, -1 : width + 1]

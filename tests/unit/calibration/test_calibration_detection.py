@@ -1,18 +1,19 @@
-"""The board in drawn pictures: its corners to a fraction of a pixel, and why a picture is of no use."""
+"""Detection of the board in drawn images: accuracy of the corners, and reasons to reject an image."""
 
 from __future__ import annotations
 
+import importlib
 import sys
 
 import numpy as np
 import pytest
-from calibration_kit import BOARD, LENS, K, picture, pixels_of
+from calibration_kit import BOARD, CAMERA, LENS, K, X, Z, picture, pixels_of
 from numpy.typing import NDArray
 
-from hal.calibration import CalibrationFailed, NoView, load_board, solve
+from hal.calibration import CalibrationFailed, NoView, View, load_board, solve
+from hal.calibration.collecting import plan_views
 from hal.calibration.detection import Detector
-from hal.calibration.rotations import exponential
-from hal.calibration.sampling import looks
+from hal.calibration.solving import inverse, motion
 from hal.errors import DriverMissing
 from hal.geometry import Pose
 
@@ -21,7 +22,7 @@ NO_LENS = (0.0,) * 5
 
 
 def facing(distance: float = 0.45, tilt: float = 0.35, turn: float = 0.3) -> NDArray[np.float64]:
-    pose = exponential(np.array([0.0, 0.0, 0.0, tilt, -0.2, turn]))
+    pose = motion(np.array([0.0, 0.0, 0.0, tilt, -0.2, turn]))
     pose[:3, 3] = np.array([0.0, 0.0, distance]) - pose[:3, :3] @ BOARD.centre
     return pose
 
@@ -39,7 +40,7 @@ def test_corners_and_pose_are_found(lens: tuple[float, ...]) -> None:
     assert 1.0 < found.blur_px < 3.0
 
 
-def test_colour_and_a_part_of_the_board_will_do() -> None:
+def test_a_colour_image_of_a_part_of_the_board_is_enough() -> None:
     pose = facing()
     grey = picture(pose, cv2)
     grey[:, :260] = 120
@@ -48,9 +49,9 @@ def test_colour_and_a_part_of_the_board_will_do() -> None:
     assert found.T_camera_board.distance(Pose.from_matrix(pose))[0] < 2e-3
 
 
-def test_corners_that_were_taken_for_others_are_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_misidentified_corners_are_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
     pose, detector = facing(), Detector(BOARD)
-    find = detector._exact
+    find = detector._refine_corners
 
     def mistaken(*given: object) -> NDArray[np.float64]:
         pixels = find(*given)
@@ -58,48 +59,57 @@ def test_corners_that_were_taken_for_others_are_left_out(monkeypatch: pytest.Mon
         pixels[20] += 6.0
         return pixels
 
-    monkeypatch.setattr(detector, "_exact", mistaken)
+    monkeypatch.setattr(detector, "_refine_corners", mistaken)
     found = detector.find(picture(pose, cv2), K, NO_LENS)
     assert len(found.points) == 21
     assert found.T_camera_board.distance(Pose.from_matrix(pose))[0] < 1e-3
 
 
-def test_pictures_of_no_use_say_why() -> None:
+def test_unusable_images_are_refused_with_a_code() -> None:
     detector = Detector(BOARD)
 
     def reason(grey: NDArray[np.uint8], lens: tuple[float, ...] = NO_LENS) -> str:
         with pytest.raises(NoView) as caught:
             detector.find(grey, K, lens)
-        return str(caught.value)
+        return caught.value.code
 
     sharp = picture(facing(), cv2)
-    assert reason(np.full((480, 640), 120, np.uint8)) == "the board is not in the picture"
-    assert "blurred" in reason(cv2.GaussianBlur(sharp, (0, 0), 2.0))
+    assert reason(np.full((480, 640), 120, np.uint8)) == "no_board"
+    assert reason(cv2.GaussianBlur(sharp, (0, 0), 2.0)) == "blurred"
     corner = sharp.copy()
     corner[:, :370] = 120
-    assert "corners are seen clearly" in reason(corner)
-    assert "off a flat board" in reason(picture(facing(0.3, 0.0, 0.0), cv2, (-0.8, 0.5, 0.0, 0.0, 0.0)))
+    assert reason(corner) == "too_few_corners"
+    assert reason(picture(facing(0.3, 0.0, 0.0), cv2, (-0.8, 0.5, 0.0, 0.0, 0.0))) == "not_flat"
 
 
-def test_the_board_that_comes_with_the_hal_is_this_one() -> None:
+def test_the_built_in_board_is_the_one_of_these_tests() -> None:
     assert load_board() == BOARD
 
 
-def test_without_opencv_the_command_that_installs_it_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_opencv_the_error_names_the_command_that_installs_it(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "cv2", None)
-    with pytest.raises(DriverMissing, match=r"pip install 'robot-hal\[calibration\]'"):
+    with pytest.raises(DriverMissing) as caught:
         Detector(BOARD)
+    assert "pip install 'robot-hal[calibration]'" in str(caught.value)
 
 
-def test_an_opencv_that_is_too_old_too(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_scipy_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "scipy.optimize", None)
+    monkeypatch.delitem(sys.modules, "hal.calibration.solving")
+    with pytest.raises(DriverMissing) as caught:
+        importlib.import_module("hal.calibration.solving")
+    assert "pip install 'robot-hal[calibration]'" in str(caught.value)
+
+
+def test_an_opencv_that_is_too_old_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delattr(cv2.aruco, "CharucoDetector")
-    with pytest.raises(DriverMissing, match="CharucoDetector"):
+    with pytest.raises(DriverMissing):
         load_board()
 
 
-def test_places_to_look_from_see_the_whole_board_from_all_sides() -> None:
+def test_planned_views_show_the_whole_board_from_all_sides() -> None:
     first = Pose.from_matrix(facing(0.6))
-    places = looks(BOARD, K, (640, 480), first, 60)
+    places = plan_views(BOARD, K, (640, 480), first, 60)
     normals, distances = [], []
     for place in places:
         pixels = pixels_of(place.matrix())
@@ -112,19 +122,14 @@ def test_places_to_look_from_see_the_whole_board_from_all_sides() -> None:
     assert np.ptp(np.array(normals)[:, :2], axis=0).min() > 0.8, "tilted to all sides"
     assert max(distances) > 1.2 * min(distances)
     assert [p.position.tolist() for p in places] == [
-        p.position.tolist() for p in looks(BOARD, K, (640, 480), first, 60)
+        p.position.tolist() for p in plan_views(BOARD, K, (640, 480), first, 60)
     ]
 
 
-def test_pictures_alone_lead_to_the_camera() -> None:
-    """Everything but an arm: drawn pictures through a lens, found, solved."""
-    from calibration_kit import CAMERA, X, Z
-
-    from hal.calibration import View
-    from hal.calibration.rotations import inverse
-
+def test_drawn_images_lead_to_the_camera() -> None:
+    """Everything but an arm: images drawn through a lens, detected, solved."""
     detector, taken = Detector(BOARD), []
-    for k, place in enumerate(looks(BOARD, K, (640, 480), Pose.from_matrix(facing(0.5)), 8)):
+    for k, place in enumerate(plan_views(BOARD, K, (640, 480), Pose.from_matrix(facing(0.5)), 8)):
         link = Z @ inverse(place.matrix()) @ inverse(X)
         grey = picture(place.matrix(), cv2, LENS, finer=2)
         taken.append(View(f"view {k}", Pose.from_matrix(link), detector.find(grey, K, LENS)))

@@ -1,4 +1,4 @@
-"""Which picture is looked at, with which K, and where its sensor is."""
+"""Which image of a frame is used, with which K and which optical frame."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from hal.calibration import NoView
-from hal.calibration.looking import look_of
+from hal.calibration.detection import select_image
 from hal.driver import CameraInfo, StreamInfo
 from hal.geometry import Pose
 from hal.types import Frame, Stamp
@@ -49,26 +49,27 @@ def frame(color: np.ndarray | None, infrared: np.ndarray | None) -> Frame:
     ],
 )
 def test_colour_is_in_the_view_that_it_is_aligned_to(names: tuple[str, ...], align: str, place: Pose) -> None:
-    look = look_of(frame(COLOR, INFRARED), info(*names), align)
+    look = select_image(frame(COLOR, INFRARED), info(*names), align)
     assert look.picture is COLOR
     assert (look.K is K, look.distortion is LENS) == (True, True)
     assert look.T_color_eye == place
 
 
 @pytest.mark.parametrize("align", ["color", "depth"])
-def test_infrared_is_in_its_own(align: str) -> None:
-    look = look_of(frame(None, INFRARED), info("depth", "infrared"), align)
+def test_infrared_has_a_frame_of_its_own(align: str) -> None:
+    look = select_image(frame(None, INFRARED), info("depth", "infrared"), align)
     assert look.picture is INFRARED
     assert (look.K is K_INFRARED, look.distortion is LENS_INFRARED) == (True, True)
     assert look.T_color_eye == STEREO
 
 
 def test_a_camera_whose_streams_are_all_one_view() -> None:
-    look = look_of(frame(None, INFRARED), info(K_infrared=None), "color")
+    look = select_image(frame(None, INFRARED), info(K_infrared=None), "color")
     assert (look.K is K, look.distortion is LENS) == (True, True)
     assert look.T_color_eye == Pose()
 
 
-def test_depth_alone_shows_no_board() -> None:
-    with pytest.raises(NoView, match="neither colour nor infrared"):
-        look_of(frame(None, None), info("depth"), "depth")
+def test_depth_alone_is_refused() -> None:
+    with pytest.raises(NoView) as caught:
+        select_image(frame(None, None), info("depth"), "depth")
+    assert caught.value.code == "no_image"
