@@ -1,4 +1,4 @@
-"""What every driver must do, as checks that you inherit: for people who write drivers, and for this project's own.
+"""The contract that every driver fulfils, as pytest checks to inherit: for driver authors, and for this project's own.
 
     from hal.testing import CameraBench, CameraContract, bench_of, camera_spec
 
@@ -11,11 +11,11 @@
     class TestMyCamera(CameraContract):
         bench = bench_of(my_camera)
 
-pytest collects the checks of ``TestMyCamera`` in the file where it stands; ``docs/test-a-driver.md`` has a whole one.
-This package needs pytest, and nothing else in ``hal`` imports it.
+pytest collects the checks of ``TestMyCamera`` in the file where the class is defined; ``docs/test-a-driver.md`` has a
+complete example. This package needs pytest, and nothing else in ``hal`` imports it.
 
-pytest rewrites the assertions of test files so that they say what they compared. It is told here, before the modules
-with the checks are imported, to do the same for those.
+The modules with the checks are registered for pytest's assertion rewriting before they are imported, so that a failed
+check shows the compared values as in a test file.
 """
 
 from __future__ import annotations
@@ -28,17 +28,27 @@ except ImportError as error:
     ) from error
 
 pytest.register_assert_rewrite(
-    *(f"{__name__}.{part}" for part in ("camera", "contract", "gamepad", "grasping", "gripper", "robot")),
-    *(f"{__name__}.{part}" for part in ("torque", "waiting", "watching")),
+    *(f"{__name__}.{part}" for part in ("benches", "camera", "gamepad", "gripper", "hosting", "robot"))
 )
 
-from .benches import Bench, CameraBench, GripperBench, PadBench, RobotBench  # noqa: E402
+from .benches import (  # noqa: E402
+    Bench,
+    CameraBench,
+    Contract,
+    GripperBench,
+    PadBench,
+    RobotBench,
+    bench_of,
+    camera_spec,
+    gripper_spec,
+    needs,
+    pad_spec,
+    robot_spec,
+)
 from .camera import CameraContract  # noqa: E402
-from .contract import Contract, bench_of, needs  # noqa: E402
 from .gamepad import GamepadContract  # noqa: E402
 from .gripper import GripperContract  # noqa: E402
 from .robot import RobotContract  # noqa: E402
-from .specs import camera_spec, gripper_spec, pad_spec, robot_spec  # noqa: E402
 
 __all__ = [
     "Bench",

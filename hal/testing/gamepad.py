@@ -1,4 +1,4 @@
-"""What every GamepadDriver owes to the public Gamepad, and to the dead-man behind it."""
+"""The contract of a GamepadDriver: what the public Gamepad and its dead-man rely on."""
 
 from __future__ import annotations
 
@@ -13,61 +13,63 @@ from ..driver import PadReading
 from ..errors import HalError
 from ..gamepad import Gamepad
 from ..types import AXES, BUTTONS
-from .benches import PadBench
-from .contract import Contract, needs
-from .waiting import in_thread
+from .benches import Contract, PadBench, needs, run_in_thread
 
 __all__ = ["GamepadContract"]
 
 _TURNS = 3000
-"""Most polls that anything may take."""
+"""Polls within which a change must show."""
 _SLOW = 0.005
-"""s; a poll that was told not to wait, and takes longer most of the time, blocks."""
+"""s; a poll without a time-out whose median is longer blocks."""
 _WAIT = 0.05
-"""s; a time-out that is tried."""
+"""s; a time-out that the checks try."""
 _SLACK = 2.0
-"""s that a poll may take longer than it was told to, on a busy machine."""
+"""s that a poll may exceed its time-out, on a busy machine."""
 
 
-def poll(bench: PadBench) -> PadReading:
-    """The next reading; it waits for nothing."""
+def _poll(bench: PadBench) -> PadReading:
+    """Poll once without waiting."""
     return bench.driver.poll(bench.pass_time(), 0.0)
 
 
-def poll_until_pressed(bench: PadBench) -> list[PadReading]:
-    """Press south, and poll until the reading says so."""
+def _poll_until_pressed(bench: PadBench) -> list[PadReading]:
+    """Press south, and poll until it is pressed; return the readings."""
     bench.press()
     readings = []
     for _ in range(_TURNS):
-        readings.append(poll(bench))
+        readings.append(_poll(bench))
         if "south" in readings[-1].buttons:
             return readings
-    raise AssertionError("south was never pressed")
+    raise AssertionError("south was pressed, and no reading shows it")
 
 
-def poll_until(bench: PadBench, connected: bool, alive_after: float | None = None) -> PadReading:
-    """Poll until the pad is there, if wanted with a proof of life later than ``alive_after`` (s), or gone."""
+def _poll_until(bench: PadBench, connected: bool, alive_after: float | None = None) -> PadReading:
+    """Poll until the pad is connected, or not; optionally with ``t_alive`` later than ``alive_after`` (s)."""
     deadline = time.monotonic() + bench.patience
     for turn in itertools.count():
-        reading = poll(bench)
+        reading = _poll(bench)
         if reading.connected is connected and (alive_after is None or reading.t_alive > alive_after):
             return reading
-        what = "it comes back by itself, and shows life again" if connected else "it is unplugged"
+        what = (
+            "a pad must reconnect by itself, with a new t_alive"
+            if connected
+            else "the pad is unplugged, and connected is True"
+        )
         assert turn < 20 or time.monotonic() < deadline, what
     raise AssertionError
 
 
-def is_released(reading: PadReading) -> None:
-    """Fails when anything of the pad is still pressed or pushed."""
-    assert not reading.buttons, "nothing is pressed on a pad that is not there"
-    assert not any(reading.axes.values()), "a pad that is not there has its sticks in the middle"
+def _check_released(reading: PadReading) -> None:
+    """Fail if a button is pressed or a stick deflected."""
+    assert not reading.buttons, "a disconnected pad has no pressed button"
+    assert not any(reading.axes.values()), "a disconnected pad has its sticks in the middle"
 
 
 class GamepadContract(Contract):
     """Checks of a gamepad's driver. The bench is a :class:`~hal.testing.PadBench`.
 
     ``left_out`` may name ``press``, ``release`` (nothing can be held there), ``lose`` (unplug it), ``restore`` (plug it
-    in again) and ``freeze`` (it stays connected, and says nothing more).
+    in again) and ``freeze`` (it stays connected, and sends nothing more).
     """
 
     abilities = ("press", "release", "lose", "restore", "freeze")
@@ -77,54 +79,54 @@ class GamepadContract(Contract):
     @needs("press")
     def test_names_and_ranges(self, bench: PadBench) -> None:
         bench.driver.open()
-        for reading in poll_until_pressed(bench):
+        for reading in _poll_until_pressed(bench):
             assert set(reading.axes) <= set(AXES), f"axes are named as in hal.types.AXES: {', '.join(AXES)}"
             assert reading.buttons <= set(BUTTONS), f"buttons are named as in hal.types.BUTTONS: {', '.join(BUTTONS)}"
             for name, value in reading.axes.items():
                 lowest = 0.0 if name in ("l2", "r2") else -1.0
-                assert lowest <= value <= 1.0, f"{name} goes from {lowest:g} to 1"
+                assert lowest <= value <= 1.0, f"{name} must be from {lowest:g} to 1"
             assert set(reading.unknown) <= set(AXES)
 
     @needs("press")
     def test_stamps(self, bench: PadBench) -> None:
         bench.driver.open()
-        readings = poll_until_pressed(bench)
+        readings = _poll_until_pressed(bench)
         for reading in readings:
             assert reading.connected
             assert reading.t <= bench.now + _SLACK * bench.real_time, "t is that of the newest event, on `now`'s clock"
-            assert reading.t_alive <= bench.now + _SLACK * bench.real_time, "t_alive is never ahead of the clock"
+            assert reading.t_alive <= bench.now + _SLACK * bench.real_time, "t_alive is never ahead of `now`"
         for before, after in itertools.pairwise(readings):
             assert after.t >= before.t
-            assert after.t_alive >= before.t_alive, "t_alive is when there was proof last: it never goes back"
+            assert after.t_alive >= before.t_alive, "t_alive is the time of the last sign of life: it never goes back"
             assert after.seq >= before.seq, "seq counts events"
         assert readings[-1].seq > readings[0].seq or len(readings) == 1
 
-    # Proof of life.
+    # Liveness.
 
     @needs("press")
-    def test_a_pad_that_is_there_shows_life_without_events(self, bench: PadBench) -> None:
+    def test_a_connected_pad_stays_alive_without_events(self, bench: PadBench) -> None:
         bench.driver.open()
-        poll_until_pressed(bench)
-        readings = [poll(bench) for _ in range(20)]
+        _poll_until_pressed(bench)
+        readings = [_poll(bench) for _ in range(20)]
         if bench.driver.proves_liveness:
             passed = 19 * bench.dt if not bench.real_time else bench.now - readings[0].t_alive
             life = readings[-1].t_alive - readings[0].t_alive
-            assert life == pytest.approx(passed, abs=0.05), "t_alive goes on while the pad is there, pressed or not"
+            assert life == pytest.approx(passed, abs=0.05), "t_alive advances while the pad is connected"
 
     @needs("freeze")
-    def test_the_silence_of_a_pad_ages_its_proof_of_life(self, bench: PadBench) -> None:
+    def test_t_alive_stops_when_the_pad_is_silent(self, bench: PadBench) -> None:
         bench.driver.open()
-        last = [poll(bench) for _ in range(5)][-1]
+        last = [_poll(bench) for _ in range(5)][-1]
         bench.freeze()
         for _ in range(3):
-            poll(bench)  # what was on its way
-        silent = [poll(bench) for _ in range(30)]
-        assert silent[-1].t_alive <= last.t_alive + 5 * bench.dt, "without a sign from the pad t_alive stands still"
+            _poll(bench)  # events that were under way
+        silent = [_poll(bench) for _ in range(30)]
+        assert silent[-1].t_alive <= last.t_alive + 5 * bench.dt, "without a sign of life t_alive must not advance"
         assert silent[-1].t_alive == silent[5].t_alive or not silent[-1].connected
 
     # Waiting.
 
-    def test_a_poll_that_was_told_not_to_wait_does_not(self, bench: PadBench) -> None:
+    def test_a_poll_without_time_out_does_not_wait(self, bench: PadBench) -> None:
         bench.driver.open()
         took = []
         for _ in range(30):
@@ -136,32 +138,32 @@ class GamepadContract(Contract):
             f"poll(now, 0) took {1e3 * statistics.median(took):.1f} ms: it must not wait"
         )
 
-    def test_a_poll_ends_in_time(self, bench: PadBench) -> None:
+    def test_a_poll_respects_its_time_out(self, bench: PadBench) -> None:
         bench.driver.open()
         for _ in range(5):
             began = time.monotonic()
             bench.driver.poll(bench.pass_time(), _WAIT)
-            assert time.monotonic() - began < _WAIT + _SLACK, "poll waits for news for its time-out at most"
+            assert time.monotonic() - began < _WAIT + _SLACK, "poll waits for events for its time-out at most"
 
     # Unplugging.
 
     @needs("press", "lose", "restore")
-    def test_nothing_is_pressed_on_a_pad_that_is_unplugged(self, bench: PadBench) -> None:
+    def test_an_unplugged_pad_is_released(self, bench: PadBench) -> None:
         bench.driver.open()
-        pressed = poll_until_pressed(bench)[-1]
+        pressed = _poll_until_pressed(bench)[-1]
         bench.lose()
-        poll_until(bench, connected=False)
-        gone = poll(bench)
+        _poll_until(bench, connected=False)
+        gone = _poll(bench)
         assert not gone.connected
-        is_released(gone)
-        assert gone.t_alive <= pressed.t_alive + 3 * bench.dt, "a pad that is gone shows no life"
+        _check_released(gone)
+        assert gone.t_alive <= pressed.t_alive + 3 * bench.dt, "an unplugged pad is not alive"
         bench.restore()
         proof = gone.t_alive if bench.driver.proves_liveness else None
-        back = poll_until(bench, connected=True, alive_after=proof)
+        back = _poll_until(bench, connected=True, alive_after=proof)
         assert back.seq >= gone.seq
 
     @needs("press", "release", "lose", "restore")
-    def test_the_dead_man_of_an_unplugged_pad_wants_a_new_press(self, bench: PadBench) -> None:
+    def test_the_dead_man_of_a_replugged_pad_needs_a_new_press(self, bench: PadBench) -> None:
         pad = Gamepad(bench.driver)
         pad.open(bench.now)
         deadman = pad.hold("south")
@@ -174,20 +176,20 @@ class GamepadContract(Contract):
             raise AssertionError(what)
 
         for _ in range(20):
-            pad.poll_once(bench.pass_time())  # nothing counts before it was seen at rest
+            pad.poll_once(bench.pass_time())  # a press only counts after the pad was seen at rest
         bench.press()
         until(True, "south is pressed, and the dead-man is not held")
         bench.lose()
-        until(False, "the pad is unplugged, and its dead-man still held")
+        until(False, "the pad is unplugged, and its dead-man is still held")
         deadline = time.monotonic() + bench.patience
         bench.restore()
         while not pad.state().connected:
             pad.poll_once(bench.pass_time())
             assert not deadman.held
-            assert time.monotonic() < deadline + _SLACK, "it comes back by itself"
+            assert time.monotonic() < deadline + _SLACK, "a pad must reconnect by itself"
         for _ in range(10):
             pad.poll_once(bench.pass_time())
-            assert not deadman.held, "held through a reconnect: it must be let go of, and pressed again"
+            assert not deadman.held, "a button held through a reconnect must be released and pressed again"
         bench.release()
         for _ in range(20):
             pad.poll_once(bench.pass_time())
@@ -199,30 +201,30 @@ class GamepadContract(Contract):
 
     # Closing.
 
-    def test_close_may_be_repeated_or_come_first(self, bench: PadBench) -> None:
+    def test_close_may_be_repeated_or_come_before_open(self, bench: PadBench) -> None:
         bench.driver.close()
         bench.driver.open()
-        assert poll(bench).connected
+        assert _poll(bench).connected
         bench.driver.close()
         bench.driver.close()
 
-    def test_another_thread_may_close_it(self, bench: PadBench) -> None:
+    def test_another_thread_may_close(self, bench: PadBench) -> None:
         bench.driver.open()
-        poll(bench)
-        in_thread(bench.driver.close)
+        _poll(bench)
+        run_in_thread(bench.driver.close)
 
-    def test_a_pad_that_is_not_open_is_not_connected(self, bench: PadBench) -> None:
+    def test_a_driver_that_is_not_open_is_not_connected(self, bench: PadBench) -> None:
         for _ in range(2):
             try:
-                reading = poll(bench)
+                reading = _poll(bench)
             except HalError:
                 pass
             else:
-                assert not reading.connected, "a closed pad is not connected, or polling it is an error of hal.errors"
-                is_released(reading)
+                assert not reading.connected, "a closed pad is not connected, or polling it raises a HalError"
+                _check_released(reading)
             bench.driver.open()
             bench.driver.close()
 
-    def test_it_says_what_it_is(self, bench: PadBench) -> None:
-        assert bench.driver.describe(), "describe says what drives, in words, for the banner"
+    def test_describe_names_the_device(self, bench: PadBench) -> None:
+        assert bench.driver.describe(), "describe names the device for the banner"
         assert all(math.isfinite(share) for share in bench.driver.flat.values())

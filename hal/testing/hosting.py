@@ -1,4 +1,4 @@
-"""A driver on a bench as a program sees it: the host's own code around it, and the public class in front."""
+"""A driver on a bench as an app sees it: the host's own code around it, and the public class in front."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from ..specs import GroupSpec, RobotSpec
 from ..types import GripperState, RobotState
 from .benches import GripperBench, RobotBench
 
-__all__ = ["Hosted", "HostedHand"]
+__all__ = ["HostedGripper", "HostedRobot"]
 
 
 class _BenchHost(Host):
@@ -37,41 +37,41 @@ class _BenchHost(Host):
         return self.stopped
 
     def request(self, method: str, params: dict[str, Any] | None = None) -> Any:
-        raise NotImplementedError(f"the checks make no requests: {method}")
+        raise NotImplementedError(f"a bench has no request {method}")
 
     def check(self) -> None:
-        """It is always there."""
+        """Do nothing: it never ends."""
 
     def stop(self) -> None:
         self.stopped += 1
 
     def close(self) -> None:
-        """The checks close what they opened."""
+        """Do nothing: the checks close what they opened."""
 
 
-class Hosted:
+class HostedRobot:
     """An arm: the host's unit around the driver, and the public :class:`~hal.robot.Robot` in front of it.
 
-    ``with Hosted(bench) as hosted`` opens the driver, and closes it.
+    ``with HostedRobot(bench) as hosted`` opens the driver, and closes it.
     """
 
     def __init__(self, bench: RobotBench) -> None:
         self.bench = bench
         self._folder = TemporaryDirectory()
-        spec = with_kinematics(bench.driver.spec, Path(self._folder.name))
+        spec = _with_kinematics(bench.driver.spec, Path(self._folder.name))
         clock = "real_time" if bench.real_time else "lock_step"
         host = _BenchHost(GroupSpec("bench", clock, 1.0 / bench.dt, (spec,)))
         with patch.object(registry, "load", lambda name, kind: lambda spec, world: bench.driver):
             self.unit = ArmUnit(spec, bench.dt, host.memory.robots[spec.name], None)
         self.robot = Robot(spec, host, LockStepClock(lambda: bench.now, self._advance_to), StopLatch())
 
-    def turn(self, cycles: int) -> RobotState:
-        """So many cycles of the host, and what the program sees then; raises what the program's ``state()`` raises."""
+    def run_cycles(self, cycles: int) -> RobotState:
+        """Run cycles of the host, and return the state that the app sees; raises what the app's ``state()`` raises."""
         for _ in range(cycles):
-            self._cycle()
+            self._run_cycle()
         return self.robot.state()
 
-    def _cycle(self) -> None:
+    def _run_cycle(self) -> None:
         unit, now = self.unit, self.bench.pass_time()
         app = AppRecord(now, 0)
         unit.read(now)
@@ -83,9 +83,9 @@ class Hosted:
 
     def _advance_to(self, t: float) -> None:
         while self.bench.now < t:
-            self._cycle()
+            self._run_cycle()
 
-    def __enter__(self) -> Hosted:
+    def __enter__(self) -> HostedRobot:
         self.unit.open(self.bench.pass_time())
         return self
 
@@ -94,10 +94,10 @@ class Hosted:
         self._folder.cleanup()
 
 
-class HostedHand:
+class HostedGripper:
     """A gripper: the host's unit around the driver, and the public :class:`~hal.gripper.Gripper` in front of it.
 
-    Whatever waits on the gripper makes the bench's time pass.
+    A call that waits for the gripper advances the bench's time.
     """
 
     def __init__(self, bench: GripperBench) -> None:
@@ -110,41 +110,41 @@ class HostedHand:
             spec, "bench", self.host, LockStepClock(lambda: bench.now, self._advance_to), StopLatch()
         )
 
-    def turn(self, seconds: float) -> GripperState:
-        """So many seconds of the host, and what the program sees then; raises what its ``state()`` raises."""
+    def run_for(self, seconds: float) -> GripperState:
+        """Run the host for ``seconds``, and return the state that the app sees; raises what its ``state()`` raises."""
         for _ in self.bench.turns(seconds):
-            self._cycle()
+            self._run_cycle()
         return self.gripper.state()
 
-    def _cycle(self) -> None:
+    def _run_cycle(self) -> None:
         now = self.bench.pass_time()
         self.unit.serve(AppRecord(now, self.host.stops))
         self.unit.publish(now)
 
     def _advance_to(self, t: float) -> None:
         while self.bench.now < t:
-            self._cycle()
+            self._run_cycle()
 
-    def __enter__(self) -> HostedHand:
+    def __enter__(self) -> HostedGripper:
         self.unit.open()
-        self.turn(self.bench.dt)
+        self.run_for(self.bench.dt)
         return self
 
     def __exit__(self, *_: object) -> None:
         self.unit.close()
 
 
-def with_kinematics(spec: RobotSpec, folder: Path) -> RobotSpec:
-    """The spec itself, or, where it names no URDF, one with an arm drawn up for it: links of 0.2 m, in a plane."""
+def _with_kinematics(spec: RobotSpec, folder: Path) -> RobotSpec:
+    """Return the spec, with a planar chain of 0.2 m links as its URDF if it names none."""
     if spec.kinematics.urdf:
         return spec
     file = folder / "arm.urdf"
-    file.write_text(_chain(spec), encoding="utf-8")
+    file.write_text(_chain_urdf(spec), encoding="utf-8")
     tip = f"link{len(spec.joints)}"
     return replace(spec, urdf=str(file), kinematics=replace(spec.kinematics, urdf=str(file), tcp_link=tip))
 
 
-def _chain(spec: RobotSpec) -> str:
+def _chain_urdf(spec: RobotSpec) -> str:
     limits = spec.limits
     parts = ['<robot name="chain"><link name="link0"/>']
     for k, name in enumerate(spec.joints):

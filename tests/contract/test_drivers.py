@@ -1,6 +1,6 @@
-"""Every driver against the contract of its kind (:mod:`hal.testing`). This is the one list of them.
+"""Every driver against its contract (:mod:`hal.testing`).
 
-A new driver joins by a bench in a file beside this one and a class here. What a class leaves out, it says why.
+To add a driver, write a bench in a file beside this one and a class here.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from .pads import mock_pad, playback_pad, terminal_keys_held, terminal_steps, we
 from .realsenses import played_realsense, recording, software_realsense
 from .robots import mock_robot, pybullet_robot, three_joints
 
-NO_LINK = dict.fromkeys(("lose", "restore", "freeze"), "it lives in the world's own process: nothing lies between them")
+NO_LINK = dict.fromkeys(("lose", "restore", "freeze"), "it is part of the simulation: there is no link")
 
 # Arms.
 
@@ -47,7 +47,7 @@ class TestPyBulletRobot(RobotContract):
 
 @pytest.fixture(scope="module")
 def fr3() -> Iterator[FR3]:
-    """An emulated robot."""
+    """An emulated FR3."""
     robot = FR3()
     yield robot
     robot.close()
@@ -57,12 +57,12 @@ def fr3() -> Iterator[FR3]:
 class TestEmulatedFr3(
     RobotContract,
     left_out={
-        "freeze": "a robot that is silent is lost: its library gives up after 1 s",
-        "rest": "an arm that gets no set-point for 20 ms is in reflex, and holds: tests/wire/test_franka_stops.py",
-        "torque": "torques begin with a request, so the first one is late: tests/wire/test_franka_torque.py",
+        "freeze": "a silent robot is lost: its library gives up after 1 s",
+        "rest": "an arm without a set-point for 20 ms goes into reflex and holds: tests/wire/test_franka_stops.py",
+        "torque": "torque control starts with a request, so the first torque is late: tests/wire/test_franka_torque.py",
     },
 ):
-    """The unmodified driver, and Franka's own client library, against the emulator in lock-step."""
+    """The driver and Franka's own client library against the emulator in lock-step."""
 
     @pytest.fixture
     def bench(self, fr3: FR3) -> Iterator[RobotBench]:
@@ -103,7 +103,7 @@ class TestPyBulletCameraInLockStep(CameraContract, left_out=NO_LINK):
 
 @pytest.fixture(scope="module")
 def studios() -> Iterator[list[Studio]]:
-    """The one in use is the last of them, unless it is broken."""
+    """The last one is in use, unless it is broken."""
     studios: list[Studio] = []
     yield studios
     for studio in studios:
@@ -113,8 +113,8 @@ def studios() -> Iterator[list[Studio]]:
 class TestPyBulletCameraInRealTime(
     CameraContract,
     left_out={
-        "restore": "the process that draws is the rig's: when it is gone, the rig is opened anew",
-        "freeze": "it draws for as long as the world's time goes on",
+        "restore": "the render process belongs to the rig: without it the rig must be opened again",
+        "freeze": "it renders for as long as simulated time passes",
     },
 ):
     @pytest.fixture
@@ -127,7 +127,7 @@ class TestPyBulletCameraInRealTime(
 
 @pytest.mark.slow
 class TestRealSenseInSoftware(CameraContract):
-    """The unmodified driver and library, and a camera in software."""
+    """The driver and the library with an emulated camera."""
 
     bench = bench_of(software_realsense)
 
@@ -137,7 +137,7 @@ FILE = dict.fromkeys(("lose", "restore", "freeze"), "a recording is a file: ther
 
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory: pytest.TempPathFactory) -> str:
-    """A file."""
+    """Path of a recording."""
     return recording(tmp_path_factory.mktemp("realsense"))
 
 
@@ -164,7 +164,7 @@ class TestMockPad(GamepadContract):
 
 
 class TestPlaybackPad(
-    GamepadContract, left_out={"release": "what is pressed in a recording stays pressed until it says otherwise"}
+    GamepadContract, left_out={"release": "a button in a recording stays pressed until the recording releases it"}
 ):
     bench = bench_of(playback_pad)
 
@@ -176,9 +176,9 @@ class TestWebPad(GamepadContract):
 class TestTerminalSteps(
     GamepadContract,
     left_out={
-        "release": "such a terminal never says when a key is let go of: a press is one step",
-        "restore": "a terminal that was closed does not come back",
-        "freeze": "nothing is held, so nobody has to prove anything after the press",
+        "release": "such a terminal reports no key release: a press is one step",
+        "restore": "a closed terminal does not come back",
+        "freeze": "nothing is held, so nothing needs to stay alive after the press",
     },
 ):
     bench = bench_of(terminal_steps)
@@ -194,6 +194,6 @@ class TestRecordedDualShock4(GamepadContract):
 
 class TestRecordedDualSense(
     GamepadContract,
-    left_out={"freeze": "by its cable alone, without a motion sensor, a silent pad is one that nobody touches"},
+    left_out={"freeze": "on a cable and without a motion sensor, a silent pad is an untouched one"},
 ):
     bench = bench_of(partial(recorded_pad, "dualsense", motion=False))

@@ -1,4 +1,4 @@
-"""Drivers that break one rule each. ``test_contract.py`` runs this file by itself, and reads what pytest says."""
+"""Drivers that break one rule each. ``test_contract.py`` runs this file on its own, and reads pytest's output."""
 
 from __future__ import annotations
 
@@ -148,7 +148,7 @@ class TestSlowRead(WrongRobot):
 
 
 class TestLimp(WrongRobot):
-    """It falls when it is told to halt."""
+    """An arm that drops at ``halt``."""
 
     class driver(MockRobot):  # noqa: N801
         def halt(self):
@@ -238,7 +238,7 @@ class TestStuckButtons(WrongPad):
 
 
 class TestCounts(WrongPad):
-    """Raw numbers of the device."""
+    """Raw values of the device."""
 
     class driver(MockPad):  # noqa: N801
         def poll(self, now, timeout):
@@ -265,5 +265,5 @@ class TestForgotten(CameraContract):
         return CameraBench(driver=MockCamera(camera_spec(), RealClock()))
 
 
-class TestBoth(WrongPad, left_out={"lose": "it is given all the same"}):
+class TestBoth(WrongPad, left_out={"lose": "and the bench has one"}):
     pass

@@ -12,7 +12,7 @@ import pyrealsense2 as rs
 
 from hal.drivers.realsense.emulator import SoftwareCamera, emulated_context
 from hal.specs import CameraSpec
-from hal.testing.specs import camera_spec
+from hal.testing import camera_spec
 
 PATIENCE = 10.0
 """s within which a first picture comes on a busy machine."""

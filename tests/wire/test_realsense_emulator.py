@@ -491,7 +491,7 @@ def test_a_program_may_end_while_it_streams(end: str) -> None:
         f"""
         import pyrealsense2 as rs
         from hal.drivers.realsense.emulator import SoftwareCamera, emulated_context
-        from hal.testing.specs import camera_spec
+        from hal.testing import camera_spec
         context = emulated_context()
         context.set_devices_changed_callback(lambda change: None)
         camera = SoftwareCamera(camera_spec(width=640, height=480))
@@ -513,7 +513,7 @@ def test_without_the_library_the_error_names_its_package() -> None:
         sys.modules["pyrealsense2"] = None
         from hal.drivers.realsense.emulator import SoftwareCamera, emulated_context
         from hal.errors import DriverMissing
-        from hal.testing.specs import camera_spec
+        from hal.testing import camera_spec
         for call in (emulated_context, lambda: SoftwareCamera(camera_spec())):
             try:
                 call()
