@@ -1,4 +1,4 @@
-"""A page with a rig's arms in three dimensions, and a handle on each tcp to drag: viser, in a process of its own."""
+"""A page that shows a rig in 3D, with a handle on each tcp to drag: viser, in a process of its own."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""Where a person has dragged the handle of an arm's tcp: a wish that lapses. Pure: no clock, no page, no arm.
+"""The goal of a dragged handle, and when it ends. Pure: no clock, no page, no arm.
 
-Nothing here moves anything. An app may move towards a goal while its dead-man is held; this file only sees to it that
-what is left of a drag does not surprise anybody later.
+A goal moves nothing by itself: an app may move the arm towards it while its dead-man is held. Goals end by themselves,
+so that an old one does not move the arm unexpectedly.
 """
 
 from __future__ import annotations
@@ -13,23 +13,23 @@ from typing import NamedTuple
 
 from hal.geometry import Pose
 
-__all__ = ["FARTHEST", "REACHED_ANGLE", "REACHED_DISTANCE", "UNUSED", "Drag", "Goal", "checked_pose"]
+__all__ = ["FARTHEST", "REACHED_ANGLE", "REACHED_DISTANCE", "UNUSED", "HandleDrag", "DraggedGoal", "checked_pose"]
 
 REACHED_DISTANCE, REACHED_ANGLE = 0.002, 0.01
-"""How near the tcp must be for a goal to count as reached, m and rad."""
+"""Distances of the tcp at which a goal counts as reached, m and rad."""
 UNUSED = 10.0
-"""A goal that is neither dragged nor approached for so long lapses, s: also that of a page which froze in a drag."""
+"""Time after which a goal that is neither dragged nor approached ends, s: also that of a page that froze in a drag."""
 _APPROACH = 0.002
-"""What counts as nearer, m; a radian counts as 0.2 m."""
+"""Decrease of the distance that counts as an approach, m; a radian counts as 0.2 m."""
 FARTHEST = 5.0
-"""Nothing that far from the base is a goal, m."""
+"""Greatest distance of a goal from the base, m."""
 
 
-class Goal(NamedTuple):
+class DraggedGoal(NamedTuple):
     """A pose of the tcp in the arm's base frame."""
 
     seq: int
-    """Counts what was dragged; never the same twice."""
+    """Number of the drag event; never the same twice."""
     position: tuple[float, ...]
     """(3,) m."""
     orientation: tuple[float, ...]
@@ -37,7 +37,7 @@ class Goal(NamedTuple):
 
 
 def checked_pose(position: Sequence[float], orientation: Sequence[float]) -> Pose | None:
-    """A pose from numbers that came over a wire; None where they make no sense (not finite, or far away)."""
+    """Return a pose from received numbers; None where they are not finite, of a wrong count, or too far away."""
     numbers = [*position, *orientation]
     if len(position) != 3 or len(orientation) != 4 or not all(map(isfinite, numbers)):
         return None
@@ -46,16 +46,16 @@ def checked_pose(position: Sequence[float], orientation: Sequence[float]) -> Pos
     return Pose(position, orientation)
 
 
-class Drag:
-    """What happens to one handle. Thread-safe: pages and the loop that draws tell it from different threads.
+class HandleDrag:
+    """The state of one handle. Thread-safe: pages and the drawing loop use it from different threads.
 
-    It belongs to the page that grabbed it, until that lets go.
+    The handle belongs to the page that grabbed it, until that releases it.
     """
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self._seq = 0
-        self._goal: Goal | None = None
+        self._goal: DraggedGoal | None = None
         self._owner: int | None = None
         self._grabbed = False
         self._used = 0.0
@@ -63,46 +63,46 @@ class Drag:
         self._tripped = False
 
     @property
-    def goal(self) -> Goal | None:
+    def goal(self) -> DraggedGoal | None:
         """The newest goal; None when there is none."""
         return self._goal
 
     @property
     def free(self) -> bool:
-        """Does the handle follow the tcp?"""
+        """Whether the handle follows the tcp."""
         return self._goal is None and not self._grabbed
 
     def grab(self, page: int) -> None:
-        """A page took hold of the handle; it counts unless another one holds it."""
+        """Grab the handle for a page; no effect while another page holds it."""
         with self._lock:
             if not self._grabbed:
                 self._owner, self._grabbed = page, True
 
     def move(self, page: int, position: Sequence[float], orientation: Sequence[float], now: float) -> bool:
-        """It was dragged to there, in the base frame. False where that does not count."""
+        """Set the goal, in the base frame; False where the pose is invalid or the page does not hold the handle."""
         pose = checked_pose(position, orientation)
         with self._lock:
             if pose is None or not self._grabbed or page != self._owner:
                 return False
             self._seq += 1
-            self._goal = Goal(self._seq, tuple(pose.position.tolist()), tuple(pose.orientation.tolist()))
+            self._goal = DraggedGoal(self._seq, tuple(pose.position.tolist()), tuple(pose.orientation.tolist()))
             self._used, self._nearest = now, inf
             return True
 
     def release(self, page: int) -> None:
-        """The page let go of the handle. Its goal stays."""
+        """Release the handle. Its goal stays."""
         with self._lock:
             if page == self._owner:
                 self._grabbed = False
 
     def leave(self, page: int) -> None:
-        """The page was closed, or its connection lost."""
+        """Clear the goal of a page that was closed, or whose connection is lost."""
         with self._lock:
             if page == self._owner:
                 self._clear()
 
     def clear(self) -> None:
-        """Forget the goal. What is still being dragged counts again only when it was let go of and grabbed anew."""
+        """Clear the goal. A drag under way counts again only after the handle is released and grabbed."""
         with self._lock:
             self._clear()
 
@@ -110,9 +110,14 @@ class Drag:
         self._goal, self._owner, self._grabbed = None, None, False
 
     def update(self, now: float, tcps: Sequence[Pose], *, tripped: bool) -> None:
-        """Clear what is reached by one of the tcps (measured, set-point), unused, or older than a trip.
+        """Clear the goal where it is reached, unused, or older than a trip.
 
-        So an arm that has tripped goes nowhere when it is released again.
+        So an arm that has tripped does not continue to an old goal after it is rearmed.
+
+        Args:
+            now: Monotonic time, s.
+            tcps: The measured tcp and that of the set-point, in the base frame; one of them must reach the goal.
+            tripped: Whether a stop of the arm is latched.
         """
         with self._lock:
             if tripped and not self._tripped:

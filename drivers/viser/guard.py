@@ -1,8 +1,8 @@
-"""viser's server, for this machine's user only. By itself viser lets in whoever reaches its port.
+"""viser's server, restricted to the user of this machine. viser itself accepts every connection to its port.
 
-The port is bound to loopback, which keeps other machines out, but neither other users of this one nor any page that
-the user's browser happens to show. So a page must come by the link with the secret, which it trades for a cookie, and
-only a page of this server's own may open the connection that carries poses and drags.
+The port is bound to loopback, which excludes other machines, but neither other users of this one nor other pages in the
+user's browser. So a page must be opened by the link with the secret, which is exchanged for a cookie, and only a page
+of this server may open the connection that carries poses and drags.
 """
 
 from __future__ import annotations
@@ -24,48 +24,56 @@ from websockets.http11 import Request, Response
 
 from hal.errors import HalError
 
-__all__ = ["HOST", "Server", "serve"]
+__all__ = ["HOST", "GuardedServer", "start_server"]
 
 HOST = "127.0.0.1"
 _HOSTS = ("127.0.0.1", "localhost", "[::1]")
-"""Names by which a browser may know this machine; a forwarded port keeps them, a hostile name server does not."""
+"""Accepted host names of this machine: a forwarded port keeps them, a hostile name server does not."""
 _REFUSED = "This page opens only by the link that the program printed.\n"
 
-Answer = Callable[[ServerConnection, Request], Response | Awaitable[Response | None] | None]
+Handler = Callable[[ServerConnection, Request], Response | Awaitable[Response | None] | None]
 
 
-class Server(viser.ViserServer):
-    """A viser server that stays on this machine."""
+class GuardedServer(viser.ViserServer):
+    """A viser server that is reachable on this machine only."""
 
     def request_share_url(self, verbose: bool = True) -> None:
-        """Never: any page may ask for this tunnel, and it would put the arm on the internet."""
+        """Do nothing: any page may request this tunnel, which would expose the arm to the internet."""
 
 
-def serve(port: int, label: str, secret: str) -> Server:
-    """A server on the first free port from ``port`` on, which lets in only who knows the secret.
+def start_server(port: int, label: str, secret: str) -> GuardedServer:
+    """Start a server on the first free port from ``port`` on that accepts only requests with the secret.
 
-    Raises HalError when the installed viser goes other ways than the ones that are guarded here.
+    Args:
+        port: The first port to try.
+        label: Title of the page.
+        secret: Value of ``token`` in the link.
+
+    Raises:
+        HalError: The installed viser cannot be restricted in this way (code ``viser_not_guarded``).
     """
     original = websockets.asyncio.server.serve
 
     @wraps(original)
-    def guarded(*args: Any, process_request: Answer, **options: Any) -> Any:
+    def guarded(*args: Any, process_request: Handler, **options: Any) -> Any:
         return original(*args, process_request=_guard(secret, process_request), **options)
 
-    # viser has no setting for this. It looks the function up in its module, and has called it when it is constructed.
+    # viser has no setting for this. It looks the function up in its module, and calls it in its constructor.
     websockets.asyncio.server.serve = guarded  # type: ignore[misc,assignment]
     try:
-        server = Server(host=HOST, port=port, label=label, verbose=False)
+        server = GuardedServer(host=HOST, port=port, label=label, verbose=False)
     finally:
         websockets.asyncio.server.serve = original  # type: ignore[misc]
     if server.get_host() != HOST or _status(server.get_port(), "/") != http.HTTPStatus.FORBIDDEN:
         server.stop()
-        raise HalError(f"viser {viser.__version__} cannot be guarded; install a version that is known to work")
+        raise HalError(
+            f"viser {viser.__version__} does not keep other users out; install viser 1.1", code="viser_not_guarded"
+        )
     return server
 
 
 def _status(port: int, path: str) -> int:
-    """What the server answers to somebody who does not know the secret."""
+    """Return the status of a request without the secret."""
     connection = http.client.HTTPConnection(HOST, port, timeout=5.0)
     try:
         connection.request("GET", path)
@@ -74,23 +82,23 @@ def _status(port: int, path: str) -> int:
         connection.close()
 
 
-def _guard(secret: str, answer: Answer) -> Answer:
-    """The answer, for those who may have it."""
-    # Cookies do not tell ports apart: each server has a name of its own for its one.
+def _guard(secret: str, handler: Handler) -> Handler:
+    """Return ``handler`` for requests with the secret, and a refusal for others."""
+    # Cookies do not distinguish ports, so each server has its own name for its cookie.
     name = f"robot_hal_{hashlib.sha256(secret.encode()).hexdigest()[:8]}"
 
     def guarded(connection: ServerConnection, request: Request) -> Any:
         refused = connection.respond(http.HTTPStatus.FORBIDDEN, _REFUSED)
-        if _port_free(request.headers.get("Host", "")) not in _HOSTS:
+        if _without_port(request.headers.get("Host", "")) not in _HOSTS:
             return refused
         if request.headers.get("Upgrade", "").lower() == "websocket":
             origin = request.headers.get("Origin")
             same = origin is None or origin == f"http://{request.headers['Host']}"
-            return answer(connection, request) if same and _same(_cookie(request, name), secret) else refused
-        asked = parse_qs(urlsplit(request.path).query).get("token", [""])[0]
-        if not _same(asked, secret) and not _same(_cookie(request, name), secret):
+            return handler(connection, request) if same and _same(_cookie(request, name), secret) else refused
+        token = parse_qs(urlsplit(request.path).query).get("token", [""])[0]
+        if not _same(token, secret) and not _same(_cookie(request, name), secret):
             return refused
-        response = answer(connection, request)
+        response = handler(connection, request)
         if isinstance(response, Response):
             response.headers["Set-Cookie"] = f"{name}={secret}; HttpOnly; SameSite=Strict; Path=/"
             response.headers["Referrer-Policy"] = "no-referrer"
@@ -99,7 +107,7 @@ def _guard(secret: str, answer: Answer) -> Answer:
     return guarded
 
 
-def _port_free(host: str) -> str:
+def _without_port(host: str) -> str:
     name, colon, port = host.rpartition(":")
     return name if colon and port.isdigit() else host
 

@@ -1,7 +1,10 @@
-"""What is drawn, as GLB files in memory: the format that a browser takes without further work.
+"""Visuals as GLB files in memory, the format that a browser displays without further work.
 
-Colours are baked into the vertices. A palette as a picture, as arms often have one, would else be sent once for each
-of a mesh's materials; only few large triangles, whose corners cannot tell the picture, keep it.
+Colours are baked into the vertices: a texture that is a palette, as arms often have one, would otherwise be sent once
+for each of a mesh's materials. Only few large triangles, whose corners cannot show the texture, keep it.
+
+viser's own view of URDFs (``ViserUrdf``) does not replace this: it ignores the units of Collada files, refuses a URDF
+with a capsule, skips missing meshes silently, sends large meshes and textures unchanged, and moves no world's bodies.
 """
 
 from __future__ import annotations
@@ -13,22 +16,22 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from .urdf import Visual
+from .urdf import UrdfVisual
 
-__all__ = ["glb"]
+__all__ = ["visual_glb"]
 
 Array = NDArray[np.float64]
 
 _HEAVY = 60_000
-"""Triangles up to which a mesh is sent as it is."""
+"""Greatest number of triangles of a mesh that is sent unchanged."""
 _CELLS = 150
-"""Cells along the longest side of a mesh that is heavier."""
+"""Grid cells along the longest side of a heavier mesh."""
 _COARSE = 200
-"""Only a piece with fewer triangles than this may keep its picture."""
+"""Only a piece with fewer triangles may keep its texture,"""
 _WIDE = 0.05
-"""And only where they span more than this share of it, on average."""
+"""and only where they span more than this share of it, on average."""
 _PIXELS = 512
-"""A picture that is kept is made this small."""
+"""Largest side of a texture that is kept, pixels."""
 _GREY = (0.7, 0.7, 0.7, 1.0)
 
 
@@ -42,21 +45,21 @@ class _Part(NamedTuple):
     normals: Array
     """(V, 3)."""
     colors: Array
-    """(V, 3) from 0 to 1, as a screen shows them (sRGB)."""
+    """(V, 3) from 0 to 1, sRGB."""
 
 
-def glb(visual: Visual) -> bytes:
-    """The shape of a visual in its own frame. Raises ValueError with the reason why it cannot be drawn."""
+def visual_glb(visual: UrdfVisual) -> bytes:
+    """Return the shape of a visual, in its own frame, as a GLB file. Raises ValueError where it cannot be drawn."""
     import trimesh
 
-    parts = _mesh(visual) if visual.shape == "mesh" else [_built(_primitive(visual))]
+    parts = _mesh(visual) if visual.shape == "mesh" else [_to_trimesh(_primitive(visual))]
     scene: Any = trimesh.Scene(parts)
     data: bytes = scene.export(file_type="glb", include_normals=True)
     return data
 
 
-def _built(part: _Part) -> Any:
-    """The part as trimesh knows it. A GLB's vertex colours are linear, not sRGB."""
+def _to_trimesh(part: _Part) -> Any:
+    """Return a part as a trimesh mesh. The vertex colours of a GLB are linear, not sRGB."""
     import trimesh
 
     linear = np.where(part.colors <= 0.04045, part.colors / 12.92, ((part.colors + 0.055) / 1.055) ** 2.4)
@@ -70,7 +73,7 @@ def _built(part: _Part) -> Any:
     )
 
 
-def _primitive(visual: Visual) -> _Part:
+def _primitive(visual: UrdfVisual) -> _Part:
     from trimesh import creation
 
     size = visual.size
@@ -84,36 +87,36 @@ def _primitive(visual: Visual) -> _Part:
         mesh = creation.capsule(size[1], size[0], count=(32, 32))
         mesh.apply_translation(-mesh.bounds.mean(axis=0))
     else:
-        raise ValueError(f"there is no shape {visual.shape!r}")
+        raise ValueError(f"unknown shape {visual.shape!r}")
     colors = np.tile((visual.rgba or _GREY)[:3], (len(mesh.vertices), 1))
     return _faceted(np.array(mesh.vertices), np.array(mesh.faces), colors)
 
 
-def _mesh(visual: Visual) -> list[Any]:
-    """The parts of a mesh file: those that keep a picture, and one with all the others."""
+def _mesh(visual: UrdfVisual) -> list[Any]:
+    """Return the parts of a mesh file: those that keep a texture, and one with all others."""
     import trimesh
 
     if not Path(visual.file).is_file():
-        raise ValueError(f"{visual.file} is not there")
+        raise ValueError(f"there is no file {visual.file}")
     try:
         loaded = trimesh.load(visual.file, process=False)
         metres = trimesh.units.unit_conversion(loaded.units or "meters", "meters")
-        pictured, parts = [], []
+        textured, parts = [], []
         for matrix, piece in _pieces(loaded):
             whole = np.diag([*(metres * np.array(visual.size)), 1.0]) @ matrix
-            if _needs_picture(piece):
-                pictured.append(_pictured(piece, whole))
+            if _needs_texture(piece):
+                textured.append(_textured(piece, whole))
             elif len(piece.faces):
                 parts.append(_part(piece, whole, visual.rgba))
-    except Exception as error:  # a parser raises whatever it likes on a bad file
+    except Exception as error:  # parsers raise anything on a bad file
         raise ValueError(f"{visual.file}: {type(error).__name__}: {error}") from None
-    if not pictured and not parts:
+    if not textured and not parts:
         raise ValueError(f"{visual.file} has no triangles")
-    return pictured + ([_built(_lighter(_joined(parts)))] if parts else [])
+    return textured + ([_to_trimesh(_decimated(_joined(parts)))] if parts else [])
 
 
 def _pieces(loaded: Any) -> Iterator[tuple[Array, Any]]:
-    """What is in a file, a piece for each material, each with its pose."""
+    """Yield (pose matrix, mesh) for each piece of a file; each material is one piece."""
     import trimesh
 
     if isinstance(loaded, trimesh.Trimesh):
@@ -126,10 +129,10 @@ def _pieces(loaded: Any) -> Iterator[tuple[Array, Any]]:
 
 
 def _part(piece: Any, matrix: Array, rgba: tuple[float, ...] | None) -> _Part:
-    """One piece, moved and coloured."""
+    """Return one piece, moved and coloured."""
     points, faces = _moved(piece, matrix)
     colors = _colors(piece, rgba)
-    # trimesh computes missing normals only with scipy; those that the file brought are in its cache.
+    # trimesh computes missing normals only with scipy; those of the file are in its cache.
     normals = np.asarray(piece.vertex_normals, float) if "vertex_normals" in piece._cache else None
     if normals is None or not np.isfinite(normals).all():
         return _faceted(points, faces, colors)
@@ -137,64 +140,64 @@ def _part(piece: Any, matrix: Array, rgba: tuple[float, ...] | None) -> _Part:
 
 
 def _moved(piece: Any, matrix: Array) -> tuple[Array, NDArray[np.int64]]:
-    """Points and faces of a piece, the latter turned where the matrix mirrors: the outside stays outside."""
+    """Return points and faces of a piece; faces are reversed where the matrix mirrors, to keep the outside outside."""
     faces = np.asarray(piece.faces)
     points: Array = np.asarray(piece.vertices, float) @ matrix[:3, :3].T + matrix[:3, 3]
     return points, faces[:, ::-1] if np.linalg.det(matrix[:3, :3]) < 0 else faces
 
 
 def _colors(piece: Any, rgba: tuple[float, ...] | None) -> Array:
-    """(V, 3). A colour of the URDF's replaces that of a material and tints a picture; white leaves both."""
+    """Return the colours (V, 3). A URDF's colour replaces that of a material and tints a texture; white keeps both."""
     count, visual = len(piece.vertices), piece.visual
     tint = np.ones(3) if rgba is None else np.asarray(rgba[:3], float)
-    picture = _picture(piece)
-    if picture is not None:
-        return _sampled(np.asarray(picture.convert("RGB")), np.asarray(visual.uv, float)) * tint
+    texture = _texture(piece)
+    if texture is not None:
+        return _sampled(np.asarray(texture.convert("RGB")), np.asarray(visual.uv, float)) * tint
     if visual.kind in ("vertex", "face"):
         return np.asarray(visual.vertex_colors, float)[:, :3] / 255 * tint
     material = getattr(visual, "material", None)
-    # A material without entries is trimesh's stand-in for a file that is not there.
+    # A material without entries is trimesh's placeholder for a missing file.
     if np.all(tint == 1) and material is not None and getattr(material, "kwargs", True):
         tint = np.asarray(material.main_color[:3], float) / 255
     return np.tile(tint, (count, 1))
 
 
-def _picture(piece: Any) -> Any | None:
+def _texture(piece: Any) -> Any | None:
     material = getattr(piece.visual, "material", None)
     image = getattr(material, "image", None) or getattr(material, "baseColorTexture", None)
     return image if getattr(piece.visual, "uv", None) is not None else None
 
 
-def _needs_picture(piece: Any) -> bool:
-    if _picture(piece) is None or not 0 < len(piece.faces) < _COARSE:
+def _needs_texture(piece: Any) -> bool:
+    if _texture(piece) is None or not 0 < len(piece.faces) < _COARSE:
         return False
     return float(np.ptp(np.asarray(piece.visual.uv)[piece.faces], axis=1).max(axis=1).mean()) > _WIDE
 
 
-def _pictured(piece: Any, matrix: Array) -> Any:
-    """A piece that keeps its picture, as trimesh knows it."""
+def _textured(piece: Any, matrix: Array) -> Any:
+    """Return a piece that keeps its texture as a trimesh mesh."""
     import trimesh
 
-    picture = _picture(piece).convert("RGB")  # type: ignore[union-attr]
-    picture.thumbnail((_PIXELS, _PIXELS))
+    texture = _texture(piece).convert("RGB")  # type: ignore[union-attr]
+    texture.thumbnail((_PIXELS, _PIXELS))
     points, faces = _moved(piece, matrix)
     flat = _faceted(points, faces, np.zeros_like(points))
     visuals: Any = trimesh.visual
-    material = visuals.material.PBRMaterial(baseColorTexture=picture, metallicFactor=0.0, roughnessFactor=0.8)
+    material = visuals.material.PBRMaterial(baseColorTexture=texture, metallicFactor=0.0, roughnessFactor=0.8)
     visual = visuals.TextureVisuals(np.asarray(piece.visual.uv)[faces.reshape(-1)], material=material)
     return trimesh.Trimesh(flat.points, flat.faces, vertex_normals=flat.normals, visual=visual, process=False)
 
 
-def _sampled(picture: NDArray[np.uint8], uv: Array) -> Array:
-    height, width, _ = picture.shape
+def _sampled(texture: NDArray[np.uint8], uv: Array) -> Array:
+    height, width, _ = texture.shape
     column = (np.mod(uv[:, 0], 1.0) * width).astype(int) % width
     row = ((1.0 - np.mod(uv[:, 1], 1.0)) * height).astype(int) % height
-    colors: Array = picture[row, column] / 255.0
+    colors: Array = texture[row, column] / 255.0
     return colors
 
 
 def _faceted(points: Array, faces: NDArray[np.int64], colors: Array) -> _Part:
-    """Each triangle with corners and a normal of its own."""
+    """Give each triangle its own corners and its own normal."""
     each = faces.reshape(-1)
     corners = points[each].reshape(-1, 3, 3)
     across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
@@ -211,8 +214,8 @@ def _joined(parts: list[_Part]) -> _Part:
     )
 
 
-def _lighter(part: _Part) -> _Part:
-    """A heavy mesh with all vertices in one cell of a grid made one; others as they are."""
+def _decimated(part: _Part) -> _Part:
+    """Join all vertices in one cell of a grid, where a mesh is heavy."""
     if len(part.faces) <= _HEAVY:
         return part
     low, extent = part.points.min(axis=0), np.ptp(part.points, axis=0).max()

@@ -1,4 +1,4 @@
-"""What a URDF looks like: its links in a tree, the joints between them, and what is drawn on each link."""
+"""The visuals of a URDF: its tree of links, the joints between them, and the shapes on each link."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ from pathlib import Path
 from hal.geometry import Pose, after_rotation, rotate
 from hal.kinematics.urdf import mesh_file
 
-__all__ = ["Joint", "UrdfTree", "Visual", "read_tree"]
+__all__ = ["UrdfTreeJoint", "UrdfTree", "UrdfVisual", "read_tree"]
 
-_TURNS = ("revolute", "continuous")
-_SLIDES = "prismatic"
+_ROTARY = ("revolute", "continuous")
+_SLIDING = "prismatic"
 
 
 @dataclass(frozen=True)
-class Visual:
-    """One thing to draw, with its pose in the frame that it belongs to."""
+class UrdfVisual:
+    """One shape to draw, with its pose in the frame of its link."""
 
     pose: Pose
     shape: str
@@ -26,21 +26,21 @@ class Visual:
     size: tuple[float, ...]
     """Scale of a mesh along x, y, z; sides of a box; radius; radius and length; m."""
     rgba: tuple[float, ...] | None = None
-    """None: as the file says."""
+    """None for the colours of the file."""
     file: str = ""
-    """Of a mesh; a path that may not be there."""
+    """Path of a mesh, which may not exist."""
 
 
 @dataclass(frozen=True)
-class Joint:
-    """A joint, and how it moves its child. A driven one has a ``source``, whose value counts: itself, or a mimic's."""
+class UrdfTreeJoint:
+    """A joint, and the motion of its child. ``source`` is the joint whose value counts: itself, or that of a mimic."""
 
     name: str
     kind: str
     parent: str
     child: str
     origin: Pose
-    """Of the child in the parent's frame, at zero."""
+    """Pose of the child in the parent's frame, at zero."""
     axis: tuple[float, ...]
     """(3,) along the parent's axes."""
     source: str
@@ -49,33 +49,33 @@ class Joint:
 
     @property
     def moves(self) -> bool:
-        """Does the child move with a value?"""
-        return self.kind in _TURNS or self.kind == _SLIDES
+        """Whether the joint can move."""
+        return self.kind in _ROTARY or self.kind == _SLIDING
 
     def placement(self, values: Mapping[str, float]) -> tuple[list[float], list[float]]:
-        """Position (3,) and quaternion (4,) of the child in the parent's frame; a joint without a value is at zero."""
+        """Return position (3,) and quaternion (4,) of the child in the parent's frame; absent values are 0."""
         position, orientation = self.origin.position.tolist(), self.origin.orientation.tolist()
         value = self.multiplier * values.get(self.source, 0.0) + self.offset
         along = [value * part for part in self.axis]
-        if self.kind in _TURNS:
+        if self.kind in _ROTARY:
             orientation = after_rotation(orientation, along)
-        elif self.kind == _SLIDES:
+        elif self.kind == _SLIDING:
             position = [a + b for a, b in zip(position, along, strict=True)]
         return position, orientation
 
 
 @dataclass(frozen=True)
 class UrdfTree:
-    """A URDF as a tree."""
+    """A URDF as a tree of links."""
 
     root: str
-    joints: tuple[Joint, ...]
+    joints: tuple[UrdfTreeJoint, ...]
     """From the root outwards: a parent comes before its children."""
-    visuals: Mapping[str, tuple[Visual, ...]]
-    """Of each link."""
+    visuals: Mapping[str, tuple[UrdfVisual, ...]]
+    """Link -> its shapes."""
 
     def poses(self, values: Mapping[str, float]) -> dict[str, Pose]:
-        """The pose of each link in the root's frame."""
+        """Return the pose of each link in the root's frame."""
         found = {self.root: Pose()}
         for joint in self.joints:
             found[joint.child] = found[joint.parent] @ Pose(*joint.placement(values))
@@ -83,7 +83,12 @@ class UrdfTree:
 
 
 def read_tree(path: str) -> UrdfTree:
-    """Read a URDF. Raises ValueError with what is wrong in it, and OSError."""
+    """Read a URDF.
+
+    Raises:
+        ValueError: It is wrong; the message tells where.
+        OSError: It cannot be read.
+    """
     try:
         robot = ElementTree.parse(path).getroot()
     except ElementTree.ParseError as error:
@@ -104,24 +109,24 @@ def read_tree(path: str) -> UrdfTree:
     return _tree(path, joints, visuals)
 
 
-def _tree(path: str, joints: list[Joint], visuals: dict[str, tuple[Visual, ...]]) -> UrdfTree:
-    """The joints in order. ValueError where they are no tree."""
+def _tree(path: str, joints: list[UrdfTreeJoint], visuals: dict[str, tuple[UrdfVisual, ...]]) -> UrdfTree:
+    """Order the joints. Raises ValueError where they are not a tree."""
     children = {joint.child for joint in joints}
     roots = [link for link in visuals if link not in children]
     if len(roots) != 1:
-        raise ValueError(f"{path} has {len(roots)} links that hang on nothing, not one")
+        raise ValueError(f"{path} has {len(roots)} root links, not one")
     placed, ordered, waiting = {roots[0]}, [], joints
     while waiting:
         ready = [joint for joint in waiting if joint.parent in placed]
         if not ready:
-            raise ValueError(f"{path}: joint {waiting[0].name} does not hang on the root")
+            raise ValueError(f"{path}: joint {waiting[0].name} is not connected to the root")
         ordered += ready
         waiting = [joint for joint in waiting if joint.parent not in placed]
         placed |= {joint.child for joint in ready}
     return UrdfTree(roots[0], tuple(ordered), visuals)
 
 
-def _joint(element: ElementTree.Element) -> Joint:
+def _joint(element: ElementTree.Element) -> UrdfTreeJoint:
     name, mimic = element.get("name", ""), element.find("mimic")
     parent, child = element.find("parent"), element.find("child")
     if parent is None or child is None:
@@ -129,9 +134,9 @@ def _joint(element: ElementTree.Element) -> Joint:
     origin = _origin(element)
     axis = _numbers(element.find("axis"), "xyz", 3, 0.0) if element.find("axis") is not None else (1.0, 0.0, 0.0)
     length = sum(part * part for part in axis) ** 0.5
-    if length == 0.0 and element.get("type") in (*_TURNS, _SLIDES):
-        raise ValueError(f"joint {name} has an axis of no length")
-    return Joint(
+    if length == 0.0 and element.get("type") in (*_ROTARY, _SLIDING):
+        raise ValueError(f"joint {name} has an axis of length 0")
+    return UrdfTreeJoint(
         name=name,
         kind=element.get("type", ""),
         parent=parent.get("link", ""),
@@ -144,7 +149,7 @@ def _joint(element: ElementTree.Element) -> Joint:
     )
 
 
-def _visual(element: ElementTree.Element, colors: Mapping[str, tuple[float, ...]], folder: Path) -> Visual | None:
+def _visual(element: ElementTree.Element, colors: Mapping[str, tuple[float, ...]], folder: Path) -> UrdfVisual | None:
     material, geometry = element.find("material"), element.find("geometry")
     rgba = colors.get(material.get("name", "")) if material is not None else None
     if material is not None and (own := material.find("color")) is not None:
@@ -155,13 +160,13 @@ def _visual(element: ElementTree.Element, colors: Mapping[str, tuple[float, ...]
     pose = _origin(element)
     if shape.tag == "mesh":
         file = mesh_file(shape.get("filename", ""), folder)
-        return Visual(pose, "mesh", _numbers(shape, "scale", 3, 1.0), rgba, str(file))
+        return UrdfVisual(pose, "mesh", _numbers(shape, "scale", 3, 1.0), rgba, str(file))
     if shape.tag == "box":
-        return Visual(pose, "box", _numbers(shape, "size", 3, 0.0), rgba)
+        return UrdfVisual(pose, "box", _numbers(shape, "size", 3, 0.0), rgba)
     if shape.tag == "sphere":
-        return Visual(pose, "sphere", _numbers(shape, "radius", 1, 0.0), rgba)
+        return UrdfVisual(pose, "sphere", _numbers(shape, "radius", 1, 0.0), rgba)
     if shape.tag in ("cylinder", "capsule"):
-        return Visual(pose, shape.tag, _numbers(shape, "radius", 1, 0.0) + _numbers(shape, "length", 1, 0.0), rgba)
+        return UrdfVisual(pose, shape.tag, _numbers(shape, "radius", 1, 0.0) + _numbers(shape, "length", 1, 0.0), rgba)
     return None
 
 

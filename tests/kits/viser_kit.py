@@ -1,4 +1,4 @@
-"""A page of the 3D viewer without a browser: it speaks viser's protocol over a plain WebSocket."""
+"""A page of the 3D viewer without a browser: viser's protocol over a plain WebSocket."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ from websockets.sync.client import connect
 
 
 def until(condition: Callable[[], Any], limit: float = 20.0) -> Any:
-    """What the condition became, once it is true."""
+    """Return the condition's value once it is true."""
     deadline = time.monotonic() + limit
     while not (value := condition()):
-        assert time.monotonic() < deadline, "it did not come to that"
+        assert time.monotonic() < deadline, "time-out"
         time.sleep(0.01)
     return value
 
 
 def get(link: str, **headers: str) -> tuple[int, str]:
-    """Status of a GET request, and the cookie that came with it."""
+    """Return the status of a GET request, and its cookie."""
     parts = urlsplit(link)
     connection = http.client.HTTPConnection(parts.netloc, timeout=10.0)
     try:
@@ -36,7 +36,7 @@ def get(link: str, **headers: str) -> tuple[int, str]:
 
 
 class PlainPage:
-    """Opens a link as a browser would, and remembers what it was told."""
+    """Opens a link as a browser does, and keeps the received state."""
 
     def __init__(self, link: str) -> None:
         status, cookie = get(link)
@@ -72,7 +72,7 @@ class PlainPage:
         self.socket.send(msgspec.msgpack.encode({"type": kind, **fields}))
 
     def drag(self, name: str, *poses: tuple[tuple[float, ...], tuple[float, ...]], let_go: bool = True) -> None:
-        """Grab a handle, drag it through poses of position and wxyz, and let go of it."""
+        """Grab a handle, drag it through poses of position and wxyz, and release it."""
         self.say("TransformControlsDragStartMessage", name=name)
         for position, wxyz in poses:
             self.say("TransformControlsUpdateMessage", name=name, position=position, wxyz=wxyz)
@@ -84,7 +84,7 @@ class PlainPage:
         self.say("GuiUpdateMessage", uuid=self.buttons[label], updates={"value": True})
 
     def hear(self) -> None:
-        """Take in what has come."""
+        """Evaluate the received messages."""
         while True:
             try:
                 frame = self.socket.recv(timeout=0.0)
@@ -110,5 +110,5 @@ class PlainPage:
             self.texts[message["uuid"]] = message["updates"].get("_markdown", self.texts[message["uuid"]])
 
     def close(self) -> None:
-        """Hang up."""
+        """Close the connection."""
         self.socket.close()

@@ -1,4 +1,4 @@
-"""What the 3D viewer sends to a browser: GLB files, and the lines of a workspace."""
+"""The GLB files and workspace lines that the 3D viewer sends to a browser."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ import trimesh
 from pictures_kit import COLLADA
 from specs import data, panda
 
-from hal.drivers.viser.meshes import glb
-from hal.drivers.viser.urdf import Visual, read_tree
+from hal.drivers.viser.meshes import visual_glb
+from hal.drivers.viser.urdf import UrdfVisual, read_tree
 from hal.geometry import Pose
 from hal.specs import WorkspaceSpec
 
 
-def loaded(visual: Visual) -> Any:
-    """What a browser would find."""
-    return trimesh.load(io.BytesIO(glb(visual)), file_type="glb", process=False)
+def loaded(visual: UrdfVisual) -> Any:
+    """Return the visual as a browser loads it."""
+    return trimesh.load(io.BytesIO(visual_glb(visual)), file_type="glb", process=False)
 
 
 def colors(scene: Any) -> np.ndarray:
@@ -37,13 +37,13 @@ def colors(scene: Any) -> np.ndarray:
     ],
 )
 def test_primitives_have_their_size_and_colour(shape: str, size: tuple[float, ...], extents: tuple[float, ...]) -> None:
-    scene = loaded(Visual(Pose(), shape, size, (1.0, 0.0, 0.0, 1.0)))
+    scene = loaded(UrdfVisual(Pose(), shape, size, (1.0, 0.0, 0.0, 1.0)))
     assert scene.extents == pytest.approx(extents, abs=2e-3)
     assert scene.bounds.mean(axis=0) == pytest.approx((0, 0, 0), abs=1e-3)
     assert (colors(scene) == (255, 0, 0)).all()
 
 
-def test_an_arms_meshes_keep_their_place_and_their_colours() -> None:
+def test_meshes_of_an_arm_keep_their_pose_and_colours() -> None:
     tree = read_tree(panda().urdf)
     (link,) = tree.visuals["panda_link1"]
     scene = loaded(link)
@@ -55,15 +55,15 @@ def test_an_arms_meshes_keep_their_place_and_their_colours() -> None:
     assert shades.max() > 180  # the white rest
 
 
-def test_a_collada_file_keeps_its_units_and_its_colours(tmp_path: Path) -> None:
+def test_collada_file_keeps_its_units_and_colours(tmp_path: Path) -> None:
     part = tmp_path / "part.dae"
     part.write_text(COLLADA)
-    scene = loaded(Visual(Pose(), "mesh", (1.0, 1.0, 1.0), None, str(part)))
+    scene = loaded(UrdfVisual(Pose(), "mesh", (1.0, 1.0, 1.0), None, str(part)))
     assert scene.extents == pytest.approx([0.02, 0.02, 0.06])
     assert (colors(scene) == (255, 0, 0)).all()
 
 
-def test_few_large_triangles_keep_their_picture() -> None:
+def test_few_large_triangles_keep_their_texture() -> None:
     tree = read_tree(data("table/table.urdf"))
     scene = loaded(tree.visuals[tree.root][0])
     pictures = [part.visual.material.baseColorTexture for part in scene.geometry.values()]
@@ -71,20 +71,20 @@ def test_few_large_triangles_keep_their_picture() -> None:
     assert max(pictures[0].size) <= 512
 
 
-def test_a_mirrored_mesh_is_not_inside_out(tmp_path: Path) -> None:
+def test_mirrored_mesh_keeps_its_outside(tmp_path: Path) -> None:
     file = tmp_path / "ball.stl"
     trimesh.creation.icosphere(2, 0.1).export(file)
     for scale in ((1.0, 1.0, 1.0), (1.0, -2.0, 1.0)):
-        (part,) = loaded(Visual(Pose(), "mesh", scale, None, str(file))).geometry.values()
+        (part,) = loaded(UrdfVisual(Pose(), "mesh", scale, None, str(file))).geometry.values()
         assert part.volume > 0
         outwards = np.einsum("ni,ni->n", part.vertex_normals, part.vertices)
         assert (outwards > 0).all()
 
 
-def test_a_heavy_mesh_gets_lighter_and_keeps_its_shape(tmp_path: Path) -> None:
+def test_heavy_mesh_is_decimated_and_keeps_its_shape(tmp_path: Path) -> None:
     file = tmp_path / "ball.ply"
     trimesh.creation.icosphere(7, 0.1).export(file)  # 327 680 triangles
-    (part,) = loaded(Visual(Pose(), "mesh", (1.0, 1.0, 1.0), (0.0, 1.0, 0.0, 1.0), str(file))).geometry.values()
+    (part,) = loaded(UrdfVisual(Pose(), "mesh", (1.0, 1.0, 1.0), (0.0, 1.0, 0.0, 1.0), str(file))).geometry.values()
     assert 10_000 < len(part.faces) < 200_000
     radius = np.linalg.norm(part.vertices, axis=1)
     assert radius == pytest.approx(np.full(len(radius), 0.1), abs=1e-3)
@@ -92,17 +92,17 @@ def test_a_heavy_mesh_gets_lighter_and_keeps_its_shape(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("content", [None, "solid nothing\nendsolid nothing\n", "\0\1\2"])
-def test_what_cannot_be_drawn_is_said(tmp_path: Path, content: str | None) -> None:
+def test_wrong_mesh_file_is_named(tmp_path: Path, content: str | None) -> None:
     file = tmp_path / "odd.stl"
     if content is not None:
         file.write_text(content)
     with pytest.raises(ValueError, match=r"odd\.stl"):
-        glb(Visual(Pose(), "mesh", (1.0, 1.0, 1.0), None, str(file)))
+        visual_glb(UrdfVisual(Pose(), "mesh", (1.0, 1.0, 1.0), None, str(file)))
 
 
-def test_a_workspace_is_drawn_where_it_ends() -> None:
+def test_workspace_is_drawn_at_its_bounded_sides() -> None:
     pytest.importorskip("viser", reason="needs viser (pip install 'robot-hal[viewer]')")
-    from hal.drivers.viser.arm import workspace_lines
+    from hal.drivers.viser.scene import workspace_lines
 
     box = workspace_lines(WorkspaceSpec((0.1, -0.2, 0.0), (0.6, 0.2, 0.5)))
     assert box.shape == (24, 2, 3)  # each edge belongs to two sides

@@ -1,4 +1,4 @@
-"""Goals of the 3D viewer: whose drag counts, and when a goal ends."""
+"""Goals of the 3D viewer: which drag counts, and when a goal ends."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from math import inf, nan
 import numpy as np
 import pytest
 
-from hal.drivers.viser.goals import FARTHEST, UNUSED, Drag, checked_pose
+from hal.drivers.viser.goals import FARTHEST, UNUSED, HandleDrag, checked_pose
 from hal.geometry import Pose
 
 LEVEL = (0.0, 0.0, 0.0, 1.0)
@@ -15,8 +15,8 @@ HERE, THERE = (0.3, 0.0, 0.5), (0.4, 0.0, 0.5)
 AT = [Pose(HERE), Pose(HERE)]
 
 
-def dragged(let_go: bool = True) -> Drag:
-    drag = Drag()
+def dragged(let_go: bool = True) -> HandleDrag:
+    drag = HandleDrag()
     drag.grab(1)
     assert drag.move(1, THERE, LEVEL, 10.0)
     if let_go:
@@ -39,7 +39,7 @@ def dragged(let_go: bool = True) -> Drag:
 )
 def test_numbers_that_make_no_sense_are_no_goal(position: tuple[float, ...], orientation: tuple[float, ...]) -> None:
     assert checked_pose(position, orientation) is None
-    drag = Drag()
+    drag = HandleDrag()
     drag.grab(1)
     assert not drag.move(1, position, orientation, 0.0)
     assert drag.goal is None
@@ -61,8 +61,8 @@ def test_a_goal_is_a_unit_quaternion_and_has_a_number_of_its_own() -> None:
     assert drag.goal.seq > second.seq
 
 
-def test_nobody_drags_what_another_page_holds() -> None:
-    drag = Drag()
+def test_handle_belongs_to_the_page_that_holds_it() -> None:
+    drag = HandleDrag()
     assert not drag.move(2, THERE, LEVEL, 0.0)  # never grabbed
     drag.grab(1)
     assert not drag.free
@@ -72,12 +72,12 @@ def test_nobody_drags_what_another_page_holds() -> None:
     drag.leave(2)
     assert drag.move(1, THERE, LEVEL, 0.0)
     drag.release(1)
-    drag.grab(2)  # it was let go of
+    drag.grab(2)  # it was released
     assert drag.move(2, HERE, LEVEL, 0.0)
 
 
-def test_grabbing_alone_is_no_goal() -> None:
-    drag = Drag()
+def test_grabbing_alone_sets_no_goal() -> None:
+    drag = HandleDrag()
     drag.grab(1)
     assert drag.goal is None
     assert not drag.free
@@ -85,7 +85,7 @@ def test_grabbing_alone_is_no_goal() -> None:
     assert drag.free
 
 
-def test_a_goal_is_reached_when_it_is_let_go_of() -> None:
+def test_goal_is_reached_only_after_its_release() -> None:
     drag = dragged(let_go=False)
     near = [Pose(HERE), Pose((0.4, 0.0015, 0.5))]
     drag.update(10.1, near, tripped=False)
@@ -99,17 +99,17 @@ def test_a_goal_is_reached_when_it_is_let_go_of() -> None:
     assert drag.free
 
 
-def test_a_goal_that_nobody_goes_to_lapses() -> None:
+def test_unused_goal_ends() -> None:
     for drag in (dragged(), dragged(let_go=False)):  # also when a page froze in the middle of a drag
         drag.update(10.0, AT, tripped=False)
         drag.update(10.0 + UNUSED - 0.1, AT, tripped=False)
         assert drag.goal is not None
         drag.update(10.0 + UNUSED + 0.1, AT, tripped=False)
         assert drag.goal is None
-        assert not drag.move(1, THERE, LEVEL, 21.0)  # until it is grabbed anew
+        assert not drag.move(1, THERE, LEVEL, 21.0)  # until it is grabbed again
 
 
-def test_a_goal_that_is_approached_stays() -> None:
+def test_approached_goal_stays() -> None:
     drag = dragged()
     for step in range(40):
         drag.update(10.0 + step, [Pose((0.3 + 0.002 * step, 0.0, 0.5))], tripped=False)
@@ -118,18 +118,18 @@ def test_a_goal_that_is_approached_stays() -> None:
     assert drag.goal is None
 
 
-def test_a_trip_ends_a_goal_and_the_drag_behind_it() -> None:
+def test_trip_ends_a_goal_and_its_drag() -> None:
     drag = dragged(let_go=False)
     drag.update(10.1, AT, tripped=True)
     assert drag.goal is None
     assert not drag.move(1, THERE, LEVEL, 10.2)
     drag.grab(1)
-    assert drag.move(1, THERE, LEVEL, 10.3)  # a new wish
+    assert drag.move(1, THERE, LEVEL, 10.3)  # a new drag
     drag.update(10.4, AT, tripped=True)
     assert drag.goal is not None
 
 
-def test_a_page_that_leaves_takes_its_goal_along() -> None:
+def test_goal_ends_with_its_page() -> None:
     drag = dragged()
     drag.leave(2)
     assert drag.goal is not None

@@ -1,0 +1,353 @@
+"""The scene: arms with their handles, and the bodies of the simulated world around them."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from viser import SceneApi, SceneNodeHandle, TransformControlsEvent, TransformControlsHandle
+
+from hal import registry
+from hal.errors import HalError
+from hal.geometry import Pose
+from hal.host.memory import SeriesBox
+from hal.host.records import GripperMail, RobotMail
+from hal.servo.watchdog import PAD_SILENCE
+from hal.specs import BodySpec, RobotSpec, WorkspaceSpec, WorldSpec, from_json
+from hal.types import RobotState, Trip
+
+from .goals import HandleDrag
+from .meshes import visual_glb
+from .urdf import UrdfTree, UrdfTreeJoint, UrdfVisual, read_tree
+
+__all__ = ["ArmView", "WorldView", "workspace_lines"]
+
+_OPEN_SIDE = 0.8
+"""Distance from the base at which an open side of a workspace is drawn, m."""
+_AMBER = (230, 150, 30)
+_AT_REST = 1e-5
+"""A node that moves by less is not updated, m and parts of a quaternion: an arm at rest costs no messages."""
+
+
+class ArmView:
+    """One arm, drawn from its mailboxes: links, set-point, workspace, and the handle on its tcp.
+
+    Every node is a child of the frame of the arm's base.
+    """
+
+    def __init__(
+        self, scene: SceneApi, spec: RobotSpec, mail: RobotMail, gripper: GripperMail | None, notes: list[str]
+    ) -> None:
+        """Draw the arm.
+
+        Args:
+            scene: The scene to draw it in.
+            spec: The arm.
+            mail: The arm's mailboxes in its host's memory.
+            gripper: Those of its gripper, if it has one.
+            notes: Gets a line for everything that cannot be drawn.
+
+        Raises:
+            ValueError: Its URDF is wrong.
+            OSError: Its URDF cannot be read.
+        """
+        self.spec = spec
+        self.mail = mail
+        self.gripper = gripper
+        self.drag = HandleDrag()
+        tree = read_tree(spec.urdf)
+        root = f"/arms/{spec.name}"
+        scene.add_frame(
+            root,
+            axes_length=0.12,
+            axes_radius=0.004,
+            position=spec.base_position,
+            wxyz=_wxyz(spec.base_orientation),
+        )
+        self._links = _draw_links(scene, f"{root}/links", tree, spec, notes)
+        self._set = scene.add_frame(f"{root}/set", axes_length=0.06, axes_radius=0.002, origin_radius=0.004)
+        if spec.workspace is not None:
+            lines = workspace_lines(spec.workspace)
+            if len(lines):
+                scene.add_line_segments(f"{root}/workspace", lines, _AMBER, thickness=0.003)
+        self.state: RobotState | None = None
+        self._scene = scene
+        self._handle = self._new_handle()
+
+    def _new_handle(self) -> TransformControlsHandle:
+        handle = self._scene.add_transform_controls(
+            f"/arms/{self.spec.name}/handle", scale=0.18, line_width=3.0, depth_test=False
+        )
+        handle.on_update(self._on_drag)
+        return handle
+
+    async def _on_drag(self, event: TransformControlsEvent) -> None:
+        """Handle a drag on the server's own thread, so that its phases keep their order."""
+        page = event.client_id
+        if page is None:
+            return
+        if event.phase == "start":
+            self.drag.grab(page)
+        elif event.phase == "end":
+            self.drag.release(page)
+        else:
+            w, x, y, z = event.target.wxyz.tolist()
+            self.drag.move(page, event.target.position.tolist(), (x, y, z, w), time.monotonic())
+
+    @property
+    def deadman_held(self) -> bool:
+        """Whether the arm's dead-man is held, by a pad that is alive."""
+        deadman = self.mail.get_deadman()
+        return deadman is not None and deadman.held and time.monotonic() - deadman.t_alive < PAD_SILENCE
+
+    def read_state(self) -> None:
+        """Read the newest state, and end the goal where it is reached, unused, or older than a trip."""
+        self.state = state = self.mail.get_state()
+        if state is None:
+            return
+        tripped = state.trip is not Trip.NONE
+        self.drag.update(time.monotonic(), (state.tcp, state.tcp_set), tripped=tripped)
+
+    def update(self) -> None:
+        """Update the page."""
+        state = self.state
+        if state is None:
+            return
+        values = dict(zip(self.spec.joints, state.q.tolist(), strict=True))
+        gripper = self.gripper.get() if self.gripper is not None else None
+        if gripper is not None and self.spec.gripper is not None:
+            values |= dict.fromkeys(self.spec.gripper.joints, gripper.state.width / 2.0)
+        for joint, node in self._links:
+            _move_node(node, *joint.placement(values))
+        _move_node(self._set, state.tcp_set.position.tolist(), state.tcp_set.orientation.tolist())
+        self._update_handle(state)
+
+    def _update_handle(self, state: RobotState) -> None:
+        goal, free = self.drag.goal, self.drag.free
+        numbers = (self._handle.position, self._handle.wxyz)
+        # viser keeps whatever a page sent: too few numbers, NaN, or whole numbers, in which it then loses fractions.
+        sound = [part.shape for part in numbers] == [(3,), (4,)] and all(np.isfinite(part).all() for part in numbers)
+        if not sound or (free and any(part.dtype != float for part in numbers)):
+            self._handle = self._new_handle()
+        with suppress(ValueError):  # sent just now by a page; the next update corrects it
+            if goal is not None:  # for a second page, and for one whose drag was refused
+                _move_node(self._handle, goal.position, goal.orientation)
+            elif free:
+                _move_node(self._handle, state.tcp.position.tolist(), state.tcp.orientation.tolist())
+
+
+def _draw_links(
+    scene: SceneApi, root: str, tree: UrdfTree, spec: RobotSpec, notes: list[str]
+) -> list[tuple[UrdfTreeJoint, SceneNodeHandle]]:
+    """Draw all links, each in a child frame of its parent's; return the joints that move, with the frames they move.
+
+    The page composes the frames by itself, so a joint at rest needs no message.
+    """
+    base = spec.kinematics.base_link
+    to_base = Pose() if base is None else tree.poses({})[base].inverse()
+    paths = {tree.root: root}
+    scene.add_frame(root, show_axes=False, position=to_base.position, wxyz=_wxyz(to_base.orientation))
+    moving: list[tuple[UrdfTreeJoint, SceneNodeHandle]] = []
+    for joint in tree.joints:
+        path = paths[joint.child] = f"{paths[joint.parent]}/{joint.child}"
+        position, orientation = joint.placement({})
+        node = scene.add_frame(path, show_axes=False, position=np.array(position), wxyz=_wxyz(orientation))
+        if joint.moves:
+            moving.append((joint, node))
+    for link, visuals in tree.visuals.items():
+        _draw_visuals(scene, paths[link], visuals, notes)
+    return moving
+
+
+def workspace_lines(workspace: WorkspaceSpec) -> NDArray[np.float32]:
+    """Return (n, 2, 3) line segments around each bounded side of a workspace, in the base frame, m.
+
+    Open sides are cut off near the base.
+    """
+    low = np.clip(workspace.lower, -_OPEN_SIDE, _OPEN_SIDE)
+    high = np.clip(workspace.upper, -_OPEN_SIDE, _OPEN_SIDE)
+    segments: list[list[NDArray[np.float64]]] = []
+    for axis in range(3):
+        for bound, drawn in ((workspace.lower[axis], low), (workspace.upper[axis], high)):
+            if drawn[axis] != bound:
+                continue
+            a, b = (axis + 1) % 3, (axis + 2) % 3
+            corners = []
+            for first, second in ((low, low), (high, low), (high, high), (low, high)):
+                corner = np.empty(3)
+                corner[[axis, a, b]] = bound, first[a], second[b]
+                corners.append(corner)
+            segments += [[corners[k], corners[(k + 1) % 4]] for k in range(4)]
+    return np.asarray(segments, np.float32).reshape(-1, 2, 3)
+
+
+class WorldView:
+    """All bodies of a simulated world, drawn from their specs and moved by a mirror of the world.
+
+    Bodies that can move are left out where the world's driver has no mirrors.
+    """
+
+    def __init__(self, scene: SceneApi, spec: WorldSpec, snapshots: SeriesBox, notes: list[str]) -> None:
+        """Draw the bodies of ``spec``; ``notes`` gets a line for everything that cannot be drawn."""
+        self._scene = scene
+        self._snapshots = snapshots
+        self._notes = notes
+        self._mirror = _mirror(spec, notes)
+        self._specs: dict[str, BodySpec] = {}
+        self._links: dict[str, dict[str | None, SceneNodeHandle]] = {}
+        self._edits: dict[int, tuple[str, Mapping[str, Any]]] = {}
+        self._number = 0
+        for body in spec.bodies:
+            self._draw(body)
+
+    def note_edit(self, method: str, params: Mapping[str, Any], revision: int) -> None:
+        """Note an edit of the world; it is repeated here before the first snapshot of its revision is shown."""
+        if self._mirror is not None:
+            self._edits[revision] = (method, params)
+
+    @property
+    def behind(self) -> bool:
+        """Whether there are edits that are not repeated yet."""
+        return bool(self._edits)
+
+    def update(self) -> None:
+        """Update the page."""
+        record = self._snapshots.read()
+        if self._mirror is None or record is None or record[0] == self._number:
+            return
+        number, _, revision, values = record
+        while self._mirror.revision < revision:
+            edit = self._edits.pop(self._mirror.revision + 1, None)
+            if edit is None:
+                return  # snapshots come through memory and may overtake edits, which come through a socket
+            self._mirror.request(*edit)
+            self._repeat_edit(*edit)
+        try:
+            self._mirror.show(values)
+        except ValueError:
+            return  # of a world that was edited since
+        self._number = number
+        for name, links in self._links.items():
+            for link, node in links.items():
+                pose = self._mirror.request("pose", {"name": name, "link": link})
+                _move_node(node, pose["position"], pose["orientation"])
+
+    def _repeat_edit(self, method: str, params: Mapping[str, Any]) -> None:
+        if method == "add":
+            self._draw(from_json(BodySpec, params["spec"]))
+        elif method == "remove":
+            self._erase(params["name"])
+        elif method == "set_color" and params["name"] in self._specs:
+            body = replace(self._specs[params["name"]], rgba=tuple(params["rgba"]))
+            self._erase(body.name)
+            self._draw(body, painted=True)
+
+    def _erase(self, name: str) -> None:
+        self._specs.pop(name, None)
+        if self._links.pop(name, None) is not None:
+            self._scene.remove_by_name(f"/bodies/{name}")
+
+    def _draw(self, body: BodySpec, *, painted: bool = False) -> None:
+        """Draw a body; ``painted`` if its colour replaces those of its files."""
+        self._specs[body.name] = body
+        if not body.visible or (self._mirror is None and not body.fixed):
+            return
+        base = Pose(body.position, body.orientation)
+        root = f"/bodies/{body.name}"
+        if body.shape == "plane":
+            self._scene.add_grid(root, 6.0, 6.0, cell_size=0.25, position=base.position, wxyz=_wxyz(base.orientation))
+            return
+        links = self._links[body.name] = {}
+        self._scene.add_frame(root, show_axes=False)
+        for number, (link, pose, visuals) in enumerate(self._parts(body, painted=painted)):
+            at = base @ pose
+            path = f"{root}/{number}"
+            links[link] = self._scene.add_frame(path, show_axes=False, position=at.position, wxyz=_wxyz(at.orientation))
+            _draw_visuals(self._scene, path, visuals, self._notes)
+
+    def _parts(self, body: BodySpec, *, painted: bool) -> list[tuple[str | None, Pose, list[UrdfVisual]]]:
+        """Return each link (None for the base link) with its pose in the body's frame, and its visuals."""
+        if body.urdf is None:
+            return [(None, Pose(), [_primitive(body)])]
+        try:
+            tree = read_tree(body.urdf)
+        except (OSError, ValueError) as error:
+            self._notes.append(f"not drawn: {error}")
+            return []
+        rgba = body.rgba if painted else None
+        return [
+            (
+                None if link == tree.root else link,
+                _scaled(pose, body.scale),
+                [_scaled_visual(visual, body.scale, rgba) for visual in tree.visuals[link]],
+            )
+            for link, pose in tree.poses({}).items()
+        ]
+
+
+def _mirror(spec: WorldSpec, notes: list[str]) -> Any | None:
+    """Return a copy of the world that snapshots pose; None where its driver offers none."""
+    try:
+        made = registry.load(spec.driver, "world")
+        if hasattr(made, "MIRRORED"):
+            return made(spec, mirror=True, drawn=False)
+        reason = "its driver has no mirrors"
+    except HalError as error:
+        reason = str(error)
+    if any(not body.fixed for body in spec.bodies):
+        notes.append(f"bodies that can move are not drawn: {reason}")
+    return None
+
+
+def _primitive(body: BodySpec) -> UrdfVisual:
+    radius, length = body.radius or 0.0, body.length or 0.0
+    size = {
+        "box": tuple(2.0 * half for half in body.half_extents or ()),
+        "sphere": (radius,),
+    }.get(body.shape, (radius, length))
+    return UrdfVisual(Pose(), body.shape, size, body.rgba)
+
+
+def _scaled_visual(visual: UrdfVisual, scale: float, rgba: tuple[float, ...] | None) -> UrdfVisual:
+    size = tuple(scale * part for part in visual.size)
+    return replace(visual, pose=_scaled(visual.pose, scale), size=size, rgba=rgba or visual.rgba)
+
+
+def _scaled(pose: Pose, scale: float) -> Pose:
+    return Pose(scale * pose.position, pose.orientation)
+
+
+def _draw_visuals(scene: SceneApi, parent: str, visuals: Iterable[UrdfVisual], notes: list[str]) -> None:
+    """Draw visuals as children of a node; ``notes`` gets a line for each that cannot be drawn."""
+    for number, visual in enumerate(visuals):
+        try:
+            data = visual_glb(visual)
+        except ValueError as error:
+            notes.append(f"not drawn: {error}")
+            continue
+        pose = visual.pose
+        scene.add_glb(f"{parent}/visual{number}", data, position=pose.position, wxyz=_wxyz(pose.orientation.tolist()))
+
+
+def _move_node(node: SceneNodeHandle, position: Sequence[float], orientation: Sequence[float]) -> None:
+    """Set the pose of a node in its parent's frame, unless it is there already; orientation x, y, z, w."""
+    at, turn = np.asarray(position, float), np.asarray(_wxyz(orientation))
+    if not _alike(node.position, at):
+        node.position = at
+    if not _alike(node.wxyz, turn) and not _alike(node.wxyz, -turn):
+        node.wxyz = turn
+
+
+def _alike(present: NDArray[np.float64], wanted: NDArray[np.float64]) -> bool:
+    return bool(np.abs(present - wanted).max() <= _AT_REST)
+
+
+def _wxyz(orientation: Sequence[float] | NDArray[np.float64]) -> tuple[float, float, float, float]:
+    """Return a quaternion x, y, z, w in viser's order."""
+    x, y, z, w = map(float, orientation)
+    return w, x, y, z
