@@ -400,12 +400,11 @@ def test_nonsense_anywhere_is_a_config_error_or_nothing_worse() -> None:
         target = broken
         for part in place[:-1]:
             target = target[part]
-        for value in (NONSENSE[k % len(NONSENSE)], NONSENSE[(5 * k + 3) % len(NONSENSE)]):
-            target[place[-1]] = value
-            try:
-                load(broken)
-            except ConfigError as error:
-                refused.extend(error.problems)
+        target[place[-1]] = NONSENSE[k % len(NONSENSE)]
+        try:
+            load(broken)
+        except ConfigError as error:
+            refused.extend(error.problems)
     assert len(refused) > 50
     assert all(problem.key and problem.message for problem in refused)
 
@@ -703,14 +702,14 @@ def test_a_key_that_only_looks_like_another_is_one_problem(tmp_path: Path) -> No
 def test_nonsense_in_a_model_or_an_object_is_a_config_error_or_nothing_worse(tmp_path: Path, name: str) -> None:
     bench, refused = Bench(tmp_path), 0
     good = getattr(bench, name)
-    for k, place in enumerate(places(good)[::2]):
+    for k, place in enumerate(places(good)[::4]):
         setattr(bench, name, copy.deepcopy(good))
         target = getattr(bench, name)
         for part in place[:-1]:
             target = target[part]
         target[place[-1]] = NONSENSE[k % len(NONSENSE)]
         refused += bool(bench.found())
-    assert refused > len(places(good)) / 4
+    assert refused > len(places(good)) / 8
 
 
 def test_a_joint_that_does_not_move_lacks_no_limits(tmp_path: Path) -> None:

@@ -26,26 +26,17 @@ def test_expected_failure():
 """
 
 
-@pytest.mark.parametrize(("strict", "expected"), [("0", "2 skipped, 1 xfailed"), ("1", "1 failed, 1 xfailed, 1 error")])
-def test_a_skipped_test(tmp_path: Path, strict: str, expected: str) -> None:
-    result = _run(tmp_path, SKIPS, strict)
-    assert expected in result.stdout
-    assert "needs umockdev" in result.stdout
-    assert "needs xvfb" in result.stdout
-    assert result.returncode == int(strict)
-
-
-@pytest.mark.parametrize(("strict", "code"), [("0", 5), ("1", 2)])
-def test_a_module_that_skips_itself(tmp_path: Path, strict: str, code: int) -> None:
-    result = _run(tmp_path, "import pytest\npytest.importorskip('no_such_library')\n", strict)
-    assert "no_such_library" in result.stdout
-    assert result.returncode == code
-
-
-def _run(folder: Path, test: str, strict: str) -> subprocess.CompletedProcess[str]:
-    (folder / "conftest.py").write_text(CONFTEST.read_text())
-    (folder / "test_skips.py").write_text(test)
-    options = ["-q", "-ra", "-p", "no:cacheprovider", "-p", "no:xdist", "--rootdir", str(folder)]
-    command = [sys.executable, "-m", "pytest", *options, str(folder)]
+@pytest.mark.parametrize(
+    ("strict", "expected"), [("0", "3 skipped, 1 xfailed"), ("1", "1 failed, 1 xfailed, 2 errors")]
+)
+def test_skipped_tests_and_modules(tmp_path: Path, strict: str, expected: str) -> None:
+    (tmp_path / "conftest.py").write_text(CONFTEST.read_text())
+    (tmp_path / "test_skips.py").write_text(SKIPS)
+    (tmp_path / "test_module.py").write_text("import pytest\npytest.importorskip('no_such_library')\n")
+    options = ["-q", "-ra", "-p", "no:cacheprovider", "-p", "no:xdist", "--continue-on-collection-errors"]
+    command = [sys.executable, "-m", "pytest", *options, "--rootdir", str(tmp_path), str(tmp_path)]
     environment = os.environ | {"HAL_TEST_STRICT": strict}
-    return subprocess.run(command, capture_output=True, text=True, timeout=60, env=environment, cwd=folder)
+    result = subprocess.run(command, capture_output=True, text=True, timeout=60, env=environment, cwd=tmp_path)
+    assert expected in result.stdout
+    assert all(reason in result.stdout for reason in ("needs umockdev", "needs xvfb", "no_such_library"))
+    assert result.returncode == int(strict)

@@ -108,6 +108,7 @@ class Killed(BaseException):
     """Stands for the end of the process."""
 
 
+@pytest.mark.slow
 def test_it_may_be_killed_at_every_step_of_finishing(
     torn: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
