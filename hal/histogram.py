@@ -8,7 +8,7 @@ __all__ = ["Histogram"]
 class Histogram:
     """Counts durations in bins of ``width`` s; longer ones than ``bins * width`` are counted in the last bin.
 
-    A percentile is the upper edge of its bin, so it is never too small; the greatest value is kept as it is.
+    A percentile is the upper edge of its bin, so it is never too small; the greatest value is kept exactly.
     """
 
     __slots__ = ("_counts", "_width", "count", "greatest")
@@ -29,7 +29,7 @@ class Histogram:
             self.greatest = value
 
     def percentile(self, share: float) -> float | None:
-        """The duration that ``share`` (0..1) of all do not exceed, s; None when nothing was counted."""
+        """Return the duration that ``share`` (0..1) of all do not exceed, s; None if nothing was counted."""
         if not self.count:
             return None
         wanted, seen = share * self.count, 0
@@ -40,7 +40,7 @@ class Histogram:
         return self.greatest
 
     def summary(self) -> dict[str, float | None]:
-        """p50, p99 and max, s."""
+        """Return p50, p99 and max, s; None if nothing was counted."""
         return {
             "p50": self.percentile(0.5),
             "p99": self.percentile(0.99),

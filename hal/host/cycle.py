@@ -34,12 +34,9 @@ __all__ = [
     "mirrors_of",
 ]
 
-# [copies.py] The stand-ins of real arms in a simulated world, so that simulated cameras see them and objects feel
-# them.
-
 
 class RobotMirror:
-    """One arm that another group moves, followed by the newest state that it published."""
+    """Kinematic copy, in a simulated world, of an arm that another group moves."""
 
     def __init__(self, name: str, mail: RobotMail, hand: GripperMail | None) -> None:
         self.name = name
@@ -47,7 +44,7 @@ class RobotMirror:
         self._hand = hand
 
     def follow(self, world: Any) -> None:
-        """Put the copy where the arm is. One that has not said anything yet stays where the rig's file puts it."""
+        """Move the copy to the arm's newest state. Before the first state it stays where the rig's file puts it."""
         state = self._mail.get_state()
         if state is None:
             return
@@ -56,7 +53,7 @@ class RobotMirror:
 
 
 def mirrors_of(group: GroupSpec, memories: Iterable[GroupMemory]) -> tuple[RobotMirror, ...]:
-    """Copies of the arms that stand in this group's world and are moved by others, found in the others' memories."""
+    """Return the mirrors of the arms that stand in this group's world and belong to the groups behind ``memories``."""
     if group.world is None:
         return ()
     robots: dict[str, RobotMail] = {}
@@ -73,14 +70,12 @@ def _hand_of(robot: RobotSpec, hands: dict[str, GripperMail]) -> GripperMail | N
     return hands.get(robot.gripper.name) if robot.gripper is not None else None
 
 
-# [arm.py] One arm in a group's cycle: its driver, its servo and its mailboxes.
-
 TCP_APART, TCP_TURNED = 0.002, 0.02
-"""By how much a device's own tcp may differ from the model's, m and rad."""
+"""Largest distance of a device's own tcp from the model's, m and rad."""
 
 
 class ArmUnit:
-    """An arm with everything that belongs to it: driver, servo, mailboxes."""
+    """One arm in the cycle: driver, servo and mailboxes."""
 
     def __init__(self, spec: RobotSpec, dt: float, mail: RobotMail, world: object | None) -> None:
         self.spec = spec
@@ -93,25 +88,25 @@ class ArmUnit:
         self.reset_statistics()
         self.reading: Reading | None = None
         self.error: ConnectionLost | None = None
-        """Why the device counts as lost."""
+        """Reason why the device counts as lost; None while it answers."""
         self._write_failed = False
         self._sound: Reading | None = None
         self._setpoint: Any = None
         self._latest_target = 0
         self._reanchored = 0
         self._prepared: Inbox | None = None
-        """The inbox that the next set-point was computed from."""
+        """The inbox from which the next set-point was computed ahead; None if it was not."""
         self._t_written = 0.0
         self._session = 0
 
     def reset_statistics(self) -> None:
-        """Measure from now on: peaks of the set-points, latencies."""
+        """Start new statistics: peaks of the set-points, latencies."""
         self.audit = SetpointAudit(self.spec.limits, self.dt)
         self.latency = Histogram(1e-4, 5000)
         self.lost_cycles = 0
-        """Samples of the device that were never seen."""
+        """Number of the device's samples that were missed."""
         self.reanchored = 0
-        """How often the device had not taken a set-point."""
+        """Number of set-points that the device did not take."""
         self.servo.reset_statistics()
         self.driver.reset_statistics()
 
@@ -125,7 +120,7 @@ class ArmUnit:
         self._anchor()
 
     def _compare_tcp(self) -> None:
-        """A device that knows where its tcp is must agree with the model, or every Cartesian motion would be wrong."""
+        """Raise ConnectionLost if the device's own tcp differs from the model's: Cartesian motions would be wrong."""
         theirs = self.driver.own_tcp()
         if theirs is None or self.reading is None:
             return
@@ -133,12 +128,13 @@ class ArmUnit:
         distance, angle = self.kinematics.pose(self.reading.q).distance(device)
         if distance > TCP_APART or angle > TCP_TURNED:
             raise ConnectionLost(
-                f"{self.spec.name}: the arm and model {self.spec.model!r} do not mean the same tool centre point: they "
-                f"are {1e3 * distance:.1f} mm and {angle:.3f} rad apart; mend the arm's end effector or the model's tcp"
+                f"{self.spec.name}: the tool centre points of the arm and of model {self.spec.model!r} differ by "
+                f"{1e3 * distance:.1f} mm and {angle:.3f} rad; fix the arm's end effector or the model's tcp",
+                code="tcp_mismatch",
             )
 
     def _anchor(self) -> None:
-        """The set-point is where the device holds."""
+        """Set the set-point to where the device holds."""
         assert self.reading is not None
         commanded = self.reading.q_commanded
         self.servo.anchor(commanded if commanded is not None else self.reading.q)
@@ -147,12 +143,12 @@ class ArmUnit:
     # Per cycle.
 
     def read(self, now: float) -> None:
-        """Ask the device. One that took no set-point stays lost for a whole cycle, though it answers again."""
+        """Read the device. One whose write failed counts as lost for a whole cycle, although it answers again."""
         before = self.reading
         try:
             self.reading = reading = self.driver.read(now)
             if self.error is not None and not self._write_failed:
-                self._compare_tcp()  # whoever comes back may have another tool
+                self._compare_tcp()  # it may have come back with another tool
                 self.error = None
         except Exception as error:
             self._lose(error)
@@ -161,18 +157,24 @@ class ArmUnit:
             self.lost_cycles += reading.seq - before.seq - 1
 
     def _lose(self, error: Exception) -> None:
-        """A driver that fails, in whatever way, is a device that does not answer."""
+        """Count the device as lost, whatever error its driver raised."""
         if isinstance(error, ConnectionLost):
             self.error = error
             return
         if self.error is None:
-            traceback.print_exception(error)  # into the process's log: this is a mistake in a driver
+            traceback.print_exception(error)  # into the process's log: a bug in the driver
         self.error = ConnectionLost(f"{self.spec.name}: {type(error).__name__}: {error}")
 
     def tick(self, now: float, app: AppRecord, late: bool = False) -> None:
-        """Compute the next set-point."""
+        """Compute the next set-point.
+
+        Args:
+            now: Time on the group's clock, s.
+            app: The app's newest record.
+            late: Whether this process could not run for a while.
+        """
         marks = self.mail.get_marks()
-        if self._session and marks.ended == self._session:  # the app says so in memory: that waits for no answer
+        if self._session and marks.ended == self._session:  # through memory, so that it waits for no answer
             self.servo.end()
         if self.error is not None or self.reading is None:
             self._prepared = None
@@ -186,7 +188,7 @@ class ArmUnit:
             self.audit.reset()  # the device's own set-points lie in between
 
     def prepare(self, app: AppRecord) -> None:
-        """A device that sets the pace waits for its answer: compute the next one before it asks."""
+        """Compute the next set-point ahead, for a device that sets the pace and waits for its answer."""
         if self._setpoint is not None and self.driver.paces_itself:
             self._prepared = self._inbox(app, self.mail.get_marks())
             self.servo.prepare(self._prepared)
@@ -195,7 +197,7 @@ class ArmUnit:
         return Inbox(self.mail.get_command(), self.mail.get_deadman(), app.stops, marks.rearms, app.t)
 
     def write(self, now: float) -> None:
-        """Hand it to the device."""
+        """Write the set-point to the device."""
         setpoint = self._setpoint
         failed, self._write_failed = self._write_failed, False
         if setpoint is None or (self.error is not None and not failed):
@@ -211,7 +213,7 @@ class ArmUnit:
         self.audit.take(setpoint)
 
     def finish_session(self) -> bool:
-        """After the last set-point of a session: hand the arm back to its own hold. True while none is open."""
+        """After the last set-point of a session, halt the device. Returns whether no session is open."""
         if self._setpoint is None and self._session and self.servo.report.status in (
             RobotStatus.IDLE, RobotStatus.LOST, RobotStatus.FAULT,
         ) and not self.servo.active:  # fmt: skip
@@ -224,7 +226,7 @@ class ArmUnit:
         return self._session == 0
 
     def note_latency(self, clock_now: float) -> None:
-        """Time from a pad's event to the set-point that follows it, once per command."""
+        """Measure the time from a pad's event to the set-point that follows it, once per command."""
         target = self.servo.report.target_seq
         if target == self._latest_target:
             return
@@ -235,7 +237,7 @@ class ArmUnit:
             self.latency.add(clock_now + ahead - command.t_event)
 
     def publish(self, now: float) -> None:
-        """Tell the app: what the servo does, with the newest reading that makes sense."""
+        """Publish the newest valid reading, with the state of the servo."""
         reading, report = self.reading, self.servo.report
         if reading is not None and self._makes_sense(reading):
             self._sound = reading
@@ -243,7 +245,7 @@ class ArmUnit:
         if reading is None:
             return
         if self.error is not None:
-            lost = self.error.fault or Fault("lost", str(self.error), "see that it is on and connected")
+            lost = self.error.fault or Fault("lost", str(self.error), "check that it is on and connected")
             reading = reading._replace(fault=lost)
         elif reading.fault is None and self.servo.fault is not None:
             reading = reading._replace(fault=self.servo.fault)
@@ -270,7 +272,12 @@ class ArmUnit:
     # Requests.
 
     def begin(self, session: Session, app: AppRecord) -> None:
-        """Open a control session. Raises ControlTaken while another one is open, ConnectionLost without an arm."""
+        """Open a control session.
+
+        Raises:
+            ControlTaken: While another one is open.
+            ConnectionLost: While the arm does not answer.
+        """
         marks = self.mail.get_marks()
         if marks.ended == session.id:
             return  # the app gave up while this request was on its way
@@ -288,27 +295,33 @@ class ArmUnit:
         self.servo.recover()
 
     def moved(self) -> None:
-        """The arm was put elsewhere (a reset of the simulated world)."""
+        """Read and anchor again: the arm was moved by a reset of the simulated world."""
         self.reading = self.driver.read(self.reading.t if self.reading else 0.0)
         self._anchor()
 
     def close(self) -> None:
-        """Let go of the device."""
+        """Close the device."""
         self.driver.close()
 
 
 class Cycle:
-    """A group: its world, if it has one, its arms and its grippers."""
+    """A group: its world, if any, its arms and its grippers."""
 
     def __init__(self, spec: GroupSpec, memory: GroupMemory, others: Iterable[GroupMemory] = ()) -> None:
-        """``others``: memories of the rig's other groups, whose arms have copies in this group's world."""
+        """Load the drivers; nothing is opened.
+
+        Args:
+            spec: The group.
+            memory: Its mailboxes.
+            others: Memories of the rig's other groups, whose arms have copies in this group's world.
+        """
         self.spec = spec
         self.memory = memory
         self._copies = mirrors_of(spec, others)
         self.dt = 1.0 / spec.rate_hz
         self.ticks = 0
         self.t = 0.0
-        """Of the newest cycle, s on the group's clock."""
+        """Time of the newest cycle on the group's clock, s."""
         self._counted_from = 0
         self.world: Any = None
         if spec.world is not None:
@@ -324,21 +337,21 @@ class Cycle:
 
     @property
     def paces_itself(self) -> bool:
-        """Does a device set the pace?"""
+        """Whether a device sets the pace."""
         return any(unit.driver.paces_itself for unit in self._units)
 
     @property
     def lost_cycles(self) -> int:
-        """Cycles of the device that sets the pace of which this group saw nothing."""
+        """Number of missed cycles of the device that sets the pace."""
         return sum(unit.lost_cycles for unit in self._units)
 
     @property
     def attended(self) -> bool:
-        """Does something real move?"""
+        """Whether the group has a real arm."""
         return any(unit.spec.attended for unit in self._units)
 
     def looping_driver(self) -> RobotDriver | None:
-        """A driver whose library wants to own the loop now."""
+        """Return a driver whose library needs to own the loop now; None if there is none."""
         return next((unit.driver for unit in self._units if unit.driver.wants_loop), None)
 
     def open(self, now: float) -> None:
@@ -357,7 +370,13 @@ class Cycle:
                 unit.driver.wait()
 
     def step(self, now: float, app: AppRecord, late: bool = False) -> None:
-        """One cycle. ``now`` is the time on the group's clock; ``late``: this process could not run for a while."""
+        """Run one cycle.
+
+        Args:
+            now: Time on the group's clock, s.
+            app: The app's newest record.
+            late: Whether this process could not run for a while.
+        """
         self.ticks += 1
         self.t = now
         if self.world is not None:
@@ -375,17 +394,14 @@ class Cycle:
             hand.serve(app)
 
     def publish(self, now: float) -> None:
-        """Tell the app what every device reports."""
+        """Publish what every device reports."""
         for unit in self._units:
             unit.publish(now)
         for hand in self._hands:
             hand.publish(now)
 
     def stop_sessions(self) -> bool:
-        """Bring every arm to rest; True when all of them are. Call it between steps until it is.
-
-        Fingers are left alone: they keep what they hold.
-        """
+        """Bring every arm to rest; call it between steps until it returns True. Grippers keep what they hold."""
         resting = True
         for unit in self._units:
             if not unit.finish_session():
@@ -394,12 +410,13 @@ class Cycle:
         return resting
 
     def request(self, method: str, params: dict[str, Any]) -> Any:
-        """What the app asks for between two steps. Names: see the ``_do_`` methods and the world's requests."""
+        """Serve a request of the app between two steps: one of the ``_do_`` methods, or ``world.`` and a world's
+        request."""
         if method.startswith("world."):
             return self._world_request(method.removeprefix("world."), params)
         handler = getattr(self, f"_do_{method}", None)
         if handler is None:
-            raise NotSupported(f"no request {method!r}")
+            raise NotSupported(f"no request {method!r}", code="no_such_request")
         return handler(**params)
 
     def _arm(self, robot: str) -> ArmUnit:
@@ -422,7 +439,7 @@ class Cycle:
         self.grippers[gripper].driver.inject(**knobs)
 
     def _do_warnings(self) -> list[str]:
-        """What the simulation had to change in the files that it loaded."""
+        """Return what the simulation had to change in the files that it loaded."""
         return list(getattr(self.world, "warnings", ()))
 
     def _do_statistics(self) -> dict[str, Any]:
@@ -447,7 +464,7 @@ class Cycle:
 
     def _world_request(self, method: str, params: dict[str, Any]) -> Any:
         if self.world is None:
-            raise NotSupported("this rig has no simulated world; rig.world exists in simulation only")
+            raise NotSupported("this rig has no simulated world; rig.world exists in simulation only", code="no_world")
         result = self.world.request(method, params)
         if method == "poses":
             result["t"] = self.t  # a world only counts its steps
@@ -459,7 +476,7 @@ class Cycle:
         return result
 
     def close(self) -> None:
-        """Let go of every device. Idempotent."""
+        """Close every device. Idempotent."""
         errors = []
         for close in (*(unit.close for unit in self._units), *(hand.close for hand in self._hands)):
             try:

@@ -13,12 +13,12 @@ from .records import AppRecord, GripperAct, GripperCommand, GripperMail
 __all__ = ["AT_WIDTH", "GripperUnit"]
 
 AT_WIDTH = 0.001
-"""Fingers that rest so close to where they should be are there, m."""
-_SWITCH_ON = "see that it is on and connected"
+"""Largest distance from the target at which fingers at rest have reached it, m."""
+_SWITCH_ON = "check that it is on and connected"
 
 
 class GripperUnit:
-    """A gripper with its mailboxes. Whatever goes wrong with it is told in its state, and stops nothing else."""
+    """A gripper with its mailboxes. Its errors are reported in its state and stop nothing else."""
 
     def __init__(self, driver: GripperDriver, mail: GripperMail) -> None:
         self.driver = driver
@@ -31,14 +31,18 @@ class GripperUnit:
         """Number of the last reading before the newest command."""
         self._outcome = GripperOutcome.NONE
         self._final = False
-        """Is the outcome no longer for the driver to say?"""
+        """Whether the outcome is decided, whatever the driver reports."""
         self._fault: Fault | None = None
-        """Why the newest command failed, where its call did."""
+        """Fault of the newest command, if its call failed."""
         self._stops = 0
         self._reason = ""
 
     def open(self) -> None:
-        """Connect. Nothing moves. Raises ConnectionLost, which says how to do without it."""
+        """Connect. Nothing moves.
+
+        Raises:
+            ConnectionLost: If the gripper does not answer; the message says how to open the rig without it.
+        """
         try:
             self.driver.open()
         except (CommandError, ConfigError, DriverMissing, NotSupported):
@@ -53,9 +57,9 @@ class GripperUnit:
     # Per cycle.
 
     def serve(self, app: AppRecord) -> None:
-        """Keep the fingers where a stop finds them; start what the app asked for last.
+        """Stop the fingers if the app stopped the rig; start the newest command of the app.
 
-        A command that was sent before a stop, or that the gripper does not take, is forgotten: nothing moves later.
+        A command that was sent before a stop, or that the gripper does not accept, is dropped: nothing moves later.
         """
         if app.stops != self._stops:
             self._stops = app.stops
@@ -87,7 +91,7 @@ class GripperUnit:
             self._fail(error)
 
     def _stop(self, ends: bool) -> None:
-        """``ends``: the newest command is not over yet."""
+        """Stop the fingers. ``ends``: whether the newest command is still running."""
         try:
             self.driver.stop()
         except Exception as error:
@@ -104,14 +108,15 @@ class GripperUnit:
         self._outcome, self._final, self._fault = outcome, True, fault
 
     def _note(self, error: Exception) -> None:
-        """Each new reason is written down once, in the process's log."""
+        """Print each new error once, to the process's log."""
         reason = f"{type(error).__name__}: {error}"
         if reason != self._reason:
             self._reason = reason
             traceback.print_exception(error)
 
     def publish(self, now: float) -> None:
-        """Tell the app the newest state. From a gripper that does not answer that is an old one, and why."""
+        """Publish the newest state. For a gripper that does not answer this is an old one, with the reason as its
+        fault."""
         lost: Fault | None = None
         try:
             reading = self.driver.read(now)
@@ -128,7 +133,7 @@ class GripperUnit:
             self.mail.put(self._reading, self._seq, self._outcome, fault, lost is not None)
 
     def _judge(self, reading: GripperReading) -> None:
-        """How the newest command goes: the driver knows, or the width tells."""
+        """Decide how the newest command goes: by the driver's outcome, or else by the width."""
         command = self._command
         if command is None or self._final:
             return
@@ -138,7 +143,7 @@ class GripperUnit:
             self._end(_outcome_at_rest(command, reading))
 
     def close(self) -> None:
-        """Let go of the device, not of what it holds."""
+        """Close the device; it keeps what it holds."""
         self.driver.close()
 
 
@@ -161,4 +166,4 @@ def _fault_of(error: Exception) -> Fault:
         return error.fault or Fault("lost", cause, remedy or _SWITCH_ON)
     if isinstance(error, HalError):
         return Fault("refused", str(error), "")
-    return Fault("driver", f"{type(error).__name__}: {error}", "this is a mistake in the driver")
+    return Fault("driver", f"{type(error).__name__}: {error}", "this is a bug in the driver")

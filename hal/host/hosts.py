@@ -30,14 +30,12 @@ __all__ = [
     "groups_of",
 ]
 
-# [groups.py] Which devices share a clock and a process.
-
 GRIPPER_HZ = 100.0
 """Rate of a gripper that has a process of its own."""
 
 
 def groups_of(plan: Plan) -> list[GroupSpec]:
-    """The groups of a rig: the devices of its simulated world together, and each other arm alone.
+    """Return the groups of a rig: the devices of its simulated world together, and each other arm alone.
 
     In lock-step the first one runs in the caller's process, and the others, if there are any, keep in step with it. A
     gripper is in the group of its arm, except for one whose driver needs a process of its own.
@@ -62,7 +60,7 @@ def groups_of(plan: Plan) -> list[GroupSpec]:
 
 
 def _is_alone(robot: RobotSpec, clock: str) -> bool:
-    """Does this arm, which does not stand in the simulated world, need a process of its own?"""
+    """Return whether an arm outside of the simulated world needs a process of its own."""
     return clock != "lock_step" or robot.emulated
 
 
@@ -71,21 +69,21 @@ def _is_apart(gripper: GripperSpec) -> bool:
 
 
 def _grippers(robots: Iterable[RobotSpec]) -> tuple[GripperSpec, ...]:
-    """Those that run beside their arms."""
+    """Return the grippers that run beside their arms."""
     return tuple(r.gripper for r in robots if r.gripper is not None and not _is_apart(r.gripper))
 
 
 HEARTBEAT = 0.02
 """Period of the app's heartbeat, s."""
 SNAPSHOT_CAPACITY = 8192
-"""Most numbers in a picture of the world: seven a body, one a joint."""
+"""Largest count of numbers in a snapshot of the world: seven a body, one a joint."""
 SILENT = 1.5
 """A host that has published nothing for so long does not answer any more, s. (A Franka's library waits 1 s for a
 state.)"""
 PAD_PERIOD = 0.01
-"""How often pads are polled in lock-step, simulated s."""
+"""Period at which pads are polled in lock-step, simulated s."""
 _STOP_LIMIT = 5.0
-"""Longest time for bringing the arms to rest before the devices are closed all the same, s."""
+"""Longest time for bringing the arms to rest before the devices are closed anyway, s."""
 
 
 class Host(ABC):
@@ -97,15 +95,15 @@ class Host(ABC):
     @property
     @abstractmethod
     def stops(self) -> int:
-        """How often :meth:`stop` was called."""
+        """Number of calls of :meth:`stop`."""
 
     @abstractmethod
     def request(self, method: str, params: dict[str, Any] | None = None) -> Any:
-        """Run something between two steps and return its answer; an error there is raised here."""
+        """Run a request between two steps and return its answer; an error in it is raised here."""
 
     @abstractmethod
     def check(self) -> None:
-        """Raise ConnectionLost when the group's process is gone."""
+        """Raise ConnectionLost if the group's process is gone."""
 
     @abstractmethod
     def stop(self) -> None:
@@ -113,23 +111,23 @@ class Host(ABC):
 
     @abstractmethod
     def close(self) -> None:
-        """Bring the arms to rest, let go of the devices. Idempotent."""
+        """Bring the arms to rest and close the devices. Idempotent."""
 
 
 class LocalHost(Host):
-    """Lock-step: the cycle runs here, whenever the clock is told to go on."""
+    """Lock-step: the cycle runs in this process, whenever the clock is advanced."""
 
     def __init__(self, spec: GroupSpec, others: Sequence[SteppedHost] = ()) -> None:
-        """``others``: groups in processes of their own that keep in step with this one."""
+        """Open the devices. ``others`` are groups in processes of their own that keep in step with this one."""
         self.spec = spec
         self.memory = GroupMemory.of(memoryview(bytearray(GroupMemory.size_of(spec))), spec)
         self._others = others
         self.cycle = Cycle(spec, self.memory, [other.memory for other in others])
         self.pollers: list[Callable[[float], object]] = []
-        """Called every :data:`PAD_PERIOD` of simulated time: pads."""
+        """Functions (pads) that are called with the time, every :data:`PAD_PERIOD` of simulated time."""
         self._stops = 0
         self._busy = threading.RLock()
-        """Time goes on in one thread only."""
+        """Held while time advances: in one thread only."""
         self._next_poll = 0.0
         self._closed = False
         self.cycle.open(0.0)
@@ -140,9 +138,10 @@ class LocalHost(Host):
         return self.cycle.ticks * self.cycle.dt
 
     def advance_to(self, t: float) -> None:
-        """Step until simulated time is ``t``, to within half a step; at least once where ``t`` lies ahead.
+        """Advance simulated time to ``t`` (s), to within half a step; by one step at least if ``t`` is ahead.
 
-        Raises HalError after :meth:`close`: a thread that waits for time to go on must not go on for ever.
+        Raises:
+            HalError: After :meth:`close`, so that a thread that waits for time to advance does not wait for ever.
         """
         with self._busy:
             self.check()
@@ -164,7 +163,7 @@ class LocalHost(Host):
         cycle.step(now, AppRecord(now, self._stops))
 
     def publish(self) -> None:
-        """Make the present state visible."""
+        """Publish the present state."""
         now = self.now()
         self.cycle.publish(now)
         self.memory.host.write(now, self.cycle.ticks, 0, True)
@@ -184,10 +183,10 @@ class LocalHost(Host):
 
     def check(self) -> None:
         if self._closed:
-            raise HalError("the rig is closed")
+            raise HalError("the rig is closed", code="closed")
 
     def stop(self) -> None:
-        self._stops += 1  # not under the lock: whoever holds it may be the one to be stopped
+        self._stops += 1  # not under the lock: its holder may be what is to be stopped
 
     def close(self) -> None:
         with self._busy:
@@ -207,7 +206,7 @@ class RemoteHost(Host):
     """Real time: the cycle runs in a process of its own."""
 
     def __init__(self, spec: GroupSpec, *, realtime: bool = False, others: Sequence[RemoteHost] = ()) -> None:
-        """``others``: groups whose arms have copies in this one's world."""
+        """Start the process. ``others`` are groups whose arms have copies in this one's world."""
         self.spec = spec
         size = GroupMemory.size_of(spec)
         from .memory import SeriesBox
@@ -228,7 +227,7 @@ class RemoteHost(Host):
         self._thread.start()
 
     def wait_ready(self) -> Any:
-        """Wait until every device is open; raises the error that one of them met."""
+        """Wait until every device is open. Raises the error that stopped one of them."""
         return self.child.wait_ready()
 
     def _beat(self) -> None:
@@ -249,14 +248,16 @@ class RemoteHost(Host):
 
     def check(self) -> None:
         if self._closed.is_set():
-            raise HalError("the rig is closed")
+            raise HalError("the rig is closed", code="closed")
         self.child.check()
         silence = self._silence()
         if silence > SILENT:
-            raise ConnectionLost(f"the {self.spec.name} process has not answered for {silence:.1f} s")
+            raise ConnectionLost(
+                f"the {self.spec.name} process has not answered for {silence:.1f} s", code="process_silent"
+            )
 
     def _silence(self) -> float:
-        """How long the host has published nothing although no request keeps it busy, s."""
+        """Return how long the host has published nothing although no request keeps it busy, s."""
         host = self.memory.get_host()
         return time.monotonic() - host.t if host.ready and not self.child.busy else 0.0
 
@@ -282,11 +283,11 @@ class SteppedHost(RemoteHost):
         super().__init__(spec)
 
     def advance_to(self, t: float) -> None:
-        """Have it step until simulated time is ``t``, to within half a step."""
+        """Advance the process to the simulated time ``t`` (s), to within half a step."""
         wanted = round(t * self.spec.rate_hz) - self._cycles
         if wanted > 0:
             self._cycles += wanted
             self.request("advance", {"cycles": wanted})
 
     def _silence(self) -> float:
-        return 0.0  # it is silent whenever nobody steps; a request that it does not answer says the rest
+        return 0.0  # silent while it is not stepped; a request without an answer shows that it is gone

@@ -1,7 +1,7 @@
-"""The process around a group's servos and grippers in real time.
+"""The process around a group's servos and grippers in real time, and what sets its pace.
 
-It ends by itself when the app is gone, brakes its arms when the app does not answer, and is not reached by the
-terminal's signals.
+It ends by itself if the app is gone, brakes its arms if the app does not answer, and the terminal's signals do not
+reach it. The pace is set by time, by a device, or by the app that steps it.
 """
 
 from __future__ import annotations
@@ -33,14 +33,12 @@ __all__ = [
     "main",
 ]
 
-# [pace.py] What sets the pace of a group's cycle in its own process: time, a device, or the app that steps it.
-
 _ASLEEP = 0.1
 """A computer that slept for longer than this, s, was suspended."""
 
 
 class Pace(ABC):
-    """When the next cycle begins."""
+    """Base class: decides when the next cycle begins."""
 
     def __init__(self) -> None:
         self.periods = Histogram(2e-5, 5000)
@@ -49,35 +47,35 @@ class Pace(ABC):
 
     @property
     def missed(self) -> int:
-        """Cycles that were skipped."""
+        """Number of cycles that were skipped."""
         return 0
 
     @property
     def pausing(self) -> bool:
-        """Does time stand still until somebody asks for more?"""
+        """Whether time stands still until the app asks for more cycles."""
         return False
 
     @abstractmethod
     def wait(self) -> float:
-        """Block until the next cycle; returns its time on the group's clock, s."""
+        """Block until the next cycle; return its time on the group's clock, s."""
 
     def now(self) -> float:
-        """The group's clock, s."""
+        """Return the present time on the group's clock, s."""
         return time.monotonic()
 
     def heard(self, app: AppRecord) -> AppRecord:
-        """The app's newest word, with its heartbeat on the group's clock."""
+        """Return the app's newest record, with its heartbeat on the group's clock."""
         return app
 
     def run_free(self) -> None:  # noqa: B027  # most do not wait for the app
-        """The app is done: go on without it."""
+        """Continue without the app, which is done."""
 
     def restart(self) -> None:
-        """Go on from now, counting nothing as missed: after work for which the group's time was paused."""
+        """Continue from now, counting nothing as missed, after work for which the group's time was paused."""
         self._last = 0.0
 
     def reset_statistics(self) -> None:
-        """Count from zero."""
+        """Set the statistics to zero."""
         self.periods = Histogram(2e-5, 5000)
 
     def _note(self, now: float) -> None:
@@ -87,7 +85,7 @@ class Pace(ABC):
 
 
 class DevicePace(Pace):
-    """A device's own cycle (a Franka's state packets)."""
+    """Pace of a device's own cycle (a Franka's state packets)."""
 
     def __init__(self, cycle: Cycle) -> None:
         super().__init__()
@@ -95,7 +93,7 @@ class DevicePace(Pace):
 
     @property
     def missed(self) -> int:
-        """Cycles of the device of which nothing was seen."""
+        """Number of the device's cycles that were missed."""
         return self._cycle.lost_cycles
 
     def wait(self) -> float:
@@ -105,14 +103,14 @@ class DevicePace(Pace):
         return now
 
     def restart(self) -> None:
-        """A device does not pause."""
+        """Do nothing: a device does not pause."""
 
 
 class StepPace(Pace):
-    """Lock-step: so many cycles as the app asks for, then time stands still."""
+    """Lock-step: runs as many cycles as the app asks for, then time stands still."""
 
     def __init__(self, cycle: Cycle, attend: Callable[[float], None]) -> None:
-        """``attend(timeout)`` serves a request of the app, if one comes."""
+        """Make the pace. ``attend(timeout)`` serves a request of the app, if one comes."""
         super().__init__()
         self._cycle = cycle
         self._attend = attend
@@ -120,7 +118,7 @@ class StepPace(Pace):
         self._free = False
 
     def grant(self, cycles: int) -> None:
-        """The app asks for so many."""
+        """Allow this many more cycles."""
         self._granted += cycles
 
     @property
@@ -139,7 +137,7 @@ class StepPace(Pace):
         return (self._cycle.ticks + 1) * self._cycle.dt
 
     def heard(self, app: AppRecord) -> AppRecord:
-        """An app that steps is there by definition."""
+        """Return a record with a heartbeat of now: an app that steps is alive by definition."""
         return AppRecord((self._cycle.ticks + 1) * self._cycle.dt, app.stops)
 
     def run_free(self) -> None:
@@ -147,28 +145,24 @@ class StepPace(Pace):
 
 
 class SuspensionWatch:
-    """Notices that the computer was suspended, in which its monotonic clock stands still."""
+    """Detects that the computer was suspended; its monotonic clock stands still meanwhile."""
 
     def __init__(self) -> None:
         self._clock = getattr(time, "CLOCK_BOOTTIME", None)
         self._asleep = self._slept()
 
     def _slept(self) -> float:
-        """How long it was suspended since it was started, s; 0 where the system cannot say."""
+        """Return how long it was suspended since it was started, s; 0 if the system cannot tell."""
         return time.clock_gettime(self._clock) - time.monotonic() if self._clock is not None else 0.0
 
     def ended(self) -> bool:
-        """Was it suspended since the last call?"""
+        """Return whether it was suspended since the last call."""
         before, self._asleep = self._asleep, self._slept()
         return self._asleep - before > _ASLEEP
 
 
-# [pacer.py] A periodic loop against absolute deadlines: what came too late is skipped and counted, never caught
-# up.
-
-
 class PeriodicPace(Pace):
-    """Wakes its caller every ``period`` s."""
+    """Pace of absolute deadlines every ``period`` s: what came too late is skipped and counted, never caught up."""
 
     def __init__(self, period: float) -> None:
         super().__init__()
@@ -178,11 +172,11 @@ class PeriodicPace(Pace):
 
     @property
     def missed(self) -> int:
-        """Periods that were skipped."""
+        """Number of periods that were skipped."""
         return self._missed
 
     def wait(self) -> float:
-        """Sleep until the next deadline; returns the time of waking, s."""
+        """Sleep until the next deadline; return the time of waking, s."""
         now = time.monotonic()
         if now < self._next:
             time.sleep(self._next - now)
@@ -196,7 +190,7 @@ class PeriodicPace(Pace):
         return now
 
     def restart(self) -> None:
-        """What took less than a period was no pause: many of those would slow time down, and no count would show it."""
+        """Skip the pause. Less than a period does not count as one: many of those would slow time down uncounted."""
         paused = int((time.monotonic() - self._next) / self.period)
         if paused > 0:
             super().restart()
@@ -208,15 +202,15 @@ class PeriodicPace(Pace):
 
 
 APP_GONE = 30.0
-"""An app that is there but has given no sign of life for so long is taken for gone, s. Its arms stopped long before."""
+"""An app without a sign of life for so long counts as gone, s. Its arms stopped long before."""
 HANG = 15
-"""A library that has not come back for so long, s, waits for a network that is gone: the process is ended."""
+"""A library that does not return for so long, s, waits for a network that is gone: the process is ended."""
 STATES_HZ = 500.0
-"""States are published at about this rate at most."""
+"""Highest rate at which states are published, about, Hz."""
 SNAPSHOTS_HZ = 250.0
 """The same for the world's poses, from which pictures are drawn."""
 STOP_LIMIT = 5.0
-"""Longest time for bringing the arms to rest before the devices are closed all the same, s."""
+"""Longest time for bringing the arms to rest before the devices are closed anyway, s."""
 
 
 class HostProcess:
@@ -235,14 +229,14 @@ class HostProcess:
         pairs = zip(memories[1:], others, strict=True)
         self.cycle = Cycle(spec, self.memory, [GroupMemory.of(memory.buffer, other) for memory, other in pairs])
         self.realtime = bool(config.get("realtime", False))
-        # A fast servo tells the app and the renderer less often than it ticks: nobody could look that often.
+        # A fast servo publishes less often than it ticks: no reader could follow.
         self._state_every = max(1, round(spec.rate_hz / STATES_HZ))
         self._snapshot_every = max(1, round(spec.rate_hz / SNAPSHOTS_HZ))
         self.closing = False
         self._resting = False
         self._give_up_at = math.inf
         self._owed: int | None = None
-        """Number of the request that is answered when time stands still again."""
+        """Number of the request that is answered when the cycles that it asked for are done."""
         self._suspension = SuspensionWatch() if self.cycle.attended else None
         self.pace: Pace
         if spec.clock == "lock_step":
@@ -253,7 +247,7 @@ class HostProcess:
             self.pace = PeriodicPace(self.cycle.dt)
 
     def run(self) -> None:
-        """Open, cycle, stop, close."""
+        """Open the devices, cycle until closed, stop the arms, close the devices."""
         signal.signal(signal.SIGTERM, self._terminate)
         cycle = self.cycle
         try:
@@ -267,7 +261,7 @@ class HostProcess:
         except BaseException:
             self.closing = True
             with contextlib.suppress(Exception):
-                self._cycle_until_closed()  # whatever went wrong, the arms are brought to rest if that can be done
+                self._cycle_until_closed()  # bring the arms to rest if possible, whatever went wrong
             raise
         finally:
             self._alarm()
@@ -281,7 +275,7 @@ class HostProcess:
                 driver.loop(self._turn)
 
     def _is_over(self) -> bool:
-        """The app is done with this process, and its arms are at rest, or have had their time."""
+        """Return whether the app is done with this process, and its arms are at rest or have had their time."""
         if not self.closing:
             return False
         now = time.monotonic()
@@ -290,7 +284,7 @@ class HostProcess:
         return self._resting or now > self._give_up_at
 
     def _alarm(self) -> None:
-        """Have this process end if a vendor's library does not come back: nothing in Python could end it then.
+        """End this process if a vendor's library does not return: nothing in Python could end it then.
 
         Not in lock-step, where the app may take its time. (The signal's default is the end.)
         """
@@ -302,7 +296,7 @@ class HostProcess:
         self.pace.run_free()
 
     def _turn(self) -> None:
-        """One cycle; a driver's library may be the one who calls it."""
+        """Run one cycle; a driver's library may be the caller."""
         cycle = self.cycle
         if self.closing:
             self._resting = cycle.stop_sessions()
@@ -320,7 +314,7 @@ class HostProcess:
         self._attend(0.0)
 
     def _settle_up(self) -> None:
-        """Lock-step: the cycles that the app asked for are done."""
+        """In lock-step, answer the request for cycles that are done."""
         if self._owed is not None and self.pace.pausing:
             number, self._owed = self._owed, None
             self._answer(number, {"result": None})
@@ -337,7 +331,7 @@ class HostProcess:
         self.memory.host.write(now, cycle.ticks, self.pace.missed, True)
 
     def _attend(self, timeout: float) -> None:
-        """Serve a request, if there is one."""
+        """Serve a request, if there is one; check that the app is there."""
         try:
             message = self.channel.receive(timeout) if timeout else self.channel.poll()
         except ConnectionLost:
@@ -365,7 +359,7 @@ class HostProcess:
         except Exception as error:
             answer = {"error": pack_error(error)}
         if self.pace.pausing:
-            self.cycle.publish(self.pace.now())  # what was asked for may have changed what the app sees
+            self.cycle.publish(self.pace.now())  # the request may have changed the state
         self._answer(message["id"], answer)
         self.pace.restart()
 
@@ -397,5 +391,5 @@ class HostProcess:
 
 
 def main(channel: Channel, memories: Sequence[SharedMemory], config: dict[str, Any]) -> None:
-    """Entry point of the child process."""
+    """Run the child process of a group."""
     HostProcess(channel, memories, config).run()

@@ -1,9 +1,9 @@
-"""The newest record of one writer for any number of readers, in memory that processes share.
+"""Mailboxes in shared memory: the newest record of one writer for any number of readers.
 
-A mailbox holds two slots, or more where readers want to look back. The writer fills the oldest one, then announces it
-by one aligned 8-byte store, so a writer that is killed in the middle of a write leaves the last whole record in place
-and no reader ever waits. Each slot carries its number and a checksum: a reader that was overtaken, or that runs on a
-processor which reorders stores, notices and tries again, a bounded number of times.
+A mailbox holds two slots, or more if readers need a history. The writer fills the oldest one, then announces it by one
+aligned 8-byte store, so a writer that is killed in the middle of a write leaves the last whole record in place, and no
+reader ever waits. Each slot carries its number and a checksum: a reader that was overtaken, or that runs on a processor
+which reorders stores, notices and tries again, a bounded number of times.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ _TRIES = 16
 
 
 class _Slots:
-    """Slots of ``capacity`` payload bytes, a power of two of them, and the number of the announced one."""
+    """Memory of slots with ``capacity`` payload bytes each (a power of two of them), and the number of the newest."""
 
     __slots__ = ("_announced", "_buffer", "_mask", "_payloads", "_seen", "_seq", "_starts")
 
@@ -55,7 +55,7 @@ class _Slots:
         return _HEADER + slots * cls._stride(capacity)
 
     def _announce(self, length: int) -> int:
-        """Publish what was filled into the free slot, ``length`` bytes of it."""
+        """Announce the free slot, of which ``length`` bytes were filled; returns its number."""
         seq = self._seq + 1
         which = seq & self._mask
         _SLOT.pack_into(self._buffer, self._starts[which], seq, crc32(self._payloads[which][:length]))
@@ -68,7 +68,7 @@ class _Slots:
         return self._announced[0]
 
     def release(self) -> None:
-        """Let go of the buffer, so that the memory behind it can be unmapped."""
+        """Release the buffer, so that the memory behind it can be unmapped."""
         for view in (*self._payloads, self._announced):
             view.release()
         self._buffer.release()
@@ -89,24 +89,24 @@ class Mailbox(_Slots):
 
     @classmethod
     def size(cls, layout: str, slots: int = 2) -> int:
-        """Bytes that a mailbox of this layout takes; a multiple of 8."""
+        """Return the number of bytes that a mailbox of this layout needs; a multiple of 8."""
         return cls._size(struct.calcsize("<" + layout), slots)
 
     def write(self, *values: Any) -> int:
-        """Announce a record; returns its number. ``struct.error`` when the values do not fit the layout."""
+        """Announce a record and return its number. Raises ``struct.error`` if the values do not fit the layout."""
         self._layout.pack_into(self._payloads[(self._seq + 1) & self._mask], 0, *values)
         return self._announce(self._layout.size)
 
     def read(self) -> tuple[int, tuple[Any, ...]] | None:
-        """The newest whole record as (number, values); None before the first one.
+        """Return the newest whole record as (number, values); None before the first one.
 
-        When every try meets a writer in the act: the last record that this reader has seen.
+        If a write is in progress at every try: the last record that this reader has read.
         """
         found = self.read_bytes()
         return None if found is None else (found[0], self._layout.unpack(found[1]))
 
     def read_bytes(self) -> tuple[int, bytes] | None:
-        """The same, not unpacked."""
+        """Return the same, not unpacked."""
         for _ in range(_TRIES):
             seq = self._announced[0]
             if seq == self._seen:
@@ -118,7 +118,7 @@ class Mailbox(_Slots):
         return (self._seen, self._record) if self._seen else None
 
     def bytes_at(self, seq: int) -> bytes | None:
-        """The whole record of that number, not unpacked; None where it is not there yet, or not any more."""
+        """Return the whole record of this number, not unpacked; None if it is not there yet, or not any more."""
         which = seq & self._mask
         number, check = _SLOT.unpack_from(self._buffer, self._starts[which])
         record = bytes(self._payloads[which])
@@ -126,7 +126,7 @@ class Mailbox(_Slots):
 
     @property
     def oldest(self) -> int:
-        """Number of the oldest record that nobody is about to write over."""
+        """Number of the oldest record that is not about to be written over."""
         return max(1, self._announced[0] - self._mask + 1)
 
 
@@ -145,11 +145,11 @@ class SeriesBox(_Slots):
 
     @classmethod
     def size(cls, capacity: int) -> int:
-        """Bytes that it takes."""
+        """Return the number of bytes that it needs."""
         return cls._size(_SERIES.size + 8 * capacity)
 
     def write(self, t: float, revision: int, values: Sequence[float]) -> int:
-        """Announce a record; returns its number. ValueError when there are more numbers than ``capacity``."""
+        """Announce a record and return its number. Raises ValueError for more than ``capacity`` numbers."""
         count = len(values)
         if count > self._capacity:
             raise ValueError(f"{count} numbers do not fit into {self._capacity}")
@@ -160,7 +160,7 @@ class SeriesBox(_Slots):
         return self._announce(end)
 
     def read(self) -> tuple[int, float, int, array[float]] | None:
-        """The newest whole record as (number, time, revision, values); None before the first one."""
+        """Return the newest whole record as (number, time, revision, values); None before the first one."""
         for _ in range(_TRIES):
             seq = self._announced[0]
             if seq == self._seen:
@@ -178,14 +178,12 @@ class SeriesBox(_Slots):
         return (self._seen, *self._record) if self._seen else None
 
 
-# [newest.py] The newest record of a mailbox, decoded once.
-
 Raw = TypeVar("Raw")
 Record = TypeVar("Record")
 
 
 class Newest(Generic[Raw, Record]):
-    """Most looks at a mailbox find nothing new: those cost one comparison."""
+    """Decodes the newest record of a mailbox once; a call that finds nothing new costs one comparison."""
 
     __slots__ = ("_decode", "_known", "_read", "_seq")
 
@@ -198,7 +196,7 @@ class Newest(Generic[Raw, Record]):
         self._known: tuple[int, Record | None] = (0, None)  # its number, and itself; replaced together
 
     def get(self) -> Record | None:
-        """None before the first one."""
+        """Return the newest record, decoded; None before the first one."""
         known = self._known
         if self._seq() != known[0]:
             found = self._read()
@@ -208,17 +206,15 @@ class Newest(Generic[Raw, Record]):
 
 
 def newest(box: Mailbox, decode: Callable[[tuple[Any, ...]], Record]) -> Callable[[], Record | None]:
-    """A function that gives the newest record of ``box``."""
+    """Return a function that returns the newest record of ``box``, decoded."""
     return Newest(box.seq, box.read, decode).get
 
-
-# [history.py] What a device said in the last seconds, out of a mailbox with many slots.
 
 _T = struct.Struct("<d")
 
 
 class Stamped(Protocol):
-    """A record that bears a stamp."""
+    """A record with a stamp."""
 
     @property
     def stamp(self) -> Stamp: ...
@@ -228,23 +224,24 @@ State = TypeVar("State", bound=Stamped)
 
 
 class History(Generic[State]):
-    """States whose records begin with their time, s. Costs the writer nothing, and never makes it wait."""
+    """The states of the last seconds, from a mailbox with many slots whose records begin with their time, s."""
 
     def __init__(self, box: Mailbox, decode: Callable[[bytes], State]) -> None:
         self._box = box
         self._decode = decode
 
     def since(self, t: float) -> list[State]:
-        """Every state that is newer than ``t``, oldest first, as far back as they are kept."""
+        """Return every state newer than ``t`` (s), oldest first, as far back as they are kept."""
         newest = self._box.seq()
         first = self._first_after(t, newest)
         found = (self._box.bytes_at(number) for number in range(first, newest + 1))
         return [self._decode(record) for record in found if record is not None]
 
     def around(self, t: float) -> tuple[State, State] | None:
-        """The last state at or before ``t`` and the first one after it, or the newest twice where there is none after.
+        """Return the last state at or before ``t`` (s) and the first one after it, or the newest twice if none is
+        after.
 
-        None where ``t`` is older than what is kept, and before the first state.
+        None if ``t`` is older than what is kept, and before the first state.
         """
         newest = self._box.seq()
         after = self._first_after(t, newest)
@@ -255,7 +252,7 @@ class History(Generic[State]):
         return None if later is None else (self._decode(before), self._decode(later))
 
     def _first_after(self, t: float, newest: int) -> int:
-        """Number of the first state that is newer than ``t``; ``newest + 1`` where none is."""
+        """Return the number of the first state newer than ``t`` (s); ``newest + 1`` if there is none."""
         low, high = min(self._box.oldest, newest + 1), newest + 1
         while low < high:
             middle = (low + high) // 2

@@ -1,7 +1,7 @@
-"""How commands and states lie in the memory that an app shares with the process that owns the devices.
+"""Layouts of all commands and states in the memory that an app shares with the process that owns the devices.
 
-The layouts stand here, once, for both sides. Numbers are doubles; NaN stands for what a driver cannot know and never
-leaves this file: it becomes None in the public records.
+Both sides use these layouts. Numbers are doubles; NaN stands for an unknown value and never leaves this file: it
+becomes None in the public records.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "AppRecord",
-    "FORMAT",
+    "FAULT_FORMAT",
     "GripperAct",
     "GripperCommand",
     "GripperMail",
@@ -45,17 +45,15 @@ __all__ = [
     "fault_values",
 ]
 
-# [fault_layout.py] How a fault lies in memory: a mark that there is one, then three texts of fixed length.
-
 _TEXTS = (48, 160, 240)  # bytes for a fault's code, cause and remedy
-FORMAT = "?" + "".join(f"{size}s" for size in _TEXTS)
-"""For :mod:`struct`; four values."""
-_FAULT = struct.Struct("<" + FORMAT)
+FAULT_FORMAT = "?" + "".join(f"{size}s" for size in _TEXTS)
+"""Format of a fault for :mod:`struct`: a mark that there is one, then three texts of fixed length."""
+_FAULT = struct.Struct("<" + FAULT_FORMAT)
 _NO_FAULT = (False, b"", b"", b"")
 
 
 def fault_values(fault: Fault | None) -> tuple[Any, ...]:
-    """The values of a record; texts that are too long are cut."""
+    """Return the four values of a fault's record; texts that are too long are cut."""
     if fault is None:
         return _NO_FAULT
     texts = (fault.code, fault.cause, fault.remedy)
@@ -63,22 +61,14 @@ def fault_values(fault: Fault | None) -> tuple[Any, ...]:
 
 
 def fault_of(there: bool, *texts: bytes) -> Fault | None:
-    """The fault that such values stand for."""
+    """Return the fault of such values; None if there is none."""
     return Fault(*(text.rstrip(b"\0").decode(errors="ignore") for text in texts)) if there else None
 
 
 def fault_at(record: bytes, offset: int) -> Fault | None:
-    """The fault that lies in a record; most have none, which one byte says."""
+    """Return the fault in a record; most have none, which one byte shows."""
     return fault_of(*_FAULT.unpack_from(record, offset)) if record[offset] else None
 
-
-# [state_layout.py] How an arm's state lies in memory: a stamp, one run of doubles, then what the servo and a
-# fault say.
-#
-# A reader takes only what it needs: the servo's part for every ``send``, or the whole state, whose arrays are
-# read-only
-# views of the record's own bytes.
-#
 
 _STAMP = struct.Struct("<ddQ")
 _SERVO = struct.Struct("<iiiQQ?Qdd")
@@ -87,7 +77,7 @@ _TRIPS = {int(trip): trip for trip in Trip}
 
 
 class ServoRecord(NamedTuple):
-    """What the servo adds to a reading."""
+    """State of the servo, which is added to a reading."""
 
     status: RobotStatus
     trip: Trip
@@ -96,20 +86,21 @@ class ServoRecord(NamedTuple):
     session: int
     arrived: bool
     refused: int
-    """Number of the newest command that the servo refused, 0 for none."""
+    """Number of the newest command that the servo refused; 0 for none."""
     t_written: float
-    """When the set-point was handed to the driver, s."""
+    """Time at which the set-point was handed to the driver, s."""
     t_stop: float
-    """When the last braking began, s."""
+    """Time at which the last braking began, s."""
     q_set: Sequence[float]
     dq_set: Sequence[float]
 
 
 class StateLayout:
-    """The record of an arm with ``n`` joints.
+    """Layout of the state of an arm with ``n`` joints: a stamp, one run of doubles, the servo's state, the fault.
 
     The doubles, in this order: q, dq, tau, q_set, dq_set (n each); tcp, tcp_set (7 each), tcp_twist (6); tau_ext (n),
-    wrench_ext (6).
+    wrench_ext (6). A reader decodes only what it needs: the servo's part for every ``send``, or the whole state, whose
+    arrays are read-only views of the record's own bytes.
     """
 
     def __init__(self, n: int) -> None:
@@ -122,8 +113,8 @@ class StateLayout:
 
     @property
     def format(self) -> str:
-        """Of the whole record, for :mod:`struct`."""
-        parts = (_STAMP.format, f"{self._count}d", _SERVO.format, FORMAT)
+        """Format of the whole record for :mod:`struct`."""
+        parts = (_STAMP.format, f"{self._count}d", _SERVO.format, FAULT_FORMAT)
         return "".join(part.removeprefix("<") for part in parts)
 
     def values(
@@ -134,7 +125,15 @@ class StateLayout:
         tcp_set: Sequence[float],
         twist: Sequence[float],
     ) -> tuple[Any, ...]:
-        """What a record holds: a reading, what the servo adds to it, and what kinematics makes of both."""
+        """Return the values of a record.
+
+        Args:
+            reading: What the device reports.
+            servo: State of the servo.
+            tcp: Pose of the tcp at the measured joints (7,): position, m, then quaternion xyzw.
+            tcp_set: Pose of the tcp at the set-point (7,).
+            twist: Twist of the tcp (6,), m/s and rad/s.
+        """
         nothing = self._nothing
         return (
             *reading[:3],  # t, t_device, seq
@@ -153,14 +152,14 @@ class StateLayout:
         )
 
     def servo(self, record: bytes) -> ServoRecord:
-        """What the servo says in a record."""
+        """Return the servo's part of a record."""
         status, trip, limited, *rest = _SERVO.unpack_from(record, self._servo_at)
         sets = self._set_points.unpack_from(record, self._set_at)
         n = self.n
         return ServoRecord._make((_STATUSES[status], _TRIPS[trip], _limited(limited), *rest, sets[:n], sets[n:]))
 
     def state(self, record: bytes) -> RobotState:
-        """The whole of a record."""
+        """Return the whole state in a record."""
         n, end = self.n, self._servo_at
         numbers: NDArray[np.float64] = np.frombuffer(record, "<f8", self._count, _STAMP.size)
         status, trip, limited, target_seq, *_ = _SERVO.unpack_from(record, end)
@@ -195,19 +194,16 @@ def _known(values: NDArray[np.float64]) -> NDArray[np.float64] | None:
     return None if isnan(values[0]) else values
 
 
-# [gripper_mail.py] How a gripper's commands and states lie in the memory that an app shares with the process that
-# owns it.
-
-_COMMAND = "QQB5d"
-_STATE = "ddQdd?bdQB?"
-_LAYOUT = struct.Struct("<" + _STATE + FORMAT)
+_GRIPPER_COMMAND = "QQB5d"
+_GRIPPER_STATE = "ddQdd?bdQB?"
+_GRIPPER_LAYOUT = struct.Struct("<" + _GRIPPER_STATE + FAULT_FORMAT)
 GRIPPER_STATES = 512
-"""So many states of a gripper stay readable: 2 s at 240 Hz, 5 s at 100 Hz."""
+"""Number of states of a gripper that stay readable: 2 s at 240 Hz, 5 s at 100 Hz."""
 _UNKNOWN, _NO, _YES = -1, 0, 1
 
 
 class GripperAct(IntEnum):
-    """What a gripper is told to do."""
+    """Kind of a gripper's command."""
 
     MOVE = 1
     GRASP = 2
@@ -219,47 +215,47 @@ class GripperCommand(NamedTuple):
     """A gripper's newest command. Only a motion has a width (m), a speed (m/s) and a force (N)."""
 
     seq: int
-    """Counts the commands of one gripper, from 1."""
+    """Number of the command, per gripper, from 1."""
     stops: int
-    """How often ``rig.stop()`` had been called when it was sent: a later stop ends it before it begins."""
+    """Calls of ``rig.stop()`` before it was sent: a later stop ends it before it begins."""
     act: GripperAct
     width: float = 0.0
     speed: float = 0.0
     force: float = 0.0
     inner: float = 0.0
-    """A grasped thing may be so much narrower than ``width``, m."""
+    """A grasped object may be this much narrower than ``width``, m."""
     outer: float = 0.0
-    """A grasped thing may be so much wider than ``width``, m."""
+    """A grasped object may be this much wider than ``width``, m."""
 
 
 class GripperRecord(NamedTuple):
-    """What the process that owns a gripper says of it."""
+    """State of a gripper as the process that owns it publishes it."""
 
     state: GripperState
     lost: bool
-    """The device did not answer when it was asked last; ``state`` is an older one, and its fault says why."""
+    """Whether the device did not answer; ``state`` is then an older one, and its fault gives the reason."""
 
 
 class GripperMail:
     """The mailboxes of one gripper."""
 
     def __init__(self, buffer: memoryview) -> None:
-        self.command = Mailbox(buffer, _COMMAND)
-        self.state = Mailbox(buffer[Mailbox.size(_COMMAND) :], _STATE + FORMAT, GRIPPER_STATES)
-        self.history = History(self.state, _state)
-        """The last :data:`STATES` states."""
+        self.command = Mailbox(buffer, _GRIPPER_COMMAND)
+        self.state = Mailbox(buffer[Mailbox.size(_GRIPPER_COMMAND) :], _GRIPPER_STATE + FAULT_FORMAT, GRIPPER_STATES)
+        self.history = History(self.state, _gripper_state)
+        """The last :data:`GRIPPER_STATES` states."""
         self.get_command = newest(self.command, _command)
-        """The newest command; None before the first one."""
+        """Returns the newest command; None before the first one."""
         self.get = newest(self.state, _record)
-        """The newest record; None before the first one."""
+        """Returns the newest record; None before the first one."""
 
     @classmethod
     def size(cls) -> int:
-        """Bytes that the mailboxes take."""
-        return Mailbox.size(_COMMAND) + Mailbox.size(_STATE + FORMAT, GRIPPER_STATES)
+        """Return the number of bytes that the mailboxes need."""
+        return Mailbox.size(_GRIPPER_COMMAND) + Mailbox.size(_GRIPPER_STATE + FAULT_FORMAT, GRIPPER_STATES)
 
     def put_command(self, command: GripperCommand) -> None:
-        """Tell the gripper what to do; the newest command wins."""
+        """Send a command; the newest command wins."""
         self.command.write(*command)
 
     def put(
@@ -270,7 +266,15 @@ class GripperMail:
         fault: Fault | None = None,
         lost: bool = False,
     ) -> None:
-        """Publish a reading, and how the command with the number ``target_seq`` goes."""
+        """Publish a reading.
+
+        Args:
+            reading: What the device reports.
+            target_seq: Number of the newest command.
+            outcome: How that command goes.
+            fault: Why it failed, or why the gripper does not answer.
+            lost: Whether the device did not answer; ``reading`` is then an older one.
+        """
         grasped = _UNKNOWN if reading.grasped is None else (_YES if reading.grasped else _NO)
         force = math.nan if reading.force is None else reading.force
         values = (*reading[:6], grasped, force, target_seq, outcome, lost)  # reading: t .. moving
@@ -298,43 +302,43 @@ def _record(values: tuple[Any, ...]) -> GripperRecord:
     return GripperRecord(state, lost)
 
 
-def _state(record: bytes) -> GripperState:
-    return _record(_LAYOUT.unpack(record)).state
+def _gripper_state(record: bytes) -> GripperState:
+    return _record(_GRIPPER_LAYOUT.unpack(record)).state
 
 
 _APP = "dQ"
 _HOST = "dQQ?"
 _DEADMAN = "??Qd"
 STATES = 1024
-"""So many states of an arm stay readable: 4 s at 240 Hz, 1 s at 1 kHz."""
+"""Number of states of an arm that stay readable: 4 s at 240 Hz, 1 s at 1 kHz."""
 
 
 class AppRecord(NamedTuple):
-    """What the app says to every arm and gripper of a group."""
+    """Record from the app to every arm and gripper of a group."""
 
     t: float
     """Heartbeat, s."""
     stops: int
-    """Counts calls of ``rig.stop()``."""
+    """Number of calls of ``rig.stop()``."""
 
 
 class HostRecord(NamedTuple):
-    """What the process that owns the devices says of itself."""
+    """Record of the process that owns the devices about itself."""
 
     t: float
     ticks: int
     missed: int
-    """Ticks that came too late and were skipped."""
+    """Number of ticks that came too late and were skipped."""
     ready: bool
 
 
 class Marks(NamedTuple):
-    """What the app says to one servo now and then."""
+    """Rare notices from the app to one servo."""
 
     rearms: int
-    """Counts calls of ``control.rearm()``."""
+    """Number of calls of ``control.rearm()``."""
     ended: int
-    """The newest session that the app ended."""
+    """Newest session that the app closed."""
 
 
 _NO_MARKS = Marks(0, 0)
@@ -355,13 +359,13 @@ class RobotMail:
         self._chunk = SeriesBox(buffer[offset:], _chunk_capacity(n))
         state = self.state
         self.get_command = newest(self.command, self._command)
-        """The newest command."""
+        """Returns the newest command; None before the first one."""
         self.get_deadman = newest(self.deadman, DeadmanRecord._make)
-        """How the dead-man stood last."""
+        """Returns the newest record of the dead-man; None before the first one."""
         self.get_state = Newest(state.seq, state.read_bytes, self._layout.state).get
-        """The newest state; None before the first one."""
+        """Returns the newest state; None before the first one."""
         self.peek = Newest(state.seq, state.read_bytes, self._layout.servo).get
-        """Only what the servo said: for every ``send``."""
+        """Returns only the servo's part of the newest state: for every ``send``."""
         self.history = History(state, self._layout.state)
         """The last :data:`STATES` states."""
         self._newest_marks = newest(self.marks, Marks._make)
@@ -369,19 +373,19 @@ class RobotMail:
 
     @staticmethod
     def layouts(n: int) -> tuple[tuple[str, int], ...]:
-        """Formats and numbers of slots, in the order in which the boxes lie."""
+        """Return formats and numbers of slots of the mailboxes, in their order in memory."""
         width = max(2 * n, 7)
         return ((f"QddidQH{width}d", 2), (_DEADMAN, 2), ("QQ", 2), (StateLayout(n).format, STATES))
 
     @classmethod
     def size(cls, n: int) -> int:
-        """Bytes that the mailboxes take."""
+        """Return the number of bytes that the mailboxes need."""
         return sum(Mailbox.size(*layout) for layout in cls.layouts(n)) + SeriesBox.size(_chunk_capacity(n))
 
     # From the app to the servo.
 
     def put_command(self, record: CommandRecord) -> None:
-        """Send a command. A chunk goes into a box of its own first: most commands are short, and often sent."""
+        """Send a command. A chunk is written to a box of its own first: most commands are short, and frequent."""
         width = max(2 * self.n, 7)
         if record.kind is Kind.JOINT_CHUNK:
             self._chunk.write(record.t, record.seq, record.values)
@@ -399,21 +403,21 @@ class RobotMail:
         )
 
     def put_deadman(self, record: DeadmanRecord) -> None:
-        """Say how the dead-man stands."""
+        """Publish the state of the dead-man."""
         self.deadman.write(record.held, record.connected, record.presses, record.t_alive)
 
     def get_marks(self) -> Marks:
-        """Rearms, and the newest session that the app ended."""
+        """Return the newest rearms and closed session."""
         return self._newest_marks() or _NO_MARKS
 
     def rearm(self) -> None:
-        """Say that ``control.rearm()`` was called once more."""
+        """Count one more call of ``control.rearm()``."""
         with self._marking:
             marks = self.get_marks()
             self.marks.write(marks.rearms + 1, marks.ended)
 
     def end(self, session: int) -> None:
-        """Say that this session is over."""
+        """Mark this session as closed."""
         with self._marking:
             self.marks.write(self.get_marks().rearms, session)
 
@@ -436,7 +440,7 @@ class RobotMail:
         tcp_set: Sequence[float],
         twist: Sequence[float],
     ) -> None:
-        """Publish an arm's state."""
+        """Publish an arm's state (see :meth:`StateLayout.values`)."""
         self.state.write(*self._layout.values(reading, servo, tcp, tcp_set, twist))
 
 
@@ -445,10 +449,10 @@ def _chunk_capacity(n: int) -> int:
 
 
 class GroupMemory:
-    """All mailboxes of a group: the app's word to all units, the host's word, then those of each arm and gripper."""
+    """All mailboxes of a group: the app's, the host's, then those of each arm and gripper."""
 
     def __init__(self, buffer: memoryview, robots: Iterable[tuple[str, int]], grippers: Iterable[str] = ()) -> None:
-        """``robots`` names each arm and its number of joints."""
+        """Lay the mailboxes out in ``buffer``; ``robots`` holds each arm's name and number of joints."""
         self.app = Mailbox(buffer, _APP)
         offset = Mailbox.size(_APP)
         self.host = Mailbox(buffer[offset:], _HOST)
@@ -466,26 +470,26 @@ class GroupMemory:
 
     @classmethod
     def of(cls, buffer: memoryview, spec: GroupSpec) -> GroupMemory:
-        """The mailboxes of this group."""
+        """Return the mailboxes of this group."""
         return cls(buffer, *_names(spec))
 
     @classmethod
     def size_of(cls, spec: GroupSpec) -> int:
-        """Bytes that the mailboxes of this group take."""
+        """Return the number of bytes that the mailboxes of this group need."""
         return cls.size(*_names(spec))
 
     @staticmethod
     def size(robots: Iterable[tuple[str, int]], grippers: Iterable[str] = ()) -> int:
-        """Bytes that it takes, for the same arguments as it is made from."""
+        """Return the number of bytes for the same arguments as the constructor's."""
         arms = sum(RobotMail.size(n) for _, n in robots)
         return Mailbox.size(_APP) + Mailbox.size(_HOST) + arms + GripperMail.size() * len(list(grippers))
 
     def get_app(self) -> AppRecord:
-        """The app's newest word."""
+        """Return the app's newest record."""
         return self._newest_app() or AppRecord(0.0, 0)
 
     def get_host(self) -> HostRecord:
-        """The host's newest word."""
+        """Return the host's newest record."""
         return self._newest_host() or HostRecord(0.0, 0, 0, False)
 
 

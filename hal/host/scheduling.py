@@ -1,4 +1,4 @@
-"""Which process runs first: a servo's host before everything else, whatever draws or encodes after it."""
+"""Which process runs first: a servo's host before everything else; drawing and encoding after it."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from ..preflight import may_lock_memory
 __all__ = ["describe", "is_realtime", "prepare_process", "yield_to_others"]
 
 PRIORITY = 50
-"""Of a host among SCHED_FIFO processes, 1 to 99."""
+"""Priority of a host among SCHED_FIFO processes, 1 to 99."""
 SLICE = 1e-4
 """Slice of a host that may not use SCHED_FIFO, s: the shorter, the sooner it runs after it wakes."""
 RUNAWAY = 2, 10
@@ -64,7 +64,7 @@ def is_realtime() -> bool:
 
 
 def describe() -> str:
-    """Return how this thread is scheduled, for people."""
+    """Return a description of how this thread is scheduled."""
     if is_realtime():
         return f"SCHED_FIFO, priority {os.sched_getparam(0).sched_priority}"
     slice_s = _slice()
@@ -86,7 +86,7 @@ def yield_to_others(nice: int) -> None:
 
 
 def _limit_runaway() -> None:
-    """A host that never pauses, because its work is too much or a library hangs, must not keep a processor.
+    """Keep a host that never pauses, because its work is too much or a library hangs, from occupying a processor.
 
     The kernel counts the time since the last pause, and sends SIGXCPU and then SIGKILL.
     """

@@ -30,16 +30,16 @@ __all__ = ["LATEST", "MISMATCHES", "NOISIEST", "Anchoring"]
 
 Floats = Sequence[float]
 LATEST = 5
-"""A report may be so many cycles old."""
+"""Largest age of a report, cycles."""
 
 NOISIEST = 1e-4
-"""Reports may be this far from the set-points, rad: noise, rounding and quantisation together."""
+"""Largest distance of reports from the set-points, rad: noise, rounding and quantisation together."""
 
 MISMATCHES = 20
-"""More reports than this in :data:`_WINDOW` cycles that nothing explains are a fault."""
+"""More unexplained reports than this in :data:`_WINDOW` cycles are a fault."""
 
 _LOSSES = 40
-"""More lost set-points than this in :data:`_WINDOW` cycles are a fault: such a link drives no arm."""
+"""More lost set-points than this in :data:`_WINDOW` cycles are a fault: such a link cannot drive an arm."""
 
 _WINDOW = 100
 """Cycles."""
@@ -49,70 +49,73 @@ _SAME = 2e-7
 at 1 kHz what is overlooked looks like a jerk of up to three times this over dt^3, 600 rad/s3."""
 
 _CONTINUED = 4e-7
-"""A device that continued by itself reports to be within this of where that is computed to be, rad: two roundings."""
+"""Largest distance between the report of a device that continued by itself and where that is computed to be, rad: two
+roundings."""
 
 _CLEAR = 4.0
-"""One set-point explains a report when every other one is so many times as far from it. Reports with noise show a lost
-set-point only when they are so many times the tolerance away from what was given."""
+"""One set-point explains a report if every other one is this many times as far from it. Noisy reports show a lost
+set-point only if they are this many times the tolerance away from what was given."""
 
 _SURE = 4
-"""So many reports in a row that only one lag explains are believed; the same for measured positions."""
+"""Number of consecutive reports that only one lag explains until it is accepted; the same for measured positions."""
 
 _AWAY = 1e-2
-"""After a silence, an arm this far from its set-point is taken from where it is, rad (when it cannot say what it
-took)."""
+"""After a silence, an arm this far from its set-point restarts from its measured position, rad (if it does not report
+what it took)."""
 
 _RESTED = 16
-"""So many readings of an arm that rests are averaged, since a start from a noisy position is a step."""
+"""Number of readings of an arm at rest that are averaged, since starting from a noisy position is a step."""
 
 _OVERSHOOT = 5e-3
-"""A device that continued by itself may have come so near to a limit that its stop ends this far beyond, rad."""
+"""A device that continued by itself may be so near to a limit that its stop ends this far beyond, rad."""
 
 _OVERSPEED = 1.01
 """The same for its speed, as a share of the limit."""
 
 
 class Anchoring:
-    """What one device does with its set-points, as its reports show it; corrects the smoother of one arm."""
+    """Learns from its reports what one device does with its set-points; corrects the smoother of one arm."""
 
     def __init__(self, smoother: JointSmoother, repeats: bool = False) -> None:
-        """``repeats``: a device that loses a set-point repeats the last one; no lost set-point of it is corrected."""
+        """Make it for one smoother. ``repeats``: the device repeats its last set-point if one is lost, so that no loss
+        is corrected."""
         self._smoother = smoother
         self._repeats = repeats
         self.fault: Fault | None = None
-        """Set when reports and set-points do not fit each other, until :meth:`recover`."""
+        """Set if reports and set-points do not fit each other, until :meth:`recover`."""
         self._seq: int | None = None
         """Number of the last reading."""
         self._cycle = 0
-        """Readings that were compared so far."""
+        """Number of readings that were compared so far."""
         self._rest: list[float] = []
-        """Where the device holds while nothing is streamed, rad: the mean of its last reports."""
+        """Position at which the device holds while nothing is streamed, rad: the mean of its last reports."""
         self._rested: Floats = ()
         """The last of these reports."""
         self._rests = 0
         self._steps = 0.0
-        """How many reports there were, and how much two of them in a row differ, rad."""
+        """Number of these reports, and the difference between two consecutive ones, rad."""
         self.reset_statistics()
         self.relearn()
         self.forget()
 
     def reset_statistics(self) -> None:
-        """Count from zero. What was learned stays."""
+        """Set the counters to zero. What was learned stays."""
         self.mismatches = 0
-        """Reports that were not the set-point at the known lag, and no lost set-point that was corrected."""
+        """Number of reports that were neither the set-point at the known lag nor a lost set-point that was corrected.
+        """
 
     def relearn(self) -> None:
-        """Learn anew how the device reports: what was learned may have been wrong, or the device another one."""
+        """Learn again how the device reports: what was learned may be wrong, or the device another one."""
         self.lag: int | None = None
-        """How many cycles old the reports are; None until that is known."""
+        """Age of the reports in cycles; None until it is known."""
         self.noise = 0.0
         """Largest difference between a report and the set-point that it shows, rad."""
         self.measured = False
-        """Whether the device reports measured positions as commanded ones, which say nothing of what it took."""
+        """Whether the device reports measured positions as commanded ones, which do not show what it took."""
         self._tolerance = _SAME
         self._hint = 0
         self._hints = 0
-        """The lag that the last readings point to, and how many of them in a row."""
+        """The lag that the last readings point to, and the number of such readings in a row."""
         self._doubt = 0.0
         """Largest distance (rad) of these readings from the set-points that they point to."""
         self._as_measured = 0
@@ -122,12 +125,12 @@ class Anchoring:
         """Cycles of the recent lost set-points."""
 
     def recover(self) -> None:
-        """Clear the fault, and learn anew how the device reports."""
+        """Clear the fault, and learn again how the device reports."""
         self.fault = None
         self.relearn()
 
     def statistics(self) -> dict[str, Any]:
-        """What is known of the device, as plain values."""
+        """Return what is known of the device, as plain values."""
         if self.measured:
             reports = "measured positions"
         else:
@@ -140,7 +143,7 @@ class Anchoring:
         }
 
     def rest(self, q: Floats | None) -> None:
-        """Nothing is streamed, and the device reports that it was commanded to ``q``, rad."""
+        """Note that nothing is streamed, and that the device reports ``q`` (n,) as its commanded position, rad."""
         if q is None or len(q) != len(self._rest) or not _apart(q, self._rest) <= NOISIEST:
             self._rest = [] if q is None else list(q)
             self._rests, self._steps = 1, 0.0
@@ -151,20 +154,21 @@ class Anchoring:
         self._rested = () if q is None else q
 
     def start(self, q: Floats) -> Floats:
-        """Where to start from when the device last reported to be at ``q``: without the noise, if it is only noise."""
+        """Return the position to start from if the device last reported ``q``, rad: without the noise, if it is only
+        noise."""
         rest = self._rest
         if len(rest) != len(q) or _apart(q, rest) > min(NOISIEST, 3.0 * self._steps):
             return q
         return rest
 
     def forget(self) -> None:
-        """The smoother was anchored anew: the device rests where it is, and what was given before does not matter."""
+        """Forget what was given: the smoother was anchored again, and the device rests there."""
         smoother = self._smoother
         q = smoother.q
         # Newest first; the device may report any of these.
         self._given: deque[Floats] = deque([q] * (LATEST + 1), LATEST + 1)
         self._motion = Setpoint(q, smoother.dq, smoother.ddq)
-        """What was given last."""
+        """The set-point that was given last."""
         self._at = self._motion
         """Where the device is, as far as is known: what it took last, or where it continued to."""
         steps = [smoother.dt * v for v in smoother.dq]
@@ -173,42 +177,46 @@ class Anchoring:
         )
         """Where it was in the last three cycles, rad; the newest is that of ``_at``."""
         self._fresh = True
-        """Nothing was given since."""
+        """Whether nothing was given since."""
         self._starts = False
-        """The set-point that was given last is the first one of a motion that begins at rest."""
+        """Whether the set-point that was given last is the first one of a motion that begins at rest."""
         self._waits = 0
-        """Cycles for which the motion that begins has waited for the device."""
+        """Number of cycles for which a motion that begins has waited for the device."""
         self.waiting = False
         """Whether the set-point is to stay in this cycle."""
         self._last: Reading | None = None
         self._before: Reading | None = None
         """The last reading and the one before."""
         self._silent = False
-        """The device may have stopped anywhere."""
+        """Whether the device may have stopped anywhere."""
         self._withheld = False
-        """The driver kept the last set-point back."""
+        """Whether the driver held the last set-point back."""
         self._away = 0
         """Cycles since the device answered last."""
 
     def gave(self, setpoint: Setpoint) -> None:
-        """This set-point goes to the device."""
+        """Note that this set-point is written to the device."""
         before, self._motion = self._motion, setpoint
         self._starts = not (any(before[1]) or any(before[2]))
         self._given.appendleft(setpoint[0])
         self._fresh = False
 
     def withheld(self) -> None:
-        """The driver did not pass the last set-point on: the device is where it says it is."""
+        """Note that the driver did not pass the last set-point on: the device is where it reports to be."""
         self._silent = self._withheld = True
 
     def lose(self) -> None:
-        """The device did not answer in this cycle. It stops by itself when that lasts."""
+        """Note that the device did not answer in this cycle. It stops by itself if that lasts."""
         self._away += 1
         if self._away * self._smoother.dt >= SILENCE:
             self._silent = True
 
     def look(self, reading: Reading, device: Trip) -> bool:
-        """Compare a reading with what was given. ``device`` is what is wrong with the device.
+        """Compare a reading with what was given.
+
+        Args:
+            reading: The newest reading.
+            device: The trip that the device causes.
 
         Returns:
             Whether the smoother was corrected.
@@ -253,7 +261,7 @@ class Anchoring:
         return self._explain(reading, q, 1 if last is None else max(1, reading.seq - last))
 
     def _pass_over(self, device: Trip) -> None:
-        """A reading that says nothing of the last set-point."""
+        """Skip a reading that shows nothing of the last set-point."""
         if self._fresh:
             return
         if self.fault is not None or device is Trip.BAD_READING:
@@ -265,14 +273,15 @@ class Anchoring:
             self.lose()  # it is an old one
 
     def _took(self) -> None:
-        """The device has what it was given last."""
+        """Note that the device has what it was given last."""
         self._at = motion = self._motion
         self._track.appendleft(motion[0])
 
     def _wait(self, q: Floats) -> bool:
-        """A motion begins, and the device reports that it rests: it lost the set-point, or its reports are late.
+        """Return whether the set-point waits in this cycle: a motion begins, and the device reports that it rests.
 
-        Whichever it was, the smallest step from rest may be repeated, and the motion may begin again from there.
+        It lost the set-point, or its reports are late. In both cases the smallest step from rest may be repeated, and
+        the motion may begin again from there.
         """
         given, rests = self._given[0], self._track[0]
         said = None if self._last is None else self._last.q_commanded
@@ -287,7 +296,7 @@ class Anchoring:
         return True
 
     def _explain(self, reading: Reading, q: Floats, cycles: int) -> bool:
-        """A report that is not the set-point at the known lag. ``cycles``: since the last reading."""
+        """Explain a report that is not the set-point at the known lag; ``cycles`` since the last reading."""
         apart = [_apart(q, sent) for sent in self._given]
         nearest = min(apart)
         lag = self.lag
@@ -311,7 +320,7 @@ class Anchoring:
         return False
 
     def _learn(self, apart: Sequence[float], nearest: float) -> None:
-        """Which lag does this report point to, if only one can be meant?"""
+        """Learn which lag this report points to, if only one explains it."""
         others = sorted(apart)[1]
         if nearest > NOISIEST or others < _CLEAR * max(nearest, _SAME):
             return
@@ -325,7 +334,7 @@ class Anchoring:
             self._tolerance = max(self._tolerance, min(2.0 * self._doubt, NOISIEST))
 
     def _mismatch(self, reading: Reading, off: float) -> None:
-        """Nothing explains this report, which is ``off`` (rad) from the set-point."""
+        """Count a report that nothing explains, and that is ``off`` (rad) from the set-point."""
         self.mismatches += 1
         if self.measured:
             return
@@ -341,7 +350,7 @@ class Anchoring:
             self.noise = max(self.noise, worst)
             self._tolerance = min(2.0 * worst, NOISIEST)
         else:
-            self._fail(reading.q_commanded, f"{MISMATCHES + 1} of {_WINDOW} reports fit nothing that it was given")
+            self._fail(reading.q_commanded, f"{MISMATCHES + 1} of {_WINDOW} reports fit no set-point")
 
     def _fail(self, told: Floats | None, what: str) -> None:
         sent = self._given[0]
@@ -351,7 +360,7 @@ class Anchoring:
             detail = f": joint {k + 1} was sent {sent[k]:.6f} rad and reported {told[k]:.6f} rad"
         self.fault = Fault(
             "SETPOINT_MISMATCH",
-            f"the arm does not follow its set-points, by what it reports: {what}{detail}",
+            f"by its reports, the arm does not follow its set-points: {what}{detail}",
             "check that the arm reports the positions that it was commanded, each joint in its place, at most "
             f"{LATEST} cycles late and within {NOISIEST:g} rad, and that its network loses nothing",
         )
@@ -359,9 +368,9 @@ class Anchoring:
     # A set-point was lost.
 
     def _continued(self, q: Floats, dq: Floats | None, cycles: int, apart: Sequence[float]) -> bool:
-        """Did the device continue by itself, to here? Then this is where it is from now on.
+        """Return whether the device continued by itself to here; then this is where it is from now on.
 
-        ``apart``: how far ``q`` is from each of the last set-points, rad.
+        ``apart`` holds the distances of ``q`` from each of the last set-points, rad.
         """
         off = apart[0]
         if self._repeats or (self._tolerance > _CONTINUED and off < _CLEAR * self._tolerance):
@@ -419,7 +428,8 @@ class Anchoring:
         return Setpoint(track[0], dq, ddq)
 
     def _allows(self, at: Setpoint) -> bool:
-        """Can the arm continue from here inside the limits, or at least not farther outside than it is now?"""
+        """Return whether the arm can continue from here inside the limits, or at least not farther outside than it is
+        now."""
         smoother = self._smoother
         for q, v, a, q0, v0, a0, low, high, most, A, J in zip(
             *at[:3],
@@ -440,7 +450,7 @@ class Anchoring:
         return True
 
     def _correct(self, q: Floats) -> bool:
-        """Go on from where the device is; it reported ``q``."""
+        """Continue from where the device is; it reported ``q``."""
         if not self._count_lost(q):
             self._at = self._motion
             return False
@@ -448,7 +458,8 @@ class Anchoring:
         return True
 
     def _count_lost(self, q: Floats) -> bool:
-        """Count a lost set-point after which the device reported ``q``; False when these are too many: a fault."""
+        """Count a lost set-point after which the device reported ``q``; returns False, and sets the fault, if there are
+        too many."""
         lost = self._lost
         lost.append(self._cycle)
         while lost[0] <= self._cycle - _WINDOW:
@@ -459,7 +470,7 @@ class Anchoring:
         return True
 
     def _resume(self, reading: Reading) -> bool:
-        """The first reading after a silence: if the arm is not at its set-point, start at rest from where it is.
+        """Handle the first reading after a silence: if the arm is not at its set-point, start at rest from where it is.
 
         The arm stopped by itself, or is doing so. A set-point at rest brakes an arm that still moves, while one that
         began at a speed in a single bad reading would run away, with the dead-man released as well.
@@ -483,7 +494,7 @@ class Anchoring:
 
 
 def _continued(track: list[Floats], cycles: int) -> list[Floats]:
-    """Positions a cycle apart, newest first, and so many cycles more at constant acceleration, rad."""
+    """Return positions a cycle apart, newest first, extended by ``cycles`` at constant acceleration, rad."""
     for _ in range(min(cycles, MISMATCHES)):
         track = [[3.0 * (a - b) + c for a, b, c in zip(*track[:3], strict=True)], *track]
     return track

@@ -1,4 +1,4 @@
-"""What a driver was really given, judged by backward differences, whoever computed it."""
+"""Check of the set-points that a driver was given, by backward differences, independent of the servo."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _HISTORY = 3
 _TORQUE_RATE = 1000.0
 """Greatest rate of a torque, Nm/s: what a Franka's interface takes."""
 _BATCH = 128
-"""Samples are judged so many at a time: one by one they would cost the servo's loop fifty times as much."""
+"""Number of samples that are checked at a time: one by one they would cost the servo's loop fifty times as much."""
 
 
 class SetpointAudit:
@@ -44,7 +44,7 @@ class SetpointAudit:
         self._torque_limits = limits.torque
         self._torque_step = _TORQUE_RATE * dt
         self._torque_peaks: list[float] = []
-        """Of torque and of its rate; empty before the first torques."""
+        """Peaks of torque and of its rate; empty before the first torques."""
         self._tau: Sequence[float] | None = None
         self._history: NDArray[np.float64] = np.empty((0, len(lower)))
         self._pending: list[float] = []
@@ -57,7 +57,7 @@ class SetpointAudit:
         self._tau = None
 
     def take(self, setpoint: Setpoint) -> None:
-        """One set-point, of whatever kind, as it was handed to the driver."""
+        """Add a set-point of any kind, as it was handed to the driver."""
         if setpoint.tau is not None:
             self._add_torques(setpoint.tau)
             return
@@ -77,7 +77,7 @@ class SetpointAudit:
         self._torque_peaks = [max(peaks[0], torque), max(peaks[1], rate)]
 
     def add(self, q: Sequence[float]) -> None:
-        """One set-point (n,), rad, as it was handed to the driver."""
+        """Add joint positions (n,), rad, as they were handed to the driver."""
         self._pending.extend(q)
         if len(self._pending) >= self._full:
             self._judge()
@@ -104,9 +104,9 @@ class SetpointAudit:
             self._peaks[which] = math.inf if math.isnan(ratio) else ratio
 
     def peaks(self) -> dict[str, float]:
-        """The greatest ratios so far: ``velocity``, ``acceleration``, ``jerk``, ``position``.
+        """Return the greatest ratios so far: ``velocity``, ``acceleration``, ``jerk``, ``position``.
 
-        And ``torque`` and ``torque_rate`` where there were torques.
+        Also ``torque`` and ``torque_rate`` if there were torques.
         """
         self._judge()
         position, velocity, acceleration, jerk = self._peaks

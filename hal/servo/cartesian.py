@@ -1,4 +1,4 @@
-"""Commands for the tcp, made into one tick of joint motion each: twists and poses.
+"""Motions of the tcp: twists and poses.
 
 Inverse kinematics runs here, once per tick, seeded from the set-point, so that a clamp or a trip never leaves a goal
 behind that has run away. Saturation scales the whole motion: the tcp keeps its direction.
@@ -49,10 +49,10 @@ _BRAKE = (0.8, 0.5)
 
 
 class _CartesianMotion(ServoMotion):
-    """What twists and poses share."""
+    """Base class of twists and poses."""
 
     def _follow_twist(self, twist: list[float]) -> None:
-        """One tick towards this twist (6,) of the tcp, along the base's axes."""
+        """Follow a twist (6,) of the tcp for one tick, along the base's axes, m/s and rad/s."""
         envelope, smoother = self.envelope, self.smoother
         speed = max(hypot(*twist[:3]), hypot(*twist[3:]))
         posture = _POSTURE * min(1.0, speed / _POSTURE_FULL)
@@ -64,11 +64,11 @@ class _CartesianMotion(ServoMotion):
         self._follow(envelope.cap_together(self._brake(dq)), together=True)
 
     def _brake(self, dq: list[float]) -> list[float]:
-        """Slow the joint speeds (n,) down where the goal is near."""
+        """Return joint speeds (n,) slowed down near the goal, rad/s."""
         return dq
 
     def _cap(self, twist: list[float]) -> list[float]:
-        """A twist (6,) cut to the tcp speed as a whole, and its linear part to what the workspace leaves."""
+        """Return a twist (6,) cut to the tcp speed as a whole, and its linear part to what the workspace leaves."""
         envelope = self.envelope
         speed = hypot(*twist[:3])
         cap = envelope.goal_tcp_speed
@@ -99,7 +99,7 @@ class TwistMotion(_CartesianMotion):
         self._values: Floats = ()
         self._goal: list[float] = []
         self._held = [False, False]
-        """Are the goal's position and orientation to be kept?"""
+        """Whether the goal's position and orientation are held."""
 
     def start(self) -> None:
         super().start()
@@ -130,7 +130,7 @@ class TwistMotion(_CartesianMotion):
         self._follow_twist(self._cap([v + _TWIST_GAIN * e for v, e in zip(twist, error, strict=True)]))
 
     def _advance(self, pose: Floats, twist: list[float]) -> None:
-        """Move the goal by one tick, part by part."""
+        """Move the goal by one tick, position and orientation separately."""
         dt, goal = self.smoother.dt, self._goal
         angular = twist[3:]
         for part, rate in enumerate((twist[:3], angular)):
@@ -163,7 +163,7 @@ class TwistMotion(_CartesianMotion):
 
 
 class PoseMotion(_CartesianMotion):
-    """Bring the tcp to a pose, straight, translation and rotation at once; the joints brake in time."""
+    """Brings the tcp to a pose, straight, translation and rotation at once; the joints brake in time."""
 
     size = 7
 

@@ -24,39 +24,32 @@ __all__ = [
     "TcpReference",
 ]
 
-# [tcp.py] Bounds on where the tcp is, on its speed and on that of its stops, without computing the kinematics in
-# every tick.
-#
-# Forward kinematics and a Jacobian in every tick would cost more than all the rest of it. Most ticks need
-# neither: the
-# tcp is nowhere near a face of the workspace or its greatest speed, and a bound that costs a few multiplications
-# proves
-# it. Only where the bound does not are they computed.
-#
-# Every bound rests on `Kinematics.reach`, r: joint i at 1 rad/s moves the tcp at r_i m/s at most, wherever the
-# arm is,
-# and turning joint j by x rad changes each column of the linear Jacobian J by r_j |x| at most. With dq the joint
-# speeds,
-# and d = q - q_reference the distance of the joints from where the tcp was computed:
-#
-# * |tcp(q) - tcp(q_reference)| <= m, where m = sum r_i |d_i| <= |r| |d|;
-# * |J(q) dq| <= sum r_i |dq_i|;
-# * |J(q) dq| <= |J(q_reference) dq| + m sum |dq_i| <= (|J(q_reference)| + |r| |d| sqrt(n)) |dq|.
-#
-# The looser forms are products of lengths, which cost one call each; the sharper ones are tried where those fail.
-#
-
 Floats = Sequence[float]
 
 _SAME = 2e-3
-"""The Jacobian is computed anew when the tcp may have moved this far, m: it errs by 2 mm/s per rad/s."""
+"""The Jacobian is computed again once the tcp may have moved this far, m: it errs by 2 mm/s per rad/s."""
 
 _PARTS = np.linspace(0.0, 1.0, 9)
-"""A stop is looked at in at least these parts of its duration."""
+"""A stop is checked at the ends of at least these parts of its duration."""
 
 
 class TcpReference:
-    """The tcp at a joint position nearby."""
+    """The tcp at a reference position nearby, and bounds on its position, its speed and that of its stops.
+
+    Forward kinematics and a Jacobian in every tick would cost more than all the rest of it. Most ticks need neither:
+    the tcp is nowhere near a face of the workspace or its greatest speed, and a bound that costs a few multiplications
+    proves it. They are only computed if the bound does not.
+
+    Every bound rests on `Kinematics.reach`, r: joint i at 1 rad/s moves the tcp at r_i m/s at most, wherever the arm
+    is, and turning joint j by x rad changes each column of the linear Jacobian J by r_j |x| at most. With dq the joint
+    speeds, and d = q - q_reference the distance of the joints from where the tcp was computed:
+
+    * |tcp(q) - tcp(q_reference)| <= m, where m = sum r_i |d_i| <= |r| |d|;
+    * |J(q) dq| <= sum r_i |dq_i|;
+    * |J(q) dq| <= |J(q_reference) dq| + m sum |dq_i| <= (|J(q_reference)| + |r| |d| sqrt(n)) |dq|.
+
+    The looser forms are products of lengths, which cost one call each; the sharper ones are tried if those fail.
+    """
 
     def __init__(self, smoother: JointSmoother, kinematics: Kinematics, workspace: WorkspaceSpec | None) -> None:
         self._smoother = smoother
@@ -75,13 +68,13 @@ class TcpReference:
         self._accelerations = np.array(smoother.acceleration)
         self._bend = sum(map(mul, self._reach, smoother.acceleration)) / 8.0
         self._at: Floats = [inf] * smoother.n
-        """Joint positions of the reference; infinitely far before the first look."""
+        """Joint positions of the reference (n,), rad; infinite before the first one."""
         self._pose: Pose7 = (inf,) * 7
         self._jacobian: Any = None
         self._rows: list[list[float]] = []
         """The linear Jacobian there, (3, n)."""
         self._curvature: Any = None
-        """How they change with each joint, (n, 3 n); None until it is asked for."""
+        """Their derivatives by each joint, (n, 3 n); None until they are needed."""
         self._centre: Floats = (0.0,) * smoother.n
         self._centre_speed = self._centre_length = 0.0
         """Joint speeds, rad/s, and the greatest speed of the tcp there, m/s, for any shares from 0 to 1 of them;
@@ -105,7 +98,7 @@ class TcpReference:
         self._margin = 0.0
 
     def open(self, velocity: Floats) -> None:
-        """A session begins whose joints keep below ``velocity`` (n,), rad/s."""
+        """Open a session whose joints stay below ``velocity`` (n,), rad/s."""
         smoother = self._smoother
         dt = smoother.dt
         self._stops = []
@@ -128,7 +121,7 @@ class TcpReference:
         self._per_acceleration = hypot(*[per_a for _, _, per_a in self._stops])
 
     def here(self) -> tuple[Pose7, NDArray[np.float64]]:
-        """Pose of the tcp and its Jacobian (6, n) at the set-point, which becomes the reference."""
+        """Return pose of the tcp and its Jacobian (6, n) at the set-point, which becomes the reference."""
         if self._at is not self._smoother.q:
             self._look()
         return self._pose, self._jacobian
@@ -148,7 +141,7 @@ class TcpReference:
             self._clearance = min([min(x - low, high - x) for x, low, high in sides])
 
     def velocity(self, dq: Floats) -> list[float]:
-        """Linear velocity (3,) in m/s of the tcp when the joints of the set-point move so, along the base's axes."""
+        """Return the linear velocity (3,) of the tcp for joint speeds ``dq`` (n,) at the set-point, base axes, m/s."""
         self._refresh()
         return [sum(map(mul, row, dq)) for row in self._rows]
 
@@ -170,7 +163,7 @@ class TcpReference:
         return self._centre_speed + self._stretch * hypot(*distances)
 
     def _put_centre(self, dq: Floats) -> None:
-        """Compute the tcp's greatest speed for all shares of the joint speeds ``dq``."""
+        """Compute the tcp's greatest speed for all shares of the joint speeds ``dq`` (n,), rad/s."""
         self._refresh()
         axes = []
         for row in self._rows:
@@ -274,7 +267,7 @@ class TcpReference:
         return max(float((fastest + left_out * total).max()), in_step) <= cap
 
     def surely_inside(self, margin: float) -> bool:
-        """Would the tcp, stopped now, stay ``margin`` (m) off every face of the workspace? False: not proven."""
+        """Return whether the tcp, stopped now, surely stays ``margin`` (m) off every face of the workspace."""
         margin = max(margin, self._step)
         if self._proof is self._smoother.q and margin <= self._margin:
             return True
@@ -283,7 +276,7 @@ class TcpReference:
         return proven
 
     def surely_stays_inside(self) -> bool:
-        """Does a stop after the step that is proposed end inside the workspace? False: not proven."""
+        """Return whether a stop after the proposed step surely ends inside the workspace."""
         return self.surely_inside(0.0)
 
     def _proves_inside(self, margin: float) -> bool:
@@ -304,7 +297,7 @@ class TcpReference:
         return self._moved() < left
 
     def _moved(self) -> float:
-        """Greatest distance in m between the tcp at the set-point and that of the reference."""
+        """Return the greatest distance between the tcp at the set-point and that of the reference, m."""
         if self._at is self._smoother.q:
             return 0.0
         total = 0.0
@@ -313,7 +306,7 @@ class TcpReference:
         return total
 
     def _refresh(self) -> bool:
-        """Look again where the set-point is, unless the reference is as good as there; True when it did."""
+        """Move the reference to the set-point unless it is as good as there; returns whether it moved."""
         if self._moved() <= _SAME:
             return False
         self._look()
@@ -324,7 +317,7 @@ _TCP_SHARE = 0.97
 """Share of the tcp speed that goals use, for what the stale Jacobian and joints that change speed one by one add."""
 
 _UNLIMITED = 100.0
-"""From this tcp speed on nothing is looked at, m/s."""
+"""From this tcp speed on nothing is checked, m/s."""
 
 _FACE_GAIN = 4.0
 """Speed towards a face of the workspace per distance to it, 1/s: 0.25 m/s slows down from 6 cm, at 1 m/s2."""
@@ -338,7 +331,7 @@ _BRAKE_JERK = 0.5
 
 
 class Envelope:
-    """Cuts goals to a session's terms; ``limited`` collects what was held back since it was last cleared."""
+    """Cuts goals to a session's terms; ``limited`` collects what was held back since it was cleared."""
 
     def __init__(self, smoother: JointSmoother, kinematics: Kinematics, workspace: WorkspaceSpec | None) -> None:
         self.smoother = smoother
@@ -347,20 +340,20 @@ class Envelope:
         self.velocity = list(smoother.velocity)
         """Greatest joint speeds of the session (n,), rad/s."""
         self._slowest = smoother.slowest
-        """A vector of joint speeds no longer than this is within every joint's, rad/s."""
+        """A vector of joint speeds no longer than this is within every joint's limit, rad/s."""
         self.tcp_speed = float("inf")
         """Greatest speed of the tcp, m/s."""
         self.goal_tcp_speed = float("inf")
         """The same for goals: a little less, for what the smoothing adds."""
         self.limited = Limited.NONE
         self.guard: Guard | None = None if workspace is None else self.stays_inside
-        """What a proposed step must satisfy beyond joint limits."""
+        """Check that a proposed step must pass beyond joint limits; None if there is none."""
         self._refused = Limited.NONE
-        """Why the guard refused a step last."""
+        """Why the guard refused the last step."""
         self._tcp = TcpReference(smoother, kinematics, workspace)
 
     def open(self, session: Session) -> None:
-        """Take over the terms of a session."""
+        """Set the terms of a session."""
         self.velocity = [session.speed * v for v in self.smoother.velocity]
         self._slowest = min(self.velocity)
         self._tcp.open(self.velocity)
@@ -371,7 +364,7 @@ class Envelope:
     # Goals: smooth caps, so that the hard checks below seldom have to act.
 
     def lets_pass(self, dq: list[float]) -> bool:
-        """Is this goal velocity surely within every cap below? False: not proven."""
+        """Return whether this goal velocity (n,), rad/s, is surely within every cap below. False: not proven."""
         smoother = self.smoother
         speed = hypot(*dq)
         if not (speed <= self._slowest and smoother.is_free(smoother.q)):
@@ -381,7 +374,8 @@ class Envelope:
         return self.far_from_faces()
 
     def cap_joints(self, dq: list[float]) -> list[float]:
-        """Each joint by itself: the session's speed, and what can still brake before a position limit."""
+        """Return goal velocities (n,), each cut to the session's speed and to what can still brake before a limit,
+        rad/s."""
         if hypot(*dq) <= self._slowest and self.smoother.is_free(self.smoother.q):
             return dq
         state = zip(dq, self.velocity, self.smoother.q, self.smoother.free, strict=True)
@@ -391,7 +385,7 @@ class Envelope:
         ]
 
     def cap_together(self, dq: list[float]) -> list[float]:
-        """The same caps, but the whole vector is scaled, so that the tcp keeps its direction."""
+        """Return the same, but with the whole vector scaled, so that the tcp keeps its direction."""
         each = self.cap_joints(dq)
         if each is dq:
             return dq
@@ -429,7 +423,7 @@ class Envelope:
         return (dq if scale == 1.0 else [scale * v for v in dq]), fast
 
     def in_proportion(self, dq: list[float], before: Floats) -> list[float]:
-        """From the goal velocity of the last tick towards ``dq``, no faster than the slowest joint can, all alike."""
+        """Return the next goal velocity (n,) from ``before`` towards ``dq``, all joints in proportion, rad/s."""
         smoother = self.smoother
         share = 1.0
         for v, v0, A in zip(dq, before, smoother.acceleration, strict=True):
@@ -439,7 +433,7 @@ class Envelope:
         return dq if share == 1.0 else [v0 + share * (v - v0) for v, v0 in zip(dq, before, strict=True)]
 
     def face_speeds(self, tcp_velocity: Floats) -> list[float]:
-        """Greatest speed (3,) in m/s along each base axis, given which way the tcp goes."""
+        """Return the greatest speed (3,) along each base axis in the direction of ``tcp_velocity`` (3,), m/s."""
         if self.workspace is None:
             return [float("inf")] * 3
         at, _ = self.here()
@@ -447,7 +441,7 @@ class Envelope:
         return [_FACE_GAIN * max(0.0, (high - x) if v > 0.0 else (x - low)) for x, v, low, high in faces]
 
     def here(self) -> tuple[Pose7, NDArray[np.float64]]:
-        """Pose of the tcp and its Jacobian (6, n) at the set-point; computed once a tick, whoever asks."""
+        """Return pose of the tcp and its Jacobian (6, n) at the set-point; computed once a tick."""
         return self._tcp.here()
 
     def stop_speed(self, dq: list[float], places: Sequence[Floats]) -> float:
@@ -456,7 +450,7 @@ class Envelope:
         return self._tcp.stop_speed(dq, np.array([self.kinematics.jacobian(q)[:3].T for q in places]))
 
     def far_from_faces(self) -> bool:
-        """Is the tcp surely where no face of the workspace slows it down?"""
+        """Return whether the tcp is surely where no face of the workspace slows it down."""
         return self.workspace is None or self._tcp.surely_inside(self.goal_tcp_speed / _FACE_GAIN)
 
     def _clip(self, i: int, v: float) -> float:
@@ -478,7 +472,8 @@ class Envelope:
     # Hard checks of a proposed step.
 
     def stays_inside(self, smoother: JointSmoother) -> bool:
-        """Would a stop after the proposed step end inside the workspace, or no farther outside than one from now?"""
+        """Return whether a stop after the proposed step ends inside the workspace, or no farther outside than one from
+        now."""
         box = self.workspace
         if box is None or self._tcp.surely_stays_inside():
             return True
@@ -500,7 +495,7 @@ class Envelope:
         return False
 
     def allows(self, smoother: JointSmoother) -> bool:
-        """`keeps_tcp_speed` and `stays_inside`."""
+        """Return whether a step passes both :meth:`keeps_tcp_speed` and :meth:`stays_inside`."""
         return self.keeps_tcp_speed(smoother) and self.stays_inside(smoother)
 
     def note(self, smoother: JointSmoother) -> None:

@@ -1,7 +1,7 @@
-"""Commands in joint space, made into one tick of motion each: targets, velocities, and the path of ``move_to``.
+"""Motions in joint space: targets, velocities, chunks of targets, and the straight path of ``move_to``.
 
-A motion is told its newest command (``accept``) and asked once per tick to move the smoother (``step``). It keeps no
-set-point of its own: after a stop or a re-anchoring it is made to forget (``start``) and goes on from where the arm is.
+A motion accepts its newest command (``accept``) and moves the smoother once per tick (``step``). It keeps no set-point
+of its own: after a stop or a re-anchoring it is reset (``start``) and continues from where the arm is.
 """
 
 from __future__ import annotations
@@ -33,31 +33,31 @@ Floats = Sequence[float]
 
 
 class ServoMotion(ABC):
-    """How one kind of command moves the arm."""
+    """Base class of all motions: how one kind of command moves the arm."""
 
     size: int
-    """Number of values that a command of this kind has."""
+    """Number of values in a command of this kind."""
 
     def __init__(self, smoother: JointSmoother, envelope: Envelope) -> None:
         self.smoother = smoother
         self.envelope = envelope
         self._wanted: list[float] | None = None
-        """Joint speeds of the last tick's goal (n,), rad/s, while goals change in proportion."""
+        """Joint speeds (n,) of the last tick's goal, rad/s, while goals change in proportion; else None."""
 
     def start(self) -> None:
-        """Forget every command; the next one is the first."""
+        """Discard every command; the next one is the first."""
         self._wanted = None
 
     def usable(self, values: Floats) -> bool:
-        """Can this command be followed at all? (As many values as ``size``, all finite.)"""
+        """Return whether a command can be followed at all: ``size`` values, all finite."""
         return len(values) == self.size and isfinite(sum(map(abs, values)))
 
     def reanchored(self) -> None:
-        """The set-point is elsewhere than the last step left it; the newest command stays."""
+        """Note that the set-point is not where the last step left it; the newest command stays valid."""
         self._wanted = None
 
     def too_far(self, values: Floats) -> bool:
-        """Is this first target farther from the set-point than a stream may begin?"""
+        """Return whether a first target is farther from the set-point than a stream may begin."""
         return False
 
     @abstractmethod
@@ -86,7 +86,7 @@ class ServoMotion(ABC):
             self._wanted = None
 
     def _follow_each(self, dq: list[float]) -> None:
-        """The same, but first each joint is capped by itself."""
+        """Follow joint speeds (n,), rad/s, each capped by itself first."""
         envelope = self.envelope
         if envelope.lets_pass(dq):
             self._wanted = None
@@ -96,7 +96,7 @@ class ServoMotion(ABC):
 
 
 class JointVelocityMotion(ServoMotion):
-    """Move the joints at given velocities; each is capped by itself."""
+    """Moves the joints at given velocities; each is capped by itself."""
 
     def __init__(self, smoother: JointSmoother, envelope: Envelope) -> None:
         super().__init__(smoother, envelope)
@@ -131,11 +131,11 @@ class JointTargetMotion(ServoMotion):
         self._q: list[float] = []
         self._dq: list[float] = []
         self._direct = False
-        """Go there directly (True), or follow as a stream."""
+        """Whether the arm goes there directly; else it follows as a stream."""
         self._still = True
-        """Did the target stand still before the newest command?"""
+        """Whether the target stood still before the newest command."""
         self._inside = True
-        """Is the target inside the position limits, now and until the deadline?"""
+        """Whether the target is inside the position limits, now and until the deadline."""
         self._stream_braking = _braking(smoother, *_STREAM)
         self._direct_braking = _braking(smoother, *_DIRECT)
 
@@ -178,7 +178,8 @@ class JointTargetMotion(ServoMotion):
         self._follow_each(self._approach(q, dq, age))
 
     def _approach(self, q: list[float], dq: list[float], age: float) -> list[float]:
-        """The speed of the target, ``age`` s on, plus what closes the error and can still brake before it is closed."""
+        """Return the speed (n,) of the target ``age`` s on, plus what closes the error and can still brake in time,
+        rad/s."""
         smoother = self.smoother
         braking = self._direct_braking if self._direct else self._stream_braking
         ahead = 2.0 * smoother.dt
@@ -198,12 +199,12 @@ class JointTargetMotion(ServoMotion):
         return goal
 
     def _is_inside(self, q: list[float], dq: list[float], age: float) -> bool:
-        """Is the target, ``age`` s on, inside the position limits?"""
+        """Return whether the target, ``age`` s on, is inside the position limits."""
         limits = zip(q, dq, self.smoother.lower, self.smoother.upper, strict=True)
         return all(low <= x + v * age <= high for x, v, low, high in limits)
 
     def _into_limits(self, q: list[float], dq: list[float]) -> tuple[list[float], list[float]]:
-        """The target, and its speed, cut to the position limits."""
+        """Return the target and its speed, cut to the position limits."""
         lower, upper = self.smoother.lower, self.smoother.upper
         inside = [max(low, min(high, x)) for x, low, high in zip(q, lower, upper, strict=True)]
         if any(abs(x - y) > 1e-6 for x, y in zip(q, inside, strict=True)):
@@ -211,7 +212,7 @@ class JointTargetMotion(ServoMotion):
         return inside, [v if x == y else 0.0 for x, y, v in zip(q, inside, dq, strict=True)]
 
     def _is_jump(self, t: float, q: list[float]) -> bool:
-        """Is the new target farther from the last one than the joints could have followed meanwhile?"""
+        """Return whether the new target is farther from the last one than the joints could have moved meanwhile."""
         before = self._command
         if before is None:
             return True
@@ -227,7 +228,7 @@ _GAIN = 8.0
 """Speed per error of a followed target, 1/s. Measured at 50 Hz targets: rms error 0.8 mrad, no chatter."""
 
 _JUMP = 0.05
-"""A step of a stream beyond what the joint speed allows counts as a jump from here on, rad."""
+"""A step of a stream larger than this, beyond what the joint speed allows, counts as a jump, rad."""
 
 _STREAM = (0.8, 0.5)
 _DIRECT = (0.9, 0.7)
@@ -245,10 +246,8 @@ def _braking(smoother: JointSmoother, share: float, jerk_share: float) -> list[t
     return [(A, J, _GAIN * _GAIN / A, _GAIN * A / J - 2.0) for A, J in limits]
 
 
-# [chunk.py] Joint targets with times: action chunks, interpolated.
-
 _SAME = 1e-6
-"""Targets this near in time are one, s: plans on one grid differ by rounding."""
+"""Targets this near in time are the same, s: plans on one grid differ by rounding."""
 
 
 class ChunkMotion(JointTargetMotion):
@@ -300,13 +299,13 @@ class ChunkMotion(JointTargetMotion):
         self._follow_each(self._approach(q, dq, 0.0))
 
     def _split(self, values: Floats) -> tuple[list[float], list[list[float]]]:
-        """Times and points of a command that is ``usable``."""
+        """Return times (k,), s, and points (k, n), rad, of a command that is ``usable``."""
         n = self.smoother.n
         count = len(values) // (n + 1)
         return list(values[:count]), [list(values[k : k + n]) for k in range(count, len(values), n)]
 
     def _due(self, now: float) -> tuple[list[float], list[float]]:
-        """Where the arm is to be at ``now``, rad, and how fast, rad/s."""
+        """Return joint positions (n,), rad, and speeds (n,), rad/s, that are due at ``now``."""
         times, points = self._times, self._points
         k = bisect_right(times, now)
         if k == len(times):
@@ -327,7 +326,7 @@ class ChunkMotion(JointTargetMotion):
         return q, dq
 
     def _slopes(self, k: int) -> list[float]:
-        """Speed of each joint at target ``k``, rad/s."""
+        """Return the speed (n,) at target ``k``, rad/s."""
         times, points = self._times, self._points
         if k == 0 or k == len(times) - 1:  # at rest before the first; the last may be the end
             return [0.0] * self.smoother.n
@@ -337,19 +336,20 @@ class ChunkMotion(JointTargetMotion):
 
 
 def slope(d0: float, d1: float, h0: float, h1: float) -> float:
-    """Slope at a point between secants ``d0`` and ``d1`` over the widths ``h0`` and ``h1``: their weighted harmonic
-    mean, 0 where they differ in sign (Fritsch and Butland's formula, in Brodlie's weighting)."""
+    """Return the slope between secants ``d0`` and ``d1`` over the widths ``h0`` and ``h1``.
+
+    It is their weighted harmonic mean, and 0 if they differ in sign (Fritsch and Butland's formula, in Brodlie's
+    weighting).
+    """
     if d0 * d1 <= 0.0:
         return 0.0
     share = (h0 + 2.0 * h1) / (3.0 * (h0 + h1))
     return d0 * d1 / (share * d1 + (1.0 - share) * d0)
 
 
-# [path.py] The motion of ``move_to``: a straight line in joint space, run by one number.
-
 _SAMPLE = 0.05
 _SAMPLES = 64
-"""The path is looked at every so many rad, at most so many times: planning must fit into a tick."""
+"""The path is checked every so many rad, at most this many times: planning must fit into a tick."""
 
 _SLOWER = 0.8
 """After a step that the guard refused, the rest of the path is planned at this share of the speed before."""
@@ -382,13 +382,22 @@ class PathMotion(ServoMotion):
         self._output = OutputParameter(1)
 
     def aim(self, goal: Floats) -> None:
-        """Take a new goal (n,), rad. CommandError, and nothing changes, when the arm may not go there."""
+        """Set the goal.
+
+        Args:
+            goal: Joint positions (n,), rad.
+
+        Raises:
+            CommandError: If the goal or the path leaves the limits or the workspace; nothing changes.
+        """
         smoother = self.smoother
         if len(goal) != smoother.n:
-            raise CommandError(f"move_to needs {smoother.n} joint positions, not {len(goal)}")
+            raise CommandError(f"move_to needs {smoother.n} joint positions, not {len(goal)}", code="wrong_shape")
         for i, (x, low, high) in enumerate(zip(goal, smoother.lower, smoother.upper, strict=True)):
             if not low - 1e-6 <= x <= high + 1e-6:
-                raise CommandError(f"joint {i} of the goal is {x:.4f} rad; its limits are {low:.4f} to {high:.4f}")
+                raise CommandError(
+                    f"joint {i} of the goal is {x:.4f} rad; its limits are {low:.4f} to {high:.4f}", code="joint_limit"
+                )
         inside = [max(low, min(high, x)) for x, low, high in zip(goal, smoother.lower, smoother.upper, strict=True)]
         self._check_workspace(inside)
         self._goal = inside
@@ -403,7 +412,7 @@ class PathMotion(ServoMotion):
         self._planned = False
 
     def accept(self, command: CommandRecord) -> None:
-        raise CommandError("a move_to session takes no commands")
+        raise CommandError("a move_to session takes no commands", code="move_to_session")
 
     def step(self, now: float) -> None:
         smoother = self.smoother
@@ -432,7 +441,7 @@ class PathMotion(ServoMotion):
         along = self._direction
         q = [x + s * d for x, d in zip(self._from, along, strict=True)]
         if not smoother.adopt(q, [ds * d for d in along], [dds * d for d in along], self.envelope.keeps_tcp_speed):
-            # It stops, and goes on more slowly from there: at the same speed the same step might be refused for ever.
+            # Stop, and continue more slowly: at the same speed the same step might be refused for ever.
             self._share *= _SLOWER
             self._planned = False
 
@@ -469,7 +478,7 @@ class PathMotion(ServoMotion):
         return [[a + k / count * (b - a) for a, b in zip(start, goal, strict=True)] for k in range(count + 1)]
 
     def _check_workspace(self, goal: Floats) -> None:
-        """The tcp must stay inside the workspace on its way, or come back in from where it starts."""
+        """Raise CommandError unless the tcp stays inside the workspace on its way, or only comes back in."""
         box = self.envelope.workspace
         if box is None:
             return
@@ -480,5 +489,6 @@ class PathMotion(ServoMotion):
             for x, x0, low, high, axis in zip(at, before, box.lower, box.upper, "xyz", strict=False):
                 if x > max(high, x0) + 1e-6 or x < min(low, x0) - 1e-6:
                     raise CommandError(
-                        f"the way there leaves the workspace: {axis} = {x:.3f} m, allowed {low:.3f} to {high:.3f}"
+                        f"the path leaves the workspace: {axis} = {x:.3f} m, allowed {low:.3f} to {high:.3f}",
+                        code="workspace",
                     )

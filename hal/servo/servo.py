@@ -32,14 +32,12 @@ __all__ = [
     "ServoReport",
 ]
 
-# [report.py] What a servo tells about its last tick.
-
 Floats = Sequence[float]
 
 
 @dataclass(slots=True)
 class ServoReport:
-    """What the servo did in its last tick."""
+    """State of a servo after its last tick."""
 
     status: RobotStatus = RobotStatus.IDLE
     trip: Trip = Trip.NONE
@@ -49,31 +47,31 @@ class ServoReport:
     refused: int = 0
     """Number of the newest command of this session that was refused; 0 for none."""
     q_set: Floats = ()
-    """rad"""
+    """Joint set-point (n,), rad."""
     dq_set: Floats = ()
     ddq_set: Floats = ()
     reanchored: int = 0
-    """How often the device had not taken a set-point, since the servo was made."""
+    """Number of set-points that the device did not take, since the servo was made."""
     arrived: bool = False
-    """Is ``move_to`` done?"""
+    """Whether ``move_to`` has reached its goal."""
     t_trip: float = 0.0
-    """When the stop was latched, s."""
+    """Time at which the stop was latched, s."""
     t_stop: float = 0.0
-    """When the last braking began, s."""
+    """Time at which the last braking began, s."""
 
 
 # Members of an enumeration that every tick names: to find one there takes Python 3.11 0.1 us.
 _NO_TRIP, _FAULT, _UNLIMITED, _FOLLOWING = Trip.NONE, Trip.FAULT, Limited.NONE, RobotStatus.FOLLOWING
 
 _ABSURD = 1e3
-"""Joint speeds beyond this are a broken reading, rad/s."""
+"""Joint speeds beyond this are an invalid reading, rad/s."""
 
 _BEYOND = 1.0
-"""Joint positions so far beyond the joint's range are a broken reading, rad."""
+"""Joint positions this far beyond the joint's range are an invalid reading, rad."""
 
 
 class Servo:
-    """Set-points for one arm, once per ``dt`` seconds."""
+    """Makes the set-points of one arm, once per ``dt`` seconds."""
 
     def __init__(
         self,
@@ -87,10 +85,10 @@ class Servo:
 
         Args:
             spec: The arm.
-            dt: Seconds between two ticks.
-            kinematics: The arm's, where they are already computed.
-            mass_matrix: Of a device that takes torques; without it, torques are refused.
-            repeats: The device repeats its last set-point when one is lost (see :attr:`.RobotDriver.repeats`).
+            dt: Time between two ticks, s.
+            kinematics: The arm's kinematics, if they are loaded already.
+            mass_matrix: Inertia of a device that takes torques; without it, torque commands are refused.
+            repeats: Whether the device repeats its last set-point when one is lost (see :attr:`.RobotDriver.repeats`).
         """
         self.spec = spec
         self.kinematics = Kinematics(spec.kinematics) if kinematics is None else kinematics
@@ -116,39 +114,53 @@ class Servo:
         self._path = PathMotion(smoother, envelope)
         self._session: Session | None = None
         self._motion: ServoMotion | None = None
-        """What moves the arm now; None until the first command."""
+        """The motion that moves the arm; None until the first command."""
         self._anchored = False
         self._ending = False
         self._followed = False
-        """Did a motion move the arm in the last tick?"""
+        """Whether a motion moved the arm in the last tick."""
         self._t_tick: float | None = None
-        """When the last tick was."""
+        """Time of the last tick, s."""
         self._seq = 0
-        """Newest command that was looked at, or that does not count any more."""
+        """Number of the newest command that was handled or is no longer valid."""
         self._resting = 0
-        """For how many ticks a session that ends was found at rest."""
+        """Number of ticks for which a session that is closing has been at rest."""
         self._corrected = False
-        """Was the set-point re-anchored in the last tick?"""
+        """Whether the set-point was re-anchored in the last tick."""
         self._ahead = False
-        """Are set-points computed ahead in this session?"""
+        """Whether set-points are computed ahead in this session."""
         self._ready: Setpoint | None = None
-        """What :meth:`prepare` computed for the next tick."""
+        """The set-point that :meth:`prepare` computed for the next tick."""
         self._seen = (0.0, _NO_TRIP, False, False)
-        """What the last tick made of the reading: when, what is wrong, was the host late, is there a fault?"""
+        """Of the last reading: its time, the trip that it causes, whether the host was late, whether there is a fault.
+        """
 
     @property
     def active(self) -> bool:
-        """Is a session open, or still braking?"""
+        """Whether a session is open or still braking."""
         return self._session is not None
 
     def anchor(self, q: Floats, dq: Floats | None = None) -> None:
-        """The set-point is here now: ``q`` (n,) rad, ``dq`` (n,) rad/s. Every goal is forgotten."""
+        """Set the set-point and discard every goal. Nothing moves.
+
+        Args:
+            q: Joint positions (n,), rad.
+            dq: Joint speeds (n,), rad/s; zeros if None.
+
+        Raises:
+            CommandError: For a wrong number of values, or positions far outside the joints' ranges.
+        """
         n = self._smoother.n
         for name, values in (("q", q), ("dq", dq)):
             if values is not None and not (len(values) == n and isfinite(sum(map(abs, values)))):
-                raise CommandError(f"cannot anchor to {name} = {list(values)}: {n} finite numbers are due")
+                raise CommandError(
+                    f"cannot anchor to {name} = {list(values)}: needs {n} finite numbers", code="bad_anchor"
+                )
         if not self._is_position(q):
-            raise CommandError(f"cannot anchor to q = {list(q)}: more than {_BEYOND:g} rad beyond the joints' limits")
+            raise CommandError(
+                f"cannot anchor to q = {list(q)}: more than {_BEYOND:g} rad beyond the joints' limits",
+                code="bad_anchor",
+            )
         self._smoother.anchor(self._anchoring.start(q) if dq is None else q, dq)
         self._ready = None
         self._torque.active = False
@@ -158,16 +170,22 @@ class Servo:
         self._publish()
 
     def begin(self, session: Session, inbox: Inbox) -> None:
-        """Open a session. The set-point must have been anchored; ``inbox`` is what it holds at the moment.
+        """Open a control session; the servo must have been anchored.
 
-        Raises ControlTaken while another one is open, CommandError when its terms cannot be met.
+        Args:
+            session: The terms of the session.
+            inbox: Its present content: presses and rearms in it do not count.
+
+        Raises:
+            ControlTaken: While another session is open.
+            CommandError: If the terms are invalid.
         """
         if self._session is not None:
             raise ControlTaken(f"session {self._session.id} controls this arm")
         if not self._anchored:
-            raise CommandError("anchor the servo before a session begins")
+            raise CommandError("anchor the servo before a session begins", code="not_anchored")
         if not (0.0 < session.speed <= 1.0 and session.tcp_speed > 0.0):
-            raise CommandError(f"a session needs 0 < speed <= 1 and tcp_speed > 0, not {session}")
+            raise CommandError(f"a session needs 0 < speed <= 1 and tcp_speed > 0, not {session}", code="bad_session")
         self._envelope.open(session)
         self._torque.open()
         if session.move_to is not None:
@@ -193,9 +211,16 @@ class Servo:
             self._forget_goals()
 
     def tick(self, now: float, reading: Reading, inbox: Inbox, late: bool = False) -> Setpoint | None:
-        """The next set-point, or None when there is nothing to write: no session is open.
+        """Compute the next set-point.
 
-        ``late`` is for a pause that ``now`` does not show, because the clock stood still in it (a suspended computer).
+        Args:
+            now: Time, s.
+            reading: The newest reading of the device.
+            inbox: The newest records of the app.
+            late: Whether this process was paused in a way that ``now`` does not show (a suspended computer).
+
+        Returns:
+            The set-point; None while no session is open.
         """
         session = self._session
         late = self._is_late(now) or late
@@ -220,7 +245,7 @@ class Servo:
                 self._motion.reanchored()
         faulty = device is _FAULT
         self._seen = (now, device, late, faulty)
-        # What was computed ahead goes out even when something is wrong: the stop begins where it ends.
+        # What was computed ahead is written even if something is wrong: the stop begins where it ends.
         setpoint = self._decide(inbox, now, device, late, faulty) if ready is None else ready
         if setpoint is not None and setpoint.tau is None:
             self._anchoring.gave(setpoint)
@@ -228,27 +253,27 @@ class Servo:
 
     @property
     def fault(self) -> Fault | None:
-        """Set when what the device reports does not fit its set-points, until :meth:`recover`. The arm is stopped."""
+        """Set if what the device reports does not fit its set-points, until :meth:`recover`; the arm is stopped."""
         return self._anchoring.fault
 
     def recover(self) -> None:
-        """Clear :attr:`fault`, and learn anew how the device reports its set-points."""
+        """Clear :attr:`fault`, and learn again how the device reports its set-points."""
         self._anchoring.recover()
 
     def withheld(self) -> None:
-        """The driver did not pass the last set-point on (see :meth:`.RobotDriver.write`)."""
+        """Note that the driver did not pass the last set-point on (see :meth:`.RobotDriver.write`)."""
         self._anchoring.withheld()
 
     def statistics(self) -> dict[str, Any]:
-        """How the device reports its set-points: ``reports``, ``report_lag``, ``report_noise``, ``mismatches``."""
+        """Return how the device reports: ``reports``, ``report_lag``, ``report_noise`` (rad), ``mismatches``."""
         return self._anchoring.statistics()
 
     def reset_statistics(self) -> None:
-        """Count mismatches from zero."""
+        """Set the count of mismatches to zero."""
         self._anchoring.reset_statistics()
 
     def _decide(self, inbox: Inbox, now: float, device: Trip, late: bool, faulty: bool) -> Setpoint | None:
-        """The next set-point, from what the device and the app said."""
+        """Update the watchdog and the motion, and return the next set-point."""
         self._watchdog.update(now, inbox, self._at_rest(), device, late)
         if self._session is None or (self._ending and self._finished()):
             self._idle(RobotStatus.FAULT if faulty else RobotStatus.IDLE)
@@ -257,12 +282,13 @@ class Servo:
         return self._move(now, RobotStatus.FAULT if faulty else None)
 
     def _is_late(self, now: float) -> bool:
-        """Was the last tick too long ago for an arm that really moves? Nothing looked after it meanwhile."""
+        """Return whether the last tick of a real arm was too long ago: nothing supervised it in between."""
         before, self._t_tick = self._t_tick, now
         return self.spec.attended and before is not None and not now - before <= SILENCE
 
     def lost(self, now: float) -> Setpoint | None:
-        """The device did not answer in this cycle: trip, and go on braking."""
+        """Trip and continue braking, because the device did not answer in this cycle. Returns the next set-point or
+        None."""
         self._t_tick = now
         ready, self._ready = self._ready, None
         self._envelope.limited = Limited.NONE
@@ -276,31 +302,31 @@ class Servo:
         return self._move(now, RobotStatus.LOST) if ready is None else ready
 
     def prepare(self, inbox: Inbox) -> None:
-        """Compute the next set-point ahead, in the idle part of the cycle: after the write.
+        """Compute the next set-point ahead, in the idle part of the cycle, after the write.
 
-        For a device that wants its answer quickly (a Franka: within 0.3 ms of its state). The next tick then only looks
-        whether the device took the last set-point, and hands over the one that is ready; it computes another one where
-        the device did not. What the app and the device say counts one cycle later than without.
+        For a device that must be answered quickly (a Franka: within 0.3 ms of its state). The next tick then only
+        checks whether the device took the last set-point, and returns the one that is ready; it computes another one if
+        the device did not. What the app and the device report takes effect one cycle later than without.
         """
         if self._torque.active:
             self._torque.prepare()
         elif self._session is not None and self._t_tick is not None:
             now, device, late, faulty = self._seen
             smoother = self._smoother
-            # Said until the next tick, for whoever looks in between.
+            # For readers between this tick and the next.
             self._envelope.limited = Limited.REANCHORED if self._corrected else _UNLIMITED
             self._ahead = True
             self._ready = self._decide(inbox, now + smoother.dt, device, late, faulty)
 
     def _judge(self, now: float, reading: Reading) -> Trip:
-        """What is wrong with the device."""
+        """Return the trip that this reading causes; ``Trip.NONE`` if the device is all right."""
         if reading.fault is not None or self._anchoring.fault is not None:
             return Trip.FAULT
         smoother = self._smoother
         if not (self._is_position(reading.q) and self._is_sound(reading.dq)):
             return Trip.BAD_READING
         q, dq = reading.q_commanded, reading.dq_commanded
-        # A device that reports the very numbers that it was given needs no second look.
+        # A device that reports exactly what it was given needs no second check.
         if q is not smoother.q and q is not None and not self._is_position(q):
             return Trip.BAD_READING
         if dq is not smoother.dq and dq is not None and not self._is_sound(dq):
@@ -310,11 +336,11 @@ class Servo:
         return _NO_TRIP
 
     def _is_known(self, reading: Reading, device: Trip) -> bool:
-        """Does this reading, in which ``device`` is wrong, tell where the arm is and how fast?"""
+        """Return whether positions and speeds in this reading are valid, given the trip ``device`` that it causes."""
         return not device or (device is Trip.FAULT and self._is_position(reading.q) and self._is_sound(reading.dq))
 
     def _overruns(self) -> Trip:
-        """Does an arm that follows torques, or is braked by them, run into a limit?"""
+        """Return ``Trip.LIMIT`` if an arm that follows torques, or is braked by them, runs into a limit."""
         limit = self._torque.overrun(driven=self._motion is self._torque)
         if limit is None:
             return _NO_TRIP
@@ -322,18 +348,18 @@ class Servo:
         return Trip.LIMIT
 
     def _is_position(self, q: Floats) -> bool:
-        """As many numbers as joints, in the joints' ranges or at least near them."""
+        """Return whether ``q`` has n values, each in its joint's range or near it."""
         if len(q) != self._smoother.n:
             return False
         near = dist(q, self._middle) <= self._radius
         return near or all(low <= x <= high for x, (low, high) in zip(q, self._range, strict=True))
 
     def _is_sound(self, values: Floats) -> bool:
-        """As many numbers as joints, finite and not absurd."""
+        """Return whether there are n finite values of plausible size."""
         return len(values) == self._smoother.n and hypot(*values) < _ABSURD
 
     def _listen(self, now: float, session: Session, command: CommandRecord | None) -> None:
-        """Take over the newest command, if it counts."""
+        """Accept the newest command if it belongs to this session and is valid; else count it as refused."""
         watchdog = self._watchdog
         mine = command is not None and command.session == session.id
         if not watchdog.allowed or watchdog.renewed:
@@ -349,7 +375,7 @@ class Servo:
         if not watchdog.allowed or command is None or not mine or command.seq <= self._seq:
             return
         if command.kind is Kind.JOINT_CHUNK and not command.values:
-            return  # overtaken by the next chunk, whose command comes in a moment
+            return  # overtaken by the next chunk, whose command follows
         self._seq = command.seq
         motion = self._motions.get(command.kind)
         if motion is None or not is_timely(now, command) or not motion.usable(command.values):
@@ -368,7 +394,7 @@ class Servo:
         self.report.target_seq = command.seq
 
     def _move(self, now: float, status: RobotStatus | None) -> Setpoint | None:
-        """One tick of motion or of the stop; ``status`` overrides the usual one."""
+        """Advance the motion or the stop by one tick; ``status`` overrides the usual one."""
         smoother, watchdog, report = self._smoother, self._watchdog, self.report
         motion = self._motion if watchdog.allowed else None
         q_from = smoother.q
@@ -400,16 +426,16 @@ class Servo:
         return Setpoint(smoother.q, smoother.dq, smoother.ddq, None, q_from)
 
     def _at_rest(self) -> bool:
-        """Does nothing move, and are positions what holds the arm?"""
+        """Return whether nothing moves, and positions (not torques) hold the arm."""
         return self._smoother.at_rest() and not self._torque.active
 
     def _leave_torques(self) -> None:
-        """From here on positions hold the arm."""
+        """Hand the arm over from torques to positions."""
         self._torque.leave()
         self._anchoring.forget()
 
     def _finished(self) -> bool:
-        """Has the session, which ends, come to rest? Then it is closed."""
+        """Close the session once it has come to rest; returns whether it is closed."""
         if self._torque.active and self._torque.blind:  # the device was left alone: it holds by itself
             self._leave_torques()
         self._resting = self._resting + 1 if self._at_rest() else 0

@@ -4,6 +4,12 @@ The free Ruckig knows no position limits, and clipping a position breaks the lim
 smoother keeps an invariant instead: **after every tick the time-optimal stop still ends inside every limit**. A step
 that would break it is replaced by the first tick of that stop, which keeps it by construction. An arm that starts
 outside a limit may only come back in: what counts is max(limit, where the stop would end now).
+
+The functions first compute the jerk-limited stop of one joint. ``v`` is a speed in rad/s, ``a`` an acceleration in
+rad/s2, ``A`` and ``J`` the limits of acceleration and jerk (rad/s2, rad/s3, both > 0). "Stop" always means the
+time-optimal stop: jerk J until the braking reaches A (or until it must be released), constant braking A, jerk J until
+rest. Every formula follows from integrating that profile; the tests compare each with Ruckig, which computes the same
+profiles numerically.
 """
 
 from __future__ import annotations
@@ -32,17 +38,6 @@ __all__ = [
     "stop_phases",
     "stop_step",
 ]
-
-# [limits.py] Jerk-limited stopping of one joint: how far, how fast at most, and where it ends. Plain floats, no
-# state.
-#
-# ``v`` is a speed in rad/s, ``a`` an acceleration in rad/s2, ``A`` and ``J`` the limits of acceleration and jerk
-# (rad/s2, rad/s3, both > 0). "Stop" always means the time-optimal stop: jerk J until the braking reaches A (or
-# until it
-# is time to release it), constant braking A, jerk J until rest. Every formula follows from integrating that
-# profile, and
-# the tests compare each with Ruckig, which computes the same profiles numerically.
-#
 
 
 def stop_distance(v: float, A: float, J: float) -> float:
@@ -130,7 +125,7 @@ def stop_step(q: float, v: float, a: float, A: float, J: float, dt: float) -> tu
 
 
 def _phases(v: float, a: float, A: float, J: float) -> tuple[float, float, float]:
-    """Durations (s) of the three phases of a stop that brakes against the positive direction."""
+    """Return the durations (s) of the three phases of a stop that brakes against the positive direction."""
     brake = min(A, sqrt(max(0.0, v * J + 0.5 * a * a)))
     brake = max(brake, -a)
     release = brake / J
@@ -145,7 +140,7 @@ Floats = Sequence[float]
 _VELOCITY, _POSITION = ControlInterface.Velocity, ControlInterface.Position
 
 Guard = Callable[["JointSmoother"], bool]
-"""Looks at the step that is proposed (``q_next``, ``dq_next``, ``ddq_next``) and answers whether it may be taken."""
+"""Returns whether a proposed step (``q_next``, ``dq_next``, ``ddq_next``) may be taken."""
 
 _INSIDE = 1.0 - 1e-5
 """Share of the limits used, so that rounding in third differences of positions never shows as a violation."""
@@ -164,7 +159,7 @@ _STILL = 1e-12
 """Speeds and accelerations below this are rounding errors, rad/s and rad/s2."""
 
 _ROUNDING = 1e-12
-"""By how much two stops along the same profile may seem to end apart, rad."""
+"""Largest apparent distance between two stops along the same profile, rad."""
 
 
 class JointSmoother:
@@ -177,7 +172,7 @@ class JointSmoother:
         self.n = n = len(limits.lower)
         self.dt = dt
         self.lower = [x + 2.0 * _EDGE for x in limits.lower]
-        """Where goals may be, rad: a little inside of where the check begins, or rounding would make it refuse them."""
+        """Limits of goals, rad: a little inside of where the check begins, or rounding would make it refuse them."""
         self.upper = [x - 2.0 * _EDGE for x in limits.upper]
         self._lower = [x + _EDGE for x in limits.lower]
         self._upper = [x - _EDGE for x in limits.upper]
@@ -203,7 +198,7 @@ class JointSmoother:
         self.dq = list(self._zeros)
         self.ddq = list(self._zeros)
         self.q_next = self.q
-        """What the step in progress proposes."""
+        """The proposed step."""
         self.dq_next = self.dq
         self.ddq_next = self.ddq
         self._none: frozenset[int] = frozenset()
@@ -211,7 +206,7 @@ class JointSmoother:
         self.held_back = self._none
         """Joints that the last step stopped because a position limit was near."""
         self.guarded = False
-        """Did the guard refuse the last step as it was first proposed?"""
+        """Whether the guard refused the last step as it was first proposed."""
         self._ruckig = Ruckig(n, dt)
         self._output = OutputParameter(n)
         self._input = InputParameter(n)
@@ -220,10 +215,10 @@ class JointSmoother:
         self._input.max_acceleration = self.acceleration
         self._input.max_jerk = self.jerk
         self._speeds: Floats = ()
-        """The speeds that Ruckig's position interface keeps; the velocity interface has no need of any."""
+        """The speeds that Ruckig's position interface keeps, rad/s; its velocity interface needs none."""
 
     def anchor(self, q: Floats, dq: Floats | None = None, ddq: Floats | None = None) -> None:
-        """Start from here. Accelerations beyond the limits are cut, since no stop could be computed from them."""
+        """Set the set-point. Accelerations beyond the limits are cut, since no stop could be computed from them."""
         self.q = list(q)
         self.dq = list(self._zeros if dq is None else dq)
         self.ddq = [
@@ -247,7 +242,7 @@ class JointSmoother:
         return not self.guarded
 
     def at_rest(self) -> bool:
-        """Does nothing move? (1e-6 rad/s, 1e-4 rad/s2: Ruckig's numbers at the end of a profile.)"""
+        """Return whether nothing moves (1e-6 rad/s, 1e-4 rad/s2: Ruckig's numbers at the end of a profile)."""
         return hypot(*self.dq) < 1e-6 and hypot(*self.ddq) < 1e-4
 
     def follow(self, dq: Floats, guard: Guard | None = None, together: bool = False) -> None:
@@ -315,7 +310,7 @@ class JointSmoother:
         self._commit()
 
     def stop(self) -> None:
-        """One tick of the time-optimal stop."""
+        """Advance the time-optimal stop by one tick."""
         self.held_back = self._none
         self.guarded = False
         self._propose_velocity(self._zeros)
@@ -324,11 +319,11 @@ class JointSmoother:
             self.dq, self.ddq = list(self._zeros), list(self._zeros)  # Ruckig leaves 1e-17 here and there
 
     def stop_end(self) -> list[float]:
-        """Where a stop that begins now ends, rad."""
+        """Return where a stop that begins now ends (n,), rad."""
         return self._ends(self.q, self.dq, self.ddq)
 
     def stop_end_next(self) -> list[float]:
-        """Where a stop after the proposed step would end, rad."""
+        """Return where a stop after the proposed step would end (n,), rad."""
         return self._ends(self.q_next, self.dq_next, self.ddq_next)
 
     def _propose_velocity(self, dq: Floats) -> None:
@@ -361,14 +356,16 @@ class JointSmoother:
         return [v if -cap <= v <= cap else (cap if v > 0.0 else -cap) for v, cap in zip(dq, self.velocity, strict=True)]
 
     def is_free(self, q: Floats) -> bool:
-        """Are these positions (n,), rad, surely where no limit can matter to joints within their speed limits?
+        """Return whether these positions (n,), rad, are surely where no limit matters to joints within their speed
+        limits.
 
         One distance instead of two comparisons a joint: none has moved farther than all of them together.
         """
         return dist(q, self._free_at) <= self._free_room
 
     def _violations(self) -> frozenset[int]:
-        """Joints whose stop after the proposed step would end beyond a limit, and farther than a stop from now."""
+        """Return the joints whose stop after the proposed step would end beyond a limit, and farther than a stop from
+        now."""
         q_next, dq_next = self.q_next, self.dq_next
         if hypot(*dq_next) <= self.slowest and self.is_free(q_next):
             return self._none

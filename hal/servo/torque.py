@@ -1,8 +1,16 @@
-"""Joint torques: the one kind of command in which the arm's place is not a set-point but what comes of it.
+"""Joint torques: the one kind of command whose result is measured instead of being a set-point of position.
 
-The device carries the arm's own weight; the torques come on top of that. Nobody but the guards here bounds such an arm,
-so it is looked at in every tick (:mod:`.torque_bounds`). Whatever ends the motion, the torques become a brake; once the
-arm is measured to be at rest it is held where it is, by positions again.
+The device compensates the arm's own weight; the torques come on top of that. Only the bounds here limit such an arm, so
+it is checked in every tick. Whatever ends the motion, the torques become a brake; once the arm is measured to be at
+rest it is held there by positions again.
+
+Torques limit neither speed nor position, so both are predicted from the arm's inertia. With M the joint-space inertia
+where the arm is, torques tau that are removed from now on as fast as their rate R allows still add
+
+    dv = M^-1 (tau T + tau |tau| / (2 R))
+
+to the joint speeds; T is the time until a torque that was just computed can be followed by a lower one. The effect of
+an obstacle or a push is not predicted; it shows in the measured speeds.
 """
 
 from __future__ import annotations
@@ -33,101 +41,89 @@ __all__ = [
     "TorqueMotion",
 ]
 
-# [torque_bounds.py] What bounds an arm that is driven by torques: how great they may be, what brakes it, and when
-# it has gone too far.
-#
-# Torques know no speed and no place, so both are predicted from the arm's inertia. With M the joint-space inertia
-# where
-# the arm is, torques tau that are taken away from now on as fast as their rate R allows still add
-#
-#     dv = M^-1 (tau T + tau |tau| / (2 R))
-#
-# to the joint speeds; T is the time until a torque that was just computed can be followed by a lower one. What an
-# obstacle or a hand does to the arm is in none of this; it shows in the measured speeds.
-#
-
 Array = NDArray[np.float64]
 Floats = Sequence[float]
 
 RATE = 990.0
-"""Greatest rate of every torque, Nm/s: the 1000 of a Franka's interface, less what rounding might add."""
+"""Greatest rate of every torque, Nm/s: the 1000 of a Franka's interface, less a margin for rounding."""
 
 _SHARE = 0.9
-"""Share of the session's speeds that torques may lead to; a joint that is faster is braked. The rest is for what the
-prediction leaves out: a load that the inertia does not know of, torques that change before they are gone."""
+"""Share of the session's speeds that torques may lead to; a faster joint is braked. The rest is for what the prediction
+leaves out: a load that the inertia does not include, torques that change before they are gone."""
 
 _COUPLED = 0.95
-"""The same for what the joints do to each other. It is more, so that a joint which coasts at its speed does not take
-the torques of all others away."""
+"""The same for the effect of the joints on each other. It is more, so that a joint that coasts at its speed does not
+take the torques of all others away."""
 
 _LAG = 2.0
-"""Ticks until a torque can be followed by a lower one: it acts for one, and what it did is measured after that."""
+"""Ticks until a torque can be followed by a lower one: it acts for one, and its effect is measured after that."""
 
 _DECAY = 40.0
-"""The brake takes this share of each joint's speed away, 1/s: rest from 0.65 rad/s in some 0.13 s. Measured in the
-simulation: with 30, an inertia that is told ten times too great still brakes; with 50, hardly."""
+"""The brake takes this share of each joint's speed away, 1/s: rest from 0.65 rad/s in about 0.13 s. Measured in the
+simulation: with 30, an inertia that is stated ten times too large still brakes; with 50, hardly."""
 
 _STABLE = 0.25
-"""And no more than this share of it per tick: the arm then comes to rest without turning back, also where the measured
-speed is a tick older than the torque."""
+"""The brake takes no more than this share per tick: the arm then comes to rest without turning back, also if the
+measured speed is a tick older than the torque."""
 
 _UNWIND = 1.6 * RATE
-"""Twice the rate at which the brake may have to be let go, Nm/s: less than it can be, so that it is never late."""
+"""Twice the rate at which the brake may have to be released, Nm/s: less than possible, so that it is never late."""
 
 _INSIDE = 1.0 - 1e-9
-"""Share of the torque limits that brakes, so that rounding never shows as a violation."""
+"""Share of the torque limits used for braking, so that rounding never shows as a violation."""
 
 _UNLIMITED = 100.0
-"""From this tcp speed on nothing is looked at, m/s."""
+"""From this tcp speed on nothing is checked, m/s."""
 
 _SLACK = 5e-3
-"""An arm that begins outside a limit may not go farther out than this, rad and m."""
+"""An arm that begins outside a limit may not move farther out than this, rad and m."""
 
 
 _RUNAWAY = 1.5
-"""Times its limit of speed: an arm that is braked gets there when its inertia is nothing like what it is told to be."""
+"""Share of its speed limit at which a braked arm counts as out of control: its inertia is very different from the
+model's."""
 
 
 class Inertia:
-    """What it takes to change an arm's joint speeds, at one place."""
+    """Joint-space inertia of an arm at one position."""
 
     def __init__(self, mass_matrix: Any, n: int) -> None:
-        """``mass_matrix`` (n, n), kg m2. Raises ValueError when it is not that of an arm."""
+        """Raise ValueError unless ``mass_matrix`` (n, n), kg m2, is that of an arm."""
         self.mass: Array = np.array(mass_matrix, float)
         if self.mass.shape != (n, n) or not (min(self.mass.diagonal().tolist()) > 0.0 and isfinite(self.mass.sum())):
             raise ValueError(f"not the inertia of an arm with {n} joints: {self.mass.tolist()}")
         self.inverse: Any = np.linalg.inv(self.mass)  # its LinAlgError is a ValueError
         self.alone: list[float] = (1.0 / self.inverse.diagonal()).tolist()
-        """(n,) inertia of each joint when the others are free, kg m2"""
+        """Inertia of each joint (n,) while the others are free, kg m2."""
 
     def added(self, tau: Floats, lag: float) -> list[float]:
-        """(n,) what torques still add to the joint speeds although they are taken away from now on, rad/s."""
+        """Return what torques (n,) still add to the joint speeds (n,), rad/s, although they are removed from now on."""
         added: list[float] = self.inverse.dot(self.impulses(tau, lag)).tolist()
         return added
 
     @staticmethod
     def impulses(tau: Floats, lag: float) -> list[float]:
-        """(n,) Nms: the same torques, over the time that it takes to be rid of them."""
+        """Return the impulses (n,), Nms, of torques over the time that it takes to remove them."""
         return [x * (lag + abs(x) * (0.5 / RATE)) for x in tau]
 
     def momentum(self, dq: Floats) -> list[float]:
-        """(n,) kg m2/s"""
+        """Return the momentum (n,) of joint speeds, kg m2/s."""
         momentum: list[float] = self.mass.dot(dq).tolist()
         return momentum
 
 
 class ArmInMotion(NamedTuple):
-    """An arm as it was measured."""
+    """Measured state of an arm."""
 
     q: Floats
-    """(n,) rad"""
+    """Joint positions (n,), rad."""
     dq: Floats
-    """(n,) rad/s"""
+    """Joint speeds (n,), rad/s."""
     inertia: Inertia
 
 
 class TorqueBounds:
-    """The bounds of one arm, under the terms of the session that the envelope knows."""
+    """Bounds of one arm, under the terms of the session in the envelope."""
 
     def __init__(self, limits: LimitsSpec, dt: float, envelope: Envelope) -> None:
         assert limits.torque is not None
@@ -140,12 +136,12 @@ class TorqueBounds:
         self._lag = _LAG * dt
         self._decay = min(_DECAY, _STABLE / dt)
         self._ranges = list(zip(limits.lower, limits.upper, strict=True))
-        """Where the joints may be in this session, rad."""
+        """Ranges of the joints in this session, rad."""
         self._box: list[tuple[float, float]] = []
-        """Where the tcp may be, m; empty for anywhere."""
+        """Ranges of the tcp, m; empty if unlimited."""
 
     def begin(self, q: Floats) -> None:
-        """A session opens, with the arm at ``q``: outside a limit it may only come back in."""
+        """Open a session with the arm at ``q`` (n,), rad: outside a limit it may only come back in."""
         self._ranges = _around(self._limits.lower, self._limits.upper, q)
         workspace = self._envelope.workspace
         if workspace is not None:
@@ -205,11 +201,12 @@ class TorqueBounds:
         return max(0.0, min(1.0, (sqrt(max(0.0, ab * ab + bb * rest)) - ab) / bb))
 
     def _surely_slower(self, speeds: Floats, cap: float) -> bool:
-        """Does the tcp keep below ``cap`` wherever the arm is, when its joints are no faster than ``speeds`` (>= 0)?"""
+        """Return whether the tcp surely stays below ``cap`` (m/s) while its joints are no faster than ``speeds`` (n,)
+        >= 0."""
         return cap >= _UNLIMITED or sum(map(mul, self._reach, speeds)) <= cap
 
     def towards(self, tau: Floats, goal: Floats) -> list[float]:
-        """One tick from ``tau`` towards ``goal``, each torque as fast as it may change."""
+        """Return ``tau`` (n,) moved by one tick towards ``goal``, each torque as fast as it may change, Nm."""
         step = self._step
         return [old + max(-step, min(step, new - old)) for old, new in zip(tau, goal, strict=True)]
 
@@ -239,11 +236,11 @@ class TorqueBounds:
         return [rest + share * brake for rest, brake in zip(rests, goal, strict=True)], share
 
     def release(self, tau: Floats) -> list[float]:
-        """One tick towards no torque: what is left when the speeds are not known."""
+        """Return ``tau`` (n,) moved by one tick towards zero: the only option while the speeds are unknown."""
         return self.towards(tau, [0.0] * len(tau))
 
     def _braking(self, arm: ArmInMotion, dq: Floats) -> tuple[list[float], float]:
-        """The torques that brake these speeds, Nm, and the share of the speed that they take away, 1/s."""
+        """Return the torques that brake these speeds, Nm, and the share of the speed that they take away, 1/s."""
         momentum = arm.inertia.momentum(dq)
         share = self._decay
         for p, most in zip(map(abs, momentum), self._torque, strict=True):
@@ -257,9 +254,9 @@ class TorqueBounds:
     # What is too far.
 
     def overrun(self, tau: Floats, arm: ArmInMotion) -> Limited | None:
-        """What the arm runs into: its measured speed is above the session's, or a stop that begins now would end
-        beyond a limit of position or a face of the workspace. ``tau`` is what drives it, Nm.
-        """
+        """Return the limit that the arm runs into: its measured speed is above the session's, or a stop that begins now
+        would end beyond a limit of position or a face of the workspace. None if it keeps all. ``tau`` (n,) drives it,
+        Nm."""
         envelope, dq = self._envelope, arm.dq
         speeds = [abs(v) for v in dq]
         if any(v > most for v, most in zip(speeds, envelope.velocity, strict=True)):
@@ -283,23 +280,23 @@ class TorqueBounds:
         return None
 
     def is_runaway(self, arm: ArmInMotion) -> bool:
-        """Is a joint so much faster than it may ever be that torques must not go on with it?"""
+        """Return whether a joint is so much faster than its limit that torques must not be used any longer."""
         return any(abs(v) > _RUNAWAY * most for v, most in zip(arm.dq, self._limits.velocity, strict=True))
 
 
 def _share(v: float, added: float, most: float) -> float:
-    """The greatest share (0..1) of ``added`` that leaves a joint at ``most`` rad/s, or does not make it faster."""
+    """Return the greatest share (0..1) of ``added`` that leaves a joint at ``most`` rad/s or does not speed it up."""
     room = most - v if added > 0.0 else most + v
     return 1.0 if abs(added) <= max(0.0, room) else max(0.0, room / abs(added))
 
 
 def _around(lower: Floats, upper: Floats, at: Floats) -> list[tuple[float, float]]:
-    """The ranges from ``lower`` to ``upper``, made wider where ``at`` lies outside or at their very edge."""
+    """Return the ranges from ``lower`` to ``upper``, widened where ``at`` is outside or at their edge."""
     return [(min(low, x - _SLACK), max(high, x + _SLACK)) for low, high, x in zip(lower, upper, at, strict=True)]
 
 
 def _stays_within(ranges: Sequence[tuple[float, float]], at: Floats, v: Floats, w: Floats, seconds: float) -> bool:
-    """Does what moves no faster than between the velocities ``v`` and ``w`` stay within these ranges for so long?"""
+    """Return whether a motion between the velocities ``v`` and ``w`` stays within these ranges for ``seconds``."""
     for (low, high), x, v0, v1 in zip(ranges, at, v, w, strict=True):
         if x + seconds * max(v0, v1, 0.0) > high or x + seconds * min(v0, v1, 0.0) < low:
             return False
@@ -307,76 +304,76 @@ def _stays_within(ranges: Sequence[tuple[float, float]], at: Floats, v: Floats, 
 
 
 MassMatrix = Callable[[Floats], Any]
-"""Joint-space inertia (n, n), kg m2, at joint positions (n,), rad: as numbers in rows, or an array."""
+"""Returns the joint-space inertia (n, n), kg m2, at joint positions (n,), rad: rows of numbers or an array."""
 
 PATIENCE = 0.020
-"""Longest silence of the device in which a torque is kept up, s: 20 cycles, after which a Franka gives up as well."""
+"""Longest silence of the device for which a torque is kept, s: 20 cycles, after which a Franka gives up as well."""
 
 _REST = 0.02
-"""Measured speeds below this are no motion, rad/s: noise, or so slow that positions can take over without a jerk."""
+"""Measured speeds below this count as rest, rad/s: noise, or slow enough for positions to take over without a jerk."""
 
 _REST_TIME = 0.030
-"""For so long, s."""
+"""Time for which the arm must be at rest before positions hold it, s."""
 
 BRAKE_LIMIT = 0.5
-"""Longest time of braking, s. A stop takes 0.1 to 0.25 s; an arm that still moves then has a load that nobody told it
-of, or is being pushed. Positions brake it further."""
+"""Longest time of braking, s. A stop takes 0.1 to 0.25 s; an arm that still moves then carries an unknown load, or is
+pushed. Positions brake it further."""
 
 
 class TorqueMotion(ServoMotion):
-    """Follow torques, and brake by torques. ``active`` from the first command until the arm is at rest again.
+    """Follows torques, and brakes by torques. ``active`` from the first command until the arm is at rest again.
 
-    The servo tells it every reading (:meth:`see`), moves it by :meth:`step` or :meth:`brake`, and writes what
-    :meth:`setpoint` says as long as it is active.
+    The servo passes every reading to :meth:`see`, advances it by :meth:`step` or :meth:`brake`, and writes
+    :meth:`setpoint` as long as it is active.
     """
 
     def __init__(
         self, smoother: JointSmoother, envelope: Envelope, limits: LimitsSpec, mass_matrix: MassMatrix | None
     ) -> None:
-        """Without a ``mass_matrix``, or without limits of torque, no command is usable."""
+        """Make the motion. Without ``mass_matrix``, or without torque limits, no command is usable."""
         super().__init__(smoother, envelope)
         self.size = smoother.n
         self.active = False
-        """Does the arm follow torques, or brake by them?"""
+        """Whether the arm follows torques, or brakes by them."""
         self.patience = max(PATIENCE, 3.0 * smoother.dt)
         self._mass_matrix = mass_matrix
         self._bounds: TorqueBounds | None = None
         if mass_matrix is not None and limits.torque is not None:
             self._bounds = TorqueBounds(limits, smoother.dt, envelope)
         self.q: Floats = smoother.q
-        """Where the arm was measured last, rad."""
+        """Newest measured joint positions (n,), rad."""
         self.dq: Floats = smoother.dq
-        """How fast, rad/s."""
+        """Newest measured joint speeds (n,), rad/s."""
         self._inertia: Inertia | None = None
         self._weighed_at: Floats | None = None
-        """Where that is the arm's inertia."""
+        """Joint positions of the inertia, rad."""
         self._arm: ArmInMotion | None = None
-        """The arm as it is now; None while the device does not tell."""
+        """Newest measured state of the arm; None while it is unknown."""
         self._nothing = [0.0] * self.size
         self._tau = self._nothing
-        """What drives the arm now, Nm."""
+        """Torques that drive the arm now (n,), Nm."""
         self._commanded = self._nothing
-        """Nm"""
+        """Commanded torques (n,), Nm."""
         self._begun = False
-        """Was the first set-point of the mode made?"""
+        """Whether the first set-point of the mode was made."""
         self._overran: Limited | None = None
-        """What the arm would have run into in the last tick, had it not been braked."""
+        """The limit that the arm would have run into in the last tick without braking."""
         self._share = 0.0
-        """How much of the brake is on (0..1)."""
+        """Share of the brake that is applied (0..1)."""
         self._given_up = False
-        """Was the device left alone, because nothing was known of the arm?"""
+        """Whether the device was left alone because the arm's state was unknown."""
         self._unseen = self._still = self._braking = 0.0
-        """For how long, s: nothing known of the arm, no motion measured, braking."""
+        """Durations, s: state unknown, no motion measured, braking."""
 
     # What the servo tells it.
 
     def open(self) -> None:
-        """A session begins, at rest."""
+        """Open a session, at rest."""
         if self._bounds is not None:
             self._bounds.begin(self.smoother.q)
 
     def see(self, reading: Reading | None) -> None:
-        """What the device reports in this tick; None when it does not, or when that makes no sense."""
+        """Note the reading of this tick; None if there is none or it is invalid."""
         if not self.active:
             if reading is not None:  # where torques would begin
                 self.q, self.dq = reading.q, reading.dq
@@ -399,7 +396,7 @@ class TorqueMotion(ServoMotion):
             self._weigh()
 
     def _weigh(self) -> None:
-        """The inertia of the arm where it was measured last; None when that cannot be."""
+        """Compute the inertia where the arm was measured last; None if it is invalid."""
         if self._weighed_at is self.q:
             return
         assert self._mass_matrix is not None
@@ -418,16 +415,21 @@ class TorqueMotion(ServoMotion):
 
     @property
     def blind(self) -> bool:
-        """Is nothing known of the arm for so long that nothing should be sent? The device then holds by itself."""
+        """Whether the arm's state has been unknown for so long that nothing should be sent; the device then holds by
+        itself."""
         return self._unseen > SILENCE
 
     @property
     def resting(self) -> bool:
-        """Is the arm measured to be at rest, with no torque left but what one tick takes away?"""
+        """Whether the arm is measured to be at rest, with no torque left but what one tick removes."""
         return self._still >= _REST_TIME and max(map(abs, self._tau)) <= RATE * self.smoother.dt
 
     def overrun(self, driven: bool) -> Limited | None:
-        """What the arm runs into. ``driven``: it follows torques; else it brakes, which must not take too long."""
+        """Return the limit that the arm runs into; None if it keeps all.
+
+        Args:
+            driven: Whether it follows torques; else it brakes, which must not take too long.
+        """
         if driven:
             return self._overran
         if self._bounds is None or self._arm is None:
@@ -438,7 +440,7 @@ class TorqueMotion(ServoMotion):
         return self._braking >= BRAKE_LIMIT or bounds.is_runaway(arm)
 
     def setpoint(self) -> Setpoint | None:
-        """What to write; None while it is blind."""
+        """Return the set-point to be written; None while the arm's state is unknown."""
         if self.blind:
             return None
         return Setpoint(self.q, self.dq, self._nothing, self._tau)
@@ -449,7 +451,7 @@ class TorqueMotion(ServoMotion):
         return self._bounds is not None and super().usable(values)
 
     def too_far(self, values: Floats) -> bool:
-        """Torques begin at rest."""
+        """Return whether the arm moves: torques begin at rest."""
         return self.active or not self.smoother.at_rest()
 
     def start(self) -> None:
@@ -467,7 +469,7 @@ class TorqueMotion(ServoMotion):
         self._commanded = list(command.values)
 
     def step(self, now: float) -> None:
-        """One tick towards the commanded torques. The first set-point has none: the device changes its mode with it."""
+        """Move the torques by one tick towards the command. The first set-point has none: it changes the mode."""
         assert self._bounds is not None
         self._braking = self._share = 0.0
         arm = self._arm
@@ -481,7 +483,7 @@ class TorqueMotion(ServoMotion):
         self._begun = True
 
     def brake(self) -> bool:
-        """One tick of braking. True, and nothing was done, when positions should take over from here."""
+        """Brake by one tick. Returns True, and does nothing, if positions should take over from here."""
         bounds, arm = self._bounds, self._arm
         assert bounds is not None
         if arm is None:
@@ -495,7 +497,7 @@ class TorqueMotion(ServoMotion):
         return False
 
     def leave(self) -> None:
-        """The end: the set-point is where the arm was measured, at its speed if it still moves."""
+        """Leave the mode: the set-point is where the arm was measured, at its speed if it still moves."""
         self.active = False
         moves = max(map(abs, self.dq)) >= _REST
         self.smoother.anchor(self.q, self.dq if moves else None)

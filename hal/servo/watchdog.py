@@ -1,4 +1,4 @@
-"""May the arm move? The dead-man, the heartbeats, the deadline of a command, stops and faults of one control session.
+"""Permission to move: the dead-man, the heartbeats, the deadline of a command, stops and faults of one session.
 
 Every comparison is written so that a number that is not finite counts as the bad case.
 """
@@ -11,55 +11,54 @@ from ..types import Trip
 __all__ = ["PAD_SILENCE", "SILENCE", "Watchdog", "is_alive", "is_timely"]
 
 SILENCE = 0.150
-"""Longest time from the last sign of life of the dead-man's pad, of the app and of the device to the stop, s."""
+"""Longest time from the last sign of life of the dead-man's pad, of the app or of the device to the stop, s."""
 
 PAD_SILENCE = SILENCE - 0.030
-"""A dead-man whose newest sign of life is older than this does not count, s. What is left of :data:`SILENCE` is for a
-servo that runs late on a loaded machine."""
+"""A dead-man whose newest sign of life is older than this does not count, s. The rest of :data:`SILENCE` is for a servo
+that runs late on a loaded machine."""
 
 _HARMLESS_AT_REST = (Trip.DEADMAN_LOST, Trip.DEADMAN_SILENT, Trip.APP_SILENT)
-"""With a dead-man that is released these are no reason to latch anything."""
+"""While the dead-man is released these latch nothing."""
 
 _NONE = Trip.NONE  # the one that is named in every tick; it is zero, and so false (Python 3.11 takes 0.1 us to find it)
 
 _AHEAD = 1.0
-"""A sign of life may be this far in the future before it is taken for garbage, s."""
+"""A sign of life may be this far in the future before it counts as invalid, s."""
 
 
 class Watchdog:
-    """The permission to move, once per tick.
+    """Decides once per tick whether the arm may move.
 
-    With a dead-man, motion is allowed from a press until its release, and a trip is left by a release and a new press.
-    A dead-man that is already held when the session opens does not count (someone may have taped it down, or hold it
-    from before) except for ``move_to``, whose goal is known. Without a dead-man, motion is allowed from the start and
-    a trip is left by ``control.rearm()``. The cause of the trip must be gone first: a press or a rearm that came while
+    With a dead-man, motion is allowed from a press until its release, and a trip is cleared by a release and a new
+    press. A dead-man that is already held when the session opens does not count (it may be taped down, or held from
+    before), except for ``move_to``, whose goal is known. Without a dead-man, motion is allowed from the start and a
+    trip is cleared by ``control.rearm()``. The cause of the trip must be gone first: a press or a rearm that came while
     it lasted does not count.
     """
 
     def __init__(self, dt: float = 0.0) -> None:
-        """``dt`` is the time between two calls of :meth:`update`, s; no silence is longer although it is only seen
-        there."""
+        """Make a watchdog whose limits hold although silence is only noticed every ``dt`` s, in :meth:`update`."""
         self._silence = SILENCE - dt
         self._pad_silence = PAD_SILENCE - dt
         self.session: Session | None = None
         self.trip = Trip.NONE
-        """Why the stop is latched."""
+        """Reason of the latched stop; ``Trip.NONE`` if none is latched."""
         self.t_trip = 0.0
-        """When it was."""
+        """Time at which it was latched, s."""
         self.allowed = False
-        """May the arm move in this tick?"""
+        """Whether the arm may move in this tick."""
         self.renewed = False
-        """Was the permission given anew in this tick? Commands sent before do not count any more."""
+        """Whether the permission was granted in this tick. Commands that were sent before do not count any more."""
         self._stops: int | None = None
         self._presses = 0
         self._rearms = 0
         self._rebase = False
-        """Presses and rearms of ticks without a reading do not count; the next tick says how many there were."""
+        """Whether presses and rearms of the ticks without a reading are still to be discarded."""
         self._command: CommandRecord | None = None
         """The command that the arm follows."""
 
     def begin(self, session: Session, inbox: Inbox) -> None:
-        """A session opens. Presses and rearms count from what ``inbox`` says now, stops from what the app knew of."""
+        """Open a session. Presses and rearms count from those in ``inbox``, stops from those that the app knew of."""
         self.session = session
         self.trip = Trip.NONE
         self.allowed = self.renewed = self._rebase = False
@@ -72,26 +71,34 @@ class Watchdog:
         self._presses = (deadman.presses if deadman is not None else 0) - int(known)
 
     def end(self) -> None:
-        """The session is over."""
+        """Close the session."""
         self.session = None
         self.allowed = False
         self.trip = Trip.NONE
 
     def expect(self, command: CommandRecord | None) -> None:
-        """The next command must come before the deadline of this one; None: none is due."""
+        """Expect the next command before the deadline of this one; None if none is due."""
         self._command = command
 
     def device_lost(self, now: float) -> None:
-        """The device did not answer in this cycle."""
+        """Latch ``Trip.DEVICE_LOST``: the device did not answer in this cycle."""
         if self.session is not None:
             self._latch(Trip.DEVICE_LOST, now)
             self._rebase = True
             self.renewed = False
 
     def update(self, now: float, inbox: Inbox, at_rest: bool, device: Trip = Trip.NONE, late: bool = False) -> bool:
-        """One tick; ``device`` is what is wrong with the arm, ``late`` says that the last tick was too long ago.
+        """Decide for one tick.
 
-        Returns ``allowed``.
+        Args:
+            now: Time, s.
+            inbox: The newest records of the app.
+            at_rest: Whether the set-point is at rest; motion only starts from rest.
+            device: The trip that the device causes.
+            late: Whether the last tick was too long ago.
+
+        Returns:
+            :attr:`allowed`.
         """
         stopped = self._stops is not None and inbox.stops != self._stops
         self._stops = inbox.stops
@@ -117,7 +124,7 @@ class Watchdog:
         return self.allowed
 
     def _cause(self, now: float, session: Session, inbox: Inbox, stopped: bool, device: Trip, late: bool) -> Trip:
-        """What forbids motion in this tick, the gravest first."""
+        """Return the gravest reason that forbids motion in this tick; ``Trip.NONE`` if there is none."""
         if device:
             return device
         if stopped:
@@ -138,7 +145,7 @@ class Watchdog:
         return _NONE
 
     def _is_late(self, now: float, session: Session, newest: CommandRecord | None) -> bool:
-        """Is a command due, and neither it nor the one that came meanwhile still in time?"""
+        """Return whether a command is due, and neither the one that is followed nor a newer one is still in time."""
         followed = self._command
         if followed is None or is_timely(now, followed):
             return False
@@ -186,10 +193,10 @@ class Watchdog:
 
 
 def is_timely(now: float, command: CommandRecord) -> bool:
-    """Is this command still to be followed, and not from the future?"""
+    """Return whether a command is before its deadline and not from the future."""
     return command.t - _AHEAD <= now <= command.deadline
 
 
 def is_alive(now: float, sign: float, silence: float = SILENCE) -> bool:
-    """Is the last sign of life (s) young enough, and not from the future?"""
+    """Return whether the last sign of life (s) is recent enough, and not from the future."""
     return -_AHEAD <= now - sign <= silence
