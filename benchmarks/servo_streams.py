@@ -114,7 +114,7 @@ class Stream:
         self.start = start
         self.q = list(start)
         self.servo.anchor(start)
-        self.servo.begin(Session(1, self.speed, 1e9, False), NO_INBOX)
+        self.servo.open_session(Session(1, self.speed, 1e9, False), NO_INBOX)
 
     def send(self, q: list[float], dq: list[float]) -> None:
         """A joint target, as an app would send it."""

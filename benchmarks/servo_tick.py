@@ -91,7 +91,7 @@ def measure(
     servo = Servo(spec, 1 / RATE_HZ, kinematics, kinematics.mass_matrix)
     servo.anchor(spec.home)
     goal = tuple(x + 0.3 * math.cos(k) for k, x in enumerate(spec.home)) if kind is None else None
-    servo.begin(Session(1, 0.3, tcp_speed, False, goal), NO_INBOX)
+    servo.open_session(Session(1, 0.3, tcp_speed, False, goal), NO_INBOX)
     bare = Bare()
     now, q, dq = 10.0, list(spec.home), STILL
     start = list(q)

@@ -82,7 +82,9 @@ class StopLatch:
     def check(self) -> None:
         """Raise MotionStopped while the stop is not acknowledged."""
         if self.stopped:
-            raise MotionStopped("rig.stop() was called", "call rig.rearm() when it is safe to move again")
+            raise MotionStopped(
+                "rig.stop() was called", "call rig.rearm() when it is safe to move again", code=Trip.STOP.code
+            )
 
 
 def trip_text(trip: Trip) -> str:
@@ -322,7 +324,7 @@ class Control:
         if self.deadman is None:
             latch.check()
         elif latch.stopped and self.deadman.held:
-            raise MotionStopped("rig.stop() was called", "release the dead-man first")
+            raise MotionStopped("rig.stop() was called", "release the dead-man first", code=Trip.STOP.code)
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
@@ -338,7 +340,9 @@ class Control:
         if not self._id:
             return
         untold = self._untold_trip()
-        self._mail.end(self._id)  # needs no answer: from here on the arm brakes, whatever happens to this program
+        self._mail.close_session(
+            self._id
+        )  # needs no answer: from here on the arm brakes, whatever happens to this program
         try:
             self._wait_for_rest()
         finally:
@@ -354,7 +358,7 @@ class Control:
 
     def _forget(self) -> None:
         """The session is over for this program; the host is told, should it not know."""
-        self._mail.end(self._id)
+        self._mail.close_session(self._id)
         self._id = 0
         self.robot._open = None
         if self._detach is not None:
@@ -480,7 +484,7 @@ class Control:
         self._stopped = servo.trip is Trip.STOP
         self._tell()
         remedy = "release the dead-man and press it again" if self.deadman else "call control.rearm() to go on"
-        raise MotionStopped(trip_text(servo.trip) + self._details(servo), remedy)
+        raise MotionStopped(trip_text(servo.trip) + self._details(servo), remedy, code=servo.trip.code)
 
     def _tell(self) -> None:
         """The program is told of a stop; so is the hand on the dead-man, once."""
@@ -502,7 +506,7 @@ class Control:
         With a dead-man, letting go of it and pressing it again is the acknowledgement: MotionStopped says so.
         """
         if self.deadman is not None:
-            raise MotionStopped("this session has a dead-man", "release it and press it again")
+            raise MotionStopped("this session has a dead-man", "release it and press it again", code="deadman_session")
         self.robot._latch.stopped = False
         self._mail.rearm()
         self._rearmed_at = self._mail.state.seq() + 1

@@ -293,7 +293,9 @@ class Gripper:
             raise RobotFault(*((fault.cause, fault.remedy) if fault else (f"{self.name} failed", "")))
         if result.outcome is GripperOutcome.STOPPED:
             self._latch.check()
-            raise MotionStopped(f"{self.name} was stopped, or got a newer command, before it was there")
+            raise MotionStopped(
+                f"{self.name} was stopped, or got a newer command, before it was there", code="gripper_stopped"
+            )
         return result
 
     def inject(self, **knobs: object) -> None:

@@ -84,7 +84,9 @@ def move_to(
             if deadman is None or deadman.held:
                 held = clock.now()
             elif clock.now() - held > patience:
-                raise MotionStopped(f"nobody held the dead-man for {patience:g} s", "call move_to again")
+                raise MotionStopped(
+                    f"the dead-man was not held for {patience:g} s", "call move_to again", code="deadman_released"
+                )
             if timeout is not None and clock.now() - start > timeout:
                 raise TimeoutError(f"{robot.name} did not reach the target within {timeout:g} s")
     return robot.state()

@@ -115,6 +115,26 @@ class Trip(_Named):
     LIMIT = 10
     """Driven by torques, the arm came to a limit: of speed, of position, of the workspace, or of the time to brake."""
 
+    @property
+    def code(self) -> str:
+        """Stable identifier of the reason, which the ``MotionStopped`` of this trip carries, such as ``pad_lost``."""
+        return _TRIP_CODES[self]
+
+
+_TRIP_CODES = {
+    Trip.NONE: "none",
+    Trip.COMMAND_LATE: "command_deadline",
+    Trip.DEADMAN_SILENT: "pad_silent",
+    Trip.DEADMAN_LOST: "pad_lost",
+    Trip.STOP: "rig_stop",
+    Trip.APP_SILENT: "app_silent",
+    Trip.FAULT: "robot_fault",
+    Trip.DEVICE_LOST: "device_lost",
+    Trip.BAD_READING: "bad_reading",
+    Trip.HOST_LATE: "host_late",
+    Trip.LIMIT: "torque_limit",
+}
+
 
 class GripperOutcome(_Named):
     """How a gripper's newest command went."""

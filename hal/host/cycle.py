@@ -175,10 +175,10 @@ class ArmUnit:
         """
         marks = self.mail.get_marks()
         if self._session and marks.ended == self._session:  # through memory, so that it waits for no answer
-            self.servo.end()
+            self.servo.close_session()
         if self.error is not None or self.reading is None:
             self._prepared = None
-            self._setpoint = self.servo.lost(now)
+            self._setpoint = self.servo.device_lost(now)
             return
         inbox, self._prepared = self._prepared or self._inbox(app, marks), None
         self._setpoint = self.servo.tick(now, self.reading, inbox, late)
@@ -204,13 +204,13 @@ class ArmUnit:
             return
         try:
             if self.driver.write(setpoint) is False:
-                self.servo.withheld()
+                self.servo.note_withheld()
         except Exception as error:
             self._write_failed = True
             self._lose(error)
             return
         self._t_written = now
-        self.audit.take(setpoint)
+        self.audit.add_setpoint(setpoint)
 
     def finish_session(self) -> bool:
         """After the last set-point of a session, halt the device. Returns whether no session is open."""
@@ -271,7 +271,7 @@ class ArmUnit:
 
     # Requests.
 
-    def begin(self, session: Session, app: AppRecord) -> None:
+    def open_session(self, session: Session, app: AppRecord) -> None:
         """Open a control session.
 
         Raises:
@@ -286,7 +286,7 @@ class ArmUnit:
         if self.error is not None:
             raise self.error
         self._anchor()
-        self.servo.begin(session, self._inbox(app, marks))
+        self.servo.open_session(session, self._inbox(app, marks))
         self._session = session.id
 
     def recover(self) -> None:
@@ -294,7 +294,7 @@ class ArmUnit:
         self.driver.recover()
         self.servo.recover()
 
-    def moved(self) -> None:
+    def anchor_again(self) -> None:
         """Read and anchor again: the arm was moved by a reset of the simulated world."""
         self.reading = self.driver.read(self.reading.t if self.reading else 0.0)
         self._anchor()
@@ -405,7 +405,7 @@ class Cycle:
         resting = True
         for unit in self._units:
             if not unit.finish_session():
-                unit.servo.end()
+                unit.servo.close_session()
                 resting = False
         return resting
 
@@ -427,7 +427,7 @@ class Cycle:
     def _do_begin(self, robot: str, session: list[Any]) -> None:
         fields = Session(*session)
         goal = tuple(fields.move_to) if fields.move_to is not None else None
-        self._arm(robot).begin(fields._replace(move_to=goal), self.memory.get_app())
+        self._arm(robot).open_session(fields._replace(move_to=goal), self.memory.get_app())
 
     def _do_recover(self, robot: str) -> None:
         self._arm(robot).recover()
@@ -472,7 +472,7 @@ class Cycle:
             name = params.get("name")
             for unit in self._units:
                 if name is None or name == unit.spec.name:
-                    unit.moved()
+                    unit.anchor_again()
         return result
 
     def close(self) -> None:

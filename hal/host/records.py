@@ -416,7 +416,7 @@ class RobotMail:
             marks = self.get_marks()
             self.marks.write(marks.rearms + 1, marks.ended)
 
-    def end(self, session: int) -> None:
+    def close_session(self, session: int) -> None:
         """Mark this session as closed."""
         with self._marking:
             self.marks.write(self.get_marks().rearms, session)

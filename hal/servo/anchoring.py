@@ -142,7 +142,7 @@ class Anchoring:
             "mismatches": self.mismatches,
         }
 
-    def rest(self, q: Floats | None) -> None:
+    def note_rest(self, q: Floats | None) -> None:
         """Note that nothing is streamed, and that the device reports ``q`` (n,) as its commanded position, rad."""
         if q is None or len(q) != len(self._rest) or not _apart(q, self._rest) <= NOISIEST:
             self._rest = [] if q is None else list(q)
@@ -153,7 +153,7 @@ class Anchoring:
             self._steps = max(0.8 * self._steps, _apart(q, self._rested))  # a few cycles of memory
         self._rested = () if q is None else q
 
-    def start(self, q: Floats) -> Floats:
+    def start_position(self, q: Floats) -> Floats:
         """Return the position to start from if the device last reported ``q``, rad: without the noise, if it is only
         noise."""
         rest = self._rest
@@ -194,24 +194,24 @@ class Anchoring:
         self._away = 0
         """Cycles since the device answered last."""
 
-    def gave(self, setpoint: Setpoint) -> None:
+    def note_given(self, setpoint: Setpoint) -> None:
         """Note that this set-point is written to the device."""
         before, self._motion = self._motion, setpoint
         self._starts = not (any(before[1]) or any(before[2]))
         self._given.appendleft(setpoint[0])
         self._fresh = False
 
-    def withheld(self) -> None:
+    def note_withheld(self) -> None:
         """Note that the driver did not pass the last set-point on: the device is where it reports to be."""
         self._silent = self._withheld = True
 
-    def lose(self) -> None:
+    def note_silence(self) -> None:
         """Note that the device did not answer in this cycle. It stops by itself if that lasts."""
         self._away += 1
         if self._away * self._smoother.dt >= SILENCE:
             self._silent = True
 
-    def look(self, reading: Reading, device: Trip) -> bool:
+    def check_report(self, reading: Reading, device: Trip) -> bool:
         """Compare a reading with what was given.
 
         Args:
@@ -270,7 +270,7 @@ class Anchoring:
         elif device is Trip.FAULT:
             self._silent = True
         else:
-            self.lose()  # it is an old one
+            self.note_silence()  # it is an old one
 
     def _took(self) -> None:
         """Note that the device has what it was given last."""

@@ -56,7 +56,7 @@ class SetpointAudit:
         self._history = self._history[:0]
         self._tau = None
 
-    def take(self, setpoint: Setpoint) -> None:
+    def add_setpoint(self, setpoint: Setpoint) -> None:
         """Add a set-point of any kind, as it was handed to the driver."""
         if setpoint.tau is not None:
             self._add_torques(setpoint.tau)

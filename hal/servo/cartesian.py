@@ -56,7 +56,7 @@ class _CartesianMotion(ServoMotion):
         envelope, smoother = self.envelope, self.smoother
         speed = max(hypot(*twist[:3]), hypot(*twist[3:]))
         posture = _POSTURE * min(1.0, speed / _POSTURE_FULL)
-        dq, near_singular = envelope.kinematics.velocity(smoother.q, twist, posture, envelope.here()[1])
+        dq, near_singular = envelope.kinematics.velocity(smoother.q, twist, posture, envelope.pose_and_jacobian()[1])
         if near_singular:
             envelope.limited |= Limited.SINGULAR
         if not isfinite(sum(dq)):
@@ -115,7 +115,7 @@ class TwistMotion(_CartesianMotion):
             smoother.settle(envelope.guard)
             self.start()
             return
-        pose, _ = envelope.here()
+        pose, _ = envelope.pose_and_jacobian()
         if not self._goal:
             self._goal = list(pose)
         twist = list(self._values[:6])
@@ -144,7 +144,7 @@ class TwistMotion(_CartesianMotion):
         self._goal = [x + dt * vx, y + dt * vy, z + dt * vz, *after_rotation(orientation, (dt * wx, dt * wy, dt * wz))]
 
     def _at_rest(self, part: int) -> bool:
-        _, jacobian = self.envelope.here()
+        _, jacobian = self.envelope.pose_and_jacobian()
         return hypot(*jacobian[3 * part : 3 * part + 3].dot(self.smoother.dq).tolist()) < _QUIET[part]
 
     def _shorten_lead(self, pose: Floats, error: list[float]) -> list[float]:
@@ -184,7 +184,7 @@ class PoseMotion(_CartesianMotion):
         self._pose = command.values
 
     def step(self, now: float) -> None:
-        at, _ = self.envelope.here()
+        at, _ = self.envelope.pose_and_jacobian()
         error = difference(at, self._pose)
         scale = 1.0
         for part, lead in ((error[:3], _LEAD[0]), (error[3:], _LEAD[1])):

@@ -120,13 +120,13 @@ class TcpReference:
         self._per_speed = hypot(*[per_v for _, per_v, _ in self._stops])
         self._per_acceleration = hypot(*[per_a for _, _, per_a in self._stops])
 
-    def here(self) -> tuple[Pose7, NDArray[np.float64]]:
+    def pose_and_jacobian(self) -> tuple[Pose7, NDArray[np.float64]]:
         """Return pose of the tcp and its Jacobian (6, n) at the set-point, which becomes the reference."""
         if self._at is not self._smoother.q:
-            self._look()
+            self._move_reference()
         return self._pose, self._jacobian
 
-    def _look(self) -> None:
+    def _move_reference(self) -> None:
         q = self._smoother.q
         if self._centre_length:
             self._centre_speed += self._spread * dist(q, self._at) * self._centre_length
@@ -309,7 +309,7 @@ class TcpReference:
         """Move the reference to the set-point unless it is as good as there; returns whether it moved."""
         if self._moved() <= _SAME:
             return False
-        self._look()
+        self._move_reference()
         return True
 
 
@@ -436,13 +436,13 @@ class Envelope:
         """Return the greatest speed (3,) along each base axis in the direction of ``tcp_velocity`` (3,), m/s."""
         if self.workspace is None:
             return [float("inf")] * 3
-        at, _ = self.here()
+        at, _ = self.pose_and_jacobian()
         faces = zip(at, tcp_velocity, self.workspace.lower, self.workspace.upper, strict=False)
         return [_FACE_GAIN * max(0.0, (high - x) if v > 0.0 else (x - low)) for x, v, low, high in faces]
 
-    def here(self) -> tuple[Pose7, NDArray[np.float64]]:
+    def pose_and_jacobian(self) -> tuple[Pose7, NDArray[np.float64]]:
         """Return pose of the tcp and its Jacobian (6, n) at the set-point; computed once a tick."""
-        return self._tcp.here()
+        return self._tcp.pose_and_jacobian()
 
     def stop_speed(self, dq: list[float], places: Sequence[Floats]) -> float:
         """Greatest speed (m/s) of the tcp that moves with joint speeds ``dq`` at any of these joint positions, or stops

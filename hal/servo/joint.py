@@ -381,7 +381,7 @@ class PathMotion(ServoMotion):
         self._input = InputParameter(1)
         self._output = OutputParameter(1)
 
-    def aim(self, goal: Floats) -> None:
+    def set_goal(self, goal: Floats) -> None:
         """Set the goal.
 
         Args:

@@ -161,7 +161,7 @@ class Servo:
                 f"cannot anchor to q = {list(q)}: more than {_BEYOND:g} rad beyond the joints' limits",
                 code="bad_anchor",
             )
-        self._smoother.anchor(self._anchoring.start(q) if dq is None else q, dq)
+        self._smoother.anchor(self._anchoring.start_position(q) if dq is None else q, dq)
         self._ready = None
         self._torque.active = False
         self._anchoring.forget()
@@ -169,7 +169,7 @@ class Servo:
         self._forget_goals()
         self._publish()
 
-    def begin(self, session: Session, inbox: Inbox) -> None:
+    def open_session(self, session: Session, inbox: Inbox) -> None:
         """Open a control session; the servo must have been anchored.
 
         Args:
@@ -189,7 +189,7 @@ class Servo:
         self._envelope.open(session)
         self._torque.open()
         if session.move_to is not None:
-            self._path.aim(session.move_to)
+            self._path.set_goal(session.move_to)
         self._session = session
         self._ending = self._ahead = False
         self._resting = 0
@@ -198,16 +198,16 @@ class Servo:
         self.report.target_seq = self.report.refused = 0
         self.report.arrived = False
         self._forget_goals()
-        self._watchdog.begin(session, inbox)
+        self._watchdog.open_session(session, inbox)
         self._anchoring.relearn()
         self.report.status = RobotStatus.HOLDING
         self.report.trip = Trip.NONE
 
-    def end(self) -> None:
+    def close_session(self) -> None:
         """Close the session: brake, then be idle."""
         if self._session is not None and not self._ending:
             self._ending = True
-            self._watchdog.end()
+            self._watchdog.close_session()
             self._forget_goals()
 
     def tick(self, now: float, reading: Reading, inbox: Inbox, late: bool = False) -> Setpoint | None:
@@ -228,14 +228,14 @@ class Servo:
         self._corrected = False
         if ready is None:
             self._envelope.limited = _UNLIMITED
-        device = self._judge(now, reading)
+        device = self._find_trip(now, reading)
         if session is None:
-            self._anchoring.rest(None if device else reading.q_commanded)
+            self._anchoring.note_rest(None if device else reading.q_commanded)
         torque = self._torque
-        torque.see(reading if self._is_known(reading, device) else None)
+        torque.observe(reading if self._is_known(reading, device) else None)
         if torque.active:
             device = device or self._overruns()
-        elif session is not None and self._anchoring.look(reading, device):
+        elif session is not None and self._anchoring.check_report(reading, device):
             ready = None
             self._corrected = True
             self._resting = 0
@@ -248,7 +248,7 @@ class Servo:
         # What was computed ahead is written even if something is wrong: the stop begins where it ends.
         setpoint = self._decide(inbox, now, device, late, faulty) if ready is None else ready
         if setpoint is not None and setpoint.tau is None:
-            self._anchoring.gave(setpoint)
+            self._anchoring.note_given(setpoint)
         return setpoint
 
     @property
@@ -260,9 +260,9 @@ class Servo:
         """Clear :attr:`fault`, and learn again how the device reports its set-points."""
         self._anchoring.recover()
 
-    def withheld(self) -> None:
+    def note_withheld(self) -> None:
         """Note that the driver did not pass the last set-point on (see :meth:`.RobotDriver.write`)."""
-        self._anchoring.withheld()
+        self._anchoring.note_withheld()
 
     def statistics(self) -> dict[str, Any]:
         """Return how the device reports: ``reports``, ``report_lag``, ``report_noise`` (rad), ``mismatches``."""
@@ -278,7 +278,7 @@ class Servo:
         if self._session is None or (self._ending and self._finished()):
             self._idle(RobotStatus.FAULT if faulty else RobotStatus.IDLE)
             return None
-        self._listen(now, self._session, inbox.command)
+        self._accept_command(now, self._session, inbox.command)
         return self._move(now, RobotStatus.FAULT if faulty else None)
 
     def _is_late(self, now: float) -> bool:
@@ -286,15 +286,15 @@ class Servo:
         before, self._t_tick = self._t_tick, now
         return self.spec.attended and before is not None and not now - before <= SILENCE
 
-    def lost(self, now: float) -> Setpoint | None:
+    def device_lost(self, now: float) -> Setpoint | None:
         """Trip and continue braking, because the device did not answer in this cycle. Returns the next set-point or
         None."""
         self._t_tick = now
         ready, self._ready = self._ready, None
         self._envelope.limited = Limited.NONE
         self._watchdog.device_lost(now)
-        self._anchoring.lose()
-        self._torque.see(None)
+        self._anchoring.note_silence()
+        self._torque.observe(None)
         if self._session is None or (self._ending and self._finished()):
             self._idle(RobotStatus.LOST)
             return None
@@ -318,7 +318,7 @@ class Servo:
             self._ahead = True
             self._ready = self._decide(inbox, now + smoother.dt, device, late, faulty)
 
-    def _judge(self, now: float, reading: Reading) -> Trip:
+    def _find_trip(self, now: float, reading: Reading) -> Trip:
         """Return the trip that this reading causes; ``Trip.NONE`` if the device is all right."""
         if reading.fault is not None or self._anchoring.fault is not None:
             return Trip.FAULT
@@ -358,7 +358,7 @@ class Servo:
         """Return whether there are n finite values of plausible size."""
         return len(values) == self._smoother.n and hypot(*values) < _ABSURD
 
-    def _listen(self, now: float, session: Session, command: CommandRecord | None) -> None:
+    def _accept_command(self, now: float, session: Session, command: CommandRecord | None) -> None:
         """Accept the newest command if it belongs to this session and is valid; else count it as refused."""
         watchdog = self._watchdog
         mine = command is not None and command.session == session.id

@@ -140,7 +140,7 @@ class TorqueBounds:
         self._box: list[tuple[float, float]] = []
         """Ranges of the tcp, m; empty if unlimited."""
 
-    def begin(self, q: Floats) -> None:
+    def open_session(self, q: Floats) -> None:
         """Open a session with the arm at ``q`` (n,), rad: outside a limit it may only come back in."""
         self._ranges = _around(self._limits.lower, self._limits.upper, q)
         workspace = self._envelope.workspace
@@ -323,7 +323,7 @@ pushed. Positions brake it further."""
 class TorqueMotion(ServoMotion):
     """Follows torques, and brakes by torques. ``active`` from the first command until the arm is at rest again.
 
-    The servo passes every reading to :meth:`see`, advances it by :meth:`step` or :meth:`brake`, and writes
+    The servo passes every reading to :meth:`observe`, advances it by :meth:`step` or :meth:`brake`, and writes
     :meth:`setpoint` as long as it is active.
     """
 
@@ -370,9 +370,9 @@ class TorqueMotion(ServoMotion):
     def open(self) -> None:
         """Open a session, at rest."""
         if self._bounds is not None:
-            self._bounds.begin(self.smoother.q)
+            self._bounds.open_session(self.smoother.q)
 
-    def see(self, reading: Reading | None) -> None:
+    def observe(self, reading: Reading | None) -> None:
         """Note the reading of this tick; None if there is none or it is invalid."""
         if not self.active:
             if reading is not None:  # where torques would begin
@@ -384,18 +384,18 @@ class TorqueMotion(ServoMotion):
         if reading is None:
             self._still = 0.0
             return
-        self._weigh()  # where the arm was a tick ago: it is the same, and may be computed ahead
+        self._update_inertia()  # where the arm was a tick ago: it is the same, and may be computed ahead
         self.q, self.dq = reading.q, reading.dq
         if reading.tau_commanded is not None:
             self._tau = list(reading.tau_commanded)  # what was lost on its way must not make the next step greater
         self._still = self._still + dt if max(map(abs, reading.dq)) < _REST else 0.0
-        self._look()
+        self._update_arm()
 
     def prepare(self) -> None:
         if self.active:
-            self._weigh()
+            self._update_inertia()
 
-    def _weigh(self) -> None:
+    def _update_inertia(self) -> None:
         """Compute the inertia where the arm was measured last; None if it is invalid."""
         if self._weighed_at is self.q:
             return
@@ -406,7 +406,7 @@ class TorqueMotion(ServoMotion):
         except ValueError:
             self._inertia = None
 
-    def _look(self) -> None:
+    def _update_arm(self) -> None:
         if self._inertia is not None:  # else it is as though the device were silent
             self._arm = ArmInMotion(self.q, self.dq, self._inertia)
             self._unseen = 0.0
@@ -462,8 +462,8 @@ class TorqueMotion(ServoMotion):
         self._overran = None
         self._unseen = self._still = self._braking = self._share = 0.0
         self._arm = None
-        self._weigh()
-        self._look()
+        self._update_inertia()
+        self._update_arm()
 
     def accept(self, command: CommandRecord) -> None:
         self._commanded = list(command.values)

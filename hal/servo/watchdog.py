@@ -57,7 +57,7 @@ class Watchdog:
         self._command: CommandRecord | None = None
         """The command that the arm follows."""
 
-    def begin(self, session: Session, inbox: Inbox) -> None:
+    def open_session(self, session: Session, inbox: Inbox) -> None:
         """Open a session. Presses and rearms count from those in ``inbox``, stops from those that the app knew of."""
         self.session = session
         self.trip = Trip.NONE
@@ -70,7 +70,7 @@ class Watchdog:
         known = session.move_to is not None and deadman is not None and deadman.held
         self._presses = (deadman.presses if deadman is not None else 0) - int(known)
 
-    def end(self) -> None:
+    def close_session(self) -> None:
         """Close the session."""
         self.session = None
         self.allowed = False
@@ -115,7 +115,7 @@ class Watchdog:
         if cause:
             self._latch(cause, now)
         if self.trip:
-            self._try_to_leave(session, inbox, at_rest, cause)
+            self._try_to_clear(session, inbox, at_rest, cause)
         elif session.deadman:
             assert deadman is not None
             self._follow_deadman(deadman, at_rest)
@@ -160,7 +160,7 @@ class Watchdog:
         self.allowed = False
         self._command = None
 
-    def _try_to_leave(self, session: Session, inbox: Inbox, at_rest: bool, cause: Trip) -> None:
+    def _try_to_clear(self, session: Session, inbox: Inbox, at_rest: bool, cause: Trip) -> None:
         self.allowed = False
         deadman = inbox.deadman
         presses = self._presses if deadman is None else deadman.presses

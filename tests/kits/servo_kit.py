@@ -95,7 +95,7 @@ class Bench:
     def begin(self, known_stops: int | None = None) -> None:
         """Open the session; the app knew of so many stops then (all of them)."""
         self.session = self.session._replace(stops=self.stops if known_stops is None else known_stops)
-        self.servo.begin(self.session, self.inbox())
+        self.servo.open_session(self.session, self.inbox())
 
     @property
     def status(self) -> RobotStatus:
@@ -148,7 +148,7 @@ class Bench:
     def lose(self) -> Setpoint | None:
         """A cycle in which the device did not answer."""
         self.now += self.dt
-        return self._take(self.servo.lost(self.now))
+        return self._take(self.servo.device_lost(self.now))
 
     def _take(self, setpoint: Setpoint | None) -> Setpoint | None:
         self.limited |= self.servo.report.limited

@@ -63,7 +63,7 @@ class Driven:
         driver.open()
         self.reading: Reading = driver.read(self.now)
         self.servo.anchor(self.reading.q)
-        self.servo.begin(Session(1, speed, tcp_speed, deadman), self.inbox())
+        self.servo.open_session(Session(1, speed, tcp_speed, deadman), self.inbox())
         self.tick()
         if deadman:
             self.press()
@@ -123,14 +123,14 @@ class Driven:
         self.reading = self.driver.read(self.now)
         self.readings.append(self.reading)
         if self.silent:
-            self.setpoint = self.servo.lost(self.now)
+            self.setpoint = self.servo.device_lost(self.now)
         else:
             self.setpoint = self.servo.tick(self.now, self.tamper(self.reading), self.inbox())
         self.limited |= self.servo.report.limited
         if self.setpoint is not None and not self.silent:
             self.driver.write(self.setpoint)
             self.given.append(self.setpoint)
-            self.audit.take(self.setpoint)
+            self.audit.add_setpoint(self.setpoint)
         if self.prepared:
             self.servo.prepare(self.inbox())
         return self.setpoint

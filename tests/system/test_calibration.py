@@ -138,8 +138,9 @@ def test_without_the_dead_man_nothing_moves(bench: Bench) -> None:
     deadman = Deadman("nobody")
     deadman.update(pressed=False, connected=True, t_alive=0.0)
     before = bench.collector.robot.state().q_set
-    with pytest.raises(hal.MotionStopped):
+    with pytest.raises(hal.MotionStopped) as stop:
         bench.drive(10, deadman=deadman)
+    assert stop.value.code == "deadman_released"
     assert np.abs(bench.collector.robot.state().q_set - before).max() < 1e-4
     assert len(bench.collector.views) == 1, "the picture from where it stood"
 

@@ -178,7 +178,7 @@ def test_somebody_elses_client_holds_the_arm(emulator: Emulator) -> None:
 def test_another_tool_at_the_flange_is_refused() -> None:
     with Emulator("--end-effector", "none") as emulator:
         said = opening(emulator.host)
-    assert "do not mean the same tool centre point" in said
+    assert "tool centre points of the arm and of model" in said
     assert "103.4 mm" in said
 
 

@@ -125,7 +125,7 @@ def test_no_limit_of_the_robot_is_ever_broken(arm: str, share: float) -> None:
         inbox = commander.inbox(0, 0.0, list(start))
         # With losses at a rig's own greatest speed: at full speed a fifth lost could carry a joint past its stop.
         speed = spec.speed if share else chance.choice([spec.speed, 1.0])
-        servo.begin(Session(1, speed, 5.0, False), inbox)
+        servo.open_session(Session(1, speed, 5.0, False), inbox)
         for cycle in range(1, min(STRETCH, cycles - begin)):
             now = cycle * DT
             reading = controller.reading(now)
@@ -147,7 +147,7 @@ def test_the_checker_stops_a_client_that_does_not_re_anchor() -> None:
     servo, controller = Servo(spec, DT), Controller("fr3", spec.home)
     servo.anchor(spec.home)
     inbox = Inbox(None, None, 0, 0, 0.0)
-    servo.begin(Session(1, 1.0, 5.0, False), inbox)
+    servo.open_session(Session(1, 1.0, 5.0, False), inbox)
     chance = random.Random(1)
     with pytest.raises(AssertionError, match="limit"):
         for cycle in range(1, 5000):

@@ -173,8 +173,9 @@ def test_commands_that_stop_coming_trip_and_rearm_goes_on(rig: hal.Rig, arm: hal
         let_pass(rig, 0.5)
         assert control.trip is Trip.COMMAND_LATE
         assert np.abs(arm.state().dq_set).max() == 0.0
-        with pytest.raises(MotionStopped, match=r"commands stopped coming \(at most 100 ms .*; call control.rearm"):
+        with pytest.raises(MotionStopped) as stop:
             control.send(velocity)
+        assert stop.value.code == "command_deadline"
         stopped = arm.state().q
         control.rearm()
         for _ in turns(rig, 20):
@@ -184,15 +185,17 @@ def test_commands_that_stop_coming_trip_and_rearm_goes_on(rig: hal.Rig, arm: hal
 
 def test_stop_from_another_thread_is_latched_also_for_the_next_session(rig: hal.Rig, arm: hal.Robot) -> None:
     velocity = JointVelocity([0.2, 0, 0, 0, 0, 0, 0])
-    with arm.control() as control, pytest.raises(MotionStopped, match=r"rig\.stop\(\)"):
+    with arm.control() as control, pytest.raises(MotionStopped) as stop:
         for k, _ in enumerate(turns(rig, 100)):
             control.send(velocity)
             if k == 20:
                 thread = threading.Thread(target=rig.stop)
                 thread.start()
                 thread.join()
-    with pytest.raises(MotionStopped, match=r"rig\.rearm\(\)"):
+    assert stop.value.code == "rig_stop"
+    with pytest.raises(MotionStopped) as stop:
         arm.move_to(arm.home)
+    assert stop.value.code == "rig_stop"
     rig.rearm()
     arm.move_to(arm.home)
     assert arm.state().q == pytest.approx(arm.home, abs=1e-6)
@@ -237,9 +240,10 @@ def test_a_pad_that_freezes_or_goes_stops_the_arm_until_it_is_pressed_anew(
             control.send(velocity)
         assert arm.state().dq_set[0] == pytest.approx(0.2)
         driver.inject(**{knob: True})
-        with pytest.raises(MotionStopped, match="release the dead-man and press it again"):
+        with pytest.raises(MotionStopped) as stop:
             for _ in turns(rig, 50):
                 control.send(velocity)
+        assert stop.value.code == trip.code
         let_pass(rig, 0.3)
         assert control.trip is trip
         assert np.abs(arm.state().dq_set).max() == 0.0
@@ -343,8 +347,9 @@ def test_move_to_blocks_keeps_its_speed_and_checks_its_goal(rig: hal.Rig, arm: h
 
 def test_move_to_waits_for_the_deadman_as_long_as_it_was_told(rig: hal.Rig, arm: hal.Robot) -> None:
     start = rig.clock.now()
-    with pytest.raises(MotionStopped, match=r"nobody held the dead-man for 0.5 s"):
+    with pytest.raises(MotionStopped) as stop:
         arm.move_to(arm.home + 0.1, deadman=rig.gamepads["pad"].hold("l2"), patience=0.5)
+    assert stop.value.code == "deadman_released"
     assert 0.5 <= rig.clock.now() - start < 0.7
     with pytest.raises(CommandError, match="patience"):
         arm.move_to(arm.home, patience=float("nan"))
@@ -414,8 +419,9 @@ def test_a_move_to_a_position_keeps_the_orientation(arm: hal.Robot) -> None:
 
 def test_the_gripper_rests_while_a_stop_is_latched(rig: hal.Rig, arm: hal.Robot) -> None:
     rig.stop()
-    with pytest.raises(MotionStopped, match=r"rig\.rearm"):
+    with pytest.raises(MotionStopped) as stop:
         arm.gripper.grip(1.0)
+    assert stop.value.code == "rig_stop"
     rig.rearm()
     assert arm.gripper.grip(1.0).width < 1e-3
 

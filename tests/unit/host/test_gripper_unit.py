@@ -164,9 +164,9 @@ def test_a_driver_that_knows_is_believed(bench: Bench) -> None:
     ("error", "cause", "remedy"),
     [
         (RobotFault("it is too hot", "let it cool down"), "it is too hot", "let it cool down"),
-        (ConnectionLost("no answer"), "no answer", "see that it is on and connected"),
+        (ConnectionLost("no answer"), "no answer", "check that it is on and connected"),
         (CommandError("too wide"), "too wide", ""),
-        (OSError("broken pipe"), "OSError: broken pipe", "this is a mistake in the driver"),
+        (OSError("broken pipe"), "OSError: broken pipe", "this is a bug in the driver"),
     ],
 )
 def test_a_call_that_raises_is_a_failure_that_is_told(
@@ -193,7 +193,7 @@ def test_a_gripper_that_does_not_answer_has_an_old_state_and_says_why(bench: Ben
     found = bench.turn()
     assert found.lost
     assert (found.state.stamp, found.state.width) == (stamp, 0.05)
-    assert found.state.fault == Fault("lost", "the cable", "see that it is on and connected")
+    assert found.state.fault == Fault("lost", "the cable", "check that it is on and connected")
     bench.tell(GripperAct.MOVE, 0.02, 0.05, 10.0)
     assert bench.turn().state.outcome is GripperOutcome.RUNNING
     bench.driver.deaf = None

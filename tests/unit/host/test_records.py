@@ -93,7 +93,7 @@ def test_a_command_a_deadman_and_marks_arrive(mails: tuple[RobotMail, RobotMail]
     app.put_deadman(deadman)
     app.rearm()
     app.rearm()
-    app.end(6)
+    app.close_session(6)
     assert host.get_deadman() == deadman
     assert host.get_marks() == (2, 6)
 

@@ -161,7 +161,7 @@ def test_what_was_learned_lasts_for_one_session() -> None:
     assert reports() == "not known yet"
     drive(late=30)
     assert reports() == "measured positions"
-    bench.servo.end()
+    bench.servo.close_session()
     bench.reading = {}
     bench.until_rest()
     bench.run(0.1)
@@ -227,7 +227,7 @@ def test_a_wrong_measured_speed_moves_no_set_point(cause: str, speed: float) -> 
         bench.run(0.1)
         bench.fault = None
     else:
-        bench.servo.withheld()
+        bench.servo.note_withheld()
     bench.reading = {"q": found, "dq": [speed] + [0.0] * (N - 1), "q_commanded": found}
     bench.tick()
     assert bench.q == pytest.approx(found, abs=1e-12)

@@ -72,9 +72,9 @@ def at(x: float) -> Setpoint:
 
 def test_torques_are_judged_by_their_limits_and_their_rate_from_none_on() -> None:
     audit = SetpointAudit(WITH_TORQUES, DT)
-    audit.take(torques(0.0, 2.0))
-    audit.take(torques(5.0, -1.0))
-    audit.take(torques(10.0, -1.0))
+    audit.add_setpoint(torques(0.0, 2.0))
+    audit.add_setpoint(torques(5.0, -1.0))
+    audit.add_setpoint(torques(10.0, -1.0))
     peaks = audit.peaks()
     assert peaks["torque"] == pytest.approx(0.5)
     assert peaks["torque_rate"] == pytest.approx(5.0 / DT / 1000.0)
@@ -84,10 +84,10 @@ def test_torques_are_judged_by_their_limits_and_their_rate_from_none_on() -> Non
 def test_positions_after_torques_begin_a_new_stream() -> None:
     audit = SetpointAudit(WITH_TORQUES, DT)
     for _ in range(10):
-        audit.take(at(0.0))
-    audit.take(torques(1.0, 1.0))
+        audit.add_setpoint(at(0.0))
+    audit.add_setpoint(torques(1.0, 1.0))
     for _ in range(10):
-        audit.take(at(0.5))
+        audit.add_setpoint(at(0.5))
     assert audit.peaks()["velocity"] == 0.0
     assert "torque" not in SetpointAudit(LIMITS, DT).peaks()
 
@@ -95,5 +95,5 @@ def test_positions_after_torques_begin_a_new_stream() -> None:
 @pytest.mark.parametrize("tau", [(math.nan, 0.0), (0.0, math.inf)])
 def test_torques_that_are_no_numbers_break_their_limits(tau: tuple[float, float]) -> None:
     audit = SetpointAudit(WITH_TORQUES, DT)
-    audit.take(torques(*tau))
+    audit.add_setpoint(torques(*tau))
     assert audit.peaks()["torque"] == math.inf

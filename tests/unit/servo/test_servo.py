@@ -158,7 +158,7 @@ def test_the_session_share_of_speed_is_kept_and_reported() -> None:
 def test_one_session_at_a_time_and_sensible_terms() -> None:
     bench = Bench()
     with pytest.raises(ControlTaken):
-        bench.servo.begin(Session(2, 1.0, 1.0, False), bench.inbox())
+        bench.servo.open_session(Session(2, 1.0, 1.0, False), bench.inbox())
     with pytest.raises(CommandError):
         Bench(speed=math.nan)
     with pytest.raises(CommandError):
@@ -170,7 +170,7 @@ def test_one_session_at_a_time_and_sensible_terms() -> None:
 def test_end_brakes_and_then_there_is_nothing_to_write() -> None:
     bench = Bench()
     bench.drive()
-    bench.servo.end()
+    bench.servo.close_session()
     assert bench.tick() is not None
     assert bench.status is RobotStatus.STOPPING
     assert bench.servo.report.t_stop == bench.now
@@ -180,7 +180,7 @@ def test_end_brakes_and_then_there_is_nothing_to_write() -> None:
     assert (bench.status, bench.servo.active) == (RobotStatus.IDLE, False)
     bench.assert_within_limits()
     bench.servo.anchor(bench.q)
-    bench.servo.begin(Session(2, 1.0, 1.0, False), bench.inbox())
+    bench.servo.open_session(Session(2, 1.0, 1.0, False), bench.inbox())
     bench.drive(0.2)  # commands of session 1
     assert not bench.moving
 
@@ -188,7 +188,7 @@ def test_end_brakes_and_then_there_is_nothing_to_write() -> None:
 def test_a_session_that_ends_while_the_device_is_lost_is_over_as_well() -> None:
     bench = Bench()
     bench.drive()
-    bench.servo.end()
+    bench.servo.close_session()
     for _ in range(200):
         last = bench.lose()
     assert last is None

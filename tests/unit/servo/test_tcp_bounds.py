@@ -105,7 +105,7 @@ def test_surely_slower_is_never_wrong(arm: Arm) -> None:
             now = 0.5 * dq
         reference = arm.reference()
         arm.smoother.anchor((q + arm.aside()).tolist())
-        reference.here()
+        reference.pose_and_jacobian()
         arm.smoother.anchor(q.tolist(), now.tolist())
         mixed = [np.where(arm.random.random(7) < 0.5, dq, now) * arm.random.random(7) for _ in range(3)]
         exact = max(arm.tcp_speed(q, speeds) for speeds in (dq, now, *mixed))
@@ -133,7 +133,7 @@ def test_surely_stops_slower_is_never_wrong(arm: Arm) -> None:
         reference = arm.reference()
         if k % 3:
             smoother.anchor((q + (1e-3, 1.0)[k % 2] * arm.aside()).tolist())
-            reference.here()
+            reference.pose_and_jacobian()
         smoother.anchor(q.tolist(), dq.tolist(), ddq.tolist())
         goal = (dq * arm.random.uniform(0.5, 1.5, 7)).tolist()
         answers: list[tuple[float, bool]] = []
@@ -199,7 +199,7 @@ def test_surely_inside_is_never_wrong(arm: Arm) -> None:
         box = WorkspaceSpec(tuple(at - half), tuple(at + half * arm.random.uniform(0.2, 1.0, 3)))
         reference = arm.reference(box)
         smoother.anchor((q + arm.aside()).tolist())
-        reference.here()
+        reference.pose_and_jacobian()
         smoother.anchor(q.tolist(), dq.tolist(), ddq.tolist())
         end = arm.kinematics.fk(smoother.stop_end())
         inside = is_inside(end, box)

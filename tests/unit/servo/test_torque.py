@@ -145,7 +145,7 @@ class TestStopping:
             Trip.FAULT,
             0.0,
         ),
-        "ended": (lambda arm: arm.servo.end(), Trip.NONE, 0.0),
+        "ended": (lambda arm: arm.servo.close_session(), Trip.NONE, 0.0),
     }
 
     @pytest.mark.parametrize("way", WAYS)
@@ -231,12 +231,12 @@ class TestStopping:
 
     def test_a_session_that_ends_is_over_once_it_rests(self) -> None:
         arm = moving()
-        arm.servo.end()
+        arm.servo.close_session()
         arm.run(0.5)
         assert arm.setpoint is None
         assert not arm.servo.active
         arm.servo.anchor(arm.q.tolist())
-        arm.servo.begin(Session(2, 0.3, 0.25, True), arm.inbox())
+        arm.servo.open_session(Session(2, 0.3, 0.25, True), arm.inbox())
 
     def test_an_arm_that_was_put_elsewhere_is_held_there(self) -> None:
         arm = moving()
@@ -460,7 +460,7 @@ class TestTheDevice:
     def test_a_session_can_end_while_it_does_not_answer(self) -> None:
         arm = moving()
         arm.silent = True
-        arm.servo.end()
+        arm.servo.close_session()
         arm.run(0.3)
         assert (arm.setpoint, arm.servo.active) == (None, False)
 

@@ -30,7 +30,7 @@ def bounds(
     envelope = Envelope(JointSmoother(spec.limits, dt), Kinematics(spec.kinematics), box)
     envelope.open(Session(1, speed, tcp_speed, False))
     made = TorqueBounds(spec.limits, dt, envelope)
-    made.begin(HOME)
+    made.open_session(HOME)
     return made, envelope
 
 

@@ -225,7 +225,7 @@ def test_a_stop_before_the_session_began_does_not_count_and_one_after_does() -> 
     bench.begin()
     bench.drive(0.3)
     assert bench.moving
-    bench.servo.end()
+    bench.servo.close_session()
     bench.until_rest()
     bench.tick()
     bench.begin()
@@ -316,7 +316,7 @@ def test_a_shorter_pause_and_one_in_which_nothing_may_move_are_no_trip() -> None
     bench.now += 9.0
     bench.tick()
     assert (bench.status, bench.trip) == (RobotStatus.HOLDING, Trip.NONE)
-    bench.servo.end()
+    bench.servo.close_session()
     bench.run(0.1)
     bench.now += 9.0
     bench.begin()
@@ -348,3 +348,7 @@ def test_a_clock_that_runs_backwards_does_no_harm() -> None:
         bench.tick()
     bench.until_rest(1.0)
     bench.assert_within_limits()
+
+
+def test_every_trip_has_a_code_of_its_own() -> None:
+    assert len({trip.code for trip in Trip}) == len(Trip)
