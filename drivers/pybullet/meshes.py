@@ -324,6 +324,8 @@ def _closed(mesh: Mesh) -> bool:
 
 
 # --- fewer triangles --------------------------------------------------------------------------------------------------
+# fast-simplification was compared: with as many triangles, pictures of a Panda and a table differ three times as much
+# from those of the full meshes (one object moves by 5 mm), and the first start takes 5 s longer.
 
 
 def simplified(mesh: Mesh) -> Mesh:
