@@ -124,12 +124,11 @@ class Gamepad:
         self.driver = driver
         self.name = driver.spec.name
         self._error: Exception | None = None
-        self._callback_error: Exception | None = None
+        self._rumble_error: Exception | None = None
         self._gate = NeutralGate()
         self._reading = _NOTHING
         self._state = PadState(Stamp(_NOTHING.t, _NOTHING.t_device, _NOTHING.seq))
         self._held: dict[str, HeldControl] = {}
-        self._listeners: dict[object, Callable[[PadState], None]] = {}
         self._lock = threading.RLock()
         self._changed = threading.Condition()
         self._stopping = threading.Event()
@@ -165,25 +164,10 @@ class Gamepad:
                 held.update(self._reading, gate_open=self._gate.open)
             return held.deadman
 
-    def on_change(self, callback: Callable[[PadState], None]) -> Callable[[], None]:
-        """Call ``callback`` with every new state, from the polling thread; the function that comes back ends that.
-
-        An exception in it ends it too, and is kept as :attr:`error`.
-        """
-        token = object()
-        with self._lock:
-            self._listeners[token] = callback
-
-        def detach() -> None:
-            with self._lock:
-                self._listeners.pop(token, None)
-
-        return detach
-
     @property
     def error(self) -> Exception | None:
-        """What went wrong last in the driver or in a callback; None while all is well."""
-        return self._error or self._callback_error
+        """The newest error of the driver in polling or rumbling; None while there is none."""
+        return self._error or self._rumble_error
 
     @property
     def waiting_for(self) -> tuple[str, ...]:
@@ -221,7 +205,7 @@ class Gamepad:
         try:
             return self.driver.rumble(_share(strong), _share(weak), seconds if seconds > 0.0 else 0.0)
         except Exception as error:
-            self._callback_error = error
+            self._rumble_error = error
             return False
 
     @property
@@ -306,19 +290,8 @@ class Gamepad:
             if (last.stamp, last.axes, last.buttons, last.connected) == (state.stamp, axes, buttons, state.connected):
                 return
             self._state = state
-            listeners = tuple(self._listeners.items())
-        for token, callback in listeners:
-            self._tell(token, callback, state)
         with self._changed:
             self._changed.notify_all()
-
-    def _tell(self, token: object, callback: Callable[[PadState], None], state: PadState) -> None:
-        try:
-            callback(state)
-        except Exception as error:
-            self._callback_error = error
-            with self._lock:
-                self._listeners.pop(token, None)
 
     def _shaped(self, name: str, value: float) -> float:
         if name.startswith("dpad"):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Iterator
 from typing import Any
 
@@ -50,9 +51,19 @@ def page(bench: Bench, page: Browser) -> Browser:
 def seen(bench: Bench) -> Iterator[list[PadState]]:
     """Every state of the pad that the app could see."""
     found: list[PadState] = []
-    stop = bench.session.pad.on_change(found.append)
+    ended = threading.Event()
+
+    def collect() -> None:
+        while not ended.is_set():
+            state = bench.session.pad.wait(0.05)
+            if not found or state is not found[-1]:
+                found.append(state)
+
+    thread = threading.Thread(target=collect)
+    thread.start()
     yield found
-    stop()
+    ended.set()
+    thread.join()
 
 
 def tap(page: Browser, target: str) -> list[dict[str, Any]]:
