@@ -486,7 +486,7 @@ def run_app(main: Any, parser: argparse.ArgumentParser, argv: list[str] | None) 
 
     _open_standard_streams()
     parser.prog = _typed(parser.prog)
-    link = logging.getLogger("hal.views")
+    link = logging.getLogger("hal.console")
     before, link.disabled = link.disabled, True  # the banner says it
     try:
         try:

@@ -301,7 +301,7 @@ class Rig:
                 gamepad.start_thread(self.clock.now)
             if spec.driver == _CONSOLE and self.console is not None:
                 # Without a word a program that waits for a dead-man would just hang. Apps print a banner instead.
-                logging.getLogger("hal.views").warning("drive from a browser: %s", self.console.link)
+                logging.getLogger("hal.console").warning("drive from a browser: %s", self.console.link)
 
     def _pad_source(self, spec: PadSpec) -> object | None:
         """What the driver of this pad is made with, besides its record."""
