@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import io
-import logging
 import os
 import resource
 import socket
@@ -18,7 +16,6 @@ import pytest
 from child_targets import HURRY
 from web_kit import WAIT, App, Page, run
 
-from hal.drivers.web.process import LogLimit
 from hal.errors import HalError
 from hal.host.process import Child
 
@@ -119,23 +116,6 @@ def test_nor_is_a_handshake_that_makes_none(app: App, key: bytes) -> None:
             writer.close()
 
     run(test)
-
-
-def test_what_libraries_complain_of_is_bounded() -> None:
-    written = io.StringIO()
-    handler = logging.StreamHandler(written)
-    handler.addFilter(LogLimit(3))
-    for k in range(1000):
-        try:
-            raise OSError(f"no more files, {k}")
-        except OSError as error:
-            record = logging.LogRecord("asyncio", logging.ERROR, "", 0, "said %d", (k,), (OSError, error, None))
-        handler.handle(record)
-    lines = written.getvalue().splitlines()
-    assert lines[0] == "said 0"
-    assert "OSError: no more files, 2" in lines
-    assert lines[-1] == "further records of this kind are not shown"
-    assert not any("3" in line for line in lines)
 
 
 def test_what_ends_the_process_is_written() -> None:
