@@ -1,4 +1,4 @@
-"""What several tests do with a page."""
+"""Actions on a page that several tests share."""
 
 from __future__ import annotations
 

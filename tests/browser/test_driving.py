@@ -1,4 +1,4 @@
-"""A person with a browser drives the arm: the right way, by the right amount, and only while the dead-man is held."""
+"""Driving with a browser: the right direction and speed, and only while the dead-man is held."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def test_nothing_moves_without_the_dead_man(bench: Bench, page: Browser) -> None
     assert abs(bench.tcp - before).max() < 1e-3
 
 
-def test_letting_go_of_the_dead_man_stops_the_arm_though_the_disc_is_held(bench: Bench, page: Browser) -> None:
+def test_release_of_the_dead_man_stops_the_arm_while_the_disc_is_held(bench: Bench, page: Browser) -> None:
     page.hold()
     with page.drag("dpad", -0.8, 0.0):
         wait_for(lambda: bench.speed() > 0.05, "motion")
@@ -107,7 +107,7 @@ def test_home_goes_while_the_dead_man_is_held(bench: Bench, page: Browser) -> No
     page.let_go()
 
 
-def test_letting_go_on_the_way_home_gives_it_up(bench: Bench, page: Browser) -> None:
+def test_release_on_the_way_home_cancels_it(bench: Bench, page: Browser) -> None:
     page.hold()
     with page.drag("dpad", 0.0, -0.8):
         wait_for(lambda: abs(bench.arm.state(max_age=2.0).q - bench.arm.home).max() > 0.2, "the arm to leave home")
@@ -157,7 +157,7 @@ def test_a_pad_of_the_browser_has_the_same_names(bench: Bench, page: Browser) ->
     wait_for(lambda: not held(bench), "the release")
 
 
-def test_the_tour_plays_for_somebody_who_only_wants_to_see_it_move(bench: Bench, page: Browser) -> None:
+def test_the_tour_moves_the_arm(bench: Bench, page: Browser) -> None:
     page.click("#demo")
     wait_for(lambda: bench.speed() > 0.05, "the tour to move the arm")
     page.click("#demo")

@@ -1,4 +1,4 @@
-"""A hand that lets go is seen to, though something came between it and the page."""
+"""Releases that the page may miss: menus, drags, a lost keyboard, a browser that hangs."""
 
 from __future__ import annotations
 
@@ -88,7 +88,7 @@ def test_no_menu_opens_anywhere(page: Browser, place: str) -> None:
     assert page.run("return window.menus") == [True]
 
 
-def test_a_menu_that_cannot_be_kept_shut_finds_nothing_held(bench: Bench, page: Browser) -> None:
+def test_a_menu_that_cannot_be_prevented_releases_everything(bench: Bench, page: Browser) -> None:
     """Firefox opens one with Shift, and asks no page."""
     drive_left(bench, page)
     shift = 8
@@ -141,7 +141,7 @@ def test_a_second_mouse_button_ends_the_press(bench: Bench, page: Browser) -> No
     button(page, "mouseReleased", at, "left", 0)
 
 
-def test_keys_that_cease_to_repeat_were_let_go_of(bench: Bench, page: Browser) -> None:
+def test_keys_that_cease_to_repeat_count_as_released(bench: Bench, page: Browser) -> None:
     """As when a locked screen takes the keyboard: no more repetitions, no release, and the focus stays."""
 
     def cease() -> None:
@@ -190,7 +190,7 @@ def test_the_older_key_does_not_go_on_repeating(bench: Bench, page: Browser) -> 
 
 
 @pytest.mark.parametrize("what", ["a click", "another key", "a key of no meaning"])
-def test_what_may_end_a_repetition_by_right(bench: Bench, page: Browser, what: str) -> None:
+def test_other_input_may_end_a_repetition(bench: Bench, page: Browser, what: str) -> None:
     def hold() -> None:
         page.hold()
         wait_for(lambda: held(bench), "the dead-man", BRIEF)

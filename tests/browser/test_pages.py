@@ -1,4 +1,4 @@
-"""Several pages, strangers, cameras, and how the page looks on a desk and on a phone."""
+"""Several pages, wrong links, cameras, and the layout of the page on a desk and on a phone."""
 
 from __future__ import annotations
 
@@ -88,7 +88,7 @@ NEEDED = ["#stop", "#hold", '[data-disc="dpad"]', '[data-disc="right"]', "#deadm
 
 
 @pytest.mark.parametrize(("width", "height", "touch"), SIZES)
-def test_what_one_needs_is_in_view_and_apart(page: Browser, width: int, height: int, touch: bool) -> None:
+def test_the_main_controls_are_in_view_and_apart(page: Browser, width: int, height: int, touch: bool) -> None:
     page.size(width, height, touch)
     try:
         places = {name: page.place(name) for name in NEEDED}
@@ -183,7 +183,7 @@ def test_only_buttons_that_do_something_are_shown(page: Browser) -> None:
     assert labels == [], "the default mapping gives no button but the way home a meaning"
 
 
-def test_an_arrow_without_space_says_what_is_missing(bench: Bench, page: Browser) -> None:
+def test_an_arrow_without_space_shows_what_is_missing(bench: Bench, page: Browser) -> None:
     wait_for(lambda: page.text("#waiting") == "Stopped. Hold Space to move.", "the advice")
     page.key("ArrowUp", "ArrowUp", True)
     wait_for(lambda: "Space too" in page.text("#waiting"), "the hint")
@@ -193,7 +193,7 @@ def test_an_arrow_without_space_says_what_is_missing(bench: Bench, page: Browser
 
 
 @pytest.mark.parametrize("what", ["a reload", "the end of the tour"])
-def test_what_somebody_intended_is_no_alarm(bench: Bench, page: Browser, what: str) -> None:
+def test_an_intended_stop_is_no_alarm(bench: Bench, page: Browser, what: str) -> None:
     if what == "a reload":
         page.hold()
         wait_for(lambda: bench.deadman.held, "the dead-man")

@@ -1,4 +1,4 @@
-"""The panel of a program that records: it shows how that goes, and the page that drives steers it."""
+"""The panel of a program that records: what it shows, and how the page in control steers it."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ def test_the_panel_is_there_once_a_recording_was_shown(bench: Bench, page: Brows
     assert enabled(page) == ["finish", "fail", "discard"]
 
 
-def test_trouble_and_rows_that_are_lacking_stand_out(bench: Bench, page: Browser) -> None:
+def test_trouble_and_dropped_rows_stand_out(bench: Bench, page: Browser) -> None:
     show(bench, page, replace(RUNNING, frames=371))
     colour = "return getComputedStyle(document.querySelector(arguments[0])).color"
     calm = page.run(colour, "#recording-dropped")
@@ -86,7 +86,7 @@ def test_trouble_and_rows_that_are_lacking_stand_out(bench: Bench, page: Browser
     assert page.run("return document.querySelector('#rec-lamp').dataset.tone") == "alarm", "also where it is far away"
 
 
-def test_a_program_that_falls_silent_while_it_records_is_told(bench: Bench, page: Browser) -> None:
+def test_a_program_that_is_silent_while_it_records_is_shown(bench: Bench, page: Browser) -> None:
     show(bench, page, RUNNING)
     lamp = "return document.querySelector('#recording-lamp').dataset.tone"
     wait_for(lambda: page.run(lamp) == "alarm", "the page to doubt it")
@@ -136,7 +136,7 @@ def test_a_second_thumb_presses_while_the_first_one_holds(
         page.size(1280, 800)
 
 
-def test_who_watches_steers_nothing(bench: Bench, page: Browser, asked: queue.SimpleQueue[str]) -> None:
+def test_a_page_without_control_steers_no_recording(bench: Bench, page: Browser, asked: queue.SimpleQueue[str]) -> None:
     show(bench, page, READY)
     page.run(
         """const socket = new WebSocket(`ws://${location.host}/live`, ['hal.v1', location.hash.slice(1)]);

@@ -1,4 +1,4 @@
-"""What the page in control sets: which arm it drives, how fast, in which frame; and the scene, which it resets."""
+"""The settings of the page in control: arm, speed, axes, and the reset of the scene."""
 
 from __future__ import annotations
 
@@ -97,7 +97,7 @@ def test_a_held_dead_man_keeps_its_arm(bench: Bench, page: Browser) -> None:
     let_go_of_all(page)
 
 
-def test_a_page_that_only_watches_says_who_drives_what(bench: Bench, page: Browser) -> None:
+def test_a_page_without_control_names_the_driver_and_the_arm(bench: Bench, page: Browser) -> None:
     page.click("#lease")
     wait_for(lambda: not page.facts["driving"], "the page to stop driving")
     assert "control" in page.text("#who")
@@ -183,7 +183,7 @@ def test_a_program_that_offers_nothing_has_no_selector(bench: Bench, page: Brows
     wait_for(lambda: names_the_driven(page, "left"), "the page to name the driven arm again")
 
 
-def test_what_a_driving_view_must_be() -> None:
+def test_invalid_driving_views() -> None:
     from hal.views import DrivingView
 
     for wrong in ({"speed": 0.0}, {"speed": float("nan")}, {"speed": 0.5, "speed_max": 0.4}, {"frame": "world"}):

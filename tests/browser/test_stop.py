@@ -1,4 +1,4 @@
-"""A STOP that fails says so."""
+"""The confirmation of STOP, and the alarm without it."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def quiet(page: Browser, seconds: float = 0.8) -> bool:
     return True
 
 
-def test_a_stop_that_works_alarms_nobody(bench: Bench, page: Browser) -> None:
+def test_a_confirmed_stop_raises_no_alarm(bench: Bench, page: Browser) -> None:
     def stop() -> None:
         drive_left(bench, page)
         before = lines(page, "STOP was sent")
@@ -55,7 +55,7 @@ def test_a_stop_that_works_alarms_nobody(bench: Bench, page: Browser) -> None:
     let_go_of_all(page)
 
 
-def test_who_stopped_is_told_however_late_the_arm_shows_it(
+def test_the_banner_names_who_stopped_however_late_the_arm_shows_it(
     bench: Bench, page: Browser, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     stop = bench.rig.stop
@@ -84,7 +84,7 @@ def test_a_stop_with_nothing_to_stop(page: Browser) -> None:
         assert lines(page, "STOP was sent") == 1
 
 
-def test_a_stop_that_nothing_follows(bench: Bench, page: Browser, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_stop_without_effect_raises_the_alarm(bench: Bench, page: Browser, monkeypatch: pytest.MonkeyPatch) -> None:
     """It is heard, and the arm goes on."""
 
     def stop_in_vain() -> None:
@@ -114,7 +114,7 @@ def on_top(page: Browser, selector: str) -> Any:
     return page.run(script, selector)
 
 
-def test_a_stop_that_never_arrives(bench: Bench, page: Browser) -> None:
+def test_a_stop_that_never_arrives_raises_the_alarm(bench: Bench, page: Browser) -> None:
     """The cable is pulled, and the page cannot know yet."""
     parts = urlsplit(bench.link)
     assert parts.port is not None

@@ -1,4 +1,4 @@
-"""Whatever happens to the browser while the arm moves: it stops, it is latched, and only a new press goes on."""
+"""Whatever happens to the browser while the arm moves: the arm trips, and only a new press continues."""
 
 from __future__ import annotations
 
@@ -178,7 +178,7 @@ def test_a_network_that_is_cut_and_comes_back(bench: Bench, browser: Browser) ->
         cable.close()
 
 
-def test_a_fault_is_told_and_recovered_from(bench: Bench, moving: Browser) -> None:
+def test_a_fault_is_shown_and_recovered_from(bench: Bench, moving: Browser) -> None:
     bench.arm.inject(fault="joint 3 is too warm")
     wait_for(lambda: "joint 3 is too warm" in moving.text("#fault"), "the page to tell the fault")
     assert "recover" in moving.text("#fault").lower()
@@ -190,7 +190,7 @@ def test_a_fault_is_told_and_recovered_from(bench: Bench, moving: Browser) -> No
     assert not moving.text("#fault")
 
 
-def test_the_app_that_ends_is_told(page: Browser) -> None:
+def test_the_end_of_the_app_is_shown(page: Browser) -> None:
     """Of another rig than the other tests'."""
     other = Bench()
     try:

@@ -1,4 +1,4 @@
-"""Whoever reaches the console's port without the token: it costs no page anything, and fills no disk."""
+"""Connections to the console's port without the token: they delay no page and fill no disk."""
 
 from __future__ import annotations
 
@@ -97,7 +97,7 @@ async def stop_of_a_new_page(app: App) -> float:
         b"GET /%ff%fe HTTP/1.1\r\nHost: \xff\xfe\r\nConnection: close\r\n\r\n",
     ],
 )
-def test_requests_that_make_no_sense_are_not_written_down(app: App, request_: bytes) -> None:
+def test_malformed_requests_are_not_logged(app: App, request_: bytes) -> None:
     async def test() -> None:
         for _ in range(30):
             reader, writer = await visit(app, request_)
@@ -108,7 +108,7 @@ def test_requests_that_make_no_sense_are_not_written_down(app: App, request_: by
 
 
 @pytest.mark.parametrize("key", [b"short", b"\xc3\xa4" * 12, b"=" * 24])
-def test_nor_is_a_handshake_that_makes_none(app: App, key: bytes) -> None:
+def test_malformed_handshakes_are_not_logged(app: App, key: bytes) -> None:
     async def test() -> None:
         for _ in range(30):
             reader, writer = await visit(app, handshake(app, key))
@@ -118,7 +118,7 @@ def test_nor_is_a_handshake_that_makes_none(app: App, key: bytes) -> None:
     run(test)
 
 
-def test_what_ends_the_process_is_written() -> None:
+def test_the_error_that_ends_the_process_is_logged() -> None:
     child = Child("console", "hal.drivers.web.process:main", {"listen": ["127.0.0.1", "no port"]})
     try:
         with pytest.raises(HalError, match="no port"):
@@ -134,7 +134,7 @@ def test_what_ends_the_process_is_written() -> None:
 
 
 @pytest.mark.parametrize("sent", [b"", b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\n"])
-def test_whoever_asks_for_nothing_is_shown_out_and_a_page_is_not(hasty: App, sent: bytes) -> None:
+def test_idle_connections_are_closed_and_pages_are_not(hasty: App, sent: bytes) -> None:
     """The second one goes on sending a byte at a time."""
 
     async def test() -> None:
@@ -156,7 +156,7 @@ def test_whoever_asks_for_nothing_is_shown_out_and_a_page_is_not(hasty: App, sen
     run(test)
 
 
-def test_whoever_asks_now_and_then_stays(hasty: App) -> None:
+def test_a_connection_with_regular_requests_stays(hasty: App) -> None:
     async def test() -> None:
         reader, writer = await visit(hasty)
         for _ in range(3):
@@ -168,7 +168,7 @@ def test_whoever_asks_now_and_then_stays(hasty: App) -> None:
     run(test)
 
 
-def test_idle_visitors_keep_no_page_out(app: App) -> None:
+def test_idle_connections_keep_no_page_out(app: App) -> None:
     async def test() -> None:
         async with Page(app) as driver:
             await driver.take()
@@ -184,7 +184,7 @@ def test_idle_visitors_keep_no_page_out(app: App) -> None:
     run(test)
 
 
-def test_whoever_asks_for_much_and_takes_nothing_is_shown_out(app: App) -> None:
+def test_a_connection_that_reads_no_answer_is_closed(app: App) -> None:
     async def test() -> None:
         before = descriptors(app)
         sock = socket.socket()
@@ -206,7 +206,7 @@ def test_whoever_asks_for_much_and_takes_nothing_is_shown_out(app: App) -> None:
     run(test)
 
 
-def test_wrong_tokens_in_a_crowd(app: App) -> None:
+def test_many_wrong_tokens_at_the_same_time(app: App) -> None:
     """Some are told why they do not come in, the others are just turned away; whoever has the right one comes in."""
 
     async def test() -> None:

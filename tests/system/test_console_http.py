@@ -1,4 +1,4 @@
-"""The console's door: who comes in, what is served to whom, under which headers."""
+"""The HTTP side of the console: tokens, hosts and origins, files, headers."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def app() -> Iterator[App]:
 
 @pytest.mark.parametrize("path", ["/live", "/pictures"])
 @pytest.mark.parametrize("token", ["wrong", TOKEN[:-1], TOKEN + "0"])
-def test_a_wrong_token_is_told_as_such(server: App, path: str, token: str) -> None:
+def test_a_wrong_token_is_reported(server: App, path: str, token: str) -> None:
     async def test() -> None:
         async with Page(server, path, token) as page:
             message = await page.ws.receive(WAIT)

@@ -1,4 +1,4 @@
-"""What the cameras see, on the pages: the newest picture, at the page's own pace, and only what is watched."""
+"""Pictures of cameras on the pages: the newest one, at the page's own pace, and only of watched cameras."""
 
 from __future__ import annotations
 
@@ -78,7 +78,7 @@ def test_one_picture_is_under_way_and_the_next_is_the_newest(app: App) -> None:
     run(test)
 
 
-def test_only_what_somebody_watches_is_asked_for_and_nothing_from_before(app: App) -> None:
+def test_only_watched_cameras_are_requested_and_old_pictures_are_not_shown(app: App) -> None:
     async def test() -> None:
         app.show("scene", 10)
         async with Page(app, "/pictures") as first:
@@ -112,7 +112,7 @@ def test_a_page_that_joins_sees_the_newest_at_once(app: App) -> None:
     run(test)
 
 
-def test_rates_and_ages_are_told(app: App) -> None:
+def test_rates_and_ages_of_pictures_are_reported(app: App) -> None:
     async def test() -> None:
         async with Page(app) as live, Page(app, "/pictures") as page:
             cameras = (await live.next("state"))["cameras"]
@@ -132,7 +132,7 @@ def test_rates_and_ages_are_told(app: App) -> None:
     run(test)
 
 
-def test_nonsense_here(app: App) -> None:
+def test_malformed_messages_on_the_picture_socket(app: App) -> None:
     async def test() -> None:
         async with Page(app, "/pictures") as page:
             for text in (

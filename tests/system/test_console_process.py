@@ -1,4 +1,4 @@
-"""The console's process with real sockets: whose pad arrives, what pages are told, how it ends."""
+"""The console's process with real sockets: whose pad arrives, what pages get, how it ends."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def gone(message: dict[str, Any]) -> bool:
 # What they say.
 
 
-def test_nonsense_is_survived_until_there_is_too_much_of_it(app: App) -> None:
+def test_malformed_messages_are_tolerated_up_to_a_limit(app: App) -> None:
     async def test() -> None:
         async with Page(app) as page:
             for k in range(98):
@@ -72,7 +72,7 @@ def test_a_message_that_is_too_long_ends_the_page(app: App) -> None:
     run(test)
 
 
-def test_too_many_messages_end_the_page_and_a_stop_among_them_is_heard(app: App) -> None:
+def test_too_many_messages_close_the_page_and_a_stop_among_them_counts(app: App) -> None:
     async def test() -> None:
         async with Page(app) as page:
             await page.take()
@@ -130,7 +130,7 @@ def test_the_lease_between_two_pages(app: App) -> None:
 
 
 @pytest.mark.parametrize("how", ["hidden", "closed", "cut"])
-def test_a_page_that_goes_away_is_a_pad_that_is_gone_at_once(app: App, how: str) -> None:
+def test_a_page_that_leaves_loses_the_pad_at_once(app: App, how: str) -> None:
     async def test() -> None:
         async with Page(app) as page:
             await page.take()
@@ -149,7 +149,7 @@ def test_a_page_that_goes_away_is_a_pad_that_is_gone_at_once(app: App, how: str)
     run(test)
 
 
-def test_a_page_that_falls_silent_is_a_pad_that_is_gone(app: App) -> None:
+def test_a_silent_page_loses_the_pad(app: App) -> None:
     async def test() -> None:
         async with Page(app) as page:
             await page.take()
@@ -176,7 +176,7 @@ def test_late_messages_move_nothing(app: App) -> None:
     run(test)
 
 
-def test_what_came_while_the_server_stood_still_moves_nothing(app: App) -> None:
+def test_messages_during_a_stall_of_the_server_move_nothing(app: App) -> None:
     """The page goes on, held at full deflection; the console's process is stopped, as by a machine that swaps."""
 
     async def test() -> None:
@@ -204,7 +204,7 @@ def test_what_came_while_the_server_stood_still_moves_nothing(app: App) -> None:
     run(test)
 
 
-def test_an_app_that_does_not_read_costs_nobody_anything(app: App) -> None:
+def test_an_app_that_does_not_read_delays_no_page(app: App) -> None:
     """It is stopped for a while. Pages are answered, and what it then finds is a handful of messages, stop included."""
 
     async def test() -> None:
@@ -256,7 +256,7 @@ def test_states(app: App) -> None:
     run(test)
 
 
-def test_numbers_that_are_none_reach_no_page(app: App) -> None:
+def test_nan_reaches_no_page_as_a_number(app: App) -> None:
     async def test() -> None:
         async with Page(app) as page:
             await page.next("hello")
@@ -270,7 +270,7 @@ def test_numbers_that_are_none_reach_no_page(app: App) -> None:
     run(test)
 
 
-def test_words_of_the_app(app: App) -> None:
+def test_messages_of_the_app(app: App) -> None:
     async def test() -> None:
         async with Page(app) as page:
             await page.next("hello")
@@ -319,7 +319,7 @@ def resident(pid: int) -> int:
 
 
 @pytest.mark.slow
-def test_a_page_that_reads_nothing_delays_nobody_and_is_cut_off(hasty: App) -> None:
+def test_a_page_that_reads_nothing_delays_no_other_and_is_disconnected(hasty: App) -> None:
     app = hasty
 
     async def test() -> None:
@@ -399,7 +399,7 @@ def test_ipv6() -> None:
         run(test)
 
 
-def test_nothing_that_a_page_sends_appears_in_its_words(app: App) -> None:
+def test_text_of_a_page_is_never_passed_on(app: App) -> None:
     """What a page writes is never passed on, neither to the app nor to other pages."""
 
     async def test() -> None:

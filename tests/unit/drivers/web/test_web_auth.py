@@ -1,10 +1,12 @@
-"""Who may come in."""
+"""Which requests are accepted, and the addresses of the page."""
 
 from __future__ import annotations
 
+import socket
+
 import pytest
 
-from hal.drivers.web.auth import Authenticator
+from hal.drivers.web.auth import Authenticator, host_names, is_loopback, page_link, ssh_tunnel
 
 TOKEN = "Zm9v-Y_mFy"
 
@@ -86,3 +88,26 @@ def test_origins(origin: str | None, own: bool) -> None:
 )
 def test_tokens(offered: str | None, admitted: bool) -> None:
     assert Authenticator(TOKEN, "127.0.0.1", []).is_valid_token(offered) is admitted
+
+
+def test_the_token_stands_in_the_fragment() -> None:
+    assert page_link("127.0.0.1", 8470, "secret") == "http://127.0.0.1:8470/#secret"
+    assert page_link("::1", 8470, "secret") == "http://[::1]:8470/#secret"
+    assert page_link("0.0.0.0", 80, "secret") == f"http://{socket.gethostname()}:80/#secret"
+
+
+def test_a_tunnel_keeps_the_port_so_that_the_link_stays_the_same() -> None:
+    assert "-L 8470:127.0.0.1:8470 " in ssh_tunnel("127.0.0.1", 8470)
+    assert "-L 8470:[::1]:8470 " in ssh_tunnel("::1", 8470)
+
+
+def test_loopback() -> None:
+    assert is_loopback("127.0.0.1")
+    assert is_loopback("::1")
+    assert is_loopback("localhost")
+    assert not is_loopback("0.0.0.0")
+    assert not is_loopback("10.0.0.1")
+
+
+def test_host_names_include_the_own_name() -> None:
+    assert socket.gethostname().lower() in host_names()

@@ -1,4 +1,4 @@
-"""What a page may say: everything else is malformed, and nothing else ever comes of it."""
+"""The messages that a page may send; everything else is malformed."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def take(text: str) -> object:
         ({"type": "drawn", "camera": "scene"}, PictureDrawn("scene")),
     ],
 )
-def test_what_a_page_may_say(message: dict[str, Any], record: object) -> None:
+def test_valid_messages(message: dict[str, Any], record: object) -> None:
     assert take(json.dumps(message)) == record
 
 
@@ -146,7 +146,7 @@ def with_axis(value: str) -> str:
         '{"a":' * (MAX_BYTES // 5),
     ],
 )
-def test_what_it_may_not(text: str) -> None:
+def test_malformed_messages(text: str) -> None:
     with pytest.raises(MalformedMessage):
         take(text)
 
@@ -159,7 +159,7 @@ JSON = st.recursive(
 
 
 @given(st.one_of(st.text(), JSON.map(json.dumps), st.fixed_dictionaries(dict.fromkeys(PAD, JSON)).map(json.dumps)))
-def test_whatever_comes_it_is_a_record_or_malformed(text: str) -> None:
+def test_any_text_is_a_record_or_malformed(text: str) -> None:
     try:
         record = take(text)
     except MalformedMessage:
@@ -168,7 +168,7 @@ def test_whatever_comes_it_is_a_record_or_malformed(text: str) -> None:
 
 
 @given(JSON, st.sampled_from([*PAD]))
-def test_a_pad_with_one_field_of_anything_is_sound_or_malformed(value: object, key: str) -> None:
+def test_a_pad_with_any_field_replaced_is_valid_or_malformed(value: object, key: str) -> None:
     try:
         record = take(json.dumps({**PAD, key: value}))
     except MalformedMessage:
@@ -179,12 +179,12 @@ def test_a_pad_with_one_field_of_anything_is_sound_or_malformed(value: object, k
         assert 0 <= record.buttons < 1 << 14
 
 
-def test_nothing_that_is_no_number_is_ever_sent() -> None:
+def test_nan_is_never_sent() -> None:
     with pytest.raises(ValueError, match="JSON"):
         encode({"t": float("nan")})
 
 
-def test_an_allowance_is_one_of_a_second() -> None:
+def test_the_rate_limit_counts_per_second() -> None:
     allowance = RateLimit()
     assert all(allowance.allows_message(5.0 + k * 1e-3) for k in range(MAX_MESSAGES))
     assert not allowance.allows_message(5.5)
@@ -192,7 +192,7 @@ def test_an_allowance_is_one_of_a_second() -> None:
     assert all(RateLimit().allows_message(7.0 + 0.02 * k) for k in range(10 * MAX_MESSAGES))
 
 
-def test_mistakes_are_counted_for_ever() -> None:
+def test_malformed_messages_count_for_the_whole_connection() -> None:
     allowance = RateLimit()
     assert all(allowance.allows_malformed() for _ in range(MAX_MALFORMED))
     assert not allowance.allows_malformed()

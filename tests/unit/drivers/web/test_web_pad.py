@@ -1,4 +1,4 @@
-"""The page as a gamepad, seen from the app: nothing is missed, nothing is made up, an interruption lets go."""
+"""The page as a gamepad, on the app's side: no event is missed, none is invented, an interruption releases."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ def test_axes_and_buttons_have_their_names(page: Page, pad: WebPad) -> None:
     assert (found.t, found.t_alive) == (0.999, 0.999)
 
 
-def test_what_the_page_repeats_proves_life_and_is_no_event(page: Page, pad: WebPad) -> None:
+def test_a_repeated_state_proves_life_and_is_no_event(page: Page, pad: WebPad) -> None:
     page.send(1.0, left_x=0.5)
     first = pad.poll(1.0, 0.0)
     page.send(1.02, left_x=0.5)
@@ -194,7 +194,7 @@ def test_the_tour_ends_when_its_page_goes_and_when_it_is_over(page: Page, pad: W
     assert page.playing[-1] is False, "the recording has an end"
 
 
-def test_a_rig_without_a_console_says_so() -> None:
+def test_a_rig_without_a_console_is_refused() -> None:
     with pytest.raises(NotSupported) as refused:
         WebPad(PadSpec("pad", "web", None)).open()
     assert refused.value.code == "no_console"

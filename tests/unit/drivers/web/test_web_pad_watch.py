@@ -1,4 +1,4 @@
-"""A pad over a network: what arrives late, after a gap, or from another time moves nothing."""
+"""A pad over a network: messages that are late, follow a gap, or have an old stamp move nothing."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def test_a_clock_that_runs_a_little_ahead_proves_no_more_than_now() -> None:
     assert watch().judge(message(T, 0.050), T + 0.020) == PadVerdict(None, T + 0.020)
 
 
-def test_a_message_that_was_under_way_for_too_long_is_a_pad_that_is_gone() -> None:
+def test_a_late_message_loses_the_pad() -> None:
     pad = connected()
     assert pad.judge(message(T, 0.020), T + 0.020 + PAD_SILENCE + 1e-6) == PadVerdict(
         MESSAGES_LATE, dropped=MESSAGES_LATE
@@ -54,7 +54,7 @@ def test_a_message_that_was_under_way_for_too_long_is_a_pad_that_is_gone() -> No
     assert pad.connected
 
 
-def test_a_gap_between_two_messages_is_a_pad_that_was_gone() -> None:
+def test_a_gap_between_two_messages_loses_the_pad_once() -> None:
     pad = connected()
     assert pad.judge(message(T, 0.25), T + 0.25) == PadVerdict(PAGE_SILENT, T + 0.25)
     assert pad.connected
@@ -89,14 +89,14 @@ def test_a_stamp_from_before_the_lease_does_not_count() -> None:
     assert watch().judge(message(T - 0.01, 0.02), T + 0.01) == PadVerdict(None, None)
 
 
-def test_a_page_whose_clock_jumped_ahead_is_not_believed() -> None:
+def test_a_page_whose_clock_jumped_ahead_does_not_count() -> None:
     """A computer that slept: its browser's clock went on, ours did not."""
     pad = connected()
     assert pad.judge(message(T, 3600.0), T + 0.02) == PadVerdict(CLOCK_AHEAD, dropped=CLOCK_AHEAD)
     assert not pad.connected
 
 
-def test_going_away_is_told_once() -> None:
+def test_a_disconnect_is_reported_once() -> None:
     pad = connected()
     assert pad.disconnect("the page was hidden") == "the page was hidden"
     assert pad.disconnect("the page was hidden") is None
@@ -114,9 +114,7 @@ def test_a_backlog_after_a_stall_counts_only_from_where_it_is_fresh_and_after_a_
 
 
 @given(st.randoms(use_true_random=False), st.floats(0.0, 0.4), st.floats(0.0, 0.4))
-def test_whatever_the_network_does_what_counts_was_said_within_the_limit(
-    chance: random.Random, up: float, down: float
-) -> None:
+def test_whatever_the_network_does_only_recent_messages_count(chance: random.Random, up: float, down: float) -> None:
     """Messages and beats arrive in order, each after some time; sometimes the page freezes. What counts is young, and
     between two that count without a loss there is no silence."""
     pad, page, now = watch(), T, T
@@ -148,7 +146,7 @@ def test_whatever_the_network_does_what_counts_was_said_within_the_limit(
 # Who drives.
 
 
-def test_one_page_drives_and_whoever_takes_it_has_it() -> None:
+def test_control_belongs_to_the_page_that_took_it_last() -> None:
     lease = DriveLease()
     assert lease.driver is None
     assert lease.watch_of("page 1") is None
@@ -165,7 +163,7 @@ def test_one_page_drives_and_whoever_takes_it_has_it() -> None:
     assert (lease.driver, lease.watch) == (None, None)
 
 
-def test_a_lease_that_comes_back_knows_nothing_of_the_time_before() -> None:
+def test_a_new_lease_ignores_stamps_of_the_last_one() -> None:
     lease = DriveLease()
     lease.grant("page 1", T)
     before = lease.watch

@@ -1,4 +1,4 @@
-"""What an app may show of a recording, and what of it reaches the pages."""
+"""The view of a recording, and the message that pages get of it."""
 
 from __future__ import annotations
 
@@ -41,13 +41,13 @@ def test_a_view_reaches_the_pages_whole() -> None:
     assert (message["seconds"], message["actions"]) == (12.35, ["finish", "fail", "discard"])
 
 
-def test_numbers_may_be_numpys() -> None:
+def test_numbers_may_be_numpy_scalars() -> None:
     view = replace(VIEW, frames=np.int64(3), free_bytes=np.uint64(1 << 40), seconds=np.float32(0.5))  # type: ignore[arg-type]
     message = json.loads(json.dumps(recording_message(view)))
     assert (message["frames"], message["free_bytes"], message["seconds"]) == (3, 1 << 40, 0.5)
 
 
-def test_words_are_one_line_and_not_endless() -> None:
+def test_texts_become_one_line_of_limited_length() -> None:
     message = recording_message(replace(VIEW, prompt="two\nlines  of it", trouble="no space left " * 1000))
     assert message["prompt"] == "two lines of it"
     assert len(message["trouble"]) == 300
@@ -69,6 +69,6 @@ def test_every_phase(phase: str) -> None:
         {"seconds": -0.1},
     ],
 )
-def test_what_is_none(wrong: dict[str, Any]) -> None:
+def test_invalid_views(wrong: dict[str, Any]) -> None:
     with pytest.raises(CommandError):
         replace(VIEW, **wrong)

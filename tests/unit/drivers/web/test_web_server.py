@@ -44,7 +44,7 @@ def test_without_its_page_it_does_not_start(tmp_path: Path) -> None:
         assert missing.value.code == "page_missing"
 
 
-def test_what_libraries_complain_of_is_bounded() -> None:
+def test_the_log_of_libraries_is_limited() -> None:
     written = io.StringIO()
     handler = logging.StreamHandler(written)
     handler.addFilter(LogLimit(3))

@@ -1,4 +1,4 @@
-"""The console's rules, without a socket: whose pad counts, what the app is told, what pages are told."""
+"""The rules of the console without a socket: whose pad counts, what the app and the pages are sent."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ RIG: dict[str, Any] = {
 
 
 class App:
-    """Reads at once, unless told not to."""
+    """Reads at once, while ``reads`` is True."""
 
     def __init__(self) -> None:
         self.queue = AppQueue()
@@ -32,7 +32,7 @@ class App:
             self.told.append(message)
 
     def news(self) -> list[dict[str, Any]]:
-        """What it was told since it was asked last."""
+        """Return the messages since the last call."""
         told, self.told = self.told, []
         return told
 
@@ -43,7 +43,7 @@ class App:
 
 
 class Room:
-    """A desk, the app behind it, and a clock."""
+    """A session, the app behind it, and a clock."""
 
     def __init__(self, **rig: Any) -> None:
         self.now = 100.0
@@ -78,7 +78,7 @@ def inbox(page: WebPage) -> list[dict[str, Any]]:
     return [json.loads(text) for text in iter(page.queue.pop, None)]
 
 
-def test_a_page_that_opens_is_told_everything_in_order() -> None:
+def test_a_page_that_opens_gets_everything_in_order() -> None:
     room = Room()
     room.driver()
     room.session.receive_from_app({"method": "labels", "labels": {"deadman": "l2", "controls": {}}})
@@ -126,7 +126,7 @@ def test_a_late_message_is_no_pad_but_is_answered() -> None:
     assert room.app.pads() == ["page 1"]
 
 
-def test_a_gap_is_told_before_the_message_that_ends_it() -> None:
+def test_a_gap_is_reported_before_the_message_that_ends_it() -> None:
     room = Room()
     driver = room.driver()
     room.now = 100.5
@@ -134,7 +134,7 @@ def test_a_gap_is_told_before_the_message_that_ends_it() -> None:
     assert room.app.pads() == [(PAGE_SILENT,), "page 1"]
 
 
-def test_silence_is_told_when_somebody_looks() -> None:
+def test_silence_is_reported_by_the_regular_check() -> None:
     room = Room()
     room.driver()
     room.session.check_pad(100.1)
@@ -145,7 +145,7 @@ def test_silence_is_told_when_somebody_looks() -> None:
 
 
 @pytest.mark.parametrize("why", ["hidden", "blur", "closing"])
-def test_away_is_away_until_the_next_message(why: str) -> None:
+def test_the_pad_of_a_page_that_left_is_lost_until_its_next_message(why: str) -> None:
     room = Room()
     driver = room.driver()
     room.say(driver, type="away", why=why)
@@ -157,14 +157,14 @@ def test_away_is_away_until_the_next_message(why: str) -> None:
     assert room.app.pads() == ["page 1"]
 
 
-def test_away_of_a_watcher_is_nobodys_business() -> None:
+def test_a_page_without_control_that_leaves_changes_nothing() -> None:
     room = Room()
     room.driver()
     room.say(room.page(), type="away", why="hidden")
     assert room.app.news() == []
 
 
-def test_the_lease_goes_to_whoever_takes_it_and_the_pad_is_gone_in_between() -> None:
+def test_taking_control_loses_the_pad_in_between() -> None:
     room = Room()
     first, second = room.driver(), room.page()
     inbox(second)
@@ -185,7 +185,7 @@ def test_the_lease_goes_to_whoever_takes_it_and_the_pad_is_gone_in_between() -> 
     assert room.app.pads() == ["page 2"]
 
 
-def test_a_page_that_takes_it_back_is_not_heard_with_what_it_said_before() -> None:
+def test_messages_from_before_control_was_taken_back_do_not_count() -> None:
     room = Room()
     first, second = room.driver(), room.page()
     room.now = 100.01
@@ -200,7 +200,7 @@ def test_a_page_that_takes_it_back_is_not_heard_with_what_it_said_before() -> No
 
 
 @pytest.mark.parametrize("how", ["let go", "leave"])
-def test_nobody_drives_after_the_driver_let_go_or_left(how: str) -> None:
+def test_no_page_drives_after_the_driver_released_or_left(how: str) -> None:
     room = Room()
     driver, other = room.driver(), room.page()
     inbox(other)
@@ -219,7 +219,7 @@ def test_nobody_drives_after_the_driver_let_go_or_left(how: str) -> None:
     assert room.app.news() == []
 
 
-def test_taking_what_one_has_changes_nothing() -> None:
+def test_taking_control_twice_changes_nothing() -> None:
     room = Room()
     driver = room.driver()
     room.say(driver, type="lease", take=True)
@@ -241,7 +241,7 @@ def test_where_another_pad_drives_pages_only_watch_and_stop() -> None:
     assert room.app.news() == [{"stop": "page 1"}]
 
 
-def test_anybody_stops_only_the_driver_recovers_and_plays() -> None:
+def test_every_page_stops_and_only_the_driver_recovers_and_plays() -> None:
     room = Room()
     driver, other = room.driver(), room.page()
     inbox(other)
@@ -272,7 +272,7 @@ def test_malformed_here(message: dict[str, Any]) -> None:
     assert (room.app.news(), inbox(driver)) == ([], [])
 
 
-def test_what_the_app_says_reaches_the_pages_that_it_is_for() -> None:
+def test_messages_of_the_app_reach_their_pages() -> None:
     room = Room()
     first, second = room.page(), room.page()
     inbox(first), inbox(second)
@@ -294,7 +294,7 @@ def recording(k: int = 0, *actions: str) -> dict[str, Any]:
     return {"method": "recording", "t": float(k), "view": {"phase": "recording", "frames": k, "actions": list(actions)}}
 
 
-def test_every_page_is_shown_the_newest_of_a_recording_and_so_is_one_that_opens_later() -> None:
+def test_every_page_gets_the_newest_view_of_a_recording() -> None:
     room = Room()
     page = room.page()
     assert "recording" not in {message["type"] for message in inbox(page)}, "there is none"
@@ -306,7 +306,7 @@ def test_every_page_is_shown_the_newest_of_a_recording_and_so_is_one_that_opens_
     assert inbox(room.page())[-1] == newest
 
 
-def test_only_the_page_that_drives_steers_a_recording_and_only_to_what_is_possible() -> None:
+def test_only_the_driver_steers_a_recording_by_its_possible_actions() -> None:
     room = Room()
     driver, other = room.driver(), room.page()
     inbox(other)
@@ -327,7 +327,7 @@ def test_only_the_page_that_drives_steers_a_recording_and_only_to_what_is_possib
     assert room.app.news() == [], "twice is once"
 
 
-def test_a_view_with_a_number_that_is_none_changes_nothing() -> None:
+def test_a_view_with_nan_changes_nothing() -> None:
     room = Room()
     page = room.page()
     room.session.receive_from_app(recording(1, "finish"))
@@ -359,7 +359,7 @@ def test_only_the_page_in_control_sets_only_what_the_program_offers() -> None:
 # What waits for an app that does not read.
 
 
-def test_an_app_that_reads_again_hears_of_every_loss_and_the_newest_pad() -> None:
+def test_an_app_that_reads_again_gets_the_loss_and_the_newest_pad() -> None:
     room = Room()
     driver = room.driver()
     room.app.reads = False
@@ -378,7 +378,7 @@ def test_an_app_that_reads_again_hears_of_every_loss_and_the_newest_pad() -> Non
     assert pad["pad"]["axes"][0] == 199 / 200.0
 
 
-def test_a_loss_outdates_the_pad_before_it() -> None:
+def test_a_loss_replaces_the_pad_before_it() -> None:
     queue = AppQueue()
     queue.put_pad(1.0, 1.0, (1.0,), 0, "page 1")
     queue.put_pad_lost(2.0, "it was hidden")
@@ -386,7 +386,7 @@ def test_a_loss_outdates_the_pad_before_it() -> None:
     assert queue.pop() is None
 
 
-def test_wishes_that_nobody_hears_are_refused() -> None:
+def test_requests_are_refused_while_the_app_does_not_read() -> None:
     room = Room()
     driver = room.driver()
     room.app.reads = False
@@ -414,7 +414,7 @@ def test_beats_first_then_notes_in_order_then_the_newest_of_the_rest() -> None:
     assert list(iter(queue.pop, None)) == ["beat 2", "note 0", "note 1", "note 2", "state 2", "recording 2"]
 
 
-def test_a_page_that_misses_a_note_is_cut_off() -> None:
+def test_a_page_that_misses_a_note_is_disconnected() -> None:
     room = Room()
     slow, other = room.page(), room.page()
     for k in range(300):

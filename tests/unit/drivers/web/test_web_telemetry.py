@@ -1,4 +1,4 @@
-"""What pages are told of a gripper, which may live in another process than its arm."""
+"""The state of a gripper on the pages; it may run in another process than its arm."""
 
 from __future__ import annotations
 
