@@ -22,14 +22,14 @@ from typing import Any
 import numpy as np
 
 import hal
-from hal.drivers.franka.emulator.control import Control
+from hal.drivers.franka.emulator.control import EmulatorControl
 
 STALL = 0.02
 """s; as many cycles without a command as the robot's controller allows."""
 
 
 @contextlib.contextmanager
-def emulator(robot: str, host: str) -> Iterator[Control]:
+def emulator(robot: str, host: str) -> Iterator[EmulatorControl]:
     """An emulator in a process of its own."""
     command = [sys.executable, "-m", "hal.drivers.franka.emulator", "--robot", robot, "--host", host, "--quiet"]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL) as process:
@@ -39,7 +39,7 @@ def emulator(robot: str, host: str) -> Iterator[Control]:
                 if process.poll() is not None or time.monotonic() > deadline:
                     raise SystemExit(f"the emulator at {host} did not start")
                 time.sleep(0.05)
-            yield Control(host)
+            yield EmulatorControl(host)
         finally:
             process.terminate()
             process.wait(5.0)

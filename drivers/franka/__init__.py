@@ -1,4 +1,4 @@
-"""A Franka arm and its hand over the network: FR3 by pylibfranka, Panda (FER) by panda-python. See docs/franka.md."""
+"""Driver of Franka arms and the Franka Hand: FR3 by pylibfranka, Panda (FER) by panda-python. See docs/franka.md."""
 
 from __future__ import annotations
 

@@ -1,12 +1,14 @@
-"""A Franka arm: reads a state and answers it with a set-point, a thousand times a second, at the robot's own pace.
+"""Driver of a Franka arm: reads a state and answers it with a set-point, 1000 times a second, at the robot's own pace.
 
-write ─► start a motion, then one set-point per state      halt ─► end it in order
-the robot ends it by itself (reflex, user stop) ─► a fault, until recover()
-the robot does not answer ─► lost; a new connection is tried, and what moved before does not go on by itself
+* ``write`` starts a motion, then sends one set-point per state; ``halt`` ends the motion.
+* When the robot ends a motion (reflex, user stop), the driver reports a fault until ``recover``.
+* When the robot does not answer, the connection counts as lost. The driver tries to connect again; a motion that was
+  interrupted does not resume.
 """
 
 from __future__ import annotations
 
+import contextlib
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -15,38 +17,39 @@ from typing import Any, ClassVar
 
 from hal.config.data_files import find_data
 from hal.driver import Reading, RobotDriver, Setpoint
-from hal.errors import RobotFault
+from hal.errors import ConnectionLost, DriverMissing, HalError, RobotFault
 from hal.histogram import Histogram
-from hal.kinematics.arm import Kinematics
+from hal.kinematics import Kinematics
+from hal.lock import DeviceLock
 from hal.preflight import has_realtime_kernel
 from hal.specs import RobotSpec
 from hal.types import Fault
 
-from .connection import Connection
-from .faults import fault_of, fault_of_exception, is_connection_lost
+from .faults import ARM_PORT, fault_of, fault_of_exception, is_connection_lost
 from .flags import FLAGS
-from .link import Kind, Link, Mode, Sample
-from .settings import ArmSettings
+from .link import ArmLink, ArmMode, ArmSample, StreamKind
+from .network import PortState, lock_arm, probe_port, resolve_host
+from .settings import ArmSettings, is_emulated
 
-__all__ = ["FrankaArm"]
+__all__ = ["ArmConnection", "FrankaArm", "create_link"]
 
-_RECOVERY = 3.0
-"""Longest time that a recovery may take until the robot is idle, s."""
-_AVERAGE = 200
-"""Commands after which a success rate, which is an average of the last 100, says something."""
+_RECOVERY_TIMEOUT = 3.0
+"""Longest time until the robot is idle after a recovery, s."""
+_RATED_COMMANDS = 200
+"""Commands after which the success rate, an average of the last 100 cycles, is recorded."""
 _NO_TORQUE = (0.0,) * 7
-_STILL = 5e-3
-"""A motion begins at rest: no set-point faster than this is its first, rad/s (5 rad/s2 within a cycle)."""
+_MAX_START_SPEED = 5e-3
+"""Largest speed of a motion's first set-point, rad/s (5 rad/s2 for one cycle): a motion starts at rest."""
 _DRIFT = 1e-6
-"""A controller that integrates velocities is no farther than this from its set-points, rad, unless one was lost."""
-_NOTHING_SHOWN: tuple[Mode | None, Fault | None] = (None, None)
-_CALM = frozenset({Mode.IDLE, Mode.MOVE})
-_BY_HAND = frozenset({Mode.USER_STOPPED, Mode.GUIDING, Mode.OTHER})
-"""What a person brought about at the arm or in Desk, and ends there."""
+"""Largest distance of a velocity controller's own position from the set-points, rad, unless one was lost."""
+_NOT_SHOWN: tuple[ArmMode | None, Fault | None] = (None, None)
+_READY_MODES = frozenset({ArmMode.IDLE, ArmMode.MOVE})
+_MANUAL_MODES = frozenset({ArmMode.USER_STOPPED, ArmMode.GUIDING, ArmMode.OTHER})
+"""Modes that a person starts and ends, at the arm or in Desk."""
 
 
 class FrankaArm(RobotDriver):
-    """An FR3 or a Panda. Which of the two, and where, stands in the rig (:class:`~.settings.ArmSettings`)."""
+    """An FR3 or a Panda, as its settings say (:class:`~.settings.ArmSettings`)."""
 
     modes: ClassVar[frozenset[str]] = frozenset({"position", "velocity", "torque"})
     paces_itself: ClassVar[bool] = True
@@ -54,33 +57,33 @@ class FrankaArm(RobotDriver):
     def __init__(self, spec: RobotSpec, world: object | None = None) -> None:
         super().__init__(spec, world)
         self.settings = ArmSettings.of(spec)
-        self._connection = Connection(spec.name, self.settings)
-        self._sample: Sample | None = None
+        self._connection = ArmConnection(spec.name, self.settings)
+        self._sample: ArmSample | None = None
         self._fault: Fault | None = None
-        """What ended a motion; kept until recover(), though the robot may be idle again."""
-        self._passing = self._told = False
-        """Does the fault go by itself, once the robot is ready again and it was told?"""
-        self._shown = _NOTHING_SHOWN
-        """The mode that was looked at last, and what it means."""
+        """Fault that ended a motion; kept until recover(), even if the robot is idle again."""
+        self._transient = self._reported = False
+        """Whether the fault clears itself once the robot is ready again, and whether it has been reported."""
+        self._shown = _NOT_SHOWN
+        """Last mode that was interpreted, and its fault."""
         self._inertias: Kinematics | None = None
         self.success_min = inf
         """Lowest success rate so far."""
         self._t_received = 0.0
         self.reset_statistics()
 
-    # The connection.
+    # Connection.
 
     def open(self) -> None:
-        """Connect, and tell the robot the rig's settings. Nothing moves."""
+        """Connect, and send the rig's settings to the robot. Nothing moves."""
         self._sample = self._connection.open()
 
     def own_tcp(self) -> list[float] | None:
-        """Where the robot says that its end effector is: 4x4 by columns, in the base frame, m."""
+        """Return the end effector's pose as the robot reports it: 4x4 by columns, in the base frame, m."""
         link = self._connection.link
         return None if link is None else link.tcp()
 
     def close(self) -> None:
-        """End the motion, if there is one, and disconnect. Idempotent."""
+        """End the motion, if one is running, and disconnect. Idempotent."""
         try:
             link = self._connection.link
             if link is not None and not link.owns_loop:
@@ -93,15 +96,15 @@ class FrankaArm(RobotDriver):
     def wait(self) -> None:
         connection = self._connection
         if connection.link is None:
-            self._sample = connection.look_for_it() or self._sample
+            self._sample = connection.try_reconnect() or self._sample
             return
-        if self._passing and self._told:
-            self._fault, self._passing = None, False
+        if self._transient and self._reported:
+            self._fault, self._transient = None, False
         before = self._sample
         try:
             self._sample = connection.link.read()
-        except connection.troubles as error:
-            self._failed(error)
+        except connection.library_errors as error:
+            self._handle_failure(error)
         self._t_received = time.perf_counter()
         if before is not None and self._sample is not None:
             self.lost_states += max(0, round(1e3 * (self._sample.t - before.t)) - 1)
@@ -110,13 +113,13 @@ class FrankaArm(RobotDriver):
         s, link = self._sample, self._connection.link
         if link is None or s is None:
             raise self._connection.error()
-        if s.mode in _CALM:
-            fault, self._shown = self._fault, _NOTHING_SHOWN
+        if s.mode in _READY_MODES:
+            fault, self._shown = self._fault, _NOT_SHOWN
         else:
             fault = self._present_fault(link, s.mode)
-        self._told = fault is not None
-        # In torque mode: what drives the arm. Else tau_d is what its own controller wants.
-        taken = s.tau_d if link.motion is Kind.TORQUE else _NO_TORQUE
+        self._reported = fault is not None
+        # In torque mode tau_d is what drives the arm; otherwise it is what the arm's own controller commands.
+        taken = s.tau_d if link.motion is StreamKind.TORQUE else _NO_TORQUE
         seq = round(1e3 * s.t)
         return Reading(now, s.t, seq, s.q, s.dq, s.tau, s.q_d, s.dq_d, s.tau_ext, s.wrench_ext, fault, taken)
 
@@ -124,56 +127,57 @@ class FrankaArm(RobotDriver):
         s, link = self._sample, self._connection.link
         if link is None or s is None:
             raise self._connection.error()
-        if self._fault is not None or s.mode not in _CALM:
+        if self._fault is not None or s.mode not in _READY_MODES:
             return False
         kind = self._kind(setpoint)
-        if link.motion is None and max(map(abs, setpoint.dq)) > _STILL:
-            return False  # the robot ended the last one by itself: the servo comes to rest first
+        if link.motion is None and max(map(abs, setpoint.dq)) > _MAX_START_SPEED:
+            return False  # the robot ended the last motion: the servo has to come to rest first
         try:
             if link.motion is not kind:
-                self._begin(link, kind, s, setpoint)
+                self._start_motion(link, kind, s, setpoint)
                 return False
             link.send(self._values(kind, setpoint, s))
-        except self._connection.troubles as error:
-            self._failed(error)
+        except self._connection.library_errors as error:
+            self._handle_failure(error)
             return False
         self.commands += 1
         if not link.owns_loop:
             self.answer_times.add(time.perf_counter() - self._t_received)
-        if self.commands > _AVERAGE:
+        if self.commands > _RATED_COMMANDS:
             self.success_min = min(self.success_min, s.success_rate)
         return True
 
-    def _kind(self, setpoint: Setpoint) -> Kind:
+    def _kind(self, setpoint: Setpoint) -> StreamKind:
         if setpoint.tau is not None:
-            return Kind.TORQUE
-        return Kind.VELOCITY if self.settings.stream == "velocity" else Kind.POSITION
+            return StreamKind.TORQUE
+        return StreamKind.VELOCITY if self.settings.stream == "velocity" else StreamKind.POSITION
 
-    def _values(self, kind: Kind, setpoint: Setpoint, s: Sample) -> Any:
-        if kind is Kind.TORQUE:
+    def _values(self, kind: StreamKind, setpoint: Setpoint, s: ArmSample) -> Any:
+        if kind is StreamKind.TORQUE:
             return setpoint.tau
-        if kind is Kind.POSITION:
+        if kind is StreamKind.POSITION:
             return setpoint.q
-        # The velocity that brings the controller's own position to the set-point in one cycle, so that nothing drifts;
-        # a report that is late or noisy is not that position.
+        # The velocity that brings the controller's own position to the set-point within one cycle, so that nothing
+        # drifts. A late or noisy report is not that position.
         start = s.q_d
         if setpoint.q_from is not None and dist(start, setpoint.q_from) > _DRIFT:
             start = setpoint.q_from
         return [(q - q_d) * self.spec.rate_hz for q, q_d in zip(setpoint.q, start, strict=True)]
 
-    def _begin(self, link: Link, kind: Kind, s: Sample, setpoint: Setpoint) -> None:
-        """Start a motion of this kind; where another one runs, end that first."""
+    def _start_motion(self, link: ArmLink, kind: StreamKind, s: ArmSample, setpoint: Setpoint) -> None:
+        """Start a motion of this kind, or end the one that is running."""
         if link.motion is not None:
             link.finish()
-        if link.motion is None:  # a library with a loop of its own ends a motion when the cycle returns to it
+        if link.motion is None:  # a library with its own loop ends a motion when the cycle returns to it
             self._connection.configure(s)
             link.still = setpoint.q
             link.start(kind)
 
     def mass_matrix(self, q: Sequence[float]) -> Any:
-        """Joint-space inertia (n, n), kg m2, at ``q``, by the published inertias of an FR3 with its hand.
+        """Return the joint-space inertia (n, n), kg m2, at ``q`` (n,), rad.
 
-        A Panda has the same lengths and nearly the same masses; the URDF that comes with PyBullet invents inertias.
+        It uses the published inertias of an FR3 with its hand. A Panda has the same lengths and nearly the same
+        masses; the inertias in PyBullet's URDF of the Panda are invented.
         """
         if self._inertias is None:
             spec = self.spec.kinematics
@@ -185,46 +189,46 @@ class FrankaArm(RobotDriver):
         return self._inertias.mass_matrix(q)
 
     def halt(self) -> None:
-        """End the motion: the robot holds by itself."""
+        """End the motion: the robot holds its position."""
         link = self._connection.link
         if link is None or link.motion is None:
             return
         try:
             link.finish()
-        except self._connection.troubles as error:
-            self._failed(error)
+        except self._connection.library_errors as error:
+            self._handle_failure(error)
 
     @property
     def wants_loop(self) -> bool:
-        """A Panda's motion runs in its library's loop."""
+        """Whether the motion has to run in the library's own loop (Panda)."""
         link = self._connection.link
         return link is not None and link.owns_loop and link.motion is not None
 
     def loop(self, turn: Callable[[], None]) -> None:
-        """Run the motion that was begun."""
+        """Run the motion that was started in the library's loop; ``turn`` is one cycle."""
         link = self._connection.link
         assert link is not None
         failed: list[BaseException] = []
 
-        def guarded() -> None:
+        def guarded_turn() -> None:
             try:
                 turn()
             except BaseException as error:
-                failed.append(error)  # not the library's: it must not be taken for a fault of the robot
+                failed.append(error)  # an error of the cycle must not count as a fault of the robot
                 raise
-            self.answer_times.add(time.perf_counter() - self._t_received)  # the answer goes when the turn is over
+            self.answer_times.add(time.perf_counter() - self._t_received)  # the answer leaves when the turn is over
 
         try:
-            link.run(guarded)
+            link.run(guarded_turn)
         except BaseException as error:
-            if failed or not isinstance(error, self._connection.troubles):
+            if failed or not isinstance(error, self._connection.library_errors):
                 raise
-            self._failed(error)
+            self._handle_failure(error)
 
     # Faults.
 
-    def _failed(self, error: Exception) -> None:
-        """A call of the library failed: is the robot gone, or did it end the motion?"""
+    def _handle_failure(self, error: Exception) -> None:
+        """Handle an exception of the library: either the connection is lost, or the robot ended the motion."""
         connection = self._connection
         link = connection.link
         assert link is not None
@@ -234,17 +238,20 @@ class FrankaArm(RobotDriver):
             return
         self.aborts += 1
         self._fault = fault_of_exception(error, realtime_kernel=has_realtime_kernel())
-        self._passing = self._told = False
+        self._transient = self._reported = False
         try:
             self._sample = s = link.read()
-        except connection.troubles as other:
+        except connection.library_errors as other:
             connection.lose(connection.explain(other))
             return
-        self._passing = s.mode in _BY_HAND
+        self._transient = s.mode in _MANUAL_MODES
 
-    def _present_fault(self, link: Link, mode: Mode) -> Fault | None:
-        """What keeps the robot from moving. What ended the motion explains a reflex best; the rest is as it is now."""
-        if mode is Mode.REFLEX and self._fault is not None:
+    def _present_fault(self, link: ArmLink, mode: ArmMode) -> Fault | None:
+        """Return what keeps the robot from moving now.
+
+        A reflex is best explained by the fault that ended the motion; every other mode by the present state.
+        """
+        if mode is ArmMode.REFLEX and self._fault is not None:
             return self._fault
         if mode is not self._shown[0]:
             fault = fault_of(link.errors(FLAGS), mode.name.lower(), realtime_kernel=has_realtime_kernel())
@@ -252,9 +259,11 @@ class FrankaArm(RobotDriver):
         return self._shown[1]
 
     def recover(self) -> None:
-        """Automatic error recovery, and wait until the robot is idle.
+        """Run the automatic error recovery, and wait until the robot is idle.
 
-        Raises RobotFault where that cannot help (user stop, guiding), ConnectionLost when the robot does not answer.
+        Raises:
+            RobotFault: Where that does not help (user stop, guiding); ``code`` is the fault's.
+            ConnectionLost: If the robot does not answer.
         """
         link, s = self._connection.link, self._sample
         if link is None or s is None:
@@ -262,27 +271,26 @@ class FrankaArm(RobotDriver):
         if link.motion is not None:
             return
         try:
-            if s.mode is Mode.REFLEX:
+            if s.mode is ArmMode.REFLEX:
                 link.recover()
             self._await_idle(link)
         except RobotFault:
             raise
-        except self._connection.troubles as error:
+        except self._connection.library_errors as error:
             fault = fault_of_exception(error, realtime_kernel=has_realtime_kernel())
-            raise RobotFault(fault.cause, fault.remedy) from None
+            raise RobotFault(fault.cause, fault.remedy, code=fault.code) from None
         self._fault = None
 
-    def _await_idle(self, link: Link) -> None:
-        deadline = time.monotonic() + _RECOVERY
+    def _await_idle(self, link: ArmLink) -> None:
+        deadline = time.monotonic() + _RECOVERY_TIMEOUT
         while True:
             self._sample = s = link.read()
-            if s.mode is Mode.IDLE:
+            if s.mode is ArmMode.IDLE:
                 return
-            if s.mode in (Mode.USER_STOPPED, Mode.GUIDING) or time.monotonic() > deadline:
+            if s.mode in (ArmMode.USER_STOPPED, ArmMode.GUIDING) or time.monotonic() > deadline:
                 fault = self._present_fault(link, s.mode)
-                raise RobotFault(
-                    fault.cause if fault else "the robot does not get ready", fault.remedy if fault else "look at Desk"
-                )
+                fault = fault or Fault("not_ready", "the robot did not become ready", "look at Desk")
+                raise RobotFault(fault.cause, fault.remedy, code=fault.code)
 
     # Statistics.
 
@@ -298,5 +306,163 @@ class FrankaArm(RobotDriver):
             "success_rate_min": None if self.success_min == inf else self.success_min,
             "received_to_sent_s": self.answer_times.summary(),
             "aborts": self.aborts,
-            "reconnects": self._connection.found_again,
+            "reconnects": self._connection.reconnects,
         }
+
+
+_EXTRAS = {"fr3": "franka", "fer": "panda"}
+
+
+def create_link(arm: str) -> ArmLink:
+    """Create a link to an arm, not connected yet. The vendor's library is imported here.
+
+    Args:
+        arm: ``fr3`` or ``fer`` (the Panda).
+
+    Raises:
+        DriverMissing: If the vendor's library is not installed.
+    """
+    try:
+        if arm == "fr3":
+            from .fr3 import Fr3Link
+
+            return Fr3Link()
+        from .panda import PandaLink
+
+        return PandaLink()
+    except ImportError as error:
+        advice = f"install it with: pip install 'robot-hal[{_EXTRAS[arm]}]'"
+        raise DriverMissing(f"driver 'franka' does not import: {error}; {advice}", name=error.name) from error
+
+
+_RETRY_PERIOD = 0.5
+"""s between attempts to find a lost robot again."""
+_FIRST_PROBE, _RETRY_PROBE = 2.0, 0.05
+"""Time-out of the check whether the robot's port is open, at first and after a loss, s."""
+_PROBE_PAUSE = 0.02
+"""s between that check and the connection, so that the robot does not take the two for two clients."""
+_PORT_MESSAGES = {
+    PortState.REFUSED: "Connection to FCI refused",
+    PortState.SILENT: "Connection timeout",
+    PortState.NO_ROUTE: "Connection error",
+}
+"""Messages of the libraries for the same conditions."""
+_START_EMULATOR = "start it in another terminal: python -m hal.drivers.franka.emulator --host {} (--help for more)"
+
+
+class ArmConnection:
+    """A link to one arm that may be lost and found again, reserved for this process.
+
+    Attributes:
+        link: The vendor's library, connected; None while the connection is lost.
+        lost: Reason for the loss, or None.
+        library_errors: Exception classes that the library raises.
+        reconnects: How often a lost robot was found again.
+    """
+
+    def __init__(self, name: str, settings: ArmSettings) -> None:
+        self.name = name
+        self.settings = settings
+        self.link: ArmLink | None = None
+        self.lost: Fault | None = None
+        self.library_errors: tuple[type[Exception], ...] = (RuntimeError,)
+        self.reconnects = 0
+        self._lock: DeviceLock | None = None
+        self._configured = False
+        self._retry_at = 0.0
+
+    def open(self) -> ArmSample:
+        """Reserve the arm, connect, and return its first state.
+
+        Raises:
+            ControlTaken: If another program on this computer uses the arm.
+            DriverMissing: If the vendor's library is not installed.
+            ConnectionLost: If the robot cannot be reached; ``code`` is the fault's.
+        """
+        self._lock = lock_arm(resolve_host(self.settings.host) or self.settings.host)
+        try:
+            link = create_link(self.settings.arm)
+            self._probe(_FIRST_PROBE)
+            return self._connect(link)
+        except BaseException as error:
+            self.close()
+            if isinstance(error, self.library_errors) and not isinstance(error, HalError):
+                raise self.error(self.explain(error)) from None
+            raise
+
+    def _probe(self, timeout: float) -> None:
+        """Raise ConnectionLost if the robot's port is not open: a library may hang for a minute in that case."""
+        host = self.settings.host
+        if resolve_host(host) is None:
+            raise self.error(self.explain(RuntimeError("Host not found")))
+        port = probe_port(host, ARM_PORT, timeout)
+        if port is PortState.REFUSED and is_emulated({"host": host}):
+            cause = f"no emulator listens at {host}, port {ARM_PORT}"
+            raise self.error(Fault("refused", cause, _START_EMULATOR.format(host)))
+        if port is not PortState.OPEN:
+            raise self.error(self.explain(RuntimeError(_PORT_MESSAGES[port])))
+        time.sleep(_PROBE_PAUSE)
+
+    def _connect(self, link: ArmLink) -> ArmSample:
+        self.link = link
+        self.library_errors = link.library_errors
+        link.connect(self.settings.host)
+        self._configured = False
+        sample = link.read()
+        self.configure(sample)
+        self.lost = None
+        return sample
+
+    def configure(self, sample: ArmSample) -> None:
+        """Send the rig's settings to the robot, once. A robot that is not idle accepts none; it gets them later."""
+        if not self._configured and self.link is not None and sample.mode is ArmMode.IDLE:
+            self.link.configure(self.settings)
+            self._configured = True
+
+    def lose(self, reason: Fault) -> None:
+        """Discard the link: the robot does not answer."""
+        self.lost = reason
+        self._retry_at = time.monotonic() + _RETRY_PERIOD
+        link, self.link = self.link, None
+        if link is not None:
+            with contextlib.suppress(*self.library_errors):  # the library may fail to sign off
+                link.disconnect()
+
+    def try_reconnect(self) -> ArmSample | None:
+        """Try once to connect again, if it is time; otherwise pause for 10 ms in place of the robot's pace."""
+        if time.monotonic() < self._retry_at:
+            time.sleep(0.01)
+            return None
+        try:
+            self._probe(_RETRY_PROBE)
+            sample = self._connect(create_link(self.settings.arm))
+        except ConnectionLost as error:
+            self.lose(error.fault or self.explain(error))
+        except self.library_errors as error:
+            self.lose(self.explain(error))
+        else:
+            self.reconnects += 1
+            return sample
+        return None
+
+    def explain(self, error: BaseException) -> Fault:
+        """Return the fault that an exception of the library stands for."""
+        return fault_of_exception(error, host=self.settings.host)
+
+    def error(self, fault: Fault | None = None) -> ConnectionLost:
+        """Return the exception to raise while there is no connection."""
+        fault = fault or self.lost or Fault("closed", "it is not open", "open the rig")
+        error = ConnectionLost(f"{self.name}: {fault.cause}; {fault.remedy}", code=fault.code)
+        error.fault = fault
+        return error
+
+    def close(self) -> None:
+        """Disconnect, and release the arm for other programs. Idempotent."""
+        link, self.link = self.link, None
+        try:
+            if link is not None:
+                link.disconnect()
+        finally:
+            if self._lock is not None:
+                self._lock.release()
+                self._lock = None

@@ -1,47 +1,233 @@
-"""A Franka's faults as states: what a flag, a mode or an exception of the client libraries means, and what mends it.
+"""Faults of a Franka: what each error flag, robot mode and client-library exception means, and how to fix it.
 
-``pylibfranka`` raises classes of its own, ``panda_py`` mostly a plain RuntimeError; both carry libfranka's text, and
-that is what is understood here.
+``pylibfranka`` raises classes of its own, ``panda_py`` mostly a plain RuntimeError. Both carry libfranka's message,
+which :func:`fault_of_exception` interprets.
 """
 
 from __future__ import annotations
 
 import re
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 from hal.types import Fault
 
-from .fault_texts import FLAG_TEXTS, LOSSY
-from .troubles import NO_HAND, REFUSED, Trouble
+from .flags import FLAG_TEXTS, LOSSY_FLAGS
 
-__all__ = ["ARM_PORT", "HAND_PORT", "fault_of", "fault_of_exception", "flags_in", "is_connection_lost", "version_fault"]
+__all__ = [
+    "ARM_PORT",
+    "HAND_PORT",
+    "KNOWN_ERRORS",
+    "NO_HAND",
+    "NO_ROUTE",
+    "REFUSED",
+    "UNKNOWN_HOST",
+    "UNREACHABLE",
+    "KnownError",
+    "fault_of",
+    "fault_of_exception",
+    "flags_in",
+    "is_connection_lost",
+    "version_fault",
+]
 
 ARM_PORT, HAND_PORT = 1337, 1338
-"""The client libraries know no others."""
+"""Fixed TCP ports of the arm and of the Franka Hand."""
 _CODE, _CAUSE = 48, 160
-"""Bytes that a fault's code and cause may have (``hal/host/records.py``)."""
-_ALL = 0.995
-"""A success rate above this says nothing: it was looked at before the packets went missing."""
-_CALM = ("idle", "move")
-_MODES = {
-    "userstopped": Fault(
-        "user_stopped",
-        "the user stop is pressed; the joints hold by themselves",
-        "see that nobody is in the arm's way, then release the user stop (the external activation device)",
+"""Largest size of a fault's code and cause in a state record, bytes (``hal/host/records.py``)."""
+
+# Messages of the client libraries.
+
+
+@dataclass(frozen=True)
+class KnownError:
+    """An error that is recognised by the libraries' message, other than flags and versions."""
+
+    pattern: str
+    """Regular expression for the message."""
+    code: str
+    cause: str
+    """``{where}`` stands for the address."""
+    remedy: str
+    lost: bool = False
+    """Whether the connection is lost with it."""
+
+    def fault(self, where: str) -> Fault:
+        """Return the fault; ``where`` is the robot's address, or "the robot"."""
+        return Fault(self.code, self.cause.format(where=where), self.remedy.format(where=where))
+
+
+_CABLE = "check that the robot is switched on, and that the cable goes to Control's LAN port, not to the arm's base"
+_DESK_MESSAGE = "read the message in Desk, and check whether something touches the arm"
+_RELEASE = "check that the arm's workspace is clear, then release the user stop (the external activation device)"
+
+REFUSED = KnownError(
+    "Connection to FCI refused",
+    "refused",
+    "{where} refuses: FCI is not active, another program holds the robot, or this is not a robot",
+    "in Desk, unlock the joints and activate FCI; end other programs that use this arm",
+    lost=True,
+)
+UNREACHABLE = KnownError(
+    "Connection timeout",
+    "unreachable",
+    "no answer from {where}",
+    f"{_CABLE}; compare the address with the one in Desk (Settings, Network)",
+    lost=True,
+)
+UNKNOWN_HOST = KnownError(
+    "Host not found",
+    "unknown_host",
+    "unknown host {where}",
+    "give the robot's address as numbers, such as real: {{host: 172.16.0.2}}",
+    lost=True,
+)
+NO_ROUTE = KnownError(
+    "Connection error",
+    "no_way",
+    "no network of this computer leads to {where}",
+    "give a network port of this computer an address in the robot's network, such as 172.16.0.1/24",
+    lost=True,
+)
+NO_HAND = KnownError(
+    REFUSED.pattern,
+    "no_hand",
+    "{where} refuses: there is no hand, or it is not set up in Desk",
+    "connect the hand and select it in Desk as the end effector; for an arm without one, gripper: {{enabled: false}}",
+    lost=True,
+)
+"""Meaning of a refusal at the hand's port."""
+
+KNOWN_ERRORS = (
+    # The network.
+    REFUSED,
+    UNREACHABLE,
+    UNKNOWN_HOST,
+    NO_ROUTE,
+    KnownError(
+        "UDP receive: Timeout",
+        "silent",
+        "the robot has sent no state for 1 s ({where})",
+        f"{_CABLE}; if it never sent one, a firewall may block UDP (sudo iptables -L)",
+        lost=True,
     ),
+    KnownError(
+        r"TCP connection got interrupted|server closed connection|TCP send|Net Exception|UDP (send|receive)",
+        "closed",
+        "the robot closed the connection ({where}): it is restarting, or FCI was deactivated in Desk",
+        "wait until it has started, and activate FCI in Desk",
+        lost=True,
+    ),
+    KnownError(
+        "incorrect object size|incorrect model library|Unexpected response|protocol error",
+        "packets",
+        "the robot's packets do not match the client library ({where})",
+        "update the robot's system; pip install -U 'robot-hal[franka]'",
+        lost=True,
+    ),
+    KnownError(
+        "position_based_velocity_limits|parse URDF|[Uu]rdf",
+        "model",
+        "the client library cannot read the robot model that the robot sends",
+        "update the robot's system; pip install -U 'robot-hal[franka]'",
+        lost=True,
+    ),
+    # What stops a motion, or keeps it from starting.
+    KnownError(
+        "User Stop pressed",
+        "user_stopped",
+        "the user stop was pressed; the arm holds its position",
+        _RELEASE,
+    ),
+    KnownError(
+        "safety function",
+        "safety_rule",
+        "a safety rule of the robot forbids external motion commands",
+        "in Desk, open Watchman and disable or delete the rule that limits this motion",
+    ),
+    KnownError(
+        "manual error recovery required",
+        "manual_recovery",
+        "automatic recovery cannot clear this error",
+        "press the user stop and release it, or clear the error in Desk",
+    ),
+    KnownError(
+        "aborted by reflex",
+        "reflex",
+        "the robot stopped by a reflex, without a reason",
+        _DESK_MESSAGE,
+    ),
+    KnownError(
+        "singular pose",
+        "singular",
+        "the arm is in a singular pose and cannot start there",
+        "guide it by hand until its elbow is bent",
+    ),
+    KnownError(
+        "invalid argument|invalid input|out of range",
+        "invalid_argument",
+        "the robot refused a setting as out of range",
+        "check the numbers under real: in the rig file",
+    ),
+    KnownError(
+        "infinite or NaN",
+        "not_a_number",
+        "a set-point was not a finite number; nothing was sent",
+        "fix the program that commands the arm",
+    ),
+    KnownError(
+        "preempted",
+        "preempted",
+        "another command ended the motion",
+        "end the other program, or the Desk task, that uses this arm",
+    ),
+    KnownError(
+        "while another control or read operation",
+        "occupied",
+        "two parts of this program used the arm at once",
+        "this is an error in the driver; restart the program",
+    ),
+    KnownError(
+        "realtime|real-time",
+        "realtime",
+        "the client library was denied real-time scheduling",
+        "install a real-time kernel and allow rtprio; hal-check prints the commands",
+    ),
+    # The hand.
+    KnownError(
+        "gripper: Command failed",
+        "hand_failed",
+        "the hand could not carry out the command",
+        "check that the fingers can move; home the hand, which is needed once after it was switched on",
+    ),
+    KnownError(
+        "gripper: Command aborted",
+        "hand_aborted",
+        "the hand's motion was stopped",
+        "send the next command when the fingers are free",
+    ),
+    KnownError(
+        "command aborted",
+        "aborted",
+        "the robot ended the motion, without a reason",
+        "read the message in Desk",
+    ),
+)
+"""In order of precedence. Each message was observed from the libraries themselves, libfranka 0.9 (Panda) and 0.21
+(FR3); the unit tests raise them.
+"""
+
+_MODES = {
+    "userstopped": Fault("user_stopped", "the user stop is pressed; the arm holds its position", _RELEASE),
     "guiding": Fault(
         "guiding",
-        "somebody guides the arm by hand: the guiding buttons are pressed",
-        "let go of the guiding buttons and step back",
+        "the arm is being guided by hand: the guiding buttons are pressed",
+        "release the guiding buttons and step back",
     ),
     "automaticerrorrecovery": Fault(
         "recovering", "the robot is recovering from an error", "wait until it is done; that takes a few seconds"
     ),
-    "reflex": Fault(
-        "reflex",
-        "the robot stopped by a reflex, and does not say why",
-        "look at the message in Desk, and whether something touches the arm",
-    ),
+    "reflex": Fault("reflex", "the robot stopped by a reflex, without a reason", _DESK_MESSAGE),
     "other": Fault(
         "not_ready",
         "the robot is not ready: its brakes are closed, or Desk is using it",
@@ -49,10 +235,11 @@ _MODES = {
     ),
 }
 _MODES["recovering"] = _MODES["automaticerrorrecovery"]
+
 _PANDA, _FR3, _HAND = 5, 10, 3
-"""Protocols; that of the hand is the same on both arms."""
+"""Protocol versions; the hand's is the same on both arms."""
 _ARMS = {_PANDA: ("a Panda (FER)", "panda"), _FR3: ("an FR3", "fr3")}
-"""Protocol -> the arm in words, and its model."""
+"""Protocol version -> name of the arm, and its model in a rig file."""
 
 
 def fault_of(
@@ -61,22 +248,22 @@ def fault_of(
     success_rate: float | None = None,
     realtime_kernel: bool | None = None,
 ) -> Fault | None:
-    """What keeps the robot from moving, by its state; None where nothing does.
+    """Return the fault that keeps the robot from moving, according to its state; None if there is none.
 
-    ``names`` are the flags that are set now, or that ended the last motion: in the modes ``idle`` and ``move`` they
-    are history. ``robot_mode`` is spelt as any of the libraries does (``Reflex``, ``kUserStopped``, ``user_stopped``).
-    ``success_rate`` is the share of the last 100 set-points that came in time, ``realtime_kernel`` whether this
-    computer has one; None where nobody knows.
+    Args:
+        names: Flags that are set now, or that ended the last motion; in the modes ``idle`` and ``move`` they are
+            history and are ignored.
+        robot_mode: Mode in the spelling of any library (``Reflex``, ``kUserStopped``, ``user_stopped``).
+        success_rate: Share of the last 100 set-points that arrived in time, 0 to 1; None if unknown.
+        realtime_kernel: Whether this computer has a real-time kernel; None if unknown.
     """
     mode = _plain(robot_mode)
-    if mode in _CALM:
+    if mode in ("idle", "move"):
         return None
     if mode == "reflex" and names:
         return _fault_of_flags(names, success_rate, realtime_kernel)
     known = _MODES.get(mode)
-    return known or Fault(
-        "unknown_mode", f"the robot is in a mode that is not known here: {robot_mode}", "look at Desk"
-    )
+    return known or Fault("unknown_mode", f"the robot is in an unknown mode: {robot_mode}", "look at Desk")
 
 
 def fault_of_exception(
@@ -87,7 +274,15 @@ def fault_of_exception(
     success_rate: float | None = None,
     realtime_kernel: bool | None = None,
 ) -> Fault:
-    """What an exception of a client library means. The rest is as in :func:`fault_of`."""
+    """Return the fault that an exception of a client library stands for.
+
+    Args:
+        error: Exception of ``pylibfranka`` or ``panda_py``.
+        host: Address of the robot, for the texts; None for "the robot".
+        port: Port of the connection; a refusal at the hand's port means that there is no hand.
+        success_rate: As in :func:`fault_of`; a rate in the message takes precedence.
+        realtime_kernel: As in :func:`fault_of`.
+    """
     text = str(error)
     versions = _versions_in(error, text)
     if versions is not None:
@@ -98,62 +293,62 @@ def fault_of_exception(
         return _fault_of_flags(names, success_rate if rate is None else rate, realtime_kernel)
     mode = re.search(r'in the current mode \("(\w[\w ]*)"\)', text)
     if mode is not None:
-        return fault_of((), mode[1]) or _busy(mode[1])
-    trouble = Trouble.in_text(text)
-    if trouble is not None:
-        if trouble is REFUSED and port == HAND_PORT:
-            trouble = NO_HAND
-        return trouble.fault("the robot" if host is None else f"{host}:{port}")
-    told = " ".join(text.split()).removeprefix("libfranka: ") or type(error).__name__
-    return Fault("libfranka", _cut(told), "look at Desk, and run hal-check")
+        return fault_of((), mode[1]) or _busy_fault(mode[1])
+    known = _known_error_in(text)
+    if known is not None:
+        if known is REFUSED and port == HAND_PORT:
+            known = NO_HAND
+        return known.fault("the robot" if host is None else f"{host}:{port}")
+    message = " ".join(text.split()).removeprefix("libfranka: ") or type(error).__name__
+    return Fault("libfranka", _shortened(message), "look at Desk, and run hal-check")
 
 
 def is_connection_lost(error: BaseException) -> bool:
-    """Is the robot gone, as far as this object of the library is concerned? Then only a new one helps."""
+    """Return whether an exception of a client library means that only a new connection helps."""
     if isinstance(error, OSError) or _versions_in(error, str(error)) is not None:
         return True
     if flags_in(str(error)):
         return False
-    trouble = Trouble.in_text(str(error))
-    return type(error).__name__ == "NetworkException" or (trouble is not None and trouble.lost)
+    known = _known_error_in(str(error))
+    return type(error).__name__ == "NetworkException" or (known is not None and known.lost)
 
 
 def flags_in(text: str) -> tuple[str, ...]:
-    """The error flags that a text of libfranka names, by their names in :data:`~.flags.FLAGS`.
+    """Return the error flags that a message of libfranka names, by their names in :data:`~.flags.FLAGS`.
 
-    Two of them are spelt differently there.
+    libfranka spells two of them differently.
     """
     words = (word.lower().removesuffix("_flag") for word in re.findall(r'"(\w+)"', text))
     return tuple(word for word in words if word in FLAG_TEXTS)
 
 
 def version_fault(server: int, library: int) -> Fault:
-    """The robot speaks protocol ``server``, the client library ``library``."""
+    """Return the fault for a robot that speaks protocol ``server`` and a client library that speaks ``library``."""
     if library == _HAND:
-        remedy = "bring the hand's system up to date in Desk, together with the arm's"
+        remedy = "update the hand's system in Desk, together with the arm's"
         return Fault("version", f"the hand speaks protocol {server}, the client library {library}", remedy)
-    expected = _ARMS[library][0] if library in _ARMS else "the model in the rig's file"
+    expected = _ARMS[library][0] if library in _ARMS else "the model in the rig file"
     cause = f"the robot speaks protocol {server}, and {expected} speaks {library}"
     if server in _ARMS:
         name, model = _ARMS[server]
-        return Fault("version", f"{cause}: it is {name}", f"say model: {model} in the rig's file")
+        return Fault("version", f"{cause}: it is {name}", f"set model: {model} in the rig file")
     if server < _PANDA:
-        return Fault("version", f"{cause}: it is a Panda with an old system", "bring it to version 4.2.1 or later")
+        return Fault("version", f"{cause}: it is a Panda with an old system", "update it to version 4.2.1 or later")
     if server < _FR3:
-        remedy = "bring its system up to date in Desk, until it speaks protocol 10"
+        remedy = "update its system in Desk until it speaks protocol 10"
         return Fault("version", f"{cause}: it is an FR3 with an older system", remedy)
     return Fault("version", f"{cause}: it is newer than this driver", "pip install -U 'robot-hal[franka]'")
 
 
 def _fault_of_flags(names: Sequence[str], success_rate: float | None, realtime_kernel: bool | None) -> Fault:
-    """The most telling flag, and which others there are, or how many."""
+    """Return the fault of the most important flag; the others are named, or counted where space is short."""
     known = [name for name in FLAG_TEXTS if name in names]
     if not known:
-        return Fault(_code(names[0]), f"the robot reports {names[0]}, which is not known here", "look at Desk")
+        return Fault(_code(names[0]), f"the robot reports an unknown flag, {names[0]}", "look at Desk")
     first, *others = known
     cause, remedy = FLAG_TEXTS[first]
-    if first in LOSSY and success_rate:
-        cause += f"; {success_rate:.0%} of the last 100 came in time"
+    if first in LOSSY_FLAGS and success_rate:
+        cause += f"; {success_rate:.0%} of the last 100 arrived in time"
     if first == "communication_constraints_violation" and realtime_kernel is False:
         remedy = f"this kernel is not a real-time kernel: install one; {remedy}"
     if others:
@@ -162,30 +357,34 @@ def _fault_of_flags(names: Sequence[str], success_rate: float | None, realtime_k
     return Fault(_code(first), cause, remedy)
 
 
+def _known_error_in(text: str) -> KnownError | None:
+    return next((known for known in KNOWN_ERRORS if re.search(known.pattern, text)), None)
+
+
 def _code(name: str) -> str:
-    """A flag's name, shortened where it is too long for a state in memory."""
+    """A flag's name, shortened to the size of a state record."""
     return name if len(name) <= _CODE else name.replace("motion_generator", "mg").removesuffix("_violation")[:_CODE]
 
 
-def _cut(text: str) -> str:
+def _shortened(text: str) -> str:
     return text if len(text.encode()) <= _CAUSE else text.encode()[: _CAUSE - 3].decode(errors="ignore") + "..."
 
 
 def _plain(mode: str) -> str:
-    """A mode's name in small letters, without ``RobotMode.``, the C++ libraries' k, blanks and underscores."""
+    """A mode's name in lower case, without ``RobotMode.``, the C++ libraries' k, blanks and underscores."""
     name = mode.rpartition(".")[2]
     if re.match(r"k[A-Z]", name):
         name = name[1:]
     return re.sub(r"[^a-z]", "", name.lower())
 
 
-def _busy(mode: str) -> Fault:
-    doing = "moving already" if _plain(mode) == "move" else "idle, and refuses all the same"
-    return Fault("busy", f"the robot refused a command: it is {doing}", "end the motion first, or wait a moment")
+def _busy_fault(mode: str) -> Fault:
+    state = "moving already" if _plain(mode) == "move" else "idle, but refuses"
+    return Fault("busy", f"the robot refused a command: it is {state}", "end the motion first, or wait a moment")
 
 
 def _versions_in(error: BaseException, text: str) -> tuple[int, int] | None:
-    """The server's protocol and the library's, where the two do not fit."""
+    """Protocol versions of the server and of the library, where they differ."""
     server, library = getattr(error, "server_version", None), getattr(error, "library_version", None)
     if isinstance(server, int) and isinstance(library, int):
         return server, library

@@ -1,4 +1,4 @@
-"""The Franka Hand: widths, grasps and homing, with the hand's own client library in a process of its own."""
+"""Driver of the Franka Hand: widths, grasps and homing, with the hand's client library in a process of its own."""
 
 from __future__ import annotations
 
@@ -11,164 +11,170 @@ from hal.errors import CommandError, ConnectionLost
 from hal.specs import GripperSpec
 from hal.types import GripperOutcome
 
-from .hand_calls import Call, Seen
-from .hand_errands import Range, is_holding
-from .hand_link import HandLink, Lost
-from .hand_pilot import HandPilot, Order
+from .hand_motions import GripperCall, HandAction, HandController, HandState, WidthRange, is_holding
+from .hand_process import HandLink, LinkLost
 from .settings import HandSettings
 
-if importlib.util.find_spec("panda_py") is None:  # imported in a process of its own, but missed here and now
+if importlib.util.find_spec("panda_py") is None:  # the hand's process imports it; report its absence at once
     raise ModuleNotFoundError("No module named 'panda_py'", name="panda_py")
 
 __all__ = ["FrankaHand"]
 
-_SILENT = 1.0
-"""s without a state after which the hand does not answer."""
-_FIRST_STATE = 2.0
-"""s in which the first state must come."""
-_CLOSING = 0.5
-"""s in which fingers that are on their way must stop before the connection is closed."""
+_STATE_TIMEOUT = 1.0
+"""s without a state after which the hand counts as not answering."""
+_FIRST_STATE_TIMEOUT = 2.0
+"""s until the first state must have arrived."""
+_CLOSE_TIMEOUT = 0.5
+"""s for moving fingers to stop before the connection is closed."""
 
 
 class FrankaHand(GripperDriver):
     """A Franka Hand of an FR3 or a Panda.
 
-    Opening is the hand's ``move``, closing its ``grasp`` (:mod:`.hand_errands` says why), so what a ``move`` of ours
-    meets while it closes is held with the force that was asked for: ``MISSED``, and ``grasped``. Fingers that hold
-    something, or rest, are never told to stop: this hand may let go for it.
+    Opening uses the hand's ``move``, closing its ``grasp`` (:mod:`.hand_motions` explains why). An object that is met
+    while closing is therefore held with the requested force: the outcome is ``MISSED``, and ``grasped`` is true.
+    Fingers that hold an object, or rest, never get a stop, because the hand may release the object.
 
-    No call blocks, except ``open`` and, for half a second at most, ``close``. Stops are watched: a hand that ignores
-    one, or lets go for one, is told as a fault.
+    No call blocks, except ``open`` and, for half a second at most, ``close``. Stops are monitored: a stop that is
+    ignored, or that releases the object, is reported as a fault.
     """
 
     def __init__(self, spec: GripperSpec, world: object | None = None) -> None:
         super().__init__(spec, world)
         settings = HandSettings.of(spec)
         self._host = settings.host
-        self._range = Range(spec.width_max, settings.tolerance)
+        self._range = WidthRange(spec.width_max, settings.tolerance)
         self._link = HandLink(spec.name, settings.host)
-        self._pilot = HandPilot(self._range)
+        self._controller = HandController(self._range)
         self._target = 0.0
         self._seq = 0
         self._is_open = False
 
     def open(self) -> None:
-        """Connect, and wait for a first state. Raises ConnectionLost, NotSupported; nothing moves."""
+        """Connect, and wait for a first state. Nothing moves.
+
+        Raises:
+            ConnectionLost: If the hand cannot be reached, or sends no states.
+            NotSupported: If the hand's protocol version is not that of the client library.
+        """
         if self._is_open:
             return
-        self._pilot = HandPilot(self._range)  # what was seen before it was closed is old
+        self._controller = HandController(self._range)  # states from before a close are outdated
         self._link.open()
         self._is_open = True
-        deadline = time.monotonic() + _FIRST_STATE
-        while self._pilot.seen is None:
+        deadline = time.monotonic() + _FIRST_STATE_TIMEOUT
+        while self._controller.state is None:
             if time.monotonic() > deadline:
                 self.close()
-                raise ConnectionLost(
-                    f"{self.spec.name}: {self._link.why or f'the hand at {self._host} sends no states'}"
-                )
+                reason = self._link.reason or f"the hand at {self._host} sends no states"
+                raise ConnectionLost(f"{self.spec.name}: {reason}", code="silent")
             time.sleep(0.005)
-            self._pump()
-        self._target = self._pilot.seen.width
+            self._process_events()
+        self._target = self._controller.state.width
 
     def read(self, now: float) -> GripperReading:
-        """The newest state. Raises ConnectionLost when the hand has been silent for a second."""
-        self._pump()
-        seen = self._fresh()
-        pilot = self._pilot
-        running = pilot.outcome is GripperOutcome.RUNNING
+        """Return the newest state. Raises ConnectionLost when the hand has sent none for a second."""
+        self._process_events()
+        state = self._fresh_state()
+        controller = self._controller
+        running = controller.outcome is GripperOutcome.RUNNING
         return GripperReading(
-            t=now - (time.monotonic() - seen.t),
-            t_device=seen.t_hand,
+            t=now - (time.monotonic() - state.t),
+            t_device=state.t_hand,
             seq=self._seq,
-            width=seen.width,
+            width=state.width,
             width_target=self._target,
-            moving=pilot.moving,
-            grasped=is_holding(seen),
-            outcome=pilot.outcome,
-            fault=pilot.fault or (None if running else self._range.trouble(seen)),
+            moving=controller.moving,
+            grasped=is_holding(state),
+            outcome=controller.outcome,
+            fault=controller.fault or (None if running else self._range.fault(state)),
         )
 
-    def _fresh(self) -> Seen:
-        seen = self._pilot.seen
-        assert seen is not None
-        age = time.monotonic() - seen.t
-        if age > _SILENT:
-            why = f"; {self._link.why}" if self._link.why else ""
-            raise ConnectionLost(f"{self.spec.name}: the hand at {self._host} has been silent for {age:.1f} s{why}")
-        return seen
+    def _fresh_state(self) -> HandState:
+        state = self._controller.state
+        assert state is not None
+        age = time.monotonic() - state.t
+        if age > _STATE_TIMEOUT:
+            reason = f"; {self._link.reason}" if self._link.reason else ""
+            text = f"{self.spec.name}: the hand at {self._host} has sent no state for {age:.1f} s{reason}"
+            raise ConnectionLost(text, code="silent")
+        return state
 
-    def _pump(self) -> None:
-        """Take what came, do what is due. Raises ConnectionLost before :meth:`open`: the link connects by itself."""
+    def _require_open(self) -> None:
+        """Raise ConnectionLost before :meth:`open`: the link would connect otherwise."""
         if not self._is_open:
-            raise ConnectionLost(f"{self.spec.name} is not open")
+            raise ConnectionLost(f"{self.spec.name} is not open", code="closed")
+
+    def _process_events(self) -> None:
+        """Process what has arrived from the hand, and send what is due. Raises ConnectionLost before :meth:`open`."""
+        self._require_open()
         for event in self._link.poll():
-            if isinstance(event, Seen):
+            if isinstance(event, HandState):
                 self._seq += 1
-                self._pilot.see(event)
-            elif isinstance(event, Lost):
-                self._pilot.lost(event)
+                self._controller.update(event)
+            elif isinstance(event, LinkLost):
+                self._controller.connection_lost(event)
             else:
-                self._pilot.answer(event, time.monotonic())
-        order = self._pilot.next_order(time.monotonic())
-        if isinstance(order, Call):
-            self._link.call(order.method, order.arguments)
-        elif order is Order.STOP:
+                self._controller.call_ended(event, time.monotonic())
+        action = self._controller.next_action(time.monotonic())
+        if isinstance(action, GripperCall):
+            self._link.call(action.method, action.arguments)
+        elif action is HandAction.STOP:
             self._link.stop()
-        elif order is Order.RECONNECT:
-            self._link.restart("the hand did not end a motion, though it was told to stop")
+        elif action is HandAction.RECONNECT:
+            self._link.restart("the hand did not end a motion in spite of a stop")
 
     # Commands.
 
     def move(self, width: float, speed: float, force: float) -> None:
-        """Bring the fingers to ``width``, cut to what the hand can do, or onto what is between them."""
+        """Move the fingers to ``width`` (m), clipped to the hand's range, or until they meet an object."""
         self._check(width, speed, force)
         self._target = min(max(width, 0.0), self.spec.width_max)
-        self._pilot.reach(self._target, min(speed, self.spec.speed), force)
-        self._pump()
+        self._controller.move(self._target, min(speed, self.spec.speed), force)
+        self._process_events()
 
     def grasp(self, width: float, speed: float, force: float, inner: float, outer: float) -> None:
-        """Close on something and hold it. Where the hand holds already, only the same force is possible."""
+        """Close on an object and hold it. A hand that holds one already accepts only the same force."""
         self._check(width, speed, force, inner, outer)
         self._target = min(max(width, 0.0), self.spec.width_max)
-        self._pilot.grasp(self._target, min(speed, self.spec.speed), force, inner, outer)
-        self._pump()
+        self._controller.grasp(self._target, min(speed, self.spec.speed), force, inner, outer)
+        self._process_events()
 
     def home(self) -> None:
-        """Find out how far the fingers open. Refused while the hand holds something: that would fall."""
+        """Measure how far the fingers open. Refused while the hand holds an object, which would fall."""
         self._check()
         self._target = self.spec.width_max
-        self._pilot.home()
-        self._pump()
+        self._controller.home()
+        self._process_events()
 
     def stop(self) -> None:
-        """Stay there; what is held stays held."""
-        if not self._is_open:
-            raise ConnectionLost(f"{self.spec.name} is not open")
-        self._pilot.stop()
-        self._pump()
+        """Stop the fingers; an object stays held."""
+        self._require_open()
+        self._controller.stop()
+        self._process_events()
 
     def _check(self, *numbers: float) -> None:
         if not all(map(math.isfinite, numbers)):
-            raise CommandError(f"{self.spec.name}: {numbers} are not all numbers")
+            raise CommandError(f"{self.spec.name}: {numbers} are not all finite numbers")
         if len(numbers) > 1 and not (numbers[1] > 0.0 and numbers[2] > 0.0):
             raise CommandError(f"{self.spec.name}: speed and force must be positive, not {numbers[1]} and {numbers[2]}")
-        self._pump()
-        self._fresh()
+        self._process_events()
+        self._fresh_state()
         if not self._link.up:
             raise ConnectionLost(
-                f"{self.spec.name}: the connection to the hand at {self._host} is lost; {self._link.why}"
+                f"{self.spec.name}: the connection to the hand at {self._host} is lost; {self._link.reason}"
             )
 
     def close(self) -> None:
-        """Stop fingers that are on their way, leave alone what holds, and hang up. Idempotent."""
+        """Stop moving fingers, keep a grasp as it is, and disconnect. Idempotent."""
         if not self._is_open:
             self._link.close()
             return
-        self._pilot.stop()
-        deadline = time.monotonic() + _CLOSING
-        self._pump()
-        while self._pilot.busy and time.monotonic() < deadline:
+        self._controller.stop()
+        deadline = time.monotonic() + _CLOSE_TIMEOUT
+        self._process_events()
+        while self._controller.busy and time.monotonic() < deadline:
             time.sleep(0.005)
-            self._pump()
+            self._process_events()
         self._is_open = False
         self._link.close()

@@ -1,9 +1,9 @@
-"""The process in which a Franka Hand's client library lives, and can be ended with it.
+"""The Franka Hand's client library in a process of its own, and the driver's side of the connection to it.
 
-The library blocks in ways that no thread is safe from. Measured with panda-python 1.1 (libfranka 0.9): its constructor
-and ``read_once`` hold the interpreter, the second for up to a second when no states come, the first for ever when the
-hand takes the connection and says nothing. When the hand hangs up during a motion, the call never returns, and takes
-a whole core. The motions and ``stop`` let other threads run.
+The library blocks in ways that threads do not protect from. Measured with panda-python 1.1 (libfranka 0.9): its
+constructor and ``read_once`` hold the interpreter, the latter for up to a second when no states arrive, the former
+forever when the hand accepts the connection and sends nothing. When the hand disconnects during a motion, the call
+never returns and uses a whole core. The motions and ``stop`` release the interpreter.
 """
 
 from __future__ import annotations
@@ -15,36 +15,228 @@ import signal
 import threading
 import time
 from collections import deque
-from collections.abc import Sequence
-from typing import Any, NoReturn
+from collections.abc import Iterator, Sequence
+from typing import Any, NoReturn, TypeAlias
 
-from hal.errors import ConnectionLost, NotSupported
-from hal.host.process import Channel, SharedMemory
+from hal.errors import ConnectionLost, HalError, NotSupported
+from hal.host.process import Channel, Child, SharedMemory, unpack_error
+from hal.types import Fault
 
-from .faults import fault_of_exception
+from .faults import HAND_PORT, fault_of_exception
+from .hand_motions import CallAnswer, HandState
 
-__all__ = ["main"]
+__all__ = ["HandLink", "LinkEvent", "LinkLost", "main"]
 
-_PORT = 1338
-_LOOK = 0.5
-"""s between two looks whether the driver is still there."""
+_TARGET = "hal.drivers.franka.hand_process:main"
+_OPEN_TIMEOUT = 8.0
+"""Longest time for the first connection, including the start of the process, s."""
+_STATE_TIMEOUT = 2.0
+"""s without a state after which the connection counts as lost: the library does not notice a hand that disconnected."""
+_PROCESS_TIMEOUT = 6.0
+"""s without any message after which the process counts as hung."""
+_RESTART_PAUSE = 1.0
+"""s between the end of one process and the start of the next, and between two attempts to connect."""
+_PARENT_CHECK = 0.5
+"""s between two checks whether the driver still exists."""
 _HUNG = 10
-"""s after which a process that does not even look is ended by the system."""
-_SHARE = 0.5
-"""Part of the time between two states in which ``read_once`` does not keep the other threads waiting."""
+"""s without such a check after which the system ends the process."""
+_READ_SHARE = 0.5
+"""Part of the time between two states that is left to the other threads before the next ``read_once``."""
 _PERIODS = 16
-"""So many of the last periods count; the shortest is the one."""
-_BREATH = 0.002
-"""s that the other threads have at least."""
-_PAUSE = 1.0
-"""s between two attempts to connect."""
+"""Number of state periods whose shortest counts."""
+_MIN_PAUSE = 0.002
+"""Shortest time for the other threads, s."""
 
 
-class _Hand:
-    """One connection. States, answers and a word for every silence go to the driver as they come."""
+# The driver's side.
+
+
+class LinkLost(str):
+    """Event: the connection is lost, with the reason."""
+
+
+LinkEvent: TypeAlias = "HandState | CallAnswer | LinkLost"
+
+
+class HandLink:
+    """Connection to the hand through one client process after another. Never blocks, and reconnects by itself."""
+
+    def __init__(self, name: str, host: str) -> None:
+        self._name = name
+        self._host = host
+        self._child: Child | None = None
+        self._connecting = False
+        self._number = 0
+        self._pending = 0
+        """Number of the motion whose answer is pending; 0 for none."""
+        self._t_message = 0.0
+        self._t_state = 0.0
+        self._t_next = 0.0
+        """Earliest start of the next process."""
+        self.reason = ""
+        """Why there is no state, if known."""
+
+    def open(self) -> None:
+        """Connect, and wait until the connection is up.
+
+        Raises:
+            ConnectionLost: If the hand cannot be reached; the message says what to do.
+            NotSupported: If the hand's protocol version is not that of the client library.
+        """
+        self._start(retry=False)
+        assert self._child is not None
+        try:
+            self._child.wait_ready(_OPEN_TIMEOUT)
+        except ConnectionLost as error:
+            self._end()
+            text = str(error)
+            if "did not get ready" in text:
+                text = f"{self._host} accepts a connection to the hand but sends nothing; is another program using it?"
+            raise ConnectionLost(f"{self._name}: {text}") from None
+        except HalError as error:
+            self._end()
+            raise type(error)(f"{self._name}: {error}", code=error.code) from None
+        self._connecting = False
+        self._t_message = self._t_state = time.monotonic()
+
+    @property
+    def up(self) -> bool:
+        """Whether calls can be sent."""
+        return self._child is not None and not self._connecting
+
+    def poll(self) -> Iterator[LinkEvent]:
+        """Yield the events since the last call."""
+        child, now = self._child, time.monotonic()
+        if child is None:
+            if now >= self._t_next:
+                self._start(retry=True)
+            return
+        try:
+            while (message := child.channel.poll()) is not None:
+                self._t_message = now
+                yield from self._events_of(message)
+        except ConnectionLost:
+            self.restart(self.reason or f"the client process for the hand at {self._host} ended")
+        if now - self._t_message > _PROCESS_TIMEOUT:
+            self.restart(f"the client library hangs; {self._host} accepts a connection to the hand but sends nothing")
+        elif now - self._t_state > _STATE_TIMEOUT and not self._connecting:
+            self.restart(self.reason)
+        if self._child is None:
+            yield LinkLost(self.reason)
+
+    def _events_of(self, message: dict[str, Any]) -> Iterator[LinkEvent]:
+        if "state" in message:
+            self._t_state, self.reason = self._t_message, ""
+            yield HandState(*message["state"])
+        elif "answer" in message:
+            number, answer = message["answer"]
+            if number == self._pending:
+                self._pending = 0
+                yield answer if isinstance(answer, bool) else Fault(*answer)
+        elif "silent" in message:
+            self.reason = message["silent"]
+        elif "ready" in message:
+            self._connecting, self._t_state = False, self._t_message
+        elif "error" in message:
+            self.reason = str(unpack_error(message["error"]))
+
+    def call(self, method: str, arguments: tuple[float, ...]) -> None:
+        """Start a motion by the library's method; its answer arrives as an event."""
+        self._number += 1
+        self._pending = self._number
+        self._send(method, arguments)
+
+    def stop(self) -> None:
+        """Stop the running motion. The motion's answer reports the end; the stop itself has none."""
+        if self._pending:
+            self._send("stop", ())
+
+    def _send(self, method: str, arguments: tuple[float, ...]) -> None:
+        if self._child is not None:
+            with contextlib.suppress(ConnectionLost):  # poll() notices it
+                self._child.channel.send({"id": self._pending, "method": method, "params": arguments}, timeout=0.1)
+
+    def restart(self, reason: str) -> None:
+        """End this connection; :meth:`poll` starts the next one."""
+        self.reason = reason
+        self._end()
+        self._t_next = time.monotonic() + _RESTART_PAUSE
+
+    def _start(self, retry: bool) -> None:
+        self._connecting = True
+        self._pending = 0
+        self._t_next = time.monotonic() + _RESTART_PAUSE  # also if no process can be started
+        self._child = Child(f"{self._name} client", _TARGET, {"host": self._host, "retry": retry})
+        self._t_message = self._t_state = time.monotonic()
+
+    def _end(self) -> None:
+        child, self._child = self._child, None
+        if child is not None:
+            child.process.kill()  # it has nothing to clean up, and may not end otherwise
+            child.close(timeout=1.0)
+
+    def close(self) -> None:
+        """Disconnect. Idempotent."""
+        self._end()
+
+
+# The client process.
+
+
+def main(channel: Channel, memories: Sequence[SharedMemory], config: dict[str, Any]) -> None:
+    """Entry point of the client process.
+
+    Args:
+        channel: Connection to the driver.
+        memories: Unused.
+        config: ``host``, and ``retry``: whether to try again after a failed attempt to connect.
+    """
+    signal.alarm(_HUNG)
+    parent = os.getppid()
+    host, retry = config["host"], config["retry"]
+    gripper = _connect(host)
+    while retry and isinstance(gripper, str) and os.getppid() == parent:
+        signal.alarm(_HUNG)
+        channel.send({"silent": gripper})
+        time.sleep(_RESTART_PAUSE)
+        gripper = _connect(host)
+    if isinstance(gripper, str):
+        raise ConnectionLost(gripper)
+    channel.send({"ready": gripper.server_version()})
+    client = _HandThreads(channel, gripper, host)
+    while os.getppid() == parent:
+        signal.alarm(_HUNG)
+        message = channel.receive(_PARENT_CHECK)
+        if message is None:
+            continue
+        if message["method"] == "close":
+            return
+        client.request(message["id"], message["method"], message["params"])
+
+
+def _connect(host: str) -> Any:
+    """Return the library's object, or the reason for its absence. Raises NotSupported for another version."""
+    from panda_py import libfranka
+
+    try:
+        return libfranka.Gripper(host)
+    except RuntimeError as error:
+        text = _explain(error, host)
+        if fault_of_exception(error).code == "version":
+            raise NotSupported(text, code="version") from None
+        return text
+
+
+def _explain(error: RuntimeError, host: str) -> str:
+    fault = fault_of_exception(error, host=host, port=HAND_PORT)
+    return f"{fault.cause}; {fault.remedy}"
+
+
+class _HandThreads:
+    """One connection, with a thread each for states, motions and stops; all report to the driver."""
 
     def __init__(self, channel: Channel, gripper: Any, host: str) -> None:
-        self._news = Channel(channel.sock.dup())  # the other one listens, with time limits of its own
+        self._output = Channel(channel.sock.dup())  # the main thread receives on the other, with its own time-outs
         self._gripper = gripper
         self._host = host
         self._motions: queue.SimpleQueue[tuple[int, str, list[float]]] = queue.SimpleQueue()
@@ -53,36 +245,36 @@ class _Hand:
         self._begun = 0
         """Number of the newest motion that has begun."""
         self._running = 0
-        """Number of the motion that is on its way; 0 for none."""
-        for target in (self._read, self._move, self._stop):
+        """Number of the running motion; 0 for none."""
+        for target in (self._run_states, self._run_motions, self._run_stops):
             threading.Thread(target=target, daemon=True).start()
 
-    def take(self, number: int, method: str, arguments: list[float]) -> None:
-        """Begin a motion, or stop the one of that number."""
+    def request(self, number: int, method: str, arguments: list[float]) -> None:
+        """Start a motion, or stop the one with that number."""
         if method == "stop":
             self._stops.put(number)
         else:
             self._motions.put((number, method, arguments))
 
-    def _read(self) -> NoReturn:
-        """Pass every state on. In between, for a part of the time until the next one, the other threads have a turn."""
+    def _run_states(self) -> NoReturn:
+        """Forward every state, and leave the interpreter to the other threads for a part of the time in between."""
         periods: deque[float] = deque(maxlen=_PERIODS)
         before = time.monotonic()
         while True:
             try:
                 state = self._gripper.read_once()
             except RuntimeError as error:
-                self._tell({"silent": _words(error, self._host)})
-                time.sleep(_BREATH)  # an error that comes at once must not take a whole core
+                self._report({"silent": _explain(error, self._host)})
+                time.sleep(_MIN_PAUSE)  # an error that returns at once must not use a whole core
                 continue
             now = time.monotonic()
             values = [state.width, state.max_width, bool(state.is_grasped), state.temperature]
-            self._tell({"state": [now, state.time.to_sec(), *values]})
+            self._report({"state": [now, state.time.to_sec(), *values]})
             periods.append(now - before)
             before = now
-            time.sleep(max(_BREATH, _SHARE * min(periods)))
+            time.sleep(max(_MIN_PAUSE, _READ_SHARE * min(periods)))
 
-    def _move(self) -> NoReturn:
+    def _run_motions(self) -> NoReturn:
         while True:
             number, method, arguments = self._motions.get()
             with self._changed:
@@ -91,71 +283,28 @@ class _Hand:
             try:
                 answer: Any = bool(getattr(self._gripper, method)(*arguments))
             except RuntimeError as error:
-                fault = fault_of_exception(error, host=self._host, port=_PORT)
+                fault = fault_of_exception(error, host=self._host, port=HAND_PORT)
                 answer = [fault.code, fault.cause, fault.remedy]
             self._running = 0
-            self._tell({"answer": [number, answer]})
+            self._report({"answer": [number, answer]})
 
-    def _stop(self) -> NoReturn:
-        """A stop must neither overtake its motion nor come when that is over: then it would do nothing, or harm.
+    def _run_stops(self) -> NoReturn:
+        """A stop must neither overtake its motion nor follow its end: then it would do nothing, or harm.
 
-        What it answers is worth nothing: the states tell.
+        Its answer is ignored: the states show the effect.
         """
         while True:
             number = self._stops.get()
             with self._changed:
                 while self._begun < number:
                     self._changed.wait()
-            time.sleep(_BREATH)  # the motion's request is on its way by then
+            time.sleep(_MIN_PAUSE)  # the motion's request has been sent by then
             if self._running == number:
                 with contextlib.suppress(RuntimeError):
                     self._gripper.stop()
 
-    def _tell(self, message: dict[str, Any]) -> None:
+    def _report(self, message: dict[str, Any]) -> None:
         try:
-            self._news.send(message)
+            self._output.send(message)
         except ConnectionLost:
             os._exit(0)  # the driver is gone
-
-
-def main(channel: Channel, memories: Sequence[SharedMemory], config: dict[str, Any]) -> None:
-    """Entry point of the child process. ``patient``: try to connect again and again, rather than fail."""
-    signal.alarm(_HUNG)
-    parent = os.getppid()
-    host, patient = config["host"], config["patient"]
-    gripper = _connect(host)
-    while patient and isinstance(gripper, str) and os.getppid() == parent:
-        signal.alarm(_HUNG)
-        channel.send({"silent": gripper})
-        time.sleep(_PAUSE)
-        gripper = _connect(host)
-    if isinstance(gripper, str):
-        raise ConnectionLost(gripper)
-    channel.send({"ready": gripper.server_version()})
-    hand = _Hand(channel, gripper, host)
-    while os.getppid() == parent:
-        signal.alarm(_HUNG)
-        message = channel.receive(_LOOK)
-        if message is None:
-            continue
-        if message["method"] == "close":
-            return
-        hand.take(message["id"], message["method"], message["params"])
-
-
-def _connect(host: str) -> Any:
-    """The library's object, or why there is none. Raises NotSupported where the versions do not fit."""
-    from panda_py import libfranka
-
-    try:
-        return libfranka.Gripper(host)
-    except RuntimeError as error:
-        text = _words(error, host)
-        if fault_of_exception(error).code == "version":
-            raise NotSupported(text) from None
-        return text
-
-
-def _words(error: RuntimeError, host: str) -> str:
-    fault = fault_of_exception(error, host=host, port=_PORT)
-    return f"{fault.cause}; {fault.remedy}"

@@ -1,4 +1,4 @@
-"""What Franka says its arms may do: joint and Cartesian limits of the FR3 and of the Panda (FER), with sources.
+"""Published limits of Franka's arms: joints and Cartesian motion of the FR3 and of the Panda (FER), with sources.
 
 Sources, all in the repository frankarobotics/docs, as of 2026-05: the page "Robot and interface specifications"
 (``source/control_parameters.rst``: conditions, Cartesian limits, the formula for the FR3's joint speeds) and its tables
@@ -27,12 +27,12 @@ __all__ = [
 Seven = tuple[float, float, float, float, float, float, float]
 
 ELBOW_FLIP = -0.467002423653011
-"""Angle of joint 4 at which the arm is stretched farthest, rad: the elbow's sign changes there."""
+"""Angle of joint 4 at which the arm is fully stretched, rad; the sign of the elbow changes there."""
 
 
 @dataclass(frozen=True)
 class Derivatives:
-    """How fast one Cartesian quantity may change: velocity, acceleration and jerk, in m or rad and s."""
+    """Limits of one Cartesian quantity: velocity, acceleration and jerk, in m or rad and s."""
 
     velocity: float
     acceleration: float
@@ -41,7 +41,7 @@ class Derivatives:
 
 @dataclass(frozen=True)
 class CartesianLimits:
-    """Limits of the tcp and of the elbow's angle (joint 3 seen from above)."""
+    """Limits of the tcp and of the elbow angle (joint 3)."""
 
     translation: Derivatives
     rotation: Derivatives
@@ -50,7 +50,7 @@ class CartesianLimits:
 
 @dataclass(frozen=True)
 class Rectangle:
-    """A box of joint positions (rad), and speeds (rad/s) for all of it."""
+    """A box of joint positions, rad, with constant speed limits inside it, rad/s."""
 
     lower: Seven
     upper: Seven
@@ -59,7 +59,7 @@ class Rectangle:
 
 @dataclass(frozen=True)
 class ArmLimits:
-    """Limits of one model, a number for each joint from the base to the flange: rad, s, Nm."""
+    """Limits of one model, one number per joint from the base to the flange, in rad, s and Nm."""
 
     model: str
     lower: Seven
@@ -72,16 +72,17 @@ class ArmLimits:
     """Nm/s"""
     cartesian: CartesianLimits
     velocity_offset: Seven | None = None
-    """With ``deceleration`` (rad/s2): what holds the speed down near the stops. None where the arm has no such rule."""
+    """Speed limit near the stops, together with ``deceleration`` (rad/s2); None for an arm without that rule."""
     deceleration: Seven | None = None
     rectangle: Rectangle | None = None
-    """Franka's suggestion for planners that know constant limits only. In its corners its speeds are up to 4.4 %
-    beyond :meth:`velocity_range`: who keeps the box must keep somewhat lower speeds as well."""
+    """Franka's suggestion for planners that support constant limits only. In the corners of the box its speeds exceed
+    :meth:`velocity_range` by up to 4.4 %, so somewhat lower speeds are needed."""
 
     def velocity_range(self, q: Sequence[float]) -> tuple[list[float], list[float]]:
-        """Lowest (7,) and highest (7,) joint velocity at joint positions ``q`` (7,), rad/s; lowest is never above 0.
+        """Return the lowest (7,) and highest (7,) joint velocity at joint positions ``q`` (7,), rad/s.
 
-        The FR3's depends on the position: next to a stop the arm may move away from it but not towards it.
+        The lowest is never above 0. The FR3's limits depend on the position: next to a stop the arm may move away from
+        it but not towards it.
         """
         if self.velocity_offset is None or self.deceleration is None:
             return [-value for value in self.velocity], list(self.velocity)
@@ -127,7 +128,7 @@ FR3_BEFORE_5_9 = replace(
     lower=(-2.7437, -1.7837, -2.9007, -3.0421, -2.8065, 0.5445, -3.0159),
     upper=(2.7437, 1.7837, 2.9007, -0.1518, 2.8065, 4.5169, 3.0159),
 )
-"""The same with an older system. These positions are the constants of panda-python; the rest is as above."""
+"""FR3 with an older system version. The positions are the constants of panda-python; the rest is as above."""
 
 FER = ArmLimits(
     model="fer",
@@ -147,4 +148,4 @@ FER = ArmLimits(
 """Franka Emika Robot: the Panda."""
 
 LIMITS: dict[str, ArmLimits] = {"fr3": FR3, "fer": FER}
-"""By model."""
+"""Limits by model."""

@@ -1,4 +1,4 @@
-"""What the driver needs of a vendor's client library, so that one driver does for both arms."""
+"""Common interface to the vendor's client libraries, so that one driver serves both arms."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ from typing import Any, NamedTuple
 
 from .settings import ArmSettings
 
-__all__ = ["Kind", "Link", "Mode", "Sample"]
+__all__ = ["ArmLink", "ArmMode", "ArmSample", "StreamKind"]
 
 Floats = Sequence[float]
 
 
-class Mode(IntEnum):
-    """What the robot says that it is doing; the numbers are those of the state packets."""
+class ArmMode(IntEnum):
+    """Mode of the robot, by its number in a state packet."""
 
     OTHER = 0
     IDLE = 1
@@ -26,95 +26,95 @@ class Mode(IntEnum):
     RECOVERING = 6
 
 
-_MODES = tuple(Mode)
+_MODES = tuple(ArmMode)
 
 
-class Kind(Enum):
-    """What a motion streams."""
+class StreamKind(Enum):
+    """Quantity that a motion streams."""
 
     POSITION = "position"
     VELOCITY = "velocity"
     TORQUE = "torque"
 
 
-class Sample(NamedTuple):
-    """One state packet, the part that every cycle needs. SI units."""
+class ArmSample(NamedTuple):
+    """The part of a state packet that every cycle needs. SI units; vectors of joints are (7,)."""
 
     t: float
     """The robot's clock, s."""
-    mode: Mode
+    mode: ArmMode
     q: Floats
     dq: Floats
     tau: Floats
     q_d: Floats
-    """The joint positions that the controller took last, rad."""
+    """Joint positions that the controller accepted last, rad."""
     dq_d: Floats
     tau_d: Floats
-    """The torques that the controller took last, Nm."""
+    """Torques that the controller accepted last, Nm."""
     tau_ext: Floats
     wrench_ext: Floats
     success_rate: float
-    """Share of the last 100 cycles in which a command came in time; 0 outside a motion."""
+    """Share of the last 100 cycles in which a command arrived in time; 0 outside a motion."""
 
 
-class Link(ABC):
-    """A connection to one arm. Every call may raise whatever the library raises; :mod:`.faults` puts it in words."""
+class ArmLink(ABC):
+    """A connection to one arm. Every call may raise whatever the library raises; :mod:`.faults` interprets it."""
 
     protocol: int
     """Version of Franka's protocol that the library speaks."""
     owns_loop = False
-    """Does the library call back for every set-point, rather than take them?"""
-    troubles: tuple[type[Exception], ...] = (RuntimeError,)
-    """What the library raises of its own."""
+    """Whether the library calls back for every set-point."""
+    library_errors: tuple[type[Exception], ...] = (RuntimeError,)
+    """Exception classes that the library raises."""
 
     def __init__(self) -> None:
         self.robot: Any = None
-        self.motion: Kind | None = None
-        """What is being streamed."""
+        self.motion: StreamKind | None = None
+        """Quantity that is being streamed; None outside a motion."""
         self.state: Any = None
-        """The library's record of the newest state."""
+        """Newest state, as the library's record."""
         self.still: Floats | None = None
-        """Where the arm holds by what its servo knows, rad; None: where the robot says."""
+        """Position at which the servo holds the arm (7,), rad; None: the position that the robot reports."""
 
     @abstractmethod
     def connect(self, host: str) -> None:
         """Connect, and wait for a first state."""
 
     @abstractmethod
-    def read(self) -> Sample:
-        """Block until the next state, for a second at most."""
+    def read(self) -> ArmSample:
+        """Block until the next state, for 1 s at most."""
 
     @abstractmethod
-    def start(self, kind: Kind) -> None:
-        """Begin a motion."""
+    def start(self, kind: StreamKind) -> None:
+        """Start a motion."""
 
     @abstractmethod
     def send(self, values: Floats) -> None:
-        """The set-point for this cycle: rad, rad/s or Nm, as the motion's kind says."""
+        """Send the set-point of this cycle (7,): rad, rad/s or Nm, depending on the motion's kind."""
 
     @abstractmethod
     def finish(self) -> None:
-        """End the motion in order; the arm is at rest."""
+        """End the motion regularly; the arm is at rest."""
 
     def run(self, turn: Callable[[], None]) -> None:
-        """The motion that was started, from the library's own loop; ``turn`` is called for every state."""
+        """Run the motion that was started in the library's own loop, which calls ``turn`` for every state."""
         raise NotImplementedError
 
     def abandon(self) -> None:
-        """Forget a motion that has ended by itself, or that cannot be ended in order."""
+        """Forget a motion that the robot has ended, or that cannot be ended regularly."""
         self.motion = self.still = None
 
     def disconnect(self) -> None:
-        """Let go of the robot. Idempotent; a motion under way is cancelled."""
+        """Release the robot; a running motion is cancelled. Idempotent."""
         self.abandon()
         self.robot = self.state = None
 
     def recover(self) -> None:
-        """Automatic error recovery."""
+        """Run the automatic error recovery."""
         self.robot.automatic_error_recovery()
 
     def configure(self, settings: ArmSettings) -> None:
-        """Tell the robot what the rig says of collisions, stiffness, load and frames."""
+        """Send the collision thresholds, stiffness, load and frames of ``settings`` to the robot."""
         robot = self.robot
         behavior = settings.collision_behavior
         if behavior is not None:
@@ -137,20 +137,20 @@ class Link(ABC):
         self.robot.set_K(matrix)
 
     def errors(self, names: Sequence[str]) -> list[str]:
-        """Which of the flags called ``names`` are set in the newest state, or ended the last motion."""
+        """Return those of the flags ``names`` that are set in the newest state, or that ended the last motion."""
         found = []
         for flags in (self.state.current_errors, self.state.last_motion_errors):
             found += [name for name in names if getattr(flags, name, False) and name not in found]
         return found
 
     def tcp(self) -> list[float]:
-        """O_T_EE of the newest state: 4x4 by columns, the end effector in the base frame."""
+        """Return O_T_EE of the newest state: the end effector in the base frame, 4x4 by columns, m."""
         return list(self.state.O_T_EE)
 
-    def sample(self, state: Any) -> Sample:
-        """The part of a library's state that every cycle needs."""
+    def sample(self, state: Any) -> ArmSample:
+        """Keep a library's state record, and return the part of it that every cycle needs."""
         self.state = state
-        return Sample(
+        return ArmSample(
             state.time.to_sec(),
             _MODES[int(state.robot_mode)],
             state.q,

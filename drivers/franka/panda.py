@@ -1,4 +1,4 @@
-"""Panda (FER): libfranka 0.9 through ``panda-python``, which calls back for every set-point."""
+"""Link to a Panda (FER) through ``panda-python`` (libfranka 0.9), which calls back for every set-point."""
 
 from __future__ import annotations
 
@@ -7,15 +7,15 @@ from typing import Any
 
 from panda_py import libfranka
 
-from .link import Floats, Kind, Link, Sample
+from .link import ArmLink, ArmSample, Floats, StreamKind
 
 __all__ = ["PandaLink"]
 
 _NO_FILTER = 1000.0
-"""Hz: what switches the library's low-pass off. Set-points come smooth out of the servo."""
+"""Cut-off that disables the library's low-pass filter, Hz: the servo's set-points are smooth already."""
 
 
-class PandaLink(Link):
+class PandaLink(ArmLink):
     """A Panda (protocol 5)."""
 
     protocol = 5
@@ -24,21 +24,21 @@ class PandaLink(Link):
     def __init__(self) -> None:
         super().__init__()
         self._fresh: Any = None
-        """The state that the library called back with, until it is read."""
+        """State of the last callback, until it is read."""
         self._answer: Floats | None = None
         self._finished = False
 
     def connect(self, host: str) -> None:
         self.robot = libfranka.Robot(host, libfranka.RealtimeConfig.kIgnore)
 
-    def read(self) -> Sample:
+    def read(self) -> ArmSample:
         if self._fresh is not None:
             state, self._fresh = self._fresh, None
             return self.sample(state)
         return self.sample(self.robot.read_once())
 
-    def start(self, kind: Kind) -> None:
-        self.motion = kind  # the motion itself begins in run()
+    def start(self, kind: StreamKind) -> None:
+        self.motion = kind  # the motion itself starts in run()
         self._answer = None
         self._finished = False
 
@@ -58,9 +58,9 @@ class PandaLink(Link):
 
         robot, stiff = self.robot, libfranka.ControllerMode.kJointImpedance
         try:
-            if kind is Kind.POSITION:
+            if kind is StreamKind.POSITION:
                 robot.control_joint_position(callback, stiff, False, _NO_FILTER)
-            elif kind is Kind.VELOCITY:
+            elif kind is StreamKind.VELOCITY:
                 robot.control_joint_velocity(callback, stiff, False, _NO_FILTER)
             else:
                 robot.control(callback, False, _NO_FILTER)
@@ -68,14 +68,14 @@ class PandaLink(Link):
             self._fresh = None
             self.abandon()
 
-    def _command(self, kind: Kind | None, state: Any) -> Any:
-        """What the turn left; where it left nothing, stay: where the controller is, without speed or torque."""
+    def _command(self, kind: StreamKind | None, state: Any) -> Any:
+        """Return the command of this turn; without one, hold the position, with no speed or torque."""
         command: Any
-        if kind is Kind.POSITION:
+        if kind is StreamKind.POSITION:
             command = libfranka.JointPositions(state.q_d if self._answer is None else self._answer)
         else:
             values = (0.0,) * 7 if self._answer is None or self._finished else self._answer
-            command = libfranka.JointVelocities(values) if kind is Kind.VELOCITY else libfranka.Torques(values)
+            command = libfranka.JointVelocities(values) if kind is StreamKind.VELOCITY else libfranka.Torques(values)
         command.motion_finished = self._finished
         return command
 

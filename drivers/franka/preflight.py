@@ -1,108 +1,103 @@
-"""Before a Franka moves: is it there, is it the arm that the rig names, may it move, and is the network fast enough?
+"""Pre-flight check of a Franka: reachable, the right arm, ready to move, and a fast network.
 
-The questions are asked in the order in which they can be answered; what an answer makes idle is not asked.
+The checks run in the order in which they can succeed; a check that depends on a failed one is left out.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import Any
 
 from hal import registry
 from hal.errors import ConnectionLost, ControlTaken
-from hal.host.process import Child
+from hal.host.process import Channel, Child, SharedMemory
 from hal.preflight import CheckResult
 from hal.specs import RobotSpec
 from hal.types import Fault
 
-from .claim import claim_arm
-from .faults import ARM_PORT, HAND_PORT, fault_of
-from .preflight_network import Answer, knock, resolve, route_to
-from .preflight_ping import ALLOW, NotMeasured, judge, measure
+from .faults import (
+    ARM_PORT,
+    HAND_PORT,
+    NO_HAND,
+    NO_ROUTE,
+    REFUSED,
+    UNKNOWN_HOST,
+    UNREACHABLE,
+    fault_of,
+    fault_of_exception,
+)
+from .flags import FLAGS
+from .network import (
+    NotMeasured,
+    PortState,
+    RoundTrips,
+    lock_arm,
+    measure_round_trips,
+    probe_port,
+    resolve_host,
+    route_to,
+)
 from .settings import ArmSettings, HandSettings
-from .troubles import NO_HAND, NO_WAY, REFUSED, UNKNOWN_HOST, UNREACHABLE
 
-__all__ = ["check"]
+__all__ = ["check", "main", "rate_round_trips"]
 
 PATIENCE = 5.0
-"""s for the robot to say who it is, the start of the process that asks included; it needs a fraction of that."""
-_TROUBLES = {Answer.REFUSED: REFUSED, Answer.SILENT: UNREACHABLE, Answer.NO_WAY: NO_WAY}
+"""s for the robot to answer, including the start of the process that connects to it; it needs a fraction of that."""
+_PORT_ERRORS = {PortState.REFUSED: REFUSED, PortState.SILENT: UNREACHABLE, PortState.NO_ROUTE: NO_ROUTE}
 _HAND_LIBRARY = "panda_py"
-_EMULATOR = "start it in another terminal: python -m hal.drivers.franka.emulator --host {host} (--help says more)"
-_FREE = "end the program that uses this arm, also on other computers; if there is none, restart the robot in Desk"
+_START_EMULATOR = "start it in another terminal: python -m hal.drivers.franka.emulator --host {host} (--help for more)"
+_IN_USE = "end the program that uses this arm, also on other computers; if there is none, restart the robot in Desk"
+_SAMPLES = 50
+"""States, 1 ms apart, from which the noise of an arm at rest is measured."""
+_GOOD, _BUDGET = 0.3e-3, 1e-3
+"""Round-trip times, s. According to Franka's documentation a whole cycle, with the computing time of both sides, has
+to fit into 1 ms; the share of 0.3 ms for the network is our choice."""
+_ALLOW_PING = "sudo sysctl -w net.ipv4.ping_group_range='0 2147483647'"
+"""Allows every user to ping without the program."""
+_IMPROVE = "connect the cable directly to Control's LAN port, end busy programs, and use a real-time kernel"
 
 
 def check(spec: RobotSpec, duration: float) -> Iterator[CheckResult]:
-    """Look at one arm; the network is measured for ``duration`` s. Nothing moves, and nothing stays connected."""
+    """Check one arm. Nothing moves, and no connection stays open.
+
+    Args:
+        spec: The arm in the rig.
+        duration: Time for measuring the network, s.
+
+    Yields:
+        One result per check.
+    """
     settings = ArmSettings.of(spec)
     try:
-        claim = claim_arm(settings.host)
+        lock = lock_arm(settings.host)
     except ControlTaken as error:
-        yield CheckResult("in use", "fail", str(error), "end that program first; nothing else was looked at")
+        yield CheckResult("in use", "fail", str(error), "end that program first; nothing else was checked")
         return
     try:
         yield from _check(spec, settings, duration)
     finally:
-        claim.release()
+        lock.release()
 
 
 def _check(spec: RobotSpec, settings: ArmSettings, duration: float) -> Iterator[CheckResult]:
     host = settings.host
-    address = resolve(host)
+    address = resolve_host(host)
     if address is None:
         yield _failed("address", UNKNOWN_HOST.fault(host))
         return
-    yield _route(host, address)
-    answer = knock(address, ARM_PORT)
-    if answer is not Answer.OPEN:
-        verdict = _failed("robot", _TROUBLES[answer].fault(f"{host}:{ARM_PORT}"))
-        yield replace(verdict, remedy=_EMULATOR.format(host=host)) if spec.emulated else verdict
+    yield _check_route(host, address)
+    port = probe_port(address, ARM_PORT)
+    if port is not PortState.OPEN:
+        result = _failed("robot", _PORT_ERRORS[port].fault(f"{host}:{ARM_PORT}"))
+        yield replace(result, remedy=_START_EMULATOR.format(host=host)) if spec.emulated else result
         return
-    yield from _robot(spec, settings)
-    yield from _hand(spec)
-    yield _network(address, duration)
-
-
-def _route(host: str, address: str) -> CheckResult:
-    route = route_to(address)
-    named = address if host == address else f"{host} is {address}"
-    if route is None:
-        return CheckResult("route", "unknown", f"{named}; Linux does not say how packets go there")
-    straight = "give a network port of this computer an address beside the robot's, and connect the two directly"
-    if route.interface == "lo":
-        return CheckResult("route", "ok", f"{named}, this computer: an emulator")
-    if route.gateway is not None:
-        return CheckResult(
-            "route", "warn", f"{named}, through the router {route.gateway} ({route.interface})", straight
-        )
-    if route.wireless:
-        return CheckResult("route", "warn", f"{named}, by radio ({route.interface})", "use a cable")
-    return CheckResult("route", "ok", f"{named}, on the network of {route.interface}")
-
-
-def _robot(spec: RobotSpec, settings: ArmSettings) -> Iterator[CheckResult]:
-    """What the robot says of itself."""
-    host = settings.host
-    said = _ask(host, settings.arm)
-    if said is None:
-        found = f"{host}:{ARM_PORT} is open, but nobody answers there: another program may hold the arm"
-        yield CheckResult("robot", "fail", found, _FREE)
-        return
-    if "missing" in said:
-        yield _missing(said["missing"])
-    elif "fault" in said:
-        fault = Fault(*said["fault"])
-        if fault.code == "closed":
-            yield CheckResult("robot", "fail", f"{host}:{ARM_PORT} hangs up: another program may hold the arm", _FREE)
-        else:
-            yield _failed("robot", fault)
-    else:
-        yield CheckResult(
-            "robot", "ok", f"answers; speaks protocol {said['protocol']}, as the model {spec.model!r} needs"
-        )
-        yield _mode(said["mode"], said["flags"])
-        yield _reports(said["noise"])
+    yield from _check_robot(spec, settings)
+    yield from _check_hand(spec)
+    try:
+        yield rate_round_trips(measure_round_trips(address, duration))
+    except NotMeasured as error:
+        yield CheckResult("network", "unknown", f"not measured: {error}", _ALLOW_PING)
 
 
 def _failed(name: str, fault: Fault) -> CheckResult:
@@ -114,56 +109,142 @@ def _missing(library: str) -> CheckResult:
     return CheckResult("library", "fail", f"{library} does not import", command)
 
 
-def _mode(mode: str, flags: list[str]) -> CheckResult:
-    """A robot that is stopped is told, and is no reason not to start: the app can clear it."""
+def _check_route(host: str, address: str) -> CheckResult:
+    route = route_to(address)
+    named = address if host == address else f"{host} is {address}"
+    if route is None:
+        return CheckResult("route", "unknown", f"{named}; the route of packets cannot be read from Linux")
+    direct = "give a network port of this computer an address in the robot's network, and connect the two directly"
+    if route.interface == "lo":
+        return CheckResult("route", "ok", f"{named}, this computer: an emulator")
+    if route.gateway is not None:
+        return CheckResult("route", "warn", f"{named}, through the router {route.gateway} ({route.interface})", direct)
+    if route.wireless:
+        return CheckResult("route", "warn", f"{named}, by radio ({route.interface})", "use a cable")
+    return CheckResult("route", "ok", f"{named}, on the network of {route.interface}")
+
+
+def _check_robot(spec: RobotSpec, settings: ArmSettings) -> Iterator[CheckResult]:
+    """Check what the robot reports about itself."""
+    host = settings.host
+    report = _query_robot(host, settings.arm)
+    if report is None:
+        found = f"{host}:{ARM_PORT} is open, but does not answer: another program may hold the arm"
+        yield CheckResult("robot", "fail", found, _IN_USE)
+    elif "missing" in report:
+        yield _missing(report["missing"])
+    elif "fault" in report:
+        fault = Fault(*report["fault"])
+        if fault.code == "closed":
+            found = f"{host}:{ARM_PORT} closes the connection: another program may hold the arm"
+            yield CheckResult("robot", "fail", found, _IN_USE)
+        else:
+            yield _failed("robot", fault)
+    else:
+        found = f"answers; speaks protocol {report['protocol']}, as the model {spec.model!r} requires"
+        yield CheckResult("robot", "ok", found)
+        yield _check_mode(report["mode"], report["flags"])
+        yield _check_noise(report["noise"])
+
+
+def _check_mode(mode: str, flags: list[str]) -> CheckResult:
+    """A robot that is stopped is only a warning: the app can recover it."""
     fault = fault_of(flags, mode)
     if fault is None:
         return CheckResult("state", "ok", "ready to move" if mode == "idle" else f"mode {mode!r}")
     return CheckResult("state", "warn", fault.cause, fault.remedy)
 
 
-def _reports(noise: float) -> CheckResult:
-    """How exactly an arm at rest reports its set-points. How late it does shows only in motion."""
+def _check_noise(noise: float) -> CheckResult:
+    """Check how exactly an arm at rest reports its set-points. The delay of the reports shows only in motion."""
     from hal.servo.anchoring import NOISIEST
 
-    found = f"reported within {noise:.1g} rad at rest; how late, the first motion shows (rig.statistics())"
+    found = f"reported within {noise:.1g} rad at rest; the first motion shows their delay (rig.statistics())"
     if noise <= NOISIEST:
         return CheckResult("set-points", "ok", found)
-    return CheckResult(
-        "set-points", "fail", found, f"the servo needs {NOISIEST:g} rad; end what moves the arm, then look again"
-    )
+    remedy = f"the servo needs {NOISIEST:g} rad; end the program that moves the arm, then check again"
+    return CheckResult("set-points", "fail", found, remedy)
 
 
-def _hand(spec: RobotSpec) -> Iterator[CheckResult]:
-    """Is the hand there, where the rig has it, and what its driver needs?"""
+def _check_hand(spec: RobotSpec) -> Iterator[CheckResult]:
+    """Check the hand, if the rig has one, and its driver's library."""
     gripper = spec.gripper
     if gripper is None or gripper.driver != spec.driver:
         return
     if _HAND_LIBRARY in registry.missing("franka"):
         yield _missing(_HAND_LIBRARY)
     host = HandSettings.of(gripper).host
-    address = resolve(host)
-    if address is not None and knock(address, HAND_PORT) is Answer.OPEN:
+    address = resolve_host(host)
+    if address is not None and probe_port(address, HAND_PORT) is PortState.OPEN:
         yield CheckResult("hand", "ok", f"answers at port {HAND_PORT}")
-        return
-    yield _failed("hand", NO_HAND.fault(f"{host}:{HAND_PORT}"))
+    else:
+        yield _failed("hand", NO_HAND.fault(f"{host}:{HAND_PORT}"))
 
 
-def _ask(host: str, arm: str) -> dict[str, Any] | None:
-    """What :mod:`.preflight_child` found out; None where it got no answer in time."""
-    child = Child("check", "hal.drivers.franka.preflight_child:main", {"host": host, "arm": arm})
+def rate_round_trips(trips: RoundTrips) -> CheckResult:
+    """Return whether round trips are short enough for set-points."""
+    if not trips.times:
+        return CheckResult("network", "unknown", f"not measured: none of {trips.sent} pings came back")
+    found = f"round trip {trips}"
+    if trips.quantile(0.5) >= _BUDGET:
+        return CheckResult("network", "fail", f"{found}: most set-points would be late", _IMPROVE)
+    if trips.lost or trips.quantile(0.99) > _GOOD or trips.times[-1] >= _BUDGET:
+        found = f"{found}; required: p99 below {1e3 * _GOOD:.1f} ms, each below {1e3 * _BUDGET:.0f} ms, none lost"
+        return CheckResult("network", "warn", found, _IMPROVE)
+    return CheckResult("network", "ok", found)
+
+
+# The process that connects to the robot.
+
+
+def _query_robot(host: str, arm: str) -> dict[str, Any] | None:
+    """Return the report of :func:`main` from a process of its own; None if there is no answer in time.
+
+    A process of its own, because the vendors' libraries keep Python's lock while they wait, raise the calling thread
+    to the highest permitted priority, and wait forever for a greeting.
+    """
+    child = Child("check", "hal.drivers.franka.preflight:main", {"host": host, "arm": arm})
     try:
         return dict(child.wait_ready(PATIENCE))
     except ConnectionLost:
         if child.process.poll() is not None:
-            raise  # it did not hang, it broke
+            raise  # the process failed; it did not hang
         return None
     finally:
         child.close(0.2)
 
 
-def _network(address: str, duration: float) -> CheckResult:
+def main(channel: Channel, memories: Sequence[SharedMemory], config: dict[str, Any]) -> None:
+    """Entry point of the process that connects to the robot. Nothing moves.
+
+    Args:
+        channel: Receives the report: ``protocol``, ``mode``, ``flags`` and ``noise`` (rad, by how much the commanded
+            positions differ that an arm at rest reports); or ``missing``, the name of a library; or ``fault``: code,
+            cause and remedy.
+        memories: Unused.
+        config: ``host`` and ``arm``, as in the settings.
+    """
+    import resource
+
+    resource.setrlimit(resource.RLIMIT_RTPRIO, (0, 0))  # a check needs no priority
+    channel.send({"ready": _read_report(config["host"], config["arm"])})
+
+
+def _read_report(host: str, arm: str) -> dict[str, Any]:
+    from .arm import create_link
+
     try:
-        return judge(measure(address, duration))
-    except NotMeasured as error:
-        return CheckResult("network", "unknown", f"not measured: {error}", ALLOW)
+        link = create_link(arm)
+    except ImportError as error:
+        return {"missing": error.name or str(error)}
+    try:
+        link.connect(host)
+        sample = link.read()
+        report = {"protocol": link.protocol, "mode": sample.mode.name.lower(), "flags": link.errors(FLAGS)}
+        reports = [list(link.read().q_d) for _ in range(_SAMPLES)]
+        report["noise"] = max(max(values) - min(values) for values in zip(*reports, strict=True))
+        link.disconnect()
+    except link.library_errors as error:
+        fault = fault_of_exception(error, host=host)
+        return {"fault": [fault.code, fault.cause, fault.remedy]}
+    return report

@@ -1,7 +1,7 @@
-"""What a rig may say of a Franka arm and of its hand under ``real:``, checked before anything is opened.
+"""Settings of a Franka arm and of its hand: the ``real:`` part of a rig file, checked before a device is opened.
 
-Ranges are those of the comments in libfranka's ``robot.h``; where that gives none, a number only has to make sense.
-Nothing here imports the vendor's libraries.
+The ranges are those of the comments in libfranka's ``robot.h``; where it gives none, a number only has to be
+physically possible. Nothing here imports the vendor's libraries.
 """
 
 from __future__ import annotations
@@ -15,14 +15,23 @@ import numpy as np
 from pydantic import BaseModel, BeforeValidator, Field, model_validator
 
 from hal.config.files import Problems, validate
-from hal.config.schema import Offset, Size, Strict, describe, is_number
+from hal.config.schema import Offset, PoseConfig, Size, Strict, describe, is_number
 from hal.errors import ConfigError
+from hal.geometry import Pose, matrix_to_quaternion
 from hal.specs import Floats, GripperSpec, RobotSpec
 
-from .frames import Frame
 from .limits import LIMITS, ArmLimits
 
-__all__ = ["ArmSettings", "CollisionBehavior", "HandSettings", "Load", "check_arm", "check_hand", "is_emulated"]
+__all__ = [
+    "ArmSettings",
+    "CollisionBehavior",
+    "FrameSetting",
+    "HandSettings",
+    "LoadSetting",
+    "check_arm",
+    "check_hand",
+    "is_emulated",
+]
 
 _LABEL = re.compile(r"(?!-)[A-Za-z0-9_-]{1,63}(?<!-)")
 
@@ -44,11 +53,11 @@ def _host(value: Any) -> str:
     return text
 
 
-def _each(what: str, *ranges: tuple[float, float]) -> BeforeValidator:
-    """Numbers with a lowest and a highest value each; they mean ``what``."""
+def _each(meaning: str, *ranges: tuple[float, float]) -> BeforeValidator:
+    """Check for as many numbers as there are ranges (lowest, highest), each within its own."""
 
     def check(value: Any) -> tuple[float, ...]:
-        size = f"{len(ranges)} numbers ({what})"
+        size = f"{len(ranges)} numbers ({meaning})"
         if not isinstance(value, (list, tuple)) or len(value) != len(ranges):
             raise ValueError(f"must be a list of {size}, not {describe(value)}")
         for k, (item, (lowest, highest)) in enumerate(zip(value, ranges, strict=True)):
@@ -68,7 +77,7 @@ _UNITS = {
     "torque": "Nm",
 }
 _ANY = 1e4
-"""Nm or N; a threshold beyond every force that the arm could exert switches the detection off."""
+"""Largest threshold, Nm or N. One beyond every force of the arm switches the detection off."""
 Host = Annotated[str, BeforeValidator(_host)]
 Torques = Annotated[Floats, _each("Nm, one for each joint", *[(0.0, _ANY)] * 7)]
 Forces = Annotated[Floats, _each("x, y, z in N, then roll, pitch, yaw in Nm", *[(0.0, _ANY)] * 6)]
@@ -78,10 +87,36 @@ CartesianStiffness = Annotated[
 ]
 
 
-class CollisionBehavior(Strict):
-    """External torques and forces: above the lower ones the arm reports a contact, above the upper ones it stops.
+class FrameSetting(PoseConfig):
+    """Pose of a frame in another one: ``{position, orientation}``, seven numbers, or a 4x4 matrix as four rows."""
 
-    The defaults are those with which libfranka's own examples move the arm.
+    @model_validator(mode="before")
+    @classmethod
+    def _rows(cls, data: Any) -> Any:
+        if not isinstance(data, (list, tuple)) or not any(isinstance(row, (list, tuple)) for row in data):
+            return data
+        if len(data) != 4 or not all(
+            isinstance(row, (list, tuple)) and len(row) == 4 and all(map(is_number, row)) for row in data
+        ):
+            raise ValueError("must be four rows of four numbers, {position, orientation}, or seven numbers")
+        matrix = np.array(data, float)
+        rotation = matrix[:3, :3]
+        if not np.allclose(matrix[3], (0, 0, 0, 1)):
+            raise ValueError("the last row of the matrix must be 0, 0, 0, 1; the translation is the last column")
+        if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3) or np.linalg.det(rotation) < 0:
+            raise ValueError("the matrix is not a rotation of a right-handed frame")
+        return {"position": matrix[:3, 3].tolist(), "orientation": matrix_to_quaternion(rotation).tolist()}
+
+    def matrix(self) -> list[float]:
+        """Return the 4x4 matrix column by column (16,), as the library expects it."""
+        columns: list[float] = Pose(self.position, self.orientation).matrix().T.ravel().tolist()
+        return columns
+
+
+class CollisionBehavior(Strict):
+    """Thresholds of external torque and force: the arm reports a contact above the lower, and stops above the upper.
+
+    The defaults are those of libfranka's examples.
     """
 
     lower_torque: Torques = (20.0, 20.0, 18.0, 18.0, 16.0, 14.0, 12.0)
@@ -99,27 +134,29 @@ class CollisionBehavior(Strict):
         return self
 
     def arguments(self) -> tuple[list[float], list[float], list[float], list[float]]:
-        """In the order of the library's call."""
+        """Return the arguments in the order of the library's call."""
         return list(self.lower_torque), list(self.upper_torque), list(self.lower_force), list(self.upper_force)
 
 
-class Load(Strict):
-    """What the hand holds for good. (The hand itself is told to the robot in its own interface, Desk.)"""
+class LoadSetting(Strict):
+    """Permanent load in the hand. (The hand itself is set up in Desk, the robot's own interface.)"""
 
     mass: float = Field(ge=0.0, le=3.0, strict=True)
-    """kg; both arms' data sheets give a payload of 3 kg."""
+    """Mass, kg; the data sheets of both arms give a payload of 3 kg."""
     com: Offset = (0.0, 0.0, 0.0)
     """Centre of mass in the frame of the flange, m."""
     inertia: Annotated[Floats, _each("xx, yy, zz, xy, xz, yz in kg m2", *[(0.0, 10.0)] * 3, *[(-10.0, 10.0)] * 3)] = (
         0.0,
     ) * 6
-    """About its centre of mass."""
+    """Moments and products about the centre of mass, kg m2."""
 
     @model_validator(mode="after")
-    def _possible(self) -> Load:
+    def _possible(self) -> LoadSetting:
         moments = np.linalg.eigvalsh(self._tensor())
         if moments[0] < -1e-9 or moments[2] > moments[0] + moments[1] + 1e-9:
-            raise ValueError(f"inertia: no body has the moments {', '.join(f'{value:.3g}' for value in moments)} kg m2")
+            raise ValueError(
+                f"inertia: impossible principal moments {', '.join(f'{value:.3g}' for value in moments)} kg m2"
+            )
         return self
 
     def _tensor(self) -> np.ndarray[Any, np.dtype[np.float64]]:
@@ -127,46 +164,46 @@ class Load(Strict):
         return np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
 
     def arguments(self) -> tuple[float, list[float], list[float]]:
-        """In the order of the library's call; the inertia as (9,)."""
+        """Return the arguments in the order of the library's call; the inertia as (9,)."""
         return self.mass, list(self.com), self._tensor().ravel().tolist()
 
 
 class ArmSettings(Strict):
-    """``real:`` of an arm."""
+    """Settings under ``real:`` of an arm."""
 
     host: Host
     arm: Literal["fr3", "fer"]
-    """FR3, or FER: the Panda. The model says which."""
+    """FR3, or FER (the Panda); set by the model."""
     stream: Literal["position", "velocity"] = "position"
-    """What the arm is told a thousand times a second."""
+    """Quantity that is sent 1000 times a second."""
     collision_behavior: CollisionBehavior = CollisionBehavior()
     joint_impedance: JointStiffness = (3000.0, 3000.0, 3000.0, 2500.0, 2500.0, 2000.0, 2000.0)
-    """Stiffness of the arm's own controller. The default is that of libfranka's examples."""
+    """Stiffness of the arm's own joint controller, Nm/rad. The default is that of libfranka's examples."""
     cartesian_impedance: CartesianStiffness | None = None
-    """Of its Cartesian controller, which nothing here uses; left alone unless it is given."""
-    load: Load | None = None
-    """Left alone unless it is given, and so are the two frames."""
-    end_effector: Frame | None = None
-    """NE_T_EE: of the end effector in the frame that is set in Desk, m."""
-    stiffness_frame: Frame | None = None
-    """EE_T_K: of the stiffness frame in the end effector's, m."""
+    """Stiffness of the arm's Cartesian controller, N/m and Nm/rad, unused here; None: not sent."""
+    load: LoadSetting | None = None
+    """None: not sent; the same for the two frames."""
+    end_effector: FrameSetting | None = None
+    """NE_T_EE: the end effector in the frame that is set in Desk, m."""
+    stiffness_frame: FrameSetting | None = None
+    """EE_T_K: the stiffness frame in the end effector's frame, m."""
 
     @classmethod
     def of(cls, spec: RobotSpec) -> ArmSettings:
-        """Those of an arm's record. Raises ConfigError, which lists everything that is wrong."""
+        """Return the settings in an arm's record. Raises ConfigError, which lists every problem."""
         return _of(cls, spec.options, f"robots.{spec.name}.real")
 
 
 class HandSettings(Strict):
-    """``real:`` of a gripper. The arm's host is put in where none is given."""
+    """Settings under ``real:`` of a gripper; the host defaults to the arm's."""
 
     host: Host
     tolerance: Size = 0.002
-    """How far from the width that was asked for the fingers may end and still be there, m."""
+    """Largest distance from the target width at which the fingers count as arrived, m."""
 
     @classmethod
     def of(cls, spec: GripperSpec) -> HandSettings:
-        """Those of a gripper's record. Raises ConfigError, which lists everything that is wrong."""
+        """Return the settings in a gripper's record. Raises ConfigError, which lists every problem."""
         return _of(cls, spec.options, f"{spec.name}.real")
 
 
@@ -182,7 +219,7 @@ def _of(model: type[_Settings], options: Mapping[str, Any], where: str) -> _Sett
 
 
 def is_emulated(options: Mapping[str, Any]) -> bool:
-    """Is the host of these options this computer? No robot is: a program stands in for it."""
+    """Return whether the host in these options is this computer, so that the robot can only be an emulator."""
     host = str(options.get("host", "")).strip().removesuffix(".").lower()
     try:
         return ipaddress.ip_address(host).is_loopback
@@ -191,11 +228,11 @@ def is_emulated(options: Mapping[str, Any]) -> bool:
 
 
 def check_arm(spec: RobotSpec) -> Iterator[tuple[str, str]]:
-    """What is wrong in an arm's record: (key in the arm's entry of the rig, sentence)."""
+    """Yield the problems in an arm's record: key in the arm's entry of the rig file, and message."""
     yield from _check_options(ArmSettings, spec.options)
     limits = LIMITS.get(str(spec.options.get("arm")))
     if len(spec.joints) != 7:
-        yield "model", f"must have 7 joints, as Franka's arms do, not {len(spec.joints)}"
+        yield "model", f"must have 7 joints for a Franka arm, not {len(spec.joints)}"
     elif limits is not None:
         yield from _check_limits(spec, limits)
     if spec.rate_hz != 1000.0:
@@ -203,7 +240,7 @@ def check_arm(spec: RobotSpec) -> Iterator[tuple[str, str]]:
 
 
 def check_hand(spec: GripperSpec) -> Iterator[tuple[str, str]]:
-    """What is wrong in a hand's record: (key in the gripper's entry, sentence)."""
+    """Yield the problems in a hand's record: key in the gripper's entry of the rig file, and message."""
     yield from _check_options(HandSettings, spec.options)
 
 
@@ -216,7 +253,7 @@ def _check_options(model: type[BaseModel], options: Mapping[str, Any]) -> Iterat
 
 
 def _check_limits(spec: RobotSpec, official: ArmLimits) -> Iterator[tuple[str, str]]:
-    """No limit of the servo may lie beyond what Franka allows; not even ``allow_looser_limits`` changes that."""
+    """Yield every limit of the servo that exceeds Franka's; ``allow_looser_limits`` does not change that."""
     name = official.model.upper()
     for kind, unit in _UNITS.items():
         ours: Floats | None = getattr(spec.limits, kind)
@@ -226,15 +263,18 @@ def _check_limits(spec: RobotSpec, official: ArmLimits) -> Iterator[tuple[str, s
             if (value < limit if kind == "lower" else value > limit)
         ]
         if wrong:
-            yield f"limits.{kind}", f"{'; '.join(wrong)} {unit}, the {name}'s own: the arm would stop with a reflex"
+            yield (
+                f"limits.{kind}",
+                f"{'; '.join(wrong)} {unit}, the limit of the {name}: the arm would stop with a reflex",
+            )
     fast = list(_too_fast(spec, official))
     if fast:
-        advice = "lower the speed, or keep farther from the stops"
-        yield "limits", f"{'; '.join(fast)} (towards its stops the {name} may only be slower); {advice}"
+        advice = "lower the speed, or keep a larger distance from the stops"
+        yield "limits", f"{'; '.join(fast)} (the limit of the {name} shrinks towards its stops); {advice}"
 
 
 def _too_fast(spec: RobotSpec, official: ArmLimits) -> Iterator[str]:
-    """Joints that may not be as fast at an end of their range as they may be elsewhere."""
+    """Yield the joints whose speed exceeds the limit at an end of their range."""
     ranges = zip(spec.limits.lower, spec.limits.upper, official.lower, official.upper, strict=True)
     lower, upper = zip(*((max(a, low), min(b, high)) for a, b, low, high in ranges), strict=True)
     down, up = official.velocity_range(lower)[0], official.velocity_range(upper)[1]

@@ -10,13 +10,14 @@ from pathlib import Path
 
 import pytest
 from app_kit import run_here
-from franka_at_home import address, emulator
 
 from hal.apps.check import main as check
 from hal.apps.teleop import main as teleop
 
+from ..wire.franka_kit import Emulator, free_host
+
 ROOT = Path(__file__).resolve().parents[2]
-HOST, EMPTY = address(4), address(5)
+EMPTY = free_host(4)
 needs_libraries = pytest.mark.skipif(
     importlib.util.find_spec("pylibfranka") is None or importlib.util.find_spec("panda_py") is None,
     reason="needs the Python packages pylibfranka and panda-python",
@@ -54,8 +55,8 @@ def test_what_fails_is_shown_with_its_remedy_and_is_the_exit_status() -> None:
 
 @needs_libraries
 def test_json_has_every_finding() -> None:
-    with emulator(HOST, "--robot", "panda"):
-        done = run("check.py", *at(HOST), "--set", "robots.arm.model=panda", "--duration", "0.1", "--json")
+    with Emulator(robot="panda", hand=True) as robot:
+        done = run("check.py", *at(robot.host), "--set", "robots.arm.model=panda", "--duration", "0.1", "--json")
     assert done.returncode == 0, done.stdout + done.stderr
     report = json.loads(done.stdout)
     assert report["fit"] is True

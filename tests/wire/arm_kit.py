@@ -7,13 +7,10 @@ from collections.abc import Sequence
 from math import nan
 
 from hal.config.data_files import find_data
-from hal.drivers.franka.emulator.arm import Arm, Reply
+from hal.drivers.franka.emulator.arm import ArmReply, EmulatedArm, RequestHandler, RobotFiles
 from hal.drivers.franka.emulator.journal import Journal
-from hal.drivers.franka.emulator.layouts import STATE, CommandPacket
-from hal.drivers.franka.emulator.model import RigidBody
-from hal.drivers.franka.emulator.plant import IdealPlant, Plant
-from hal.drivers.franka.emulator.protocol import PROTOCOLS, Controller, Generator
-from hal.drivers.franka.emulator.requests import Files, Requests
+from hal.drivers.franka.emulator.plant import IdealPlant, Plant, RigidBody
+from hal.drivers.franka.emulator.protocol import PROTOCOLS, STATE, CommandPacket, Controller, Generator
 from hal.drivers.franka.limits import LIMITS
 
 HOME = (0.0, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785)
@@ -27,16 +24,16 @@ class Bench:
     def __init__(self, version: int = 10, plant: Plant | None = None, library: bytes | None = None) -> None:
         self.version = version
         self.journal = Journal(quiet=True)
-        self.replies: list[Reply] = []
+        self.replies: list[ArmReply] = []
         self.plant = plant or IdealPlant(RigidBody(URDF), HOME)
         limits = LIMITS["fr3" if version == 10 else "fer"]
-        self.arm = Arm(PROTOCOLS[version], limits, self.plant, self.journal, send=self.replies.append)
-        self.requests = Requests(self.arm, Files(b"<robot/>", library))
+        self.arm = EmulatedArm(PROTOCOLS[version], limits, self.plant, self.journal, send=self.replies.append)
+        self.requests = RequestHandler(self.arm, RobotFiles(b"<robot/>", library))
 
     def ask(self, name: str, payload: bytes = b"") -> int:
         """Request something; the status of the answer, after the next cycle if need be."""
         before = len(self.replies)
-        self.requests.take(name, 7, payload)
+        self.requests.handle(name, 7, payload)
         if len(self.replies) == before:
             self.idle()
         return self.replies[before].body[0]

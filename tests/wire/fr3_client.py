@@ -15,7 +15,7 @@ from typing import Any
 
 import pylibfranka as franka
 
-from hal.drivers.franka.emulator.control import Control
+from hal.drivers.franka.emulator.control import EmulatorControl
 from hal.drivers.franka.flags import FLAGS
 
 Report = dict[str, Any]
@@ -154,7 +154,7 @@ def read(host: str) -> Report:
 def motion(host: str, times: int = 1, commands: list[str] | None = None, **arguments: Any) -> Report:
     """One motion or several, in the middle of which fault commands are given."""
     robot = connect(host)
-    with Control(host) as control:
+    with EmulatorControl(host) as control:
 
         def disturb(values: list[float]) -> None:
             for command in commands or []:
@@ -177,7 +177,7 @@ def smooth(host: str, share: float, anchored: bool, jerk: float, duration: float
     home = list(state.q_d)
     given.current_position, given.current_velocity, given.current_acceleration = home, [0.0] * 7, [0.0] * 7
     anchors, cycles, error = 0, 0, ""
-    with Control(host) as faults:
+    with EmulatorControl(host) as faults:
         faults.send("lose-commands", share)
     try:
         while True:
@@ -229,7 +229,7 @@ def dropped(host: str) -> Report:
 def recovery(host: str, flag: str) -> Report:
     """A reflex, a motion that is refused, recovery, a motion."""
     robot = connect(host)
-    with Control(host) as control:
+    with EmulatorControl(host) as control:
         first = move(robot, disturb=lambda values: control.send("reflex", flag) and None)
     told = after(robot)
     refused = attempt(lambda: move(robot))
@@ -245,7 +245,7 @@ def all_flags(host: str) -> Report:
     """What the client names each flag that the robot raises."""
     robot = connect(host)
     names = []
-    with Control(host) as control:
+    with EmulatorControl(host) as control:
         for index in range(len(FLAGS)):
             control.send("reflex", index)
             wait_mode(robot, franka.RobotMode.Reflex)
@@ -261,7 +261,7 @@ def all_flags(host: str) -> Report:
 def stops(host: str, button: str) -> Report:
     """A stop is pressed in a motion; what is possible while it is pressed, and after."""
     robot = connect(host)
-    with Control(host) as control:
+    with EmulatorControl(host) as control:
         first = move(robot, disturb=lambda values: control.send(button, "on") and None)
         told = after(robot)
         refused = attempt(lambda: move(robot))
@@ -342,7 +342,7 @@ def second(host: str) -> Report:
 def comeback(host: str, away: float) -> Report:
     """The robot is restarted in a motion; the old object is dead, a new one works."""
     robot = connect(host)
-    with Control(host) as control:
+    with EmulatorControl(host) as control:
         first = move(robot, duration=2.0, disturb=lambda values: control.send("restart", away) and None)
     dead = attempt(robot.read_once)
     attempts = 0
@@ -361,7 +361,7 @@ def comeback(host: str, away: float) -> Report:
 def unanswered(host: str) -> Report:
     """The end of the motion is never told: the library waits for ever."""
     robot = connect(host)
-    with Control(host) as control:
+    with EmulatorControl(host) as control:
         control.send("no-move-reply on")
     return move(robot, duration=0.05, at=1.0)
 
@@ -369,7 +369,7 @@ def unanswered(host: str) -> Report:
 def slow(host: str, seconds: float) -> Report:
     """How long a setter takes."""
     robot = connect(host)
-    with Control(host) as control:
+    with EmulatorControl(host) as control:
         control.send("slow-reply", seconds)
     began = time.monotonic()
     robot.set_joint_impedance([3000.0] * 7)
@@ -378,7 +378,7 @@ def slow(host: str, seconds: float) -> Report:
 
 def truncated(host: str) -> Report:
     robot = connect(host)
-    with Control(host) as control:
+    with EmulatorControl(host) as control:
         control.send("truncate on")
         texts = [attempt(robot.read_once) for _ in range(20)]
     return {"error": next((text for text in texts if text), "")}

@@ -21,7 +21,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from hal.drivers.franka.emulator.control import Control
+from hal.drivers.franka.emulator.control import EmulatorControl
 
 __all__ = ["FR3_CLIENT", "PANDA_CLIENT", "Emulator", "free_host", "run_client"]
 
@@ -70,7 +70,7 @@ class Emulator:
             raise RuntimeError("the emulator did not get ready:\n" + "\n".join(self.lines))
         self.start_time = time.monotonic() - began
         """s from the start of the process to its "ready"."""
-        self.control = Control(self.host)
+        self.control = EmulatorControl(self.host)
 
     def _read(self) -> None:
         assert self.process.stdout is not None

@@ -1,4 +1,4 @@
-"""An emulated Franka Hand and the driver that talks to it, through Franka's own client library, for tests."""
+"""An emulated Franka Hand and its driver, with Franka's own client library in between, for tests."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from .franka_kit import free_host
 __all__ = ["LIMIT", "HandBench"]
 
 LIMIT = 15.0
-"""s within which whatever a test waits for must happen, on a busy machine."""
+"""Longest wait for any condition, on a busy machine, s."""
 _TURN = 0.005
 
 
@@ -43,16 +43,16 @@ class HandBench:
                 raise
 
     def command(self, words: str) -> dict[str, Any]:
-        """A word to the emulated hand, and how it is then."""
+        """Send a command to the emulated hand, and return its state after it."""
         return self.server.command(words.split())
 
     @property
     def requests(self) -> dict[str, int]:
-        """How often each command came to the hand."""
+        """Number of requests of each kind that the hand received."""
         return dict(self.command("state")["requests"])
 
     def read(self) -> GripperReading:
-        """As the process that owns a gripper does."""
+        """Read as the gripper's process does."""
         began = time.monotonic()
         try:
             return self.hand.read(began)
@@ -60,7 +60,7 @@ class HandBench:
             self.slowest = max(self.slowest, time.monotonic() - began)
 
     def wait(self, what: Callable[[GripperReading], bool], limit: float = LIMIT) -> GripperReading:
-        """Read until a reading is as it should be."""
+        """Read until a reading meets a condition."""
         deadline = time.monotonic() + limit
         while True:
             reading = self.read()
@@ -70,11 +70,11 @@ class HandBench:
             time.sleep(_TURN)
 
     def finish(self) -> GripperReading:
-        """Until the newest command is over."""
+        """Read until the newest command has ended."""
         return self.wait(lambda reading: reading.outcome is not GripperOutcome.RUNNING)
 
     def wait_server(self, what: Callable[[dict[str, Any]], bool]) -> dict[str, Any]:
-        """Read until the emulated hand is as it should be."""
+        """Read until the emulated hand's state meets a condition."""
         deadline = time.monotonic() + LIMIT
         while True:
             state = self.command("state")
@@ -84,19 +84,19 @@ class HandBench:
             self.hand.read(0.0)
             time.sleep(_TURN)
 
-    def wait_lost(self) -> str:
-        """Read until the driver says that the hand is lost, and what it says."""
+    def wait_lost(self) -> ConnectionLost:
+        """Read until the driver reports that the hand is lost, and return its error."""
         deadline = time.monotonic() + LIMIT
         while True:
             try:
                 self.read()
             except ConnectionLost as error:
-                return str(error)
+                return error
             assert time.monotonic() < deadline, "never lost"
             time.sleep(_TURN)
 
     def wait_back(self, connections: int) -> GripperReading:
-        """Read until the hand answers again, over its so-manieth connection."""
+        """Read until the hand answers again, over connection number ``connections``."""
         deadline = time.monotonic() + LIMIT
         while True:
             with contextlib.suppress(ConnectionLost):

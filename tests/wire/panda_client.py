@@ -15,7 +15,7 @@ from typing import Any
 
 from panda_py import libfranka as franka
 
-from hal.drivers.franka.emulator.control import Control
+from hal.drivers.franka.emulator.control import EmulatorControl
 from hal.drivers.franka.flags import FLAGS
 
 Report = dict[str, Any]
@@ -135,7 +135,7 @@ def read(host: str) -> Report:
 def motion(host: str, times: int = 1, commands: list[str] | None = None, **arguments: Any) -> Report:
     """One motion or several, in the middle of which fault commands are given."""
     robot = connect(host)
-    with Control(host) as control:
+    with EmulatorControl(host) as control:
 
         def disturb(values: list[float]) -> None:
             for command in commands or []:
@@ -170,7 +170,7 @@ def thrown(host: str) -> Report:
 def recovery(host: str, flag: str) -> Report:
     """A reflex, a motion that is refused, recovery, a motion."""
     robot = connect(host)
-    with Control(host) as control:
+    with EmulatorControl(host) as control:
         first = move(robot, disturb=lambda values: control.send("reflex", flag) and None)
     told = after(robot)
     refused = move(robot)["error"]
@@ -184,7 +184,7 @@ def all_flags(host: str) -> Report:
     """What the client names each flag that the robot raises."""
     robot = connect(host)
     names = []
-    with Control(host) as control:
+    with EmulatorControl(host) as control:
         for index in range(len(FLAGS)):
             control.send("reflex", index)
             wait_mode(robot, franka.RobotMode.kReflex)
@@ -222,7 +222,7 @@ def refused(host: str) -> Report:
 
 def truncated(host: str) -> Report:
     robot = connect(host)
-    with Control(host) as control:
+    with EmulatorControl(host) as control:
         control.send("truncate on")
         texts = [attempt(robot.read_once) for _ in range(20)]
     return {"error": next((text for text in texts if text), "")}

@@ -8,10 +8,9 @@ from math import inf, nan, sqrt
 import numpy as np
 import pytest
 
-from hal.drivers.franka.emulator.model import FLANGE_TO_HAND, RigidBody
-from hal.drivers.franka.emulator.plant import IdealPlant, LaggingPlant, Plant
+from hal.drivers.franka.emulator.motion import MotionSample, at_rest
+from hal.drivers.franka.emulator.plant import FLANGE_TO_HAND, IdealPlant, LaggingPlant, Plant, RigidBody
 from hal.drivers.franka.emulator.protocol import Generator
-from hal.drivers.franka.emulator.samples import Sample, at_rest
 from hal.drivers.franka.emulator.urdf import arm_only
 from hal.drivers.franka.flags import FLAGS, flag_index
 
@@ -28,7 +27,7 @@ def test_a_motion_that_is_stopped_brakes_within_the_limits_and_the_next_waits_fo
     assert speed > 0.2
     assert bench.ask("StopMove") == 2  # the Move is answered first: preempted
     assert [(reply.name, reply.body[0]) for reply in bench.replies[-2:]] == [("Move", 2), ("StopMove", 0)]
-    bench.requests.take("Move", 8, struct.pack("<II6d", 0, 1, *[1.0] * 6) + bytes(57))
+    bench.requests.handle("Move", 8, struct.pack("<II6d", 0, 1, *[1.0] * 6) + bytes(57))
     cycles = 0
     while bench.arm.motion is None:
         before = bench.arm.sample.dq[0]
@@ -169,9 +168,9 @@ def test_modes_in_the_state() -> None:
 
 def test_what_a_panda_has_besides() -> None:
     bench = Bench(version=5, library=b"\x7fELF")
-    bench.requests.take("GetCartesianLimit", 1, struct.pack("<I", 0))
+    bench.requests.handle("GetCartesianLimit", 1, struct.pack("<I", 0))
     assert bench.replies[-1].body == bytes(154)
-    bench.requests.take("LoadModelLibrary", 2, bytes(2))
+    bench.requests.handle("LoadModelLibrary", 2, bytes(2))
     assert bench.replies[-1].body == b"\0\x7fELF"
     assert bench.ask("SetFilters", struct.pack("<5d", *[100.0] * 5)) == 0
     # Its torque control asks for velocities as well, which stay 0.
@@ -261,7 +260,7 @@ def pushed(plant: Plant) -> float:
 
 def test_two_physics_engines_agree_roughly_on_what_a_torque_does() -> None:
     pytest.importorskip("pybullet", reason="needs pybullet (pip install pybullet)")
-    from hal.drivers.franka.emulator.plant_pybullet import PyBulletPlant
+    from hal.drivers.franka.emulator.plant import PyBulletPlant
 
     body = RigidBody(URDF)
     bullet = PyBulletPlant(body, URDF, HOME)
@@ -280,7 +279,7 @@ def test_two_physics_engines_agree_roughly_on_what_a_torque_does() -> None:
             share = min(1.0, k / 400)
             speed = 0.125 if k < 400 else 0.0
             q = [a + (b - a) * share for a, b in zip(HOME, goal, strict=True)]
-            bullet.follow(Sample(q, [speed * (n == 3) for n in range(7)], ZERO))
+            bullet.follow(MotionSample(q, [speed * (n == 3) for n in range(7)], ZERO))
         assert bullet.q == pytest.approx(goal, abs=2e-3)
     finally:
         bullet.close()

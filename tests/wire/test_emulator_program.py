@@ -15,7 +15,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from hal.drivers.franka.emulator.control import Control
+from hal.drivers.franka.emulator.control import EmulatorControl
 
 from .franka_kit import FR3_CLIENT, Emulator, run_client
 
@@ -225,7 +225,7 @@ def test_nobody_reads_what_it_prints() -> None:
     try:
         assert select.select([reading], [], [], 20.0)[0]
         os.close(reading)
-        with Control(host) as control:
+        with EmulatorControl(host) as control:
             for _ in range(3):
                 control.send("user-stop on")
             assert control.send("state")["mode"] == "user_stopped"

@@ -1,6 +1,6 @@
-"""Every fault that the emulator can make, as an app meets it: the error, how soon, what the arm does, how to go on.
+"""Every fault that the emulator can inject: the app's error, its delay, the state of the arm, and how to continue.
 
-pytest -s tests/wire/test_franka_faults.py      # prints the table of docs/franka.md anew
+pytest -s tests/wire/test_franka_faults.py      # prints the table of docs/measured.md
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from .rig_kit import Drive, arm_of, rig_of, settled, wait_until
 
 pytest.importorskip("pylibfranka", reason="needs pylibfranka: pip install 'robot-hal[franka]'")
 
-DOCS = Path(__file__).parents[2] / "docs" / "franka.md"
+DOCS = Path(__file__).parents[2] / "docs" / "measured.md"
 
 
 @dataclass(frozen=True)
@@ -34,13 +34,13 @@ class Case:
     says: str
     """In the error's text."""
     status: RobotStatus
-    """Of the arm afterwards, until somebody does something."""
+    """Status of the arm afterwards."""
     within: float
-    """s, at most, from the command to the app's error; far more than it takes on a machine at rest."""
+    """Longest time from the command to the app's error, s, with a large margin."""
     undo: str = ""
-    """A command that takes the fault away, where it does not go by itself."""
+    """Command that ends the fault, if it does not end by itself."""
     recover: bool = True
-    """Does it take recover()?"""
+    """Whether recover() is required."""
 
     @property
     def name(self) -> str:
@@ -80,7 +80,7 @@ def rig(emulator: Emulator) -> Iterator[Rig]:
 def table() -> Iterator[list[str]]:
     rows: list[str] = []
     yield rows
-    print("\n| fault | the app gets | after | the arm is | to go on |\n|---|---|---|---|---|")
+    print("\n| fault | the app gets | after | state of the arm | to continue |\n|---|---|---|---|---|")
     print("\n".join(rows))
 
 
@@ -166,7 +166,7 @@ def test_an_arm_does_not_go_on_by_itself(emulator: Emulator, rig: Rig) -> None:
         assert abs(arm.state().q - before).max() > 1e-3, "after rearm() it goes on"
 
 
-def test_the_docs_have_every_fault() -> None:
+def test_the_docs_list_every_fault() -> None:
     text = DOCS.read_text()
     missing = [case.command for case in CASES if f"| `{case.command}` |" not in text]
     assert not missing

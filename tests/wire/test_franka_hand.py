@@ -17,7 +17,7 @@ import pytest
 
 pytest.importorskip("panda_py", reason="needs panda-python: pip install 'robot-hal[panda]'")
 
-from hal.drivers.franka import hand, hand_calls, hand_link, hand_pilot
+from hal.drivers.franka import hand, hand_motions, hand_process
 from hal.drivers.franka.hand import FrankaHand
 from hal.errors import CommandError, ConnectionLost, NotSupported
 from hal.specs import GripperSpec
@@ -39,10 +39,10 @@ def bench() -> Iterator[HandBench]:
 @pytest.fixture
 def brisk(monkeypatch: pytest.MonkeyPatch) -> None:
     """Nobody has to wait as long as a real hand may need."""
-    monkeypatch.setattr(hand_calls, "_SLACK", 0.3)
-    monkeypatch.setattr(hand_pilot, "_STOP_ANSWER", 0.3)
-    monkeypatch.setattr(hand_pilot, "_REST", 0.3)
-    monkeypatch.setattr(hand_link, "_PAUSE", 0.1)
+    monkeypatch.setattr(hand_motions, "_CALL_MARGIN", 0.3)
+    monkeypatch.setattr(hand_motions, "_STOP_ANSWER", 0.3)
+    monkeypatch.setattr(hand_motions, "_REST", 0.3)
+    monkeypatch.setattr(hand_process, "_RESTART_PAUSE", 0.1)
 
 
 def client_of(bench: HandBench) -> int:
@@ -228,7 +228,7 @@ def test_a_motion_that_is_never_answered_is_given_up(bench, brisk):
 
 def test_silence_is_a_lost_hand_and_nothing_waits_for_it(bench):
     bench.command("silence 1.3")
-    assert "silent" in bench.wait_lost()
+    assert bench.wait_lost().code == "silent"
     with pytest.raises(ConnectionLost):
         bench.hand.move(0.08, 0.1, 40.0)
     bench.wait_back(1)
@@ -240,7 +240,7 @@ def test_silence_is_a_lost_hand_and_nothing_waits_for_it(bench):
 @pytest.mark.parametrize("how", ["the hand hangs up", "the client library dies", "the hand restarts"])
 def test_a_connection_comes_back_but_not_the_command_that_it_cost(bench, brisk, monkeypatch, how):
     """The library itself would wait for ever here, and take a whole core."""
-    monkeypatch.setattr(hand_link, "_SILENT", 0.5)
+    monkeypatch.setattr(hand_process, "_STATE_TIMEOUT", 0.5)
     client = client_of(bench)
     bench.hand.move(0.08, 0.01, 40.0)
     bench.wait(lambda r: r.width > 0.041)
@@ -310,10 +310,10 @@ def test_a_hand_that_another_program_uses_is_told(bench):
 
 
 def test_a_hand_that_takes_the_connection_and_says_nothing_is_told(monkeypatch):
-    monkeypatch.setattr(hand_link, "_OPEN", 1.0)
+    monkeypatch.setattr(hand_process, "_OPEN_TIMEOUT", 1.0)
     with HandBench(connect=False) as bench:
         bench.command("slow-reply 1000")
-        with pytest.raises(ConnectionLost, match="says nothing"):
+        with pytest.raises(ConnectionLost, match="sends nothing"):
             bench.hand.open()
 
 
@@ -333,11 +333,12 @@ def test_numbers_beyond_the_hand_are_brought_into_its_range(bench):
 
 
 def test_a_hand_that_sends_no_states_is_told(monkeypatch):
-    monkeypatch.setattr(hand, "_FIRST_STATE", 0.3)
+    monkeypatch.setattr(hand, "_FIRST_STATE_TIMEOUT", 0.3)
     with HandBench(connect=False) as bench:
         bench.command("silence 1000")
-        with pytest.raises(ConnectionLost, match="no state"):
+        with pytest.raises(ConnectionLost) as caught:
             bench.hand.open()
+    assert caught.value.code == "silent"
 
 
 def test_the_client_library_ends_with_its_driver(bench):

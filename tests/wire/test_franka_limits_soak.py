@@ -16,8 +16,7 @@ import pytest
 from hal.commands import CommandRecord, Inbox, Kind, Session
 from hal.config import load
 from hal.driver import Reading, Setpoint
-from hal.drivers.franka.emulator.checker import LimitChecker
-from hal.drivers.franka.emulator.samples import Sample, at_rest, by_position, extrapolated
+from hal.drivers.franka.emulator.motion import LimitChecker, MotionSample, at_rest, by_position, extrapolated
 from hal.drivers.franka.limits import LIMITS
 from hal.servo.servo import Servo
 from hal.specs import RobotSpec
@@ -43,7 +42,7 @@ class Controller:
 
     def __init__(self, arm: str, q: tuple[float, ...]) -> None:
         self.checker = LimitChecker(LIMITS[arm])
-        self.sample: Sample = at_rest(q)
+        self.sample: MotionSample = at_rest(q)
         self.single = arm == "fr3"
         self.cycles = self.lost = 0
         self.travel = 0.0

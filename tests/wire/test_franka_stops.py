@@ -13,7 +13,7 @@ import hal
 from hal.config import load
 from hal.driver import Setpoint
 from hal.drivers.franka.arm import FrankaArm
-from hal.drivers.franka.link import Kind, Link, Mode, Sample
+from hal.drivers.franka.link import ArmLink, ArmMode, ArmSample, StreamKind
 from hal.types import RobotStatus
 
 from .franka_kit import Emulator
@@ -26,12 +26,12 @@ HOME = (0.0, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785)
 ZERO = (0.0,) * 7
 
 
-class ScriptedLink(Link):
+class ScriptedLink(ArmLink):
     """A robot whose next states are given, and whose motion ends with a user stop."""
 
     owns_loop = True
 
-    def __init__(self, modes: list[Mode]) -> None:
+    def __init__(self, modes: list[ArmMode]) -> None:
         super().__init__()
         self.modes = modes
         self.t = 1.0
@@ -39,14 +39,14 @@ class ScriptedLink(Link):
 
     def connect(self, host: str) -> None: ...
 
-    def read(self) -> Sample:
+    def read(self) -> ArmSample:
         self.t += 1e-3
         mode = self.modes.pop(0) if len(self.modes) > 1 else self.modes[0]
-        values: dict[str, Any] = dict.fromkeys(Sample._fields, ZERO)
+        values: dict[str, Any] = dict.fromkeys(ArmSample._fields, ZERO)
         values |= {"t": self.t, "mode": mode, "q": HOME, "q_d": HOME, "success_rate": 1.0}
-        return Sample(**values)
+        return ArmSample(**values)
 
-    def start(self, kind: Kind) -> None:
+    def start(self, kind: StreamKind) -> None:
         self.started += 1
         self.motion = kind
 
@@ -68,11 +68,11 @@ def test_a_user_stop_that_is_over_at_once_is_still_told() -> None:
     """It was seen once, by the driver itself; in the next state it is released. The servo has to hear of it."""
     plan = load("franka_emulator", overrides=["robots.arm.model=panda", "cameras={}"]).resolve()
     arm = FrankaArm(plan.robots[0])
-    link = ScriptedLink([Mode.MOVE, Mode.USER_STOPPED, Mode.IDLE])
+    link = ScriptedLink([ArmMode.MOVE, ArmMode.USER_STOPPED, ArmMode.IDLE])
     arm._connection.link = link
     arm.wait()
     arm.read(0.0)
-    link.motion = Kind.POSITION
+    link.motion = StreamKind.POSITION
     arm.loop(lambda: None)
     arm.wait()
     reading = arm.read(0.0)

@@ -1,1 +1,1 @@
-"""A program that stands in for a Franka: the vendor's own client library talks to it as it does to the arm."""
+"""An emulator of a Franka: the vendor's own client library talks to it as to the arm."""

@@ -1,4 +1,4 @@
-"""``python -m hal.drivers.franka.emulator``: see ``--help``."""
+"""The emulator as a program: ``python -m hal.drivers.franka.emulator --help``."""
 
 from __future__ import annotations
 
@@ -14,29 +14,26 @@ from typing import TYPE_CHECKING, Any
 from hal.config.data_files import find_data
 from hal.drivers.franka.limits import LIMITS
 
-from .arm import Arm
-from .console import CONTROL_PORT, Console
-from .executor import Executor
+from .arm import EmulatedArm, RobotFiles
+from .console import CommandConsole, Executor
+from .control import CONTROL_PORT
 from .faults import help_text
 from .journal import Journal
-from .model import RigidBody
-from .pacing import Pacing
-from .plant import IdealPlant, LaggingPlant, Plant
+from .plant import IdealPlant, LaggingPlant, Plant, PyBulletPlant, RigidBody
 from .protocol import PORT, PROTOCOLS
-from .requests import Files
-from .server import ArmServer
+from .server import ArmServer, Pacing
 from .urdf import arm_only
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
 _ROBOTS = {"fr3": ("FR3", "fr3", 10), "panda": ("Panda", "fer", 5)}
-"""Choice -> name, model of its limits, protocol."""
+"""Choice -> name, key of its limits, protocol."""
 _HOME = (0.0, -0.785398163, 0.0, -2.35619449, 0.0, 1.57079633, 0.785398163)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """The program; returns its exit status."""
+    """Run the program, and return its exit status."""
     options = _parser().parse_args(arguments)
     journal = Journal(options.quiet)
     try:
@@ -58,17 +55,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _prepare(options: argparse.Namespace, stack: ExitStack, journal: Journal) -> tuple[ArmServer, str]:
-    """Everything, ready to run, and the line that says so. Raises OSError and ValueError with what is wrong."""
+    """Return the server, ready to run, and the line that announces it. Raises OSError and ValueError."""
     title, model, version = _ROBOTS[options.robot]
     urdf = options.urdf or find_data("robots", "fr3.urdf")
     library = options.model_library
-    files = Files(
+    files = RobotFiles(
         arm_only(urdf.read_text(encoding="utf-8")).encode(), library.read_bytes() if library is not None else None
     )
     plant = _plant(options, urdf)
     stack.callback(plant.close)
     with_hand = options.end_effector == "hand"
-    arm = Arm(PROTOCOLS[version], LIMITS[model], plant, journal, with_hand)
+    arm = EmulatedArm(PROTOCOLS[version], LIMITS[model], plant, journal, with_hand)
     pacing = Pacing(options.lockstep, not (options.lockstep and options.unpaced), options.patience)
     server = ArmServer(options.host, arm, files, pacing, options.seed)
     stack.callback(server.close)
@@ -76,11 +73,11 @@ def _prepare(options: argparse.Namespace, stack: ExitStack, journal: Journal) ->
     if hand is not None:
         hand.start()
         stack.callback(hand.stop)
-    # Nobody on the network is to give fault commands.
+    # Fault commands are accepted from this computer only.
     control_host = options.host if ipaddress.ip_address(options.host).is_loopback else "127.0.0.1"
-    console = Console(control_host, server.poller, Executor(server, hand).execute)
+    console = CommandConsole(control_host, server.poller, Executor(server, hand).execute)
     stack.callback(console.close)
-    server.attach(console)
+    server.attach(console.serve)
     hands = "no hand" if hand is None else f"hand {PORT + 1}"
     return server, (
         f"ready: {title} at {options.host}, arm {PORT}, {hands}, control {control_host}:{CONTROL_PORT}; "
@@ -91,26 +88,42 @@ def _prepare(options: argparse.Namespace, stack: ExitStack, journal: Journal) ->
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="python -m hal.drivers.franka.emulator",
-        description="Stands in for a Franka arm and its hand: the vendor's own client libraries talk to it as to the "
-        "robot. It checks limits and timing as documented; what is not documented is assumed. It proves nothing about "
-        "a real arm.",
+        description="Emulates a Franka arm and its hand for the vendor's own client libraries. Limits and timing are "
+        "checked as documented; what is not documented is assumed. It proves nothing about a real arm.",
         epilog="commands, typed here or sent to the control port:\n" + help_text(),
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     add = parser.add_argument
     add("--robot", choices=sorted(_ROBOTS), default="fr3", help="which arm (%(default)s)")
     add("--host", default="127.0.0.2", type=_address, help="address to listen on; the ports are fixed (%(default)s)")
-    add("--plant", choices=("ideal", "lag", "pybullet"), default="ideal", help="what moves behind it (%(default)s)")
+    add(
+        "--plant", choices=("ideal", "lag", "pybullet"), default="ideal", help="model of the arm's motion (%(default)s)"
+    )
     add("--lag", type=_positive, default=0.01, metavar="S", help="time constant of --plant lag, s (%(default)s)")
-    add("--lockstep", action="store_true", help="while a motion runs, wait for the answer to each state")
-    add("--unpaced", action="store_true", help="with --lockstep: as fast as a client answers that steps its own time")
-    add("--patience", type=_positive, default=5.0, metavar="S", help="with --lockstep: wait so long, s (%(default)s)")
+    add("--lockstep", action="store_true", help="during a motion, wait for the answer to each state")
+    add(
+        "--unpaced",
+        action="store_true",
+        help="with --lockstep: as fast as the client answers, for clients in simulated time",
+    )
+    add(
+        "--patience",
+        type=_positive,
+        default=5.0,
+        metavar="S",
+        help="with --lockstep: longest wait for an answer, s (%(default)s)",
+    )
     add("--q", type=float, nargs=7, default=_HOME, metavar="RAD", help="joint positions at the start (home)")
     add("--urdf", type=Path, help="the arm's URDF (the project's fr3.urdf)")
-    add("--model-library", type=Path, metavar="FILE", help="panda: shared object to send when asked for (none)")
-    add("--end-effector", choices=("hand", "none"), default="hand", help="what is on the flange (%(default)s)")
-    add("--no-hand", action="store_true", help="serve no hand, only the arm")
-    add("--seed", type=int, default=0, help="of what is lost by chance (%(default)s)")
+    add(
+        "--model-library",
+        type=Path,
+        metavar="FILE",
+        help="panda: shared object for clients that request the model (none)",
+    )
+    add("--end-effector", choices=("hand", "none"), default="hand", help="tool on the flange (%(default)s)")
+    add("--no-hand", action="store_true", help="serve the arm only")
+    add("--seed", type=int, default=0, help="seed of random losses (%(default)s)")
     add("--quiet", action="store_true", help="print no events")
     return parser
 
@@ -120,8 +133,6 @@ def _plant(options: argparse.Namespace, urdf: Path) -> Plant:
     if options.plant == "lag":
         return LaggingPlant(body, options.q, options.lag)
     if options.plant == "pybullet":
-        from .plant_pybullet import PyBulletPlant
-
         return PyBulletPlant(body, urdf, options.q)
     return IdealPlant(body, options.q)
 

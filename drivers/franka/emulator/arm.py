@@ -1,4 +1,4 @@
-"""The robot's side of the control interface: modes, motions, errors. There is no socket and no clock in it."""
+"""The emulated arm: modes, motions and errors, its answers to requests, and its state packets. No socket, no clock."""
 
 from __future__ import annotations
 
@@ -7,39 +7,44 @@ from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 from hal.drivers.franka.flags import FLAGS
-from hal.drivers.franka.limits import ArmLimits
+from hal.drivers.franka.limits import ELBOW_FLIP, ArmLimits
 
-from .checker import LimitChecker
-from .faults import Reports
-from .journal import Figures, Journal
-from .layouts import CommandPacket
-from .motion import Ending, Motion
-from .moves import MoveOptions
+from .faults import SetpointReports
+from .journal import Counters, Journal
+from .motion import DT, ArmMotion, Ending, Floats, LimitChecker, MotionSample, MoveOptions, at_rest, braked, read_move
 from .plant import Plant
-from .protocol import ControllerMode, Generator, GeneratorMode, Outcome, Protocol, RobotMode
-from .samples import Floats, Sample, at_rest, braked
-from .setters import Settings
-from .state import StateWriter
+from .protocol import (
+    FLAG_COUNT,
+    CommandPacket,
+    ControllerMode,
+    FrankaProtocol,
+    Generator,
+    GeneratorMode,
+    RequestOutcome,
+    RobotMode,
+    StatePacket,
+)
+from .settings import SETTERS, ClientSettings
 
-__all__ = ["Arm", "Reply"]
+__all__ = ["ArmReply", "EmulatedArm", "RequestHandler", "RobotFiles"]
 
-_BY_HAND = frozenset({"joint_position_limits_violation"})
-"""Errors that need a person to move the arm by hand; that it is just these is an assumption."""
+_MANUAL_ERRORS = frozenset({"joint_position_limits_violation"})
+"""Errors that are cleared only by guiding the arm by hand. Which ones is an assumption."""
 
 
-class Reply(NamedTuple):
+class ArmReply(NamedTuple):
     """A response to a request."""
 
     name: str
     number: int
     body: bytes
     after_state: bool
-    """It must not leave before the next state: the client reads the state when it has the response."""
+    """Whether it must follow the next state: the client reads that state once it has the response."""
 
 
 @dataclass
-class Stops:
-    """What keeps the arm from moving, apart from errors."""
+class StopSwitches:
+    """Switches that keep the arm from moving, apart from errors."""
 
     user: bool = False
     emergency: bool = False
@@ -47,21 +52,21 @@ class Stops:
 
 
 @dataclass
-class Arm:
-    """One arm. :meth:`tick` is its control cycle; what requests ask for is done in between (see :mod:`.requests`)."""
+class EmulatedArm:
+    """One arm. :meth:`tick` is its control cycle; requests are served in between (:class:`RequestHandler`)."""
 
-    protocol: Protocol
+    protocol: FrankaProtocol
     limits: ArmLimits
     plant: Plant
     journal: Journal
     with_hand: bool = True
-    send: Callable[[Reply], None] = lambda reply: None
-    """Where answers go: the connection's."""
-    figures: Figures = field(default_factory=Figures)
+    send: Callable[[ArmReply], None] = lambda reply: None
+    """Sends an answer to the client."""
+    counters: Counters = field(default_factory=Counters)
     no_move_reply: bool = False
-    """A fault: the end of a motion is never told."""
-    reports: Reports = field(default_factory=Reports)
-    """Faults of what the states say was commanded."""
+    """Injected fault: the end of a motion is never answered."""
+    reports: SetpointReports = field(default_factory=SetpointReports)
+    """Injected faults of the reported set-points."""
 
     def __post_init__(self) -> None:
         self.checker = LimitChecker(self.limits)
@@ -71,29 +76,29 @@ class Arm:
         self.restart()
 
     def restart(self) -> None:
-        """As after switching it on, where it stands."""
-        self.settings = Settings(self.with_hand)
-        self.stops = Stops()
+        """Reset to the state after switching on, at the present position."""
+        self.settings = ClientSettings(self.with_hand)
+        self.stops = StopSwitches()
         self.errors: frozenset[int] = frozenset()
         self.last_errors: frozenset[int] = frozenset()
-        self.motion: Motion | None = None
-        self.sample: Sample = at_rest(self.plant.q)
+        self.motion: ArmMotion | None = None
+        self.sample: MotionSample = at_rest(self.plant.q)
         self.shown = self.sample
-        """What the state says that it was commanded."""
+        """Set-point that the state reports."""
         self._pending: tuple[int, MoveOptions] | None = None
 
     def place(self, q: Floats | None) -> None:
-        """Put the arm there (7,), rad, or where it was at the start. Raises ValueError while a motion runs."""
+        """Put the arm at ``q`` (7,), rad, or at its start position. Raises ValueError while a motion runs."""
         if self.motion is not None:
             raise ValueError("not while a motion runs")
         self.plant.place(self._start if q is None else q)
         self.sample = at_rest(self.plant.q)
 
-    # What it shows.
+    # State.
 
     @property
     def mode(self) -> RobotMode:
-        """As the state tells it."""
+        """Mode in the state."""
         if self.stops.emergency:
             return RobotMode.OTHER
         if self.stops.user:
@@ -106,7 +111,7 @@ class Arm:
 
     @property
     def modes(self) -> tuple[GeneratorMode, ControllerMode]:
-        """Of motion generator and controller. What an idle robot shows for the latter is an assumption."""
+        """Modes of motion generator and controller. The latter of an idle robot is an assumption."""
         if self.motion is None:
             return GeneratorMode.IDLE, ControllerMode.OTHER
         options = self.motion.options
@@ -114,13 +119,13 @@ class Arm:
 
     @property
     def at_rest(self) -> bool:
-        """Does it stand, with nothing running?"""
+        """Whether the arm is at rest and no motion is running."""
         return self.motion is None and not self.sample.moving and max(map(abs, self.plant.dq)) < 1e-4
 
     # One cycle.
 
     def tick(self, command: CommandPacket | None) -> bytearray:
-        """Go on for one millisecond with this command, or without one; gives the state packet after it."""
+        """Advance one millisecond, with or without a command, and return the state packet after it."""
         motion = self.motion
         if motion is None:
             self._rest()
@@ -128,14 +133,14 @@ class Arm:
             ending = motion.step(command, self.plant.q)
             self.sample = motion.sample
             if motion.lost_in_row:
-                self.figures.lost += 1
-                self.figures.lost_in_row = max(self.figures.lost_in_row, motion.lost_in_row)
+                self.counters.lost += 1
+                self.counters.lost_in_row = max(self.counters.lost_in_row, motion.lost_in_row)
             if ending is not None:
                 self._end(ending)
         self._move()
         self.shown = self.reports.shown(self.sample, self.plant.q, self.plant.dq)
         self.message_id += 1
-        self.figures.cycles += 1
+        self.counters.cycles += 1
         return self._writer.write(self)
 
     def _rest(self) -> None:
@@ -151,32 +156,32 @@ class Arm:
             return
         self.plant.push(motion.torques)
         if motion.options.generator is Generator.NONE:
-            motion.sample = self.sample = Sample(self.plant.q, self.plant.dq, (0.0,) * 7)
+            motion.sample = self.sample = MotionSample(self.plant.q, self.plant.dq, (0.0,) * 7)
         violation = self.checker.measured(self.plant.q, self.plant.dq)
         if violation is not None:
-            self._end(Ending(Outcome.REFLEX, violation.text, violation.flag))
+            self._end(Ending(RequestOutcome.REFLEX, violation.text, violation.flag))
 
     # Motions.
 
     def _begin(self, number: int, options: MoveOptions) -> None:
         self.last_errors = frozenset()
         self.sample = at_rest(self.sample.q)
-        self.answer("Move", number, Outcome.STARTED, after_state=False)
-        self.motion = Motion(number, options, self.sample, self.message_id, self.checker)
-        self.figures.motions += 1
-        self.journal.say("motion started", f"motion started: {options.describe()}")
+        self.answer("Move", number, RequestOutcome.STARTED, after_state=False)
+        self.motion = ArmMotion(number, options, self.sample, self.message_id, self.checker)
+        self.counters.motions += 1
+        self.journal.record("motion started", f"motion started: {options.describe()}")
 
     def _end(self, ending: Ending) -> None:
         motion = self.motion
         assert motion is not None
         if motion.external:
-            self.sample = Sample(self.plant.q, self.plant.dq, (0.0,) * 7)
+            self.sample = MotionSample(self.plant.q, self.plant.dq, (0.0,) * 7)
         speed = max(map(abs, self.sample.dq))
         self.motion = None
         rate = motion.success_rate
         if ending.flag is not None:
             self._raise(ending.flag, ending.text)
-        self.journal.say(
+        self.journal.record(
             "motion ended",
             f"motion ended: {ending.outcome.value} ({ending.text}) after {motion.commands} commands, "
             f"success rate {rate:.2f}, at {speed:.3g} rad/s",
@@ -190,91 +195,93 @@ class Arm:
 
     def _raise(self, flag: int, text: str) -> None:
         self.errors = self.last_errors = frozenset({flag})
-        self.figures.reflexes += 1
-        self.journal.say("reflex", f"reflex {FLAGS[flag]}: {text}", flag=FLAGS[flag], reason=text)
+        self.counters.reflexes += 1
+        self.journal.record("reflex", f"reflex {FLAGS[flag]}: {text}", flag=FLAGS[flag], reason=text)
 
-    # What happens to it.
+    # Faults and stops.
 
     def reflex(self, flag: int) -> None:
-        """The controller stops the arm with this error."""
+        """Raise an error flag, which ends a running motion."""
         if self.motion is not None:
-            self._end(Ending(Outcome.REFLEX, "by command", flag))
+            self._end(Ending(RequestOutcome.REFLEX, "by command", flag))
         else:
             self._raise(flag, "by command")
 
     def user_stop(self, on: bool) -> None:
-        """The button in somebody's hand is pressed or released."""
+        """Press or release the user stop."""
         self.stops.user = on
         self._stopped(on, "user stop")
 
     def emergency_stop(self, on: bool) -> None:
-        """The emergency stop. That the arm is idle as soon as it is released is an assumption."""
+        """Press or release the emergency stop. That the arm is idle once it is released is an assumption."""
         self.stops.emergency = on
         self._stopped(on, "emergency stop")
 
     def guiding(self, on: bool) -> None:
-        """Somebody leads the arm by hand. Raises ValueError while a motion runs."""
+        """Start or end guiding by hand. Raises ValueError while a motion runs."""
         if on and self.motion is not None:
             raise ValueError("not while a motion runs")
         self.stops.guiding = on
-        if not on and any(FLAGS[flag] in _BY_HAND for flag in self.errors):
+        if not on and any(FLAGS[flag] in _MANUAL_ERRORS for flag in self.errors):
             self.errors = frozenset()
-        self.journal.say("guiding", f"guiding {'on' if on else 'off'}")
+        self.journal.record("guiding", f"guiding {'on' if on else 'off'}")
 
     def _stopped(self, on: bool, what: str) -> None:
-        self.journal.say(what, f"{what} {'pressed' if on else 'released'}")
+        self.journal.record(what, f"{what} {'pressed' if on else 'released'}")
         if on and self.motion is not None:
-            self._end(Ending(Outcome.EMERGENCY, what))
+            self._end(Ending(RequestOutcome.EMERGENCY, what))
         if on:
             self._refuse_pending()
 
     def client_gone(self) -> None:
-        """The connection ended: the robot stops by itself."""
+        """Handle the end of the connection: the robot stops."""
         self._pending = None
         if self.motion is not None:
-            self._end(Ending(Outcome.ABORTED, "the client is gone"))
+            self._end(Ending(RequestOutcome.ABORTED, "the client disconnected"))
 
     def _refuse_pending(self) -> None:
         if self._pending is not None:
-            self.answer("Move", self._pending[0], Outcome.NOT_POSSIBLE)
+            self.answer("Move", self._pending[0], RequestOutcome.NOT_POSSIBLE)
             self._pending = None
 
-    # What a client asks for.
+    # Requests of the client.
 
-    def move(self, number: int, options: MoveOptions) -> Outcome | None:
-        """Begin a motion in the next cycle, or when the arm has come to rest; the reason where it may not."""
+    def move(self, number: int, options: MoveOptions) -> RequestOutcome | None:
+        """Start a motion in the next cycle, or once the arm is at rest; return the outcome if it is refused."""
         if self.motion is not None or self.mode is not RobotMode.IDLE:
-            return Outcome.NOT_POSSIBLE
+            return RequestOutcome.NOT_POSSIBLE
         self._refuse_pending()
         self._pending = (number, options)
         return None
 
-    def stop(self) -> Outcome:
-        """End the motion that runs."""
+    def stop(self) -> RequestOutcome:
+        """End the running motion."""
         self._refuse_pending()
         if self.motion is None:
-            return Outcome.NOT_POSSIBLE
-        self._end(Ending(Outcome.PREEMPTED, "StopMove"))
-        return Outcome.SUCCESS
+            return RequestOutcome.NOT_POSSIBLE
+        self._end(Ending(RequestOutcome.PREEMPTED, "StopMove"))
+        return RequestOutcome.SUCCESS
 
-    def recover(self) -> Outcome:
+    def recover(self) -> RequestOutcome:
         """Clear the errors."""
         if self.stops.emergency:
-            return Outcome.EMERGENCY
+            return RequestOutcome.EMERGENCY
         if self.motion is not None or self.stops.user or self.stops.guiding:
-            return Outcome.NOT_POSSIBLE
-        if any(FLAGS[flag] in _BY_HAND for flag in self.errors):
-            return Outcome.MANUAL
+            return RequestOutcome.NOT_POSSIBLE
+        if any(FLAGS[flag] in _MANUAL_ERRORS for flag in self.errors):
+            return RequestOutcome.MANUAL
         self.errors = frozenset()
-        return Outcome.SUCCESS
+        return RequestOutcome.SUCCESS
 
-    def answer(self, name: str, number: int, outcome: Outcome, body: bytes = b"", *, after_state: bool = True) -> None:
-        """Respond to a request."""
+    def answer(
+        self, name: str, number: int, outcome: RequestOutcome, body: bytes = b"", *, after_state: bool = True
+    ) -> None:
+        """Send the response to a request."""
         status = self.protocol.status(name, outcome)
-        self.send(Reply(name, number, bytes((status,)) + body, after_state))
+        self.send(ArmReply(name, number, bytes((status,)) + body, after_state))
 
     def report(self) -> dict[str, Any]:
-        """The state as plain values, for the control port."""
+        """Return the state as plain values, for the control port."""
         generator, controller = self.modes
         return {
             "message_id": self.message_id,
@@ -292,3 +299,172 @@ class Arm:
             "success_rate": self.motion.success_rate if self.motion is not None else 0.0,
             "commands": self.motion.commands if self.motion is not None else 0,
         }
+
+
+# State packets.
+
+_HAND_MASS = 0.73
+_HAND_CENTRE = (-0.01, 0.0, 0.03)
+_HAND_INERTIA = (0.001, 0.0, 0.0, 0.0, 0.0025, 0.0, 0.0, 0.0, 0.0017)
+"""m_ee (kg), F_x_Cee (m) and I_ee (kg m2) of an arm with a Franka Hand."""
+
+
+class StateWriter:
+    """Keeps one state packet up to date, and writes only what may have changed.
+
+    Contacts, external forces and accelerometers are always 0.
+    """
+
+    def __init__(self, version: int) -> None:
+        self.packet = StatePacket(version)
+        self._settings: object = None
+        self._changes = -1
+        self._flags: object = None
+        self._q: Floats | None = None
+        self._q_d: Floats | None = None
+        self._tau: Floats = (0.0,) * 7
+        self.packet.put("O_ddP_O", (0.0, 0.0, -9.81))
+
+    def write(self, arm: EmulatedArm) -> bytearray:
+        """Return the packet after this cycle, always in the same buffer."""
+        packet, plant, motion, sample = self.packet, arm.plant, arm.motion, arm.shown
+        if arm.settings is not self._settings or arm.settings.changes != self._changes:
+            self._write_settings(arm)
+        packet.put("message_id", (arm.message_id,))
+        q, tau = plant.q, plant.tau
+        if q is not self._q or sample.q is not self._q_d:
+            self._write_poses(arm)
+        dtau = [(new - old) / DT for new, old in zip(tau, self._tau, strict=True)]
+        self._tau = tau
+        torques: Floats = motion.torques if motion is not None else (0.0,) * 7
+        packet.put_joints((*tau, *torques, *dtau, *q, *sample.q, *plant.dq, *sample.dq, *sample.ddq))
+        packet.put_motors((*q, *plant.dq))
+        packet.put_modes(*arm.modes)
+        flags = (arm.errors, arm.last_errors)
+        if flags != self._flags:
+            self._flags = flags
+            for name, raised in (("errors", arm.errors), ("reflex_reason", arm.last_errors)):
+                packet.put(name, [int(k in raised) for k in range(FLAG_COUNT)])
+        packet.put("robot_mode", (arm.mode,))
+        packet.put("control_command_success_rate", (motion.success_rate if motion is not None else 0.0,))
+        return packet.buffer
+
+    def _write_poses(self, arm: EmulatedArm) -> None:
+        q, q_d = arm.plant.q, arm.shown.q
+        self._q, self._q_d = q, q_d
+        packet, tip = self.packet, arm.settings.F_T_EE
+        pose = arm.plant.body.tip(q, tip)
+        desired = pose if q_d is q else arm.plant.body.tip(q_d, tip)
+        packet.put("O_T_EE", pose)
+        packet.put("O_T_EE_d", desired)
+        packet.put("O_T_EE_c", desired)
+        packet.put("elbow", _elbow(q))
+        packet.put("elbow_d", _elbow(q_d))
+        packet.put("elbow_c", _elbow(q_d))
+
+    def _write_settings(self, arm: EmulatedArm) -> None:
+        packet, settings = self.packet, arm.settings
+        self._settings, self._changes = settings, settings.changes
+        packet.put("F_T_EE", settings.F_T_EE)
+        packet.put("EE_T_K", settings.EE_T_K)
+        packet.put("F_T_NE", settings.F_T_NE)
+        packet.put("NE_T_EE", settings.NE_T_EE)
+        if settings.with_hand:
+            packet.put("m_ee", (_HAND_MASS,))
+            packet.put("F_x_Cee", _HAND_CENTRE)
+            packet.put("I_ee", _HAND_INERTIA)
+        mass, centre, inertia = settings.load
+        packet.put("m_load", (mass,))
+        packet.put("F_x_Cload", centre)
+        packet.put("I_load", inertia)
+        self._q = None
+
+
+def _elbow(q: Floats) -> tuple[float, float]:
+    """Return the angle of joint 3, rad, and the direction in which joint 4 bends."""
+    return q[2], 1.0 if q[3] > ELBOW_FLIP else -1.0
+
+
+# Requests.
+
+_VIRTUAL_WALL = bytes(24 + 128 + 1)
+"""Payload of GetCartesianLimit: size, frame, whether it is active. There is no virtual wall."""
+
+
+@dataclass(frozen=True)
+class RobotFiles:
+    """Files that a client may request."""
+
+    urdf: bytes
+    model_library: bytes | None = None
+    """Shared object for a Panda's client; none is included."""
+
+
+class RequestHandler:
+    """Decodes requests, one at a time, and has the arm carry them out and answer."""
+
+    def __init__(self, arm: EmulatedArm, files: RobotFiles) -> None:
+        self._arm = arm
+        self._files = files
+        self._handlers: dict[str, Callable[[int, bytes], None]] = {
+            "Move": self._move,
+            "StopMove": self._stop,
+            "AutomaticErrorRecovery": self._recover,
+            "GetRobotModel": self._model,
+            "LoadModelLibrary": self._library,
+            "GetCartesianLimit": self._wall,
+        }
+
+    def handle(self, name: str, number: int, payload: bytes) -> None:
+        """Carry out one request, whose payload has the right size."""
+        if name in SETTERS:
+            self._set(name, number, payload)
+        else:
+            self._handlers[name](number, payload)
+
+    def _set(self, name: str, number: int, payload: bytes) -> None:
+        arm = self._arm
+        if arm.motion is not None:  # refusing settings during a motion is an assumption
+            arm.answer(name, number, RequestOutcome.NOT_POSSIBLE)
+            return
+        reason = arm.settings.store(name, payload)
+        text = "accepted" if reason is None else f"refused, {reason}"
+        arm.journal.record("setting", f"{name}: {text}", name=name, refused=reason)
+        arm.answer(name, number, RequestOutcome.SUCCESS if reason is None else RequestOutcome.INVALID)
+
+    def _move(self, number: int, payload: bytes) -> None:
+        arm = self._arm
+        try:
+            options = read_move(payload)
+        except ValueError as error:
+            self._refuse(number, RequestOutcome.INVALID, str(error))
+            return
+        if options.generator in (Generator.CARTESIAN_POSITION, Generator.CARTESIAN_VELOCITY):
+            self._refuse(number, RequestOutcome.NOT_POSSIBLE, "Cartesian motions are not emulated")
+            return
+        reason = arm.move(number, options)
+        if reason is not None:
+            self._refuse(number, reason, f"the robot's mode is {arm.mode.name.lower()}")
+
+    def _refuse(self, number: int, outcome: RequestOutcome, why: str) -> None:
+        self._arm.journal.record("refused", f"Move refused: {why}")
+        self._arm.answer("Move", number, outcome)
+
+    def _stop(self, number: int, payload: bytes) -> None:
+        self._arm.answer("StopMove", number, self._arm.stop())
+
+    def _recover(self, number: int, payload: bytes) -> None:
+        outcome = self._arm.recover()
+        self._arm.journal.record("recovery", f"automatic error recovery: {outcome.value}", outcome=outcome.value)
+        self._arm.answer("AutomaticErrorRecovery", number, outcome)
+
+    def _model(self, number: int, payload: bytes) -> None:
+        self._arm.answer("GetRobotModel", number, RequestOutcome.SUCCESS, self._files.urdf)
+
+    def _library(self, number: int, payload: bytes) -> None:
+        library = self._files.model_library
+        outcome = RequestOutcome.NOT_POSSIBLE if library is None else RequestOutcome.SUCCESS
+        self._arm.answer("LoadModelLibrary", number, outcome, library or b"")
+
+    def _wall(self, number: int, payload: bytes) -> None:
+        self._arm.answer("GetCartesianLimit", number, RequestOutcome.SUCCESS, _VIRTUAL_WALL)

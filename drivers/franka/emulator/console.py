@@ -1,4 +1,8 @@
-"""Where commands come in: lines on standard input, and a control port on a loopback address that speaks JSON lines."""
+"""Command console of the emulator: standard input and a control port, and what each command does.
+
+The control port listens on a loopback address; its clients send lines of JSON or plain words. The table of commands is
+in :mod:`.faults`.
+"""
 
 from __future__ import annotations
 
@@ -6,32 +10,41 @@ import contextlib
 import json
 import os
 import select
+import signal
 import socket
 import stat
 import sys
+import time
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Protocol
 
-from .link import listen
+from hal.drivers.franka.flags import flag_index
 
-__all__ = ["CONTROL_PORT", "Console"]
+from .control import CONTROL_PORT
+from .faults import help_text
+from .journal import Counters
+from .server import ArmServer, listen
 
-CONTROL_PORT = 1339
-_LONGEST = 4096
-"""Bytes of a line."""
+__all__ = ["CommandConsole", "Executor", "HandCommands"]
+
+Words = list[str]
+Answer = dict[str, Any]
+
+_MAX_LINE = 4096
+"""Largest size of a line, bytes."""
 
 Execute = Callable[[list[str]], dict[str, Any]]
 
 
-class Console:
-    """Reads lines, has them executed, and answers. Everything happens in :meth:`serve`, in the caller's thread.
+class CommandConsole:
+    """Reads lines, executes them, and answers, all in :meth:`serve` and in the caller's thread.
 
     A line on the control port is a JSON object ``{"command": ["reflex", "joint_reflex"]}`` or the words themselves;
     its answer is a JSON object with ``ok``, and ``error`` where that is false.
     """
 
     def __init__(self, host: str, poller: select.epoll, execute: Execute) -> None:
-        """Raises OSError when the port is taken."""
+        """Raises OSError if the port is in use."""
         self._poller = poller
         self._execute = execute
         self._listener = listen(host, CONTROL_PORT)
@@ -43,7 +56,7 @@ class Console:
             poller.register(self._stdin, select.EPOLLIN)
 
     def serve(self, descriptor: int) -> None:
-        """Do what is to be done with a descriptor that is ready."""
+        """Process the input of a descriptor that is ready."""
         if descriptor == self._listener.fileno():
             with contextlib.suppress(OSError):
                 connection, _ = self._listener.accept()
@@ -51,14 +64,14 @@ class Console:
                 self._connections[connection.fileno()] = connection
                 self._poller.register(connection, select.EPOLLIN)
         elif descriptor == self._stdin:
-            self._type(descriptor)
+            self._serve_stdin(descriptor)
         elif descriptor in self._connections:
-            self._converse(descriptor)
+            self._serve_connection(descriptor)
 
-    def _converse(self, descriptor: int) -> None:
+    def _serve_connection(self, descriptor: int) -> None:
         connection = self._connections[descriptor]
         try:
-            lines = self._lines(descriptor, connection.recv(_LONGEST))
+            lines = self._lines(descriptor, connection.recv(_MAX_LINE))
             for line in lines:
                 connection.sendall(json.dumps(self._answer(line)).encode() + b"\n")
         except (OSError, EOFError):
@@ -67,11 +80,11 @@ class Console:
             self._unfinished.pop(descriptor, None)
             connection.close()
 
-    def _type(self, descriptor: int) -> None:
+    def _serve_stdin(self, descriptor: int) -> None:
         try:
             if os.isatty(descriptor) and os.tcgetpgrp(descriptor) != os.getpgrp():
-                raise EOFError  # in the background: what is typed is for the shell, and reading it would stop us
-            lines = self._lines(descriptor, os.read(descriptor, _LONGEST))
+                raise EOFError  # in the background: reading the terminal would stop this process
+            lines = self._lines(descriptor, os.read(descriptor, _MAX_LINE))
         except (OSError, EOFError):
             self._poller.unregister(descriptor)
             self._stdin = None
@@ -83,10 +96,10 @@ class Console:
                 print(text, flush=True)
 
     def _lines(self, descriptor: int, data: bytes) -> list[str]:
-        """Whole lines. Raises EOFError at the end and for a line that has none."""
+        """Return the complete lines. Raises EOFError at the end, and for a line that is too long."""
         received = self._unfinished.get(descriptor, b"") + data
         *lines, rest = received.split(b"\n")
-        if not data or len(rest) > _LONGEST:
+        if not data or len(rest) > _MAX_LINE:
             raise EOFError
         self._unfinished[descriptor] = rest
         return [line.decode(errors="replace").strip() for line in lines if line.strip()]
@@ -98,7 +111,7 @@ class Console:
             return {"ok": False, "error": str(error)}
 
     def close(self) -> None:
-        """Let go of the port."""
+        """Close the port."""
         for connection in (self._listener, *self._connections.values()):
             connection.close()
 
@@ -114,10 +127,188 @@ def _words(line: str) -> list[str]:
 
 
 def _readable_stdin() -> int | None:
-    """Its descriptor where somebody may type or write into it."""
+    """Return the descriptor of standard input if it is a terminal, a pipe or a socket."""
     with contextlib.suppress(OSError, ValueError, AttributeError):
         descriptor = sys.stdin.fileno()
         kind = os.fstat(descriptor).st_mode
         if os.isatty(descriptor) or stat.S_ISFIFO(kind) or stat.S_ISSOCK(kind):
             return descriptor
     return None
+
+
+# Commands.
+
+_MAX_DURATION = 600.0
+"""Longest duration of a fault, s."""
+
+
+class HandCommands(Protocol):
+    """Interface of the hand's server to the console."""
+
+    def command(self, words: list[str]) -> dict[str, Any]:
+        """Execute a command of the hand; ``error`` in the answer reports a failure."""
+
+
+class Executor:
+    """Executes commands on a server and on its hand, if there is one."""
+
+    def __init__(self, server: ArmServer, hand: HandCommands | None) -> None:
+        self._server = server
+        self._hand = hand
+        self._verbs: dict[str, Callable[[Words], Answer | None]] = {
+            "silence": self._silence,
+            "lose-states": lambda words: server.faults.states.set(words),
+            "lose-commands": lambda words: server.faults.commands.set(words),
+            "report-lag": self._report_lag,
+            "report-noise": self._report_noise,
+            "report-measured": self._report_measured,
+            "truncate": self._truncate,
+            "reflex": self._reflex,
+            "user-stop": lambda words: server.arm.user_stop(_switch(words)),
+            "emergency-stop": lambda words: server.arm.emergency_stop(_switch(words)),
+            "guiding": lambda words: server.arm.guiding(_switch(words)),
+            "place": self._place,
+            "stall": lambda words: time.sleep(_seconds(words)),
+            "slow-reply": self._slow_reply,
+            "no-move-reply": self._no_move_reply,
+            "version": self._version,
+            "kill": lambda words: os.kill(os.getpid(), signal.SIGKILL),
+            "restart": self._restart,
+            "hand": self._to_hand,
+            "state": self._state,
+            "stats": self._stats,
+            "reset-stats": self._reset_stats,
+            "settings": lambda words: {"settings": server.arm.settings.given},
+            "log": self._log,
+            "help": lambda words: {"text": help_text()},
+        }
+
+    def execute(self, words: Words) -> Answer:
+        """Execute a command, and return its answer. Raises ValueError if it is invalid."""
+        verb, *rest = words or [""]
+        if verb not in self._verbs:
+            raise ValueError(f"no command {verb!r}; help lists them")
+        try:
+            answer = self._verbs[verb](rest) or {}
+        except (ValueError, IndexError) as error:
+            raise ValueError(f"{verb}: {error}") from None
+        if verb in _FAULTS:
+            self._server.arm.journal.record("command", "command: " + " ".join(words))
+        return answer
+
+    def _silence(self, words: Words) -> None:
+        self._server.faults.silent_until = time.monotonic() + _seconds(words)
+
+    def _report_lag(self, words: Words) -> None:
+        reports = self._server.arm.reports
+        (word,) = _exactly(words, 1)
+        if not 0 <= int(word) <= reports.MAX_LAG:
+            raise ValueError(f"takes 0 to {reports.MAX_LAG} cycles")
+        reports.lag = int(word)
+
+    def _report_noise(self, words: Words) -> None:
+        (word,) = _exactly(words, 1)
+        if not 0.0 <= float(word) <= 1.0:
+            raise ValueError("takes 0 to 1 rad")
+        self._server.arm.reports.noise = float(word)
+
+    def _report_measured(self, words: Words) -> None:
+        self._server.arm.reports.measured = _switch(words)
+
+    def _truncate(self, words: Words) -> None:
+        self._server.faults.truncate = _switch(words)
+
+    def _reflex(self, words: Words) -> None:
+        (name,) = _exactly(words, 1)
+        self._server.arm.reflex(flag_index(name))
+
+    def _place(self, words: Words) -> None:
+        arm = self._server.arm
+        q = [float(word) for word in words]
+        limits = zip(q, arm.limits.lower, arm.limits.upper, strict=True) if q else ()
+        if not all(lower <= position <= upper for position, lower, upper in limits):
+            raise ValueError("beyond the arm's range")
+        arm.place(q or None)
+
+    def _slow_reply(self, words: Words) -> None:
+        self._server.faults.slow_reply = _seconds(words)
+
+    def _no_move_reply(self, words: Words) -> None:
+        self._server.arm.no_move_reply = _switch(words)
+
+    def _version(self, words: Words) -> None:
+        (number,) = _exactly(words, 1)
+        version = int(number)
+        if not 0 <= version < 65536:
+            raise ValueError("a version is from 0 to 65535")
+        self._server.faults.version = version
+
+    def _restart(self, words: Words) -> None:
+        away = _seconds(words) if words else 0.0
+        self._server.restart(away)
+        if self._hand is not None:
+            self._to_hand(["restart", str(away)])
+
+    def _to_hand(self, words: Words) -> Answer:
+        if self._hand is None:
+            raise ValueError("this emulator has no hand")
+        answer = self._hand.command(words)
+        if "error" in answer:
+            raise ValueError(answer["error"])
+        return answer
+
+    def _state(self, words: Words) -> Answer:
+        session = self._server.session
+        connected = session is not None and session.connected
+        return {**self._server.arm.report(), "connected": connected, "t": time.monotonic()}
+
+    def _stats(self, words: Words) -> Answer:
+        arm = self._server.arm
+        return {**arm.counters.report(), "limits": arm.checker.report()}
+
+    def _reset_stats(self, words: Words) -> None:
+        self._server.arm.counters = Counters()
+        self._server.arm.checker.reset()
+
+    def _log(self, words: Words) -> Answer:
+        return {"events": self._server.arm.journal.events(int(words[0]) if words else 100)}
+
+
+_FAULTS = frozenset(
+    [
+        "silence",
+        "lose-states",
+        "lose-commands",
+        "report-lag",
+        "report-noise",
+        "report-measured",
+        "truncate",
+        "stall",
+        "slow-reply",
+        "no-move-reply",
+        "version",
+        "restart",
+    ],
+)
+"""Commands that are recorded as events; the others are visible by their effect, or change nothing."""
+
+
+def _exactly(words: Words, count: int) -> Words:
+    if len(words) != count:
+        raise ValueError(f"takes {count} argument{'s' if count > 1 else ''}")
+    return words
+
+
+def _switch(words: Words) -> bool:
+    (word,) = _exactly(words, 1)
+    if word not in ("on", "off"):
+        raise ValueError("takes on or off")
+    return word == "on"
+
+
+def _seconds(words: Words) -> float:
+    (word,) = _exactly(words, 1)
+    seconds = float(word)
+    if not 0.0 <= seconds <= _MAX_DURATION:
+        raise ValueError(f"takes 0 to {_MAX_DURATION:g} seconds")
+    return seconds

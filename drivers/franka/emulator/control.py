@@ -1,4 +1,4 @@
-"""Sends fault commands to a running emulator: from a shell, or from a test.
+"""Client of a running emulator's control port, for shells and tests.
 
 python -m hal.drivers.franka.emulator.control --host 127.0.0.2 reflex joint_reflex
 """
@@ -11,25 +11,31 @@ import socket
 import sys
 from typing import Any
 
-from .console import CONTROL_PORT
 from .faults import help_text
 
-__all__ = ["Control", "main"]
+__all__ = ["CONTROL_PORT", "EmulatorControl", "main"]
+
+CONTROL_PORT = 1339
+"""TCP"""
 
 
-class Control:
-    """A connection to an emulator's control port; use it in a ``with`` statement, or close it."""
+class EmulatorControl:
+    """A connection to an emulator's control port, also as a context manager."""
 
     def __init__(self, host: str, timeout: float = 10.0) -> None:
-        """``timeout`` (s) is for each answer. Raises OSError when no emulator is there."""
+        """Connect to the emulator at ``host``; ``timeout`` (s) is for each answer. Raises OSError if there is none."""
         self._socket = socket.create_connection((host, CONTROL_PORT), timeout)
         self._reader = self._socket.makefile("r", encoding="utf-8")
 
     def send(self, *words: object) -> dict[str, Any]:
         """Execute one command, given as one text or as words: ``send("silence 0.5")``, ``send("silence", 0.5)``.
 
-        Raises ValueError with the emulator's words when it refuses, and ConnectionError when it is gone, which
-        after ``kill`` is as it should be: the answer is empty then.
+        Returns:
+            The answer; empty after ``kill``.
+
+        Raises:
+            ValueError: With the emulator's message, if it refuses the command.
+            ConnectionError: If the emulator has ended.
         """
         command = " ".join(str(word) for word in words).split()
         self._socket.sendall(json.dumps({"command": command}).encode() + b"\n")
@@ -37,18 +43,18 @@ class Control:
         if not line and command == ["kill"]:
             return {}
         if not line:
-            raise ConnectionError("the emulator is gone")
+            raise ConnectionError("the emulator has ended")
         answer: dict[str, Any] = json.loads(line)
         if not answer.pop("ok"):
             raise ValueError(answer["error"])
         return answer
 
     def close(self) -> None:
-        """Hang up."""
+        """Disconnect."""
         self._reader.close()
         self._socket.close()
 
-    def __enter__(self) -> Control:
+    def __enter__(self) -> EmulatorControl:
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -56,10 +62,10 @@ class Control:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """The program; returns its exit status."""
+    """Run the program, and return its exit status."""
     parser = argparse.ArgumentParser(
         prog="python -m hal.drivers.franka.emulator.control",
-        description="Send one fault command to a running emulator, and print its answer as JSON.",
+        description="Send one command to a running emulator, and print its answer as JSON.",
         epilog="commands:\n" + help_text(),
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
@@ -67,7 +73,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("command", nargs="+", help="the command and its arguments")
     options = parser.parse_args(arguments)
     try:
-        with Control(options.host) as control:
+        with EmulatorControl(options.host) as control:
             answer = control.send(*options.command)
     except (OSError, ValueError) as error:
         print(f"error: {error}", file=sys.stderr)

@@ -1,69 +1,143 @@
-"""A server that stands in for a Franka Hand: Franka's own client library talks to it as to the hand.
+"""Emulated Franka Hand: Franka's own client library talks to it as to the hand.
 
-It answers on TCP 1338 and sends states by UDP, from a thread of its own that sleeps nearly all of the time, so it may
+It answers on TCP 1338 and sends states by UDP, from a thread of its own that sleeps nearly all of the time, so it can
 run beside the arm's loop. On its own: ``python -m hal.drivers.franka.emulator.hand --host 127.0.0.2``.
 """
 
 from __future__ import annotations
 
+import argparse
+import json
+import socketserver
+import sys
 import threading
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
-from .hand_faults import COMMANDS, Faults, help_text, number, switch
-from .hand_fingers import FULL_WIDTH, Fingers, Kind, Motion
-from .hand_network import HandNetwork
-from .hand_wire import PORT, VERSION, Code, HandState, Request, Status, response
+from .hand_fingers import FULL_WIDTH, FingerMotion, FingerMotionKind, Fingers
+from .hand_network import (
+    HAND_PORT,
+    HAND_VERSION,
+    HandCode,
+    HandNetwork,
+    HandRequest,
+    HandStatePacket,
+    HandStatus,
+    hand_response,
+)
 
-__all__ = ["HandServer"]
+__all__ = ["HAND_COMMANDS", "HAND_CONTROL_PORT", "HandFaults", "HandServer", "main"]
+
+# Commands.
+
+HAND_COMMANDS = {
+    "object W|none": "put an object of W m between the fingers, or remove it",
+    "grasp-ends-at-width on|off": "a grasp that meets nothing ends at its width, or closes all the way (the default)",
+    "unhome": "undo the homing, as after switching on",
+    "stop-ignored on|off": "Stop is answered, but has no effect (libfranka, issue 18)",
+    "stop-releases on|off": "Stop ends the pressing force (libfranka, issue 111)",
+    "silence S": "send no states for S seconds",
+    "slow-reply S": "answer everything S seconds later (0: at once)",
+    "fail [N]": "fail the next N motions at once (1)",
+    "version N": "claim to speak this protocol",
+    "temperature T": "report T degrees Celsius",
+    "drop": "close the connection",
+    "restart [S]": "switch off, and on again S seconds later (0.5)",
+    "state": "present state of the hand",
+    "help": "this table",
+}
+"""Usage -> meaning."""
+
+
+def help_text() -> str:
+    """Return the table as text."""
+    width = max(map(len, HAND_COMMANDS))
+    return "\n".join(f"{words:<{width}}  {meaning}" for words, meaning in HAND_COMMANDS.items())
+
+
+@dataclass
+class HandFaults:
+    """Faults of the hand that are injected at present."""
+
+    version: int
+    """Protocol that it claims to speak."""
+    temperature: int = 30
+    """Degrees Celsius."""
+    stop_ignored: bool = False
+    stop_releases: bool = False
+    silent_until: float = 0.0
+    """End of a silence on the monotonic clock, s."""
+    slow_reply: float = 0.0
+    """Delay of every answer, s."""
+    failures: int = 0
+    """Number of motions that fail from now on."""
+
+
+def switch(word: str) -> bool:
+    """Return whether a word is ``on`` rather than ``off``. Raises ValueError for any other."""
+    if word not in ("on", "off"):
+        raise ValueError(f"must be on or off, not {word!r}")
+    return word == "on"
+
+
+def number(word: str, least: float = 0.0, most: float = 1e6) -> float:
+    """Return a word as a number in a range. Raises ValueError if it is not."""
+    value = float(word)
+    if not least <= value <= most:
+        raise ValueError(f"must be a number in {least:g}..{most:g}, not {word}")
+    return value
+
+
+# The hand.
 
 _STEP = 0.01
-"""s between two looks at the fingers while they move."""
-_DOWN = "0.5"
-"""s for which it is away when it restarts."""
+"""s between two steps of moving fingers."""
+_RESTART = "0.5"
+"""Duration of a restart, s."""
 
 
 class HandServer:
-    """A hand on the address ``host``, in real time.
+    """A hand at the address ``host``, in real time.
 
-    Assumptions, for want of a real one: a motion goes on when its client is gone; a stop is answered at once; after
-    switching on it must be homed; a thing between the fingers is rigid and stays in their middle.
+    Assumptions: a motion continues when its client disconnects; a stop is answered at once; after switching on the
+    hand must be homed; an object between the fingers is rigid and stays in their middle.
     """
 
     def __init__(
         self,
         host: str,
-        version: int = VERSION,
+        version: int = HAND_VERSION,
         object_width: float | None = None,
         period: float = 0.02,
         homed: bool = True,
-        port: int = PORT,
+        port: int = HAND_PORT,
     ) -> None:
-        """``period`` is the time between two states, s; ``homed`` False is a hand that was just switched on."""
+        """``period`` is the time between two states, s; ``homed`` is False for a hand that was just switched on."""
         self.period = period
         self.fingers = Fingers(object_width, homed)
-        self.faults = Faults(version)
-        self._requests = {code.name.lower(): 0 for code in Code}
+        self.faults = HandFaults(version)
+        self._requests = {code.name.lower(): 0 for code in HandCode}
         self._newest: dict[str, tuple[float, ...]] = {}
         self._network = HandNetwork((host, port))
         self._lock = threading.RLock()
         self._ending = threading.Event()
-        self._running: Request | None = None
-        """The motion that waits for its answer."""
+        self._running: HandRequest | None = None
+        """Running motion, whose answer is pending."""
         self._born = self._advanced = self._next_state = time.monotonic()
         self._back_at = 0.0
         self._thread = threading.Thread(target=self._run, name="franka-hand", daemon=True)
 
-    # From outside, in any thread.
+    # For other threads.
 
     def start(self) -> None:
-        """Listen, and serve from a thread of its own. OSError where the address is taken."""
+        """Listen, and serve from a thread of its own. Raises OSError if the address is in use."""
         self._network.listen()
         self._thread.start()
 
     def stop(self) -> None:
-        """Hang up and end. Idempotent."""
+        """Disconnect the client and end. Idempotent."""
         if not self._ending.is_set():
             self._ending.set()
             self._network.wake()
@@ -72,18 +146,18 @@ class HandServer:
             self._network.close()
 
     def command(self, words: list[str]) -> dict[str, Any]:
-        """Do what ``words`` say (``help`` lists them), and say how everything is then. ValueError for other words."""
+        """Execute a command (``help`` lists them); return the state after it. Raises ValueError if it is invalid."""
         if not words or words[0] == "help":
             return {"text": help_text()}
-        usage = next((usage for usage in COMMANDS if usage.split()[0] == words[0]), None)
+        usage = next((usage for usage in HAND_COMMANDS if usage.split()[0] == words[0]), None)
         if usage is None:
-            raise ValueError(f"the hand knows no {words[0]!r}; it knows {', '.join(COMMANDS)}")
+            raise ValueError(f"no command {words[0]!r} of the hand; help lists them")
         action: Callable[..., None] = getattr(self, "_do_" + words[0].replace("-", "_"))
         with self._lock:
             try:
                 action(*words[1:])
             except (TypeError, ValueError) as error:
-                raise ValueError(f"{' '.join(words)!r} is not {usage!r}: {error}") from None
+                raise ValueError(f"{' '.join(words)}: {error}; usage: {usage}") from None
             state = self._state()
         self._network.wake()
         return state
@@ -99,11 +173,11 @@ class HandServer:
             "motion": None if motion is None else motion.kind.value,
             "client": self._network.client is not None,
             "listening": self._network.listening,
-            "requests": dict(self._requests),  # how often each came
-            "newest": {name: list(values) for name, values in self._newest.items()},  # the numbers that came with it
+            "requests": dict(self._requests),  # number of each
+            "newest": {name: list(values) for name, values in self._newest.items()},  # their latest arguments
         }
 
-    # Words.
+    # Commands.
 
     def _do_object(self, width: str) -> None:
         self.fingers.put(None if width == "none" else number(width, 1e-6, FULL_WIDTH))
@@ -136,29 +210,29 @@ class HandServer:
         self.faults.temperature = int(number(degrees, 0, 65535))
 
     def _do_drop(self) -> None:
-        self._network.hang_up()
+        self._network.disconnect()
 
-    def _do_restart(self, seconds: str = _DOWN) -> None:
+    def _do_restart(self, seconds: str = _RESTART) -> None:
         self._back_at = time.monotonic() + number(seconds)
         self._network.shut()
         self._running = None
         self.fingers.switch_off()
 
     def _do_state(self) -> None:
-        """Every answer is the state."""
+        """Do nothing: every answer is the state."""
 
-    # Its thread.
+    # The thread.
 
     def _run(self) -> None:
         while not self._ending.is_set():
-            keys = self._network.wait(self._patience())
+            keys = self._network.wait(self._time_to_next())
             with self._lock:
-                for request in self._network.take(keys):
+                for request in self._network.receive(keys):
                     self._serve(request)
-                self._turn()
+                self._step()
 
-    def _patience(self) -> float:
-        """How long nothing can be due, s."""
+    def _time_to_next(self) -> float:
+        """Return the time until the next step is due, s."""
         with self._lock:
             now, client = time.monotonic(), self._network.client
             due = [now + 1.0]
@@ -170,7 +244,7 @@ class HandServer:
                 due.append(self._back_at)
             return max(0.0, min(due) - now)
 
-    def _turn(self) -> None:
+    def _step(self) -> None:
         now = time.monotonic()
         if not self._network.listening and now >= self._back_at:
             self._network.listen()
@@ -187,38 +261,38 @@ class HandServer:
         if status is not None:
             self._end_motion(status)
 
-    def _report(self, now: float) -> HandState:
+    def _report(self, now: float) -> HandStatePacket:
         fingers = self.fingers
-        clock = int((now - self._born) * 1e3)  # Franka's library takes the number of a message for milliseconds
-        return HandState(clock, fingers.width, fingers.max_width, fingers.is_grasped, self.faults.temperature)
+        clock = int((now - self._born) * 1e3)  # Franka's library interprets the number of a message as milliseconds
+        return HandStatePacket(clock, fingers.width, fingers.max_width, fingers.is_grasped, self.faults.temperature)
 
     # Requests.
 
-    def _serve(self, request: Request) -> None:
+    def _serve(self, request: HandRequest) -> None:
         name = request.code.name.lower()
         self._requests[name] += 1
         self._newest[name] = request.values
         self._advance(time.monotonic())
-        if request.code is Code.CONNECT:
-            self._greet(request)
-        elif request.code is Code.STOP:
+        if request.code is HandCode.CONNECT:
+            self._connect(request)
+        elif request.code is HandCode.STOP:
             if not self.faults.stop_ignored:
                 self.fingers.halt(self.faults.stop_releases)
-                self._end_motion(Status.ABORTED)
-            self._answer(request, Status.SUCCESS)
+                self._end_motion(HandStatus.ABORTED)
+            self._answer(request, HandStatus.SUCCESS)
         else:
             self._begin(request)
 
-    def _greet(self, request: Request) -> None:
+    def _connect(self, request: HandRequest) -> None:
         version, udp_port = map(int, request.values)
         fits = version == self.faults.version
         if fits and self._network.client is not None:
             self._network.client.udp_port = udp_port
             self._next_state = time.monotonic()
-        self._answer(request, Status.SUCCESS if fits else Status.FAIL, self.faults.version)
+        self._answer(request, HandStatus.SUCCESS if fits else HandStatus.FAIL, self.faults.version)
 
-    def _begin(self, request: Request) -> None:
-        status: Status | None = Status.FAIL
+    def _begin(self, request: HandRequest) -> None:
+        status: HandStatus | None = HandStatus.FAIL
         if self.faults.failures:
             self.faults.failures -= 1
         else:
@@ -228,28 +302,83 @@ class HandServer:
         else:
             self._answer(request, status)
 
-    def _end_motion(self, status: Status) -> None:
+    def _end_motion(self, status: HandStatus) -> None:
         running, self._running = self._running, None
         if running is not None:
             self._answer(running, status)
 
-    def _answer(self, request: Request, status: Status, version: int | None = None) -> None:
+    def _answer(self, request: HandRequest, status: HandStatus, version: int | None = None) -> None:
         client = self._network.client
         if client is not None:
-            client.answer(response(request, status, version), time.monotonic() + self.faults.slow_reply)
+            client.answer(hand_response(request, status, version), time.monotonic() + self.faults.slow_reply)
 
 
-def _motion(request: Request) -> Motion:
+def _motion(request: HandRequest) -> FingerMotion:
     values = request.values
-    if request.code is Code.MOVE:
-        return Motion(Kind.MOVE, values[0], values[1])
-    if request.code is Code.GRASP:
+    if request.code is HandCode.MOVE:
+        return FingerMotion(FingerMotionKind.MOVE, values[0], values[1])
+    if request.code is HandCode.GRASP:
         width, inner, outer, speed, force = values
-        return Motion(Kind.GRASP, width, speed, force, inner, outer)
-    return Motion(Kind.HOMING)
+        return FingerMotion(FingerMotionKind.GRASP, width, speed, force, inner, outer)
+    return FingerMotion(FingerMotionKind.HOMING)
+
+
+# The program.
+
+HAND_CONTROL_PORT = 1340
+"""TCP; lines as on the arm's control port (:mod:`.console`): words, or ``{"command": ["object", "0.03"]}``."""
+
+
+class _ControlHandler(socketserver.StreamRequestHandler):
+    server: _ControlServer
+
+    def handle(self) -> None:
+        for line in self.rfile:
+            self.wfile.write(json.dumps(_execute(self.server.hand, line.decode(errors="replace"))).encode() + b"\n")
+
+
+class _ControlServer(socketserver.ThreadingTCPServer):
+    allow_reuse_address = True
+    daemon_threads = True
+
+    def __init__(self, hand: HandServer, host: str) -> None:
+        self.hand = hand
+        super().__init__((host, HAND_CONTROL_PORT), _ControlHandler)
+
+
+def _execute(hand: HandServer, line: str) -> dict[str, Any]:
+    try:
+        words = json.loads(line)["command"] if line.lstrip().startswith("{") else line.split()
+        return {"ok": True, **hand.command([str(word) for word in words])}
+    except (ValueError, KeyError, TypeError) as error:
+        return {"ok": False, "error": str(error)}
+
+
+def main() -> None:
+    """Run the hand alone, until standard input ends."""
+    parser = argparse.ArgumentParser(description="Emulates a Franka Hand for the vendor's own client library.")
+    parser.add_argument("--host", default="127.0.0.2", help="address to listen on (%(default)s)")
+    parser.add_argument("--object", type=float, metavar="W", help="object of W m between the fingers")
+    parser.add_argument("--period", type=float, default=0.02, metavar="S", help="s between states (%(default)s)")
+    parser.add_argument("--unhomed", action="store_true", help="not homed, as after switching on")
+    arguments = parser.parse_args()
+    hand = HandServer(
+        arguments.host, object_width=arguments.object, period=arguments.period, homed=not arguments.unhomed
+    )
+    hand.start()
+    control = _ControlServer(hand, arguments.host)
+    threading.Thread(target=control.serve_forever, daemon=True).start()
+    print(
+        f"ready: Franka Hand at {arguments.host}; "
+        f"type commands here, or send them to port {HAND_CONTROL_PORT}; help lists them",
+        flush=True,
+    )
+    for line in sys.stdin:
+        answer = _execute(hand, line)
+        print(answer.get("text") or json.dumps(answer), flush=True)
+    control.shutdown()
+    hand.stop()
 
 
 if __name__ == "__main__":
-    from .hand_program import main
-
     main()

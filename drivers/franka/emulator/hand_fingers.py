@@ -1,7 +1,7 @@
-"""What the emulated hand's fingers do. Pure: time is only what :meth:`Fingers.advance` is told.
+"""Motion of the emulated hand's fingers. Pure: time passes only in :meth:`Fingers.advance`.
 
-No real hand was at hand. What its documents leave open follows what users of real hands report; each such place is
-marked as an assumption.
+Not compared with a real hand. What its documentation leaves open follows reports by users of real hands; each such
+place is marked as an assumption.
 """
 
 from __future__ import annotations
@@ -10,20 +10,20 @@ import math
 from dataclasses import dataclass
 from enum import Enum
 
-from .hand_wire import Status
+from .hand_network import HandStatus
 
-__all__ = ["FULL_WIDTH", "Fingers", "Kind", "Motion"]
+__all__ = ["FULL_WIDTH", "Fingers", "FingerMotionKind", "FingerMotion"]
 
 FULL_WIDTH = 0.08
-"""m between the fingers when they are open all the way."""
+"""Width of completely open fingers, m."""
 _SPEED_MAX = 0.1  # m/s of the width: 50 mm/s for each finger
-_OWN_SPEED = 0.1  # m/s, where nobody said how fast; assumption
-_SPRING = 0.002  # m that fingers give when a stop takes their force away; assumption
-_BLOCKED = 100.0  # s until a Move that meets something is answered: what users report (franka_ros, issue 281)
+_OWN_SPEED = 0.1  # m/s, where no speed is given; assumption
+_SPRING = 0.002  # m by which fingers open when a stop removes their force; assumption
+_BLOCKED = 100.0  # s until a Move that meets an object is answered, as users report (franka_ros, issue 281)
 
 
-class Kind(Enum):
-    """The three motions."""
+class FingerMotionKind(Enum):
+    """The three kinds of motion."""
 
     HOMING = "homing"
     GRASP = "grasp"
@@ -31,91 +31,91 @@ class Kind(Enum):
 
 
 @dataclass
-class Motion:
-    """A motion on its way. Widths in m, speed in m/s, force in N."""
+class FingerMotion:
+    """A running motion. Widths in m, speed in m/s, force in N."""
 
-    kind: Kind
+    kind: FingerMotionKind
     width: float = 0.0
     speed: float = _OWN_SPEED
     force: float = 0.0
     inner: float = 0.0
     outer: float = 0.0
     goal: float = 0.0
-    """Where it ends when nothing is in the way, m."""
+    """Width at its end without an object, m."""
     blocked: float = 0.0
-    """How long something has been in its way, s."""
+    """Time for which an object has blocked it, s."""
     closed: bool = False
-    """Of a homing: was it closed already?"""
+    """For homing: whether the fingers have closed already."""
 
 
 class Fingers:
-    """Two coupled fingers, and at most one thing between them."""
+    """Two coupled fingers, and at most one object between them."""
 
     def __init__(self, object_width: float | None = None, homed: bool = True) -> None:
         self.width = FULL_WIDTH / 2.0
         self.homed = homed
         self.is_grasped = False
         self.force = 0.0
-        """With which they press, N."""
+        """Pressing force, N."""
         self.object_width = object_width
-        self.motion: Motion | None = None
+        self.motion: FingerMotion | None = None
         self.grasp_ends_at_width = False
-        """Does a grasp end at its width where nothing is met? Assumption: it does not, and closes on whatever comes."""
+        """Whether a grasp that meets no object ends at its width. Assumption: it does not, and closes further."""
 
     @property
     def max_width(self) -> float:
-        """What the hand says of itself. Assumption: 0 before homing."""
+        """Greatest width that the hand reports, m. Assumption: 0 before homing."""
         return FULL_WIDTH if self.homed else 0.0
 
-    def start(self, motion: Motion) -> Status | None:
-        """Begin; a status where it is over at once.
+    def start(self, motion: FingerMotion) -> HandStatus | None:
+        """Start a motion; return its status if it ends at once.
 
-        Assumption: numbers that cannot be, and a command while another one runs, fail.
+        Assumption: impossible numbers, and a command while another one runs, fail.
         """
         numbers = (motion.width, motion.speed, motion.force, motion.inner, motion.outer)
         if self.motion is not None or not all(math.isfinite(x) and x >= 0.0 for x in numbers):
-            return Status.FAIL
+            return HandStatus.FAIL
         if motion.width > FULL_WIDTH or motion.speed == 0.0:
-            return Status.FAIL
-        if motion.kind is Kind.GRASP and self.is_grasped:
-            self.let_go()  # as users report: it lets go and does not succeed (libfranka, issue 108; franka_ros, 130)
-            return Status.UNSUCCESSFUL
+            return HandStatus.FAIL
+        if motion.kind is FingerMotionKind.GRASP and self.is_grasped:
+            self.release()  # as users report: it lets go and does not succeed (libfranka, issue 108; franka_ros, 130)
+            return HandStatus.UNSUCCESSFUL
         motion.speed = min(motion.speed, _SPEED_MAX)
-        closes = motion.kind is Kind.GRASP and motion.width < self.width and not self.grasp_ends_at_width
+        closes = motion.kind is FingerMotionKind.GRASP and motion.width < self.width and not self.grasp_ends_at_width
         motion.goal = 0.0 if closes else motion.width
         self.motion = motion
         self.is_grasped, self.force = False, 0.0
         return None
 
     def switch_off(self) -> None:
-        """No power: no motion, no force, and homing is forgotten. Assumption: the fingers stay where they are."""
+        """Switch off: no motion, no force, not homed. Assumption: the fingers keep their position."""
         self.motion, self.homed = None, False
-        self.let_go()
+        self.release()
 
     def halt(self, release: bool) -> None:
-        """Stay; with ``release`` the force goes, and the fingers spring back a little."""
+        """Stop; with ``release`` the force ends too, and the fingers spring back a little."""
         self.motion = None
         if release and self.is_grasped:
-            self.let_go()
+            self.release()
             self.width = min(FULL_WIDTH, self.width + _SPRING)
 
-    def let_go(self) -> None:
-        """No force any more."""
+    def release(self) -> None:
+        """End the pressing force."""
         self.is_grasped, self.force = False, 0.0
 
     def put(self, object_width: float | None) -> None:
-        """Put a thing of so many m between the fingers, or take away what is there."""
+        """Put an object of this width, m, between the fingers; None removes it."""
         self.object_width = object_width
 
-    def advance(self, dt: float) -> Status | None:
-        """Let ``dt`` s pass; the status of the motion that ended in them."""
+    def advance(self, dt: float) -> HandStatus | None:
+        """Advance by ``dt`` s; return the status of a motion that ended."""
         motion = self.motion
         if motion is None:
             self._press(dt)
             return None
-        if motion.kind is Kind.MOVE:
+        if motion.kind is FingerMotionKind.MOVE:
             status = self._advance_move(motion, dt)
-        elif motion.kind is Kind.GRASP:
+        elif motion.kind is FingerMotionKind.GRASP:
             status = self._advance_grasp(motion, dt)
         else:
             status = self._advance_homing(motion, dt)
@@ -123,40 +123,40 @@ class Fingers:
             self.motion = None
         return status
 
-    def _advance_move(self, motion: Motion, dt: float) -> Status | None:
-        if self._go(motion.goal, motion.speed, dt):
-            return Status.SUCCESS
+    def _advance_move(self, motion: FingerMotion, dt: float) -> HandStatus | None:
+        if self._move_towards(motion.goal, motion.speed, dt):
+            return HandStatus.SUCCESS
         if self._on_object():
             motion.blocked += dt
-        return Status.UNSUCCESSFUL if motion.blocked > _BLOCKED else None
+        return HandStatus.UNSUCCESSFUL if motion.blocked > _BLOCKED else None
 
-    def _advance_grasp(self, motion: Motion, dt: float) -> Status | None:
-        if not self._go(motion.goal, motion.speed, dt) and not self._on_object():
+    def _advance_grasp(self, motion: FingerMotion, dt: float) -> HandStatus | None:
+        if not self._move_towards(motion.goal, motion.speed, dt) and not self._on_object():
             return None
         self.is_grasped = motion.width - motion.inner < self.width < motion.width + motion.outer
         self.force = motion.force if self.is_grasped else 0.0
-        return Status.SUCCESS if self.is_grasped else Status.UNSUCCESSFUL
+        return HandStatus.SUCCESS if self.is_grasped else HandStatus.UNSUCCESSFUL
 
-    def _advance_homing(self, motion: Motion, dt: float) -> Status | None:
-        """Close, then open. Assumption: a thing in between spoils it."""
+    def _advance_homing(self, motion: FingerMotion, dt: float) -> HandStatus | None:
+        """Close, then open. Assumption: it fails with an object in between."""
         if not motion.closed:
-            motion.closed = self._go(0.0, motion.speed, dt)
-            return Status.FAIL if self._on_object() else None
-        if not self._go(FULL_WIDTH, motion.speed, dt):
+            motion.closed = self._move_towards(0.0, motion.speed, dt)
+            return HandStatus.FAIL if self._on_object() else None
+        if not self._move_towards(FULL_WIDTH, motion.speed, dt):
             return None
         self.homed = True
-        return Status.SUCCESS
+        return HandStatus.SUCCESS
 
     def _press(self, dt: float) -> None:
-        """Fingers with a force close further where nothing is between them any more, and have lost it."""
+        """Fingers with a force close further once the object is removed, and have then lost it."""
         before = self.width
-        if self.force and not self._go(0.0, _OWN_SPEED, dt) and self.width != before:
+        if self.force and not self._move_towards(0.0, _OWN_SPEED, dt) and self.width != before:
             self.is_grasped = False
 
-    def _go(self, goal: float, speed: float, dt: float) -> bool:
-        """Towards ``goal``, as far as what is between the fingers lets them. Are they there?"""
-        thing = self.object_width
-        limit = goal if thing is None or self.width < thing else max(goal, thing)
+    def _move_towards(self, goal: float, speed: float, dt: float) -> bool:
+        """Move towards ``goal`` (m), as far as the object allows; return whether it is reached."""
+        size = self.object_width
+        limit = goal if size is None or self.width < size else max(goal, size)
         rest = limit - self.width
         step = speed * dt
         self.width = limit if abs(rest) <= step else self.width + math.copysign(step, rest)

@@ -1,4 +1,4 @@
-"""What the emulator tells: events with their times, for a person and for tests, and figures over a run."""
+"""Record of the emulator: events with their times, and counters over a run."""
 
 from __future__ import annotations
 
@@ -9,60 +9,66 @@ from typing import Any
 
 from hal.histogram import Histogram
 
-__all__ = ["STALL", "Figures", "Journal"]
+__all__ = ["STALL", "Counters", "Journal"]
 
 STALL = 0.02
-"""s: a cycle that comes later than this is written down by its time and length."""
+"""Lateness of a cycle above which its time and length are recorded, s."""
 _KEPT = 1000
 
 
 class Journal:
-    """The last thousand events; each is also a line on standard output."""
+    """The last thousand events; each is also printed as a line."""
 
     def __init__(self, quiet: bool = False) -> None:
         self._quiet = quiet
         self._events: deque[dict[str, Any]] = deque(maxlen=_KEPT)
         self._number = 0
 
-    def say(self, kind: str, text: str, **details: object) -> None:
-        """Something happened. ``kind`` is one word for programs, ``details`` are plain values."""
+    def record(self, kind: str, text: str, **details: object) -> None:
+        """Record an event.
+
+        Args:
+            kind: Kind of event, for programs.
+            text: One line for people.
+            details: Further plain values.
+        """
         self._number += 1
         self._events.append({"n": self._number, "t": time.monotonic(), "kind": kind, "text": text, **details})
         if not self._quiet:
             self.print(text)
 
     def print(self, text: str) -> None:
-        """A line with the time of day; into nothing once nobody reads any more."""
+        """Print a line with the time of day; print nothing once standard output is closed."""
         now = time.time()
         clock = time.strftime("%H:%M:%S", time.localtime(now))
         try:
             print(f"{clock}.{int(now % 1 * 1000):03d}  {text}", flush=True)
         except (OSError, ValueError):
             self._quiet = True
-            sys.stdout = open("/dev/null", "w")  # noqa: SIM115  # or the interpreter complains at its end
+            sys.stdout = open("/dev/null", "w")  # noqa: SIM115  # prevents an error at the interpreter's exit
 
     def events(self, last: int = _KEPT) -> list[dict[str, Any]]:
-        """The last so many: n, t (monotonic clock, s), kind, text, and details."""
+        """Return the last events: n, t (monotonic clock, s), kind, text, and details."""
         return list(self._events)[-last:]
 
 
-class Figures:
+class Counters:
     """Counters and times since the start or the last reset."""
 
     def __init__(self) -> None:
         self.since = time.monotonic()
         self.cycles = 0
         self.states = 0
-        """States that went out."""
+        """States that were sent."""
         self.states_lost = 0
-        """By the fault commands, or in silence."""
+        """States that were lost by fault commands."""
         self.commands = 0
-        """Commands that came in, of any kind."""
+        """Commands received, of any kind."""
         self.accepted = 0
         self.lost = 0
         """Cycles of a motion without their command."""
         self.lost_in_row = 0
-        """Greatest number of them in a row."""
+        """Largest number of consecutive ones."""
         self.thrown_away = 0
         """Commands lost by the fault commands."""
         self.stale = 0
@@ -74,16 +80,16 @@ class Figures:
         self.answers = Histogram(5e-6, 4000)
         """From a state sent to its command received."""
         self.stalls: deque[tuple[float, float]] = deque(maxlen=_KEPT)
-        """When (monotonic clock, s) a cycle should have been and how much later it was, s."""
+        """Due time of a cycle (monotonic clock, s) and its lateness, s."""
 
     def late(self, due: float, by: float) -> None:
-        """A cycle was due then and came so much later, s."""
+        """Record a cycle that was ``due`` (monotonic clock, s) and ran ``by`` s later."""
         self.lateness.add(by)
         if by >= STALL:
             self.stalls.append((due, by))
 
     def report(self) -> dict[str, Any]:
-        """Everything as plain values; times in s."""
+        """Return everything as plain values; times in s."""
         values: dict[str, Any] = {}
         for name, value in vars(self).items():
             if isinstance(value, Histogram):

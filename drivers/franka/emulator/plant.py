@@ -1,25 +1,127 @@
-"""What moves: the arm behind the controller. It takes desired motion or torques every millisecond and is measured."""
+"""The simulated arm behind the emulated controller: rigid-body model and plants.
+
+Kinematics and dynamics are computed by pinocchio from a URDF. The Panda has the same kinematics as the FR3 and nearly
+its masses, so both emulators use the same URDF.
+"""
 
 from __future__ import annotations
 
+import tempfile
 from abc import ABC, abstractmethod
-from math import exp
+from math import exp, sqrt
+from pathlib import Path
+from typing import Any
 
-from .model import RigidBody
-from .samples import DT, Floats, Sample
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
 
-__all__ = ["VISCOUS", "IdealPlant", "LaggingPlant", "Plant"]
+from .motion import DT, Floats, MotionSample
+from .urdf import without_shapes
+
+__all__ = [
+    "FLANGE_TO_HAND",
+    "IDENTITY",
+    "IdealPlant",
+    "LaggingPlant",
+    "Plant",
+    "Pose16",
+    "PyBulletPlant",
+    "RigidBody",
+    "multiply",
+]
+
+Pose16 = tuple[float, ...]
+"""A 4x4 matrix by columns, as in packets."""
+
+_ROOT = sqrt(0.5)
+IDENTITY: Pose16 = (1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0)
+FLANGE_TO_HAND: Pose16 = (_ROOT, -_ROOT, 0.0, 0.0, _ROOT, _ROOT, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.1034, 1.0)
+"""From the flange to the tcp of the Franka Hand: -45 degrees about z and 103.4 mm, as set by Franka's Desk."""
+
+
+def multiply(a: Pose16, b: Pose16) -> Pose16:
+    """Return the product of two transformations."""
+    product = _matrix(a) @ _matrix(b)
+    return tuple(product.T.ravel().tolist())
+
+
+def _matrix(pose: Pose16) -> NDArray[np.float64]:
+    matrix: NDArray[np.float64] = np.array(pose).reshape(4, 4).T
+    return matrix
+
+
+class RigidBody:
+    """The arm with its end effector. Positions are (7,), rad, from base to flange."""
+
+    def __init__(self, urdf: Path) -> None:
+        """Raises ValueError if the URDF cannot be read, or lacks the seven joints or the flange."""
+        model = pin.buildModelFromUrdf(str(urdf))
+        names = [_named(model, f"joint{k}") for k in range(1, 8)]
+        others = [k for k in range(1, model.njoints) if model.names[k] not in names]
+        self._model: Any = pin.buildReducedModel(model, others, pin.neutral(model))
+        if [str(name) for name in self._model.names][1:] != names:
+            raise ValueError(f"{urdf}: the seven joints must follow each other from base to flange")
+        self._data: Any = self._model.createData()
+        flange = next((k for k, frame in enumerate(self._model.frames) if frame.name.endswith("link8")), None)
+        if flange is None:
+            raise ValueError(f"{urdf}: no link whose name ends in 'link8', the flange")
+        self._flange = flange
+        self._placement: Any = self._data.oMf[flange]
+        self._still = np.zeros(7)
+
+    def flange(self, q: Floats) -> NDArray[np.float64]:
+        """Return the pose (4, 4) of the flange in the base frame, m."""
+        pin.forwardKinematics(self._model, self._data, np.array(q))
+        pin.updateFramePlacement(self._model, self._data, self._flange)
+        pose: NDArray[np.float64] = self._placement.homogeneous
+        return pose
+
+    def tip(self, q: Floats, flange_to_tip: Pose16) -> Pose16:
+        """Return the pose of the frame at ``flange_to_tip`` from the flange, in the base frame."""
+        pose = self.flange(q) @ _matrix(flange_to_tip)
+        return tuple(pose.T.ravel().tolist())
+
+    def torques(self, q: Floats, dq: Floats, ddq: Floats) -> list[float]:
+        """Return the joint torques (7,), Nm, gravity included, for a motion."""
+        torques: list[float] = pin.rnea(self._model, self._data, np.array(q), np.array(dq), np.array(ddq)).tolist()
+        return torques
+
+    def step(self, q: Floats, dq: Floats, tau: Floats, friction: Floats, dt: float) -> list[float]:
+        """Return the joint velocities (7,), rad/s, after ``dt`` s under torques ``tau`` (7,), Nm, without gravity.
+
+        ``friction`` (7,), Nm s/rad, is evaluated at the end of the step, so any value is stable.
+        """
+        position, velocity = np.array(q), np.array(dq)
+        model, data = self._model, self._data
+        coriolis = pin.rnea(model, data, position, velocity, self._still) - pin.rnea(
+            model, data, position, self._still, self._still
+        )
+        upper = np.triu(pin.crba(model, data, position))
+        mass = upper + np.triu(upper, 1).T
+        right = mass @ velocity + dt * (np.array(tau) - coriolis)
+        mass[range(7), range(7)] += dt * np.array(friction)
+        after: list[float] = np.linalg.solve(mass, right).tolist()
+        return after
+
+
+def _named(model: Any, ending: str) -> str:
+    found = [str(name) for name in model.names if str(name).endswith(ending)]
+    if len(found) != 1:
+        raise ValueError(f"the URDF has {len(found)} joints whose name ends in {ending!r}, not one")
+    return found[0]
+
 
 VISCOUS = (0.5, 0.5, 0.5, 0.5, 0.2, 0.2, 0.2)
-"""What is left of joint friction after the robot's own compensation, Nm s/rad. Chosen here."""
+"""Viscous joint friction that remains after the robot's own compensation, Nm s/rad. Chosen here."""
 _COULOMB = (0.1, 0.1, 0.1, 0.1, 0.05, 0.05, 0.05)
-"""The same of Coulomb's kind, Nm."""
+"""Coulomb friction that remains, Nm."""
 _STICKING = 1e-3
-"""rad/s, below which Coulomb's friction is like a viscous one."""
+"""Speed below which Coulomb friction acts like viscous friction, rad/s."""
 
 
 class Plant(ABC):
-    """An arm. ``q`` rad, ``dq`` rad/s and ``tau`` Nm, each (7,), are what its sensors show."""
+    """An arm that follows desired motion or torques; ``q`` rad, ``dq`` rad/s and ``tau`` Nm, (7,), are measured."""
 
     def __init__(self, body: RigidBody, q: Floats) -> None:
         self.body = body
@@ -28,36 +130,36 @@ class Plant(ABC):
         self.tau: Floats = body.torques(self.q, self.dq, self.dq)
 
     def place(self, q: Floats) -> None:
-        """Stand at ``q`` (7,), rad, from now on."""
+        """Put the arm at rest at ``q`` (7,), rad."""
         self.q, self.dq = tuple(q), (0.0,) * 7
         self.tau = self.body.torques(self.q, self.dq, self.dq)
 
     @abstractmethod
-    def follow(self, desired: Sample) -> None:
-        """Go on for one cycle under the robot's own joint controller."""
+    def follow(self, desired: MotionSample) -> None:
+        """Advance one cycle under the robot's own joint controller."""
 
     def push(self, torques: Floats) -> None:
-        """Go on for one cycle under the client's torques (7,), Nm; the robot carries the arm's weight."""
+        """Advance one cycle under the client's torques (7,), Nm; the robot compensates gravity."""
         friction = [a + b / (abs(v) + _STICKING) for a, b, v in zip(VISCOUS, _COULOMB, self.dq, strict=True)]
         self.dq = self.body.step(self.q, self.dq, torques, friction, DT)
         self.q = [p + v * DT for p, v in zip(self.q, self.dq, strict=True)]
         gravity = self.body.torques(self.q, (0.0,) * 7, (0.0,) * 7)
         self.tau = [a + b for a, b in zip(gravity, torques, strict=True)]
 
-    def close(self) -> None:  # noqa: B027  # most have nothing to let go of
-        """Let go of what it holds."""
+    def close(self) -> None:  # noqa: B027  # optional
+        """Release resources."""
 
 
 class IdealPlant(Plant):
-    """Is where it is told to be, at once."""
+    """Follows the desired motion exactly."""
 
-    _last: Sample | None = None
+    _last: MotionSample | None = None
 
     def place(self, q: Floats) -> None:
         super().place(q)
         self._last = None
 
-    def follow(self, desired: Sample) -> None:
+    def follow(self, desired: MotionSample) -> None:
         if desired is self._last:
             return
         self._last = desired
@@ -70,15 +172,96 @@ class IdealPlant(Plant):
 
 
 class LaggingPlant(Plant):
-    """Follows with a first-order lag of ``lag`` s, as a stiff joint controller does roughly."""
+    """Follows with a first-order lag of ``lag`` s, roughly like a stiff joint controller."""
 
     def __init__(self, body: RigidBody, q: Floats, lag: float) -> None:
         super().__init__(body, q)
         self._share = 1.0 - exp(-DT / lag)
 
-    def follow(self, desired: Sample) -> None:
+    def follow(self, desired: MotionSample) -> None:
         before, speed = self.q, self.dq
         self.q = [p + (goal - p) * self._share for p, goal in zip(before, desired.q, strict=True)]
         self.dq = [(new - old) / DT for new, old in zip(self.q, before, strict=True)]
         ddq = [(new - old) / DT for new, old in zip(self.dq, speed, strict=True)]
         self.tau = self.body.torques(self.q, self.dq, ddq)
+
+
+_GAIN = 0.072
+"""Share of the position error that a motor corrects per step; with much more a loaded arm vibrates."""
+_TORQUE = (87.0, 87.0, 87.0, 87.0, 12.0, 12.0, 12.0)
+
+
+class PyBulletPlant(Plant):
+    """An arm in PyBullet: position control by its motors, torque control by torques on top of gravity.
+
+    A motor is a velocity constraint with a torque limit. Collisions are ignored, and meshes not loaded.
+    """
+
+    def __init__(self, body: RigidBody, urdf: Path, q: Floats) -> None:
+        """Raises ValueError if PyBullet is missing or cannot load the URDF."""
+        super().__init__(body, q)
+        try:
+            import pybullet
+        except ImportError:
+            raise ValueError("--plant pybullet needs PyBullet: pip install 'robot-hal[sim]'") from None
+        self._bullet: Any = pybullet
+        pybullet.connect(pybullet.DIRECT)
+        pybullet.setTimeStep(DT)
+        pybullet.setGravity(0.0, 0.0, -9.81)
+        self._arm = self._load(urdf)
+        count = pybullet.getNumJoints(self._arm)
+        names = {pybullet.getJointInfo(self._arm, k)[1].decode(): k for k in range(count)}
+        self._joints = [next(k for name, k in names.items() if name.endswith(f"joint{n}")) for n in range(1, 8)]
+        for joint, damping in zip(self._joints, VISCOUS, strict=True):
+            pybullet.changeDynamics(self._arm, joint, jointDamping=damping, linearDamping=0.0, angularDamping=0.0)
+        self._motors_on = True
+        self.place(q)
+
+    def place(self, q: Floats) -> None:
+        super().place(q)
+        for joint, position in zip(self._joints, q, strict=True):
+            self._bullet.resetJointState(self._arm, joint, position)
+
+    def _load(self, urdf: Path) -> int:
+        bullet = self._bullet
+        with tempfile.NamedTemporaryFile("w", suffix=".urdf") as bare:
+            bare.write(without_shapes(urdf.read_text(encoding="utf-8")))
+            bare.flush()
+            try:
+                arm: int = bullet.loadURDF(bare.name, useFixedBase=True, flags=bullet.URDF_USE_INERTIA_FROM_FILE)
+            except bullet.error as error:
+                raise ValueError(f"PyBullet cannot load {urdf}: {error}") from None
+        return arm
+
+    def follow(self, desired: MotionSample) -> None:
+        self._motors_on = True
+        self._bullet.setJointMotorControlArray(
+            self._arm,
+            self._joints,
+            self._bullet.POSITION_CONTROL,
+            [p - v * DT for p, v in zip(desired.q, desired.dq, strict=True)],
+            desired.dq,
+            _TORQUE,
+            [_GAIN] * 7,
+            [1.0] * 7,
+        )
+        self._step()
+
+    def push(self, torques: Floats) -> None:
+        bullet = self._bullet
+        if self._motors_on:
+            bullet.setJointMotorControlArray(self._arm, self._joints, bullet.VELOCITY_CONTROL, forces=[0.0] * 7)
+            self._motors_on = False
+        gravity = self.body.torques(self.q, (0.0,) * 7, (0.0,) * 7)
+        applied = [a + b for a, b in zip(gravity, torques, strict=True)]
+        bullet.setJointMotorControlArray(self._arm, self._joints, bullet.TORQUE_CONTROL, forces=applied)
+        self._step()
+        self.tau = applied
+
+    def _step(self) -> None:
+        self._bullet.stepSimulation()
+        states = self._bullet.getJointStates(self._arm, self._joints)
+        self.q, self.dq, _, self.tau = zip(*states, strict=True)
+
+    def close(self) -> None:
+        self._bullet.disconnect()

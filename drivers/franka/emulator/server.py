@@ -1,69 +1,238 @@
-"""The emulator's loop: gathers the command of a cycle, lets the arm go on, and sends the state. One thread, one arm."""
+"""Server of the emulated arm: one client at a time, requests over TCP, states and commands over UDP, in one thread.
+
+In every cycle the server gathers the client's command, advances the arm and sends the state.
+"""
 
 from __future__ import annotations
 
 import contextlib
 import select
+import socket
 import struct
 import time
 from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import NamedTuple
 
-from .arm import Arm, Reply
-from .console import Console
-from .faults import Faults
-from .layouts import CommandPacket, read_command
-from .link import Incoming, Session, listen
-from .pacing import Pacer, Pacing
-from .protocol import HEADER, PORT, Outcome
-from .requests import Files, Requests
+from .arm import ArmReply, EmulatedArm, RequestHandler, RobotFiles
+from .faults import InjectedFaults
+from .journal import Counters
+from .motion import DT
+from .protocol import HEADER, PORT, CommandPacket, RequestOutcome, read_command
 
-__all__ = ["ArmServer"]
+__all__ = ["ArmClient", "ArmServer", "Pacing", "listen"]
+
+# Timing.
+
+
+@dataclass(frozen=True)
+class Pacing:
+    """When the next cycle begins.
+
+    In real time a state is sent every millisecond, answered or not. In lock-step, during a motion, the emulator waits
+    for the answer to each state, so nothing is lost however slow either side is: for tests, and for running faster
+    than real time. Without a motion, a state is sent every millisecond in both cases.
+    """
+
+    lockstep: bool = False
+    paced: bool = True
+    """Lock-step only: no cycle is shorter than a millisecond."""
+    patience: float = 5.0
+    """Lock-step only: time after which an answer counts as lost, s."""
+
+    def describe(self) -> str:
+        """Return a short description."""
+        if not self.lockstep:
+            return "real time"
+        return "lock-step, paced" if self.paced else "lock-step"
+
+
+class CyclePacer:
+    """Absolute deadlines, a millisecond apart.
+
+    A cycle that is more than a millisecond late shifts all later ones, so the client always has its millisecond.
+    """
+
+    def __init__(self) -> None:
+        self._due = time.monotonic()
+
+    def wait(self, counters: Counters | None) -> None:
+        """Sleep until the next deadline, and record the lateness in ``counters``, if given."""
+        self._due += DT
+        left = self._due - time.monotonic()
+        if left > 0.0:
+            time.sleep(left)
+        now = time.monotonic()
+        late = now - self._due
+        if counters is not None:
+            counters.late(self._due, late)
+        if late > DT:
+            self._due = now
+
+    def skip(self) -> None:
+        """Set the next deadline to a millisecond from now."""
+        self._due = time.monotonic()
+
+
+# The connection.
+
+_MAX_REQUEST = 65536
+"""Largest size of a request, bytes."""
+_MAX_COMMANDS = 64
+"""Commands that are read at once, so that a flood of them does not delay the arm."""
+_CONNECT_TIMEOUT = 2.0
+"""s after which a connection without a Connect request is replaced by the next one."""
+_SEND_TIMEOUT = 1.0
+"""Longest time until a client accepts a response, s."""
+
+
+class ArmRequest(NamedTuple):
+    """A request as received."""
+
+    code: int
+    number: int
+    payload: bytes
+
+
+def listen(host: str, port: int) -> socket.socket:
+    """Return a listening socket.
+
+    Raises:
+        OSError: With host and port in its text, if they are in use or not of this machine.
+    """
+    listener = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
+    listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    try:
+        listener.bind((host, port))
+        listener.listen(4)
+    except OSError as error:
+        listener.close()
+        raise OSError(error.errno, f"cannot listen on {host}:{port}: {error.strerror}") from None
+    listener.setblocking(False)
+    return listener
+
+
+class ArmClient:
+    """One connected client."""
+
+    def __init__(self, connection: socket.socket, host: str) -> None:
+        self.tcp = connection
+        self.tcp.settimeout(_SEND_TIMEOUT)
+        self.tcp.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        self.peer: str = connection.getpeername()[0]
+        self.name = "{}:{}".format(*connection.getpeername())
+        self.udp = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self.udp.bind((host, 0))
+        self.udp.setblocking(False)
+        self.connected = False
+        """Whether a Connect request was accepted."""
+        self._since = time.monotonic()
+        self._port = 0
+        self._received = bytearray()
+
+    def open_udp(self, port: int) -> None:
+        """Send states to the client's port from now on."""
+        self._port = port
+        self.connected = True
+
+    def requests(self) -> list[ArmRequest]:
+        """Return the requests that arrived. Raises ConnectionError at the end, and for invalid data."""
+        data = self.tcp.recv(_MAX_REQUEST)
+        if not data:
+            raise ConnectionError("the client closed the connection")
+        self._received += data
+        found = []
+        while len(self._received) >= HEADER.size:
+            code, number, size = HEADER.unpack_from(self._received)
+            if not HEADER.size <= size <= _MAX_REQUEST:
+                raise ConnectionError(f"a request of {size} bytes")
+            if len(self._received) < size:
+                break
+            found.append(ArmRequest(code, number, bytes(self._received[HEADER.size : size])))
+            del self._received[:size]
+        return found
+
+    def gone(self) -> bool:
+        """Return whether the client has disconnected, with nothing left to read, or never sent Connect."""
+        if not self.connected and time.monotonic() > self._since + _CONNECT_TIMEOUT:
+            return True
+        try:
+            readable = select.select([self.tcp], [], [], 0.0)[0]
+            return bool(readable) and not self.tcp.recv(1, socket.MSG_PEEK)
+        except OSError:
+            return True
+
+    def reply(self, code: int, number: int, body: bytes) -> None:
+        """Answer a request. Raises OSError if the client does not accept it."""
+        self.tcp.sendall(HEADER.pack(code, number, HEADER.size + len(body)) + body)
+
+    def send_state(self, packet: bytes | bytearray | memoryview) -> None:
+        """Send a state; one that cannot be sent is lost, as on a network."""
+        with contextlib.suppress(OSError):
+            self.udp.sendto(packet, (self.peer, self._port))
+
+    def commands(self) -> list[bytes]:
+        """Return the datagrams that arrived, oldest first."""
+        found: list[bytes] = []
+        with contextlib.suppress(OSError):
+            while len(found) < _MAX_COMMANDS:
+                found.append(self.udp.recv(2048))
+        return found
+
+    def close(self) -> None:
+        """Close both sockets."""
+        self.tcp.close()
+        self.udp.close()
+
+
+# The server.
 
 _IDLE = 0.05
-"""s between two looks around while there is no client."""
+"""Cycle time while there is no client, s."""
 _SLICE = 0.05
-"""s: a signal is noticed within this time, however long an answer is waited for."""
+"""Longest uninterrupted wait for an answer, s, so that signals are noticed."""
 _FIRST_PATIENCE = 0.1
-"""s that each state is held back in lock-step until a motion's first command; the client's library takes up to two
-states before it lets its caller command anything."""
-_TAKEN_BEFORE = 2
+"""Time between states in lock-step before a motion's first command, s. The client's library reads up to two states
+before its caller can command anything."""
+_STATES_BEFORE = 2
 _HUNG_PATIENCE = 0.01
-"""s for each further answer once one did not come at all."""
+"""Time for each further answer once one is overdue, s."""
 
 
 class ArmServer:
-    """Port 1337 of one address: accepts one client at a time and serves it until :meth:`stop`."""
+    """Serves one client at a time on port 1337 of one address, until :meth:`stop`."""
 
-    def __init__(self, host: str, arm: Arm, files: Files, pacing: Pacing, seed: int = 0) -> None:
-        """Raises OSError when the port cannot be had."""
+    def __init__(self, host: str, arm: EmulatedArm, files: RobotFiles, pacing: Pacing, seed: int = 0) -> None:
+        """Raises OSError if the port is not available."""
         self.host = host
         self.arm = arm
         self.pacing = pacing
-        self.faults = Faults(seed)
+        self.faults = InjectedFaults(seed)
         self.poller = select.epoll()
-        self.session: Session | None = None
+        self.session: ArmClient | None = None
         arm.send = self._send_reply
-        self._answers = Requests(arm, files)
-        self._pacer = Pacer()
+        self._handler = RequestHandler(arm, files)
+        self._pacer = CyclePacer()
         self._listener = listen(host, PORT)
         self.poller.register(self._listener, select.EPOLLIN)
-        self._console: Console | None = None
-        self._requests: deque[tuple[float, Incoming]] = deque()
-        self._replies: list[Reply] = []
+        self._serve_other: Callable[[int], None] | None = None
+        self._requests: deque[tuple[float, ArmRequest]] = deque()
+        self._replies: list[ArmReply] = []
         self._command: CommandPacket | None = None
         self._answered = False
-        self._state_went = False
+        self._state_sent = False
         self._sent_at = 0.0
         self._hung = False
         self._away_until = 0.0
         self._stopping = False
 
-    def attach(self, console: Console) -> None:
-        """Serve this console's descriptors as well."""
-        self._console = console
+    def attach(self, serve: Callable[[int], None]) -> None:
+        """Pass descriptors that others registered with :attr:`poller` to ``serve`` once they are ready."""
+        self._serve_other = serve
 
     def run(self) -> None:
-        """Until :meth:`stop`."""
+        """Serve until :meth:`stop`."""
         while not self._stopping:
             self._gather()
             packet = self.arm.tick(self._command)
@@ -72,18 +241,18 @@ class ArmServer:
             self._flush()
 
     def stop(self) -> None:
-        """End the loop soon; for signal handlers."""
+        """End the loop soon. Safe in signal handlers."""
         self._stopping = True
 
     def close(self) -> None:
-        """Let go of every socket."""
+        """Close every socket."""
         if self.session is not None:
             self._end_session("the emulator ends")
         self._listener.close()
         self.poller.close()
 
     def restart(self, away: float) -> None:
-        """Drop the client, forget everything, and be away for so long, s."""
+        """Restart as if switched off and on: drop the client, reset, and stay unreachable for ``away`` s."""
         if self.session is not None:
             self._end_session("restart")
         self.faults.clear()
@@ -114,76 +283,76 @@ class ArmServer:
             self._serve(_IDLE)
             self._pacer.skip()
         else:
-            self._pacer.wait(self.arm.figures)
+            self._pacer.wait(self.arm.counters)
             self._serve(0.0)
 
     def _waits_for_answers(self) -> bool:
         motion = self.arm.motion
         if not self.pacing.lockstep or motion is None or motion.options.asynchronous:
             return False
-        return not motion.waiting or motion.states_shown >= _TAKEN_BEFORE
+        return not motion.waiting or motion.states_shown >= _STATES_BEFORE
 
     def _await_answer(self) -> None:
-        """Lock-step: wait for the answer to the last state, unless that did not go out."""
+        """Wait for the answer to the last state (lock-step), unless that state was not sent."""
         motion = self.arm.motion
         assert motion is not None
         if motion.waiting:
             patience = _FIRST_PATIENCE
         else:
             patience = _HUNG_PATIENCE if self._hung else self.pacing.patience
-        deadline = time.monotonic() + patience if self._state_went else 0.0
+        deadline = time.monotonic() + patience if self._state_sent else 0.0
         while True:
             left = deadline - time.monotonic()
             self._serve(max(0.0, min(left, _SLICE)))
             if self._answered:
                 self._hung = False
-                self.arm.figures.answers.add(time.monotonic() - self._sent_at)
+                self.arm.counters.answers.add(time.monotonic() - self._sent_at)
                 return
             if self.arm.motion is not motion or self._stopping:
                 return
             if left <= 0.0:
-                self._hung = not motion.waiting and self._state_went
+                self._hung = not motion.waiting and self._state_sent
                 return
 
     def _serve(self, timeout: float) -> None:
-        """Wait up to ``timeout`` s for something to come in, and see to it."""
+        """Wait up to ``timeout`` s for input, and process it."""
         for descriptor, _ in self.poller.poll(timeout):
             session = self.session
             if session is not None and descriptor == session.udp.fileno():
                 self._receive(session)
             elif session is not None and descriptor == session.tcp.fileno():
-                self._converse(session)
+                self._read_requests(session)
             elif descriptor == self._listener.fileno():
                 self._accept()
-            elif self._console is not None:
-                self._console.serve(descriptor)
+            elif self._serve_other is not None:
+                self._serve_other(descriptor)
         while self._requests and self._requests[0][0] <= time.monotonic():
             self._handle(self._requests.popleft()[1])
 
-    def _receive(self, session: Session) -> None:
-        figures, motion = self.arm.figures, self.arm.motion
+    def _receive(self, session: ArmClient) -> None:
+        counters, motion = self.arm.counters, self.arm.motion
         for data in session.commands():
-            figures.commands += 1
-            if motion is not None and self.faults.commands.strikes():
-                figures.thrown_away += 1
+            counters.commands += 1
+            if motion is not None and self.faults.commands.loses_next():
+                counters.thrown_away += 1
                 self._answered = True
                 continue
             command = read_command(data, self.arm.protocol.version)
             if command is None:
-                figures.malformed += 1
-                if figures.malformed == 1:
-                    self.arm.journal.say("malformed", f"commands of {len(data)} bytes are ignored")
+                counters.malformed += 1
+                if counters.malformed == 1:
+                    self.arm.journal.record("malformed", f"commands of {len(data)} bytes are ignored")
             elif motion is None:
                 continue
             elif self._counts(command):
                 self._command = command
                 self._answered = True
-                figures.accepted += 1
+                counters.accepted += 1
             else:
-                figures.stale += 1
+                counters.stale += 1
 
     def _counts(self, command: CommandPacket) -> bool:
-        """Only the answer to the last state does; a motion's first command may answer any of its states."""
+        """Return whether a command answers the last state; a motion's first command may answer any of its states."""
         motion = self.arm.motion
         assert motion is not None
         if motion.waiting or motion.options.asynchronous:
@@ -198,20 +367,20 @@ class ArmServer:
         except OSError:
             return
         if self.session is not None and self.session.gone():
-            self._end_session("it makes room for the next one")
+            self._end_session("replaced by the next one")
         if self.session is not None:
             connection.close()
-            self.arm.journal.say("second client", f"a second client, {peer}:{port}, is turned away")
+            self.arm.journal.record("second client", f"a second client, {peer}:{port}, is refused")
             return
         try:
-            self.session = Session(connection, self.host)
+            self.session = ArmClient(connection, self.host)
         except OSError:
             connection.close()
             return
         self.poller.register(self.session.tcp, select.EPOLLIN)
         self.poller.register(self.session.udp, select.EPOLLIN)
 
-    def _converse(self, session: Session) -> None:
+    def _read_requests(self, session: ArmClient) -> None:
         try:
             requests = session.requests()
         except OSError as error:
@@ -220,7 +389,7 @@ class ArmServer:
         due = time.monotonic() + self.faults.slow_reply
         self._requests.extend((due, request) for request in requests)
 
-    def _handle(self, request: Incoming) -> None:
+    def _handle(self, request: ArmRequest) -> None:
         session, protocol = self.session, self.arm.protocol
         if session is None:
             return
@@ -230,16 +399,16 @@ class ArmServer:
         elif kind.name == "Connect":
             self._connect(session, request)
         elif len(request.payload) != kind.size - HEADER.size:
-            self.arm.journal.say(
+            self.arm.journal.record(
                 "malformed", f"{kind.name} of {len(request.payload) + HEADER.size} bytes, not {kind.size}"
             )
-            status = protocol.status(kind.name, Outcome.INVALID)
-            self._send_reply(Reply(kind.name, request.number, bytes((status,)), after_state=True))
+            status = protocol.status(kind.name, RequestOutcome.INVALID)
+            self._send_reply(ArmReply(kind.name, request.number, bytes((status,)), after_state=True))
         else:
-            self._answers.take(kind.name, request.number, request.payload)
+            self._handler.handle(kind.name, request.number, request.payload)
 
-    def _connect(self, session: Session, request: Incoming) -> None:
-        """Answered with the version that the emulator speaks; another version of the client is refused."""
+    def _connect(self, session: ArmClient, request: ArmRequest) -> None:
+        """Answer with the emulator's version; a client of another version is refused."""
         if len(request.payload) != 4:
             self._end_session("a malformed Connect")
             return
@@ -248,12 +417,12 @@ class ArmServer:
         good = version == ours
         if good:
             session.open_udp(port)
-            self.arm.journal.say("client", f"client {session.name} connected, protocol {version}")
+            self.arm.journal.record("client", f"client {session.name} connected, protocol {version}")
         else:
-            self.arm.journal.say("client", f"client {session.name} refused: it speaks {version}, this arm {ours}")
-        status = self.arm.protocol.status("Connect", Outcome.SUCCESS if good else Outcome.NOT_POSSIBLE)
+            self.arm.journal.record("client", f"client {session.name} refused: protocol {version}, not {ours}")
+        status = self.arm.protocol.status("Connect", RequestOutcome.SUCCESS if good else RequestOutcome.NOT_POSSIBLE)
         body = struct.pack("<BH", status, ours)
-        self._send_reply(Reply("Connect", request.number, body, after_state=False))
+        self._send_reply(ArmReply("Connect", request.number, body, after_state=False))
 
     def _end_session(self, why: str) -> None:
         session, self.session = self.session, None
@@ -262,25 +431,25 @@ class ArmServer:
         self._requests.clear()
         self._replies.clear()
         self.arm.client_gone()
-        self._replies.clear()  # nobody is left who could hear the end of the motion
-        self.arm.journal.say("client gone", f"client {session.name} is gone: {why}")
+        self._replies.clear()  # no client is left for the answer about the end of the motion
+        self.arm.journal.record("client gone", f"client {session.name} disconnected: {why}")
 
-    # What goes out.
+    # Output.
 
-    def _send_state(self, session: Session, packet: bytearray) -> None:
-        faults, figures, motion = self.faults, self.arm.figures, self.arm.motion
+    def _send_state(self, session: ArmClient, packet: bytearray) -> None:
+        faults, counters, motion = self.faults, self.arm.counters, self.arm.motion
         self._sent_at = time.monotonic()
-        if self._sent_at < faults.silent_until or faults.states.strikes():
-            self._state_went = False
-            figures.states_lost += 1
+        if self._sent_at < faults.silent_until or faults.states.loses_next():
+            self._state_sent = False
+            counters.states_lost += 1
             return
         session.send_state(memoryview(packet)[:-1] if faults.truncate else packet)
-        self._state_went = True
-        figures.states += 1
+        self._state_sent = True
+        counters.states += 1
         if motion is not None:
             motion.states_shown += 1
 
-    def _send_reply(self, reply: Reply) -> None:
+    def _send_reply(self, reply: ArmReply) -> None:
         if reply.after_state:
             self._replies.append(reply)
         else:
@@ -290,9 +459,9 @@ class ArmServer:
         while self._replies:
             self._write(self._replies.pop(0))
 
-    def _write(self, reply: Reply) -> None:
+    def _write(self, reply: ArmReply) -> None:
         session = self.session
         if session is None:
             return
-        with contextlib.suppress(OSError):  # its end is told by the next read
+        with contextlib.suppress(OSError):  # the next read reports the end
             session.reply(self.arm.protocol.codes[reply.name], reply.number, reply.body)

@@ -7,10 +7,12 @@ from math import cos, pi
 
 import pytest
 
-from hal.drivers.franka.emulator.checker import LimitChecker, Tolerances, Violation
-from hal.drivers.franka.emulator.samples import (
+from hal.drivers.franka.emulator.motion import (
     DT,
-    Sample,
+    LimitChecker,
+    MotionSample,
+    Tolerances,
+    Violation,
     at_rest,
     braked,
     by_position,
@@ -24,12 +26,14 @@ HOME = (0.0, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785)
 FR3, FER = LIMITS["fr3"], LIMITS["fer"]
 
 
-def moving(dq: float = 0.0, ddq: float = 0.0, joint: int = 0, q: tuple[float, ...] = HOME) -> Sample:
+def moving(dq: float = 0.0, ddq: float = 0.0, joint: int = 0, q: tuple[float, ...] = HOME) -> MotionSample:
     """One joint moves, the others stand."""
-    return Sample(q, [dq if k == joint else 0.0 for k in range(7)], [ddq if k == joint else 0.0 for k in range(7)])
+    return MotionSample(
+        q, [dq if k == joint else 0.0 for k in range(7)], [ddq if k == joint else 0.0 for k in range(7)]
+    )
 
 
-def after(before: Sample, acceleration: float, joint: int = 0) -> Sample:
+def after(before: MotionSample, acceleration: float, joint: int = 0) -> MotionSample:
     """The next sample, with that acceleration in one joint."""
     dq = list(before.dq)
     dq[joint] += acceleration * DT
@@ -150,7 +154,7 @@ def test_going_on_after_losses_multiplies_the_jerk_that_is_seen(lost: int, times
 
 
 def test_an_arm_comes_to_rest_by_itself_within_its_deceleration() -> None:
-    samples = [Sample(HOME, (1.0, -0.5, *[0.0] * 5), (0.0,) * 7)]
+    samples = [MotionSample(HOME, (1.0, -0.5, *[0.0] * 5), (0.0,) * 7)]
     while samples[-1].moving:
         samples.append(braked(samples[-1], FR3.acceleration))
         assert len(samples) < 200

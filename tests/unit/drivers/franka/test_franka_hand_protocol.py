@@ -6,14 +6,21 @@ import struct
 
 import pytest
 
-from hal.drivers.franka.emulator.hand_fingers import FULL_WIDTH, Fingers, Kind, Motion
-from hal.drivers.franka.emulator.hand_wire import Code, HandState, Request, Requests, Status, response
+from hal.drivers.franka.emulator.hand_fingers import FULL_WIDTH, FingerMotion, FingerMotionKind, Fingers
+from hal.drivers.franka.emulator.hand_network import (
+    HandCode,
+    HandRequest,
+    HandRequestParser,
+    HandStatePacket,
+    HandStatus,
+    hand_response,
+)
 
 GRASP = struct.pack("<HII5d", 2, 7, 50, 0.03, 0.004, 0.006, 0.1, 40.0)
 MOVE = struct.pack("<HII2d", 3, 8, 26, 0.08, 0.05)
 
 
-def run(fingers: Fingers, seconds: float, dt: float = 0.01) -> Status | None:
+def run(fingers: Fingers, seconds: float, dt: float = 0.01) -> HandStatus | None:
     """Let time pass; the status of the motion that ended."""
     for _ in range(round(seconds / dt)):
         status = fingers.advance(dt)
@@ -23,14 +30,14 @@ def run(fingers: Fingers, seconds: float, dt: float = 0.01) -> Status | None:
 
 
 def test_requests_are_cut_from_a_stream_however_it_arrives():
-    requests = Requests()
+    requests = HandRequestParser()
     stream = struct.pack("<HIIHH", 0, 0, 14, 3, 40000) + struct.pack("<HII", 1, 1, 10) + GRASP + MOVE
     found = [request for byte in stream for request in requests.feed(bytes([byte]))]
     assert found == [
-        Request(Code.CONNECT, 0, (3, 40000)),
-        Request(Code.HOMING, 1, ()),
-        Request(Code.GRASP, 7, (0.03, 0.004, 0.006, 0.1, 40.0)),
-        Request(Code.MOVE, 8, (0.08, 0.05)),
+        HandRequest(HandCode.CONNECT, 0, (3, 40000)),
+        HandRequest(HandCode.HOMING, 1, ()),
+        HandRequest(HandCode.GRASP, 7, (0.03, 0.004, 0.006, 0.1, 40.0)),
+        HandRequest(HandCode.MOVE, 8, (0.08, 0.05)),
     ]
 
 
@@ -38,14 +45,18 @@ def test_requests_are_cut_from_a_stream_however_it_arrives():
     "stream", [struct.pack("<HII", 9, 0, 10), struct.pack("<HII", 3, 0, 10), b"GET / HTTP/1.1\r\n"]
 )
 def test_what_no_client_says_is_refused(stream):
-    with pytest.raises(ValueError, match=r"is not a valid Code|bytes; it has"):
-        list(Requests().feed(stream))
+    with pytest.raises(ValueError, match=r"valid HandCode|bytes"):
+        list(HandRequestParser().feed(stream))
 
 
 def test_answers_and_states_have_the_sizes_that_the_client_wants():
-    assert response(Request(Code.MOVE, 8, ()), Status.UNSUCCESSFUL) == struct.pack("<HIIH", 3, 8, 12, 2)
-    assert response(Request(Code.CONNECT, 0, ()), Status.SUCCESS, 3) == struct.pack("<HIIHH", 0, 0, 14, 0, 3)
-    packed = HandState(5, 0.03, 0.08, True, 31).pack()
+    assert hand_response(HandRequest(HandCode.MOVE, 8, ()), HandStatus.UNSUCCESSFUL) == struct.pack(
+        "<HIIH", 3, 8, 12, 2
+    )
+    assert hand_response(HandRequest(HandCode.CONNECT, 0, ()), HandStatus.SUCCESS, 3) == struct.pack(
+        "<HIIHH", 0, 0, 14, 0, 3
+    )
+    packed = HandStatePacket(5, 0.03, 0.08, True, 31).pack()
     assert len(packed) == 23
     assert struct.unpack("<IddBH", packed) == (5, 0.03, 0.08, 1, 31)
 
@@ -53,24 +64,24 @@ def test_answers_and_states_have_the_sizes_that_the_client_wants():
 def test_fingers_move_at_the_speed_that_was_asked_for_and_no_faster_than_they_can():
     fingers = Fingers()
     fingers.width = 0.0
-    assert fingers.start(Motion(Kind.MOVE, 0.05, 0.02)) is None
+    assert fingers.start(FingerMotion(FingerMotionKind.MOVE, 0.05, 0.02)) is None
     assert run(fingers, 1.0) is None
     assert fingers.width == pytest.approx(0.02)
-    assert run(fingers, 2.0) is Status.SUCCESS
+    assert run(fingers, 2.0) is HandStatus.SUCCESS
     assert fingers.width == 0.05
-    fingers.start(Motion(Kind.MOVE, 0.0, 9.0))
+    fingers.start(FingerMotion(FingerMotionKind.MOVE, 0.0, 9.0))
     assert run(fingers, 0.4) is None
 
 
 @pytest.mark.parametrize(
-    ("inner", "outer", "status"), [(0.005, 0.005, Status.SUCCESS), (0.005, 0.0, Status.UNSUCCESSFUL)]
+    ("inner", "outer", "status"), [(0.005, 0.005, HandStatus.SUCCESS), (0.005, 0.0, HandStatus.UNSUCCESSFUL)]
 )
 def test_a_grasp_closes_on_what_is_there_and_is_judged_by_its_width(inner, outer, status):
     fingers = Fingers(object_width=0.03)
-    assert fingers.start(Motion(Kind.GRASP, 0.028, 0.1, 40.0, inner, outer)) is None
+    assert fingers.start(FingerMotion(FingerMotionKind.GRASP, 0.028, 0.1, 40.0, inner, outer)) is None
     assert run(fingers, 1.0) is status
     assert fingers.width == 0.03
-    assert fingers.is_grasped is (status is Status.SUCCESS)
+    assert fingers.is_grasped is (status is HandStatus.SUCCESS)
     assert fingers.force == (40.0 if fingers.is_grasped else 0.0)
 
 
@@ -78,24 +89,24 @@ def test_a_grasp_of_nothing_closes_all_the_way_unless_it_is_told_to_end_at_its_w
     for ends_at_width, rest in ((False, 0.0), (True, 0.02)):
         fingers = Fingers()
         fingers.grasp_ends_at_width = ends_at_width
-        fingers.start(Motion(Kind.GRASP, 0.02, 0.1, 40.0, 0.0, 0.0))
-        assert run(fingers, 1.0) is Status.UNSUCCESSFUL
+        fingers.start(FingerMotion(FingerMotionKind.GRASP, 0.02, 0.1, 40.0, 0.0, 0.0))
+        assert run(fingers, 1.0) is HandStatus.UNSUCCESSFUL
         assert fingers.width == rest
         assert not fingers.is_grasped
 
 
 def test_a_second_grasp_lets_go_and_a_second_motion_is_refused():
     fingers = Fingers(object_width=0.03)
-    fingers.start(Motion(Kind.GRASP, 0.03, 0.1, 40.0, 0.01, 0.01))
-    assert fingers.start(Motion(Kind.MOVE, 0.08, 0.1)) is Status.FAIL
-    assert run(fingers, 1.0) is Status.SUCCESS
-    assert fingers.start(Motion(Kind.GRASP, 0.03, 0.1, 60.0, 0.01, 0.01)) is Status.UNSUCCESSFUL
+    fingers.start(FingerMotion(FingerMotionKind.GRASP, 0.03, 0.1, 40.0, 0.01, 0.01))
+    assert fingers.start(FingerMotion(FingerMotionKind.MOVE, 0.08, 0.1)) is HandStatus.FAIL
+    assert run(fingers, 1.0) is HandStatus.SUCCESS
+    assert fingers.start(FingerMotion(FingerMotionKind.GRASP, 0.03, 0.1, 60.0, 0.01, 0.01)) is HandStatus.UNSUCCESSFUL
     assert not fingers.is_grasped
 
 
 def test_a_thing_that_is_pulled_out_is_lost_and_the_fingers_close():
     fingers = Fingers(object_width=0.03)
-    fingers.start(Motion(Kind.GRASP, 0.03, 0.1, 40.0, 0.01, 0.01))
+    fingers.start(FingerMotion(FingerMotionKind.GRASP, 0.03, 0.1, 40.0, 0.01, 0.01))
     run(fingers, 1.0)
     fingers.put(None)
     run(fingers, 1.0)
@@ -105,26 +116,26 @@ def test_a_thing_that_is_pulled_out_is_lost_and_the_fingers_close():
 
 def test_a_move_that_meets_something_hangs_for_minutes():
     fingers = Fingers(object_width=0.03)
-    fingers.start(Motion(Kind.MOVE, 0.0, 0.1))
+    fingers.start(FingerMotion(FingerMotionKind.MOVE, 0.0, 0.1))
     assert run(fingers, 90.0, dt=0.1) is None
-    assert run(fingers, 20.0, dt=0.1) is Status.UNSUCCESSFUL
+    assert run(fingers, 20.0, dt=0.1) is HandStatus.UNSUCCESSFUL
 
 
 def test_homing_finds_the_width_unless_something_is_in_the_way():
     fingers = Fingers(homed=False)
     assert fingers.max_width == 0.0
-    fingers.start(Motion(Kind.HOMING))
-    assert run(fingers, 3.0) is Status.SUCCESS
+    fingers.start(FingerMotion(FingerMotionKind.HOMING))
+    assert run(fingers, 3.0) is HandStatus.SUCCESS
     assert fingers.width == fingers.max_width == FULL_WIDTH
     fingers.put(0.03)
-    fingers.start(Motion(Kind.HOMING))
-    assert run(fingers, 3.0) is Status.FAIL
+    fingers.start(FingerMotion(FingerMotionKind.HOMING))
+    assert run(fingers, 3.0) is HandStatus.FAIL
 
 
 @pytest.mark.parametrize("release", [False, True])
 def test_a_halt_keeps_the_grip_unless_it_releases(release):
     fingers = Fingers(object_width=0.03)
-    fingers.start(Motion(Kind.GRASP, 0.03, 0.1, 40.0, 0.01, 0.01))
+    fingers.start(FingerMotion(FingerMotionKind.GRASP, 0.03, 0.1, 40.0, 0.01, 0.01))
     run(fingers, 1.0)
     fingers.halt(release)
     assert fingers.is_grasped is not release
@@ -133,4 +144,4 @@ def test_a_halt_keeps_the_grip_unless_it_releases(release):
 
 @pytest.mark.parametrize("values", [(float("nan"), 0.1), (0.04, 0.0), (0.09, 0.1), (-0.01, 0.1)])
 def test_numbers_that_cannot_be_fail(values):
-    assert Fingers().start(Motion(Kind.MOVE, *values)) is Status.FAIL
+    assert Fingers().start(FingerMotion(FingerMotionKind.MOVE, *values)) is HandStatus.FAIL

@@ -6,8 +6,7 @@ import struct
 
 import pytest
 
-from hal.drivers.franka.emulator.layouts import COMMAND, STATE, StatePacket, read_command
-from hal.drivers.franka.emulator.protocol import PROTOCOLS, Outcome
+from hal.drivers.franka.emulator.protocol import COMMAND, PROTOCOLS, STATE, RequestOutcome, StatePacket, read_command
 
 
 def test_sizes_are_those_that_clients_accept() -> None:
@@ -97,9 +96,9 @@ def test_codes_sizes_and_statuses_of_requests() -> None:
     assert (new.codes["AutomaticErrorRecovery"], old.codes["AutomaticErrorRecovery"]) == (10, 12)
     assert (new.codes["GetRobotModel"], old.codes["LoadModelLibrary"]) == (11, 13)
     assert (new.requests[new.codes["Move"]].size, old.requests[old.codes["Move"]].size) == (125, 68)
-    assert (new.status("Move", Outcome.REFLEX), old.status("Move", Outcome.REFLEX)) == (8, 6)
-    assert (new.status("Move", Outcome.EMERGENCY), old.status("Move", Outcome.EMERGENCY)) == (9, 7)
-    assert (new.status("Move", Outcome.ABORTED), old.status("Move", Outcome.ABORTED)) == (11, 9)
-    assert new.status("AutomaticErrorRecovery", Outcome.MANUAL) == 3
-    assert old.status("AutomaticErrorRecovery", Outcome.MANUAL) == 2
-    assert new.status("StopMove", Outcome.INVALID) == new.status("StopMove", Outcome.NOT_POSSIBLE) == 1
+    assert (new.status("Move", RequestOutcome.REFLEX), old.status("Move", RequestOutcome.REFLEX)) == (8, 6)
+    assert (new.status("Move", RequestOutcome.EMERGENCY), old.status("Move", RequestOutcome.EMERGENCY)) == (9, 7)
+    assert (new.status("Move", RequestOutcome.ABORTED), old.status("Move", RequestOutcome.ABORTED)) == (11, 9)
+    assert new.status("AutomaticErrorRecovery", RequestOutcome.MANUAL) == 3
+    assert old.status("AutomaticErrorRecovery", RequestOutcome.MANUAL) == 2
+    assert new.status("StopMove", RequestOutcome.INVALID) == new.status("StopMove", RequestOutcome.NOT_POSSIBLE) == 1

@@ -6,7 +6,6 @@ from math import sqrt
 
 import pytest
 
-from hal.drivers.franka.flags import FLAGS, flag_index
 from hal.drivers.franka.limits import LIMITS, ArmLimits
 
 HOME = (0.0, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785)
@@ -72,11 +71,3 @@ def test_the_suggested_rectangle_has_corners_a_little_beyond_the_formula() -> No
     lowest, highest = FR3.velocity_range(box.lower)[0], FR3.velocity_range(box.upper)[1]
     shares = [box.velocity[k] / min(highest[k], -lowest[k]) for k in range(7)]
     assert 1.0 < max(shares) < 1.045
-
-
-def test_flags_by_name_and_by_number() -> None:
-    assert len(FLAGS) == len(set(FLAGS)) == 41
-    assert flag_index("joint_reflex") == flag_index("6") == 6
-    for wrong in ("41", "-1", "joint", ""):
-        with pytest.raises(ValueError, match="no error flag"):
-            flag_index(wrong)

@@ -1,4 +1,4 @@
-"""What a rig may say of a Franka arm and its hand, and what is refused before anything is opened."""
+"""Settings of a Franka arm and its hand, and what is refused before a device is opened."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from hal.specs import GripperSpec, LimitsSpec, RobotSpec
 
 
 def arm(model: str = "fr3", **options: Any) -> RobotSpec:
-    """A real arm that is in order but for these options."""
+    """A valid real arm with these options."""
     spec = load("franka", sim=False, overrides=[f"robots.arm.model={model}"]).resolve().robots[0]
     return replace(spec, options={**spec.options, **options})
 
@@ -37,12 +37,12 @@ def limited(model: str = "fr3", **limits: Any) -> RobotSpec:
 
 
 def other(values: tuple[float, ...], joint: int, value: float) -> tuple[float, ...]:
-    """``values`` with another one for one joint, counted from 1."""
+    """``values`` with another value for one joint, counted from 1."""
     return (*values[: joint - 1], value, *values[joint:])
 
 
 @pytest.mark.parametrize("model", ["fr3", "panda"])
-def test_the_labs_rig_is_in_order(model: str) -> None:
+def test_the_example_rig_is_valid(model: str) -> None:
     assert list(check_arm(arm(model))) == []
     settings = ArmSettings.of(arm(model))
     assert (settings.host, settings.arm) == ("172.16.0.2", {"fr3": "fr3", "panda": "fer"}[model])
@@ -51,7 +51,7 @@ def test_the_labs_rig_is_in_order(model: str) -> None:
     assert HandSettings.of(hand()).host == "172.16.0.2"
 
 
-def test_what_is_left_out_is_as_in_the_vendors_examples_or_left_alone() -> None:
+def test_the_defaults_are_those_of_the_vendors_examples() -> None:
     settings = ArmSettings.of(arm())
     lower, upper, force, _ = settings.collision_behavior.arguments()
     assert lower == upper == [20, 20, 18, 18, 16, 14, 12]
@@ -61,7 +61,7 @@ def test_what_is_left_out_is_as_in_the_vendors_examples_or_left_alone() -> None:
     assert alone == (None,) * 4
 
 
-def test_everything_that_may_be_said() -> None:
+def test_every_setting() -> None:
     spec = arm(
         stream="velocity",
         collision_behavior={"upper_torque": [30] * 7, "upper_force": [40] * 6},
@@ -106,8 +106,8 @@ def test_everything_that_may_be_said() -> None:
         ({"collision_behavior": {"lower_force": [30] * 6}}, "real.collision_behavior", "lower_force must not be above"),
         ({"load": {"mass": 3.1}}, "real.load.mass", "less than or equal to 3"),
         ({"load": {"com": [0, 0, 0]}}, "real.load.mass", "is missing"),
-        ({"load": {"mass": 1, "inertia": [1, 1, 3, 0, 0, 0]}}, "real.load", "no body has the moments"),
-        ({"load": {"mass": 1, "inertia": [1, 1, 1, 2, 0, 0]}}, "real.load", "no body has the moments"),
+        ({"load": {"mass": 1, "inertia": [1, 1, 3, 0, 0, 0]}}, "real.load", "impossible principal moments"),
+        ({"load": {"mass": 1, "inertia": [1, 1, 1, 2, 0, 0]}}, "real.load", "impossible principal moments"),
         ({"end_effector": [0, 0, 0.1]}, "real.end_effector", "7 numbers"),
         ({"end_effector": [[1, 0, 0]] * 4}, "real.end_effector", "four rows of four numbers"),
         ({"end_effector": [[1, 0, 0, 0]] * 3 + [[0, 0, 0, 1]]}, "real.end_effector", "right-handed"),
@@ -116,7 +116,7 @@ def test_everything_that_may_be_said() -> None:
         ({"stiffness_frame": {"orientation": [0, 0, 0, 2]}}, "real.stiffness_frame.orientation", "unit quaternion"),
     ],
 )
-def test_what_makes_no_sense_is_told_by_its_key(options: dict[str, Any], key: str, words: str) -> None:
+def test_an_invalid_value_is_reported_by_its_key(options: dict[str, Any], key: str, words: str) -> None:
     spec = arm(**options)
     said = dict(check_arm(spec))
     assert words in said[key]
@@ -136,7 +136,7 @@ def test_a_host_must_be_given() -> None:
     assert [key for key, _ in check_hand(replace(hand(), options={}))] == ["real.host"]
 
 
-def test_what_a_hand_may_not_be_told() -> None:
+def test_invalid_settings_of_a_hand() -> None:
     assert "did you mean 'tolerance'" in dict(check_hand(hand(tolerence=0.01)))["real.tolerence"]
     assert "above 0" in dict(check_hand(hand(tolerance=0)))["real.tolerance"]
 
@@ -157,7 +157,7 @@ def test_what_a_hand_may_not_be_told() -> None:
         ({}, False),
     ],
 )
-def test_this_computer_is_no_robot(options: dict[str, Any], emulated: bool) -> None:
+def test_a_robot_on_this_computer_is_emulated(options: dict[str, Any], emulated: bool) -> None:
     assert is_emulated(options) is emulated
 
 
@@ -200,7 +200,7 @@ def test_the_arms_own_limits_are_allowed() -> None:
 
 
 def test_an_fr3_may_not_be_fast_where_its_range_ends() -> None:
-    """At each end by itself: what is wrong is told with the joint, its speed and the speed that is allowed there."""
+    """At each end by itself; the message has the joint, its speed and the limit there."""
     good = arm().limits
     for end, k in (("lower", 0), ("upper", 1)):
         near = FR3.lower[0] + 0.1 if end == "lower" else FR3.upper[0] - 0.1
@@ -221,7 +221,7 @@ def test_franka_s_own_rectangular_speeds_are_a_little_too_fast() -> None:
 
 
 def test_numbers_that_are_not_known_do_not_confuse_the_check() -> None:
-    """Where a file has mistakes, limits are NaN; whoever wrote it was told of those already."""
+    """Limits are NaN where the file has errors, which are reported elsewhere."""
     unknown = (math.nan,) * 7
     assert list(check_arm(replace(arm(), limits=LimitsSpec(*[unknown] * 5)))) == []
 

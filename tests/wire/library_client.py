@@ -1,6 +1,6 @@
-"""Asks a lying robot through a vendor's library, and prints what that raises, and what it is taken for.
+"""Uses a robot through a vendor's library, and prints what that raises, and the fault that it stands for.
 
-``python franka_listener.py '{"library": "pylibfranka", "host": ..., "tries": {"name": "move", ...}}'``: one connection
+``python library_client.py '{"library": "pylibfranka", "host": ..., "tries": {"name": "move", ...}}'``: one connection
 per try, in that order.
 """
 

@@ -1,6 +1,6 @@
-"""A robot that says what a test wants to hear: ``python franka_liar.py '{"host": ..., "says": [{...}, ...]}'``.
+"""A robot that breaks the rules on request: ``python lying_robot.py '{"host": ..., "says": [{...}, ...]}'``.
 
-Each connection gets the next of ``says``; see :class:`Lie`. Unlike the emulator it keeps to no rules.
+Each connection gets the next entry of ``says``; see :class:`Lie`. Unlike the emulator it follows no rules.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
-from hal.drivers.franka.emulator.layouts import STATE
+from hal.drivers.franka.emulator.protocol import STATE
 
 CONNECT, MOVE, STOP = 0, 1, 2
 GET_MODEL = 11  # of protocol 10
@@ -29,10 +29,10 @@ SHRINKING = '<position_based_velocity_limits velocity_offset="0.5" deceleration_
 
 @dataclass
 class Lie:
-    """What one connection is told."""
+    """Behaviour for one connection."""
 
     layout: int = 10
-    """Protocol by which states are laid out."""
+    """Protocol of the states' layout."""
     version: int = 10
     """Protocol that is claimed."""
     hang_up: bool = False
@@ -41,7 +41,7 @@ class Lie:
     short: int = 0
     """Bytes that each state lacks."""
     model: bool = True
-    """Is the model of the robot whole?"""
+    """Whether the robot's model is complete."""
     start: int = 1
     """First answer to Move; 1 is that it began."""
     end: int | None = None
@@ -53,7 +53,7 @@ class Lie:
 
 
 def serve(connection: socket.socket, host: str, peer: str, lie: Lie) -> None:
-    """Lie until the client hangs up."""
+    """Serve one connection until the client disconnects."""
     states = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     states.bind((host, 0))
     port, number, moving, began = 0, 0, None, 0.0
@@ -97,7 +97,7 @@ def reply(connection: socket.socket, code: int, request: int | None, body: bytes
 
 
 def requests(buffer: bytearray) -> Iterator[tuple[int, int, bytes]]:
-    """Take the whole ones out: code, number, payload."""
+    """Remove and yield the complete requests: code, number, payload."""
     while len(buffer) >= 12:
         code, request, size = struct.unpack_from("<III", buffer)
         if len(buffer) < size:
@@ -108,7 +108,7 @@ def requests(buffer: bytearray) -> Iterator[tuple[int, int, bytes]]:
 
 
 def state(lie: Lie, number: int, moving: bool) -> bytes:
-    """One state packet; while it moves, it moves joints."""
+    """Return one state packet."""
     layout = STATE[lie.layout]
     packet = bytearray(layout.size)
     values: dict[str, Any] = {

@@ -1,7 +1,7 @@
-"""What a client sets: payloads taken apart, looked at, and remembered.
+"""Settings that a client sends to the emulated arm: decoded, checked and stored.
 
-Ranges of impedances are those of the client library's documentation. What else a controller refuses is not
-documented; that it refuses what makes no physical sense is an assumption.
+The ranges of impedances are those of the client library's documentation. What else a controller refuses is not
+documented; that it refuses physically impossible values is an assumption.
 """
 
 from __future__ import annotations
@@ -11,14 +11,14 @@ from collections.abc import Callable, Sequence
 from math import isfinite
 from typing import Any
 
-from .model import FLANGE_TO_HAND, IDENTITY, Pose16, multiply
+from .plant import FLANGE_TO_HAND, IDENTITY, Pose16, multiply
 
-__all__ = ["SETTERS", "Settings"]
+__all__ = ["SETTERS", "ClientSettings"]
 
 Values = tuple[float, ...]
 
 _ROTATION = 1e-5
-"""How far columns of a rotation matrix may be from unit length and right angles."""
+"""Largest deviation of the columns of a rotation matrix from unit length and right angles."""
 _HEAVIEST = 30.0
 """kg"""
 
@@ -44,16 +44,16 @@ SETTERS: dict[str, tuple[str, tuple[tuple[str, int], ...]]] = {
     "SetLoad": ("13d", (("mass", 1), ("F_x_Cload", 3), ("I_load", 9))),
     "SetFilters": ("5d", (("frequencies", 5),)),
 }
-"""Request -> payload, and the names of what is in it."""
+"""Request -> format of its payload, and names and sizes of the fields."""
 
 
-class Settings:
-    """What was set since the robot was started."""
+class ClientSettings:
+    """Settings since the robot was started."""
 
     def __init__(self, with_hand: bool) -> None:
         self.with_hand = with_hand
         self.given: dict[str, dict[str, Any]] = {}
-        """Request -> name -> values, as they came last."""
+        """Request -> field -> latest values."""
         self.F_T_NE: Pose16 = FLANGE_TO_HAND if with_hand else IDENTITY
         self.NE_T_EE: Pose16 = IDENTITY
         self.F_T_EE: Pose16 = self.F_T_NE
@@ -62,8 +62,8 @@ class Settings:
         self.load: tuple[float, Values, Values] = (0.0, (0.0,) * 3, (0.0,) * 9)
         self.changes = 0
 
-    def take(self, name: str, payload: bytes) -> str | None:
-        """Remember what a setter says; the reason where it is refused."""
+    def store(self, name: str, payload: bytes) -> str | None:
+        """Decode, check and store the payload of a setter; return the reason if it is refused."""
         kinds, fields = SETTERS[name]
         values: Values = struct.unpack(f"<{kinds}", payload)
         if not all(isfinite(value) for value in values):
@@ -121,11 +121,11 @@ def _rigid(name: str) -> Callable[[dict[str, Values]], str | None]:
             for j in range(3):
                 product = sum(a * b for a, b in zip(columns[i], columns[j], strict=True))
                 if abs(product - (i == j)) > _ROTATION:
-                    return f"{name} is no rotation and translation"
+                    return f"{name} is not a rigid transformation"
         x, y, z = columns
         across = (x[1] * y[2] - x[2] * y[1], x[2] * y[0] - x[0] * y[2], x[0] * y[1] - x[1] * y[0])
         if sum(a * b for a, b in zip(across, z, strict=True)) < 0.0:
-            return f"{name} mirrors"
+            return f"{name} is a reflection"
         return None
 
     return check
