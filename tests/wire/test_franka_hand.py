@@ -40,8 +40,8 @@ def bench() -> Iterator[HandBench]:
 def brisk(monkeypatch: pytest.MonkeyPatch) -> None:
     """Nobody has to wait as long as a real hand may need."""
     monkeypatch.setattr(hand_motions, "_CALL_MARGIN", 0.3)
-    monkeypatch.setattr(hand_motions, "_STOP_ANSWER", 0.3)
-    monkeypatch.setattr(hand_motions, "_REST", 0.3)
+    monkeypatch.setattr(hand_motions, "_STOP_TIMEOUT", 0.3)
+    monkeypatch.setattr(hand_motions, "_SETTLE_TIME", 0.3)
     monkeypatch.setattr(hand_process, "_RESTART_PAUSE", 0.1)
 
 
