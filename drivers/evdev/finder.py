@@ -1,7 +1,7 @@
 """The input devices of this machine: what is plugged in, an opened device, and when to look again.
 
 :class:`LinuxInput` lists devices from sysfs, which needs no permission and opens nothing. :class:`EvdevNode` is one
-opened device on python-evdev. :class:`DeviceFinder` looks as soon as the kernel reports a change, or periodically.
+opened device on python-evdev. :class:`DeviceFinder` scans as soon as the kernel reports a change, or periodically.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ __all__ = [
     "FolderWatch",
     "InputSystem",
     "LinuxInput",
-    "Node",
+    "InputNode",
     "NodeInfo",
     "evdev_module",
     "lock_device",
@@ -51,7 +51,7 @@ class NodeInfo(NamedTuple):
     sensor and touchpad are devices of their own."""
     is_joystick: bool = False
     """Whether it has the buttons of a joystick. Some gamepads have (Logitech's in D mode), and so have steering wheels:
-    it is a pad only where a model knows it, or the rig names it."""
+    it is a pad only where a model matches it, or the rig names it."""
 
     def belongs_to(self, other: NodeInfo) -> bool:
         """Whether the two are parts of the same pad."""
@@ -82,7 +82,7 @@ class Event(NamedTuple):
     """The kernel's stamp, s."""
 
 
-class Node(Protocol):
+class InputNode(Protocol):
     """An opened input device as the driver needs it. Calls raise OSError when the device is gone."""
 
     path: str
@@ -123,7 +123,7 @@ class InputSystem(Protocol):
     def fingerprint(self) -> object:
         """Return a value that differs after a device came or went, or its permissions changed. Cheap."""
 
-    def open(self, path: str) -> Node:
+    def open(self, path: str) -> InputNode:
         """Open a device. Raises OSError."""
 
 
@@ -155,7 +155,7 @@ def lock_device(fd: int) -> bool:
 
 
 class EvdevNode:
-    """A :class:`Node` on python-evdev."""
+    """A :class:`InputNode` on python-evdev."""
 
     def __init__(self, path: str) -> None:
         """Open the device at ``path``.
@@ -241,7 +241,7 @@ class LinuxInput:
             marks.append((name, status.st_ino, status.st_ctime_ns))
         return tuple(marks)
 
-    def open(self, path: str) -> Node:
+    def open(self, path: str) -> InputNode:
         return EvdevNode(path)
 
     @staticmethod
@@ -304,9 +304,9 @@ _ONLYDIR = 0x01000000
 _INOTIFY_EVENT = struct.Struct("iIII")  # watch, mask, cookie, length of the name that follows
 
 _RESCAN = 0.2
-"""Time between two looks without a watch, s."""
+"""Time between two scans without a watch, s."""
 _RESCAN_WATCHED = 2.0
-"""Time between two looks with a watch, s."""
+"""Time between two scans with a watch, s."""
 
 
 class FolderWatch:
@@ -416,7 +416,7 @@ class DeviceFinder:
             self._watch = None
             return True
 
-    def open(self, info: NodeInfo) -> Node:
+    def open(self, info: NodeInfo) -> InputNode:
         """Open a device. Raises OSError."""
         return self._system.open(info.path)
 

@@ -19,7 +19,7 @@ from hal.pads.model import PadModel, choose_model, guess_model, guess_warning, p
 from hal.specs import PadSpec
 from hal.types import AXES
 
-from .finder import DeviceFinder, InputSystem, LinuxInput, Node, NodeInfo, evdev_module, permission_note
+from .finder import DeviceFinder, InputNode, InputSystem, LinuxInput, NodeInfo, evdev_module, permission_note
 from .link import PadLink
 
 __all__ = ["EvdevPad"]
@@ -199,7 +199,7 @@ class EvdevPad(GamepadDriver):
             return
         self.flat = self._link.mapper.flat
 
-    def _guessed(self, info: NodeInfo, node: Node) -> PadModel:
+    def _guessed(self, info: NodeInfo, node: InputNode) -> PadModel:
         model = guess_model(info.identity, node.axes, node.keys, node.rels)
         self.notes = (*self.notes, guess_warning(model))
         return model
@@ -220,7 +220,7 @@ class EvdevPad(GamepadDriver):
                     part.close()
                 return
 
-    def _try_open(self, finder: DeviceFinder, info: NodeInfo, *, quiet: bool = False) -> Node | None:
+    def _try_open(self, finder: DeviceFinder, info: NodeInfo, *, quiet: bool = False) -> InputNode | None:
         """Open a device; None where it is gone, or may not be read (udev sets the permissions a moment later).
 
         ``quiet`` adds no note where it may not be read: a desktop keeps touchpads to itself.

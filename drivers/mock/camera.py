@@ -15,7 +15,7 @@ from hal.errors import CommandError, ConnectionLost
 from hal.geometry import Pose
 from hal.specs import CameraSpec
 
-from .faults import CameraFaults, with_faults
+from .faults import MockCameraFaults, with_faults
 
 __all__ = ["PLANE", "SQUARE", "STEP", "MockCamera", "PictureStamp", "read_picture"]
 
@@ -54,7 +54,7 @@ class MockCamera(CameraDriver):
     ``source`` is the rig's clock. In real time, frames come at the camera's rate, counted from ``open``. In lock-step
     each ``grab`` immediately returns a new frame of the present time; without a clock, one that is a period later than
     the last. The colour picture contains the frame's number and time, see :func:`read_picture`. In the segmentation
-    the square is body 0. Faults: :class:`~hal.drivers.mock.faults.CameraFaults`.
+    the square is body 0. Faults: :class:`~hal.drivers.mock.faults.MockCameraFaults`.
     """
 
     simulated: ClassVar[bool] = True
@@ -63,7 +63,7 @@ class MockCamera(CameraDriver):
         super().__init__(spec, source)
         if spec.width * spec.height * 3 < _HEAD:
             raise CommandError(f"camera {spec.name!r}: a mock picture needs 4 pixels, not {spec.width}x{spec.height}")
-        self.faults = CameraFaults()
+        self.faults = MockCameraFaults()
         self.is_open = False
         self._clock = source if isinstance(source, Clock) else None
         self._waits = isinstance(source, RealClock)
@@ -159,7 +159,7 @@ class MockCamera(CameraDriver):
         """Set faults; those that are not named stay as they are.
 
         Args:
-            faults: Fields of :class:`~hal.drivers.mock.faults.CameraFaults` with their new values.
+            faults: Fields of :class:`~hal.drivers.mock.faults.MockCameraFaults` with their new values.
 
         Raises:
             CommandError: There is no such fault (code ``unknown_fault``), or it cannot have that value
@@ -169,7 +169,7 @@ class MockCamera(CameraDriver):
 
     def clear(self) -> None:
         """Remove every fault."""
-        self.faults = CameraFaults()
+        self.faults = MockCameraFaults()
 
     def close(self) -> None:
         self.is_open = False

@@ -9,11 +9,11 @@ from typing import TypeVar
 
 from hal.errors import CommandError
 
-__all__ = ["CameraFaults", "GripperFaults", "PadFaults", "RobotFaults", "with_faults"]
+__all__ = ["MockCameraFaults", "MockGripperFaults", "MockPadFaults", "MockRobotFaults", "with_faults"]
 
 
 @dataclass(frozen=True)
-class RobotFaults:
+class MockRobotFaults:
     """Faults of :class:`~hal.drivers.mock.robot.MockRobot`."""
 
     delay_s: float = 0.0
@@ -37,7 +37,7 @@ class RobotFaults:
 
 
 @dataclass(frozen=True)
-class GripperFaults:
+class MockGripperFaults:
     """Faults of :class:`~hal.drivers.mock.robot.MockGripper`, and an object between its fingers."""
 
     object_width: float | None = None
@@ -55,7 +55,7 @@ class GripperFaults:
 
 
 @dataclass(frozen=True)
-class CameraFaults:
+class MockCameraFaults:
     """Faults of :class:`~hal.drivers.mock.camera.MockCamera`."""
 
     delay_s: float = 0.0
@@ -71,7 +71,7 @@ class CameraFaults:
 
 
 @dataclass(frozen=True)
-class PadFaults:
+class MockPadFaults:
     """Faults of :class:`~hal.drivers.mock.gamepad.MockPad`."""
 
     freeze: bool = False
@@ -80,9 +80,13 @@ class PadFaults:
     """The pad is unplugged: readings with ``connected=False``, sticks centred and no button pressed."""
 
 
-_GARBAGE = {RobotFaults: ("nan", "inf", "short"), GripperFaults: ("nan", "inf"), CameraFaults: ("shape", "nan")}
+_GARBAGE = {
+    MockRobotFaults: ("nan", "inf", "short"),
+    MockGripperFaults: ("nan", "inf"),
+    MockCameraFaults: ("shape", "nan"),
+}
 
-_F = TypeVar("_F", RobotFaults, GripperFaults, CameraFaults, PadFaults)
+_F = TypeVar("_F", MockRobotFaults, MockGripperFaults, MockCameraFaults, MockPadFaults)
 
 
 def with_faults(present: _F, changes: Mapping[str, object]) -> _F:

@@ -12,7 +12,7 @@ from hal.errors import CommandError
 from hal.specs import PadSpec
 from hal.types import AXES, BUTTONS
 
-from .faults import PadFaults, with_faults
+from .faults import MockPadFaults, with_faults
 
 __all__ = ["MockPad"]
 
@@ -25,7 +25,7 @@ class MockPad(GamepadDriver):
 
     A change becomes an event at the next ``poll``, with that poll's time. Triggers are axis and button in one, as on a
     real pad: pressing ``l2`` moves its axis to 1, and moving its axis presses it. Any thread may move them. Faults:
-    :class:`~hal.drivers.mock.faults.PadFaults`.
+    :class:`~hal.drivers.mock.faults.MockPadFaults`.
     """
 
     simulated: ClassVar[bool] = True
@@ -33,7 +33,7 @@ class MockPad(GamepadDriver):
 
     def __init__(self, spec: PadSpec, source: object | None = None) -> None:
         super().__init__(spec, source)
-        self.faults = PadFaults()
+        self.faults = MockPadFaults()
         self.is_open = False
         self.meant_for: str | None = None
         """Value of :attr:`mapping`."""
@@ -138,7 +138,7 @@ class MockPad(GamepadDriver):
         """Set faults; those that are not named stay as they are.
 
         Args:
-            faults: Fields of :class:`~hal.drivers.mock.faults.PadFaults` with their new values.
+            faults: Fields of :class:`~hal.drivers.mock.faults.MockPadFaults` with their new values.
 
         Raises:
             CommandError: There is no such fault (code ``unknown_fault``), or it cannot have that value
@@ -149,7 +149,7 @@ class MockPad(GamepadDriver):
 
     def clear(self) -> None:
         """Remove every fault: the pad is plugged in and sends."""
-        self.faults = PadFaults()
+        self.faults = MockPadFaults()
         self._news.set()
 
     def close(self) -> None:

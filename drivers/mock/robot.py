@@ -16,7 +16,7 @@ from hal.errors import CommandError, ConnectionLost
 from hal.specs import GripperSpec, RobotSpec
 from hal.types import Fault, GripperOutcome
 
-from .faults import GripperFaults, RobotFaults, with_faults
+from .faults import MockGripperFaults, MockRobotFaults, with_faults
 
 __all__ = ["FRICTION", "INERTIA", "KEEP_UP", "LOG_LENGTH", "MockGripper", "MockRobot"]
 
@@ -37,7 +37,7 @@ class MockRobot(RobotDriver):
     Without new ones for ``KEEP_UP`` seconds the arm stands still.
 
     Time is only the ``now`` of ``read``; the device's own clock starts with the first reading. Closing and opening
-    again keeps the position, as a real arm's joints do. Faults: :class:`~hal.drivers.mock.faults.RobotFaults`.
+    again keeps the position, as a real arm's joints do. Faults: :class:`~hal.drivers.mock.faults.MockRobotFaults`.
     """
 
     modes: ClassVar[frozenset[str]] = frozenset({"position", "torque"})
@@ -46,7 +46,7 @@ class MockRobot(RobotDriver):
 
     def __init__(self, spec: RobotSpec, world: object | None = None) -> None:
         super().__init__(spec, world)
-        self.faults = RobotFaults()
+        self.faults = MockRobotFaults()
         self.log: deque[Setpoint] = deque(maxlen=LOG_LENGTH)
         """Every set-point written, oldest first, also those that the arm ignored because of a fault."""
         self.is_open = False
@@ -157,7 +157,7 @@ class MockRobot(RobotDriver):
         """Set faults; those that are not named stay as they are.
 
         Args:
-            faults: Fields of :class:`~hal.drivers.mock.faults.RobotFaults` with their new values.
+            faults: Fields of :class:`~hal.drivers.mock.faults.MockRobotFaults` with their new values.
 
         Raises:
             CommandError: There is no such fault (code ``unknown_fault``), or it cannot have that value
@@ -180,7 +180,7 @@ class MockRobot(RobotDriver):
 
     def clear(self) -> None:
         """Remove every fault."""
-        self.faults = RobotFaults()
+        self.faults = MockRobotFaults()
 
     def close(self) -> None:
         if self.is_open:
@@ -205,14 +205,14 @@ class MockGripper(GripperDriver):
     """A gripper in memory, open at the start. Time is only the ``now`` of ``read``.
 
     Widths and speeds are clamped to the gripper's range, as by a gripper's own controller. Faults, and an object to
-    hold: :class:`~hal.drivers.mock.faults.GripperFaults`.
+    hold: :class:`~hal.drivers.mock.faults.MockGripperFaults`.
     """
 
     simulated: ClassVar[bool] = True
 
     def __init__(self, spec: GripperSpec, world: object | None = None) -> None:
         super().__init__(spec, world)
-        self.faults = GripperFaults()
+        self.faults = MockGripperFaults()
         self.log: list[tuple[float, float, float]] = []
         """Every ``move`` and ``grasp``: width in m, speed in m/s, force in N."""
         self.homed = 0
@@ -308,7 +308,7 @@ class MockGripper(GripperDriver):
         """Set faults; those that are not named stay as they are.
 
         Args:
-            faults: Fields of :class:`~hal.drivers.mock.faults.GripperFaults` with their new values.
+            faults: Fields of :class:`~hal.drivers.mock.faults.MockGripperFaults` with their new values.
 
         Raises:
             CommandError: There is no such fault (code ``unknown_fault``), or it cannot have that value
@@ -318,7 +318,7 @@ class MockGripper(GripperDriver):
 
     def clear(self) -> None:
         """Remove every fault, and the object."""
-        self.faults = GripperFaults()
+        self.faults = MockGripperFaults()
 
     def close(self) -> None:
         self._stopped = True

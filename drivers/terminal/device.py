@@ -27,9 +27,9 @@ _GUARDIAN_ENDS = 2.0  # s
 class Terminal:
     """A terminal that gives keys one by one, without echo, from :meth:`enter` to :meth:`leave`.
 
-    Ctrl-C and Ctrl-Z keep their meaning. The terminal is opened anew, so that nothing here changes how the program's
-    standard input and output behave, and writing never waits for a terminal that takes nothing. A process of its own
-    (:mod:`.guardian`) restores the settings if this one is killed.
+    Ctrl-C and Ctrl-Z keep their meaning. The terminal is opened a second time, so that nothing here changes how the
+    program's standard input and output behave, and writing never waits for a terminal that takes nothing. A process of
+    its own (:mod:`.guardian`) restores the settings if this one is killed.
     """
 
     def __init__(self, path: str | None = None) -> None:

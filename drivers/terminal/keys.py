@@ -1,9 +1,9 @@
 """The terminal's protocol: bytes into keys and replies, and the check that keys can be held.
 
 :class:`KeyParser` reads plain terminals and those that speak the Kitty keyboard protocol. Its input may be typed,
-pasted or cut in two on the way, so it never raises and never grows without bound; what cannot be told from Esc counts
-as Esc, because Esc stops the arm. :func:`enable_key_reports` switches the reports of key releases on where the terminal
-has them, and :class:`LinkCheck` proves that they still arrive.
+pasted or cut in two on the way, so it never raises and never grows without bound; what may be Esc counts as Esc,
+because Esc stops the arm. :func:`enable_key_reports` switches the reports of key releases on where the terminal has
+them, and :class:`LinkCheck` proves that they still arrive.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ __all__ = [
     "RELEASE",
     "REPEAT",
     "SHIFT",
-    "Answer",
+    "TerminalReply",
     "Key",
     "KeyParser",
     "LinkCheck",
@@ -49,7 +49,7 @@ class Key(NamedTuple):
     """Bits of SHIFT, ALT and CTRL."""
 
 
-class Answer(NamedTuple):
+class TerminalReply(NamedTuple):
     """A sequence that the terminal sends by itself: a reply to a query, or a change of the window's focus."""
 
     what: str
@@ -101,14 +101,14 @@ class KeyParser:
         """The beginning of a sequence, from its ESC on."""
         self._since = 0.0
 
-    def feed(self, data: bytes, now: float) -> list[Key | Answer]:
+    def feed(self, data: bytes, now: float) -> list[Key | TerminalReply]:
         """Return the keys and replies that ``data`` completes.
 
         Args:
             data: Bytes that were read. Call it with none, too: an unfinished sequence becomes Esc with time.
             now: Monotonic time, s.
         """
-        found: list[Key | Answer] = []
+        found: list[Key | TerminalReply] = []
         for byte in data:
             if self._pending:
                 self._continue_sequence(byte, found)
@@ -126,7 +126,7 @@ class KeyParser:
             found.append(Key("escape"))
         return found
 
-    def _continue_sequence(self, byte: int, found: list[Key | Answer]) -> None:
+    def _continue_sequence(self, byte: int, found: list[Key | TerminalReply]) -> None:
         pending = self._pending
         if byte == _ESC:  # the sequence before it is incomplete: Esc is held down
             found.append(Key("escape"))
@@ -141,7 +141,7 @@ class KeyParser:
         if pending[1] == ord("O") or 0x40 <= byte <= 0x7E:
             inside, final = pending[2:-1].decode("latin-1"), chr(byte)
             focus = not inside and final in "IO" and pending[1] == ord("[")
-            event = Answer(final) if focus else _parse_sequence(inside, final)
+            event = TerminalReply(final) if focus else _parse_sequence(inside, final)
             pending.clear()
             if event is not None:
                 found.append(event)
@@ -149,14 +149,14 @@ class KeyParser:
             pending.clear()
 
 
-def _parse_sequence(inside: str, final: str) -> Key | Answer | None:
+def _parse_sequence(inside: str, final: str) -> Key | TerminalReply | None:
     """Return what ``CSI inside final`` means; None where it has no meaning here."""
     if inside[:1] in ("<", "=", ">"):
         return None
     if inside.startswith("?"):
         digits = inside[1:].rstrip("$")
         numbers = [_number(field) for field in digits.split(";")]
-        return Answer("?" + inside[1 + len(digits) :] + final, tuple(numbers))
+        return TerminalReply("?" + inside[1 + len(digits) :] + final, tuple(numbers))
     fields = [[_number(part) for part in field.split(":")] for field in inside.split(";")]
     code = fields[0][0]
     if final == "u":
@@ -182,7 +182,7 @@ def _number(text: str) -> int:
 # Whether keys can be held, and still can.
 
 _FLAGS = 1 | 2 | 4 | 8
-"""Of the Kitty protocol: Esc told from sequences, releases, keys of other alphabets, releases of letters and space."""
+"""Of the Kitty protocol: Esc distinct from sequences, releases, other alphabets, releases of letters and space."""
 _NEEDED_FLAGS = 2 | 8
 _FOCUS_MODE = 1004
 """The private mode that reports whether the terminal's window has the focus."""
@@ -210,9 +210,9 @@ _TRIES = 3
 class LinkCheck:
     """Repeated questions that the terminal must answer: is it still there, and does it still report releases?
 
-    Each question has a number that is part of its answer (it asks for the state of a private mode that no terminal
-    has). So the age of the newest *question* that was answered bounds the age of all that is known of the keys, and a
-    late answer to an old question, after a stall, does not count as a new one.
+    Each question has a number that is part of its answer (it queries a private mode that no terminal has). So the age
+    of the newest *question* that was answered bounds the age of all that is known of the keys, and a late answer to an
+    old question, after a stall, does not count as a new one.
     """
 
     def __init__(self) -> None:
@@ -236,7 +236,7 @@ class LinkCheck:
         self._asked[self._number] = now
         return f"\x1b[?u\x1b[?{_FOCUS_MODE}$p\x1b[?{_FIRST_UNUSED + self._number}$p".encode()
 
-    def handle_answer(self, answer: Answer) -> bool:
+    def handle_answer(self, answer: TerminalReply) -> bool:
         """Evaluate a reply of the terminal; True when it answers a question that was asked here."""
         numbers = answer.numbers
         if answer.what == "?u":
@@ -306,14 +306,14 @@ def disable_key_reports(terminal: Terminal) -> None:
         pass
 
 
-def _is_fence(answer: Answer) -> bool:
+def _is_fence(answer: TerminalReply) -> bool:
     return answer.what == "?c"
 
 
 def _collect_answers(
     terminal: Terminal,
     parser: KeyParser,
-    is_last: Callable[[Answer], bool],
+    is_last: Callable[[TerminalReply], bool],
     on_key: Callable[[Key], None],
     timeout: float = _ANSWER_TIMEOUT,
 ) -> set[str] | None:

@@ -22,7 +22,7 @@ from .controls import (
     TerminalOptions,
 )
 from .device import Terminal
-from .keys import CTRL, PRESS, Answer, Key, KeyParser, disable_key_reports, enable_key_reports
+from .keys import CTRL, PRESS, Key, KeyParser, TerminalReply, disable_key_reports, enable_key_reports
 
 __all__ = ["TerminalPad"]
 
@@ -76,7 +76,7 @@ class TerminalPad(GamepadDriver):
             raise
 
     def _take_terminal(self) -> bool:
-        """Take the terminal over, or give it back, as job control asks; True while it may be read.
+        """Take the terminal over, or give it back, by the rules of job control; True while it may be read.
 
         Raises OSError when the terminal is gone.
         """
@@ -143,9 +143,9 @@ class TerminalPad(GamepadDriver):
                     terminal.write(mode.link.question(now))
         return terminal.read(min(timeout, self._mode.time_to_next(now)))
 
-    def _handle(self, event: Key | Answer, now: float) -> None:
+    def _handle(self, event: Key | TerminalReply, now: float) -> None:
         mode = self._mode
-        if isinstance(event, Answer):
+        if isinstance(event, TerminalReply):
             if isinstance(mode, HeldControls):
                 if event.what in ("I", "O"):
                     self._focus = event.what == "I"

@@ -58,7 +58,7 @@ def start_server(port: int, label: str, secret: str) -> GuardedServer:
     def guarded(*args: Any, process_request: Handler, **options: Any) -> Any:
         return original(*args, process_request=_guard(secret, process_request), **options)
 
-    # viser has no setting for this. It looks the function up in its module, and calls it in its constructor.
+    # viser has no setting for this. It finds the function in its module, and calls it in its constructor.
     websockets.asyncio.server.serve = guarded  # type: ignore[misc,assignment]
     try:
         server = GuardedServer(host=HOST, port=port, label=label, verbose=False)

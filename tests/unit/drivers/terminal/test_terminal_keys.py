@@ -4,10 +4,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hal.drivers.terminal.keys import ALT, CTRL, PRESS, RELEASE, REPEAT, SHIFT, Answer, Key, KeyParser
+from hal.drivers.terminal.keys import ALT, CTRL, PRESS, RELEASE, REPEAT, SHIFT, Key, KeyParser, TerminalReply
 
 
-def parsed(*pieces: bytes) -> list[Key | Answer]:
+def parsed(*pieces: bytes) -> list[Key | TerminalReply]:
     parser = KeyParser()
     return [event for k, piece in enumerate(pieces) for event in parser.feed(piece, 0.001 * k)]
 
@@ -34,8 +34,8 @@ def parsed(*pieces: bytes) -> list[Key | Answer]:
         (b"\x1b[57441;2u\x1b[57441;1:3u", [Key("shift", PRESS, SHIFT), Key("shift", RELEASE)]),
         (b"\x1b[119;9u", [Key("w", PRESS, ALT)]),  # super
         # Answers.
-        (b"\x1b[?15u\x1b[?62;22c", [Answer("?u", (15,)), Answer("?c", (62, 22))]),
-        (b"\x1b[?1004;1$y\x1b[I\x1b[O", [Answer("?$y", (1004, 1)), Answer("I"), Answer("O")]),
+        (b"\x1b[?15u\x1b[?62;22c", [TerminalReply("?u", (15,)), TerminalReply("?c", (62, 22))]),
+        (b"\x1b[?1004;1$y\x1b[I\x1b[O", [TerminalReply("?$y", (1004, 1)), TerminalReply("I"), TerminalReply("O")]),
         # Sequences without a meaning here.
         (b"\x1b[12;40R\x1b[99~\x1b[>1;2c\x1b[<0;3;5M\x1b[3;1:9u\x01\xc3\xa4", []),
         (b"\x7f\x08\x1b[127u", [Key("backspace"), Key("backspace"), Key("backspace")]),
@@ -45,7 +45,7 @@ def parsed(*pieces: bytes) -> list[Key | Answer]:
         (b"\x1b\x1b\x1b[A", [Key("escape"), Key("escape"), Key("up")]),
     ],
 )
-def test_bytes_become_keys_and_replies(data: bytes, events: list[Key | Answer]) -> None:
+def test_bytes_become_keys_and_replies(data: bytes, events: list[Key | TerminalReply]) -> None:
     assert parsed(data) == events
     assert parsed(*(bytes([byte]) for byte in data)) == events, "byte by byte"
 
