@@ -18,10 +18,9 @@ pytest.importorskip("zstandard", reason="pip install 'robot-hal[record]'")
 pytest.importorskip("gymnasium", reason="pip install 'robot-hal[gym]'")
 pytest.importorskip("pybullet", reason="pip install 'robot-hal[sim]'")
 
-from collect_kit import CIRCLE, CROSS, PS, SQUARE, seed_of, write_pad
-from recording_kit import small
+from app_kit import CIRCLE, CROSS, PS, SQUARE, seed_of, write_pad
+from recording_kit import ROUNDED, Stage, at_row, small
 from recording_layout import check_layout, check_stamps
-from stage_kit import ROUNDED, Stage, at_row
 
 import hal
 from hal.apps import collect

@@ -13,7 +13,7 @@ import pytest
 pytest.importorskip("zstandard", reason="pip install 'robot-hal[record]'")
 pytest.importorskip("pybullet", reason="pip install 'robot-hal[sim]'")
 
-from collect_kit import CROSS, PS, seed_of, write_pad
+from app_kit import CROSS, PS, seed_of, write_pad
 
 import hal
 from hal.apps.collect import parser

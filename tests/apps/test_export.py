@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from app_kit import run_here
-from export_kit import make_recording
+from recording_kit import make_recording
 
 from hal.apps.export import main
 

@@ -12,8 +12,8 @@ from pathlib import Path
 
 import pytest
 from app_kit import run_here
-from export_kit import make_recording
 from PIL import Image
+from recording_kit import make_recording
 
 from hal.apps import export, review
 

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from collect_kit import CIRCLE, CROSS, PS, SQUARE, write_pad
+from app_kit import CIRCLE, CROSS, PS, SQUARE, write_pad
 
 ROOT = Path(__file__).resolve().parents[2]
 APP = ROOT / "apps" / "rollout.py"

@@ -1,22 +1,48 @@
-"""Small recordings of mock rigs, and what every recording must keep (:mod:`recording_layout`)."""
+"""Small recordings of rigs, and what every recording must keep (:mod:`recording_layout`).
+
+First recordings of mock rigs, then one to export, then a second rig in which recorded scenes are drawn again.
+"""
 
 from __future__ import annotations
 
+import math
 import time
-from typing import Any
+from pathlib import Path
+from typing import Any, NamedTuple
 
+import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 import hal
+from hal.geometry import Pose
 from hal.rig import Rig
 
 pytest.importorskip("zstandard", reason="pip install 'robot-hal[record]'")
 
 from recording_layout import check_layout, check_stamps
 
-from hal.recording import Recorder
+from hal.recording import Dataset, Episode, Recorder
 
-__all__ = ["CAMERAS", "SIZE", "check_layout", "check_stamps", "drive", "kill_writer", "mock_rig", "record", "small"]
+__all__ = [
+    "CAMERAS",
+    "ROUNDED",
+    "SIZE",
+    "Likeness",
+    "Scene",
+    "Stage",
+    "at_row",
+    "at_time",
+    "check_layout",
+    "check_stamps",
+    "drive",
+    "kill_writer",
+    "make_recording",
+    "mock_rig",
+    "pictures",
+    "record",
+    "small",
+]
 
 CAMERAS = ("scene", "wrist")
 SIZE = (64, 48)
@@ -61,3 +87,103 @@ def kill_writer(recorder: Recorder) -> None:
         time.sleep(0.01)
     recorder._child.process.kill()
     recorder._child.process.wait()
+
+
+MARKS = (True, False, None)
+
+
+def make_recording(folder: Path) -> Dataset:
+    """Record episodes of 0.6, 0.4 and 0.3 s: a success with a stop in it, a failure, and one that is not marked."""
+    with mock_rig() as rig, Recorder(rig, out=folder, fps=20, task="lift the cube") as recorder:
+        recorder.start(seed=1)
+        drive(rig, 0.3)
+        arm = rig.robots["panda"]
+        with arm.control(rate_hz=50, unattended=True) as control:
+            for tick in rig.clock.rate(50):
+                if tick.elapsed > 0.1:
+                    break
+                control.send(hal.Twist([0.0, 0.05, 0.0]))
+            rig.stop()
+            rig.clock.sleep(0.2)
+            with pytest.raises(hal.MotionStopped):
+                control.send(hal.Twist([0.0, 0.05, 0.0]))
+        recorder.save(MARKS[0], wait=True)
+        rig.rearm()
+        record(recorder, 0.4, MARKS[1])
+        record(recorder, 0.3, MARKS[2])
+    return Dataset(folder)
+
+
+def pictures(dataset: Dataset, what: str, camera: str) -> list[np.ndarray[Any, Any]]:
+    """Return the frames or depth of a camera, one array per episode."""
+    return [
+        np.stack(list(episode.frames(camera) if what == "rgb" else episode.depth(camera)))
+        for episode in dataset.episodes
+    ]
+
+
+THINGS = ("cube", "duck")
+ROUNDED = 3
+"""Pixels on edges that may go either way: rows hold positions as 32-bit numbers."""
+
+
+class Scene(NamedTuple):
+    """Where everything was."""
+
+    q: NDArray[np.float64]
+    width: float
+    things: dict[str, NDArray[np.float64]]
+
+
+class Likeness(NamedTuple):
+    """How a recorded picture and one that was drawn anew differ."""
+
+    psnr: float
+    """Of the colours, dB."""
+    wrong: int
+    """Pixels whose depth differs by more than its rounding and a millimetre."""
+
+
+def at_row(episode: Episode, k: int) -> Scene:
+    state = episode.columns["observation.state"][k].astype(float)
+    return Scene(state[:7], state[7], {name: episode.columns[f"observation.object.{name}"][k] for name in THINGS})
+
+
+def at_time(episode: Episode, t: float) -> Scene:
+    """Between two rows, in proportion, each by its own stamps."""
+
+    def between(key: str, stamps: str) -> NDArray[np.float64]:
+        values, times = episode.columns[key].astype(float), episode.stamps[stamps]
+        return np.array([np.interp(t, times, column) for column in values.T])
+
+    state = between("observation.state", "robot.panda")
+    return Scene(state[:7], state[7], {name: between(f"observation.object.{name}", "objects") for name in THINGS})
+
+
+class Stage:
+    """A second rig of the same configuration, in which recorded scenes are put up."""
+
+    def __init__(self, rig: hal.Rig, episode: Episode) -> None:
+        self.rig, self.episode = rig, episode
+        self.frames = {name: list(episode.frames(name)) for name in CAMERAS}
+        self.depths = {name: list(episode.depth(name)) for name in CAMERAS}
+
+    def put(self, scene: Scene) -> None:
+        self.rig.world.reset("panda", q=[*scene.q, scene.width / 2, scene.width / 2])
+        for name, pose in scene.things.items():
+            self.rig.world.reset(name, pose=Pose(pose[:3], pose[3:]))
+
+    def look(self, camera: str, k: int) -> Likeness:
+        """Compare a new picture with that of row ``k``."""
+        drawn = self.rig.cameras[camera].read()
+        assert drawn.color is not None
+        assert drawn.depth is not None
+        error = np.square(self.frames[camera][k].astype(float) - drawn.color).mean()
+        rounding = 0.5 * self.episode.info["cameras"][camera]["depth_unit_m"]
+        wrong = np.abs(self.depths[camera][k] - drawn.depth) > rounding + 1e-3
+        return Likeness(10.0 * math.log10(255.0**2 / max(error, 1e-9)), int(wrong.sum()))
+
+    def pose(self, camera: str) -> Pose:
+        where = self.rig.cameras[camera].latest().T_world_camera
+        assert where is not None
+        return where

@@ -10,8 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from recording_kit import CAMERAS, check_layout, check_stamps, small
-from stage_kit import ROUNDED, Likeness, Scene, Stage, at_row, at_time
+from recording_kit import CAMERAS, ROUNDED, Likeness, Scene, Stage, at_row, at_time, check_layout, check_stamps, small
 
 import hal
 from hal.geometry import Pose

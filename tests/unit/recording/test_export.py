@@ -10,8 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from export_kit import make_recording, pictures
-from recording_kit import SIZE
+from recording_kit import SIZE, make_recording, pictures
 
 import hal
 from hal.errors import CommandError, DatasetError

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from export_kit import make_recording, pictures
+from recording_kit import make_recording, pictures
 
 import hal
 from hal.recording import Dataset, Recorder

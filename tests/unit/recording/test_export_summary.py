@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from export_kit import make_recording
+from recording_kit import make_recording
 
 from hal.recording import Dataset, review
 from hal.recording.review import Canvas, as_json, draw_sheet, summary, ticks

@@ -12,8 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from export_kit import make_recording
-from recording_kit import check_layout, drive, kill_writer, mock_rig, record
+from recording_kit import check_layout, drive, kill_writer, make_recording, mock_rig, record
 
 from hal.errors import CommandError, ConnectionLost, DatasetError, DeviceNotFound, HalError
 from hal.learning.replay import RecordedTrajectory
