@@ -488,12 +488,12 @@ class Beginning:
         """Was everything put back? Not where the dead-man was let go of."""
         import numpy as np
 
-        from hal.learning.episode import put_back
+        from hal.learning.episode import reset_scene
 
         deadman = self._driving.deadman
         options: dict[str, Any] = {"deadman": deadman, "since": since, "patience": LET_GO, "hand": False}
         try:
-            put_back(self._rig, self._robot, random=np.random.default_rng(seed), **options)
+            reset_scene(self._rig, self._robot, random=np.random.default_rng(seed), **options)
         except MotionStopped:
             if deadman.held or not deadman.connected or not self.drives_home:
                 raise

@@ -216,14 +216,14 @@ class Run:
         """Everything back to where it starts: a real arm drives home, things with random ranges as the seed says."""
         import numpy as np
 
-        from hal.learning.episode import put_back, stands_in_world
+        from hal.learning.episode import reset_scene, stands_in_world
 
         rig, robot = self.rig, self.robot
         if not stands_in_world(rig, robot):
             held = f"; let go of {self.button}, then hold it until the arm is there" if self.button else ""
             self._say(f"episode {number}: home, and the gripper opens{held}")
         random = np.random.default_rng(seed)
-        put = put_back(rig, robot, random=random, deadman=self.deadman, unattended=self.args.unattended)
+        put = reset_scene(rig, robot, random=random, deadman=self.deadman, unattended=self.args.unattended)
         if self.put_back is not None:
             self.put_back(rig, random)
         elif put:

@@ -10,7 +10,7 @@ import sys
 import numpy as np
 
 import hal
-from hal.learning.episode import put_back
+from hal.learning.episode import reset_scene
 
 WIDTH = 0.03
 """Of the cube between the fingers, m."""
@@ -35,7 +35,7 @@ def main(seed: str = "0") -> None:
     """Put the cube somewhere, pick it up, and check that it was lifted."""
     with hal.open("panda_table", sim=True, clock="lock_step", pad="none") as rig:
         arm = rig.robots["panda"]
-        put_back(rig, arm, random=np.random.default_rng(int(seed)))
+        reset_scene(rig, arm, random=np.random.default_rng(int(seed)))
         start = rig.world.pose("cube")
         grasp = grasp_pose(arm, start)
 

@@ -14,6 +14,8 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from ._moved import install as _install_aliases
+
 if TYPE_CHECKING:
     from .camera import Camera
     from .commands import (
@@ -168,6 +170,7 @@ _MODULES = {
         "Trip",
     ),
 }
+_install_aliases()
 _HOME = {name: module for module, names in _MODULES.items() for name in names}
 
 

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from numpy.typing import NDArray
 
+from ._moved import names_of
 from .driver import CameraDriver, CameraTally, RawFrame
 from .errors import ConnectionLost, HalError, StaleStateError
 from .geometry import Pose
@@ -418,3 +419,6 @@ class Moving:
         except HalError:
             return None
         return self._robot.base @ self._kinematics.link_pose(self._link, q) @ self._pose
+
+
+__getattr__ = names_of(__name__)

@@ -8,6 +8,7 @@ from collections.abc import Callable, Collection, Mapping
 from types import MappingProxyType
 from typing import TYPE_CHECKING
 
+from ._moved import names_of
 from .deadman import Deadman, Threshold
 from .driver import GamepadDriver, PadReading
 from .errors import DeviceNotFound
@@ -316,3 +317,6 @@ class Gamepad:
 def _share(value: float) -> float:
     """0..1; what is not a number is 0."""
     return min(1.0, value) if value > 0.0 else 0.0
+
+
+__getattr__ = names_of(__name__)

@@ -6,6 +6,7 @@ import threading
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from ._moved import names_of
 from .arguments import number
 from .errors import ConnectionLost, MotionStopped, RobotFault, StaleStateError
 from .host.records import GripperAct, GripperCommand
@@ -304,3 +305,6 @@ class Gripper:
 
     def __repr__(self) -> str:
         return f"<Gripper of {self._robot}: 0..{self.spec.width_max:g} m, driver {self.spec.driver}>"
+
+
+__getattr__ = names_of(__name__)

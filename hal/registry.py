@@ -1,16 +1,15 @@
-"""Drivers by name: a table of the built-in ones, and the entry-point group ``hal.drivers`` for everybody else's.
+"""Find drivers by name: a table of the built-in drivers, and the entry-point group ``hal.drivers`` for all others.
 
-Nothing here imports a driver before it is asked for, and nothing else in ``hal`` imports one at all.
+This is the only module of ``hal`` that names drivers. It imports a driver when it is first used.
 
-A driver is three things: a folder, a class per kind of device in it (:class:`~hal.robot.RobotDriver` and its
-siblings), and one :class:`DriverSpec` that names those classes. A package of your own announces its spec in its
-``pyproject.toml``, and then the model of an arm or a camera, or its entry in a rig, may say
-``drivers: {real: my_arm}``, and that of a gamepad ``driver: my_pad``::
+A driver is a folder with one class for each kind of device (see :mod:`hal.driver`), and one :class:`DriverSpec` that
+names these classes. Another package announces its spec in its ``pyproject.toml``; a robot or camera model, or the
+device's entry in a rig file, can then use ``drivers: {real: my_arm}``, and a gamepad ``driver: my_pad``::
 
     [project.entry-points."hal.drivers"]
     my_arm = "my_lab.my_arm:DRIVER"
 
-Without a package, they may name the spec itself: ``drivers: {real: "my_lab.my_arm:DRIVER"}``.
+Without a package, name the spec itself: ``drivers: {real: "my_lab.my_arm:DRIVER"}``.
 """
 
 from __future__ import annotations
@@ -18,14 +17,30 @@ from __future__ import annotations
 import importlib
 import importlib.util
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from difflib import get_close_matches
 from types import MappingProxyType
-from typing import Any
+from typing import Any, Literal
 
 from .errors import DeviceNotFound, DriverMissing, NotSupported
 
-__all__ = ["BUILT_IN", "GROUP", "DriverSpec", "checked", "driver", "function", "load", "missing", "names"]
+__all__ = [
+    "BUILT_IN",
+    "GROUP",
+    "DriverSpec",
+    "PadInput",
+    "checked",
+    "driver",
+    "function",
+    "load",
+    "missing",
+    "names",
+    "pad_driver",
+    "provider",
+]
+
+PadInput = Literal["plugged", "console", "terminal", "recording"]
+"""A gamepad that is plugged in, the page of the console, the keys of the program's terminal, or a recording."""
 
 GROUP = "hal.drivers"
 """The entry-point group."""
@@ -43,22 +58,22 @@ BUILT_IN: Mapping[str, str] = MappingProxyType(
         "web": "hal.drivers.web:DRIVER",
     }
 )
-"""Name of a driver that comes with the hal -> where its :class:`DriverSpec` is, as "module:ATTRIBUTE"."""
+"""Name of a built-in driver -> where its :class:`DriverSpec` is, as "module:ATTRIBUTE"."""
 
 
 @dataclass(frozen=True)
 class DriverSpec:
-    """What one driver offers. Every class is named as ``"module:Class"`` and imported when it is first used."""
+    """The classes and capabilities of one driver. Classes are named as ``"module:Class"`` and imported on first use."""
 
     name: str
     robot: str | None = None
-    """A :class:`~hal.robot.RobotDriver`."""
+    """A :class:`~hal.driver.RobotDriver`."""
     gripper: str | None = None
-    """A :class:`~hal.gripper.GripperDriver`."""
+    """A :class:`~hal.driver.GripperDriver`."""
     camera: str | None = None
-    """A :class:`~hal.camera.CameraDriver`."""
+    """A :class:`~hal.driver.CameraDriver`."""
     gamepad: str | None = None
-    """A :class:`~hal.gamepad.GamepadDriver`."""
+    """A :class:`~hal.driver.GamepadDriver`."""
     world: str | None = None
     """The simulated world that this driver's arms, grippers and cameras stand in."""
     viewer: str | None = None
@@ -69,6 +84,10 @@ class DriverSpec:
     """What draws the pictures of all simulated cameras of a rig."""
     console: str | None = None
     """A page in a browser that shows a rig and drives it."""
+    pad_input: PadInput | None = None
+    """Where the input of this driver's gamepads comes from; the rig chooses a gamepad of ``model: auto`` by it."""
+    pad_title: str = ""
+    """A few words for :attr:`pad_input`, for status messages."""
     checks: Mapping[str, str] = field(default_factory=dict)
     """Kind of device (``robot``, ``gripper``, ``camera``, ``gamepad``) -> "module:function", which looks at the
     resolved record of such a device before anything is opened, and yields (key, message) for each thing that is wrong
@@ -94,8 +113,7 @@ class DriverSpec:
         return tuple(kind for kind in _KINDS if getattr(self, kind) is not None)
 
 
-_NO_KINDS = ("name", "checks", "emulated", "preflight", "camera_preflight", "path_options", "own_process", "requires")
-_KINDS = tuple(f.name for f in fields(DriverSpec) if f.name not in _NO_KINDS)
+_KINDS = ("robot", "gripper", "camera", "gamepad", "world", "viewer", "viewer3d", "pictures", "console")
 
 
 def names() -> tuple[str, ...]:
@@ -120,6 +138,30 @@ def driver(name: str) -> DriverSpec:
     if not isinstance(spec, DriverSpec):
         raise DriverMissing(f"driver {name!r}: {place} is a {type(spec).__name__}, not a hal.registry.DriverSpec")
     return spec
+
+
+def provider(kind: str) -> str:
+    """Return the name of the first built-in driver that has a class for ``kind``, for example ``console``.
+
+    Raises:
+        NotSupported: No built-in driver has one.
+    """
+    for name in BUILT_IN:
+        if kind in driver(name).kinds:
+            return name
+    raise NotSupported(f"no driver has a {kind}")
+
+
+def pad_driver(pad_input: PadInput) -> str:
+    """Return the name of the built-in gamepad driver whose input comes from ``pad_input``.
+
+    Raises:
+        NotSupported: No built-in driver has this input.
+    """
+    for name in BUILT_IN:
+        if driver(name).pad_input == pad_input:
+            return name
+    raise NotSupported(f"no gamepad driver for {pad_input} input")
 
 
 def load(name: str, kind: str) -> Any:

@@ -22,9 +22,9 @@ from .gripper import Gripper
 from .host.hosts import Host, LocalHost, RemoteHost, SteppedHost, groups_of
 from .host.process import SharedMemory
 from .observation import Observation, Observer
-from .pads.choice import Chosen, choose_pad, in_words
+from .pads.choice import Chosen, choose_pad
 from .robot import Robot
-from .specs import GroupSpec, PadSpec, RobotSpec
+from .specs import GroupSpec, RobotSpec
 from .views import Console, Listen
 from .world import NoWorld, World
 
@@ -59,7 +59,6 @@ class Devices(dict[str, T]):
 
 
 _FIRST_FRAME = 5.0
-_CONSOLE = "web"
 
 
 def open_rig(
@@ -129,11 +128,11 @@ def check_opening(plan: Plan, pad: str | None, viewer: str, console: bool) -> li
     if viewer == "gui" and plan.world is None:
         raise NotSupported("there is no simulated world to look at; leave the viewer out")
     if viewer == "3d":
-        registry.load("viser", "viewer3d")
-    if console or any(chosen.spec.driver == _CONSOLE for chosen in pads):
+        registry.load(registry.provider("viewer3d"), "viewer3d")
+    if console or any(chosen.input == "console" for chosen in pads):
         if lock_step:
             raise NotSupported("the console is for real time; in lock-step, time runs as fast as the program lets it")
-        registry.load(_CONSOLE, "console")
+        registry.load(registry.provider("console"), "console")
     return pads
 
 
@@ -186,12 +185,12 @@ class Rig:
         pads = check_opening(plan, pad, viewer, console)
         groups = groups_of(plan)
         world_host = self._start_hosts(groups, realtime)
-        if console or any(chosen.spec.driver == _CONSOLE for chosen in pads):
+        if console or any(chosen.input == "console" for chosen in pads):
             self._start_console(listen, pads)
         if world_host is not None:
             self._open_pictures(world_host, viewer)
         if viewer == "3d":
-            self.viewer3d = registry.load("viser", "viewer3d")(self)
+            self.viewer3d = registry.load(registry.provider("viewer3d"), "viewer3d")(self)
         refused = False
         for host in self._hosts:
             if isinstance(host, RemoteHost):
@@ -281,15 +280,17 @@ class Rig:
                 self.notes.append(f"camera {camera.name} has sent no frame in its first {_FIRST_FRAME:g} s")
 
     def _start_console(self, listen: Listen, pads: Sequence[Chosen]) -> None:
-        drives = any(chosen.spec.driver == _CONSOLE for chosen in pads)
-        others = ", ".join(in_words(chosen.spec.driver) for chosen in pads) or "the program itself"
-        self.console = registry.load(_CONSOLE, "console")(self, listen, driven_by=None if drives else others)
+        drives = any(chosen.input == "console" for chosen in pads)
+        others = ", ".join(chosen.title for chosen in pads) or "the program itself"
+        self.console = registry.load(registry.provider("console"), "console")(
+            self, listen, driven_by=None if drives else others
+        )
 
     def _open_pads(self, pads: Sequence[Chosen]) -> None:
         for chosen in pads:
             self.notes.extend(chosen.notes)
             spec = chosen.spec
-            driver = registry.load(spec.driver, "gamepad")(spec, self._pad_source(spec))
+            driver = registry.load(spec.driver, "gamepad")(spec, self._pad_source(chosen))
             gamepad = Gamepad(driver)
             self._devices[spec.name] = driver
             self.gamepads[spec.name] = gamepad
@@ -299,17 +300,17 @@ class Rig:
                 self._local.pollers.append(gamepad.poll_once)
             else:
                 gamepad.start_thread(self.clock.now)
-            if spec.driver == _CONSOLE and self.console is not None:
+            if chosen.input == "console" and self.console is not None:
                 # Without a word a program that waits for a dead-man would just hang. Apps print a banner instead.
                 logging.getLogger("hal.console").warning("drive from a browser: %s", self.console.link)
 
-    def _pad_source(self, spec: PadSpec) -> object | None:
-        """What the driver of this pad is made with, besides its record."""
-        if spec.driver == _CONSOLE:
+    def _pad_source(self, chosen: Chosen) -> object | None:
+        """Return the second argument of a gamepad driver: the console, this rig's stop, or the world's time."""
+        if chosen.input == "console":
             return self.console
-        if spec.driver == "terminal":
+        if chosen.input == "terminal":
             return self.stop
-        return self._world_time() if spec.driver == "playback" else None
+        return self._world_time() if chosen.input == "recording" else None
 
     def _world_time(self) -> Callable[[], float] | None:
         """How far a simulated world with arms has come, s, where that is not what the clock shows: in real time."""

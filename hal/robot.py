@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ._moved import names_of
 from .arguments import number, vector
 from .control import Control, check_deadman
 from .errors import CommandError, ConnectionLost, MotionStopped, StaleStateError
@@ -291,3 +292,6 @@ class Robot:
 
     def __repr__(self) -> str:
         return f"<Robot {self.name}: {self.spec.model}, {self.n} joints, driver {self.spec.driver}>"
+
+
+__getattr__ = names_of(__name__)

@@ -9,5 +9,7 @@ __all__ = ["DRIVER"]
 DRIVER = DriverSpec(
     name="evdev",
     gamepad="hal.drivers.evdev.pad:EvdevPad",
+    pad_input="plugged",
+    pad_title="a gamepad at the program's computer",
     requires={"evdev": "pip install evdev-binary (x86-64), or pip install evdev (compiles itself)"},
 )

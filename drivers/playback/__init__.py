@@ -9,5 +9,7 @@ __all__ = ["DRIVER"]
 DRIVER = DriverSpec(
     name="playback",
     gamepad="hal.drivers.playback.pad:PlaybackPad",
+    pad_input="recording",
+    pad_title="a recording",
     checks={"gamepad": "hal.drivers.playback.pad:check"},
 )

@@ -6,4 +6,9 @@ from hal.registry import DriverSpec
 
 __all__ = ["DRIVER"]
 
-DRIVER = DriverSpec(name="terminal", gamepad="hal.drivers.terminal.pad:TerminalPad")
+DRIVER = DriverSpec(
+    name="terminal",
+    gamepad="hal.drivers.terminal.pad:TerminalPad",
+    pad_input="terminal",
+    pad_title="the terminal of the program",
+)

@@ -9,6 +9,8 @@ __all__ = ["DRIVER"]
 DRIVER = DriverSpec(
     name="web",
     gamepad="hal.drivers.web.pad:WebPad",
+    pad_input="console",
+    pad_title="the console",
     console="hal.drivers.web.console:WebConsole",
     requires={"aiohttp": "pip install aiohttp", "simplejpeg": "pip install simplejpeg"},
 )

@@ -37,9 +37,6 @@ __all__ = [
 CHOSEN_LATER = "auto"
 """Not the name of a driver: the pad is chosen when the rig opens."""
 
-NO_WINDOW_KEYBOARD = "the keyboard of the viewer's window is no pad any more; use web (the console) or terminal"
-"""Message for rigs and options that still name ``keyboard``."""
-
 
 def resolve_pad(context: Context, name: str, config: PadConfig) -> PadSpec | None:
     """The pad, or None with the problems noted."""
@@ -49,12 +46,8 @@ def resolve_pad(context: Context, name: str, config: PadConfig) -> PadSpec | Non
         model = _model(context, key, config)
     if context.driver is None:
         with suppress(Unknown):
-            _check_recording(context, f"{key}.file", config)
-        with suppress(Unknown):
-            if config.driver == "keyboard":
-                context.problem(f"{key}.driver", NO_WINDOW_KEYBOARD)
-            elif config.driver != CHOSEN_LATER:
-                context.check_driver(config.driver, "gamepad", f"{key}.driver")
+            if config.driver == CHOSEN_LATER or context.check_driver(config.driver, "gamepad", f"{key}.driver"):
+                _check_recording(context, f"{key}.file", config)
     models = tuple(load_pad_models(context.problems).values())
     if context.problems.found:
         return None
@@ -97,9 +90,10 @@ def _recording(context: Context, file: str) -> Path:
 
 
 def _check_recording(context: Context, key: str, config: PadConfig) -> None:
-    if config.driver != "playback":
+    plays = config.driver != CHOSEN_LATER and registry.driver(config.driver).pad_input == "recording"
+    if not plays:
         if config.file is not None:
-            context.problem(key, f"is for the driver playback, not {config.driver!r}")
+            context.problem(key, f"is for the driver {registry.pad_driver('recording')}, not {config.driver!r}")
     elif config.file is None:
         context.problem(key, "is missing: the recording that is to be played")
     elif not os.path.isfile(_recording(context, config.file)):

@@ -21,8 +21,8 @@ if TYPE_CHECKING:
     from ..world import World
 
 __all__ = [
-    "draw_poses",
-    "put_back",
+    "sample_poses",
+    "reset_scene",
     "stands_in_world",
 ]
 
@@ -104,7 +104,7 @@ class _NoRoom(Exception):
         self.name, self.met = name, met
 
 
-def draw_poses(rig: Rig, random: np.random.Generator, given: Collection[str] = ()) -> dict[str, Pose]:
+def sample_poses(rig: Rig, random: np.random.Generator, given: Collection[str] = ()) -> dict[str, Pose]:
     """A pose for each of the rig's things that have random ranges, in the order in which they are configured.
 
     Nothing is moved. Call it after ``rig.world.reset()``: what has no ranges counts where it is now, and so do things
@@ -223,7 +223,7 @@ def stands_in_world(rig: Rig, robot: Robot) -> bool:
     return world is not None and robot.spec.driver == world.driver
 
 
-def put_back(
+def reset_scene(
     rig: Rig,
     robot: Robot,
     q: ArrayLike | None = None,
@@ -264,7 +264,7 @@ def put_back(
     for name, pose in put.items():
         rig.world.reset(name, pose=pose)
     if random is not None:
-        drawn = draw_poses(rig, random, given=put)
+        drawn = sample_poses(rig, random, given=put)
         for name, pose in drawn.items():
             rig.world.reset(name, pose=pose)
         put |= drawn

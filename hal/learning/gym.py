@@ -30,7 +30,7 @@ from ..observation import Observation
 from ..rig import Rig, open_rig
 from ..robot import Robot
 from ..specs import CameraSpec
-from .episode import put_back
+from .episode import reset_scene
 
 __all__ = [
     "Action",
@@ -263,7 +263,7 @@ class RigEnv(gymnasium.Env[Spaces, NDArray[np.float32]]):
         options = options or {}
         self._end()
         q, poses = options.get("q", self.robot.spec.initial), options.get("poses")
-        put = put_back(
+        put = reset_scene(
             self.rig,
             self.robot,
             q,

@@ -1,4 +1,4 @@
-"""Which pad drives: what ``model: auto`` comes to, and what a program's ``--pad`` may say."""
+"""Choose the gamepad that drives: what ``model: auto`` resolves to, and the values of a program's ``--pad``."""
 
 from __future__ import annotations
 
@@ -8,97 +8,113 @@ from typing import NamedTuple
 
 from .. import registry
 from ..config.data_files import find_data
-from ..config.resolve import NO_WINDOW_KEYBOARD
 from ..errors import DeviceNotFound, DriverMissing, NotSupported
+from ..registry import PadInput
 from ..specs import PadSpec
 
-__all__ = ["KINDS", "TOUR", "Chosen", "check_wanted", "choose_pad", "in_words", "tour"]
+__all__ = ["TOUR", "Chosen", "check_wanted", "choose_pad", "pad_choices", "tour"]
 
 TOUR = ("config", "teleop/tour.jsonl")
 """The recorded tour, among the data files."""
-KINDS = ("auto", "evdev", "web", "terminal", "demo", "none")
-"""Values of ``--pad``, besides the path of a recording."""
-_AUTO = "auto"
-_WORDS = {
-    "evdev": "a gamepad at the program's computer",
-    "terminal": "the terminal of the program",
-    "playback": "a recording",
-}
+_AUTO, _DEMO, _NONE = "auto", "demo", "none"
+_LIVE: tuple[PadInput, ...] = ("plugged", "console", "terminal")
+_NO_RECORDING = "a recording cannot hold the dead-man of a real arm; plug a gamepad in, or use --pad {console}"
 
 
 class Chosen(NamedTuple):
-    """A pad that is going to be opened."""
+    """A gamepad that is going to be opened."""
 
     spec: PadSpec
     notes: tuple[str, ...] = ()
-    """What a person should know."""
+    """Messages for the user."""
+
+    @property
+    def input(self) -> PadInput | None:
+        """Where its input comes from; None for a driver that declares none."""
+        return registry.driver(self.spec.driver).pad_input
+
+    @property
+    def title(self) -> str:
+        """A few words for status messages, for example ``a recording``."""
+        return registry.driver(self.spec.driver).pad_title or f"the pad of driver {self.spec.driver}"
+
+
+def pad_choices() -> tuple[str, ...]:
+    """Return the values of ``--pad``, besides the path of a recording."""
+    return (_AUTO, *(registry.pad_driver(source) for source in _LIVE), _DEMO, _NONE)
 
 
 def choose_pad(spec: PadSpec, wanted: str | None, *, attended: bool, lock_step: bool, emulated: bool = False) -> Chosen:
-    """The pad to open. ``wanted`` is one of :data:`KINDS`, the path of a recording, or None, which means ``auto``.
+    """Choose the driver of a gamepad whose driver is ``auto``; any other gamepad stays as it is.
 
-    It only matters for a pad whose driver is ``auto`` in the rig. ``auto`` is a pad that is plugged in, else the
-    console, which anybody with a browser can drive from. In lock-step, where nobody could, it is the recorded tour.
-    ``attended``: something real moves; ``emulated``: a program stands in for all of that, so that a recording may drive
-    it.
+    ``auto`` is a gamepad that is plugged in, else the console, which any browser can drive. In lock-step, where nothing
+    can be driven by hand, it is the recorded tour.
 
-    Raises DeviceNotFound and NotSupported, with what to do instead.
+    Args:
+        spec: The gamepad of the rig file.
+        wanted: One of :func:`pad_choices`, the path of a recording, or None for ``auto``.
+        attended: Whether a real device moves.
+        lock_step: Whether the rig runs in lock-step.
+        emulated: Whether every real device is an emulator, so that a recording may drive it.
+
+    Raises:
+        DeviceNotFound: No such choice or recording, or no gamepad for a real arm in lock-step.
+        NotSupported: A recording for a real arm.
     """
     if spec.driver != _AUTO:
         return Chosen(spec)
     check_wanted(wanted)
     if wanted in (None, _AUTO):
         return _first(spec, attended and not emulated, lock_step)
-    if wanted == "evdev":
+    if wanted == registry.pad_driver("plugged"):
         pads, notes = _plugged()
         missing = () if pads else ("no gamepad is plugged in yet: plug one in at any time",)
-        return Chosen(replace(spec, driver="evdev"), (*notes, *missing))
-    if wanted in ("web", "terminal"):
+        return Chosen(replace(spec, driver=wanted), (*notes, *missing))
+    if wanted in pad_choices() and wanted != _DEMO:
         return Chosen(replace(spec, driver=wanted))
     if attended and not emulated:
-        raise NotSupported("a recording cannot hold the dead-man of a real arm; plug a pad in, or use --pad web")
-    notes = ("a recording holds the dead-man: what counts as real here is emulated",) if attended else ()
-    return Chosen(tour(spec) if wanted == "demo" else _recording(spec, Path(str(wanted))), notes)
+        text = _NO_RECORDING.format(console=registry.pad_driver("console"))
+        raise NotSupported(text, code="recording_on_real_arm")
+    notes = ("a recording holds the dead-man: every real device here is an emulator",) if attended else ()
+    return Chosen(tour(spec) if wanted == _DEMO else _recording(spec, Path(str(wanted))), notes)
 
 
 def check_wanted(wanted: str | None) -> None:
-    """Raise DeviceNotFound or NotSupported when ``wanted`` is neither a kind of pad nor an existing recording."""
-    if wanted == "keyboard":
-        raise NotSupported(f"--pad keyboard: {NO_WINDOW_KEYBOARD}", code="no_window_keyboard")
-    if wanted is not None and wanted not in KINDS and not Path(wanted).is_file():
-        kinds = ", ".join(KINDS)
-        raise DeviceNotFound(f"there is no pad {wanted!r}: {kinds}, or the path of a recording (.jsonl)")
+    """Check a value of ``--pad``.
 
-
-def in_words(driver: str) -> str:
-    """What drives, for people who look on."""
-    return _WORDS.get(driver, f"the pad of driver {driver}")
+    Raises:
+        DeviceNotFound: It is neither one of :func:`pad_choices` nor an existing recording.
+    """
+    if wanted is not None and wanted not in pad_choices() and not Path(wanted).is_file():
+        choices = ", ".join(pad_choices())
+        raise DeviceNotFound(f"there is no pad {wanted!r}: {choices}, or the path of a recording (.jsonl)")
 
 
 def tour(spec: PadSpec) -> PadSpec:
-    """The recorded tour in the place of this pad."""
+    """Return ``spec`` with the recorded tour as its driver."""
     return _recording(spec, find_data(*TOUR))
 
 
 def _first(spec: PadSpec, attended: bool, lock_step: bool) -> Chosen:
     pads, notes = _plugged()
     if pads:
-        return Chosen(replace(spec, driver="evdev"), notes)
+        return Chosen(replace(spec, driver=registry.pad_driver("plugged")), notes)
     if not lock_step:
-        return Chosen(replace(spec, driver="web"), notes)
+        return Chosen(replace(spec, driver=registry.pad_driver("console")), notes)
     if attended:
         text = "no gamepad is plugged in, and a real arm does not move without one: plug one in"
-        raise DeviceNotFound("; ".join([text, *notes]))
-    return Chosen(tour(spec), (*notes, "in lock-step nobody can drive by hand: playing the recorded tour"))
+        raise DeviceNotFound("; ".join([text, *notes]), code="no_gamepad")
+    return Chosen(tour(spec), (*notes, "lock-step cannot be driven by hand: playing the recorded tour"))
 
 
 def _plugged() -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Return the names of the gamepads that are plugged in, and notes."""
     try:
-        found = registry.load("evdev", "gamepad").plugged()
+        found = registry.load(registry.pad_driver("plugged"), "gamepad").plugged()
     except (DriverMissing, NotSupported) as error:
         return (), (str(error),)
     return found.pads, found.notes
 
 
 def _recording(spec: PadSpec, path: Path) -> PadSpec:
-    return replace(spec, driver="playback", options={"file": str(path)})
+    return replace(spec, driver=registry.pad_driver("recording"), options={"file": str(path)})

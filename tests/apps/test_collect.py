@@ -24,7 +24,7 @@ from recording_layout import check_layout, check_stamps
 
 import hal
 from hal.apps import collect
-from hal.learning.episode import put_back
+from hal.learning.episode import reset_scene
 from hal.learning.gym import RigEnv
 from hal.recording import Dataset, Episode
 
@@ -82,7 +82,7 @@ def world() -> Iterator[hal.Rig]:
 
 def put(world: hal.Rig, seed: int) -> np.ndarray:
     """Where the cube is put with this seed."""
-    poses = put_back(world, world.robots["panda"], random=np.random.default_rng(seed))
+    poses = reset_scene(world, world.robots["panda"], random=np.random.default_rng(seed))
     return np.asarray(poses["cube"].position[:2])
 
 

@@ -32,7 +32,7 @@ from hal.config.data_files import find_data
 from hal.driver import GamepadDriver, PadReading
 from hal.gamepad import Gamepad
 from hal.geometry import quaternion_to_matrix
-from hal.learning.episode import put_back
+from hal.learning.episode import reset_scene
 from hal.pads.codes import ABS, EV_ABS, EV_KEY, KEY
 from hal.pads.mapper import AxisRange, PadMapper
 from hal.pads.model import pad_model
@@ -234,7 +234,7 @@ def lines() -> list[str]:
 
         start = FIRST_CROSS
         for number in range(EPISODES):
-            put_back(rig, arm, random=place_of(number))
+            reset_scene(rig, arm, random=place_of(number))
             drive(person.let_go(), until=start)
             drive(person.demonstrate())
             print(

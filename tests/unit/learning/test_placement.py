@@ -12,7 +12,7 @@ import pytest
 
 import hal
 from hal import Pose
-from hal.learning.episode import draw_poses, put_back
+from hal.learning.episode import sample_poses, reset_scene
 
 TABLE = {"name": "table", "shape": "box", "half_extents": [0.5, 0.5, 0.3], "position": [0, 0, 0.3]}
 FAR = {"arm": {"model": "panda", "base": [0, -2, 0, 0, 0, 0, 1]}}
@@ -34,7 +34,7 @@ def bench(*objects: Any, clock: str = "lock_step") -> Iterator[hal.Rig]:
 
 def drawn(rig: hal.Rig, seed: int) -> dict[str, Pose]:
     rig.world.reset()
-    return draw_poses(rig, np.random.default_rng(seed))
+    return sample_poses(rig, np.random.default_rng(seed))
 
 
 def overlap(rig: hal.Rig, a: str, b: str) -> bool:
@@ -102,10 +102,10 @@ def test_the_same_seed_gives_the_same_poses_to_the_bit() -> None:
 def test_a_rig_without_ranges_or_without_a_world_draws_nothing() -> None:
     random = np.random.default_rng(1)
     with bench(brick("brick")) as rig:
-        assert draw_poses(rig, random) == {}
+        assert sample_poses(rig, random) == {}
     with hal.open("panda_table", driver="mock", overrides=["cameras={}"]) as rig:
-        assert draw_poses(rig, random) == {}
-        assert put_back(rig, rig.robots["panda"], random=random) == {}
+        assert sample_poses(rig, random) == {}
+        assert reset_scene(rig, rig.robots["panda"], random=random) == {}
     assert random.bit_generator.state == np.random.default_rng(1).bit_generator.state
 
 
@@ -200,13 +200,13 @@ def test_given_poses_win_and_the_others_keep_clear_of_them() -> None:
     here = Pose([0.05, 0.0, 0.7])  # where blue would be without a draw
     with bench(*things) as rig:
         for seed in range(20):
-            put = put_back(rig, rig.robots["arm"], poses={"red": here}, random=np.random.default_rng(seed))
+            put = reset_scene(rig, rig.robots["arm"], poses={"red": here}, random=np.random.default_rng(seed))
             assert list(put) == ["red", "blue"]
             assert put["red"] == here
             for name, pose in put.items():
                 assert rig.world.pose(name).distance(pose) == pytest.approx((0, 0), abs=1e-5)
             assert not overlap(rig, "red", "blue")
-        assert put_back(rig, rig.robots["arm"]) == {}, "without a generator nothing is drawn"
+        assert reset_scene(rig, rig.robots["arm"]) == {}, "without a generator nothing is drawn"
         assert rig.world.pose("blue").position == pytest.approx([0, 0, 0.7])
 
 
@@ -234,8 +234,8 @@ def test_a_real_arm_beside_a_simulated_world_drives_first_and_then_things_are_pu
         arm = rig.robots["arm"]
         q = arm.home + 0.05
         with pytest.raises(hal.CommandError, match="dead"):
-            put_back(rig, arm, q, random=np.random.default_rng(2))
-        put = put_back(rig, arm, q, random=np.random.default_rng(2), unattended=True)
+            reset_scene(rig, arm, q, random=np.random.default_rng(2))
+        put = reset_scene(rig, arm, q, random=np.random.default_rng(2), unattended=True)
         assert np.abs(arm.state().q - q).max() < 0.01
         assert list(put) == ["red"]
         assert rig.world.pose("red").position[:2] == pytest.approx(put["red"].position[:2], abs=0.01)
@@ -246,7 +246,7 @@ def test_a_real_arm_beside_a_simulated_world_drives_first_and_then_things_are_pu
 def test_the_builtin_bench_has_a_cube_that_starts_in_front_of_the_arm() -> None:
     with hal.open("panda_table", sim=True, clock="lock_step", pad="none") as rig:
         for seed in range(8):
-            put = put_back(rig, rig.robots["panda"], random=np.random.default_rng(seed))
+            put = reset_scene(rig, rig.robots["panda"], random=np.random.default_rng(seed))
             assert list(put) == ["cube"]
             assert not overlap(rig, "cube", "duck")
             rig.clock.sleep(0.5)

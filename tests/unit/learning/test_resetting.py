@@ -12,7 +12,7 @@ import hal
 from hal.apps.collect import parser
 from hal.apps.collecting import DemonstrationSession
 from hal.drivers.mock.gamepad import MockPad
-from hal.learning.episode import put_back
+from hal.learning.episode import reset_scene
 from hal.recording import Dataset, Recorder
 
 AWAY = np.array([0.3, 0.0, 0.0, 0.0, 0.0, 0.0, 0.2])
@@ -62,7 +62,7 @@ def test_what_was_held_before_drives_nobody_home(rig: hal.Rig) -> None:
     person = Person(rig, (0.1, press()), (1.5, release()), (2.0, press()))
     rig.clock.sleep(0.5)
     assert person.deadman.held
-    put_back(rig, person.arm, deadman=person.deadman)
+    reset_scene(rig, person.arm, deadman=person.deadman)
     assert person.moved_by == {2}
     assert np.abs(person.arm.state().q - person.arm.home).max() < 1e-3
     assert person.arm.gripper is not None
@@ -73,12 +73,12 @@ def test_nobody_presses(rig: hal.Rig) -> None:
     person = Person(rig, (0.1, press()))
     rig.clock.sleep(0.5)
     with pytest.raises(hal.MotionStopped, match="nobody pressed the dead-man for 2 s"):
-        put_back(rig, person.arm, deadman=person.deadman, patience=2.0)
+        reset_scene(rig, person.arm, deadman=person.deadman, patience=2.0)
     assert person.moved_by == set()
 
 
 def test_without_a_hand_to_open(rig: hal.Rig) -> None:
-    put_back(rig, rig.robots["panda"], unattended=True, hand=False)
+    reset_scene(rig, rig.robots["panda"], unattended=True, hand=False)
     gripper = rig.robots["panda"].gripper
     assert gripper is not None
     assert gripper.state().width < 0.01
