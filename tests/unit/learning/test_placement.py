@@ -12,7 +12,7 @@ import pytest
 
 import hal
 from hal import Pose
-from hal.learning.episode import sample_poses, reset_scene
+from hal.learning.episode import reset_scene, sample_poses
 
 TABLE = {"name": "table", "shape": "box", "half_extents": [0.5, 0.5, 0.3], "position": [0, 0, 0.3]}
 FAR = {"arm": {"model": "panda", "base": [0, -2, 0, 0, 0, 0, 1]}}
