@@ -1,4 +1,4 @@
-"""Coming from Ark: its configuration files into a rig's file, with an account of every key.
+"""Import Ark's configuration files as a rig's file, with a report of every key.
 
 python apps/import_ark.py global_config.yaml -o config/mine.yaml
 python apps/import_ark.py global_config.yaml --check
@@ -16,48 +16,51 @@ from typing import TYPE_CHECKING
 from hal.apps._common import run_app
 
 if TYPE_CHECKING:
-    from hal.ark import Imported, Options
+    from hal.ark import ArkOptions, Imported
 
 __all__ = ["main", "parser"]
 
 
 def parser() -> argparse.ArgumentParser:
-    """The command line."""
+    """Return the parser of ``import-ark``."""
     made = argparse.ArgumentParser(
         prog="import-ark",
-        description="Make a rig's file of Ark's configuration files, and tell what became of every key.",
-        epilog="Ark's files are only read. The exit status is 2, and nothing is written, when something is wrong.",
+        description="Convert Ark's configuration files to a rig file, with a report of every key.",
+        epilog="Ark's files are only read. On an error nothing is written and the exit status is 2.",
     )
     made.add_argument("source", type=Path, metavar="GLOBAL_FILE", help="Ark's global_config.yaml")
     what = made.add_mutually_exclusive_group(required=True)
-    what.add_argument("-o", "--out", type=Path, metavar="FILE", help="the rig's file to write")
-    what.add_argument("--check", action="store_true", help="only tell; write nothing")
-    made.add_argument("--force", action="store_true", help="write over a file that is there")
+    what.add_argument("-o", "--out", type=Path, metavar="FILE", help="rig file to write")
+    what.add_argument("--check", action="store_true", help="only report; write nothing")
+    made.add_argument("--force", action="store_true", help="overwrite an existing file")
     made.add_argument(
-        "--start", type=Path, metavar="FOLDER", help="where Ark is started: its paths are relative to it (searched for)"
+        "--start",
+        type=Path,
+        metavar="FOLDER",
+        help="folder that Ark is started in and its paths are relative to (default: search)",
     )
     made.add_argument(
         "--arm",
         action="append",
         default=[],
         metavar="NAME=MODEL",
-        help="which model of the hal a robot is (told by its joints); may be repeated, like the next two",
+        help="model of a robot (default: by its joints); may be repeated, like the next two",
     )
+    made.add_argument("--urdf", action="append", default=[], metavar="NAME=FILE", help="URDF of a robot or an object")
     made.add_argument(
-        "--urdf", action="append", default=[], metavar="NAME=FILE", help="where the URDF of a robot or an object is"
+        "--without", action="append", default=[], metavar="NAME", help="leave out a robot, sensor or object"
     )
-    made.add_argument("--without", action="append", default=[], metavar="NAME", help="leave something out")
     made.add_argument(
         "--camera-model",
         default="pinhole",
         metavar="MODEL",
-        help="of every camera: %(default)s has the angles that Ark's file says; realsense_d435 has the real one's",
+        help="model of every camera: %(default)s has the field of view of Ark's file, realsense_d435 the real one's",
     )
     return made
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Entry point."""
+    """Run the program; return its exit status."""
     return run_app(_main, parser(), argv)
 
 
@@ -75,21 +78,21 @@ def _main(args: argparse.Namespace) -> int:
     texts = imported.texts(path) if path is not None else {}
     there = [str(file) for file in texts if file.exists()]
     if there and not args.force:
-        raise CommandError(f"{', '.join(there)} is there already; --force writes over it")
+        raise CommandError(f"{', '.join(there)} exists; --force overwrites it")
     print("\n".join(_report(imported)))
     if path is None:
-        print("\nin order; nothing is written: --check")
+        print("\nvalid; nothing is written (--check)")
         return 0
     _write(texts, path)
     program = "python apps/teleop.py" if sys.argv[0].endswith(".py") else "hal-teleop"
-    print(f"\nstart it: {program} --sim --config {args.out}")
+    print(f"\nstart: {program} --sim --config {args.out}")
     return 0
 
 
-def _options(args: argparse.Namespace) -> Options:
-    from hal.ark import Options
+def _options(args: argparse.Namespace) -> ArkOptions:
+    from hal.ark import ArkOptions
 
-    return Options(
+    return ArkOptions(
         start=args.start,
         arms=_pairs("--arm", args.arm),
         urdfs={name: Path(file).expanduser() for name, file in _pairs("--urdf", args.urdf).items()},
@@ -111,20 +114,20 @@ def _pairs(option: str, given: Sequence[str]) -> dict[str, str]:
 
 
 def _report(imported: Imported) -> list[str]:
-    from hal.ark.ledger import summary, table
+    from hal.ark.output import summary, table
 
     width = max(100, min(160, shutil.get_terminal_size((120, 24)).columns))
     lines = [*table(imported.rows, imported.source.parent, width), "", summary(imported.rows)]
     if imported.left_out:
-        lines.append(f"left out, as --without says: {', '.join(imported.left_out)}")
+        lines.append(f"left out (--without): {', '.join(imported.left_out)}")
     for name, model in imported.models.items():
-        lines += ["", f"{name}: Ark's files do not say everything about this arm. In the model made for it, look at"]
+        lines += ["", f"{name}: Ark's files do not describe this arm completely. Check in its model:"]
         lines += [f"  - {text}" for text in model.to_fill_in]
     return lines
 
 
 def _write(texts: dict[Path, str], path: Path) -> None:
-    """Write the rig's file ``path`` and the others, and tell what the rig has."""
+    """Write the rig's file ``path`` and the others, and list the rig's devices."""
     from hal.apps._common import listing
     from hal.config import load
 
@@ -136,7 +139,7 @@ def _write(texts: dict[Path, str], path: Path) -> None:
 
 
 def _put(path: Path, text: str) -> None:
-    """Write a file, whole or not at all."""
+    """Write a file completely or not at all."""
     temporary = path.with_name(f".{path.name}.new")
     try:
         temporary.write_text(text, encoding="utf-8")

@@ -1,12 +1,11 @@
-"""Coming from Ark: its configuration files made into a rig's file, with an account of every key.
+"""Import of configuration files of Ark (2025) as a rig's file, with a report of every key.
 
-``reading`` knows Ark's YAML and where each key stands, ``ledger`` what became of it, ``places`` where Ark finds files.
-``simulator``, ``arms`` (with ``real_config``), ``sensors`` and ``things`` make a rig's entries of its sections.
-``known`` has facts about arms that the hal has, ``arm_model`` makes a model for another one, ``links`` reads its URDF.
-``text`` writes YAML that a person can read, and ``importing`` does all of it.
+``reading`` reads Ark's YAML with line numbers, ``entries`` lists its robots, sensors and objects, ``robots`` (with
+``arm_model`` for arms without a model here) and ``scene`` (cameras, objects, simulator) convert them, ``output`` writes
+the rig's YAML and the report, and ``importing`` runs the import.
 """
 
+from .entries import ArkOptions
 from .importing import Imported, import_ark
-from .options import Options
 
-__all__ = ["Imported", "Options", "import_ark"]
+__all__ = ["ArkOptions", "Imported", "import_ark"]

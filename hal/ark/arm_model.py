@@ -1,40 +1,131 @@
-"""A model for an arm that the hal does not know: what Ark's file and the URDF say, and what a person must still say."""
+"""Model of an arm that has none here: from Ark's file and a URDF, with a list of what the user must still fill in."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
-from ..kinematics.urdf import UrdfJoint
-from .ledger import Ledger
-from .links import ArkUrdf
-from .reading import Node, Reading
-from .text import Commented, Inline, Remark
+from ..geometry import Pose
+from ..kinematics.urdf import UrdfJoint, read_urdf
+from .output import Commented, Inline, KeyReport, Remark
+from .reading import ArkNode, ArkReader
 
-__all__ = ["ArmModel", "arm_model"]
+__all__ = [
+    "ArkUrdf",
+    "ArmModel",
+    "arm_model",
+]
+
+
+class ArkUrdf:
+    """Joints and links of a URDF as Ark counts and places them, through PyBullet.
+
+    Raises:
+        ValueError: The URDF is invalid.
+        OSError: The file cannot be read.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.model = read_urdf(path)
+        moved = {joint.child for joint in self.model.joints.values()}
+        if moved.issuperset(self.model.links):
+            raise ValueError("has no root: every link is moved by a joint")
+        root = ElementTree.parse(path).getroot()
+        self._joints = {joint.get("name", ""): _origin(joint.find("origin")) for joint in root.findall("joint")}
+        self._centres = {link.get("name", ""): _origin(link.find("inertial/origin")) for link in root.findall("link")}
+
+    @property
+    def root(self) -> str:
+        """The link that is no joint's child."""
+        moved = {joint.child for joint in self.model.joints.values()}
+        return next(link for link in self.model.links if link not in moved)
+
+    def is_fixed(self, link: str) -> bool:
+        """Return whether a fixed joint connects it to its parent."""
+        return any(joint.kind == "fixed" and joint.child == link for joint in self.model.joints.values())
+
+    def order(self, merged: bool) -> list[UrdfJoint]:
+        """Return the joints as PyBullet numbers them: down each branch, in the order of the file.
+
+        With ``merged`` fixed ones do not count, and the list ends where the moving ones branch: PyBullet goes through
+        branches that it has merged in an order of its own.
+        """
+        if not merged:
+            return list(self._below(self.root))
+        chain: list[UrdfJoint] = []
+        following = self._moving(self.root)
+        while len(following) == 1:
+            chain += following
+            following = self._moving(following[0].child)
+        return chain
+
+    def _below(self, link: str) -> Iterator[UrdfJoint]:
+        for joint in self.model.joints.values():
+            if joint.parent == link:
+                yield joint
+                yield from self._below(joint.child)
+
+    def _moving(self, link: str) -> list[UrdfJoint]:
+        """The next joints that are not fixed."""
+        found = []
+        for joint in self.model.joints.values():
+            if joint.parent == link:
+                found += self._moving(joint.child) if joint.kind == "fixed" else [joint]
+        return found
+
+    def place(self, link: str, known: Collection[str]) -> tuple[str, Pose] | None:
+        """Return the centre of mass of a link, which Ark measures from, as a link in ``known`` and a pose in its frame.
+
+        Returns None unless fixed joints alone connect the link to one in ``known``.
+        """
+        if link not in self.model.links:
+            return None
+        pose = self._centres[link]
+        at = link
+        for joint in self.model.above(link):
+            if at in known:
+                break
+            if joint.kind != "fixed":
+                return None
+            pose = self._joints[joint.name] @ pose
+            at = joint.parent
+        return (at, pose) if at in known else None
+
+
+def _origin(element: ElementTree.Element | None) -> Pose:
+    if element is None:
+        return Pose()
+    x, y, z = map(float, element.get("xyz", "0 0 0").split())
+    roll, pitch, yaw = map(float, element.get("rpy", "0 0 0").split())
+    return Pose.from_rpy([x, y, z], [roll, pitch, yaw])
+
 
 TO_SPEED, TO_ACCELERATION = 0.3, 0.02
 """s from rest to full speed, and to full acceleration: what docs/your-own-arm.md calls gentle."""
 SLOWEST, FASTEST = {"prismatic": 0.1}, {"prismatic": 0.25}
-"""m/s: taken where a URDF names no speed, and the most that is believed of one."""
+"""m/s: default for a URDF without a speed, and the largest accepted one."""
 SLOW, FAST = 0.5, 3.2
-"""rad/s, for joints that turn."""
+"""The same for revolute joints, rad/s."""
 
 
 @dataclass(frozen=True)
 class ArmModel:
-    """A model's file, to be written beside the rig."""
+    """A model's file, which is written beside the rig."""
 
     given: str
     """The robot's name in Ark's file."""
     entries: Mapping[str, Any]
     to_fill_in: tuple[str, ...]
-    """What Ark's files do not know, in words."""
+    """What the user must check, as text."""
 
 
-def arm_model(given: str, node: Node, urdf: ArkUrdf, merged: bool, reading: Reading, ledger: Ledger) -> ArmModel:
-    """From a robot's ``config``. Raises Wrong; the problem is noted."""
+def arm_model(
+    given: str, node: ArkNode, urdf: ArkUrdf, merged: bool, reading: ArkReader, ledger: KeyReport
+) -> ArmModel:
+    """Return a model made from a robot's ``config``. Raises InvalidValue; the problem is noted."""
     order = urdf.order(merged)
     joints = _joints(node, urdf, order, reading, ledger)
     link, guessed = _tcp(node, urdf, order, joints, reading, ledger)
@@ -43,8 +134,8 @@ def arm_model(given: str, node: Node, urdf: ArkUrdf, merged: bool, reading: Read
     entries: dict[str, Any] = {
         "#head": Remark(
             f"Made from Ark's {node.file.name} and {urdf.model.path.name}. Ark has no limits of acceleration and\n"
-            "jerk: lines with CHECK were chosen here, for simulation. No driver of the real arm is named, since none\n"
-            "shall move by guessed limits. docs/your-own-arm.md says how to go on."
+            "jerk: lines with CHECK are defaults for simulation. There is no driver of the real arm, because it must\n"
+            "not move with guessed limits. Next steps: docs/your-own-arm.md."
         ),
         "description": f"{given}, imported from Ark",
         "urdf": urdf.model.path,
@@ -75,17 +166,19 @@ def arm_model(given: str, node: Node, urdf: ArkUrdf, merged: bool, reading: Read
     return ArmModel(given, entries, to_fill_in)
 
 
-def _joints(node: Node, urdf: ArkUrdf, order: list[UrdfJoint], reading: Reading, ledger: Ledger) -> list[UrdfJoint]:
-    """The arm's joints, from base to tip: those of the group ``arm``, or what is in no gripper."""
+def _joints(
+    node: ArkNode, urdf: ArkUrdf, order: list[UrdfJoint], reading: ArkReader, ledger: KeyReport
+) -> list[UrdfJoint]:
+    """The arm's joints, from base to tip: those of the group ``arm``, or all outside a gripper."""
     groups = node.get("joint_groups")
-    named: dict[str, Node] = {}
+    named: dict[str, ArkNode] = {}
     for name, group in (groups.children if groups is not None else {}).items():
         names = reading.need(reading.keys(group), "joints")
         named[name] = names
         for k, joint in enumerate(reading.words(names)):
             if joint not in urdf.model.joints:
                 raise reading.wrong(names, f"item {k + 1}: {urdf.model.path.name} has no joint {joint!r}")
-        ledger.changed(group.get("control_mode"), "", "each command says it: JointTarget, JointVelocity, ...")
+        ledger.changed(group.get("control_mode"), "", "chosen by each command: JointTarget, JointVelocity, ...")
     moving = [joint for joint in (order or urdf.model.joints.values()) if joint.movable]
     fingers = {joint for name, names in named.items() if "grip" in name.lower() for joint in names.data}
     chosen = "arm" if "arm" in named else "all" if "all" in named else next(iter(named), "")
@@ -100,16 +193,16 @@ def _joints(node: Node, urdf: ArkUrdf, order: list[UrdfJoint], reading: Reading,
             fixed = "; without those that are fixed" if any(not joint.movable for joint in wanted) else ""
             ledger.kept(names, "", f"joints, in the model made for it{fixed}")
         elif set(names.data) <= fingers:
-            ledger.nothing(names, "no gripper is made of them: width, speed and force are unknown")
+            ledger.ignored(names, "no gripper is made of them: width, speed and force are unknown")
         else:
-            ledger.nothing(names, "the arm and its gripper are commanded apart")
+            ledger.ignored(names, "the arm and its gripper are commanded apart")
     return joints
 
 
 def _tcp(
-    node: Node, urdf: ArkUrdf, order: list[UrdfJoint], joints: list[UrdfJoint], reading: Reading, ledger: Ledger
+    node: ArkNode, urdf: ArkUrdf, order: list[UrdfJoint], joints: list[UrdfJoint], reading: ArkReader, ledger: KeyReport
 ) -> tuple[str, bool]:
-    """The tcp's link, and whether it had to be guessed."""
+    """The tcp's link, and whether it is a guess."""
     index = node.get("ee_index")
     last = joints[-1].child
     if index is None:
@@ -128,7 +221,7 @@ def _tcp(
 
 
 def _home(
-    node: Node, order: list[UrdfJoint], joints: list[UrdfJoint], reading: Reading, ledger: Ledger
+    node: ArkNode, order: list[UrdfJoint], joints: list[UrdfJoint], reading: ArkReader, ledger: KeyReport
 ) -> list[float | int]:
     initial = node.get("initial_configuration")
     if initial is None:
@@ -148,7 +241,7 @@ def _home(
 
 
 def _speeds(joints: list[UrdfJoint]) -> tuple[list[float], list[str]]:
-    """Of each joint, and in words what is not the URDF's."""
+    """Speed of each joint, and notes on those that are not the URDF's."""
     speeds, odd = [], []
     for joint in joints:
         least, most = SLOWEST.get(joint.kind, SLOW), FASTEST.get(joint.kind, FAST)

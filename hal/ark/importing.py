@@ -1,4 +1,4 @@
-"""Ark's global file and all that it names, into a rig's file."""
+"""Import of Ark's global file, and the files that it names, as a rig's file."""
 
 from __future__ import annotations
 
@@ -14,35 +14,30 @@ from ..config.data_files import list_data
 from ..config.files import nearest
 from ..errors import CommandError, ConfigError, Problem
 from .arm_model import ArmModel
-from .arms import Arm, import_arm
-from .items import Work
-from .ledger import Ledger, Row
-from .options import Options
-from .places import Places
-from .reading import Node, Reading, Wrong
-from .sensors import import_camera
-from .simulator import import_simulator
-from .text import Commented, Inline, Remark, yaml_text
-from .things import import_object
+from .entries import ArkOptions, ImportState
+from .output import Commented, Inline, KeyReport, KeyRow, Remark, yaml_text
+from .reading import ArkNode, ArkReader, FileFinder, InvalidValue
+from .robots import ArkArm, import_arm
+from .scene import import_camera, import_object, import_simulator
 
 __all__ = ["Imported", "import_ark"]
 
 
 @dataclass(frozen=True)
 class Imported:
-    """A rig made of Ark's files, checked; nothing is written yet."""
+    """A checked rig made from Ark's files; nothing is written yet."""
 
     source: Path
     """Ark's global file."""
     entries: Mapping[str, Any]
-    rows: tuple[Row, ...]
-    """What became of every key."""
+    rows: tuple[KeyRow, ...]
+    """Outcome of every key."""
     models: Mapping[str, ArmModel]
-    """Robot -> a model that was made for it."""
+    """Models that were made, by robot."""
     left_out: tuple[str, ...]
 
     def texts(self, path: Path) -> dict[Path, str]:
-        """The rig's file ``path``, and those of the models beside it, with their texts. The rig is the last."""
+        """Return the texts of the rig's file ``path`` and of the models beside it; the rig is the last."""
         entries = dict(self.entries)
         texts: dict[Path, str] = {}
         if self.models:
@@ -57,54 +52,60 @@ class Imported:
 
 
 SECTIONS = ("simulator", "robots", "sensors", "objects")
-"""Of a global file."""
+"""Sections of a global file."""
 
 
-def import_ark(path: str | Path, options: Options | None = None) -> Imported:
-    """Read Ark's global file ``path`` and what it names, and make a rig of it. Nothing is written.
+def import_ark(path: str | Path, options: ArkOptions | None = None) -> Imported:
+    """Read Ark's global file and the files that it names, and convert them to a rig. Nothing is written.
 
-    Raises ConfigError with every problem, each with file and line; CommandError for options that fit nothing.
+    Args:
+        path: Ark's ``global_config.yaml``.
+        options: Options of the import.
+
+    Raises:
+        ConfigError: The files cannot be converted; lists every problem with file and line.
+        CommandError: An option names something that the files do not have.
     """
-    options = options or Options()
+    options = options or ArkOptions()
     _check_options(options)
     path = Path(path).expanduser().resolve()
-    work = Work(Reading(), Ledger(), Places(path, options.start), options)
+    work = ImportState(ArkReader(), KeyReport(), FileFinder(path, options.start), options)
     try:
         root = work.reading.file(path)
-    except Wrong:
+    except InvalidValue:
         work.reading.raise_any()
         raise AssertionError("wrong, and no problem noted") from None
     _check_generation(root)
     entries: dict[str, Any] = {}
-    with suppress(Wrong):
+    with suppress(InvalidValue):
         entries = import_simulator(root, work.reading, work.ledger)
 
     problems = work.reading.problems.found
     before = len(problems)
-    arms: dict[str, Arm] = {}
+    arms: dict[str, ArkArm] = {}
     for item in work.items(root, "robots"):
-        with suppress(Wrong):
+        with suppress(InvalidValue):
             arms[item.given] = import_arm(item, work)
     all_arms = len(problems) == before
     objects = []
     for item in work.items(root, "objects"):
-        with suppress(Wrong):
+        with suppress(InvalidValue):
             objects.append(import_object(item, work))
     cameras: dict[str, Any] = {}
     for item in work.items(root, "sensors"):
-        with suppress(Wrong):
+        with suppress(InvalidValue):
             cameras[item.name] = import_camera(item, work, arms, all_arms)
     work.reading.raise_any()
     _check_names(work)
 
     simulation = entries.pop("simulation", None)
-    entries["sim"] = Commented(True, "the one flag: false for the real arm and cameras")
+    entries["sim"] = Commented(True, "false for the real arm and cameras")
     sections: dict[str, Any] = {
         "robots": {arm.name: arm.entry for arm in arms.values()},
         "cameras": cameras,
         "gamepads": {
             "#pad": Remark(
-                "Ark has pads in programs of their own. Found when the rig opens; else a page in the browser."
+                "Ark has gamepads in separate programs. Here: the one that is plugged in, else the web console."
             ),
             work.own_name("pad"): Inline(model="auto"),
         },
@@ -119,7 +120,7 @@ def import_ark(path: str | Path, options: Options | None = None) -> Imported:
     return imported
 
 
-def _check_generation(root: Node) -> None:
+def _check_generation(root: ArkNode) -> None:
     """Raise ConfigError for a file that is not a global file: the files of Ark since June 2026, or anything else."""
     if any(section in root.children for section in SECTIONS):
         return
@@ -127,31 +128,31 @@ def _check_generation(root: Node) -> None:
     recent = "local" in root.children or "external" in root.children or keys & {"main", "simulator", "n_envs"}
     if recent:
         message = (
-            "is of the Ark that hosts.yaml, nodes.yaml and sim_envs.yaml belong to (since June 2026). These files list "
-            "computers, programs and simulators; arms, cameras and objects are in that Ark's Python classes, so there "
-            "is nothing here to make a rig of. Write the rig's file (docs/rig-file.md), or import the "
-            "global_config.yaml of the Ark of 2025"
+            "belongs to the Ark since June 2026 (hosts.yaml, nodes.yaml, sim_envs.yaml). These files list computers, "
+            "programs and simulators; its arms, cameras and objects are Python classes and cannot be imported. Write a "
+            "rig's file (docs/rig-file.md), or import the global_config.yaml of the Ark of 2025"
         )
     else:
         message = f"is not a global file of Ark: it has none of {', '.join(SECTIONS)}"
-    raise ConfigError([Problem(str(root.file), "", message)])
+    raise ConfigError([Problem(str(root.file), "", message, "newer_ark" if recent else "not_ark")])
 
 
 def _model_file(rig: Path, robot: str) -> Path:
-    """Where the model of a robot is written that the hal does not know."""
+    """File of a model that was made for a robot."""
     return rig.with_name(f"{rig.stem}_{robot}.yaml")
 
 
-def _check_options(options: Options) -> None:
+def _check_options(options: ArkOptions) -> None:
     models = list_data("sensors", "cameras")
     if options.camera_model not in models:
-        raise CommandError(f"there is no camera model {options.camera_model!r}{nearest(options.camera_model, models)}")
+        known = nearest(options.camera_model, models)
+        raise CommandError(f"unknown camera model {options.camera_model!r}{known}", code="unknown_model")
     if options.start is not None and not options.start.is_dir():
-        raise CommandError(f"--start {options.start}: there is no such folder")
+        raise CommandError(f"--start {options.start}: there is no such folder", code="no_folder")
 
 
-def _check_names(work: Work) -> None:
-    """Every name that an option gives is one of the files'."""
+def _check_names(work: ImportState) -> None:
+    """Raise CommandError unless every name in the options occurs in the files."""
     robots, sensors, objects = (work.given[section] for section in ("robots", "sensors", "objects"))
     asked = [
         *(("--without", name, [*robots, *sensors, *objects]) for name in sorted(work.options.without)),
@@ -160,11 +161,13 @@ def _check_names(work: Work) -> None:
     ]
     for option, name, names in asked:
         if name not in names:
-            raise CommandError(f"{option} {name}: Ark's files have nothing of that name{nearest(name, names)}")
+            raise CommandError(
+                f"{option} {name}: no such name in Ark's files{nearest(name, names)}", code="unknown_name"
+            )
 
 
-def _check(imported: Imported, ledger: Ledger) -> None:
-    """Is it a rig? What is wrong is told as Ark's files have it."""
+def _check(imported: Imported, ledger: KeyReport) -> None:
+    """Raise ConfigError if it is not a valid rig; problems refer to Ark's files."""
     with tempfile.TemporaryDirectory() as folder:
         rig = Path(folder).resolve() / "rig.yaml"
         for file, text in imported.texts(rig).items():
@@ -175,8 +178,8 @@ def _check(imported: Imported, ledger: Ledger) -> None:
             raise ConfigError([_in_ark(problem, imported, rig, ledger) for problem in error.problems]) from None
 
 
-def _in_ark(problem: Problem, imported: Imported, rig: Path, ledger: Ledger) -> Problem:
-    """A problem of the rig that was made, as one of the line in Ark's files that it comes from."""
+def _in_ark(problem: Problem, imported: Imported, rig: Path, ledger: KeyReport) -> Problem:
+    """A problem of the new rig, as one of the line in Ark's files that it comes from."""
     if problem.file == str(rig):
         node, where = ledger.origin(problem.key), f"as {problem.key} of the rig"
     else:

@@ -1,4 +1,4 @@
-"""Ark's YAML files with the line of every key, and errors that name file and line."""
+"""Reads Ark's YAML files with the line of every key; errors name file and line."""
 
 from __future__ import annotations
 
@@ -12,34 +12,81 @@ import yaml
 from ..config.files import PlacedErrors, Problems, check_size, nearest
 from ..config.schema import describe, is_number
 from ..errors import ConfigError
+from ..kinematics.urdf import package_folder
 
-__all__ = ["Node", "Reading", "Wrong"]
+__all__ = [
+    "ArkNode",
+    "PackageFile",
+    "FileFinder",
+    "ArkReader",
+    "InvalidValue",
+]
+
+UPWARDS = 4
+"""Searched folders above the global file; the tutorial's robots are three levels above its folder."""
+PACKAGE = "pybullet_data"
+"""Package whose folder Ark adds to PyBullet's search path."""
 
 
-class Wrong(Exception):
-    """Something cannot be used; the problem is noted already."""
+class PackageFile(str):
+    """Path of a file inside :data:`PACKAGE`."""
 
 
-class Node:
-    """A value in one of Ark's files, and where it stands."""
+class FileFinder:
+    """Finds files by paths relative to the folder that Ark is started in, which its files do not state.
 
-    def __init__(self, file: Path, line: int, key: str, data: Any, children: dict[str, Node]) -> None:
+    Args:
+        global_file: Ark's global file.
+        start: The folder that Ark is started in; None to search beside and above the global file.
+    """
+
+    def __init__(self, global_file: Path, start: Path | None) -> None:
+        folder = global_file.parent
+        guesses = [start] if start is not None else [folder, *folder.parents[:UPWARDS], Path.cwd()]
+        self.starts = list(dict.fromkeys(guess.resolve() for guess in guesses))
+
+    def find(self, path: str, *beside: Path) -> Path | None:
+        """Return a file or folder: ``path`` relative to where Ark starts, or to one of the folders ``beside``."""
+        given = Path(path).expanduser()
+        return next(
+            (there for folder in (*self.starts, *beside) if (there := (folder / given).resolve()).exists()), None
+        )
+
+    def in_package(self, path: str) -> PackageFile | None:
+        """Return the path if it exists in PyBullet's own data."""
+        folder = package_folder(PACKAGE)
+        return PackageFile(path) if folder is not None and (folder / path).is_file() else None
+
+    def searched(self) -> str:
+        """Return the searched folders as text."""
+        first, *others = map(str, self.starts)
+        return first if not others else f"{first} and {len(others)} more folders"
+
+
+class InvalidValue(Exception):
+    """A value cannot be used; the problem is already noted."""
+
+
+class ArkNode:
+    """A value in one of Ark's files, with its position."""
+
+    def __init__(self, file: Path, line: int, key: str, data: Any, children: dict[str, ArkNode]) -> None:
         self.file = file
         self.line = line
-        """Of its key, counted from 1."""
+        """Line of its key, counted from 1."""
         self.key = key
-        """Dotted, from the top of its file; empty for the whole file."""
+        """Dotted key from the top of the file; empty for the whole file."""
         self.data = data
         self.children = children
-        """Of keys and values, and of a list in which there are such; nothing else is looked into."""
+        """Values of a mapping, and of a list that contains mappings; empty for others."""
 
-    def get(self, key: str) -> Node | None:
-        """What stands at a key; None where there is nothing."""
+    def get(self, key: str) -> ArkNode | None:
+        """Return the value of a key; None if it is missing or empty."""
         child = self.children.get(key)
         return None if child is None or child.data is None else child
 
-    def leaves(self) -> Iterator[Node]:
-        """Itself where it is a plain value, else those below it, in the order of the file."""
+    def leaves(self) -> Iterator[ArkNode]:
+        """Yield the plain values at or below this one, in the order of the file."""
         if not self.children:
             yield self
         for child in self.children.values():
@@ -51,94 +98,94 @@ class Node:
         return f"{self.file}:{self.line}"
 
 
-class Reading:
-    """Reads Ark's files, and takes values out of them. What is wrong is noted, with its line, and raises Wrong."""
+class ArkReader:
+    """Reads and checks values of Ark's files. A wrong one is noted with its line, and InvalidValue is raised."""
 
     def __init__(self) -> None:
         self.problems = Problems()
-        self.files: dict[Path, Node] = {}
-        """What was read so far, in that order."""
+        self.files: dict[Path, ArkNode] = {}
+        """Files read so far, in order."""
 
-    def wrong(self, node: Node, message: str) -> Wrong:
-        """Note a problem; raise what comes back."""
+    def wrong(self, node: ArkNode, message: str) -> InvalidValue:
+        """Note a problem and return the exception to raise."""
         self.problems.add(node.place, node.key, message)
-        return Wrong()
+        return InvalidValue()
 
-    def file(self, path: Path) -> Node:
-        """The keys and values of a file, read once."""
+    def file(self, path: Path) -> ArkNode:
+        """Return the content of a file; every file is read once."""
         if path not in self.files:
             self.files[path] = self._read(path)
         return self.files[path]
 
-    def _read(self, path: Path) -> Node:
+    def _read(self, path: Path) -> ArkNode:
         try:
             text = path.read_text(encoding="utf-8")
         except FileNotFoundError:
             siblings = [p.name for p in path.parent.glob("*.y*ml")] if path.parent.is_dir() else []
             self.problems.add(path, "", "there is no such file" + (nearest(path.name, siblings) if siblings else ""))
-            raise Wrong from None
+            raise InvalidValue from None
         except (OSError, UnicodeDecodeError) as error:
             self.problems.add(path, "", f"cannot be read: {error}")
-            raise Wrong from None
+            raise InvalidValue from None
         try:
             root, data = _parse(text)
         except yaml.YAMLError as error:
             line, message = _not_yaml(text, error)
             self.problems.add(f"{path}:{line}", "", message)
-            raise Wrong from None
+            raise InvalidValue from None
         if not isinstance(data, dict) or root is None:
-            self.problems.add(path, "", f"must hold keys and values, not {describe(data)}")
-            raise Wrong
+            self.problems.add(path, "", f"must be keys and values, not {describe(data)}")
+            raise InvalidValue
         for line, key, message in (*_long_quotes(root, ""), *_twice(root, "")):
             self.problems.add(f"{path}:{line}", key, message)
         return _node(path, 1, "", root, data)
 
-    def need(self, node: Node, key: str) -> Node:
-        """What stands at a key that must be there."""
+    def need(self, node: ArkNode, key: str) -> ArkNode:
+        """Return the value of a required key."""
         child = node.get(key)
         if child is None:
             raise self.wrong(node, f"{key!r} is missing")
         return child
 
-    def keys(self, node: Node) -> Node:
-        """The same node, if it holds keys and values."""
+    def keys(self, node: ArkNode) -> ArkNode:
+        """Return the same node if it is a mapping."""
         if not isinstance(node.data, dict):
-            raise self.wrong(node, f"must hold keys and values, not {describe(node.data)}")
+            raise self.wrong(node, f"must be keys and values, not {describe(node.data)}")
         return node
 
-    def text(self, node: Node) -> str:
-        """A word."""
+    def text(self, node: ArkNode) -> str:
+        """Return a text that is not empty."""
         if not isinstance(node.data, str) or not node.data:
             raise self.wrong(node, f"must be a text, not {describe(node.data)}")
         return node.data
 
-    def words(self, node: Node) -> list[str]:
-        """A list of words."""
+    def words(self, node: ArkNode) -> list[str]:
+        """Return a list of texts."""
         if not isinstance(node.data, list) or not all(isinstance(item, str) for item in node.data):
             raise self.wrong(node, f"must be a list of names, not {describe(node.data)}")
         return list(node.data)
 
-    def flag(self, node: Node) -> bool:
-        """True or false; PyBullet takes 1 and 0 as well."""
+    def flag(self, node: ArkNode) -> bool:
+        """Return true or false; 1 and 0 are accepted, as by PyBullet."""
         if node.data not in (True, False, 0, 1):
             raise self.wrong(node, f"must be true or false, not {describe(node.data)}")
         return bool(node.data)
 
-    def whole(self, node: Node) -> int:
-        """A whole number."""
+    def whole(self, node: ArkNode) -> int:
+        """Return a whole number."""
         if not isinstance(node.data, int) or isinstance(node.data, bool):
             raise self.wrong(node, f"must be a whole number, not {describe(node.data)}")
         return node.data
 
-    def number(self, node: Node, *, positive: bool = False) -> float | int:
-        """A number, as it is written."""
+    def number(self, node: ArkNode, *, positive: bool = False) -> float | int:
+        """Return a number as written."""
         if not is_number(node.data) or (positive and not node.data > 0):
             raise self.wrong(node, f"must be a {'positive ' if positive else ''}number, not {describe(node.data)}")
         value: float | int = node.data
         return value
 
-    def numbers(self, node: Node, counts: Collection[int] = ()) -> list[float | int]:
-        """A list of numbers, as they are written, one of ``counts`` long."""
+    def numbers(self, node: ArkNode, counts: Collection[int] = ()) -> list[float | int]:
+        """Return a list of numbers as written; its length is one of ``counts`` if given."""
         data = node.data
         if not isinstance(data, list) or (counts and len(data) not in counts):
             size = f"{' or '.join(map(str, sorted(counts)))} numbers" if counts else "numbers"
@@ -148,22 +195,22 @@ class Reading:
                 raise self.wrong(node, f"must be numbers; item {k + 1} is {describe(item)}")
         return list(data)
 
-    def rotation(self, node: Node) -> list[float | int]:
-        """Three angles, or a quaternion that is not zero."""
+    def rotation(self, node: ArkNode) -> list[float | int]:
+        """Return three angles, or a quaternion that is not zero."""
         values = self.numbers(node, (3, 4))
         if len(values) == 4 and math.hypot(*values) < 1e-6:
             raise self.wrong(node, "is no rotation: a quaternion of nothing but zeros")
         return values
 
     def raise_any(self) -> None:
-        """Raise a ConfigError with every problem, if there is one."""
+        """Raise ConfigError with every problem, if there is one."""
         if self.problems.found:
             found = self.problems.found
             raise ConfigError(sorted(found, key=lambda problem: problem.file.rpartition(":")[0] or problem.file))
 
 
 class _Loader(PlacedErrors, yaml.SafeLoader):
-    """YAML 1.1, as Ark reads it."""
+    """YAML 1.1, as read by Ark."""
 
 
 def _parse(text: str) -> tuple[yaml.Node | None, Any]:
@@ -177,8 +224,8 @@ def _parse(text: str) -> tuple[yaml.Node | None, Any]:
         loader.dispose()
 
 
-def _node(file: Path, line: int, key: str, node: yaml.Node, data: Any) -> Node:
-    children: dict[str, Node] = {}
+def _node(file: Path, line: int, key: str, node: yaml.Node, data: Any) -> ArkNode:
+    children: dict[str, ArkNode] = {}
     if isinstance(node, yaml.MappingNode) and isinstance(data, dict):
         by_text = {str(name): value for name, value in data.items()}
         for name, value in node.value:
@@ -188,17 +235,17 @@ def _node(file: Path, line: int, key: str, node: yaml.Node, data: Any) -> Node:
     elif isinstance(node, yaml.SequenceNode) and isinstance(data, list) and any(isinstance(x, dict) for x in data):
         for k, (item, value) in enumerate(zip(node.value, data, strict=True)):
             children[str(k)] = _node(file, item.start_mark.line + 1, f"{key}.{k}", item, value)
-    return Node(file, line, key, data, children)
+    return ArkNode(file, line, key, data, children)
 
 
 def _twice(node: yaml.Node, key: str) -> Iterator[tuple[int, str, str]]:
-    """Keys that are given twice: line, key and message."""
+    """Repeated keys: line, key and message."""
     if isinstance(node, yaml.MappingNode):
         first: dict[str, int] = {}
         for name, value in node.value:
             inside, line = f"{key}.{name.value}" if key else str(name.value), name.start_mark.line + 1
             if inside in first:
-                yield line, inside, f"is given in line {first[inside]}, too; Ark takes the last one. Take one out"
+                yield line, inside, f"is also given in line {first[inside]}; Ark uses the last one. Remove one"
             first[inside] = line
             yield from _twice(value, inside)
     elif isinstance(node, yaml.SequenceNode):
@@ -207,7 +254,7 @@ def _twice(node: yaml.Node, key: str) -> Iterator[tuple[int, str, str]]:
 
 
 def _long_quotes(node: yaml.Node, key: str) -> Iterator[tuple[int, str, str]]:
-    """Quoted texts that run over several lines and look like YAML: line, key and message."""
+    """Quoted texts that span several lines and contain YAML: line, key and message."""
     if isinstance(node, yaml.MappingNode):
         for name, value in node.value:
             yield from _long_quotes(value, f"{key}.{name.value}" if key else str(name.value))
@@ -221,7 +268,7 @@ def _long_quotes(node: yaml.Node, key: str) -> Iterator[tuple[int, str, str]]:
 
 
 def _not_yaml(text: str, error: yaml.YAMLError) -> tuple[int, str]:
-    """The line to look at, and what is wrong there. A quote that is not closed shows only lines later."""
+    """Line and message of a syntax error. For an unclosed quote the line where it opens, not where parsing failed."""
     if isinstance(error, yaml.reader.ReaderError):
         return text.count(
             "\n", 0, error.position
@@ -238,7 +285,7 @@ def _not_yaml(text: str, error: yaml.YAMLError) -> tuple[int, str]:
 
 
 def _open_quote(line: str) -> bool:
-    """Does a quoted text begin in this line that does not end in it?"""
+    """Whether a quoted text begins in this line and does not end in it."""
     quote = ""
     before = " "
     for letter in line:

@@ -9,8 +9,8 @@ from typing import Any
 
 import yaml
 
-from hal.ark import Imported, Options, import_ark
-from hal.ark.reading import Node
+from hal.ark import ArkOptions, Imported, import_ark
+from hal.ark.reading import ArkNode
 from hal.config.files import parse_yaml
 
 DATA = Path(__file__).resolve().parents[1] / "data" / "ark"
@@ -82,7 +82,7 @@ def write(
     return path
 
 
-def imported(folder: Path, options: Options | None = None, **sections: Any) -> tuple[dict[str, Any], Imported]:
+def imported(folder: Path, options: ArkOptions | None = None, **sections: Any) -> tuple[dict[str, Any], Imported]:
     """The rig made of a configuration, as it would be read back, and the import."""
     result = import_ark(write(folder, **sections), options)
     path = folder / "rig.yaml"
@@ -97,7 +97,7 @@ def row(result: Imported, key: str, file: str = "") -> tuple[str, str]:
     return found.outcome, found.here
 
 
-def leaves(node: Node, above: tuple[Node, ...] = ()) -> Iterator[tuple[Node, ...]]:
+def leaves(node: ArkNode, above: tuple[ArkNode, ...] = ()) -> Iterator[tuple[ArkNode, ...]]:
     """Every plain value below a node, with what it is in, from the outside in."""
     path = (*above, node)
     if not node.children:

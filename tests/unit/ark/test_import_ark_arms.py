@@ -13,8 +13,8 @@ from ark_kit import CAMERA, PANDA, PANDA_URDF, changed, imported, row
 from pybullet_utils.bullet_client import BulletClient
 
 import hal
-from hal.ark import Options
-from hal.ark.links import ArkUrdf
+from hal.ark import ArkOptions
+from hal.ark.arm_model import ArkUrdf
 from hal.config import load
 from hal.config.files import parse_yaml
 from hal.geometry import Pose
@@ -53,11 +53,11 @@ def test_frankas_are_known_by_their_joints(tmp_path: Path, keys: dict[str, Any],
 
 
 def test_a_person_may_say_which_arm_it_is(tmp_path: Path) -> None:
-    data, result = imported(tmp_path, Options(arms={"arm": "fr3"}), robots={"arm": PANDA})
+    data, result = imported(tmp_path, ArkOptions(arms={"arm": "fr3"}), robots={"arm": PANDA})
     assert data["robots"]["arm"]["model"] == "fr3"
     assert "as --arm says" in row(result, "robots.0.config.urdf_path")[1]
     with pytest.raises(hal.ConfigError, match="--arm arm=fr4: there is no such model; did you mean 'fr3'"):
-        imported(tmp_path, Options(arms={"arm": "fr4"}), robots={"arm": PANDA})
+        imported(tmp_path, ArkOptions(arms={"arm": "fr4"}), robots={"arm": PANDA})
 
 
 def test_base(tmp_path: Path) -> None:
@@ -106,10 +106,10 @@ def test_a_real_arms_address_is_kept_and_nothing_becomes_real_or_faster_by_it(tm
 
 def test_where_ark_has_its_tcp_is_told(tmp_path: Path) -> None:
     robot = changed(PANDA, ee_index=11)
-    for options in (Options(), Options(urdfs={"arm": PANDA_URDF})):
+    for options in (ArkOptions(), ArkOptions(urdfs={"arm": PANDA_URDF})):
         _, result = imported(tmp_path, options, robots={"arm": robot})
         assert "Ark's tcp_link: 3.4 mm before it" in row(result, "robots.0.config.ee_index")[1]
-    _, result = imported(tmp_path, Options(urdfs={"arm": PANDA_URDF}), robots={"arm": changed(robot, ee_index=6)})
+    _, result = imported(tmp_path, ArkOptions(urdfs={"arm": PANDA_URDF}), robots={"arm": changed(robot, ee_index=6)})
     assert "not Ark's panda_link7" in row(result, "robots.0.config.ee_index")[1]
 
 
@@ -175,7 +175,7 @@ def test_fingers_are_no_joints_of_the_arm(tmp_path: Path) -> None:
     model = parse_yaml((tmp_path / "rig_arm.yaml").read_text())
     assert model["joints"] == [f"joint{k}" for k in range(1, 7)]
     assert "gripper" not in model
-    assert row(result, "robots.0.config.joint_groups.gripper.joints")[0] == "nothing"
+    assert row(result, "robots.0.config.joint_groups.gripper.joints")[0] == "ignored"
 
 
 def test_fixed_joints_of_a_group_are_no_joints_of_the_arm(tmp_path: Path) -> None:
@@ -199,7 +199,7 @@ def test_speeds_that_a_urdf_lacks_or_makes_up_are_told(tmp_path: Path) -> None:
     text = (XARM / "xarm6_robot.urdf").read_text()
     assert text.count('velocity="3.14"') >= 2
     urdf.write_text(text.replace('velocity="3.14"', 'velocity="100"', 1).replace('velocity="3.14"', "", 1))
-    _, result = imported(tmp_path, Options(urdfs={"arm": urdf}), robots={"arm": xarm(class_dir=None)})
+    _, result = imported(tmp_path, ArkOptions(urdfs={"arm": urdf}), robots={"arm": xarm(class_dir=None)})
     told = result.models["arm"].to_fill_in
     assert any("joint1 has 100 in the URDF, which looks like a placeholder" in one for one in told)
     assert any("joint2 has none in the URDF" in one for one in told)

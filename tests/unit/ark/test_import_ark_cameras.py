@@ -13,7 +13,7 @@ import pytest
 from ark_kit import CAMERA, PANDA, PANDA_URDF, changed, imported, row
 from pybullet_utils.bullet_client import BulletClient
 
-from hal.ark import Options
+from hal.ark import ArkOptions
 from hal.config import load
 from hal.geometry import Pose
 from hal.kinematics.arm import Kinematics
@@ -76,7 +76,7 @@ ATTACHED: list[dict[str, Any]] = [
 def test_attached_to_a_panda(tmp_path: Path, link: str, attach: dict[str, Any], with_urdf: bool) -> None:
     q = [0.2, -0.6, 0.1, -2.1, 0.3, 1.6, 0.5]
     attach = {"parent_name": "arm", "parent_link": link, **attach}
-    options = Options(urdfs={"arm": PANDA_URDF} if with_urdf else {})
+    options = ArkOptions(urdfs={"arm": PANDA_URDF} if with_urdf else {})
     imported(tmp_path, options, robots={"arm": PANDA}, sensors={"eye": camera(**attach)})
     assert our_view(tmp_path / "rig.yaml", q) == pytest.approx(ark_view(PANDA_URDF, q, attach), abs=1e-5)
 
@@ -112,7 +112,7 @@ def test_a_link_that_is_gone_from_arks_urdf_is_told(tmp_path: Path) -> None:
     (tmp_path / "panda.urdf").write_text(without + "</robot>\n")
     eye = camera(parent_name="arm", parent_link="camera_link")
     data, result = imported(
-        tmp_path, Options(urdfs={"arm": tmp_path / "panda.urdf"}), robots={"arm": PANDA}, sensors={"eye": eye}
+        tmp_path, ArkOptions(urdfs={"arm": tmp_path / "panda.urdf"}), robots={"arm": PANDA}, sensors={"eye": eye}
     )
     assert data["cameras"]["eye"]["attached"]["link"] == "panda_hand"
     assert (
@@ -128,7 +128,7 @@ def test_without_a_link_it_is_the_base(tmp_path: Path) -> None:
 
 def test_on_an_fr3_the_hand_is_that_ones(tmp_path: Path) -> None:
     eye = camera(parent_name="arm", parent_link="camera_link")
-    data, _ = imported(tmp_path, Options(arms={"arm": "fr3"}), robots={"arm": PANDA}, sensors={"eye": eye})
+    data, _ = imported(tmp_path, ArkOptions(arms={"arm": "fr3"}), robots={"arm": PANDA}, sensors={"eye": eye})
     assert data["cameras"]["eye"]["attached"]["link"] == "fr3_hand"
 
 
@@ -137,7 +137,7 @@ def test_degrees_are_told(tmp_path: Path) -> None:
     _, result = imported(tmp_path, robots={"arm": PANDA}, sensors={"eye": eye})
     outcome, here = row(result, "sensors.0.config.sim_config.attach.offset_rotation")
     assert outcome == "changed"
-    assert "were these degrees? Ark takes them for rad, too" in here
+    assert "check that these are not degrees" in here
 
 
 @pytest.mark.parametrize("up", [1, 2])
@@ -181,7 +181,7 @@ def test_streams(tmp_path: Path) -> None:
     assert data["cameras"]["eye"]["streams"] == ["color", "depth", "segmentation"]
     assert row(result, "sensors.0.config.streams.color.format") == (
         "changed",
-        "the model's business; a frame is RGB whatever it is",
+        "depends on the model; frames are RGB in any case",
     )
     assert row(result, "sensors.0.config.streams.infrared.enable")[1].endswith("left out")
 
@@ -196,11 +196,11 @@ def test_old_files_have_no_camera_type(tmp_path: Path) -> None:
     both = changed(CAMERA, sim_config__attach={"parent_name": "arm"})
     data, result = imported(tmp_path, robots={"arm": PANDA}, sensors={"eye": both})
     assert "look_at" in data["cameras"]["eye"]
-    assert row(result, "sensors.0.config.sim_config.attach")[0] == "nothing"
+    assert row(result, "sensors.0.config.sim_config.attach")[0] == "ignored"
 
 
 def test_a_real_cameras_size_is_cut_from_one_that_it_has(tmp_path: Path) -> None:
     eye = changed(CAMERA, width=1280, height=720, frequency=15)
-    imported(tmp_path, Options(camera_model="realsense_d435"), robots={"arm": PANDA}, sensors={"eye": eye})
+    imported(tmp_path, ArkOptions(camera_model="realsense_d435"), robots={"arm": PANDA}, sensors={"eye": eye})
     spec = load(tmp_path / "rig.yaml").resolve().cameras[0]
     assert (spec.capture_width, spec.width, spec.height, spec.rate_hz) == (1280, 1280, 720, 15)

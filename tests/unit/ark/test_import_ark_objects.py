@@ -11,7 +11,7 @@ import yaml
 from ark_kit import BALL, DATA, PANDA, changed, imported, row, write
 
 import hal
-from hal.ark import Options, import_ark
+from hal.ark import ArkOptions, import_ark
 from hal.geometry import Pose
 
 MUG = DATA / "tutorial" / "config" / "objects" / "mug" / "model.urdf"
@@ -82,7 +82,7 @@ def test_a_mass_of_nothing_stands_still_and_dynamics_are_told(tmp_path: Path) ->
     data, result = imported(tmp_path, objects={"ball": config})
     assert data["objects"][0]["mass"] == 0
     assert row(result, "objects.0.config.dynamics.lateralFriction") == (
-        "nothing",
+        "ignored",
         "not in a rig's file: rig.world.set_dynamics('ball', lateral_friction=0.7)",
     )
     assert row(result, "objects.0.config.dynamics.jointDamping")[1] == "rig.world.set_dynamics has no such"
@@ -113,7 +113,7 @@ def test_urdfs_are_found_from_where_ark_is_started(tmp_path: Path, monkeypatch: 
     folder.mkdir(parents=True)
     source = write(folder, objects={"mug": mug("things/mug.urdf")})
 
-    def found(options: Options | None = None) -> Path:
+    def found(options: ArkOptions | None = None) -> Path:
         entry = import_ark(source, options).entries["objects"][0]
         return Path(entry["urdf"])
 
@@ -125,9 +125,9 @@ def test_urdfs_are_found_from_where_ark_is_started(tmp_path: Path, monkeypatch: 
     nearer = put(folder / "things" / "mug.urdf")
     assert found() == nearer
     elsewhere = put(tmp_path / "started" / "things" / "mug.urdf")
-    assert found(Options(start=tmp_path / "started")) == elsewhere
+    assert found(ArkOptions(start=tmp_path / "started")) == elsewhere
     said = put(tmp_path / "mug2.urdf")
-    assert found(Options(urdfs={"mug": said})) == said
+    assert found(ArkOptions(urdfs={"mug": said})) == said
 
 
 def test_urdfs_of_pybullet_are_named_by_their_package(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""Ark's robots: an arm that the hal knows, or a model made from the URDF that Ark's file names."""
+"""Conversion of Ark's robots: to a built-in model, or to a model made from the URDF."""
 
 from __future__ import annotations
 
@@ -6,44 +6,155 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from ..config import load
 from ..config.data_files import list_data
 from ..config.files import nearest
 from ..geometry import Pose
-from .arm_model import ArmModel, arm_model
-from .items import Item, Work
-from .known import FIXED_LINKS, FRANKAS, JOINT_COUNTS, LINKS, TCP_LINK, KnownArm, franka_with
-from .ledger import Ledger
-from .links import ArkUrdf
-from .options import Options
-from .places import Places
-from .posing import position_of, rotation_of
-from .reading import Node, Reading
-from .real_config import import_real
-from .text import Commented, Inline, plain
+from ..kinematics.urdf import read_urdf
+from ..specs import GripperSpec, RobotSpec
+from .arm_model import ArkUrdf, ArmModel, arm_model
+from .entries import ArkItem, ArkOptions, ImportState, position_of, rotation_of
+from .output import Commented, Inline, KeyReport, Remark, plain
+from .reading import ArkNode, ArkReader, FileFinder
 
-__all__ = ["Arm", "import_arm"]
+__all__ = [
+    "ArkArm",
+    "FIXED_LINKS",
+    "FRANKAS",
+    "JOINT_COUNTS",
+    "KnownArm",
+    "LINKS",
+    "TCP_LINK",
+    "franka_with",
+    "import_arm",
+    "import_real",
+]
+
+FRANKAS = {"panda": "panda_", "fr3": "fr3_"}
+"""Models of Franka's arms, and the prefix of their joints and links."""
+JOINT_COUNTS = (7, 9, 10, 12)
+"""Numbers of joints of Ark's Panda: the arm; with the fingers (fixed joints merged); with the hand's fixed joint; with
+those of its camera and its tcp."""
+LINKS = {
+    "camera_link": ("panda_hand", Pose.from_rpy([-0.05, 0.0, 0.0], [1.3, 0.0, -1.57])),
+    "tcp_link": ("panda_hand", Pose.from_rpy([0.0, 0.0, 0.1], [0.0, 0.0, 3.14])),
+}
+"""Links that ark_franka's URDF had besides Franka's own in July 2025: parent link and pose. The centre of mass of every
+link is at its origin."""
+FIXED_LINKS = ("panda_hand", *LINKS)
+"""Links of that URDF that PyBullet can merge with others."""
+TCP_LINK = 11
+"""Index of ``tcp_link`` in that URDF."""
+
+
+class KnownArm:
+    """A built-in model."""
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+        self.spec: RobotSpec = load({"robots": {"arm": {"model": name}}}, driver="mock").resolve().robots[0]
+        self.links = tuple(read_urdf(Path(self.spec.urdf)).links)
+
+    @property
+    def base_link(self) -> str:
+        """Link of its base."""
+        return self.spec.kinematics.base_link or self.links[0]
+
+    @property
+    def is_franka(self) -> bool:
+        """Whether it is a Panda or an FR3."""
+        return self.name in FRANKAS
+
+    def place(self, link: str) -> tuple[str, Pose] | None:
+        """Return a link of Ark's Panda as a link of this arm and a pose in its frame; None if it has no such link."""
+        own, pose = LINKS.get(link, (link, Pose()))
+        if self.is_franka:
+            own = FRANKAS[self.name] + own.removeprefix("panda_")
+        return (own, pose) if own in self.links else None
+
+
+def franka_with(joints: set[str]) -> str | None:
+    """Return the model of Franka's arm with these joints; None if neither has them."""
+    for model, prefix in FRANKAS.items():
+        if joints.issuperset(f"{prefix}joint{k}" for k in range(1, 8)):
+            return model
+    return None
+
+
+MOST_SPEED = 0.3
+"""Largest share of the joint speeds that an import sets, the rig's default; users may write more."""
+
+
+def import_real(
+    node: ArkNode, key: str, hand: GripperSpec | None, reading: ArkReader, ledger: KeyReport
+) -> dict[str, Any]:
+    """Return the entries of a Franka from ``real_config``: addresses, and low speeds. The rig stays simulated.
+
+    Args:
+        node: The robot's ``config``.
+        key: The robot's key in the rig.
+        hand: Its gripper.
+        reading: Checks values.
+        ledger: Receives the outcome of every key.
+    """
+    entries: dict[str, Any] = {
+        "#workspace": Remark(
+            "workspace: {table_height: 0.01}    # m over the base: Ark has no such bound, a real arm should"
+        )
+    }
+    real = node.get("real_config")
+    if real is None:
+        entries["#real"] = Remark("real: {host: 172.16.0.2}            # the robot's address, for --real")
+        return entries
+    reading.keys(real)
+    host, own = real.get("robot_ip"), real.get("gripper_ip")
+    gripper: dict[str, Any] = {}
+    if host is not None:
+        entries["real"] = Inline(host=reading.text(host))
+        ledger.kept(host, f"{key}.real.host")
+    if own is not None and host is not None and own.data == host.data:
+        ledger.kept(own, f"{key}.real.host", "a hand has the arm's, unless it is given its own")
+    elif own is not None:
+        gripper["real"] = Inline(host=reading.text(own))
+        ledger.kept(own, f"{key}.gripper.real.host")
+    share = real.get("relative_dynamics_factor")
+    if share is not None and reading.number(share, positive=True) <= MOST_SPEED:
+        entries["speed"] = Commented(share.data, "Ark's relative_dynamics_factor")
+        ledger.changed(share, f"{key}.speed", "share of the joint speeds, for commands; move_speed stays")
+    else:
+        ledger.changed(share, "", f"{key}.speed stays {MOST_SPEED:g} of the joint speeds: more is for you to write")
+    speed = real.get("gripper_speed")
+    if speed is not None and hand is not None:
+        if reading.number(speed, positive=True) <= hand.speed:
+            gripper["speed"] = speed.data
+            ledger.kept(speed, f"{key}.gripper.speed")
+        else:
+            ledger.changed(speed, "", f"{hand.speed:g} m/s, the most that the hand can do")
+    if gripper:
+        entries["gripper"] = gripper
+    return entries
 
 
 @dataclass
-class Arm:
-    """A robot as it will stand in the rig."""
+class ArkArm:
+    """A converted robot."""
 
     name: str
     given: str
-    """Its name in Ark's file."""
+    """Name in Ark's file."""
     known: KnownArm | None
-    """The hal's model; None where one is made."""
+    """Built-in model; None if one is made."""
     urdf: ArkUrdf | None
-    """Ark's, where it was found."""
+    """Ark's URDF, if it was found."""
     merged: bool
-    """Does PyBullet merge its fixed links?"""
+    """Whether PyBullet merges its fixed links."""
     entry: dict[str, Any] = field(default_factory=dict)
     made: ArmModel | None = None
 
     def place(self, link: str | None) -> tuple[str, Pose, str] | None:
-        """Where Ark counts from on a link: a link of the model, a pose in its frame, and what a person should know.
+        """Return the frame that Ark measures from on a link: a link of the model, a pose in its frame, and a note.
 
-        ``link=None`` is Ark's word for the base. None where the arm has no such link.
+        ``link=None`` means the base. Returns None if the arm has no such link.
         """
         links = self.known.links if self.known is not None else tuple(self.urdf.model.links) if self.urdf else ()
         if link is None:
@@ -63,8 +174,8 @@ class Arm:
         return at, pose, "" if at == link else f"{link} is fixed to {at}, and no link of this model"
 
 
-def import_arm(item: Item, work: Work) -> Arm:
-    """An entry of ``robots``. Raises Wrong; the problem is noted."""
+def import_arm(item: ArkItem, work: ImportState) -> ArkArm:
+    """Convert an entry of ``robots``. Raises InvalidValue; the problem is noted."""
     name, given, node, key = item
     reading, ledger, places, options = work.reading, work.ledger, work.places, work.options
     merge = reading.keys(node).get("merge_fixed_links")
@@ -74,21 +185,21 @@ def import_arm(item: Item, work: Work) -> Arm:
     _checks(node, reading, ledger)
     path = node.get("urdf_path")
     if model is not None:
-        arm = Arm(name, given, KnownArm(model), urdf, merged)
+        arm = ArkArm(name, given, KnownArm(model), urdf, merged)
         arm.entry["model"] = Commented(model, why)
         ledger.changed(path, f"{key}.model", f"{model} brings its own URDF; {why}")
         _groups(node, ledger)
     elif urdf is not None:
         made = arm_model(given, node, urdf, merged, reading, ledger)
-        arm = Arm(name, given, None, urdf, merged, made=made)
+        arm = ArkArm(name, given, None, urdf, merged, made=made)
         arm.entry["model"] = Commented(made, "made from the URDF: look at what it says about limits")
         ledger.changed(path, f"{key}.model", "a model made from it, in a file beside the rig")
     else:
         raise reading.wrong(
             path or node,
-            f"there is no file {reading.need(node, 'urdf_path').data!r}, in class_dir or in {places.told()}, and the "
-            f"joints are not those of {' or '.join(FRANKAS)}. Say --urdf {given}=FILE, or --arm {given}=MODEL for one "
-            f"that the hal knows ({', '.join(list_data('robots'))}), or --without {given}",
+            f"there is no file {reading.need(node, 'urdf_path').data!r}, in class_dir or in {places.searched()}, and "
+            f"the joints are not those of {' or '.join(FRANKAS)}. Add --urdf {given}=FILE, or --arm {given}=MODEL for "
+            f"a built-in model ({', '.join(list_data('robots'))}), or --without {given}",
         )
     _base(arm, node, key, reading, ledger)
     if arm.known is not None:
@@ -97,12 +208,12 @@ def import_arm(item: Item, work: Work) -> Arm:
     if arm.known is not None and arm.known.is_franka:
         arm.entry.update(import_real(node, key, arm.known.spec.gripper, reading, ledger))
     else:
-        ledger.nothing(node.children.get("real_config"), "no driver here drives the real one")
+        ledger.ignored(node.children.get("real_config"), "no driver here drives the real one")
     return arm
 
 
-def _urdf(given: str, node: Node, reading: Reading, places: Places, options: Options) -> ArkUrdf | None:
-    """Ark's URDF, if it is there: in ``class_dir``, which is relative to where Ark starts."""
+def _urdf(given: str, node: ArkNode, reading: ArkReader, places: FileFinder, options: ArkOptions) -> ArkUrdf | None:
+    """Ark's URDF, if it is found: in ``class_dir``, which is relative to where Ark starts."""
     path, folder = node.get("urdf_path"), node.get("class_dir")
     if given in options.urdfs:
         found: Path | None = options.urdfs[given].resolve()
@@ -121,8 +232,10 @@ def _urdf(given: str, node: Node, reading: Reading, places: Places, options: Opt
         raise reading.wrong(path or node, f"{found}: {error}") from None
 
 
-def _model(given: str, node: Node, urdf: ArkUrdf | None, reading: Reading, options: Options) -> tuple[str | None, str]:
-    """The model of the hal that the robot is, and how that is known; None where it is none."""
+def _model(
+    given: str, node: ArkNode, urdf: ArkUrdf | None, reading: ArkReader, options: ArkOptions
+) -> tuple[str | None, str]:
+    """The robot's built-in model and the reason for the choice; None if there is none."""
     if given in options.arms:
         model, there = options.arms[given], list_data("robots")
         if model not in there:
@@ -142,7 +255,7 @@ def _model(given: str, node: Node, urdf: ArkUrdf | None, reading: Reading, optio
     return None, ""
 
 
-def _checks(node: Node, reading: Reading, ledger: Ledger) -> None:
+def _checks(node: ArkNode, reading: ArkReader, ledger: KeyReport) -> None:
     """Keys that only must not say something else."""
     source = node.get("source")
     if source is not None and source.data != "urdf":
@@ -152,28 +265,28 @@ def _checks(node: Node, reading: Reading, ledger: Ledger) -> None:
     if fixed is not None and not reading.flag(fixed):
         raise reading.wrong(fixed, "an arm stands fixed here; a robot that drives or falls has no counterpart")
     ledger.kept(fixed, "", "every arm is")
-    ledger.nothing(node.children.get("class_dir"), "models and drivers are found by name")
-    ledger.nothing(node.children.get("merge_fixed_links"), "links keep their names")
-    ledger.nothing(
+    ledger.ignored(node.children.get("class_dir"), "models and drivers are found by name")
+    ledger.ignored(node.children.get("merge_fixed_links"), "links keep their names")
+    ledger.ignored(
         node.children.get("frequency"),
         "a simulated arm is driven at simulation.physics_hz; control(rate_hz=) says how often a program commands",
     )
 
 
-def _groups(node: Node, ledger: Ledger) -> None:
-    """Joint groups of an arm whose model has its joints already."""
+def _groups(node: ArkNode, ledger: KeyReport) -> None:
+    """Joint groups of an arm with a built-in model."""
     groups = node.get("joint_groups")
     for name, group in (groups.children if groups is not None else {}).items():
         hand = name == "gripper"
         if name in ("arm", "gripper"):
             ledger.kept(group.get("joints"), "", f"the {name}'s, in the model")
         else:
-            ledger.nothing(group.get("joints"), "one command has both: control.send(command, width=metres)")
-        does = "arm.gripper.move(width in m)" if hand else "each command says it: JointTarget, JointVelocity, ..."
+            ledger.ignored(group.get("joints"), "one command has both: control.send(command, width=metres)")
+        does = "arm.gripper.move(width in m)" if hand else "chosen by each command: JointTarget, JointVelocity, ..."
         ledger.changed(group.get("control_mode"), "", does)
 
 
-def _base(arm: Arm, node: Node, key: str, reading: Reading, ledger: Ledger) -> None:
+def _base(arm: ArkArm, node: ArkNode, key: str, reading: ArkReader, ledger: KeyReport) -> None:
     position = position_of(node, "base_position", f"{key}.base.position", reading, ledger)
     rotation = rotation_of(node, "base_orientation", f"{key}.base.orientation", reading, ledger)
     base = Inline({"position": position} if position is not None else {})
@@ -185,8 +298,8 @@ def _base(arm: Arm, node: Node, key: str, reading: Reading, ledger: Ledger) -> N
         arm.entry["base"] = Commented(base, comment) if comment else base
 
 
-def _start(arm: Arm, known: KnownArm, node: Node, key: str, reading: Reading, ledger: Ledger) -> None:
-    """The joints of a known arm come first in Ark's list; behind them fixed joints and fingers."""
+def _start(arm: ArkArm, known: KnownArm, node: ArkNode, key: str, reading: ArkReader, ledger: KeyReport) -> None:
+    """The joints of a known arm are first in Ark's list, before fixed joints and fingers."""
     initial = node.get("initial_configuration")
     if initial is None:
         return
@@ -206,7 +319,7 @@ def _start(arm: Arm, known: KnownArm, node: Node, key: str, reading: Reading, le
     ledger.changed(initial, f"{key}.initial", "; ".join(["where a simulation starts; home is the model's", *notes]))
 
 
-def _end_effector(arm: Arm, known: KnownArm, node: Node, reading: Reading, ledger: Ledger) -> None:
+def _end_effector(arm: ArkArm, known: KnownArm, node: ArkNode, reading: ArkReader, ledger: KeyReport) -> None:
     index = node.get("ee_index")
     if index is None:
         return
