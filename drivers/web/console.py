@@ -62,7 +62,7 @@ class WebConsole(Console):
         """Start the process; the arguments are those of :class:`~hal.views.Console`.
 
         Raises:
-            NotSupported: In lock-step, where nobody could drive (``needs_real_time``).
+            NotSupported: In lock-step, where no person could drive by hand (``needs_real_time``).
         """
         super().__init__(rig, listen, driven_by=driven_by)
         self._queues: list[PadQueue] = []
@@ -213,7 +213,7 @@ class WebConsole(Console):
             self._setting_handler(str(message["setting"]), message["value"])
 
     def _report_loss(self, why: str) -> None:
-        """Show on the pages why the pad was lost, once, and whether somebody intended that (calm) or not (alarm)."""
+        """Show on the pages why the pad was lost, once, and whether that was intended (calm) or not (alarm)."""
         loss = "alarm" if why in ALARMS else "calm"
         if (why, loss) != self._loss:
             self._channel.send("say", t=time.monotonic(), text=why, loss=loss)

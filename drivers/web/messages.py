@@ -41,7 +41,7 @@ CLOCK_AHEAD = "The page's clock runs ahead"
 MESSAGES_LATE = "The page's messages came late"
 PAGE_SILENT = "The page gave no sign of life"
 ALARMS = frozenset((RELEASE_MISSED, CLOCK_AHEAD, MESSAGES_LATE, PAGE_SILENT))
-"""Reasons for losing the pad that nobody intended."""
+"""Reasons for losing the pad that are not intended."""
 _LEFT = {
     "hidden": "the page was hidden",
     "blur": "the page lost the keyboard focus",

@@ -121,7 +121,7 @@ class WebPad(GamepadDriver):
         self._lost_until = -math.inf
         self._tour: GamepadDriver | None = None
         self._stop_count = 0
-        """Stop count when the tour began. A further stop ends the tour, because nobody is there to acknowledge it."""
+        """Stop count when the tour began. A further stop ends the tour, which could not acknowledge it."""
         self._wanted: bool | None = None
         """Whether to start (True) or end the tour in the next poll; None for neither."""
         self._open = False
