@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 
 from hal.drivers.franka.emulator.motion import MotionSample, at_rest
-from hal.drivers.franka.emulator.plant import FLANGE_TO_HAND, IdealPlant, LaggingPlant, Plant, RigidBody
+from hal.drivers.franka.emulator.plant import FLANGE_TO_HAND, IdealPlant, LaggingPlant, Plant, RigidBody, arm_only
 from hal.drivers.franka.emulator.protocol import Generator
-from hal.drivers.franka.emulator.urdf import arm_only
 from hal.drivers.franka.flags import FLAGS, flag_index
 
 from .arm_kit import HOME, URDF, ZERO, Bench

@@ -19,10 +19,9 @@ from .console import CommandConsole, Executor
 from .control import CONTROL_PORT
 from .faults import help_text
 from .journal import Journal
-from .plant import IdealPlant, LaggingPlant, Plant, PyBulletPlant, RigidBody
+from .plant import IdealPlant, LaggingPlant, Plant, PyBulletPlant, RigidBody, arm_only
 from .protocol import PORT, PROTOCOLS
 from .server import ArmServer, Pacing
-from .urdf import arm_only
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

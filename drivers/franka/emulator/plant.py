@@ -1,4 +1,4 @@
-"""The simulated arm behind the emulated controller: rigid-body model and plants.
+"""The simulated arm behind the emulated controller: rigid-body model, plants, and the URDF that a client gets.
 
 Kinematics and dynamics are computed by pinocchio from a URDF. The Panda has the same kinematics as the FR3 and nearly
 its masses, so both emulators use the same URDF.
@@ -6,7 +6,9 @@ its masses, so both emulators use the same URDF.
 
 from __future__ import annotations
 
+import re
 import tempfile
+import xml.etree.ElementTree as ElementTree
 from abc import ABC, abstractmethod
 from math import exp, sqrt
 from pathlib import Path
@@ -17,7 +19,6 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from .motion import DT, Floats, MotionSample
-from .urdf import without_shapes
 
 __all__ = [
     "FLANGE_TO_HAND",
@@ -28,7 +29,9 @@ __all__ = [
     "Pose16",
     "PyBulletPlant",
     "RigidBody",
+    "arm_only",
     "multiply",
+    "without_shapes",
 ]
 
 Pose16 = tuple[float, ...]
@@ -265,3 +268,61 @@ class PyBulletPlant(Plant):
 
     def close(self) -> None:
         self._bullet.disconnect()
+
+
+# URDF.
+
+_PREFIX = re.compile(r"^.*_(?=(link|joint)\d$)")
+
+
+def without_shapes(urdf: str) -> str:
+    """Return a URDF without visual and collision shapes. Raises ValueError if it is not valid XML."""
+    root = _parsed(urdf)
+    for link in root.findall("link"):
+        for name in ("visual", "collision"):
+            for shape in link.findall(name):
+                link.remove(shape)
+    return ElementTree.tostring(root, encoding="unicode")
+
+
+def arm_only(urdf: str) -> str:
+    """Return the part of a URDF that a client gets: base to flange, without the hand and without shapes.
+
+    Prefixes before ``link`` and ``joint`` are removed. The client's library requires seven joints and a frame named
+    exactly ``link8``, and does not check either: with other names it reads beyond its memory when it loads the model.
+
+    Raises:
+        ValueError: Without a link whose name ends in ``link8``.
+    """
+    root = _parsed(without_shapes(urdf))
+    joints = {_end(joint, "child"): joint for joint in root.findall("joint")}
+    link = next((name for name in joints if name.endswith("link8")), None)
+    if link is None:
+        raise ValueError("the URDF has no link whose name ends in 'link8', the flange")
+    kept = {link}
+    while link in joints:
+        link = _end(joints[link], "parent")
+        kept.add(link)
+    for joint in joints.values():
+        if _end(joint, "child") not in kept:
+            root.remove(joint)
+    for element in root.findall("link"):
+        if element.get("name") not in kept:
+            root.remove(element)
+    for element in root.iter():
+        for key in ("name", "link"):
+            if key in element.attrib:
+                element.set(key, _PREFIX.sub("", element.attrib[key]))
+    return ElementTree.tostring(root, encoding="unicode")
+
+
+def _parsed(urdf: str) -> ElementTree.Element:
+    try:
+        return ElementTree.fromstring(urdf)
+    except ElementTree.ParseError as error:
+        raise ValueError(f"the URDF is not valid XML: {error}") from None
+
+
+def _end(joint: ElementTree.Element, which: str) -> str:
+    element = joint.find(which)
+    return "" if element is None else element.get("link", "")
