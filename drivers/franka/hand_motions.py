@@ -33,7 +33,7 @@ __all__ = [
     "EndedCall",
     "GraspCommand",
     "GripperCall",
-    "GripperCommand",
+    "HandCommand",
     "HandAction",
     "HandController",
     "HandState",
@@ -186,7 +186,7 @@ class WidthRange(NamedTuple):
         return None if fits else _not_homed_fault(state.max_width, self.width_max)
 
 
-class GripperCommand(ABC):
+class HandCommand(ABC):
     """One command, until its result."""
 
     def __init__(self, range_: WidthRange) -> None:
@@ -206,7 +206,7 @@ class GripperCommand(ABC):
         """Return whether a running motion serves this command."""
 
 
-class WidthCommand(GripperCommand):
+class WidthCommand(HandCommand):
     """Move the fingers to a width (m), or until they meet an object."""
 
     def __init__(self, range_: WidthRange, width: float, speed: float, force: float) -> None:
@@ -247,7 +247,7 @@ class WidthCommand(GripperCommand):
         return _grasp_call(state, width, self.speed, self.force, 0.0, self.range.width_max)
 
 
-class GraspCommand(GripperCommand):
+class GraspCommand(HandCommand):
     """Close on an object of a certain width and hold it."""
 
     def __init__(
@@ -288,7 +288,7 @@ class GraspCommand(GripperCommand):
         return _same(call, _grasp_call(state, *self.numbers))
 
 
-class HomeCommand(GripperCommand):
+class HomeCommand(HandCommand):
     """Measure how far the fingers open. A held object would fall."""
 
     def next(self, state: HandState, ended: EndedCall | None) -> GripperCall | CommandResult:
@@ -357,7 +357,7 @@ class HandController:
         self.state: HandState | None = None
         self.speed = 0.0
         """Rate of change of the width between the last two states, m/s."""
-        self._command: GripperCommand | None = None
+        self._command: HandCommand | None = None
         self._running: _RunningCall | None = None
         self._ended: EndedCall | None = None
         """Last motion since the newest command was given."""
@@ -396,7 +396,7 @@ class HandController:
         if self._command is not None:
             self._command, self.outcome = None, GripperOutcome.STOPPED
 
-    def _accept(self, command: GripperCommand) -> None:
+    def _accept(self, command: HandCommand) -> None:
         self._command, self._ended = command, None
         self.outcome, self.fault = GripperOutcome.RUNNING, None
 

@@ -1,4 +1,4 @@
-"""A Franka and its hand on a bench: the unmodified drivers and Franka's own libraries, against emulators."""
+"""Benches for a Franka and its hand: the unmodified drivers and Franka's own libraries, against emulators."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from .apart import Apart
 __all__ = ["FR3", "franka_hand"]
 
 _AWAY = 0.3
-"""s for which a robot that is restarted is away."""
+"""Duration of a restart, s."""
 
 
 class FR3:
-    """An emulated robot that serves many checks in turn, each as if it were switched on anew."""
+    """An emulated robot that serves many checks, each as after switching on."""
 
     def __init__(self) -> None:
         pytest.importorskip("pylibfranka", reason="needs pylibfranka: pip install 'robot-hal[franka]'")
@@ -72,7 +72,7 @@ def franka_hand() -> Iterator[GripperBench]:
 
         def restore() -> None:
             time.sleep(_AWAY)
-            fingers.homed = True  # by a person, in Desk: a hand that was off has forgotten it
+            fingers.homed = True  # as done in Desk: a hand that was off is not homed
 
         yield GripperBench(
             driver=bench.hand,

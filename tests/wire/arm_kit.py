@@ -1,4 +1,4 @@
-"""An emulated arm without a network: requests and commands are handed to it, answers and states read off it."""
+"""An emulated arm without a network: tests pass requests and commands, and read answers and states."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ ZERO = (0.0,) * 7
 
 
 class Bench:
-    """An arm, and a client's end of it."""
+    """An arm and its client."""
 
     def __init__(self, version: int = 10, plant: Plant | None = None, library: bytes | None = None) -> None:
         self.version = version
@@ -31,7 +31,7 @@ class Bench:
         self.requests = RequestHandler(self.arm, RobotFiles(b"<robot/>", library))
 
     def ask(self, name: str, payload: bytes = b"") -> int:
-        """Request something; the status of the answer, after the next cycle if need be."""
+        """Send a request; return the status of its answer, after the next cycle if necessary."""
         before = len(self.replies)
         self.requests.handle(name, 7, payload)
         if len(self.replies) == before:
@@ -39,13 +39,13 @@ class Bench:
         return self.replies[before].body[0]
 
     def move(self, generator: Generator = Generator.JOINT_POSITION, external: bool = False) -> int:
-        """Ask for a motion."""
+        """Request a motion."""
         controller = Controller.EXTERNAL if external else Controller.JOINT_IMPEDANCE
         payload = struct.pack("<II6d", controller, generator, *[1.0] * 6)
         return self.ask("Move", payload + (bytes(57) if self.version == 10 else b""))
 
     def idle(self, cycles: int = 1) -> None:
-        """Cycles without a command."""
+        """Run cycles without a command."""
         for _ in range(cycles):
             self.arm.tick(None)
 
@@ -56,12 +56,12 @@ class Bench:
         tau: Sequence[float] = ZERO,
         finished: bool = False,
     ) -> None:
-        """One cycle with a command."""
+        """Run one cycle with a command."""
         position = tuple(q) if q is not None else (nan,) * 7 if finished else tuple(self.arm.sample.q)
         self.arm.tick(CommandPacket(self.arm.message_id, position, tuple(dq), tuple(tau), finished))
 
     def state(self, name: str) -> tuple[float, ...]:
-        """A field of the state packet, after another cycle."""
+        """Return a field of the state packet, after another cycle."""
         packet = bytes(self.arm.tick(None))
         field = STATE[self.version].fields[name]
         values: tuple[float, ...] = struct.unpack_from(f"<{field.values}{field.kind}", packet, field.offset)

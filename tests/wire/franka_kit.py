@@ -34,7 +34,7 @@ END_LIMIT = 5.0
 
 
 def free_host(block: int = 1) -> str:
-    """An address 127.0.block.x none of whose Franka ports is taken; different test processes begin elsewhere."""
+    """Return an address 127.0.block.x with free Franka ports; different test processes start at different ones."""
     for k in range(250):
         host = f"127.0.{block}.{(os.getpid() + k) % 250 + 1}"
         with contextlib.suppress(OSError), contextlib.ExitStack() as stack:
@@ -47,13 +47,13 @@ def free_host(block: int = 1) -> str:
 
 
 class Emulator:
-    """A running emulator. ``options`` are those of its command line; without ``hand`` it serves the arm only."""
+    """A running emulator. ``options`` are those of its command line; without ``hand`` it serves only the arm."""
 
     def __init__(self, *options: str, robot: str = "fr3", host: str | None = None, hand: bool = False) -> None:
-        """Returns when it is ready. Raises RuntimeError, with what it printed, when it does not get ready."""
+        """Start it, and wait until it is ready. Raises RuntimeError, with its output, if it is not in time."""
         self.host = host or free_host()
         self.lines: list[str] = []
-        """What it printed so far."""
+        """Its output so far."""
         self._ready = threading.Event()
         command = [sys.executable, "-m", "hal.drivers.franka.emulator", "--robot", robot, "--host", self.host, *options]
         if not hand:
@@ -69,7 +69,7 @@ class Emulator:
             self.process.wait()
             raise RuntimeError("the emulator did not get ready:\n" + "\n".join(self.lines))
         self.start_time = time.monotonic() - began
-        """s from the start of the process to its "ready"."""
+        """Time from the start of the process to its "ready", s."""
         self.control = EmulatorControl(self.host)
 
     def _read(self) -> None:
@@ -87,12 +87,12 @@ class Emulator:
         self.process.stdin.flush()
 
     def events(self, kind: str | None = None) -> list[dict[str, Any]]:
-        """Its last events, of one kind or of any."""
+        """Return its last events, of one kind or of any."""
         events: list[dict[str, Any]] = self.control.send("log 1000")["events"]
         return [event for event in events if kind in (None, event["kind"])]
 
     def wait_event(self, kind: str, after: int = 0, timeout: float = 10.0) -> dict[str, Any]:
-        """The first event of that kind with a number above ``after``. TimeoutError when there is none in time."""
+        """Return the first event of a kind with a number above ``after``. Raises TimeoutError if there is none."""
         deadline = time.monotonic() + timeout
         while True:
             for event in self.events(kind):
@@ -103,19 +103,19 @@ class Emulator:
             time.sleep(0.005)
 
     def refresh(self) -> None:
-        """As if switched on anew, at home: for tests that share one."""
+        """Reset it to the state after switching on, at home, for tests that share one."""
         self.control.send("restart")
         self.control.send("place")
         self.control.send("reset-stats")
 
     def end(self, number: int = signal.SIGTERM) -> int:
-        """Send it this signal; its exit status."""
+        """Send it a signal, and return its exit status."""
         with contextlib.suppress(ProcessLookupError):
             self.process.send_signal(number)
         return self.process.wait(END_LIMIT)
 
     def close(self) -> None:
-        """End it, whatever state it is in."""
+        """End it in any state."""
         self.control.close()
         if self.process.poll() is None:
             self.process.terminate()
@@ -138,11 +138,11 @@ class Emulator:
 
 
 def run_client(script: Path, scenario: str, host: str, timeout: float = 30.0, **arguments: object) -> dict[str, Any]:
-    """Run one scenario of a client script in a process of its own, and give what it reports.
+    """Run one scenario of a client script in a process of its own, and return its report.
 
-    The vendor's libraries block without letting other Python threads run, and change the scheduling of the thread that
-    constructs a robot; so they are kept out of the tests' process. Raises subprocess.TimeoutExpired when it hangs, and
-    RuntimeError with what it printed when it fails.
+    The vendor's libraries block all Python threads, and change the scheduling of the thread that constructs a robot,
+    so they stay out of the tests' process. Raises subprocess.TimeoutExpired if the script hangs, and RuntimeError with
+    its output if it fails.
     """
     command = [sys.executable, str(script), scenario, host, json.dumps(arguments)]
     done = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=timeout)
@@ -154,7 +154,7 @@ def run_client(script: Path, scenario: str, host: str, timeout: float = 30.0, **
 
 @contextlib.contextmanager
 def shared(*options: str, robot: str) -> Iterator[Emulator]:
-    """An emulator for a module; fails when it did not live to its end."""
+    """An emulator for a module; fails if it ended before the module."""
     with Emulator(*options, robot=robot) as emulator:
         yield emulator
         assert emulator.process.poll() is None, "\n".join(emulator.lines)

@@ -1,4 +1,4 @@
-"""A whole rig whose arm is an emulated Franka: the same that a user opens, without cameras and pads."""
+"""A whole rig with an emulated Franka, as a user opens it, without cameras and pads."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ __all__ = ["Drive", "arm_of", "rig_of", "settled", "wait_until"]
 
 
 def rig_of(host: str, robot: str = "fr3", *more: str, lock_step: bool = False, sim: bool = False) -> Rig:
-    """The rehearsal's rig without cameras and, unless ``more`` says otherwise, without its hand."""
+    """Open the emulator's rig without cameras and, unless ``more`` enables it, without its hand."""
     model = "panda" if robot == "panda" else "fr3"
     overrides = [f"robots.arm.model={model}", "cameras={}", f"robots.arm.real.host={host}"]
     overrides += [] if sim else ["robots.arm.gripper.enabled=false"]
@@ -25,12 +25,12 @@ def rig_of(host: str, robot: str = "fr3", *more: str, lock_step: bool = False, s
 
 
 def arm_of(rig: Rig) -> Robot:
-    """Its arm."""
+    """Return its arm."""
     return rig.robots["arm"]
 
 
 def wait_until(condition: Callable[[], bool], what: str, timeout: float = 10.0) -> float:
-    """Poll until it holds; s that it took. TimeoutError, which names it, when it does not in time."""
+    """Poll until a condition holds, and return the time it took, s. Raises TimeoutError with ``what``."""
     began = time.monotonic()
     while not condition():
         if time.monotonic() - began > timeout:
@@ -41,17 +41,17 @@ def wait_until(condition: Callable[[], bool], what: str, timeout: float = 10.0) 
 
 @dataclass
 class Drive:
-    """An arm in motion: twists to and fro at 50 Hz, and the first error that the app got."""
+    """An arm in motion: alternating twists at 50 Hz, and the first error that the app got."""
 
     arm: Robot
     error: Exception | None = None
     t_error: float = 0.0
-    """When, on the monotonic clock, s."""
+    """Time of the error on the monotonic clock, s."""
     t_stale: float = 0.0
-    """When its state was first found to be too old, s; 0 for never."""
+    """Time of the first StaleStateError, s; 0 for none."""
 
     def go(self, rig: Rig, seconds: float, until: Callable[[], bool] = lambda: False) -> None:
-        """Send for so long, or until something, or until the first error."""
+        """Send for ``seconds``, or until a condition, or until the first error."""
         with contextlib.suppress(hal.HalError), self.arm.control(rate_hz=50, unattended=True) as control:
             start = rig.clock.now()
             for tick in rig.clock.rate(50):
@@ -69,7 +69,7 @@ class Drive:
 
 
 def settled(arm: Robot) -> RobotState:
-    """Its state once nothing is going on."""
+    """Return its state once it is idle, in fault or lost."""
     wait_until(
         lambda: arm.state(max_age=5.0).status in (RobotStatus.IDLE, RobotStatus.FAULT, RobotStatus.LOST), "settled"
     )
