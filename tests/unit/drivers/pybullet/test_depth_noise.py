@@ -75,7 +75,7 @@ def test_a_smaller_picture_has_the_errors_of_the_captured_one() -> None:
 
 
 @pytest.mark.parametrize("patch", [1.0, 4.0, 9.0])
-def test_neighbours_err_alike_over_a_patch(patch: float) -> None:
+def test_errors_are_correlated_over_a_patch(patch: float) -> None:
     spec = camera(noise={"patch": patch, "step": 0})
     found = errors(spec, 2.0, 8)
     assert found.std() == pytest.approx(0.08 * 4 / FB, rel=0.08), "whatever the patch"
@@ -157,7 +157,7 @@ def test_outside_the_range_there_is_nothing() -> None:
     assert measured.max() <= spec.depth_max
 
 
-def test_chance_is_that_of_the_seed_the_frame_and_the_camera() -> None:
+def test_noise_depends_on_seed_frame_and_camera() -> None:
     spec = camera()
 
     def picture(spec: CameraSpec, number: int) -> bytes:
@@ -170,7 +170,7 @@ def test_chance_is_that_of_the_seed_the_frame_and_the_camera() -> None:
     assert len(set(others)) == 3
 
 
-def test_a_lidars_grows_with_the_distance_alone() -> None:
+def test_lidar_noise_grows_with_the_distance() -> None:
     spec = camera("realsense_l515")
     noise = made(spec)
     for z, sigma in ((1.0, 0.0025), (5.0, 0.009), (8.0, 0.0025 + 7 * 0.013 / 8)):
@@ -184,7 +184,7 @@ def test_a_lidars_grows_with_the_distance_alone() -> None:
     assert np.allclose(seen / 0.00025, np.rint(seen / 0.00025), atol=0.02)
 
 
-def test_off_unless_asked_for() -> None:
+def test_no_noise_by_default() -> None:
     for spec in (camera(noise=False), camera(simulated={}), camera(streams=["color"], align="color")):
         assert depth_noise(spec) is None
     with pytest.raises(ConfigError, match="subpixl"):

@@ -107,7 +107,7 @@ def test_a_broken_cache_file_is_made_again(cube: Path, tmp_path: Path, damage: s
     assert again.calls == 0
 
 
-def test_a_cache_that_cannot_be_written_is_only_slower(cube: Path, tmp_path: Path) -> None:
+def test_cache_that_cannot_be_written_is_ignored(cube: Path, tmp_path: Path) -> None:
     obstacle = tmp_path / "obstacle"
     obstacle.write_text("a file where the folder should be")
     counted = Counted()
@@ -117,7 +117,7 @@ def test_a_cache_that_cannot_be_written_is_only_slower(cube: Path, tmp_path: Pat
     assert counted.calls == 1
 
 
-def test_the_cache_is_where_the_user_says(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_cache_folder_follows_the_environment(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     assert cache_folder() == tmp_path / "robot-hal" / "meshes"
     monkeypatch.delenv("XDG_CACHE_HOME")
@@ -125,7 +125,7 @@ def test_the_cache_is_where_the_user_says(monkeypatch: pytest.MonkeyPatch, tmp_p
     assert cache_folder() == tmp_path / ".cache" / "robot-hal" / "meshes"
 
 
-def test_what_cannot_be_parsed_is_left_out_with_a_warning(tmp_path: Path) -> None:
+def test_broken_files_are_left_out_with_a_warning(tmp_path: Path) -> None:
     broken = tmp_path / "broken.obj"
     broken.write_text("this is no mesh")
     with pytest.warns(UserWarning, match="broken.obj"):

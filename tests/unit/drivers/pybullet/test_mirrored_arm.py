@@ -42,13 +42,13 @@ def run(world: PyBulletWorld, seconds: float) -> None:
         world.step()
 
 
-def test_it_is_a_robot_and_stands_where_the_rig_says_until_it_is_told_more(world: PyBulletWorld) -> None:
+def test_stays_at_its_start_until_the_first_state(world: PyBulletWorld) -> None:
     assert world.describe("arm")["robot"]
     run(world, 1.0)
     assert joints(world) == pytest.approx(PANDA_HOME, abs=1e-4)
 
 
-def test_it_is_at_once_where_the_arm_is_and_its_links_with_it(world: PyBulletWorld) -> None:
+def test_takes_the_state_of_the_arm_at_once(world: PyBulletWorld) -> None:
     q = [0.3, -0.2, 0.4, -1.5, 0.2, 1.2, -0.6]
     world.follow("arm", q, REST, 0.03)
     assert joints(world) == pytest.approx(q)
@@ -57,7 +57,7 @@ def test_it_is_at_once_where_the_arm_is_and_its_links_with_it(world: PyBulletWor
     assert world.pose("arm", "panda_hand")["position"] == pytest.approx(hand.position, abs=1e-5)
 
 
-def test_it_neither_sags_nor_lags(world: PyBulletWorld) -> None:
+def test_neither_sags_nor_lags(world: PyBulletWorld) -> None:
     """After a step it is where the arm will be then."""
     q, dq = list(PANDA_HOME), [0.0] * 7
     for k in range(480):
@@ -70,7 +70,7 @@ def test_it_neither_sags_nor_lags(world: PyBulletWorld) -> None:
 
 
 @pytest.mark.parametrize("dq", [0.0, 1.0])
-def test_when_nobody_says_where_the_arm_is_it_stays(world: PyBulletWorld, dq: float) -> None:
+def test_without_new_states_it_stays(world: PyBulletWorld, dq: float) -> None:
     world.follow("arm", PANDA_HOME, [dq] * 7, 0.04)
     world.step()
     stopped = joints(world)
@@ -79,7 +79,7 @@ def test_when_nobody_says_where_the_arm_is_it_stays(world: PyBulletWorld, dq: fl
     assert joints(world) == pytest.approx(stopped, abs=1e-4)
 
 
-def test_it_pushes_what_it_meets_and_is_not_held_up() -> None:
+def test_pushes_objects_and_is_not_stopped_by_them() -> None:
     """A cube of 50 kg in the way of the forearm, which swings about the first joint."""
     world = copied(floor(), box("block", (0.33, 0.35, 0.3), (0.1, 0.1, 0.3), mass=50.0))
     q = [0.0, 0.6, 0.0, -2.2, 0.0, 2.0, 0.785]
@@ -94,7 +94,7 @@ def test_it_pushes_what_it_meets_and_is_not_held_up() -> None:
     world.close()
 
 
-def test_its_fingers_hold_a_thing_that_only_the_simulation_has() -> None:
+def test_fingers_hold_a_simulated_object() -> None:
     """The real fingers close on nothing; the copy's close as far as the cube, and carry it."""
     kinematics = Kinematics(panda().kinematics)
     here = tuple(kinematics.fk(PANDA_HOME)[:3])
@@ -116,7 +116,7 @@ def test_its_fingers_hold_a_thing_that_only_the_simulation_has() -> None:
     world.close()
 
 
-def test_a_width_that_nobody_knows_leaves_the_fingers_alone(world: PyBulletWorld) -> None:
+def test_unknown_width_leaves_the_fingers_alone(world: PyBulletWorld) -> None:
     world.follow("arm", PANDA_HOME, REST, 0.02)
     run(world, 0.1)
     world.follow("arm", PANDA_HOME, REST, None)
@@ -124,7 +124,7 @@ def test_a_width_that_nobody_knows_leaves_the_fingers_alone(world: PyBulletWorld
     assert joints(world, FINGERS) == pytest.approx(0.01, abs=1e-4)
 
 
-def test_a_reset_leaves_it_where_the_real_arm_is(world: PyBulletWorld) -> None:
+def test_reset_leaves_it_at_the_real_arm(world: PyBulletWorld) -> None:
     q = [0.5, *PANDA_HOME[1:]]
     world.follow("arm", q, REST, 0.04)
     world.reset()
@@ -137,7 +137,7 @@ def test_a_reset_leaves_it_where_the_real_arm_is(world: PyBulletWorld) -> None:
     assert caught.value.code == "is_robot"
 
 
-def test_a_mirror_shows_it() -> None:
+def test_mirror_world_shows_it() -> None:
     world = copied(floor())
     mirror = PyBulletWorld(world.spec, mirror=True)
     world.follow("arm", [0.5, *PANDA_HOME[1:]], REST, 0.01)
@@ -163,9 +163,7 @@ def test_a_mirror_shows_it() -> None:
         (None, REST, 0.04),
     ],
 )
-def test_impossible_numbers_are_refused_and_it_stays(
-    world: PyBulletWorld, q: list[float], dq: list[float], width: float
-) -> None:
+def test_impossible_states_are_refused(world: PyBulletWorld, q: list[float], dq: list[float], width: float) -> None:
     with pytest.raises(CommandError):
         world.follow("arm", q, dq, width)
     world.step()
@@ -173,7 +171,7 @@ def test_impossible_numbers_are_refused_and_it_stays(
     assert joints(world, FINGERS) == pytest.approx(0.04, abs=1e-4)
 
 
-def test_only_a_copy_can_be_told(world: PyBulletWorld) -> None:
+def test_only_a_mirrored_arm_takes_states(world: PyBulletWorld) -> None:
     with pytest.raises(DeviceNotFound) as caught:
         world.follow("arn", PANDA_HOME, REST, None)
     assert caught.value.code == "unknown_body"

@@ -56,7 +56,7 @@ def bend(scene: PyBulletWorld, steps: int = 60) -> None:
         scene.step()
 
 
-def test_it_follows_the_link_from_the_start_and_through_every_step(scene: PyBulletWorld, spec: WorldSpec) -> None:
+def test_follows_its_link_through_steps_and_resets(scene: PyBulletWorld, spec: WorldSpec) -> None:
     assert max(off(scene)) < 1e-6
     start = pose_of(scene, "board")
     bend(scene)
@@ -69,7 +69,7 @@ def test_it_follows_the_link_from_the_start_and_through_every_step(scene: PyBull
     assert pose_of(scene, "board").distance(start)[0] < 1e-6
 
 
-def test_it_weighs_nothing_and_touches_nothing(spec: WorldSpec) -> None:
+def test_has_no_weight_and_no_contacts(spec: WorldSpec) -> None:
     def fall(bodies: tuple[BodySpec, ...]) -> np.ndarray:
         scene = PyBulletWorld(WorldSpec(spec.driver, spec.physics_hz, spec.gravity, bodies, spec.robots))
         try:
@@ -83,7 +83,7 @@ def test_it_weighs_nothing_and_touches_nothing(spec: WorldSpec) -> None:
     assert np.array_equal(fall((obstacle,)), fall((held(), obstacle)))
 
 
-def test_mirrors_show_it_where_it_is(scene: PyBulletWorld, spec: WorldSpec) -> None:
+def test_mirror_world_shows_it(scene: PyBulletWorld, spec: WorldSpec) -> None:
     mirror = PyBulletWorld(from_json(WorldSpec, to_json(spec)), mirror=True)
     try:
         bend(scene)
@@ -94,7 +94,7 @@ def test_mirrors_show_it_where_it_is(scene: PyBulletWorld, spec: WorldSpec) -> N
         mirror.close()
 
 
-def test_it_comes_and_goes_and_nobody_puts_it_elsewhere(scene: PyBulletWorld) -> None:
+def test_is_added_and_removed_but_not_placed(scene: PyBulletWorld) -> None:
     scene.add(held("second", link="panda_link7"))
     scene.step()
     expected = pose_of(scene, "panda", "panda_link7") @ IN_HAND
@@ -116,7 +116,7 @@ def test_it_comes_and_goes_and_nobody_puts_it_elsewhere(scene: PyBulletWorld) ->
         ({"robot": "board"}, "no arm 'board'"),
     ],
 )
-def test_an_arm_or_link_that_is_not_there_is_told_and_nothing_changes(
+def test_missing_arm_or_link_is_refused_and_changes_nothing(
     scene: PyBulletWorld, wrong: dict[str, str], text: str
 ) -> None:
     with pytest.raises(ConfigError, match=text):
@@ -129,7 +129,7 @@ def test_an_arm_or_link_that_is_not_there_is_told_and_nothing_changes(
 HELD = "{file: charuco_board, attached: {robot: panda, link: panda_hand, pose: [0.03, 0, 0.19, 0.5, 0.5, 0.5, 0.5]}}"
 
 
-def test_a_rig_may_say_so(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_rig_file_attaches_an_object(monkeypatch: pytest.MonkeyPatch) -> None:
     rig = {"cameras": {}, "objects": f"[{HELD}]"}
     overrides = [f"{key}={value}" for key, value in rig.items()]
     with hal.open("panda_table", sim=True, clock="lock_step", pad="none", overrides=overrides) as opened:
@@ -148,7 +148,7 @@ def test_a_rig_may_say_so(monkeypatch: pytest.MonkeyPatch) -> None:
         ("{name: p, shape: plane, attached: {robot: panda, link: panda_hand}}", "nobody can carry it"),
     ],
 )
-def test_a_rig_that_says_it_wrongly_is_told(entry: str, text: str) -> None:
+def test_wrong_attachment_in_a_rig_is_refused(entry: str, text: str) -> None:
     with pytest.raises(ConfigError, match=text):
         load("panda_table", sim=True, overrides=[f"objects=[{entry}]"])
 
@@ -156,7 +156,7 @@ def test_a_rig_that_says_it_wrongly_is_told(entry: str, text: str) -> None:
 P = "[0.1, 0.2, 0.3, 0, 0, 0.6, 0.8]"
 
 
-def test_a_camera_may_be_attached_by_its_pose() -> None:
+def test_camera_is_attached_by_its_pose() -> None:
     place = f"cameras.wrist.attached={{robot: panda, link: hand, pose: {P}}}"
     plan = load("panda_table", sim=True, overrides=[place]).resolve()
     view = next(camera.view for camera in plan.cameras if camera.name == "wrist")
@@ -173,7 +173,7 @@ def test_a_camera_may_be_attached_by_its_pose() -> None:
         ("translation: [0, 0, 1]", "cannot stand beside translation"),
     ],
 )
-def test_and_then_by_nothing_else(more: str, text: str) -> None:
+def test_camera_with_two_places_is_refused(more: str, text: str) -> None:
     place = f"cameras.wrist.attached={{robot: panda, link: hand, pose: {P}, {more}}}"
     with pytest.raises(ConfigError, match=text):
         load("panda_table", sim=True, overrides=[place])

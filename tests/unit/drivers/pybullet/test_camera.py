@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+import os
+import signal
+import time
 from collections.abc import Iterator
 
 import numpy as np
 import pytest
 from pictures_kit import box, camera, look_at, renderer, world
-from specs import panda
+from specs import data, panda, world_spec
 
+from hal.camera import RawFrame
 from hal.drivers.pybullet.camera import (
     DirectSource,
     PyBulletCamera,
+    PyBulletPictures,
     RenderWorker,
     SharedSource,
     TinyRenderer,
@@ -22,9 +27,10 @@ from hal.drivers.pybullet.mirror import WorldMirror
 from hal.drivers.pybullet.renderer import create_context
 from hal.drivers.pybullet.world import PyBulletWorld
 from hal.errors import ConfigError, ConnectionLost, DriverMissing, NotSupported
+from hal.host.hosts import RemoteHost
 from hal.host.memory import SeriesBox
 from hal.host.ring import frame_rings, frame_rings_size
-from hal.specs import BodySpec, ViewSpec, to_json
+from hal.specs import BodySpec, GroupSpec, ViewSpec, to_json
 
 STILL = (0.0, 0.0, 0.0, 1.0)
 ABOVE = look_at((0.0, 0.0, 1.2), (0.0, 0.0, 0.0), (1.0, 0.0, 0.0))
@@ -45,7 +51,7 @@ def direct(scene: PyBulletWorld, spec: object) -> PyBulletCamera:
 class TestDirect:
     """Lock-step."""
 
-    def test_draws_the_present_state_and_stamps_it(self) -> None:
+    def test_frame_shows_and_stamps_the_present_state(self) -> None:
         scene = world(ball("ball", 0.0))
         driver = direct(scene, camera(view=FROM_ABOVE))
         first = driver.grab(0.0)
@@ -86,7 +92,7 @@ class TestDirect:
         assert abs(np.dot(after.T_world_camera.orientation, expected[1])) == pytest.approx(1.0)
         scene.close()
 
-    def test_a_camera_needs_a_place(self) -> None:
+    def test_camera_without_a_place_is_refused(self) -> None:
         scene = world(robots=(panda(),))
         draws = TinyRenderer(scene)
         with pytest.raises(ConfigError):
@@ -96,7 +102,7 @@ class TestDirect:
             DirectSource(scene, draws, camera(view=nowhere), lambda: 0.0)
         scene.close()
 
-    def test_without_a_world_it_says_so(self) -> None:
+    def test_camera_without_a_world_is_refused(self) -> None:
         with pytest.raises(NotSupported) as caught:
             PyBulletCamera(camera()).open()
         assert caught.value.code == "world_missing"
@@ -139,7 +145,7 @@ def bench() -> Iterator[Bench]:
 class TestWorker:
     """Real time."""
 
-    def test_shows_what_was_published(self, bench: Bench) -> None:
+    def test_worker_draws_published_snapshots(self, bench: Bench) -> None:
         bench.worker.warm_up()
         bench.worker.run_once()
         assert bench.source.grab(0.0) is None  # nothing was published yet
@@ -162,7 +168,7 @@ class TestWorker:
         rows = [np.flatnonzero((image == 1).any(axis=1)).mean() for image in (first.segmentation, second.segmentation)]
         assert rows[0] - rows[1] > 5  # +x is up in this picture
 
-    def test_an_edit_is_done_before_its_snapshot_is_shown(self, bench: Bench) -> None:
+    def test_edit_is_made_before_its_snapshot_is_shown(self, bench: Bench) -> None:
         bench.publish()
         bench.worker.run_once()
         assert bench.source.grab(0.0) is not None
@@ -200,7 +206,7 @@ class TestWorker:
         assert 1 not in np.unique(frame.segmentation)
         assert 0 in np.unique(frame.segmentation)
 
-    def test_a_source_says_when_its_process_is_gone(self, bench: Bench) -> None:
+    def test_source_reports_the_end_of_its_process(self, bench: Bench) -> None:
         def gone() -> None:
             raise ConnectionLost("the renderer process ended")
 
@@ -216,7 +222,7 @@ class TestChoice:
     def no_gl(self) -> object:
         raise DriverMissing("no EGL; apt install libegl1 libgl1-mesa-dri")
 
-    def test_without_gl_pybullet_draws_and_says_why(self, monkeypatch: pytest.MonkeyPatch) -> None:
+    def test_without_gl_the_tiny_renderer_draws_and_gives_the_reason(self, monkeypatch: pytest.MonkeyPatch) -> None:
         scene = world(box("wall", (1.0, 1.0, 0.1), (0.0, 0.0, 1.0)))
         monkeypatch.setattr("hal.drivers.pybullet.renderer.create_context", self.no_gl)
         chosen = choose_renderer(scene)
@@ -232,7 +238,7 @@ class TestChoice:
             choose_renderer(scene, "opengl")
         scene.close()
 
-    def test_a_missing_library_names_its_command(self, monkeypatch: pytest.MonkeyPatch) -> None:
+    def test_missing_moderngl_is_a_missing_driver(self, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setitem(__import__("sys").modules, "moderngl", None)
         with pytest.raises(DriverMissing):
             create_context()
@@ -268,3 +274,52 @@ def test_gl_draws_from_any_thread() -> None:
     assert all(np.array_equal(found[0].depth, images.depth) for images in found)
     draws.close()
     scene.close()
+
+
+def newest(driver: PyBulletCamera, after: float) -> RawFrame:
+    """A frame that shows the world later than ``after``."""
+    deadline = time.monotonic() + 20.0
+    while time.monotonic() < deadline:
+        frame = driver.grab(0.5)
+        if frame is not None and frame.t > after:
+            return frame
+    raise AssertionError("no frame came")
+
+
+def test_renderer_process_draws_follows_edits_and_reports_its_end() -> None:
+    data("plane.urdf")  # skips where PyBullet is not installed
+    spec = world_spec(box("floor", (2.0, 2.0, 0.05), (0.0, 0.0, -0.05)), box("block", (0.1, 0.1, 0.1), (0.0, 0.0, 0.1)))
+    cameras = [camera(64, 48, name=name, view=FROM_ABOVE) for name in ("one", "two")]
+    host = RemoteHost(GroupSpec("world", "real_time", 240.0, (), spec))
+    pictures = PyBulletPictures(host, cameras, "tiny")
+    try:
+        pictures.wait_ready()
+        host.wait_ready()
+        assert "TinyRenderer" in pictures.describe()
+        assert "one" in pictures
+        drivers = [PyBulletCamera(camera, pictures.source(camera.name)) for camera in cameras]
+        start = time.monotonic()
+        for driver in drivers:
+            driver.open()
+            frame = newest(driver, start - 1.0)
+            assert frame.t <= time.monotonic()
+            assert frame.color is not None
+            assert 1 in np.unique(frame.segmentation)
+            again = newest(driver, frame.t)
+            assert again.seq > frame.seq
+
+        paint = {"name": "block", "rgba": [0.0, 0.0, 1.0, 1.0]}
+        pictures.edited("set_color", paint, host.request("world.set_color", paint))
+        blue = newest(drivers[0], time.monotonic())
+        assert blue.color is not None
+        red, _, strong = blue.color[blue.segmentation == 1].mean(axis=0)
+        assert strong > red + 50
+
+        assert pictures._child is not None
+        os.kill(pictures._child.process.pid, signal.SIGKILL)
+        with pytest.raises(ConnectionLost):
+            newest(drivers[0], time.monotonic())
+    finally:
+        pictures.close()
+        pictures.close()
+        host.close()

@@ -82,7 +82,7 @@ class TestStepping:
         assert np.abs(one[-1] - one[0]).max() > 0.01  # something fell
         assert np.array_equal(one, other)
 
-    def test_without_its_visual_meshes_a_world_moves_alike_bit_for_bit(self) -> None:
+    def test_world_without_visual_meshes_moves_identically(self) -> None:
         things = world_spec(floor(), cube((0.0, 0.0, 0.5)), mug(), panda())
         drawn, plain = PyBulletWorld(things), PyBulletWorld(things, drawn=False)
         names = {
@@ -99,7 +99,7 @@ class TestStepping:
         assert plain.revision == drawn.revision
         assert plain.aabb("mug") == drawn.aabb("mug")
 
-    def test_a_body_falls_as_galileo_says(self) -> None:
+    def test_free_fall(self) -> None:
         world = PyBulletWorld(world_spec(cube((0.0, 0.0, 10.0))))
         world.set_dynamics("cube", linear_damping=0.0)
         run(world, 240)
@@ -173,14 +173,14 @@ class TestBodies:
         run(world, 480)
         assert pose(world, "it").position[2] == pytest.approx(half[2], abs=0.005)
 
-    def test_without_mass_or_fixed_it_stays_in_the_air(self) -> None:
+    def test_massless_or_fixed_body_does_not_fall(self) -> None:
         world = PyBulletWorld(world_spec(box("wall", (0, 0, 1), (0.1, 0.1, 0.1)), mug(fixed=True), cube()))
         before = [pose(world, name) for name in ("wall", "mug", "cube")]
         run(world, 100)
         after = [pose(world, name) for name in ("wall", "mug", "cube")]
         assert [a == b for a, b in zip(before, after, strict=True)] == [True, True, False]
 
-    def test_without_collision_it_falls_through(self) -> None:
+    def test_body_without_collision_falls_through_the_floor(self) -> None:
         world = PyBulletWorld(
             world_spec(floor(), box("ghost", (0, 0, 0.2), (0.1, 0.1, 0.1), mass=1.0, collision=False))
         )
@@ -407,7 +407,7 @@ class TestDynamics:
             {"contact_stiffness": 100.0},
         ],
     )
-    def test_what_cannot_be_is_refused_and_changes_nothing(
+    def test_impossible_dynamics_are_refused_and_change_nothing(
         self, lasting: PyBulletWorld, values: dict[str, object]
     ) -> None:
         world = lasting
@@ -532,7 +532,7 @@ class TestBadInput:
         for expected in ("nowhere.urdf", "not a URDF", "radius", "dodecahedron", "unique", "panda_jiont7"):
             assert sum(expected in line for line in said) >= 1, expected
 
-    def test_arms_that_start_inside_each_other_are_refused_by_name(self) -> None:
+    def test_overlapping_arms_are_refused(self) -> None:
         apart = panda("right", base_position=(0.0, 0.4, 0.0))
         PyBulletWorld(world_spec(panda("left"), apart)).close()
         for right in (panda("right"), replace(apart, initial=(-1.57, *PANDA_HOME[1:]))):
