@@ -19,10 +19,13 @@ __all__ = ["MODULES", "NAMES", "RENAMED", "install", "names_of"]
 
 MODULES: Mapping[str, str] = MappingProxyType(
     {
+        "hal.calibration.recording": "hal.calibration.collecting",
+        "hal.calibration.setting": "hal.calibration.setup",
         "hal.camera_driver": "hal.driver",
         "hal.camera_info": "hal.driver",
         "hal.config.urdf": "hal.kinematics.urdf",
         "hal.console": "hal.views",
+        "hal.cropping": "hal.images",
         "hal.gripper_motion": "hal.gripper",
         "hal.gym": "hal.learning.gym",
         "hal.ik": "hal.kinematics.ik",
@@ -44,7 +47,13 @@ NAMES: Mapping[str, Mapping[str, str]] = MappingProxyType(
 )
 """Module -> names that it had in 0.1.0 -> the module that has them now."""
 
-RENAMED: Mapping[str, Mapping[str, str]] = MappingProxyType({"hal.learning.episode": {"put_back": "reset_scene"}})
+RENAMED: Mapping[str, Mapping[str, str]] = MappingProxyType(
+    {
+        "hal.calibration.collecting": {"drive": "collect_views", "take_and_tell": "add_view"},
+        "hal.calibration.setup": {"guess_of": "initial_guess", "setting_of": "find_setup"},
+        "hal.learning.episode": {"put_back": "reset_scene"},
+    }
+)
 """Module -> names of 0.1.0 -> their new names."""
 
 

@@ -192,7 +192,7 @@ def import_arm(item: ArkItem, work: ImportState) -> ArkArm:
     elif urdf is not None:
         made = arm_model(given, node, urdf, merged, reading, ledger)
         arm = ArkArm(name, given, None, urdf, merged, made=made)
-        arm.entry["model"] = Commented(made, "made from the URDF: look at what it says about limits")
+        arm.entry["model"] = Commented(made, "made from the URDF: check its limits")
         ledger.changed(path, f"{key}.model", "a model made from it, in a file beside the rig")
     else:
         raise reading.wrong(
@@ -240,7 +240,7 @@ def _model(
         model, there = options.arms[given], list_data("robots")
         if model not in there:
             raise reading.wrong(node, f"--arm {given}={model}: there is no such model{nearest(model, there)}")
-        return model, "as --arm says"
+        return model, "from --arm"
     joints = set(urdf.model.joints) if urdf is not None else set()
     groups = node.get("joint_groups")
     for group in groups.children.values() if groups is not None else ():
@@ -251,7 +251,7 @@ def _model(
         return franka, "its joints have that arm's names"
     path = node.get("urdf_path")
     if urdf is None and not joints and path is not None and "panda" in str(path.data).rpartition("/")[2].lower():
-        return "panda", "the name of Ark's URDF says so"
+        return "panda", "by the name of Ark's URDF"
     return None, ""
 
 
@@ -269,7 +269,7 @@ def _checks(node: ArkNode, reading: ArkReader, ledger: KeyReport) -> None:
     ledger.ignored(node.children.get("merge_fixed_links"), "links keep their names")
     ledger.ignored(
         node.children.get("frequency"),
-        "a simulated arm is driven at simulation.physics_hz; control(rate_hz=) says how often a program commands",
+        "a simulated arm is driven at simulation.physics_hz; control(rate_hz=) sets the rate of commands",
     )
 
 

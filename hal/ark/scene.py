@@ -245,7 +245,7 @@ def import_simulator(root: ArkNode, reading: ArkReader, ledger: KeyReport) -> di
 def _backend(node: ArkNode, ledger: KeyReport) -> None:
     backend = node.get("backend_type")
     if backend is not None and backend.data == "pybullet":
-        ledger.kept(backend, "", "PyBullet, as every model's drivers.sim says")
+        ledger.kept(backend, "", "PyBullet, from the drivers.sim of every model")
     else:
         ledger.changed(backend, "", "PyBullet simulates here")
 
@@ -482,11 +482,11 @@ def import_camera(item: ArkItem, work: ImportState, arms: Mapping[str, ArkArm], 
     if word == "fixed":
         ledger.kept(kind, f"{camera.key}.look_at")
         camera.fixed(reading.keys(reading.need(sim, "fix")))
-        ledger.ignored(attach, "camera_type says that the camera is fixed")
+        ledger.ignored(attach, "camera_type is fixed")
     elif word == "attached":
         ledger.kept(kind, f"{camera.key}.attached")
         camera.attached(reading.keys(reading.need(sim, "attach")), arms, all_arms, work.given["objects"])
-        ledger.ignored(fix, "camera_type says that the camera is attached")
+        ledger.ignored(fix, "camera_type is attached")
     else:
         raise reading.wrong(kind or node, f"must be fixed or attached, not {word!r}")
     return camera.entry

@@ -55,7 +55,7 @@ def test_frankas_are_known_by_their_joints(tmp_path: Path, keys: dict[str, Any],
 def test_a_person_may_say_which_arm_it_is(tmp_path: Path) -> None:
     data, result = imported(tmp_path, ArkOptions(arms={"arm": "fr3"}), robots={"arm": PANDA})
     assert data["robots"]["arm"]["model"] == "fr3"
-    assert "as --arm says" in row(result, "robots.0.config.urdf_path")[1]
+    assert "from --arm" in row(result, "robots.0.config.urdf_path")[1]
     with pytest.raises(hal.ConfigError, match="--arm arm=fr4: there is no such model; did you mean 'fr3'"):
         imported(tmp_path, ArkOptions(arms={"arm": "fr4"}), robots={"arm": PANDA})
 
