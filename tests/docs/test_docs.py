@@ -78,7 +78,7 @@ def test_the_numbers_of_the_safety_rules_are_those_of_the_code() -> None:
         assert value == pytest.approx(told), f"{module}.py {name} is {value}, the document says {number} {unit}"
 
 
-@pytest.mark.parametrize("document", ["safety.md", "console.md"])
+@pytest.mark.parametrize("document", ["safety.md", "measured.md", "console.md"])
 def test_the_tests_that_a_document_names_are_there(document: str) -> None:
     text = (ROOT / "docs" / document).read_text(encoding="utf-8")
     for path in set(re.findall(r"`((?:hal|tests|drivers|benchmarks|config|apps)/[\w/]+\.\w+)`", text)):
