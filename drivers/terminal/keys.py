@@ -208,7 +208,7 @@ _TRIES = 3
 
 
 class LinkCheck:
-    """Repeated questions that the terminal must answer: is it still there, and does it still report releases?
+    """Repeated questions to the terminal, whose answers prove that it is there and still reports key releases.
 
     Each question has a number that is part of its answer (it queries a private mode that no terminal has). So the age
     of the newest *question* that was answered bounds the age of all that is known of the keys, and a late answer to an
