@@ -15,10 +15,10 @@ from hal.driver import CameraDriver, CameraInfo, CameraTally, RawFrame, StreamIn
 from hal.errors import ConnectionLost, DeviceNotFound
 from hal.geometry import Pose, frozen
 from hal.host.process import Child, SharedMemory, unpack_error
+from hal.host.ring import FrameRing
 from hal.specs import CameraSpec, to_json
 
 from .options import RealSenseSettings
-from .ring import PictureRing
 
 __all__ = ["RealSenseCamera"]
 
@@ -235,7 +235,7 @@ class RealSenseCamera(CameraDriver):
             self._lost = True
             self._drop(link)
             text = f"the camera's process has been silent for {link.silence:.1f} s: the library hangs in it"
-            raise ConnectionLost(text, code="process_hangs")
+            raise ConnectionLost(text, code="process_silent")
         return None
 
     def inject(self, **knobs: object) -> None:
@@ -281,19 +281,20 @@ class CameraLink:
     """
 
     def __init__(self, spec: CameraSpec) -> None:
-        self._memory = SharedMemory(PictureRing.size(spec))
-        self._ring = PictureRing(self._memory.buffer, spec)
+        self._memory = SharedMemory(FrameRing.size(spec))
+        self._ring = FrameRing(self._memory.buffer, spec)
         self._child = Child(
-            f"camera {spec.name}", "hal.drivers.realsense.process:main", {"spec": to_json(spec)}, [self._memory]
+            f"camera {spec.name}",
+            "hal.drivers.realsense.process:main",
+            {"spec": to_json(spec)},
+            [self._memory],
+            self._handle_news,
         )
-        self._listening = threading.Lock()
-        self._requesting = threading.Lock()
         self._taking = threading.Lock()
-        self._number = 0
-        self._answers: dict[int, dict[str, Any]] = {}
         self._after = 0
         """Number of the last frame that was taken."""
-        self._silence = 0.0
+        self.silence = 0.0
+        """Time spent waiting for frames since the process last sent anything, s."""
         self.lost: ConnectionLost | None = None
         """The loss of the camera that the process reported; None while the camera works."""
         try:
@@ -305,12 +306,7 @@ class CameraLink:
     @property
     def is_alive(self) -> bool:
         """Whether the process runs."""
-        return self._child.process.poll() is None
-
-    @property
-    def silence(self) -> float:
-        """Time spent waiting for frames since the process last sent anything, s."""
-        return self._silence
+        return self._child.is_alive
 
     @property
     def tally(self) -> CameraTally:
@@ -329,25 +325,11 @@ class CameraLink:
             ConnectionLost: If the process has ended, or does not answer in time (it hangs, and must be ended).
             HalError: The error that the request raised in the process.
         """
-        with self._requesting:
-            self._number += 1
-            number = self._number
-            self._child.check()
-            self._child.channel.send({"id": number, "method": method, "params": params}, timeout)
-        deadline = time.monotonic() + timeout
-        while number not in self._answers:
-            self._listen(min(_SLICE, max(0.0, deadline - time.monotonic())))
-            if time.monotonic() > deadline and number not in self._answers:
-                text = f"the camera's process did not answer {method!r} within {timeout:g} s: the library hangs in it"
-                raise ConnectionLost(text, code="process_hangs")
-        answer = self._answers.pop(number)
-        if "error" in answer:
-            raise unpack_error(answer["error"])
-        return answer["result"]
+        return self._child.request(method, params, timeout)
 
     def start_session(self, before: int) -> None:
         """Skip the frames up to number ``before``, which belong to an earlier session."""
-        self._after, self._silence, self.lost = before, 0.0, None
+        self._after, self.silence, self.lost = before, 0.0, None
 
     def next_frame(self, timeout: float, every: bool) -> RawFrame | None:
         """Return the newest frame that was not taken yet.
@@ -367,42 +349,25 @@ class CameraLink:
         listened = False
         while True:
             with self._taking:  # otherwise two threads could take one frame, and the slower one step back to it
-                taken = self._ring.take(self._after, every)
+                taken = self._ring.read(self._after, every)
                 if taken is not None:
                     self._after, frame = taken
-                    self._silence = 0.0
+                    self.silence = 0.0
                     return frame._replace(t=time.monotonic()) if every else frame
             now = time.monotonic()
             if self.lost is not None or (listened and now >= deadline):
                 return None
-            if self._listen(min(_SLICE, max(0.0, deadline - now))):
-                self._silence = 0.0
+            if self._child.listen(min(_SLICE, max(0.0, deadline - now))):
+                self.silence = 0.0
             else:
-                self._silence += min(time.monotonic() - now, 2.0 * _SLICE)
+                self.silence += min(time.monotonic() - now, 2.0 * _SLICE)
             listened = True
 
-    def _listen(self, timeout: float) -> bool:
-        """Receive and file one message, in whichever thread waits for one; False if none came."""
-        if not self._listening.acquire(timeout=max(timeout, 1e-3)):
-            return False
-        try:
-            message = self._child.channel.receive(timeout)
-        except ConnectionLost:
-            self._child.process.wait(_PATIENCE)
-            self._child.check()
-            raise
-        finally:
-            self._listening.release()
-        if message is None:
-            self._child.check()
-            return False
-        if "id" in message:
-            self._answers[message["id"]] = message
-        elif "lost" in message:
-            lost = unpack_error(message["lost"])
+    def _handle_news(self, news: dict[str, Any]) -> None:
+        if "lost" in news:
+            lost = unpack_error(news["lost"])
             assert isinstance(lost, ConnectionLost)
             self.lost = lost
-        return True
 
     def close(self, timeout: float = _PATIENCE) -> None:
         """End the process; kill it if it does not end within ``timeout`` s. Idempotent."""

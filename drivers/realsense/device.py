@@ -18,12 +18,12 @@ from typing import Any, NamedTuple
 import pyrealsense2 as rs
 
 from hal.errors import ConnectionLost, ControlTaken, DeviceNotFound, NotSupported
+from hal.host.ring import FrameRing
 from hal.lock import DeviceLock
 from hal.specs import CameraSpec
 
 from .options import RealSenseSettings, apply_options, find_sensors, has_auto_exposure, read_options
 from .pipeline import FramePipeline, LivePipeline, PlaybackPipeline, choose_profiles, describe_optics
-from .ring import PictureRing
 from .streaming import FrameStreamer
 
 __all__ = ["ConnectedCamera", "RealSenseDevice", "RecordingFiles", "find_camera", "find_cameras", "lock_camera"]
@@ -43,7 +43,7 @@ class RealSenseDevice:
     Nothing of the library is shared with another camera: each has its own process and its own context.
     """
 
-    def __init__(self, spec: CameraSpec, ring: PictureRing, notify: Callable[[dict[str, Any]], None]) -> None:
+    def __init__(self, spec: CameraSpec, ring: FrameRing, notify: Callable[[dict[str, Any]], None]) -> None:
         """Create the library's context, with the emulated camera in it if the rig selects one.
 
         Args:

@@ -10,18 +10,18 @@ hang (librealsense issue 7252), and a library that crashes takes its process wit
 from __future__ import annotations
 
 import os
-import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
-from hal.errors import CommandError, HalError
-from hal.host.process import Channel, SharedMemory, pack_error
+from hal.errors import ConnectionLost
+from hal.host.process import Channel, SharedMemory, serve
+from hal.host.ring import FrameRing
 from hal.host.scheduling import yield_to_others
 from hal.specs import CameraSpec, from_json
 
 from .device import RealSenseDevice, find_cameras
-from .ring import PictureRing
 
 __all__ = ["list_plugged", "main"]
 
@@ -30,38 +30,10 @@ _NICE = 5
 _CHECK = 0.5
 """s between two checks whether the app still runs."""
 _LINGER = 6.0
-"""s that the process of a closed camera waits for the next ``open``. An app that lost its camera opens it again, and an
+"""s that the process of a closed camera waits for the next request. An app that lost its camera opens it again, and an
 emulated one must still exist then."""
 _TAKEN = 5.0
 """s for the app to take a message; an app that does not has ended or is stopped for good."""
-
-
-class _Sender:
-    """Sends messages to the app from any thread, each of them whole."""
-
-    def __init__(self, channel: Channel) -> None:
-        self._channel = Channel(channel.sock.dup())  # the other one receives, with time limits of its own
-        self._notifier = channel.sock.dup()
-        self._lock = threading.Lock()
-
-    def send(self, message: dict[str, Any]) -> None:
-        """Send an answer, or news that must not be lost."""
-        with self._lock:
-            self._channel.send(message, _TAKEN)
-
-    def notify(self, news: dict[str, Any]) -> None:
-        """Send news. The news of a new frame may be dropped if the app is behind: it has older ones to read."""
-        if "frame" not in news:
-            self.send(news)
-            return
-        with self._lock:
-            self._notifier.setblocking(False)
-            try:
-                self._notifier.send(b'{"frame": %d}\n' % news["frame"])
-            except BlockingIOError:
-                pass
-            except OSError:
-                os._exit(0)  # the app has ended
 
 
 def main(channel: Channel, memories: Sequence[SharedMemory], config: dict[str, Any]) -> None:
@@ -73,45 +45,42 @@ def main(channel: Channel, memories: Sequence[SharedMemory], config: dict[str, A
         config: ``spec``: the camera's record, as JSON.
     """
     yield_to_others(_NICE)
-    parent = os.getppid()
     spec = from_json(CameraSpec, config["spec"])
-    sender = _Sender(channel)
-    device = RealSenseDevice(spec, PictureRing(memories[0].buffer, spec), sender.notify)
-    sender.send({"ready": True})
-    idle_since = time.monotonic()
+    device = RealSenseDevice(spec, FrameRing(memories[0].buffer, spec), partial(_notify, channel))
+    last_request = time.monotonic()
+
+    def call(method: Callable[..., Any], **params: Any) -> Any:
+        nonlocal last_request
+        try:
+            return method(**params)
+        finally:
+            last_request = time.monotonic()
+
+    def wait_time() -> float | None:
+        return _CHECK if device.is_open or time.monotonic() - last_request < _LINGER else None
+
+    methods: dict[str, Callable[..., Any]] = {
+        "open": device.open,
+        "shut": device.close,
+        "reset": device.reset,
+        "inject": device.inject,
+    }
+    channel.send({"ready": True})
     try:
-        while os.getppid() == parent:
-            message = channel.receive(_CHECK)
-            if message is None:
-                if not device.is_open and time.monotonic() - idle_since > _LINGER:
-                    return
-                continue
-            if message["method"] == "close":  # the process; "shut" closes the camera
-                return
-            _answer(device, sender, message)
-            idle_since = time.monotonic()
+        serve(channel, {name: partial(call, method) for name, method in methods.items()}, wait_time, _TAKEN)
     finally:
         device.dispose()
 
 
-def _answer(device: RealSenseDevice, sender: _Sender, message: dict[str, Any]) -> None:
-    number, method, params = message["id"], message["method"], message["params"]
+def _notify(channel: Channel, news: dict[str, Any]) -> None:
+    """Send news to the app. The news of a new frame may be dropped if the app is behind: it has older ones to read."""
     try:
-        result: Any = None
-        if method == "open":
-            result = device.open(**params)
-        elif method == "shut":
-            device.close()
-        elif method == "reset":
-            result = device.reset()
-        elif method == "inject":
-            device.inject(**params)
+        if "frame" in news:
+            channel.send_if_free(news)
         else:
-            raise CommandError(f"a camera's process has no request {method!r}", code="unknown_request")
-    except (HalError, RuntimeError, TypeError, ValueError) as error:
-        sender.send({"id": number, "error": pack_error(error)})
-        return
-    sender.send({"id": number, "result": result})
+            channel.send(news, _TAKEN)
+    except ConnectionLost:
+        os._exit(0)  # the app has ended
 
 
 def list_plugged(channel: Channel, memories: Sequence[SharedMemory], config: Any) -> None:

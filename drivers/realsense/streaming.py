@@ -21,11 +21,11 @@ from numpy.typing import NDArray
 from hal.driver import CameraTally
 from hal.errors import ConnectionLost
 from hal.host.process import pack_error
+from hal.host.ring import FrameRing, Images
 from hal.images import Cropping
 from hal.specs import CameraSpec
 
 from .pipeline import FramePipeline
-from .ring import Images, PictureRing
 
 __all__ = [
     "GLOBAL",
@@ -382,7 +382,7 @@ class FrameStreamer:
         spec: CameraSpec,
         profiles: Mapping[str, Any],
         pipeline: FramePipeline,
-        ring: PictureRing,
+        ring: FrameRing,
         notify: Callable[[dict[str, Any]], None],
         *,
         stall: float,
@@ -414,7 +414,7 @@ class FrameStreamer:
         self._numbers = CaptureNumbers()
         self._times = CaptureTimes(played=not pipeline.is_live)
         self._repeated, self._mismatched = ring.tally
-        self._before = ring.forget()
+        self._before = ring.release_all()
         self._started: StreamStart | None = None
         self._warm_since: float | None = None
         self._seen: dict[str, tuple[int, float]] = {}
@@ -499,7 +499,7 @@ class FrameStreamer:
             return _Capture(frames, single, stamps, arrival, wall)
         self._repeated += match is FrameMatch.REPEATED
         self._mismatched += match is FrameMatch.MISMATCHED
-        self._ring.count(CameraTally(self._repeated, self._mismatched))
+        self._ring.tally = CameraTally(self._repeated, self._mismatched)
         return None
 
     def _write(self, capture: _Capture) -> None:
@@ -509,8 +509,8 @@ class FrameStreamer:
         seq = self._numbers(first.number)
         written = 0
         if self._is_warm(capture.arrival) and self._wait_for_room():
-            self._converter.convert(capture.frames, capture.single, self._ring.begin())
-            written = self._ring.end(t, t_device, seq, measure_skew(capture.stamps))
+            self._converter.convert(capture.frames, capture.single, self._ring.open_slot())
+            written = self._ring.publish(t, t_device, seq, measure_skew(capture.stamps))
         self._notify({"frame": written})
         if self._started is None:
             with self._changed:

@@ -29,7 +29,7 @@ from .realsense_bench import (
 from hal.drivers.realsense.device import RealSenseDevice, find_camera, lock_camera  # isort: skip  # needs the library
 from hal.drivers.realsense.emulator import SoftwareCamera, emulated_context  # isort: skip
 from hal.drivers.realsense.options import apply_options, find_sensors  # isort: skip
-from hal.drivers.realsense.ring import PictureRing  # isort: skip
+from hal.host.ring import FrameRing  # isort: skip
 
 
 def test_a_camera_works_again_after_it_was_unplugged() -> None:
@@ -83,7 +83,7 @@ def test_a_process_that_hangs_is_killed_and_replaced() -> None:
         cam.read(timeout=5.0)
         pid = process_of(cam)
         os.kill(pid, signal.SIGSTOP)
-        assert read_until_lost(cam, 8.0).code == "process_hangs"
+        assert read_until_lost(cam, 8.0).code == "process_silent"
         read_again(cam, 15.0)
         assert process_of(cam) != pid
         assert not os.path.exists(f"/proc/{pid}")
@@ -195,7 +195,7 @@ def test_an_open_camera_is_locked_against_other_programs(monkeypatch: pytest.Mon
     context, plugged = emulated_context(), SoftwareCamera(camera, serial="900000000042")
     plugged.attach(context)
     monkeypatch.setattr(RealSenseDevice, "_create_context", lambda self, spec: (context, None))
-    ring = PictureRing(memoryview(bytearray(PictureRing.size(camera))), camera)
+    ring = FrameRing(memoryview(bytearray(FrameRing.size(camera))), camera)
     device = RealSenseDevice(camera, ring, lambda news: None)
     try:
         other = lock_camera(plugged.serial)
