@@ -1,4 +1,4 @@
-"""The console: start-up, cost, latency from the page to the set-point, time from a browser's end to the arm's braking.
+"""The console: start-up, cost, latency from page to set-point, and time from the end of a browser to the arm's braking.
 
     python benchmarks/console.py [--seconds 20] [--runs 30] [--only start cost latency stops]
 
@@ -30,20 +30,20 @@ TICKS = os.sysconf("SC_CLK_TCK")
 
 
 def cpu(pid: int) -> float:
-    """Processor time that a process has had, s."""
+    """Return the processor time that a process has used, s."""
     fields = Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()
     return (int(fields[11]) + int(fields[12])) / TICKS
 
 
 def percentiles(values: list[float]) -> str:
-    """p50, p99 and the greatest, ms."""
+    """Format p50, p99 and the maximum, ms."""
     ordered = sorted(values)
     at = ordered[min(len(ordered) - 1, int(0.99 * len(ordered)))]
     return f"p50 {1e3 * statistics.median(ordered):.1f}  p99 {1e3 * at:.1f}  max {1e3 * ordered[-1]:.1f} ms"
 
 
 def start(runs: int) -> None:
-    """From the command to a link that answers, in a fresh process, and what of it is imports."""
+    """Print the time from the command to a link that answers, in a fresh process, and the share of imports."""
     imports = "import hal, hal.rig, hal.config, hal.kinematics.arm, pinocchio, ruckig, pydantic, pybullet"
     begun = time.monotonic()
     subprocess.run([sys.executable, "-c", imports], check=True, stdout=subprocess.DEVNULL)
@@ -65,7 +65,7 @@ def start(runs: int) -> None:
 
 
 def cost(seconds: float) -> None:
-    """Processor time of the console and missed ticks of the servo, with a page that drives and shows both cameras."""
+    """Print the console's processor time and the servo's missed ticks, with a page that drives."""
     with hal.open("panda_table", sim=True, pad="none") as rig:
         print(f"{'without the console':34s}{'':26s} missed {_missed(rig, seconds):.2f} %")
     bench = Bench(cameras=True)
@@ -115,7 +115,7 @@ def _console(bench: Bench, pid: int, name: str, seconds: float) -> None:
 
 
 async def be_a_page(link: str) -> None:
-    """Do what the page does, without a browser beside the servo: hold the dead-man, take every picture."""
+    """Act as the page without the load of a browser: hold the dead-man, receive every picture."""
     import asyncio
 
     import aiohttp
@@ -159,7 +159,7 @@ async def be_a_page(link: str) -> None:
 
 
 def latency(runs: int) -> None:
-    """From a key's event in the page to the first set-point that moves."""
+    """Print the time from a key event in the page to the first set-point that moves."""
     bench, browser = Bench(), Browser()
     found = []
     try:
@@ -194,7 +194,7 @@ def latency(runs: int) -> None:
 
 
 class _Watch:
-    """Waits in a thread for the first set-point that moves: the call that presses the key returns late."""
+    """Waits for the first set-point that moves, in a thread because the call that presses the key returns late."""
 
     def __init__(self, bench: Bench) -> None:
         import threading
@@ -220,7 +220,7 @@ class _Watch:
 
 
 def stops(runs: int) -> None:
-    """From what happens to the browser to the begin of braking, at full speed."""
+    """Print the time from an event in the browser to the start of braking, at full speed."""
     ways: dict[str, Callable[[Browser], float]] = {
         "key let go (reference)": lambda browser: _timed(lambda: browser.let_go()),
         "stop button": lambda browser: _timed(lambda: browser.key("Escape", "Escape", True)),

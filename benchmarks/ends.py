@@ -1,4 +1,4 @@
-"""How long after an app's end its arm begins to brake, is at rest, and its processes are gone.
+"""Times from the end of an app until its arm brakes, is at rest, and its processes have ended.
 
     python benchmarks/ends.py [--runs 5]
 
@@ -20,7 +20,7 @@ from observer import Watched
 
 
 def measure(how: str) -> tuple[float, float, float | None]:
-    """Seconds to the begin of braking, to rest, and until no process is left (None: they are meant to stay)."""
+    """Return seconds to the start of braking, to rest, and until no process is left (None: they are meant to stay)."""
     with tempfile.TemporaryDirectory() as folder:
         app = Watched(Path(folder), ending="exception" if how == "exception" else "")
         try:

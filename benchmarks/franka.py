@@ -1,4 +1,4 @@
-"""A Franka against the emulator in real time: missed cycles, times to answer, and what disturbs them.
+"""A Franka against the emulator in real time: missed cycles, response times, and their disturbances.
 
     python benchmarks/franka.py [--robot fr3|panda] [--seconds 60] [--disturbances]
 
@@ -51,14 +51,14 @@ def _listens(host: str) -> bool:
 
 
 def busy(stop: threading.Event) -> None:
-    """A thread that never rests, as a slow policy is one."""
+    """Run a busy thread, like a slow policy."""
     value = 0
     while not stop.is_set():
         value = (value * 31 + 7) % 1000003
 
 
 def collect(stop: threading.Event) -> None:
-    """Garbage collections over half a million objects."""
+    """Run garbage collections over half a million objects."""
     kept = [[k] for k in range(500_000)]
     while not stop.wait(0.2):
         gc.collect()
@@ -68,7 +68,7 @@ def collect(stop: threading.Event) -> None:
 def drive(
     host: str, robot: str, seconds: float, *, disturb: str | None = None, cameras: bool = False
 ) -> dict[str, Any]:
-    """Send twists at 50 Hz; what the arm's process says at the end."""
+    """Send twists at 50 Hz, and return the final report of the arm's process."""
     model = "fr3" if robot == "fr3" else "panda"
     overrides = [f"robots.arm.real.host={host}", f"robots.arm.model={model}"]
     overrides += [] if cameras else ["cameras={}"]
@@ -116,7 +116,7 @@ def drive(
 
 
 def show(name: str, found: dict[str, Any], stalls: list[Any]) -> None:
-    """One line of the table."""
+    """Print one line of the table."""
     driver, cycles = found["driver"], found["cycles"]
     answer = driver["received_to_sent_s"]
     rate = driver["success_rate_min"]

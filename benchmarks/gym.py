@@ -1,12 +1,12 @@
-"""``RigEnv`` in lock-step beside raw PyBullet, several in processes of their own, and how fresh its observations are.
+"""``RigEnv`` in lock-step beside PyBullet by hand, in several processes, and the freshness of its observations.
 
     python benchmarks/gym.py [--seconds 4] [--rounds 5]
 
 Each part has its reference in the same run; rounds alternate and the medians are printed. The references of lock-step
-are those of ``benchmarks/lock_step.py``: bare PyBullet calls for the same scene, one motor command and one reading a
-step, and with cameras PyBullet's own renderer. The goals: 0.55 of raw PyBullet without a camera, 4 times its renderer
-with two of 256x256, 1.8 times as many steps with two processes as with one, and no observation handed out twice. The
-last rows of that part say what the machine had to give at the time: two programs that wait for nobody, and two that
+are those of ``benchmarks/lock_step.py``: PyBullet's own functions for the same scene, one motor command and one reading
+per step, and with cameras PyBullet's own renderer. The goals: 0.55 of PyBullet by hand without a camera, 4 times its
+renderer with two of 256x256, 1.8 times as many steps with two processes as with one, and no observation twice. The last
+rows of the second part are what the machine allowed at the time: two independent environments, and two programs that
 only count.
 """
 
@@ -28,18 +28,18 @@ import hal
 from hal.learning.gym import RigEnv
 
 sys.path.insert(0, str(Path(__file__).resolve().parent))
-from lock_step import CONFIG, POLICY_HZ, rate, raw
+from lock_step import CONFIG, POLICY_HZ, by_hand, rate
 
 BARE = ("cameras={}",)
 
 
 def make(cameras: bool = False) -> RigEnv:
-    """One environment, in lock-step."""
+    """Return one environment in lock-step."""
     return RigEnv(CONFIG, sim=True, rate_hz=POLICY_HZ, overrides=() if cameras else BARE)
 
 
 def actions(start: np.ndarray) -> Callable[[int], np.ndarray]:
-    """The motion of ``lock_step.py``, around the joint positions ``start``, rad."""
+    """Return the motion of ``lock_step.py`` around the joint positions ``start``, rad."""
     phases = np.arange(start.size)
 
     def action(turn: int) -> np.ndarray:
@@ -50,7 +50,7 @@ def actions(start: np.ndarray) -> Callable[[int], np.ndarray]:
 
 
 def stepping(env: RigEnv) -> Callable[[], None]:
-    """One step of it."""
+    """Return a function that makes one step of the environment."""
     seen, _ = env.reset(seed=1)
     action, turn = actions(seen["q"]), 0
 
@@ -63,19 +63,20 @@ def stepping(env: RigEnv) -> Callable[[], None]:
 
 
 def lock_step(cameras: bool, seconds: float, rounds: int) -> tuple[float, float, float]:
-    """Steps/s of ours and of raw PyBullet, and the median of their ratios."""
+    """Return steps/s of RigEnv and of PyBullet by hand, and the median of their ratios."""
     env = make(cameras)
-    reference, world = raw(env.rig, cameras)
+    assert env.rig.plan.world is not None
+    reference, disconnect = by_hand(env.rig.plan.world, cameras, every_tick=False)
     step = stepping(env)
     pairs = [(rate(step, seconds), rate(reference, seconds)) for _ in range(rounds)]
     env.close()
-    world.close()
+    disconnect()
     mine, theirs = (statistics.median(values) for values in zip(*pairs, strict=True))
     return mine, theirs, statistics.median(a / b for a, b in pairs)
 
 
 def together(count: int, seconds: float, cameras: bool = False) -> float:
-    """Steps/s of so many in one ``AsyncVectorEnv``, all together; each step waits for the slowest."""
+    """Return the total steps/s of ``count`` in one ``AsyncVectorEnv``; each step waits for the slowest."""
     envs = gymnasium.vector.AsyncVectorEnv([partial(make, cameras)] * count, context="spawn")
     try:
         seen, _ = envs.reset(seed=1)
@@ -102,7 +103,7 @@ print(count / seconds)
 
 
 def alone(seconds: float) -> float:
-    """Steps/s of one that waits for nobody."""
+    """Return steps/s of one independent environment."""
     env = make()
     found = rate(stepping(env), seconds)
     env.close()
@@ -110,7 +111,7 @@ def alone(seconds: float) -> float:
 
 
 def programs(*command: str) -> Callable[[int, float], float]:
-    """The sum of what so many programs print that run at the same time and know nothing of each other."""
+    """Return a function that sums what independent programs print that run at the same time."""
 
     def measure(count: int, seconds: float) -> float:
         line = [sys.executable, *command, str(seconds)]
@@ -121,14 +122,14 @@ def programs(*command: str) -> Callable[[int, float], float]:
 
 
 def scaling(measure: Callable[[int, float], float], seconds: float, rounds: int) -> tuple[float, float, float]:
-    """Of two, of one, and the median of their ratios."""
+    """Return the measure of two, of one, and the median of their ratios."""
     pairs = [(measure(2, seconds), measure(1, seconds)) for _ in range(rounds)]
     two, one = (statistics.median(values) for values in zip(*pairs, strict=True))
     return two, one, statistics.median(a / b for a, b in pairs)
 
 
 def freshness(driver: str | None, seconds: float) -> tuple[int, int, int]:
-    """Steps in real time, and in how many a picture, or a state, was older than the action or had been seen before."""
+    """Return steps in real time, and those with an old or repeated picture, and with an old or repeated state."""
 
     def real_time(*_: object) -> hal.Rig:
         return hal.open(CONFIG, sim=True if driver is None else None, driver=driver, clock="real_time", pad="none")

@@ -1,4 +1,4 @@
-"""Microseconds per kinematics call, each beside the bare pinocchio calls that it cannot do without.
+"""Microseconds per kinematics call, each beside the bare pinocchio calls that it needs.
 
 python benchmarks/kinematics.py [--calls 20000]
 """
@@ -19,7 +19,7 @@ from hal.kinematics.arm import Kinematics
 
 
 def microseconds(call: Callable[[], object], calls: int, repeats: int = 7) -> float:
-    """Median over ``repeats`` runs of the mean time of one call."""
+    """Return the median over ``repeats`` runs of the mean time of one call, us."""
     count = max(1, calls // repeats)
     call()
     means = []

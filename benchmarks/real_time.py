@@ -30,7 +30,7 @@ from hal.host.main import PeriodicPace
 
 
 def bare(rate_hz: float, seconds: float) -> float:
-    """Share of ticks that a loop with nothing to do misses in this process."""
+    """Return the share of ticks that an empty loop misses in this process."""
     pacer, end = PeriodicPace(1.0 / rate_hz), time.monotonic() + seconds
     turns = 0
     while time.monotonic() < end:
@@ -41,7 +41,7 @@ def bare(rate_hz: float, seconds: float) -> float:
 
 @contextlib.contextmanager
 def busy_programs(number: int) -> Iterator[None]:
-    """Other programs that compute without a pause."""
+    """Run other programs that compute without a pause."""
     programs = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(number)]
     try:
         yield
@@ -52,7 +52,7 @@ def busy_programs(number: int) -> Iterator[None]:
 
 
 def run(rate_hz: float, seconds: float, cameras: bool, realtime: bool = True) -> dict[str, Any]:
-    """Drive the arm at 50 Hz and look at its state and every frame."""
+    """Drive the arm at 50 Hz, and read its state and every frame."""
     overrides = [f"simulation.physics_hz={rate_hz:g}"] + ([] if cameras else ["cameras={}"])
     with hal.open(
         "panda_table", sim=True, clock="real_time", overrides=overrides, pad="none", realtime=realtime
@@ -85,7 +85,7 @@ def run(rate_hz: float, seconds: float, cameras: bool, realtime: bool = True) ->
 
 
 def loaded(rates: list[float], seconds: float) -> None:
-    """Print what is missed with and without load, by scheduling; the right is given up on the way."""
+    """Print the missed ticks with and without load, by scheduling; gives up the right to real-time priority."""
     for asked in ("asked for", "refused", "not asked for"):
         if asked == "refused":
             give_up_right()

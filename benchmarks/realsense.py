@@ -1,4 +1,4 @@
-"""A RealSense: what comes of what was sent, cost, rate, latency, and what an unplugged camera does to an arm.
+"""A RealSense: received frames, cost, rate, latency, and the effect of an unplugged camera on an arm.
 
     python benchmarks/realsense.py [--seconds 20] [--only live recording latency unplug]
 
@@ -27,12 +27,12 @@ import hal
 from hal.drivers.realsense.emulator import SoftwareCamera, write_recording
 
 PHASES = 8
-"""So many pictures repeat, but for the number in their upper edge, and that aligned depth does not show."""
+"""Number of images after which all but the drawn number repeats; aligned depth does not show the number."""
 STREAMS = ("color", "depth", "infrared")
 
 
 def rig_file(**real: Any) -> dict[str, Any]:
-    """One camera at 30 Hz with three VGA streams."""
+    """Return the rig: one camera at 30 Hz with three VGA streams."""
     camera = {
         "model": "realsense_d435",
         "capture": {"width": 640, "height": 480, "rate_hz": 30},
@@ -43,13 +43,13 @@ def rig_file(**real: Any) -> dict[str, Any]:
 
 
 def cpu(pid: int) -> float:
-    """Processor time that a process has had, s."""
+    """Return the processor time that a process has used, s."""
     fields = Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()
     return (int(fields[11]) + int(fields[12])) / 100.0
 
 
 def children() -> list[int]:
-    """Processes that this one has started."""
+    """Return the processes that this one has started."""
     found = []
     for task in Path("/proc/self/task").iterdir():
         with contextlib.suppress(OSError):
@@ -58,7 +58,7 @@ def children() -> list[int]:
 
 
 def percentiles(values: list[float]) -> str:
-    """p50 and p99, ms."""
+    """Format p50 and p99, ms."""
     return f"p50 {1e3 * np.percentile(values, 50):.1f}  p99 {1e3 * np.percentile(values, 99):.1f} ms"
 
 
@@ -66,7 +66,7 @@ def percentiles(values: list[float]) -> str:
 
 
 def live(seconds: float) -> None:
-    """Is every picture whole, and what does the reader cost?"""
+    """Print whether every image is exact, and the cost of reading."""
     alone = fed_to_nobody(seconds)
     with hal.open(rig_file()) as rig:
         camera = rig.cameras["cam"]
@@ -85,13 +85,13 @@ def live(seconds: float) -> None:
 
 
 def fed_to_nobody(seconds: float) -> float:
-    """Share of a processor that the emulated camera takes in a process of its own."""
+    """Return the share of a processor that the emulated camera uses in a process of its own."""
     command = [sys.executable, __file__, "--feed", str(seconds)]
     return float(subprocess.run(command, capture_output=True, text=True, check=True).stdout)
 
 
 def feed(seconds: float) -> float:
-    """Be that process."""
+    """Run the emulated camera in this process for so many seconds."""
     import pyrealsense2 as rs
 
     from hal.drivers.realsense.emulator import emulated_context
@@ -117,13 +117,13 @@ def feed(seconds: float) -> float:
 
 
 def spec() -> Any:
-    """The camera's record, as the rig resolves it."""
+    """Return the camera's record, as the rig resolves it."""
     with hal.open(rig_file()) as rig:
         return rig.cameras["cam"].spec
 
 
 def exactness(seconds: float) -> None:
-    """Every pixel of every frame against what was sent; aligned depth against the library's own alignment."""
+    """Compare every pixel with what was sent, and aligned depth with the library's own alignment."""
     with hal.open(rig_file()) as rig:
         camera = rig.cameras["cam"]
         reference = SoftwareCamera(camera.spec)
@@ -151,7 +151,7 @@ def exactness(seconds: float) -> None:
 
 
 def aligned_by_the_library(camera: Any) -> dict[int, np.ndarray]:
-    """Phase -> depth in the view of colour, mm, by a bare loop over a recording; 0 beyond the camera's range."""
+    """Return phase -> depth in the view of colour, mm, by a bare loop over a recording; 0 beyond the camera's range."""
     found: dict[int, np.ndarray] = {}
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "phases.db3"
@@ -164,7 +164,7 @@ def aligned_by_the_library(camera: Any) -> dict[int, np.ndarray]:
 
 
 def bare_loop(path: Path) -> Iterator[tuple[int, np.ndarray, np.ndarray]]:
-    """The library alone: wait, align, copy. Number, colour and depth of each set."""
+    """Play with the library alone (wait, align, copy); yield number, colour and depth of each set."""
     import pyrealsense2 as rs
 
     context = rs.context()
@@ -193,7 +193,7 @@ def bare_loop(path: Path) -> Iterator[tuple[int, np.ndarray, np.ndarray]]:
 
 
 def recording(seconds: float) -> None:
-    """Aligned frames per second, as fast as they can be had."""
+    """Print aligned frames per second, as fast as possible."""
     frames = max(150, round(30 * seconds))
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "some.db3"
@@ -215,14 +215,14 @@ def recording(seconds: float) -> None:
 
 
 def bare_rate(path: Path) -> tuple[float, float]:
-    """Frames per second, and processor time for each, s."""
+    """Return frames per second, and processor time for each, s."""
     before = time.process_time()
     times = [time.monotonic() for _ in bare_loop(path)]
     return (len(times) - 1) / (times[-1] - times[0]), (time.process_time() - before) / len(times)
 
 
 def read_rate(path: Path) -> tuple[float, float, int, Any]:
-    """The same through the hal, both processes; how many frames came, and the camera's counts."""
+    """Return the same through `hal`, both processes, with the number of frames and the camera's counts."""
     real = {"emulated": False, "play": str(path), "paced": False, "repeat": False}
     times = []
     with hal.open(rig_file(**real)) as rig:
@@ -243,7 +243,7 @@ def read_rate(path: Path) -> tuple[float, float, int, Any]:
 
 
 def latency(seconds: float) -> None:
-    """From the moment that the last picture of a set is pushed to the frame in the app.
+    """Print the time from pushing the last image of a set to the frame in the app.
 
     The stamps are the host's time at each push (``clock: system``), the last one is colour's.
     """
@@ -260,7 +260,7 @@ def latency(seconds: float) -> None:
 
 
 def bare_latency(seconds: float) -> list[float]:
-    """The library in this process, aligned and copied, and nothing of ours but the camera."""
+    """Return the same for the library alone in this process, aligned and copied."""
     import pyrealsense2 as rs
 
     from hal.drivers.realsense.emulator import emulated_context
@@ -286,7 +286,7 @@ def bare_latency(seconds: float) -> list[float]:
 
 
 def new_memory() -> float:
-    """Memory that a driver's ``grab`` takes, measured, for each byte of the pictures that it gives."""
+    """Return the memory that a driver's ``grab`` allocates per byte of the images that it returns."""
     from hal import registry
 
     driver = registry.load("realsense", "camera")(spec())
@@ -316,7 +316,7 @@ def new_memory() -> float:
 
 
 def unplug(seconds: float) -> None:
-    """A simulated Panda is driven at 50 Hz, while nothing happens and while the camera is unplugged for 3 s."""
+    """Drive a simulated Panda at 50 Hz, undisturbed and while the camera is unplugged for 3 s."""
     camera = rig_file()["cameras"]["cam"] | {"sim": False}
     overrides = [f"cameras={json.dumps({'cam': camera})}"]
     with hal.open("panda_table", sim=None, pad="none", overrides=overrides) as rig:
@@ -333,7 +333,7 @@ def unplug(seconds: float) -> None:
 
 
 def drive(rig: hal.Rig, arm: Any, cam: Any, seconds: float, gone: float) -> tuple[float, float, int, float]:
-    """Missed ticks in %, longest period of the loop in s, how often the arm stopped, and how long the camera took."""
+    """Return missed ticks in %, longest loop period in s, number of stops, and the camera's time to reconnect in s."""
     import threading
 
     took: list[float] = []

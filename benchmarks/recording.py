@@ -1,4 +1,4 @@
-"""Recording while somebody drives in real time: lost rows, missed servo ticks, processor time, MB per minute.
+"""Recording during real-time driving: lost rows, missed servo ticks, processor time, MB per minute.
 
     python benchmarks/recording.py [--seconds 20] [--pairs 3] [--size 640x480] [--cameras mock]
 
@@ -28,13 +28,13 @@ _NAMES = ("scene", "wrist")
 
 
 def cpu(pid: int) -> float:
-    """Processor time that a process has used, s."""
+    """Return the processor time that a process has used, s."""
     fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
     return (int(fields[11]) + int(fields[12])) / _TICKS
 
 
 def drive(rig: Rig, seconds: float, recorder: Recorder | None) -> dict[str, Any]:
-    """Twists at 50 Hz, with or without a recorder that looks on."""
+    """Send twists at 50 Hz, with or without a recorder."""
     arm = rig.robots["panda"]
     if recorder is not None:
         recorder.start()
@@ -74,7 +74,7 @@ def drive(rig: Rig, seconds: float, recorder: Recorder | None) -> dict[str, Any]
 
 
 def show(title: str, found: dict[str, Any]) -> None:
-    """One line."""
+    """Print one line."""
     rates = ", ".join(f"{name} {rate:.1f}" for name, rate in found["fps"].items())
     line = f"  {title:18s} missed {100 * found['missed']:.2f} %, app {100 * found['app']:.0f} % of a core"
     if "status" in found:
@@ -83,7 +83,7 @@ def show(title: str, found: dict[str, Any]) -> None:
 
 
 def report(out: Path, found: dict[str, Any]) -> None:
-    """What came onto the disk."""
+    """Print what was written to disk."""
     status = found["status"]
     episode = Dataset(out).episodes[-1]
     grid = episode.stamps["grid"]

@@ -37,21 +37,21 @@ with hal.open({config!r}, sim=True, clock={clock!r}, pad="none") as rig:
 
 
 def sized(camera: CameraSpec, width: int, height: int) -> CameraSpec:
-    """The same view in another size."""
+    """Return the same view in another size."""
     focal = 0.9 * width
     K = ((focal, 0.0, (width - 1) / 2), (0.0, focal, (height - 1) / 2), (0.0, 0.0, 1.0))
     return replace(camera, width=width, height=height, K=K, streams=("color", "depth"))
 
 
 def timed(renderer: Renderer, world: PyBulletWorld, camera: CameraSpec) -> float:
-    """One frame, ms."""
+    """Return the time of one frame, ms."""
     start = time.perf_counter()
     renderer.render(camera, camera_pose(world, camera))
     return (time.perf_counter() - start) * 1e3
 
 
 def first_frame(config: str, clock: str, cache: str) -> float:
-    """From the call of hal.open, libraries imported, to a frame of every camera, s; in a fresh process."""
+    """Return the time from hal.open, libraries imported, to a frame of every camera, s, in a fresh process."""
     code = FIRST_FRAME.format(config=config, clock=clock)
     environment = {**os.environ, "XDG_CACHE_HOME": cache}
     done = subprocess.run(

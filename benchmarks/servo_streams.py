@@ -1,14 +1,14 @@
-"""Random target streams through the servo: are the limits kept, are held targets reached in time and not overshot?
+"""Random target streams through the servo: limits, times to reach held targets, and overshoot.
 
     python benchmarks/servo_streams.py [count] [--seed N]
 
 Each stream has its own servo rate, command rate (10-1000 Hz), limits (acceleration x 0.1-1, jerk x 0.02-1), start
 (inside, at or beyond a limit) and a mixture of smooth motion, jumps (past the limits too), reversals, broken commands
-and silence, and ends with a target that is held. The judge only sees the positions that a driver would be given. The
+and silence, and ends with a target that is held. Only the positions that a driver would receive are judged. The
 reference for the time to reach the held target is Ruckig's time-optimal motion from the same state under the same
 limits; overshoot is what lies beyond everything that this reference passes. Both are measured from the first command
-with that target; only after a stream of positions without speeds, where nobody can know yet that it will be held, from
-the second.
+with that target; after a stream of positions without velocities, where it is not yet known that it will be held,
+from the second.
 """
 
 from __future__ import annotations
@@ -44,13 +44,13 @@ class NoKinematics:
     """Joint streams with an unlimited tcp speed need none; any use beyond the servo's making is an error."""
 
     def reach(self) -> tuple[float, ...]:
-        """No lever arms."""
+        """Return no lever arms."""
         return (0.0,) * N
 
 
 @dataclass
 class Result:
-    """What one stream showed."""
+    """Result of one stream."""
 
     peaks: dict[str, float]
     travel: float
@@ -65,7 +65,7 @@ class Result:
 
 
 def robot_spec(limits: LimitsSpec, rate_hz: float) -> RobotSpec:
-    """A spec with these limits and no model behind it."""
+    """Return a spec with these limits and without a model."""
     home = (0.0, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785)
     identity = (0.0, 0.0, 0.0, 1.0)
     names = tuple(f"joint{i}" for i in range(N))
@@ -106,7 +106,7 @@ class Stream:
         self.travel = 0.0
         self.command: CommandRecord | None = None
         self.bare = False
-        """Was the last command one of a stream of positions without speeds?"""
+        """Whether the last command was one of a stream of positions without velocities."""
         start = [rng.uniform(low, high) for low, high in zip(PANDA.lower, PANDA.upper, strict=True)]
         if rng.random() < 0.3:  # at a limit, or outside
             i = rng.randrange(N)
@@ -117,7 +117,7 @@ class Stream:
         self.servo.open_session(Session(1, self.speed, 1e9, False), NO_INBOX)
 
     def send(self, q: list[float], dq: list[float]) -> None:
-        """A joint target, as an app would send it."""
+        """Send a joint target as an app would."""
         before = self.command.values if self.command is not None else None
         self.bare = before is not None and (*q, *dq) != before and not any(dq) and not any(before[N:])
         self.seq += 1
@@ -125,7 +125,7 @@ class Stream:
         self.command = CommandRecord(self.seq, 1, self.now, deadline, Kind.JOINT_TARGET, (*q, *dq))
 
     def tick(self) -> list[float]:
-        """One tick of the servo."""
+        """Run one tick of the servo."""
         self.now += self.dt
         self.ticks += 1
         reading = Reading(self.now, self.now, self.ticks, self.q, [0.0] * N)
@@ -138,7 +138,7 @@ class Stream:
         return q
 
     def wander(self, seconds: float) -> None:
-        """Random commands of every sort."""
+        """Send random commands of every kind."""
         rng = self.random
         target, velocity = list(self.q), [0.0] * N
         next_command = self.now
@@ -177,7 +177,7 @@ class Stream:
             self.tick()
 
     def hold(self) -> tuple[float, float]:
-        """A last target that is held; returns the time's ratio to the optimum, and the overshoot."""
+        """Hold a last target; return the ratio of its time to the optimum, and the overshoot."""
         rng = self.random
         report = self.servo.report
         while self.servo.report.trip:  # the last act was silence: rearm
@@ -212,7 +212,7 @@ class Stream:
         return (reached - begun) / max(optimum, self.dt), overshoot
 
     def _reference(self, goal: list[float]) -> tuple[float, list[float], list[float]]:
-        """Time-optimal time to within NEAR of the goal, and the range that each joint passes."""
+        """Return the time-optimal time to within NEAR of the goal, and the range that each joint passes."""
         report = self.servo.report
         inputs = InputParameter(N)
         inputs.current_position, inputs.current_velocity = report.q_set, report.dq_set
@@ -237,7 +237,7 @@ class Stream:
 
 
 def run(seed: int) -> Result:
-    """One stream from its start to the end of its held target."""
+    """Run one stream from its start to the end of its held target."""
     stream = Stream(seed)
     stream.wander(stream.random.uniform(0.5, 2.0))
     ratio, overshoot = stream.hold()
@@ -250,7 +250,7 @@ def run(seed: int) -> Result:
 
 
 def quantile(values: list[float], share: float) -> float:
-    """The value below which that share of the values lies."""
+    """Return the value below which a share of the values is."""
     return sorted(values)[min(len(values) - 1, int(share * len(values)))]
 
 

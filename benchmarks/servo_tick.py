@@ -4,7 +4,7 @@
 
 "Prepared" is the tick of a device that sets the pace (a Franka): the set-point was computed after the last write, which
 takes the time in the next column, and is handed out when the device took the last one. ``--idle`` waits for the rest of
-each millisecond, as a host does: what a processor has forgotten meanwhile is part of the truth.
+each millisecond, as a host does: the processor's cold caches are then included.
 
 Times differ from machine to machine and from minute to minute; the last column, the ratio to the reference measured in
 turn with it, is what to compare.
@@ -38,7 +38,7 @@ Values = Callable[[float, list[float]], list[float]]
 
 
 def panda() -> RobotSpec:
-    """The Panda that comes with PyBullet's data."""
+    """Return the Panda of PyBullet's data."""
     import pybullet_data
 
     spec = robot_spec(PANDA, RATE_HZ)
@@ -53,7 +53,7 @@ def panda() -> RobotSpec:
 
 
 class Bare:
-    """The reference: a velocity target of seven joints, changed every tick, and the result read back."""
+    """Return the reference: a velocity target of seven joints, changed every tick, and the result read back, us."""
 
     def __init__(self) -> None:
         self.ruckig, self.inputs, self.output = Ruckig(7, 1 / RATE_HZ), InputParameter(7), OutputParameter(7)
@@ -74,7 +74,7 @@ class Bare:
 
 @dataclass
 class Times:
-    """Of one kind of command, us."""
+    """Medians of one kind of command, us."""
 
     median: float
     p99: float
@@ -86,7 +86,7 @@ class Times:
 def measure(
     spec: RobotSpec, kind: Kind | None, values: Values, tcp_speed: float, ticks: int, prepared: bool, idle: bool
 ) -> Times:
-    """Times of a tick, with or without what is computed ahead of it. Without a kind: move_to."""
+    """Return the times of a tick, with or without computing ahead. Without a kind: move_to."""
     kinematics = Kinematics(spec.kinematics)
     servo = Servo(spec, 1 / RATE_HZ, kinematics, kinematics.mass_matrix)
     servo.anchor(spec.home)
@@ -132,7 +132,7 @@ def measure(
 
 
 def audit_time(ticks: int) -> float:
-    """Median time of one sample of the audit, us."""
+    """Return the median time of one sample of the audit, us."""
     audit = SetpointAudit(PANDA, 1 / RATE_HZ)
     times = []
     for k in range(ticks):

@@ -26,7 +26,7 @@ WAYS = {
 
 
 def seconds(arguments: list[str]) -> float:
-    """Wall time of a fresh interpreter."""
+    """Return the wall time of a fresh interpreter, s."""
     start = time.perf_counter()
     subprocess.run([sys.executable, *arguments], check=True, stdout=subprocess.DEVNULL)
     return time.perf_counter() - start

@@ -1,4 +1,4 @@
-"""How straight the arm goes and stops under a stick, and how far one key of a terminal moves it.
+"""Straightness of motions and stops under a stick, and the distance of one key press in a terminal.
 
     python benchmarks/steps.py [--presses 10]
 
@@ -24,7 +24,7 @@ KEYS = {"arrow up": "\x1b[A", "arrow left": "\x1b[D", "Page Up": "\x1b[5~", "J (
 
 
 def pushes(speed: float, count: int = 10) -> None:
-    """Push to and fro for half a second each, with half a second at rest between: what it costs in height and tilt."""
+    """Push to and fro for half a second each, with half a second between; print the deviation in height and tilt."""
     with hal.open("panda_table", driver="mock", overrides=["cameras={}"]) as rig:
         arm = rig.robots["panda"]
         start, first = arm.state().tcp_set, None
@@ -43,7 +43,7 @@ def pushes(speed: float, count: int = 10) -> None:
 
 
 def keys(presses: int) -> None:
-    """One press of a terminal's key, again and again, there and back by hand of the world's reset."""
+    """Press a terminal's key repeatedly, and reset the world after each press."""
     with FarEnd() as far:
         pad = {"driver": "terminal", "options": {"tty": far.path, "mode": "step"}}
         overrides = ["cameras={}", f"gamepads.pad={pad}".replace("'", '"')]

@@ -1,8 +1,8 @@
-"""How long after a dead-man, a pad or a stream of commands falls silent the arm begins to brake, in real time.
+"""Time from the silence of a dead-man, a pad or a stream of commands until the arm brakes, in real time.
 
     python benchmarks/stops.py [--runs 5]
 
-A recorded pad holds the dead-man and a direction; then it freezes, is unplugged, or lets go, or the program stops
+A recorded pad holds the dead-man and a direction; then it freezes, is unplugged or released, or the program stops
 sending. The times of the event and of the braking are those of the two processes' common clock. The reference in the
 same run is `rig.stop()`, which no limit delays.
 """
@@ -22,12 +22,12 @@ import hal
 from hal.errors import MotionStopped
 
 EVENT = 2.5
-"""When it happens, s after the pad's first poll."""
+"""Time of the event, s after the pad's first poll."""
 WAYS = ("rig.stop() (reference)", "dead-man released", "pad frozen", "pad unplugged", "commands stop")
 
 
 def recording(folder: Path, tour: Path, release: bool) -> Path:
-    """A pad that presses L2 and the d-pad, in the format of the recorded tour."""
+    """Write a recording that presses L2 and the d-pad, in the format of the recorded tour."""
     header = json.loads(tour.read_text().splitlines()[0])
     events = [
         (0.1, "abs", "ABS_X", 128),
@@ -51,7 +51,7 @@ def recording(folder: Path, tour: Path, release: bool) -> Path:
 
 
 def measure(way: str, folder: Path) -> tuple[float, float]:
-    """Seconds from the event to the begin of braking, and to rest."""
+    """Return seconds from the event to the start of braking, and to rest."""
     from hal.config.data_files import find_data
 
     path = recording(folder, find_data("config", "teleop/tour.jsonl"), way == "dead-man released")

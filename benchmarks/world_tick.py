@@ -1,4 +1,4 @@
-"""What the simulated world and its drivers cost per tick, beside raw PyBullet in the same run.
+"""Cost of the simulated world and its drivers per tick, beside raw PyBullet in the same run.
 
     python benchmarks/world_tick.py [--hz 240] [--seconds 5]
 
@@ -35,7 +35,7 @@ def cube_places(count: int) -> list[tuple[float, float, float]]:
 
 
 def motion(t: float) -> tuple[list[float], list[float]]:
-    """Joint positions and velocities of the test motion."""
+    """Return joint positions and velocities of the test motion."""
     q = [home + 0.25 * (1.0 - math.cos(2.0 * t)) for home in PANDA_HOME]
     return q, [0.5 * math.sin(2.0 * t)] * 7
 
@@ -106,7 +106,7 @@ def raw(count: int, hz: float) -> tuple[Any, dict[str, Callable[[], object]]]:
 
 
 def measure(calls: dict[str, Callable[[], object]], ticks: int) -> dict[str, float]:
-    """Median of each call in us, called in turn in every tick."""
+    """Return the median of each call, us, called in turn in every tick."""
     times: dict[str, list[float]] = {name: [] for name in calls}
     clock = time.perf_counter
     for _ in range(ticks):
