@@ -1,6 +1,6 @@
-"""An arm's driver in a process of its own, call by call: for a library that keeps Python's lock while it blocks.
+"""An arm's driver in a process of its own, for a library that holds Python's lock while it blocks.
 
-Such a library would stop the tests' own threads and time-outs, and one call of it that hangs would end the whole run.
+Such a library would stop the tests' threads and time-outs, and a call that hangs would end the whole run.
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ __all__ = ["Apart", "main"]
 
 HERE = str(Path(__file__).parent)
 LIMIT = 20.0
-"""s for each call; then the process is ended, and the check fails."""
+"""s for each call; then the process is killed, and the check fails."""
 
 
 class Apart(RobotDriver):
-    """A driver that passes every call on to one of that class in another process, and every error back."""
+    """A driver that forwards every call to another process, and every error back."""
 
     modes = frozenset()  # type: ignore[assignment]  # known once the other one is made
     paces_itself = False
@@ -80,7 +80,7 @@ class Apart(RobotDriver):
 
 
 def main(channel: Channel, memories: object, config: Mapping[str, Any]) -> None:
-    """The other process."""
+    """Main program of the other process."""
     module, _, name = config["place"].partition(":")
     driver: RobotDriver = getattr(importlib.import_module(module), name)(from_json(RobotSpec, config["spec"]))
     channel.send({"ready": {"modes": sorted(driver.modes), "paces_itself": driver.paces_itself}})

@@ -1,4 +1,4 @@
-"""Gamepads on a bench."""
+"""Benches of the mock, playback, console and terminal pads, for the contract."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ RECORDED_PAD = """\
 
 @contextmanager
 def playback_pad() -> Iterator[PadBench]:
-    """What happens is in the file and its options; the bench only goes to that time."""
+    """A recording whose file and options contain the events; the bench sets the time of each."""
     from hal.drivers.playback.pad import PlaybackPad
 
     with TemporaryDirectory() as folder:
@@ -53,7 +53,7 @@ def playback_pad() -> Iterator[PadBench]:
         def go_to(seconds: float) -> None:
             bench.now = start + seconds
 
-        bench.press = lambda: None  # it comes by itself
+        bench.press = lambda: None  # the recording presses it
         bench.lose = lambda: go_to(2.5)
         bench.restore = lambda: go_to(4.5)
         bench.freeze = lambda: go_to(30.0)
@@ -63,7 +63,7 @@ def playback_pad() -> Iterator[PadBench]:
 
 @contextmanager
 def web_pad() -> Iterator[PadBench]:
-    """The page of the console; every 10 ms it says how its pad stands."""
+    """The pad of a console page, which sends its state every 10 ms."""
     from hal.drivers.web.pad import PadQueue, WebPad, pad_reading
     from hal.types import AXES
 
@@ -102,7 +102,7 @@ def web_pad() -> Iterator[PadBench]:
 
 @contextmanager
 def terminal_steps() -> Iterator[PadBench]:
-    """The keys of a terminal that never says when one is let go of."""
+    """The keys of a terminal that reports no key release."""
     from terminal_kit import FarEnd
 
     from hal.drivers.terminal.pad import TerminalPad
@@ -115,7 +115,7 @@ def terminal_steps() -> Iterator[PadBench]:
 
 @contextmanager
 def terminal_keys_held() -> Iterator[PadBench]:
-    """The keys of a terminal that says when one is let go of, and whether it is looked at."""
+    """The keys of a terminal that reports key releases and its focus."""
     from terminal_kit import FarEnd
 
     from hal.drivers.terminal.pad import TerminalPad
@@ -128,7 +128,7 @@ def terminal_keys_held() -> Iterator[PadBench]:
 
         def freeze() -> None:
             far.silent = True
-            time.sleep(0.05)  # what was on its way
+            time.sleep(0.05)  # input that was under way
 
         yield PadBench(
             driver=driver,

@@ -20,13 +20,23 @@ from hal.testing import (
     bench_of,
 )
 
-from .cameras import Studio, mock_camera, mock_camera_in_lock_step, pybullet_camera_in_lock_step
+from .benches import (
+    RenderedWorld,
+    mock_camera,
+    mock_camera_in_lock_step,
+    mock_gripper,
+    mock_robot,
+    played_realsense,
+    pybullet_camera_in_lock_step,
+    pybullet_gripper,
+    pybullet_robot,
+    recording,
+    software_realsense,
+    three_joints,
+)
 from .evdev_pads import recorded_pad
 from .frankas import FR3, franka_hand
-from .grippers import mock_gripper, pybullet_gripper
 from .pads import mock_pad, playback_pad, terminal_keys_held, terminal_steps, web_pad
-from .realsenses import played_realsense, recording, software_realsense
-from .robots import mock_robot, pybullet_robot, three_joints
 
 NO_LINK = dict.fromkeys(("lose", "restore", "freeze"), "it is part of the simulation: there is no link")
 
@@ -102,12 +112,12 @@ class TestPyBulletCameraInLockStep(CameraContract, left_out=NO_LINK):
 
 
 @pytest.fixture(scope="module")
-def studios() -> Iterator[list[Studio]]:
+def worlds() -> Iterator[list[RenderedWorld]]:
     """The last one is in use, unless it is broken."""
-    studios: list[Studio] = []
-    yield studios
-    for studio in studios:
-        studio.close()
+    worlds: list[RenderedWorld] = []
+    yield worlds
+    for world in worlds:
+        world.close()
 
 
 class TestPyBulletCameraInRealTime(
@@ -118,10 +128,10 @@ class TestPyBulletCameraInRealTime(
     },
 ):
     @pytest.fixture
-    def bench(self, studios: list[Studio]) -> Iterator[CameraBench]:
-        if not studios or studios[-1].broken:
-            studios.append(Studio())
-        with studios[-1].camera() as bench:
+    def bench(self, worlds: list[RenderedWorld]) -> Iterator[CameraBench]:
+        if not worlds or worlds[-1].broken:
+            worlds.append(RenderedWorld())
+        with worlds[-1].camera() as bench:
             yield bench
 
 
