@@ -39,7 +39,7 @@ __all__ = [
     "provider",
 ]
 
-PadInput = Literal["plugged", "console", "terminal", "recording"]
+PadInput = Literal["plugged", "console", "keys", "recording"]
 """A gamepad that is plugged in, the page of the console, the keys of the program's terminal, or a recording."""
 
 GROUP = "hal.drivers"

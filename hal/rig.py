@@ -308,7 +308,7 @@ class Rig:
         """Return the second argument of a gamepad driver: the console, this rig's stop, or the world's time."""
         if chosen.input == "console":
             return self.console
-        if chosen.input == "terminal":
+        if chosen.input == "keys":
             return self.stop
         return self._world_time() if chosen.input == "recording" else None
 

@@ -9,6 +9,6 @@ __all__ = ["DRIVER"]
 DRIVER = DriverSpec(
     name="terminal",
     gamepad="hal.drivers.terminal.pad:TerminalPad",
-    pad_input="terminal",
+    pad_input="keys",
     pad_title="the terminal of the program",
 )

@@ -17,7 +17,7 @@ __all__ = ["TOUR", "Chosen", "check_wanted", "choose_pad", "pad_choices", "tour"
 TOUR = ("config", "teleop/tour.jsonl")
 """The recorded tour, among the data files."""
 _AUTO, _DEMO, _NONE = "auto", "demo", "none"
-_LIVE: tuple[PadInput, ...] = ("plugged", "console", "terminal")
+_LIVE: tuple[PadInput, ...] = ("plugged", "console", "keys")
 _NO_RECORDING = "a recording cannot hold the dead-man of a real arm; plug a gamepad in, or use --pad {console}"
 
 

@@ -1,0 +1,165 @@
+"""The rules for the layout of the code: who may import whom, no circles, no driver named in ``hal/``, unique names."""
+
+from __future__ import annotations
+
+import ast
+import re
+from collections import Counter
+from collections.abc import Iterator
+from functools import cache
+from pathlib import Path
+
+ROOT = Path(__file__).parents[2]
+LARGEST_FILE = 600
+CIRCLES = 3
+"""At most so many import circles, TYPE_CHECKING included, and none of more modules than this."""
+SHARED_CLASS_NAMES = 3
+DRIVERS = tuple(sorted(path.parent.name for path in (ROOT / "drivers").glob("*/__init__.py")))
+
+
+@cache
+def sources() -> dict[str, Path]:
+    """Return every module of the package, by its dotted name."""
+    found = {}
+    for folder in ("hal", "drivers", "apps"):
+        for path in (ROOT / folder).rglob("*.py"):
+            parts = path.relative_to(ROOT).with_suffix("").parts
+            if path.is_relative_to(ROOT / "hal" / "data") or parts[:2] in (("hal", "drivers"), ("hal", "apps")):
+                continue  # links to the folders beside hal/
+            parts = parts if folder == "hal" else ("hal", *parts)
+            found[".".join(parts[:-1] if parts[-1] == "__init__" else parts)] = path
+    return found
+
+
+@cache
+def tree(path: Path) -> ast.Module:
+    """Return a module's syntax tree."""
+    return ast.parse(path.read_text(encoding="utf-8"))
+
+
+def imports(module: str) -> Iterator[str]:
+    """Yield the dotted names that a module imports, ``module.name`` for each name, TYPE_CHECKING included."""
+    path = sources()[module]
+    package = module.split(".") if path.name == "__init__.py" else module.split(".")[:-1]
+    for node in ast.walk(tree(path)):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            base = package[: len(package) - node.level + 1] if node.level else []
+            name = ".".join([*base, *([node.module] if node.module else [])])
+            yield name
+            yield from (f"{name}.{alias.name}" for alias in node.names)
+
+
+def circles() -> list[list[str]]:
+    """Return the strongly connected components of the imports that have more than one module."""
+    modules = {name for name, path in sources().items() if path.name != "__init__.py"}
+    edges = {module: sorted({name for name in imports(module) if name in modules} - {module}) for module in modules}
+    order: list[str] = []
+    seen: set[str] = set()
+
+    def visit(start: str, graph: dict[str, list[str]], out: list[str]) -> None:
+        stack = [(start, iter(graph[start]))]
+        seen.add(start)
+        while stack:
+            rest = stack[-1][1]
+            follower = next((name for name in rest if name not in seen), None)
+            if follower is None:
+                out.append(stack.pop()[0])
+            else:
+                seen.add(follower)
+                stack.append((follower, iter(graph[follower])))
+
+    for module in sorted(modules):
+        if module not in seen:
+            visit(module, edges, order)
+    backwards: dict[str, list[str]] = {module: [] for module in modules}
+    for module, followers in edges.items():
+        for follower in followers:
+            backwards[follower].append(module)
+    seen.clear()
+    found = []
+    for module in reversed(order):
+        if module not in seen:
+            part: list[str] = []
+            visit(module, backwards, part)
+            found.append(sorted(part))
+    return [part for part in found if len(part) > 1]
+
+
+def test_import_circles_are_few_and_small() -> None:
+    found = circles()
+    assert len(found) <= CIRCLES, found
+    assert all(len(part) <= CIRCLES for part in found), found
+
+
+def test_hal_names_no_driver() -> None:
+    """Only the registry does. The reader of Ark's configurations knows the names that Ark uses."""
+    quoted = re.compile(rf"""["']({"|".join(DRIVERS)})["']""")
+    wrong = {
+        f"{module}: {found[0]}"
+        for module, path in sources().items()
+        if not module.startswith(("hal.drivers", "hal.apps", "hal.ark")) and module != "hal.registry"
+        for found in quoted.finditer(path.read_text(encoding="utf-8"))
+    }
+    assert not wrong
+
+
+def test_hal_imports_no_driver_and_no_app() -> None:
+    wrong = {
+        f"{module} imports {name}"
+        for module in sources()
+        if not module.startswith(("hal.drivers", "hal.apps"))
+        for name in imports(module)
+        if name.startswith(("hal.drivers.", "hal.apps."))
+    }
+    assert not wrong
+
+
+def test_a_driver_imports_no_other_driver_and_no_app() -> None:
+    wrong = {
+        f"{module} imports {name}"
+        for module in sources()
+        if module.startswith("hal.drivers.")
+        for name in imports(module)
+        if name.startswith("hal.apps.")
+        or (name.startswith("hal.drivers.") and name.split(".")[2] != module.split(".")[2])
+    }
+    assert not wrong
+
+
+def test_nothing_outside_hal_uses_a_private_attribute_of_a_rig() -> None:
+    private = re.compile(r"\brig\._[a-z]")
+    wrong = [
+        module
+        for module, path in sources().items()
+        if module.startswith(("hal.drivers.", "hal.apps.")) and private.search(path.read_text(encoding="utf-8"))
+    ]
+    assert not wrong
+
+
+def test_class_names_are_unique() -> None:
+    names = Counter(
+        node.name
+        for path in sources().values()
+        for node in tree(path).body
+        if isinstance(node, ast.ClassDef) and not node.name.startswith("_")
+    )
+    shared = [name for name, count in names.items() if count > 1]
+    assert len(shared) <= SHARED_CLASS_NAMES, shared
+
+
+def test_no_file_is_too_long() -> None:
+    long = {module: n for module, path in sources().items() if (n := len(path.read_text().splitlines())) > LARGEST_FILE}
+    assert not long
+
+
+def test_no_docstring_is_a_question() -> None:
+    wrong = [
+        f"{module}:{node.lineno}"
+        for module, path in sources().items()
+        for node in ast.walk(tree(path))
+        if isinstance(node, (ast.FunctionDef, ast.ClassDef))
+        and (ast.get_docstring(node) or "").split("\n")[0].rstrip().endswith("?")
+    ]
+    assert not wrong
