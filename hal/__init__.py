@@ -39,6 +39,7 @@ if TYPE_CHECKING:
         DatasetError,
         DeviceNotFound,
         DriverMissing,
+        Fault,
         HalError,
         MotionStopped,
         NotSupported,
@@ -54,18 +55,7 @@ if TYPE_CHECKING:
     from .robot import Robot
     from .specs import BodySpec
     from .teleop import Teleop
-    from .types import (
-        Fault,
-        Frame,
-        GripperOutcome,
-        GripperState,
-        Limited,
-        PadState,
-        RobotState,
-        RobotStatus,
-        Stamp,
-        Trip,
-    )
+    from .types import Frame, GripperOutcome, GripperState, Limited, PadState, RobotState, RobotStatus, Stamp, Trip
 
     open = open_rig
 

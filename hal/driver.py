@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from .errors import NotSupported
+from .errors import Fault, NotSupported
 from .geometry import Pose, frozen
 from .specs import CameraSpec
-from .types import Fault, GripperOutcome
+from .types import GripperOutcome
 
 if TYPE_CHECKING:
     from .specs import GripperSpec, PadSpec, RobotSpec

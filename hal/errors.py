@@ -24,7 +24,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from .types import Fault
+    pass  # FOLD: import dropped
 
 __all__ = [
     "CommandError",
@@ -34,6 +34,7 @@ __all__ = [
     "DatasetError",
     "DeviceNotFound",
     "DriverMissing",
+    "Fault",
     "HalError",
     "MotionStopped",
     "NotSupported",
@@ -59,6 +60,18 @@ class HalError(Exception):
         super().__init__(*args, **more)  # such as the `name` of an ImportError
         if code is not None:
             self.code = code
+
+
+@dataclass(frozen=True, slots=True)
+class Fault:
+    """A fault of a device, with its cause and its remedy."""
+
+    code: str
+    cause: str
+    remedy: str
+
+    def __str__(self) -> str:
+        return f"{self.cause} ({self.code}); {self.remedy}"
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING
 
 from ._moved import names_of
 from .arguments import number
-from .errors import ConnectionLost, MotionStopped, RobotFault, StaleStateError
+from .errors import ConnectionLost, Fault, MotionStopped, RobotFault, StaleStateError
 from .host.records import GripperAct, GripperCommand
-from .types import Fault, GripperOutcome, GripperState
+from .types import GripperOutcome, GripperState
 
 if TYPE_CHECKING:
     from .clock import Clock
@@ -158,7 +158,7 @@ class Gripper:
 
     def state_at(self, t: float) -> GripperState:
         """The state at ``t`` (s on ``rig.clock``), interpolated; as :meth:`hal.robot.Robot.state_at`."""
-        from .observation import gripper_at
+        from .interpolation import gripper_at
 
         self.check()
         return gripper_at(self._mail.history, t, f"the gripper of {self._robot}")

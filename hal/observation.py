@@ -4,103 +4,27 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from types import MappingProxyType
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from .arguments import number, whole
 from .errors import CommandError, DeviceNotFound, StaleStateError
-from .geometry import Pose, after_rotation, difference
-from .host.memory import History
-from .types import Frame, GripperState, RobotState, Stamp
+from .types import Frame, GripperState, RobotState
 
 if TYPE_CHECKING:
     from collections.abc import Collection
 
     from .rig import Rig
 
-__all__ = [
-    "Moment",
-    "Observation",
-    "Observer",
-    "gripper_at",
-    "robot_at",
-]
+__all__ = ["Moment", "Observation", "Observer"]
 
 # [interpolation.py] What a device's state was between two of its samples.
 
 Array = NDArray[np.float64]
-AnyState = TypeVar("AnyState", RobotState, GripperState)
-
-NEWER = 0.05
-"""s by which a time may be newer than the newest state; that state then stands for it."""
-
-
-def robot_at(history: History[RobotState], t: float, name: str) -> RobotState:
-    """An arm's state at ``t``: numbers in proportion between its neighbours, everything else as in the one before.
-
-    Raises StaleStateError where ``t`` is older than what is kept, or newer than the newest state by more than 50 ms.
-    """
-    before, after, share = _neighbours(history, t, name)
-    if share == 0.0:
-        return before
-
-    def mixed(a: Array | None, b: Array | None) -> Array | None:
-        return None if a is None or b is None else a + share * (b - a)
-
-    def sure(a: Array, b: Array) -> Array:
-        return a + share * (b - a)
-
-    return replace(
-        before,
-        stamp=_stamp(before.stamp, after.stamp, share),
-        q=sure(before.q, after.q),
-        dq=sure(before.dq, after.dq),
-        tau=mixed(before.tau, after.tau),
-        q_set=sure(before.q_set, after.q_set),
-        dq_set=sure(before.dq_set, after.dq_set),
-        tcp=_pose(before.tcp, after.tcp, share),
-        tcp_set=_pose(before.tcp_set, after.tcp_set, share),
-        tcp_twist=sure(before.tcp_twist, after.tcp_twist),
-        tau_ext=mixed(before.tau_ext, after.tau_ext),
-        wrench_ext=mixed(before.wrench_ext, after.wrench_ext),
-    )
-
-
-def gripper_at(history: History[GripperState], t: float, name: str) -> GripperState:
-    """The same for a gripper: its width."""
-    before, after, share = _neighbours(history, t, name)
-    if share == 0.0:
-        return before
-    width = before.width + share * (after.width - before.width)
-    return replace(before, stamp=_stamp(before.stamp, after.stamp, share), width=width)
-
-
-def _neighbours(history: History[AnyState], t: float, name: str) -> tuple[AnyState, AnyState, float]:
-    """The states before and after ``t``, and how far between them it lies, 0..1."""
-    found = history.around(t)
-    if found is None:
-        raise StaleStateError(f"{name}: its state of {t:.3f} s is not known, or not any more")
-    before, after = found
-    span = after.stamp.t - before.stamp.t
-    if span <= 0.0:  # nothing came after it
-        if t - before.stamp.t > NEWER:
-            raise StaleStateError(f"{name}: its newest state is {t - before.stamp.t:.3f} s older than {t:.3f} s")
-        return before, after, 0.0
-    return before, after, (t - before.stamp.t) / span
-
-
-def _stamp(a: Stamp, b: Stamp, share: float) -> Stamp:
-    return Stamp(a.t + share * (b.t - a.t), a.t_device + share * (b.t_device - a.t_device), a.seq)
-
-
-def _pose(a: Pose, b: Pose, share: float) -> Pose:
-    twist = difference((*a.position, *a.orientation), (*b.position, *b.orientation))
-    turned = after_rotation(a.orientation.tolist(), [share * value for value in twist[3:]])
-    return Pose(a.position + share * (b.position - a.position), turned)
 
 
 _NONE: Mapping[str, RobotState] = MappingProxyType({})

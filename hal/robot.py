@@ -178,7 +178,7 @@ class Robot:
 
         The last second is kept. Raises StaleStateError for a time that is older, or more than 50 ms in the future.
         """
-        from .observation import robot_at
+        from .interpolation import robot_at
 
         self._host.check()
         return robot_at(self._mail.history, t, self.name)

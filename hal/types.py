@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from .errors import Fault
 from .geometry import Pose
 
 __all__ = [
@@ -177,18 +178,6 @@ class Limited(IntFlag):
     """The device had not taken the last set-point; the motion goes on from where it says it is."""
     TORQUE = 128
     """The commanded torques were cut to the torque limits."""
-
-
-@dataclass(frozen=True, slots=True)
-class Fault:
-    """A fault, with what a person can do about it."""
-
-    code: str
-    cause: str
-    remedy: str
-
-    def __str__(self) -> str:
-        return f"{self.cause} ({self.code}); {self.remedy}"
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -17,13 +17,12 @@ from typing import Any, ClassVar
 
 from hal.config.data_files import find_data
 from hal.driver import Reading, RobotDriver, Setpoint
-from hal.errors import ConnectionLost, DriverMissing, HalError, RobotFault
+from hal.errors import ConnectionLost, DriverMissing, Fault, HalError, RobotFault
 from hal.histogram import Histogram
 from hal.kinematics import Kinematics
 from hal.lock import DeviceLock
 from hal.preflight import has_realtime_kernel
 from hal.specs import RobotSpec
-from hal.types import Fault
 
 from .faults import ARM_PORT, fault_of, fault_of_exception, is_connection_lost
 from .flags import FLAGS

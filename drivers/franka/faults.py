@@ -10,7 +10,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from hal.types import Fault
+from hal.errors import Fault
 
 from .flags import FLAG_TEXTS, LOSSY_FLAGS
 

@@ -25,7 +25,8 @@ from dataclasses import dataclass
 from enum import Enum
 from typing import NamedTuple, TypeAlias
 
-from hal.types import Fault, GripperOutcome
+from hal.errors import Fault
+from hal.types import GripperOutcome
 
 __all__ = [
     "CallAnswer",

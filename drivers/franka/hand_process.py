@@ -18,9 +18,8 @@ from collections import deque
 from collections.abc import Iterator, Sequence
 from typing import Any, NoReturn, TypeAlias
 
-from hal.errors import ConnectionLost, HalError, NotSupported
+from hal.errors import ConnectionLost, Fault, HalError, NotSupported
 from hal.host.process import Channel, Child, SharedMemory, unpack_error
-from hal.types import Fault
 
 from .faults import HAND_PORT, fault_of_exception
 from .hand_motions import CallAnswer, HandState

@@ -10,11 +10,10 @@ from dataclasses import replace
 from typing import Any
 
 from hal import registry
-from hal.errors import ConnectionLost, ControlTaken
+from hal.errors import ConnectionLost, ControlTaken, Fault
 from hal.host.process import Channel, Child, SharedMemory
 from hal.preflight import CheckResult
 from hal.specs import RobotSpec
-from hal.types import Fault
 
 from .faults import (
     ARM_PORT,

@@ -12,9 +12,9 @@ from collections.abc import Iterable, Sequence
 from typing import ClassVar
 
 from hal.driver import GripperDriver, GripperReading, Reading, RobotDriver, Setpoint
-from hal.errors import CommandError, ConnectionLost
+from hal.errors import CommandError, ConnectionLost, Fault
 from hal.specs import GripperSpec, RobotSpec
-from hal.types import Fault, GripperOutcome
+from hal.types import GripperOutcome
 
 from .faults import MockGripperFaults, MockRobotFaults, with_faults
 

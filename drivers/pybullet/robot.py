@@ -6,9 +6,8 @@ from collections.abc import Sequence
 from typing import Any, ClassVar
 
 from hal.driver import Reading, RobotDriver, Setpoint
-from hal.errors import CommandError, ConnectionLost
+from hal.errors import CommandError, ConnectionLost, Fault
 from hal.specs import RobotSpec
-from hal.types import Fault
 
 from .motors import JointTorques, hold, position_gain
 from .world import PyBulletWorld

@@ -8,8 +8,9 @@ from typing import Any
 
 from hal.commands import DeadmanRecord
 from hal.control import trip_text
+from hal.errors import Fault
 from hal.host.records import GripperMail, GroupMemory, RobotMail
-from hal.types import Fault, RobotState, RobotStatus, Trip
+from hal.types import RobotState, RobotStatus, Trip
 
 __all__ = ["Telemetry", "rounded"]
 

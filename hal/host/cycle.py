@@ -16,14 +16,14 @@ import numpy as np
 from .. import registry
 from ..commands import Inbox, Session
 from ..driver import Reading, RobotDriver
-from ..errors import ConnectionLost, ControlTaken, DeviceNotFound, NotSupported
+from ..errors import ConnectionLost, ControlTaken, DeviceNotFound, Fault, NotSupported
 from ..geometry import Pose
 from ..histogram import Histogram
 from ..kinematics.arm import Kinematics
 from ..servo.audit import SetpointAudit
 from ..servo.servo import Servo
 from ..specs import GroupSpec, RobotSpec
-from ..types import Fault, RobotStatus
+from ..types import RobotStatus
 from .gripper_unit import GripperUnit
 from .records import AppRecord, GripperMail, GroupMemory, Marks, RobotMail, ServoRecord
 

@@ -6,8 +6,8 @@ import math
 import traceback
 
 from ..driver import GripperDriver, GripperReading
-from ..errors import CommandError, ConfigError, ConnectionLost, DriverMissing, HalError, NotSupported, RobotFault
-from ..types import Fault, GripperOutcome
+from ..errors import CommandError, ConfigError, ConnectionLost, DriverMissing, Fault, HalError, NotSupported, RobotFault
+from ..types import GripperOutcome
 from .records import AppRecord, GripperAct, GripperCommand, GripperMail
 
 __all__ = ["AT_WIDTH", "GripperUnit"]

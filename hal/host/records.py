@@ -19,8 +19,9 @@ from numpy.typing import NDArray
 
 from ..commands import CHUNK_POINTS, CommandRecord, DeadmanRecord, Kind
 from ..driver import Reading
+from ..errors import Fault
 from ..geometry import Pose
-from ..types import Fault, GripperOutcome, GripperState, Limited, RobotState, RobotStatus, Stamp, Trip
+from ..types import GripperOutcome, GripperState, Limited, RobotState, RobotStatus, Stamp, Trip
 from .memory import History, Mailbox, Newest, SeriesBox, newest
 
 if TYPE_CHECKING:

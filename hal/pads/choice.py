@@ -75,7 +75,7 @@ def choose_pad(spec: PadSpec, wanted: str | None, *, attended: bool, lock_step: 
     if attended and not emulated:
         text = _NO_RECORDING.format(console=registry.pad_driver("console"))
         raise NotSupported(text, code="recording_on_real_arm")
-    notes = ("a recording holds the dead-man: every real device here is an emulator",) if attended else ()
+    notes = ("a recording holds the dead-man: every real device here is emulated",) if attended else ()
     return Chosen(tour(spec) if wanted == _DEMO else _recording(spec, Path(str(wanted))), notes)
 
 

@@ -17,9 +17,19 @@ from .codecs import Encoder
 from .dataset import check_compatible
 from .finish import keep_mark
 from .index import read_index
-from .layout import MORE_STREAMS, TIMES, Layout, Pace, about_call, about_rig, about_start, features_of, locked, require
+from .layout import MORE_STREAMS, TIMES, Layout, Pace, features_of, locked, require
 from .ring import RowRing
-from .sampling import CameraTrack, Grid, LockStepGrid, RealTimeGrid, Sampler, movable
+from .sampling import (
+    CameraTrack,
+    Grid,
+    LockStepGrid,
+    RealTimeGrid,
+    Sampler,
+    about_call,
+    about_rig,
+    about_start,
+    movable,
+)
 
 if TYPE_CHECKING:
     from ..rig import Rig

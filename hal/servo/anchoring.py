@@ -22,7 +22,8 @@ from math import inf
 from typing import Any
 
 from ..driver import Reading, Setpoint
-from ..types import Fault, Trip
+from ..errors import Fault
+from ..types import Trip
 from .smoothing import JointSmoother, stop_peak
 from .watchdog import SILENCE
 

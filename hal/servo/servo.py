@@ -15,10 +15,10 @@ from typing import Any
 
 from ..commands import CommandRecord, Inbox, Kind, Session
 from ..driver import Reading, Setpoint
-from ..errors import CommandError, ControlTaken
+from ..errors import CommandError, ControlTaken, Fault
 from ..kinematics.arm import Kinematics
 from ..specs import RobotSpec
-from ..types import Fault, Limited, RobotStatus, Trip
+from ..types import Limited, RobotStatus, Trip
 from .anchoring import Anchoring
 from .cartesian import PoseMotion, TwistMotion
 from .envelope import Envelope

@@ -12,9 +12,9 @@ from pathlib import Path
 from typing import Any
 
 from hal.driver import Reading, RobotDriver, Setpoint
+from hal.errors import Fault
 from hal.host.process import Channel, Child, pack_error
 from hal.specs import RobotSpec, from_json, to_json
-from hal.types import Fault
 
 __all__ = ["Apart", "main"]
 

@@ -160,7 +160,7 @@ class TestLimp(WrongRobot):
 class TestFaultWithoutRemedy(WrongRobot):
     class driver(MockRobot):  # noqa: N801
         def read(self, now):
-            from hal.types import Fault
+            from hal.errors import Fault
 
             reading = super().read(now)
             return reading._replace(fault=reading.fault and Fault("7", reading.fault.cause, ""))

@@ -13,11 +13,12 @@ from specs import panda
 
 from hal.commands import CommandRecord, DeadmanRecord, Inbox, Kind, Session
 from hal.driver import Reading, Setpoint
+from hal.errors import Fault
 from hal.kinematics.arm import Kinematics
 from hal.servo.audit import SetpointAudit
 from hal.servo.servo import Servo
 from hal.specs import LimitsSpec, RobotSpec
-from hal.types import Fault, Limited, RobotStatus, Trip
+from hal.types import Limited, RobotStatus, Trip
 
 N = 7
 STILL = (0.0,) * N

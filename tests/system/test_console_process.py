@@ -17,9 +17,9 @@ from child_targets import HURRY
 from web_kit import REST, TOKEN, WAIT, App, Page, run
 
 from hal.drivers.web.messages import PAGE_SILENT
-from hal.errors import NotSupported
+from hal.errors import Fault, NotSupported
 from hal.servo.watchdog import PAD_SILENCE
-from hal.types import Fault, RobotStatus
+from hal.types import RobotStatus
 
 
 @pytest.fixture

@@ -14,8 +14,8 @@ import pytest
 
 from hal.drivers.franka.faults import flags_in
 from hal.drivers.franka.flags import FLAGS
+from hal.errors import Fault
 from hal.host import records
-from hal.types import Fault
 
 from .franka_kit import free_host
 

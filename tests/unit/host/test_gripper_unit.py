@@ -7,11 +7,11 @@ from typing import Any
 import pytest
 
 from hal.driver import GripperDriver, GripperReading
-from hal.errors import CommandError, ConnectionLost, RobotFault
+from hal.errors import CommandError, ConnectionLost, Fault, RobotFault
 from hal.host.gripper_unit import GripperUnit
 from hal.host.records import AppRecord, GripperAct, GripperCommand, GripperMail, GripperRecord
 from hal.specs import GripperSpec
-from hal.types import Fault, GripperOutcome
+from hal.types import GripperOutcome
 
 
 class Scripted(GripperDriver):

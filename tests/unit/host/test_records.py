@@ -8,8 +8,9 @@ import pytest
 
 from hal.commands import CommandRecord, DeadmanRecord, Kind
 from hal.driver import GripperReading, Reading
+from hal.errors import Fault
 from hal.host.records import GripperAct, GripperCommand, GripperMail, GroupMemory, RobotMail, ServoRecord
-from hal.types import Fault, GripperOutcome, Limited, RobotStatus, Trip
+from hal.types import GripperOutcome, Limited, RobotStatus, Trip
 
 N = 6
 Q, DQ, Q_SET, DQ_SET = ([10.0 * k + i for i in range(N)] for k in range(4))

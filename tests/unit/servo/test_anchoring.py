@@ -15,10 +15,11 @@ from servo_kit import STILL, Bench, N
 from specs import panda
 
 from hal.commands import Kind
+from hal.errors import Fault
 from hal.kinematics.arm import Kinematics
 from hal.servo.anchoring import LATEST
 from hal.servo.audit import SetpointAudit
-from hal.types import Fault, Limited, RobotStatus
+from hal.types import Limited, RobotStatus
 
 
 class Device:

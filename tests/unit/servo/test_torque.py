@@ -17,9 +17,10 @@ from torque_kit import NOTHING, Driven, N, one, wheels
 from hal.commands import Kind, Session
 from hal.driver import Reading, Setpoint
 from hal.drivers.mock.robot import MockRobot
+from hal.errors import Fault
 from hal.servo.servo import Servo
 from hal.specs import WorkspaceSpec
-from hal.types import Fault, Limited, RobotStatus, Trip
+from hal.types import Limited, RobotStatus, Trip
 
 HEAVY = 1e4  # kg m2: no torque makes such an arm fast, so that none is held back
 

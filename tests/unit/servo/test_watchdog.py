@@ -9,7 +9,8 @@ from servo_kit import Bench
 from specs import panda
 
 from hal.commands import Kind
-from hal.types import Fault, RobotStatus, Trip
+from hal.errors import Fault
+from hal.types import RobotStatus, Trip
 
 PATIENCE = 0.15
 PAD_PATIENCE = 0.12

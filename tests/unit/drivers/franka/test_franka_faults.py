@@ -14,8 +14,8 @@ from hal.drivers.franka.faults import (
     version_fault,
 )
 from hal.drivers.franka.flags import FLAG_TEXTS, FLAGS, flag_index
+from hal.errors import Fault
 from hal.host import records
-from hal.types import Fault
 
 
 def fits(fault: Fault) -> bool:

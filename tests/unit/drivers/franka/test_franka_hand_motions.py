@@ -22,8 +22,8 @@ from hal.drivers.franka.hand_motions import (
     WidthRange,
     is_holding,
 )
-from hal.errors import DriverMissing
-from hal.types import Fault, GripperOutcome
+from hal.errors import DriverMissing, Fault
+from hal.types import GripperOutcome
 
 DT = 0.01
 ABORTED = Fault("hand_aborted", "it was stopped", "")
