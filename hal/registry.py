@@ -104,6 +104,8 @@ class DriverSpec:
     """Options that are paths of files: in a rig or a model they are relative to the file that names them."""
     own_process: frozenset[str] = frozenset()
     """Kinds of device that need a process of their own (``gripper``: the vendor's calls block)."""
+    stands_in: bool = False
+    """Whether ``hal.open(driver=...)`` may put this driver in place of every device, in lock-step."""
     requires: Mapping[str, str] = field(default_factory=dict)
     """Import name of each library that the driver needs -> the command that installs it."""
 

@@ -15,4 +15,5 @@ DRIVER = DriverSpec(
     gripper="hal.drivers.mock.robot:MockGripper",
     camera="hal.drivers.mock.camera:MockCamera",
     gamepad="hal.drivers.mock.gamepad:MockPad",
+    stands_in=True,
 )

@@ -101,7 +101,7 @@ class Context:
     @property
     def time(self) -> str:
         """The clock, after the caller's word: ``real_time`` or ``lock_step``."""
-        default = "lock_step" if self.driver == "mock" else self.rig.simulation.clock or "real_time"
+        default = "lock_step" if self.driver is not None else self.rig.simulation.clock or "real_time"
         return self.clock or default
 
     def simulated(self, device: Device, parent: Device | None = None) -> bool:

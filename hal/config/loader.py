@@ -12,6 +12,7 @@ from typing import Any
 
 from pydantic import PrivateAttr
 
+from .. import registry
 from ..specs import Plan
 from .context import Context
 from .data_files import data_folder, is_path, list_data, user_path
@@ -52,25 +53,34 @@ def load(
     Raises ConfigError with every problem.
     """
     problems = Problems()
-    _check_arguments(sim, driver, clock, problems)
+    _check_arguments(sim, clock, problems)
+    stand_in = _stand_in(driver, problems)
     data, source, base = _read(config, problems)
     if data is None:
         problems.raise_any()
         raise AssertionError("no data and no problem")
     data = apply_overrides(data, overrides, problems)
     rig = validate(RigConfig, data, source, problems)
-    stand_in = "mock" if driver is not None else None  # another one was noted above
     rig._plan = resolve(Context(source, base, rig, sim, stand_in, clock, problems))
     return rig
 
 
-def _check_arguments(sim: object, driver: str | None, clock: str | None, problems: Problems) -> None:
+def _check_arguments(sim: object, clock: str | None, problems: Problems) -> None:
     if sim is not None and not isinstance(sim, bool):
         problems.add("<arguments>", "sim", f"must be true, false or nothing, not {sim!r}")
     if clock is not None and clock not in CLOCKS:
         problems.add("<arguments>", "clock", f"{clock!r} is not possible{nearest(clock, CLOCKS)}")
-    if driver is not None and driver != "mock":
-        problems.add("<arguments>", "driver", f"only 'mock' can stand in for every device, not {driver!r}")
+
+
+def _stand_in(driver: str | None, problems: Problems) -> str | None:
+    """Return the driver that replaces every other; after a problem one that can, so that the rest is checked, too."""
+    if driver is None:
+        return None
+    fit = [name for name in registry.BUILT_IN if registry.driver(name).stands_in]
+    if driver in fit:
+        return driver
+    problems.add("<arguments>", "driver", f"only {', '.join(fit)} can stand in for every device, not {driver!r}")
+    return fit[0]
 
 
 def _read(config: str | Path | Mapping[str, Any], problems: Problems) -> tuple[dict[str, Any] | None, str, Path]:
