@@ -14,7 +14,7 @@ from hal.errors import ConfigError
 from .blocks import RUN, SHOWN, Block, anchors_of, blocks_of, links_of
 from .running import ROOT, Reader
 
-DOCUMENTS = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+DOCUMENTS = [ROOT / "README.md", *sorted(ROOT.glob("C*.md")), *sorted((ROOT / "docs").rglob("*.md"))]
 
 
 def names(paths: list[Path]) -> list[str]:
