@@ -1,4 +1,31 @@
-"""TODO: docstring."""
+"""The driver interface: one abstract class for each kind of device, with the records that it hands over.
+
+A driver talks to one device and does nothing else. Limits, smoothing, deadlines, the dead-man, stops and the ages of
+states are handled above it, and are the same for every driver. To support a new device, subclass one of
+
+    RobotDriver      open, read, write, halt, close
+    GripperDriver    open, read, move, stop, close
+    CameraDriver     open, grab, close
+    GamepadDriver    open, poll, close
+
+with the methods listed, which are abstract (all others are optional), and name the class in a
+:class:`hal.registry.DriverSpec`.
+
+Rules for every driver:
+
+* ``__init__`` stores the device's record (``self.spec``; ``spec.options`` holds the driver's options from the rig
+  file) and opens nothing.
+* ``open`` connects and never moves anything. ``close`` may be called at any time, more than once, and stops safely
+  first.
+* A device that does not answer raises :class:`~hal.errors.ConnectionLost`, at every call. Any other exception counts
+  as a mistake in the driver and ends the process that runs it.
+* Methods return within one cycle of the device, except those whose docstring grants a timeout.
+* SI units and radians. Times named ``t`` are on the host's monotonic clock (``time.monotonic()``; in lock-step the
+  simulated time), ``t_device`` is on the device's own clock. An unknown value is None, never 0.
+
+``docs/write-a-driver.md`` shows a complete driver and its test; :mod:`hal.testing` holds the contract tests that every
+driver must pass.
+"""
 
 from __future__ import annotations
 
@@ -13,16 +40,16 @@ from numpy.typing import NDArray
 
 from .errors import Fault, NotSupported
 from .geometry import Pose, frozen
-from .specs import CameraSpec
 from .types import GripperOutcome
 
 if TYPE_CHECKING:
-    from .specs import GripperSpec, PadSpec, RobotSpec
+    from .specs import CameraSpec, GripperSpec, PadSpec, RobotSpec
 
 __all__ = [
     "CameraDriver",
     "CameraInfo",
     "CameraTally",
+    "DeviceDriver",
     "GamepadDriver",
     "GripperDriver",
     "GripperReading",
@@ -36,9 +63,285 @@ __all__ = [
     "nominal_info",
 ]
 
-# [camera_info.py] What a camera is, and how it sees: read once when it is opened.
-
 Array = NDArray[np.float64]
+Floats = Sequence[float]
+
+
+class DeviceDriver(ABC):
+    """What the drivers of all kinds of device have in common."""
+
+    simulated: ClassVar[bool] = False
+    """Whether no real device is behind this driver: nothing real moves, nobody real presses a button."""
+
+    @abstractmethod
+    def open(self) -> None:
+        """Connect to the device, within some seconds. Nothing moves.
+
+        Raises:
+            DeviceNotFound: No such device; the message lists those that are there.
+            ConnectionLost: The device does not answer.
+            NotSupported: The device cannot do what its record requests, for example a camera's stream.
+        """
+
+    def inject(self, **faults: object) -> None:
+        """Switch simulated faults on or off, for tests; a driver without faults raises NotSupported."""
+        raise NotSupported(f"driver {type(self).__name__} has no faults to inject")
+
+    @abstractmethod
+    def close(self) -> None:
+        """Stop safely and release the device, in bounded time. Idempotent; a lost link is no error.
+
+        A gripper keeps the object that it holds.
+        """
+
+
+# Robot arms
+
+
+class Reading(NamedTuple):
+    """State of an arm, as its driver reports it once per cycle. Plain floats, no arrays: this is the hot path."""
+
+    t: float
+    """Time of the measurement on the host's clock, s."""
+    t_device: float
+    """Time of the measurement on the device's own clock, s."""
+    seq: int
+    """Number of the device's sample; a gap is a lost sample."""
+    q: Floats
+    """Joint positions (n,), rad."""
+    dq: Floats
+    """Joint velocities (n,), rad/s."""
+    tau: Floats | None = None
+    """Joint torques (n,), Nm."""
+    q_commanded: Floats | None = None
+    """Set-point (n,) that the device reports as the last one it took, rad; None if it does not report one. The servo
+    detects lost set-points by it."""
+    dq_commanded: Floats | None = None
+    """Velocity of that set-point (n,), rad/s."""
+    tau_ext: Floats | None = None
+    """External joint torques (n,), Nm."""
+    wrench_ext: Floats | None = None
+    """External force and torque (6,) at the tcp, N and Nm."""
+    fault: Fault | None = None
+    """Fault of the device; it stops the arm and latches the stop."""
+    tau_commanded: Floats | None = None
+    """In torque mode: torques (n,) that the device reports as the last ones it took, Nm; None until it has changed its
+    mode. The servo continues from them, as it does from ``q_commanded``."""
+
+
+class Setpoint(NamedTuple):
+    """Set-point that the servo writes to an arm's driver once per cycle: continuous, and within all limits.
+
+    A driver may keep the sequences and report them as ``q_commanded``, but must not change them.
+    """
+
+    q: Floats
+    """Joint positions (n,), rad."""
+    dq: Floats
+    """Joint velocities (n,), rad/s."""
+    ddq: Floats
+    """Joint accelerations (n,), rad/s^2."""
+    tau: Floats | None = None
+    """Joint torques (n,), Nm, in torque mode only: to be applied on top of those that carry the arm's own weight.
+    ``q`` and ``dq`` are then the measured ones."""
+    q_from: Floats | None = None
+    """Position (n,) of the device at present, as far as the servo can tell: the set-point before this one, rad. In
+    position mode only."""
+
+
+class RobotDriver(DeviceDriver):
+    """Driver of one arm.
+
+    All methods are called from one thread of the process that runs the arm's servo. ``wait`` (where the device sets
+    the pace), ``read`` and ``write`` are called once per cycle. A device that stops getting set-points must hold by
+    itself, because the process may be killed.
+
+    Args:
+        spec: Record of the arm: joints, limits, rate, options.
+        world: Simulated world that the arm stands in; None for a real arm.
+    """
+
+    modes: ClassVar[frozenset[str]] = frozenset({"position"})
+    """Kinds of set-point that the device takes: ``position``, ``velocity``, ``torque``."""
+    paces_itself: ClassVar[bool] = False
+    """Whether the device sets the pace: :meth:`wait` then blocks until its next cycle (a Franka's state packets)."""
+    repeats: ClassVar[bool] = False
+    """Whether the device repeats the last set-point when one is lost. False if it extrapolates at constant
+    acceleration (a Franka), or if none can be lost. Only an extrapolation is corrected, because it looks different from
+    a report that is late."""
+
+    def __init__(self, spec: RobotSpec, world: object | None = None) -> None:
+        self.spec = spec
+        self.world = world
+
+    def wait(self) -> None:
+        """Block until the device's next cycle, for a bounded time. Needed if :attr:`paces_itself` is True.
+
+        Raises nothing for the device: :meth:`read` reports what went wrong.
+        """
+        raise NotSupported(f"driver {type(self).__name__} does not pace itself")
+
+    @abstractmethod
+    def read(self, now: float) -> Reading:
+        """Return the newest state of the arm; does not block.
+
+        If nothing new has come, return the last reading again: its age shows that the device has frozen.
+
+        Args:
+            now: Time on the host's clock, s, for devices that report no time of measurement.
+
+        Raises:
+            ConnectionLost: The device does not answer. It is read again in the next cycle, so a driver that can
+                reconnect does it here.
+        """
+
+    @abstractmethod
+    def write(self, setpoint: Setpoint) -> bool | None:
+        """Send the next set-point to the device.
+
+        Returns:
+            False if it was not passed on, for example because the device has to start a motion first: the servo then
+            continues from the position of the next reading. True or None otherwise.
+
+        Raises:
+            ConnectionLost: The device does not take it.
+        """
+
+    @abstractmethod
+    def halt(self) -> None:
+        """End streaming: the device stops and holds by its own means. Idempotent."""
+
+    def recover(self) -> None:
+        """Clear a fault of the device; called only when the user asks for it. Devices without faults need nothing."""
+
+    @property
+    def wants_loop(self) -> bool:
+        """Whether the device's library takes over the cycle from now on (see :meth:`loop`)."""
+        return False
+
+    def loop(self, turn: Callable[[], None]) -> None:
+        """Run the device's own control loop, which calls ``turn`` once per cycle until the motion is over.
+
+        For libraries that take set-points only as the result of a callback. During a turn, :meth:`wait` does not block,
+        :meth:`read` returns the state that the callback was given, and :meth:`write` keeps the callback's result.
+
+        Args:
+            turn: Runs one whole cycle of all devices in this process.
+        """
+        raise NotSupported(f"driver {type(self).__name__} does not own a loop")
+
+    def mass_matrix(self, q: Floats) -> Any:
+        """Return the joint-space inertia of the arm. Needed if :attr:`modes` has ``torque``.
+
+        The servo brakes by it and bounds the torques by it. A factor of three in either direction is good enough;
+        the invented inertias of many URDFs are not.
+
+        Args:
+            q: Joint positions (n,), rad.
+
+        Returns:
+            (n, n) in kg m^2, as nested sequences or an array.
+        """
+        raise NotSupported(f"driver {type(self).__name__} does not know the arm's inertia")
+
+    def own_tcp(self) -> Floats | None:
+        """Return the pose of the tcp at the last reading, as computed by the device.
+
+        It is compared with the model's forward kinematics when the arm is opened, and a mismatch is refused.
+
+        Returns:
+            Homogeneous matrix (16,) in column-major order, base frame, m; None if the device reports none.
+        """
+        return None
+
+    def statistics(self) -> dict[str, Any]:
+        """Return figures about the connection, as plain numbers and texts, for reports."""
+        return {}
+
+    def reset_statistics(self) -> None:
+        """Start the figures of :meth:`statistics` again from zero."""
+
+
+# Grippers
+
+
+class GripperReading(NamedTuple):
+    """State of a gripper, as its driver reports it; ``t``, ``t_device`` and ``seq`` are as in :class:`Reading`."""
+
+    t: float
+    t_device: float
+    seq: int
+    width: float
+    """Distance between the fingers, m."""
+    width_target: float
+    """Width of the newest command, m."""
+    moving: bool
+    grasped: bool | None = None
+    """Whether the fingers hold an object; None if unknown."""
+    force: float | None = None
+    """Grip force, N; None if unknown."""
+    outcome: GripperOutcome | None = None
+    """Outcome of the newest command, from the return of its call on; None if the driver cannot tell: it is then derived
+    from ``moving`` and the width."""
+    fault: Fault | None = None
+    """Why the newest command failed, with the remedy."""
+
+
+class GripperDriver(DeviceDriver):
+    """Driver of one gripper.
+
+    ``move``, ``grasp`` and ``home`` start a motion and return at once, because a gripper must never block the arm. The
+    newest command replaces the one in progress. ``stop`` and ``close`` never open the fingers. All methods are called
+    from one thread and return within a few ms; where the vendor's calls block, announce
+    ``own_process=frozenset({"gripper"})`` in the :class:`~hal.registry.DriverSpec`. A command whose call raises counts
+    as failed.
+
+    Args:
+        spec: Record of the gripper: widths, speed, force, options.
+        world: Simulated world that the gripper is part of; None for a real one.
+    """
+
+    def __init__(self, spec: GripperSpec, world: object | None = None) -> None:
+        self.spec = spec
+        self.world = world
+
+    @abstractmethod
+    def read(self, now: float) -> GripperReading:
+        """Return the newest state; does not block. ``now`` is the time on the host's clock, s."""
+
+    @abstractmethod
+    def move(self, width: float, speed: float, force: float) -> None:
+        """Start to move the fingers.
+
+        Args:
+            width: Distance between the fingers at the end, m.
+            speed: Speed, m/s.
+            force: Greatest force on an object in between, N.
+        """
+
+    def grasp(self, width: float, speed: float, force: float, inner: float, outer: float) -> None:
+        """Start to close on an object and hold it.
+
+        By default it is a :meth:`move` to ``width - inner``, which presses on what is in between.
+
+        Args:
+            width: Expected width of the object, m.
+            speed: Speed, m/s.
+            force: Force to hold it with, N.
+            inner: The object counts as held if it is at most so much narrower than ``width``, m,
+            outer: and at most so much wider, m.
+        """
+        self.move(max(0.0, width - inner), speed, force)
+
+    def home(self) -> None:
+        """Start to measure how far the fingers open. Some grippers need it once after they are switched on."""
+
+    @abstractmethod
+    def stop(self) -> None:
+        """Keep the fingers where they are, and the grip force as it is."""
+
+
+# Cameras
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -46,47 +349,135 @@ class StreamInfo:
     """One stream as the sensor takes it: before alignment, crop and scaling."""
 
     format: str | None
-    """Of the device (``bgr8``, ``z16``, ...); None where it has none."""
+    """Pixel format of the device (``bgr8``, ``z16``, ...); None if it has none."""
     width: int
     height: int
     rate_hz: float
     K: Array
-    """(3, 3) camera matrix, pixels; the centre of the upper left pixel is (0, 0)."""
+    """Camera matrix (3, 3), pixels; the centre of the upper left pixel is (0, 0)."""
     distortion: Array
     """(5,) k1, k2, p1, p2, k3 (OpenCV's order)."""
     T_color_stream: Pose
-    """Pose of this sensor's optical frame in that of the colour sensor; no turn and no shift for colour itself."""
+    """Pose of this sensor's optical frame in the colour sensor's; the identity for colour itself."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CameraInfo:
-    """A camera that is open. A real one reports its own calibration, a simulated one the model's figures."""
+    """Identity and calibration of an open camera. A real one reports its own figures, a simulated one the model's."""
 
     title: str
-    """Make and model, for people."""
+    """Make and model, for messages."""
     K: Array
-    """(3, 3) of colour and depth as they are handed out: aligned, cropped and scaled."""
+    """Camera matrix (3, 3) of the colour and depth images of a frame: aligned, cropped and scaled; pixels."""
     distortion: Array
-    """(5,) of the same, OpenCV's order."""
+    """(5,) of the same images, in OpenCV's order."""
     K_infrared: Array | None
-    """(3, 3) of both infrared pictures as they are handed out; they are never aligned. None without infrared."""
+    """Camera matrix (3, 3) of both infrared images of a frame, which are never aligned; None without infrared."""
     clock: str
-    """What ``Stamp.t_device`` counts: ``hardware`` (the sensor's own clock), ``global`` (that clock, brought by its
-    library to the host's time of day), ``system`` (the host's time of day at arrival), ``simulated``."""
+    """Clock of ``Stamp.t_device``: ``hardware`` (the sensor's own), ``global`` (the sensor's, converted by its library
+    to the host's time of day), ``system`` (the host's time of day at arrival) or ``simulated``."""
     serial: str | None = None
     firmware: str | None = None
     usb: str | None = None
-    """The link that was found, for example ``3.2``; ``2.1`` means fewer modes and is worth another cable."""
+    """USB version of the link, for example ``3.2``; ``2.1`` offers fewer modes, and is often a matter of the cable."""
     depth_scale: float | None = None
-    """Metres in one unit of the raw depth picture."""
+    """Metres per unit of the raw depth image."""
     streams: Mapping[str, StreamInfo] = field(default_factory=lambda: MappingProxyType({}))
-    """Those that are on, by the names of the rig's file."""
+    """The streams that are on, by their names in the rig file."""
     options: Mapping[str, float] = field(default_factory=lambda: MappingProxyType({}))
-    """What the device could be told, with its present values."""
+    """The device's settings, with their present values."""
+
+
+class RawFrame(NamedTuple):
+    """One capture as a driver hands it over.
+
+    Images have the output's size: colour (H, W, 3) RGB, depth (H, W) in m with 0 where nothing was measured, the others
+    (H, W); None for a stream that is off.
+    """
+
+    t: float
+    """Time of the exposure on the host's clock, s; of a simulated frame, the time of the world that it shows."""
+    t_device: float
+    """Time of the exposure on the device's own clock, s."""
+    seq: int
+    """Number of the capture; a gap is a lost capture. It may start again at any number after ``open``."""
+    color: NDArray[np.uint8] | None
+    depth: NDArray[np.float32] | None
+    infrared: NDArray[np.uint8] | None
+    segmentation: NDArray[np.int32] | None
+    """Number of the body in each pixel, -1 for none; simulation only."""
+    T_world_camera: Pose | None
+    """Pose of the camera in the world; None if the driver does not know it: it is then computed from the rig file and
+    the state of the arm that carries the camera."""
+    infrared_right: NDArray[np.uint8] | None = None
+    skew: float | None = None
+    """Time of the colour image minus that of the depth image, s."""
+
+
+class CameraTally(NamedTuple):
+    """Sets of images that a camera's driver has dropped since it was created."""
+
+    repeated: int = 0
+    """Sets without any new image."""
+    mismatched: int = 0
+    """Sets whose images do not belong together."""
+
+
+class CameraDriver(DeviceDriver):
+    """Driver of one camera.
+
+    Its methods are called from one thread at a time, ``open`` not always from the same as the others. A driver need not
+    reconnect by itself: when ``grab`` raises ConnectionLost, :class:`~hal.camera.Camera` calls ``close`` and ``open``
+    in the background, at bounded intervals, until the camera is back. A second ``close`` without ``open`` in between
+    means that the camera is closed for good.
+
+    Args:
+        spec: Record of the camera: streams, size, rate, options.
+        source: What a simulated camera takes its images from; the rig's clock if nothing renders for it.
+    """
+
+    on_demand: bool = False
+    """Whether no capture is missed however late it is read (a recording without pace): every ``read`` of the camera
+    then calls ``grab``, and no thread reads ahead."""
+    tally: CameraTally = CameraTally()
+    """Sets of images dropped so far."""
+
+    def __init__(self, spec: CameraSpec, source: object | None = None) -> None:
+        self.spec = spec
+        self.source = source
+
+    @classmethod
+    def plugged(cls) -> tuple[str, ...]:
+        """Describe the cameras that could be opened now, each with what identifies it. Opens nothing."""
+        return ()
+
+    @property
+    def info(self) -> CameraInfo:
+        """Identity and calibration; read after every ``open``, because another camera may have been plugged in."""
+        return nominal_info(self.spec, "simulated" if self.simulated else "hardware")
+
+    @abstractmethod
+    def grab(self, timeout: float) -> RawFrame | None:
+        """Return the newest frame that was not returned yet.
+
+        In lock-step, a simulated camera returns the same frame again while nothing in the world has changed.
+
+        Returns:
+            The frame; None if none came within ``timeout`` s.
+
+        Raises:
+            ConnectionLost: The device is gone, or has been silent for so long that it must be opened again.
+        """
 
 
 def nominal_info(spec: CameraSpec, clock: str, title: str = "") -> CameraInfo:
-    """What a camera that knows no better says of itself: the figures of its spec."""
+    """Return the info of a camera that does not report its own calibration, from the figures of its model.
+
+    Args:
+        spec: Record of the camera.
+        clock: See :attr:`CameraInfo.clock`.
+        title: Make and model; the model's name by default.
+    """
     streams = {
         name: StreamInfo(
             format=stream.format,
@@ -110,401 +501,99 @@ def nominal_info(spec: CameraSpec, clock: str, title: str = "") -> CameraInfo:
     )
 
 
-# [camera_driver.py] What a camera's driver is: the abstract class, and the records that it hands over.
-
-
-class RawFrame(NamedTuple):
-    """One capture as a driver hands it over: already at the output's size, colour as RGB, depth in metres."""
-
-    t: float
-    """When it was taken, on the host's clock, s: for a simulated frame, the time of the world that it shows."""
-    t_device: float
-    seq: int
-    """Counts captures, from any number on; a gap is a capture that was lost. May start anew after ``open``."""
-    color: NDArray[np.uint8] | None
-    depth: NDArray[np.float32] | None
-    infrared: NDArray[np.uint8] | None
-    segmentation: NDArray[np.int32] | None
-    T_world_camera: Pose | None
-    """None where the driver does not know it; the rig then works it out from its file and the arm's state."""
-    infrared_right: NDArray[np.uint8] | None = None
-    skew: float | None = None
-    """By how much colour was taken later than depth, s."""
-
-
-class CameraTally(NamedTuple):
-    """What a driver kept back since it was made."""
-
-    repeated: int = 0
-    """Sets of pictures in which nothing was new."""
-    mismatched: int = 0
-    """Sets whose pictures do not belong together."""
-
-
-class CameraDriver(ABC):
-    """One camera. The calls come from one thread, which may be another one than that of ``open``.
-
-    When ``grab`` raises ConnectionLost, the public :class:`~hal.camera.Camera` calls ``close`` and then ``open`` again,
-    in the background and at bounded intervals, until it works: a driver needs no way back of its own.
-    """
-
-    simulated: ClassVar[bool] = False
-    on_demand: bool = False
-    """True where no capture is missed however late it is asked for (a recording that is not paced): every ``read`` of
-    the camera is then a ``grab``, and no thread takes frames ahead of it."""
-    tally: CameraTally = CameraTally()
-
-    def __init__(self, spec: CameraSpec, source: object | None = None) -> None:
-        self.spec = spec
-        self.source = source
-        """Where a simulated camera gets its pictures from; the rig's clock where nothing draws for it."""
-
-    @classmethod
-    def plugged(cls) -> tuple[str, ...]:
-        """What could be opened at the moment, in words, each with what tells it apart. Opens nothing."""
-        return ()
-
-    @property
-    def info(self) -> CameraInfo:
-        """What the camera is; asked for after every ``open``, because another one may have been plugged in."""
-        return nominal_info(self.spec, "simulated" if self.simulated else "hardware")
-
-    @abstractmethod
-    def open(self) -> None:
-        """Connect and start streaming. Raises DeviceNotFound (lists what is there), ConnectionLost, NotSupported.
-
-        Bounded: what cannot be had within some seconds is an error.
-        """
-
-    @abstractmethod
-    def grab(self, timeout: float) -> RawFrame | None:
-        """The newest frame that was not handed out yet; waits up to ``timeout`` s, then None.
-
-        In lock-step, a simulated camera returns the same frame again while nothing in the world has changed.
-
-        Raises :class:`~hal.errors.ConnectionLost` when the device is gone, or so silent that it must be opened anew.
-        """
-
-    def inject(self, **knobs: object) -> None:
-        """Switch faults on or off, for tests. Only drivers that simulate have any."""
-        raise NotSupported(f"driver {type(self).__name__} has no faults to inject")
-
-    @abstractmethod
-    def close(self) -> None:
-        """Stop streaming, let go of the device. Idempotent, and bounded in time whatever the device does.
-
-        A second call without ``open`` in between means that the camera is closed for good.
-        """
-
-
-Floats = Sequence[float]
-
-
-class Reading(NamedTuple):
-    """What a robot driver reports once per cycle. Plain floats: this is the hot path."""
-
-    t: float
-    """When it was measured, on the host's clock, s."""
-    t_device: float
-    """The same on the device's own clock, s."""
-    seq: int
-    """Counts the device's samples; gaps are lost samples."""
-    q: Floats
-    """Joint positions, rad."""
-    dq: Floats
-    """Joint velocities, rad/s."""
-    tau: Floats | None = None
-    """Joint torques, Nm."""
-    q_commanded: Floats | None = None
-    """The set-point that the device says it took last, rad: how the servo notices that one was lost. None where the
-    device cannot say."""
-    dq_commanded: Floats | None = None
-    tau_ext: Floats | None = None
-    wrench_ext: Floats | None = None
-    fault: Fault | None = None
-    """A fault stops and latches the arm."""
-    tau_commanded: Floats | None = None
-    """In torque mode: the torques that the device says it took last, Nm; none at all before it has changed its mode.
-    The servo goes on from these, as it does from ``q_commanded``."""
-
-
-class Setpoint(NamedTuple):
-    """What the servo writes to a driver once per cycle; every value lies inside the limits, continuously.
-
-    A driver may keep the numbers, and report them as ``q_commanded``, but must not change them.
-    """
-
-    q: Floats
-    """rad"""
-    dq: Floats
-    """rad/s"""
-    ddq: Floats
-    """rad/s2"""
-    tau: Floats | None = None
-    """Nm, in torque mode only: what to apply on top of what carries the arm's own weight. ``q`` and ``dq`` are then
-    what was measured."""
-    q_from: Floats | None = None
-    """Where the device is now, by what the servo knows: the set-point before this one, rad. Only in position mode."""
-
-
-class RobotDriver(ABC):
-    """One arm. It only talks to its device: limits, smoothing, time-outs and stopping stand above it.
-
-    Made by the registry with the arm's :class:`~hal.specs.RobotSpec` and, for a simulated arm, the world it stands
-    in. The calls come from one thread. ``open`` connects and reads; it never moves anything. ``close`` is idempotent
-    and stops safely first. A device that does not answer raises :class:`~hal.errors.ConnectionLost`.
-    """
-
-    modes: ClassVar[frozenset[str]] = frozenset({"position"})
-    """Kinds of set-point the device takes: ``position``, ``velocity``, ``torque``."""
-    paces_itself: ClassVar[bool] = False
-    """True where the device sets the pace: :meth:`wait` blocks until its next cycle (a Franka's state packets)."""
-    simulated: ClassVar[bool] = False
-    """True where nothing real can move."""
-    repeats: ClassVar[bool] = False
-    """What the device does when a set-point is lost: True where it repeats the last one, False where it extrapolates at
-    constant acceleration (a Franka), or where none can be lost. Only what was extrapolated differs from a late
-    report, and is corrected."""
-
-    def __init__(self, spec: RobotSpec, world: object | None = None) -> None:
-        self.spec = spec
-        self.world = world
-
-    @abstractmethod
-    def open(self) -> None:
-        """Connect. Nothing moves."""
-
-    def wait(self) -> None:
-        """Block until the device's next cycle, for a bounded time. Only of drivers that pace themselves.
-
-        Raises nothing: what went wrong is for :meth:`read` to say.
-        """
-        raise NotSupported(f"driver {type(self).__name__} does not pace itself")
-
-    @abstractmethod
-    def read(self, now: float) -> Reading:
-        """The newest state; ``now`` is the host's clock, for devices without one. Does not block."""
-
-    @abstractmethod
-    def write(self, setpoint: Setpoint) -> bool | None:
-        """Hand over the next set-point.
-
-        Returns:
-            False when it was not passed on to the device, for example because a motion has to be started first. The
-            servo then starts from where the next reading says that the device is. Anything else means that it was.
-        """
-
-    @abstractmethod
-    def halt(self) -> None:
-        """End streaming: the device stops and holds by its own means. Idempotent."""
-
-    def recover(self) -> None:  # noqa: B027  # most have nothing to do
-        """Clear a fault, as the user's own act. A driver without faults has nothing to do."""
-
-    @property
-    def wants_loop(self) -> bool:
-        """Does the device's library want to own the loop from now on (see :meth:`loop`)?"""
-        return False
-
-    def loop(self, turn: Callable[[], None]) -> None:
-        """Let the library call ``turn`` (one whole cycle of the group) until the motion is over.
-
-        For libraries that stream set-points only out of a callback of their own: inside a turn, ``wait`` does not
-        block, ``read`` gives the state that the callback was called with and ``write`` keeps what it is to return.
-        """
-        raise NotSupported(f"driver {type(self).__name__} does not own a loop")
-
-    def mass_matrix(self, q: Floats) -> Any:
-        """Joint-space inertia (n, n), kg m2, at joint positions ``q``, rad: numbers in rows, or an array.
-
-        Of drivers that take torques: the servo brakes by it, and bounds what it lets through. Three times too much or
-        too little is still good enough; that of a URDF whose inertias are invented is not.
-        """
-        raise NotSupported(f"driver {type(self).__name__} does not know the arm's inertia")
-
-    def own_tcp(self) -> Floats | None:
-        """Where the device itself says that its tcp was in the last reading: 4x4 by columns, in the base frame, m.
-
-        None where it does not know. It is compared with ours when the arm is opened, and a mismatch is refused.
-        """
-        return None
-
-    def statistics(self) -> dict[str, Any]:
-        """What the driver knows of its connection, as plain numbers and texts, for reports."""
-        return {}
-
-    def reset_statistics(self) -> None:  # noqa: B027
-        """Count from zero."""
-
-    def inject(self, **knobs: object) -> None:
-        """Switch faults on or off, for tests. Only drivers that simulate have any."""
-        raise NotSupported(f"driver {type(self).__name__} has no faults to inject")
-
-    @abstractmethod
-    def close(self) -> None:
-        """Stop safely and let go of the device. Idempotent."""
-
-
-class GripperReading(NamedTuple):
-    """What a gripper driver reports."""
-
-    t: float
-    t_device: float
-    seq: int
-    width: float
-    """Distance between the fingers, m."""
-    width_target: float
-    """Width of the newest command, m."""
-    moving: bool
-    grasped: bool | None = None
-    force: float | None = None
-    outcome: GripperOutcome | None = None
-    """How the newest command goes, from the return of its call on; None where the driver cannot know, and it is judged
-    by ``moving`` and the width."""
-    fault: Fault | None = None
-    """Why the last command failed, with what to do about it."""
-
-
-class GripperDriver(ABC):
-    """One gripper. ``move``, ``grasp`` and ``home`` start a motion and return at once: a gripper never blocks the arm.
-
-    The newest command wins; one motion is in flight. Neither ``stop`` nor ``close`` opens the fingers or lets go of
-    what they hold. All calls, ``read`` too, come from one thread and return within a few ms.
-    """
-
-    simulated: ClassVar[bool] = False
-
-    def __init__(self, spec: GripperSpec, world: object | None = None) -> None:
-        self.spec = spec
-        self.world = world
-
-    @abstractmethod
-    def open(self) -> None:
-        """Connect. Nothing moves."""
-
-    @abstractmethod
-    def read(self, now: float) -> GripperReading:
-        """The newest state."""
-
-    @abstractmethod
-    def move(self, width: float, speed: float, force: float) -> None:
-        """Start towards ``width`` (m) at ``speed`` (m/s), pressing with at most ``force`` (N)."""
-
-    def grasp(self, width: float, speed: float, force: float, inner: float, outer: float) -> None:
-        """Start to close on something of ``width`` (m) at ``speed`` (m/s) and hold it with ``force`` (N).
-
-        It is held when the fingers end between ``width - inner`` and ``width + outer`` (m). A driver without a grasp of
-        its own closes as far as that, and so presses on what is there.
-        """
-        self.move(max(0.0, width - inner), speed, force)
-
-    def home(self) -> None:  # noqa: B027  # most have nothing to do
-        """Start to find out how far the fingers open. Only some grippers need it, once after they are switched on."""
-
-    @abstractmethod
-    def stop(self) -> None:
-        """Stay where the fingers are, keep the grip force."""
-
-    def inject(self, **knobs: object) -> None:
-        """Switch faults on or off, for tests. Only drivers that simulate have any."""
-        raise NotSupported(f"driver {type(self).__name__} has no faults to inject")
-
-    @abstractmethod
-    def close(self) -> None:
-        """Let go of the device, not of the object. Idempotent."""
+# Gamepads
 
 
 class PadReading(NamedTuple):
-    """What a gamepad driver reports. Canonical names (``hal.types.AXES``, ``BUTTONS``), no dead zone applied yet."""
+    """State of a gamepad, as its driver reports it: names of ``hal.types.AXES`` and ``BUTTONS``, without dead zone."""
 
     t: float
-    """Time of the newest event, on the host's clock, s."""
+    """Time of the newest event on the host's clock, s."""
     t_alive: float
-    """When the driver last had proof that the pad is there and speaking, s. The dead-man's watchdog looks at this."""
+    """Time of the last proof that the pad is connected and sending, s. The dead-man's watchdog uses it."""
     t_device: float
+    """Time of the newest event on the device's own clock, s."""
     seq: int
-    """Counts events."""
+    """Number of the newest event."""
     axes: Mapping[str, float]
-    """Sticks -1..1, right and up positive; triggers 0..1. A trigger that is only a button is 0 or 1, or left out."""
+    """Axis -> value: sticks -1..1, right and up positive; triggers 0..1. A trigger that is only a button is 0 or 1, or
+    missing."""
     buttons: frozenset[str]
+    """The buttons that are pressed."""
     connected: bool
     unknown: Collection[str] = ()
-    """Axes that the pad has not spoken of yet; they show 0, and nothing counts until they were moved."""
+    """Axes that the pad has not reported yet; their value is 0, and no control counts until they have moved."""
 
 
 class Plugged(NamedTuple):
-    """What a driver could open."""
+    """Gamepads that a driver could open now."""
 
     pads: tuple[str, ...]
-    """Pads that are there, in words."""
+    """A description of each."""
     notes: tuple[str, ...] = ()
-    """What stands in the way of others, each with the command that mends it."""
+    """Reasons why others cannot be opened, each with the command that fixes it."""
     devices: tuple[str, ...] = ()
-    """What ``options.device`` of a rig calls each of :attr:`pads`, where the driver has such an option."""
+    """Value of ``options.device`` for each of :attr:`pads`; empty if the driver has no such option."""
 
 
-class GamepadDriver(ABC):
-    """One pad. ``poll`` is called for as long as the rig is open, from one thread; a pad that is not plugged in is
-    not an error but a reading with ``connected=False``, and comes back by itself when it is plugged in again.
+class GamepadDriver(DeviceDriver):
+    """Driver of one gamepad.
+
+    ``poll`` is called from one thread for as long as the rig is open. A pad that is not plugged in is no error, neither
+    for ``open`` nor for ``poll``: the reading has ``connected=False``, and the pad is found when it is plugged in.
+
+    Args:
+        spec: Record of the pad: dead zone, options.
+        source: What a pad in another process gets its readings from; for ``playback``, the world's time.
     """
 
-    simulated: ClassVar[bool] = False
     proves_liveness: bool = False
-    """True where silence means that the pad is gone (unplugging is seen, or the pad streams), so that its buttons
-    may serve as a dead-man on a real arm. It may change when another pad is plugged in."""
+    """Whether silence means that the pad is gone (it streams, or an unplugged cable is detected). Only then may its
+    buttons serve as the dead-man of a real arm. It may change when another pad is plugged in."""
 
     def __init__(self, spec: PadSpec, source: object | None = None) -> None:
         self.spec = spec
         self.source = source
-        """Where a pad that lives in another process gets its record from; for ``playback``, the world's time."""
         self.notes: tuple[str, ...] = ()
-        """What a person should know about the pad, each with what mends it."""
+        """Messages for the user about this pad, each with the remedy."""
         self.flat: Mapping[str, float] = MappingProxyType({})
-        """Axis -> share of its travel that the pad itself calls neutral."""
+        """Axis -> share of its travel (0..1) that the pad itself calls neutral."""
 
     @classmethod
     def plugged(cls) -> Plugged:
-        """What could be opened at the moment. Quick, opens nothing, and never raises for what is not there."""
+        """Return the pads that could be opened now. Quick; opens nothing; a missing pad is no error."""
         return Plugged(())
 
     @abstractmethod
-    def open(self) -> None:
-        """Look for the pad."""
-
-    @abstractmethod
     def poll(self, now: float, timeout: float) -> PadReading:
-        """The present reading; waits up to ``timeout`` s for news. ``now`` is the time on ``rig.clock``."""
+        """Return the present state, after waiting up to ``timeout`` s for a change; ``now`` is the rig's clock, s."""
 
     def describe(self) -> str:
-        """What drives, in words, for the banner."""
+        """Return a few words that identify the input device, for the banner."""
         return type(self).__name__
 
     def details(self) -> Mapping[str, str]:
-        """What is known of the pad that is plugged in, for a person who has trouble with it: what -> in words."""
+        """Return what is known of the connected pad, topic -> text, for troubleshooting."""
         return {}
 
     @property
     def mapping(self) -> str | None:
-        """Teleoperation mapping that is meant for the pad that is plugged in; None where any will do."""
+        """Name of the teleoperation mapping made for the connected pad; None if any mapping fits."""
         return None
 
     def rumble(self, strong: float, weak: float, seconds: float) -> bool:
-        """Let the pad's motors shake the hand: shares of what they can (0..1), and how long, s. True where they will.
+        """Start the heavy and the light motor with these powers (0..1); return whether the pad vibrates.
 
-        Returns at once, from whatever thread it is called.
+        Does not block; may be called from any thread.
         """
         return False
 
     @property
     def can_hold(self) -> bool:
-        """Can a control be held down? Where not (a terminal's keys), each press is one small step."""
+        """Whether a control can be held down. If not (keys of a terminal), each press is one small step."""
         return True
 
     @property
     def finished(self) -> bool:
-        """Has it nothing more to say? Only a recording ends."""
+        """Whether a recording has come to its end; always False for a device."""
         return False
-
-    @abstractmethod
-    def close(self) -> None:
-        """Let go of the device. Idempotent."""
