@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 
 from hal.errors import ConfigError, Problem
+from hal.geometry import compose
 from hal.specs import BodySpec, RobotSpec
 
 from .engine import Body, PyBulletClient, nearest, numbers
 from .motors import position_gain
-from .transforms import compose
 
 __all__ = [
     "AttachedObjects",

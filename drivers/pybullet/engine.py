@@ -21,10 +21,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hal.errors import CommandError, DriverMissing
+from hal.geometry import Transform, compose, inverse
 from hal.specs import BodySpec, RobotSpec, from_json
 
 from .scene import Visual
-from .transforms import Transform, compose, inverse
 
 __all__ = [
     "Body",

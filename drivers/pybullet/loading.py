@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Container, Sequence
 
 from hal.errors import ConfigError, Problem
+from hal.geometry import Transform, compose, inverse
 from hal.specs import BodySpec, RobotSpec
 
 from .engine import Body, Gear, PyBulletClient, listed, silenced
-from .transforms import Transform, compose, inverse
 from .urdf import Mimic, loadable, read_urdf
 
 __all__ = [

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hal.errors import CommandError, ConfigError, DeviceNotFound, NotSupported, Problem
+from hal.geometry import Transform
 from hal.specs import BodySpec, RobotSpec, WorldSpec
 
 from .attachments import AttachedObjects, MirroredArm
@@ -36,7 +37,6 @@ from .engine import (
 from .loading import load_object, load_robot
 from .motors import hold
 from .scene import Visual
-from .transforms import Transform
 
 __all__ = [
     "PyBulletWorld",
