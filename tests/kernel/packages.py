@@ -59,7 +59,6 @@ class Package:
     def read(self, path: str) -> bytes:
         """A file's contents, unpacked if its name ends in ``.xz``."""
         stream = self._tar.extractfile(self.files[path])
-        assert stream is not None
         data = stream.read()
         return lzma.decompress(data) if path.endswith(".xz") else data
 

@@ -83,7 +83,6 @@ class Watched:
             text=True,
         )
         os.close(slave)
-        assert self.process.stdout is not None
         line = self.process.stdout.readline()
         if not line:
             raise RuntimeError(f"the app ended with {self.process.wait(5)} before it moved")

@@ -176,8 +176,6 @@ class Stage:
     def look(self, camera: str, k: int) -> Likeness:
         """Compare a new picture with that of row ``k``."""
         drawn = self.rig.cameras[camera].read()
-        assert drawn.color is not None
-        assert drawn.depth is not None
         error = np.square(self.frames[camera][k].astype(float) - drawn.color).mean()
         rounding = 0.5 * self.episode.info["cameras"][camera]["depth_unit_m"]
         wrong = np.abs(self.depths[camera][k] - drawn.depth) > rounding + 1e-3

@@ -29,8 +29,6 @@ def load_streams() -> Any:
     """The module ``benchmarks/servo_streams.py``."""
     path = Path(__file__).parents[2] / "benchmarks" / "servo_streams.py"
     spec = importlib.util.spec_from_file_location("servo_streams", path)
-    assert spec is not None
-    assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     sys.modules[spec.name] = module
     spec.loader.exec_module(module)
@@ -111,11 +109,9 @@ class Bench:
         return any(abs(v) > 1e-6 for v in self.servo.report.dq_set)
 
     def press(self) -> None:
-        assert self.deadman is not None
         self.deadman = self.deadman._replace(held=True, presses=self.deadman.presses + 1)
 
     def release(self) -> None:
-        assert self.deadman is not None
         self.deadman = self.deadman._replace(held=False)
 
     def send(self, kind: Kind, values: Sequence[float], deadline: float = 0.1) -> int:

@@ -177,7 +177,6 @@ class InTerminal:
             lambda: re.search(pattern, self.far.screen.decode()) is not None, f"{pattern!r} on the screen", timeout
         )
         found = re.search(pattern, self.far.screen.decode())
-        assert found is not None
         return found[1]
 
     def holders(self) -> list[str]:

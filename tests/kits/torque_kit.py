@@ -71,7 +71,6 @@ class Driven:
     @property
     def tau(self) -> Sequence[float]:
         """What the driver was given last, Nm."""
-        assert self.setpoint is not None
         assert self.setpoint.tau is not None
         return self.setpoint.tau
 
@@ -97,11 +96,9 @@ class Driven:
         return float(np.linalg.norm((self.servo.kinematics.jacobian(self.q) @ self.dq)[:3]))
 
     def press(self) -> None:
-        assert self.deadman is not None
         self.deadman = self.deadman._replace(held=True, presses=self.deadman.presses + 1)
 
     def release(self) -> None:
-        assert self.deadman is not None
         self.deadman = self.deadman._replace(held=False)
 
     def inbox(self) -> Inbox:

@@ -64,7 +64,6 @@ class Bench:
 
     def _ask(self, what: str, **details: Any) -> dict[str, Any]:
         server = self._server
-        assert server.stdin is not None
         assert server.stdout is not None
         server.stdin.write(json.dumps({"do": what, **details}) + "\n")
         server.stdin.flush()
@@ -78,7 +77,6 @@ class Bench:
     def close(self) -> None:
         """End the process that plays the pads."""
         server = self._server
-        assert server.stdin is not None
         server.stdin.close()
         try:
             server.wait(5.0)

@@ -54,7 +54,6 @@ def ark_view(urdf: Path, q: list[float], attach: dict[str, Any], merged: bool = 
 def our_view(rig: Path, q: list[float]) -> np.ndarray:
     plan = load(rig).resolve()
     view = plan.cameras[0].view
-    assert view is not None
     assert view.link is not None
     link = replace(plan.robots[0].kinematics, tcp_link=view.link, tcp_position=(0, 0, 0), tcp_orientation=(0, 0, 0, 1))
     at = Kinematics(link).fk(q)
@@ -155,7 +154,6 @@ def test_fixed(tmp_path: Path, yaw: float, pitch: float, roll: float, up: int) -
     }
     _, result = imported(tmp_path, robots={"arm": PANDA}, sensors={"eye": changed(CAMERA, sim_config={"fix": fix})})
     view = load(tmp_path / "rig.yaml").resolve().cameras[0].view
-    assert view is not None
     expected = optical(p.computeViewMatrixFromYawPitchRoll([0.1, 0.2, 0.3], 0.9, yaw, pitch, roll, up))
     assert Pose(view.position, view.orientation).matrix() == pytest.approx(expected, abs=1e-5)
     told = "upside down" in row(result, "sensors.0.config.sim_config.fix.pitch")[1]

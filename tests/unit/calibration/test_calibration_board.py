@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from errors_kit import raises_code
 from PIL import Image
 
 from hal.calibration import Board, load_board
@@ -38,7 +39,6 @@ def test_a_page_is_to_scale(tmp_path: Path, ending: str) -> None:
     assert (width, height) == (0.297, 0.210), "A4"
     if ending == "pdf":
         box = re.search(rb"/MediaBox\s*\[\s*0\s+0\s+([\d.]+)\s+([\d.]+)", path.read_bytes())
-        assert box is not None
         assert [float(v) / 72 * 0.0254 for v in box.groups()] == pytest.approx([width, height], rel=1e-4)
         return
     image = Image.open(path)
@@ -60,9 +60,8 @@ def test_a_measured_square_scales_everything() -> None:
     assert measured.square == 0.0348
     assert measured.marker / measured.square == pytest.approx(BOARD.marker / BOARD.square)
     assert np.allclose(measured.corners, BOARD.corners * 0.0348 / 0.035)
-    with pytest.raises(CommandError) as caught:
+    with raises_code(CommandError, "bad_square"):
         BOARD.measured(34.8)
-    assert caught.value.code == "bad_square"
 
 
 def test_a_board_from_a_file(tmp_path: Path) -> None:

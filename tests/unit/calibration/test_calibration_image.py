@@ -6,6 +6,7 @@ from types import MappingProxyType
 
 import numpy as np
 import pytest
+from errors_kit import raises_code
 
 from hal.calibration import NoView
 from hal.calibration.detection import select_image
@@ -70,6 +71,5 @@ def test_a_camera_whose_streams_are_all_one_view() -> None:
 
 
 def test_depth_alone_is_refused() -> None:
-    with pytest.raises(NoView) as caught:
+    with raises_code(NoView, "no_image"):
         select_image(frame(None, None), info("depth"), "depth")
-    assert caught.value.code == "no_image"

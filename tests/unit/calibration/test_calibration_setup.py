@@ -6,6 +6,7 @@ import os
 from pathlib import Path
 
 import pytest
+from errors_kit import raises_code
 
 from hal.calibration import setup
 from hal.calibration.setup import (
@@ -144,17 +145,14 @@ def test_the_written_pose_is_loaded_again(tmp_path: Path) -> None:
     assert (setting.eye, setting.link, setting.link_name) == ("in-hand", "panda_hand", "hand")
     solved = Pose([-0.0912345, 0.0123456, 0.0234567], [0.1, -0.2, 0.7, 0.6])
     output = RigFileOutput.of(str(path), None, setting.camera)
-    assert output is not None
     assert f"{path}.bak" in output.write(*setting.entry(solved))[0]
     again = load(path)
     view = again.resolve().cameras[0].view
-    assert view is not None
     assert (view.robot, view.link) == ("panda", "panda_hand")
     distance, angle = Pose(view.position, view.orientation).distance(solved)
     assert distance < 1e-6
     assert angle < 1e-7
     known = find_setup(again, again.resolve()).known
-    assert known is not None
     assert known.distance(solved)[0] < 1e-6
 
 
@@ -163,10 +161,8 @@ def test_a_camera_beside_the_arm_gets_a_pose_in_the_world(tmp_path: Path) -> Non
     setting = find_setup(config, config.resolve())
     assert (setting.eye, setting.link, setting.frame) == ("to-hand", "panda_hand", "the world")
     output = RigFileOutput.of(config.resolve().source, str(tmp_path / "mine.yaml"), setting.camera)
-    assert output is not None
     output.write(*setting.entry(Pose([1.0, 2.0, 3.0])))
     view = load(tmp_path / "mine.yaml").resolve().cameras[0].view
-    assert view is not None
     assert view.robot is None
     assert view.position == (1.0, 2.0, 3.0)
 
@@ -183,9 +179,8 @@ def test_a_rig_that_would_not_load_is_not_written(tmp_path: Path) -> None:
 def test_a_built_in_rig_and_a_missing_folder_are_not_written_to(tmp_path: Path) -> None:
     built_in = str(find_data("config", "panda_calibration.yaml"))
     assert RigFileOutput.of(built_in, None, "wrist") is None
-    with pytest.raises(CommandError) as caught:
+    with raises_code(CommandError, "no_folder"):
         RigFileOutput.of(built_in, str(tmp_path / "nowhere" / "rig.yaml"), "wrist")
-    assert caught.value.code == "no_folder"
 
 
 def chosen(rig_name: str = "panda_table", **wanted: object) -> CalibrationSetup:
@@ -204,9 +199,8 @@ def chosen(rig_name: str = "panda_table", **wanted: object) -> CalibrationSetup:
     ],
 )
 def test_missing_and_misspelt_names_are_refused(wanted: dict[str, object], code: str) -> None:
-    with pytest.raises(CommandError) as caught:
+    with raises_code(CommandError, code):
         chosen(**wanted)
-    assert caught.value.code == code
 
 
 def test_the_setup_comes_from_the_rig_and_the_options() -> None:
@@ -217,11 +211,9 @@ def test_the_setup_comes_from_the_rig_and_the_options() -> None:
     assert (moved.eye, moved.link, moved.known) == ("in-hand", "panda_link7", None)
     other = chosen(camera="wrist", link="panda_link7")
     assert (other.link, other.known) == ("panda_link7", None)
-    with pytest.raises(CommandError) as caught:
+    with raises_code(CommandError, "missing_guess"):
         initial_guess(other, None)
-    assert caught.value.code == "missing_guess"
     assert initial_guess(other, VALUE) == Pose([0.1, 0.2, 0.3])
     for wrong in ("[1, 2]", "{", "[0, 0, 0, 0, 0, 0, 0]"):
-        with pytest.raises(CommandError) as caught:
+        with raises_code(CommandError, "bad_guess"):
             initial_guess(other, wrong)
-        assert caught.value.code == "bad_guess"

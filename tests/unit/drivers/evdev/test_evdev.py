@@ -9,22 +9,13 @@ import sys
 import time
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 
 from hal.errors import ConfigError, DriverMissing, NotSupported
 from hal.gamepad import Gamepad
-from hal.pads.codes import (
-    ABS,
-    BUS_BLUETOOTH,
-    BUS_USB,
-    EV_ABS,
-    EV_KEY,
-    EV_MSC,
-    EV_SYN,
-    KEY,
-    SYN_DROPPED,
-)
+from hal.pads.codes import ABS, BUS_BLUETOOTH, BUS_USB, EV_ABS, EV_KEY, EV_MSC, EV_SYN, KEY, SYN_DROPPED
 from hal.pads.mapper import AxisRange
 from hal.pads.model import Identity
 from hal.specs import PadSpec
@@ -34,7 +25,6 @@ if sys.platform != "linux":
 
 from evdev_kit import AXES, DS4, MODELS, REST, ROOT, FakeInput, FakeNode, MakePad, poll, poll_until
 
-from hal.drivers.evdev.finder import NodeInfo
 from hal.drivers.evdev.pad import EvdevPad
 
 PADS = ROOT / "tests" / "data" / "pads"
@@ -59,26 +49,9 @@ def replay(name: str, node: str, events: int, folder: Path) -> list[dict[str, An
 
 
 # The meaning of each code in the recordings, stated independently: (control, value at the least, at the greatest).
-STICK_OF = {
-    (3, 0): ("left_x", -1, 1),
-    (3, 1): ("left_y", 1, -1),
-    (3, 3): ("right_x", -1, 1),
-    (3, 4): ("right_y", 1, -1),
-}
-BUTTON_OF = {
-    0x134: "west",
-    0x130: "south",
-    0x131: "east",
-    0x133: "north",
-    0x136: "l1",
-    0x137: "r1",
-    0x138: "l2",
-    0x139: "r2",
-    0x13A: "select",
-    0x13B: "start",
-    0x13D: "l3",
-    0x13E: "r3",
-}
+STICK_OF = {0: ("left_x", -1, 1), 1: ("left_y", 1, -1), 3: ("right_x", -1, 1), 4: ("right_y", 1, -1)}
+BUTTON_OF = {0x134: "west", 0x130: "south", 0x131: "east", 0x133: "north", 0x136: "l1", 0x137: "r1"}
+BUTTON_OF |= {0x138: "l2", 0x139: "r2", 0x13A: "select", 0x13B: "start", 0x13D: "l3", 0x13E: "r3"}
 
 
 def expected_readings(path: Path) -> tuple[int, list[tuple[dict[str, float], list[str]]]]:
@@ -89,8 +62,8 @@ def expected_readings(path: Path) -> tuple[int, list[tuple[dict[str, float], lis
     lines = [line.split()[2:] for line in path.read_text().splitlines() if line.startswith("E:")]
     for kind, code, text in lines:
         where, value = (int(kind, 16), int(code, 16)), int(text)
-        if where in STICK_OF:
-            control, low, high = STICK_OF[where]
+        if where[0] == 3 and where[1] in STICK_OF:
+            control, low, high = STICK_OF[where[1]]
             axes[control] = low + (high - low) * value / 255
         elif where == (3, 0x10):
             axes["dpad_x"] = value
@@ -134,12 +107,6 @@ def test_recorded_pad_is_read_completely(
 
 
 # A fake input system.
-
-
-def test_disconnected_without_a_pad(make_pad: MakePad) -> None:
-    pad = make_pad()
-    assert not poll(pad).connected
-    assert not pad.proves_liveness
 
 
 def test_events_become_readings(system: FakeInput, make_pad: MakePad) -> None:
@@ -277,33 +244,6 @@ def test_unplugging_releases_everything_until_replugged(system: FakeInput, make_
     assert news.seq > gone.seq
 
 
-def test_unplugging_while_held_needs_a_new_press(system: FakeInput, make_pad: MakePad) -> None:
-    node = system.plug(DS4)
-    pad = Gamepad(make_pad())
-    pad.open(time.monotonic())
-    deadman = pad.hold("l2")
-    held = [(EV_ABS, ABS["ABS_X"], 255), (EV_ABS, ABS["ABS_Z"], 255)]
-    node.send(*REST)
-    pad.poll_once(time.monotonic())
-    node.send(*held)
-    pad.poll_once(time.monotonic())
-    assert (pad.state().axis("left_x"), deadman.held) == (1.0, True)
-    system.unplug(node)
-    pad.poll_once(time.monotonic())
-    assert (pad.state().connected, pad.state().axis("left_x"), deadman.held) == (False, 0.0, False)
-    again = system.plug(DS4)
-    again.shown |= {ABS["ABS_X"]: 255, ABS["ABS_Z"]: 255}
-    poll_until(pad.driver, lambda reading: reading.connected)  # type: ignore[arg-type]
-    again.send(*REST, *held)
-    pad.poll_once(time.monotonic())
-    assert (pad.state().connected, pad.state().axis("left_x"), deadman.held) == (True, 0.0, False)
-    again.send(*REST, (EV_ABS, ABS["ABS_Z"], 0))
-    pad.poll_once(time.monotonic())
-    again.send(*held)
-    pad.poll_once(time.monotonic())
-    assert (pad.state().axis("left_x"), deadman.held) == (1.0, True)
-
-
 def test_poll_returns_on_an_event_and_on_unplugging(system: FakeInput, make_pad: MakePad) -> None:
     node = system.plug(DS4)
     pad = make_pad()
@@ -348,19 +288,13 @@ def test_devices_are_listed_only_after_a_change(
 ) -> None:
     system.plug(DS4)
     system.forbidden.add("/dev/input/event3")
-    looks: list[int] = []
-    nodes = system.nodes
-
-    def looked() -> list[NodeInfo]:
-        looks.append(1)
-        return nodes()
-
-    monkeypatch.setattr(system, "nodes", looked)
+    nodes = Mock(side_effect=system.nodes)
+    monkeypatch.setattr(system, "nodes", nodes)
     pad = make_pad()
     end = time.monotonic() + 0.5
     while time.monotonic() < end:
         pad.poll(time.monotonic(), 0.01)
-    assert len(looks) == 1
+    assert nodes.call_count == 1
 
 
 # Proof of life.
@@ -369,14 +303,6 @@ def test_devices_are_listed_only_after_a_change(
 MOTION = DS4._replace(name="Wireless Controller Motion Sensors")
 TOUCH = DS4._replace(name="Wireless Controller Touchpad")
 BEAT = (EV_MSC, 5, 1)
-
-
-def test_every_poll_proves_life_of_a_wired_pad(system: FakeInput, make_pad: MakePad) -> None:
-    system.plug(DS4)
-    pad = make_pad()
-    times = [pad.poll(100.0 + k, 0.0).t_alive for k in range(3)]
-    assert times == pytest.approx([100.0, 101.0, 102.0], abs=0.05)
-    assert pad.proves_liveness
 
 
 @pytest.mark.parametrize("bus", [BUS_USB, BUS_BLUETOOTH])
@@ -472,8 +398,8 @@ def test_pad_whose_silence_goes_unnoticed_is_no_deadman_of_a_real_arm(
 
 def test_other_devices_are_not_opened(system: FakeInput, make_pad: MakePad) -> None:
     system.plug(Identity("Keyboard", 1, 2, BUS_USB, "usbhid"), pad=False)
-    assert not poll(make_pad()).connected
-    assert system.opened == []
+    pad = make_pad()
+    assert (poll(pad).connected, pad.proves_liveness, system.opened) == (False, False, [])
 
 
 def test_options_choose_the_pad(system: FakeInput, make_pad: MakePad) -> None:

@@ -88,7 +88,6 @@ def test_a_violation_says_joint_value_and_limit() -> None:
     jumped = by_position(before, [HOME[0], HOME[1], HOME[2] + 0.05, *HOME[3:]])
     violation = LimitChecker(FR3).joints(before, jumped)
     assert name(violation) == "joint_motion_generator_velocity_limits_violation"
-    assert violation is not None
     assert violation.text == "joint 3: velocity 50 rad/s, limit 2.62 rad/s"
 
 

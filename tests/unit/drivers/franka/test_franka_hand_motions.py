@@ -428,7 +428,6 @@ def test_random_commands_come_to_an_end(seed):
     bench.pass_time(1.0)
     controller.move(0.08, 0.1, 40.0)
     if bench.finish(40.0) is GripperOutcome.FAILED:  # an interrupted homing
-        assert controller.fault is not None
         assert controller.fault.code in ("not_homed", "lost", "no_answer")
         controller.home()
         assert bench.finish(40.0) is GripperOutcome.DONE

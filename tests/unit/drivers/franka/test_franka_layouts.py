@@ -70,7 +70,6 @@ def test_a_command_is_taken_apart(version: int) -> None:
     kinds = "<Q14d24dBB7d"
     data = struct.pack(kinds, *values) + (b"\0" if version == 10 else b"")
     command = read_command(data, version)
-    assert command is not None
     assert command.message_id == 7
     assert command.q == tuple(k / 10 for k in range(7))
     assert command.dq == tuple(k / 10 for k in range(7, 14))
@@ -81,13 +80,11 @@ def test_a_command_is_taken_apart(version: int) -> None:
     finished = bytearray(data)
     finished[313] = 1
     found = read_command(bytes(finished), version)
-    assert found is not None
     assert found.finished
 
 
 def test_the_end_of_torque_control_has_a_byte_of_its_own_in_protocol_10() -> None:
     found = read_command(bytes(370) + b"\1", 10)
-    assert found is not None
     assert found.finished
 
 

@@ -56,8 +56,6 @@ def test_towards_a_stop_the_fr3_gets_slower_until_it_may_only_go_back() -> None:
 
 
 def test_the_formula_for_the_speed() -> None:
-    assert FR3.velocity_offset is not None
-    assert FR3.deceleration is not None
     q = list(HOME)
     q[1] = FR3.lower[1] + 0.1
     expected = sqrt(2 * FR3.deceleration[1] * 0.1) - FR3.velocity_offset[1]
@@ -67,7 +65,6 @@ def test_the_formula_for_the_speed() -> None:
 
 def test_the_suggested_rectangle_has_corners_a_little_beyond_the_formula() -> None:
     box = FR3.rectangle
-    assert box is not None
     lowest, highest = FR3.velocity_range(box.lower)[0], FR3.velocity_range(box.upper)[1]
     shares = [box.velocity[k] / min(highest[k], -lowest[k]) for k in range(7)]
     assert 1.0 < max(shares) < 1.045

@@ -26,7 +26,6 @@ def arm(model: str = "fr3", **options: Any) -> RobotSpec:
 
 def hand(**options: Any) -> GripperSpec:
     spec = arm().gripper
-    assert spec is not None
     return replace(spec, options={**spec.options, **options})
 
 
@@ -76,8 +75,6 @@ def test_every_setting() -> None:
     mass, com, inertia = settings.load.arguments() if settings.load else (0, [], [])
     assert (mass, com) == (0.5, [0, 0, 0.1])
     assert inertia == [1e-3, 1e-5, 2e-5, 1e-5, 2e-3, 3e-5, 2e-5, 3e-5, 2.5e-3]
-    assert settings.end_effector is not None
-    assert settings.stiffness_frame is not None
     assert settings.end_effector.matrix() == pytest.approx([1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0.1, 1])
     columns = np.reshape(settings.stiffness_frame.matrix(), (4, 4)).T
     assert columns == pytest.approx(np.array([[0, -1, 0, 0.1], [1, 0, 0, 0.2], [0, 0, 1, 0.3], [0, 0, 0, 1]]))
@@ -214,7 +211,6 @@ def test_an_fr3_may_not_be_fast_where_its_range_ends() -> None:
 
 
 def test_franka_s_own_rectangular_speeds_are_a_little_too_fast() -> None:
-    assert FR3.rectangle is not None
     ((key, text),) = check_arm(limited(velocity=FR3.rectangle.velocity))
     assert key == "limits"
     assert all(f"fr3_joint{k}" in text for k in range(1, 8))

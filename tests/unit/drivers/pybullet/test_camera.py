@@ -9,6 +9,7 @@ from collections.abc import Iterator
 
 import numpy as np
 import pytest
+from errors_kit import raises_code
 from pictures_kit import box, camera, look_at, renderer, world
 from specs import data, panda, world_spec
 
@@ -58,14 +59,10 @@ class TestDirect:
         for _ in range(48):
             scene.step()
         later = driver.grab(0.0)
-        assert first is not None
-        assert later is not None
         assert (first.t, first.t_device) == (10.0, 0.0)
         assert later.seq == first.seq + 1
         assert later.t_device == pytest.approx(0.2)
         assert later.t == pytest.approx(10.2)
-        assert later.depth is not None
-        assert first.depth is not None
         middle = (60, 80)
         fall = later.depth[middle] - first.depth[middle]
         assert fall == pytest.approx(0.5 * 9.81 * 0.2**2, rel=0.1)
@@ -79,10 +76,6 @@ class TestDirect:
         before = driver.grab(0.0)
         scene.reset("panda", q=[0.5, -0.3, 0.2, -1.8, 0.1, 1.4, 0.2])
         after = driver.grab(0.0)
-        assert before is not None
-        assert after is not None
-        assert before.T_world_camera is not None
-        assert after.T_world_camera is not None
         distance, angle = before.T_world_camera.distance(after.T_world_camera)
         assert distance > 0.1
         assert angle > 0.1
@@ -103,9 +96,8 @@ class TestDirect:
         scene.close()
 
     def test_camera_without_a_world_is_refused(self) -> None:
-        with pytest.raises(NotSupported) as caught:
+        with raises_code(NotSupported, "world_missing"):
             PyBulletCamera(camera()).open()
-        assert caught.value.code == "world_missing"
 
 
 class Bench:
@@ -152,7 +144,6 @@ class TestWorker:
         bench.publish()
         bench.worker.run_once()
         first = bench.source.grab(0.0)
-        assert first is not None
         assert first.t == bench.t
         bench.worker.run_once()
         assert bench.source.grab(0.0) is None  # the world stands still: no new picture of the same moment
@@ -160,7 +151,6 @@ class TestWorker:
         bench.publish()
         bench.worker.run_once()
         second = bench.source.grab(0.0)
-        assert second is not None
         assert second.t == bench.t
         assert first.segmentation is not None
         assert second.segmentation is not None
@@ -183,9 +173,7 @@ class TestWorker:
         bench.mirror.edited(*add)
         bench.worker.run_once()
         frame = bench.source.grab(0.0)
-        assert frame is not None
         assert frame.segmentation is not None
-        assert frame.color is not None
         seen = frame.segmentation == 2
         assert seen.sum() > 20
         red, _, blue = frame.color[seen].mean(axis=0)
@@ -197,23 +185,12 @@ class TestWorker:
         bench.mirror.edited(*remove)
         bench.worker.run_once()  # the snapshot still has the ball
         frame = bench.source.grab(0.0)
-        assert frame is not None
         assert 1 in np.unique(frame.segmentation)
         bench.publish()
         bench.worker.run_once()
         frame = bench.source.grab(0.0)
-        assert frame is not None
         assert 1 not in np.unique(frame.segmentation)
         assert 0 in np.unique(frame.segmentation)
-
-    def test_source_reports_the_end_of_its_process(self, bench: Bench) -> None:
-        def gone() -> None:
-            raise ConnectionLost("the renderer process ended")
-
-        specs = [bench.spec]
-        ring = frame_rings(memoryview(bytearray(frame_rings_size(specs))), specs)[bench.spec.name]
-        with pytest.raises(ConnectionLost):
-            SharedSource(ring, gone).grab(0.0)
 
 
 class TestChoice:
@@ -229,7 +206,6 @@ class TestChoice:
         assert isinstance(chosen, TinyRenderer)
         assert "apt install libegl1" in chosen.description
         images = chosen.render(camera(16, 12), camera_pose(scene, camera(16, 12)))
-        assert images.depth is not None
         assert (images.depth > 0).all()
         with pytest.raises(DriverMissing):
             choose_renderer(scene, "gl")
@@ -311,11 +287,9 @@ def test_renderer_process_draws_follows_edits_and_reports_its_end() -> None:
         paint = {"name": "block", "rgba": [0.0, 0.0, 1.0, 1.0]}
         pictures.edited("set_color", paint, host.request("world.set_color", paint))
         blue = newest(drivers[0], time.monotonic())
-        assert blue.color is not None
         red, _, strong = blue.color[blue.segmentation == 1].mean(axis=0)
         assert strong > red + 50
 
-        assert pictures._child is not None
         os.kill(pictures._child.process.pid, signal.SIGKILL)
         with pytest.raises(ConnectionLost):
             newest(drivers[0], time.monotonic())

@@ -8,10 +8,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from errors_kit import raises_code
 from specs import PANDA_HOME, box, cube, floor, panda, world_spec
 
 from hal.drivers.pybullet.world import PyBulletWorld
-from hal.errors import CommandError, DeviceNotFound, NotSupported
+from hal.errors import CommandError, DeviceNotFound
 from hal.kinematics.arm import Kinematics
 
 REST = [0.0] * 7
@@ -129,12 +130,10 @@ def test_reset_leaves_it_at_the_real_arm(world: PyBulletWorld) -> None:
     world.follow("arm", q, REST, 0.04)
     world.reset()
     assert joints(world) == pytest.approx(q)
-    with pytest.raises(CommandError) as caught:
+    with raises_code(CommandError, "is_mirrored"):
         world.reset("arm")
-    assert caught.value.code == "is_mirrored"
-    with pytest.raises(CommandError) as caught:
+    with raises_code(CommandError, "is_robot"):
         world.set_pose("arm", {"position": [0, 0, 1]})
-    assert caught.value.code == "is_robot"
 
 
 def test_mirror_world_shows_it() -> None:
@@ -146,8 +145,6 @@ def test_mirror_world_shows_it() -> None:
     for link in ("panda_hand", "panda_leftfinger"):
         shown, there = mirror.pose("arm", link), world.pose("arm", link)
         assert shown["position"] == pytest.approx(there["position"], abs=1e-6)
-    with pytest.raises(NotSupported):
-        mirror.step()
     world.close()
     mirror.close()
 
@@ -172,14 +169,11 @@ def test_impossible_states_are_refused(world: PyBulletWorld, q: list[float], dq:
 
 
 def test_only_a_mirrored_arm_takes_states(world: PyBulletWorld) -> None:
-    with pytest.raises(DeviceNotFound) as caught:
+    with raises_code(DeviceNotFound, "unknown_body"):
         world.follow("arn", PANDA_HOME, REST, None)
-    assert caught.value.code == "unknown_body"
-    with pytest.raises(CommandError) as caught:
+    with raises_code(CommandError, "not_mirrored"):
         world.follow("floor", PANDA_HOME, REST, None)
-    assert caught.value.code == "not_mirrored"
     simulated = PyBulletWorld(world_spec(panda("arm")))
-    with pytest.raises(CommandError) as caught:
+    with raises_code(CommandError, "not_mirrored"):
         simulated.follow("arm", PANDA_HOME, REST, None)
-    assert caught.value.code == "not_mirrored"
     simulated.close()

@@ -8,13 +8,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from errors_kit import raises_code
 from numpy.typing import NDArray
 from specs import IIWA_HOME, PANDA_HOME, box, cube, floor, iiwa, panda, world_spec
 
 from hal.driver import Reading, Setpoint
 from hal.drivers.pybullet.robot import PyBulletRobot
 from hal.drivers.pybullet.world import PyBulletWorld
-from hal.errors import CommandError, ConfigError, ConnectionLost
+from hal.errors import CommandError
 from hal.specs import BodySpec, RobotSpec
 
 ZERO = (0.0,) * 7
@@ -174,18 +175,6 @@ class TestHolding:
         assert reading.q_commanded == last
         assert np.abs(reading.dq).max() < 1e-4
 
-    def test_close_holds_too_and_is_idempotent(self) -> None:
-        world, driver = opened()
-        follow(world, driver, 0.5)
-        last = driver.read(0.0).q_commanded
-        driver.close()
-        driver.close()
-        for _ in range(240):
-            world.step()
-        again = PyBulletRobot(driver.spec, world)
-        again.open()
-        assert again.read(0.0).q == pytest.approx(last, abs=1e-4)
-
     def test_it_gives_way_to_a_wall_within_its_torques(self) -> None:
         world, driver = opened(None, box("wall", (0.5, 0.2, 0.5), (0.3, 0.02, 0.5)))
         home, torques, deepest = np.array(PANDA_HOME), [], 0.0
@@ -226,14 +215,6 @@ class TestReadings:
         assert reading.q_commanded == pytest.approx([0.1, *PANDA_HOME[1:]])
         assert reading.dq_commanded == [0.0] * 7
 
-    def test_opening_moves_nothing(self) -> None:
-        world = PyBulletWorld(world_spec(panda()))
-        before = world.snapshot()
-        driver = PyBulletRobot(panda(), world)
-        driver.open()
-        driver.read(0.0)
-        assert world.snapshot() == before
-
     def test_two_arms_do_not_disturb_each_other(self) -> None:
         left, right = panda("left"), iiwa("right", base_position=(0.0, 1.5, 0.0))
         world = PyBulletWorld(world_spec(floor(), left, right))
@@ -255,22 +236,11 @@ class TestFaults:
         driver.recover()
         assert moved(driver.read(3.0), frozen)
 
-    def test_lost_raises_until_recovered(self) -> None:
-        _, driver = opened()
-        driver.inject(disconnect=True)
-        with pytest.raises(ConnectionLost):
-            driver.read(0.0)
-        with pytest.raises(ConnectionLost):
-            driver.write(Setpoint(PANDA_HOME, ZERO, ZERO))
-        driver.recover()
-        assert driver.read(0.0).q == pytest.approx(PANDA_HOME)
-
     def test_a_fault_is_reported_and_holds_the_arm(self) -> None:
         world, driver = opened()
         follow(world, driver, 0.5)
         driver.inject(fault="collision")
         at_fault = driver.read(0.0)
-        assert at_fault.fault is not None
         assert at_fault.fault.cause == "collision"
         for tick in range(240):
             driver.write(swing(0.5 + tick * world.dt, np.array(PANDA_HOME)))
@@ -283,23 +253,11 @@ class TestFaults:
         driver.write(Setpoint([here[0] + 0.01, *here[1:]], ZERO, ZERO))
         assert driver.read(0.0).q_commanded == [here[0] + 0.01, *here[1:]]
 
-    def test_an_unknown_fault_is_refused(self) -> None:
-        _, driver = opened()
-        with pytest.raises(CommandError) as caught:
-            driver.inject(explode=True)
-        assert caught.value.code == "unknown_fault"
-
 
 def moved(one: Reading, other: Reading) -> bool:
     return float(np.abs(np.subtract(one.q, other.q)).max()) > 0.1
 
 
 def test_a_world_is_needed() -> None:
-    with pytest.raises(CommandError) as caught:
+    with raises_code(CommandError, "world_missing"):
         PyBulletRobot(panda(), None)
-    assert caught.value.code == "world_missing"
-
-
-def test_a_joint_that_the_urdf_lacks() -> None:
-    with pytest.raises(ConfigError, match="panda_jiont7"):
-        PyBulletWorld(world_spec(panda(joints=(*panda().joints[:6], "panda_jiont7"))))

@@ -8,6 +8,7 @@ from contextlib import ExitStack
 from typing import Any
 
 import pytest
+from errors_kit import raises_code
 from terminal_kit import FarEnd, wait_for
 
 from hal.commands import DeadmanRecord
@@ -373,9 +374,8 @@ def test_opening_without_a_terminal_is_refused(tmp_path) -> None:
     file.touch()
     for path in (str(file), str(tmp_path / "nowhere")):
         driver = TerminalPad(PadSpec(name="pad", driver="terminal", model=None, options={"tty": path}))
-        with pytest.raises(NotSupported) as caught:
+        with raises_code(NotSupported, "no_terminal"):
             driver.open()
-        assert caught.value.code == "no_terminal"
         driver.close()
 
 

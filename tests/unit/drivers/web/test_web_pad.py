@@ -6,6 +6,7 @@ import math
 import threading
 
 import pytest
+from errors_kit import raises_code
 
 from hal.config.files import Problems
 from hal.config.models import load_pad_models
@@ -195,9 +196,8 @@ def test_the_tour_ends_when_its_page_goes_and_when_it_is_over(page: Page, pad: W
 
 
 def test_a_rig_without_a_console_is_refused() -> None:
-    with pytest.raises(NotSupported) as refused:
+    with raises_code(NotSupported, "no_console"):
         WebPad(PadSpec("pad", "web", None)).open()
-    assert refused.value.code == "no_console"
 
 
 def test_a_lost_pad_has_nothing_pressed() -> None:

@@ -7,7 +7,7 @@ import logging
 import re
 from pathlib import Path
 
-import pytest
+from errors_kit import raises_code
 
 from hal.drivers.web.process import LogLimit
 from hal.drivers.web.server import read_page_files
@@ -39,9 +39,8 @@ def test_only_files_of_a_page_are_read(tmp_path: Path) -> None:
 def test_without_its_page_it_does_not_start(tmp_path: Path) -> None:
     (tmp_path / "pad.js").write_text("")
     for folder in (tmp_path, tmp_path / "nowhere"):
-        with pytest.raises(DriverMissing) as missing:
+        with raises_code(DriverMissing, "page_missing"):
             read_page_files(folder)
-        assert missing.value.code == "page_missing"
 
 
 def test_the_log_of_libraries_is_limited() -> None:
