@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 import hal
+from hal import _moved
 from hal.errors import ConfigError
 
 from .blocks import RUN, SHOWN, Block, anchors_of, blocks_of, links_of
@@ -78,13 +79,23 @@ def test_the_numbers_of_the_safety_rules_are_those_of_the_code() -> None:
         assert value == pytest.approx(told), f"{module}.py {name} is {value}, the document says {number} {unit}"
 
 
-@pytest.mark.parametrize("document", ["safety.md", "measured.md", "console.md"])
-def test_the_tests_that_a_document_names_are_there(document: str) -> None:
-    text = (ROOT / "docs" / document).read_text(encoding="utf-8")
+@pytest.mark.parametrize("document", DOCUMENTS, ids=names(DOCUMENTS))
+def test_the_files_that_a_document_names_are_there(document: Path) -> None:
+    text = document.read_text(encoding="utf-8")
     for path in set(re.findall(r"`((?:hal|tests|drivers|benchmarks|config|apps)/[\w/]+\.\w+)`", text)):
         assert (ROOT / path).is_file(), path
     for path, test in re.findall(r"`(tests/[\w/]+\.py)::(\w+)`", text):
         assert f"def {test}(" in (ROOT / path).read_text(), f"{path} has no {test}"
+
+
+def test_the_changelog_has_every_moved_name() -> None:
+    rows = re.findall(r"^\| (`.*) \| (`.*) \|$", (ROOT / "CHANGELOG.md").read_text(encoding="utf-8"), re.MULTILINE)
+    shown = [(set(re.findall(r"`(.*?)`", old)), set(re.findall(r"`(.*?)`", new))) for old, new in rows]
+    moved = [({old}, {new}) for old, new in _moved.MODULES.items()]
+    moved += [({module, name}, {new}) for module, names in _moved.NAMES.items() for name, new in names.items()]
+    moved += [({module, old}, {new}) for module, names in _moved.RENAMED.items() for old, new in names.items()]
+    missing = [(old, new) for old, new in moved if not any(old <= left and new <= right for left, right in shown)]
+    assert not missing
 
 
 @pytest.mark.parametrize(
