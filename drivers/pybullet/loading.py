@@ -2,19 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Container, Sequence
+import tempfile
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Container, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
 
 from hal.errors import ConfigError, Problem
 from hal.geometry import Transform, compose, inverse
+from hal.kinematics.mesh_files import mesh_file, mesh_near
+from hal.kinematics.urdf import UrdfMimic, UrdfModel, parse_xml, read_urdf
 from hal.specs import BodySpec, RobotSpec
 
 from .engine import Body, Gear, PyBulletClient, listed, silenced
-from .urdf import Mimic, loadable, read_urdf
 
 __all__ = [
     "fix_inertias",
     "load_object",
     "load_robot",
+    "loadable_urdf",
 ]
 
 PLANE = (5.0, 5.0)
@@ -49,13 +55,14 @@ def load_object(client: PyBulletClient, spec: BodySpec, drawn: bool = True) -> t
         return body, []
     if spec.urdf is None:
         raise ConfigError([Problem("objects", f"{key}.urdf", "is missing, and the shape is urdf")])
-    facts = read_urdf(spec.urdf, f"{key}.urdf")
+    urdf = _read_urdf(spec.urdf, f"{key}.urdf")
+    massless = _massless(urdf)
     number = _load_urdf(client, spec.urdf, f"{key}.urdf", fixed=_is_fixed(spec), scale=spec.scale, drawn=drawn)
     body = _describe(client, spec, number, f"{key}.urdf")
-    _couple(client, body, facts.mimics)
-    warnings = fix_inertias(client, body, facts.massless)
-    if facts.massless:
-        warnings.append(f"{spec.name}: no <inertial> in {listed(facts.massless)}; PyBullet takes 1 kg for each")
+    _couple(client, body, urdf.mimics)
+    warnings = fix_inertias(client, body, massless)
+    if massless:
+        warnings.append(f"{spec.name}: no <inertial> in {listed(massless)}; PyBullet takes 1 kg for each")
     return body, warnings
 
 
@@ -65,13 +72,14 @@ def load_robot(client: PyBulletClient, spec: RobotSpec, drawn: bool = True) -> t
     Takes, returns and raises the same as :func:`load_object`; a joint or link that the URDF lacks is a ConfigError too.
     """
     key = f"robots.{spec.name}"
-    facts = read_urdf(spec.urdf, f"{key}.urdf")
+    urdf = _read_urdf(spec.urdf, f"{key}.urdf")
+    massless = _massless(urdf)
     number = _load_urdf(client, spec.urdf, f"{key}.urdf", fixed=True, scale=1.0, drawn=drawn)
     body = _describe(client, spec, number, f"{key}.urdf")
     fingers = spec.gripper.joints if spec.gripper else ()
     _check_names(body, spec, fingers, key)
 
-    warnings = fix_inertias(client, body, facts.massless)
+    warnings = fix_inertias(client, body, massless)
     without_effort: list[str] = []
     limits = spec.limits
     for joint in body.movable:
@@ -94,14 +102,53 @@ def load_robot(client: PyBulletClient, spec: RobotSpec, drawn: bool = True) -> t
     if without_effort:
         warnings.append(f"{spec.name}: no effort limit of {listed(without_effort)}; {UNKNOWN_EFFORT:g} Nm (N) is used")
     body.base = _root_pose(client, body, spec)
-    mimics = facts.mimics or tuple(Mimic(finger, fingers[0], 1.0, 0.0) for finger in fingers[1:])
+    mimics = urdf.mimics or tuple(UrdfMimic(finger, fingers[0], 1.0, 0.0) for finger in fingers[1:])
     _couple(client, body, mimics)
     return body, warnings
 
 
+def _read_urdf(path: str, key: str) -> UrdfModel:
+    """Read and check a URDF and its meshes. Raises ConfigError, in the configuration key ``key``, with all problems."""
+    try:
+        model = read_urdf(Path(path))
+    except OSError as error:
+        raise ConfigError([Problem(path, key, f"cannot be read: {error.strerror}", "missing_file")]) from None
+    except ValueError as error:
+        raise ConfigError([Problem(path, key, str(error), "bad_urdf")]) from None
+    folder = Path(path).resolve().parent
+    names = dict.fromkeys(mesh.get("filename", "") for mesh in parse_xml(path).iter("mesh"))
+    missing = [name for name in names if not mesh_file(name, folder).is_file()]
+    if missing:
+        text = "names a mesh that does not exist"
+        raise ConfigError([Problem(path, key, f"{text}: {name}", "missing_file") for name in missing])
+    return model
+
+
+def _massless(urdf: UrdfModel) -> tuple[str, ...]:
+    """Return the links that have shapes but no ``<inertial>``: PyBullet gives them a mass of 1 kg."""
+    return tuple(link.name for link in urdf.links.values() if link.inertial is None and link.has_shapes)
+
+
+@contextmanager
+def loadable_urdf(path: str) -> Iterator[str]:
+    """Yield the path of a URDF that PyBullet can load: a temporary copy where meshes are in installed packages."""
+    folder = Path(path).resolve().parent
+    root = parse_xml(path)
+    files = [element for tag in ("mesh", "texture") for element in root.iter(tag) if element.get("filename")]
+    if all(mesh_near(element.get("filename", ""), folder) for element in files):
+        yield path
+        return
+    for element in files:
+        element.set("filename", str(mesh_file(element.get("filename", ""), folder)))
+    with tempfile.TemporaryDirectory() as place:
+        copy = Path(place) / Path(path).name
+        copy.write_bytes(ElementTree.tostring(root, encoding="utf-8"))
+        yield str(copy)
+
+
 def _load_urdf(client: PyBulletClient, path: str, key: str, *, fixed: bool, scale: float, drawn: bool) -> int:
     number = -1
-    with loadable(path) as file, silenced() as captured:
+    with loadable_urdf(path) as file, silenced() as captured:
         try:
             flags = client.URDF_USE_INERTIA_FROM_FILE  # else PyBullet invents inertias from the collision shapes
             if not drawn:
@@ -215,7 +262,7 @@ def _root_pose(client: PyBulletClient, body: Body, spec: RobotSpec) -> Transform
     return compose((spec.base_position, spec.base_orientation), inverse((state[4], state[5])))
 
 
-def _couple(client: PyBulletClient, body: Body, mimics: Sequence[Mimic]) -> None:
+def _couple(client: PyBulletClient, body: Body, mimics: Sequence[UrdfMimic]) -> None:
     """Couple joints that have a ``<mimic>``, which PyBullet ignores."""
     for mimic in mimics:
         if mimic.joint not in body.joints or mimic.of not in body.joints or mimic.multiplier == 0.0:

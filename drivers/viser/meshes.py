@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from .urdf import UrdfVisual
+from hal.kinematics.urdf import UrdfVisual
 
 __all__ = ["visual_glb"]
 

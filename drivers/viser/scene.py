@@ -6,6 +6,7 @@ import time
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,13 +18,13 @@ from hal.errors import HalError
 from hal.geometry import Pose
 from hal.host.memory import SeriesBox
 from hal.host.records import GripperMail, RobotMail
+from hal.kinematics.urdf import UrdfJoint, UrdfModel, UrdfVisual, read_urdf
 from hal.servo.watchdog import PAD_SILENCE
 from hal.specs import BodySpec, RobotSpec, WorkspaceSpec, WorldSpec, from_json
 from hal.types import RobotState, Trip
 
 from .goals import HandleDrag
 from .meshes import visual_glb
-from .urdf import UrdfTree, UrdfTreeJoint, UrdfVisual, read_tree
 
 __all__ = ["ArmView", "WorldView", "workspace_lines"]
 
@@ -60,7 +61,7 @@ class ArmView:
         self.mail = mail
         self.gripper = gripper
         self.drag = HandleDrag()
-        tree = read_tree(spec.urdf)
+        urdf = _read_urdf(spec.urdf)
         root = f"/arms/{spec.name}"
         scene.add_frame(
             root,
@@ -69,7 +70,7 @@ class ArmView:
             position=spec.base_position,
             wxyz=_wxyz(spec.base_orientation),
         )
-        self._links = _draw_links(scene, f"{root}/links", tree, spec, notes)
+        self._links = _draw_links(scene, f"{root}/links", urdf, spec, notes)
         self._set = scene.add_frame(f"{root}/set", axes_length=0.06, axes_radius=0.002, origin_radius=0.004)
         if spec.workspace is not None:
             lines = workspace_lines(spec.workspace)
@@ -142,25 +143,25 @@ class ArmView:
 
 
 def _draw_links(
-    scene: SceneApi, root: str, tree: UrdfTree, spec: RobotSpec, notes: list[str]
-) -> list[tuple[UrdfTreeJoint, SceneNodeHandle]]:
+    scene: SceneApi, root: str, urdf: UrdfModel, spec: RobotSpec, notes: list[str]
+) -> list[tuple[UrdfJoint, SceneNodeHandle]]:
     """Draw all links, each in a child frame of its parent's; return the joints that move, with the frames they move.
 
     The page composes the frames by itself, so a joint at rest needs no message.
     """
     base = spec.kinematics.base_link
-    to_base = Pose() if base is None else tree.poses({})[base].inverse()
-    paths = {tree.root: root}
+    to_base = Pose() if base is None else urdf.poses({})[base].inverse()
+    paths = {urdf.root: root}
     scene.add_frame(root, show_axes=False, position=to_base.position, wxyz=_wxyz(to_base.orientation))
-    moving: list[tuple[UrdfTreeJoint, SceneNodeHandle]] = []
-    for joint in tree.joints:
+    moving: list[tuple[UrdfJoint, SceneNodeHandle]] = []
+    for joint in urdf.outwards:
         path = paths[joint.child] = f"{paths[joint.parent]}/{joint.child}"
         position, orientation = joint.placement({})
         node = scene.add_frame(path, show_axes=False, position=np.array(position), wxyz=_wxyz(orientation))
-        if joint.moves:
+        if joint.movable:
             moving.append((joint, node))
-    for link, visuals in tree.visuals.items():
-        _draw_visuals(scene, paths[link], visuals, notes)
+    for name, link in urdf.links.items():
+        _draw_visuals(scene, paths[name], link.visuals, notes)
     return moving
 
 
@@ -275,19 +276,27 @@ class WorldView:
         if body.urdf is None:
             return [(None, Pose(), [_primitive(body)])]
         try:
-            tree = read_tree(body.urdf)
+            urdf = _read_urdf(body.urdf)
         except (OSError, ValueError) as error:
             self._notes.append(f"not drawn: {error}")
             return []
         rgba = body.rgba if painted else None
         return [
             (
-                None if link == tree.root else link,
+                None if link == urdf.root else link,
                 _scaled(pose, body.scale),
-                [_scaled_visual(visual, body.scale, rgba) for visual in tree.visuals[link]],
+                [_scaled_visual(visual, body.scale, rgba) for visual in urdf.links[link].visuals],
             )
-            for link, pose in tree.poses({}).items()
+            for link, pose in urdf.poses({}).items()
         ]
+
+
+def _read_urdf(path: str) -> UrdfModel:
+    """Read a URDF. Raises ValueError, which names the file, or OSError."""
+    try:
+        return read_urdf(Path(path), meshes=False)  # a mesh that cannot be drawn becomes a note
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from None
 
 
 def _mirror(spec: WorldSpec, notes: list[str]) -> Any | None:

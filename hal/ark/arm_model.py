@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import xml.etree.ElementTree as ElementTree
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -30,18 +29,11 @@ class ArkUrdf:
 
     def __init__(self, path: Path) -> None:
         self.model = read_urdf(path)
-        moved = {joint.child for joint in self.model.joints.values()}
-        if moved.issuperset(self.model.links):
-            raise ValueError("has no root: every link is moved by a joint")
-        root = ElementTree.parse(path).getroot()
-        self._joints = {joint.get("name", ""): _origin(joint.find("origin")) for joint in root.findall("joint")}
-        self._centres = {link.get("name", ""): _origin(link.find("inertial/origin")) for link in root.findall("link")}
 
     @property
     def root(self) -> str:
         """The link that is no joint's child."""
-        moved = {joint.child for joint in self.model.joints.values()}
-        return next(link for link in self.model.links if link not in moved)
+        return self.model.root
 
     def is_fixed(self, link: str) -> bool:
         """Return whether a fixed joint connects it to its parent."""
@@ -83,24 +75,16 @@ class ArkUrdf:
         """
         if link not in self.model.links:
             return None
-        pose = self._centres[link]
+        pose = self.model.links[link].inertial or Pose()
         at = link
         for joint in self.model.above(link):
             if at in known:
                 break
             if joint.kind != "fixed":
                 return None
-            pose = self._joints[joint.name] @ pose
+            pose = joint.origin @ pose
             at = joint.parent
         return (at, pose) if at in known else None
-
-
-def _origin(element: ElementTree.Element | None) -> Pose:
-    if element is None:
-        return Pose()
-    x, y, z = map(float, element.get("xyz", "0 0 0").split())
-    roll, pitch, yaw = map(float, element.get("rpy", "0 0 0").split())
-    return Pose.from_rpy([x, y, z], [roll, pitch, yaw])
 
 
 TO_SPEED, TO_ACCELERATION = 0.3, 0.02

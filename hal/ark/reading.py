@@ -12,7 +12,7 @@ import yaml
 from ..config.files import PlacedErrors, Problems, check_size, nearest
 from ..config.schema import describe, is_number
 from ..errors import ConfigError
-from ..kinematics.urdf import package_folder
+from ..kinematics.mesh_files import package_folder
 
 __all__ = [
     "ArkNode",

@@ -13,7 +13,8 @@ from typing import Any, TypeVar
 
 from .. import registry
 from ..errors import HalError
-from ..kinematics.urdf import UrdfModel, package_folder
+from ..kinematics.mesh_files import package_folder
+from ..kinematics.urdf import UrdfModel
 from ..specs import CameraSpec, RobotSpec
 from .data_files import user_path
 from .files import Problems, nearest, read_yaml, validate, with_holes

@@ -19,6 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 from ..arguments import vector
 from ..errors import CommandError
 from ..geometry import Pose, difference
+from .urdf import parse_xml
 
 if TYPE_CHECKING:
     from ..specs import KinematicsSpec
@@ -293,14 +294,14 @@ def _reduced_model(spec: KinematicsSpec, pin: Any) -> Any:
 
 def _bounded_joints(urdf: str) -> str:
     """The URDF's text with continuous joints made revolute: pinocchio gives the former two numbers each."""
-    tree = ElementTree.parse(urdf)
-    for joint in tree.iter("joint"):
+    robot = parse_xml(urdf)
+    for joint in robot.iter("joint"):
         if joint.get("type") == "continuous":
             joint.set("type", "revolute")
             for old in joint.findall("limit"):
                 joint.remove(old)
             ElementTree.SubElement(joint, "limit", lower="-1e9", upper="1e9", effort="1e9", velocity="1e9")
-    return ElementTree.tostring(tree.getroot(), encoding="unicode")
+    return ElementTree.tostring(robot, encoding="unicode")
 
 
 def _frame(model: Any, link: str, spec: KinematicsSpec) -> int:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import random
 from collections.abc import Iterator
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,41 +13,58 @@ from numpy.typing import NDArray
 from ..errors import Unreachable
 from ..geometry import Pose
 
-if TYPE_CHECKING:
-    from .arm import Kinematics
-
-__all__ = ["solve"]
+__all__ = ["IkModel", "solve"]
 
 Array = NDArray[np.float64]
 
 ITERATIONS = 80
 """Steps from one start; a start that converges needs about ten."""
 RADIAN_IN_METRES = 0.3
-"""What one rad of orientation counts as, when two positions that both miss the pose are compared."""
+"""Weight of orientation, m/rad, when two positions that both miss the pose are compared."""
 STEP_MAX = 0.5
-"""Longest step of a joint, rad: the Jacobian says nothing farther away."""
+"""Longest step of a joint, rad: the Jacobian is not valid farther away."""
 CANDIDATES = 4
-"""Solutions to choose the nearest from, when the seed itself leads to none."""
+"""Solutions to choose the nearest from, when the search from the seed finds none."""
 
 
-class _Result(NamedTuple):
-    q: Array
-    position_error: float
-    rotation_error: float
+class IkModel(Protocol):
+    """What the search needs of an arm with n joints; a :class:`~hal.kinematics.arm.Kinematics` has it."""
 
-    def miss(self) -> float:
-        return self.position_error + RADIAN_IN_METRES * self.rotation_error
+    lower: Array
+    """(n,) rad."""
+    upper: Array
+    """(n,) rad."""
+    home: Array
+    """(n,) rad."""
+
+    def pose_error(self, q: Array, pose: Array) -> Array:
+        """Return the constant twist (6,) that takes the tcp from ``q`` to ``pose`` (7,) in 1 s."""
+
+    def jacobian(self, q: Array) -> Array:
+        """Return the Jacobian (6, n) of the tcp at ``q``."""
 
 
 def solve(
-    kinematics: Kinematics, pose: Pose, seed: Array, position_tolerance: float, rotation_tolerance: float, starts: int
+    arm: IkModel, pose: Pose, seed: Array, position_tolerance: float, rotation_tolerance: float, starts: int
 ) -> Array:
-    """See :meth:`hal.kinematics.arm.Kinematics.solve`."""
+    """Return joint positions (n,) inside the limits that bring the tcp to ``pose``.
+
+    Args:
+        arm: The arm.
+        pose: Pose of the tcp in the arm's base frame.
+        seed: (n,) joint positions to start from; a solution near them is preferred.
+        position_tolerance: m.
+        rotation_tolerance: rad.
+        starts: Most points to search from; they are the same in every call.
+
+    Raises:
+        Unreachable: No start led to the pose.
+    """
     target = np.concatenate([pose.position, pose.orientation])
     closest: _Result | None = None
     found: list[Array] = []
-    for number, start in enumerate(_starts(kinematics, seed, starts)):
-        result = _descend(kinematics, target, start, position_tolerance, rotation_tolerance)
+    for number, start in enumerate(_starts(arm, seed, starts)):
+        result = _descend(arm, target, start, position_tolerance, rotation_tolerance)
         if result.position_error <= position_tolerance and result.rotation_error <= rotation_tolerance:
             if number == 0:
                 return result.q
@@ -59,8 +76,7 @@ def solve(
     if found:
         return min(found, key=lambda q: float(np.abs(q - seed).max()))
     assert closest is not None
-    # Not what the descent believed, but where the forward kinematics of its answer really are.
-    position_error, rotation_error = _errors(kinematics.pose_error(closest.q, target))
+    position_error, rotation_error = _errors(arm.pose_error(closest.q, target))
     raise Unreachable(
         f"no joint position inside the limits brings the tcp to {pose!r}",
         position_error=position_error,
@@ -69,39 +85,41 @@ def solve(
     )
 
 
-def _starts(kinematics: Kinematics, seed: Array, count: int) -> Iterator[Array]:
-    """The seed, home, then points between the seed and random ones, ever farther from the seed."""
-    lower, upper = _search_range(kinematics, seed)
+def _starts(arm: IkModel, seed: Array, count: int) -> Iterator[Array]:
+    """Yield the seed, home, then points between the seed and random ones, ever farther from the seed."""
+    lower, upper = _search_range(arm, seed)
     yield np.clip(seed, lower, upper)
     if count > 1:
-        yield np.clip(kinematics.home, lower, upper)
-    numbers = random.Random(0)  # the same starts for the same question, always
+        yield np.clip(arm.home, lower, upper)
+    numbers = random.Random(0)  # the same starts in every call
     for k in range(2, count):
         anywhere = np.array([numbers.uniform(a, b) for a, b in zip(lower, upper, strict=True)])
         share = min(1.0, 2.0 * k / count)
         yield np.clip((1.0 - share) * seed + share * anywhere, lower, upper)
 
 
-def _search_range(kinematics: Kinematics, seed: Array) -> tuple[Array, Array]:
-    """The limits, or a turn either way of the seed for a joint that turns without end."""
-    return np.maximum(kinematics.lower, seed - 2 * math.pi), np.minimum(kinematics.upper, seed + 2 * math.pi)
+def _search_range(arm: IkModel, seed: Array) -> tuple[Array, Array]:
+    """Return the limits; for a joint without an end, one turn either way of the seed."""
+    return np.maximum(arm.lower, seed - 2 * math.pi), np.minimum(arm.upper, seed + 2 * math.pi)
 
 
 def _descend(
-    kinematics: Kinematics, target: Array, start: Array, position_tolerance: float, rotation_tolerance: float
+    arm: IkModel, target: Array, start: Array, position_tolerance: float, rotation_tolerance: float
 ) -> _Result:
-    """Levenberg-Marquardt with the damping that Sugihara (IEEE T-RO 27(5), 2011) gives for unreachable targets:
-    half the squared error and a small bias. Joints that press against a limit are left out of the step.
+    """Search from one start by Levenberg-Marquardt.
+
+    The damping is that of Sugihara (IEEE T-RO 27(5), 2011) for unreachable targets: half the squared error and a small
+    bias. Joints that press against a limit are left out of the step.
     """
     q = start.copy()
-    lower, upper = kinematics.lower, kinematics.upper
-    error = kinematics.pose_error(q, target)
+    lower, upper = arm.lower, arm.upper
+    error = arm.pose_error(q, target)
     best = _Result(q, *_errors(error))
     stalled = 0
     for _ in range(ITERATIONS):
         if best.position_error <= 0.1 * position_tolerance and best.rotation_error <= 0.1 * rotation_tolerance:
             break
-        jacobian = kinematics.jacobian(q)
+        jacobian = arm.jacobian(q)
         gradient = error @ jacobian
         free = ~(((q <= lower) & (gradient < 0.0)) | ((q >= upper) & (gradient > 0.0)))
         if not free.any():
@@ -115,7 +133,7 @@ def _descend(
         if longest > STEP_MAX:
             step *= STEP_MAX / longest
         q = np.clip(q + step, lower, upper)
-        error = kinematics.pose_error(q, target)
+        error = arm.pose_error(q, target)
         result = _Result(q, *_errors(error))
         stalled = 0 if result.miss() < 0.999 * best.miss() else stalled + 1
         if result.miss() < best.miss():
@@ -123,6 +141,15 @@ def _descend(
         if stalled == 8:
             break
     return best
+
+
+class _Result(NamedTuple):
+    q: Array
+    position_error: float
+    rotation_error: float
+
+    def miss(self) -> float:
+        return self.position_error + RADIAN_IN_METRES * self.rotation_error
 
 
 def _errors(twist: Array) -> tuple[float, float]:

@@ -1,189 +1,67 @@
-"""A URDF read as plain XML: enough to check it and to fill in limits, without a physics engine.
+"""Read and check URDF files: links, joints, shapes and limits as plain records, without a physics engine.
 
-Everything is checked that makes a library crash or fail with an error of its own: the tree, every number, meshes.
+Everything that crashes a library, or makes it fail with an error of its own, is checked first: the tree, every number
+and the mesh files. Prefixes that the file does not declare (``drake:``, ``xacro:``) are accepted, as other readers of
+URDF do.
 """
 
 from __future__ import annotations
 
-import importlib.util
 import math
-import re
-import struct
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property
 from pathlib import Path
 from types import MappingProxyType
+from xml.parsers import expat
 
-import numpy as np
+from ..geometry import Pose, after_rotation, rotate
+from .mesh_files import check_mesh, is_installed, mesh_file
 
-__all__ = [
-    "UrdfJoint",
-    "UrdfModel",
-    "check_mesh",
-    "mesh_file",
-    "near",
-    "package_folder",
-    "read_urdf",
-]
+__all__ = ["UrdfJoint", "UrdfLink", "UrdfMimic", "UrdfModel", "UrdfVisual", "parse_xml", "read_urdf"]
 
-# [packages.py] Files that URDFs name: where the folder of an installed Python package is, and which file a mesh's
-# name means.
-
-_PACKAGE = "package://"
-_SCHEMES = (_PACKAGE, "model://", "file://")
-
-
-def package_folder(package: str) -> Path | None:
-    """Folder of an installed Python package, which is not imported; None where there is none of that name."""
-    try:
-        spec = importlib.util.find_spec(package)
-    except (ImportError, ValueError):
-        return None
-    if spec is None:
-        return None
-    if spec.submodule_search_locations:
-        return Path(next(iter(spec.submodule_search_locations)))
-    return Path(spec.origin).parent if spec.origin else None
-
-
-def mesh_file(name: str, folder: Path) -> Path:
-    """The file that a URDF in ``folder`` calls ``name``; where it should be beside the URDF when it is nowhere.
-
-    It may lie beside the URDF or above it (:func:`near`), or, as ``package://NAME/...``, in an installed package.
-    """
-    found = near(name, folder)
-    if found is not None:
-        return found
-    plain = _plain(name)
-    package, _, rest = plain.partition("/")
-    if name.startswith(_PACKAGE) and package.isidentifier():
-        root = package_folder(package)
-        if root is not None and (root / rest).is_file():
-            return root / rest
-    return folder / plain
-
-
-def near(name: str, folder: Path) -> Path | None:
-    """The file in ``folder`` or in one above it, whatever package a URI names: where PyBullet looks."""
-    plain = _plain(name)
-    return next((place / plain for place in (folder, *folder.parents) if (place / plain).is_file()), None)
-
-
-def _plain(name: str) -> str:
-    for scheme in _SCHEMES:
-        name = name.removeprefix(scheme)
-    return name
-
-
-# [meshes.py] Checks of mesh files, before a library reads them: some crash on an index that leads out of the
-# file.
-
-FARTHEST = 1e6
-"""Largest coordinate of a vertex, in whatever unit the file has."""
-_VERTEX = re.compile(rb"^[ \t]*v[ \t]+(\S+)[ \t]+(\S+)[ \t]+(\S+)", re.MULTILINE)
-_FACE = re.compile(rb"^[ \t]*f[ \t]+([^\r\n]*)", re.MULTILINE)
-# The numbers of a corner, POSITION/TEXTURE/NORMAL, each with the lines that it counts.
-_CORNERS = (
-    ("vertex", re.compile(rb"(?:^|\s)(-?\d+)"), re.compile(rb"^[ \t]*v[ \t]", re.MULTILINE)),
-    ("texture", re.compile(rb"\d/(-?\d+)"), re.compile(rb"^[ \t]*vt[ \t]", re.MULTILINE)),
-    ("normal", re.compile(rb"\d/-?\d*/(-?\d+)"), re.compile(rb"^[ \t]*vn[ \t]", re.MULTILINE)),
-)
-
-
-def check_mesh(path: Path) -> None:
-    """Check an OBJ, STL or Collada file; files of other kinds are left to the libraries.
-
-    Raises:
-        ValueError: What is wrong in it.
-        OSError: It cannot be read.
-    """
-    state = path.stat()
-    _check(path, state.st_mtime_ns, state.st_size)
-
-
-@lru_cache(maxsize=512)
-def _check(path: Path, changed_ns: int, size: int) -> None:
-    check = {".obj": _check_obj, ".stl": _check_stl, ".dae": _check_collada}.get(path.suffix.lower())
-    if check is not None:
-        check(path.read_bytes())
-
-
-def _check_obj(data: bytes) -> None:
-    _check_coordinates(np.array(_VERTEX.findall(data)))
-    faces = b"\n".join(_FACE.findall(data))
-    for kind, corner, line in _CORNERS:
-        found = corner.findall(faces)
-        _check_indices(found, len(line.findall(data)), kind, first=1)
-
-
-def _check_stl(data: bytes) -> None:
-    if len(data) >= 84:
-        (count,) = struct.unpack_from("<I", data, 80)
-        if len(data) == 84 + 50 * count:
-            rows = np.frombuffer(data, np.dtype([("at", "<f4", 12), ("rest", "<u2")]), count, 84)
-            _check_coordinates(rows["at"][:, 3:])
-            return
-    if not data.lstrip().startswith(b"solid"):
-        raise ValueError("is cut off, or no STL: its size is not that of the triangles it announces")
-    _check_coordinates(np.array(re.findall(rb"vertex\s+(\S+)\s+(\S+)\s+(\S+)", data)))
-
-
-def _check_collada(data: bytes) -> None:
-    try:
-        root = ElementTree.fromstring(data)
-    except (ElementTree.ParseError, LookupError, ValueError) as error:
-        raise ValueError(f"is not valid XML: {error}") from None
-    for element in root.iter():
-        element.tag = str(element.tag).rpartition("}")[2]  # without its namespace
-    counts: dict[str, int] = {}  # entries of each source, by its id; of <vertices>, those of the positions
-    for source in root.iter("source"):
-        accessor = source.find("technique_common/accessor")
-        array = source.find("float_array")
-        if accessor is None or array is None:
-            continue
-        values = np.array((array.text or "").split() or ["0"])
-        _check_coordinates(values)
-        stride = max(1, int(accessor.get("stride", "1")))
-        counts[source.get("id", "")] = min(int(accessor.get("count", "0")), len(values) // stride)
-    for vertices in root.iter("vertices"):
-        positions = [one.get("source", "")[1:] for one in vertices.findall("input")]
-        counts[vertices.get("id", "")] = min((counts.get(name, 0) for name in positions), default=0)
-    for kind in ("triangles", "polylist", "polygons", "tristrips", "trifans", "lines"):
-        for primitive in root.iter(kind):
-            inputs = [(int(one.get("offset", "0")), one.get("source", "")[1:]) for one in primitive.findall("input")]
-            width = 1 + max((offset for offset, _ in inputs), default=0)
-            for part in primitive.findall("p"):
-                indices = (part.text or "").split()
-                for offset, name in inputs:
-                    _check_indices([i.encode() for i in indices[offset::width]], counts.get(name, 0), name, first=0)
-
-
-def _check_coordinates(values: np.ndarray) -> None:
-    try:
-        numbers = values.astype(float)
-    except ValueError as error:
-        raise ValueError(f"has a coordinate that is no number: {error}") from None
-    if not (np.abs(numbers) <= FARTHEST).all():
-        raise ValueError(f"has a coordinate that is not finite, or beyond {FARTHEST:g}")
-
-
-def _check_indices(found: list[bytes], count: int, kind: str, *, first: int) -> None:
-    """Indices count from ``first``; negative ones, where they are allowed, count back from the last entry."""
-    if not found:
-        return
-    if max(map(len, found)) > 12:
-        raise ValueError(f"has a {kind} index of {max(map(len, found))} digits")
-    indices = np.array(found).astype(np.int64)
-    least, most = -count if first else 0, count - 1 + first
-    wrong = indices[(indices < least) | (indices > most) | ((indices == 0) & (first == 1))]
-    if len(wrong):
-        raise ValueError(f"has {kind} index {wrong[0]}, and {count} of that kind")
-
-
-MOVABLE = ("revolute", "continuous", "prismatic")
+TURNING = ("revolute", "continuous")
+"""Joints that turn about an axis, rad."""
+MOVABLE = (*TURNING, "prismatic")
 """Joints about or along one axis."""
+
+
+@dataclass(frozen=True)
+class UrdfVisual:
+    """One shape to draw, with its pose in the frame of its link."""
+
+    pose: Pose
+    shape: str
+    """``mesh``, ``box``, ``sphere``, ``cylinder`` or ``capsule``."""
+    size: tuple[float, ...]
+    """Scale of a mesh along x, y, z; sides of a box; radius; radius and length; m."""
+    rgba: tuple[float, ...] | None = None
+    """None for the colours of the mesh file."""
+    file: str = ""
+    """Path of a mesh, which may not exist."""
+
+
+@dataclass(frozen=True)
+class UrdfLink:
+    """A link."""
+
+    name: str
+    inertial: Pose | None
+    """Pose of the centre of mass; None where the link has no ``<inertial>``."""
+    has_shapes: bool
+    """Whether it has a visual or a collision shape."""
+    visuals: tuple[UrdfVisual, ...]
+
+
+@dataclass(frozen=True)
+class UrdfMimic:
+    """A joint that follows another: ``q[joint] = multiplier * q[of] + offset``."""
+
+    joint: str
+    of: str
+    multiplier: float = 1.0
+    offset: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -194,76 +72,154 @@ class UrdfJoint:
     kind: str
     parent: str
     child: str
+    origin: Pose
+    """Pose of the child in the parent's frame, at zero."""
+    axis: tuple[float, ...]
+    """(3,) unit vector along the parent's axes."""
     lower: float | None = None
     upper: float | None = None
     velocity: float | None = None
     effort: float | None = None
+    mimic: UrdfMimic | None = None
 
     @property
     def movable(self) -> bool:
-        """One axis that can be driven."""
+        """Whether the joint has one axis that can be driven."""
         return self.kind in MOVABLE
+
+    def placement(self, values: Mapping[str, float]) -> tuple[list[float], list[float]]:
+        """Return position (3,) and quaternion (4,) of the child in the parent's frame.
+
+        Args:
+            values: Joint -> position, rad or m; absent joints are at 0. A joint with a mimic follows its leader.
+        """
+        position, orientation = self.origin.position.tolist(), self.origin.orientation.tolist()
+        if self.mimic is None:
+            value = values.get(self.name, 0.0)
+        else:
+            value = self.mimic.multiplier * values.get(self.mimic.of, 0.0) + self.mimic.offset
+        along = [value * part for part in self.axis]
+        if self.kind in TURNING:
+            orientation = after_rotation(orientation, along)
+        elif self.kind == "prismatic":
+            position = [a + b for a, b in zip(position, along, strict=True)]
+        return position, orientation
 
 
 @dataclass(frozen=True)
 class UrdfModel:
-    """Links and joints of a URDF."""
+    """Links and joints of a URDF, which are a tree."""
 
     path: Path
-    links: Mapping[str, bool]
-    """Name -> does the link have an ``<inertial>``?"""
+    links: Mapping[str, UrdfLink]
     joints: Mapping[str, UrdfJoint]
+    """In the order of the file."""
+
+    @property
+    def root(self) -> str:
+        """The link that is no joint's child."""
+        children = {joint.child for joint in self.joints.values()}
+        return next(link for link in self.links if link not in children)
+
+    @property
+    def mimics(self) -> tuple[UrdfMimic, ...]:
+        """The joints that follow others."""
+        return tuple(joint.mimic for joint in self.joints.values() if joint.mimic is not None)
+
+    @cached_property
+    def outwards(self) -> tuple[UrdfJoint, ...]:
+        """The joints from the root outwards: a parent comes before its children."""
+        placed, ordered, waiting = {self.root}, list[UrdfJoint](), list(self.joints.values())
+        while waiting:
+            ready = [joint for joint in waiting if joint.parent in placed]
+            ordered += ready
+            waiting = [joint for joint in waiting if joint.parent not in placed]
+            placed |= {joint.child for joint in ready}
+        return tuple(ordered)
 
     def above(self, link: str) -> Iterator[UrdfJoint]:
-        """The joints between a link and the root, nearest first."""
+        """Yield the joints between a link and the root, nearest first."""
         by_child = {joint.child: joint for joint in self.joints.values()}
-        seen: set[str] = set()
-        while link in by_child and link not in seen:
-            seen.add(link)
+        while link in by_child:
             yield by_child[link]
             link = by_child[link].parent
 
+    def poses(self, values: Mapping[str, float]) -> dict[str, Pose]:
+        """Return the pose of each link in the root's frame; ``values`` are as in :meth:`UrdfJoint.placement`."""
+        found = {self.root: Pose()}
+        for joint in self.outwards:
+            found[joint.child] = found[joint.parent] @ Pose(*joint.placement(values))
+        return found
+
     def without_mass(self) -> list[str]:
-        """Links that move and have no ``<inertial>``: simulators make up a mass for them."""
+        """Return the links that move and have no ``<inertial>``: simulators make up a mass for them."""
         return [
             name
-            for name, has_mass in self.links.items()
-            if not has_mass and any(joint.kind != "fixed" for joint in self.above(name))
+            for name, link in self.links.items()
+            if link.inertial is None and any(joint.kind != "fixed" for joint in self.above(name))
         ]
 
 
-def read_urdf(path: Path) -> UrdfModel:
+def read_urdf(path: Path, *, meshes: bool = True) -> UrdfModel:
     """Read and check a URDF.
 
+    Args:
+        path: The file.
+        meshes: Whether to check the mesh files that it names, too.
+
     Raises:
-        ValueError: What is wrong in it, or in a mesh that it names.
+        ValueError: It, or a mesh that it names, is wrong; the message does not name ``path``.
         OSError: It cannot be read.
     """
-    try:
-        root = ElementTree.parse(path).getroot()
-    except (ElementTree.ParseError, LookupError, ValueError) as error:  # an encoding that Python lacks is the latter
-        raise ValueError(f"is not valid XML, so not a URDF: {error}") from None
-    if root.tag != "robot":
-        raise ValueError(f"is not a URDF: its root element is <{root.tag}>, not <robot>")
-    links = {_name(element): element.find("inertial") is not None for element in root.findall("link")}
+    robot = parse_xml(path)
+    if robot.tag != "robot":
+        raise ValueError(f"is not a URDF: its root element is <{robot.tag}>, not <robot>")
+    links = {_name(element): element for element in robot.findall("link")}
     if not links:
         raise ValueError("has no links")
     joints = {}
-    for element in root.findall("joint"):
-        joint = _joint(element)
-        joints[joint.name] = joint
-        for link in (joint.parent, joint.child):
+    for element in robot.findall("joint"):
+        name = _name(element)
+        joints[name] = element
+        for link in _ends(element):
             if link not in links:
-                raise ValueError(f"joint {joint.name!r} names link {link!r}, which is not there")
+                raise ValueError(f"joint {name!r} refers to link {link!r}, which does not exist")
+        _check_kind(element)
     for kind, names in (("link", links), ("joint", joints)):
-        if len(names) < len(root.findall(kind)):
+        if len(names) < len(robot.findall(kind)):
             raise ValueError(f"has two {kind}s of one name")
-    _check_tree(links, joints)
-    for element in (*root.findall("link"), *root.findall("joint")):
+    for element in (*links.values(), *joints.values()):
         _check_numbers(element)
-    for name in dict.fromkeys(mesh.get("filename", "") for mesh in root.iter("mesh")):
-        _check_mesh(name, path.resolve().parent)
-    return UrdfModel(path, MappingProxyType(links), MappingProxyType(joints))
+    found = {name: _joint(element) for name, element in joints.items()}
+    _check_tree(links, found)
+    folder = path.resolve().parent
+    if meshes:
+        for name in dict.fromkeys(mesh.get("filename", "") for mesh in robot.iter("mesh")):
+            _check_mesh(name, folder)
+    colors = _named_colors(robot)
+    drawn = {name: _link(element, colors, folder) for name, element in links.items()}
+    return UrdfModel(path, MappingProxyType(drawn), MappingProxyType(found))
+
+
+def parse_xml(path: Path | str) -> ElementTree.Element:
+    """Parse an XML file without resolving namespaces: prefixes need no declaration and stay in the tags.
+
+    Raises:
+        ValueError: It is not valid XML.
+        OSError: It cannot be read.
+    """
+    data = Path(path).read_bytes()
+    builder = ElementTree.TreeBuilder()
+    parser = expat.ParserCreate()
+    parser.buffer_text = True
+    parser.StartElementHandler = builder.start
+    parser.EndElementHandler = builder.end
+    parser.CharacterDataHandler = builder.data
+    try:
+        parser.Parse(data, True)
+        return builder.close()
+    except (expat.ExpatError, LookupError, ValueError) as error:  # LookupError: an encoding that Python lacks
+        raise ValueError(f"is not valid XML, so not a URDF: {error}") from None
 
 
 def _name(element: ElementTree.Element) -> str:
@@ -273,24 +229,37 @@ def _name(element: ElementTree.Element) -> str:
     return name
 
 
-def _check_tree(links: Mapping[str, bool], joints: Mapping[str, UrdfJoint]) -> None:
-    """Every link hangs on one joint, but for one, and all of them on that."""
+def _ends(joint: ElementTree.Element) -> tuple[str, str]:
+    parent, child = joint.find("parent"), joint.find("child")
+    if parent is None or child is None:
+        raise ValueError(f"joint {joint.get('name')!r} has no parent or no child")
+    return parent.get("link", ""), child.get("link", "")
+
+
+def _check_kind(joint: ElementTree.Element) -> None:
+    kind, kinds = joint.get("type", ""), (*MOVABLE, "fixed", "floating", "planar")
+    if kind not in kinds:
+        raise ValueError(f"joint {joint.get('name')!r} has type {kind!r}; types: {', '.join(kinds)}")
+
+
+def _check_tree(links: Mapping[str, object], joints: Mapping[str, UrdfJoint]) -> None:
+    """Check that every link but one, the root, is the child of one joint, and that all of them lead to the root."""
     parents: dict[str, UrdfJoint] = {}
     for joint in joints.values():
         if joint.child in parents:
             other = parents[joint.child].name
-            raise ValueError(f"link {joint.child!r} hangs on two joints, {other!r} and {joint.name!r}")
+            raise ValueError(f"link {joint.child!r} is the child of two joints, {other!r} and {joint.name!r}")
         parents[joint.child] = joint
     roots = [link for link in links if link not in parents]
     if len(roots) > 1:
         names = ", ".join(map(repr, roots[:6])) + (" ..." if len(roots) > 6 else "")
-        raise ValueError(f"falls apart: {names} hang on no joint, and only the root may")
+        raise ValueError(f"is not one tree: {names} are no joint's child, and only the root may be none")
     for link in links:
         place, steps = link, 0
         while place in parents and steps <= len(links):
             place, steps = parents[place].parent, steps + 1
         if place in parents:
-            raise ValueError(f"link {link!r} hangs on itself, through joint {parents[link].name!r}")
+            raise ValueError(f"link {link!r} is its own ancestor, through joint {parents[link].name!r}")
 
 
 # Attributes that hold numbers: how many, and the least that each may be.
@@ -322,24 +291,24 @@ def _check_numbers(owner: ElementTree.Element) -> None:
             try:
                 values = [float(word) for word in text.split()]
             except ValueError:
-                raise ValueError(f"{place}{element.tag} {attribute}={text!r}> is no number") from None
+                raise ValueError(f"{place}{element.tag} {attribute}={text!r}> is not a number") from None
             if len(values) != count:
                 raise ValueError(f"{place}{element.tag} {attribute}={text!r}> must be {count} number(s)")
             if not all(math.isfinite(value) and value >= least for value in values):
                 must = "finite" if least < 0.0 else "finite and not negative"
                 raise ValueError(f"{place}{element.tag} {attribute}={text!r}> must be {must}")
             if element.tag == "axis" and owner.get("type") in MOVABLE and math.hypot(*values) < 1e-6:
-                raise ValueError(f"{place}axis xyz={text!r}> is no direction")
+                raise ValueError(f"{place}axis xyz={text!r}> is not a direction")
 
 
 def _check_mesh(name: str, folder: Path) -> None:
-    """Check a mesh that is there; a driver that needs one reports those that are not.
+    """Check a mesh file if it exists; a driver that needs a missing one reports it.
 
-    Those of installed packages are trusted, as their code is: checking them would take up to a second.
+    Meshes of installed packages are trusted, as their code is: checking them would take up to a second.
     """
     try:
         file = mesh_file(name, folder)
-        if file.is_file() and not any(part in ("site-packages", "dist-packages") for part in file.parts):
+        if file.is_file() and not is_installed(file):
             check_mesh(file)
     except ValueError as error:
         raise ValueError(f"mesh {name}: {error}") from None
@@ -347,33 +316,97 @@ def _check_mesh(name: str, folder: Path) -> None:
         raise ValueError(f"mesh {name} cannot be read: {error}") from None
 
 
+# Records of elements whose numbers have been checked.
+
+
+def _floats(element: ElementTree.Element | None, attribute: str, default: tuple[float, ...]) -> tuple[float, ...]:
+    text = element.get(attribute) if element is not None else None
+    return default if text is None else tuple(float(word) for word in text.split())
+
+
+def _origin(owner: ElementTree.Element) -> Pose:
+    origin, zero = owner.find("origin"), (0.0, 0.0, 0.0)
+    return Pose() if origin is None else Pose.from_rpy(_floats(origin, "xyz", zero), _floats(origin, "rpy", zero))
+
+
 def _joint(element: ElementTree.Element) -> UrdfJoint:
-    name = _name(element)
-    parent, child, limit = element.find("parent"), element.find("child"), element.find("limit")
-    if parent is None or child is None:
-        raise ValueError(f"joint {name!r} lacks its parent or its child")
+    name, kind = element.get("name", ""), element.get("type", "")
+    parent, child = _ends(element)
+    origin, limit, mimic = _origin(element), element.find("limit"), element.find("mimic")
+    axis = _floats(element.find("axis"), "xyz", (1.0, 0.0, 0.0))
+    length = math.hypot(*axis) or 1.0
 
     def number(attribute: str) -> float | None:
-        text = limit.get(attribute) if limit is not None else None
-        try:
-            return float(text) if text is not None else None
-        except ValueError:
-            raise ValueError(f"joint {name!r}: {attribute}={text!r} is no number") from None
+        return next(iter(_floats(limit, attribute, ())), None)
 
-    kind = element.get("type", "")
-    if kind not in (*MOVABLE, "fixed", "floating", "planar"):
-        raise ValueError(f"joint {name!r} has type {kind!r}; types: {', '.join(MOVABLE)}, fixed, floating, planar")
-    bounded = kind != "continuous"
     # A URDF's lower and upper limits are 0 where they are left out of a <limit> (the specification says so).
     default = 0.0 if limit is not None else None
     lower, upper = number("lower"), number("upper")
+    bounded = kind != "continuous"
     return UrdfJoint(
         name=name,
         kind=kind,
-        parent=parent.get("link", ""),
-        child=child.get("link", ""),
+        parent=parent,
+        child=child,
+        origin=origin,
+        axis=tuple(rotate(origin.orientation.tolist(), [part / length for part in axis])),
         lower=(lower if lower is not None else default) if bounded else None,
         upper=(upper if upper is not None else default) if bounded else None,
         velocity=number("velocity"),
         effort=number("effort"),
+        mimic=None
+        if mimic is None
+        else UrdfMimic(
+            name,
+            mimic.get("joint", ""),
+            float(mimic.get("multiplier", 1.0)),
+            float(mimic.get("offset", 0.0)),
+        ),
     )
+
+
+_Colors = Mapping[str, tuple[float, ...]]
+
+
+def _named_colors(robot: ElementTree.Element) -> _Colors:
+    """Return the colours of all materials, which may be defined after their first use; wrong ones are left out."""
+    colors: dict[str, tuple[float, ...]] = {}
+    for material in robot.iter("material"):
+        try:
+            rgba = _floats(material.find("color"), "rgba", ())
+        except ValueError:
+            continue
+        if len(rgba) == 4:
+            colors.setdefault(material.get("name", ""), rgba)
+    return colors
+
+
+def _link(element: ElementTree.Element, colors: _Colors, folder: Path) -> UrdfLink:
+    inertial = element.find("inertial")
+    visuals = [_visual(visual, colors, folder) for visual in element.findall("visual")]
+    return UrdfLink(
+        name=element.get("name", ""),
+        inertial=_origin(inertial) if inertial is not None else None,
+        has_shapes=element.find("visual") is not None or element.find("collision") is not None,
+        visuals=tuple(visual for visual in visuals if visual is not None),
+    )
+
+
+def _visual(element: ElementTree.Element, colors: _Colors, folder: Path) -> UrdfVisual | None:
+    material, geometry = element.find("material"), element.find("geometry")
+    rgba = colors.get(material.get("name", "")) if material is not None else None
+    if material is not None and (own := material.find("color")) is not None:
+        rgba = _floats(own, "rgba", (1.0, 1.0, 1.0, 1.0))
+    shape = next(iter(geometry), None) if geometry is not None else None
+    if shape is None:
+        return None
+    pose = _origin(element)
+    if shape.tag == "mesh":
+        file = mesh_file(shape.get("filename", ""), folder)
+        return UrdfVisual(pose, "mesh", _floats(shape, "scale", (1.0, 1.0, 1.0)), rgba, str(file))
+    if shape.tag == "box":
+        return UrdfVisual(pose, "box", _floats(shape, "size", (0.0, 0.0, 0.0)), rgba)
+    if shape.tag in ("sphere", "cylinder", "capsule"):
+        length = () if shape.tag == "sphere" else _floats(shape, "length", (0.0,))
+        return UrdfVisual(pose, shape.tag, _floats(shape, "radius", (0.0,)) + length, rgba)
+    return None

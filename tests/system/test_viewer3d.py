@@ -26,8 +26,8 @@ from websockets.sync.client import connect
 
 import hal
 from hal import BodySpec, CartesianTarget, JointVelocity, MotionStopped, NotSupported, Pose, registry
-from hal.drivers.viser.urdf import read_tree
 from hal.drivers.viser.viewer import ViserViewer
+from hal.kinematics.urdf import read_urdf
 
 pytestmark = pytest.mark.slow
 
@@ -125,7 +125,7 @@ def test_links_fingers_and_handle_follow_the_arm(rig: hal.Rig, viewer: ViserView
     q[[0, 3]] += (0.2, -0.15)
     arm.move_to(q, speed=0.3)
     arm.gripper.move(0.02)
-    tree = read_tree(arm.spec.urdf)
+    tree = read_urdf(Path(arm.spec.urdf))
 
     def shown() -> bool:
         page.hear()

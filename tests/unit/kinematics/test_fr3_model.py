@@ -89,11 +89,11 @@ def test_every_link_stands_where_that_of_pybullets_panda_does() -> None:
 
 def test_pybullet_says_nothing_about_it() -> None:
     from hal.drivers.pybullet.engine import PyBulletClient, silenced
-    from hal.drivers.pybullet.urdf import loadable
+    from hal.drivers.pybullet.loading import loadable_urdf
 
     data("")
     client = PyBulletClient()
-    with loadable(str(URDF)) as file, silenced() as chatter:
+    with loadable_urdf(str(URDF)) as file, silenced() as chatter:
         body = client.loadURDF(file, useFixedBase=True, flags=client.URDF_USE_INERTIA_FROM_FILE)
     assert chatter.text == ""
     drawn = [Path(shape[4].decode()) for shape in client.getVisualShapeData(body)]
@@ -103,10 +103,10 @@ def test_pybullet_says_nothing_about_it() -> None:
 
 
 def test_the_other_views_find_its_meshes() -> None:
-    from hal.drivers.viser.urdf import read_tree
+    from hal.kinematics.urdf import read_urdf
 
     data("")
-    visuals = [visual for link in read_tree(str(URDF)).visuals.values() for visual in link]
+    visuals = [visual for link in read_urdf(URDF).links.values() for visual in link.visuals]
     assert len(visuals) == 11
     assert all(Path(visual.file).is_file() for visual in visuals)
 

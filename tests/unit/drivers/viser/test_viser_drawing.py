@@ -13,8 +13,8 @@ from pictures_kit import COLLADA
 from specs import data, panda
 
 from hal.drivers.viser.meshes import visual_glb
-from hal.drivers.viser.urdf import UrdfVisual, read_tree
 from hal.geometry import Pose
+from hal.kinematics.urdf import UrdfVisual, read_urdf
 from hal.specs import WorkspaceSpec
 
 
@@ -44,11 +44,11 @@ def test_primitives_have_their_size_and_colour(shape: str, size: tuple[float, ..
 
 
 def test_meshes_of_an_arm_keep_their_pose_and_colours() -> None:
-    tree = read_tree(panda().urdf)
-    (link,) = tree.visuals["panda_link1"]
+    links = read_urdf(Path(panda().urdf)).links
+    (link,) = links["panda_link1"].visuals
     scene = loaded(link)
     assert scene.bounds == pytest.approx(trimesh.load(link.file, process=False).bounds, abs=1e-5)
-    (finger,) = tree.visuals["panda_leftfinger"]
+    (finger,) = links["panda_leftfinger"].visuals
     shades = colors(loaded(finger)).astype(int)
     assert (np.ptp(shades, axis=1) < 20).all()  # greys
     assert shades.min() < 70  # the dark pad, in linear numbers
@@ -64,8 +64,8 @@ def test_collada_file_keeps_its_units_and_colours(tmp_path: Path) -> None:
 
 
 def test_few_large_triangles_keep_their_texture() -> None:
-    tree = read_tree(data("table/table.urdf"))
-    scene = loaded(tree.visuals[tree.root][0])
+    urdf = read_urdf(Path(data("table/table.urdf")))
+    scene = loaded(urdf.links[urdf.root].visuals[0])
     pictures = [part.visual.material.baseColorTexture for part in scene.geometry.values()]
     assert len(pictures) == 1
     assert max(pictures[0].size) <= 512

@@ -1,4 +1,4 @@
-"""The viewer's URDF reader, compared with the kinematics that move the arm."""
+"""Poses, joints and shapes of a URDF, compared with the kinematics that move the arm."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from specs import PANDA_HOME, data, panda
 
-from hal.drivers.viser.urdf import read_tree
 from hal.geometry import Pose
 from hal.kinematics.arm import Kinematics
+from hal.kinematics.urdf import parse_xml, read_urdf
 from hal.specs import KinematicsSpec
 
 SMALL = """
@@ -54,7 +54,7 @@ def iiwa() -> KinematicsSpec:
 @pytest.mark.parametrize("arm", ["panda", "iiwa"])
 def test_links_agree_with_the_kinematics(arm: str) -> None:
     spec = panda().kinematics if arm == "panda" else iiwa()
-    kinematics, tree = Kinematics(spec), read_tree(spec.urdf)
+    kinematics, tree = Kinematics(spec), read_urdf(Path(spec.urdf))
     tcp = Pose(spec.tcp_position, spec.tcp_orientation)
     random = np.random.default_rng(3)
     for q in [np.array(PANDA_HOME), *random.uniform(spec.lower, spec.upper, (20, 7))]:
@@ -62,14 +62,14 @@ def test_links_agree_with_the_kinematics(arm: str) -> None:
         base = poses[spec.base_link or tree.root].inverse()
         for found, wanted in (
             (base @ poses[spec.tcp_link] @ tcp, kinematics.pose(q)),
-            (base @ poses[tree.joints[3].child], kinematics.link_pose(tree.joints[3].child, q)),
+            (base @ poses[tree.outwards[3].child], kinematics.link_pose(tree.outwards[3].child, q)),
         ):
             assert np.abs(found.position - wanted.position).max() < 1e-6
             assert found.distance(wanted)[1] < 1e-6
 
 
 def test_fingers_move_apart_by_the_width() -> None:
-    tree = read_tree(panda().urdf)
+    tree = read_urdf(Path(panda().urdf))
     poses = tree.poses({"panda_finger_joint1": 0.03, "panda_finger_joint2": 0.03})
     assert poses["panda_leftfinger"].distance(poses["panda_rightfinger"])[0] == pytest.approx(0.06)
 
@@ -77,17 +77,17 @@ def test_fingers_move_apart_by_the_width() -> None:
 def test_joints_in_any_order_mimics_and_materials(tmp_path: Path) -> None:
     file = tmp_path / "small.urdf"
     file.write_text(SMALL)
-    tree = read_tree(str(file))
-    assert [joint.name for joint in tree.joints] == ["first", "second"]
+    tree = read_urdf(file)
+    assert [joint.name for joint in tree.outwards] == ["first", "second"]
     poses = tree.poses({"first": 0.25})  # the second slides by 0 along its own z, which is the arm's x
     assert poses["tip"].position == pytest.approx([0.0, 0.0, 1.0])
     poses = tree.poses({"first": 0.0})
     assert poses["tip"].position == pytest.approx([0.5, 0.0, 1.0])
-    box, mesh = tree.visuals["arm"]
+    box, mesh = tree.links["arm"].visuals
     assert (box.shape, box.size, box.rgba) == ("box", (1.0, 2.0, 3.0), (1.0, 0.0, 0.0, 1.0))
     assert (mesh.size, mesh.rgba) == ((1.0, 1.0, -1.0), None)
     assert mesh.file == str(tmp_path / "nowhere/a.stl")
-    (cylinder,) = tree.visuals["tip"]
+    (cylinder,) = tree.links["tip"].visuals
     assert cylinder.size == (0.1, 0.2)
     assert cylinder.pose.position == pytest.approx([0.0, 0.0, 0.1])
 
@@ -108,4 +108,18 @@ def test_wrong_urdf_is_refused(tmp_path: Path, change: tuple[str, str]) -> None:
     file = tmp_path / "small.urdf"
     file.write_text(SMALL.replace(*change))
     with pytest.raises(ValueError):  # noqa: PT011
-        read_tree(str(file))
+        read_urdf(file)
+
+
+def test_prefixes_that_the_file_does_not_declare(tmp_path: Path) -> None:
+    file = tmp_path / "small.urdf"
+    extra = '<drake:ignore_self_collision/><transmission xacro:at="tip"/>'
+    limit = '<limit lower="0" upper="1" effort="1" velocity="1"/></joint>'
+    file.write_text(SMALL.replace("</robot>", f"{extra}</robot>").replace("</joint>", limit, 1))
+    urdf = read_urdf(file)
+    assert urdf.root == "base"
+    root = parse_xml(file)
+    assert root.find("drake:ignore_self_collision") is not None
+    assert root.findall("transmission")[0].attrib == {"xacro:at": "tip"}
+    spec = KinematicsSpec(str(file), ("first",), (-1.0,), (1.0,), (0.0,), None, "tip", (0.0,) * 3, (0.0, 0.0, 0.0, 1.0))
+    assert Kinematics(spec).fk([0.0])[:3] == pytest.approx((0.0, 0.0, 1.0))

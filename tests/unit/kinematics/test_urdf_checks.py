@@ -14,7 +14,8 @@ import pytest
 
 from hal.config import load
 from hal.errors import ConfigError
-from hal.kinematics.urdf import check_mesh, read_urdf
+from hal.kinematics.mesh_files import check_mesh
+from hal.kinematics.urdf import read_urdf
 
 MUTATIONS = int(os.environ.get("HAL_FUZZ_COUNT", "300"))
 """Number of mutated URDFs and meshes; a longer run is asked for by the environment."""
@@ -55,18 +56,18 @@ JOINT = '<joint name="{}" type="fixed"><parent link="{}"/><child link="{}"/></jo
 @pytest.mark.parametrize(
     ("old", "new", "words"),
     [
-        ("</robot>", '<link name="loose"/></robot>', "'base', 'loose' hang on no joint"),
-        ("</robot>", JOINT.format("back", "upper", "base"), "hangs on itself"),
-        ("</robot>", JOINT.format("other", "base", "upper"), "'upper' hangs on two joints, 'turn' and 'other'"),
+        ("</robot>", '<link name="loose"/></robot>', "'base', 'loose' are no joint's child"),
+        ("</robot>", JOINT.format("back", "upper", "base"), "is its own ancestor"),
+        ("</robot>", JOINT.format("other", "base", "upper"), "'upper' is the child of two joints, 'turn' and 'other'"),
         ("</robot>", '<link name="base"/></robot>', "two links of one name"),
         ('<link name="base"/>', '<link name="base"/><link/>', "a <link> has no name"),
         ('type="revolute"', 'type="spherical"', "joint 'turn' has type 'spherical'"),
         ('axis xyz="0 0 1"', 'axis xyz="nan 0 1"', "joint 'turn': <axis xyz='nan 0 1'> must be finite"),
-        ('axis xyz="0 0 1"', 'axis xyz="0 0 0"', "joint 'turn': <axis xyz='0 0 0'> is no direction"),
+        ('axis xyz="0 0 1"', 'axis xyz="0 0 0"', "joint 'turn': <axis xyz='0 0 0'> is not a direction"),
         ('effort="10"', 'effort="-10"', "<limit effort='-10'> must be finite and not negative"),
         ('origin xyz="0 0 0.1"/>\n    <axis', 'origin xyz="0 0.1"/>\n    <axis', "must be 3 number(s)"),
         ('mass value="1"', 'mass value="inf"', "link 'upper': <mass value='inf'>"),
-        ('box size="0.1 0.1 0.2"', 'box size="0.1 ${w} 0.2"', "is no number"),
+        ('box size="0.1 0.1 0.2"', 'box size="0.1 ${w} 0.2"', "is not a number"),
         ('<robot name="arm">', '<?xml version="1.0" encoding="klingon"?><robot name="arm">', "not valid XML"),
         ('<robot name="arm">', '<?xml version="1.0" encoding="utf-7"?><robot name="arm">', "not valid XML"),
     ],
@@ -84,18 +85,18 @@ def test_what_is_wrong_in_a_urdf_is_one_sentence(old: str, new: str, words: str,
 @pytest.mark.parametrize(
     ("name", "content", "words"),
     [
-        ("a.obj", TRIANGLE + "f 1 2 99999999\n", "vertex index 99999999, and 3"),
-        ("a.obj", TRIANGLE + "f 1 2 -99999999\n", "vertex index -99999999, and 3"),
+        ("a.obj", TRIANGLE + "f 1 2 99999999\n", "vertex index 99999999, but only 3"),
+        ("a.obj", TRIANGLE + "f 1 2 -99999999\n", "vertex index -99999999, but only 3"),
         ("a.obj", TRIANGLE + "f 0 1 2\n", "vertex index 0"),
-        ("a.obj", TRIANGLE + "f 1/7 2/8 3/9\n", "texture index 7, and 0"),
-        ("a.obj", TRIANGLE + "vn 0 0 1\nf 1//1 2//1 3//2\n", "normal index 2, and 1"),
+        ("a.obj", TRIANGLE + "f 1/7 2/8 3/9\n", "texture index 7, but only 0"),
+        ("a.obj", TRIANGLE + "vn 0 0 1\nf 1//1 2//1 3//2\n", "normal index 2, but only 1"),
         ("a.obj", TRIANGLE + f"f 1 2 {'9' * 400}\n", "400 digits"),
         ("a.obj", "v nan 0 0\n" + TRIANGLE + "f 1 2 3\n", "not finite"),
-        ("a.obj", "v one 0 0\n" + TRIANGLE + "f 1 2 3\n", "no number"),
-        ("a.stl", "", "cut off"),
-        ("a.stl", b"\0" * 80 + struct.pack("<I", 1000) + b"\0" * 50, "cut off"),
+        ("a.obj", "v one 0 0\n" + TRIANGLE + "f 1 2 3\n", "not a number"),
+        ("a.stl", "", "truncated"),
+        ("a.stl", b"\0" * 80 + struct.pack("<I", 1000) + b"\0" * 50, "truncated"),
         ("a.stl", b"\0" * 80 + struct.pack("<I", 1) + struct.pack("<12f", *[float("nan")] * 12) + b"\0\0", "finite"),
-        ("a.dae", COLLADA.replace("0 1 2</p>", "0 1 99999999</p>"), "v index 99999999, and 3"),
+        ("a.dae", COLLADA.replace("0 1 2</p>", "0 1 99999999</p>"), "v index 99999999, but only 3"),
         ("a.dae", COLLADA.replace("0 1 2</p>", "0 1 -1</p>"), "v index -1"),
         ("a.dae", COLLADA[:300], "not valid XML"),
     ],

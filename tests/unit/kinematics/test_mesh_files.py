@@ -10,7 +10,7 @@ from specs import data, world_spec
 
 from hal.drivers.pybullet.world import PyBulletWorld
 from hal.errors import ConfigError
-from hal.kinematics.urdf import mesh_file, package_folder
+from hal.kinematics.mesh_files import mesh_file, package_folder
 from hal.specs import BodySpec
 
 CUBE = """
@@ -86,7 +86,10 @@ def test_the_simulation_draws_a_mesh_out_of_a_package(package: Path, tmp_path: P
     world.close()
 
 
-def test_a_mesh_that_is_in_no_package_is_told(package: Path, tmp_path: Path) -> None:
+def test_a_mesh_that_no_package_has_is_a_problem(package: Path, tmp_path: Path) -> None:
     data("")
-    with pytest.raises(ConfigError, match=r"thing.urdf.*names a mesh that is not there: package://lab_meshes/ball.obj"):
+    with pytest.raises(ConfigError) as caught:
         PyBulletWorld(world_spec(thing(tmp_path, "package://lab_meshes/ball.obj")))
+    (problem,) = caught.value.problems
+    assert (problem.file, problem.code) == (str(tmp_path / "thing.urdf"), "missing_file")
+    assert "package://lab_meshes/ball.obj" in problem.message
