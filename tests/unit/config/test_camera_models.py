@@ -240,7 +240,7 @@ AT = {"width": 640, "height": 480, "rate_hz": 30}
             ["did you mean 'subpixel'"],
         ),
         ({"simulated": {"depth_noise": {"subpixel": -1}}}, "simulated.depth_noise.subpixel", ["greater than 0"]),
-        ({"model": "pinhole", "simulated": {"depth_noise": True}}, "simulated.depth_noise", ["pinhole", "how it"]),
+        ({"model": "pinhole", "simulated": {"depth_noise": True}}, "simulated.depth_noise", ["pinhole"]),
         (
             {"model": "realsense_l515", "simulated": {"depth_noise": {"subpixel": 0.1}}},
             "simulated.depth_noise.subpixel",
