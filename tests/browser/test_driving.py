@@ -23,9 +23,7 @@ def held(bench: Bench) -> bool:
     [(0.0, 1.0, (1.0, 0.0)), (0.0, -0.54, (-0.5, 0.0)), (-1.0, 0.0, (0.0, 1.0)), (0.54, 0.0, (0.0, -0.5))],
     ids=["forward", "back at half speed", "left", "right at half speed"],
 )
-def test_a_disc_moves_the_arm_its_way_at_its_speed(
-    bench: Bench, page: Browser, right: float, up: float, expected: tuple[float, float]
-) -> None:
+def test_a_disc_moves_the_arm_its_way_at_its_speed(bench, page, right, up, expected):
     """0.08 of the way is the dead zone, so 0.54 of it is half the speed."""
     before = bench.tcp.copy()
     page.hold()
@@ -76,7 +74,6 @@ def test_keys_and_the_button_do_the_same(bench: Bench, page: Browser) -> None:
 
 def test_the_sliders_place_is_the_grip(bench: Bench, page: Browser) -> None:
     """It takes the fingers over when it crosses the place where they are: open, at first."""
-    assert bench.arm.gripper is not None
     bench.arm.gripper.open()
     slider = page.place("#gripper")
     page.hold()

@@ -32,12 +32,7 @@ def repeat(page: Browser, code: str, key: str) -> None:
     """The keyboard repeats a key that is down."""
     virtual = {"Space": 32, "ArrowLeft": 37}[code]
     page.cdp(
-        "Input.dispatchKeyEvent",
-        type="rawKeyDown",
-        code=code,
-        key=key,
-        windowsVirtualKeyCode=virtual,
-        autoRepeat=True,
+        "Input.dispatchKeyEvent", type="rawKeyDown", code=code, key=key, windowsVirtualKeyCode=virtual, autoRepeat=True
     )
 
 

@@ -94,9 +94,7 @@ def test_a_program_that_is_silent_while_it_records_is_shown(bench: Bench, page: 
     assert page.text("#recording-phase") == "recording"
 
 
-def test_a_press_reaches_the_program_and_leaves_a_held_dead_man_alone(
-    bench: Bench, page: Browser, asked: queue.SimpleQueue[str]
-) -> None:
+def test_a_press_reaches_the_program_and_leaves_a_held_dead_man_alone(bench, page, asked):
     show(bench, page, replace(READY, actions=ACTIONS))
     page.hold()
     wait_for(lambda: bench.deadman.held, "the dead-man")
@@ -115,9 +113,7 @@ def test_a_press_reaches_the_program_and_leaves_a_held_dead_man_alone(
     assert asked.get(timeout=20.0) == "record", "who slides off a button has thought better of it"
 
 
-def test_a_second_thumb_presses_while_the_first_one_holds(
-    bench: Bench, page: Browser, asked: queue.SimpleQueue[str]
-) -> None:
+def test_a_second_thumb_presses_while_the_first_one_holds(bench, page, asked):
     page.size(390, 844, touch=True)
     try:
         show(bench, page, READY)
@@ -168,14 +164,13 @@ def test_keys_press_the_buttons_of_the_pad_that_do_the_same(bench: Bench, page: 
     assert page.text(button("finish")).split() == ["Save", "0"]
     for key, name in (("1", "south"), ("0", "home")):
         page.key(f"Digit{key}", key, True)
-        wait_for(lambda name=name: bench.session.pad.state().pressed(name), f"{name} to be pressed")  # type: ignore[misc]
+        wait_for(lambda name=name: bench.session.pad.state().pressed(name), f"{name} to be pressed")
         page.key(f"Digit{key}", key, False)
-        wait_for(lambda name=name: not bench.session.pad.state().pressed(name), f"{name} to be let go of")  # type: ignore[misc]
+        wait_for(lambda name=name: not bench.session.pad.state().pressed(name), f"{name} to be let go of")
 
 
 @pytest.mark.parametrize(
-    ("phase", "title"),
-    [("done", "The program has finished: 2 episodes saved"), ("saving", "The program has ended")],
+    ("phase", "title"), [("done", "The program has finished: 2 episodes saved"), ("saving", "The program has ended")]
 )
 def test_a_run_that_ends_by_itself_is_no_alarm(browser: Browser, phase: str, title: str) -> None:
     program = Bench()
@@ -197,9 +192,7 @@ def test_a_run_that_ends_by_itself_is_no_alarm(browser: Browser, phase: str, tit
     [(RUNNING, "the arm has been stopped"), (replace(READY, phase="done", saved=1), "has finished: 1 episode saved")],
     ids=["recording", "done"],
 )
-def test_a_link_that_breaks_is_an_alarm_unless_the_run_was_done(
-    bench: Bench, page: Browser, view: RecordingView, words: str
-) -> None:
+def test_a_link_that_breaks_is_an_alarm_unless_the_run_was_done(bench, page, view, words):
     show(bench, page, view)
     page.run(
         """const {send} = WebSocket.prototype, title = document.querySelector('#overlay-title');

@@ -188,6 +188,6 @@ def test_invalid_driving_views() -> None:
 
     for wrong in ({"speed": 0.0}, {"speed": float("nan")}, {"speed": 0.5, "speed_max": 0.4}, {"frame": "world"}):
         with pytest.raises(hal.CommandError):
-            DrivingView("arm", **wrong)  # type: ignore[arg-type]
+            DrivingView("arm", **wrong)
     with pytest.raises(hal.CommandError):
         DrivingView("arm", settings=("torque",))

@@ -55,9 +55,7 @@ def test_a_confirmed_stop_raises_no_alarm(bench: Bench, page: Browser) -> None:
     let_go_of_all(page)
 
 
-def test_the_banner_names_who_stopped_however_late_the_arm_shows_it(
-    bench: Bench, page: Browser, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_banner_names_who_stopped_however_late_the_arm_shows_it(bench, page, monkeypatch):
     stop = bench.rig.stop
 
     def stop_late() -> None:
@@ -75,7 +73,6 @@ def test_the_banner_names_who_stopped_however_late_the_arm_shows_it(
 def test_a_stop_with_nothing_to_stop(page: Browser) -> None:
     """No program drives the arm: nothing is latched, and nothing moves."""
     with hal.open("panda_table", sim=True, pad="web", listen=":0", overrides=["cameras={}"]) as rig:
-        assert rig.console is not None
         page.open(rig.console.link)
         wait_for(lambda: page.facts.get("lastState"), "a state")
         assert page.facts["lastState"]["robots"]["panda"]["status"] == "idle"

@@ -90,9 +90,7 @@ def presses(page: Browser, button: str) -> list[dict[str, Any]]:
         ('[data-button="east"]', "east"),
     ],
 )
-def test_a_tap_lasts_until_the_app_has_looked(
-    bench: Bench, page: Browser, seen: list[PadState], target: str, button: str
-) -> None:
+def test_a_tap_lasts_until_the_app_has_looked(bench, page, seen, target, button):
     tap(page, target)
     wait_for(lambda: any(not one["down"] for one in presses(page, button)), "the release")
     sent = presses(page, button)

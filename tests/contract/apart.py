@@ -26,7 +26,7 @@ LIMIT = 20.0
 class Apart(RobotDriver):
     """A driver that forwards every call to another process, and every error back."""
 
-    modes = frozenset()  # type: ignore[assignment]  # known once the other one is made
+    modes = frozenset()  # known once the other one is made
     paces_itself = False
 
     def __init__(self, place: str, spec: RobotSpec) -> None:
@@ -37,8 +37,8 @@ class Apart(RobotDriver):
         finally:
             sys.path.remove(HERE)
         about = self._child.wait_ready()
-        self.modes = frozenset(about["modes"])  # type: ignore[misc]
-        self.paces_itself = about["paces_itself"]  # type: ignore[misc]
+        self.modes = frozenset(about["modes"])
+        self.paces_itself = about["paces_itself"]
 
     def _call(self, method: str, *arguments: Any, **knobs: Any) -> Any:
         return self._child.request(method, {"arguments": arguments, "knobs": knobs}, LIMIT)
@@ -51,7 +51,7 @@ class Apart(RobotDriver):
 
     def read(self, now: float) -> Reading:
         reading = Reading(*self._call("read", now))
-        return reading if reading.fault is None else reading._replace(fault=Fault(*reading.fault))  # type: ignore[misc]
+        return reading if reading.fault is None else reading._replace(fault=Fault(*reading.fault))
 
     def write(self, setpoint: Setpoint) -> None:
         self._call("write", setpoint)

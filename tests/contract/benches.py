@@ -14,14 +14,7 @@ from hal.clock import LockStepClock, RealClock
 from hal.drivers.mock.camera import MockCamera
 from hal.drivers.mock.robot import MockGripper, MockRobot
 from hal.specs import BodySpec, CameraSpec, GroupSpec, ViewSpec, WorldSpec
-from hal.testing import (
-    CameraBench,
-    GripperBench,
-    RobotBench,
-    camera_spec,
-    gripper_spec,
-    robot_spec,
-)
+from hal.testing import CameraBench, GripperBench, RobotBench, camera_spec, gripper_spec, robot_spec
 
 from ..kits.specs import data, panda
 
@@ -189,7 +182,6 @@ class RenderedWorld:
         """Kill the render process."""
         self.broken = True
         child = self.pictures._child
-        assert child is not None
         child.process.kill()
         child.process.wait()
 

@@ -203,7 +203,6 @@ class TestRecordedDualShock4(GamepadContract):
 
 
 class TestRecordedDualSense(
-    GamepadContract,
-    left_out={"freeze": "on a cable and without a motion sensor, a silent pad is an untouched one"},
+    GamepadContract, left_out={"freeze": "on a cable and without a motion sensor, a silent pad is an untouched one"}
 ):
     bench = bench_of(partial(recorded_pad, "dualsense", motion=False))

@@ -41,7 +41,7 @@ def run_here(main: Callable[[list[str]], int], *arguments: object, answer: str =
         warnings.catch_warnings(),
     ):
         warnings.simplefilter("default")
-        warnings.showwarning = warn  # type: ignore[assignment]
+        warnings.showwarning = warn
         try:
             status = main([str(argument) for argument in arguments])
         except SystemExit as ended:  # argparse

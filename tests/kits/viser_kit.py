@@ -44,9 +44,9 @@ class PlainPage:
         self.address = urlsplit(link).netloc
         self.socket = connect(
             f"ws://{self.address}",
-            subprotocols=[f"viser-v{viser.__version__}"],  # type: ignore[list-item]
+            subprotocols=[f"viser-v{viser.__version__}"],
             additional_headers={"Cookie": cookie},
-            origin=f"http://{self.address}",  # type: ignore[arg-type]
+            origin=f"http://{self.address}",
             max_size=None,
             compression=None,
         )

@@ -63,7 +63,7 @@ class Bench:
         def blind(*arguments: Any, **options: Any) -> hal.Frame:
             return replace(read(*arguments, **options), T_world_camera=None)
 
-        camera.read = blind  # type: ignore[method-assign]
+        camera.read = blind
         self.told: list[str] = []
 
     def drive(self, wanted: int, seed: int = 0, **options: Any) -> Calibration:
@@ -105,10 +105,7 @@ def test_the_camera_is_found(bench: Bench, seed: int) -> None:
 
 @pytest.mark.parametrize(
     "options",
-    [
-        ["cameras.wrist.streams=[color,depth]", "cameras.wrist.align=depth"],
-        ["cameras.wrist.streams=[infrared]"],
-    ],
+    [["cameras.wrist.streams=[color,depth]", "cameras.wrist.align=depth"], ["cameras.wrist.streams=[infrared]"]],
 )
 def test_images_of_another_sensor_give_the_pose_of_the_colour_sensor(options: list[str]) -> None:
     """Between the two are 15 mm."""
@@ -167,7 +164,6 @@ def test_the_arm_keeps_its_distance_and_its_workspace(bench: Bench) -> None:
     """Looked at in every step, by the world's own truth."""
     world, arm = bench.rig.world, bench.collector.robot
     box = arm.spec.workspace
-    assert box is not None
     nearest, lowest = math.inf, math.inf
     take = bench.collector.take_view
 
@@ -179,7 +175,7 @@ def test_the_arm_keeps_its_distance_and_its_workspace(bench: Bench) -> None:
         lowest = min(lowest, float(arm.state().tcp.position[2] - box.lower[2]))
         return take()
 
-    bench.collector.take_view = watched  # type: ignore[method-assign]
+    bench.collector.take_view = watched
     bench.drive(12)
     assert nearest > 0.3
     assert lowest > 0.0

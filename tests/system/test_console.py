@@ -36,7 +36,7 @@ def console(rig: hal.Rig) -> Any:
 
 def page_of(rig: hal.Rig) -> Page:
     parts = urlsplit(console(rig).link)
-    return Page(SimpleNamespace(url=f"http://{parts.netloc}"), token=parts.fragment)  # type: ignore[arg-type]
+    return Page(SimpleNamespace(url=f"http://{parts.netloc}"), token=parts.fragment)
 
 
 async def until(condition: Callable[[], Any], page: Page | None = None, **pad: Any) -> None:
@@ -57,16 +57,14 @@ def view(frames: int, *actions: str) -> RecordingView:
     """How a recording goes, after so many rows."""
     counts = {"episode": 0, "saved": 0, "wanted": 3, "succeeded": 0, "failed": 0, "discarded": 0, "dropped": 0}
     words = {"phase": "recording", "prompt": "drive", "task": "the task", "trouble": ""}
-    return RecordingView(**words, **counts, seconds=0.1, frames=frames, free_bytes=10**10, actions=actions)  # type: ignore[arg-type]
+    return RecordingView(**words, **counts, seconds=0.1, frames=frames, free_bytes=10**10, actions=actions)
 
 
 def speed(rig: hal.Rig) -> float:
     return float(abs(rig.robots["panda"].state(max_age=5.0).dq_set).max())
 
 
-def test_a_stop_is_heard_after_a_mistake_in_what_came_before(
-    rig: hal.Rig, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_a_stop_is_heard_after_a_mistake_in_what_came_before(rig, monkeypatch, capfd):
     def fails(*_: object) -> None:
         raise RuntimeError("can't start new thread")
 
@@ -103,9 +101,7 @@ def test_only_one_recovery_at_a_time(rig: hal.Rig, monkeypatch: pytest.MonkeyPat
     assert len(calls) == 1
 
 
-def test_a_console_that_is_killed_leaves_no_stick_pushed_and_says_so(
-    rig: hal.Rig, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_a_console_that_is_killed_leaves_no_stick_pushed_and_says_so(rig, capfd):
     pad = rig.gamepads["pad"]
 
     async def test() -> None:
@@ -163,9 +159,7 @@ def test_a_stop_ends_the_tour_for_good(rig: hal.Rig) -> None:
     run(test)
 
 
-def test_a_recording_is_steered_from_the_page_and_a_mistake_in_the_app_costs_nothing_else(
-    rig: hal.Rig, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_a_recording_is_steered_from_the_page_and_a_mistake_in_the_app_costs_nothing_else(rig, capfd):
     asked: queue.SimpleQueue[str] = queue.SimpleQueue()
 
     def take(action: str) -> None:

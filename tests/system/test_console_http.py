@@ -50,9 +50,7 @@ def test_a_wrong_token_is_reported(server: App, path: str, token: str) -> None:
         ({"Host": "testbench", "Origin": "http://testbench"}, 421),
     ],
 )
-def test_foreign_origins_and_hosts_are_turned_away(
-    server: App, path: str, headers: dict[str, str], status: int
-) -> None:
+def test_foreign_origins_and_hosts_are_turned_away(server, path, headers, status):
     async def test() -> None:
         with pytest.raises(aiohttp.WSServerHandshakeError) as caught:
             async with Page(server, path, **headers):

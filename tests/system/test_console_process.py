@@ -141,7 +141,7 @@ def test_a_page_that_leaves_loses_the_pad_at_once(app: App, how: str) -> None:
             elif how == "closed":
                 await page.ws.close()
             else:
-                page.ws._response.connection.transport.abort()  # type: ignore[union-attr]
+                page.ws._response.connection.transport.abort()
             pad = await app.pad()
             assert not pad["connected"]
             assert pad["why"] == ("the page was hidden" if how == "hidden" else "the page in control was closed")

@@ -9,10 +9,7 @@ import pytest
 
 from hal.types import RobotStatus, Trip
 
-pytestmark = [
-    pytest.mark.slow,
-    pytest.mark.skipif(not sys.platform.startswith("linux"), reason="reads /proc"),
-]
+pytestmark = [pytest.mark.slow, pytest.mark.skipif(not sys.platform.startswith("linux"), reason="reads /proc")]
 
 
 MOTION = "hal.JointVelocity(velocity)"

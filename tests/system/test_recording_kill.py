@@ -39,7 +39,6 @@ def test_every_finished_episode_is_intact_and_the_live_one_but_for_its_end(tmp_p
     chance = random.Random(seed)
     out = tmp_path / "out"
     app = start(out, seed)
-    assert app.stdout is not None
     first: dict[str, Any] = json.loads(app.stdout.readline())
     assert first["what"] == "ready"
     time.sleep(chance.uniform(0.5, 5.0))

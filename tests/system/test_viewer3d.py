@@ -113,8 +113,8 @@ def test_access_needs_the_link(viewer: ViserViewer) -> None:
         with pytest.raises(InvalidStatus, match="403"):
             connect(
                 f"ws://{parts.netloc}",
-                subprotocols=[f"viser-v{viser.__version__}"],  # type: ignore[list-item]
-                origin=origin,  # type: ignore[arg-type]
+                subprotocols=[f"viser-v{viser.__version__}"],
+                origin=origin,
                 additional_headers=crumbs,
             )
 
@@ -162,7 +162,6 @@ def test_drag_sets_a_goal_until_it_is_cleared(rig: hal.Rig, viewer: ViserViewer,
     page.drag(HANDLE, ((float("nan"), 0.0, 0.5), (1, 0, 0, 0)), ((9.0, 0.0, 0.5), (1, 0, 0, 0)), ((0.4,), (1, 0, 0, 0)))
     until(lambda: viewer._goals["panda"].t > sent + 0.2)  # repeated since
     kept = viewer.goal("panda")
-    assert kept is not None
     assert kept.position == pytest.approx(wanted[0])
     viewer.clear_goal("panda")
     assert viewer.goal("panda") is None
@@ -292,7 +291,6 @@ time.sleep(60)
 def test_viewer_ends_with_a_killed_app() -> None:
     app = subprocess.Popen([sys.executable, "-c", APP], stdout=subprocess.PIPE, text=True)
     try:
-        assert app.stdout is not None
         pid = int(app.stdout.readline())
         assert Path(f"/proc/{pid}").exists()
         app.kill()

@@ -82,7 +82,6 @@ class Emulator:
 
     def type(self, line: str) -> None:
         """Type a line into its standard input."""
-        assert self.process.stdin is not None
         self.process.stdin.write(line + "\n")
         self.process.stdin.flush()
 

@@ -58,8 +58,6 @@ class App:
             stderr=subprocess.PIPE,
             text=True,
         )
-        assert self.process.stdout is not None
-        assert self.process.stderr is not None
         line = self.process.stdout.readline()
         assert line, self.process.stderr.read()
         self.children: list[int] = json.loads(line)["children"]
@@ -115,7 +113,6 @@ def test_the_arms_own_process_is_killed(emulator: Emulator) -> None:
         os.kill(app.children[0], signal.SIGKILL)
         emulator.wait_event("motion ended")
         app.process.wait(10.0)
-        assert app.process.stderr is not None
         said = app.process.stderr.read()
         assert "ConnectionLost" in said
         assert "arm process ended" in said

@@ -75,7 +75,7 @@ def test_one_silent_stream_is_named() -> None:
 
 def process_of(cam: object) -> int:
     """Return the number of the process with the library."""
-    return int(cam._driver._link._child.process.pid)  # type: ignore[attr-defined]
+    return int(cam._driver._link._child.process.pid)
 
 
 def test_a_process_that_hangs_is_killed_and_replaced() -> None:
@@ -100,7 +100,7 @@ def test_a_process_that_dies_is_replaced() -> None:
 def test_close_is_bounded_and_idempotent_even_if_the_library_hangs() -> None:
     driver = RealSenseCamera(software())
     driver.open()
-    os.kill(driver._link._child.process.pid, signal.SIGSTOP)  # type: ignore[union-attr]
+    os.kill(driver._link._child.process.pid, signal.SIGSTOP)
     began = time.monotonic()
     driver.close()
     driver.close()
@@ -115,7 +115,7 @@ def test_close_is_bounded_and_idempotent_even_if_the_library_hangs() -> None:
 def test_a_closed_camera_leaves_no_process() -> None:
     driver = RealSenseCamera(software())
     driver.open()
-    pid = driver._link._child.process.pid  # type: ignore[union-attr]
+    pid = driver._link._child.process.pid
     driver.close()
     assert not os.path.exists(f"/proc/{pid}")
 
@@ -123,7 +123,7 @@ def test_a_closed_camera_leaves_no_process() -> None:
 def test_a_lost_camera_that_is_closed_for_good_leaves_no_process() -> None:
     driver = RealSenseCamera(software())
     driver.open()
-    pid = driver._link._child.process.pid  # type: ignore[union-attr]
+    pid = driver._link._child.process.pid
     driver.inject(disconnect=True)
     with pytest.raises(ConnectionLost):
         while True:

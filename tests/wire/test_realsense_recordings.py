@@ -117,10 +117,7 @@ def test_a_recording_plays_what_was_streamed(tmp_path: Path) -> None:
             cam.read(timeout=5.0)
     for part in (file, tmp_path / "mine-2.db3"):
         played = []
-        with (
-            opened(spec(play=str(part), paced=False, repeat=False)) as cam,
-            pytest.raises(ConnectionLost) as ended,
-        ):
+        with opened(spec(play=str(part), paced=False, repeat=False)) as cam, pytest.raises(ConnectionLost) as ended:
             while True:
                 frame = cam.read(timeout=5.0)
                 played.append(read_number(frame.color))

@@ -37,7 +37,6 @@ def test_a_rig_opens_an_emulated_camera() -> None:
     with hal.open(rig(emulated=True, warm_up_s=0.0)) as bench:
         cam = bench.cameras["wrist"]
         frame = cam.read(timeout=5.0)
-        assert frame.color is not None
         assert frame.color.shape == (256, 256, 3)
         assert read_number(frame.color) > 0
         assert cam.info.serial is not None
@@ -95,6 +94,5 @@ def test_the_same_rig_runs_on_a_recording(tmp_path: Path) -> None:
     with hal.open(rig(play=file, paced=False, repeat=False)) as bench:
         cam = bench.cameras["wrist"]
         frame = cam.read()
-        assert frame.color is not None
         assert frame.color.shape == (256, 256, 3)
         assert cam.read().stamp.seq == frame.stamp.seq + 1

@@ -45,7 +45,6 @@ def test_neighbours_of_a_time() -> None:
         box.write(float(k), 0.0)
     for t, expected in ((17.5, (17.0, 18.0)), (17.0, (17.0, 18.0)), (20.0, (20.0, 20.0)), (25.0, (20.0, 20.0))):
         found = history.around(t)
-        assert found is not None
         assert (found[0].stamp.t, found[1].stamp.t) == expected
     assert history.around(5.0) is None, "too old"
 
@@ -101,7 +100,6 @@ def test_an_arm_between_two_samples() -> None:
                 with pytest.raises(StaleStateError):
                     arm.state_at(nobody_knows)
             hand = arm.gripper
-            assert hand is not None
             first, second = hand.states(rig.clock.now() - 0.3)[:2]
             middle = hand.state_at((first.stamp.t + second.stamp.t) / 2)
             assert middle.width == pytest.approx((first.width + second.width) / 2)

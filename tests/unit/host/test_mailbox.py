@@ -85,7 +85,6 @@ def test_a_series_may_change_its_length() -> None:
     assert (number, t, revision, list(values)) == (1, 0.5, 1, [1.0, 2.0, 3.0])
     writer.write(0.6, 2, [9.0])
     found = reader.read()
-    assert found is not None
     assert list(found[3]) == [9.0]
     with pytest.raises(ValueError, match="6 numbers do not fit into 5"):
         writer.write(0.7, 3, [0.0] * 6)

@@ -33,7 +33,7 @@ def test_steps_wait_for_the_app_and_go_as_far_as_it_says() -> None:
         asked.append(timeout)
         steps.grant(2)
 
-    steps = StepPace(cycle, attend)  # type: ignore[arg-type]
+    steps = StepPace(cycle, attend)
     assert steps.pausing
     for expected in (0.01, 0.02):
         assert steps.wait() == pytest.approx(expected)
@@ -47,14 +47,14 @@ def test_steps_wait_for_the_app_and_go_as_far_as_it_says() -> None:
 
 def test_steps_tell_the_app_is_there_at_the_time_of_the_step() -> None:
     cycle = FakeCycle(ticks=9)
-    steps = StepPace(cycle, lambda timeout: None)  # type: ignore[arg-type]
+    steps = StepPace(cycle, lambda timeout: None)
     assert steps.heard(AppRecord(12345.0, 3)) == AppRecord(pytest.approx(0.1), 3)
     assert steps.now() == pytest.approx(0.09)
 
 
 def test_steps_of_a_device_read_it_once_each() -> None:
     cycle = FakeCycle(paces_itself=True)
-    steps = StepPace(cycle, lambda timeout: None)  # type: ignore[arg-type]
+    steps = StepPace(cycle, lambda timeout: None)
     steps.grant(3)
     for _ in range(3):
         steps.wait()
@@ -63,7 +63,7 @@ def test_steps_of_a_device_read_it_once_each() -> None:
 
 
 def test_without_the_app_steps_go_on_by_themselves() -> None:
-    steps = StepPace(FakeCycle(), lambda timeout: None)  # type: ignore[arg-type]
+    steps = StepPace(FakeCycle(), lambda timeout: None)
     steps.run_free()
     assert not steps.pausing
     assert steps.wait() > 0.0
@@ -71,7 +71,7 @@ def test_without_the_app_steps_go_on_by_themselves() -> None:
 
 def test_a_device_sets_the_pace_and_counts_what_it_lost() -> None:
     cycle = FakeCycle(paces_itself=True, lost_cycles=4)
-    pace = DevicePace(cycle)  # type: ignore[arg-type]
+    pace = DevicePace(cycle)
     before = time.monotonic()
     for _ in range(3):
         assert pace.wait() >= before

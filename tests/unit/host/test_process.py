@@ -141,7 +141,7 @@ def test_a_busy_receiver_loses_only_messages_that_may_be_lost() -> None:
     sender, receiver = Channel(ours), Channel(theirs)
     sent = sum(sender.send_if_free({"frame": k}) for k in range(5000))
     assert 0 < sent < 5000
-    assert [receiver.receive(1.0)["frame"] for _ in range(sent)] == list(range(sent))  # type: ignore[index]
+    assert [receiver.receive(1.0)["frame"] for _ in range(sent)] == list(range(sent))
     assert receiver.poll() is None
     assert sender.send_if_free({"frame": 0})
     receiver.close()
@@ -195,7 +195,6 @@ def test_ends_when_its_parent_is_killed(tmp_path: Path) -> None:
     parent = subprocess.Popen(
         [sys.executable, "-c", program], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, cwd=tmp_path
     )
-    assert parent.stdout is not None
     assert parent.stdout.readline().strip() == "fine"
     pid = int(parent.stdout.readline())
     parent.kill()

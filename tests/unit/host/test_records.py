@@ -37,7 +37,6 @@ def test_a_state_arrives_as_it_was_sent(mails: tuple[RobotMail, RobotMail]) -> N
     host.put_state(Reading(3.0, 4.0, 9, Q, DQ, tau, Q, DQ, tau_ext, wrench, fault), SERVO, TCP, TCP_SET, TWIST)
     assert app.peek() == SERVO
     state = app.get_state()
-    assert state is not None
     assert (state.stamp.t, state.stamp.t_device, state.stamp.seq) == (3.0, 4.0, 9)
     for array, values in (
         (state.q, Q),
@@ -53,7 +52,6 @@ def test_a_state_arrives_as_it_was_sent(mails: tuple[RobotMail, RobotMail]) -> N
         (state.tau_ext, tau_ext),
         (state.wrench_ext, wrench),
     ):
-        assert array is not None
         assert array.tolist() == list(values)
         assert not array.flags.writeable
     assert (state.status, state.trip, state.limited, state.target_seq) == (*SERVO[:3], 7)
@@ -64,7 +62,6 @@ def test_what_is_not_known_stays_unknown(mails: tuple[RobotMail, RobotMail]) -> 
     host, app = mails
     host.put_state(Reading(3.0, 4.0, 9, Q, DQ), SERVO, TCP, TCP_SET, TWIST)
     state = app.get_state()
-    assert state is not None
     assert (state.tau, state.tau_ext, state.wrench_ext, state.fault) == (None, None, None, None)
 
 
@@ -75,8 +72,6 @@ def test_a_record_is_decoded_once_and_kept_when_the_next_one_comes(mails: tuple[
     assert app.get_state() is first
     host.put_state(Reading(4.0, 5.0, 10, DQ, Q), SERVO, TCP, TCP_SET, TWIST)
     second = app.get_state()
-    assert first is not None
-    assert second is not None
     assert (second.stamp.seq, second.q.tolist()) == (10, DQ)
     assert (first.stamp.seq, first.q.tolist()) == (9, Q), "arrays of an old state do not change"
 
@@ -110,7 +105,6 @@ def test_a_grippers_command_and_state_arrive() -> None:
     reading = GripperReading(3.0, 4.0, 9, 0.031, 0.03, True, True, 12.5)
     host.put(reading, 7, GripperOutcome.FAILED, fault, lost=True)
     found = app.get()
-    assert found is not None
     assert found.lost
     state = found.state
     assert (state.stamp.t, state.stamp.t_device, state.stamp.seq) == (3.0, 4.0, 9)
@@ -124,7 +118,6 @@ def test_a_grippers_command_and_state_arrive() -> None:
     assert (state.outcome, state.fault, state.target_seq) == (GripperOutcome.FAILED, fault, 7)
     host.put(GripperReading(3.1, 4.1, 10, 0.031, 0.03, False))
     found = app.get()
-    assert found is not None
     assert (found.lost, found.state.grasped, found.state.force, found.state.fault) == (False, None, None, None)
 
 
@@ -140,8 +133,6 @@ def test_mailboxes_of_a_group_do_not_overlap() -> None:
     host.host.write(2.0, 3, 4, True)
     for k, name in enumerate(grippers):
         command, found = host.grippers[name].get_command(), app.grippers[name].get()
-        assert command is not None
-        assert found is not None
         assert (command.seq, found.state.width) == (k + 1, 0.01 * k)
     assert (host.robots["left"].get_marks().rearms, host.robots["right"].get_marks().rearms) == (0, 1)
     assert (host.get_app(), app.get_host()) == ((1.0, 5), (2.0, 3, 4, True))
@@ -157,6 +148,5 @@ def test_a_torn_record_is_not_taken_for_the_newest(mails: tuple[RobotMail, Robot
     assert host.get_command() is first
     memory[8 + 16] = good
     second = host.get_command()
-    assert second is not None
     assert second.seq == 2
     assert math.isfinite(second.t)

@@ -38,7 +38,6 @@ class Device:
     def cycle(self, take: bool) -> None:
         dt = self.bench.dt
         setpoint = self.bench.tick()
-        assert setpoint is not None
         if take:
             q = list(setpoint.q)
         elif self.kind == "repeats":
@@ -99,7 +98,6 @@ def test_a_device_that_repeats_and_misses_half_of_its_set_points_is_a_fault() ->
     for _ in range(250):
         bench.send(Kind.JOINT_VELOCITY, [0.3] * N)
         device.cycle(take=chance.random() < 0.5)
-    assert bench.servo.fault is not None
     assert "lost, or reported late" in bench.servo.fault.cause
     bench.assert_within_limits()
 
@@ -185,7 +183,6 @@ def test_an_arm_that_a_fault_stopped_is_taken_from_where_it_stands() -> None:
         if k % 5 == 0:
             bench.target([x + 0.09 for x in bench.q])
         setpoint = bench.tick()
-        assert setpoint is not None
         bench.reading = {"q_commanded": list(setpoint.q), "dq_commanded": list(setpoint.dq)}
     stands = list(bench.q)
     assert bench.moving
@@ -349,9 +346,7 @@ def peaks_of(bench: Bench, positions: Sequence[Sequence[float]]) -> dict[str, fl
 @pytest.mark.timeout(1200)
 @settings(max_examples=STREAMS, deadline=None, suppress_health_check=list(HealthCheck))
 @given(STRETCHES, st.integers(0, 2**32), st.booleans(), st.booleans(), st.sampled_from([240.0, 1000.0]))
-def test_no_report_breaks_a_limit(
-    stretches: list[Stretch], seed: int, ahead: bool, repeats: bool, rate_hz: float
-) -> None:
+def test_no_report_breaks_a_limit(stretches, seed, ahead, repeats, rate_hz):
     """Whatever a device reports, position, speed, acceleration and jerk of every joint stay inside the limits.
 
     The device takes every set-point, so what the driver is given is what the device sees. Judged by backward

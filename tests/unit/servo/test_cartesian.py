@@ -203,9 +203,7 @@ def test_outside_the_workspace_the_tcp_may_only_come_back_in() -> None:
 
 
 @given(st.tuples(UNIT, UNIT, UNIT), st.tuples(UNIT, UNIT, UNIT), st.tuples(UNIT, UNIT, UNIT))
-def test_quaternions(
-    a: tuple[float, float, float], turn: tuple[float, float, float], vector: tuple[float, float, float]
-) -> None:
+def test_quaternions(a, turn, vector):
     start = after_rotation((0.0, 0.0, 0.0, 1.0), a)
     matrix = quaternion_to_matrix(start)
     assert rotate(start, vector) == pytest.approx(list(matrix @ vector), abs=1e-12)

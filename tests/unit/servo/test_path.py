@@ -71,9 +71,7 @@ def test_the_arm_rests_only_at_the_end_of_a_long_way(rate_hz: float, speed: floa
         (0.02, [-2.465, 1.486, -2.516, -1.198, 0.359, 1.597, 1.701], [0.0, 0.009, 0.0, -0.03, -0.039, 0.0, 0.007]),
     ],
 )
-def test_a_goal_is_reached_although_the_first_step_is_refused(
-    tcp_speed: float, start: list[float], way: list[float]
-) -> None:
+def test_a_goal_is_reached_although_the_first_step_is_refused(tcp_speed, start, way):
     bench = Bench(speed=0.3, tcp_speed=tcp_speed, move_to=np.add(start, way).tolist(), begin=False)
     bench.q = start
     bench.servo.anchor(start)

@@ -128,7 +128,6 @@ def test_hostile_numbers_never_leave_the_limits() -> None:
             kind = rng.choice((Kind.JOINT_TARGET, Kind.JOINT_VELOCITY, Kind.CARTESIAN_TARGET, Kind.TWIST))
             size = {Kind.JOINT_TARGET: 14}.get(kind, 7)
             bench.send(kind, [rng.choice((0.0, 1.0, -1e300, 1e300, 1e-320, math.nan, 3.0)) for _ in range(size)])
-            assert bench.command is not None
             bench.command = bench.command._replace(
                 t=rng.choice((bench.now, math.nan, -1e300, bench.now + 9.0)),
                 deadline=rng.choice((bench.now + 0.1, math.inf, math.nan, -1.0)),

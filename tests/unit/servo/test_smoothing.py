@@ -62,9 +62,7 @@ def test_every_limit_is_kept(shares: tuple[float, float], rate: float, requests:
     st.tuples(st.floats(-2.0, 2.0), st.floats(-1.0, 1.0)),
     st.lists(REQUEST, min_size=1, max_size=8),
 )
-def test_from_outside_and_in_motion_no_farther_than_a_stop(
-    shares: tuple[float, float], q: tuple[float, float], dq: tuple[float, float], requests: list
-) -> None:
+def test_from_outside_and_in_motion_no_farther_than_a_stop(shares, q, dq, requests):
     smoother = JointSmoother(tightened(LIMITS, *shares), 1 / 240)
     smoother.anchor(q, dq)
     stop = JointSmoother(tightened(LIMITS, *shares), 1 / 240)

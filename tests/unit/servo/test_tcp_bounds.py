@@ -278,7 +278,7 @@ def test_singularities_are_seen_although_they_are_not_always_looked_for(arm: Arm
         looked += 1
         return look(*arguments)
 
-    kinematics._is_near_singular = counted  # type: ignore[method-assign]
+    kinematics._is_near_singular = counted
     for _ in range(20):
         a, b = arm.somewhere(), arm.somewhere()
         for share in np.arange(0.0, 1.0, 0.002):

@@ -177,9 +177,7 @@ def test_no_stream_and_no_stop_is_faster_than_the_session_allows(name: str) -> N
         ),
     ],
 )
-def test_an_arm_whose_first_step_is_refused_starts_more_slowly(
-    kind: Kind, tcp_speed: float, start: list[float], values: list[float]
-) -> None:
+def test_an_arm_whose_first_step_is_refused_starts_more_slowly(kind, tcp_speed, start, values):
     """The same step would be refused in every tick, and the arm would never move."""
     bench = Bench(arm("panda"), speed=0.3, tcp_speed=tcp_speed, begin=False)
     bench.q = start

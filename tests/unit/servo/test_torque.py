@@ -65,7 +65,6 @@ class TestFollowing:
 
     def test_set_points_say_what_was_measured(self) -> None:
         arm = moving()
-        assert arm.setpoint is not None
         assert (list(arm.setpoint.q), list(arm.setpoint.dq)) == (arm.q.tolist(), arm.dq.tolist())
         assert list(arm.servo.report.q_set) == arm.q.tolist()
 
@@ -105,14 +104,13 @@ class TestFollowing:
         spec = panda()
         spec = replace(spec, limits=replace(spec.limits, torque=torque))
         bench = Bench(spec)
-        bench.servo = Servo(spec, bench.dt, None, mass_matrix)  # type: ignore[arg-type]
+        bench.servo = Servo(spec, bench.dt, None, mass_matrix)
         bench.servo.anchor(bench.q)
         bench.begin()
         bench.tick()
         refused = bench.send(Kind.JOINT_TORQUE, NOTHING)
         setpoint = bench.tick()
         assert bench.servo.report.refused == refused
-        assert setpoint is not None
         assert setpoint.tau is None
 
     @pytest.mark.parametrize("values", [[1.0] * 6, [math.nan] * 7, [math.inf] * 7, []])
@@ -243,7 +241,6 @@ class TestStopping:
         arm = moving()
         arm.servo.anchor(panda().home)
         setpoint = arm.tick()
-        assert setpoint is not None
         assert setpoint.tau is None
         assert setpoint.q == pytest.approx(panda().home)
 
@@ -340,7 +337,6 @@ class TestGuards:
         assert 0.4 < arm.now - begun < 0.6
         assert arm.servo.report.trip is Trip.LIMIT
         assert arm.dq[1] > 0.1
-        assert arm.setpoint is not None
         assert arm.setpoint.dq[1] == pytest.approx(arm.dq[1], rel=0.5), "positions go on at the speed that it has"
         assert arm.until_held() < 0.2
         arm.assert_within_limits()
@@ -405,7 +401,6 @@ class TestTheDevice:
         assert arm.setpoint is None
         arm.tamper = lambda reading: reading
         arm.tick()
-        assert arm.setpoint is not None
         assert arm.setpoint.tau is None, "positions take over where the arm is"
         assert arm.q == pytest.approx(arm.servo.report.q_set, abs=0.01)
         arm.until_held()

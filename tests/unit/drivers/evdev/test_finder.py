@@ -222,9 +222,7 @@ def test_devices_are_read_from_sysfs(tmp_path: Path) -> None:
         ("2420 10000 0 0 0 0", "2608000 3", "0", (False, False)),  # the touchpad of a Sony pad
     ],
 )
-def test_pads_are_recognised_by_the_events_that_they_can_send(
-    tmp_path: Path, keys: str, axes: str, rels: str, kind: tuple[bool, bool]
-) -> None:
+def test_pads_are_recognised_by_the_events_that_they_can_send(tmp_path, keys, axes, rels, kind):
     put_device(tmp_path, 0, keys, axes, rels)
     (info,) = LinuxInput(tmp_path / "sys", tmp_path / "dev").nodes()
     assert (info.is_pad, info.is_joystick) == kind

@@ -217,9 +217,7 @@ SPACEMICE = [
 
 @pytest.mark.parametrize(("vendor", "product", "bus", "guards"), SPACEMICE)
 @pytest.mark.parametrize("mode", ["REL", "ABS"])
-def test_spacemouse_is_known_in_both_modes(
-    vendor: int, product: int, bus: int, guards: bool, mode: str, system: FakeInput, make_pad: MakePad
-) -> None:
+def test_spacemouse_is_known_in_both_modes(vendor, product, bus, guards, mode, system, make_pad):
     axes = {code: AxisRange(-350, 350) for code in range(6)} if mode == "ABS" else {}
     rels = REL.values() if mode == "REL" else ()
     node = FakeNode("/dev/input/event3", axes, [KEY["BTN_0"], KEY["BTN_1"]], rels)

@@ -53,9 +53,7 @@ def moved(pad: EvdevPad) -> dict[str, float]:
         ("RZ", 500, "turn_z", -1.0),  # out of range
     ],
 )
-def test_pushes_and_turns_are_along_the_axes_of_the_base(
-    mode: str, code: str, value: int, control: str, expected: float, system: FakeInput, make_pad: MakePad
-) -> None:
+def test_pushes_and_turns_are_along_the_axes_of_the_base(mode, code, value, control, expected, system, make_pad):
     node = system.put(rel_node() if mode == "REL" else abs_node(), COMPACT)
     pad = make_pad()
     assert pad.describe() == "SpaceMouse Compact (USB, /dev/input/event3)"
@@ -164,7 +162,7 @@ def test_unplugging_while_pushed_needs_a_new_press(system: FakeInput, make_pad: 
     again = rel_node(5)
     again.down = [LEFT]  # not released meanwhile
     system.put(again, COMPACT)
-    poll_until(pad.driver, lambda reading: reading.connected)  # type: ignore[arg-type]
+    poll_until(pad.driver, lambda reading: reading.connected)
     settle_end = time.monotonic() + 10.0
     while pad.waiting_for != ("l1",):
         assert time.monotonic() < settle_end, pad.waiting_for

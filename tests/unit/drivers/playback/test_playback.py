@@ -260,9 +260,7 @@ def test_tour_moves_and_turns_the_tool(tour: list[tuple[float, PadReading]]) -> 
     assert turned > 0.5
 
 
-def test_tour_releases_the_deadman_while_moving_closes_the_gripper_and_ends_released(
-    tour: list[tuple[float, PadReading]],
-) -> None:
+def test_tour_releases_the_deadman_while_moving_closes_the_gripper_and_ends_released(tour):
     pad = Gamepad(player(TOUR))
     pad.open(0.0)
     deadman = pad.hold("l2")

@@ -116,9 +116,7 @@ def test_is_added_and_removed_but_not_placed(scene: PyBulletWorld) -> None:
         ({"robot": "board"}, "no arm 'board'"),
     ],
 )
-def test_missing_arm_or_link_is_refused_and_changes_nothing(
-    scene: PyBulletWorld, wrong: dict[str, str], text: str
-) -> None:
+def test_missing_arm_or_link_is_refused_and_changes_nothing(scene, wrong, text):
     with pytest.raises(ConfigError, match=text):
         scene.add(held("second", **wrong))
     assert scene.names() == ["board", "panda"]

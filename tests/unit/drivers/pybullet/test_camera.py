@@ -39,12 +39,12 @@ FROM_ABOVE = ViewSpec(tuple(ABOVE.position), tuple(ABOVE.orientation))
 
 
 def ball(name: str, x: float, **more: object) -> BodySpec:
-    return BodySpec(name, (x, 0.0, 0.1), STILL, "sphere", radius=0.1, **{"mass": 1.0, **more})  # type: ignore[arg-type]
+    return BodySpec(name, (x, 0.0, 0.1), STILL, "sphere", radius=0.1, **{"mass": 1.0, **more})
 
 
 def direct(scene: PyBulletWorld, spec: object) -> PyBulletCamera:
-    source = DirectSource(scene, TinyRenderer(scene), spec, lambda: 10.0 + scene.t)  # type: ignore[arg-type]
-    driver = PyBulletCamera(spec, source)  # type: ignore[arg-type]
+    source = DirectSource(scene, TinyRenderer(scene), spec, lambda: 10.0 + scene.t)
+    driver = PyBulletCamera(spec, source)
     driver.open()
     return driver
 

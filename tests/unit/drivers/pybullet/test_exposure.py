@@ -134,7 +134,7 @@ def test_without_noise_depth_is_as_it_is_drawn() -> None:
     plain = drawing.render(spec, EYE).depth
     frame = Exposure(spec).capture(scene, drawing, 0.0, 0.0, 1)
     assert np.array_equal(frame.depth, plain)
-    assert frame.T_world_camera == Pose(spec.view.position, spec.view.orientation)  # type: ignore[union-attr]
+    assert frame.T_world_camera == Pose(spec.view.position, spec.view.orientation)
     noisy = camera(streams=["color", "depth"], simulated={"depth_noise": {"subpixel": 0.08}})
     captured = [Exposure(noisy).capture(scene, drawing, 0.0, 0.0, number).depth for number in (1, 1, 2)]
     assert np.array_equal(captured[0], captured[1])

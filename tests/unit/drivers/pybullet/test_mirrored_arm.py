@@ -23,7 +23,7 @@ FINGERS = ("panda_finger_joint1", "panda_finger_joint2")
 def copied(*things: object) -> PyBulletWorld:
     """A world with the copy of a real arm."""
     arm = panda("arm", driver="franka")
-    return PyBulletWorld(world_spec(*things, arm))  # type: ignore[arg-type]
+    return PyBulletWorld(world_spec(*things, arm))
 
 
 @pytest.fixture

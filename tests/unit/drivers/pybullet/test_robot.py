@@ -57,7 +57,7 @@ def follow(
 class TestFollowing:
     @pytest.mark.parametrize("hz", [240.0, 1000.0])
     @pytest.mark.parametrize(("spec", "home"), [(panda, PANDA_HOME), (iiwa, IIWA_HOME)])
-    def test_smooth_motion_is_followed_within_a_tenth_of_a_millirad(self, spec, home, hz: float) -> None:  # type: ignore[no-untyped-def]
+    def test_smooth_motion_is_followed_within_a_tenth_of_a_millirad(self, spec, home, hz: float) -> None:
         world, driver = opened(spec(), hz=hz)
         errors, speeds = follow(world, driver, 1.5)
         assert np.abs(speeds).max() == pytest.approx(1.0, abs=0.02)  # it did move

@@ -105,9 +105,7 @@ def test_wrong_options(options: dict[str, Any], key: str) -> None:
 
 def test_streams_and_formats_must_be_known() -> None:
     wrong = replace(
-        camera(),
-        streams=("color", "segmentation"),
-        sensors={"color": SensorSpec(640, 480, 30.0, K, "y16")},
+        camera(), streams=("color", "segmentation"), sensors={"color": SensorSpec(640, 480, 30.0, K, "y16")}
     )
     assert {key for key, _ in problems(wrong)} == {"streams.segmentation", "streams.color.format"}
 

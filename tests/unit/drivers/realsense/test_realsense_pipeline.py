@@ -46,9 +46,7 @@ PIXELS = [[u, v] for u in (0.0, 17.0, 300.5, 636.5, 900.0, 1279.0) for v in (0.0
         ("inverse_brown_conrady", D455, 0.05),
     ],
 )
-def test_the_librarys_rays_project_to_the_same_pixels_with_opencv(
-    model: str, coefficients: list[float], bound: float
-) -> None:
+def test_the_librarys_rays_project_to_the_same_pixels_with_opencv(model, coefficients, bound):
     camera = intrinsics(getattr(rs.distortion, model), coefficients)
     lens = convert_intrinsics(camera)
     rays = np.array([rs.rs2_deproject_pixel_to_point(camera, pixel, 1.3) for pixel in PIXELS])

@@ -92,9 +92,7 @@ def _terminal(monkeypatch: pytest.MonkeyPatch) -> None:
         ("\x1b[6~", None, 0.0, {"l2", "r1"}, 0.05),
     ],
 )
-def test_key_press_holds_the_deadman_for_one_bounded_step(
-    bench, key: str, axis: str | None, share: float, buttons: set[str], longest: float
-) -> None:
+def test_key_press_holds_the_deadman_for_one_bounded_step(bench, key, axis, share, buttons, longest):
     it = bench()
     it.press(key)
     state = it.pad.state()

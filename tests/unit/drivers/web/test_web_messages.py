@@ -83,7 +83,7 @@ def with_axis(value: str) -> str:
         *(
             json.dumps({**PAD, **wrong})
             for wrong in (
-                {"axes": PAD["axes"][:7]},  # type: ignore[index]
+                {"axes": PAD["axes"][:7]},
                 {"axes": []},
                 {"axes": {}},
                 {"axes": [0, 0, 0, 0, -0.5, 0, 0, 0]},  # a trigger has no other side

@@ -42,7 +42,7 @@ def test_a_view_reaches_the_pages_whole() -> None:
 
 
 def test_numbers_may_be_numpy_scalars() -> None:
-    view = replace(VIEW, frames=np.int64(3), free_bytes=np.uint64(1 << 40), seconds=np.float32(0.5))  # type: ignore[arg-type]
+    view = replace(VIEW, frames=np.int64(3), free_bytes=np.uint64(1 << 40), seconds=np.float32(0.5))
     message = json.loads(json.dumps(recording_message(view)))
     assert (message["frames"], message["free_bytes"], message["seconds"]) == (3, 1 << 40, 0.5)
 

@@ -151,7 +151,7 @@ def test_the_pad_of_a_page_that_left_is_lost_until_its_next_message(why: str) ->
     room.say(driver, type="away", why=why)
     room.say(driver, type="away", why=why)
     (gone,) = room.app.pads()
-    assert "page" in gone[0]  # type: ignore[index]
+    assert "page" in gone[0]
     room.now = 100.02
     room.pad(driver, 100.0, 20.0)
     assert room.app.pads() == ["page 1"]
@@ -175,7 +175,7 @@ def test_taking_control_loses_the_pad_in_between() -> None:
     assert not told[0]["pad"]["connected"]
     assert told[1:] == [{"driver": "page 2"}]
     assert inbox(first) == [
-        {"type": "lease", "driver": "page 2", "you": False, "t": 100.01, "why": "page 2 took control"},
+        {"type": "lease", "driver": "page 2", "you": False, "t": 100.01, "why": "page 2 took control"}
     ]
     assert inbox(second)[0]["you"]
     room.pad(first, 100.0, 10.0, [1.0] * 8)
