@@ -6,7 +6,7 @@ import asyncio
 import os
 import struct
 import time
-from collections.abc import Awaitable, Callable
+from collections.abc import Callable
 from typing import Any
 
 import aiohttp
@@ -60,11 +60,6 @@ def frame(spec: CameraSpec, value: float, t: float | None = None) -> RawFrame:
     images[stream] = np.full(shape, value, kind)
     now = time.monotonic() if t is None else t
     return RawFrame(now, now, 0, **images, T_world_camera=None)
-
-
-def run(test: Callable[[], Awaitable[None]]) -> None:
-    """Run a test that talks to the process."""
-    asyncio.run(asyncio.wait_for(test(), 60.0))
 
 
 class App:

@@ -14,7 +14,7 @@ from typing import Any
 from urllib.parse import urlsplit
 
 import pytest
-from web_kit import REST, Page, run
+from web_kit import REST, Page
 
 import hal
 from hal.views import RecordingView
@@ -64,24 +64,20 @@ def speed(rig: hal.Rig) -> float:
     return float(abs(rig.robots["panda"].state(max_age=5.0).dq_set).max())
 
 
-def test_a_stop_is_heard_after_a_mistake_in_what_came_before(rig, monkeypatch, capfd):
+async def test_a_stop_is_heard_after_a_mistake_in_what_came_before(rig, monkeypatch, capfd):
     def fails(*_: object) -> None:
         raise RuntimeError("can't start new thread")
 
     monkeypatch.setattr(console(rig), "_start_recovery", fails)
-
-    async def test() -> None:
-        async with page_of(rig) as page:
-            await page.take()
-            await page.say(type="recover", robot="panda")
-            await page.say(type="stop")
-            await until(lambda: rig._latch.stopped)
-
-    run(test)
+    async with page_of(rig) as page:
+        await page.take()
+        await page.say(type="recover", robot="panda")
+        await page.say(type="stop")
+        await until(lambda: rig._latch.stopped)
     assert "can't start new thread" in capfd.readouterr().err
 
 
-def test_only_one_recovery_at_a_time(rig: hal.Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_only_one_recovery_at_a_time(rig: hal.Rig, monkeypatch: pytest.MonkeyPatch) -> None:
     calls: list[float] = []
 
     def slow() -> None:
@@ -89,30 +85,22 @@ def test_only_one_recovery_at_a_time(rig: hal.Rig, monkeypatch: pytest.MonkeyPat
         time.sleep(0.5)
 
     monkeypatch.setattr(rig.robots["panda"], "recover", slow)
-
-    async def test() -> None:
-        async with page_of(rig) as page:
-            await page.take()
-            for _ in range(20):
-                await page.say(type="recover", robot="panda")
-            assert "already" in (await page.next("refused"))["why"]
-
-    run(test)
+    async with page_of(rig) as page:
+        await page.take()
+        for _ in range(20):
+            await page.say(type="recover", robot="panda")
+        assert "already" in (await page.next("refused"))["why"]
     assert len(calls) == 1
 
 
-def test_a_console_that_is_killed_leaves_no_stick_pushed_and_says_so(rig, capfd):
+async def test_a_console_that_is_killed_leaves_no_stick_pushed_and_says_so(rig, capfd):
     pad = rig.gamepads["pad"]
-
-    async def test() -> None:
-        async with page_of(rig) as page:
-            await page.take()
-            await until(lambda: pad.state().connected, page)
-            await until(lambda: pad.state().axis("left_x") > 0.9, page, axes=[1.0, *REST[1:]])
-            os.kill(process_of(rig), signal.SIGKILL)
-            await until(lambda: not pad.state().connected)
-
-    run(test)
+    async with page_of(rig) as page:
+        await page.take()
+        await until(lambda: pad.state().connected, page)
+        await until(lambda: pad.state().axis("left_x") > 0.9, page, axes=[1.0, *REST[1:]])
+        os.kill(process_of(rig), signal.SIGKILL)
+        await until(lambda: not pad.state().connected)
     assert pad.state().axis("left_x") == 0.0
     assert "no page can drive or stop" in capfd.readouterr().err
 
@@ -128,38 +116,34 @@ def test_a_console_that_is_stopped_does_not_hold_up_the_end(rig: hal.Rig) -> Non
 
 
 @pytest.mark.slow
-def test_a_stop_ends_the_tour_for_good(rig: hal.Rig) -> None:
+async def test_a_stop_ends_the_tour_for_good(rig: hal.Rig) -> None:
     arm, pad = rig.robots["panda"], rig.gamepads["pad"]
     teleop = hal.Teleop(arm)
+    async with page_of(rig) as page:
+        await page.take()
+        await until(lambda: pad.state().connected, page)
+        await page.say(type="demo", play=True)
+        with arm.control(deadman=pad.hold("l2"), rate_hz=20) as control:
 
-    async def test() -> None:
-        async with page_of(rig) as page:
-            await page.take()
-            await until(lambda: pad.state().connected, page)
-            await page.say(type="demo", play=True)
-            with arm.control(deadman=pad.hold("l2"), rate_hz=20) as control:
+            def turn() -> None:
+                with contextlib.suppress(hal.MotionStopped):
+                    control.send(teleop.step(pad.state(), 0.05)[0])
 
-                def turn() -> None:
-                    with contextlib.suppress(hal.MotionStopped):
-                        control.send(teleop.step(pad.state(), 0.05)[0])
+            async def drive(condition: Callable[[], Any], seconds: float = WAIT) -> bool:
+                deadline = time.monotonic() + seconds
+                while not condition() and time.monotonic() < deadline:
+                    turn()
+                    await page.drive()
+                    await asyncio.sleep(0.02)
+                return bool(condition())
 
-                async def drive(condition: Callable[[], Any], seconds: float = WAIT) -> bool:
-                    deadline = time.monotonic() + seconds
-                    while not condition() and time.monotonic() < deadline:
-                        turn()
-                        await page.drive()
-                        await asyncio.sleep(0.02)
-                    return bool(condition())
-
-                assert await drive(lambda: speed(rig) > 0.05), "the tour moves the arm"
-                await page.say(type="stop")
-                assert await drive(lambda: control.trip is hal.Trip.STOP and speed(rig) == 0.0), "the arm stops"
-                assert not await drive(lambda: speed(rig) > 1e-6, seconds=9.0), "the recording's next press is no press"
-
-    run(test)
+            assert await drive(lambda: speed(rig) > 0.05), "the tour moves the arm"
+            await page.say(type="stop")
+            assert await drive(lambda: control.trip is hal.Trip.STOP and speed(rig) == 0.0), "the arm stops"
+            assert not await drive(lambda: speed(rig) > 1e-6, seconds=9.0), "the recording's next press is no press"
 
 
-def test_a_recording_is_steered_from_the_page_and_a_mistake_in_the_app_costs_nothing_else(rig, capfd):
+async def test_a_recording_is_steered_from_the_page_and_a_mistake_in_the_app_costs_nothing_else(rig, capfd):
     asked: queue.SimpleQueue[str] = queue.SimpleQueue()
 
     def take(action: str) -> None:
@@ -167,27 +151,24 @@ def test_a_recording_is_steered_from_the_page_and_a_mistake_in_the_app_costs_not
         if action == "fail":
             raise RuntimeError("the disk is gone")
 
-    async def test() -> None:
-        async with page_of(rig) as page:
-            await page.take()
-            console(rig).show_recording(view(0, "record", "fail"))
-            await page.next("recording")
-            await page.say(type="action", action="record")
-            assert "records nothing" in (await page.next("refused"))["why"], "the program did not ask for any"
-            console(rig).on_action(take)
-            await page.say(type="action", action="fail")
-            assert "the program failed" in (await page.next("refused"))["why"]
-            await page.say(type="action", action="record")
-            await until(lambda: asked.qsize() == 2)
-            await page.say(type="stop")
-            await until(lambda: rig._latch.stopped)
-
-    run(test)
+    async with page_of(rig) as page:
+        await page.take()
+        console(rig).show_recording(view(0, "record", "fail"))
+        await page.next("recording")
+        await page.say(type="action", action="record")
+        assert "records nothing" in (await page.next("refused"))["why"], "the program did not ask for any"
+        console(rig).on_action(take)
+        await page.say(type="action", action="fail")
+        assert "the program failed" in (await page.next("refused"))["why"]
+        await page.say(type="action", action="record")
+        await until(lambda: asked.qsize() == 2)
+        await page.say(type="stop")
+        await until(lambda: rig._latch.stopped)
     assert [asked.get(), asked.get()] == ["fail", "record"]
     assert "the disk is gone" in capfd.readouterr().err
 
 
-def test_a_console_that_is_stopped_holds_up_no_recording_and_shows_the_newest_later(rig: hal.Rig) -> None:
+async def test_a_console_that_is_stopped_holds_up_no_recording_and_shows_the_newest_later(rig: hal.Rig) -> None:
     """Nor does what is said so often push out what was said once."""
     os.kill(process_of(rig), signal.SIGSTOP)
     try:
@@ -198,12 +179,8 @@ def test_a_console_that_is_stopped_holds_up_no_recording_and_shows_the_newest_la
         assert time.monotonic() - begin < 5.0, "it waits for nobody"
     finally:
         os.kill(process_of(rig), signal.SIGCONT)
-
-    async def test() -> None:
-        async with page_of(rig) as page:
-            while (await page.next("say"))["text"] != "said before":
-                pass
-            while (await page.next("recording"))["frames"] != 19_999:
-                pass
-
-    run(test)
+    async with page_of(rig) as page:
+        while (await page.next("say"))["text"] != "said before":
+            pass
+        while (await page.next("recording"))["frames"] != 19_999:
+            pass

@@ -8,32 +8,17 @@ import os
 import resource
 import socket
 import time
-from collections.abc import Iterator
 from pathlib import Path
 
 import aiohttp
 import pytest
 from child_targets import HURRY
-from web_kit import WAIT, App, Page, run
+from web_kit import WAIT, App, Page
 
 from hal.errors import HalError
 from hal.host.process import Child
 
 KEY = b"AAAAAAAAAAAAAAAAAAAAAA=="
-
-
-@pytest.fixture
-def app() -> Iterator[App]:
-    """Where it ends, it looks whether the console's process wrote anything."""
-    with App() as found:
-        yield found
-
-
-@pytest.fixture
-def hasty() -> Iterator[App]:
-    """One that has less patience, so that less has to be waited for."""
-    with App(target="child_targets:impatient_console") as found:
-        yield found
 
 
 async def visit(app: App, sent: bytes = b"") -> tuple[asyncio.StreamReader, asyncio.StreamWriter]:
@@ -97,25 +82,19 @@ async def stop_of_a_new_page(app: App) -> float:
         b"GET /%ff%fe HTTP/1.1\r\nHost: \xff\xfe\r\nConnection: close\r\n\r\n",
     ],
 )
-def test_malformed_requests_are_not_logged(app: App, request_: bytes) -> None:
-    async def test() -> None:
-        for _ in range(30):
-            reader, writer = await visit(app, request_)
-            assert (await answer(reader))[:12] in {b"HTTP/1.1 400", b"HTTP/1.0 400", b"HTTP/1.1 421", b"HTTP/1.1 405"}
-            writer.close()
-
-    run(test)
+async def test_malformed_requests_are_not_logged(app: App, request_: bytes) -> None:
+    for _ in range(30):
+        reader, writer = await visit(app, request_)
+        assert (await answer(reader))[:12] in {b"HTTP/1.1 400", b"HTTP/1.0 400", b"HTTP/1.1 421", b"HTTP/1.1 405"}
+        writer.close()
 
 
 @pytest.mark.parametrize("key", [b"short", b"\xc3\xa4" * 12, b"=" * 24])
-def test_malformed_handshakes_are_not_logged(app: App, key: bytes) -> None:
-    async def test() -> None:
-        for _ in range(30):
-            reader, writer = await visit(app, handshake(app, key))
-            assert await asyncio.wait_for(reader.readexactly(12), WAIT) == b"HTTP/1.1 400"
-            writer.close()
-
-    run(test)
+async def test_malformed_handshakes_are_not_logged(app: App, key: bytes) -> None:
+    for _ in range(30):
+        reader, writer = await visit(app, handshake(app, key))
+        assert await asyncio.wait_for(reader.readexactly(12), WAIT) == b"HTTP/1.1 400"
+        writer.close()
 
 
 def test_the_error_that_ends_the_process_is_logged() -> None:
@@ -134,106 +113,89 @@ def test_the_error_that_ends_the_process_is_logged() -> None:
 
 
 @pytest.mark.parametrize("sent", [b"", b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\n"])
-def test_idle_connections_are_closed_and_pages_are_not(hasty: App, sent: bytes) -> None:
+async def test_idle_connections_are_closed_and_pages_are_not(hasty: App, sent: bytes) -> None:
     """The second one goes on sending a byte at a time."""
-
-    async def test() -> None:
-        async with Page(hasty) as page:
-            await page.take()
-            reader, writer = await visit(hasty, sent)
-            start = time.monotonic()
-            ended = asyncio.ensure_future(answer(reader))
-            while not ended.done():
-                if sent:
-                    writer.write(b"a")
-                await page.drive()
-                await asyncio.sleep(0.05)
-            assert await ended == b""
-            assert time.monotonic() - start > 4.0 / HURRY, "whoever is slow has some time"
+    async with Page(hasty) as page:
+        await page.take()
+        reader, writer = await visit(hasty, sent)
+        start = time.monotonic()
+        ended = asyncio.ensure_future(answer(reader))
+        while not ended.done():
+            if sent:
+                writer.write(b"a")
             await page.drive()
+            await asyncio.sleep(0.05)
+        assert await ended == b""
+        assert time.monotonic() - start > 4.0 / HURRY, "whoever is slow has some time"
+        await page.drive()
+        await page.next("state")
+
+
+async def test_a_connection_with_regular_requests_stays(hasty: App) -> None:
+    reader, writer = await visit(hasty)
+    for _ in range(3):
+        await asyncio.sleep(2.0 / HURRY)
+        writer.write(b"GET /page/nothing HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n")
+        assert (await asyncio.wait_for(reader.readuntil(b"no such file\n"), WAIT)).startswith(b"HTTP/1.1 404")
+    writer.close()
+
+
+async def test_idle_connections_keep_no_page_out(app: App) -> None:
+    async with Page(app) as driver:
+        await driver.take()
+        visitors = [await visit(app) for _ in range(300)]
+        assert await stop_of_a_new_page(app) < WAIT / 2
+        assert descriptors(app) < 200, "of 300 who came before it"
+        await driver.drive()
+        for reader, _ in visitors[:100]:
+            assert await answer(reader) == b"", "the first ones make room"
+        for _, writer in visitors:
+            writer.close()
+
+
+async def test_a_connection_that_reads_no_answer_is_closed(app: App) -> None:
+    before = descriptors(app)
+    sock = socket.socket()
+    sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+    sock.connect(("127.0.0.1", app.port))
+    sock.setblocking(False)
+    request = b"GET /page/index.html HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n"
+    with contextlib.suppress(BlockingIOError):
+        for _ in range(20000):
+            sock.send(request)
+    async with Page(app) as page:
+        for _ in range(400):
             await page.next("state")
-
-    run(test)
-
-
-def test_a_connection_with_regular_requests_stays(hasty: App) -> None:
-    async def test() -> None:
-        reader, writer = await visit(hasty)
-        for _ in range(3):
-            await asyncio.sleep(2.0 / HURRY)
-            writer.write(b"GET /page/nothing HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n")
-            assert (await asyncio.wait_for(reader.readuntil(b"no such file\n"), WAIT)).startswith(b"HTTP/1.1 404")
-        writer.close()
-
-    run(test)
+            if descriptors(app) <= before + 1:
+                break
+        assert descriptors(app) <= before + 1, "the page's alone"
+    sock.close()
 
 
-def test_idle_connections_keep_no_page_out(app: App) -> None:
-    async def test() -> None:
-        async with Page(app) as driver:
-            await driver.take()
-            visitors = [await visit(app) for _ in range(300)]
-            assert await stop_of_a_new_page(app) < WAIT / 2
-            assert descriptors(app) < 200, "of 300 who came before it"
-            await driver.drive()
-            for reader, _ in visitors[:100]:
-                assert await answer(reader) == b"", "the first ones make room"
-            for _, writer in visitors:
-                writer.close()
-
-    run(test)
-
-
-def test_a_connection_that_reads_no_answer_is_closed(app: App) -> None:
-    async def test() -> None:
-        before = descriptors(app)
-        sock = socket.socket()
-        sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
-        sock.connect(("127.0.0.1", app.port))
-        sock.setblocking(False)
-        request = b"GET /page/index.html HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n"
-        with contextlib.suppress(BlockingIOError):
-            for _ in range(20000):
-                sock.send(request)
-        async with Page(app) as page:
-            for _ in range(400):
-                await page.next("state")
-                if descriptors(app) <= before + 1:
-                    break
-            assert descriptors(app) <= before + 1, "the page's alone"
-        sock.close()
-
-    run(test)
-
-
-def test_many_wrong_tokens_at_the_same_time(app: App) -> None:
+async def test_many_wrong_tokens_at_the_same_time(app: App) -> None:
     """Some are told why they do not come in, the others are just turned away; whoever has the right one comes in."""
-
-    async def test() -> None:
-        async with Page(app) as driver:
-            await driver.take()
-            crowd = [await visit(app, handshake(app)) for _ in range(100)]
-            heads = [await asyncio.wait_for(reader.readexactly(12), WAIT) for reader, _ in crowd]
-            assert set(heads) == {b"HTTP/1.1 101", b"HTTP/1.1 403"}
-            assert heads[:16] == [b"HTTP/1.1 101"] * 16
-            assert await stop_of_a_new_page(app) < WAIT / 2
-            await driver.drive()
-            for _, writer in crowd:
-                writer.close()
-            for _ in range(100):  # until they are gone
-                async with aiohttp.ClientSession() as session:
-                    try:
-                        ws = await session.ws_connect(
-                            app.url + "/live", protocols=("hal.v1", "wrong"), headers={"Origin": app.url}
-                        )
-                    except aiohttp.WSServerHandshakeError:
-                        await asyncio.sleep(0.05)
-                        continue
-                    assert (await ws.receive(WAIT)).data == 4403
-                    return
-            raise AssertionError("nobody is told any more")
-
-    run(test)
+    async with Page(app) as driver:
+        await driver.take()
+        crowd = [await visit(app, handshake(app)) for _ in range(100)]
+        heads = [await asyncio.wait_for(reader.readexactly(12), WAIT) for reader, _ in crowd]
+        assert set(heads) == {b"HTTP/1.1 101", b"HTTP/1.1 403"}
+        assert heads[:16] == [b"HTTP/1.1 101"] * 16
+        assert await stop_of_a_new_page(app) < WAIT / 2
+        await driver.drive()
+        for _, writer in crowd:
+            writer.close()
+        for _ in range(100):  # until they are gone
+            async with aiohttp.ClientSession() as session:
+                try:
+                    ws = await session.ws_connect(
+                        app.url + "/live", protocols=("hal.v1", "wrong"), headers={"Origin": app.url}
+                    )
+                except aiohttp.WSServerHandshakeError:
+                    await asyncio.sleep(0.05)
+                    continue
+                assert (await ws.receive(WAIT)).data == 4403
+                return
+        raise AssertionError("nobody is told any more")
 
 
 def test_few_descriptors_are_made_more() -> None:

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import aiohttp
 import pytest
-from web_kit import TOKEN, WAIT, App, Page, run
+from web_kit import TOKEN, WAIT, App, Page
 
 from hal.drivers.web.server import read_page_files
 
@@ -18,24 +18,15 @@ def server() -> Iterator[App]:
         yield found
 
 
-@pytest.fixture
-def app() -> Iterator[App]:
-    with App() as found:
-        yield found
-
-
 @pytest.mark.parametrize("path", ["/live", "/pictures"])
 @pytest.mark.parametrize("token", ["wrong", TOKEN[:-1], TOKEN + "0"])
-def test_a_wrong_token_is_reported(server: App, path: str, token: str) -> None:
-    async def test() -> None:
-        async with Page(server, path, token) as page:
-            message = await page.ws.receive(WAIT)
-            assert (message.type, message.data) == (aiohttp.WSMsgType.CLOSE, 4403)
-            assert "token" in message.extra
-        async with Page(server) as page:
-            assert (await page.next("state"))["pages"] == 1, "the other one never was a page"
-
-    run(test)
+async def test_a_wrong_token_is_reported(server: App, path: str, token: str) -> None:
+    async with Page(server, path, token) as page:
+        message = await page.ws.receive(WAIT)
+        assert (message.type, message.data) == (aiohttp.WSMsgType.CLOSE, 4403)
+        assert "token" in message.extra
+    async with Page(server) as page:
+        assert (await page.next("state"))["pages"] == 1, "the other one never was a page"
 
 
 @pytest.mark.parametrize("path", ["/live", "/pictures"])
@@ -50,24 +41,18 @@ def test_a_wrong_token_is_reported(server: App, path: str, token: str) -> None:
         ({"Host": "testbench", "Origin": "http://testbench"}, 421),
     ],
 )
-def test_foreign_origins_and_hosts_are_turned_away(server, path, headers, status):
-    async def test() -> None:
+async def test_foreign_origins_and_hosts_are_turned_away(server, path, headers, status):
+    with pytest.raises(aiohttp.WSServerHandshakeError) as caught:
+        async with Page(server, path, **headers):
+            pass
+    assert caught.value.status == status
+
+
+async def test_a_handshake_without_an_origin_is_turned_away(server: App) -> None:
+    async with aiohttp.ClientSession() as session:
         with pytest.raises(aiohttp.WSServerHandshakeError) as caught:
-            async with Page(server, path, **headers):
-                pass
-        assert caught.value.status == status
-
-    run(test)
-
-
-def test_a_handshake_without_an_origin_is_turned_away(server: App) -> None:
-    async def test() -> None:
-        async with aiohttp.ClientSession() as session:
-            with pytest.raises(aiohttp.WSServerHandshakeError) as caught:
-                await session.ws_connect(server.url + "/live", protocols=("hal.v1", TOKEN))
-            assert caught.value.status == 403
-
-    run(test)
+            await session.ws_connect(server.url + "/live", protocols=("hal.v1", TOKEN))
+        assert caught.value.status == 403
 
 
 @pytest.mark.parametrize(
@@ -83,57 +68,48 @@ def test_a_handshake_without_an_origin_is_turned_away(server: App) -> None:
         ("/page/nothing.js", "GET", "attacker.example", 421),
     ],
 )
-def test_every_answer_has_its_headers(server: App, path: str, method: str, host: str | None, status: int) -> None:
-    async def test() -> None:
-        headers = {} if host is None else {"Host": host}
-        async with (
-            aiohttp.ClientSession() as session,
-            session.request(method, server.url + path, headers=headers) as answer,
-        ):
-            assert answer.status == status
-            assert answer.headers["Cache-Control"] == "no-store"
-            assert answer.headers["X-Content-Type-Options"] == "nosniff"
-            assert answer.headers["Referrer-Policy"] == "no-referrer"
-            policy = answer.headers.get("Content-Security-Policy", "")
-            assert TOKEN not in await answer.text()
-            if host is None:
-                assert policy.startswith("default-src 'none'; script-src 'self'; ")
-                assert f"connect-src 'self' ws://127.0.0.1:{server.port};" in policy
-            else:
-                assert host not in policy
-
-    run(test)
+async def test_every_answer_has_its_headers(server: App, path: str, method: str, host: str | None, status: int) -> None:
+    headers = {} if host is None else {"Host": host}
+    async with (
+        aiohttp.ClientSession() as session,
+        session.request(method, server.url + path, headers=headers) as answer,
+    ):
+        assert answer.status == status
+        assert answer.headers["Cache-Control"] == "no-store"
+        assert answer.headers["X-Content-Type-Options"] == "nosniff"
+        assert answer.headers["Referrer-Policy"] == "no-referrer"
+        policy = answer.headers.get("Content-Security-Policy", "")
+        assert TOKEN not in await answer.text()
+        if host is None:
+            assert policy.startswith("default-src 'none'; script-src 'self'; ")
+            assert f"connect-src 'self' ws://127.0.0.1:{server.port};" in policy
+        else:
+            assert host not in policy
 
 
-def test_the_page_is_served(server: App) -> None:
-    async def test() -> None:
-        files = read_page_files()
-        assert "index.html" in files
-        async with aiohttp.ClientSession() as session:
-            for name, (body, kind) in files.items():
-                async with session.get(f"{server.url}/page/{name}") as answer:
-                    assert (answer.status, answer.headers["Content-Type"]) == (200, kind)
-                    assert await answer.read() == body
-            async with session.get(server.url + "/") as answer:
-                assert await answer.read() == files["index.html"][0]
-            async with session.get(server.url + "/page/keys.js") as answer:
-                assert (await answer.text()).startswith('export const KEYS = {"hold": ["Space"], ')
-
-    run(test)
+async def test_the_page_is_served(server: App) -> None:
+    files = read_page_files()
+    assert "index.html" in files
+    async with aiohttp.ClientSession() as session:
+        for name, (body, kind) in files.items():
+            async with session.get(f"{server.url}/page/{name}") as answer:
+                assert (answer.status, answer.headers["Content-Type"]) == (200, kind)
+                assert await answer.read() == body
+        async with session.get(server.url + "/") as answer:
+            assert await answer.read() == files["index.html"][0]
+        async with session.get(server.url + "/page/keys.js") as answer:
+            assert (await answer.text()).startswith('export const KEYS = {"hold": ["Space"], ')
 
 
-def test_too_many_pages(app: App) -> None:
-    async def test() -> None:
-        pages = [Page(app) for _ in range(16)]
-        for page in pages:
-            await page.__aenter__()
-            await page.next("hello")
-        async with Page(app) as one_more:
-            assert await one_more.closed() == 4409
-        await pages[3].__aexit__()
-        async with Page(app) as another:
-            assert (await another.next("hello"))["name"] == "page 17"
-        for page in pages:
-            await page.__aexit__()
-
-    run(test)
+async def test_too_many_pages(app: App) -> None:
+    pages = [Page(app) for _ in range(16)]
+    for page in pages:
+        await page.__aenter__()
+        await page.next("hello")
+    async with Page(app) as one_more:
+        assert await one_more.closed() == 4409
+    await pages[3].__aexit__()
+    async with Page(app) as another:
+        assert (await another.next("hello"))["name"] == "page 17"
+    for page in pages:
+        await page.__aexit__()

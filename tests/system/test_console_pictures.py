@@ -10,7 +10,7 @@ import aiohttp
 import numpy as np
 import pytest
 from PIL import Image
-from web_kit import HEADER, WAIT, App, Page, camera, run
+from web_kit import HEADER, WAIT, App, Page, camera
 
 SCENE, WRIST = camera("scene"), camera("wrist", 40, 30)
 LARGE = camera("large", 640, 480)
@@ -38,130 +38,105 @@ async def watch(app: App, page: Page, *cameras: str) -> None:
     assert await app.next(lambda message: "watched" in message) == {"watched": list(cameras)}
 
 
-def test_a_picture_arrives_as_it_was_taken(app: App) -> None:
-    async def test() -> None:
-        async with Page(app, "/pictures") as page:
-            await watch(app, page, "scene", "wrist", "large")
-            for name, spec in app.cameras.items():
-                t = time.monotonic() - 0.25
-                app.show(name, 200, t)
-                got, seq, taken, age, pixels = await picture(page)
-                assert (got, seq, taken) == (name, 1, t)
-                assert 0.25 <= age < 5.0
-                assert pixels.shape == (spec.height, spec.width, 3)
-                assert np.abs(pixels.astype(int) - 200).max() <= 2
-
-    run(test)
+async def test_a_picture_arrives_as_it_was_taken(app: App) -> None:
+    async with Page(app, "/pictures") as page:
+        await watch(app, page, "scene", "wrist", "large")
+        for name, spec in app.cameras.items():
+            t = time.monotonic() - 0.25
+            app.show(name, 200, t)
+            got, seq, taken, age, pixels = await picture(page)
+            assert (got, seq, taken) == (name, 1, t)
+            assert 0.25 <= age < 5.0
+            assert pixels.shape == (spec.height, spec.width, 3)
+            assert np.abs(pixels.astype(int) - 200).max() <= 2
 
 
-def test_one_picture_is_under_way_and_the_next_is_the_newest(app: App) -> None:
-    async def test() -> None:
-        async with Page(app, "/pictures") as page, Page(app) as other:
-            await watch(app, page, "scene", "wrist")
-            for value in (10, 20, 30, 40):
-                app.show("scene", value)
-            name, seq, *_ = await picture(page)
-            assert (name, 1 <= seq <= 4) == ("scene", True)
-            app.show("scene", 50)
-            app.show("wrist", 60)
-            assert (await picture(page))[0] == "wrist", "credit is each camera's own"
-            await other.next("state")
-            await page.say(type="drawn", camera="scene")
-            name, seq, *_, pixels = await picture(page)
-            assert (name, seq) == ("scene", 5)
-            assert abs(int(pixels[0, 0, 0]) - 50) <= 2
-            await page.say(type="drawn", camera="scene")
-            await other.next("state")
-            app.show("scene", 70)
-            assert (await picture(page))[:2] == ("scene", 6), "there was none newer to be sent before"
-
-    run(test)
+async def test_one_picture_is_under_way_and_the_next_is_the_newest(app: App) -> None:
+    async with Page(app, "/pictures") as page, Page(app) as other:
+        await watch(app, page, "scene", "wrist")
+        for value in (10, 20, 30, 40):
+            app.show("scene", value)
+        name, seq, *_ = await picture(page)
+        assert (name, 1 <= seq <= 4) == ("scene", True)
+        app.show("scene", 50)
+        app.show("wrist", 60)
+        assert (await picture(page))[0] == "wrist", "credit is each camera's own"
+        await other.next("state")
+        await page.say(type="drawn", camera="scene")
+        name, seq, *_, pixels = await picture(page)
+        assert (name, seq) == ("scene", 5)
+        assert abs(int(pixels[0, 0, 0]) - 50) <= 2
+        await page.say(type="drawn", camera="scene")
+        await other.next("state")
+        app.show("scene", 70)
+        assert (await picture(page))[:2] == ("scene", 6), "there was none newer to be sent before"
 
 
-def test_only_watched_cameras_are_requested_and_old_pictures_are_not_shown(app: App) -> None:
-    async def test() -> None:
-        app.show("scene", 10)
-        async with Page(app, "/pictures") as first:
-            await watch(app, first, "scene")
-            async with Page(app, "/pictures") as second:
-                await second.say(type="watch", cameras=["wrist", "scene"])
-                assert await app.next() == {"watched": ["scene", "wrist"]}
-                app.show("scene", 20)
-                for page in (first, second):
-                    name, seq, *_ = await picture(page)
-                    assert (name, seq) == ("scene", 2), "the old one is not shown as if it were new"
-                await second.say(type="watch", cameras=["wrist"])
-                await first.say(type="watch", cameras=[])
-                assert await app.next() == {"watched": ["wrist"]}
-                app.show("wrist", 30)
-                assert (await picture(second))[0] == "wrist"
-            assert await app.next() == {"watched": []}
-
-    run(test)
+async def test_only_watched_cameras_are_requested_and_old_pictures_are_not_shown(app: App) -> None:
+    app.show("scene", 10)
+    async with Page(app, "/pictures") as first:
+        await watch(app, first, "scene")
+        async with Page(app, "/pictures") as second:
+            await second.say(type="watch", cameras=["wrist", "scene"])
+            assert await app.next() == {"watched": ["scene", "wrist"]}
+            app.show("scene", 20)
+            for page in (first, second):
+                name, seq, *_ = await picture(page)
+                assert (name, seq) == ("scene", 2), "the old one is not shown as if it were new"
+            await second.say(type="watch", cameras=["wrist"])
+            await first.say(type="watch", cameras=[])
+            assert await app.next() == {"watched": ["wrist"]}
+            app.show("wrist", 30)
+            assert (await picture(second))[0] == "wrist"
+        assert await app.next() == {"watched": []}
 
 
-def test_a_page_that_joins_sees_the_newest_at_once(app: App) -> None:
-    async def test() -> None:
-        async with Page(app, "/pictures") as first, Page(app, "/pictures") as second:
-            await watch(app, first, "large")
-            app.show("large", 20)
-            assert (await picture(first))[1] == 1
-            await second.say(type="watch", cameras=["large"])
-            assert (await picture(second))[1] == 1
-
-    run(test)
+async def test_a_page_that_joins_sees_the_newest_at_once(app: App) -> None:
+    async with Page(app, "/pictures") as first, Page(app, "/pictures") as second:
+        await watch(app, first, "large")
+        app.show("large", 20)
+        assert (await picture(first))[1] == 1
+        await second.say(type="watch", cameras=["large"])
+        assert (await picture(second))[1] == 1
 
 
-def test_rates_and_ages_of_pictures_are_reported(app: App) -> None:
-    async def test() -> None:
-        async with Page(app) as live, Page(app, "/pictures") as page:
+async def test_rates_and_ages_of_pictures_are_reported(app: App) -> None:
+    async with Page(app) as live, Page(app, "/pictures") as page:
+        cameras = (await live.next("state"))["cameras"]
+        assert cameras["scene"] == {"fps": None, "age": None}
+        await watch(app, page, "scene")
+        start = time.monotonic()
+        while cameras["scene"]["fps"] is None or time.monotonic() < start + 1.0:
+            app.show("scene", 20)
+            cameras = (await live.next("state"))["cameras"]  # 20 times a second
+        assert 5.0 < cameras["scene"]["fps"] < 40.0
+        assert 0.0 <= cameras["scene"]["age"] < 1.0
+        assert cameras["wrist"] == {"fps": None, "age": None}
+        while cameras["scene"]["fps"] is not None:
             cameras = (await live.next("state"))["cameras"]
-            assert cameras["scene"] == {"fps": None, "age": None}
-            await watch(app, page, "scene")
-            start = time.monotonic()
-            while cameras["scene"]["fps"] is None or time.monotonic() < start + 1.0:
-                app.show("scene", 20)
-                cameras = (await live.next("state"))["cameras"]  # 20 times a second
-            assert 5.0 < cameras["scene"]["fps"] < 40.0
-            assert 0.0 <= cameras["scene"]["age"] < 1.0
-            assert cameras["wrist"] == {"fps": None, "age": None}
-            while cameras["scene"]["fps"] is not None:
-                cameras = (await live.next("state"))["cameras"]
-            assert cameras["scene"]["age"] > 1.0
-
-    run(test)
+        assert cameras["scene"]["age"] > 1.0
 
 
-def test_malformed_messages_on_the_picture_socket(app: App) -> None:
-    async def test() -> None:
-        async with Page(app, "/pictures") as page:
-            for text in (
-                '{"type":"stop"}',
-                '{"type":"watch","cameras":["attic"]}',
-                '{"type":"drawn","camera":"attic"}',
-            ):
-                await page.ws.send_str(text)
-            await page.say(type="drawn", camera="scene")
-            await watch(app, page, "scene")
-            for _ in range(98):
-                await page.ws.send_str("nonsense")
-            assert await page.closed() == 4400
-            assert await app.next() == {"watched": []}
-
-    run(test)
+async def test_malformed_messages_on_the_picture_socket(app: App) -> None:
+    async with Page(app, "/pictures") as page:
+        for text in ('{"type":"stop"}', '{"type":"watch","cameras":["attic"]}', '{"type":"drawn","camera":"attic"}'):
+            await page.ws.send_str(text)
+        await page.say(type="drawn", camera="scene")
+        await watch(app, page, "scene")
+        for _ in range(98):
+            await page.ws.send_str("nonsense")
+        assert await page.closed() == 4400
+        assert await app.next() == {"watched": []}
 
 
-def test_a_page_that_draws_nothing_leaves_the_others_their_pictures(app: App) -> None:
-    async def test() -> None:
-        async with Page(app, "/pictures") as slow, Page(app, "/pictures") as page:
-            await watch(app, slow, "large")
-            await page.say(type="watch", cameras=["large"])
-            for k in range(1, 30):
-                app.show("large", k)
-                assert (await picture(page))[1] == k
-                await page.say(type="drawn", camera="large")
-            assert (await picture(slow))[1] == 1
-            await slow.say(type="drawn", camera="large")
-            assert (await picture(slow))[1] == 29
-
-    run(test)
+async def test_a_page_that_draws_nothing_leaves_the_others_their_pictures(app: App) -> None:
+    async with Page(app, "/pictures") as slow, Page(app, "/pictures") as page:
+        await watch(app, slow, "large")
+        await page.say(type="watch", cameras=["large"])
+        for k in range(1, 30):
+            app.show("large", k)
+            assert (await picture(page))[1] == k
+            await page.say(type="drawn", camera="large")
+        assert (await picture(slow))[1] == 1
+        await slow.say(type="drawn", camera="large")
+        assert (await picture(slow))[1] == 29

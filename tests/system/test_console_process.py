@@ -8,31 +8,17 @@ import os
 import signal
 import socket
 import time
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 from child_targets import HURRY
-from web_kit import REST, TOKEN, WAIT, App, Page, run
+from web_kit import REST, TOKEN, WAIT, App, Page
 
 from hal.drivers.web.messages import PAGE_SILENT
 from hal.errors import Fault, NotSupported
 from hal.servo.watchdog import PAD_SILENCE
 from hal.types import RobotStatus
-
-
-@pytest.fixture
-def app() -> Iterator[App]:
-    with App() as found:
-        yield found
-
-
-@pytest.fixture
-def hasty() -> Iterator[App]:
-    """One that has less patience, so that less has to be waited for."""
-    with App(target="child_targets:impatient_console") as found:
-        yield found
 
 
 def gone(message: dict[str, Any]) -> bool:
@@ -42,251 +28,210 @@ def gone(message: dict[str, Any]) -> bool:
 # What they say.
 
 
-def test_malformed_messages_are_tolerated_up_to_a_limit(app: App) -> None:
-    async def test() -> None:
-        async with Page(app) as page:
-            for k in range(98):
-                await page.ws.send_str('{"type":"pad","seen":NaN}' if k % 2 else "[" * 4000)
-            await page.ws.send_bytes(b'{"type":"stop"}')
-            await page.ws.send_str("{" + " " * 4094 + "}")
-            await page.take()
-            await page.drive()
-            assert (await app.pad())["connected"]
-            await page.ws.send_str("nonsense")
-            assert await page.closed() == 4400
-            assert (await app.pad())["why"] == "the page in control was closed"
-        async with Page(app) as page:
-            await page.next("hello")
-
-    run(test)
+async def test_malformed_messages_are_tolerated_up_to_a_limit(app: App) -> None:
+    async with Page(app) as page:
+        for k in range(98):
+            await page.ws.send_str('{"type":"pad","seen":NaN}' if k % 2 else "[" * 4000)
+        await page.ws.send_bytes(b'{"type":"stop"}')
+        await page.ws.send_str("{" + " " * 4094 + "}")
+        await page.take()
+        await page.drive()
+        assert (await app.pad())["connected"]
+        await page.ws.send_str("nonsense")
+        assert await page.closed() == 4400
+        assert (await app.pad())["why"] == "the page in control was closed"
+    async with Page(app) as page:
+        await page.next("hello")
 
 
-def test_a_message_that_is_too_long_ends_the_page(app: App) -> None:
-    async def test() -> None:
-        async with Page(app) as page:
-            await page.ws.send_str(" " * 4097)
-            assert await page.closed() == 1009
-        async with Page(app) as page:
-            await page.next("hello")
-
-    run(test)
+async def test_a_message_that_is_too_long_ends_the_page(app: App) -> None:
+    async with Page(app) as page:
+        await page.ws.send_str(" " * 4097)
+        assert await page.closed() == 1009
+    async with Page(app) as page:
+        await page.next("hello")
 
 
-def test_too_many_messages_close_the_page_and_a_stop_among_them_counts(app: App) -> None:
-    async def test() -> None:
-        async with Page(app) as page:
-            await page.take()
-            for _ in range(900):
-                await page.ws.send_json(page.pad([1.0] * 8))
-            await page.say(type="stop")
-            missing = [{"stop": "page 1"}, {"driver": None}]  # in either order
-            told = await app.all_until(lambda message: message in missing and (missing.remove(message) or not missing))
-            assert sum("pad" in message and message["pad"]["connected"] for message in told) <= 400
-            assert any(gone(message) for message in told), "it drives no more"
-            assert await page.closed() == 4408
-
-    run(test)
+async def test_too_many_messages_close_the_page_and_a_stop_among_them_counts(app: App) -> None:
+    async with Page(app) as page:
+        await page.take()
+        for _ in range(900):
+            await page.ws.send_json(page.pad([1.0] * 8))
+        await page.say(type="stop")
+        missing = [{"stop": "page 1"}, {"driver": None}]  # in either order
+        told = await app.all_until(lambda message: message in missing and (missing.remove(message) or not missing))
+        assert sum("pad" in message and message["pad"]["connected"] for message in told) <= 400
+        assert any(gone(message) for message in told), "it drives no more"
+        assert await page.closed() == 4408
 
 
-def test_a_watcher_stops_the_arm(app: App) -> None:
-    async def test() -> None:
-        async with Page(app) as driver, Page(app) as watcher:
-            await driver.take()
-            await watcher.next("hello")
-            await watcher.say(type="stop")
-            assert await app.next(lambda message: "stop" in message) == {"stop": "page 2"}
-            await watcher.say(type="recover", robot="arm")
-            assert "only the page in control" in (await watcher.next("refused"))["why"]
-            await driver.say(type="recover", robot="arm")
-            assert await app.next() == {"recover": "arm", "page": "page 1"}
-
-    run(test)
+async def test_a_watcher_stops_the_arm(app: App) -> None:
+    async with Page(app) as driver, Page(app) as watcher:
+        await driver.take()
+        await watcher.next("hello")
+        await watcher.say(type="stop")
+        assert await app.next(lambda message: "stop" in message) == {"stop": "page 2"}
+        await watcher.say(type="recover", robot="arm")
+        assert "only the page in control" in (await watcher.next("refused"))["why"]
+        await driver.say(type="recover", robot="arm")
+        assert await app.next() == {"recover": "arm", "page": "page 1"}
 
 
-def test_the_lease_between_two_pages(app: App) -> None:
-    async def test() -> None:
-        async with Page(app) as first:
-            await first.take()
-            assert await app.next() == {"driver": "page 1"}
-            await first.drive([0.5, 0, 0, 0, 1, 0, 0, 0], 64)
-            pad = await app.pad()
-            assert (pad["connected"], pad["from"], pad["buttons"]) == (True, "page 1", 64)
-            assert pad["axes"] == [0.5, 0, 0, 0, 1, 0, 0, 0]
-            assert pad["t"] - PAD_SILENCE <= pad["t_alive"] <= pad["t"] <= time.monotonic()
-            async with Page(app) as second:
-                await second.take()
-                assert (await app.pad())["why"] == "page 2 took control"
-                assert await app.next() == {"driver": "page 2"}
-                lost = await first.next("lease")
-                assert (lost["driver"], lost["you"], lost["why"]) == ("page 2", False, "page 2 took control")
-                await first.ws.send_json(first.pad([1.0] * 8))
-                await second.drive()
-                assert (await app.pad())["from"] == "page 2"
-            assert (await app.pad())["why"] == "the page in control was closed"
-            assert await app.next() == {"driver": None}
-            assert (await first.next("lease"))["driver"] is None
-
-    run(test)
+async def test_the_lease_between_two_pages(app: App) -> None:
+    async with Page(app) as first:
+        await first.take()
+        assert await app.next() == {"driver": "page 1"}
+        await first.drive([0.5, 0, 0, 0, 1, 0, 0, 0], 64)
+        pad = await app.pad()
+        assert (pad["connected"], pad["from"], pad["buttons"]) == (True, "page 1", 64)
+        assert pad["axes"] == [0.5, 0, 0, 0, 1, 0, 0, 0]
+        assert pad["t"] - PAD_SILENCE <= pad["t_alive"] <= pad["t"] <= time.monotonic()
+        async with Page(app) as second:
+            await second.take()
+            assert (await app.pad())["why"] == "page 2 took control"
+            assert await app.next() == {"driver": "page 2"}
+            lost = await first.next("lease")
+            assert (lost["driver"], lost["you"], lost["why"]) == ("page 2", False, "page 2 took control")
+            await first.ws.send_json(first.pad([1.0] * 8))
+            await second.drive()
+            assert (await app.pad())["from"] == "page 2"
+        assert (await app.pad())["why"] == "the page in control was closed"
+        assert await app.next() == {"driver": None}
+        assert (await first.next("lease"))["driver"] is None
 
 
 @pytest.mark.parametrize("how", ["hidden", "closed", "cut"])
-def test_a_page_that_leaves_loses_the_pad_at_once(app: App, how: str) -> None:
-    async def test() -> None:
-        async with Page(app) as page:
-            await page.take()
-            await page.drive([0.0] * 4 + [1.0] + [0.0] * 3, 64)
-            assert (await app.pad())["connected"]
-            if how == "hidden":
-                await page.say(type="away", why="hidden")
-            elif how == "closed":
-                await page.ws.close()
-            else:
-                page.ws._response.connection.transport.abort()
-            pad = await app.pad()
-            assert not pad["connected"]
-            assert pad["why"] == ("the page was hidden" if how == "hidden" else "the page in control was closed")
-
-    run(test)
+async def test_a_page_that_leaves_loses_the_pad_at_once(app: App, how: str) -> None:
+    async with Page(app) as page:
+        await page.take()
+        await page.drive([0.0] * 4 + [1.0] + [0.0] * 3, 64)
+        assert (await app.pad())["connected"]
+        if how == "hidden":
+            await page.say(type="away", why="hidden")
+        elif how == "closed":
+            await page.ws.close()
+        else:
+            page.ws._response.connection.transport.abort()
+        pad = await app.pad()
+        assert not pad["connected"]
+        assert pad["why"] == ("the page was hidden" if how == "hidden" else "the page in control was closed")
 
 
-def test_a_silent_page_loses_the_pad(app: App) -> None:
-    async def test() -> None:
-        async with Page(app) as page:
-            await page.take()
-            await page.drive()
-            pad = await app.pad()
-            lost = await app.pad()
-            assert (lost["connected"], lost["why"]) == (False, PAGE_SILENT)
-            assert lost["t"] - pad["t_alive"] > PAD_SILENCE
-
-    run(test)
+async def test_a_silent_page_loses_the_pad(app: App) -> None:
+    async with Page(app) as page:
+        await page.take()
+        await page.drive()
+        pad = await app.pad()
+        lost = await app.pad()
+        assert (lost["connected"], lost["why"]) == (False, PAGE_SILENT)
+        assert lost["t"] - pad["t_alive"] > PAD_SILENCE
 
 
-def test_late_messages_move_nothing(app: App) -> None:
-    async def test() -> None:
-        async with Page(app) as page:
-            await page.take()
-            await asyncio.sleep(0.5)
-            for age in (0.4, 0.3, 0.2):
-                await page.ws.send_json(page.pad([1.0] * 8, age=age))
-            await page.drive()
-            told = await app.all_until(lambda message: "pad" in message)
-            assert told[-1]["pad"]["axes"] == REST
-
-    run(test)
+async def test_late_messages_move_nothing(app: App) -> None:
+    async with Page(app) as page:
+        await page.take()
+        await asyncio.sleep(0.5)
+        for age in (0.4, 0.3, 0.2):
+            await page.ws.send_json(page.pad([1.0] * 8, age=age))
+        await page.drive()
+        told = await app.all_until(lambda message: "pad" in message)
+        assert told[-1]["pad"]["axes"] == REST
 
 
-def test_messages_during_a_stall_of_the_server_move_nothing(app: App) -> None:
+async def test_messages_during_a_stall_of_the_server_move_nothing(app: App) -> None:
     """The page goes on, held at full deflection; the console's process is stopped, as by a machine that swaps."""
-
-    async def test() -> None:
-        async with Page(app) as page:
-            await page.take()
-            await page.drive()
-            assert (await app.pad())["connected"]
-            os.kill(app.child.process.pid, signal.SIGSTOP)
-            try:
-                until = time.monotonic() + 0.8
-                while time.monotonic() < until:
-                    await page.ws.send_json(page.pad([1.0] * 8, 64))
-                    await asyncio.sleep(0.02)
-            finally:
-                os.kill(app.child.process.pid, signal.SIGCONT)
-            assert not (await app.pad())["connected"]
-            await page.drive([0.125] * 8)
-            while True:
-                pad = await app.pad()
-                if pad["connected"]:
-                    assert pad["t"] - pad["t_alive"] <= PAD_SILENCE
-                    if pad["axes"][0] == 0.125:
-                        return
-
-    run(test)
+    async with Page(app) as page:
+        await page.take()
+        await page.drive()
+        assert (await app.pad())["connected"]
+        os.kill(app.child.process.pid, signal.SIGSTOP)
+        try:
+            until = time.monotonic() + 0.8
+            while time.monotonic() < until:
+                await page.ws.send_json(page.pad([1.0] * 8, 64))
+                await asyncio.sleep(0.02)
+        finally:
+            os.kill(app.child.process.pid, signal.SIGCONT)
+        assert not (await app.pad())["connected"]
+        await page.drive([0.125] * 8)
+        while True:
+            pad = await app.pad()
+            if pad["connected"]:
+                assert pad["t"] - pad["t_alive"] <= PAD_SILENCE
+                if pad["axes"][0] == 0.125:
+                    return
 
 
-def test_an_app_that_does_not_read_delays_no_page(app: App) -> None:
+async def test_an_app_that_does_not_read_delays_no_page(app: App) -> None:
     """It is stopped for a while. Pages are answered, and what it then finds is a handful of messages, stop included."""
-
-    async def test() -> None:
-        async with Page(app) as page, Page(app) as watcher:
-            await page.take()
-            for k in range(200):
-                await page.drive([k / 200.0] * 8)
-                if k == 150:
-                    await watcher.say(type="stop")
-                await asyncio.sleep(0.005)
-            await page.next("state")
-            told = await app.all_until(lambda message: "pad" in message and message["pad"]["axes"][0] == 199 / 200.0)
-            assert {"stop": "page 2"} in told
-            assert len(told) < 60
-
-    run(test)
+    async with Page(app) as page, Page(app) as watcher:
+        await page.take()
+        for k in range(200):
+            await page.drive([k / 200.0] * 8)
+            if k == 150:
+                await watcher.say(type="stop")
+            await asyncio.sleep(0.005)
+        await page.next("state")
+        told = await app.all_until(lambda message: "pad" in message and message["pad"]["axes"][0] == 199 / 200.0)
+        assert {"stop": "page 2"} in told
+        assert len(told) < 60
 
 
 # What they are told.
 
 
-def test_states(app: App) -> None:
-    async def test() -> None:
-        async with Page(app) as page:
-            arm = (await page.next("state"))["robots"]["arm"]
-            assert arm == {"lost": "no state received yet"}
-            app.put_state(time.monotonic(), q=0.123456789, fault=Fault("e1", "the button is pressed", "release it"))
+async def test_states(app: App) -> None:
+    async with Page(app) as page:
+        arm = (await page.next("state"))["robots"]["arm"]
+        assert arm == {"lost": "no state received yet"}
+        app.put_state(time.monotonic(), q=0.123456789, fault=Fault("e1", "the button is pressed", "release it"))
+        state = await page.next("state")
+        while "lost" in state["robots"]["arm"]:
             state = await page.next("state")
-            while "lost" in state["robots"]["arm"]:
-                state = await page.next("state")
-            arm = state["robots"]["arm"]
-            assert (arm["q"], arm["q_set"], arm["dq"]) == ([0.12346] * 3, [0.25] * 3, [0.0] * 3)
-            assert arm["tcp"] == [0.1, 0.2, 0.3, 0.0, 0.0, 0.0, 1.0]
-            assert (arm["status"], arm["trip"], arm["trip_text"], arm["limited"]) == ("following", "none", "", "speed")
-            assert arm["fault"] == {"code": "e1", "cause": "the button is pressed", "remedy": "release it"}
-            assert arm["gripper"] == {"width": 0.04, "width_target": 0.08, "moving": True, "grasped": None}
-            assert arm["deadman"]["held"]
-            assert 0.0 <= arm["age"] < 0.1
-            host = state["hosts"]["group"]
-            assert (host["rate_hz"], host["ticks"], host["missed"]) == (240.0, 1000, 3)
-            assert (state["pages"], state["playing"]) == (1, False)
-            while "lost" not in state["robots"]["arm"]:
-                state = await page.next("state")
-            assert "old" in state["robots"]["arm"]["lost"]
-            app.put_state(time.monotonic(), status=RobotStatus.LOST, fault=Fault("lost", "no packets", ""))
-            while "no packets" not in state["robots"]["arm"]["lost"]:
-                state = await page.next("state")
-
-    run(test)
+        arm = state["robots"]["arm"]
+        assert (arm["q"], arm["q_set"], arm["dq"]) == ([0.12346] * 3, [0.25] * 3, [0.0] * 3)
+        assert arm["tcp"] == [0.1, 0.2, 0.3, 0.0, 0.0, 0.0, 1.0]
+        assert (arm["status"], arm["trip"], arm["trip_text"], arm["limited"]) == ("following", "none", "", "speed")
+        assert arm["fault"] == {"code": "e1", "cause": "the button is pressed", "remedy": "release it"}
+        assert arm["gripper"] == {"width": 0.04, "width_target": 0.08, "moving": True, "grasped": None}
+        assert arm["deadman"]["held"]
+        assert 0.0 <= arm["age"] < 0.1
+        host = state["hosts"]["group"]
+        assert (host["rate_hz"], host["ticks"], host["missed"]) == (240.0, 1000, 3)
+        assert (state["pages"], state["playing"]) == (1, False)
+        while "lost" not in state["robots"]["arm"]:
+            state = await page.next("state")
+        assert "old" in state["robots"]["arm"]["lost"]
+        app.put_state(time.monotonic(), status=RobotStatus.LOST, fault=Fault("lost", "no packets", ""))
+        while "no packets" not in state["robots"]["arm"]["lost"]:
+            state = await page.next("state")
 
 
-def test_nan_reaches_no_page_as_a_number(app: App) -> None:
-    async def test() -> None:
-        async with Page(app) as page:
-            await page.next("hello")
+async def test_nan_reaches_no_page_as_a_number(app: App) -> None:
+    async with Page(app) as page:
+        await page.next("hello")
+        app.put_state(time.monotonic(), q=float("nan"))
+        state = await page.next("state")
+        while "q" not in state["robots"]["arm"]:
             app.put_state(time.monotonic(), q=float("nan"))
             state = await page.next("state")
-            while "q" not in state["robots"]["arm"]:
-                app.put_state(time.monotonic(), q=float("nan"))
-                state = await page.next("state")
-            assert state["robots"]["arm"]["q"] == [None] * 3
-
-    run(test)
+        assert state["robots"]["arm"]["q"] == [None] * 3
 
 
-def test_messages_of_the_app(app: App) -> None:
-    async def test() -> None:
-        async with Page(app) as page:
-            await page.next("hello")
-            app.send("labels", labels={"deadman": "l2", "home": None})
-            assert await page.next("labels") == {"type": "labels", "deadman": "l2", "home": None}
-            app.send("say", t=1.5, text="grüß Gott")
-            assert await page.next("say") == {"type": "say", "t": 1.5, "text": "grüß Gott"}
-            app.send("waiting", controls=["r2"])
-            assert await page.next("pad") == {"type": "pad", "waiting": ["r2"]}
-            app.send("playing", on=True)
-            while not (await page.next("state"))["playing"]:
-                pass
-            app.send("refused", page="page 1", why="not now")
-            assert (await page.next("refused"))["why"] == "not now"
-
-    run(test)
+async def test_messages_of_the_app(app: App) -> None:
+    async with Page(app) as page:
+        await page.next("hello")
+        app.send("labels", labels={"deadman": "l2", "home": None})
+        assert await page.next("labels") == {"type": "labels", "deadman": "l2", "home": None}
+        app.send("say", t=1.5, text="grüß Gott")
+        assert await page.next("say") == {"type": "say", "t": 1.5, "text": "grüß Gott"}
+        app.send("waiting", controls=["r2"])
+        assert await page.next("pad") == {"type": "pad", "waiting": ["r2"]}
+        app.send("playing", on=True)
+        while not (await page.next("state"))["playing"]:
+            pass
+        app.send("refused", page="page 1", why="not now")
+        assert (await page.next("refused"))["why"] == "not now"
 
 
 # A page that reads nothing.
@@ -319,43 +264,36 @@ def resident(pid: int) -> int:
 
 
 @pytest.mark.slow
-def test_a_page_that_reads_nothing_delays_no_other_and_is_disconnected(hasty: App) -> None:
+async def test_a_page_that_reads_nothing_delays_no_other_and_is_disconnected(hasty: App) -> None:
     app = hasty
-
-    async def test() -> None:
-        frozen = handshake(app, "/live")
-        async with Page(app) as page:
-            await page.take()
-            start, memory = time.monotonic(), resident(app.child.process.pid)
-            pages, longest = 2, 0.0
-            while pages == 2 and time.monotonic() < start + 30.0:
-                app.put_state(time.monotonic())
-                sent = time.monotonic()
-                await page.drive()
-                longest = max(longest, time.monotonic() - sent)
-                pages = (await page.next("state"))["pages"]
-            assert pages == 1
-            assert time.monotonic() - start > 9.0 / HURRY, "it is given some time"
-            assert longest < 1.0
-            assert resident(app.child.process.pid) - memory < 8 << 20
-        frozen.close()
-
-    run(test)
+    frozen = handshake(app, "/live")
+    async with Page(app) as page:
+        await page.take()
+        start, memory = time.monotonic(), resident(app.child.process.pid)
+        pages, longest = 2, 0.0
+        while pages == 2 and time.monotonic() < start + 30.0:
+            app.put_state(time.monotonic())
+            sent = time.monotonic()
+            await page.drive()
+            longest = max(longest, time.monotonic() - sent)
+            pages = (await page.next("state"))["pages"]
+        assert pages == 1
+        assert time.monotonic() - start > 9.0 / HURRY, "it is given some time"
+        assert longest < 1.0
+        assert resident(app.child.process.pid) - memory < 8 << 20
+    frozen.close()
 
 
 # How it ends.
 
 
-def test_the_app_closes(app: App) -> None:
-    async def test() -> None:
-        async with Page(app) as live, Page(app, "/pictures") as pictures:
-            await live.take()
-            app.child.channel.send({"id": 0, "method": "close", "params": {}})
-            assert await live.closed() == 4410
-            assert await pictures.closed() == 4410
-            assert app.child.process.wait(WAIT) == 0
-
-    run(test)
+async def test_the_app_closes(app: App) -> None:
+    async with Page(app) as live, Page(app, "/pictures") as pictures:
+        await live.take()
+        app.child.channel.send({"id": 0, "method": "close", "params": {}})
+        assert await live.closed() == 4410
+        assert await pictures.closed() == 4410
+        assert app.child.process.wait(WAIT) == 0
 
 
 def test_it_closes_at_once_though_a_page_does_not_answer(app: App) -> None:
@@ -386,29 +324,21 @@ def test_an_address_of_another_machine() -> None:
     assert refused.value.code == "bad_address"
 
 
-def test_ipv6() -> None:
+async def test_ipv6() -> None:
     if not Path("/proc/net/if_inet6").exists() or "lo" not in Path("/proc/net/if_inet6").read_text():
         pytest.skip("this machine has no IPv6")
     with App(listen=["::1", 0]) as app:
         app.url = f"http://[::1]:{app.port}"
-
-        async def test() -> None:
-            async with Page(app) as page:
-                await page.next("hello")
-
-        run(test)
+        async with Page(app) as page:
+            await page.next("hello")
 
 
-def test_text_of_a_page_is_never_passed_on(app: App) -> None:
+async def test_text_of_a_page_is_never_passed_on(app: App) -> None:
     """What a page writes is never passed on, neither to the app nor to other pages."""
-
-    async def test() -> None:
-        async with Page(app) as page, Page(app) as other:
-            await page.take()
-            for message in ({"type": "away", "why": "<b>x</b>"}, {"type": "recover", "robot": "<b>x</b>"}):
-                await page.ws.send_str(json.dumps(message))
-            await page.say(type="stop")
-            assert "<b>" not in json.dumps(await app.all_until(lambda message: "stop" in message))
-            assert "<b>" not in json.dumps(await other.next("state"))
-
-    run(test)
+    async with Page(app) as page, Page(app) as other:
+        await page.take()
+        for message in ({"type": "away", "why": "<b>x</b>"}, {"type": "recover", "robot": "<b>x</b>"}):
+            await page.ws.send_str(json.dumps(message))
+        await page.say(type="stop")
+        assert "<b>" not in json.dumps(await app.all_until(lambda message: "stop" in message))
+        assert "<b>" not in json.dumps(await other.next("state"))

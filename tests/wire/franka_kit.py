@@ -23,11 +23,10 @@ from typing import Any
 
 from hal.drivers.franka.emulator.control import EmulatorControl
 
-__all__ = ["FR3_CLIENT", "PANDA_CLIENT", "Emulator", "free_host", "run_client"]
+__all__ = ["Emulator", "free_host", "run_client"]
 
-HERE = Path(__file__).parent
-FR3_CLIENT = HERE / "fr3_client.py"
-PANDA_CLIENT = HERE / "panda_client.py"
+LIBRARIES = {"fr3": "pylibfranka", "panda": "panda_py"}
+"""The vendor's library of each robot."""
 PORTS = (1337, 1338, 1339)
 START_LIMIT = 20.0
 END_LIMIT = 5.0
@@ -136,17 +135,18 @@ class Emulator:
         self.close()
 
 
-def run_client(script: Path, scenario: str, host: str, timeout: float = 30.0, **arguments: object) -> dict[str, Any]:
-    """Run one scenario of a client script in a process of its own, and return its report.
+def run_client(robot: str, scenario: str, host: str, timeout: float = 30.0, **arguments: object) -> dict[str, Any]:
+    """Run one scenario of ``franka_client.py`` in a process of its own, and return its report.
 
     The vendor's libraries block all Python threads, and change the scheduling of the thread that constructs a robot,
     so they stay out of the tests' process. Raises subprocess.TimeoutExpired if the script hangs, and RuntimeError with
     its output if it fails.
     """
-    command = [sys.executable, str(script), scenario, host, json.dumps(arguments)]
+    script = Path(__file__).with_name("franka_client.py")
+    command = [sys.executable, str(script), LIBRARIES[robot], scenario, host, json.dumps(arguments)]
     done = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=timeout)
     if done.returncode != 0:
-        raise RuntimeError(f"{script.name} {scenario} ended with {done.returncode}:\n{done.stdout}{done.stderr}")
+        raise RuntimeError(f"{robot} {scenario} ended with {done.returncode}:\n{done.stdout}{done.stderr}")
     report: dict[str, Any] = json.loads(done.stdout.splitlines()[-1])
     return report
 

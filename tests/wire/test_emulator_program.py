@@ -17,7 +17,7 @@ import pytest
 
 from hal.drivers.franka.emulator.control import EmulatorControl
 
-from .franka_kit import FR3_CLIENT, Emulator, run_client
+from .franka_kit import Emulator, run_client
 
 PROGRAM = [sys.executable, "-m", "hal.drivers.franka.emulator"]
 
@@ -258,7 +258,7 @@ def test_a_motion_in_real_time(arm: Emulator) -> None:
     pytest.importorskip("pylibfranka", reason="needs pylibfranka: pip install 'robot-hal[franka]'")
     for _ in range(3):  # a loaded machine may lose twenty commands in a row
         arm.refresh()
-        report = run_client(FR3_CLIENT, "motion", arm.host, way=0.004, duration=0.4)
+        report = run_client("fr3", "motion", arm.host, way=0.004, duration=0.4)
         if report["error"] == "":
             break
         assert "communication_constraints_violation" in report["error"]
