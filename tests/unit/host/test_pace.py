@@ -1,13 +1,15 @@
-"""What sets the pace of a group's cycle: requests in lock-step, a device, a computer that was suspended."""
+"""Paces of a group's cycle: periodic, by a device, by steps in lock-step; and suspension of the computer."""
 
 from __future__ import annotations
 
 import time
 from dataclasses import dataclass, field
+from types import SimpleNamespace
 
 import pytest
 
-from hal.host.main import DevicePace, StepPace, SuspensionWatch
+from hal.host import main
+from hal.host.main import DevicePace, PeriodicPace, StepPace, SuspensionWatch
 from hal.host.records import AppRecord
 
 
@@ -95,3 +97,68 @@ def test_where_the_system_cannot_say_nothing_was_suspended(monkeypatch: pytest.M
     monkeypatch.delattr(time, "CLOCK_BOOTTIME", raising=False)
     suspension = SuspensionWatch()
     assert not suspension.ended()
+
+
+PERIOD = 0.004
+
+
+class FakeTime:
+    """A clock that advances only by sleeping and by work."""
+
+    def __init__(self) -> None:
+        self.now = 100.0
+
+    def monotonic(self) -> float:
+        return self.now
+
+    def advance(self, seconds: float) -> None:
+        self.now += seconds
+
+
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> FakeTime:
+    made = FakeTime()
+    monkeypatch.setattr(main, "time", SimpleNamespace(monotonic=made.monotonic, sleep=made.advance))
+    return made
+
+
+def test_work_that_fits_delays_nothing(clock: FakeTime) -> None:
+    pace = PeriodicPace(PERIOD)
+    for turn in range(1, 501):
+        assert pace.wait() == pytest.approx(100.0 + turn * PERIOD)
+        clock.advance(0.9 * PERIOD)
+    assert pace.missed == 0
+
+
+def test_cycles_that_come_too_late_are_skipped_and_counted(clock: FakeTime) -> None:
+    pace = PeriodicPace(PERIOD)
+    pace.wait()
+    clock.advance(3.5 * PERIOD)
+    assert pace.wait() == pytest.approx(100.0 + 4.5 * PERIOD), "at once"
+    assert pace.missed == 2
+    assert pace.wait() == pytest.approx(100.0 + 5.0 * PERIOD), "the grid is the old one"
+    assert pace.missed == 2
+
+
+@pytest.mark.parametrize("request_s", [0.2 * PERIOD, 1.3 * PERIOD])
+def test_requests_do_not_slow_the_pace(clock: FakeTime, request_s: float) -> None:
+    pace = PeriodicPace(PERIOD)
+    for turn in range(500):
+        pace.wait()
+        if turn % 8 == 0:
+            clock.advance(request_s)
+            pace.restart()
+    assert clock.now == pytest.approx(100.0 + 500 * PERIOD)
+    assert pace.missed == 0
+
+
+def test_a_request_that_takes_long_is_a_pause(clock: FakeTime) -> None:
+    pace = PeriodicPace(PERIOD)
+    pace.wait()
+    clock.advance(100.5 * PERIOD)
+    pace.restart()
+    assert pace.wait() <= 100.0 + 102.5 * PERIOD
+    assert pace.missed == 0
+    before = pace.wait()
+    assert pace.wait() - before == pytest.approx(PERIOD), "nothing is caught up"
+    assert pace.periods.summary()["max"] == pytest.approx(PERIOD, rel=0.6), "and the pause was no period"

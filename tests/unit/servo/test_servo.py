@@ -249,13 +249,3 @@ def test_what_is_computed_ahead_is_what_would_be_computed_then(seed: int) -> Non
         return bench.history
 
     assert history(True) == history(False)
-
-
-def test_the_same_input_gives_the_same_output() -> None:
-    def history() -> list[list[float]]:
-        bench = Bench(panda(), tcp_speed=0.25)
-        bench.stream(0.4, Kind.TWIST, [0.1, 0.05, -0.1, 0.0, 0.2, 0.0, 0.0])
-        bench.stream(0.2, Kind.JOINT_VELOCITY, [0.3] * N)
-        return bench.history
-
-    assert history() == history()

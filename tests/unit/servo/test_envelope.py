@@ -9,47 +9,36 @@ from typing import Any
 import numpy as np
 import pytest
 from servo_kit import Bench
-from specs import PANDA_HOME, data, panda
+from specs import PANDA_HOME, iiwa, panda
 
 from hal.commands import Kind
 from hal.kinematics.arm import NEAR_SINGULAR, Kinematics
 from hal.servo.envelope import TcpReference
 from hal.servo.servo import Servo
 from hal.servo.smoothing import JointSmoother
-from hal.specs import KinematicsSpec, LimitsSpec, WorkspaceSpec
+from hal.specs import RobotSpec, WorkspaceSpec
 
 Array = np.ndarray[Any, np.dtype[np.float64]]
 DT = 1 / 240
 
 
-def iiwa() -> tuple[KinematicsSpec, LimitsSpec]:
+def weak_iiwa() -> RobotSpec:
     """KUKA's arm with a tool that points aside, and slow, weak joints."""
-    upper = (2.96, 2.09, 2.96, 2.09, 2.96, 2.09, 3.05)
-    lower = tuple(-x for x in upper)
-    joints = tuple(f"lbr_iiwa_joint_{k}" for k in range(1, 8))
-    kinematics = KinematicsSpec(
-        urdf=data("kuka_iiwa/model.urdf"),
-        joints=joints,
-        lower=lower,
-        upper=upper,
-        home=(0.0, 0.5, 0.0, -1.3, 0.0, 1.2, 0.0),
-        base_link=None,
-        tcp_link="lbr_iiwa_link_7",
-        tcp_position=(0.2, 0.03, 0.1),
-        tcp_orientation=(0.0, 0.0, 0.6, 0.8),
-    )
-    return kinematics, LimitsSpec(lower, upper, (1.7,) * 7, (4.0,) * 7, (40.0,) * 7)
+    spec = iiwa()
+    tool = replace(spec.kinematics, tcp_position=(0.2, 0.03, 0.1), tcp_orientation=(0.0, 0.0, 0.6, 0.8))
+    limits = replace(spec.limits, velocity=(1.7,) * 7, acceleration=(4.0,) * 7, jerk=(40.0,) * 7)
+    return replace(spec, kinematics=tool, limits=limits)
 
 
 class Arm:
     """One arm with everything that the bounds are about."""
 
-    def __init__(self, spec: KinematicsSpec, limits: LimitsSpec) -> None:
-        self.limits = limits
-        self.kinematics = Kinematics(spec)
-        self.smoother = JointSmoother(limits, DT)
+    def __init__(self, spec: RobotSpec) -> None:
+        self.limits = spec.limits
+        self.kinematics = Kinematics(spec.kinematics)
+        self.smoother = JointSmoother(spec.limits, DT)
         self.random = np.random.default_rng(3)
-        self.cap = [0.3 * v for v in limits.velocity]
+        self.cap = [0.3 * v for v in spec.limits.velocity]
 
     def reference(self, box: WorkspaceSpec | None = None) -> TcpReference:
         reference = TcpReference(self.smoother, self.kinematics, box)
@@ -73,10 +62,7 @@ class Arm:
 
 @pytest.fixture(params=["panda", "iiwa"])
 def arm(request: pytest.FixtureRequest) -> Arm:
-    if request.param == "panda":
-        spec = panda()
-        return Arm(spec.kinematics, spec.limits)
-    return Arm(*iiwa())
+    return Arm(panda() if request.param == "panda" else weak_iiwa())
 
 
 def test_reach_bounds_the_jacobian_its_change_and_the_way_of_the_tcp(arm: Arm) -> None:
@@ -215,8 +201,8 @@ def test_surely_inside_is_never_wrong(arm: Arm) -> None:
 
 def test_a_stop_that_begins_at_rest_may_still_go_far() -> None:
     """A weak joint that has just begun to speed up needs long to take the acceleration back."""
-    spec, limits = iiwa()
-    kinematics, smoother = Kinematics(spec), JointSmoother(limits, 1e-4)
+    spec = weak_iiwa()
+    kinematics, smoother = Kinematics(spec.kinematics), JointSmoother(spec.limits, 1e-4)
     smoother.anchor(spec.home, None, [4.0] + [0.0] * 6)
     at = np.array(kinematics.fk(spec.home)[:3])
     way = float(np.linalg.norm(np.subtract(kinematics.fk(smoother.stop_end())[:3], at)))
