@@ -1,30 +1,26 @@
-"""Every error that the hal raises, in one tree.
+"""All errors of this package, in one tree.
 
     HalError
-    ├── ConfigError (ValueError)            a rig, a model or an argument file is wrong; lists every problem
-    ├── CommandError (ValueError)           a command was malformed; nothing was sent
+    ├── ConfigError (ValueError)            a rig, a model or a mapping is wrong; lists every problem
+    ├── CommandError (ValueError)           a command or an argument is invalid; nothing was sent
     ├── DatasetError (ValueError)           a file of a recording is missing or damaged; names the file and the episode
     ├── Unreachable (ValueError)            no joint position reaches the pose; carries the residual
     ├── DriverMissing (ImportError)         a library is not installed; names the command that installs it
     ├── DeviceNotFound (LookupError)        no such device; lists those that are there
-    ├── ConnectionLost (ConnectionError)    the device, or the process that owned it, is gone
+    ├── ConnectionLost (ConnectionError)    the device, or the process that owned it, does not answer
     ├── StaleStateError (TimeoutError)      the newest state or frame is too old to act on
-    ├── MotionStopped (RuntimeError)        a stop is latched; says what tripped it and how to go on
+    ├── MotionStopped (RuntimeError)        a stop is latched; states its reason and how to acknowledge it
     ├── RobotFault (RuntimeError)           the robot reports a fault; carries cause and remedy
-    ├── ControlTaken (RuntimeError)         somebody else controls this arm
-    └── NotSupported (NotImplementedError)  this driver, or this rig, cannot do that
+    ├── ControlTaken (RuntimeError)         another session or program controls this arm
+    └── NotSupported (NotImplementedError)  this driver or this rig cannot do that
 
-Each one is also the builtin in brackets, so callers may catch either.
+Each is also the builtin error in brackets. Every error has a ``code``, a stable identifier of the case.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
-
-if TYPE_CHECKING:
-    pass  # FOLD: import dropped
 
 __all__ = [
     "CommandError",
@@ -67,8 +63,11 @@ class Fault:
     """A fault of a device, with its cause and its remedy."""
 
     code: str
+    """Identifier of the fault, as the device or its driver names it."""
     cause: str
+    """What went wrong, in words."""
     remedy: str
+    """What to do about it, in words."""
 
     def __str__(self) -> str:
         return f"{self.cause} ({self.code}); {self.remedy}"
@@ -76,7 +75,7 @@ class Fault:
 
 @dataclass(frozen=True, slots=True)
 class Problem:
-    """One thing that is wrong in a configuration file."""
+    """One mistake in a configuration file."""
 
     file: str
     """The file, or a description such as ``<dict>`` or ``--set``."""
@@ -111,7 +110,7 @@ class CommandError(HalError, ValueError):
 
 
 class DatasetError(HalError, ValueError):
-    """A file of a recording is missing, truncated, damaged, or does not fit the other files."""
+    """A file of a recording is missing, truncated or damaged, or does not fit the other files."""
 
     code = "bad_dataset"
 
@@ -129,7 +128,7 @@ class DatasetError(HalError, ValueError):
 
 
 class Unreachable(HalError, ValueError):
-    """No joint position inside the limits reaches the pose."""
+    """No joint position within the limits reaches the pose."""
 
     code = "unreachable"
 
@@ -138,22 +137,22 @@ class Unreachable(HalError, ValueError):
     ) -> None:
         super().__init__(f"{message} (closest found: {position_error:.4f} m, {rotation_error:.4f} rad away)")
         self.position_error = position_error
-        """Distance of the closest position found, in m."""
+        """Distance of the closest position found, m."""
         self.rotation_error = rotation_error
-        """Angle to the closest orientation found, in rad."""
+        """Angle to the closest orientation found, rad."""
         self.q = q
-        """The closest joint positions found, in rad, where there are any."""
+        """The closest joint positions found (n,), rad; None if there are none."""
 
 
 class DriverMissing(HalError, ImportError):
-    """A driver's library is not installed. The message names the command that installs it."""
+    """A driver's library is not installed. The message has the command that installs it."""
 
     code = "driver_missing"
 
     def __init__(self, *args: object, name: str | None = None, code: str | None = None) -> None:
         super().__init__(*args, code=code)
         self.name = name
-        """The library, as for any ImportError; None where there is no single one."""
+        """Import name of the library, as for any ImportError; None if there is no single one."""
 
 
 class DeviceNotFound(HalError, LookupError):
@@ -163,14 +162,14 @@ class DeviceNotFound(HalError, LookupError):
 
 
 class ConnectionLost(HalError, ConnectionError):
-    """A device, or the process that owned it, does not answer any more."""
+    """A device, or the process that owns it, does not answer."""
 
     code = "connection_lost"
 
     fault: Fault | None = None
-    """Cause and remedy, where the driver knows them."""
+    """Cause and remedy, if the driver reported them."""
     final: bool = False
-    """True where nothing will bring the device back (a recording has ended): nobody looks for it any more."""
+    """Whether the device cannot come back (a recording has ended); there is then no attempt to reconnect."""
 
 
 class StaleStateError(HalError, TimeoutError):
@@ -180,7 +179,10 @@ class StaleStateError(HalError, TimeoutError):
 
 
 class MotionStopped(HalError, RuntimeError):
-    """A stop is latched: nothing moves until it is acknowledged (see ``Control.rearm``)."""
+    """A stop is latched: nothing moves until it is acknowledged (see ``Control.rearm``).
+
+    ``code`` is that of the trip (:attr:`hal.Trip.code`), or names another reason, for example ``deadman_released``.
+    """
 
     code = "motion_stopped"
 
@@ -191,7 +193,7 @@ class MotionStopped(HalError, RuntimeError):
 
 
 class RobotFault(HalError, RuntimeError):
-    """The robot reports a fault. ``recover()`` is the user's own act."""
+    """The robot, or a gripper, reports a fault. Only the user clears it, with ``recover()``."""
 
     code = "robot_fault"
 
@@ -202,12 +204,12 @@ class RobotFault(HalError, RuntimeError):
 
 
 class ControlTaken(HalError, RuntimeError):
-    """Another control session owns this arm."""
+    """Another control session, or another program, controls this device."""
 
     code = "control_taken"
 
 
 class NotSupported(HalError, NotImplementedError):
-    """This driver, or this rig, cannot do that. The message says what can."""
+    """This driver or this rig cannot do that. The message names what can."""
 
     code = "not_supported"

@@ -1,10 +1,10 @@
-"""A gripper: the driver's abstract class and the public class. Widths in metres."""
+"""A gripper of an arm: its state, and motions that block or run in the background. Widths are in m."""
 
 from __future__ import annotations
 
 import threading
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NoReturn
 
 from ._moved import names_of
 from .arguments import number
@@ -24,84 +24,23 @@ __all__ = [
     "GripperResult",
 ]
 
-# [gripper_motion.py] A motion of a gripper that was started: is it over, and how did it end?
-
-_SHORTEST_LOOK = 0.01
+_SHORTEST_WAIT = 0.01
+"""Shortest time between two checks of a motion, s."""
 _PATIENCE = 2.0
-"""A gripper that is busy may say nothing new for so long, s."""
-_ON_ITS_WAY = (GripperOutcome.NONE, GripperOutcome.RUNNING)
-
-
-@dataclass(frozen=True, slots=True)
-class GripperResult:
-    """How a motion ended. True where the fingers did what they were told."""
-
-    outcome: GripperOutcome
-    state: GripperState
-    """The gripper when the end was first seen."""
-    fault: Fault | None
-    """Why it failed, where it did."""
-
-    def __bool__(self) -> bool:
-        return self.outcome is GripperOutcome.DONE
-
-
-class GripperMotion:
-    """A motion under way. Made by :meth:`hal.gripper.Gripper.start` and its siblings; nothing depends on keeping it."""
-
-    def __init__(self, gripper: Gripper, seq: int) -> None:
-        self._gripper = gripper
-        self._seq = seq
-        self._result: GripperResult | None = None
-
-    @property
-    def done(self) -> bool:
-        """Is it over, however it ended? Never waits; raises ConnectionLost or StaleStateError when nobody can tell."""
-        if self._look() is None:
-            self._gripper.state(_PATIENCE)
-        return self._result is not None
-
-    def wait(self, timeout: float = 10.0) -> GripperResult:
-        """Wait until it is over; in lock-step this makes time go on.
-
-        A motion that a newer command or a stop ended is ``STOPPED``. Raises TimeoutError after ``timeout`` s,
-        ConnectionLost when the gripper does not answer, StaleStateError when it says nothing new for 2 s.
-        """
-        gripper = self._gripper
-        clock = gripper.clock
-        deadline = clock.now() + timeout
-        period = max(_SHORTEST_LOOK, gripper.period)
-        while (result := self._look()) is None:
-            state = gripper.state(_PATIENCE)
-            if clock.now() >= deadline:
-                raise TimeoutError(f"{gripper.name} is still moving after {timeout:g} s: {state}")
-            clock.sleep(period)
-        return result
-
-    def _look(self) -> GripperResult | None:
-        """The result, once there is one."""
-        state = self._gripper.newest() if self._result is None else None
-        if self._result is None and state is not None:
-            if state.target_seq > self._seq:
-                self._result = GripperResult(GripperOutcome.STOPPED, state, None)
-            elif state.target_seq == self._seq and state.outcome not in _ON_ITS_WAY:
-                failed = state.outcome is GripperOutcome.FAILED
-                self._result = GripperResult(state.outcome, state, state.fault if failed else None)
-        return self._result
-
-    def __repr__(self) -> str:
-        how = self._result.outcome if self._result is not None else "not over when it was looked at last"
-        return f"<GripperMotion {self._seq} of {self._gripper.name}: {how}>"
+"""Greatest age of a state while a motion runs, s: some grippers send none while they are busy."""
+_UNFINISHED = (GripperOutcome.NONE, GripperOutcome.RUNNING)
 
 
 class Gripper:
-    """The gripper of an arm. The newest command wins; fingers keep what they hold when a session ends or trips.
+    """The gripper of an arm, the same for every driver. The newest command replaces the one before.
 
-    ``move``, ``grasp``, ``home``, ``open`` and ``grip`` wait until the fingers rest. They raise RobotFault, with cause
-    and remedy, when the gripper failed, MotionStopped when a stop or a newer command came first, TimeoutError, and
-    ConnectionLost. ``start``, ``start_grasp`` and ``start_home`` return at once, with a motion to ask or to wait for.
-    All of them raise CommandError for numbers that the gripper cannot do, and MotionStopped while ``rig.stop()`` is
-    latched.
+    ``move``, ``grasp``, ``home``, ``open`` and ``grip`` block until the fingers rest; ``start``, ``start_grasp`` and
+    ``start_home`` return at once, with a :class:`GripperMotion`. Fingers keep what they hold when a session ends or
+    trips.
+
+    Every command raises CommandError for values that the gripper cannot do, MotionStopped while ``rig.stop()`` is
+    latched, and ConnectionLost. The blocking ones also raise RobotFault, with cause and remedy, if the gripper failed,
+    MotionStopped if a stop or a newer command came first (``code`` is ``gripper_stopped``), and TimeoutError.
     """
 
     def __init__(self, spec: GripperSpec, robot: str, host: Host, clock: Clock, latch: StopLatch) -> None:
@@ -116,7 +55,7 @@ class Gripper:
         self._motion: GripperMotion | None = None
         self._sending = threading.RLock()  # a signal handler may call stop() in the middle of a command
 
-    # How it is.
+    # State.
 
     @property
     def width_max(self) -> float:
@@ -125,28 +64,33 @@ class Gripper:
 
     @property
     def period(self) -> float:
-        """New states come about this often, s."""
+        """Time between two states, s."""
         return 1.0 / self._host.spec.rate_hz
 
     def check(self) -> None:
-        """Raise ConnectionLost when the process that owns the gripper is gone."""
+        """Raise ConnectionLost if the process that owns the gripper is gone."""
         self._host.check()
 
     def newest(self) -> GripperState | None:
-        """The newest state, however old; None before the first one."""
+        """Return the newest state of any age; None before the first."""
         found = self._mail.get()
         return None if found is None else found.state
 
     def state(self, max_age: float = 0.5) -> GripperState:
-        """The newest state.
+        """Return the newest state; never waits.
 
-        When it is older than ``max_age`` s: StaleStateError, or ConnectionLost where it is known that the gripper does
-        not answer. ConnectionLost, too, when the process that owns it is gone.
+        Args:
+            max_age: Greatest age of the state, s.
+
+        Raises:
+            StaleStateError: The newest state is older than ``max_age``, or there is none yet (``code`` is
+                ``no_state``).
+            ConnectionLost: It is older, and the gripper is known not to answer; or the process that owns it is gone.
         """
         self.check()
         found = self._mail.get()
         if found is None:
-            raise StaleStateError(f"the gripper of {self._robot} has not reported a state yet")
+            raise StaleStateError(f"the gripper of {self._robot} has not reported a state yet", code="no_state")
         age = self.clock.now() - found.state.stamp.t
         if not age <= max_age:
             number("max_age", max_age, "s")
@@ -157,22 +101,22 @@ class Gripper:
         return found.state
 
     def state_at(self, t: float) -> GripperState:
-        """The state at ``t`` (s on ``rig.clock``), interpolated; as :meth:`hal.robot.Robot.state_at`."""
+        """Return the state at ``t`` (s on ``rig.clock``), interpolated; as :meth:`hal.robot.Robot.state_at`."""
         from .interpolation import gripper_at
 
         self.check()
         return gripper_at(self._mail.history, t, f"the gripper of {self._robot}")
 
     def states(self, after: float) -> list[GripperState]:
-        """Every state that is newer than ``after`` (s on ``rig.clock``), oldest first; the last second is kept."""
+        """Return all states of the last second that are newer than ``after`` (s on ``rig.clock``), oldest first."""
         self.check()
         return self._mail.history.since(after)
 
     @property
     def trouble(self) -> str:
-        """Why commands do not move the fingers: nobody answers, or the newest command failed. Empty when they do.
+        """Reason why commands do not move the fingers (no answer, or the newest command failed); empty if they do.
 
-        Never waits: for loops that go on without a gripper.
+        Never waits or raises; for control loops that continue without a gripper.
         """
         try:
             state = self.state()
@@ -182,15 +126,21 @@ class Gripper:
         return f"the gripper of {self._robot} failed: {state.fault}" if failed else ""
 
     def width_of(self, fraction: float) -> float:
-        """Width in m of a grip from 0 (open) to 1 (closed). CommandError outside that."""
+        """Return the width in m of a grip from 0 (open) to 1 (closed). CommandError for other values."""
         grip = number("a grip, from 0 (open) to 1 (closed),", fraction, least=0.0, most=1.0)
         return (1.0 - grip) * self.spec.width_max
 
     # Commands that return at once.
 
     def start(self, width: float, speed: float | None = None, force: float | None = None) -> GripperMotion:
-        """Start towards ``width`` (m) at ``speed`` (m/s) with at most ``force`` (N)."""
-        return self._begin(GripperAct.MOVE, *self._checked(width, speed, force))
+        """Start a motion of the fingers.
+
+        Args:
+            width: Distance between the fingers at the end, m.
+            speed: Speed, m/s, up to the gripper's own, which is the default.
+            force: Greatest force on an object in between, N; the gripper's default if left out.
+        """
+        return self._start_motion(GripperAct.MOVE, *self._checked(width, speed, force))
 
     def start_grasp(
         self,
@@ -200,24 +150,31 @@ class Gripper:
         inner: float = 0.005,
         outer: float = 0.005,
     ) -> GripperMotion:
-        """Start to close on something of about ``width`` (m) and hold it with ``force`` (N).
+        """Start to close on an object and hold it.
 
-        It is held when the fingers end between ``width - inner`` and ``width + outer`` (m); what is narrower, wider or
-        not there at all is ``MISSED``.
+        The object counts as held if the fingers end between ``width - inner`` and ``width + outer``; otherwise the
+        outcome is ``MISSED``.
+
+        Args:
+            width: Expected width of the object, m.
+            force: Force to hold it with, N; the gripper's default if left out.
+            speed: Speed, m/s, up to the gripper's own, which is the default.
+            inner: Greatest amount by which the object may be narrower, m.
+            outer: Greatest amount by which the object may be wider, m.
         """
         for name, value in (("inner", inner), ("outer", outer)):
             number(name, value, "m", least=0.0)
-        return self._begin(GripperAct.GRASP, *self._checked(width, speed, force), inner, outer)
+        return self._start_motion(GripperAct.GRASP, *self._checked(width, speed, force), inner, outer)
 
     def start_home(self) -> GripperMotion:
-        """Start to find out how far the fingers open. Some grippers need it once after they are switched on.
+        """Start to measure how far the fingers open. Some grippers need it once after they are switched on.
 
-        They open and close for it, and drop what they hold; grippers that need none do nothing.
+        The fingers open and close, and drop what they hold; grippers that need no homing do nothing.
         """
-        return self._begin(GripperAct.HOME)
+        return self._start_motion(GripperAct.HOME)
 
     def stop(self) -> None:
-        """Stay where the fingers are, with the force that they have. Returns at once; any thread may call it."""
+        """Stop the fingers where they are, with the present force. Returns at once; may be called from any thread."""
         self.check()
         self._put(self._host.stops, GripperAct.STOP)
 
@@ -230,7 +187,7 @@ class Gripper:
             number("force", force, "N", least=0.0, above=True),
         )
 
-    def _begin(self, act: GripperAct, *numbers: float) -> GripperMotion:
+    def _start_motion(self, act: GripperAct, *numbers: float) -> GripperMotion:
         stops = self._host.stops  # before the latch: a stop that comes after this line ends the motion
         self._latch.check()
         self.check()
@@ -239,7 +196,7 @@ class Gripper:
             return self._motion
 
     def _send(self, width: float, speed: float, force: float) -> None:
-        """Start a motion out of a loop that drives an arm: nobody has to be there, and nothing waits."""
+        """Start a motion from a control loop: no error if the gripper does not answer, and no wait."""
         stops = self._host.stops
         if not self._latch.stopped:
             self._put(stops, GripperAct.MOVE, width, speed, force)
@@ -247,7 +204,7 @@ class Gripper:
     def _put(self, stops: int, act: GripperAct, *numbers: float) -> int:
         with self._sending:
             if self._motion is not None:
-                self._motion._look()  # how it ended cannot be seen any more after the next command
+                self._motion._find_result()  # its outcome is lost once the next command is sent
             self._commands += 1
             self._mail.put_command(GripperCommand(self._commands, stops, act, *numbers))
             return self._commands
@@ -257,7 +214,14 @@ class Gripper:
     def move(
         self, width: float, speed: float | None = None, force: float | None = None, timeout: float = 10.0
     ) -> GripperState:
-        """Move to ``width`` and wait until the fingers rest: there, or on what they hold."""
+        """Move to ``width`` and wait until the fingers rest, there or on an object; see :meth:`start`.
+
+        Args:
+            width: Distance between the fingers at the end, m.
+            speed: Speed, m/s.
+            force: Greatest force, N.
+            timeout: Longest time to wait, s.
+        """
         return self._finish(self.start(width, speed, force), timeout).state
 
     def grasp(
@@ -269,22 +233,24 @@ class Gripper:
         outer: float = 0.005,
         timeout: float = 10.0,
     ) -> bool:
-        """Close on something of about ``width`` and wait: True when it is held. See :meth:`start_grasp`."""
+        """Close on an object of about ``width`` (m) and wait; return whether it is held. See :meth:`start_grasp`."""
         return bool(self._finish(self.start_grasp(width, force, speed, inner, outer), timeout))
 
     def home(self, timeout: float = 30.0) -> GripperState:
-        """Find out how far the fingers open, and wait: see :meth:`start_home`."""
+        """Measure how far the fingers open, and wait; see :meth:`start_home`."""
         result = self._finish(self.start_home(), timeout)
         if not result:
-            raise RobotFault(f"{self.name} did not finish homing", "see that nothing is between its fingers; try again")
+            raise RobotFault(
+                f"{self.name} did not finish homing", "clear the space between its fingers, then try again"
+            )
         return result.state
 
     def grip(self, fraction: float, force: float | None = None) -> GripperState:
-        """Close by a fraction from 0 (open) to 1 (closed) and wait: a helper on top of :meth:`move`."""
+        """Close by a fraction from 0 (open) to 1 (closed) and wait."""
         return self.move(self.width_of(fraction), force=force)
 
     def open(self) -> GripperState:
-        """Open all the way and wait."""
+        """Open completely and wait."""
         return self.move(self.spec.width_max)
 
     def _finish(self, motion: GripperMotion, timeout: float) -> GripperResult:
@@ -295,16 +261,97 @@ class Gripper:
         if result.outcome is GripperOutcome.STOPPED:
             self._latch.check()
             raise MotionStopped(
-                f"{self.name} was stopped, or got a newer command, before it was there", code="gripper_stopped"
+                f"{self.name} was stopped, or got a newer command, before the end", code="gripper_stopped"
             )
         return result
 
-    def inject(self, **knobs: object) -> None:
-        """Switch faults of a simulated driver on or off, for tests."""
-        self._host.request("inject_gripper", {"gripper": self.name, "knobs": knobs})
+    def inject(self, **faults: object) -> None:
+        """Switch faults of a simulated driver on or off, for tests; see the driver's own ``inject``."""
+        self._host.request("inject_gripper", {"gripper": self.name, "faults": faults})
+
+    if not TYPE_CHECKING:  # so that type checkers still report unknown attributes
+
+        def __getattr__(self, name: str) -> NoReturn:
+            hint = "; the rig closes the device; to close the fingers use grip(1.0)" if name == "close" else ""
+            raise AttributeError(f"a gripper has no attribute {name!r}{hint}", name=name, obj=self)
 
     def __repr__(self) -> str:
         return f"<Gripper of {self._robot}: 0..{self.spec.width_max:g} m, driver {self.spec.driver}>"
+
+
+class GripperMotion:
+    """A motion that was started by ``start``, ``start_grasp`` or ``start_home``; it does not depend on this object."""
+
+    def __init__(self, gripper: Gripper, seq: int) -> None:
+        self._gripper = gripper
+        self._seq = seq
+        self._result: GripperResult | None = None
+
+    @property
+    def done(self) -> bool:
+        """Whether the motion is over, with any outcome; never waits.
+
+        Raises:
+            ConnectionLost: The gripper does not answer.
+            StaleStateError: It has sent no state for 2 s.
+        """
+        if self._find_result() is None:
+            self._gripper.state(_PATIENCE)
+        return self._result is not None
+
+    def wait(self, timeout: float = 10.0) -> GripperResult:
+        """Wait until the motion is over; in lock-step this advances time.
+
+        Args:
+            timeout: Longest time to wait, s.
+
+        Returns:
+            The result; ``STOPPED`` if a newer command or a stop ended the motion.
+
+        Raises:
+            TimeoutError: After ``timeout``; the motion continues.
+            ConnectionLost: The gripper does not answer.
+            StaleStateError: It has sent no state for 2 s.
+        """
+        gripper = self._gripper
+        clock = gripper.clock
+        deadline = clock.now() + timeout
+        period = max(_SHORTEST_WAIT, gripper.period)
+        while (result := self._find_result()) is None:
+            state = gripper.state(_PATIENCE)
+            if clock.now() >= deadline:
+                raise TimeoutError(f"{gripper.name} is still moving after {timeout:g} s: {state}")
+            clock.sleep(period)
+        return result
+
+    def _find_result(self) -> GripperResult | None:
+        """Return the result, or None while the motion runs."""
+        state = self._gripper.newest() if self._result is None else None
+        if self._result is None and state is not None:
+            if state.target_seq > self._seq:
+                self._result = GripperResult(GripperOutcome.STOPPED, state, None)
+            elif state.target_seq == self._seq and state.outcome not in _UNFINISHED:
+                failed = state.outcome is GripperOutcome.FAILED
+                self._result = GripperResult(state.outcome, state, state.fault if failed else None)
+        return self._result
+
+    def __repr__(self) -> str:
+        how = self._result.outcome if self._result is not None else "running when last checked"
+        return f"<GripperMotion {self._seq} of {self._gripper.name}: {how}>"
+
+
+@dataclass(frozen=True, slots=True)
+class GripperResult:
+    """Outcome of a motion that is over. It is true if the outcome is ``DONE``."""
+
+    outcome: GripperOutcome
+    state: GripperState
+    """State of the gripper when the end was first seen."""
+    fault: Fault | None
+    """Why it failed; None if it did not."""
+
+    def __bool__(self) -> bool:
+        return self.outcome is GripperOutcome.DONE
 
 
 __getattr__ = names_of(__name__)

@@ -1,4 +1,8 @@
-"""An arm: the driver's abstract class (small, talks to one device) and the public class (see below)."""
+"""An arm of a rig: its state, its kinematics, and blocking motions.
+
+:class:`Robot` is what research code uses, the same for every driver. Commands are streamed in a session
+(:meth:`Robot.control`, :class:`hal.control.Control`); :meth:`Robot.move_to` needs none.
+"""
 
 from __future__ import annotations
 
@@ -24,81 +28,24 @@ if TYPE_CHECKING:
     from .kinematics.arm import Kinematics
     from .specs import LimitsSpec, RobotSpec
 
-__all__ = [
-    "Robot",
-    "move_to",
-]
+__all__ = ["Robot"]
 
-# [moving.py] ``move_to``: a session that goes to one place and ends there.
-
-
-def move_to(
-    robot: Robot,
-    target: ArrayLike | Pose | None,
-    position: ArrayLike | None,
-    *,
-    deadman: Deadman | None,
-    unattended: bool,
-    speed: float | None,
-    tcp_speed: float | None,
-    timeout: float | None,
-    patience: float,
-) -> RobotState:
-    """See :meth:`hal.robot.Robot.move_to`."""
-    if patience != math.inf:
-        number("patience", patience, "s", least=0.0)
-    if timeout is not None:
-        number("timeout", timeout, "s", least=0.0, above=True)
-    check_deadman(deadman)
-    if (target is None) == (position is None):
-        raise CommandError("pass move_to either a target (joint positions or a hal.Pose) or position=")
-    if position is not None:
-        target = Pose(vector("position", position, 3), robot.state().tcp_set.orientation)
-    goal = robot.ik(target) if isinstance(target, Pose) else vector("target", target)
-    if goal.size != robot.n:
-        hint = "; for a position of the tcp pass position=" if goal.size == 3 else ""
-        raise CommandError(f"{robot.name} has {robot.n} joints; the target has {goal.size}{hint}")
-    limits = robot.limits
-    outside = np.flatnonzero((goal < limits.lower) | (goal > limits.upper))
-    if outside.size:
-        names = ", ".join(robot.joints[k] for k in outside)
-        raise CommandError(f"the target is outside the position limits of {names}")
-    session = Control(
-        robot,
-        deadman=deadman,
-        rate_hz=50.0,
-        speed=speed,
-        tcp_speed=tcp_speed,
-        unattended=unattended,
-        goal=tuple(goal.tolist()),
-    )
-    clock = robot.clock
-    start = held = clock.now()
-    with session:
-        for _ in clock.rate(50.0):
-            servo = session._peek()
-            session._check_trip(servo, clock.now())
-            if servo.refused and servo.session == session._id:
-                raise CommandError(f"the way to the target leaves the workspace of {robot.name}")
-            if servo.arrived and servo.session == session._id:
-                break
-            if deadman is None or deadman.held:
-                held = clock.now()
-            elif clock.now() - held > patience:
-                raise MotionStopped(
-                    f"the dead-man was not held for {patience:g} s", "call move_to again", code="deadman_released"
-                )
-            if timeout is not None and clock.now() - start > timeout:
-                raise TimeoutError(f"{robot.name} did not reach the target within {timeout:g} s")
-    return robot.state()
-
-
-_NEWS = 0.2
+_MOVE_RATE = 50.0
+"""Rate at which :meth:`Robot.move_to` checks its motion, Hz."""
+_FRESH_STATE = 0.2
 """Longest wait for a state after a recovery, s."""
 
 
 class Robot:
-    """One arm of a rig, the same whatever driver it ends in. Made by :func:`hal.open`."""
+    """One arm of a rig, the same for every driver; created by :func:`hal.open`.
+
+    Args:
+        spec: Record of the arm.
+        host: Process, or thread, that runs the arm's servo.
+        clock: The rig's clock.
+        latch: The rig's latched stop.
+        gripper: Gripper of this arm; None if it has none.
+    """
 
     def __init__(
         self, spec: RobotSpec, host: Host, clock: Clock, latch: StopLatch, gripper: Gripper | None = None
@@ -114,9 +61,9 @@ class Robot:
         self._open: Control | None = None
         self._kinematics: Kinematics | None = None
         self.gripper = gripper
-        """The gripper on this arm, if the model has one."""
+        """Gripper on this arm; None if the model has none."""
 
-    # What it is.
+    # The arm itself.
 
     @property
     def n(self) -> int:
@@ -130,17 +77,17 @@ class Robot:
 
     @property
     def home(self) -> NDArray[np.float64]:
-        """The model's home position (n,), rad."""
+        """Home position (n,) of the model, rad."""
         return frozen(self.spec.home)
 
     @property
     def base(self) -> Pose:
-        """Where the arm's base frame stands in the world, as the rig's file says."""
+        """Pose of the base frame in the world, from the rig file."""
         return Pose(self.spec.base_position, self.spec.base_orientation)
 
     @property
     def limits(self) -> LimitsSpec:
-        """Joint limits that the servo keeps."""
+        """Joint limits that the servo enforces."""
         return self.spec.limits
 
     @property
@@ -152,18 +99,23 @@ class Robot:
             self._kinematics = Kinematics(self.spec.kinematics)
         return self._kinematics
 
-    # What it does.
+    # State and kinematics.
 
     def state(self, max_age: float = 0.1) -> RobotState:
-        """The newest state.
+        """Return the newest state; never waits.
 
-        Raises StaleStateError when it is older than ``max_age`` s, ConnectionLost when the arm, or the process that
-        owns it, is gone.
+        Args:
+            max_age: Greatest age of the state, s.
+
+        Raises:
+            StaleStateError: The newest state is older than ``max_age``, or there is none yet (``code`` is
+                ``no_state``).
+            ConnectionLost: The arm, or the process that owns it, does not answer.
         """
         self._host.check()
         state = self._mail.get_state()
         if state is None:
-            raise StaleStateError(f"{self.name} has not reported a state yet")
+            raise StaleStateError(f"{self.name} has not reported a state yet", code="no_state")
         age = self.clock.now() - state.stamp.t
         if state.status is RobotStatus.LOST:
             reason = f": {state.fault.cause}; {state.fault.remedy}" if state.fault is not None else ""
@@ -174,9 +126,14 @@ class Robot:
         return state
 
     def state_at(self, t: float) -> RobotState:
-        """The state at ``t`` (s on ``rig.clock``), a picture's stamp for example: interpolated between two samples.
+        """Return the state at a given time, for example a frame's stamp, interpolated between two samples.
 
-        The last second is kept. Raises StaleStateError for a time that is older, or more than 50 ms in the future.
+        Args:
+            t: Time on ``rig.clock``, s. The states of the last second are kept.
+
+        Raises:
+            StaleStateError: ``t`` is older than that, or more than 50 ms in the future.
+            ConnectionLost: The process that owns the arm is gone.
         """
         from .interpolation import robot_at
 
@@ -184,29 +141,39 @@ class Robot:
         return robot_at(self._mail.history, t, self.name)
 
     def states(self, after: float) -> list[RobotState]:
-        """Every state that is newer than ``after`` (s on ``rig.clock``), oldest first.
+        """Return all kept states that are newer than ``after`` (s on ``rig.clock``), oldest first.
 
-        In real time one for each cycle of the last second, in lock-step one for each time that somebody waited.
+        The last second is kept: in real time one state per cycle, in lock-step one per wait of the program.
         """
         self._host.check()
         return self._mail.history.since(after)
 
     def check(self) -> None:
-        """Raise ConnectionLost when the process that owns the arm is gone: then nothing brings the arm back."""
+        """Raise ConnectionLost if the process that owns the arm is gone; the arm cannot come back then."""
         self._host.check()
 
     def fk(self, q: ArrayLike) -> Pose:
-        """Pose of the tcp in the base frame at joint positions ``q`` (n,), rad."""
+        """Return the pose of the tcp in the base frame at joint positions ``q`` (n,), rad."""
         return self.kinematics.pose(vector("q", q, self.n))
 
     def ik(self, pose: Pose, q_seed: ArrayLike | None = None) -> NDArray[np.float64]:
-        """Joint positions (n,) in rad that bring the tcp to ``pose`` (base frame), near ``q_seed`` or the present.
+        """Return joint positions that bring the tcp to a pose.
 
-        Raises Unreachable, with the residual in m and rad, where there are none.
+        Args:
+            pose: Pose of the tcp in the base frame, with an orientation.
+            q_seed: Joint positions (n,), rad, near which to search; the present ones by default.
+
+        Returns:
+            Joint positions (n,), rad.
+
+        Raises:
+            Unreachable: No joint positions within the limits were found; carries the residual.
         """
         pose = tcp_pose("pose", pose)
         seed = self.state().q if q_seed is None else vector("q_seed", q_seed, self.n)
         return self.kinematics.solve(pose, seed)
+
+    # Motion.
 
     def control(
         self,
@@ -217,14 +184,21 @@ class Robot:
         tcp_speed: float | None = None,
         unattended: bool = False,
     ) -> Control:
-        """A session in which this arm follows commands; use it in a ``with`` statement.
+        """Return a control session, in which this arm follows commands; use it in a ``with`` statement.
 
-        ``deadman`` lets it move only while held, ``rate_hz`` says how often commands will come (and so, when they
-        are late), ``speed`` is a share of the joint speed limits (the rig's own by default, which it cannot exceed),
-        ``tcp_speed`` a speed in m/s. An arm that really moves needs a dead-man or ``unattended=True``.
+        Args:
+            deadman: Switch that must be held for the arm to move, for example ``pad.hold("l2")``. An arm that really
+                moves needs one, or ``unattended=True``.
+            rate_hz: Rate at which commands will be sent; later ones trip the session.
+            speed: Share of the joint speed limits, up to the rig's own share, which is the default.
+            tcp_speed: Greatest speed of the tcp, m/s, up to the rig's own, which is the default.
+            unattended: Move an arm that really moves without a dead-man.
+
+        Raises:
+            CommandError: An invalid argument, or neither ``deadman`` nor ``unattended`` for an arm that really moves
+                (``code`` is ``deadman_required``).
+            NotSupported: The dead-man's pad is not safe enough for a real arm.
         """
-        from .control import Control
-
         return Control(self, deadman=deadman, rate_hz=rate_hz, speed=speed, tcp_speed=tcp_speed, unattended=unattended)
 
     def move_to(
@@ -239,56 +213,98 @@ class Robot:
         timeout: float | None = None,
         patience: float = 60.0,
     ) -> RobotState:
-        """Move to joint positions or to a tcp pose, straight in joint space; block until the arm is there.
+        """Move to joint positions or to a pose of the tcp, straight in joint space; block until the arm is there.
 
         Args:
             target: Joint positions (n,) in rad, or a pose of the tcp in the base frame with an orientation.
-            position: Position (3,) of the tcp in the base frame, m, instead of ``target``; its orientation stays as it
+            position: Position (3,) of the tcp in the base frame, m, instead of ``target``; the orientation stays as it
                 is.
-            deadman: The arm waits until it is held, and pauses while it is not.
+            deadman: Switch that must be held; the arm waits for it and pauses while it is released.
             unattended: Move an arm that really moves without a dead-man.
             speed: Share of the joint speed limits, up to 1; the rig's ``move_speed`` (0.1) by default.
-            tcp_speed: Greatest speed of the tcp, m/s; the rig's by default, which it cannot exceed.
-            timeout: After so many seconds the motion ends with TimeoutError; None waits for ever.
-            patience: For how long the dead-man may be released, s.
+            tcp_speed: Greatest speed of the tcp, m/s, up to the rig's own, which is the default.
+            timeout: Longest duration, s; None for no limit.
+            patience: Longest time for which the dead-man may be released, s.
 
         Returns:
             The state on arrival.
 
         Raises:
-            CommandError: For a target that makes no sense, or that is outside the limits or the workspace.
-            Unreachable: For a pose without joint positions.
-            MotionStopped: After a trip, or when the dead-man was released for longer than ``patience``.
+            CommandError: An invalid target (``code`` is ``outside_limits`` or ``outside_workspace`` for one that the
+                arm must not reach).
+            Unreachable: No joint positions for the pose.
+            MotionStopped: After a trip, or if the dead-man was released for longer than ``patience`` (``code`` is
+                ``deadman_released``).
             TimeoutError: After ``timeout``.
         """
-        # FOLD: import dropped
-
-        return move_to(
+        if patience != math.inf:
+            number("patience", patience, "s", least=0.0)
+        if timeout is not None:
+            number("timeout", timeout, "s", least=0.0, above=True)
+        check_deadman(deadman)
+        session = Control(
             self,
-            target,
-            position,
             deadman=deadman,
-            unattended=unattended,
+            rate_hz=_MOVE_RATE,
             speed=speed,
             tcp_speed=tcp_speed,
-            timeout=timeout,
-            patience=patience,
+            unattended=unattended,
+            goal=self._goal(target, position),
         )
+        clock = self.clock
+        start = held = clock.now()
+        with session:
+            for _ in clock.rate(_MOVE_RATE):
+                servo = session._peek()
+                session._check_trip(servo, clock.now())
+                if servo.refused and servo.session == session._id:
+                    raise CommandError(
+                        f"the way to the target leaves the workspace of {self.name}", code="outside_workspace"
+                    )
+                if servo.arrived and servo.session == session._id:
+                    break
+                if deadman is None or deadman.held:
+                    held = clock.now()
+                elif clock.now() - held > patience:
+                    raise MotionStopped(
+                        f"the dead-man was not held for {patience:g} s", "call move_to again", code="deadman_released"
+                    )
+                if timeout is not None and clock.now() - start > timeout:
+                    raise TimeoutError(f"{self.name} did not reach the target within {timeout:g} s")
+        return self.state()
+
+    def _goal(self, target: ArrayLike | Pose | None, position: ArrayLike | None) -> tuple[float, ...]:
+        """Return the joint positions (n,) in rad that ``move_to`` goes to, checked against the limits."""
+        if (target is None) == (position is None):
+            raise CommandError("pass move_to either a target (joint positions or a hal.Pose) or position=")
+        if position is not None:
+            target = Pose(vector("position", position, 3), self.state().tcp_set.orientation)
+        goal = self.ik(target) if isinstance(target, Pose) else vector("target", target)
+        if goal.size != self.n:
+            hint = "; for a position of the tcp pass position=" if goal.size == 3 else ""
+            raise CommandError(
+                f"{self.name} has {self.n} joints; the target has {goal.size}{hint}", code="wrong_joint_count"
+            )
+        outside = np.flatnonzero((goal < self.limits.lower) | (goal > self.limits.upper))
+        if outside.size:
+            names = ", ".join(self.joints[k] for k in outside)
+            raise CommandError(f"the target is outside the position limits of {names}", code="outside_limits")
+        return tuple(goal.tolist())
 
     def recover(self) -> None:
-        """Clear a fault of the device. It is always the user's own act. Afterwards :meth:`state` is newer than this."""
+        """Clear a fault of the device; only the user decides on it. :meth:`state` returns a newer state afterwards."""
         self._host.request("recover", {"robot": self.name})
         if self._host.spec.clock == "real_time":
-            asked = self.clock.now()
-            while (now := self.clock.now()) < asked + _NEWS:
+            start = self.clock.now()
+            while (now := self.clock.now()) < start + _FRESH_STATE:
                 state = self._mail.get_state()
-                if state is not None and state.stamp.t >= asked:
+                if state is not None and state.stamp.t >= start:
                     return
-                self.clock.sleep(min(0.001, asked + _NEWS - now))
+                self.clock.sleep(min(0.001, start + _FRESH_STATE - now))
 
-    def inject(self, **knobs: object) -> None:
-        """Switch faults of a simulated driver on or off, for tests; the driver's ``inject`` lists its knobs."""
-        self._host.request("inject", {"robot": self.name, "knobs": knobs})
+    def inject(self, **faults: object) -> None:
+        """Switch faults of a simulated driver on or off, for tests; see the driver's own ``inject``."""
+        self._host.request("inject", {"robot": self.name, "faults": faults})
 
     def __repr__(self) -> str:
         return f"<Robot {self.name}: {self.spec.model}, {self.n} joints, driver {self.spec.driver}>"

@@ -1,7 +1,7 @@
-"""What devices report: frozen records in SI units, read-only arrays, quaternions xyzw.
+"""States of devices: frozen records in SI units, with read-only arrays and quaternions x, y, z, w.
 
-The same records come from every driver. ``None`` means that the driver cannot know a value; nothing is ever
-filled in with zeros.
+Every driver yields the same records. None means that the driver cannot know a value; unknown values are never filled in
+with zeros.
 """
 
 from __future__ import annotations
@@ -39,52 +39,52 @@ __all__ = [
 Array = NDArray[np.float64]
 
 STICK_AXES = ("left_x", "left_y", "right_x", "right_y", "l2", "r2", "dpad_x", "dpad_y")
-"""Names of a gamepad's axes. Sticks and d-pad in -1..1, right and up positive; triggers in 0..1."""
+"""Axes of a gamepad with sticks. Sticks and d-pad in -1..1, right and up positive; triggers in 0..1."""
 
 CAP_AXES = ("push_x", "push_y", "push_z", "turn_x", "turn_y", "turn_z")
-"""Names of the axes of a pad whose one cap moves in every direction (a SpaceMouse), -1..1: pushed forwards, to the
-left and up, and turned about these, right-handed. So they are those of an arm's base frame for whoever stands behind
+"""Axes of a pad with one cap that moves in all directions (a SpaceMouse), -1..1: pushed forward, left and up, and
+rotated about these directions, right-handed. They match the axes of an arm's base frame for a user who stands behind
 it."""
 
 AXES = STICK_AXES + CAP_AXES
-"""Names of all axes that a pad may have."""
+"""All axes that a pad may have."""
 
 BUTTONS = ("south", "east", "west", "north", "l1", "r1", "l2", "r2", "select", "start", "l3", "r3", "home", "touchpad")
-"""Names of a pad's buttons, by place rather than by print: ``south`` is Cross on a Sony pad and A on an Xbox pad."""
+"""Buttons of a pad, named by position: ``south`` is Cross on a Sony pad and A on an Xbox pad."""
 
 
 @dataclass(frozen=True, slots=True)
 class Stamp:
-    """When something was measured."""
+    """Time of a measurement."""
 
     t: float
-    """Seconds on ``rig.clock``: the host's monotonic clock, or simulated time in lock-step."""
+    """Time on ``rig.clock``, s: the host's monotonic clock, or simulated time in lock-step."""
     t_device: float
-    """Seconds on the device's own clock (the robot's, the sensor's or the simulated world's)."""
+    """Time on the device's own clock (the robot's, the sensor's or the simulated world's), s."""
     seq: int
-    """Counts samples; a gap is a sample that was lost."""
+    """Number of the sample; a gap is a lost sample."""
 
 
 class _Named(IntEnum):
-    """A number on the wire, a name for people."""
+    """An integer enum that prints as its name in lower case."""
 
     def __str__(self) -> str:
         return self.name.lower()
 
 
 class RobotStatus(_Named):
-    """What the arm is doing."""
+    """What an arm is doing."""
 
     IDLE = 0
     """No control session; the device holds by itself."""
     FOLLOWING = 1
-    """A session is open and motion is allowed."""
+    """In a session, and allowed to move."""
     STOPPING = 2
     """Braking, within the limits."""
     HOLDING = 3
-    """A session is open, the arm is at rest: the dead-man is released, or nothing was commanded yet."""
+    """In a session, at rest: the dead-man is released, or there was no command yet."""
     TRIPPED = 4
-    """At rest or braking after a trip; latched (see :class:`Trip`)."""
+    """Braking or at rest after a trip, which is latched (see :class:`Trip`)."""
     FAULT = 5
     """The device reports a fault."""
     LOST = 6
@@ -92,33 +92,33 @@ class RobotStatus(_Named):
 
 
 class Trip(_Named):
-    """Why a stop was latched."""
+    """Reason for which a stop was latched."""
 
     NONE = 0
     COMMAND_LATE = 1
     """No command came before the deadline of the last one."""
     DEADMAN_SILENT = 2
-    """The dead-man's pad gave no sign of life within the limit."""
+    """The pad of the dead-man sent nothing within the limit."""
     DEADMAN_LOST = 3
-    """The dead-man's pad was disconnected."""
+    """The pad of the dead-man was disconnected."""
     STOP = 4
     """``rig.stop()`` was called."""
     APP_SILENT = 5
-    """The app's process does not answer: stopped, swapped out or in a debugger."""
+    """The program does not run: it is stopped, swapped out or in a debugger."""
     FAULT = 6
     """The robot reported a fault."""
     DEVICE_LOST = 7
     """The robot does not answer."""
     BAD_READING = 8
-    """The robot reported numbers that cannot be."""
+    """The robot reported impossible values."""
     HOST_LATE = 9
-    """The servo's own process was stopped, or could not run, for too long."""
+    """The process of the servo was stopped, or could not run, for too long."""
     LIMIT = 10
-    """Driven by torques, the arm came to a limit: of speed, of position, of the workspace, or of the time to brake."""
+    """In torque mode the arm reached a limit: of speed, of position, of the workspace, or of the time to brake."""
 
     @property
     def code(self) -> str:
-        """Stable identifier of the reason, which the ``MotionStopped`` of this trip carries, such as ``pad_lost``."""
+        """Stable identifier, such as ``pad_lost``; the ``MotionStopped`` of this trip has the same ``code``."""
         return _TRIP_CODES[self]
 
 
@@ -138,24 +138,24 @@ _TRIP_CODES = {
 
 
 class GripperOutcome(_Named):
-    """How a gripper's newest command went."""
+    """Outcome of a gripper's newest command."""
 
     NONE = 0
-    """There was none."""
+    """No command was sent."""
     RUNNING = 1
-    """The fingers are on their way."""
+    """The fingers are moving."""
     DONE = 2
-    """They are where they should be, or, after a grasp, hold something of the right width."""
+    """The fingers reached the width or, after a grasp, hold an object of the right width."""
     MISSED = 3
-    """They rest somewhere else, or closed on nothing."""
+    """The fingers rest at another width, or closed on nothing."""
     STOPPED = 4
-    """``stop()`` or a newer command ended it."""
+    """Ended by ``stop()`` or by a newer command."""
     FAILED = 5
-    """The gripper refused it; its fault says why."""
+    """Refused by the gripper; its fault has the reason."""
 
 
 class Limited(IntFlag):
-    """What the servo held back in this tick."""
+    """Limits by which the servo reduced the motion in this tick."""
 
     def __str__(self) -> str:
         names = [flag.name or "" for flag in type(self) if flag and flag in self]
@@ -163,26 +163,26 @@ class Limited(IntFlag):
 
     NONE = 0
     SPEED = 1
-    """The commanded motion was slowed to the session's joint speed."""
+    """The motion was slowed to the session's joint speed."""
     TCP_SPEED = 2
-    """The commanded motion was slowed to the tcp speed."""
+    """The motion was slowed to the tcp speed."""
     POSITION = 4
     """A joint limit is near; the motion towards it was slowed or stopped."""
     WORKSPACE = 8
-    """The workspace's boundary is near; the motion towards it was slowed or stopped."""
+    """The boundary of the workspace is near; the motion towards it was slowed or stopped."""
     LEAD = 16
-    """The goal ran ahead of the arm and was held back."""
+    """The goal was too far ahead of the arm and was held back."""
     SINGULAR = 32
-    """The arm is close to a singularity and does not follow the commanded direction exactly."""
+    """The arm is close to a singularity and does not exactly follow the commanded direction."""
     REANCHORED = 64
-    """The device had not taken the last set-point; the motion goes on from where it says it is."""
+    """The device did not take the last set-point; the motion continues from the position that it reports."""
     TORQUE = 128
     """The commanded torques were cut to the torque limits."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RobotState:
-    """An arm, in its own base frame. ``n`` is the number of joints."""
+    """State of an arm with ``n`` joints; poses and twists are in its base frame."""
 
     stamp: Stamp
     q: Array
@@ -192,32 +192,33 @@ class RobotState:
     tau: Array | None
     """Measured joint torques (n,), Nm."""
     q_set: Array
-    """Joint set-point (n,), rad: what was last written to the device."""
+    """Joint set-point (n,) that was last written to the device, rad."""
     dq_set: Array
     """Velocity of the set-point (n,), rad/s."""
     tcp: Pose
-    """Tool centre point: forward kinematics of ``q``."""
+    """Pose of the tool centre point: forward kinematics of ``q``."""
     tcp_set: Pose
-    """Tool centre point of ``q_set``."""
+    """Pose of the tool centre point at ``q_set``."""
     tcp_twist: Array
-    """Measured (6,) linear velocity in m/s and angular velocity in rad/s of the tcp, along the base's axes."""
+    """Measured linear velocity in m/s, then angular velocity in rad/s, of the tcp (6,), along the axes of the base."""
     tau_ext: Array | None
-    """External joint torques (n,), Nm, where the device estimates them."""
+    """External joint torques (n,), Nm; None if the device does not estimate them."""
     wrench_ext: Array | None
-    """External force and torque (6,), N and Nm, at the tcp, where the device estimates them."""
+    """External force and torque at the tcp (6,), N and Nm; None if the device does not estimate them."""
     status: RobotStatus
     trip: Trip
-    """Why a stop is latched; ``Trip.NONE`` when none is."""
+    """Reason for the latched stop; ``Trip.NONE`` if no stop is latched."""
     fault: Fault | None
+    """The device's fault; None if it reports none."""
     limited: Limited
-    """What the servo held back in this tick, and why."""
+    """Limits by which the servo reduced the motion in this tick."""
     target_seq: int
-    """Number of the command that the set-point follows; 0 before the first one."""
+    """Number of the command that the set-point follows; 0 before the first."""
 
 
 @dataclass(frozen=True, slots=True)
 class GripperState:
-    """A parallel gripper."""
+    """State of a gripper with two fingers."""
 
     stamp: Stamp
     width: float
@@ -226,68 +227,68 @@ class GripperState:
     """Width of the newest command, m."""
     moving: bool
     grasped: bool | None
-    """True while the fingers press on something short of the target; None where the driver cannot know."""
+    """Whether the fingers press on an object; None if unknown."""
     force: float | None
-    """Grip force, N, where the driver knows it."""
+    """Grip force, N; None if unknown."""
     outcome: GripperOutcome
-    """How the newest command went."""
+    """Outcome of the newest command."""
     fault: Fault | None
-    """Why it failed, or why the gripper does not answer, with what to do about it."""
+    """Why the newest command failed, or why the gripper does not answer, with the remedy."""
     target_seq: int
-    """Number of the newest command that the gripper took; 0 before the first one."""
+    """Number of the newest command that the gripper took; 0 before the first."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Frame:
-    """One capture of one camera, upright, in OpenCV's axes (x right, y down, z forward). Arrays are read-only."""
+    """One capture of one camera: upright images in OpenCV's axes (x right, y down, z forward). Arrays are read-only."""
 
     stamp: Stamp
     color: NDArray[np.uint8] | None
     """(H, W, 3) RGB."""
     depth: NDArray[np.float32] | None
-    """(H, W) metres along the optical axis, aligned to colour; 0 where there is no measurement."""
+    """(H, W) distance along the optical axis, m, aligned to colour; 0 where nothing was measured."""
     infrared: NDArray[np.uint8] | None
-    """(H, W), of the left imager where there are two; in its own view (``camera.info.K_infrared``), never aligned."""
+    """(H, W) of the left imager, in its own view (``camera.info.K_infrared``); never aligned."""
     segmentation: NDArray[np.int32] | None
-    """(H, W) number of the body in ``rig.world.bodies``, -1 for none; simulation only, on request."""
+    """(H, W) index into ``rig.world.bodies``, -1 for none; simulation only, if the rig enables it."""
     K: Array
     """(3, 3) camera matrix, pixels; the centre of the upper left pixel is (0, 0)."""
     distortion: Array
     """(5,) k1, k2, p1, p2, k3 (OpenCV's order)."""
     T_world_camera: Pose | None
-    """Pose of the camera in the world when the frame was taken, where it is known."""
+    """Pose of the camera in the world at the time of the frame; None if unknown."""
     infrared_right: NDArray[np.uint8] | None = None
     """(H, W), of the right imager."""
     skew: float | None = None
-    """By how much colour was taken later than depth, s; None without both."""
+    """Time of the colour image minus that of the depth image, s; None without both."""
 
 
 @dataclass(frozen=True, slots=True)
 class PadState:
-    """A gamepad, whatever its make; dead zone applied."""
+    """State of a gamepad of any make, with the dead zone applied."""
 
     stamp: Stamp
     axes: Mapping[str, float] = field(default_factory=lambda: MappingProxyType({}))
-    """Values of :data:`AXES`."""
+    """Axis -> value; names of :data:`AXES`."""
     buttons: frozenset[str] = frozenset()
-    """Names (of :data:`BUTTONS`) that are pressed."""
+    """The buttons that are pressed; names of :data:`BUTTONS`."""
     connected: bool = False
 
     def axis(self, name: str) -> float:
-        """Value of an axis; 0 when the pad has no such axis. KeyError for a name that no pad has."""
+        """Return the value of an axis; 0 if this pad does not have it. KeyError for a name not in :data:`AXES`."""
         if name not in AXES:
             raise KeyError(f"{name!r} is no axis; axes: {', '.join(AXES)}")
         return self.axes.get(name, 0.0)
 
     def pressed(self, name: str) -> bool:
-        """Is the button pressed? KeyError for a name that no pad has."""
+        """Return whether a button is pressed. KeyError for a name not in :data:`BUTTONS`."""
         if name not in BUTTONS:
             raise KeyError(f"{name!r} is no button; buttons: {', '.join(BUTTONS)}")
         return name in self.buttons
 
 
 def as_dict(record: Any) -> dict[str, Any]:
-    """A record as plain lists and numbers, ready for JSON."""
+    """Return a record as nested dicts of plain lists, numbers and texts, ready for JSON."""
     from dataclasses import fields, is_dataclass
 
     def plain(value: Any) -> Any:

@@ -432,11 +432,11 @@ class Cycle:
     def _do_recover(self, robot: str) -> None:
         self._arm(robot).recover()
 
-    def _do_inject(self, robot: str, knobs: dict[str, Any]) -> None:
-        self._arm(robot).driver.inject(**knobs)
+    def _do_inject(self, robot: str, faults: dict[str, Any]) -> None:
+        self._arm(robot).driver.inject(**faults)
 
-    def _do_inject_gripper(self, gripper: str, knobs: dict[str, Any]) -> None:
-        self.grippers[gripper].driver.inject(**knobs)
+    def _do_inject_gripper(self, gripper: str, faults: dict[str, Any]) -> None:
+        self.grippers[gripper].driver.inject(**faults)
 
     def _do_warnings(self) -> list[str]:
         """Return what the simulation had to change in the files that it loaded."""
