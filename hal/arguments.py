@@ -1,4 +1,4 @@
-"""Checks of arguments. Each raises a CommandError that says what was passed, and what to pass instead."""
+"""Checks of arguments: each returns the value, or raises a CommandError that names the argument and what it must be."""
 
 from __future__ import annotations
 
@@ -28,15 +28,15 @@ def number(
     """Return one finite number from ``least`` to ``most``, as a float.
 
     Args:
-        name: Of the argument, for the message.
-        value: What was passed.
-        unit: Of the number, for the message.
-        least: The least that it may be.
-        most: The most that it may be; ``math.inf`` itself is allowed nowhere.
-        above: Whether it must be above ``least``, which is then 0, instead of at least that.
+        name: Name of the argument, for the message.
+        value: The argument.
+        unit: Unit, for the message.
+        least: Smallest value allowed.
+        most: Greatest value allowed; infinity itself never is.
+        above: Whether the value must be above ``least``, which is then 0, instead of at least that.
 
     Raises:
-        CommandError: It is no number, not finite, or out of the range.
+        CommandError: Not a number, not finite, or out of range.
     """
     try:
         if isinstance(value, (bool, str, bytes)) or np.ndim(value) != 0:
@@ -50,17 +50,17 @@ def number(
 
 
 def whole(name: str, value: Any, *, least: int) -> int:
-    """Return a whole number of at least ``least``. Raises CommandError for anything else."""
+    """Return an integer of at least ``least``. Raises CommandError for anything else."""
     if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < least:
         raise CommandError(f"{name} must be a whole number of at least {least}, not {_shown(value)}")
     return int(value)
 
 
 def vector(name: str, values: Any, size: int | None = None) -> Array:
-    """Return a read-only vector (size,) of finite numbers; None: of any size.
+    """Return a read-only vector (size,) of finite numbers; of any length if ``size`` is None.
 
     Raises:
-        CommandError: Another shape, no numbers, or one that is not finite.
+        CommandError: Another shape, not numbers, or a number that is not finite.
     """
     try:
         array = frozen(values)

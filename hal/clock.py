@@ -1,4 +1,4 @@
-"""``rig.clock``: the same loop waits in real time and steps a lock-step simulation."""
+"""``rig.clock``: a paced loop waits in real time, and advances the simulation in lock-step."""
 
 from __future__ import annotations
 
@@ -15,39 +15,39 @@ __all__ = ["Clock", "LockStepClock", "RealClock", "Tick"]
 
 _ROUNDING = 1e-9
 _LONGEST = 1e9
-"""s; nobody waits for 30 years."""
+"""Greatest time of a sleep, s."""
 
 
 class Tick(NamedTuple):
-    """One turn of a paced loop."""
+    """One iteration of a paced loop."""
 
     t: float
     """Time on the clock, s."""
     dt: float
-    """Time since the turn before, s: a whole number of periods."""
+    """Time since the last iteration, s: a whole number of periods."""
     missed: int
-    """Turns that were skipped because the loop's body took too long; they are never caught up."""
+    """Iterations that were skipped because the loop's body took too long; they are never made up for."""
     elapsed: float = 0.0
-    """Time since the loop's first turn, s: the same in real time and in lock-step."""
+    """Time since the loop's first iteration, s; the same in real time and in lock-step."""
 
 
 class Clock(ABC):
-    """Seconds that only go forward."""
+    """A clock that only moves forward, in s."""
 
     @abstractmethod
     def now(self) -> float:
-        """Seconds: the host's monotonic clock, or simulated time."""
+        """Return the time, s: of the host's monotonic clock, or of the simulation."""
 
     @abstractmethod
     def sleep_until(self, t: float) -> None:
-        """Return when the clock shows ``t``. In lock-step this is what makes time go on."""
+        """Wait until the clock shows ``t``, s. In lock-step this advances the simulation."""
 
     def sleep(self, seconds: float) -> None:
-        """Let ``seconds`` pass."""
+        """Wait for a duration, s. In lock-step this advances the simulation."""
         self.sleep_until(self.now() + number("seconds", seconds))
 
     def rate(self, hz: float) -> Iterator[Tick]:
-        """Turn for ever, ``hz`` times a second. The first turn comes at once.
+        """Yield a :class:`Tick` ``hz`` times a second, for ever; the first at once.
 
         Raises:
             CommandError: The rate is not positive, or not finite.
@@ -68,12 +68,14 @@ class Clock(ABC):
 
 
 class RealClock(Clock):
-    """The host's monotonic clock, the same in every process of this machine."""
+    """The host's monotonic clock, the same in every process of this computer."""
 
     def now(self) -> float:
+        """Return the time of the host's monotonic clock, s."""
         return time.monotonic()
 
     def sleep_until(self, t: float) -> None:
+        """Wait until the clock shows ``t``, s."""
         rest = t - time.monotonic()
         if rest > 0.0:
             time.sleep(rest if rest < _LONGEST else number("t", t, "s on this clock", most=_LONGEST))
@@ -82,51 +84,67 @@ class RealClock(Clock):
 
 
 class LockStepClock(Clock):
-    """Simulated time: it stands still until somebody waits, and then runs as fast as the machine can."""
+    """Simulated time: it stands still until the program waits, and then runs as fast as the computer can.
+
+    Args:
+        now: Returns the simulated time, s.
+        advance_to: Advances the simulation to a time, s.
+    """
 
     def __init__(self, now: Callable[[], float], advance_to: Callable[[float], None]) -> None:
         self._now = now
         self._advance_to = advance_to
         self._stops: list[_Stop] = []
         self._going = threading.RLock()
-        """Time goes on in one thread only."""
+        """Only one thread at a time advances the simulation."""
 
     def now(self) -> float:
+        """Return the simulated time, s."""
         return self._now()
 
     def sleep_until(self, t: float) -> None:
+        """Advance the simulation to ``t``, s."""
         if not abs(t) < _LONGEST:
             number("t", t, "s on this clock", most=_LONGEST)
         with self._going:
             while (stop := self._next(t)) is not None:
                 self._advance_to(stop.due)
-                stop.take(self._now())
+                stop.run(self._now())
             self._advance_to(t)
 
     def every(self, seconds: float, call: Callable[[], object]) -> Callable[[], None]:
-        """Have time stop every ``seconds`` from now on, whoever waits for however long, and ``call`` called there.
+        """Call a function at regular simulated times, from the thread that waits then.
 
-        It is called by the thread that waits, and what it raises is raised there. The function that comes back ends
-        this; any thread may call it, at any time, more than once. Raises CommandError for a time that is not positive.
+        An exception of the function is raised by that wait.
+
+        Args:
+            seconds: Period, s, counted from now.
+            call: The function.
+
+        Returns:
+            A function that ends the calls; any thread may call it, more than once.
+
+        Raises:
+            CommandError: The period is not positive.
         """
         number("seconds", seconds, least=0.0, above=True)
         stop = _Stop(self.now(), seconds, call)
         self._stops.append(stop)
 
         def detach() -> None:
-            with contextlib.suppress(ValueError):  # it was ended before
+            with contextlib.suppress(ValueError):  # already removed
                 self._stops.remove(stop)
 
         return detach
 
     def _next(self, t: float) -> _Stop | None:
-        """The first stop on the way to ``t``; of several at one time, the one that was there first."""
+        """Return the first stop up to ``t``; of several at the same time, the one that was added first."""
         ahead = [stop for stop in tuple(self._stops) if stop.due <= t + _ROUNDING]
         return min(ahead, key=lambda stop: stop.due, default=None)
 
 
 class _Stop:
-    """What is called at ``start`` and every ``period`` s from then on, but for the start itself."""
+    """A function that is called every ``period`` s after ``start``."""
 
     def __init__(self, start: float, period: float, call: Callable[[], object]) -> None:
         self._start = start
@@ -136,10 +154,10 @@ class _Stop:
 
     @property
     def due(self) -> float:
-        """When it is called next, s."""
+        """Time of the next call, s."""
         return self._start + self._number * self._period
 
-    def take(self, now: float) -> None:
-        """Call it; what lies behind by now is not caught up."""
+    def run(self, now: float) -> None:
+        """Call the function; calls that are overdue are skipped."""
         self._number = 1 + max(self._number, int((now - self._start) / self._period + _ROUNDING))
         self._call()

@@ -1,4 +1,9 @@
-"""What can be asked of an arm. Frozen, checked when made, SI units; frames are the arm's base frame unless said."""
+"""Commands to an arm: frozen records in SI units, checked when they are created.
+
+A program sends one of the six commands with :meth:`hal.control.Control.send`. Poses and twists are in the arm's base
+frame unless stated otherwise. The second half of this file holds the records in which commands, sessions and dead-man
+switches reach the servo.
+"""
 
 from __future__ import annotations
 
@@ -32,28 +37,20 @@ __all__ = [
 ]
 
 Array = NDArray[np.float64]
-
-
 _set = object.__setattr__  # the commands are frozen, also for their own constructors
-
-
-class Kind(IntEnum):
-    """How a command travels to the servo."""
-
-    NONE = 0
-    JOINT_TARGET = 1
-    JOINT_VELOCITY = 2
-    JOINT_TORQUE = 3
-    CARTESIAN_TARGET = 4
-    TWIST = 5
-    JOINT_CHUNK = 6
+CHUNK_POINTS = 256
+"""Greatest number of targets in one chunk."""
+CHUNK_AHEAD = 3.0
+"""Farthest that a chunk may reach into the future, s: for so long the arm may follow an old decision."""
 
 
 @dataclass(frozen=True, slots=True, eq=False, init=False)
 class JointTarget:
-    """Be at joint positions ``q`` (n,) in rad, moving at ``dq`` (n,) in rad/s (zero when left out).
+    """Go to joint positions; between two commands the servo extrapolates along ``dq``.
 
-    Between two commands the servo extrapolates along ``dq``.
+    Args:
+        q: Joint positions (n,), rad.
+        dq: Joint velocities (n,) at that moment, rad/s; zero by default.
     """
 
     q: Array
@@ -64,20 +61,17 @@ class JointTarget:
         _set(self, "dq", None if dq is None else vector("dq", dq, self.q.size))
 
 
-CHUNK_POINTS = 256
-"""At most so many targets in one chunk."""
-CHUNK_AHEAD = 3.0
-"""s; a chunk may reach no farther into the future: for so long the arm may move by what was decided before."""
-
-
 @dataclass(frozen=True, slots=True, eq=False, init=False)
 class JointChunk:
-    """Be at joint positions ``q`` (k, n) in rad at the times ``t`` (k,), s on ``rig.clock``: what policies that predict
-    action chunks put out.
+    """Follow joint positions at given times: the output of policies that predict chunks of actions.
 
-    The servo interpolates, without overshoot. A new chunk replaces what is left of the one before from its own first
-    time on; targets whose time has passed only lead to those that follow. The end of the last one is the deadline: who
-    sends nothing more until then is late, and trips.
+    The servo interpolates without overshoot. A new chunk replaces the rest of the one before from its own first time
+    on; targets in the past only lead to the following ones. The end of the last chunk is the deadline of the next
+    command.
+
+    Args:
+        t: Times (k,), increasing, s on ``rig.clock``.
+        q: Joint positions (k, n), rad.
     """
 
     t: Array
@@ -105,7 +99,11 @@ class JointChunk:
 
 @dataclass(frozen=True, slots=True, eq=False, init=False)
 class JointVelocity:
-    """Move the joints at ``dq`` (n,), rad/s."""
+    """Move the joints at a velocity.
+
+    Args:
+        dq: Joint velocities (n,), rad/s.
+    """
 
     dq: Array
 
@@ -115,11 +113,14 @@ class JointVelocity:
 
 @dataclass(frozen=True, slots=True, eq=False, init=False)
 class JointTorque:
-    """Apply joint torques ``tau`` (n,), Nm, on top of those with which the arm carries its own weight.
+    """Apply joint torques on top of those that carry the arm's own weight.
 
-    They are followed as fast as 990 Nm/s, and only as far as the arm could still be kept below the session's speeds
-    when what it presses against gives way. Commands of another kind must wait until the arm is at rest and no torque is
-    left, and torques until it rests.
+    They change by at most 990 Nm/s, and are reduced so far that the arm stays below the session's speeds if the object
+    that it presses against gives way. Other commands are refused until the arm is at rest without torques, and torques
+    until it is at rest.
+
+    Args:
+        tau: Joint torques (n,), Nm.
     """
 
     tau: Array
@@ -130,7 +131,11 @@ class JointTorque:
 
 @dataclass(frozen=True, slots=True, eq=False, init=False)
 class CartesianTarget:
-    """Bring the tcp to ``pose``, which needs an orientation; inverse kinematics runs in the servo."""
+    """Bring the tcp to a pose; inverse kinematics runs in the servo.
+
+    Args:
+        pose: Pose of the tcp in the base frame, with an orientation.
+    """
 
     pose: Pose
 
@@ -140,9 +145,12 @@ class CartesianTarget:
 
 @dataclass(frozen=True, slots=True, eq=False, init=False)
 class Twist:
-    """Move the tcp at ``linear`` (3,) m/s while it turns at ``angular`` (3,) rad/s.
+    """Move and rotate the tcp at a velocity.
 
-    Along the base's axes, or with ``frame="tcp"`` along the tcp's own.
+    Args:
+        linear: Linear velocity (3,), m/s.
+        angular: Angular velocity (3,), rad/s.
+        frame: Axes of both: those of the arm's ``base``, or of the ``tcp`` itself.
     """
 
     linear: Array
@@ -160,8 +168,32 @@ class Twist:
 Command: TypeAlias = JointTarget | JointChunk | JointVelocity | JointTorque | CartesianTarget | Twist
 
 
+class Sent(NamedTuple):
+    """Result of ``Control.send``."""
+
+    command: Command | None
+    """The command that was sent, for example cut to the limits; None if there was none."""
+    reasons: tuple[str, ...] = ()
+    """Reasons why it differs from the one that was passed, or why the arm does not follow it."""
+
+
+# What reaches the servo
+
+
+class Kind(IntEnum):
+    """Kind of a command on its way to the servo."""
+
+    NONE = 0
+    JOINT_TARGET = 1
+    JOINT_VELOCITY = 2
+    JOINT_TORQUE = 3
+    CARTESIAN_TARGET = 4
+    TWIST = 5
+    JOINT_CHUNK = 6
+
+
 def encode(command: Command, now: float) -> tuple[Kind, tuple[float, ...]]:
-    """A command as it travels from ``now`` on; see :class:`hal.commands.CommandRecord`."""
+    """Return the kind and the values with which a command travels at ``now`` (s); see :class:`CommandRecord`."""
     if isinstance(command, JointChunk):
         return Kind.JOINT_CHUNK, (*(command.t - now).tolist(), *command.q.ravel().tolist())
     if isinstance(command, JointTarget):
@@ -177,73 +209,63 @@ def encode(command: Command, now: float) -> tuple[Kind, tuple[float, ...]]:
     return Kind.TWIST, (*command.linear.tolist(), *command.angular.tolist(), 1.0 if command.frame == "tcp" else 0.0)
 
 
-class Sent(NamedTuple):
-    """What ``Control.send`` really sent, and why it differs from what was asked, if it does."""
-
-    command: Command | None
-    reasons: tuple[str, ...] = ()
-
-
-# [inbox.py] What reaches an arm's servo from outside, once per tick: the newest of everything, never a queue.
-
-
 class Session(NamedTuple):
-    """The terms of one control session; they do not change while it lasts."""
+    """Terms of one control session, which stay the same until it ends."""
 
     id: int
     speed: float
-    """Share of the joint speed limits."""
+    """Share of the joint speed limits, 0..1."""
     tcp_speed: float
     """Greatest speed of the tcp, m/s."""
     deadman: bool
-    """Motion only while a dead-man is held."""
+    """Whether the arm moves only while a dead-man is held."""
     move_to: tuple[float, ...] | None = None
-    """Go to these joint positions (rad) and stay; None for a session that follows streamed commands."""
+    """Joint positions (n,) to go to and stay, rad; None for a session that follows streamed commands."""
     stops: int = 0
-    """Calls of ``rig.stop()`` that the app knew of, and had acknowledged, when it opened the session."""
+    """Number of calls of ``rig.stop()`` that had been acknowledged when the session was opened."""
 
 
 class CommandRecord(NamedTuple):
-    """One command as it travels: see :mod:`hal.commands` for what the values mean."""
+    """One command on its way to the servo."""
 
     seq: int
     session: int
-    """The session that sent it; a command of another one is ignored."""
+    """Session that sent it; commands of other sessions are ignored."""
     t: float
-    """When it was sent, on the host's clock, s."""
+    """Time of sending on the host's clock, s."""
     deadline: float
-    """When the next one must have come, s."""
+    """Time by which the next command must arrive, s."""
     kind: Kind
     values: tuple[float, ...]
-    """JOINT_TARGET: q then dq; JOINT_VELOCITY: dq; JOINT_TORQUE: tau; CARTESIAN_TARGET: position and quaternion;
-    TWIST: linear, angular, then 1.0 where they are given along the tcp's axes and 0.0 where along the base's;
-    JOINT_CHUNK: k times, counted from ``t``, then k times q."""
+    """By kind. JOINT_TARGET: q, then dq; JOINT_VELOCITY: dq; JOINT_TORQUE: tau; CARTESIAN_TARGET: position and
+    quaternion; TWIST: linear, angular, then 1.0 for the axes of the tcp and 0.0 for those of the base; JOINT_CHUNK: k
+    times relative to ``t``, then k times q."""
     t_event: float = 0.0
-    """When the pad event behind it happened, s; 0 where there is none. Only latency is computed from it."""
+    """Time of the pad event behind the command, s; 0 without one. Used for latency figures only."""
 
 
 class DeadmanRecord(NamedTuple):
-    """A dead-man switch."""
+    """State of a dead-man switch."""
 
     held: bool
     connected: bool
     presses: int
-    """Counts presses, so that a release between two ticks is not missed."""
+    """Number of presses so far, so that a release between two ticks is not missed."""
     t_alive: float
-    """Last proof that the pad is alive, on the host's clock, s."""
+    """Time of the last proof that the pad is connected, on the host's clock, s."""
 
 
 class Inbox(NamedTuple):
-    """Everything that the servo looks at besides the reading."""
+    """Everything that the servo gets in one tick besides the reading: always the newest values, never a queue."""
 
     command: CommandRecord | None
     deadman: DeadmanRecord | None
     stops: int
-    """Counts calls of ``rig.stop()``."""
+    """Number of calls of ``rig.stop()``."""
     rearms: int
-    """Counts calls of ``control.rearm()``."""
+    """Number of calls of ``control.rearm()``."""
     t_app: float
-    """The app's heartbeat, on the host's clock, s."""
+    """Time of the program's last heartbeat on the host's clock, s."""
 
 
 NO_INBOX = Inbox(None, None, 0, 0, 0.0)

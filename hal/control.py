@@ -1,4 +1,8 @@
-"""One control session: what an arm follows, from when to when, and under whose thumb."""
+"""Control sessions: exclusive, dead-man-guarded streaming of commands to one arm.
+
+:class:`Control` is the session. Every command passes :class:`CommandChecks` before it is sent. :class:`StopLatch` holds
+``rig.stop()`` until it is acknowledged.
+"""
 
 from __future__ import annotations
 
@@ -54,197 +58,27 @@ __all__ = [
     "FIRST_STEP_DISTANCE",
     "FIRST_STEP_TURN",
     "StopLatch",
-    "trip_text",
 ]
 
-# [stops.py] Stops that are latched: in words, and until somebody acknowledges them.
-
-_TRIPS = {
-    Trip.COMMAND_LATE: "the commands stopped coming",
-    Trip.DEADMAN_SILENT: "the dead-man's pad gave no sign of life",
-    Trip.DEADMAN_LOST: "the dead-man's pad was disconnected",
-    Trip.STOP: "rig.stop() was called",
-    Trip.APP_SILENT: "the app did not answer",
-    Trip.FAULT: "the robot reported a fault",
-    Trip.DEVICE_LOST: "the robot does not answer",
-    Trip.BAD_READING: "the robot reported numbers that cannot be",
-    Trip.HOST_LATE: "the servo's own process was stopped, or could not run, for too long",
-    Trip.LIMIT: "driven by torques, the arm came to a limit of speed, position or workspace, or did not come to rest",
-}
-
-
-class StopLatch:
-    """Remembers that ``rig.stop()`` was called until somebody acknowledges it."""
-
-    def __init__(self) -> None:
-        self.stopped = False
-
-    def check(self) -> None:
-        """Raise MotionStopped while the stop is not acknowledged."""
-        if self.stopped:
-            raise MotionStopped(
-                "rig.stop() was called", "call rig.rearm() when it is safe to move again", code=Trip.STOP.code
-            )
-
-
-def trip_text(trip: Trip) -> str:
-    """A trip in words."""
-    return _TRIPS.get(trip, trip.name.lower())
-
-
-# [command_checks.py] What an app's command must be before it is sent: of the right size, possible for this arm,
-# and not far away.
-
 FIRST_STEP_ANGLE = 0.1
-"""Farthest that a first joint target may be from the set-point, rad per joint."""
+"""Greatest distance of a first joint target from the set-point, rad per joint."""
 FIRST_STEP_DISTANCE = 0.05
+"""Greatest distance of a first pose from the set-point, m. The servo enforces the same bounds."""
 FIRST_STEP_TURN = 0.2
-"""Farthest that a first pose may be from the set-point, m and rad. The servo keeps the same bounds by itself."""
-_JOINTS = {JointTarget: "q", JointVelocity: "dq", JointTorque: "tau"}
-_MEANT: dict[type, str] = {
-    Pose: "hal.CartesianTarget(pose)",
-    np.ndarray: "hal.JointTarget(q)",
-    list: "hal.JointTarget(q)",
-    tuple: "hal.JointTarget(q)",
-}
-"""The command that was probably meant by something that is not a command."""
-
-
-class CommandChecks:
-    """Those of one arm."""
-
-    def __init__(self, robot: Robot) -> None:
-        self._robot = robot
-        self._lower, self._upper = np.array(robot.limits.lower), np.array(robot.limits.upper)
-        self._takes_torques = False
-        """Is it known that the arm takes torques?"""
-
-    def checked(self, command: Command, now: float, reasons: list[str]) -> Command:
-        """The command as it may be sent at ``now`` (s); why it differs from what was asked is added to ``reasons``.
-
-        Raises CommandError, NotSupported, Unreachable.
-        """
-        if isinstance(command, JointTorque):
-            self._check_torques()
-        self._check_kind(command)
-        if isinstance(command, CartesianTarget):
-            self._check_reach(command)
-        elif isinstance(command, JointTarget):
-            q = self._in_limits(command.q, reasons)
-            return command if q is command.q else JointTarget(q, command.dq)
-        elif isinstance(command, JointChunk):
-            self._check_times(command, now)
-            q = self._in_limits(command.q, reasons)
-            return command if q is command.q else JointChunk(command.t, q)
-        elif isinstance(command, JointTorque):
-            return self._within_torques(command, reasons)
-        return command
-
-    def check_first(self, command: Command, now: float, q_set: Sequence[float]) -> None:
-        """A first target far from ``q_set`` (n,), rad, where the arm stands, would make it leap: CommandError."""
-        if isinstance(command, (JointTarget, JointChunk)):
-            first = command.q if isinstance(command, JointTarget) else _at(command, now)
-            step = np.abs(first - np.asarray(q_set))
-            worst = int(np.argmax(step))
-            if step[worst] > FIRST_STEP_ANGLE:
-                raise CommandError(
-                    f"the first target is {step[worst]:.3f} rad from the set-point at {self._robot.joints[worst]}, "
-                    f"more than {FIRST_STEP_ANGLE} rad: use move_to first"
-                )
-        elif isinstance(command, CartesianTarget):
-            distance, turn = self._robot.fk(q_set).distance(command.pose)
-            if distance > FIRST_STEP_DISTANCE or turn > FIRST_STEP_TURN:
-                raise CommandError(
-                    f"the first pose is {distance:.3f} m and {turn:.3f} rad from the set-point, more than "
-                    f"{FIRST_STEP_DISTANCE} m or {FIRST_STEP_TURN} rad: use move_to first"
-                )
-
-    def _check_kind(self, command: Command) -> None:
-        robot, n = self._robot, self._robot.n
-        if isinstance(command, JointChunk):
-            count = command.q.shape[1]
-        elif (size := _JOINTS.get(type(command))) is not None:
-            count = getattr(command, size).size
-        elif isinstance(command, (CartesianTarget, Twist)):
-            return
-        else:
-            meant = _MEANT.get(type(command))
-            hint = f"; did you mean {meant}?" if meant else ""
-            raise CommandError(f"{type(command).__name__} is not a command{hint}")
-        if count != n:
-            raise CommandError(f"{robot.name} has {n} joints; {type(command).__name__} has {count}")
-
-    def _check_reach(self, command: CartesianTarget) -> None:
-        farthest = self._robot.kinematics.farthest()
-        away = float(np.linalg.norm(command.pose.position)) - farthest
-        if away > 0.0:
-            raise Unreachable(
-                f"{self._robot.name} reaches {farthest:.2f} m from its base", position_error=away, rotation_error=0.0
-            )
-
-    @staticmethod
-    def _check_times(command: JointChunk, now: float) -> None:
-        end = float(command.t[-1]) - now
-        if end <= 0.0:
-            raise CommandError(f"the chunk's last target was due {-end:.3f} s ago: its times are on rig.clock")
-        if end > CHUNK_AHEAD:
-            raise CommandError(f"the chunk reaches {end:.3f} s into the future; at most {CHUNK_AHEAD:g} s are allowed")
-
-    def _in_limits(self, q: NDArray[np.float64], reasons: list[str]) -> NDArray[np.float64]:
-        """``q`` (n,) or (k, n) cut to the position limits; the very same array where that changes nothing."""
-        inside: NDArray[np.float64] = np.minimum(np.maximum(q, self._lower), self._upper)
-        over = (inside != q).any(axis=0) if q.ndim > 1 else inside != q
-        if not over.any():
-            return q
-        names = [name for name, is_over in zip(self._robot.joints, over, strict=True) if is_over]
-        reasons.append(f"position limit of {', '.join(names)}")
-        return inside
-
-    def _check_torques(self) -> None:
-        """NotSupported for an arm that takes no torques. Its driver's class says so, and is looked at once."""
-        spec = self._robot.spec
-        if self._takes_torques:
-            return
-        modes: frozenset[str] = registry.load(spec.driver, "robot").modes
-        if "torque" not in modes:
-            raise NotSupported(f"{spec.name}: driver {spec.driver} takes no torques, only: {', '.join(sorted(modes))}")
-        if spec.limits.torque is None:
-            raise NotSupported(f"{spec.name}: model {spec.model} takes no torques without limits.torque, Nm per joint")
-        self._takes_torques = True
-
-    def _within_torques(self, command: JointTorque, reasons: list[str]) -> JointTorque:
-        most = self._robot.limits.torque
-        if most is None:
-            return command
-        wanted = zip(command.tau.tolist(), most, self._robot.joints, strict=True)
-        over = [name for x, limit, name in wanted if abs(x) > limit]
-        if not over:
-            return command
-        reasons.append(f"torque limit of {', '.join(over)}")
-        return JointTorque(np.clip(command.tau, np.negative(most), most))
-
-
-def _at(chunk: JointChunk, t: float) -> NDArray[np.float64]:
-    """Where a chunk wants the arm (n,) at ``t``, rad; before its first time, its first target."""
-    k = int(np.searchsorted(chunk.t, t, side="right"))
-    due: NDArray[np.float64] = chunk.q[min(k, len(chunk.t) - 1)]
-    if 0 < k < len(chunk.t):
-        share = (t - chunk.t[k - 1]) / (chunk.t[k] - chunk.t[k - 1])
-        due = chunk.q[k - 1] + share * (due - chunk.q[k - 1])
-    return due
-
-
+"""Greatest angle between a first pose and the set-point, rad."""
 _SHORTEST_DEADLINE = 0.1
 _PERIODS = 2.5
 _MOST_AT_ONCE = 100
-"""So many commands in a row without any time in between are a mistake: a lock-step clock stands still."""
+"""Number of commands in a row without any passing of time that counts as a mistake: a lock-step clock stands still."""
 _REST_LIMIT = 5.0
 
 
 class Control:
-    """A session in which one arm follows commands. Made by :meth:`hal.robot.Robot.control`.
+    """A control session of one arm; created by :meth:`hal.robot.Robot.control`, used in a ``with`` statement.
 
-    Leaving it, for whatever reason, brings the arm to rest; the first exception is the one that is raised.
+    Leaving the ``with`` block, for whatever reason, brings the arm to rest; an exception of the block is the one that
+    is raised. The arguments are those of :meth:`hal.robot.Robot.control`, and ``goal`` (n,), rad, for a session that
+    moves to one joint position.
     """
 
     def __init__(
@@ -262,7 +96,8 @@ class Control:
         spec = robot.spec
         if spec.attended and deadman is None and not unattended:
             raise CommandError(
-                f"{robot.name} really moves: pass deadman=pad.hold('l2'), or unattended=True when nobody is near it"
+                f"{robot.name} really moves: pass deadman=pad.hold('l2'), or unattended=True if no person is near it",
+                code="deadman_required",
             )
         if deadman is not None and spec.attended and not spec.emulated:
             deadman.check_trust()
@@ -271,7 +106,9 @@ class Control:
         self._deadline = max(_SHORTEST_DEADLINE, _PERIODS / rate_hz)
         if goal is None and self._deadline > spec.deadline_max:
             slowest = _PERIODS / spec.deadline_max
-            raise CommandError(f"{rate_hz:g} Hz is too slow for {robot.name}: send at {slowest:.1f} Hz or more")
+            raise CommandError(
+                f"{rate_hz:g} Hz is too slow for {robot.name}: send at {slowest:.1f} Hz or more", code="rate_too_low"
+            )
         self.robot = robot
         self.deadman = deadman
         self.speed = _share("speed", speed, spec.speed if goal is None else spec.move_speed, spec.speed, goal)
@@ -281,7 +118,7 @@ class Control:
         self._host = robot._host
         self._id = 0
         self._stopped = False
-        self._told = False
+        self._reported = False
         self._rearmed_at = -math.inf
         self._detach: Callable[[], None] | None = None
         self._grip: float | None = None
@@ -291,9 +128,16 @@ class Control:
         """Commands that were sent at the time of the last one."""
         self._checks = CommandChecks(robot)
 
-    # Opening and leaving.
+    # Opening and closing.
 
     def __enter__(self) -> Control:
+        """Open the session.
+
+        Raises:
+            ControlTaken: The session is open already, or another one of this arm is.
+            MotionStopped: ``rig.stop()`` was called and is not acknowledged (``code`` is ``rig_stop``).
+            ConnectionLost: The arm does not answer.
+        """
         robot = self.robot
         if self._id:
             raise ControlTaken("this control session is open already")
@@ -312,7 +156,7 @@ class Control:
             if self.deadman is not None:
                 self._detach = self.deadman.attach(self._mail.put_deadman)
             self._host.request("begin", {"robot": robot.name, "session": list(session)})
-        except BaseException:  # Ctrl-C too: the host may have it already, or get it later
+        except BaseException:  # Ctrl-C too: the host may have opened the session, or may still do so
             self._forget()
             raise
         if self.deadman is not None and self._host.stops == stops:
@@ -336,28 +180,31 @@ class Control:
                 raise
 
     def close(self) -> None:
-        """Bring the arm to rest and end the session. Idempotent."""
+        """Bring the arm to rest and end the session. Idempotent; warns of a stop that no ``send`` has reported.
+
+        Raises:
+            ConnectionLost: The arm did not come to rest in time, or its process is gone.
+        """
         if not self._id:
             return
-        untold = self._untold_trip()
-        self._mail.close_session(
-            self._id
-        )  # needs no answer: from here on the arm brakes, whatever happens to this program
+        unreported = self._unreported_trip()
+        # Needs no answer: from here on the arm brakes, whatever happens to this program.
+        self._mail.close_session(self._id)
         try:
             self._wait_for_rest()
         finally:
             self._forget()
-        if untold is not Trip.NONE:
-            text = f"{self.robot.name} was stopped in this session: {trip_text(untold)}"
+        if unreported is not Trip.NONE:
+            text = f"{self.robot.name} was stopped in this session: {unreported.text}"
             warnings.warn(text, RuntimeWarning, stacklevel=3)
 
-    def _untold_trip(self) -> Trip:
-        """A stop that nobody was told of, because nothing was sent after it: it must not pass in silence."""
+    def _unreported_trip(self) -> Trip:
+        """Return a stop that no call has reported, because no command was sent after it."""
         found = self._mail.peek()
-        return Trip.NONE if found is None or found.session != self._id or self._told else found.trip
+        return Trip.NONE if found is None or found.session != self._id or self._reported else found.trip
 
     def _forget(self) -> None:
-        """The session is over for this program; the host is told, should it not know."""
+        """End the session on this side; the host ends it too if it has not yet."""
         self._mail.close_session(self._id)
         self._id = 0
         self.robot._open = None
@@ -373,7 +220,7 @@ class Control:
                 raise ConnectionLost(f"{self.robot.name} did not come to rest within {_REST_LIMIT:g} s: {found.status}")
             clock.sleep(1.0 / self._host.spec.rate_hz)
 
-    # Driving.
+    # Commands.
 
     @property
     def status(self) -> RobotStatus:
@@ -382,7 +229,7 @@ class Control:
 
     @property
     def trip(self) -> Trip:
-        """Why a stop is latched; ``Trip.NONE`` when none is."""
+        """Reason for the latched stop; ``Trip.NONE`` if no stop is latched."""
         return self._peek().trip
 
     def _peek(self) -> ServoRecord:
@@ -414,10 +261,13 @@ class Control:
             What was sent, and the reasons for every difference from ``command``.
 
         Raises:
-            CommandError: For a wrong shape, a non-finite value, a grip or width out of range, or an unreachable first
-                target; nothing is sent.
-            MotionStopped: After a stop, until it is acknowledged (see :meth:`rearm`).
+            CommandError: A wrong shape, a value that is not finite, a grip or width out of range, or a first target too
+                far away; nothing is sent.
+            Unreachable: A pose beyond the arm's reach; nothing is sent.
+            NotSupported: Torques or a grip, for an arm without; nothing is sent.
+            MotionStopped: After a trip, until it is acknowledged (see :meth:`rearm`); ``code`` is that of the trip.
             RobotFault: While the robot reports a fault.
+            ConnectionLost: The process that owns the arm is gone.
         """
         if gripper is not None:
             warnings.warn(
@@ -426,19 +276,19 @@ class Control:
                 stacklevel=2,
             )
         if not self._id:
-            raise CommandError("this control session is not open: use it in a 'with' statement")
+            raise CommandError("this control session is not open: use it in a 'with' statement", code="session_closed")
         servo = self._peek()
         now = self.robot.clock.now()
         self._check_trip(servo, now)
         waiting = self.deadman is not None and not self.deadman.held
         reasons: list[str] = []
         if servo.limited and servo.status is RobotStatus.FOLLOWING:
-            reasons.append(f"the servo holds the motion back: {servo.limited}")
+            reasons.append(f"the servo limits the motion: {servo.limited}")
         if servo.session == self._id and servo.refused > self._refused:
             self._refused = servo.refused
             reasons.append(
-                "the servo refused an earlier command: too far for a first one, too late, or torques and another kind "
-                "of command without a rest in between"
+                "the servo refused an earlier command: a first target too far away, too late, or torques and another "
+                "kind of command without a rest in between"
             )
         target = self._finger_width(grip, width, gripper)
         if command is not None:
@@ -459,41 +309,43 @@ class Control:
         return Sent(command, tuple(reasons))
 
     def _check_time(self, now: float) -> None:
-        """Refuse a loop that never lets the time of a lock-step clock pass: its arm would not move."""
+        """Refuse a loop in which the time of a lock-step clock never passes: its arm would not move."""
         self._at_once = self._at_once + 1 if now == self._t_sent else 0
         self._t_sent = now
         if self._at_once >= _MOST_AT_ONCE:
             raise CommandError(
                 f"no time passed while {_MOST_AT_ONCE} commands were sent: with clock='lock_step' it passes only while "
-                "the program waits for it, with rig.clock.rate() or rig.clock.sleep()"
+                "the program waits for it, with rig.clock.rate() or rig.clock.sleep()",
+                code="no_time_passed",
             )
 
     def _check_trip(self, servo: ServoRecord, now: float) -> None:
+        """Raise RobotFault or MotionStopped if the servo has latched a stop that it still holds."""
         if servo.status is RobotStatus.FAULT:
             fault = self.robot.state(max_age=math.inf).fault
-            self._tell()
+            self._report_stop()
             cause, remedy = (fault.cause, fault.remedy) if fault else ("the robot reports a fault", "")
             raise RobotFault(cause, f"{remedy}; then robot.recover()" if remedy else "call robot.recover()")
         if servo.trip is Trip.NONE:
-            self._told = False
-            if self._stopped:  # a press of the dead-man acknowledged the stop
+            self._reported = False
+            if self._stopped:  # acknowledged by a press of the dead-man
                 self._stopped = self.robot._latch.stopped = False
             return
         if self._rearmed_at > -math.inf and self._mail.state.seq() <= self._rearmed_at:
-            return  # the servo has not seen the rearm yet
+            return  # the servo has not handled the rearm yet
         self._stopped = servo.trip is Trip.STOP
-        self._tell()
-        remedy = "release the dead-man and press it again" if self.deadman else "call control.rearm() to go on"
-        raise MotionStopped(trip_text(servo.trip) + self._details(servo), remedy, code=servo.trip.code)
+        self._report_stop()
+        remedy = "release the dead-man and press it again" if self.deadman else "call control.rearm() to continue"
+        raise MotionStopped(servo.trip.text + self._details(servo), remedy, code=servo.trip.code)
 
-    def _tell(self) -> None:
-        """The program is told of a stop; so is the hand on the dead-man, once."""
-        if self.deadman is not None and not self._told:
+    def _report_stop(self) -> None:
+        """Note that the program learns of a stop, and let the pad of the dead-man rumble, once."""
+        if self.deadman is not None and not self._reported:
             self.deadman.alarm()
-        self._told = True
+        self._reported = True
 
     def _details(self, servo: ServoRecord) -> str:
-        """What there is to add to the words for a trip."""
+        """Return what to add to the words for a trip."""
         if servo.trip is Trip.COMMAND_LATE:
             longest = f"at most {1e3 * self._deadline:.0f} ms may pass between two at rate_hz={self._rate_hz:g}"
             return f" ({longest}; for a slower loop pass a lower rate_hz, or send chunks)"
@@ -501,9 +353,11 @@ class Control:
         return f" ({state.fault.cause})" if state is not None and state.fault is not None else ""
 
     def rearm(self) -> None:
-        """Acknowledge a trip in a session without a dead-man; the arm follows the next command.
+        """Acknowledge a trip in a session without a dead-man; the arm then follows the next command.
 
-        With a dead-man, letting go of it and pressing it again is the acknowledgement: MotionStopped says so.
+        Raises:
+            MotionStopped: The session has a dead-man: releasing and pressing it again is the acknowledgement (``code``
+                is ``deadman_session``).
         """
         if self.deadman is not None:
             raise MotionStopped("this session has a dead-man", "release it and press it again", code="deadman_session")
@@ -512,17 +366,17 @@ class Control:
         self._rearmed_at = self._mail.state.seq() + 1
 
     def _finger_width(self, grip: float | None, width: float | None, former: float | None) -> float | None:
-        """Return the width (m) that ``send`` asks for, or None; checked before anything is sent."""
+        """Return the width in m that ``send`` requests of the gripper, or None; checked before anything is sent."""
         given = {"grip": grip, "width": width, "gripper": former}
-        asked = {name: value for name, value in given.items() if value is not None}
-        if not asked:
+        passed = {name: value for name, value in given.items() if value is not None}
+        if not passed:
             return None
-        if len(asked) > 1:
-            raise CommandError(f"pass one of grip= (0 open to 1 closed) and width= (m), not {' and '.join(asked)}")
+        if len(passed) > 1:
+            raise CommandError(f"pass one of grip= (0 open to 1 closed) and width= (m), not {' and '.join(passed)}")
         gripper = self.robot.gripper
         if gripper is None:
-            raise NotSupported(f"{self.robot.name} has no gripper")
-        ((name, value),) = asked.items()
+            raise NotSupported(f"{self.robot.name} has no gripper", code="no_gripper")
+        ((name, value),) = passed.items()
         if name == "width":
             return number(name, value, "m", least=0.0, most=gripper.width_max)
         return gripper.width_of(number(name, value))
@@ -539,13 +393,202 @@ class Control:
             self._grip = width
 
 
-def _share(name: str, asked: float | None, default: float, most: float, goal: object) -> float:
-    """``asked`` or the default, checked against the most that the rig allows."""
+def _share(name: str, value: float | None, default: float, most: float, goal: object) -> float:
+    """Return ``value`` or the default, checked against the most that the rig allows."""
     most = 1.0 if goal is not None else most
-    return number(name, default if asked is None else asked, least=0.0, above=True, most=most)
+    return number(name, default if value is None else value, least=0.0, above=True, most=most)
 
 
 def check_deadman(deadman: object) -> None:
-    """Raise CommandError for what is no dead-man, a gamepad for example."""
+    """Raise CommandError if ``deadman`` is neither None nor a Deadman, for example a gamepad."""
     if deadman is not None and not isinstance(deadman, Deadman):
-        raise CommandError(f"deadman must be a dead-man, as pad.hold('l2') returns it, not a {type(deadman).__name__}")
+        raise CommandError(
+            f"deadman must be a dead-man, as pad.hold('l2') returns it, not a {type(deadman).__name__}",
+            code="not_a_deadman",
+        )
+
+
+_JOINTS = {JointTarget: "q", JointVelocity: "dq", JointTorque: "tau"}
+_MEANT: dict[type, str] = {
+    Pose: "hal.CartesianTarget(pose)",
+    np.ndarray: "hal.JointTarget(q)",
+    list: "hal.JointTarget(q)",
+    tuple: "hal.JointTarget(q)",
+}
+"""Type that is not a command -> the command that was probably intended."""
+
+
+class CommandChecks:
+    """Checks of the commands for one arm: size, limits, reach, and distance of the first target.
+
+    Args:
+        robot: The arm.
+    """
+
+    def __init__(self, robot: Robot) -> None:
+        self._robot = robot
+        self._lower, self._upper = np.array(robot.limits.lower), np.array(robot.limits.upper)
+        self._takes_torques = False
+        """Whether the driver is known to take torques."""
+
+    def checked(self, command: Command, now: float, reasons: list[str]) -> Command:
+        """Return the command to send: the same one, or one cut to the limits.
+
+        Args:
+            command: The command.
+            now: Time on the rig's clock, s.
+            reasons: List to which the reasons for every change are appended.
+
+        Raises:
+            CommandError: Not a command, or one of the wrong size (``code`` is ``not_a_command``, ``wrong_joint_count``,
+                ``chunk_in_the_past`` or ``chunk_too_long``).
+            NotSupported: Torques, for an arm that takes none.
+            Unreachable: A pose beyond the arm's reach.
+        """
+        if isinstance(command, JointTorque):
+            self._check_torques()
+        self._check_kind(command)
+        if isinstance(command, CartesianTarget):
+            self._check_reach(command)
+        elif isinstance(command, JointTarget):
+            q = self._in_limits(command.q, reasons)
+            return command if q is command.q else JointTarget(q, command.dq)
+        elif isinstance(command, JointChunk):
+            self._check_times(command, now)
+            q = self._in_limits(command.q, reasons)
+            return command if q is command.q else JointChunk(command.t, q)
+        elif isinstance(command, JointTorque):
+            return self._within_torques(command, reasons)
+        return command
+
+    def check_first(self, command: Command, now: float, q_set: Sequence[float]) -> None:
+        """Refuse a first target that is far from the set-point, so that the arm does not leap to it.
+
+        Args:
+            command: The command.
+            now: Time on the rig's clock, s.
+            q_set: Joint set-point (n,), rad.
+
+        Raises:
+            CommandError: The target is too far away (``code`` is ``first_step_too_far``).
+        """
+        if isinstance(command, (JointTarget, JointChunk)):
+            first = command.q if isinstance(command, JointTarget) else _target_at(command, now)
+            step = np.abs(first - np.asarray(q_set))
+            worst = int(np.argmax(step))
+            if step[worst] > FIRST_STEP_ANGLE:
+                raise CommandError(
+                    f"the first target is {step[worst]:.3f} rad from the set-point at {self._robot.joints[worst]}, "
+                    f"more than {FIRST_STEP_ANGLE} rad: use move_to first",
+                    code="first_step_too_far",
+                )
+        elif isinstance(command, CartesianTarget):
+            distance, turn = self._robot.fk(q_set).distance(command.pose)
+            if distance > FIRST_STEP_DISTANCE or turn > FIRST_STEP_TURN:
+                raise CommandError(
+                    f"the first pose is {distance:.3f} m and {turn:.3f} rad from the set-point, more than "
+                    f"{FIRST_STEP_DISTANCE} m or {FIRST_STEP_TURN} rad: use move_to first",
+                    code="first_step_too_far",
+                )
+
+    def _check_kind(self, command: Command) -> None:
+        robot, n = self._robot, self._robot.n
+        if isinstance(command, JointChunk):
+            count = command.q.shape[1]
+        elif (size := _JOINTS.get(type(command))) is not None:
+            count = getattr(command, size).size
+        elif isinstance(command, (CartesianTarget, Twist)):
+            return
+        else:
+            meant = _MEANT.get(type(command))
+            hint = f"; did you mean {meant}?" if meant else ""
+            raise CommandError(f"{type(command).__name__} is not a command{hint}", code="not_a_command")
+        if count != n:
+            raise CommandError(
+                f"{robot.name} has {n} joints; {type(command).__name__} has {count}", code="wrong_joint_count"
+            )
+
+    def _check_reach(self, command: CartesianTarget) -> None:
+        farthest = self._robot.kinematics.farthest()
+        away = float(np.linalg.norm(command.pose.position)) - farthest
+        if away > 0.0:
+            raise Unreachable(
+                f"{self._robot.name} reaches {farthest:.2f} m from its base", position_error=away, rotation_error=0.0
+            )
+
+    @staticmethod
+    def _check_times(command: JointChunk, now: float) -> None:
+        end = float(command.t[-1]) - now
+        if end <= 0.0:
+            raise CommandError(
+                f"the chunk's last target was due {-end:.3f} s ago: its times are on rig.clock",
+                code="chunk_in_the_past",
+            )
+        if end > CHUNK_AHEAD:
+            raise CommandError(
+                f"the chunk reaches {end:.3f} s into the future; at most {CHUNK_AHEAD:g} s are allowed",
+                code="chunk_too_long",
+            )
+
+    def _in_limits(self, q: NDArray[np.float64], reasons: list[str]) -> NDArray[np.float64]:
+        """Return ``q`` (n,) or (k, n) cut to the position limits; the same array if that changes nothing."""
+        inside: NDArray[np.float64] = np.minimum(np.maximum(q, self._lower), self._upper)
+        over = (inside != q).any(axis=0) if q.ndim > 1 else inside != q
+        if not over.any():
+            return q
+        names = [name for name, is_over in zip(self._robot.joints, over, strict=True) if is_over]
+        reasons.append(f"position limit of {', '.join(names)}")
+        return inside
+
+    def _check_torques(self) -> None:
+        """Raise NotSupported for an arm that takes no torques. The driver's class is checked once."""
+        spec = self._robot.spec
+        if self._takes_torques:
+            return
+        modes: frozenset[str] = registry.load(spec.driver, "robot").modes
+        if "torque" not in modes:
+            raise NotSupported(
+                f"{spec.name}: driver {spec.driver} takes no torques, only: {', '.join(sorted(modes))}",
+                code="no_torque_mode",
+            )
+        if spec.limits.torque is None:
+            raise NotSupported(
+                f"{spec.name}: model {spec.model} takes no torques without limits.torque, Nm per joint",
+                code="no_torque_limits",
+            )
+        self._takes_torques = True
+
+    def _within_torques(self, command: JointTorque, reasons: list[str]) -> JointTorque:
+        most = self._robot.limits.torque
+        if most is None:
+            return command
+        wanted = zip(command.tau.tolist(), most, self._robot.joints, strict=True)
+        over = [name for x, limit, name in wanted if abs(x) > limit]
+        if not over:
+            return command
+        reasons.append(f"torque limit of {', '.join(over)}")
+        return JointTorque(np.clip(command.tau, np.negative(most), most))
+
+
+def _target_at(chunk: JointChunk, t: float) -> NDArray[np.float64]:
+    """Return the joint positions (n,) of a chunk at time ``t``, rad; its first target before its first time."""
+    k = int(np.searchsorted(chunk.t, t, side="right"))
+    due: NDArray[np.float64] = chunk.q[min(k, len(chunk.t) - 1)]
+    if 0 < k < len(chunk.t):
+        share = (t - chunk.t[k - 1]) / (chunk.t[k] - chunk.t[k - 1])
+        due = chunk.q[k - 1] + share * (due - chunk.q[k - 1])
+    return due
+
+
+class StopLatch:
+    """Holds a call of ``rig.stop()`` until it is acknowledged."""
+
+    def __init__(self) -> None:
+        self.stopped = False
+
+    def check(self) -> None:
+        """Raise MotionStopped while the stop is not acknowledged."""
+        if self.stopped:
+            raise MotionStopped(
+                "rig.stop() was called", "call rig.rearm() when it is safe to move again", code=Trip.STOP.code
+            )

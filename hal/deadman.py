@@ -1,4 +1,4 @@
-"""A dead-man switch: whatever a person holds so that the arm may move."""
+"""The dead-man switch: a control that must be held for the arm to move."""
 
 from __future__ import annotations
 
@@ -15,9 +15,11 @@ Sink = Callable[[DeadmanRecord], None]
 
 
 class Threshold:
-    """Makes a button of an analogue trigger: pressed from ``press`` on, let go of below ``release`` (0..1).
+    """Turns an analogue trigger into a button, with hysteresis so that a trembling finger does not release it.
 
-    The gap between the two keeps a trembling finger from letting go and pressing again.
+    Args:
+        press: Travel (0..1) from which it counts as pressed.
+        release: Travel below which it counts as released.
     """
 
     def __init__(self, press: float = 0.5, release: float = 0.3) -> None:
@@ -28,16 +30,21 @@ class Threshold:
         self.held = False
 
     def update(self, value: float) -> bool:
-        """Is it held at this travel? A value that is not a number counts as released."""
+        """Return whether the trigger is held at this travel (0..1); NaN counts as released."""
         self.held = value >= (self.release if self.held else self.press)
         return self.held
 
 
 class Deadman:
-    """One dead-man switch. Its owner (a gamepad, a web page) calls :meth:`update`; control sessions :meth:`attach`.
+    """A dead-man switch. Its owner (a gamepad, a web page) calls :meth:`update`; control sessions call :meth:`attach`.
 
-    It counts as held only after it was seen released while its device was connected, so what was held before, or all
-    through an interruption, moves nothing. Every method may be called from any thread.
+    It counts as held only after it was seen released while its device was connected; a control that was held before
+    that, or throughout an interruption, moves nothing. Every method may be called from any thread.
+
+    Args:
+        name: Name for messages, for example ``l2 of pad``.
+        distrust: Returns why this switch must not guard a real arm at the moment, with the remedy; None if it may.
+        alarm: Signals a stop to the hand that holds the switch (a pad rumbles); must return at once.
     """
 
     def __init__(
@@ -57,30 +64,39 @@ class Deadman:
         self._sinks: dict[object, Sink] = {}
         self._lock = threading.RLock()
         self.error: Exception | None = None
-        """Why a listener was dropped."""
+        """Error for which a listener was dropped; None if there was none."""
 
     def alarm(self) -> None:
-        """Tell the hand that holds it that the arm was stopped, where it can be told."""
+        """Signal to the hand that holds the switch that the arm was stopped, if the device can."""
         if self._alarm is not None:
             self._alarm()
 
     @property
     def record(self) -> DeadmanRecord:
-        """The present state, as the servo gets it."""
+        """Present state, as the servo gets it."""
         return self._record
 
     @property
     def held(self) -> bool:
-        """Is it held, and does that count?"""
+        """Whether the switch is held, and counts."""
         return self._record.held
 
     @property
     def connected(self) -> bool:
-        """Is its device there?"""
+        """Whether the device of the switch is connected."""
         return self._record.connected
 
     def update(self, pressed: bool, connected: bool, t_alive: float) -> DeadmanRecord:
-        """Take what the device says; ``t_alive`` (s, host's clock) is when it last gave proof that it is there."""
+        """Take a state of the device and pass it on to all listeners.
+
+        Args:
+            pressed: Whether the control is pressed.
+            connected: Whether the device is connected.
+            t_alive: Time of the last proof of that on the host's clock, s.
+
+        Returns:
+            The new state of the switch.
+        """
         with self._lock:
             trusted = not self._must_be_trusted or self._distrust is None or self._distrust() is None
             if not connected or not trusted:
@@ -92,18 +108,18 @@ class Deadman:
             presses = last.presses + int(held and not last.held)
             self._record = DeadmanRecord(held, connected, presses, t_alive)
             for token in tuple(self._sinks):
-                self._hand_to(token)
+                self._pass_to(token)
             return self._record
 
     def attach(self, sink: Sink) -> Callable[[], None]:
-        """Call ``sink`` now and at every update; the function that comes back ends that.
+        """Call ``sink`` now and at every update, until the returned function is called.
 
-        A sink that raises is dropped (see ``error``): its receiver then hears nothing more, which stops the arm.
+        A sink that raises is dropped (see :attr:`error`): its receiver gets no further updates, which stops the arm.
         """
         token = object()
         with self._lock:
             self._sinks[token] = sink
-            self._hand_to(token)
+            self._pass_to(token)
 
         def detach() -> None:
             with self._lock:
@@ -111,7 +127,7 @@ class Deadman:
 
         return detach
 
-    def _hand_to(self, token: object) -> None:
+    def _pass_to(self, token: object) -> None:
         try:
             self._sinks[token](self._record)
         except Exception as error:
@@ -119,13 +135,17 @@ class Deadman:
             del self._sinks[token]
 
     def check_trust(self) -> None:
-        """Before it guards a real arm: raises NotSupported, with the remedy, where its silence would go unnoticed.
+        """Require that this switch is safe enough for a real arm, now and from now on.
 
-        From then on it counts as held only while that stays so, for another device may take the place of this one.
+        From then on it counts as held only while that is so, because another device may replace the present one.
+
+        Raises:
+            NotSupported: It is not, because its silence would pass unnoticed; the message has the remedy (``code`` is
+                ``deadman_not_trusted``).
         """
         reason = self._distrust() if self._distrust is not None else None
         if reason is not None:
-            raise NotSupported(reason)
+            raise NotSupported(reason, code="deadman_not_trusted")
         with self._lock:
             self._must_be_trusted = True
 

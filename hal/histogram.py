@@ -6,9 +6,11 @@ __all__ = ["Histogram"]
 
 
 class Histogram:
-    """Counts durations in bins of ``width`` s; longer ones than ``bins * width`` are counted in the last bin.
+    """Counts durations in bins; a percentile is the upper edge of its bin, so it is never too small.
 
-    A percentile is the upper edge of its bin, so it is never too small; the greatest value is kept exactly.
+    Args:
+        width: Width of a bin, s.
+        bins: Number of bins; longer durations are counted in the last one. The greatest is kept exactly.
     """
 
     __slots__ = ("_counts", "_width", "count", "greatest")

@@ -119,21 +119,29 @@ class Trip(_Named):
     @property
     def code(self) -> str:
         """Stable identifier, such as ``pad_lost``; the ``MotionStopped`` of this trip has the same ``code``."""
-        return _TRIP_CODES[self]
+        return _TRIPS[self][0]
+
+    @property
+    def text(self) -> str:
+        """The reason in words."""
+        return _TRIPS[self][1]
 
 
-_TRIP_CODES = {
-    Trip.NONE: "none",
-    Trip.COMMAND_LATE: "command_deadline",
-    Trip.DEADMAN_SILENT: "pad_silent",
-    Trip.DEADMAN_LOST: "pad_lost",
-    Trip.STOP: "rig_stop",
-    Trip.APP_SILENT: "app_silent",
-    Trip.FAULT: "robot_fault",
-    Trip.DEVICE_LOST: "device_lost",
-    Trip.BAD_READING: "bad_reading",
-    Trip.HOST_LATE: "host_late",
-    Trip.LIMIT: "torque_limit",
+_TRIPS = {
+    Trip.NONE: ("none", "none"),
+    Trip.COMMAND_LATE: ("command_deadline", "the commands stopped coming"),
+    Trip.DEADMAN_SILENT: ("pad_silent", "the pad of the dead-man sent nothing"),
+    Trip.DEADMAN_LOST: ("pad_lost", "the pad of the dead-man was disconnected"),
+    Trip.STOP: ("rig_stop", "rig.stop() was called"),
+    Trip.APP_SILENT: ("app_silent", "the program did not run"),
+    Trip.FAULT: ("robot_fault", "the robot reported a fault"),
+    Trip.DEVICE_LOST: ("device_lost", "the robot does not answer"),
+    Trip.BAD_READING: ("bad_reading", "the robot reported impossible values"),
+    Trip.HOST_LATE: ("host_late", "the servo's process was stopped, or could not run, for too long"),
+    Trip.LIMIT: (
+        "torque_limit",
+        "in torque mode the arm reached a limit of speed, position or workspace, or did not come to rest",
+    ),
 }
 
 

@@ -7,7 +7,6 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from hal.commands import DeadmanRecord
-from hal.control import trip_text
 from hal.errors import Fault
 from hal.host.records import GripperMail, GroupMemory, RobotMail
 from hal.types import RobotState, RobotStatus, Trip
@@ -71,7 +70,7 @@ def _robot(mail: RobotMail, gripper: GripperMail | None, now: float) -> dict[str
         "age": rounded(age),
         "status": str(state.status),
         "trip": str(state.trip),
-        "trip_text": trip_text(state.trip) if state.trip is not Trip.NONE else "",
+        "trip_text": state.trip.text if state.trip is not Trip.NONE else "",
         "limited": str(state.limited),
         "fault": _fault(state.fault),
         "q": _list(state.q),
