@@ -75,6 +75,33 @@ def test_a_release_between_two_ticks_is_a_release() -> None:
     bench.until_rest(0.5)
 
 
+def test_a_press_while_the_arm_brakes_counts_only_once_it_is_at_rest() -> None:
+    bench = held()
+    bench.release()
+    bench.tick()
+    bench.press()
+    bench.drive(bench.dt)
+    while bench.moving:
+        assert bench.status is RobotStatus.STOPPING
+        bench.drive(bench.dt)
+    bench.drive(0.3)
+    assert bench.status is RobotStatus.FOLLOWING
+    assert bench.moving
+    bench.assert_within_limits()
+
+
+def test_a_command_that_was_sent_before_the_press_is_not_followed_after_it() -> None:
+    bench = held()
+    bench.release()
+    bench.until_rest(0.5)
+    bench.send(Kind.JOINT_VELOCITY, [0.5] + [0.0] * 6, deadline=9.0)
+    bench.press()  # the servo sees both in the same tick
+    bench.run(0.3)
+    assert not bench.moving
+    bench.drive(0.1)
+    assert bench.moving
+
+
 def test_a_late_command_trips_and_only_a_new_press_goes_on() -> None:
     bench = held()
     sent = bench.now
