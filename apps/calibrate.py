@@ -103,7 +103,8 @@ def _print_board(args: argparse.Namespace) -> int:
 def _main(args: argparse.Namespace) -> int:
     import hal
     from hal import calibration
-    from hal.apps._common import banner, check_everything, invitation, listing
+    from hal.apps._common import check_everything
+    from hal.apps._display import banner, list_devices, list_links
     from hal.apps.check import may_open
     from hal.config import load
     from hal.config.mapping import load_mapping
@@ -125,12 +126,12 @@ def _main(args: argparse.Namespace) -> int:
     if args.dry_run:
         check_everything(plan, args)
         print(f"{plan.source} is valid; it would open:")
-        print("\n".join(f"  {line}" for line in [*listing(plan), *plan.warnings, task]))
+        print("\n".join(f"  {line}" for line in [*list_devices(plan), *plan.warnings, task]))
         return 0
     if not may_open(plan):
         return ACTION_NEEDED
     with hal.open(**rig_options(args)) as rig:
-        print(f"{banner(rig)}\n  {task}\n{invitation(rig)}", flush=True)
+        print(f"{banner(rig)}\n  {task}\n{list_links(rig)}", flush=True)
         collector = calibration.Collector(rig, setup, calibration.Detector(board))
         try:
             _collect(args, rig, collector, guess)

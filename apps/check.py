@@ -1,4 +1,4 @@
-"""Look before a real arm moves: at this computer, at the arm, and at the network between them. Or at gamepads.
+"""Pre-flight check of this computer, the arm and the network between them; or a list of gamepads or cameras.
 
 python apps/check.py --real --config my_rig.yaml
 python apps/check.py --pads
@@ -27,16 +27,13 @@ __all__ = [
     "main",
     "may_open",
     "parser",
-    "show_cameras",
-    "show_pads",
 ]
 
-# [check_cameras.py] Which cameras are plugged in, with what a rig needs to name each of them: ``hal-check
-# --cameras``.
+# --cameras: the cameras that are plugged in, with the keys that select each of them in a rig file.
 
 
 def show_cameras() -> bool:
-    """Print what every driver finds. False where no camera is plugged in."""
+    """Print the cameras that every driver finds; return whether there are any."""
     from hal import registry
     from hal.errors import HalError
 
@@ -62,34 +59,41 @@ def show_cameras() -> bool:
     return found
 
 
-# [check_pads.py] Which gamepads are plugged in, what they say at the moment, and which may guard a real arm:
-# ``hal-check --pads``.
+# --pads: the gamepads that are plugged in, their present values, and whether each may be the dead-man of a real arm.
 
-_RATE = 50.0  # Hz; a pad is looked at so often
-_DRAWN = 0.1  # s between two pictures on a terminal
-_LOOK = 1.0  # s between two looks at what is plugged in
+_RATE = 50.0
+"""Rate at which pads are polled, Hz."""
+_DRAW_PERIOD = 0.1
+"""s between two updates of a terminal."""
+_SCAN_PERIOD = 1.0
+"""s between two searches for plugged-in pads."""
 _STEP = 0.05
-"""Where lines are printed, an axis must have moved so far for another one."""
+"""Change of an axis that is printed as a new line when there is no terminal."""
 _LINES = 12
-"""Of a terminal that says nothing of its height, less than it surely has."""
+"""Height of a terminal that does not report it: a value that fits into any."""
 _INDENT = " " * 10
 _REAL = ("auto", "evdev")
 
 
 def show_pads(specs: Sequence[PadSpec], duration: float | None) -> bool:
-    """Show every pad for ``duration`` s, or until Ctrl-C; False where none that may be read was there.
+    """Show pads as they come and go.
 
-    ``specs`` are the pads of a rig, which choose by their options; where there are none, all that are plugged in.
+    Args:
+        specs: Pads of a rig; if empty, all that are plugged in are shown.
+        duration: Time to show them, s; None until Ctrl-C.
+
+    Returns:
+        Whether there was a pad that can be read.
     """
-    with _Pads(specs) as pads:
+    with _PadMonitor(specs) as pads:
         screen = _Screen(sys.stdout)
         end = time.monotonic() + duration if duration is not None else None
         for text in pads.start():
-            screen.tell(text)
+            screen.print(text)
         try:
             while end is None or time.monotonic() < end:
-                for text in pads.look():
-                    screen.tell(text)
+                for text in pads.poll():
+                    screen.print(text)
                 screen.show(pads.open)
                 time.sleep(1.0 / _RATE)
         except KeyboardInterrupt:
@@ -98,8 +102,8 @@ def show_pads(specs: Sequence[PadSpec], duration: float | None) -> bool:
         return pads.found
 
 
-class _Pads:
-    """The pads that are looked at: all that are plugged in, or a rig's. They come and go."""
+class _PadMonitor:
+    """The pads that are shown: all that are plugged in, or those of a rig."""
 
     def __init__(self, specs: Sequence[PadSpec]) -> None:
         from hal import registry
@@ -111,10 +115,10 @@ class _Pads:
         self._described: dict[str, str] = {}
         self._next = 0.0
         self.open: dict[str, Gamepad] = {}
-        """By the rig's name, or by the device."""
+        """Name in the rig, or device -> pad."""
         self.found = False
 
-    def __enter__(self) -> _Pads:
+    def __enter__(self) -> _PadMonitor:
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -122,20 +126,20 @@ class _Pads:
             pad.close()
 
     def start(self) -> Iterator[str]:
-        """Open what is there, and say what a person should know before anything else."""
+        """Open the pads that are plugged in; yield messages for the user."""
         for spec in self._skipped:
-            yield f"{spec.name}: driver {spec.driver}, which is no pad that is plugged in"
+            yield f"{spec.name}: driver {spec.driver} is not a plugged-in gamepad"
         for spec in self._specs:
             self._open(spec.name, spec)
-        yield from self.look()
+        yield from self.poll()
         if not any(pad.state().connected for pad in self.open.values()):
-            yield "no gamepad is plugged in that may be read; plug one in at any time, Ctrl-C ends"
+            yield "no gamepad detected; plug one in at any time, Ctrl-C ends"
 
-    def look(self) -> Iterator[str]:
-        """Poll every pad; in words, what came, went or stands in the way since the last call."""
+    def poll(self) -> Iterator[str]:
+        """Poll every pad; yield messages about pads that came, went or cannot be read since the last call."""
         now = time.monotonic()
         if now >= self._next:
-            self._next = now + _LOOK
+            self._next = now + _SCAN_PERIOD
             yield from self._plugged()
         for name, pad in list(self.open.items()):
             pad.poll_once(now)
@@ -163,7 +167,7 @@ class _Pads:
         before, now = self._described.get(name, ""), _about(pad)
         if now != before:
             self._described[name] = now
-            yield now or f"{name} is gone"
+            yield now or f"{name}: unplugged"
         if now:
             self.found = True
             self._notes.update(pad.notes)
@@ -187,38 +191,38 @@ def _any_pad(device: str) -> PadSpec:
 
 
 def _about(pad: Gamepad) -> str:
-    """A pad in some lines; nothing where it is not there."""
+    """Return the description of a pad in some lines; empty if it is not plugged in."""
     if not pad.state().connected:
         return ""
     lines = [pad.describe()]
     lines += [f"{_INDENT}{what:14s} {text}" for what, text in pad.driver.details().items()]
     lines.append(f"{_INDENT}{'mapping':14s} {pad.mapping or 'default'}")
-    lines.append(f"{_INDENT}{'real arm':14s} {pad.distrust() or 'it may be the dead-man'}")
+    lines.append(f"{_INDENT}{'real arm':14s} {pad.distrust() or 'may be the dead-man'}")
     return "\n".join([*lines, *pad.notes])
 
 
 class _Screen:
-    """On a terminal one block that is drawn again and again; elsewhere a line for every change."""
+    """Output: on a terminal one block that is redrawn, elsewhere a line for every change."""
 
     def __init__(self, stream: TextIO) -> None:
         self._stream = stream
         self._live = stream.isatty()
         self._next = 0.0
         self._drawn = 0
-        self._told: dict[str, _Shown] = {}
+        self._printed: dict[str, _PadValues] = {}
 
-    def tell(self, text: str) -> None:
-        """Print what stays."""
+    def print(self, text: str) -> None:
+        """Print lines above the block."""
         self._clear()
         self._write(text + "\n")
 
     def show(self, pads: Mapping[str, Gamepad]) -> None:
-        """The values of all pads."""
+        """Show the values of all pads."""
         if not self._live:
             for name, pad in pads.items():
-                self._tell_changes(name, pad)
+                self._print_changes(name, pad)
         elif time.monotonic() >= self._next:
-            self._next = time.monotonic() + _DRAWN
+            self._next = time.monotonic() + _DRAW_PERIOD
             size = shutil.get_terminal_size((80, _LINES))
             lines = [line for name, pad in pads.items() for line in _block(name, pad)]
             self._clear()
@@ -230,10 +234,10 @@ class _Screen:
         """Leave the last values on the screen."""
         self._drawn = 0
 
-    def _tell_changes(self, name: str, pad: Gamepad) -> None:
-        now, before = _Shown(pad.state(), pad.waiting_for), self._told.get(name)
+    def _print_changes(self, name: str, pad: Gamepad) -> None:
+        now, before = _PadValues(pad.state(), pad.waiting_for), self._printed.get(name)
         if before is None or now.differs(before):
-            self._told[name] = now
+            self._printed[name] = now
             self._write(f"{name}: {now}\n")
 
     def _clear(self) -> None:
@@ -246,8 +250,8 @@ class _Screen:
         self._stream.flush()
 
 
-class _Shown:
-    """What was last said of a pad."""
+class _PadValues:
+    """The values of a pad as shown."""
 
     def __init__(self, state: PadState, waiting_for: tuple[str, ...]) -> None:
         self.axes = dict(state.axes)
@@ -255,8 +259,8 @@ class _Shown:
         self.connected = state.connected
         self.waiting_for = waiting_for
 
-    def differs(self, other: _Shown) -> bool:
-        """Enough for another line?"""
+    def differs(self, other: _PadValues) -> bool:
+        """Whether the difference deserves another line."""
         if (self.buttons, self.connected, self.waiting_for) != (other.buttons, other.connected, other.waiting_for):
             return True
         moved = (abs(value - other.axes.get(name, 0.0)) for name, value in self.axes.items())
@@ -270,13 +274,13 @@ class _Shown:
         if self.buttons:
             parts.append(f"[{' '.join(sorted(self.buttons))}]")
         if self.waiting_for:
-            parts.append(f"let go of, or move once: {', '.join(self.waiting_for)}")
+            parts.append(f"release, or move once: {', '.join(self.waiting_for)}")
         return "  ".join(parts) or "at rest"
 
 
 def _block(name: str, pad: Gamepad) -> list[str]:
-    """The values of one pad as lines of a picture."""
-    shown = _Shown(pad.state(), pad.waiting_for)
+    """Return the values of one pad as lines of the block."""
+    shown = _PadValues(pad.state(), pad.waiting_for)
     if not shown.connected:
         return [f"{name}: not plugged in"]
     lines = [f"{name}:"]
@@ -285,12 +289,12 @@ def _block(name: str, pad: Gamepad) -> list[str]:
     lines += ["  " + "   ".join(bars[at : at + 2]) for at in range(0, len(bars), 2)]
     lines.append(f"  pressed  {' '.join(sorted(shown.buttons)) or '-'}")
     if shown.waiting_for:
-        lines.append(f"  let go of, or move once: {', '.join(shown.waiting_for)}")
+        lines.append(f"  release, or move once: {', '.join(shown.waiting_for)}")
     return lines
 
 
 def _bar(value: float) -> str:
-    """-1..1 as a bar from the middle."""
+    """Return a value of -1..1 as a bar from the middle."""
     half = 8
     filled = round(abs(value) * half)
     left = ("#" * filled if value < 0.0 else "").rjust(half)
@@ -298,41 +302,40 @@ def _bar(value: float) -> str:
     return f"[{left}|{right}]"
 
 
-BRIEFLY = 0.5
-"""s of measuring before a program opens a rig."""
-MEASURED = 2.0
-"""s of measuring otherwise."""
+_BRIEF_DURATION = 0.5
+"""Duration of the measurements before a program opens a rig, s."""
+_DURATION = 2.0
+"""Duration of the measurements otherwise, s."""
 _SHOWN = {"ok": "ok", "warn": "WARN", "fail": "FAIL", "unknown": "unknown"}
 
 
 def parser() -> argparse.ArgumentParser:
-    """The command line."""
+    """Return the parser of the command line."""
     made = argparse.ArgumentParser(
         prog="check",
-        description="Look before a real arm moves: at this computer, at the arm, and at the network between them.",
-        epilog="Nothing moves. The exit status is 2 when something fails, else 0.",
+        description="Pre-flight check of this computer, the arm and the network between them.",
+        epilog="Nothing moves. The exit status is 2 if a check fails, else 0.",
     )
     add_config_options(made)
-    how_long = f"measure so long ({MEASURED:g}; --pads: until Ctrl-C)"
+    how_long = f"duration of the measurements ({_DURATION:g}; --pads: until Ctrl-C)"
     made.add_argument("--duration", type=float, metavar="S", help=how_long)
-    made.add_argument("--json", action="store_true", help="print the findings as one JSON object")
+    made.add_argument("--json", action="store_true", help="print the results as one JSON object")
     made.add_argument(
         "--pads",
         action="store_true",
-        help="instead, show every gamepad that is plugged in, what it says, and whether it may guard a real arm; with "
-        "--config or --set, the pads of that rig. The exit status is 2 when there was none",
+        help="instead, show the plugged-in gamepads, their values, and whether each may be the dead-man of a real arm; "
+        "with --config or --set, the pads of that rig. The exit status is 2 if there is none",
     )
     made.add_argument(
         "--cameras",
         action="store_true",
-        help="instead, list the cameras that are plugged in, with their serial numbers. The exit status is 2 when "
-        "there is none",
+        help="instead, list the plugged-in cameras with their serial numbers. The exit status is 2 if there is none",
     )
     return made
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Entry point."""
+    """Run the program; return the exit status."""
     return run_app(_main, parser(), argv)
 
 
@@ -344,10 +347,8 @@ def _main(args: argparse.Namespace) -> int:
     if args.pads:
         return _pads(args)
     if args.cameras:
-        # FOLD: import dropped
-
         return 0 if show_cameras() else ACTION_NEEDED
-    duration = MEASURED if args.duration is None else args.duration
+    duration = _DURATION if args.duration is None else args.duration
     if not 0.0 < duration <= 60.0:
         raise CommandError(f"--duration must be above 0 and at most 60, not {duration:g}")
     plan = load(args.config, sim=args.sim, overrides=args.overrides).resolve()
@@ -358,17 +359,16 @@ def _main(args: argparse.Namespace) -> int:
     else:
         found = _shown(verdicts)
         if not real_arms(plan) and not checked_cameras(plan):
-            print(f"nothing in {plan.source} has a check of its own: only this computer was looked at")
+            print("no device checks for this rig; checked this computer only")
     return 0 if _fit(found) else ACTION_NEEDED
 
 
 def _pads(args: argparse.Namespace) -> int:
-    # FOLD: import dropped
     from hal.config import load
     from hal.errors import CommandError
 
     if args.json:
-        raise CommandError("--json is not for --pads, which goes on until Ctrl-C")
+        raise CommandError("--json cannot be used with --pads, which runs until Ctrl-C")
     if args.duration is not None and not args.duration > 0.0:
         raise CommandError(f"--duration must be positive, not {args.duration:g}")
     of_a_rig = args.overrides or args.config != parser().get_default("config")
@@ -377,12 +377,16 @@ def _pads(args: argparse.Namespace) -> int:
 
 
 def may_open(plan: Plan) -> bool:
-    """The same, briefly and in print, for a program that is about to open a rig. True at once without a real arm."""
+    """Check a rig briefly before a program opens it, and print the results.
+
+    Returns:
+        Whether no check failed; True at once without a real arm.
+    """
     from hal.preflight import preflight, real_arms
 
     arms = real_arms(plan)
-    emulated = all(robot.emulated for robot in arms)  # a rehearsal does not depend on how fit this computer is
-    return not arms or _fit(_shown(preflight(plan, BRIEFLY, machine=not emulated, cameras=False)))
+    emulated = all(robot.emulated for robot in arms)  # an emulator does not depend on this computer's timing
+    return not arms or _fit(_shown(preflight(plan, _BRIEF_DURATION, machine=not emulated, cameras=False)))
 
 
 def _fit(verdicts: Sequence[CheckResult]) -> bool:
@@ -390,7 +394,7 @@ def _fit(verdicts: Sequence[CheckResult]) -> bool:
 
 
 def _shown(verdicts: Iterable[CheckResult]) -> list[CheckResult]:
-    """Print each as soon as it is known, and below it what to do, once where it is the same for several."""
+    """Print each result as soon as it is known, with its remedy below, which is printed once if several share it."""
     found = []
     remedies = set()
     for verdict in verdicts:

@@ -1,4 +1,4 @@
-"""Write a recording in a form that other programs train on: robomimic, diffusion policy, or plain .npz files.
+"""Convert a recording for training: robomimic, diffusion policy (zarr), or plain .npz files.
 
 python apps/export.py data/demo --to robomimic
 python apps/export.py data/demo --to zarr --resize 96x96 --successful-only
@@ -21,17 +21,16 @@ if TYPE_CHECKING:
 
 __all__ = ["main", "parser"]
 
-_OFTEN = 0.1
-"""s between two words about how far it is, on a terminal."""
+_PROGRESS_PERIOD = 0.1
+"""s between two updates of the progress on a terminal."""
 
 
 def parser() -> argparse.ArgumentParser:
-    """The command line."""
+    """Return the parser of the command line."""
     made = argparse.ArgumentParser(
         prog="export",
-        description="Write a recording in a form that other programs train on. The recording itself is only read; "
-        "LeRobot trains on it as it is.",
-        epilog="What is written appears when it is whole. The exit status is 0 then, else 2.",
+        description="Convert a recording for training. The recording is only read; LeRobot trains on it directly.",
+        epilog="The output appears only when it is complete. The exit status is then 0, else 2.",
     )
     made.add_argument("dataset", metavar="DATASET", help="the folder of a recording")
     made.add_argument(
@@ -41,26 +40,30 @@ def parser() -> argparse.ArgumentParser:
         choices=("robomimic", "zarr", "npz"),
         help="robomimic: one HDF5 file; zarr: as diffusion policy's replay buffer; npz: one .npz per episode",
     )
-    made.add_argument("--out", metavar="PATH", help="where it goes (beside the dataset)")
-    made.add_argument("--force", action="store_true", help="overwrite such an export that is there")
-    what = made.add_argument_group("what is taken along")
-    what.add_argument("--episodes", metavar="0,3-5", help="these only")
-    what.add_argument("--successful-only", action="store_true", help="only those that were marked a success")
-    what.add_argument("--cameras", metavar="A,B", help="these only, or none")
-    what.add_argument("--no-depth", dest="depth", action="store_false", help="leave depth out")
-    what.add_argument("--resize", metavar="WxH", help="crop pictures to this shape about their middle, and scale them")
+    made.add_argument("--out", metavar="PATH", help="output (default: beside the dataset)")
+    made.add_argument("--force", action="store_true", help="overwrite if it exists")
+    what = made.add_argument_group("selection")
+    what.add_argument("--episodes", metavar="0,3-5", help="episodes to export (default: all)")
+    what.add_argument("--successful-only", action="store_true", help="only episodes marked as a success")
+    what.add_argument("--cameras", metavar="A,B", help="cameras to export, or none (default: all)")
+    what.add_argument("--no-depth", dest="depth", action="store_false", help="do not export depth")
+    what.add_argument(
+        "--resize", metavar="WxH", help="crop images to this aspect ratio around the center, and scale them"
+    )
     names = made.add_argument_group("for --to npz")
-    names.add_argument("--camera", metavar="NAME", help="which one is called camera (the first that no arm carries)")
-    names.add_argument("--gripper-camera", metavar="NAME", help="and gripper_camera (the first that an arm carries)")
+    names.add_argument("--camera", metavar="NAME", help="camera exported as camera (default: the first fixed one)")
+    names.add_argument(
+        "--gripper-camera", metavar="NAME", help="camera exported as gripper_camera (default: the first on an arm)"
+    )
     split = made.add_argument_group("for --to robomimic")
     split.add_argument(
-        "--valid", type=float, default=0.1, metavar="SHARE", help="share of episodes to validate with (%(default)s)"
+        "--valid", type=float, default=0.1, metavar="SHARE", help="share of episodes for validation (%(default)s)"
     )
     return made
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Entry point."""
+    """Run the program; return the exit status."""
     return run_app(_main, parser(), argv)
 
 
@@ -80,7 +83,7 @@ def _main(args: argparse.Namespace) -> int:
         gripper_camera=args.gripper_camera,
         valid=args.valid,
         force=args.force,
-        progress=_shown() if sys.stderr.isatty() else None,
+        progress=_show_progress() if sys.stderr.isatty() else None,
     )
     for note in made.notes:
         print(f"note: {note}")
@@ -106,14 +109,14 @@ def _size(text: str | None) -> tuple[int, int] | None:
     return int(match[1]), int(match[2])
 
 
-def _shown() -> Callable[[Progress], None]:
-    """Says how far it is, in one line of the terminal."""
+def _show_progress() -> Callable[[Progress], None]:
+    """Return a function that shows the progress in one line of the terminal."""
     last = 0.0
 
     def show(progress: Progress) -> None:
         nonlocal last
         now = time.monotonic()
-        if now - last > _OFTEN or progress.share >= 1.0:
+        if now - last > _PROGRESS_PERIOD or progress.share >= 1.0:
             last = now
             end = "\n" if progress.share >= 1.0 else ""
             print(f"\r{100 * progress.share:3.0f} %  episode {progress.episode}", end=end, file=sys.stderr, flush=True)

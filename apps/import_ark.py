@@ -128,13 +128,13 @@ def _report(imported: Imported) -> list[str]:
 
 def _write(texts: dict[Path, str], path: Path) -> None:
     """Write the rig's file ``path`` and the others, and list the rig's devices."""
-    from hal.apps._common import listing
+    from hal.apps._display import list_devices
     from hal.config import load
 
     for file, text in texts.items():
         _put(file, text)
     plan = load(path).resolve()
-    lines = [*listing(plan), *(f"note     {warning}" for warning in plan.warnings)]
+    lines = [*list_devices(plan), *(f"note     {warning}" for warning in plan.warnings)]
     print("\n".join(["", *(f"written: {file}" for file in texts), *(f"  {line}" for line in lines)]))
 
 

@@ -1,4 +1,4 @@
-"""Every program under one command, and what comes with the hal.
+"""The command ``hal``: all programs, and lists of the built-in models and rigs.
 
 hal teleop --sim
 hal list robots
@@ -21,11 +21,11 @@ PROGRAMS = {
     "teleop": "drive an arm: page in a browser, gamepad, terminal, recorded tour",
     "check": "check this computer, real arms and cameras before they move; show gamepads",
     "collect": "record demonstrations",
-    "review": "look through a dataset, check and repair it",
-    "replay": "play a recorded episode again",
+    "review": "view, check and repair a dataset",
+    "replay": "replay a recorded episode",
     "rollout": "run a policy and count its successes",
     "export": "convert a dataset for training",
-    "calibrate": "find out where a camera is",
+    "calibrate": "measure where a camera is",
     "import-ark": "convert a configuration of Ark",
 }
 LISTS = {
@@ -34,7 +34,7 @@ LISTS = {
     "rigs": ("config",),
     "pads": ("sensors", "gamepads"),
 }
-"""What ``hal list`` knows -> the folder of its files."""
+"""Kind of built-in file -> its folder."""
 
 
 def parser() -> argparse.ArgumentParser:
@@ -44,7 +44,7 @@ def parser() -> argparse.ArgumentParser:
         prog="hal",
         formatter_class=argparse.RawDescriptionHelpFormatter,
         description=f"programs:\n{programs}\n\n"
-        f"  {'list':12s} list what comes with the hal: {', '.join(LISTS)}\n"
+        f"  {'list':12s} list built-in files: {', '.join(LISTS)}\n"
         f"  {'schema':12s} print the JSON schema of a rig's file, for editors",
         epilog="hal PROGRAM --help shows a program's own options.",
     )
@@ -55,7 +55,7 @@ def parser() -> argparse.ArgumentParser:
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Entry point."""
+    """Run the program; return the exit status."""
     return run_app(_main, parser(), argv)
 
 
@@ -78,12 +78,12 @@ def _main(args: argparse.Namespace) -> int:
 
 
 def _list(arguments: list[str]) -> int:
-    made = argparse.ArgumentParser(prog="hal list", description="List what comes with the hal, by the names to use.")
+    made = argparse.ArgumentParser(prog="hal list", description="List built-in models and rigs by name.")
     made.add_argument("kinds", nargs="*", metavar="KIND", help=f"{', '.join(LISTS)} (all)")
     kinds = made.parse_args(arguments).kinds or list(LISTS)
     for kind in kinds:
         if kind not in LISTS:
-            made.error(f"there is no kind {kind!r}; kinds: {', '.join(LISTS)}")
+            made.error(f"unknown kind {kind!r}; kinds: {', '.join(LISTS)}")
     from hal.config.data_files import find_data, list_data
 
     for kind in kinds:

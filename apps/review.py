@@ -1,4 +1,4 @@
-"""Show what was recorded: a dataset in numbers, an episode as a picture or for the rerun viewer.
+"""Show a dataset: its statistics, an episode as a picture or for the rerun viewer; check and repair it.
 
 python apps/review.py data/demo
 python apps/review.py data/demo --episode 3
@@ -35,35 +35,38 @@ _MARK = {True: "success", False: "failure", None: "-"}
 
 
 def parser() -> argparse.ArgumentParser:
-    """The command line."""
+    """Return the parser of the command line."""
     made = argparse.ArgumentParser(
         prog="review",
-        description="Show what was recorded: a dataset in numbers, an episode as a picture or for the rerun viewer.",
-        epilog="The dataset is only read, except by --repair. The exit status is 2 when an episode cannot be read or "
-        "repaired, or --check finds something, else 0.",
+        description="Show a dataset: its statistics, one episode as a picture or for rerun; check and repair it.",
+        epilog="The dataset is only read, except by --repair. The exit status is 2 if an episode cannot be read or "
+        "repaired, or --check finds a problem, else 0.",
     )
     made.add_argument("dataset", metavar="DATASET", help="the folder of a recording")
     made.add_argument(
-        "--episode", type=int, metavar="N", help="only this one, and draw it: pictures in time, joints, gripper, stops"
+        "--episode",
+        type=int,
+        metavar="N",
+        help="only this episode, with a picture of it: images over time, joints, gripper, stops",
     )
-    made.add_argument("--png", metavar="FILE", help="where the picture goes (beside the dataset)")
+    made.add_argument("--png", metavar="FILE", help="file of the picture (default: beside the dataset)")
     made.add_argument(
         "--rrd", metavar="FILE", help="write a file for the rerun viewer instead; needs the extra [review]"
     )
     files = made.add_mutually_exclusive_group()
     files.add_argument(
-        "--check", action="store_true", help="compare every file with the index: rows, pictures, depth, time stamps"
+        "--check", action="store_true", help="compare every file with the index: rows, images, depth, time stamps"
     )
     files.add_argument(
         "--repair", action="store_true", help="finish interrupted episodes, and rebuild a lost index from the episodes"
     )
-    made.add_argument("--json", action="store_true", help="print the numbers as one JSON object")
-    made.add_argument("--force", action="store_true", help="overwrite a picture or .rrd that is there")
+    made.add_argument("--json", action="store_true", help="print the statistics as one JSON object")
+    made.add_argument("--force", action="store_true", help="overwrite an existing picture or .rrd file")
     return made
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Entry point."""
+    """Run the program; return the exit status."""
     return run_app(_main, parser(), argv)
 
 
@@ -79,7 +82,7 @@ def _main(args: argparse.Namespace) -> int:
         return _check(args, dataset)
     if args.episode is None:
         if args.png or args.rrd:
-            raise CommandError("--png and --rrd show one episode: say which with --episode N")
+            raise CommandError("--png and --rrd show one episode: select it with --episode N")
         found = summary(dataset)
     else:
         (episode,) = chosen(dataset, [args.episode], successful_only=False)
@@ -100,7 +103,7 @@ def _check(args: argparse.Namespace, dataset: Dataset) -> int:
     from hal.recording.layout import Layout
 
     if args.png or args.rrd:
-        raise CommandError("--check draws nothing: leave out --png and --rrd")
+        raise CommandError("--check cannot be used with --png or --rrd")
     wanted = None if args.episode is None else [args.episode]
     count = len(chosen(dataset, wanted, successful_only=False))
     found = list(dict.fromkeys(str(error) for error in check_dataset(dataset, wanted)))
@@ -118,11 +121,11 @@ def _repair(args: argparse.Namespace) -> int:
     from hal.recording.review import summary
 
     if args.episode is not None or args.png or args.rrd or args.json:
-        raise CommandError("--repair is for the whole dataset and takes no other option")
+        raise CommandError("--repair is for the whole dataset and cannot be used with other options")
     done, damaged = [], []
     try:
         done = repair(args.dataset)
-        with suppress(CommandError):  # there is no episode
+        with suppress(CommandError):  # no episode
             damaged = summary(Dataset(args.dataset)).broken
     except DatasetError as error:
         if error.episode is None:
@@ -136,7 +139,7 @@ def _repair(args: argparse.Namespace) -> int:
 
 
 def _warn_of_index(dataset: Dataset, found: Summary) -> None:
-    """Say what is wrong in ``meta/``, apart from the episodes that cannot be read."""
+    """Print the first problem in ``meta/``, apart from the episodes that cannot be read."""
     from hal.recording.checking import check_index
     from hal.recording.index import repair_command
     from hal.recording.layout import Layout
@@ -148,7 +151,7 @@ def _warn_of_index(dataset: Dataset, found: Summary) -> None:
 
 
 def _drawn(args: argparse.Namespace, root: Path, episode: Episode) -> Iterator[Path]:
-    """Write what shows the episode; where that is."""
+    """Write the picture or the .rrd file of an episode; yield its path."""
     from hal.recording.exporters.output import fresh
 
     if args.rrd:
@@ -169,7 +172,7 @@ def _drawn(args: argparse.Namespace, root: Path, episode: Episode) -> Iterator[P
 
 
 def _table(found: Summary) -> Iterator[str]:
-    """The numbers, line by line."""
+    """Yield the statistics, line by line."""
     from hal.recording.layout import SLOW
 
     count = len(found.episodes)

@@ -18,101 +18,98 @@ if TYPE_CHECKING:
     from hal.robot import Robot
     from hal.types import PadState
 
+__all__ = ["TeleopRun", "main", "parser"]
+
 
 def parser() -> argparse.ArgumentParser:
-    """The command line."""
+    """Return the parser of ``teleop``."""
     made = argparse.ArgumentParser(
         prog="teleop",
-        description="Drive an arm from a browser or with a gamepad, in simulation or for real.",
-        epilog="Ctrl-C stops the arm.",
+        description="Drive an arm from a browser or with a gamepad, simulated or real.",
+        epilog="Ctrl-C stops the arm and ends the program.",
     )
     add_rig_options(made)
     drive = add_driving_options(made)
-    drive.add_argument("--duration", type=float, metavar="S", help="end after so many seconds")
-    drive.add_argument("--report", metavar="FILE", help="write how the run went, as JSON")
+    drive.add_argument("--duration", type=float, metavar="S", help="end after S seconds")
+    drive.add_argument("--report", metavar="FILE", help="write measurements of the run to a JSON file")
     return made
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Entry point."""
+    """Run ``teleop``; return the exit status."""
     return run_app(_main, parser(), argv)
 
 
 def _main(args: argparse.Namespace) -> int:
     import hal
-    from hal.apps._common import banner, planned
+    from hal.apps._common import check_driving_options, check_report, resolve_plan, select_devices
+    from hal.apps._display import banner
     from hal.apps.check import may_open
-    from hal.apps.driving import check_driving, chosen_devices
     from hal.errors import CommandError
 
-    check_driving(args)
+    check_driving_options(args)
     if args.duration is not None and not args.duration > 0.0:
         raise CommandError(f"--duration must be positive, not {args.duration:g}")
-    if args.report:
-        from hal.apps._common import check_writable
-
-        check_writable(args.report)
-    plan = planned(args)
+    check_report(args.report)
+    plan = resolve_plan(args)
     if plan is None:
         return 0
     if not may_open(plan):
         return ACTION_NEEDED
     with hal.open(**rig_options(args)) as rig:
         print(banner(rig), flush=True)
-        return Session(rig, *chosen_devices(rig, args), args).run()
+        return TeleopRun(rig, *select_devices(rig, args), args).run()
 
 
-class Session:
-    """One run of the app."""
+class TeleopRun:
+    """One run of the program on an open rig."""
 
     def __init__(self, rig: Rig, robot: Robot, pad: Gamepad, args: argparse.Namespace) -> None:
-        from hal.apps.driving import Driving
+        from hal.apps._display import TeleopDisplay
 
         self.rig, self.pad, self.args = rig, pad, args
-        self.driving = Driving(rig, robot, pad, mapping=args.mapping, speed=args.speed or 1.0, adjustable=True)
-        self.end = rig.clock.now() + args.duration if args.duration else None
+        self.display = TeleopDisplay(rig, robot, pad, mapping=args.mapping, speed=args.speed or 1.0, adjustable=True)
+        self.session = self.display.session
+        self.end_time = rig.clock.now() + args.duration if args.duration else None
 
     def run(self) -> int:
-        """Drive until the time is over, the recording ends or Ctrl-C; then stop, report, close."""
-        from hal.apps._common import invitation
+        """Drive until the time is over, a recorded pad ends or Ctrl-C; then report. Return the exit status."""
+        from hal.apps._display import list_links
 
-        driving, clean = self.driving, False
+        display, clean = self.display, False
+        reason = "stopped"
         try:
-            print(driving.help())
-            print(invitation(self.rig), flush=True)
-            driving.drive(self._over)
+            print(self.session.help())
+            print(list_links(self.rig), flush=True)
+            reason = self.session.run(self._end_reason)
             clean = True
         except KeyboardInterrupt:
-            clean = True  # the session's end brought the arm to rest
+            clean = True  # the arm is at rest
         finally:
-            driving.line.clear()
+            display.line.clear()
             if self.args.report:
                 self._write_report(clean)
-        driving.line.event(
-            f"{self._ending()} after {self.rig.clock.now() - driving.report.start:.1f} s; the arm is at rest"
-        )
+        seconds = self.rig.clock.now() - display.report.start
+        display.line.event(f"{reason} after {seconds:.1f} s; the arm is at rest")
         return 0
 
-    def _over(self, state: PadState) -> str:
-        """Why this should end."""
+    def _end_reason(self, state: PadState) -> str:
+        """Return why the run has to end, or nothing."""
         if self.pad.finished:
-            return f"{self.pad.describe()} was played to its end"
-        if self.end is not None and self.rig.clock.now() >= self.end:
-            return f"finished (--duration {self.args.duration})"
+            return f"{self.pad.describe()} has ended"
+        if self.end_time is not None and self.rig.clock.now() >= self.end_time:
+            return f"finished (--duration {self.args.duration:g})"
         return ""
 
     def _write_report(self, clean: bool) -> None:
-        """A rig that is gone cannot be asked; what ended the run must be told all the same."""
+        """Write the report; if the rig cannot answer any more, print why there is none."""
         from hal.errors import HalError
 
-        report = self.driving.report
+        report = self.display.report
         try:
             report.write(self.args.report, report.collect(clean))
         except (HalError, OSError) as error:
-            self.driving.line.event(f"no report: {error}")
-
-    def _ending(self) -> str:
-        return self._over(self.pad.state()) or "stopped"
+            self.display.line.event(f"no report: {error}")
 
 
 if __name__ == "__main__":

@@ -53,6 +53,7 @@ if TYPE_CHECKING:
     from .observation import Observation
     from .rig import Rig, open_rig
     from .robot import Robot
+    from .session import SessionEvent, TeleopSession
     from .specs import BodySpec
     from .teleop import Teleop
     from .types import Frame, GripperOutcome, GripperState, Limited, PadState, RobotState, RobotStatus, Stamp, Trip
@@ -99,9 +100,11 @@ __all__ = [
     "RobotState",
     "RobotStatus",
     "Sent",
+    "SessionEvent",
     "StaleStateError",
     "Stamp",
     "Teleop",
+    "TeleopSession",
     "Trip",
     "Twist",
     "Unreachable",
@@ -145,6 +148,7 @@ _MODULES = {
     "geometry": ("Pose",),
     "rig": ("Rig",),
     "robot": ("Robot",),
+    "session": ("SessionEvent", "TeleopSession"),
     "specs": ("BodySpec",),
     "teleop": ("Teleop",),
     "types": (

@@ -577,6 +577,14 @@ class GamepadDriver(DeviceDriver):
         return {}
 
     @property
+    def control_names(self) -> Mapping[str, str]:
+        """Control (of ``hal.types.AXES`` and ``BUTTONS``) -> its name as printed on the pad that is plugged in.
+
+        Controls that are missing have the names of :data:`hal.gamepad.CONTROL_NAMES`.
+        """
+        return {}
+
+    @property
     def mapping(self) -> str | None:
         """Name of the teleoperation mapping made for the connected pad; None if any mapping fits."""
         return None

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     pass
 
 __all__ = [
+    "CONTROL_NAMES",
     "Gamepad",
     "HeldControl",
     "NeutralGate",
@@ -101,6 +102,19 @@ class NeutralGate:
 RUMBLE_STRONG, RUMBLE_WEAK, RUMBLE_SECONDS = 1.0, 0.5, 0.5
 """How a pad rumbles unless told otherwise: shares of what its heavy and its light motor can, and s. A driver that must
 prepare a rumble prepares this one, so that a trip is felt at once."""
+
+CONTROL_NAMES: Mapping[str, str] = MappingProxyType(
+    {
+        **{name: name.upper() for name in ("l1", "r1", "l2", "r2", "l3", "r3")},
+        **{f"dpad_{axis}": f"D-pad {way}" for axis, way in (("x", "left/right"), ("y", "up/down"))},
+        **{
+            f"{side}_{axis}": f"{side} stick {way}"
+            for side in ("left", "right")
+            for axis, way in (("x", "left/right"), ("y", "up/down"))
+        },
+    }
+)
+"""Control -> its name in messages, unless the pad has another one printed on it."""
 
 _POLL = 0.01  # s; how long a poll may wait for news, and so how often a dead-man's heartbeat is passed on
 _AFTER_ERROR = 0.2  # s
@@ -213,6 +227,10 @@ class Gamepad:
     def notes(self) -> tuple[str, ...]:
         """What a person should know about the pad, each with what mends it."""
         return self.driver.notes
+
+    def control_name(self, control: str) -> str:
+        """Return the name of an axis or a button as printed on the pad that is plugged in: ``south`` is ``Cross``."""
+        return self.driver.control_names.get(control) or CONTROL_NAMES.get(control, control)
 
     def describe(self) -> str:
         """What drives, in words."""

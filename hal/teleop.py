@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from .arguments import number
 from .commands import Twist
-from .config.mapping import AxisMapping, TeleopMapping, load_mapping
+from .config.mapping import TeleopMapping, load_mapping
 from .errors import CommandError
 from .geometry import Pose, difference
 from .types import PadState
@@ -196,31 +196,28 @@ class Teleop:
         }
 
     def help(self, pad: Gamepad) -> list[str]:
-        """What the controls do, a line each, for people."""
-        mapping = self.mapping
+        """Return what the controls do, a line each, with their names as printed on ``pad``."""
+        mapping, name = self.mapping, pad.control_name
+        deadman = name(mapping.deadman)
         if pad.can_hold:
-            lines = [f"hold {mapping.deadman} to move; release it to stop"]
+            lines = [f"hold {deadman} to move; release it to stop"]
         else:
-            lines = [f"each key is one small step, with {mapping.deadman} in it"]
+            lines = [f"each key is one small step, with {deadman} included"]
         moves = [
-            f"{name} {_control(axis)} ({self.speed * axis.scale:g} {'m/s' if k < 3 else 'rad/s'})"
-            for k, (name, axis) in enumerate(zip(_DIRECTIONS, mapping.axes(), strict=True))
+            f"{direction} {'/'.join(map(name, axis.controls))} ({self.speed * axis.scale:g} {unit})"
+            for direction, axis, unit in zip(_DIRECTIONS, mapping.axes(), 3 * ["m/s"] + 3 * ["rad/s"], strict=True)
             if axis is not None
         ]
         lines.append("move: " + ", ".join(moves[:3]))
         if moves[3:]:
             lines.append("turn: " + ", ".join(moves[3:]))
         if mapping.gripper is not None and self.robot.gripper is not None:
-            lines.append("gripper: " + ", ".join(mapping.gripper.controls))
+            lines.append("gripper: " + ", ".join(map(name, mapping.gripper.controls)))
         if mapping.go_home is not None and pad.can_hold:
-            lines.append(f"home: {mapping.go_home}, with {mapping.deadman} held")
+            lines.append(f"home: {name(mapping.go_home)}, with {deadman} held")
         return lines
 
 
 def _check_state(pad: PadState) -> None:
     if not isinstance(pad, PadState):
         raise CommandError(f"pass the pad's state, teleop.step(pad.state(), tick.dt), not a {type(pad).__name__}")
-
-
-def _control(axis: AxisMapping) -> str:
-    return "/".join(axis.controls)

@@ -255,6 +255,11 @@ class EvdevPad(GamepadDriver):
         link = self._link
         return link.model.mapping if link is not None else None
 
+    @property
+    def control_names(self) -> Mapping[str, str]:
+        """See :meth:`GamepadDriver.control_names`."""
+        return self._link.model.control_names if self._link is not None else {}
+
     def describe(self) -> str:
         link = self._link
         if link is None:

@@ -186,6 +186,11 @@ class PlaybackPad(GamepadDriver):
         """Whether the recording has ended; never where it loops."""
         return self._mapper is not None and not self._options.loop and self._next >= len(self._recording.events)
 
+    @property
+    def control_names(self) -> Mapping[str, str]:
+        """See :meth:`GamepadDriver.control_names`."""
+        return self._mapper.model.control_names if self._mapper is not None else {}
+
     def describe(self) -> str:
         """See :meth:`GamepadDriver.describe`."""
         return f"replaying {self._options.file.name}"

@@ -6,8 +6,10 @@ import os
 import signal
 import threading
 import time
+from collections.abc import Mapping
 
 from hal.driver import GamepadDriver, PadReading
+from hal.pads.keyboard import keyboard_table
 from hal.pads.model import validated
 from hal.specs import PadSpec
 
@@ -213,6 +215,11 @@ class TerminalPad(GamepadDriver):
     def can_hold(self) -> bool:
         """Whether keys can be held; otherwise each press is one step."""
         return isinstance(self._mode, HeldControls)
+
+    @property
+    def control_names(self) -> Mapping[str, str]:
+        """See :meth:`GamepadDriver.control_names`."""
+        return keyboard_table("terminal").names
 
     def describe(self) -> str:
         """See :meth:`GamepadDriver.describe`."""

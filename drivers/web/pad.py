@@ -13,7 +13,9 @@ from typing import Any, Protocol
 from hal import registry
 from hal.driver import GamepadDriver, PadReading
 from hal.errors import NotSupported
+from hal.gamepad import CONTROL_NAMES
 from hal.pads.choice import tour
+from hal.pads.keyboard import keyboard_table
 from hal.servo.watchdog import PAD_SILENCE
 from hal.specs import PadSpec
 from hal.types import AXES, BUTTONS
@@ -186,6 +188,13 @@ class WebPad(GamepadDriver):
             t = max(last.t, found.t)
             self._reported = found._replace(t=t, t_device=t, seq=last.seq + 1)
         return self._reported
+
+    @property
+    def control_names(self) -> Mapping[str, str]:
+        """The keys of the page; for the dead-man and buttons with the gamepad's control, which the page shows too."""
+        keys = keyboard_table("browser").names
+        named = {name for name in keys if name in BUTTONS and name in CONTROL_NAMES}
+        return {name: f"{key} ({CONTROL_NAMES[name]})" if name in named else key for name, key in keys.items()}
 
     def describe(self) -> str:
         page = self._console.driver

@@ -11,6 +11,10 @@ from ..config.data_files import find_data
 __all__ = ["KeyboardTable", "keyboard_table"]
 
 
+_ASCII = {"↑": "Up", "↓": "Down", "←": "Left", "→": "Right"}
+"""Label of an arrow key -> its name for messages."""
+
+
 class KeyboardTable(NamedTuple):
     """The keys of one kind of keyboard, by what they do. ``_asdict()`` of it is JSON."""
 
@@ -32,6 +36,8 @@ class KeyboardTable(NamedTuple):
     """Share of its travel to which a stick is pushed while a slow key is held."""
     grip_speed: float
     """Speed of r2 while one of its keys is held, full travels per second."""
+    names: Mapping[str, str]
+    """Control -> the label of its first key, or of both keys of an axis, in ASCII."""
     legend: tuple[tuple[str, str], ...]
     """(labels of the keys, their control) for people, in the order of the table, without l2, ``slow`` and ``stop``."""
 
@@ -67,6 +73,11 @@ def keyboard_table(column: str) -> KeyboardTable:
         go_home=keys("go_home"),
         slow_share=float(data["slow_share"]),
         grip_speed=float(data["grip_speed"]),
+        names={
+            control: "/".join(_ASCII.get(label, label) for label in found[: 2 if control in axes else 1])
+            for control, found in labels.items()
+            if control not in ("slow", "stop", "go_home")
+        },
         legend=tuple(
             ((" " if control in axes else " / ").join(found), control)
             for control, found in labels.items()

@@ -26,6 +26,44 @@ __all__ = [
     "validated",
 ]
 
+PRINTED: Mapping[str, Mapping[str, str]] = {
+    "playstation": {
+        "south": "Cross",
+        "east": "Circle",
+        "west": "Square",
+        "north": "Triangle",
+        "start": "Options",
+        "select": "Share",
+        "home": "PS",
+    },
+    "xbox": {
+        "south": "A",
+        "east": "B",
+        "west": "X",
+        "north": "Y",
+        "l1": "LB",
+        "r1": "RB",
+        "l2": "LT",
+        "r2": "RT",
+        "l3": "LS",
+        "r3": "RS",
+        "start": "Menu",
+        "select": "View",
+        "home": "Xbox",
+    },
+    "spacemouse": {
+        "l1": "left button",
+        "r1": "right button",
+        "push_x": "push forward/back",
+        "push_y": "push left/right",
+        "push_z": "lift/press",
+        "turn_x": "tilt left/right",
+        "turn_y": "tilt forward/back",
+        "turn_z": "twist",
+    },
+}
+"""Family of pads -> control -> its name as printed on the pad, or how it is moved."""
+
 _M = TypeVar("_M", bound=BaseModel)
 _BUSES = {BUS_USB: "usb", BUS_BLUETOOTH: "bluetooth"}
 _AXIS_CODES = (*ABS, *REL)
@@ -120,8 +158,15 @@ class PadModel(_Strict):
     """End of the name of the pad's motion sensor, which speaks all the time and so shows that the pad is alive."""
     touch_node: str | None = None
     """End of the name of the pad's touchpad, a device of its own; pressing it down is the button ``touchpad``."""
+    printed: Annotated[str, _known("family of pads", PRINTED)] | None = None
+    """Family of pads (of :data:`PRINTED`) whose names of the controls this pad has; None for plain names."""
     mapping: str | None = None
     """Teleoperation mapping that is meant for this pad (``config/teleop``); the default one when left out."""
+
+    @property
+    def control_names(self) -> Mapping[str, str]:
+        """Control -> its name as printed on the pad, where that is known."""
+        return PRINTED[self.printed] if self.printed is not None else {}
 
     @model_validator(mode="after")
     def _has_ranges(self) -> PadModel:

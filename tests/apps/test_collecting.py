@@ -16,8 +16,8 @@ pytest.importorskip("pybullet", reason="pip install 'robot-hal[sim]'")
 from app_kit import CROSS, PS, seed_of, write_pad
 
 import hal
+from hal.apps._collecting import CollectRun
 from hal.apps.collect import parser
-from hal.apps.collecting import DemonstrationSession
 from hal.camera import Camera
 from hal.drivers.mock.gamepad import MockPad
 from hal.recording import Dataset, Recorder
@@ -80,7 +80,7 @@ def collect(
         page = Page(rig, press, None if by_page else "pad") if press is not None else None
         rig.console = page
         robot, gamepad = rig.robots["panda"], rig.gamepads["pad"]
-        status = DemonstrationSession(rig, robot, gamepad, recorder, parser().parse_args([*options])).run()
+        status = CollectRun(rig, robot, gamepad, recorder, parser().parse_args([*options])).run()
         return status, page.views if page is not None else []
 
 
@@ -151,7 +151,7 @@ def test_an_arm_that_is_not_simulated_drives_home_first_while_l2_is_held(
         arm, hand = rig.robots["panda"], rig.driver("pad")
         assert isinstance(hand, MockPad)
         arm.move_to(arm.home + 0.05)
-        run = DemonstrationSession(rig, arm, rig.gamepads["pad"], recorder, parser().parse_args(["--episodes", "1"]))
+        run = CollectRun(rig, arm, rig.gamepads["pad"], recorder, parser().parse_args(["--episodes", "1"]))
 
         def until(true: Callable[[], object]) -> Iterator[None]:
             end = time.monotonic() + 60.0
@@ -160,7 +160,7 @@ def test_an_arm_that_is_not_simulated_drives_home_first_while_l2_is_held(
                 yield
 
         def person() -> Iterator[None]:
-            yield from until(lambda: run.phase == "resetting" and run.driving.deadman.connected)
+            yield from until(lambda: run.phase == "resetting" and run.session.deadman.connected)
             at_rest = rig.clock.now() + 0.5
             yield from until(lambda: rig.clock.now() > at_rest)
             assert np.abs(arm.state().q_set - arm.home).max() > 0.04, "nothing moves before L2 is held"
@@ -200,10 +200,7 @@ def test_a_stop_is_named_where_a_demonstration_fails(
 
         rig.console = Page(rig, stop)
         args = parser().parse_args(["--episodes", "1"])
-        assert (
-            DemonstrationSession(rig, rig.robots["panda"], rig.gamepads["pad"], recorder, args, lambda *_: False).run()
-            == 0
-        )
+        assert CollectRun(rig, rig.robots["panda"], rig.gamepads["pad"], recorder, args, lambda *_: False).run() == 0
     told = capsys.readouterr().out
     assert "the cube was not lifted" in told
     assert ("the arm was stopped in this episode" in told) is stops

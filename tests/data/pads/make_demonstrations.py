@@ -27,7 +27,7 @@ import numpy as np
 import yaml
 
 import hal
-from hal.apps.collecting import seed_of
+from hal.apps._collecting import episode_seed
 from hal.config.data_files import find_data
 from hal.driver import GamepadDriver, PadReading
 from hal.gamepad import Gamepad
@@ -209,7 +209,7 @@ def together(*doings: Iterator[None]) -> Iterator[None]:
 
 def place_of(number: int) -> np.random.Generator:
     """Draws where things start in that episode, as apps/collect.py does with its default seed."""
-    return np.random.default_rng(seed_of(0, number))
+    return np.random.default_rng(episode_seed(0, number))
 
 
 def lines() -> list[str]:

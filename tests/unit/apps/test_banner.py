@@ -7,12 +7,12 @@ from typing import Any
 import pytest
 
 import hal
-from hal.apps._common import banner, listing
+from hal.apps._display import banner, list_devices
 from hal.config import load
 
 
 def robot_line(config: Any, **arguments: Any) -> str:
-    (line,) = (line for line in listing(load(config, **arguments).resolve()) if line.startswith("robot"))
+    (line,) = (line for line in list_devices(load(config, **arguments).resolve()) if line.startswith("robot"))
     return line
 
 

@@ -147,7 +147,7 @@ def test_a_toggle_is_explained(rig: hal.Rig, arm: hal.Robot) -> None:
     assert teleop.labels()["controls"]["r1"] == ["open or close the gripper"]
     text = "\n".join(teleop.help(rig.gamepads["pad"]))
     assert "gripper: r1" in text
-    assert "hold l1 to move" in text
+    assert "hold L1 to move" in text
 
 
 def test_home_counts_once_a_press(arm: hal.Robot) -> None:
@@ -182,9 +182,9 @@ def test_a_bad_mapping_lists_every_problem(arm: hal.Robot) -> None:
 
 def test_help_names_the_controls(rig: hal.Rig, arm: hal.Robot) -> None:
     text = "\n".join(hal.Teleop(arm).help(rig.gamepads["pad"]))
-    assert "hold l2 to move" in text
-    assert "dpad_y (0.2 m/s)" in text
-    assert "gripper: r2" in text
+    assert "hold L2 to move" in text
+    assert "D-pad up/down (0.2 m/s)" in text
+    assert "gripper: R2" in text
 
 
 def test_labels_say_what_each_control_does() -> None:

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 import hal
+from hal.apps._collecting import CollectRun
 from hal.apps.collect import parser
-from hal.apps.collecting import DemonstrationSession
 from hal.drivers.mock.gamepad import MockPad
 from hal.learning.episode import reset_scene
 from hal.recording import Dataset, Recorder
@@ -86,9 +86,7 @@ def test_without_a_hand_to_open(rig: hal.Rig) -> None:
 
 def collect(rig: hal.Rig, folder: Path, *options: str) -> int:
     with Recorder(rig, folder) as recorder:
-        run = DemonstrationSession(
-            rig, rig.robots["panda"], rig.gamepads["pad"], recorder, parser().parse_args([*options])
-        )
+        run = CollectRun(rig, rig.robots["panda"], rig.gamepads["pad"], recorder, parser().parse_args([*options]))
         return run.run()
 
 

@@ -1,0 +1,307 @@
+"""Output of the programs: the banner, the live status line, and the report of a run."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TextIO
+from urllib.parse import urlsplit
+
+if TYPE_CHECKING:
+    from hal.gamepad import Gamepad
+    from hal.rig import Rig
+    from hal.robot import Robot
+    from hal.session import SessionEvent
+    from hal.specs import CameraSpec, GripperSpec, Plan, RobotSpec
+    from hal.types import RobotState
+
+__all__ = ["RunReport", "StatusLine", "TeleopDisplay", "banner", "list_devices", "list_links"]
+
+# The banner.
+
+
+def banner(rig: Rig) -> str:
+    """Return the devices of an open rig, its renderer and its notes, one per line."""
+    plan = rig.plan
+    lines = [f"rig      {plan.source}"]
+    for line in list_devices(plan):
+        if line.startswith("gamepad"):
+            continue
+        lines.append(line)
+        if line.startswith("world") and rig.renderer:
+            lines.append(f"renderer {rig.renderer}")
+    lines.extend(f"gamepad  {pad.name:10s} {pad.describe()}" for pad in rig.gamepads.values())
+    lines.extend(f"note     {note}" for note in rig.notes)
+    return "\n".join(f"  {line}" for line in lines)
+
+
+def list_devices(plan: Plan) -> list[str]:
+    """Return the devices of a rig that is not open, one per line."""
+    lines = []
+    for robot in plan.robots:
+        simulated = not robot.attended or (plan.world is not None and robot.driver == plan.world.driver)
+        where = f"simulated ({robot.driver})" if simulated else _real(robot, robot)
+        gripper = robot.gripper
+        hand = f", gripper 0..{gripper.width_max:g} m" if gripper else ""
+        if gripper and robot.attended and simulated:
+            hand += f", {_real(robot, gripper)}"
+        lines.append(f"robot    {robot.name:10s} {robot.model}, {where}, {robot.rate_hz:g} Hz{hand}")
+        if robot.attended:
+            lines.append(f"limits   {robot.name:10s} {_limits(robot)}")
+    for camera in plan.cameras:
+        streams = "+".join(camera.streams)
+        lines.append(
+            f"camera   {camera.name:10s} {camera.model} ({camera.driver}{_image_source(camera)}), "
+            f"{camera.width}x{camera.height} {streams} at {camera.rate_hz:g} Hz"
+        )
+    lines.extend(f"gamepad  {pad.name:10s} {pad.driver}" for pad in plan.pads)
+    if plan.world is not None:
+        bodies = ", ".join(body.name for body in plan.world.bodies) or "empty"
+        lines.append(f"world    {plan.world.driver}, {plan.world.physics_hz:g} Hz: {bodies}")
+    lines.append(f"clock    {plan.clock.replace('_', ' ')}")
+    return lines
+
+
+def _image_source(camera: CameraSpec) -> str:
+    """Return a note if the images of a real camera come from an emulator or a recording."""
+    if camera.options.get("emulated"):
+        return ", EMULATED"
+    played = camera.options.get("play")
+    return f", playing {played}" if played else ""
+
+
+def _real(robot: RobotSpec, device: RobotSpec | GripperSpec) -> str:
+    """Return the driver and the address of a real device, or of its emulator."""
+    host = f" at {device.options['host']}" if "host" in device.options else ""
+    return f"{'EMULATED' if robot.emulated else 'REAL'} ({device.driver}{host})"
+
+
+def _limits(robot: RobotSpec) -> str:
+    """Return the limits of an arm that really moves."""
+    box = robot.workspace
+    where = "no workspace" if box is None else f"workspace {_triple(box.lower)} to {_triple(box.upper)} m"
+    largest = f"at most {max(robot.limits.acceleration):g} rad/s2, {max(robot.limits.jerk):g} rad/s3"
+    return f"{100 * robot.speed:g} % of the joint speeds, tcp {robot.tcp_speed:g} m/s, {largest}; {where}"
+
+
+def _triple(values: tuple[float, ...]) -> str:
+    return " ".join(f"{value:g}" for value in values)
+
+
+def list_links(rig: Rig) -> str:
+    """Return the links to open in a browser, with the ssh commands for other computers; empty if there are none."""
+    lines = []
+    if rig.console is not None:
+        does = "drive, watch and stop" if rig.console.driven_by is None else "watch and stop"
+        lines += [
+            "",
+            f"  Open this in a browser to {does}:",
+            "",
+            f"      {rig.console.link}",
+            "",
+        ]
+        if rig.console.tunnel:
+            lines += ["  On another computer, run this first:", "", f"      {rig.console.tunnel}", ""]
+    if rig.viewer3d is not None:
+        if not lines:
+            lines.append("")
+        lines += ["  3D view, on this computer:", "", f"      {rig.viewer3d.link}", ""]
+        if rig.console is not None and rig.console.tunnel:
+            port = urlsplit(rig.viewer3d.link).port
+            lines += [f"  (on another computer, add to the ssh command: -L {port}:127.0.0.1:{port})", ""]
+    return "\n".join(lines)
+
+
+# The live line.
+
+
+class StatusLine:
+    """A live line at the bottom of a terminal. Without a terminal only :meth:`event` prints."""
+
+    def __init__(self, stream: TextIO | None = None, period: float = 0.1) -> None:
+        self._stream = sys.stdout if stream is None else stream
+        self._live = self._stream.isatty()
+        self._period = period
+        self._next = 0.0
+        self._drawn = False
+
+    def update(self, text: Callable[[], str]) -> None:
+        """Draw the line again if its period is over; ``text`` is called only then."""
+        now = time.monotonic()
+        if not self._live or now < self._next:
+            return
+        self._next = now + self._period
+        width = shutil.get_terminal_size().columns - 1
+        self._write("\r\x1b[K" + text()[:width])
+        self._drawn = True
+
+    def event(self, text: str) -> None:
+        """Print a line above the live one."""
+        self.clear()
+        self._write(text + "\n")
+
+    def clear(self) -> None:
+        """Remove the live line."""
+        if self._drawn:
+            self._write("\r\x1b[K")
+            self._drawn = False
+
+    def _write(self, text: str) -> None:
+        try:
+            self._stream.write(text)
+            self._stream.flush()
+        except OSError:  # the terminal was closed: the arm must still be brought to rest
+            self._live = False
+
+
+class TeleopDisplay:
+    """A :class:`hal.TeleopSession` in a terminal: prints its events, draws the live line and measures the run."""
+
+    def __init__(self, rig: Rig, robot: Robot, pad: Gamepad, **options: Any) -> None:
+        """Create the session; ``options`` are keyword arguments of :class:`hal.TeleopSession`."""
+        from hal.session import TeleopSession
+
+        self.line = StatusLine()
+        self.report = RunReport(rig, robot)
+        self.note = ""
+        """First words of the live line."""
+        self.session = TeleopSession(rig, robot, pad, on_event=self._print_event, on_tick=self._draw, **options)
+
+    def _print_event(self, event: SessionEvent) -> None:
+        self.line.event(event.text)
+        if event.kind == "stopped":
+            self.report.add_trip(event.reason)
+        elif event.kind == "fault":
+            self.report.add_fault(event.reason)
+        elif event.kind == "robot_changed":
+            self.report.set_robot(self.session.robot)
+        elif event.kind == "pad_changed":
+            self.line.event(self.session.help())
+
+    def _draw(self) -> None:
+        if self.session.state is not None:
+            self.report.add_state(self.session.state)
+        self.line.update(self._text)
+
+    def _text(self) -> str:
+        session, state = self.session, self.session.state
+        if state is None:
+            return f"  {self.note}{session.robot.name} does not answer"
+        held = "held" if session.deadman.held else "released"
+        if session.pad.waiting_for and session.pad.state().connected:
+            names = ", ".join(map(session.pad.control_name, session.pad.waiting_for))
+            held = f"waiting: release, or move once: {names}"
+        x, y, z = state.tcp.position
+        parts = [f"dead-man {held:8s}", f"{state.status.name.lower():9s}"]
+        if self.report.trips:
+            parts.append(f"trips {len(self.report.trips)}")
+        parts.append(f"tcp {x:6.3f} {y:6.3f} {z:6.3f} m")
+        gripper = session.robot.gripper.newest() if session.robot.gripper is not None else None
+        if gripper is not None and not session.gripper_trouble:
+            parts.append(f"gripper {1e3 * gripper.width:4.0f} mm")
+        if state.limited:
+            parts.append(f"limited: {state.limited}")
+        for name, camera in session.rig.cameras.items():
+            if (fps := camera.counts().fps) is not None:
+                parts.append(f"{name} {fps:.0f} fps")
+        return f"  {self.note}{'  '.join(parts)}"
+
+
+# The report.
+
+
+class RunReport:
+    """Measurements of a run for ``--report``, as JSON. Times in ms, lengths in m."""
+
+    def __init__(self, rig: Rig, robot: Robot) -> None:
+        from hal.histogram import Histogram
+
+        self._rig = rig
+        self._robot = robot
+        self.start = rig.clock.now()
+        self._ages = Histogram(1e-4, 5000)
+        self._travel = 0.0
+        self._position: Any = None
+        self.trips: list[dict[str, Any]] = []
+        self.faults: list[dict[str, Any]] = []
+
+    def set_robot(self, robot: Robot) -> None:
+        """Report about this arm from now on. The travel of all arms is added up."""
+        self._robot, self._position = robot, None
+
+    def add_state(self, state: RobotState) -> None:
+        """Add a state of the arm."""
+        self._ages.add(self._rig.clock.now() - state.stamp.t)
+        position = state.tcp.position
+        if self._position is not None:
+            delta = position - self._position
+            self._travel += float(delta @ delta) ** 0.5
+        self._position = position
+
+    def add_trip(self, reason: str) -> None:
+        """Add a trip."""
+        self.trips.append({"t_s": round(self._rig.clock.now() - self.start, 3), "reason": reason})
+
+    def add_fault(self, cause: str) -> None:
+        """Add a fault."""
+        self.faults.append({"t_s": round(self._rig.clock.now() - self.start, 3), "cause": cause})
+
+    def collect(self, clean_exit: bool) -> dict[str, Any]:
+        """Return everything so far. Call it while the rig is open."""
+        rig, robot = self._rig, self._robot
+        group = next(g for g in rig.statistics().values() if robot.name in g["robots"])
+        own = group["robots"][robot.name]
+        latency = own["latency_s"]
+        cameras = {}
+        for name, camera in rig.cameras.items():
+            counts = camera.counts()
+            cameras[name] = {
+                "frames": counts.frames,
+                "fps": counts.fps,
+                "age_ms_p50": _ms(counts.age_p50),
+                "dropped": counts.dropped,
+            }
+        return {
+            "backend": robot.spec.driver,
+            "clock": rig.plan.clock,
+            "duration_s": rig.clock.now() - self.start,
+            "servo": {
+                "rate_hz": robot.spec.rate_hz,
+                "ticks": group["ticks"],
+                "missed": group.get("missed", 0),
+                "period_ms": _summary(group.get("period_s")),
+                **{key: own[key] for key in ("reanchored", "reports", "report_lag", "report_noise", "mismatches")},
+                "driver": own["driver"],
+            },
+            "latency_ms": {"p50": _ms(latency["p50"]), "p99": _ms(latency["p99"])},
+            "state_age_ms": _summary(self._ages.summary()),
+            "tcp_travel_m": self._travel,
+            "tcp_end": self._end(),
+            "peak": own["peak"],
+            "cameras": cameras,
+            "trips": self.trips,
+            "faults": self.faults,
+            "clean_exit": clean_exit,
+        }
+
+    def _end(self) -> dict[str, list[float]]:
+        """Return the tcp's pose in the arm's base frame, m and xyzw."""
+        tcp = self._robot.state(max_age=float("inf")).tcp
+        return {"position": tcp.position.tolist(), "orientation": tcp.orientation.tolist()}
+
+    @staticmethod
+    def write(path: str, report: dict[str, Any]) -> None:
+        """Write a report that :meth:`collect` returned."""
+        Path(path).write_text(json.dumps(report, indent=2) + "\n")
+
+
+def _ms(seconds: float | None) -> float | None:
+    return None if seconds is None else 1e3 * seconds
+
+
+def _summary(summary: dict[str, float | None] | None) -> dict[str, float | None] | None:
+    return None if summary is None else {name: _ms(value) for name, value in summary.items()}
