@@ -146,7 +146,7 @@ def test_a_toggle_is_explained(rig: hal.Rig, arm: hal.Robot) -> None:
     teleop = hal.Teleop(arm, mapping="spacemouse")
     assert teleop.labels()["controls"]["r1"] == ["open or close the gripper"]
     text = "\n".join(teleop.help(rig.gamepads["pad"]))
-    assert "gripper: r1" in text
+    assert "gripper: R1" in text
     assert "hold L1 to move" in text
 
 
