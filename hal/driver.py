@@ -8,8 +8,7 @@ states are handled above it, and are the same for every driver. To support a new
     CameraDriver     open, grab, close
     GamepadDriver    open, poll, close
 
-with the methods listed, which are abstract (all others are optional), and name the class in a
-:class:`hal.registry.DriverSpec`.
+with the methods listed (all others are optional), and name the class in a :class:`hal.registry.DriverSpec`.
 
 Rules for every driver:
 
@@ -23,8 +22,7 @@ Rules for every driver:
 * SI units and radians. Times named ``t`` are on the host's monotonic clock (``time.monotonic()``; in lock-step the
   simulated time), ``t_device`` is on the device's own clock. An unknown value is None, never 0.
 
-``docs/write-a-driver.md`` shows a complete driver and its test; :mod:`hal.testing` holds the contract tests that every
-driver must pass.
+``docs/write-a-driver.md`` shows a complete driver; :mod:`hal.testing` holds the contract tests for every driver.
 """
 
 from __future__ import annotations
@@ -578,10 +576,7 @@ class GamepadDriver(DeviceDriver):
 
     @property
     def control_names(self) -> Mapping[str, str]:
-        """Control (of ``hal.types.AXES`` and ``BUTTONS``) -> its name as printed on the pad that is plugged in.
-
-        Controls that are missing have the names of :data:`hal.gamepad.CONTROL_NAMES`.
-        """
+        """Control -> its name as printed on the connected pad; others have :data:`hal.gamepad.CONTROL_NAMES`."""
         return {}
 
     @property
@@ -590,10 +585,7 @@ class GamepadDriver(DeviceDriver):
         return None
 
     def rumble(self, strong: float, weak: float, seconds: float) -> bool:
-        """Start the heavy and the light motor with these powers (0..1); return whether the pad vibrates.
-
-        Does not block; may be called from any thread.
-        """
+        """Start the heavy and the light motor (powers 0..1) without blocking; return whether the pad vibrates."""
         return False
 
     @property

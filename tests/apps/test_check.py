@@ -37,7 +37,7 @@ def at(host: str) -> tuple[str, ...]:
 def test_a_simulated_rig_has_nothing_to_check_but_the_computer() -> None:
     done = run_here(check, "--sim")
     assert done.returncode == 0, done.stderr
-    assert "only this computer was looked at" in done.stdout
+    assert "checked this computer only" in done.stdout
     assert [word for word in ("kernel", "processor", "scheduling", "memory") if word not in done.stdout] == []
 
 

@@ -133,7 +133,7 @@ def test_two_demonstrations_by_one_command(tmp_path: Path, world: hal.Rig) -> No
     assert done.returncode == 0, done.stdout + done.stderr
     assert "Traceback" not in done.stderr
     check_demonstrations(tmp_path, 2)
-    for text in ("south (Cross) starts the recording", "2 of 2 in this run", "2 succeeded, 0 failed, 0 forgotten"):
+    for text in ("Cross: start recording", "2 of 2 in this run", "2 succeeded, 0 failed, 0 discarded"):
         assert text in done.stdout
     assert "unmarked" not in done.stdout
     for episode in episodes(tmp_path):
@@ -154,20 +154,20 @@ def test_a_demonstration_that_grasps_air_is_a_failure(
     assert np.ptp(cube[:, 2]) < 0.02, "it stayed on the table"
     assert last.success is False
     out = capsys.readouterr().out
-    assert "grasps air" in out
+    assert "closes on air" in out
     assert "the cube was not lifted" in out
-    assert "--success" not in out
+    assert "--success returned" not in out
     assert "0 succeeded, 1 failed" in out
 
 
 @pytest.mark.parametrize(
     ("body", "mark", "says"),
     [
-        ("return True", True, "a success"),
+        ("return True", True, "success"),
         (
             "return rig.world.pose('cube').position[2] > 1.0 and observation",
             False,
-            "--success says that it is no success",
+            "--success returned False",
         ),
         ("return 1 / 0", None, "--success raised ZeroDivisionError"),
     ],
@@ -280,7 +280,7 @@ def test_what_may_not_be_pressed_now_does_nothing(
     (episode,) = episodes(tmp_path)
     assert episode.length == pytest.approx(2.0 * 30, abs=3), "from the first Cross to PS"
     assert report(tmp_path)["discarded"] == 0
-    assert "to forget the episode, let go of l2 first" in capsys.readouterr().out
+    assert "to discard the episode, release L2 first" in capsys.readouterr().out
 
 
 def test_a_recording_that_ends_early_keeps_what_was_recorded(
@@ -292,11 +292,11 @@ def test_a_recording_that_ends_early_keeps_what_was_recorded(
     assert episode.success is None
     assert episode.length == pytest.approx(30, abs=3)
     told = capsys.readouterr().out
-    assert all(text in told for text in ("was played to its end", "episode 0 was being recorded: it is kept, unmarked"))
+    assert all(text in told for text in ("has ended", "episode 0 was being recorded: saved, unmarked"))
     (told_of,) = report(tmp_path)["episodes"]
     assert (told_of["success"], told_of["frames"]) == (None, episode.length)
     assert "1 episode(s) saved" in told
-    assert "0 succeeded, 0 failed, 1 not marked, 0 forgotten" in told
+    assert "0 succeeded, 0 failed, 1 not marked, 0 discarded" in told
 
 
 def test_ctrl_c_keeps_what_was_recorded_unmarked(tmp_path: Path) -> None:
@@ -312,7 +312,7 @@ def test_ctrl_c_keeps_what_was_recorded_unmarked(tmp_path: Path) -> None:
         app.send_signal(signal.SIGINT)
         told += app.communicate(timeout=60.0)[0]
     assert app.returncode == 1, told
-    assert all(text in told for text in ("episode 0 was being recorded: it is kept, unmarked", "ended: interrupted"))
+    assert all(text in told for text in ("episode 0 was being recorded: saved, unmarked", "ended: interrupted"))
     assert "Traceback" not in told
     (episode,) = episodes(tmp_path)
     assert episode.success is None
@@ -329,10 +329,10 @@ def test_ctrl_c_keeps_what_was_recorded_unmarked(tmp_path: Path) -> None:
         (["--seed", "-1"], ["--seed must be 0 or more"]),
         (["--fps", "0"], ["--fps must be 1 or more"]),
         (["--fps", "500"], ["fps must be"]),
-        (["--out", __file__], ["is no folder"]),
+        (["--out", __file__], ["is not a folder"]),
         (["--cameras", "wirst", "--dry-run"], ["no camera 'wirst'"]),
         (["--robot", "pandas"], ["pandas", "panda"]),
-        (["--pad", "none"], ["needs something that drives"]),
+        (["--pad", "none"], ["needs a gamepad"]),
         (["--pad", "nothing.jsonl"], ["nothing.jsonl"]),
         (["--mapping", "spacemouse"], ["no button for record and finish", "--console"]),
         (["--report", "/nowhere/report.json"], ["/nowhere"]),

@@ -69,7 +69,7 @@ def hello(link: str) -> dict[str, Any]:
 @pytest.mark.slow
 def test_without_a_pad_the_app_prints_a_link_that_works_and_a_tunnel() -> None:
     with teleop("--pad", "web") as (printed, link):
-        assert "hold l2 to move" in printed
+        assert "hold Space (L2) to move" in printed
         assert "Open this in a browser to drive" in printed
         assert urlsplit(link).hostname == "127.0.0.1"
         rig = hello(link)["rig"]

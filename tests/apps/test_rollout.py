@@ -93,7 +93,7 @@ def test_a_policy_reaches_its_goal_in_every_episode(folder: Path) -> None:
     for episode in found["episodes"]:
         assert episode["missed"] == 0
         assert 0.0 < episode["inference_ms"]["p50"] <= episode["inference_ms"]["p99"]
-    assert "3 of 3 that were marked succeeded" in done.stdout
+    assert "3 of 3 marked episodes succeeded" in done.stdout
     rollout(folder, *reach, "--episodes", 3, *FAST)
     assert [e["seconds"] for e in report(folder)["episodes"]] == [e["seconds"] for e in found["episodes"]]
     too_short = rollout(folder, *reach, "--seconds", 0.5, *FAST)
@@ -141,7 +141,7 @@ def test_who_holds_the_dead_man_marks_with_the_buttons_that_save_a_demonstration
     assert (succeeded["ended"], succeeded["success"]) == ("success", True)
     assert 1.3 < succeeded["seconds"] < 1.6, "it counts while the dead-man is held"
     assert (failed["ended"], failed["success"], failed["turns"]) == ("failure", False, 0)
-    assert "home (PS) marks a success; west (Square) marks a failure" in done.stdout
+    assert "PS: success; Square: failure" in done.stdout
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator
 import pytest
 
 import hal
-from hal.apps.teleop import Session, parser
+from hal.apps.teleop import TeleopRun, parser
 from hal.drivers.mock.gamepad import MockPad
 
 
@@ -31,15 +31,16 @@ class App:
 
     def __init__(self, rig: hal.Rig, *arguments: str) -> None:
         self.robot, self.pad = rig.robots["panda"], rig.gamepads["pad"]
-        self.session = Session(rig, self.robot, self.pad, parser().parse_args([*arguments, "--duration", "60"]))
-        self._thread = threading.Thread(target=self.session.run, daemon=True)
+        self.app = TeleopRun(rig, self.robot, self.pad, parser().parse_args([*arguments, "--duration", "60"]))
+        self.session = self.app.session
+        self._thread = threading.Thread(target=self.app.run, daemon=True)
 
     def __enter__(self) -> App:
         self._thread.start()
         return self
 
     def __exit__(self, *_: object) -> None:
-        self.session.end = 0.0
+        self.app.end_time = 0.0
         self._thread.join(30.0)
         assert not self._thread.is_alive()
 
@@ -60,7 +61,7 @@ def test_a_pad_with_a_mapping_of_its_own_gets_it_and_drives(
 ) -> None:
     hand.meant_for = "spacemouse"
     with App(rig) as app:
-        assert app.session.driving.mapping == "spacemouse"
+        assert app.session.mapping == "spacemouse"
         app.until_ready()
         where = app.robot.state().tcp.position[2]
         hand.press("l1")
@@ -69,18 +70,18 @@ def test_a_pad_with_a_mapping_of_its_own_gets_it_and_drives(
         hand.release("l1")
     text = capsys.readouterr().out
     assert "mapping spacemouse: one cap for all six directions" in text
-    assert "hold l1 to move" in text
+    assert "hold L1 to move" in text
 
 
 def test_a_pad_without_one_gets_the_default_and_an_option_beats_both(
     rig: hal.Rig, hand: MockPad, capsys: pytest.CaptureFixture[str]
 ) -> None:
     with App(rig) as app:
-        assert app.session.driving.mapping == "default"
-    assert "mapping default: the tutorial's PS4 mapping" in capsys.readouterr().out
+        assert app.session.mapping == "default"
+    assert "mapping default: sticks and d-pad of a gamepad" in capsys.readouterr().out
     hand.meant_for = "spacemouse"
     with App(rig, "--mapping", "default") as app:
-        assert app.session.driving.mapping == "default"
+        assert app.session.mapping == "default"
 
 
 def test_a_pad_that_is_plugged_in_later_brings_its_mapping_with_it(
@@ -93,10 +94,10 @@ def test_a_pad_that_is_plugged_in_later_brings_its_mapping_with_it(
         hand.press("l1")  # and holds its dead-man while doing so
         hand.stick("push_x", 1.0)
         hand.clear()
-        app.until(lambda: app.session.driving.mapping == "spacemouse" and app.pad.state().connected)
+        app.until(lambda: app.session.mapping == "spacemouse" and app.pad.state().connected)
         where = app.robot.state().q_set
         time.sleep(0.3)
-        assert not app.session.driving.deadman.held
+        assert not app.session.deadman.held
         assert (app.robot.state().q_set == where).all(), "what was held when it came moves nothing"
         hand.release("l1")
         hand.stick("push_x", 0.0)
@@ -107,24 +108,24 @@ def test_a_pad_that_is_plugged_in_later_brings_its_mapping_with_it(
         hand.release("l1")
         hand.inject(disconnect=True)
         app.until(lambda: not app.pad.state().connected)
-        assert app.session.driving.mapping == "spacemouse", "while there is none, nothing changes"
+        assert app.session.mapping == "spacemouse", "while there is none, nothing changes"
         hand.meant_for = None
         hand.stick("push_x", 0.0)
         hand.clear()
-        app.until(lambda: app.session.driving.mapping == "default")
+        app.until(lambda: app.session.mapping == "default")
     text = capsys.readouterr().out
     assert "driving with a mock pad" in text
-    assert text.count("hold l2 to move") == 2
+    assert text.count("hold L2 to move") == 2
 
 
 def test_a_trip_shakes_the_hand_once(rig: hal.Rig, hand: MockPad) -> None:
     with App(rig) as app:
         app.until_ready()
         hand.press("l2")
-        app.until(lambda: app.session.driving.deadman.held)
+        app.until(lambda: app.session.deadman.held)
         assert hand.rumbles == []
         hand.inject(freeze=True)  # held, and silent
-        app.until(lambda: app.session.driving.stopped)
+        app.until(lambda: app.session.stopped)
         time.sleep(0.2)
         assert len(hand.rumbles) == 1
         strong, _, seconds = hand.rumbles[0]

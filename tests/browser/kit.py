@@ -17,7 +17,7 @@ from typing import Any
 import pytest
 
 import hal
-from hal.apps.teleop import Session, parser
+from hal.apps.teleop import TeleopRun, parser
 from hal.commands import DeadmanRecord
 from hal.deadman import Deadman
 from hal.host.records import ServoRecord
@@ -58,11 +58,12 @@ class Bench:
         assert self.rig.console is not None
         self.console = self.rig.console
         self.link = self.console.link
-        self.session = Session(self.rig, self.arm, self.rig.gamepads["pad"], self.args)
+        self.app = TeleopRun(self.rig, self.arm, self.rig.gamepads["pad"], self.args)
+        self.session = self.app.session
         self._silences: list[float] = []
         self._alive = math.inf
         self.deadman.attach(self._heard)
-        self._thread = threading.Thread(target=self.session.run, name="the app's loop")
+        self._thread = threading.Thread(target=self.app.run, name="the app's loop")
         self._thread.start()
 
     @property
@@ -75,7 +76,7 @@ class Bench:
     @property
     def deadman(self) -> Deadman:
         """What must be held for the arm to move."""
-        return self.session.driving.deadman
+        return self.session.deadman
 
     @property
     def status(self) -> str:
@@ -122,7 +123,7 @@ class Bench:
         return self.speed() < 1e-3
 
     def close(self) -> None:
-        self.session.end = self.rig.clock.now()
+        self.app.end_time = self.rig.clock.now()
         self._thread.join(PATIENCE)
         self.rig.close()
         assert not self._thread.is_alive()

@@ -155,7 +155,7 @@ def test_a_page_without_control_steers_no_recording(bench: Bench, page: Browser,
 
 
 def test_keys_press_the_buttons_of_the_pad_that_do_the_same(bench: Bench, page: Browser) -> None:
-    bench.console.explain(bench.session.driving.teleop.labels(actions=("home", *ACTIONS)))
+    bench.console.explain(bench.session.teleop.labels(actions=("home", *ACTIONS)))
     show(bench, page, READY)
     script = "return [...document.querySelectorAll('#legend tr')].map((row) => row.textContent)"
     wait_for(lambda: "1record" in page.run(script), "the legend")

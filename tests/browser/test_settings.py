@@ -90,9 +90,9 @@ def test_a_held_dead_man_keeps_its_arm(bench: Bench, page: Browser) -> None:
     wait_for(lambda: bench.deadman.held, "the dead-man")
     choose(page, "right")
     wait_for(lambda: "elease" in page.text("#notice"), "the page to refuse")
-    bench.session.driving._wishes["robot"] = "right"  # a page that asks all the same
+    bench.session._changes["robot"] = "right"  # a page that asks all the same
     wait_for(lambda: "release the dead-man first" in page.text("#log"), "the program to refuse", BRIEF)
-    assert bench.session.driving.robot.name == "left"
+    assert bench.session.robot.name == "left"
     assert names_the_driven(page, "left")
     let_go_of_all(page)
 
@@ -102,14 +102,14 @@ def test_a_page_without_control_names_the_driver_and_the_arm(bench: Bench, page:
     wait_for(lambda: not page.facts["driving"], "the page to stop driving")
     assert "control" in page.text("#who")
     choose(page, "right")
-    assert bench.session.driving.robot.name == "left", "what a page without control shows moves nothing"
+    assert bench.session.robot.name == "left", "what a page without control shows moves nothing"
     page.click("#lease")
     wait_for(lambda: page.facts["driving"] and names_the_driven(page, "left"), "control again, of what was driven")
 
 
 def test_the_speed_slider_slows_the_arm_down(bench: Bench, page: Browser) -> None:
     page.run("const s = document.querySelector('#speed'); s.value = 25; s.dispatchEvent(new Event('input'))")
-    wait_for(lambda: bench.session.driving.teleop.speed == 0.25, "the program to hear it")
+    wait_for(lambda: bench.session.teleop.speed == 0.25, "the program to hear it")
     wait_for(lambda: page.text("#speed-share") == "25 %", "the page to show what the program does")
     page.run("const s = document.querySelector('#speed'); s.value = 100; s.dispatchEvent(new Event('input'))")
     wait_for(lambda: page.text("#speed-share") == "100 %", "the page to show it")
@@ -119,9 +119,9 @@ def test_the_frame_can_be_switched(bench: Bench, page: Browser) -> None:
     """Up along the tool's own axes of a hand that points down is down in the base's."""
     press = "[...document.querySelectorAll('#frame button')].find((b) => b.textContent === arguments[0]).click()"
     page.run(press, "tool")
-    wait_for(lambda: bench.session.driving.teleop.frame == "tcp", "the program to hear it")
+    wait_for(lambda: bench.session.teleop.frame == "tcp", "the program to hear it")
     wait_for(lambda: "tool" in page.text('[data-button="l1"]'), "the labels to follow")
-    arm = bench.session.driving.robot
+    arm = bench.session.robot
     before = arm.state(max_age=2.0).tcp.position[2]
 
     def move() -> None:
@@ -133,12 +133,12 @@ def test_the_frame_can_be_switched(bench: Bench, page: Browser) -> None:
     let_go_of_all(page)
     wait_until_released(bench)
     page.run(press, "base")
-    wait_for(lambda: bench.session.driving.teleop.frame == "base", "the program to hear it")
+    wait_for(lambda: bench.session.teleop.frame == "base", "the program to hear it")
 
 
 def test_a_reset_stops_first_and_needs_a_new_press(bench: Bench, page: Browser) -> None:
     """What was held through the reset moves nothing."""
-    arm = bench.session.driving.robot
+    arm = bench.session.robot
     start = arm.home
 
     def move() -> None:
@@ -155,7 +155,7 @@ def test_a_reset_stops_first_and_needs_a_new_press(bench: Bench, page: Browser) 
     page.key("ArrowUp", "ArrowUp", False)
     let_go_of_all(page)
     wait_until_released(bench)
-    drive_up(bench, page, bench.session.driving.robot.name)
+    drive_up(bench, page, bench.session.robot.name)
 
 
 def test_a_page_without_control_resets_nothing(bench: Bench, page: Browser) -> None:
@@ -179,7 +179,7 @@ def test_a_program_that_offers_nothing_has_no_selector(bench: Bench, page: Brows
         assert page.text("#reset") == ""
         assert page.run("return document.querySelector('#speed').disabled")
     finally:
-        bench.session.driving._steering._show()
+        bench.session._show_driving()
     wait_for(lambda: names_the_driven(page, "left"), "the page to name the driven arm again")
 
 

@@ -56,7 +56,7 @@ def hold_and_drive() -> str | None:
                 log = browser.text("#log")
                 assert "hung" in log, f"stopped in turn {turn} without a reason: {bench.trip}\n{log}"
                 return log
-        assert bench.session.driving.report.trips == []
+        assert bench.app.display.report.trips == []
         assert moved > 0.03 * SECONDS, "the arm went to and fro"
         return None
     finally:

@@ -41,7 +41,7 @@ LISTEN = """
 @pytest.fixture
 def page(bench: Bench, page: Browser) -> Browser:
     """The console, of which is noted what it sends; it knows what every button does."""
-    bench.console.explain(bench.session.driving.teleop.labels(actions=("home", *ACTIONS)))
+    bench.console.explain(bench.session.teleop.labels(actions=("home", *ACTIONS)))
     wait_for(lambda: "record" in page.text('[data-button="south"]'), "the page to know its buttons")
     page.run(LISTEN)
     return page

@@ -36,8 +36,8 @@ def test_the_arm_drives_home_before_each_episode_and_moves_only_while_l2_is_held
     command += [word for option in options for word in ("--set", option)]
     done = subprocess.run(command, capture_output=True, text=True, timeout=100)
     assert done.returncode == 0, done.stdout + done.stderr
-    assert "let go of l2, then hold it until the arm is home" in done.stdout
-    assert "put everything where it starts; south (Cross) starts the recording" in done.stdout
+    assert "release L2, then hold it until the arm is home" in done.stdout
+    assert "place the objects; Cross: start recording" in done.stdout
     assert json.loads(report.read_text())["trips"] == []
 
     reached, lifted = Dataset(out).episodes
