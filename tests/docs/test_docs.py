@@ -93,7 +93,7 @@ def test_the_changelog_has_every_moved_name() -> None:
     shown = [(set(re.findall(r"`(.*?)`", old)), set(re.findall(r"`(.*?)`", new))) for old, new in rows]
     moved = [({old}, {new}) for old, new in _moved.MODULES.items()]
     moved += [({module, name}, {new}) for module, names in _moved.NAMES.items() for name, new in names.items()]
-    moved += [({module, old}, {new}) for module, names in _moved.RENAMED.items() for old, new in names.items()]
+    moved += [({old}, {module, new}) for module, names in _moved.RENAMED.items() for old, new in names.items()]
     missing = [(old, new) for old, new in moved if not any(old <= left and new <= right for left, right in shown)]
     assert not missing
 

@@ -155,3 +155,33 @@ def test_class_names_are_unique() -> None:
 def test_no_file_is_too_long() -> None:
     long = {module: n for module, path in sources().items() if (n := len(path.read_text().splitlines())) > LARGEST_FILE}
     assert not long
+
+
+def import_table() -> dict[str, tuple[list[str], set[str]]]:
+    """Return the table of docs/architecture.md: package -> its modules and packages, and the packages it imports."""
+    text = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
+    rows = re.findall(r"^\| (\w+) \| (`[^|]*) \| [^|]* \| ([^|]*) \|$", text, re.MULTILINE)
+    table = {}
+    for package, files, imported in rows:
+        names = [file.rstrip("/").removeprefix("hal/") for file in re.findall(r"`(.*?)`", files)]
+        table[package] = ([f"hal.{name}" for name in names], set(re.findall(r"\w+", imported)) - {"nothing"})
+    return table
+
+
+def test_the_import_table_of_the_architecture_is_true() -> None:
+    table = import_table()
+    homes = {name: package for package, (names, _) in table.items() for name in names}
+
+    def home(module: str) -> str | None:
+        """Return the package of a module, or of a name in one."""
+        return homes.get(".".join(module.split(".")[:2]))
+
+    lacking = [module for module in sources() if module not in ("hal", "hal._moved") and home(module) is None]
+    assert not lacking, "these modules are in no row of the table"
+    found: dict[str, set[str]] = {package: set() for package in table}
+    for module in sources():
+        own = home(module)
+        if own is not None:
+            found[own] |= {other for name in imports(module) if (other := home(name)) not in (None, own)}
+    wrong = {package: found[package] for package in table if found[package] != table[package][1]}
+    assert not wrong, "docs/architecture.md: these packages really import"
