@@ -1,4 +1,4 @@
-"""A camera of a rig: the public class."""
+"""A camera of a rig: frames, callbacks for every frame, and reconnection in the background."""
 
 from __future__ import annotations
 
@@ -32,48 +32,37 @@ __all__ = [
     "CameraCounts",
     "CameraDriver",
     "CameraTally",
-    "Moving",
+    "MovingCamera",
     "RawFrame",
     "place_of",
 ]
 
 _LOG = logging.getLogger("hal.camera")
-_GRAB = 0.1  # s; how long the camera's thread waits for a frame before it looks whether it is to end
-_SOON, _LATER = 0.2, 2.0  # s between two attempts to reach a lost camera, in its first minute and after
+_GRAB = 0.1
+"""Longest wait for a frame in the camera's thread before it checks whether to end, s."""
+_SOON, _LATER = 0.2, 2.0
+"""Time between two attempts to reopen a lost camera, in its first minute and after that, s."""
 _MINUTE = 60.0
 GIVE_UP = 1800.0
-"""s after which a lost camera is not looked for any more."""
-
+"""Time after which a lost camera is given up, s."""
 Place = Callable[[float], "Pose | None"]
-"""Where the colour sensor is in the world at a time on the rig's clock, s; None where that is not known."""
-
-
-class CameraCounts(NamedTuple):
-    """What a camera has done so far."""
-
-    frames: int
-    dropped: int
-    """Frames that the camera took and this program never saw: gaps in the numbers."""
-    fps: float | None
-    """Over the whole run; None before two frames."""
-    age_p50: float | None
-    """Median age of a frame when it arrived, s."""
-    repeated: int = 0
-    """Sets of pictures in which nothing was new, and which were not handed out."""
-    mismatched: int = 0
-    """Sets whose pictures did not belong together, and which were not handed out."""
-    reconnects: int = 0
-    """How often the camera was lost and came back."""
+"""Returns the pose of the colour sensor in the world at a time on the rig's clock, s; None if unknown."""
 
 
 class Camera:
-    """One camera of a rig, the same whatever driver it ends in. Made by :func:`hal.open`.
+    """One camera of a rig, the same for every driver; created by :func:`hal.open`.
 
-    In real time a thread of its own takes every frame from the driver, so a slow camera never holds up its reader,
-    and ``latest`` never waits. In lock-step both return the present state of the world, which is drawn once.
+    In real time a thread takes every frame from the driver, so ``latest`` never waits and a slow reader loses no time.
+    In lock-step ``read`` and ``latest`` both return the present state of the world, which is rendered once.
 
-    A camera that is lost (unplugged, reset, silent) raises ConnectionLost from ``read`` and ``latest``, is looked for
-    in the background for half an hour, and then works again, the same object.
+    When the camera is lost (unplugged, reset, silent), ``read`` and ``latest`` raise ConnectionLost. It is reopened in
+    the background for half an hour; the same object then works again.
+
+    Args:
+        driver: Driver of the camera.
+        clock: The rig's clock.
+        threaded: Whether a thread reads ahead.
+        place: Pose of a camera whose driver does not report it; see :func:`place_of`.
     """
 
     def __init__(self, driver: CameraDriver, clock: Clock, *, threaded: bool, place: Place | None = None) -> None:
@@ -86,8 +75,8 @@ class Camera:
         self._news = threading.Condition()
         self._newest: Frame | None = None
         self._raw: RawFrame | None = None
-        """What the driver gave for the newest frame."""
-        self._handed_out = -1
+        """The driver's frame for the newest one."""
+        self._returned_seq = -1
         self._error: ConnectionLost | None = None
         self._closing = threading.Event()
         self._grabbing = threading.RLock()
@@ -98,11 +87,12 @@ class Camera:
         self._first = self._last = 0.0
         self._frames = self._dropped = self._reconnects = 0
         self._offset: int | None = 0
-        """Added to the driver's numbers, which start anew when it is opened again; None until its first one."""
+        """Added to the driver's frame numbers, which may start again on ``open``; None until the first frame after it.
+        """
         self._info: CameraInfo = driver.info
 
     def open(self) -> None:
-        """Connect and start to take frames; :func:`hal.open` does it."""
+        """Connect and start to take frames; called by :func:`hal.open`."""
         self._driver.open()
         self._info = self._driver.info
         if self._threaded:
@@ -111,25 +101,31 @@ class Camera:
 
     @property
     def info(self) -> CameraInfo:
-        """Serial number, calibration of every stream, link, options: read when the camera was opened."""
+        """Serial number, calibration of every stream, link and options, read when the camera was opened."""
         return self._info
 
     @property
     def K(self) -> NDArray[np.float64]:
-        """Camera matrix (3, 3) of colour and depth as they are handed out, pixels."""
+        """Camera matrix (3, 3) of the colour and depth images, pixels."""
         return self._info.K
 
     @property
     def connected(self) -> bool:
-        """False from the moment that the camera is lost until its next frame."""
+        """Whether the camera is connected; after a loss, from its next frame on."""
         return self._error is None
 
     def read(self, timeout: float = 1.0, after: float | None = None) -> Frame:
-        """The next frame that was not handed out yet; with ``after``, the first one taken at that time or later.
+        """Return the next frame that was not returned yet.
 
-        In real time a frame shows what was some ms ago: after a motion, ``read(after=rig.clock.now())`` shows its end.
+        In real time a frame shows the past by some ms: after a motion, ``read(after=rig.clock.now())`` shows its end.
 
-        Raises StaleStateError when none came within ``timeout`` s, ConnectionLost when the camera is gone.
+        Args:
+            timeout: Longest time to wait, s.
+            after: Earliest time of the frame, s on ``rig.clock``; None for any.
+
+        Raises:
+            StaleStateError: No such frame came within ``timeout``.
+            ConnectionLost: The camera does not answer.
         """
         if not self._threaded:
             return self._grab(timeout, after)
@@ -139,12 +135,17 @@ class Camera:
                 raise self._error
             if not fresh:
                 raise StaleStateError(f"camera {self.name} took no frame within {timeout:g} s")
-            return self._hand_out()
+            return self._return_newest()
 
     def latest(self, max_age: float = 0.2) -> Frame:
-        """The newest frame, handed out before or not; never waits.
+        """Return the newest frame, whether returned before or not; never waits.
 
-        Raises StaleStateError when it is older than ``max_age`` s, ConnectionLost when the camera is gone.
+        Args:
+            max_age: Greatest age of the frame, s.
+
+        Raises:
+            StaleStateError: The newest frame is older, or there is none yet (``code`` is ``no_frame``).
+            ConnectionLost: The camera does not answer.
         """
         if not self._threaded:
             return self._grab(1.0)
@@ -152,17 +153,19 @@ class Camera:
             if self._error is not None:
                 raise self._error
             if self._newest is None:
-                raise StaleStateError(f"camera {self.name} has taken no frame yet")
+                raise StaleStateError(f"camera {self.name} has taken no frame yet", code="no_frame")
             age = self.clock.now() - self._newest.stamp.t
             if age > max_age:
                 raise StaleStateError(f"the newest frame of camera {self.name} is {age:.3f} s old")
-            return self._hand_out()
+            return self._return_newest()
 
     def on_frame(self, callback: Callable[[Frame], None]) -> Callable[[], None]:
-        """In real time, call ``callback`` with every frame, from the camera's thread; what comes back ends that.
+        """Call a function with every frame, from the camera's thread, in real time.
 
-        It delays the next frame for as long as it takes. An exception in it ends it,
-        and is logged.
+        The next frame waits for it. An exception in it is logged and ends the calls.
+
+        Returns:
+            A function that ends the calls.
         """
         token = object()
         with self._news:
@@ -175,9 +178,12 @@ class Camera:
         return detach
 
     def on_connection(self, callback: Callable[[ConnectionLost | None], None]) -> Callable[[], None]:
-        """Call ``callback`` when the camera is lost, with the error, and when it is back, with None.
+        """Call a function when the camera is lost, with the error, and when it is back, with None.
 
-        From the camera's own thread. An exception in it ends it, and is logged. What comes back ends it, too.
+        It is called from the camera's thread. An exception in it is logged and ends the calls.
+
+        Returns:
+            A function that ends the calls.
         """
         token = object()
         with self._news:
@@ -189,12 +195,17 @@ class Camera:
 
         return detach
 
-    def inject(self, **knobs: object) -> None:
-        """Switch faults on or off, for tests: what there is, the driver says. Raises NotSupported, CommandError."""
-        self._driver.inject(**knobs)
+    def inject(self, **faults: object) -> None:
+        """Switch faults on or off, for tests; see the driver's own ``inject``.
+
+        Raises:
+            NotSupported: The driver has no faults.
+            CommandError: No such fault.
+        """
+        self._driver.inject(**faults)
 
     def counts(self) -> CameraCounts:
-        """Frames, gaps, rate and age so far."""
+        """Return the number of frames and gaps, the rate and the age so far."""
         with self._news:
             span = self._last - self._first
             fps = (self._frames - 1) / span if self._frames > 1 and span > 0.0 else None
@@ -205,23 +216,23 @@ class Camera:
 
     def _unseen(self, after: float | None) -> bool:
         newest = self._newest
-        if newest is None or newest.stamp.seq == self._handed_out:
+        if newest is None or newest.stamp.seq == self._returned_seq:
             return False
         return after is None or newest.stamp.t >= after
 
     def wait_for_first(self, timeout: float) -> bool:
-        """Is there a frame to hand out, now or within ``timeout`` s?"""
+        """Return whether there is a frame, now or within ``timeout`` s."""
         if not self._threaded:
             return True
         with self._news:
             return self._news.wait_for(lambda: self._error is not None or self._newest is not None, timeout)
 
-    def _hand_out(self) -> Frame:
+    def _return_newest(self) -> Frame:
         assert self._newest is not None
-        self._handed_out = self._newest.stamp.seq
+        self._returned_seq = self._newest.stamp.seq
         return self._newest
 
-    # Where nothing takes frames ahead: lock-step, and recordings that are not paced.
+    # Without a thread: in lock-step, and for recordings without pace.
 
     def _grab(self, timeout: float, after: float | None = None) -> Frame:
         deadline = time.monotonic() + timeout
@@ -237,12 +248,12 @@ class Camera:
                     if raw is None or (after is not None and raw.t < after and rest < 0.0):
                         raise StaleStateError(f"camera {self.name} took no frame within {timeout:g} s")
                     if raw is self._raw and self._newest is not None:
-                        frame = self._newest  # nothing has changed since it was drawn
+                        frame = self._newest  # nothing has changed since it was rendered
                     else:
-                        frame = self._take(raw)
-                        self._call(self._listeners, frame)
+                        frame = self._accept_frame(raw)
+                        self._notify(self._listeners, frame)
                     if after is None or raw.t >= after or not self._driver.on_demand:
-                        self._handed_out = frame.stamp.seq
+                        self._returned_seq = frame.stamp.seq
                         return frame
         except ConnectionLost as error:
             if error is self._error:
@@ -256,14 +267,14 @@ class Camera:
             try:
                 raw = self._driver.grab(_GRAB)
             except Exception as error:
-                if self._lose(error).final or not self._look_for_it():
+                if self._lose(error).final or not self._retry_until_back():
                     return
                 continue
             if raw is not None:
-                self._call(self._listeners, self._take(raw))
+                self._notify(self._listeners, self._accept_frame(raw))
 
-    def _look_for_it(self) -> bool:
-        """Open the lost camera again, and see a frame of it. False where that is given up, or the camera is closed."""
+    def _retry_until_back(self) -> bool:
+        """Reopen the lost camera until a frame comes. Return False if that is given up, or the camera was closed."""
         since = time.monotonic()
         while (gone := time.monotonic() - since) < GIVE_UP:
             if self._closing.wait(_SOON if gone < _MINUTE else _LATER):
@@ -272,15 +283,15 @@ class Camera:
                 self._reopen()
                 raw = None
                 while raw is None and not self._closing.is_set():
-                    raw = self._driver.grab(_GRAB)  # a driver whose device stays silent says so in time
+                    raw = self._driver.grab(_GRAB)  # raises if the device stays silent
             except Exception as error:
                 if self._lose(error).final:
                     return False
                 continue
             if raw is not None:
-                self._call(self._listeners, self._take(raw))
+                self._notify(self._listeners, self._accept_frame(raw))
                 return True
-        over = ConnectionLost(f"it did not come back within {GIVE_UP / 60.0:g} minutes, and is looked for no more")
+        over = ConnectionLost(f"it did not come back within {GIVE_UP / 60.0:g} minutes and was given up")
         over.final = True
         self._lose(over)
         return False
@@ -294,7 +305,7 @@ class Camera:
             self._offset = None
 
     def _lose(self, error: Exception) -> ConnectionLost:
-        """Note that the camera is gone, tell whoever waits for it; the error to raise comes back."""
+        """Note that the camera is lost, and notify all who wait for it; return the error to raise."""
         newest = self._newest
         seen = "no frame came from it" if newest is None else f"its last frame is of {newest.stamp.t:.3f} s"
         lost = ConnectionLost(f"camera {self.name} is lost ({seen}, now is {self.clock.now():.3f} s): {error}")
@@ -307,11 +318,11 @@ class Camera:
             self._news.notify_all()
         if first:
             _LOG.warning("%s", lost)
-            self._call(self._watchers, lost)
+            self._notify(self._watchers, lost)
         return lost
 
-    def _take(self, raw: RawFrame) -> Frame:
-        frame = self._frame(raw)
+    def _accept_frame(self, raw: RawFrame) -> Frame:
+        frame = self._frame_of(raw)
         with self._news:
             back, self._error = self._error is not None, None
             self._newest, self._raw = frame, raw
@@ -319,21 +330,21 @@ class Camera:
             self._news.notify_all()
         if back:
             _LOG.warning("camera %s is back", self.name)
-            self._call(self._watchers, None)
+            self._notify(self._watchers, None)
         return frame
 
-    def _call(self, listeners: dict[object, Callable[[Any], None]], news: Frame | ConnectionLost | None) -> None:
+    def _notify(self, listeners: dict[object, Callable[[Any], None]], argument: Frame | ConnectionLost | None) -> None:
         with self._news:
             present = tuple(listeners.items())
         for token, callback in present:
             try:
-                callback(news)
+                callback(argument)
             except Exception:
-                _LOG.exception("camera %s: what was called with its news failed, and is called no more", self.name)
+                _LOG.exception("camera %s: a callback failed and is called no more", self.name)
                 with self._news:
                     listeners.pop(token, None)
 
-    def _frame(self, raw: RawFrame) -> Frame:
+    def _frame_of(self, raw: RawFrame) -> Frame:
         for image in (raw.color, raw.depth, raw.infrared, raw.infrared_right, raw.segmentation):
             if image is not None:
                 image.flags.writeable = False
@@ -368,42 +379,64 @@ class Camera:
         )
 
     def close(self) -> None:
-        """Stop taking frames. Idempotent."""
+        """Stop taking frames and release the device. Idempotent."""
         self._closing.set()
         if self._thread is not None:
             self._thread.join(timeout=2.0)
             self._thread = None
         self._driver.close()
-        self._driver.close()  # the first one may be the end of a loss, after which a driver expects to be opened again
+        self._driver.close()  # after a loss the driver takes the first call for part of a reconnection
 
     def __repr__(self) -> str:
         spec = self.spec
         return f"<Camera {self.name}: {spec.width}x{spec.height} at {spec.rate_hz:g} Hz, driver {spec.driver}>"
 
 
-# [camera_place.py] Where a camera is that cannot know it itself: by the rig's file, and on an arm by that arm's
-# state.
+class CameraCounts(NamedTuple):
+    """Figures about a camera since it was opened."""
+
+    frames: int
+    dropped: int
+    """Frames that the camera took and this program did not get: gaps in their numbers."""
+    fps: float | None
+    """Mean frame rate, Hz; None before two frames."""
+    age_p50: float | None
+    """Median age of a frame on arrival, s."""
+    repeated: int = 0
+    """Sets of images without any new one, which were dropped."""
+    mismatched: int = 0
+    """Sets whose images did not belong together, which were dropped."""
+    reconnects: int = 0
+    """Number of times that the camera was lost and came back."""
 
 
 def place_of(spec: CameraSpec, robots: Mapping[str, Robot]) -> Place | None:
-    """Pose in the world of the colour sensor's optical frame; None where the rig does not say where the camera is."""
+    """Return the pose of the colour sensor's optical frame in the world as a function of time.
+
+    Args:
+        spec: Record of the camera; its view is fixed in the world, or on the link of an arm.
+        robots: The rig's arms, by name.
+
+    Returns:
+        The function, for :class:`Camera`; None if the rig file does not place the camera.
+    """
     view = spec.view
     if view is None:
         return None
     here = Pose(view.position, view.orientation)
     if view.robot is None:
         return lambda t: here
-    return Moving(robots[view.robot], view, here)
+    return MovingCamera(robots[view.robot], view, here)
 
 
-def handed_out(spec: CameraSpec) -> Pose:
-    """Pose of the optical frame that the frames have, in that of the colour sensor, by the model's figures."""
-    sensor = spec.sensors.get(spec.reference)
-    return Pose(sensor.position, sensor.orientation) if sensor is not None else Pose()
+class MovingCamera:
+    """Pose of a camera on an arm's link, from the arm's state at the time of the frame.
 
-
-class Moving:
-    """A camera on an arm's link: by the arm's state at the time of the picture."""
+    Args:
+        robot: The arm.
+        view: View of the camera, with the link.
+        pose: Pose of the colour sensor on that link.
+    """
 
     def __init__(self, robot: Robot, view: ViewSpec, pose: Pose) -> None:
         from .kinematics.arm import Kinematics
@@ -411,7 +444,7 @@ class Moving:
         self._robot = robot
         self._link = str(view.link)
         self._pose = pose
-        self._kinematics = Kinematics(robot.spec.kinematics)  # its own: one for each thread
+        self._kinematics = Kinematics(robot.spec.kinematics)  # not shared: each thread needs its own
 
     def __call__(self, t: float) -> Pose | None:
         try:
@@ -419,6 +452,12 @@ class Moving:
         except HalError:
             return None
         return self._robot.base @ self._kinematics.link_pose(self._link, q) @ self._pose
+
+
+def frame_from_color(spec: CameraSpec) -> Pose:
+    """Return the pose of the frames' optical frame in the colour sensor's, from the figures of the model."""
+    sensor = spec.sensors.get(spec.reference)
+    return Pose(sensor.position, sensor.orientation) if sensor is not None else Pose()
 
 
 __getattr__ = names_of(__name__)

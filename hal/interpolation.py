@@ -20,13 +20,19 @@ AnyState = TypeVar("AnyState", RobotState, GripperState)
 
 
 NEWER = 0.05
-"""s by which a time may be newer than the newest state; that state then stands for it."""
+"""Time by which a request may be newer than the newest state, which then stands for it, s."""
 
 
 def robot_at(history: History[RobotState], t: float, name: str) -> RobotState:
-    """An arm's state at ``t``: numbers in proportion between its neighbours, everything else as in the one before.
+    """Return an arm's state at a time: numbers interpolated linearly, everything else from the state before.
 
-    Raises StaleStateError where ``t`` is older than what is kept, or newer than the newest state by more than 50 ms.
+    Args:
+        history: States of the arm.
+        t: Time on ``rig.clock``, s.
+        name: Name of the arm, for the message.
+
+    Raises:
+        StaleStateError: ``t`` is older than the history, or newer than the newest state by more than 50 ms.
     """
     before, after, share = _neighbours(history, t, name)
     if share == 0.0:
@@ -55,7 +61,16 @@ def robot_at(history: History[RobotState], t: float, name: str) -> RobotState:
 
 
 def gripper_at(history: History[GripperState], t: float, name: str) -> GripperState:
-    """The same for a gripper: its width."""
+    """Return a gripper's state at a time: its width interpolated, everything else from the state before.
+
+    Args:
+        history: States of the gripper.
+        t: Time on ``rig.clock``, s.
+        name: Name of the gripper, for the message.
+
+    Raises:
+        StaleStateError: As for :func:`robot_at`.
+    """
     before, after, share = _neighbours(history, t, name)
     if share == 0.0:
         return before
@@ -64,7 +79,7 @@ def gripper_at(history: History[GripperState], t: float, name: str) -> GripperSt
 
 
 def _neighbours(history: History[AnyState], t: float, name: str) -> tuple[AnyState, AnyState, float]:
-    """The states before and after ``t``, and how far between them it lies, 0..1."""
+    """Return the states before and after ``t``, and the position of ``t`` between them, 0..1."""
     found = history.around(t)
     if found is None:
         raise StaleStateError(f"{name}: its state of {t:.3f} s is not known, or not any more")

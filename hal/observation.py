@@ -1,4 +1,4 @@
-"""What a rig sees at one moment: every camera's newest picture, and the arms as they were when it was taken."""
+"""Observations of a rig: every camera's newest frame, with the states of the arms at its time."""
 
 from __future__ import annotations
 
@@ -7,9 +7,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import TYPE_CHECKING
-
-import numpy as np
-from numpy.typing import NDArray
 
 from .arguments import number, whole
 from .errors import CommandError, DeviceNotFound, StaleStateError
@@ -22,21 +19,36 @@ if TYPE_CHECKING:
 
 __all__ = ["Moment", "Observation", "Observer"]
 
-# [interpolation.py] What a device's state was between two of its samples.
-
-Array = NDArray[np.float64]
-
-
 _NONE: Mapping[str, RobotState] = MappingProxyType({})
 _FRESH = 0.2
-"""s; a picture that is older is waited for."""
+"""Age from which a frame is too old, so that the next one is waited for, s."""
 _NEXT = 0.02
-"""s that a state may be waited for that is as new as the newest picture."""
+"""Longest wait for a state that is as new as the newest frame, s."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Observation:
+    """All of a rig at one time ``t``."""
+
+    t: float
+    """Time of the newest frame, or of the newest states if there are no cameras; s on ``rig.clock``."""
+    cameras: Mapping[str, Moment]
+    """By name; each with the states at the time of its own frame."""
+    robots: Mapping[str, RobotState]
+    """By name, interpolated to ``t``."""
+    grippers: Mapping[str, GripperState]
+    """By the name of the arm, interpolated to ``t``."""
+    history: tuple[Observation, ...] = field(default=())
+    """The last requested observations, oldest first, this one included; padded with the oldest where there were fewer.
+    """
+
+    def __repr__(self) -> str:
+        return f"<Observation of {self.t:.3f} s: cameras {', '.join(self.cameras) or 'none'}; {', '.join(self.robots)}>"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Moment:
-    """One picture, and every arm and gripper interpolated to its stamp."""
+    """One frame, with every arm and gripper interpolated to its time."""
 
     frame: Frame
     robots: Mapping[str, RobotState]
@@ -44,42 +56,21 @@ class Moment:
     """By the name of the arm."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Observation:
-    """All of a rig at one moment, ``t``: ``cameras`` by name, each with the states of its own stamp; ``robots`` and
-    ``grippers`` by the arm's name, interpolated to ``t``; ``history``, the last observations that were *asked for*.
-    """
-
-    t: float
-    """The stamp of the newest picture; without cameras, that of the newest state. s on ``rig.clock``."""
-    cameras: Mapping[str, Moment]
-    robots: Mapping[str, RobotState]
-    """Interpolated to ``t``."""
-    grippers: Mapping[str, GripperState]
-    """By the name of the arm, interpolated to ``t``."""
-    history: tuple[Observation, ...] = field(default=())
-    """This one and those of the calls before, oldest first: as many as were asked for. What was not there yet is the
-    oldest one again."""
-
-    def __repr__(self) -> str:
-        return f"<Observation of {self.t:.3f} s: cameras {', '.join(self.cameras) or 'none'}; {', '.join(self.robots)}>"
-
-
 class Observer:
-    """Observations of one rig, and the last ones before them."""
+    """Takes the observations of one rig, and keeps the last ones for their history."""
 
     def __init__(self, rig: Rig) -> None:
         self._rig = rig
         self._past: deque[Observation] = deque(maxlen=1)
 
     def forget(self) -> None:
-        """A new episode begins: what came before is no part of its history."""
+        """Forget all observations, because a new episode begins."""
         self._past.clear()
 
     def observe(
         self, after: float | None, timeout: float, history: int, cameras: Collection[str] | None
     ) -> Observation:
-        """See :meth:`hal.rig.Rig.observe`."""
+        """Take an observation; see :meth:`hal.rig.Rig.observe`."""
         whole("history", history, least=1)
         number("timeout", timeout, "s", least=0.0)
         if after is not None:
@@ -118,7 +109,7 @@ class Observer:
             return camera.read(timeout)
 
     def _await_states(self, t: float) -> None:
-        """A picture may be some ms newer than the newest state: wait for the next one, but not for long."""
+        """Wait briefly for states as new as the newest frame, which may be some ms newer."""
         if self._rig.lock_step:
             return
         deadline = self._rig.clock.now() + _NEXT
@@ -127,7 +118,7 @@ class Observer:
                 self._rig.clock.sleep(0.0005)
 
     def _newest_states(self, after: float | None, timeout: float) -> tuple[float, Mapping[str, RobotState]]:
-        """The newest states of all arms, waiting for ones that are not older than ``after``, and the oldest's time."""
+        """Return the newest states of all arms, not older than ``after``, and the time of the oldest of them."""
         clock = self._rig.clock
         deadline = clock.now() + timeout
         while True:
@@ -142,7 +133,7 @@ class Observer:
     def _states(
         self, t: float, known: Mapping[str, RobotState] = _NONE
     ) -> tuple[Mapping[str, RobotState], Mapping[str, GripperState]]:
-        """Those of ``t``. The newest ones are mostly just these, and need no search in what is kept."""
+        """Return all states at ``t``; ``known`` ones of that very time need no search in the history."""
         robots: dict[str, RobotState] = {}
         grippers: dict[str, GripperState] = {}
         for robot in self._rig.robots.values():

@@ -1,4 +1,4 @@
-"""A rig: the named devices of one bench, behind one clock. ``hal.open`` makes it."""
+"""A rig: the named devices of one setup behind one clock. :func:`open_rig` is ``hal.open``."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from difflib import get_close_matches
 from functools import partial
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Any, NamedTuple, NoReturn, TypeVar
 
 from . import registry
 from .camera import Camera, place_of
@@ -39,26 +39,9 @@ __all__ = [
     "open_rig",
 ]
 
-# [devices.py] Devices by name.
-
 T = TypeVar("T")
-
-
-class Devices(dict[str, T]):
-    """Devices by name. A name that is not there raises DeviceNotFound, which lists those that are."""
-
-    def __init__(self, kind: str) -> None:
-        super().__init__()
-        self._kind = kind
-
-    def __missing__(self, name: str) -> T:
-        close = get_close_matches(name, self, n=1)
-        hint = f" (did you mean {close[0]!r}?)" if close else ""
-        there = ", ".join(self) if self else "none"
-        raise DeviceNotFound(f"this rig has no {self._kind} {name!r}{hint}; it has: {there}")
-
-
 _FIRST_FRAME = 5.0
+"""Longest wait for a camera's first frame, s."""
 
 
 def open_rig(
@@ -74,19 +57,32 @@ def open_rig(
     listen: str | None = None,
     realtime: bool = True,
 ) -> Rig:
-    """Open a rig: a file, the name of a built-in one, or a dict of the same shape.
+    """Open a rig. Nothing moves.
 
-    ``sim=True`` makes everything simulated, ``sim=False`` sets the rig's flag to real, None leaves the file's flags.
-    ``driver="mock"`` puts a mock in the place of every device. ``clock`` is ``real_time`` or ``lock_step``.
-    ``overrides`` are ``KEY=VALUE`` for any key of the rig. ``pad`` says what a pad of ``model: auto`` is: ``auto``,
-    ``evdev``, ``web`` (the console), ``terminal``, ``demo`` (the recorded tour), the path of a recording,
-    or ``none`` to open no pad. ``viewer="gui"`` opens a window onto the simulated world, ``viewer="3d"`` a page with
-    the arms in three dimensions. ``console=True`` serves the console also where another pad drives; ``listen`` is the
-    address, and the port, at which it listens: loopback unless told otherwise. ``realtime=False``
-    leaves the processes that run servos at the default scheduling; otherwise, in real time, they ask for SCHED_FIFO and
-    locked memory, and :attr:`Rig.notes` says how to allow it where it is refused.
+    Args:
+        config: Path of a rig file, name of a built-in rig, or a dict of the same structure.
+        sim: True simulates every device, False makes every device real; None keeps the flags of the rig file.
+        driver: Driver that replaces those of all devices; ``"mock"`` needs no devices and no simulation.
+        clock: ``"real_time"`` or ``"lock_step"``; None keeps that of the rig file.
+        overrides: Values for keys of the rig file, as ``KEY=VALUE`` strings or a mapping.
+        pad: Device behind a pad of ``model: auto``: ``auto``, ``evdev``, ``web`` (the console), ``terminal``, ``demo``
+            (a recorded tour), the path of a recording, or ``none`` for no pad.
+        viewer: ``"gui"`` opens a window with the simulated world, ``"3d"`` serves a page with the arms in 3D.
+        console: Serve the console, even if another pad drives.
+        listen: Address and port of the console, ``ADDRESS[:PORT]``; this computer only by default.
+        realtime: Request real-time scheduling (SCHED_FIFO) and locked memory for the servos in real time; if they are
+            refused, :attr:`Rig.notes` has the remedy.
 
-    Nothing moves. Raises ConfigError (every problem at once), DriverMissing, DeviceNotFound, ConnectionLost.
+    Returns:
+        The rig; close it, or use it in a ``with`` statement.
+
+    Raises:
+        ConfigError: The rig file is wrong; lists every problem.
+        CommandError: An argument is wrong.
+        DriverMissing: A library is not installed; the message has the command that installs it.
+        DeviceNotFound: No such device.
+        ConnectionLost: A device does not answer.
+        NotSupported: A viewer or a console that this rig cannot have.
     """
     from .config import load
 
@@ -102,53 +98,13 @@ def open_rig(
     return rig
 
 
-def check_opening(plan: Plan, pad: str | None, viewer: str, console: bool) -> list[Chosen]:
-    """Choose the pads, and check what can be checked before a device or a process is opened.
-
-    Args:
-        plan: What is to be opened.
-        pad: As :func:`open_rig` takes it; ``viewer`` and ``console`` likewise.
-
-    Raises:
-        DriverMissing: The libraries of a page are not installed.
-        DeviceNotFound: No such pad.
-        NotSupported: A viewer or a console that this rig cannot have, or a recording for a real arm.
-        ConfigError: A recording that cannot be played.
-    """
-    lock_step = plan.clock == "lock_step"
-    known = {"attended": plan.attended, "emulated": plan.emulated, "lock_step": lock_step}
-    pads = [] if pad == "none" else [choose_pad(spec, pad, **known) for spec in plan.pads]
-    wrong = [
-        Problem("--pad", "", message)
-        for chosen in pads
-        for _, message in registry.checked(chosen.spec.driver, "gamepad", chosen.spec)
-    ]
-    if wrong:
-        raise ConfigError(wrong)
-    if viewer == "gui" and plan.world is None:
-        raise NotSupported("there is no simulated world to look at; leave the viewer out")
-    if viewer == "3d":
-        registry.load(registry.provider("viewer3d"), "viewer3d")
-    if console or any(chosen.input == "console" for chosen in pads):
-        if lock_step:
-            raise NotSupported("the console is for real time; in lock-step, time runs as fast as the program lets it")
-        registry.load(registry.provider("console"), "console")
-    return pads
-
-
-class SharedStates(NamedTuple):
-    """The states of one group of devices, in memory that another process may read; see :meth:`Rig.shared_states`."""
-
-    spec: GroupSpec
-    """The group: its robots, grippers and, where it has one, its simulated world."""
-    memory: SharedMemory
-    """Laid out as :class:`~hal.host.records.GroupMemory` of :attr:`spec`, then the bodies of a simulated world."""
-
-
 class Rig:
     """Robots, cameras and gamepads by name, one clock, and the simulated world if there is one.
 
-    Close it, or use it in a ``with`` statement; the end of the program closes it too.
+    Created by :func:`hal.open`. Close it, or use it in a ``with`` statement; it is also closed when the program ends.
+
+    Args:
+        plan: The resolved rig.
     """
 
     def __init__(self, plan: Plan) -> None:
@@ -159,13 +115,13 @@ class Rig:
         self.world: World = NoWorld()  # type: ignore[assignment]  # every use of it raises NotSupported
         self.clock: Clock = RealClock()
         self.notes: list[str] = list(plan.warnings)
-        """What a person should know: what was not found, and the command that mends it."""
+        """Messages for the user about what was not found or refused, each with the remedy."""
         self._hosts: list[Host] = []
         self._latch = StopLatch()
         self.console: Console | None = None
-        """The page in a browser, where there is one."""
+        """The page in a browser; None if it is not served."""
         self.viewer3d: Viewer3D | None = None
-        """The page with the arms in three dimensions, where there is one."""
+        """The page with the arms in 3D; None if it is not served."""
         self._pictures: Pictures | None = None
         self._viewer: Viewer | None = None
         self._devices: dict[str, Any] = {}
@@ -177,7 +133,7 @@ class Rig:
 
     @property
     def lock_step(self) -> bool:
-        """Does this rig's time stand still until somebody waits?"""
+        """Whether time stands still until the program waits."""
         return self.plan.clock == "lock_step"
 
     def _open(self, *, pad: str | None, viewer: str, console: bool, listen: Listen, realtime: bool) -> None:
@@ -188,7 +144,7 @@ class Rig:
         if console or any(chosen.input == "console" for chosen in pads):
             self._start_console(listen, pads)
         if world_host is not None:
-            self._open_pictures(world_host, viewer)
+            self._open_world_views(world_host, viewer)
         if viewer == "3d":
             self.viewer3d = registry.load(registry.provider("viewer3d"), "viewer3d")(self)
         refused = False
@@ -214,7 +170,7 @@ class Rig:
                 self.console.show(camera)
         self._open_pads(pads)
         for host in self._hosts:
-            host.request("reset_statistics")  # starting up is not what anybody wants to measure
+            host.request("reset_statistics")  # leave out the start
 
     def _note_refused_priority(self) -> None:
         from .preflight import REALTIME_RIGHT
@@ -224,7 +180,10 @@ class Rig:
         self.notes.append(f"real-time priority (SCHED_FIFO) is refused: a busy computer delays the servos; {remedy}")
 
     def _start_hosts(self, groups: Sequence[GroupSpec], realtime: bool) -> Host | None:
-        """The processes of the groups; returns the one with the simulated world. Its copies of arms follow the rest."""
+        """Start the processes of the groups; return the one with the simulated world.
+
+        That one is started last, because it mirrors the arms of the others.
+        """
         world_host: Host | None = None
         if self.lock_step:
             group, *others = groups
@@ -250,8 +209,8 @@ class Rig:
         host = next(host for host in self._hosts if spec in host.spec.grippers)
         return Gripper(spec, robot.name, host, self.clock, self._latch)
 
-    def _open_pictures(self, host: Host, viewer: str) -> None:
-        """Whatever shows the world: the renderer of its cameras, a window."""
+    def _open_world_views(self, host: Host, viewer: str) -> None:
+        """Open what displays the simulated world: the renderer of its cameras, and a window."""
         world = host.spec.world
         assert world is not None
         cameras = [camera for camera in self.plan.cameras if camera.driver == world.driver]
@@ -277,7 +236,7 @@ class Rig:
             camera.open()
         for camera in self.cameras.values():
             if not camera.wait_for_first(_FIRST_FRAME):
-                self.notes.append(f"camera {camera.name} has sent no frame in its first {_FIRST_FRAME:g} s")
+                self.notes.append(f"camera {camera.name} sent no frame in its first {_FIRST_FRAME:g} s")
 
     def _start_console(self, listen: Listen, pads: Sequence[Chosen]) -> None:
         drives = any(chosen.input == "console" for chosen in pads)
@@ -301,7 +260,7 @@ class Rig:
             else:
                 gamepad.start_thread(self.clock.now)
             if chosen.input == "console" and self.console is not None:
-                # Without a word a program that waits for a dead-man would just hang. Apps print a banner instead.
+                # A program that waits for a dead-man would seem to hang. Apps print a banner instead.
                 logging.getLogger("hal.console").warning("drive from a browser: %s", self.console.link)
 
     def _pad_source(self, chosen: Chosen) -> object | None:
@@ -313,28 +272,28 @@ class Rig:
         return self._world_time() if chosen.input == "recording" else None
 
     def _world_time(self) -> Callable[[], float] | None:
-        """How far a simulated world with arms has come, s, where that is not what the clock shows: in real time."""
+        """Return a function for the time of a simulated world with arms, s, if it differs from the clock's."""
         host = next((host for host in self._hosts if host.spec.world is not None and host.spec.robots), None)
         if host is None or self.lock_step:
             return None
         memory, rate_hz = host.memory, host.spec.rate_hz
         return lambda: memory.get_host().ticks / rate_hz
 
-    # What it is.
+    # The rig itself.
 
     @property
     def attended(self) -> bool:
-        """Does something real move on this rig, so that a person must be there?"""
+        """Whether something real moves on this rig, so that a person must be present."""
         return self.plan.attended
 
     @property
     def emulated(self) -> bool:
-        """Does a program stand in for everything that counts as real here, so that nothing can be hurt?"""
+        """Whether everything that counts as real here is emulated, so that nobody can be hurt."""
         return self.plan.emulated
 
     @property
     def has_world(self) -> bool:
-        """Is there a simulated world, ``rig.world``?"""
+        """Whether there is a simulated world, ``rig.world``."""
         return isinstance(self.world, World)
 
     @property
@@ -342,14 +301,20 @@ class Rig:
         host = self._hosts[0]
         if not isinstance(host, LocalHost):
             raise NotSupported(
-                "drivers live in processes of their own in real time; open the rig with clock='lock_step'"
+                "drivers run in their own processes in real time; open the rig with clock='lock_step'",
+                code="needs_lock_step",
             )
         return host
 
     def driver(self, name: str) -> Any:
-        """The driver object behind a device, in lock-step: for unit tests that set a mock's pad or read its log.
+        """Return the driver object of a device, in lock-step only; for tests that press a mock pad or read its log.
 
-        ``name`` is a robot's, a camera's or a pad's, or ``robot.gripper``.
+        Args:
+            name: Name of a robot, a camera or a pad, or ``NAME.gripper`` for a robot's gripper.
+
+        Raises:
+            DeviceNotFound: No such device.
+            NotSupported: In real time, where drivers are in processes of their own.
         """
         cycle = self._local.cycle
         drivers: dict[str, Any] = {unit_name: unit.driver for unit_name, unit in cycle.arms.items()}
@@ -362,11 +327,11 @@ class Rig:
 
     @property
     def renderer(self) -> str | None:
-        """What draws the pictures of simulated cameras, in words; None where nothing does."""
+        """Description of the renderer of the simulated cameras; None if there are none."""
         return self._pictures.describe() if self._pictures is not None else None
 
     def statistics(self) -> dict[str, Any]:
-        """Per group: ticks, missed ticks, periods (s), and per robot the peaks of its set-points and latencies."""
+        """Return ticks, missed ticks and periods (s) per group, peaks of set-points and latencies per robot."""
         return {host.spec.name: host.request("statistics") for host in self._hosts}
 
     def shared_states(self) -> list[SharedStates]:
@@ -390,7 +355,7 @@ class Rig:
         """Number that grows with every call of :meth:`stop`."""
         return sum(host.stops for host in self._hosts)
 
-    # What it sees and does.
+    # Observing and stopping.
 
     def observe(
         self,
@@ -400,24 +365,31 @@ class Rig:
         history: int = 1,
         cameras: Collection[str] | None = None,
     ) -> Observation:
-        """Every camera's newest picture with the arms and grippers interpolated to its stamp, in one record.
+        """Return every camera's newest frame with the states of all arms and grippers interpolated to its time.
 
-        With ``after`` (s on ``rig.clock``) everything is from that time or later: after a motion,
-        ``rig.observe(after=rig.clock.now())`` shows its end. ``history`` says how many observations, this one included,
-        are in :attr:`~hal.observation.Observation.history`. ``cameras`` are the names of those that count, else all.
+        Args:
+            after: Earliest time of everything in it, s on ``rig.clock``: after a motion,
+                ``rig.observe(after=rig.clock.now())`` shows its end. None for any.
+            timeout: Longest time to wait, s.
+            history: Number of observations, this one included, in :attr:`~hal.observation.Observation.history`.
+            cameras: Names of the cameras to use; all by default.
 
-        Raises StaleStateError when a picture or a state did not come within ``timeout`` s, ConnectionLost.
+        Raises:
+            StaleStateError: A frame or a state did not come within ``timeout``.
+            ConnectionLost: A device does not answer.
+            CommandError: An invalid argument.
+            DeviceNotFound: No such camera.
         """
         return self._observer.observe(after, timeout, history, cameras)
 
     def forget_observations(self) -> None:
-        """A new episode begins: what was observed before is no part of its history."""
+        """Start a new history of observations, for a new episode."""
         self._observer.forget()
 
     def stop(self) -> None:
-        """Stop every arm, within its limits, and latch it. Any thread may call it, at any time.
+        """Stop every arm, within its limits, and latch the stop. May be called from any thread at any time.
 
-        A session goes on after ``control.rearm()``, or when its dead-man was let go of and pressed again; a new one
+        A session continues after ``control.rearm()``, or when its dead-man is released and pressed again; a new session
         without a dead-man needs :meth:`rearm` first.
         """
         self._latch.stopped = True
@@ -425,7 +397,7 @@ class Rig:
             host.stop()
 
     def say(self, text: str) -> None:
-        """Show a line to whoever watches: on the console's pages, where there are some."""
+        """Display a line on the console's pages, if there are any."""
         if self.console is not None:
             self.console.say(text)
 
@@ -439,11 +411,11 @@ class Rig:
     def _world_edited(self, method: str, params: dict[str, Any], revision: int) -> None:
         for shown in (self._pictures, self._viewer, self.viewer3d):
             if shown is not None:
-                with contextlib.suppress(ConnectionLost):  # its own next use says that it is gone
+                with contextlib.suppress(ConnectionLost):  # its own next use raises the error
                     shown.edited(method, params, revision)
 
     def close(self) -> None:
-        """Bring the arms to rest and let go of every device. Idempotent; the first error is raised at the end."""
+        """Bring the arms to rest and release every device. Idempotent; the first error is raised at the end."""
         if self._closed:
             return
         errors: list[BaseException] = []
@@ -478,3 +450,77 @@ class Rig:
     def __repr__(self) -> str:
         devices = ", ".join([*self.robots, *self.cameras, *self.gamepads])
         return f"<Rig {self.plan.source}: {devices}; {self.plan.clock}>"
+
+
+def check_opening(plan: Plan, pad: str | None, viewer: str, console: bool) -> list[Chosen]:
+    """Choose the pads, and check what can be checked before a device or a process is opened.
+
+    Args:
+        plan: The resolved rig.
+        pad: As in :func:`open_rig`.
+        viewer: As in :func:`open_rig`.
+        console: As in :func:`open_rig`.
+
+    Returns:
+        The pads to open.
+
+    Raises:
+        DriverMissing: The libraries of a page are not installed.
+        DeviceNotFound: No such pad.
+        NotSupported: A viewer or a console that this rig cannot have, or a recording for a real arm.
+        ConfigError: A recording that cannot be played.
+    """
+    lock_step = plan.clock == "lock_step"
+    known = {"attended": plan.attended, "emulated": plan.emulated, "lock_step": lock_step}
+    pads = [] if pad == "none" else [choose_pad(spec, pad, **known) for spec in plan.pads]
+    wrong = [
+        Problem("--pad", "", message)
+        for chosen in pads
+        for _, message in registry.checked(chosen.spec.driver, "gamepad", chosen.spec)
+    ]
+    if wrong:
+        raise ConfigError(wrong)
+    if viewer == "gui" and plan.world is None:
+        raise NotSupported("there is no simulated world to view; leave the viewer out", code="no_world")
+    if viewer == "3d":
+        registry.load(registry.provider("viewer3d"), "viewer3d")
+    if console or any(chosen.input == "console" for chosen in pads):
+        if lock_step:
+            raise NotSupported(
+                "the console needs real time; in lock-step, time runs as fast as the program", code="needs_real_time"
+            )
+        registry.load(registry.provider("console"), "console")
+    return pads
+
+
+class Devices(dict[str, T]):
+    """Devices by name. An unknown name raises DeviceNotFound, which lists the known ones.
+
+    Args:
+        kind: Word for the devices in messages, ``robot`` for example; with an s it is the rig's attribute.
+    """
+
+    def __init__(self, kind: str) -> None:
+        super().__init__()
+        self._kind = kind
+
+    def __missing__(self, name: str) -> T:
+        close = get_close_matches(name, self, n=1)
+        hint = f" (did you mean {close[0]!r}?)" if close else ""
+        there = ", ".join(self) if self else "none"
+        raise DeviceNotFound(f"this rig has no {self._kind} {name!r}{hint}; it has: {there}", code=f"no_{self._kind}")
+
+    if not TYPE_CHECKING:  # so that type checkers still report unknown attributes
+
+        def __getattr__(self, name: str) -> NoReturn:
+            hint = f"; use rig.{self.__dict__.get('_kind')}s[{name!r}]" if name in self else ""
+            raise AttributeError(f"{type(self).__name__!r} has no attribute {name!r}{hint}", name=name, obj=self)
+
+
+class SharedStates(NamedTuple):
+    """States of one group of devices, in memory that another process may read; see :meth:`Rig.shared_states`."""
+
+    spec: GroupSpec
+    """The group: its robots, grippers and, where it has one, its simulated world."""
+    memory: SharedMemory
+    """Laid out as :class:`~hal.host.records.GroupMemory` of :attr:`spec`, then the bodies of a simulated world."""

@@ -1,4 +1,4 @@
-"""The simulated world: bodies, poses, dynamics, contacts. It exists in simulation only."""
+"""The simulated world of a rig: bodies, poses, dynamics and contacts. Simulation only."""
 
 from __future__ import annotations
 
@@ -19,86 +19,90 @@ Array = NDArray[np.float64]
 
 
 class Contact(NamedTuple):
-    """Two bodies that touch."""
+    """Contact of two bodies."""
 
     a: str
     b: str
     link_a: str | None
     link_b: str | None
     position: Array
-    """On ``b``, in the world, m."""
+    """Point on ``b``, in the world, m."""
     normal: Array
-    """From ``b`` towards ``a``."""
+    """Unit vector from ``b`` to ``a``."""
     distance: float
-    """Negative where they overlap, m."""
+    """Distance, m; negative if they overlap."""
     force: float
-    """Along the normal, N."""
+    """Force along the normal, N."""
 
 
 class Poses(NamedTuple):
-    """Where bodies were at one moment."""
+    """Poses of bodies at one moment."""
 
     t: float
-    """The time of the world that they show, s on ``rig.clock``."""
+    """Time of the world, s on ``rig.clock``."""
     poses: Mapping[str, Pose]
-    """Of each body's base in the world, by the body's name."""
+    """Pose of each body's base in the world, by the body's name."""
 
 
 class World:
-    """``rig.world``. Every call runs between two physics steps, with simulated time standing still.
+    """The simulated world, ``rig.world``. Every call runs between two physics steps.
 
-    An unknown body or link raises DeviceNotFound, which lists those that are there.
+    An unknown body or link raises DeviceNotFound, which lists the known ones. Poses are in the world's frame.
+
+    Args:
+        request: Sends a request to the process of the simulation.
+        edited: Called after every edit that changes what is drawn, with the method, its parameters and the new
+            revision.
     """
 
     def __init__(self, request: Callable[[str, dict[str, Any]], Any], edited: Callable[[str, Any, int], None]) -> None:
         self._request = request
         self._edited = edited
-        """Told of every edit that changes what is drawn: method, parameters, revision."""
 
-    def _ask(self, method: str, **params: Any) -> Any:
+    def _call(self, method: str, **params: Any) -> Any:
         return self._request(f"world.{method}", params)
 
     def _edit(self, method: str, **params: Any) -> None:
-        self._edited(method, params, int(self._ask(method, **params)))
+        self._edited(method, params, int(self._call(method, **params)))
 
     @property
     def bodies(self) -> tuple[str, ...]:
-        """Names of all bodies; a body's place here is its number in ``Frame.segmentation``."""
-        return tuple(self._ask("names"))
+        """Names of all bodies; the index here is the number in ``Frame.segmentation``."""
+        return tuple(self._call("names"))
 
     def add(self, body: BodySpec) -> None:
-        """Put a body into the world."""
+        """Add a body."""
         self._edit("add", spec=to_json(body))
 
     def remove(self, name: str) -> None:
-        """Take a body out of the world. Robots stay."""
+        """Remove a body. Robots cannot be removed."""
         self._edit("remove", name=name)
 
     def set_color(self, name: str, rgba: Sequence[float]) -> None:
-        """Paint a body (red, green, blue, alpha; 0..1)."""
+        """Change the colour of a body: red, green, blue, alpha in 0..1."""
         self._edit("set_color", name=name, rgba=[float(value) for value in rgba])
 
     def pose(self, name: str, link: str | None = None) -> Pose:
-        """Pose of a body's base, or of one of its links, in the world: ground truth."""
-        return _pose(self._ask("pose", name=name, link=link))
+        """Return the true pose of a body's base, or of one of its links, in the world."""
+        return _pose(self._call("pose", name=name, link=link))
 
     def poses(self, names: Collection[str] | None = None) -> Poses:
-        """Those of the bases of many bodies, else of all, at one moment: one request, however many there are."""
-        found = self._ask("poses", names=None if names is None else list(names))
+        """Return the poses of several bodies' bases at one moment, in one request; of all bodies by default."""
+        found = self._call("poses", names=None if names is None else list(names))
         return Poses(float(found["t"]), {name: _pose(pose) for name, pose in found["poses"].items()})
 
     def set_pose(self, name: str, pose: Pose) -> None:
-        """Put a body somewhere else, at rest. Robots are moved by their servo, or put back by :meth:`reset`."""
-        self._ask("set_pose", name=name, pose=_plain(pose))
+        """Place a body, at rest. Robots are moved by their servo, or by :meth:`reset`."""
+        self._call("set_pose", name=name, pose=_plain(pose))
 
     def velocity(self, name: str) -> tuple[Array, Array]:
-        """Linear (3,) m/s and angular (3,) rad/s velocity of a body's base, in the world."""
-        linear, angular = self._ask("velocity", name=name)
+        """Return the linear (3,) m/s and the angular (3,) rad/s velocity of a body's base, in the world."""
+        linear, angular = self._call("velocity", name=name)
         return frozen(linear), frozen(angular)
 
     def set_velocity(self, name: str, linear: ArrayLike = (0, 0, 0), angular: ArrayLike = (0, 0, 0)) -> None:
-        """Give a body a velocity, m/s and rad/s, in the world."""
-        self._ask(
+        """Set the linear (3,) m/s and the angular (3,) rad/s velocity of a body's base, in the world."""
+        self._call(
             "set_velocity",
             name=name,
             linear=np.asarray(linear, float).tolist(),
@@ -106,16 +110,16 @@ class World:
         )
 
     def dynamics(self, name: str, link: str | None = None) -> dict[str, Any]:
-        """Mass (kg), frictions, restitution, dampings, contact stiffness and damping, as the physics uses them."""
-        return dict(self._ask("dynamics", name=name, link=link))
+        """Return mass (kg), frictions, restitution, dampings, and contact stiffness and damping of a body or link."""
+        return dict(self._call("dynamics", name=name, link=link))
 
     def set_dynamics(self, name: str, link: str | None = None, **values: float) -> dict[str, Any]:
-        """Change some of them; returns those values as they were, so that they can be put back."""
-        return dict(self._ask("set_dynamics", name=name, link=link, **values))
+        """Change some of the values of :meth:`dynamics`; return these values as they were before."""
+        return dict(self._call("set_dynamics", name=name, link=link, **values))
 
     @contextmanager
     def changed_dynamics(self, name: str, link: str | None = None, **values: float) -> Iterator[None]:
-        """Change some of them for as long as the ``with`` block lasts."""
+        """Change some of the values of :meth:`dynamics` for the duration of a ``with`` block."""
         before = self.set_dynamics(name, link, **values)
         try:
             yield
@@ -123,22 +127,25 @@ class World:
             self.set_dynamics(name, link, **before)
 
     def contacts(self, a: str | None = None, b: str | None = None) -> tuple[Contact, ...]:
-        """Where bodies touch, all or only those of ``a``, or between ``a`` and ``b``."""
-        found = self._ask("contacts", a=a, b=b)
+        """Return all contacts, those of body ``a``, or those between ``a`` and ``b``."""
+        found = self._call("contacts", a=a, b=b)
         return tuple(
             Contact(**(contact | {"position": frozen(contact["position"]), "normal": frozen(contact["normal"])}))
             for contact in found
         )
 
     def aabb(self, name: str) -> tuple[Array, Array]:
-        """Lower and upper corner (3,) of the box along the world's axes around a body, m."""
-        found = self._ask("aabb", name=name)
+        """Return the lower and the upper corner (3,) of a body's axis-aligned bounding box in the world, m."""
+        found = self._call("aabb", name=name)
         return frozen(found["lower"]), frozen(found["upper"])
 
     def reset(self, name: str | None = None, *, pose: Pose | None = None, q: ArrayLike | None = None) -> None:
-        """Put one thing, or everything, back: at rest, to its configured pose and joints or to those given here.
+        """Reset one body, or everything, to its configured pose and joint positions, at rest.
 
-        ``pose`` is a body's in the world; ``q`` (n,) are an arm's joint positions, rad.
+        Args:
+            name: Body or robot; None for all.
+            pose: Pose of the body in the world, instead of the configured one.
+            q: Joint positions (n,) of an arm, rad, instead of the configured ones.
         """
         params: dict[str, Any] = {"name": name}
         if pose is not None:
@@ -149,7 +156,7 @@ class World:
 
 
 class NoWorld:
-    """What ``rig.world`` is where nothing is simulated: every use of it says so."""
+    """Stands for ``rig.world`` if nothing is simulated: every use of it raises NotSupported."""
 
     def __getattr__(self, name: str) -> Any:
         raise NotSupported("rig.world exists in simulation only: this rig has no simulated world")

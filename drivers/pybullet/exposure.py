@@ -31,9 +31,10 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from hal.camera import RawFrame, handed_out
+from hal.camera import frame_from_color
 from hal.config.files import Problems, validate
 from hal.config.schema import Flag, Strict, describe
+from hal.driver import RawFrame
 from hal.errors import ConfigError, DeviceNotFound, Problem
 from hal.geometry import Pose
 from hal.specs import CameraSpec, SensorSpec
@@ -88,7 +89,7 @@ class Exposure:
 
     def __init__(self, spec: CameraSpec) -> None:
         self.spec = spec
-        self._T_color = handed_out(spec)
+        self._T_color = frame_from_color(spec)
         self._noise = depth_noise(spec)
         self._sides = {name: _side(spec, name) for name in _SIDES if name in spec.streams}
         left = self._sides.get("infrared")
@@ -138,7 +139,7 @@ def _moved(pose: Pose, by: Pose) -> Pose:
 
 def _side(spec: CameraSpec, name: str) -> _Shot:
     sensor = spec.sensors.get(name)
-    view = Pose(sensor.position, sensor.orientation) if sensor is not None else handed_out(spec)
+    view = Pose(sensor.position, sensor.orientation) if sensor is not None else frame_from_color(spec)
     return _Shot(replace(spec, streams=("infrared",), K=spec.K_infrared or spec.K), view)
 
 
@@ -299,7 +300,7 @@ class _StereoNoise(DepthNoise):
         self._scale = np.float32(sensor.K[0][0] * baseline)
         """Depth x disparity, m x pixels of the captured depth picture."""
         self._bumps = _SmoothNoise(spec.height, spec.width, noise.patch * spec.K[0][0] / sensor.K[0][0])
-        left = handed_out(spec).inverse().transform(sensor.position)
+        left = frame_from_color(spec).inverse().transform(sensor.position)
         self._imagers = [_Imager(spec, sensor, offset, baseline) for offset in (left, left + [baseline, 0.0, 0.0])]
 
     def __call__(self, depth: Image, number: int) -> Image:
