@@ -87,7 +87,7 @@ class Gamepad:
         return self._state
 
     def wait(self, timeout: float) -> PadState:
-        """Return the state after its next change, or the present one after ``timeout`` s. Needs :meth:`start_thread`."""
+        """Return the state after its next change, or the present one after ``timeout`` s. Needs a thread."""
         seen = self._state
         with self._changed:
             self._changed.wait_for(lambda: self._state is not seen or self._stopping.is_set(), timeout)

@@ -28,7 +28,7 @@ _ROUNDS = 100
 _EXACT = 1e-10
 """Largest error of an inverted distortion, in units of the focal length."""
 _DIVERGED = 100.0
-"""In the same units: an error from which the iteration does not return."""
+"""Error from which the iteration does not return, in the same units."""
 
 
 class Crop(NamedTuple):

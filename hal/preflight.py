@@ -1,7 +1,6 @@
-"""Before a real arm moves: is this computer fit for it, is the arm there, and is the way to it fast enough? And the
-cameras: are they plugged in, by which link, and do they keep their rate?
+"""Checks before a real arm moves: this computer, the arms and their network, the cameras and their frame rates.
 
-Nothing moves, and nothing stays open.
+Nothing moves, and nothing stays open. ``hal-check`` prints the results.
 """
 
 from __future__ import annotations
@@ -36,26 +35,76 @@ __all__ = [
     "real_arms",
 ]
 
-# [verdict.py] One finding of the check before a real arm moves.
-
 Level = Literal["ok", "warn", "fail", "unknown"]
-"""``warn``: it may work. ``fail``: it will not. ``unknown``: nobody could look, which is never the same as ``ok``."""
+"""``warn``: it may work. ``fail``: it will not. ``unknown``: it could not be checked, which is not the same as ``ok``.
+"""
+Check = Callable[[RobotSpec, float], Iterator[CheckResult]]
+"""A driver's ``DriverSpec.preflight``: its arguments are the arm's record, and how long it may measure, s."""
+CameraCheck = Callable[[CameraSpec, float], Iterator[CheckResult]]
+"""A driver's ``DriverSpec.camera_preflight``, likewise."""
 
 
 @dataclass(frozen=True, slots=True)
 class CheckResult:
-    """What was looked at, how that stands, and what a person can do about it."""
+    """Result of one check."""
 
     name: str
+    """What was checked."""
     level: Level
     found: str
+    """What was found, in words."""
     remedy: str = ""
-    """What mends it, a command where there is one; empty where nothing is to be done."""
+    """What to do about it, a command if there is one; empty if nothing is to be done."""
 
 
-# [machine.py] Is this computer fit for set-points at a fixed rate? What every real arm wants of it, whatever its
-# make.
+def preflight(
+    plan: Plan, duration: float = 2.0, *, machine: bool = True, cameras: bool = True
+) -> Iterator[CheckResult]:
+    """Check this computer, then every real arm and camera; yield each result as soon as it is known.
 
+    Errors of a driver's check become results.
+
+    Args:
+        plan: The resolved rig.
+        duration: Time for which each arm's network and each camera's rate is measured, s.
+        machine: Whether to check this computer.
+        cameras: Whether to check the cameras.
+    """
+    if machine:
+        yield from check_machine()
+    devices: list[RobotSpec | CameraSpec] = [*real_arms(plan), *(checked_cameras(plan) if cameras else ())]
+    for device in devices:
+        for result in _check(device, duration):
+            yield replace(result, name=f"{device.name}: {result.name}")
+
+
+def real_arms(plan: Plan) -> tuple[RobotSpec, ...]:
+    """Return the arms of a rig that are real or emulated."""
+    return tuple(robot for robot in plan.robots if robot.attended or robot.emulated)
+
+
+def checked_cameras(plan: Plan) -> tuple[CameraSpec, ...]:
+    """Return the cameras of a rig whose driver can check them before they are opened."""
+    return tuple(camera for camera in plan.cameras if registry.driver(camera.driver).camera_preflight is not None)
+
+
+def _check(device: RobotSpec | CameraSpec, duration: float) -> Iterator[CheckResult]:
+    arm = isinstance(device, RobotSpec)
+    try:
+        spec = registry.driver(device.driver)
+        check: Callable[[Any, float], Iterator[CheckResult]] | None = registry.function(
+            device.driver, spec.preflight if arm else spec.camera_preflight
+        )
+        if check is None:
+            kind = "arm" if arm else "camera"
+            yield CheckResult(kind, "unknown", f"its driver {device.driver!r} has no check of its own")
+            return
+        yield from check(device, duration)
+    except (HalError, OSError) as error:
+        yield CheckResult("check", "fail", f"{type(error).__name__}: {error}", "fix this first, then check again")
+
+
+# This computer
 _ROOT = Path("/")
 _GOVERNORS = "sys/devices/system/cpu/cpu[0-9]*/cpufreq/scaling_governor"
 _IPC_LOCK = 14
@@ -64,22 +113,23 @@ REALTIME_RIGHT = (
     'printf \'%s - rtprio 99\\n%s - memlock unlimited\\n\' "$USER" "$USER" | '
     "sudo tee /etc/security/limits.d/99-realtime.conf; then log out and in"
 )
-"""Command that gives this user the right to real-time scheduling and to locked memory."""
+"""Command that allows this user real-time scheduling and locked memory."""
 _FULL_SPEED = "echo performance | sudo tee /sys/devices/system/cpu/cpu*/cpufreq/scaling_governor (until the next start)"
 _KERNELS = {
     "debian": "sudo apt install linux-image-rt-amd64, then start the computer with it",
     "ubuntu": "sudo pro enable realtime-kernel, then start the computer with it",
 }
-"""Distribution -> how a real-time kernel gets there."""
+"""Distribution -> how to install a real-time kernel."""
 
 
 def check_machine(root: Path = _ROOT) -> Iterator[CheckResult]:
-    """One verdict each: kernel, processor's frequency, right to real-time scheduling, right to lock memory.
+    """Check the kernel, the frequency of the processors, and the rights to real-time scheduling and locked memory.
 
-    ``root`` is where the files of the system are looked for.
+    Args:
+        root: Folder in which the system's files are, for tests.
     """
     if not sys.platform.startswith("linux"):
-        yield CheckResult("machine", "unknown", f"nothing is known of {sys.platform}", "use Linux for a real arm")
+        yield CheckResult("machine", "unknown", f"cannot check {sys.platform}", "use Linux for a real arm")
         return
     yield _kernel(root)
     yield _frequency(root)
@@ -88,11 +138,11 @@ def check_machine(root: Path = _ROOT) -> Iterator[CheckResult]:
 
 
 def has_realtime_kernel(root: Path = _ROOT) -> bool | None:
-    """Does this computer run a kernel with PREEMPT_RT? None where that cannot be found out."""
+    """Return whether this computer runs a kernel with PREEMPT_RT; None if that is unknown."""
     version = _text(root / "proc/version")
     if version is None:
         return None
-    # The file came with the patches for older kernels; the name of a newer kernel says it.
+    # Older, patched kernels have the file; newer ones have it in their name.
     return _text(root / "sys/kernel/realtime") == "1" or "PREEMPT_RT" in version or "PREEMPT RT" in version
 
 
@@ -102,16 +152,16 @@ def _kernel(root: Path) -> CheckResult:
         return CheckResult("kernel", "unknown", "cannot read /proc/version")
     release = os.uname().release
     if realtime:
-        return CheckResult("kernel", "ok", f"{release}, a real-time kernel (PREEMPT_RT)")
-    found = f"{release}, no real-time kernel: a set-point now and then will be late"
+        return CheckResult("kernel", "ok", f"{release}, real-time kernel (PREEMPT_RT)")
+    found = f"{release}, no real-time kernel: some set-points will be late"
     return CheckResult("kernel", "warn", found, _KERNELS.get(_distribution(root), "install a kernel with PREEMPT_RT"))
 
 
 def _frequency(root: Path) -> CheckResult:
-    """Processors that slow down to save power wake up late."""
+    """Check the frequency governor: processors that slow down to save power wake up late."""
     governors = {text for path in root.glob(_GOVERNORS) if (text := _text(path))}
     if not governors:
-        return CheckResult("processor", "unknown", "Linux does not say how the processor's frequency is governed")
+        return CheckResult("processor", "unknown", "frequency governor: unknown")
     saving = ", ".join(sorted(governors - {"performance"}))
     if not saving:
         return CheckResult("processor", "ok", "full speed (governor performance)")
@@ -123,12 +173,12 @@ def _scheduling() -> CheckResult:
     if _may_be_fifo(priority):
         return CheckResult("scheduling", "ok", f"SCHED_FIFO is allowed, up to priority {priority}")
     limit = resource.getrlimit(resource.RLIMIT_RTPRIO)[0]
-    found = f"SCHED_FIFO is not allowed up to priority {priority} ('ulimit -r' says {limit})"
+    found = f"SCHED_FIFO is not allowed up to priority {priority} ('ulimit -r' is {limit})"
     return CheckResult("scheduling", "warn", found, REALTIME_RIGHT)
 
 
 def _may_be_fifo(priority: int) -> bool:
-    """Try it, in a thread of its own, for limits, capabilities and containers all have a say."""
+    """Try it, in a thread of its own, because limits, capabilities and containers all matter."""
     allowed = False
 
     def attempt() -> None:
@@ -146,7 +196,7 @@ def _may_be_fifo(priority: int) -> bool:
 
 
 def may_lock_memory(root: Path = _ROOT) -> bool:
-    """Whether this process may lock all of its memory."""
+    """Return whether this process may lock all of its memory."""
     limit = resource.getrlimit(resource.RLIMIT_MEMLOCK)[0]
     return limit == resource.RLIM_INFINITY or bool((_capabilities(root) or 0) >> _IPC_LOCK & 1)
 
@@ -160,13 +210,13 @@ def _memory(root: Path) -> CheckResult:
 
 
 def _capabilities(root: Path) -> int | None:
-    """Capabilities of this process, as bits."""
+    """Return the capabilities of this process, as bits; None if unknown."""
     lines = (_text(root / "proc/self/status") or "").splitlines()
     return next((int(line.split()[1], 16) for line in lines if line.startswith("CapEff:")), None)
 
 
 def _distribution(root: Path) -> str:
-    """``debian``, ``ubuntu``, ...: ID of os-release(5)."""
+    """Return the ID of os-release(5): ``debian``, ``ubuntu``, ..."""
     lines = (_text(root / "etc/os-release") or "").splitlines()
     return next((line[3:].strip("\"'") for line in lines if line.startswith("ID=")), "")
 
@@ -176,56 +226,3 @@ def _text(path: Path) -> str | None:
         return path.read_text(errors="replace").strip()
     except OSError:
         return None
-
-
-Check = Callable[[RobotSpec, float], Iterator[CheckResult]]
-"""What a driver offers as ``DriverSpec.preflight``: it is given the arm, and how long it may measure, s."""
-CameraCheck = Callable[[CameraSpec, float], Iterator[CheckResult]]
-"""And as ``DriverSpec.camera_preflight``."""
-
-
-def real_arms(plan: Plan) -> tuple[RobotSpec, ...]:
-    """The arms of a rig that have somebody at the other end: a robot, or a program that stands in for one."""
-    return tuple(robot for robot in plan.robots if robot.attended or robot.emulated)
-
-
-def checked_cameras(plan: Plan) -> tuple[CameraSpec, ...]:
-    """The cameras of a rig whose driver can look at them before they are opened."""
-    return tuple(camera for camera in plan.cameras if registry.driver(camera.driver).camera_preflight is not None)
-
-
-def preflight(
-    plan: Plan, duration: float = 2.0, *, machine: bool = True, cameras: bool = True
-) -> Iterator[CheckResult]:
-    """Check the machine, then every real arm and camera; each verdict comes as soon as it is known.
-
-    Errors of a driver's check are verdicts, too, and are not raised.
-
-    Args:
-        plan: The rig.
-        duration: How long each arm's network, and each camera's rate, is measured, s.
-        machine: Whether to check this computer.
-        cameras: Whether to check the cameras.
-    """
-    if machine:
-        yield from check_machine()
-    devices: list[RobotSpec | CameraSpec] = [*real_arms(plan), *(checked_cameras(plan) if cameras else ())]
-    for device in devices:
-        for verdict in _check(device, duration):
-            yield replace(verdict, name=f"{device.name}: {verdict.name}")
-
-
-def _check(device: RobotSpec | CameraSpec, duration: float) -> Iterator[CheckResult]:
-    arm = isinstance(device, RobotSpec)
-    try:
-        spec = registry.driver(device.driver)
-        check: Callable[[Any, float], Iterator[CheckResult]] | None = registry.function(
-            device.driver, spec.preflight if arm else spec.camera_preflight
-        )
-        if check is None:
-            kind = "arm" if arm else "camera"
-            yield CheckResult(kind, "unknown", f"its driver {device.driver!r} has no check of its own")
-            return
-        yield from check(device, duration)
-    except (HalError, OSError) as error:
-        yield CheckResult("check", "fail", f"{type(error).__name__}: {error}", "mend this first, then check again")

@@ -1,9 +1,9 @@
-"""Find drivers by name: a table of the built-in drivers, and the entry-point group ``hal.drivers`` for all others.
+"""Find drivers by name: the built-in ones, and those that other packages announce as entry points of ``hal.drivers``.
 
-This is the only module of ``hal`` that names drivers. It imports a driver when it is first used.
+This is the only module of ``hal`` that names drivers. A driver is imported when it is first used.
 
-A driver is a folder with one class for each kind of device (see :mod:`hal.driver`), and one :class:`DriverSpec` that
-names these classes. Another package announces its spec in its ``pyproject.toml``; a robot or camera model, or the
+A driver is a folder or module with one class per kind of device (see :mod:`hal.driver`), and one :class:`DriverSpec`
+that names these classes. Another package announces its spec in its ``pyproject.toml``; a robot or camera model, or the
 device's entry in a rig file, can then use ``drivers: {real: my_arm}``, and a gamepad ``driver: my_pad``::
 
     [project.entry-points."hal.drivers"]
@@ -40,10 +40,11 @@ __all__ = [
 ]
 
 PadInput = Literal["plugged", "console", "keys", "recording"]
-"""A gamepad that is plugged in, the page of the console, the keys of the program's terminal, or a recording."""
+"""Where a gamepad's input comes from: a pad that is plugged in, the console's page, the keys of the terminal, or a
+recording."""
 
 GROUP = "hal.drivers"
-"""The entry-point group."""
+"""Group of the entry points."""
 
 BUILT_IN: Mapping[str, str] = MappingProxyType(
     {
@@ -58,12 +59,12 @@ BUILT_IN: Mapping[str, str] = MappingProxyType(
         "web": "hal.drivers.web:DRIVER",
     }
 )
-"""Name of a built-in driver -> where its :class:`DriverSpec` is, as "module:ATTRIBUTE"."""
+"""Name of a built-in driver -> place of its :class:`DriverSpec`, as "module:ATTRIBUTE"."""
 
 
 @dataclass(frozen=True)
 class DriverSpec:
-    """The classes and capabilities of one driver. Classes are named as ``"module:Class"`` and imported on first use."""
+    """Classes and capabilities of one driver. Classes are named as ``"module:Class"`` and imported on first use."""
 
     name: str
     robot: str | None = None
@@ -75,43 +76,42 @@ class DriverSpec:
     gamepad: str | None = None
     """A :class:`~hal.driver.GamepadDriver`."""
     world: str | None = None
-    """The simulated world that this driver's arms, grippers and cameras stand in."""
+    """The simulated world of this driver's arms, grippers and cameras."""
     viewer: str | None = None
-    """A window onto a mirror."""
+    """A window with the simulated world: :class:`~hal.views.Viewer`."""
     viewer3d: str | None = None
-    """A page with the arms in three dimensions."""
+    """A page with the arms in 3D: :class:`~hal.views.Viewer3D`."""
     pictures: str | None = None
-    """What draws the pictures of all simulated cameras of a rig."""
+    """Renderer of all simulated cameras of a rig: :class:`~hal.views.Pictures`."""
     console: str | None = None
-    """A page in a browser that shows a rig and drives it."""
+    """A page in a browser that displays a rig and drives it: :class:`~hal.views.Console`."""
     pad_input: PadInput | None = None
     """Where the input of this driver's gamepads comes from; the rig chooses a gamepad of ``model: auto`` by it."""
     pad_title: str = ""
     """A few words for :attr:`pad_input`, for status messages."""
     checks: Mapping[str, str] = field(default_factory=dict)
-    """Kind of device (``robot``, ``gripper``, ``camera``, ``gamepad``) -> "module:function", which looks at the
-    resolved record of such a device before anything is opened, and yields (key, message) for each thing that is wrong
-    in it; keys are relative to the device's entry in the rig, for example ``real.host``. It must not import the
-    driver's libraries."""
+    """Kind of device (``robot``, ``gripper``, ``camera``, ``gamepad``) -> "module:function", which checks the resolved
+    record of such a device before anything is opened. It yields (key, message) for each mistake; keys are relative to
+    the device's entry in the rig, for example ``real.host``. It must not import the driver's libraries."""
     emulated: str | None = None
-    """"module:function" that says of the options of a real device whether a program stands in for it, which may be
-    stepped by ``rig.clock`` (an address on this computer)."""
+    """"module:function" that returns whether the options of a real device name an emulator on this computer, which
+    ``rig.clock`` may step."""
     preflight: str | None = None
-    """"module:function" that looks at a real arm before it moves (see :mod:`hal.preflight`)."""
+    """"module:function" that checks a real arm before it moves (see :mod:`hal.preflight`)."""
     camera_preflight: str | None = None
     """The same for a real camera."""
     path_options: frozenset[str] = frozenset()
-    """Options that are paths of files: in a rig or a model they are relative to the file that names them."""
+    """Options that are paths of files; in a rig or a model they are relative to the file that names them."""
     own_process: frozenset[str] = frozenset()
     """Kinds of device that need a process of their own (``gripper``: the vendor's calls block)."""
     stands_in: bool = False
     """Whether ``hal.open(driver=...)`` may put this driver in place of every device, in lock-step."""
     requires: Mapping[str, str] = field(default_factory=dict)
-    """Import name of each library that the driver needs -> the command that installs it."""
+    """Import name of each library that the driver needs -> command that installs it."""
 
     @property
     def kinds(self) -> tuple[str, ...]:
-        """The kinds of device that this driver has."""
+        """Kinds of device that this driver has."""
         return tuple(kind for kind in _KINDS if getattr(self, kind) is not None)
 
 
@@ -119,15 +119,19 @@ _KINDS = ("robot", "gripper", "camera", "gamepad", "world", "viewer", "viewer3d"
 
 
 def names() -> tuple[str, ...]:
-    """Names of all drivers, built in and installed, in alphabetical order. Imports none of them."""
+    """Return the names of all drivers, built in and installed, in alphabetical order. Imports none of them."""
     return tuple(sorted({*BUILT_IN, *_entry_points()}))
 
 
 def driver(name: str) -> DriverSpec:
-    """The spec of the driver called ``name``, or named as "module:ATTRIBUTE".
+    """Return the spec of a driver.
 
-    Raises DeviceNotFound (lists the drivers that there are) and DriverMissing (it is announced, but its package does
-    not import).
+    Args:
+        name: Name of the driver, or place of its spec as "module:ATTRIBUTE".
+
+    Raises:
+        DeviceNotFound: No such driver; lists the known ones (``code`` is ``unknown_driver``).
+        DriverMissing: The driver is announced, but its package cannot be imported.
     """
     place = BUILT_IN.get(name)
     if place is None and ":" in name:
@@ -135,7 +139,10 @@ def driver(name: str) -> DriverSpec:
     if place is None:
         place = _entry_points().get(name)
     if place is None:
-        raise DeviceNotFound(f"there is no driver {name!r}{_nearest(name, names())}; drivers: {', '.join(names())}")
+        raise DeviceNotFound(
+            f"there is no driver {name!r}{_nearest(name, names())}; drivers: {', '.join(names())}",
+            code="unknown_driver",
+        )
     spec = _resolve(place, name, {})
     if not isinstance(spec, DriverSpec):
         raise DriverMissing(f"driver {name!r}: {place} is a {type(spec).__name__}, not a hal.registry.DriverSpec")
@@ -167,10 +174,16 @@ def pad_driver(pad_input: PadInput) -> str:
 
 
 def load(name: str, kind: str) -> Any:
-    """The class that the driver ``name`` has for ``kind`` (``robot``, ``gripper``, ``camera``, ``gamepad``, ...).
+    """Return the class that a driver has for a kind of device.
 
-    Raises what :func:`driver` raises, NotSupported (the driver has no such kind; lists what it has), and
-    DriverMissing (a library that it needs is not installed; names the command that installs it).
+    Args:
+        name: Name of the driver, or place of its spec.
+        kind: ``robot``, ``gripper``, ``camera``, ``gamepad``, ``world``, ...
+
+    Raises:
+        DeviceNotFound: No such driver.
+        NotSupported: The driver has no such kind; lists what it has.
+        DriverMissing: A library that it needs is not installed; the message has the command that installs it.
     """
     spec = driver(name)
     if kind not in _KINDS:
@@ -182,9 +195,10 @@ def load(name: str, kind: str) -> Any:
 
 
 def function(name: str, place: str | None) -> Callable[..., Any] | None:
-    """The function that the driver ``name`` names as ``place`` in its spec (a check, ``emulated``, ``preflight``).
+    """Return the function at ``place``, one of a driver's spec such as ``preflight``; None for None.
 
-    None where it names none. Raises DriverMissing.
+    Raises:
+        DriverMissing: A library that it needs is not installed.
     """
     if place is None:
         return None
@@ -193,15 +207,15 @@ def function(name: str, place: str | None) -> Callable[..., Any] | None:
 
 
 def checked(name: str, kind: str, record: object) -> list[tuple[str, str]]:
-    """Return what the driver ``name`` finds wrong in a device's record: (key in its entry of the rig, sentence)."""
+    """Return the mistakes that a driver finds in a device's record: (key in the device's entry of the rig, message)."""
     check = function(name, driver(name).checks.get(kind))
     return list(check(record)) if check is not None else []
 
 
 def missing(name: str) -> dict[str, str]:
-    """Libraries that the driver ``name`` needs and that are not installed -> the command that installs each.
+    """Return the libraries that a driver needs and that are not installed -> the command that installs each.
 
-    Looks for them without importing them, so a program can say what is missing before it opens anything.
+    Imports none of them, so a program can report what is missing before it opens anything.
     """
     return {
         library: command
@@ -211,14 +225,14 @@ def missing(name: str) -> dict[str, str]:
 
 
 def _resolve(place: str, name: str, requires: Mapping[str, str]) -> Any:
-    """The attribute named by "module:ATTRIBUTE"; trouble is reported as that of the driver ``name``."""
+    """Return the attribute at "module:ATTRIBUTE"; errors are reported as those of the driver ``name``."""
     module_name, _, attribute = place.partition(":")
     try:
         module = importlib.import_module(module_name)
     except ImportError as error:
         library = (error.name or "").partition(".")[0]
         if library == "hal" and not isinstance(error, ModuleNotFoundError):
-            raise  # a mistake inside the hal itself; a traceback serves whoever mends it
+            raise  # a mistake in this package: the traceback is more useful
         remedy = requires.get(library)
         hints = [remedy] if remedy else [f"{command} (for {wanted})" for wanted, command in requires.items()]
         advice = f"; install it with: {', '.join(hints)}" if hints else ""
@@ -232,7 +246,7 @@ def _resolve(place: str, name: str, requires: Mapping[str, str]) -> Any:
 
 
 def _entry_points() -> dict[str, str]:
-    """Drivers that installed packages announce, name -> "module:ATTRIBUTE"."""
+    """Return the drivers that installed packages announce, name -> "module:ATTRIBUTE"."""
     from importlib.metadata import entry_points  # 25 ms, so only when it is needed
 
     return {point.name: point.value for point in entry_points(group=GROUP)}

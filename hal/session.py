@@ -20,7 +20,7 @@ from .errors import (
     StaleStateError,
 )
 from .learning.episode import reset_scene, stands_in_world
-from .teleop import Teleop, towards
+from .teleop import Teleop, twist_towards
 from .views import DrivingView
 
 if TYPE_CHECKING:
@@ -343,7 +343,7 @@ class TeleopSession:
             return motion
         linear, angular = self.teleop.mapping.speeds()
         speed = self.teleop.speed
-        return towards(goal, self.robot.state(max_age=STATE_AGE).tcp_set, speed * linear, speed * angular)
+        return twist_towards(goal, self.robot.state(max_age=STATE_AGE).tcp_set, speed * linear, speed * angular)
 
     def _update_state(self) -> None:
         try:

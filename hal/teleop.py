@@ -1,4 +1,4 @@
-"""Teleoperation: from what a person does with a pad to what is asked of an arm and its gripper."""
+"""Teleoperation: turns the states of a gamepad into commands for an arm and its gripper."""
 
 from __future__ import annotations
 
@@ -21,35 +21,13 @@ if TYPE_CHECKING:
 
 __all__ = [
     "Teleop",
-    "towards",
+    "twist_towards",
 ]
 
-# [following.py] Going to a pose by speeds: for a goal that a person drags about, and that a limit or a released
-# dead-man holds up.
-
-_GAIN = 4.0
-"""1/s: the share of what is left that is covered per second near the goal. Far slower than the servo brakes, so it
-arrives without overshoot."""
-
-
-def towards(goal: Pose, tcp: Pose, linear: float, angular: float) -> Twist:
-    """The speeds that bring ``tcp`` to ``goal``, both in the base frame: at most ``linear`` m/s and ``angular`` rad/s.
-
-    Straight, and turning about one axis; both slow down towards the end.
-    """
-    left = difference((*tcp.position, *tcp.orientation), (*goal.position, *goal.orientation))
-    return Twist(_capped(left[:3], linear), _capped(left[3:], angular))
-
-
-def _capped(left: Sequence[float], most: float) -> list[float]:
-    distance = hypot(*left)
-    return [min(_GAIN, most / distance) * part for part in left] if distance > 0.0 else [0.0, 0.0, 0.0]
-
-
 _CROSSED = 0.05
-"""A trigger this close to the present grip has reached it (share of the travel)."""
+"""Distance between trigger and grip at which the trigger counts as having reached it, as a share of the travel."""
 _HALF = 0.5
-"""Share of its greatest width below which a gripper that was told to go there is closed."""
+"""Share of its greatest width below which a gripper's target counts as closed."""
 _DIRECTIONS = ("x", "y", "z", "roll", "pitch", "yaw")
 _WORDS = (
     ("back", "forward"),
@@ -59,29 +37,41 @@ _WORDS = (
     ("tip up", "tip down"),
     ("turn right", "turn left"),
 )
-"""The six directions in the arm's base frame (x forward, y left, z up), the negative end first."""
+"""The six directions of :data:`_DIRECTIONS` in the arm's base frame (x forward, y left, z up), the negative one first.
+"""
+_GAIN = 4.0
+"""Share of the remaining distance that is covered per second near the goal, 1/s. Far slower than the servo brakes, so
+the tcp arrives without overshoot."""
 
 
 class Teleop:
     """Turns pad states into commands by a mapping (``config/teleop``).
 
-    A trigger that closes the gripper takes it over only after it has crossed the present grip, so that neither the
-    start of a session, nor a new press of the dead-man, nor a pad that comes back ever drops what the fingers hold. A
-    button that opens and closes does so when it is pressed with the dead-man held, whatever was before: what it does
-    follows from what the gripper was told last, by whomever.
+    A trigger that closes the gripper takes over only once it has crossed the present grip: neither the start of a
+    session, nor a new press of the dead-man, nor a reconnected pad ever drops what the fingers hold. A button that
+    opens and closes acts when it is pressed with the dead-man held, on the last command that the gripper got from
+    anywhere.
+
+    Args:
+        robot: The arm.
+        mapping: Name or path of a mapping, or the mapping itself.
+        speed: Share of the mapping's speeds, above 0, at most 1.
+
+    Raises:
+        ConfigError: The mapping is wrong.
+        CommandError: The speed is out of range.
     """
 
     def __init__(
         self, robot: Robot, mapping: str | Path | Mapping[str, Any] | TeleopMapping = "default", speed: float = 1.0
     ) -> None:
-        """``speed`` scales the mapping's speeds, above 0, at most 1. Raises ConfigError for a bad mapping."""
         speed = number("speed", speed, least=0.0, above=True, most=1.0)
         self.robot = robot
         self.mapping = load_mapping(mapping)
         self.speed = speed
         """Share of the mapping's speeds, above 0, at most 1."""
         self.frame = self.mapping.frame
-        """``base`` or ``tcp``: the axes that the controls move along; at first the mapping's."""
+        """Axes that the controls move along, ``base`` or ``tcp``; the mapping's at first."""
         self._has_grip = False
         self._side = 0.0
         self._was_toggle = True
@@ -90,17 +80,21 @@ class Teleop:
         self._was_acting = frozenset(self.mapping.actions)
 
     def reset(self) -> None:
-        """A new session: the gripper's trigger must cross the present grip again before it counts, and a button that
-        opens and closes must be let go of."""
+        """Start a new session: a gripper's trigger must cross the present grip again, its button be released."""
         self._has_grip = False
         self._side = 0.0
         self._was_toggle = True
         self._toggled = None
 
     def step(self, pad: PadState, dt: float) -> tuple[Twist, float | None]:
-        """The command for the arm, and for the gripper: a grip from 0 (open) to 1 (closed), or None for none.
+        """Return the command for a pad's state.
 
-        ``dt`` is the time since the last step, s; the command is a speed, so nothing here depends on it.
+        Args:
+            pad: State of the pad.
+            dt: Time since the last step, s; without effect, because the command is a velocity.
+
+        Returns:
+            The twist for the arm, and the grip from 0 (open) to 1 (closed), or None to leave the gripper alone.
         """
         _check_state(pad)
         twist = self.mapping.twist(pad)
@@ -108,7 +102,7 @@ class Teleop:
         return Twist(linear, angular, frame=self.frame), self._grip(pad)
 
     def home_pressed(self, pad: PadState) -> bool:
-        """Was the button that drives the arm home pressed since the last call?"""
+        """Return whether the button that moves the arm home was pressed since the last call."""
         _check_state(pad)
         button = self.mapping.go_home
         pressed = button is not None and pad.pressed(button)
@@ -116,7 +110,7 @@ class Teleop:
         return fresh
 
     def pressed(self, pad: PadState) -> frozenset[str]:
-        """Which of the mapping's actions had their button pressed since the last call, with the dead-man or without."""
+        """Return the mapping's actions whose button was pressed since the last call, dead-man or not."""
         acting = frozenset(action for action, button in self.mapping.actions.items() if pad.pressed(button))
         fresh, self._was_acting = acting - self._was_acting, acting
         return fresh
@@ -138,7 +132,7 @@ class Teleop:
         if not self._has_grip:
             state = gripper.newest()
             if state is None or gripper.trouble:
-                return None  # nobody knows where the fingers are
+                return None  # the width is unknown
             difference = wanted - (1.0 - state.width / gripper.width_max)
             crossed = self._side * difference < 0.0
             self._has_grip = crossed or abs(difference) < _CROSSED
@@ -146,7 +140,7 @@ class Teleop:
         return wanted if self._has_grip else None
 
     def _toggle(self, pressed: bool, gripper: Gripper) -> float | None:
-        """The grip that a press asks for, for as long as it lasts, so that no single command matters."""
+        """Return the grip of a press, for as long as it lasts, so that no single command matters."""
         if pressed and not self._was_toggle:
             state = gripper.newest()
             if state is not None and not gripper.trouble:
@@ -158,11 +152,14 @@ class Teleop:
         return self._toggled
 
     def labels(self, actions: Collection[str] = ()) -> dict[str, Any]:
-        """What the controls do, for a page that draws them.
+        """Return what the controls do, for a page that displays them.
 
-        ``actions`` are those of the mapping that the app knows, and ``home`` where it looks at :meth:`home_pressed`.
+        Args:
+            actions: Actions of the mapping that the program handles, and ``home`` if it uses :meth:`home_pressed`.
 
-        ``controls`` has the meanings of an axis at its two ends (-1 and 1, or released and pressed), and of a button.
+        Returns:
+            A dict for JSON. Its ``controls`` map an axis to its meanings at both ends (-1 and 1, or released and
+            pressed), and a button to its meaning.
         """
         mapping = self.mapping
         controls: dict[str, list[str]] = {}
@@ -196,7 +193,7 @@ class Teleop:
         }
 
     def help(self, pad: Gamepad) -> list[str]:
-        """Return what the controls do, a line each, with their names as printed on ``pad``."""
+        """Return what the controls of ``pad`` do, in lines of text."""
         mapping, name = self.mapping, pad.control_name
         deadman = name(mapping.deadman)
         if pad.can_hold:
@@ -221,3 +218,21 @@ class Teleop:
 def _check_state(pad: PadState) -> None:
     if not isinstance(pad, PadState):
         raise CommandError(f"pass the pad's state, teleop.step(pad.state(), tick.dt), not a {type(pad).__name__}")
+
+
+def twist_towards(goal: Pose, tcp: Pose, linear: float, angular: float) -> Twist:
+    """Return the velocity that moves the tcp to a goal: straight, about one axis of rotation, slowing down at the end.
+
+    Args:
+        goal: Pose to reach, base frame.
+        tcp: Present pose, base frame.
+        linear: Greatest linear speed, m/s.
+        angular: Greatest angular speed, rad/s.
+    """
+    left = difference((*tcp.position, *tcp.orientation), (*goal.position, *goal.orientation))
+    return Twist(_capped(left[:3], linear), _capped(left[3:], angular))
+
+
+def _capped(left: Sequence[float], most: float) -> list[float]:
+    distance = hypot(*left)
+    return [min(_GAIN, most / distance) * part for part in left] if distance > 0.0 else [0.0, 0.0, 0.0]

@@ -1,4 +1,4 @@
-"""The console: a page in a browser that shows a rig and, as a gamepad, drives it. Abstract; a driver brings it."""
+"""Views of a rig, abstract: the console in a browser, the renderer of simulated cameras, the viewers."""
 
 from __future__ import annotations
 
@@ -33,40 +33,130 @@ __all__ = [
     "Viewer3D",
 ]
 
-# [console.py] The console: a page in a browser that shows a rig and, as a gamepad, drives it. Abstract; a driver
-# brings it.
-
 LOOPBACK = "127.0.0.1"
 PORT = 8470
-"""Where the console listens unless told otherwise; the next free port where that is taken."""
+"""Default port of the console; the next free one if it is taken."""
 _PORTS = 65535
 PHASES = ("resetting", "ready", "recording", "saving", "done")
-"""What a program that records episodes may be at."""
+"""Phases of a program that records episodes."""
 ACTIONS = ("record", "finish", "fail", "discard")
-"""What a page may ask it for: start an episode, save it as a success, save it as a failure, throw it away."""
-
+"""Requests of a page to that program: start an episode, save it as a success, save it as a failure, discard it."""
 SETTINGS = ("robot", "speed", "frame", "scene")
-"""What the page in control may set: the arm that it drives, its speed, its frame; and ``scene``, which is reset."""
+"""Settings that the page in control may change: the arm to drive, its speed, its frame; ``scene`` resets the scene."""
 FRAMES = ("base", "tcp")
-"""Whose axes an arm may be driven along: those of its base, or of its tool."""
+"""Frames along whose axes an arm may be driven."""
+
+
+class Console(ABC):
+    """A page in a browser that displays a rig and, as a gamepad, drives it; and its server.
+
+    ``wait_ready`` is called once and first; everything else may be called from any thread.
+
+    Args:
+        rig: The rig.
+        listen: Where to listen.
+        driven_by: Description of the pad that drives, if it is not the page: the page then only displays and stops.
+    """
+
+    notes: tuple[str, ...] = ()
+    """Messages for the user, for the banner."""
+
+    def __init__(self, rig: Rig, listen: Listen, *, driven_by: str | None) -> None:
+        """``driven_by`` names what drives where it is not the page, which then only shows, and stops."""
+        self.rig = rig
+        self.listen = listen
+        self.driven_by = driven_by
+
+    @abstractmethod
+    def wait_ready(self) -> None:
+        """Wait until pages can be opened; raise the server's error if it failed."""
+
+    @property
+    @abstractmethod
+    def link(self) -> str:
+        """Address to open in a browser. It permits to drive, so it is a secret."""
+
+    @property
+    @abstractmethod
+    def tunnel(self) -> str:
+        """Command that makes the link work on another computer; empty if none is needed."""
+
+    @abstractmethod
+    def show(self, camera: Camera) -> None:
+        """Display a camera's frames to the pages that show it."""
+
+    @abstractmethod
+    def say(self, text: str) -> None:
+        """Display a line on every page."""
+
+    @abstractmethod
+    def explain(self, labels: Mapping[str, Any]) -> None:
+        """Label the page's controls; the labels are those of :meth:`hal.teleop.Teleop.labels`."""
+
+    @abstractmethod
+    def show_driving(self, view: DrivingView) -> None:
+        """Display which arm is driven, how fast and in which frame; never waits. Only the newest view counts."""
+
+    @abstractmethod
+    def on_setting(self, changed: Callable[[str, str | float], None]) -> None:
+        """Call a function when the page in control changes a setting of the newest :class:`DrivingView`.
+
+        Args:
+            changed: Gets the setting and its value: the name of an arm, a share of the mapping's speeds, a frame, or
+                ``"reset"`` for ``scene``. It must only note them and return, as with :meth:`on_action`. The program
+                decides: it must change the arm or the frame only while the dead-man is released, and stop the arm
+                    before it resets the
+                scene. Its next :class:`DrivingView` shows the result.
+        """
+
+    @abstractmethod
+    def show_recording(self, view: RecordingView) -> None:
+        """Display the state of a recording; never waits. The first call adds the panel to the pages.
+
+        Only the newest view counts. While an episode is recorded, call it at least every 10 s: after that pages report
+        that there is no news.
+        """
+
+    @abstractmethod
+    def on_action(self, taken: Callable[[str], None]) -> None:
+        """Call a function with one of :data:`ACTIONS` when the page in control presses that button.
+
+        Args:
+            taken: It may be called when the action is no longer possible. It is called in the thread that brings the
+                pad's state, and delaying that trips the arm: note the action and return. Its exceptions are printed. A
+                later function replaces this one.
+        """
+
+    @abstractmethod
+    def close(self) -> None:
+        """Stop the server. Idempotent."""
 
 
 class Listen(NamedTuple):
-    """Where to listen."""
+    """Address and port to listen at."""
 
     address: str = LOOPBACK
-    """Of an interface; other than loopback only where the user said so."""
+    """Address of an interface; this computer only, unless the user chose another."""
     port: int = PORT
     fixed: bool = False
-    """Was the port asked for, so that no other will do?"""
+    """Whether the user chose the port, so that no other will do."""
 
     @classmethod
     def parse(cls, text: str | None) -> Listen:
-        """``ADDRESS[:PORT]`` or ``:PORT``, IPv6 in brackets; None is loopback. CommandError for anything else."""
+        """Return the address and port of a text.
+
+        Args:
+            text: ``ADDRESS[:PORT]`` or ``:PORT``, IPv6 addresses in brackets; None for the default.
+
+        Raises:
+            CommandError: Anything else (``code`` is ``bad_address``).
+        """
         if text is None:
             return cls()
         hint = f"; for a port alone write :{text}" if text.isdigit() else ""
-        wrong = CommandError(f"--listen takes an address and a port, for example 0.0.0.0:{PORT}, not {text!r}{hint}")
+        wrong = CommandError(
+            f"--listen takes an address and a port, for example 0.0.0.0:{PORT}, not {text!r}{hint}", code="bad_address"
+        )
         if hint:
             raise wrong
         if text.startswith("["):
@@ -83,7 +173,7 @@ class Listen(NamedTuple):
         return cls(address or LOOPBACK, int(port) if port else PORT, bool(port))
 
     def check(self) -> None:
-        """Raise CommandError where nothing can listen: at an address of another machine, or at a port that is taken."""
+        """Raise CommandError if a server cannot listen there: not an address of this computer, or a taken port."""
         port = self.port if self.fixed else 0
         try:
             family, kind, protocol, _, place = socket.getaddrinfo(self.address, port, type=socket.SOCK_STREAM)[0]
@@ -92,37 +182,72 @@ class Listen(NamedTuple):
                 probe.bind(place)
         except (OSError, UnicodeError) as error:
             reason = getattr(error, "strerror", None) or error
-            raise CommandError(f"--listen: nothing can listen at {self.address}, port {self.port}: {reason}") from None
+            raise CommandError(
+                f"--listen: cannot listen at {self.address}, port {self.port}: {reason}", code="bad_address"
+            ) from None
+
+
+@dataclass(frozen=True, slots=True)
+class DrivingView:
+    """State of teleoperation, as pages display it.
+
+    Raises:
+        CommandError: An unknown frame or setting, or an impossible speed.
+    """
+
+    robot: str
+    """Name of the arm that the pad drives."""
+    speed: float = 1.0
+    """Share of the mapping's speeds, above 0, at most :attr:`speed_max`."""
+    speed_max: float = 1.0
+    """Greatest :attr:`speed` that a page may set, at most 1."""
+    frame: str = "base"
+    """Axes that the controls move along, ``base`` or ``tcp``."""
+    settings: tuple[str, ...] = ()
+    """Those of :data:`SETTINGS` that the page in control may change."""
+
+    def __post_init__(self) -> None:
+        if not 0.0 < self.speed <= self.speed_max <= 1.0:
+            raise CommandError(f"a speed must be above 0 and at most 1, not {self.speed} of {self.speed_max}")
+        if self.frame not in FRAMES:
+            raise CommandError(f"a frame must be one of {', '.join(FRAMES)}, not {self.frame!r}")
+        unknown = [name for name in self.settings if name not in SETTINGS]
+        if unknown:
+            raise CommandError(f"a setting must be one of {', '.join(SETTINGS)}, not {unknown[0]!r}")
 
 
 @dataclass(frozen=True, slots=True)
 class RecordingView:
-    """A recording, as pages show it. CommandError for a phase or an action that is none, or for times that are none."""
+    """State of a recording, as pages display it.
+
+    Raises:
+        CommandError: An unknown phase or action, or an impossible time.
+    """
 
     phase: str
     """One of :data:`PHASES`."""
     prompt: str
-    """What the person should do now, one line."""
+    """What the user should do now, one line."""
     task: str
     episode: int
     """Number in the dataset of the present episode, or of the next one."""
     saved: int
-    """Episodes of this run that are kept: :attr:`succeeded` and :attr:`failed`."""
+    """Episodes saved in this run: :attr:`succeeded` and :attr:`failed`."""
     wanted: int
-    """Episodes that this run is to keep; 0: no number was given."""
+    """Episodes to save in this run; 0 for no limit."""
     succeeded: int
     failed: int
     discarded: int
     seconds: float
-    """Length of the present episode."""
+    """Length of the present episode, s."""
     frames: int
-    """Its rows so far."""
+    """Rows of the present episode so far."""
     dropped: int
-    """Rows that it lacks."""
+    """Rows that are missing in it."""
     free_bytes: int
     """Free space on the disk."""
     trouble: str
-    """What a person should look at; empty where all is well."""
+    """A problem that needs attention; empty if there is none."""
     actions: tuple[str, ...]
     """Those of :data:`ACTIONS` that are possible now."""
 
@@ -136,133 +261,43 @@ class RecordingView:
             raise CommandError(f"seconds must be finite and at least 0, not {self.seconds}")
 
 
-@dataclass(frozen=True, slots=True)
-class DrivingView:
-    """Which arm a pad drives, and how. CommandError for a frame or a setting that does not exist, or a wrong speed."""
-
-    robot: str
-    """Name of the arm that the pad drives."""
-    speed: float = 1.0
-    """Share of the mapping's speeds, above 0, at most :attr:`speed_max`."""
-    speed_max: float = 1.0
-    """Greatest :attr:`speed` that a page may set, at most 1."""
-    frame: str = "base"
-    """``base`` or ``tcp``: the axes that the controls move along."""
-    settings: tuple[str, ...] = ()
-    """Those of :data:`SETTINGS` that the page in control may set."""
-
-    def __post_init__(self) -> None:
-        if not 0.0 < self.speed <= self.speed_max <= 1.0:
-            raise CommandError(f"a speed must be above 0 and at most 1, not {self.speed} of {self.speed_max}")
-        if self.frame not in FRAMES:
-            raise CommandError(f"a frame must be one of {', '.join(FRAMES)}, not {self.frame!r}")
-        unknown = [name for name in self.settings if name not in SETTINGS]
-        if unknown:
-            raise CommandError(f"a setting must be one of {', '.join(SETTINGS)}, not {unknown[0]!r}")
-
-
-class Console(ABC):
-    """The page and the server behind it. ``wait_ready`` comes once, then everything else, from any thread."""
-
-    notes: tuple[str, ...] = ()
-    """What a person should know, for the banner."""
-
-    def __init__(self, rig: Rig, listen: Listen, *, driven_by: str | None) -> None:
-        """``driven_by`` names what drives where it is not the page, which then only shows, and stops."""
-        self.rig = rig
-        self.listen = listen
-        self.driven_by = driven_by
-
-    @abstractmethod
-    def wait_ready(self) -> None:
-        """Wait until pages can be opened; raises the error that the server met."""
-
-    @property
-    @abstractmethod
-    def link(self) -> str:
-        """What a person opens. Whoever has it may drive, so it is a secret."""
-
-    @property
-    @abstractmethod
-    def tunnel(self) -> str:
-        """The command that makes the link work on another computer; empty where none is needed."""
-
-    @abstractmethod
-    def show(self, camera: Camera) -> None:
-        """Show this camera to whoever watches it."""
-
-    @abstractmethod
-    def say(self, text: str) -> None:
-        """Show a line on every page."""
-
-    @abstractmethod
-    def explain(self, labels: Mapping[str, Any]) -> None:
-        """Write onto the page's controls what they do: :meth:`hal.teleop.Teleop.labels`."""
-
-    @abstractmethod
-    def show_driving(self, view: DrivingView) -> None:
-        """Show which arm is driven, how fast and in which frame; never waits. Only the newest view counts."""
-
-    @abstractmethod
-    def on_setting(self, changed: Callable[[str, str | float], None]) -> None:
-        """Call ``changed`` when the page in control changes one of the settings of the newest :class:`DrivingView`.
-
-        It gets the setting's name and value: the name of an arm, a share of the mapping's speeds, a frame, or
-        ``"reset"`` for ``scene``. As with :meth:`on_action`, it must only note them and return. The program decides:
-        it must change the arm or the frame only while the dead-man is released, and stop the arm before it resets the
-        scene. What it does shows in its next :class:`DrivingView`.
-        """
-
-    @abstractmethod
-    def show_recording(self, view: RecordingView) -> None:
-        """Show how a recording goes, from now on; never waits. The panel for it appears with the first one.
-
-        Only the newest counts. While an episode is recorded, say so now and then: after ten seconds without news pages
-        show that there are none.
-        """
-
-    @abstractmethod
-    def on_action(self, taken: Callable[[str], None]) -> None:
-        """Call ``taken`` with one of :data:`ACTIONS` when the page that drives presses that button.
-
-        It may come when it is no longer possible, and it is called in the thread that brings the pad, which trips the
-        arm where it is held up: note it, and return. What it raises is printed. A later ``taken`` replaces this one.
-        """
-
-    @abstractmethod
-    def close(self) -> None:
-        """End it. Idempotent."""
-
-
-# [pictures.py] What shows a simulated world: the renderer behind its cameras, and a window. Abstract; drivers
-# bring them.
-
-
 class Shown(ABC):
-    """Something that mirrors the world of a host, in a process of its own in real time."""
+    """A view that mirrors the simulated world of a host, in real time in a process of its own."""
 
     notes: tuple[str, ...] = ()
-    """What a person should know, for the banner."""
+    """Messages for the user, for the banner."""
 
     @abstractmethod
     def wait_ready(self) -> None:
-        """Wait until it shows the world; raises the error that it met while it started."""
+        """Wait until it displays the world; raise the error that it met while starting."""
 
     @abstractmethod
     def edited(self, method: str, params: dict[str, Any], revision: int) -> None:
-        """The world was edited: do the same before a snapshot of that revision is shown."""
+        """Repeat an edit of the world before a snapshot of that revision is displayed.
+
+        Args:
+            method: Method of :class:`hal.world.World`.
+            params: Its parameters.
+            revision: Revision of the world after the edit.
+        """
 
     @abstractmethod
     def describe(self) -> str:
-        """What it is, in words, for the banner."""
+        """Return a few words about it, for the banner."""
 
     @abstractmethod
     def close(self) -> None:
-        """End it. Idempotent."""
+        """Stop it. Idempotent."""
 
 
 class Pictures(Shown):
-    """The renderer of all simulated cameras of a world."""
+    """The renderer of all simulated cameras of a world.
+
+    Args:
+        host: Process of the world.
+        cameras: Records of the cameras.
+        renderer: Renderer that the rig file names.
+    """
 
     def __init__(self, host: Host, cameras: Sequence[CameraSpec], renderer: str) -> None:
         self.host = host
@@ -274,18 +309,26 @@ class Pictures(Shown):
 
     @abstractmethod
     def source(self, camera: str) -> object:
-        """Where the driver of this camera gets its pictures from."""
+        """Return what the driver of this camera takes its images from."""
 
 
 class Viewer(Shown):
-    """A window onto the world."""
+    """A window with the simulated world.
+
+    Args:
+        host: Process of the world.
+    """
 
     def __init__(self, host: Host) -> None:
         self.host = host
 
 
 class Viewer3D(Shown):
-    """A page with a rig's arms in three dimensions, and a handle on each tcp that a person may drag."""
+    """A page with a rig's arms in 3D, and a draggable handle on each tcp.
+
+    Args:
+        rig: The rig.
+    """
 
     def __init__(self, rig: Rig) -> None:
         self.rig = rig
@@ -293,13 +336,13 @@ class Viewer3D(Shown):
     @property
     @abstractmethod
     def link(self) -> str:
-        """What a person opens."""
+        """Address to open in a browser."""
 
     @abstractmethod
     def goal(self, robot: str) -> Pose | None:
-        """Where a person has dragged the handle of this arm: a pose of the tcp in the arm's base frame, or None.
+        """Return the pose to which the handle of an arm was dragged, base frame; None if it is on the tcp.
 
-        A wish, not a permission: whoever moves the arm there asks its dead-man.
+        It is a wish, not a permission: the program that moves the arm needs a dead-man.
         """
 
     @abstractmethod

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hal.geometry import Pose, after_rotation
-from hal.teleop import towards
+from hal.teleop import twist_towards
 
 numbers = st.floats(-1.0, 1.0)
 poses = st.builds(
@@ -21,7 +21,7 @@ def test_it_arrives_within_its_speeds_and_without_overshoot(goal: Pose, start: P
     tcp, dt = start, 0.02
     left = tcp.distance(goal)
     for _ in range(2000):
-        twist = towards(goal, tcp, 0.2, 0.8)
+        twist = twist_towards(goal, tcp, 0.2, 0.8)
         assert np.linalg.norm(twist.linear) <= 0.2 + 1e-9
         assert np.linalg.norm(twist.angular) <= 0.8 + 1e-9
         turned = after_rotation(tcp.orientation.tolist(), (dt * twist.angular).tolist())
@@ -38,6 +38,6 @@ def test_it_arrives_within_its_speeds_and_without_overshoot(goal: Pose, start: P
 
 def test_there_it_rests() -> None:
     here = Pose([0.3, 0.0, 0.5], [1.0, 0.0, 0.0, 0.0])
-    twist = towards(here, here, 0.2, 0.8)
+    twist = twist_towards(here, here, 0.2, 0.8)
     assert twist.linear == pytest.approx(np.zeros(3))
     assert twist.angular == pytest.approx(np.zeros(3))
