@@ -447,6 +447,7 @@ class MovingCamera:
         self._kinematics = Kinematics(robot.spec.kinematics)  # not shared: each thread needs its own
 
     def __call__(self, t: float) -> Pose | None:
+        """Return the pose of the colour sensor at time ``t``, s; None if the arm's state then is unknown."""
         try:
             q = self._robot.state_at(t).q
         except HalError:

@@ -53,8 +53,6 @@ class Deadman:
         distrust: Callable[[], str | None] | None = None,
         alarm: Callable[[], object] | None = None,
     ) -> None:
-        """``distrust`` says why this switch may not guard a real arm at the moment, or None where it may. ``alarm``
-        tells the hand that holds it of a stop, and returns at once: a pad rumbles."""
         self.name = name
         self._alarm = alarm
         self._distrust = distrust

@@ -289,7 +289,6 @@ class NeutralGate:
     """
 
     def __init__(self, near: float = 0.25) -> None:
-        """``near``: share of an axis' travel that counts as neutral; more than a worn stick's drift."""
         self.near = near
         self.open = False
         self._seen_up: frozenset[str] = frozenset()

@@ -36,12 +36,7 @@ __all__ = [
 ]
 
 Level = Literal["ok", "warn", "fail", "unknown"]
-"""``warn``: it may work. ``fail``: it will not. ``unknown``: it could not be checked, which is not the same as ``ok``.
-"""
-Check = Callable[[RobotSpec, float], Iterator[CheckResult]]
-"""A driver's ``DriverSpec.preflight``: its arguments are the arm's record, and how long it may measure, s."""
-CameraCheck = Callable[[CameraSpec, float], Iterator[CheckResult]]
-"""A driver's ``DriverSpec.camera_preflight``, likewise."""
+"""``warn``: it may work. ``fail``: it will not. ``unknown``: it could not be checked, which is not ``ok``."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,6 +50,12 @@ class CheckResult:
     """What was found, in words."""
     remedy: str = ""
     """What to do about it, a command if there is one; empty if nothing is to be done."""
+
+
+Check = Callable[[RobotSpec, float], Iterator[CheckResult]]
+"""A driver's ``DriverSpec.preflight``: its arguments are the arm's record, and how long it may measure, s."""
+CameraCheck = Callable[[CameraSpec, float], Iterator[CheckResult]]
+"""A driver's ``DriverSpec.camera_preflight``, likewise."""
 
 
 def preflight(
@@ -105,6 +106,7 @@ def _check(device: RobotSpec | CameraSpec, duration: float) -> Iterator[CheckRes
 
 
 # This computer
+
 _ROOT = Path("/")
 _GOVERNORS = "sys/devices/system/cpu/cpu[0-9]*/cpufreq/scaling_governor"
 _IPC_LOCK = 14

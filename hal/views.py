@@ -62,7 +62,6 @@ class Console(ABC):
     """Messages for the user, for the banner."""
 
     def __init__(self, rig: Rig, listen: Listen, *, driven_by: str | None) -> None:
-        """``driven_by`` names what drives where it is not the page, which then only shows, and stops."""
         self.rig = rig
         self.listen = listen
         self.driven_by = driven_by
