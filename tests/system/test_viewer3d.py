@@ -133,7 +133,7 @@ def test_links_fingers_and_handle_follow_the_arm(rig: hal.Rig, viewer: ViserView
         values = dict(zip(arm.spec.joints, state.q.tolist(), strict=True))
         width = arm.gripper.state().width
         values |= {"panda_finger_joint1": width / 2, "panda_finger_joint2": width / 2}
-        for joint in (joint for joint in tree.joints if joint.moves):
+        for joint in (joint for joint in tree.joints.values() if joint.movable):
             (path,) = [name for name in page.nodes if name.endswith(f"/{joint.child}")]
             node = page.nodes[path]
             position, (x, y, z, w) = joint.placement(values)
