@@ -1,23 +1,18 @@
-"""``apps/replay.py`` as a person starts it, on an episode that the recorder wrote."""
+"""``apps/replay.py`` as a program: an episode in real time, and Ctrl-C."""
 
 from __future__ import annotations
 
 import json
 import os
-import re
-import shutil
 import signal
 import subprocess
 import sys
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
-from app_kit import run_here
 
 import hal
-from hal.apps.replay import main
 
 for library in ("pyarrow", "av", "zstandard"):
     pytest.importorskip(library, reason="pip install 'robot-hal[record]'")
@@ -26,22 +21,15 @@ ROOT = Path(__file__).resolve().parents[2]
 APP = ROOT / "apps" / "replay.py"
 TOUR = ROOT / "config" / "teleop" / "tour.jsonl"
 BARE = ("--sim", "--set", "cameras={}")
-FAST = (*BARE, "--set", "simulation.clock=lock_step")
 
 
 @pytest.fixture(scope="module")
 def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The recorded tour, driven in simulation."""
-    return drive(tmp_path_factory.mktemp("replay") / "demo")
+    """The first three seconds of the recorded tour, driven in simulation."""
+    return drive(tmp_path_factory.mktemp("replay") / "beginning", 3.0)
 
 
-@pytest.fixture(scope="module")
-def beginning(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Its first seconds, in which the arm goes forwards, to the side and turns."""
-    return drive(tmp_path_factory.mktemp("replay") / "beginning", 6.0)
-
-
-def drive(out: Path, seconds: float = 60.0) -> Path:
+def drive(out: Path, seconds: float) -> Path:
     from hal.recording import Recorder
 
     options: dict[str, Any] = {"sim": True, "clock": "lock_step", "pad": str(TOUR), "overrides": ["cameras={}"]}
@@ -59,37 +47,15 @@ def drive(out: Path, seconds: float = 60.0) -> Path:
     return out
 
 
-def replay(*arguments: object, timeout: float = 90.0) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, str(APP), *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, timeout=timeout)
-
-
-@pytest.mark.parametrize("speed", [1.0, 0.5])
-def test_a_simulated_episode_replayed_in_simulation(dataset: Path, tmp_path: Path, speed: float) -> None:
-    out = tmp_path / "report.json"
-    done = replay(dataset, "--episode", "-1", "--speed", speed, "--report", out, *FAST)
-    assert done.returncode == 0, done.stderr
-    found = json.loads(out.read_text())
-    joints = found["deviation"]["joints_rad"]
-    assert len(joints) == 7
-    assert max(joint["rms"] for joint in joints.values()) < 0.01
-    assert found["deviation"]["tcp_mm"]["rms"] < 5.0
-    assert found["finished"] is True
-    assert found["pauses"] == 0
-    assert found["duration_s"] > 10.0
-    assert found["took_s"] == pytest.approx(found["duration_s"] / speed, abs=2.0)
-    assert re.search(r"panda_joint7 +rms 0\.00", done.stdout)
-    assert "a tour" in done.stdout
-
-
 @pytest.mark.slow
-def test_the_same_in_real_time(beginning: Path, tmp_path: Path) -> None:
+def test_an_episode_in_real_time(dataset: Path, tmp_path: Path) -> None:
     out = tmp_path / "report.json"
-    done = replay(beginning, "--report", out, *BARE)
+    command = [sys.executable, str(APP), str(dataset), "--report", str(out), *BARE]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=90)
     assert done.returncode == 0, done.stdout + done.stderr
     found = json.loads(out.read_text())
     assert found["finished"] is True
-    assert found["servo"]["ticks"] > 1000
+    assert found["servo"]["ticks"] > 500
     joints = found["deviation"]["joints_rad"]
     if found["servo"]["missed"] < 0.05 * found["servo"]["ticks"]:  # else it cannot be where it should
         assert max(joint["rms"] for joint in joints.values()) < 0.01
@@ -98,7 +64,7 @@ def test_the_same_in_real_time(beginning: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_ctrl_c_stops_it_and_says_how_far_it_was(dataset: Path, tmp_path: Path) -> None:
+def test_ctrl_c_stops_the_replay(dataset: Path, tmp_path: Path) -> None:
     out = tmp_path / "report.json"
     command = [sys.executable, "-u", str(APP), str(dataset), "--report", str(out), *BARE]
     process = subprocess.Popen(
@@ -115,113 +81,3 @@ def test_ctrl_c_stops_it_and_says_how_far_it_was(dataset: Path, tmp_path: Path) 
     assert "ENDED" in text
     assert "Ctrl-C" in text
     assert json.loads(out.read_text())["finished"] is False
-
-
-@pytest.mark.parametrize(
-    ("arguments", "texts"),
-    [
-        (["--episode", "3"], ["--episode 3", "has 1"]),
-        (["--speed", "1.5"], ["--speed", "at most 1"]),
-        (["--report", "/nowhere/at/all.json"], ["/nowhere/at"]),
-        (["--robot", "pandas"], ["no robot 'pandas'", "did you mean 'panda'"]),
-        (["--set", "robots.panda.speed=0.02"], ["CommandError", "rad/s", "at speed"]),
-        (["--set", "robots.panda.limits.upper=[2,1.7,2,-2.3,2,3.7,2]"], ["panda_joint4 goes through"]),
-        (["--set", "objects=[floor, table]"], ["cube, duck"]),
-    ],
-)
-def test_what_cannot_be_replayed_is_a_message(dataset: Path, arguments: list[str], texts: list[str]) -> None:
-    done = run_here(main, dataset, *FAST, *arguments)
-    assert done.returncode == 2, done.stdout + done.stderr
-    for text in texts:
-        assert text in done.stderr
-
-
-def test_a_folder_without_episodes_and_another_arm(dataset: Path, tmp_path: Path) -> None:
-    done = replay(tmp_path, *FAST)
-    assert done.returncode == 2
-    assert "Traceback" not in done.stderr
-    assert "no episode" in done.stderr
-    other = run_here(main, dataset, *FAST, "--set", "robots.panda.model=fr3")
-    assert other.returncode == 2, other.stdout + other.stderr
-    assert "recorded with the model panda, and this arm is a fr3" in other.stderr
-
-
-def test_a_dry_run_opens_nothing(dataset: Path) -> None:
-    done = run_here(main, dataset, "--dry-run", *FAST)
-    assert done.returncode == 0, done.stderr
-    assert "'a tour'" in done.stdout
-
-
-def test_what_lies_on_disk_is_what_was_driven(dataset: Path) -> None:
-    """Not only what the replay makes of it."""
-    from hal.recording import Dataset
-
-    episode = Dataset(dataset).episodes[0]
-    q = episode.columns["observation.setpoint"][:, :7]
-    assert np.ptp(q, axis=0).max() > 0.1
-    assert episode.success is True
-
-
-TWO = """
-robots:
-  left: {model: panda, base: {position: [0, 0.5, 0]}}
-  right: {model: panda, base: {position: [0, -0.5, 0]}}
-"""
-
-
-def drive_two(out: Path, rig_file: Path, arms: tuple[str, ...], info: dict[str, str]) -> Path:
-    """Some of two arms move for a moment."""
-    from hal.recording import Recorder
-
-    rig_file.write_text(TWO)
-    with hal.open(rig_file, sim=True, clock="lock_step", pad="none") as rig, Recorder(rig, out, fps=30) as recorder:
-        recorder.start(info=info)
-        for name in arms:
-            with rig.robots[name].control(rate_hz=50) as control:
-                for tick in rig.clock.rate(50):
-                    control.send(hal.Twist([0.0, 0.0, 0.1]), grip=0.0)
-                    if tick.elapsed > 0.6:
-                        break
-        recorder.save(wait=True)
-    return out
-
-
-@pytest.mark.parametrize(
-    ("arms", "info", "arguments", "replayed", "still"),
-    [
-        (("right",), {"robot": "right"}, (), "right", []),
-        (("left", "right"), {"robot": "right"}, (), "right", ["left"]),
-        (("left", "right"), {"robot": "right"}, ("--robot", "left"), "left", ["right"]),
-        (("left", "right"), {"robot": "middle"}, (), "left", ["right"]),
-    ],
-)
-def test_of_two_arms_the_one_that_was_driven_is_replayed(
-    tmp_path: Path,
-    arms: tuple[str, ...],
-    info: dict[str, str],
-    arguments: tuple[str, ...],
-    replayed: str,
-    still: list[str],
-) -> None:
-    rig_file, report = tmp_path / "two.yaml", tmp_path / "report.json"
-    out = drive_two(tmp_path / "out", rig_file, arms, info)
-    options = ("--config", rig_file, "--sim", "--set", "simulation.clock=lock_step", "--report", report)
-    done = run_here(main, out, *options, *arguments)
-    assert done.returncode == 0, done.stdout + done.stderr
-    assert json.loads(report.read_text())["robot"] == replayed
-    assert re.findall(r"^  replays +(\w+)$", done.stdout, re.MULTILINE) == [replayed]
-    told = re.findall(r"^  still +(\w+) moved in the recording; it is not replayed$", done.stdout, re.MULTILINE)
-    assert told == still
-
-
-@pytest.mark.parametrize("keep", [0.0, 0.5, 1.0])
-def test_a_damaged_episode_is_named_before_anything_is_opened(dataset: Path, tmp_path: Path, keep: float) -> None:
-    root = Path(shutil.copytree(dataset, tmp_path / "demo"))
-    file = root / "data/chunk-000/file-000.parquet"
-    file.write_bytes(file.read_bytes()[: int(keep * file.stat().st_size)])
-    if keep == 1.0:
-        file.unlink()
-    done = replay(root, *FAST)
-    assert done.returncode == 2
-    assert done.stderr.startswith("DatasetError: episode 0: data/chunk-000/file-000.parquet: "), done.stderr
-    assert "simulated" not in done.stdout

@@ -1,20 +1,16 @@
-"""The export as a person starts it."""
+"""``apps/export.py`` in this process."""
 
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
-from app_kit import run_here
+from app_kit import Done, run_here
 from recording_kit import make_recording
 
 from hal.apps.export import main
-
-ROOT = Path(__file__).resolve().parents[2]
 
 
 @pytest.fixture(scope="module")
@@ -22,12 +18,11 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return make_recording(tmp_path_factory.mktemp("apps") / "demo").root
 
 
-def run(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, str(ROOT / "apps" / "export.py"), *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, timeout=60)
+def run(*arguments: str | Path) -> Done:
+    return run_here(main, *arguments)
 
 
-def test_it_says_what_it_wrote(folder: Path, tmp_path: Path) -> None:
+def test_the_output_is_described(folder: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     done = run(folder, "--to", "npz", "--out", out, "--episodes", "0,2", "--resize", "32x24", "--no-depth")
     assert done.returncode == 0, done.stderr
@@ -40,14 +35,13 @@ def test_it_says_what_it_wrote(folder: Path, tmp_path: Path) -> None:
         assert "camera_depth" not in file.files
 
 
-def test_a_second_time_it_wants_to_be_asked(folder: Path, tmp_path: Path) -> None:
+def test_an_existing_output_needs_force(folder: Path, tmp_path: Path) -> None:
     command = (folder, "--to", "zarr", "--out", tmp_path / "out.zarr", "--successful-only", "--cameras", "none")
-    assert run_here(main, *command).returncode == 0
+    assert run(*command).returncode == 0
     again = run(*command)
     assert again.returncode == 2
     assert "--force overwrites it" in again.stderr
-    assert "Traceback" not in again.stderr
-    assert run_here(main, *command, "--force").returncode == 0
+    assert run(*command, "--force").returncode == 0
 
 
 @pytest.mark.parametrize(
@@ -58,14 +52,14 @@ def test_a_second_time_it_wants_to_be_asked(folder: Path, tmp_path: Path) -> Non
         (("--cameras", "front,wrist"), "no camera front"),
     ],
 )
-def test_what_is_wrong_is_said_in_words(folder: Path, tmp_path: Path, wrong: tuple[str, str], says: str) -> None:
-    done = run_here(main, folder, "--to", "zarr", "--out", tmp_path / "out", *wrong)
+def test_a_mistake_is_a_message(folder: Path, tmp_path: Path, wrong: tuple[str, str], says: str) -> None:
+    done = run(folder, "--to", "zarr", "--out", tmp_path / "out", *wrong)
     assert done.returncode == 2
     assert says in done.stderr
     assert list(tmp_path.iterdir()) == []
 
 
 def test_a_folder_without_a_recording(tmp_path: Path) -> None:
-    done = run_here(main, tmp_path, "--to", "npz")
+    done = run(tmp_path, "--to", "npz")
     assert done.returncode == 2
     assert "there is no episode in" in done.stderr

@@ -1,0 +1,107 @@
+"""``apps/teleop.py`` in this process: the recorded tour in lock-step, dry runs, mistakes, the help."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+
+import pytest
+from app_kit import run_here
+
+import hal
+from hal.apps.teleop import main
+
+ROOT = Path(__file__).resolve().parents[3]
+TOUR = ROOT / "tests" / "data" / "pads" / "tour.jsonl"
+FAST = ("--set", "cameras={}", "--set", "simulation.clock=lock_step")
+
+
+def test_the_recorded_tour_drives_the_arm(tmp_path: Path) -> None:
+    out = tmp_path / "out.json"
+    done = run_here(main, "--sim", "--pad", TOUR, "--duration", 15, "--report", out, *FAST)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert "finished (--duration 15)" in done.stdout
+    found = json.loads(out.read_text())
+    assert (found["backend"], found["clean_exit"], found["trips"], found["faults"]) == ("pybullet", True, [], [])
+    assert found["tcp_travel_m"] >= 0.3
+    assert found["servo"]["rate_hz"] == 240
+    assert found["servo"]["ticks"] > 133 * 15
+    peak = found["peak"]
+    assert set(peak) == {"velocity", "acceleration", "jerk", "position"}
+    assert 0.1 < peak["velocity"] <= 0.3 + 1e-6, "the greatest speed of a session is 0.3 of the joint limits"
+    assert max(peak.values()) <= 1.0 + 1e-6
+
+
+def test_the_tour_turns_the_wrist_moves_the_gripper_and_releases_in_motion() -> None:
+    """What the recording does to the arm, tick by tick."""
+    arm_moves, widths, speeds_at_release = [], [], []
+    with hal.open("panda_table", sim=True, clock="lock_step", pad=str(TOUR), overrides=["cameras={}"]) as rig:
+        arm, pad = rig.robots["panda"], rig.gamepads["pad"]
+        start = arm.state()
+        teleop_ = hal.Teleop(arm)
+        deadman = pad.hold(teleop_.mapping.deadman)
+        with arm.control(deadman=deadman, rate_hz=50) as control:
+            held = False
+            for tick in rig.clock.rate(50):
+                motion, grip = teleop_.step(pad.state(), tick.dt)
+                control.send(motion, grip=grip)
+                state = arm.state()
+                if held and not deadman.held:
+                    speeds_at_release.append(abs(state.dq_set).max())
+                held = deadman.held
+                arm_moves.append((state.tcp.distance(start.tcp), abs(state.q - start.q)[6]))
+                widths.append(arm.gripper.state().width)
+                if pad.finished:
+                    break
+    assert max(turned for (_, turned), _ in arm_moves) > 0.3, "the hand turned"
+    assert min(widths) < 0.2 * max(widths), "the hand closed"
+    assert widths[-1] > 0.9 * max(widths), "and opened again"
+    assert len(speeds_at_release) >= 2
+    assert max(speeds_at_release) > 0.05, "the dead-man was let go of in mid-motion"
+
+
+def test_dry_run_lists_and_opens_nothing() -> None:
+    done = run_here(main, "--sim", "--dry-run")
+    assert done.returncode == 0, done.stderr
+    assert re.search(r"robot +panda .*simulated \(pybullet\)", done.stdout)
+    assert "256x256" in done.stdout
+    assert "note     panda: inertia computed from" in done.stdout, "the simulated world was loaded"
+
+
+def test_arms_that_start_inside_each_other_are_found_by_a_dry_run() -> None:
+    second = "robots.second={model: panda, base: {position: [-0.5, 0, 0.6]}}"
+    done = run_here(main, "--sim", "--dry-run", "--set", second)
+    assert done.returncode == 2
+    assert "inside robot 'panda'" in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("arguments", "texts"),
+    [
+        (["--config", "panda_tabel"], ["ConfigError", "panda_tabel", "panda_table"]),
+        (["--config", "nowhere/rig.yaml"], ["ConfigError", "nowhere/rig.yaml"]),
+        (["--set", "cameras.wrist.output.widht=320"], ["--set", "widht", "did you mean 'width'"]),
+        (["--set", "robots.panda.base.position=[1,2]"], ["robots.panda.base.position"]),
+        (["--pad", "nothing.jsonl"], ["DeviceNotFound", "nothing.jsonl"]),
+        (["--pad", "keyboard"], ["web", "terminal"]),
+        (["--mapping", "defualt"], ["defualt", "default"]),
+        (["--robot", "pandas", "--pad", str(TOUR)], ["no robot 'pandas'", "did you mean 'panda'"]),
+        (["--speed", "2"], ["--speed must be above 0 and at most 1"]),
+        (["--duration", "-1"], ["--duration must be positive"]),
+        (["--report", "/nowhere/out.json"], ["/nowhere"]),
+    ],
+)
+def test_a_mistake_is_a_message(arguments: list[str], texts: list[str]) -> None:
+    bare = "cameras={}" if "widht" not in str(arguments) else "sim=true"
+    done = run_here(main, "--sim", "--set", bare, *arguments)
+    assert done.returncode == 2
+    for text in texts:
+        assert text in done.stderr
+
+
+def test_help_names_every_option() -> None:
+    done = run_here(main, "--help")
+    assert done.returncode == 0
+    for option in ["config", "sim", "real", "pad", "viewer", "duration", "speed", "set", "report", "dry-run"]:
+        assert f"--{option}" in done.stdout
