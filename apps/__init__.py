@@ -1,1 +1,1 @@
-"""Programs that a person starts."""
+"""The programs."""

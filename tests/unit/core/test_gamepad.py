@@ -358,3 +358,11 @@ def test_a_closed_pad_is_not_polled(driver: Played, pad: Gamepad) -> None:
     driver.shows("south")
     pad.poll_once(1.0)
     assert not pad.state().connected
+
+
+def test_controls_are_named_as_printed_on_the_pad(
+    driver: Played, pad: Gamepad, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert [pad.control_name(name) for name in ("l2", "dpad_x", "south")] == ["L2", "D-pad left/right", "south"]
+    monkeypatch.setattr(Played, "control_names", {"l2": "LT", "south": "A"})
+    assert [pad.control_name(name) for name in ("l2", "r2", "south")] == ["LT", "R2", "A"]

@@ -24,3 +24,11 @@ def test_keys_stand_for_controls_of_a_gamepad(column: str) -> None:
     assert len(set(used)) == len(used), "no key has two meanings"
     assert {control for _, control in table.legend} >= {*table.buttons.values(), "r2", "dpad_x"}
     json.dumps(table._asdict())
+
+
+def test_keys_name_the_controls() -> None:
+    browser, terminal = keyboard_table("browser").names, keyboard_table("terminal").names
+    assert (browser["l2"], browser["left_y"], browser["dpad_x"], browser["home"]) == ("Space", "W/S", "Left/Right", "0")
+    assert (terminal["l2"], terminal["l1"], terminal["home"]) == ("Space", "Q", "Home")
+    assert set(browser) <= {*AXES, *BUTTONS}
+    assert all(name.isascii() for name in (*browser.values(), *terminal.values()))
