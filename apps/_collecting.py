@@ -278,7 +278,7 @@ class CollectRun:
         for one in self.kept:
             if one.failure:
                 return f"episode {one.number} could not be saved: {one.failure}"
-        return f"{self.pad.describe()} has ended" if self.pad.finished else ""
+        return "the recorded pad has ended" if self.pad.finished else ""
 
     # Prompts, the live line and the console.
 

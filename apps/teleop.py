@@ -96,7 +96,7 @@ class TeleopRun:
     def _end_reason(self, state: PadState) -> str:
         """Return why the run has to end, or nothing."""
         if self.pad.finished:
-            return f"{self.pad.describe()} has ended"
+            return "the recorded pad has ended"
         if self.end_time is not None and self.rig.clock.now() >= self.end_time:
             return f"finished (--duration {self.args.duration:g})"
         return ""

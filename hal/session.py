@@ -366,7 +366,7 @@ class TeleopSession:
         return _Due.OTHER_PAD if self._other_pad_ready() else self._apply_settings()
 
     def _pad_finished(self, state: PadState) -> str:
-        return f"{self.pad.describe()} has ended" if self.pad.finished else ""
+        return "the recorded pad has ended" if self.pad.finished else ""
 
     # The way home.
 
