@@ -282,8 +282,12 @@ class Child:
             self._number = number = self._number + 1
             self._waiting.add(number)
         try:
-            self.check()
-            self.channel.send({"id": number, "method": method, "params": params or {}}, timeout)
+            try:
+                self.check()
+                self.channel.send({"id": number, "method": method, "params": params or {}}, timeout)
+            except ConnectionLost:
+                self._raise_last_error()
+                raise
             return self._wait_answer(number, timeout, f"answer {method!r}")["result"]
         finally:
             self._waiting.discard(number)
@@ -350,6 +354,15 @@ class Child:
                 raise ConnectionLost(
                     f"the {self.name} process did not {task} within {timeout:g} s{self._tail()}", code="process_silent"
                 )
+
+    def _raise_last_error(self) -> None:
+        """Raise the error that ended the process, if it sent one that was not read yet."""
+        with contextlib.suppress(ConnectionLost):
+            while self._listen(0.0, None):
+                pass
+        failure = self._answers.get(None, {})
+        if "error" in failure:
+            raise unpack_error(failure["error"])
 
     def _wait_end(self, timeout: float) -> bool:
         try:
