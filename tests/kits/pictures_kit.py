@@ -13,6 +13,7 @@ from hal.drivers.pybullet.world import PyBulletWorld
 from hal.errors import DriverMissing
 from hal.geometry import Pose
 from hal.specs import BodySpec, CameraSpec, RobotSpec, ViewSpec, WorldSpec
+from hal.testing import camera_spec
 
 STREAMS = ("color", "depth", "segmentation")
 COLLADA = """<?xml version="1.0" encoding="utf-8"?>
@@ -57,27 +58,10 @@ def camera(
     """A pinhole camera in the world's origin, looking along +z, unless ``view`` says otherwise."""
     fx = focal or 0.9 * width
     centre = more.pop("centre", ((width - 1) / 2, (height - 1) / 2))
-    fy = more.pop("fy", fx)
-    values: dict[str, Any] = {
-        "depth_min": 0.1,
-        "depth_max": 10.0,
-        "streams": STREAMS,
-        "rate_hz": 30.0,
-        "view": ViewSpec((0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0)),
-        **more,
-    }
-    return CameraSpec(
-        name=name,
-        model="test",
-        driver="pybullet",
-        capture_width=width,
-        capture_height=height,
-        width=width,
-        height=height,
-        K=((fx, 0.0, centre[0]), (0.0, fy, centre[1]), (0.0, 0.0, 1.0)),
-        distortion=(0.0,) * 5,
-        **values,
-    )
+    K = ((fx, 0.0, centre[0]), (0.0, more.pop("fy", fx), centre[1]), (0.0, 0.0, 1.0))
+    view = ViewSpec((0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
+    values = {"depth_max": 10.0, "streams": STREAMS, "view": view, **more}
+    return camera_spec(name=name, driver="pybullet", width=width, height=height, K=K, **values)
 
 
 def look_at(eye: tuple[float, ...], target: tuple[float, ...], up: tuple[float, ...] = (0.0, 0.0, 1.0)) -> Pose:

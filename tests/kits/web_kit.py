@@ -20,6 +20,7 @@ from hal.host.records import GroupMemory, ServoRecord
 from hal.host.ring import frame_rings, frame_rings_size
 from hal.pads.keyboard import keyboard_table
 from hal.specs import CameraSpec, to_json
+from hal.testing import camera_spec
 from hal.types import Limited, RobotStatus, Trip
 
 TOKEN = "a-token-of-the-test_0123456789"
@@ -32,23 +33,9 @@ HEADER = struct.Struct("<BBHIdf")
 
 
 def camera(name: str, width: int = 64, height: int = 48, stream: str = "color", rate_hz: float = 30.0) -> CameraSpec:
-    """A camera whose ring holds one stream."""
-    return CameraSpec(
-        name=name,
-        model="test",
-        driver="mock",
-        capture_width=width,
-        capture_height=height,
-        width=width,
-        height=height,
-        rate_hz=rate_hz,
-        K=((60.0, 0.0, 31.5), (0.0, 60.0, 23.5), (0.0, 0.0, 1.0)),
-        distortion=(0.0,) * 5,
-        depth_min=0.2,
-        depth_max=2.2,
-        streams=(stream,),
-        view=None,
-    )
+    """Return a camera whose ring holds one stream."""
+    size = {"width": width, "height": height, "rate_hz": rate_hz}
+    return camera_spec(name=name, **size, depth_min=0.2, depth_max=2.2, streams=(stream,), view=None)
 
 
 def frame(spec: CameraSpec, value: float, t: float | None = None) -> RawFrame:

@@ -65,18 +65,6 @@ async def test_too_many_messages_close_the_page_and_a_stop_among_them_counts(app
         assert await page.closed() == 4408
 
 
-async def test_a_watcher_stops_the_arm(app: App) -> None:
-    async with Page(app) as driver, Page(app) as watcher:
-        await driver.take()
-        await watcher.next("hello")
-        await watcher.say(type="stop")
-        assert await app.next(lambda message: "stop" in message) == {"stop": "page 2"}
-        await watcher.say(type="recover", robot="arm")
-        assert "only the page in control" in (await watcher.next("refused"))["why"]
-        await driver.say(type="recover", robot="arm")
-        assert await app.next() == {"recover": "arm", "page": "page 1"}
-
-
 async def test_the_lease_between_two_pages(app: App) -> None:
     async with Page(app) as first:
         await first.take()
@@ -87,6 +75,10 @@ async def test_the_lease_between_two_pages(app: App) -> None:
         assert pad["axes"] == [0.5, 0, 0, 0, 1, 0, 0, 0]
         assert pad["t"] - PAD_SILENCE <= pad["t_alive"] <= pad["t"] <= time.monotonic()
         async with Page(app) as second:
+            await second.say(type="stop")
+            assert await app.next(lambda message: "stop" in message) == {"stop": "page 2"}
+            await second.say(type="recover", robot="arm")
+            assert "only the page in control" in (await second.next("refused"))["why"]
             await second.take()
             assert (await app.pad())["why"] == "page 2 took control"
             assert await app.next() == {"driver": "page 2"}

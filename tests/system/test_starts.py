@@ -43,24 +43,20 @@ def run(arguments: list[str], program: str | None, folder: Path) -> str:
     return done.stdout
 
 
-def test_an_unguarded_script(tmp_path: Path) -> None:
+@pytest.mark.parametrize("how", ["unguarded script", "standard input", "interactive prompt", "thread"])
+def test_a_program(tmp_path: Path, how: str) -> None:
+    """Without a main guard, and where nothing closes the rig."""
+    body = "\n    ".join(WITH.strip().splitlines())
+    threaded = f"import threading\ndef run():\n    {body}\nt = threading.Thread(target=run)\nt.start()\nt.join()\n"
     script = tmp_path / "experiment.py"
     script.write_text(WITH)
-    expect(run([str(script)], None, tmp_path))
-
-
-def test_standard_input_without_closing(tmp_path: Path) -> None:
-    expect(run(["-"], BODY, tmp_path))
-
-
-def test_the_interactive_prompt_without_closing(tmp_path: Path) -> None:
-    expect(run(["-i", "-q"], BODY, tmp_path))
-
-
-def test_a_thread(tmp_path: Path) -> None:
-    body = "\n    ".join(WITH.strip().splitlines())
-    program = f"import threading\ndef run():\n    {body}\nt = threading.Thread(target=run)\nt.start()\nt.join()\n"
-    expect(run(["-c", program], None, tmp_path))
+    arguments, program = {
+        "unguarded script": ([str(script)], None),
+        "standard input": (["-"], BODY),
+        "interactive prompt": (["-i", "-q"], BODY),
+        "thread": (["-c", threaded], None),
+    }[how]
+    expect(run(arguments, program, tmp_path))
 
 
 def test_a_notebook_kernel(tmp_path: Path) -> None:

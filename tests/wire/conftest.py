@@ -35,3 +35,16 @@ def panda(_lockstep_panda: Emulator) -> Emulator:
     """A Panda in lock-step."""
     _lockstep_panda.refresh()
     return _lockstep_panda
+
+
+@pytest.fixture
+def robot() -> str:
+    """The robot of a test that is not parametrized by it."""
+    return "fr3"
+
+
+@pytest.fixture
+def emulator(robot: str, request: pytest.FixtureRequest) -> Emulator:
+    """``robot`` in lock-step."""
+    emulator: Emulator = request.getfixturevalue(robot)
+    return emulator

@@ -256,10 +256,7 @@ def setters(host: str) -> Report:
         lambda: set_tool([*IDENTITY[:12], 0.0, 0.0, 0.1, 1.0]),
         lambda: robot.set_load(0.5, [0.0, 0.0, 0.05], INERTIA),
     ]
-    bad = [
-        lambda: robot.set_joint_impedance([20000.0] * 7),
-        lambda: robot.set_load(-0.5, [0.0, 0.0, 0.05], INERTIA),
-    ]
+    bad = [lambda: robot.set_joint_impedance([20000.0] * 7), lambda: robot.set_load(-0.5, [0.0, 0.0, 0.05], INERTIA)]
     if IS_FR3:
         good += [
             lambda: robot.set_cartesian_impedance([100.0] * 3 + [10.0] * 3),

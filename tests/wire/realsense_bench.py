@@ -14,6 +14,7 @@ from hal.camera import Camera
 from hal.clock import RealClock
 from hal.errors import ConnectionLost, HalError
 from hal.specs import CameraSpec, SensorSpec
+from hal.testing import camera_spec
 from hal.types import Frame
 
 pytest.importorskip("pyrealsense2", reason="needs pyrealsense2: pip install 'robot-hal[realsense]'")
@@ -43,24 +44,18 @@ def spec(
         stream: SensorSpec(*size, rate_hz, K, format, (0.015 * (stream != "color"), 0.0, 0.0))
         for stream, format in (formats or {}).items()
     }
-    return CameraSpec(
+    captured = {"capture_width": size[0], "capture_height": size[1], "width": width, "height": height, "K": K}
+    depth = {"depth_min": 0.2, "depth_max": 5.0, "align": align, "sensors": sensors}
+    return camera_spec(
         name=name,
         model="realsense_d435",
         driver="realsense",
-        capture_width=size[0],
-        capture_height=size[1],
-        width=width,
-        height=height,
         rate_hz=rate_hz,
-        K=K,
-        distortion=(0.0,) * 5,
-        depth_min=0.2,
-        depth_max=5.0,
         streams=streams,
         view=None,
         options=options,
-        align=align,
-        sensors=sensors,
+        **captured,
+        **depth,
     )
 
 

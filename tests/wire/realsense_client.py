@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -116,6 +117,7 @@ class Bench:
 
     def __init__(self, spec: CameraSpec = VGA, context: Any = None, **options: Any) -> None:
         self.context = context if context is not None else emulated_context()
+        self._clients: list[Client] = []
         self.announced: list[tuple[list[str], list[bool]]] = []
         """(serials that came, whether each watched device went)"""
         self.watched: list[Any] = []
@@ -129,8 +131,12 @@ class Bench:
 
     def client(self, *streams: str, **options: Any) -> Client:
         """Start a pipeline on this camera."""
-        return Client(self.context, self.camera.serial, *streams, **options)
+        self._clients.append(Client(self.context, self.camera.serial, *streams, **options))
+        return self._clients[-1]
 
     def close(self) -> None:
-        """Remove the camera."""
+        """Stop the pipelines, and remove the camera."""
+        for client in self._clients:
+            with contextlib.suppress(RuntimeError):  # it was stopped
+                client.stop()
         self.camera.close()

@@ -19,18 +19,6 @@ both = pytest.mark.parametrize("robot", ["fr3", "panda"])
 
 
 @pytest.fixture
-def robot() -> str:
-    return "fr3"
-
-
-@pytest.fixture
-def emulator(robot: str, request: pytest.FixtureRequest) -> Emulator:
-    """The robot in lock-step: an FR3, where a test is not for ``both``."""
-    emulator: Emulator = request.getfixturevalue(robot)
-    return emulator
-
-
-@pytest.fixture
 def client(robot: str, emulator: Emulator) -> Client:
     """Run a scenario of its client, and return the report."""
     return lambda scenario, **options: run_client(robot, scenario, emulator.host, **options)

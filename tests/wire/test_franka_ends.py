@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import signal
@@ -9,6 +10,7 @@ import socket
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -68,7 +70,7 @@ class App:
 
     def close(self) -> None:
         if self.process.poll() is None:
-            self.process.kill()
+            self.process.kill()  # also if it is stopped
         self.process.wait(10.0)
         for stream in (self.process.stdout, self.process.stderr):
             if stream is not None:
@@ -79,46 +81,40 @@ def model_of(emulator: Emulator) -> str:
     return "panda" if "Panda" in "".join(emulator.lines[:2]) else "fr3"
 
 
+@pytest.fixture
+def app(emulator: Emulator) -> Iterator[App]:
+    started = App(emulator, model_of(emulator))
+    yield started
+    started.close()
+
+
 @pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGINT])
-def test_an_app_that_ends_leaves_an_arm_at_rest(emulator: Emulator, how: signal.Signals) -> None:
-    app = App(emulator, model_of(emulator))
-    try:
-        assert max(map(abs, emulator.control.send("state")["dq"])) > 0.1, "it moves"
-        app.process.send_signal(how)
-        ended = emulator.wait_event("motion ended")
-        assert "success (finished)" in ended["text"], "in order, not cut off"
-        wait_until(app.nobody_left, "gone")
-        assert max(map(abs, emulator.control.send("state")["dq"])) < 1e-9
-        assert not emulator.events("reflex")
-    finally:
-        app.close()
+def test_an_app_that_ends_leaves_an_arm_at_rest(emulator: Emulator, app: App, how: signal.Signals) -> None:
+    assert max(map(abs, emulator.control.send("state")["dq"])) > 0.1, "it moves"
+    app.process.send_signal(how)
+    ended = emulator.wait_event("motion ended")
+    assert "success (finished)" in ended["text"], "in order, not cut off"
+    wait_until(app.nobody_left, "gone")
+    assert max(map(abs, emulator.control.send("state")["dq"])) < 1e-9
+    assert not emulator.events("reflex")
 
 
-def test_an_app_that_is_stopped_leaves_an_arm_at_rest(emulator: Emulator) -> None:
-    app = App(emulator, model_of(emulator))
-    try:
-        app.process.send_signal(signal.SIGSTOP)
-        wait_until(lambda: max(map(abs, emulator.control.send("state")["dq"])) < 1e-9, "at rest")
-        assert not emulator.events("reflex")
-        assert emulator.control.send("state")["mode"] == "move", "it holds, and the session may go on"
-    finally:
-        app.process.send_signal(signal.SIGCONT)
-        app.close()
+def test_an_app_that_is_stopped_leaves_an_arm_at_rest(emulator: Emulator, app: App) -> None:
+    app.process.send_signal(signal.SIGSTOP)
+    wait_until(lambda: max(map(abs, emulator.control.send("state")["dq"])) < 1e-9, "at rest")
+    assert not emulator.events("reflex")
+    assert emulator.control.send("state")["mode"] == "move", "it holds, and the session may continue"
 
 
-def test_the_arms_own_process_is_killed(emulator: Emulator) -> None:
-    """Then nobody can end the motion in order: the robot does, and the app hears of it."""
-    app = App(emulator, model_of(emulator))
-    try:
-        os.kill(app.children[0], signal.SIGKILL)
-        emulator.wait_event("motion ended")
-        app.process.wait(10.0)
-        said = app.process.stderr.read()
-        assert "ConnectionLost" in said
-        assert "arm process ended" in said
-        wait_until(lambda: max(map(abs, emulator.control.send("state")["dq"])) < 1e-9, "at rest")
-    finally:
-        app.close()
+def test_the_arms_own_process_is_killed(emulator: Emulator, app: App) -> None:
+    """Then no program can end the motion in order: the robot does, and the app gets an error."""
+    os.kill(app.children[0], signal.SIGKILL)
+    emulator.wait_event("motion ended")
+    app.process.wait(10.0)
+    said = app.process.stderr.read()
+    assert "ConnectionLost" in said
+    assert "arm process ended" in said
+    wait_until(lambda: max(map(abs, emulator.control.send("state")["dq"])) < 1e-9, "at rest")
 
 
 def opening_error(host: str, robot: str = "fr3", *more: str) -> hal.HalError:
@@ -155,14 +151,10 @@ def test_another_version_is_named(emulator: Emulator) -> None:
     assert opening_error(emulator.host, model_of(emulator)).code == "version"
 
 
-def test_a_second_program_is_told_who_the_first_one_is(emulator: Emulator) -> None:
-    app = App(emulator, model_of(emulator))
-    try:
-        error = opening_error(emulator.host, model_of(emulator))
-        assert isinstance(error, hal.ControlTaken)
-        assert f"process {app.process.pid}" in str(error)
-    finally:
-        app.close()
+def test_the_error_of_a_second_program_names_the_first_one(emulator: Emulator, app: App) -> None:
+    error = opening_error(emulator.host, model_of(emulator))
+    assert isinstance(error, hal.ControlTaken)
+    assert f"process {app.process.pid}" in str(error)
 
 
 def test_somebody_elses_client_holds_the_arm(emulator: Emulator) -> None:
@@ -217,3 +209,47 @@ def test_an_arm_is_ready_while_another_thread_works(emulator: Emulator) -> None:
             thread.join()
     assert not emulator.events("reflex")
     assert "success" in emulator.events("motion ended")[-1]["text"]
+
+
+# An app that is gone leaves no process behind, though the robot hangs: the libraries then wait for ever.
+
+LONGEST = 40.0
+"""s: what docs/safety.md gives an app that is silent (30), and some."""
+
+
+def runs(pid: int) -> bool:
+    try:
+        with open(f"/proc/{pid}/stat") as file:
+            return file.read().rpartition(")")[2].split()[0] != "Z"
+    except OSError:
+        return False
+
+
+@contextlib.contextmanager
+def killed(robot: str) -> Iterator[int]:
+    """The process of an arm whose robot hangs, and whose app was killed."""
+    with Emulator(robot=robot) as emulator:
+        app = App(emulator, robot)
+        host = app.children[0]
+        try:
+            emulator.process.send_signal(signal.SIGSTOP)
+            time.sleep(0.05)
+            app.process.kill()
+            yield host
+        finally:
+            emulator.process.send_signal(signal.SIGCONT)
+            if runs(host):
+                os.kill(host, signal.SIGKILL)
+            app.close()
+
+
+@pytest.mark.slow
+def test_an_app_is_killed_while_the_robot_hangs() -> None:
+    """Both arms at once, for both wait for as long."""
+    with contextlib.ExitStack() as stack:
+        hosts = {robot: stack.enter_context(killed(robot)) for robot in ("fr3", "panda")}
+        deadline = time.monotonic() + LONGEST
+        while any(map(runs, hosts.values())) and time.monotonic() < deadline:
+            time.sleep(0.05)
+        left = [robot for robot, host in hosts.items() if runs(host)]
+        assert not left, "the arm's process holds the arm for ever"

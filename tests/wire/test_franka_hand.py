@@ -94,18 +94,6 @@ def test_what_a_move_closes_on_is_held_until_it_opens(bench):
     assert (reading.outcome, reading.grasped) == (DONE, False)
 
 
-def test_a_trigger_that_is_pulled_onto_something_ends_with_a_hold():
-    with HandBench(object_width=0.02) as bench:
-        for k in range(25):
-            bench.hand.move(0.04 * (1.0 - k / 24), 0.1, 40.0)
-            seq = bench.read().seq
-            bench.wait(lambda r, seq=seq: r.seq > seq)
-        reading = bench.finish()
-        assert (reading.outcome, reading.grasped, reading.width) == (MISSED, True, 0.02)
-        assert bench.requests["stop"] <= 5
-        assert bench.requests["move"] <= 5
-
-
 def test_a_grasp_holds_what_has_the_right_width_only(bench):
     bench.command("object 0.03")
     bench.hand.grasp(0.02, 0.1, 40.0, 0.005, 0.005)
@@ -155,18 +143,6 @@ def test_a_stop_leaves_the_fingers_where_they_are(bench, brisk):
     bench.hand.stop()
     bench.wait(lambda r: r.seq > reading.seq + 25)
     assert (bench.read().width, bench.read().fault, bench.requests["stop"]) == (width, None, 1)
-
-
-def test_the_newest_command_wins_and_those_that_had_not_begun_are_dropped(bench):
-    bench.hand.move(0.08, 0.02, 40.0)
-    bench.wait(lambda r: r.width > 0.041)
-    bench.hand.grasp(0.01, 0.1, 40.0, 0.005, 0.005)
-    bench.hand.move(0.03, 0.1, 40.0)
-    reading = bench.finish()
-    assert (reading.outcome, reading.width_target) == (DONE, 0.03)
-    assert reading.width == pytest.approx(0.03, abs=0.002)
-    assert bench.command("state")["newest"]["grasp"][0] == 0.03
-    assert bench.requests["grasp"] == 1
 
 
 def test_a_stop_that_is_ignored_is_told_and_the_next_command_waits(bench, brisk):

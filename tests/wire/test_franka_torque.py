@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-
 import numpy as np
 import pytest
 
@@ -17,19 +15,10 @@ pytest.importorskip("pylibfranka", reason="needs pylibfranka: pip install 'robot
 pytest.importorskip("panda_py", reason="needs panda-python: pip install 'robot-hal[panda]'")
 
 
-@pytest.fixture(params=["fr3", "panda"])
-def emulator(request: pytest.FixtureRequest) -> Iterator[Emulator]:
-    with Emulator("--lockstep", "--unpaced", robot=request.param) as started:
-        yield started
-
-
-def robot_of(emulator: Emulator) -> str:
-    return "panda" if "Panda" in "".join(emulator.lines[:2]) else "fr3"
-
-
 @pytest.mark.parametrize("losses", ["lose-commands 0", "lose-commands 0.05"])
-def test_an_arm_on_torques(emulator: Emulator, losses: str) -> None:
-    with rig_of(emulator.host, robot_of(emulator), lock_step=True) as rig:
+@pytest.mark.parametrize("robot", ["fr3", "panda"])
+def test_an_arm_on_torques(emulator: Emulator, robot: str, losses: str) -> None:
+    with rig_of(emulator.host, robot, lock_step=True) as rig:
         arm = arm_of(rig)
         emulator.control.send(losses)
         home = arm.state().q

@@ -72,9 +72,8 @@ def at(emulator: Emulator, model: str) -> list[str]:
 
 @pytest.mark.parametrize("losses", ["lose-commands 0.05", "lose-commands 0.2", "lose-states 0.05"])
 @pytest.mark.parametrize("robot", ["fr3", "panda"])
-def test_packets_that_are_lost_end_no_motion(request: pytest.FixtureRequest, robot: str, losses: str) -> None:
+def test_packets_that_are_lost_end_no_motion(emulator: Emulator, robot: str, losses: str) -> None:
     """The share of lost packets is far beyond what a cable does; 20 runs each with HAL_SOAK=1, else 2."""
-    emulator: Emulator = request.getfixturevalue(robot)
     for _ in range(RUNS):
         emulator.refresh()
         with rig_of(emulator.host, robot, lock_step=True) as rig:
@@ -104,15 +103,8 @@ def test_the_app_outlives_an_arm_that_is_lost(tmp_path: Path) -> None:
     tour = write_tour(tmp_path / "calm.jsonl")
     with Emulator("--lockstep") as emulator:
         command = [sys.executable, str(APP), "--real", "--config", "franka_emulator", "--pad", str(tour)]
-        command += [
-            "--set",
-            "cameras={}",
-            *at(emulator, "fr3"),
-            "--duration",
-            "6",
-            "--report",
-            str(tmp_path / "r.json"),
-        ]
+        command += ["--set", "cameras={}", *at(emulator, "fr3")]
+        command += ["--duration", "6", "--report", str(tmp_path / "r.json")]
         with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as app:
             emulator.wait_event("motion started", timeout=20.0)
             emulator.control.send("restart 0.3")
@@ -125,8 +117,7 @@ def test_the_app_outlives_an_arm_that_is_lost(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("robot", ["fr3", "panda"])
-def test_velocities_instead_of_positions_go_to_the_same_place(request: pytest.FixtureRequest, robot: str) -> None:
-    emulator: Emulator = request.getfixturevalue(robot)
+def test_velocities_instead_of_positions_go_to_the_same_place(emulator: Emulator, robot: str) -> None:
     with rig_of(emulator.host, robot, "robots.arm.real.stream=velocity", lock_step=True) as rig:
         arm = arm_of(rig)
         goal = arm.home.copy()

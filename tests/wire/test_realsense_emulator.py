@@ -8,9 +8,10 @@ import subprocess
 import sys
 import textwrap
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -31,10 +32,22 @@ from .realsense_client import VGA, Bench, Client, Picture, listed, played  # noq
 
 
 @pytest.fixture
-def bench() -> Iterator[Bench]:
-    made = Bench()
-    yield made
-    made.close()
+def make_bench() -> Iterator[Callable[..., Bench]]:
+    """Make cameras in contexts; they and their clients are closed at the end of the test."""
+    made: list[Bench] = []
+
+    def make(*arguments: Any, **options: Any) -> Bench:
+        made.append(Bench(*arguments, **options))
+        return made[-1]
+
+    yield make
+    for bench in made:
+        bench.close()
+
+
+@pytest.fixture
+def bench(make_bench: Callable[..., Bench]) -> Bench:
+    return make_bench()
 
 
 def differing(camera: SoftwareCamera, found: dict[str, Picture], number: int) -> list[str]:
@@ -66,14 +79,14 @@ def test_it_is_listed_as_a_d435(bench: Bench) -> None:
     assert bench.announced == [([bench.camera.serial], [])]
 
 
-def test_calibration_and_units_follow_the_spec() -> None:
+def test_calibration_and_units_follow_the_spec(make_bench) -> None:
     turned = (0.0, float(np.sin(0.01)), 0.0, float(np.cos(0.01)))
     K = ((400.0, 0.0, 321.0), (0.0, 401.0, 238.5), (0.0, 0.0, 1.0))
     sensors = {
         "color": SensorSpec(640, 480, 30.0, ((610.0, 0.0, 318.0), (0.0, 611.0, 240.0), (0.0, 0.0, 1.0))),
         "depth": SensorSpec(640, 480, 30.0, K, position=(0.0148, 0.0002, -0.0003), orientation=turned),
     }
-    bench = Bench(replace(VGA, sensors=sensors))
+    bench = make_bench(replace(VGA, sensors=sensors))
     client = bench.client("depth", "color")
     depth, color = (
         client.profile.get_stream(kind).as_video_stream_profile() for kind in (rs.stream.depth, rs.stream.color)
@@ -87,8 +100,6 @@ def test_calibration_and_units_follow_the_spec() -> None:
     point = rs.rs2_transform_point_to_point(there, [0.0, 0.0, 1.0])  # a turn of 0.02 rad about y
     assert point == pytest.approx((0.0148 + np.sin(0.02), 0.0002, np.cos(0.02) - 0.0003), abs=1e-6)
     assert client.profile.get_device().first_depth_sensor().get_depth_scale() == pytest.approx(0.001)
-    client.stop()
-    bench.close()
 
 
 def test_options_have_ranges_and_keep_their_values(bench: Bench) -> None:
@@ -114,7 +125,6 @@ def test_sets_are_matched_and_exact_to_the_bit(bench: Bench) -> None:
         assert {read_number(picture.pixels) for picture in found.values()} == {number}
         numbers.append(number)
     assert numbers == sorted(set(numbers)), "every one is new"
-    client.stop()
 
 
 @pytest.mark.parametrize("format", ["rgb8", "bgr8", "rgba8", "bgra8", "yuyv", "uyvy"])
@@ -123,7 +133,6 @@ def test_every_color_format(bench: Bench, format: str) -> None:
     found = client.set()
     assert differing(bench.camera, found, found["color"].number) == []
     assert read_number(found["color"].pixels, format) == found["color"].number
-    client.stop()
 
 
 def test_packed_color_is_the_same_image(bench: Bench) -> None:
@@ -137,7 +146,6 @@ def test_packed_color_is_the_same_image(bench: Bench) -> None:
     mode = bench.camera.modes["color"]._replace(format="rgb8")
     meant = bench.camera.expected(packed.get_frame_number(), {"color": mode})["color"]
     assert np.median(np.abs(rgb - meant)) <= 3
-    client.stop()
 
 
 def test_modes_other_than_that_of_the_spec(bench: Bench) -> None:
@@ -151,23 +159,19 @@ def test_modes_other_than_that_of_the_spec(bench: Bench) -> None:
         bench.client("depth", width=641)
 
 
-def test_without_metadata_the_library_mixes_frames_of_two_moments() -> None:
-    bench = Bench(metadata=False)
+def test_without_metadata_the_library_mixes_frames_of_two_moments(make_bench) -> None:
+    bench = make_bench(metadata=False)
     client = bench.client()
     numbers = [{picture.number for picture in client.set().values()} for _ in range(40)]
     assert any(len(of_set) > 1 for of_set in numbers[5:])
-    client.stop()
-    bench.close()
 
 
-def test_a_seed_tells_two_cameras_apart() -> None:
-    one, other = (Bench(replace(VGA, name=f"camera_{seed}"), seed=seed) for seed in (0, 1))
+def test_a_seed_tells_two_cameras_apart(make_bench) -> None:
+    one, other = (make_bench(replace(VGA, name=f"camera_{seed}"), seed=seed) for seed in (0, 1))
     assert one.camera.serial != other.camera.serial
     assert all(
         not np.array_equal(one.camera.expected(3)[name], other.camera.expected(3)[name]) for name in ("depth", "color")
     )
-    one.close()
-    other.close()
 
 
 @pytest.mark.parametrize("number", [0, 1, 12345, 2**24 - 1])
@@ -183,8 +187,8 @@ def test_the_number_can_be_read_from_a_scaled_crop(bench: Bench, number: int) ->
 # The scene.
 
 
-def test_depth_aligned_to_color_is_within_two_millimetres() -> None:
-    bench = Bench(pattern="scene")
+def test_depth_aligned_to_color_is_within_two_millimetres(make_bench) -> None:
+    bench = make_bench(pattern="scene")
     client = bench.client("depth", "color")
     client.whole()
     align = rs.align(rs.stream.color)
@@ -203,8 +207,6 @@ def test_depth_aligned_to_color_is_within_two_millimetres() -> None:
     box = bench.camera.expected(aligned.get_frame_number())["color"]
     reds = (box[..., 0].astype(int) - box[..., 2] > 100) | (box[..., 2].astype(int) - box[..., 0] > 100)
     assert reds.sum() > 2000, "the box is visible"
-    client.stop()
-    bench.close()
 
 
 def test_the_box_moves(bench: Bench) -> None:
@@ -236,7 +238,6 @@ def test_a_stalled_camera_is_listed_and_silent(bench: Bench) -> None:
     assert listed(bench.context) == [bench.camera.serial]
     bench.camera.stall(False)
     assert client.whole()["depth"].number > before + 3, "it continued to take frames"
-    client.stop()
 
 
 def test_lost_frames_leave_gaps_in_the_numbers(bench: Bench) -> None:
@@ -244,7 +245,6 @@ def test_lost_frames_leave_gaps_in_the_numbers(bench: Bench) -> None:
     client = bench.client()
     numbers = [client.whole()["depth"].number for _ in range(12)]
     assert not any(number % 3 == 0 for number in numbers)
-    client.stop()
 
 
 def test_one_stream_alone_may_lose_frames(bench: Bench) -> None:
@@ -276,11 +276,10 @@ def test_unplugging_is_announced_and_ends_the_pipeline_and_replugging_brings_it_
     again = bench.client()
     found = again.whole()
     assert differing(camera, found, found["depth"].number) == []
-    again.stop()
 
 
-def test_in_a_plain_context_an_unplugged_camera_cannot_be_found_by_its_number() -> None:
-    bench = Bench(context=rs.context())
+def test_in_a_plain_context_an_unplugged_camera_cannot_be_found_by_its_number(make_bench) -> None:
+    bench = make_bench(context=rs.context())
     client = bench.client()
     client.whole()
     bench.camera.unplug()
@@ -291,12 +290,11 @@ def test_in_a_plain_context_an_unplugged_camera_cannot_be_found_by_its_number() 
     bench.camera.replug()
     assert listed(bench.context) == [bench.camera.serial]
     assert bench.announced[-1] == ([bench.camera.serial], [])
-    bench.close()
 
 
-def test_unplugging_one_camera_does_not_affect_another() -> None:
+def test_unplugging_one_camera_does_not_affect_another(make_bench) -> None:
     context = emulated_context()
-    one, other = (Bench(replace(VGA, name=name), context, seed=7 * k) for k, name in enumerate(("left", "right")))
+    one, other = (make_bench(replace(VGA, name=name), context, seed=7 * k) for k, name in enumerate(("left", "right")))
     clients = [bench.client() for bench in (one, other)]
     before = [client.whole()["depth"].number for client in clients]
     one.camera.unplug()
@@ -304,10 +302,6 @@ def test_unplugging_one_camera_does_not_affect_another() -> None:
     after = clients[1].whole()
     assert after["depth"].number > before[1]
     assert differing(other.camera, after, after["depth"].number) == []
-    for client in clients:
-        client.stop()
-    one.close()
-    other.close()
 
 
 def test_repeated_replugging_leaks_no_thread(bench: Bench) -> None:
@@ -327,8 +321,8 @@ def test_repeated_replugging_leaks_no_thread(bench: Bench) -> None:
 
 
 @pytest.mark.parametrize("clock", ["hardware", "global", "system"])
-def test_stamps_are_on_the_reported_clock(clock: str) -> None:
-    bench = Bench(clock=clock)
+def test_stamps_are_on_the_reported_clock(clock: str, make_bench) -> None:
+    bench = make_bench(clock=clock)
     client = bench.client()
     client.whole()
     found = [client.set()["depth"] for _ in range(10)]
@@ -342,8 +336,6 @@ def test_stamps_are_on_the_reported_clock(clock: str) -> None:
     else:
         assert abs(time.time() - found[-1].stamp) < 5.0
         assert np.median(steps) == pytest.approx(1 / 30, abs=0.02)
-    client.stop()
-    bench.close()
 
 
 def test_skew_stamps_color_later_than_depth(bench: Bench) -> None:
@@ -352,21 +344,18 @@ def test_skew_stamps_color_later_than_depth(bench: Bench) -> None:
     found = client.whole()
     assert found["color"].stamp - found["depth"].stamp == pytest.approx(0.004, abs=1e-6)
     assert found["infrared"].stamp == found["depth"].stamp
-    client.stop()
 
 
-def test_color_numbers_may_be_ahead() -> None:
-    bench = Bench(color_ahead=40)
+def test_color_numbers_may_be_ahead(make_bench) -> None:
+    bench = make_bench(color_ahead=40)
     client = bench.client()
     found = [client.set() for _ in range(15)][-1]
     assert found["color"].number == found["depth"].number + 40
     assert differing(bench.camera, found, found["depth"].number) == []
-    client.stop()
-    bench.close()
 
 
-def test_the_sensor_clock_wraps_after_32_bits_of_microseconds() -> None:
-    bench = Bench(clock_at=2**32 * 1e-6 - 1.5)
+def test_the_sensor_clock_wraps_after_32_bits_of_microseconds(make_bench) -> None:
+    bench = make_bench(clock_at=2**32 * 1e-6 - 1.5)
     client = bench.client("depth")
     stamps = []
     deadline = time.monotonic() + 20.0
@@ -374,12 +363,10 @@ def test_the_sensor_clock_wraps_after_32_bits_of_microseconds() -> None:
         stamps.append(client.set()["depth"].stamp)
     assert stamps[0] > 4290.0
     assert stamps[-1] < 2.0
-    client.stop()
-    bench.close()
 
 
-def test_jitter_delays_the_arrival_and_not_the_stamp() -> None:
-    bench = Bench(arrival_jitter=0.02)
+def test_jitter_delays_the_arrival_and_not_the_stamp(make_bench) -> None:
+    bench = make_bench(arrival_jitter=0.02)
     client = bench.client()
     client.whole()
     delays, stamps = [], []
@@ -392,8 +379,6 @@ def test_jitter_delays_the_arrival_and_not_the_stamp() -> None:
     if not bench.camera.late:
         steps = [(b - a) / (m - n) for (n, a), (m, b) in itertools.pairwise(stamps)]
         assert steps == pytest.approx([1 / 30] * len(steps), abs=1e-6)
-    client.stop()
-    bench.close()
 
 
 # Recordings.
@@ -478,7 +463,6 @@ def test_a_wrong_fault_is_refused_and_changes_nothing(bench: Bench) -> None:
     assert bench.camera.plugged
     client = Client(bench.context, bench.camera.serial)
     client.whole()
-    client.stop()
 
 
 def run(program: str) -> subprocess.CompletedProcess[str]:

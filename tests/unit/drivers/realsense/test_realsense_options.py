@@ -14,28 +14,14 @@ from hal.config import load
 from hal.drivers.realsense.options import RealSenseSettings, problems
 from hal.errors import ConfigError
 from hal.specs import CameraSpec, SensorSpec
+from hal.testing import camera_spec
 
 K = ((600.0, 0.0, 319.5), (0.0, 600.0, 239.5), (0.0, 0.0, 1.0))
 
 
 def camera(**options: Any) -> CameraSpec:
-    return CameraSpec(
-        name="wrist",
-        model="realsense_d435",
-        driver="realsense",
-        capture_width=640,
-        capture_height=480,
-        width=640,
-        height=480,
-        rate_hz=30.0,
-        K=K,
-        distortion=(0.0,) * 5,
-        depth_min=0.2,
-        depth_max=5.0,
-        streams=("color", "depth"),
-        view=None,
-        options=options,
-    )
+    streams = ("color", "depth")
+    return camera_spec(name="wrist", driver="realsense", width=640, height=480, streams=streams, options=options)
 
 
 @pytest.mark.parametrize(
