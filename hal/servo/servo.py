@@ -232,17 +232,21 @@ class Servo:
         if session is None:
             self._anchoring.note_rest(None if device else reading.q_commanded)
         torque = self._torque
-        torque.observe(reading if self._is_known(reading, device) else None)
+        known = self._is_known(reading, device)
         if torque.active:
+            torque.observe(reading if known else None)
             device = device or self._overruns()
-        elif session is not None and self._anchoring.check_report(reading, device):
-            ready = None
-            self._corrected = True
-            self._resting = 0
-            self.report.reanchored += 1
-            self._envelope.limited = Limited.REANCHORED
-            if self._motion is not None:
-                self._motion.reanchored()
+        else:
+            if known:
+                torque.q, torque.dq = reading.q, reading.dq  # where torques would begin
+            if session is not None and self._anchoring.check_report(reading, device):
+                ready = None
+                self._corrected = True
+                self._resting = 0
+                self.report.reanchored += 1
+                self._envelope.limited = Limited.REANCHORED
+                if self._motion is not None:
+                    self._motion.reanchored()
         faulty = device is _FAULT
         self._seen = (now, device, late, faulty)
         # What was computed ahead is written even if something is wrong: the stop begins where it ends.
@@ -294,7 +298,8 @@ class Servo:
         self._envelope.limited = Limited.NONE
         self._watchdog.device_lost(now)
         self._anchoring.note_silence()
-        self._torque.observe(None)
+        if self._torque.active:
+            self._torque.observe(None)
         if self._session is None or (self._ending and self._finished()):
             self._idle(RobotStatus.LOST)
             return None

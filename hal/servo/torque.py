@@ -323,8 +323,8 @@ pushed. Positions brake it further."""
 class TorqueMotion(ServoMotion):
     """Follows torques, and brakes by torques. ``active`` from the first command until the arm is at rest again.
 
-    The servo passes every reading to :meth:`observe`, advances it by :meth:`step` or :meth:`brake`, and writes
-    :meth:`setpoint` as long as it is active.
+    Before, the servo keeps :attr:`q` and :attr:`dq` up to date. While it is active, the servo passes every reading to
+    :meth:`observe`, advances it by :meth:`step` or :meth:`brake`, and writes :meth:`setpoint`.
     """
 
     def __init__(
@@ -374,10 +374,6 @@ class TorqueMotion(ServoMotion):
 
     def observe(self, reading: Reading | None) -> None:
         """Note the reading of this tick; None if there is none or it is invalid."""
-        if not self.active:
-            if reading is not None:  # where torques would begin
-                self.q, self.dq = reading.q, reading.dq
-            return
         dt = self.smoother.dt
         self._arm = None
         self._unseen += dt
