@@ -30,6 +30,7 @@ def browser(bench: Bench) -> Iterator[Browser]:
 @pytest.fixture
 def page(bench: Bench, browser: Browser) -> Iterator[Browser]:
     """The console, opened anew; it drives, nothing is held, and no stop is latched."""
+    browser.size(1280, 800)
     browser.open(bench.link)
     browser.wait_driving()
     wait_for(lambda: bench.session.pad.state().connected and not bench.session.pad.waiting_for, "the pad to be at rest")

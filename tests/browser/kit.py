@@ -195,6 +195,11 @@ class Browser:
         kind = "rawKeyDown" if down else "keyUp"
         self.cdp("Input.dispatchKeyEvent", type=kind, code=code, key=key, windowsVirtualKeyCode=number)
 
+    def tap(self, code: str, key: str) -> None:
+        """Press a key and release it."""
+        self.key(code, key, True)
+        self.key(code, key, False)
+
     def hold(self) -> None:
         """Hold the dead-man with the space bar."""
         self.key("Space", " ", True)

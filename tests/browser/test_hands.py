@@ -194,8 +194,7 @@ def test_other_input_may_end_a_repetition(bench: Bench, page: Browser, what: str
             page.click('[data-disc="dpad"]')
         else:
             code, key = ("Digit2", "2") if what == "another key" else ("KeyZ", "z")
-            page.key(code, key, True)
-            page.key(code, key, False)
+            page.tap(code, key)
         stays_held(page)
 
     undisturbed(bench, page, hold)

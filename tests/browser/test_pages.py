@@ -90,33 +90,30 @@ NEEDED = ["#stop", "#hold", '[data-disc="dpad"]', '[data-disc="right"]', "#deadm
 @pytest.mark.parametrize(("width", "height", "touch"), SIZES)
 def test_the_main_controls_are_in_view_and_apart(page: Browser, width: int, height: int, touch: bool) -> None:
     page.size(width, height, touch)
-    try:
-        places = {name: page.place(name) for name in NEEDED}
-        for name, at in places.items():
-            assert at["width"] >= 24, name
-            assert at["height"] >= 16, name
-            assert at["left"] >= -0.5, name
-            assert at["top"] >= -0.5, name
-            assert at["right"] <= width + 0.5, f"{name} is cut off on the right"
-            assert at["bottom"] <= height + 0.5, f"{name} is below the fold"
-        for one in ("#stop", "#hold"):
-            for other, at in places.items():
-                apart = (
-                    places[one]["right"] <= at["left"] + 0.5
-                    or at["right"] <= places[one]["left"] + 0.5
-                    or places[one]["bottom"] <= at["top"] + 0.5
-                    or at["bottom"] <= places[one]["top"] + 0.5
-                )
-                assert one == other or apart, f"{one} and {other} overlap"
-        assert page.run("return document.documentElement.scrollWidth") <= width
-        assert places["#stop"]["width"] * places["#stop"]["height"] > 44 * 36, "large enough for a thumb"
-        top = page.run(
-            "const r = arguments[0]; return document.elementFromPoint(r.x, r.y).closest('#stop') !== null",
-            places["#stop"],
-        )
-        assert top, "something covers the stop button"
-    finally:
-        page.size(1280, 800)
+    places = {name: page.place(name) for name in NEEDED}
+    for name, at in places.items():
+        assert at["width"] >= 24, name
+        assert at["height"] >= 16, name
+        assert at["left"] >= -0.5, name
+        assert at["top"] >= -0.5, name
+        assert at["right"] <= width + 0.5, f"{name} is cut off on the right"
+        assert at["bottom"] <= height + 0.5, f"{name} is below the fold"
+    for one in ("#stop", "#hold"):
+        for other, at in places.items():
+            apart = (
+                places[one]["right"] <= at["left"] + 0.5
+                or at["right"] <= places[one]["left"] + 0.5
+                or places[one]["bottom"] <= at["top"] + 0.5
+                or at["bottom"] <= places[one]["top"] + 0.5
+            )
+            assert one == other or apart, f"{one} and {other} overlap"
+    assert page.run("return document.documentElement.scrollWidth") <= width
+    assert places["#stop"]["width"] * places["#stop"]["height"] > 44 * 36, "large enough for a thumb"
+    top = page.run(
+        "const r = arguments[0]; return document.elementFromPoint(r.x, r.y).closest('#stop') !== null",
+        places["#stop"],
+    )
+    assert top, "something covers the stop button"
 
 
 TEXTS = """const found = [];
@@ -130,29 +127,23 @@ TEXTS = """const found = [];
 @pytest.mark.parametrize(("width", "height", "touch"), [*SIZES, (390, 844, True), (960, 600, False)])
 def test_no_text_is_smaller_than_twelve_pixels(page: Browser, width: int, height: int, touch: bool) -> None:
     page.size(width, height, touch)
-    try:
-        script = "return found.filter(([at]) => parseFloat(getComputedStyle(at).fontSize) < 12).map(([, text]) => text)"
-        assert page.run(TEXTS + script) == []
-        assert page.run("return document.documentElement.scrollWidth") <= width
-    finally:
-        page.size(1280, 800)
+    script = "return found.filter(([at]) => parseFloat(getComputedStyle(at).fontSize) < 12).map(([, text]) => text)"
+    assert page.run(TEXTS + script) == []
+    assert page.run("return document.documentElement.scrollWidth") <= width
 
 
 @pytest.mark.parametrize(("width", "height"), [(1440, 900), (1024, 768), (960, 600)])
 def test_every_key_that_drives_is_named_on_a_screen_with_a_keyboard(page: Browser, width: int, height: int) -> None:
     """960x600 is a laptop's window at 150 % zoom."""
     page.size(width, height)
-    try:
-        shown = page.run(
-            """return [...document.querySelectorAll('.discs kbd, #home kbd')]
-                   .filter((one) => one.checkVisibility())
-                   .filter((one) => one.getBoundingClientRect().bottom <= innerHeight)
-                   .map((one) => one.textContent)"""
-        )
-        assert set(shown) == {"Q", "E", "arrows", "G", "H", "W A S D", "I J K L", "Home"}
-        assert page.run("return [...document.querySelectorAll('.pad')].every((one) => !one.checkVisibility())")
-    finally:
-        page.size(1280, 800)
+    shown = page.run(
+        """return [...document.querySelectorAll('.discs kbd, #home kbd')]
+               .filter((one) => one.checkVisibility())
+               .filter((one) => one.getBoundingClientRect().bottom <= innerHeight)
+               .map((one) => one.textContent)"""
+    )
+    assert set(shown) == {"Q", "E", "arrows", "G", "H", "W A S D", "I J K L", "Home"}
+    assert page.run("return [...document.querySelectorAll('.pad')].every((one) => !one.checkVisibility())")
 
 
 def test_the_keys_of_the_gripper_stand_beside_what_they_do(page: Browser) -> None:
@@ -212,8 +203,7 @@ def test_an_intended_stop_is_no_alarm(bench: Bench, page: Browser, what: str) ->
 
 
 def test_backspace_stops_as_in_a_terminal(bench: Bench, page: Browser) -> None:
-    page.key("Backspace", "Backspace", True)
-    page.key("Backspace", "Backspace", False)
+    page.tap("Backspace", "Backspace")
     wait_for(lambda: bench.trip == "stop", "the stop")
     wait_for(lambda: "Stopped by STOP (you," in page.text("#trip"), "the page to say who stopped it")
     assert page.run("return document.querySelector('#trip').classList.contains('alarm')")
@@ -222,18 +212,15 @@ def test_backspace_stops_as_in_a_terminal(bench: Bench, page: Browser) -> None:
 def test_two_thumbs(bench: Bench, page: Browser) -> None:
     """One on the dead-man, the other one on a disc; lifting the first stops the arm."""
     page.size(844, 390, touch=True)
-    try:
-        hold, disc = page.place("#hold"), page.place('[data-disc="dpad"]')
-        left = {"x": hold["x"], "y": hold["y"], "id": 1}
-        right = {"x": disc["x"], "y": disc["y"], "id": 2}
-        page.cdp("Input.dispatchTouchEvent", type="touchStart", touchPoints=[left])
-        wait_for(lambda: bench.deadman.held, "the thumb to hold")
-        page.cdp("Input.dispatchTouchEvent", type="touchStart", touchPoints=[left, right])
-        right["x"] -= 0.5 * disc["width"]
-        page.cdp("Input.dispatchTouchEvent", type="touchMove", touchPoints=[left, right])
-        wait_for(lambda: bench.tcp_speed[1] > 0.1, "motion")
-        page.cdp("Input.dispatchTouchEvent", type="touchEnd", touchPoints=[left])
-        wait_for(lambda: not bench.deadman.held and bench.rests(), "the arm to rest")
-        page.cdp("Input.dispatchTouchEvent", type="touchEnd", touchPoints=[])
-    finally:
-        page.size(1280, 800)
+    hold, disc = page.place("#hold"), page.place('[data-disc="dpad"]')
+    left = {"x": hold["x"], "y": hold["y"], "id": 1}
+    right = {"x": disc["x"], "y": disc["y"], "id": 2}
+    page.cdp("Input.dispatchTouchEvent", type="touchStart", touchPoints=[left])
+    wait_for(lambda: bench.deadman.held, "the thumb to hold")
+    page.cdp("Input.dispatchTouchEvent", type="touchStart", touchPoints=[left, right])
+    right["x"] -= 0.5 * disc["width"]
+    page.cdp("Input.dispatchTouchEvent", type="touchMove", touchPoints=[left, right])
+    wait_for(lambda: bench.tcp_speed[1] > 0.1, "motion")
+    page.cdp("Input.dispatchTouchEvent", type="touchEnd", touchPoints=[left])
+    wait_for(lambda: not bench.deadman.held and bench.rests(), "the arm to rest")
+    page.cdp("Input.dispatchTouchEvent", type="touchEnd", touchPoints=[])

@@ -115,21 +115,18 @@ def test_a_press_reaches_the_program_and_leaves_a_held_dead_man_alone(bench, pag
 
 def test_a_second_thumb_presses_while_the_first_one_holds(bench, page, asked):
     page.size(390, 844, touch=True)
-    try:
-        show(bench, page, READY)
-        hold, record = page.place("#hold"), page.place(button("record"))
-        assert record["bottom"] <= 844, "in view without scrolling"
-        thumbs = [{"x": hold["x"], "y": hold["y"], "id": 1}, {"x": record["x"], "y": record["y"], "id": 2}]
-        page.cdp("Input.dispatchTouchEvent", type="touchStart", touchPoints=thumbs[:1])
-        wait_for(lambda: bench.deadman.held, "the thumb to hold")
-        page.cdp("Input.dispatchTouchEvent", type="touchStart", touchPoints=thumbs)
-        page.cdp("Input.dispatchTouchEvent", type="touchEnd", touchPoints=thumbs[1:])
-        assert asked.get(timeout=20.0) == "record"
-        assert bench.deadman.held
-        page.cdp("Input.dispatchTouchEvent", type="touchEnd", touchPoints=[])
-        wait_for(lambda: not bench.deadman.held, "the release")
-    finally:
-        page.size(1280, 800)
+    show(bench, page, READY)
+    hold, record = page.place("#hold"), page.place(button("record"))
+    assert record["bottom"] <= 844, "in view without scrolling"
+    thumbs = [{"x": hold["x"], "y": hold["y"], "id": 1}, {"x": record["x"], "y": record["y"], "id": 2}]
+    page.cdp("Input.dispatchTouchEvent", type="touchStart", touchPoints=thumbs[:1])
+    wait_for(lambda: bench.deadman.held, "the thumb to hold")
+    page.cdp("Input.dispatchTouchEvent", type="touchStart", touchPoints=thumbs)
+    page.cdp("Input.dispatchTouchEvent", type="touchEnd", touchPoints=thumbs[1:])
+    assert asked.get(timeout=20.0) == "record"
+    assert bench.deadman.held
+    page.cdp("Input.dispatchTouchEvent", type="touchEnd", touchPoints=[])
+    wait_for(lambda: not bench.deadman.held, "the release")
 
 
 def test_a_page_without_control_steers_no_recording(bench: Bench, page: Browser, asked: queue.SimpleQueue[str]) -> None:

@@ -111,8 +111,7 @@ def test_a_window_that_lost_the_focus(bench: Bench, moving: Browser) -> None:
 
 def test_stop_by_the_person_who_drives(bench: Bench, moving: Browser) -> None:
     def escape() -> None:
-        moving.key("Escape", "Escape", True)
-        moving.key("Escape", "Escape", False)
+        moving.tap("Escape", "Escape")
 
     stops_for(bench, moving, "stop", escape)
     wait_for(lambda: "STOP" in moving.text("#trip"), "the page to say why")

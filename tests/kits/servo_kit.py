@@ -114,6 +114,12 @@ class Bench:
     def release(self) -> None:
         self.deadman = self.deadman._replace(held=False)
 
+    def press_again(self) -> None:
+        """Release the dead-man for a tick, and press it."""
+        self.release()
+        self.tick()
+        self.press()
+
     def send(self, kind: Kind, values: Sequence[float], deadline: float = 0.1) -> int:
         self.seq += 1
         self.command = CommandRecord(self.seq, 1, self.now, self.now + deadline, kind, tuple(values))

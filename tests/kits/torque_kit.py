@@ -101,6 +101,12 @@ class Driven:
     def release(self) -> None:
         self.deadman = self.deadman._replace(held=False)
 
+    def press_again(self) -> None:
+        """Release the dead-man for a tick, and press it."""
+        self.release()
+        self.tick()
+        self.press()
+
     def inbox(self) -> Inbox:
         if self.app_alive:
             self.t_app = self.now

@@ -69,6 +69,11 @@ class HandBench:
             assert time.monotonic() < deadline, f"not within {limit:g} s; the last reading: {reading}"
             time.sleep(_TURN)
 
+    def do(self, command: str, *arguments: float) -> GripperReading:
+        """Give a command, and read until it has ended."""
+        getattr(self.hand, command)(*arguments)
+        return self.finish()
+
     def finish(self) -> GripperReading:
         """Read until the newest command has ended."""
         return self.wait(lambda reading: reading.outcome is not GripperOutcome.RUNNING)

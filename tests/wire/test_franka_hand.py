@@ -79,39 +79,30 @@ def test_widths_are_reached_whatever_a_grasp_of_nothing_does(ends_at_width):
 
 def test_what_a_move_closes_on_is_held_until_it_opens(bench):
     bench.command("object 0.03")
-    bench.hand.move(0.0, 0.1, 35.0)
-    reading = bench.finish()
+    reading = bench.do("move", 0.0, 0.1, 35.0)
     assert (reading.outcome, reading.grasped, reading.width, reading.fault) == (MISSED, True, 0.03, None)
     assert bench.command("state")["force"] == 35.0
     before = bench.requests
     bench.hand.move(0.01, 0.1, 35.0)
-    bench.hand.stop()
-    assert bench.finish().grasped
+    assert bench.do("stop").grasped
     assert bench.requests == before
     assert bench.command("state")["is_grasped"]
-    bench.hand.move(0.05, 0.1, 35.0)
-    reading = bench.finish()
+    reading = bench.do("move", 0.05, 0.1, 35.0)
     assert (reading.outcome, reading.grasped) == (DONE, False)
 
 
 def test_a_grasp_holds_what_has_the_right_width_only(bench):
     bench.command("object 0.03")
-    bench.hand.grasp(0.02, 0.1, 40.0, 0.005, 0.005)
-    assert (bench.finish().outcome, bench.read().grasped) == (MISSED, False)
-    bench.hand.move(0.04, 0.1, 40.0)
-    bench.finish()
-    bench.hand.grasp(0.03, 0.1, 50.0, 0.005, 0.005)
-    assert (bench.finish().outcome, bench.read().grasped) == (DONE, True)
+    assert (bench.do("grasp", 0.02, 0.1, 40.0, 0.005, 0.005).outcome, bench.read().grasped) == (MISSED, False)
+    bench.do("move", 0.04, 0.1, 40.0)
+    assert (bench.do("grasp", 0.03, 0.1, 50.0, 0.005, 0.005).outcome, bench.read().grasped) == (DONE, True)
     assert bench.command("state")["newest"]["grasp"] == [0.03, 0.005, 0.005, 0.1, 50.0]
     before = bench.requests
-    bench.hand.grasp(0.03, 0.1, 50.0, 0.005, 0.005)
-    assert bench.finish().outcome is DONE
-    bench.hand.grasp(0.03, 0.1, 60.0, 0.005, 0.005)
-    reading = bench.finish()
+    assert bench.do("grasp", 0.03, 0.1, 50.0, 0.005, 0.005).outcome is DONE
+    reading = bench.do("grasp", 0.03, 0.1, 60.0, 0.005, 0.005)
     assert reading.outcome is FAILED
     assert reading.fault.code == "holding"
-    bench.hand.home()
-    assert bench.finish().outcome is FAILED
+    assert bench.do("home").outcome is FAILED
     assert bench.requests == before
     assert bench.command("state")["is_grasped"]
 
@@ -122,11 +113,9 @@ def test_a_hand_that_is_not_homed_says_so_and_is_homed():
         fault = bench.read().fault
         assert fault.code == "not_homed"
         assert "home" in fault.remedy
-        bench.hand.move(0.08, 0.1, 40.0)
-        assert (bench.finish().outcome, bench.read().fault) == (FAILED, fault)
+        assert (bench.do("move", 0.08, 0.1, 40.0).outcome, bench.read().fault) == (FAILED, fault)
         assert bench.requests["move"] == 0
-        bench.hand.home()
-        reading = bench.finish()
+        reading = bench.do("home")
         assert (reading.outcome, reading.fault, reading.width) == (DONE, None, 0.08)
         assert bench.slowest < 0.3  # the library's own call takes more than a second
 
@@ -152,8 +141,7 @@ def test_a_stop_that_is_ignored_is_told_and_the_next_command_waits(bench, brisk)
     bench.hand.stop()
     reading = bench.wait(lambda r: r.fault is not None)
     assert (reading.outcome, reading.fault.code, reading.moving) == (STOPPED, "stop_ignored", True)
-    bench.hand.move(0.07, 0.1, 40.0)
-    assert bench.finish().outcome is DONE
+    assert bench.do("move", 0.07, 0.1, 40.0).outcome is DONE
     assert bench.read().width == pytest.approx(0.07, abs=0.002)
 
 
@@ -172,27 +160,23 @@ def test_a_stop_that_lets_go_is_told(bench, brisk):
 
 def test_a_motion_that_the_hand_refuses_has_failed(bench):
     bench.command("fail")
-    bench.hand.move(0.08, 0.1, 40.0)
-    reading = bench.finish()
+    reading = bench.do("move", 0.08, 0.1, 40.0)
     assert reading.outcome is FAILED
     assert reading.fault.code == "hand_failed"
-    bench.hand.move(0.05, 0.1, 40.0)
-    assert (bench.finish().outcome, bench.read().fault) == (DONE, None)
+    assert (bench.do("move", 0.05, 0.1, 40.0).outcome, bench.read().fault) == (DONE, None)
 
 
 def test_a_motion_that_is_never_answered_is_given_up(bench, brisk):
     client = client_of(bench)
     bench.command("slow-reply 1000")
-    bench.hand.move(0.045, 0.1, 40.0)
-    reading = bench.finish()
+    reading = bench.do("move", 0.045, 0.1, 40.0)
     assert reading.outcome is FAILED
     assert reading.fault.code == "no_answer"
     bench.wait_server(lambda state: not state["client"])
     bench.command("slow-reply 0")
     bench.wait_back(2)
     assert client_of(bench) != client
-    bench.hand.move(0.05, 0.1, 40.0)
-    assert bench.finish().outcome is DONE
+    assert bench.do("move", 0.05, 0.1, 40.0).outcome is DONE
 
 
 def test_silence_is_a_lost_hand_and_nothing_waits_for_it(bench):
@@ -202,8 +186,7 @@ def test_silence_is_a_lost_hand_and_nothing_waits_for_it(bench):
         bench.hand.move(0.08, 0.1, 40.0)
     bench.wait_back(1)
     assert bench.slowest < 0.5  # the library waits for a second
-    bench.hand.move(0.05, 0.1, 40.0)
-    assert bench.finish().outcome is DONE
+    assert bench.do("move", 0.05, 0.1, 40.0).outcome is DONE
 
 
 @pytest.mark.parametrize("how", ["the hand hangs up", "the client library dies", "the hand restarts"])
@@ -226,15 +209,13 @@ def test_a_connection_comes_back_but_not_the_command_that_it_cost(bench, brisk, 
     with pytest.raises(ProcessLookupError):
         os.kill(client, 0)
     if how == "the hand restarts":
-        bench.hand.move(0.05, 0.1, 40.0)
-        fault = bench.finish().fault
+        fault = bench.do("move", 0.05, 0.1, 40.0).fault
         assert fault.code == "not_homed"
 
 
 def test_closing_leaves_alone_what_is_held(bench):
     bench.command("object 0.03")
-    bench.hand.move(0.0, 0.1, 40.0)
-    bench.finish()
+    bench.do("move", 0.0, 0.1, 40.0)
     client = client_of(bench)
     before = bench.requests
     bench.hand.close()
@@ -272,8 +253,7 @@ def test_a_hand_that_another_program_uses_is_told(bench):
     other = FrankaHand(bench.hand.spec)
     with pytest.raises(ConnectionLost, match=bench.host):
         other.open()
-    bench.hand.move(0.05, 0.1, 40.0)
-    assert bench.finish().outcome is DONE
+    assert bench.do("move", 0.05, 0.1, 40.0).outcome is DONE
 
 
 def test_a_hand_that_takes_the_connection_and_says_nothing_is_told(monkeypatch):
@@ -294,8 +274,7 @@ def test_numbers_that_cannot_be_are_never_sent(bench):
 
 
 def test_numbers_beyond_the_hand_are_brought_into_its_range(bench):
-    bench.hand.move(0.2, 5.0, 40.0)
-    assert bench.finish().outcome is DONE
+    assert bench.do("move", 0.2, 5.0, 40.0).outcome is DONE
     assert bench.command("state")["newest"]["move"] == [0.08, 0.1]
 
 

@@ -177,18 +177,14 @@ class TestStopping:
 
     def test_a_press_counts_once_it_rests_and_follows_new_torques_only(self) -> None:
         arm = moving()
-        arm.release()
-        arm.tick()
-        arm.press()
+        arm.press_again()
         arm.send(one(0, 5.0), deadline=9.0)
         arm.tick()
         assert arm.state == (RobotStatus.STOPPING, Trip.NONE)
         arm.until_held()
         arm.run(0.2)
         assert not arm.by_torques, "what was sent before the press was granted does not count"
-        arm.release()
-        arm.tick()
-        arm.press()
+        arm.press_again()
         arm.drive(0.2, one(0, 5.0))
         assert arm.by_torques
         assert arm.dq[0] > 0.1
@@ -197,9 +193,7 @@ class TestStopping:
         arm = moving()
         arm.stops += 1
         arm.tick()
-        arm.release()
-        arm.tick()
-        arm.press()
+        arm.press_again()
         while arm.by_torques:
             assert arm.servo.report.trip is Trip.STOP
             arm.tick()
@@ -291,9 +285,7 @@ class TestGuards:
         assert (arm.q >= limits.lower).all()
         edge = limits.upper if direction > 0.0 else limits.lower
         assert abs(arm.q[joint] - edge[joint]) < 0.35
-        arm.release()
-        arm.tick()
-        arm.press()
+        arm.press_again()
         arm.drive(0.2, one(joint, -direction * 3.0))
         assert arm.state == (RobotStatus.FOLLOWING, Trip.NONE), "it may leave"
 
@@ -317,9 +309,7 @@ class TestGuards:
         assert arm.servo.report.trip is Trip.LIMIT
         arm.until_held()
         assert arm.q[0] < 2.96
-        arm.release()
-        arm.tick()
-        arm.press()
+        arm.press_again()
         arm.drive(0.3, one(0, -3.0))
         assert arm.state == (RobotStatus.FOLLOWING, Trip.NONE)
         assert arm.q[0] < 2.94
@@ -365,9 +355,7 @@ class TestMixed:
         assert arm.by_torques
         arm.release()
         arm.until_held()
-        arm.release()
-        arm.tick()
-        arm.press()
+        arm.press_again()
         arm.drive(0.2)
         assert arm.by_torques
         for _ in range(60):

@@ -77,9 +77,7 @@ def test_a_release_between_two_ticks_is_a_release() -> None:
 
 def test_a_press_while_the_arm_brakes_counts_only_once_it_is_at_rest() -> None:
     bench = held()
-    bench.release()
-    bench.tick()
-    bench.press()
+    bench.press_again()
     bench.drive(bench.dt)
     while bench.moving:
         assert bench.status is RobotStatus.STOPPING
@@ -168,18 +166,14 @@ def test_every_trip_stops_latches_and_is_left_by_a_new_press(break_it, mend_it, 
     assert bench.status is (RobotStatus.FAULT if trip is Trip.FAULT else RobotStatus.TRIPPED)
     # A press while the cause lasts does not count, not even once it is gone.
     if bench.deadman is not None:
-        bench.release()
-        bench.tick()
-        bench.press()
+        bench.press_again()
         bench.drive(0.1)
     exec(f"b.{mend_it}", names)
     bench.drive(0.5)
     if trip is not Trip.STOP:  # a stop is over at once; the press above was a new one
         assert bench.trip is trip
         assert not bench.moving
-    bench.release()
-    bench.tick()
-    bench.press()
+    bench.press_again()
     bench.drive(0.3)
     assert bench.trip is Trip.NONE
     assert bench.moving
@@ -302,9 +296,7 @@ def test_a_servo_that_could_not_run_trips_an_arm_that_really_moves() -> None:
     bench.drive(0.3)
     assert bench.trip is Trip.HOST_LATE
     assert not bench.moving
-    bench.release()
-    bench.tick()
-    bench.press()
+    bench.press_again()
     bench.drive(0.3)
     assert bench.trip is Trip.NONE
     assert bench.moving

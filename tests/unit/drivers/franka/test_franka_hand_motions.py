@@ -108,6 +108,11 @@ class Bench:
             self._waiting = False
             self.controller.call_ended(ANSWERS[status], self.now)
 
+    def do(self, command: str, *arguments: float) -> GripperOutcome:
+        """Give a command and wait until it has ended."""
+        getattr(self.controller, command)(*arguments)
+        return self.finish()
+
     def finish(self, limit: float = 10.0) -> GripperOutcome:
         """Wait until the newest command has ended."""
         for _ in range(round(limit / DT)):
@@ -134,11 +139,9 @@ def bench(request: pytest.FixtureRequest) -> Bench:
 
 
 def test_opening_is_a_move_and_closing_is_a_grasp(bench):
-    bench.controller.move(0.07, 0.1, 40.0)
-    assert bench.finish() is GripperOutcome.DONE
+    assert bench.do("move", 0.07, 0.1, 40.0) is GripperOutcome.DONE
     assert [call[:2] for call in bench.calls] == [("move", (0.07, 0.1))]
-    bench.controller.move(0.02, 0.1, 40.0)
-    assert bench.finish() is GripperOutcome.DONE
+    assert bench.do("move", 0.02, 0.1, 40.0) is GripperOutcome.DONE
     assert bench.calls[1][:2] == ("grasp", (0.02, 0.1, 40.0, 0.0, 0.08))
     assert bench.fingers.width == pytest.approx(0.02, abs=0.002)
     assert bench.narrowest > 0.01
@@ -147,8 +150,7 @@ def test_opening_is_a_move_and_closing_is_a_grasp(bench):
 
 def test_what_is_met_while_closing_is_held_with_the_force_that_was_asked_for(bench):
     bench.fingers.put(0.03)
-    bench.controller.move(0.01, 0.1, 25.0)
-    assert bench.finish() is GripperOutcome.MISSED
+    assert bench.do("move", 0.01, 0.1, 25.0) is GripperOutcome.MISSED
     assert (bench.fingers.is_grasped, bench.fingers.force, bench.fingers.width) == (True, 25.0, 0.03)
     assert bench.controller.fault is None
 
@@ -156,22 +158,18 @@ def test_what_is_met_while_closing_is_held_with_the_force_that_was_asked_for(ben
 def test_closing_further_on_what_is_held_sends_nothing(bench):
     """A second grasp would let go."""
     bench.fingers.put(0.03)
-    bench.controller.move(0.01, 0.1, 40.0)
-    bench.finish()
+    bench.do("move", 0.01, 0.1, 40.0)
     for width in (0.02, 0.0):
-        bench.controller.move(width, 0.1, 40.0)
-        assert bench.finish() is GripperOutcome.MISSED
+        assert bench.do("move", width, 0.1, 40.0) is GripperOutcome.MISSED
     assert len(bench.calls) == 1
     assert bench.fingers.is_grasped
-    bench.controller.move(0.08, 0.1, 40.0)
-    assert bench.finish() is GripperOutcome.DONE
+    assert bench.do("move", 0.08, 0.1, 40.0) is GripperOutcome.DONE
     assert bench.calls[1][:2] == ("move", (0.08, 0.1))
 
 
 def test_something_narrower_than_the_width_is_not_held(bench):
     bench.fingers.put(0.01)
-    bench.controller.move(0.03, 0.1, 40.0)
-    assert bench.finish() is GripperOutcome.DONE
+    assert bench.do("move", 0.03, 0.1, 40.0) is GripperOutcome.DONE
     assert bench.fingers.width == pytest.approx(0.03, abs=0.002)
     assert not bench.fingers.is_grasped
 
@@ -181,15 +179,13 @@ def test_fingers_that_were_stopped_just_before_they_shut_still_press(bench):
     bench.fingers.put(0.001)
     bench.fingers.width = 0.0018
     bench.pass_time(0.05)
-    bench.controller.move(0.0, 0.1, 40.0)
-    assert bench.finish() is GripperOutcome.DONE
+    assert bench.do("move", 0.0, 0.1, 40.0) is GripperOutcome.DONE
     assert bench.fingers.force == 40.0
     calls = len(bench.calls)
     bench.fingers.put(None)
     bench.fingers.width = 0.0
     bench.pass_time(0.05)
-    bench.controller.move(0.0, 0.1, 40.0)
-    assert bench.finish() is GripperOutcome.DONE
+    assert bench.do("move", 0.0, 0.1, 40.0) is GripperOutcome.DONE
     assert len(bench.calls) == calls
 
 
@@ -211,8 +207,7 @@ def test_a_command_that_had_not_begun_is_dropped(bench):
     bench.pass_time(0.1)
     bench.controller.grasp(0.03, 0.1, 40.0, 0.005, 0.005)
     bench.pass_time(0.05)
-    bench.controller.move(0.06, 0.1, 40.0)
-    assert bench.finish() is GripperOutcome.DONE
+    assert bench.do("move", 0.06, 0.1, 40.0) is GripperOutcome.DONE
     assert [call.method for call in bench.calls] == ["move", "move"]
     assert bench.fingers.width == pytest.approx(0.06, abs=0.002)
 
@@ -221,28 +216,21 @@ def test_a_command_that_had_not_begun_is_dropped(bench):
 def test_a_grasp_is_judged_by_the_hand(thing, outcome):
     bench = Bench(Fingers(thing))
     bench.fingers.width = 0.07
-    bench.controller.grasp(0.03, 0.1, 40.0, 0.005, 0.005)
-    assert bench.finish() is GripperOutcome[outcome]
+    assert bench.do("grasp", 0.03, 0.1, 40.0, 0.005, 0.005) is GripperOutcome[outcome]
     assert bench.fingers.is_grasped is (outcome == "DONE")
 
 
 def test_a_hold_takes_neither_another_force_nor_homing(bench):
     bench.fingers.put(0.03)
-    bench.controller.grasp(0.03, 0.1, 35.0, 0.005, 0.005)
-    bench.finish()
-    bench.controller.grasp(0.03, 0.1, 35.0, 0.005, 0.005)
-    assert bench.finish() is GripperOutcome.DONE
-    bench.controller.grasp(0.02, 0.1, 35.0, 0.005, 0.005)
-    assert bench.finish() is GripperOutcome.MISSED
-    bench.controller.grasp(0.03, 0.1, 60.0, 0.005, 0.005)
-    assert bench.finish() is GripperOutcome.FAILED
-    bench.controller.home()
-    assert bench.finish() is GripperOutcome.FAILED
+    bench.do("grasp", 0.03, 0.1, 35.0, 0.005, 0.005)
+    assert bench.do("grasp", 0.03, 0.1, 35.0, 0.005, 0.005) is GripperOutcome.DONE
+    assert bench.do("grasp", 0.02, 0.1, 35.0, 0.005, 0.005) is GripperOutcome.MISSED
+    assert bench.do("grasp", 0.03, 0.1, 60.0, 0.005, 0.005) is GripperOutcome.FAILED
+    assert bench.do("home") is GripperOutcome.FAILED
     assert bench.controller.fault.code == "holding"
     bench.controller.connection_lost("the cable was pulled")  # from here on nobody knows with which force it holds
     bench.pass_time(0.1)
-    bench.controller.grasp(0.03, 0.1, 35.0, 0.005, 0.005)
-    assert bench.finish() is GripperOutcome.FAILED
+    assert bench.do("grasp", 0.03, 0.1, 35.0, 0.005, 0.005) is GripperOutcome.FAILED
     assert len(bench.calls) == 1
     assert bench.fingers.is_grasped
 
@@ -250,8 +238,7 @@ def test_a_hold_takes_neither_another_force_nor_homing(bench):
 def test_fingers_that_open_stop_where_a_newer_command_says(bench):
     bench.controller.move(0.08, 0.05, 40.0)
     bench.pass_time(0.1)
-    bench.controller.move(0.05, 0.05, 40.0)
-    assert bench.finish() is GripperOutcome.DONE
+    assert bench.do("move", 0.05, 0.05, 40.0) is GripperOutcome.DONE
     assert bench.stops == 1
     assert bench.widest < 0.055
 
@@ -277,16 +264,13 @@ def test_a_hand_that_is_not_homed_does_nothing_else(bench):
         assert bench.finish() is GripperOutcome.FAILED
         assert bench.controller.fault.code == "not_homed"
     assert not bench.calls
-    bench.controller.home()
-    assert bench.finish() is GripperOutcome.DONE
-    bench.controller.move(0.02, 0.1, 40.0)
-    assert bench.finish() is GripperOutcome.DONE
+    assert bench.do("home") is GripperOutcome.DONE
+    assert bench.do("move", 0.02, 0.1, 40.0) is GripperOutcome.DONE
 
 
 def test_failed_homing_is_a_fault(bench):
     bench.fingers.put(0.03)
-    bench.controller.home()
-    assert bench.finish() is GripperOutcome.FAILED
+    assert bench.do("home") is GripperOutcome.FAILED
     assert bench.controller.fault.code == "hand_failed"
 
 
@@ -332,8 +316,7 @@ def test_an_ignored_stop_is_a_fault_and_the_next_command_waits_for_the_end(bench
     bench.controller.stop()
     bench.pass_time(1.2)
     assert bench.controller.fault.code == "stop_ignored"
-    bench.controller.move(0.02, 0.1, 40.0)
-    assert bench.finish() is GripperOutcome.DONE
+    assert bench.do("move", 0.02, 0.1, 40.0) is GripperOutcome.DONE
     assert bench.fingers.width == pytest.approx(0.02, abs=0.002)
 
 
@@ -362,8 +345,7 @@ def test_a_stop_that_releases_the_object_is_a_fault(lets_go):
 def test_a_hold_that_is_never_answered_is_not_stopped_until_it_is_to_open(bench):
     bench.mute = True
     bench.fingers.put(0.03)
-    bench.controller.grasp(0.03, 0.1, 40.0, 0.005, 0.005)
-    assert bench.finish() is GripperOutcome.FAILED
+    assert bench.do("grasp", 0.03, 0.1, 40.0, 0.005, 0.005) is GripperOutcome.FAILED
     bench.pass_time(3.0)
     assert (bench.stops, bench.reconnects) == (0, 0)
     assert bench.fingers.is_grasped
@@ -382,8 +364,7 @@ def test_a_motion_without_an_answer_is_ended(bench):
     bench.pass_time(3.0)
     assert bench.reconnects == 1
     bench.mute = False
-    bench.controller.move(0.02, 0.1, 40.0)
-    assert bench.finish() is GripperOutcome.DONE
+    assert bench.do("move", 0.02, 0.1, 40.0) is GripperOutcome.DONE
 
 
 def test_a_command_is_lost_with_the_connection_and_never_sent_again(bench):
