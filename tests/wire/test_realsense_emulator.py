@@ -280,7 +280,7 @@ def test_unplugging_is_announced_and_ends_the_pipeline_and_replugging_brings_it_
 
 def test_in_a_plain_context_an_unplugged_camera_cannot_be_found_by_its_number(make_bench) -> None:
     bench = make_bench(context=rs.context())
-    client = bench.client()
+    client = Client(bench.context, bench.camera.serial)  # the bench would keep it
     client.whole()
     bench.camera.unplug()
     assert listed(bench.context) == [""], "the pipeline still holds it"
@@ -306,7 +306,7 @@ def test_unplugging_one_camera_does_not_affect_another(make_bench) -> None:
 
 def test_repeated_replugging_leaks_no_thread(bench: Bench) -> None:
     def once() -> int:
-        client = bench.client("depth")
+        client = Client(bench.context, bench.camera.serial, "depth")  # the bench would keep it
         client.set()
         bench.camera.unplug()
         client.stop()
