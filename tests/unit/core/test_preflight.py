@@ -1,19 +1,24 @@
-"""The check of a rig: which arms are looked at, and what becomes of drivers that cannot, or fail to."""
+"""The checks before a motion: of arms and cameras by their drivers, and of this computer on made-up system files."""
 
 from __future__ import annotations
 
+import os
+import resource
 import sys
 from collections.abc import Iterator
 from dataclasses import replace
+from pathlib import Path
 from types import ModuleType
 
 import pytest
 
 from hal.config import load
 from hal.errors import DriverMissing
-from hal.preflight import CheckResult, preflight, real_arms
+from hal.preflight import CheckResult, check_machine, has_realtime_kernel, preflight, real_arms
 from hal.registry import DriverSpec
 from hal.specs import CameraSpec, Plan, RobotSpec
+
+linux = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="needs Linux")
 
 
 def check(spec: RobotSpec, duration: float) -> Iterator[CheckResult]:
@@ -24,7 +29,7 @@ def check(spec: RobotSpec, duration: float) -> Iterator[CheckResult]:
 
 @pytest.fixture
 def plan(monkeypatch: pytest.MonkeyPatch) -> Plan:
-    """A rig with one arm that takes itself for real."""
+    """A rig with one arm that counts as real."""
     module = ModuleType("checked_driver")
     vars(module).update(check=check, DRIVER=DriverSpec("checked_driver", preflight="checked_driver:check"))
     monkeypatch.setitem(sys.modules, "checked_driver", module)
@@ -51,7 +56,7 @@ def test_an_emulated_arm_is_checked_too(plan: Plan) -> None:
     assert of_arms(emulated) == of_arms(plan)
 
 
-def test_a_check_that_breaks_is_a_failure_after_what_it_found(plan: Plan) -> None:
+def test_a_check_that_raises_is_a_failure_after_its_first_results(plan: Plan) -> None:
     broken = replace(plan, robots=(replace(plan.robots[0], options={"broken": True}),))
     first, last = of_arms(broken)
     assert first.level == "ok"
@@ -65,7 +70,7 @@ def test_a_driver_without_a_check_is_unknown(plan: Plan) -> None:
     assert "'mock'" in found.found
 
 
-def test_a_driver_that_is_not_there_is_a_failure(plan: Plan) -> None:
+def test_an_unknown_driver_is_a_failure(plan: Plan) -> None:
     (found,) = of_arms(replace(plan, robots=(replace(plan.robots[0], driver="nothing:DRIVER"),)))
     assert found.level == "fail"
 
@@ -82,3 +87,127 @@ def test_a_camera_is_checked_by_its_driver_unless_left_out(monkeypatch: pytest.M
     plan = replace(plan, cameras=(replace(first, driver="checked_camera:DRIVER"), *others))
     assert of_arms(plan) == [CheckResult(f"{first.name}: rate", "ok", "30 Hz over 0.25 s")]
     assert [v for v in preflight(plan, 0.25, cameras=False) if ":" in v.name] == []
+
+
+# This computer
+
+ORDINARY = "Linux version 6.8.0-45-generic (buildd@x) #45-Ubuntu SMP PREEMPT_DYNAMIC Fri Aug 30 12:02:04 UTC 2024"
+CAPABLE, INCAPABLE = "CapEff:\t000001ffffffffff", "CapEff:\t0000000000000000"
+
+
+def write(root: Path, **files: str) -> Path:
+    """Write files, named by their paths with ``__`` for a slash."""
+    for name, text in files.items():
+        path = root / name.replace("__", "/")
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text + "\n")
+    return root
+
+
+def machine_check(root: Path, name: str) -> CheckResult:
+    return next(v for v in check_machine(root) if v.name == name)
+
+
+@linux
+@pytest.mark.parametrize(
+    "version",
+    [
+        "Linux version 6.12.38-rt-amd64 (x) #1 SMP PREEMPT_RT Debian 6.12.38-1",
+        "Linux version 5.9.1-rt20 (x) #1 SMP PREEMPT_RT Thu Mar 4",
+        "Linux version 4.14.12-rt10 (x) #1 SMP PREEMPT RT Wed Apr 24",
+    ],
+)
+def test_a_real_time_kernel_is_recognised_by_its_name(tmp_path: Path, version: str) -> None:
+    write(tmp_path, proc__version=version)
+    assert has_realtime_kernel(tmp_path) is True
+    assert machine_check(tmp_path, "kernel").level == "ok"
+
+
+@linux
+def test_a_real_time_kernel_is_recognised_by_its_file(tmp_path: Path) -> None:
+    write(tmp_path, proc__version=ORDINARY, sys__kernel__realtime="1")
+    assert has_realtime_kernel(tmp_path) is True
+
+
+@linux
+@pytest.mark.parametrize(
+    ("release", "remedy"),
+    [
+        ("ID=ubuntu", "sudo pro enable realtime-kernel"),
+        ('NAME="Debian"\nID="debian"', "sudo apt install linux-image-rt-amd64"),
+        ("ID=arch", "PREEMPT_RT"),
+    ],
+)
+def test_an_ordinary_kernel_is_a_warning_with_the_command_for_this_system(
+    tmp_path: Path, release: str, remedy: str
+) -> None:
+    write(tmp_path, proc__version=ORDINARY, etc__os_release="")
+    (tmp_path / "etc/os-release").write_text(release)
+    found = machine_check(tmp_path, "kernel")
+    assert has_realtime_kernel(tmp_path) is False
+    assert found.level == "warn"
+    assert remedy in found.remedy
+
+
+@linux
+def test_what_cannot_be_checked_is_unknown(tmp_path: Path) -> None:
+    assert has_realtime_kernel(tmp_path) is None
+    assert machine_check(tmp_path, "kernel").level == "unknown"
+    assert machine_check(tmp_path, "processor").level == "unknown"
+
+
+@linux
+@pytest.mark.parametrize(
+    ("governors", "level"),
+    [(["performance", "performance"], "ok"), (["performance", "powersave"], "warn"), (["schedutil"] * 2, "warn")],
+)
+def test_processors_that_save_power_are_a_warning(tmp_path: Path, governors: list[str], level: str) -> None:
+    for k, governor in enumerate(governors):
+        write(tmp_path, **{f"sys__devices__system__cpu__cpu{k}__cpufreq__scaling_governor": governor})
+    found = machine_check(tmp_path, "processor")
+    assert found.level == level
+    if level == "warn":
+        assert set(governors) - {"performance"} == {found.found.split("governor ")[1].strip(")")}
+        assert "tee /sys/devices/system/cpu/cpu*/cpufreq/scaling_governor" in found.remedy
+
+
+@linux
+@pytest.mark.parametrize(
+    ("capabilities", "limit", "level"),
+    [
+        (CAPABLE, 2**16, "ok"),
+        (INCAPABLE, resource.RLIM_INFINITY, "ok"),
+        (INCAPABLE, 2**26, "warn"),
+        ("", 2**26, "unknown"),
+    ],
+)
+def test_memory_may_be_locked_by_capability_or_by_limit(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capabilities: str, limit: int, level: str
+) -> None:
+    write(tmp_path, proc__self__status=f"Name:\tpython\n{capabilities}")
+    monkeypatch.setattr(resource, "getrlimit", lambda _: (limit, limit))
+    found = machine_check(tmp_path, "memory")
+    assert found.level == level
+    if level == "warn":
+        assert "64 MiB" in found.found
+        assert "memlock" in found.remedy
+
+
+@linux
+def test_this_computer_gets_every_result_and_keeps_its_scheduling() -> None:
+    before = os.sched_getscheduler(0)
+    found = list(check_machine())
+    assert [v.name for v in found] == ["kernel", "processor", "scheduling", "memory"]
+    assert all(v.remedy for v in found if v.level in ("warn", "fail"))
+    assert os.sched_getscheduler(0) == before
+
+
+@linux
+def test_no_right_to_real_time_scheduling_is_a_warning(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: object) -> None:
+        raise PermissionError
+
+    monkeypatch.setattr(os, "sched_setscheduler", refuse)
+    found = machine_check(Path("/"), "scheduling")
+    assert found.level == "warn"
+    assert "rtprio 99" in found.remedy
