@@ -145,7 +145,9 @@ def driver(name: str) -> DriverSpec:
         )
     spec = _resolve(place, name, {})
     if not isinstance(spec, DriverSpec):
-        raise DriverMissing(f"driver {name!r}: {place} is a {type(spec).__name__}, not a hal.registry.DriverSpec")
+        raise DriverMissing(
+            f"driver {name!r}: {place} is a {type(spec).__name__}, not a hal.registry.DriverSpec", code="bad_driver"
+        )
     return spec
 
 
@@ -187,10 +189,15 @@ def load(name: str, kind: str) -> Any:
     """
     spec = driver(name)
     if kind not in _KINDS:
-        raise NotSupported(f"there is no kind of driver {kind!r}{_nearest(kind, _KINDS)}; kinds: {', '.join(_KINDS)}")
+        raise NotSupported(
+            f"there is no kind of driver {kind!r}{_nearest(kind, _KINDS)}; kinds: {', '.join(_KINDS)}",
+            code="unknown_kind",
+        )
     place = getattr(spec, kind)
     if place is None:
-        raise NotSupported(f"driver {name!r} has no {kind}; it has: {', '.join(spec.kinds) or 'nothing'}")
+        raise NotSupported(
+            f"driver {name!r} has no {kind}; it has: {', '.join(spec.kinds) or 'nothing'}", code="no_such_kind"
+        )
     return _resolve(place, name, spec.requires)
 
 
@@ -242,7 +249,7 @@ def _resolve(place: str, name: str, requires: Mapping[str, str]) -> Any:
     try:
         return getattr(module, attribute)
     except AttributeError:
-        raise DriverMissing(f"driver {name!r}: module {module_name} has no {attribute!r}") from None
+        raise DriverMissing(f"driver {name!r}: module {module_name} has no {attribute!r}", code="bad_driver") from None
 
 
 def _entry_points() -> dict[str, str]:

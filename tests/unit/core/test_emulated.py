@@ -1,4 +1,4 @@
-"""An arm that counts as real, with a program in its place: stepped by the clock, and driven by a recording."""
+"""An emulated arm counts as real: it is stepped by the clock, and may be driven by a recording."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from errors_kit import raises_code
 
 import hal
 from hal.errors import CommandError, NotSupported
@@ -31,7 +32,7 @@ def lab(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 
 
 def rig(**hosts: str) -> dict[str, Any]:
-    """Arms without hands, by name, each at its host."""
+    """Return a rig of arms without grippers, by name, each at its host."""
     drivers, hand = {"real": "lab_arm:DRIVER"}, {"enabled": False}
     robots = {n: {"model": "panda", "drivers": drivers, "gripper": hand, "real": {"host": h}} for n, h in hosts.items()}
     return {"sim": False, "robots": robots, "gamepads": {"pad": {}}}
@@ -55,10 +56,13 @@ def test_the_tour_drives_it_in_lock_step() -> None:
 
 
 def test_it_still_needs_a_dead_man() -> None:
-    with hal.open(rig(arm="here"), clock="lock_step", pad="none") as bench, pytest.raises(CommandError, match="dead"):
+    with (
+        hal.open(rig(arm="here"), clock="lock_step", pad="none") as bench,
+        raises_code(CommandError, "deadman_required"),
+    ):
         bench.robots["arm"].control(rate_hz=50)
 
 
-def test_one_arm_that_really_moves_forbids_it() -> None:
-    with pytest.raises(NotSupported, match="recording cannot hold the dead-man"):
+def test_a_recording_must_not_drive_a_real_arm() -> None:
+    with raises_code(NotSupported, "recording_on_real_arm"):
         hal.open(rig(arm="here", other="there"), pad="demo")

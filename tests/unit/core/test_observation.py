@@ -1,4 +1,4 @@
-"""One record of everything that a rig sees."""
+"""Observations: frames and states of one time, and their history."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def test_pictures_and_states_of_the_same_time_in_real_time() -> None:
         assert all(m.frame.stamp.t >= after for m in rig.observe(after=after).cameras.values())
 
 
-def test_history_is_as_long_as_asked_for_and_begins_anew() -> None:
+def test_history_has_the_requested_length_and_starts_again() -> None:
     with hal.open("panda_table", driver="mock") as rig:
 
         def stamps() -> list[float]:
@@ -44,7 +44,7 @@ def test_history_is_as_long_as_asked_for_and_begins_anew() -> None:
 
         start = rig.clock.now()
         first = round(start + 0.1, 3)
-        assert stamps() == [first] * 3, "what was not there yet is the oldest again"
+        assert stamps() == [first] * 3, "padded with the oldest"
         assert stamps() == pytest.approx([first, first, first + 0.1])
         stamps()
         assert stamps() == pytest.approx([first + 0.1, first + 0.2, first + 0.3])
@@ -60,31 +60,31 @@ def test_some_cameras_or_none() -> None:
         assert set(rig.observe(cameras=["wrist"]).cameras) == {"wrist"}
         bare = rig.observe(cameras=[])
         assert bare.t == rig.robots["panda"].state().stamp.t
-        with pytest.raises(DeviceNotFound, match="scene, wrist"):
+        with pytest.raises(DeviceNotFound):
             rig.observe(cameras=["wirst"])
 
 
-def test_an_old_picture_is_waited_for_and_not_handed_out() -> None:
+def test_an_old_frame_is_not_returned() -> None:
     with hal.open("panda_table", driver="mock", clock="real_time", pad="none") as rig:
         wrist = rig.cameras["wrist"]
         old = rig.observe().cameras["wrist"].frame
         wrist.inject(freeze=True)
         rig.clock.sleep(0.5)
-        with pytest.raises(StaleStateError, match="wrist"):
+        with pytest.raises(StaleStateError):
             rig.observe(timeout=0.2)
         wrist.inject(freeze=False)
         assert rig.observe(timeout=5.0).cameras["wrist"].frame.stamp.t > old.stamp.t + 0.3
 
 
-def test_a_camera_that_takes_nothing_new_is_an_error() -> None:
+def test_a_camera_without_new_frames_is_an_error() -> None:
     with hal.open("panda_table", driver="mock", clock="real_time", pad="none") as rig:
         rig.observe()
         rig.cameras["wrist"].inject(freeze=True)
-        with pytest.raises(StaleStateError, match="wrist"):
+        with pytest.raises(StaleStateError):
             rig.observe(after=rig.clock.now(), timeout=0.3)
 
 
-def test_without_cameras_a_fresh_state_is_waited_for() -> None:
+def test_without_cameras_it_waits_for_a_new_state() -> None:
     with hal.open("panda_table", driver="mock", clock="real_time", pad="none", overrides=["cameras={}"]) as rig:
         for _ in range(20):
             now = rig.clock.now()

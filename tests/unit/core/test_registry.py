@@ -1,4 +1,4 @@
-"""Drivers by name: built in, installed by somebody else, named directly, missing."""
+"""Drivers by name: built in, installed by another package, named directly, missing."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from errors_kit import raises_code
 
 from hal import registry
 from hal.driver import RobotDriver
@@ -19,7 +20,7 @@ DRIVERS = Path(__file__).parents[3] / "drivers"
 
 @pytest.fixture
 def lab(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
-    """A folder on sys.path, as site-packages is, whose modules are forgotten afterwards."""
+    """A folder on sys.path, like site-packages, whose modules are removed afterwards."""
     before = set(sys.modules)
     monkeypatch.syspath_prepend(tmp_path)
     yield tmp_path
@@ -29,7 +30,7 @@ def lab(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
 
 
 def install(folder: Path, name: str, module: str, text: str) -> None:
-    """What pip leaves behind for a package with one entry point and one module."""
+    """Write what pip installs for a package with one entry point and one module."""
     (folder / f"{module}.py").write_text(text)
     info = folder / f"{module}-1.0.dist-info"
     info.mkdir()
@@ -50,7 +51,7 @@ def test_the_mock_robot_is_a_robot_driver() -> None:
     assert issubclass(registry.load("mock", "robot"), RobotDriver)
 
 
-def test_nothing_is_imported_before_it_is_asked_for() -> None:
+def test_nothing_is_imported_before_its_first_use() -> None:
     code = (
         "import sys, hal.registry as r; r.driver('mock');"
         "print([m for m in sys.modules if m.startswith(('hal.drivers.mock.', 'importlib.metadata', 'pybullet'))])"
@@ -65,13 +66,13 @@ def test_an_unknown_driver_lists_the_drivers_and_the_nearest_spelling() -> None:
 
 
 def test_a_kind_that_a_driver_lacks_lists_what_it_has() -> None:
-    with pytest.raises(NotSupported, match="'mock' has no world; it has: robot, gripper, camera, gamepad"):
+    with pytest.raises(NotSupported, match="it has: robot, gripper, camera, gamepad"):
         registry.load("mock", "world")
-    with pytest.raises(NotSupported, match="did you mean 'gripper'"):
+    with raises_code(NotSupported, "unknown_kind"):
         registry.load("mock", "griper")
 
 
-def test_a_third_partys_driver_through_its_entry_point(lab: Path) -> None:
+def test_a_driver_of_another_package_through_its_entry_point(lab: Path) -> None:
     install(
         lab,
         "lab_arm",
@@ -86,7 +87,7 @@ def test_a_third_partys_driver_through_its_entry_point(lab: Path) -> None:
     assert registry.load("lab_arm", "robot").__name__ == "Arm"
 
 
-def test_a_third_party_cannot_replace_a_built_in_driver(lab: Path) -> None:
+def test_another_package_cannot_replace_a_built_in_driver(lab: Path) -> None:
     install(lab, "mock", "lab_impostor", "raise RuntimeError('imported')\n")
     assert registry.load("mock", "robot").__module__ == "hal.drivers.mock.robot"
 
@@ -122,16 +123,12 @@ def test_a_library_that_is_installed_is_not_missing(lab: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("DRIVER = 'lab'", "is a str, not a hal.registry.DriverSpec"),
-        ("", "has no 'DRIVER'"),
-        ("import no_such_thing", "no_such_thing"),
-    ],
+    ("text", "code"),
+    [("DRIVER = 'lab'", "bad_driver"), ("", "bad_driver"), ("import no_such_thing", "driver_missing")],
 )
-def test_a_package_that_announces_nonsense(lab: Path, text: str, message: str) -> None:
+def test_a_package_that_announces_an_invalid_driver(lab: Path, text: str, code: str) -> None:
     install(lab, "lab_broken", "lab_broken_driver", text)
-    with pytest.raises(DriverMissing, match=message):
+    with raises_code(DriverMissing, code):
         registry.driver("lab_broken")
 
 
@@ -141,7 +138,7 @@ def test_an_error_in_a_drivers_own_code_is_not_hidden(lab: Path) -> None:
         registry.driver("lab_bug:DRIVER")
 
 
-def test_a_spec_knows_its_kinds() -> None:
+def test_the_kinds_of_a_spec() -> None:
     assert DriverSpec("x", camera="a:B", viewer="a:C").kinds == ("camera", "viewer")
     assert DriverSpec("x").kinds == ()
 
@@ -152,5 +149,5 @@ def test_a_function_that_a_driver_names(lab: Path) -> None:
     check = registry.function("mock", "lab_checks:check")
     assert check is not None
     assert check(None) == [("real.host", "is missing")]
-    with pytest.raises(DriverMissing, match="module lab_checks has no 'chekc'"):
+    with raises_code(DriverMissing, "bad_driver"):
         registry.function("mock", "lab_checks:chekc")

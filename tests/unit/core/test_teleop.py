@@ -6,7 +6,7 @@ from collections.abc import Iterator
 import pytest
 
 import hal
-from hal import CommandError, ConfigError, PadState, Stamp, Twist
+from hal import ConfigError, PadState, Stamp, Twist
 from hal.types import AXES
 
 
@@ -41,13 +41,10 @@ def test_the_default_mapping_is_the_tutorials(arm: hal.Robot) -> None:
     assert twist().frame == "base"
 
 
-def test_speed_scales_the_mapping_and_is_checked(arm: hal.Robot) -> None:
+def test_speed_scales_the_mapping(arm: hal.Robot) -> None:
     motion, _ = hal.Teleop(arm, speed=0.5).step(pad(dpad_y=1.0, left_x=1.0), 0.02)
     assert motion.linear == pytest.approx([0.1, 0, 0])
     assert motion.angular == pytest.approx([0, 0, -0.4])
-    for bad in (0.0, 1.5, float("nan")):
-        with pytest.raises(CommandError, match="speed must be a positive number"):
-            hal.Teleop(arm, speed=bad)
 
 
 def test_a_trigger_moves_the_gripper_only_after_it_crossed_the_present_grip(arm: hal.Robot) -> None:
@@ -88,7 +85,7 @@ TOGGLE = {"deadman": "l2", "gripper": {"toggle": "r1"}}
 
 
 def wait_for_target(arm: hal.Robot, share: float) -> None:
-    """Until the gripper's state shows the command of that grip."""
+    """Wait until the gripper's state shows the command of that grip."""
     width = (1.0 - share) * arm.gripper.width_max
     end = time.monotonic() + 10.0
     while arm.gripper.state(10.0).width_target != pytest.approx(width):
@@ -100,11 +97,11 @@ def test_one_button_closes_and_opens_in_turn(arm: hal.Robot) -> None:
     teleop = hal.Teleop(arm, mapping=TOGGLE)
 
     def press() -> float | None:
-        """All that a press of some ticks asks for."""
-        asked = [teleop.step(pad("l2", "r1"), 0.02)[1] for _ in range(3)]
-        assert len(set(asked)) == 1, "as long as it is held: no single command matters"
+        """Return the grip of a press of some ticks."""
+        sent = [teleop.step(pad("l2", "r1"), 0.02)[1] for _ in range(3)]
+        assert len(set(sent)) == 1, "as long as it is held: no single command matters"
         assert teleop.step(pad("l2"), 0.02)[1] is None
-        return asked[0]
+        return sent[0]
 
     assert teleop.step(pad("l2"), 0.02)[1] is None
     for wanted in (1.0, 0.0, 1.0):
@@ -113,9 +110,9 @@ def test_one_button_closes_and_opens_in_turn(arm: hal.Robot) -> None:
         wait_for_target(arm, wanted)
 
 
-def test_a_toggle_says_what_follows_from_the_gripper_and_not_from_its_own_count(arm: hal.Robot) -> None:
+def test_a_toggle_depends_on_the_gripper_and_not_on_its_own_count(arm: hal.Robot) -> None:
     teleop = hal.Teleop(arm, mapping=TOGGLE)
-    arm.gripper.grip(1.0)  # somebody else closed it
+    arm.gripper.grip(1.0)  # closed by another part of the program
     wait_for_target(arm, 1.0)
     teleop.step(pad("l2"), 0.02)
     assert teleop.step(pad("l2", "r1"), 0.02)[1] == 0.0
@@ -187,7 +184,7 @@ def test_help_names_the_controls(rig: hal.Rig, arm: hal.Robot) -> None:
     assert "gripper: R2" in text
 
 
-def test_labels_say_what_each_control_does() -> None:
+def test_labels_of_each_control() -> None:
     with hal.open("panda_table", driver="mock", overrides=["cameras={}"]) as rig:
         labels = hal.Teleop(rig.robots["panda"]).labels(actions=("record", "home"))
     assert (labels["deadman"], labels["home"], labels["robot"]) == ("l2", "north", "panda")
