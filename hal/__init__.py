@@ -6,7 +6,7 @@
         arm = rig.robots["panda"]
         arm.move_to(arm.home)
 
-Importing this package costs nothing to speak of: every name loads when it is first used.
+Importing this package is cheap: every name is loaded on first use.
 """
 
 from __future__ import annotations

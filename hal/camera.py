@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from numpy.typing import NDArray
 
 from ._moved import names_of
-from .driver import CameraDriver, CameraTally, RawFrame
+from .driver import CameraDriver, RawFrame
 from .errors import ConnectionLost, HalError, StaleStateError
 from .geometry import Pose
 from .histogram import Histogram
@@ -27,15 +27,7 @@ if TYPE_CHECKING:
     from .driver import CameraInfo
     from .robot import Robot
 
-__all__ = [
-    "Camera",
-    "CameraCounts",
-    "CameraDriver",
-    "CameraTally",
-    "MovingCamera",
-    "RawFrame",
-    "place_of",
-]
+__all__ = ["Camera", "CameraCounts", "MovingCamera", "frame_from_color", "place_of"]
 
 _LOG = logging.getLogger("hal.camera")
 _GRAB = 0.1

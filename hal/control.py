@@ -224,7 +224,7 @@ class Control:
 
     @property
     def status(self) -> RobotStatus:
-        """What the arm is doing."""
+        """Status of the arm."""
         return self._peek().status
 
     @property

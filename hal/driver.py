@@ -66,10 +66,10 @@ Floats = Sequence[float]
 
 
 class DeviceDriver(ABC):
-    """What the drivers of all kinds of device have in common."""
+    """Base class of the drivers of all kinds of device."""
 
     simulated: ClassVar[bool] = False
-    """Whether no real device is behind this driver: nothing real moves, nobody real presses a button."""
+    """Whether no real device is behind this driver: nothing real moves, no person presses a button."""
 
     @abstractmethod
     def open(self) -> None:
@@ -210,7 +210,7 @@ class RobotDriver(DeviceDriver):
         """End streaming: the device stops and holds by its own means. Idempotent."""
 
     def recover(self) -> None:
-        """Clear a fault of the device; called only when the user asks for it. Devices without faults need nothing."""
+        """Clear a fault of the device, only on the user's request. Devices without faults need nothing."""
 
     @property
     def wants_loop(self) -> bool:
@@ -387,7 +387,7 @@ class CameraInfo:
 
 
 class RawFrame(NamedTuple):
-    """One capture as a driver hands it over.
+    """One capture of a camera.
 
     Images have the output's size: colour (H, W, 3) RGB, depth (H, W) in m with 0 where nothing was measured, the others
     (H, W); None for a stream that is off.
@@ -571,7 +571,7 @@ class GamepadDriver(DeviceDriver):
         return type(self).__name__
 
     def details(self) -> Mapping[str, str]:
-        """Return what is known of the connected pad, topic -> text, for troubleshooting."""
+        """Return facts about the connected pad, topic -> text, for troubleshooting."""
         return {}
 
     @property

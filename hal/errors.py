@@ -65,9 +65,9 @@ class Fault:
     code: str
     """Identifier of the fault, as the device or its driver names it."""
     cause: str
-    """What went wrong, in words."""
+    """The cause, in words."""
     remedy: str
-    """What to do about it, in words."""
+    """The remedy, in words."""
 
     def __str__(self) -> str:
         return f"{self.cause} ({self.code}); {self.remedy}"
@@ -82,7 +82,7 @@ class Problem:
     key: str
     """Dotted path of the key, for example ``robots.panda.base.position``."""
     message: str
-    """What is wrong and what would be right."""
+    """The mistake, and what would be right."""
     code: str = "invalid"
     """Stable identifier of the kind of problem, for example ``unknown_key`` or ``missing_file``."""
 

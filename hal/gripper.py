@@ -233,7 +233,16 @@ class Gripper:
         outer: float = 0.005,
         timeout: float = 10.0,
     ) -> bool:
-        """Close on an object of about ``width`` (m) and wait; return whether it is held. See :meth:`start_grasp`."""
+        """Close on an object and wait until the fingers rest; return whether they hold it.
+
+        Args:
+            width: Expected width of the object, m.
+            force: Force to hold it with, N.
+            speed: Speed, m/s.
+            inner: Greatest amount by which the object may be narrower, m.
+            outer: Greatest amount by which the object may be wider, m.
+            timeout: Longest time to wait, s.
+        """
         return bool(self._finish(self.start_grasp(width, force, speed, inner, outer), timeout))
 
     def home(self, timeout: float = 30.0) -> GripperState:
@@ -246,7 +255,12 @@ class Gripper:
         return result.state
 
     def grip(self, fraction: float, force: float | None = None) -> GripperState:
-        """Close by a fraction from 0 (open) to 1 (closed) and wait."""
+        """Close by a fraction and wait until the fingers rest.
+
+        Args:
+            fraction: From 0 (open) to 1 (closed).
+            force: Greatest force on an object in between, N.
+        """
         return self.move(self.width_of(fraction), force=force)
 
     def open(self) -> GripperState:

@@ -40,8 +40,8 @@ __all__ = [
 ]
 
 PadInput = Literal["plugged", "console", "keys", "recording"]
-"""Where a gamepad's input comes from: a pad that is plugged in, the console's page, the keys of the terminal, or a
-recording."""
+"""Source of a gamepad's input: a pad that is plugged in, the console's page, the keys of the terminal, or a recording.
+"""
 
 GROUP = "hal.drivers"
 """Group of the entry points."""
@@ -86,7 +86,7 @@ class DriverSpec:
     console: str | None = None
     """A page in a browser that displays a rig and drives it: :class:`~hal.views.Console`."""
     pad_input: PadInput | None = None
-    """Where the input of this driver's gamepads comes from; the rig chooses a gamepad of ``model: auto`` by it."""
+    """Source of the input of this driver's gamepads; the rig chooses a gamepad of ``model: auto`` by it."""
     pad_title: str = ""
     """A few words for :attr:`pad_input`, for status messages."""
     checks: Mapping[str, str] = field(default_factory=dict)

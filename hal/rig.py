@@ -283,12 +283,12 @@ class Rig:
 
     @property
     def attended(self) -> bool:
-        """Whether something real moves on this rig, so that a person must be present."""
+        """Whether anything real moves on this rig, so that someone must be present."""
         return self.plan.attended
 
     @property
     def emulated(self) -> bool:
-        """Whether everything that counts as real here is emulated, so that nobody can be hurt."""
+        """Whether everything that counts as real here is emulated, so that no one can be hurt."""
         return self.plan.emulated
 
     @property
@@ -335,10 +335,7 @@ class Rig:
         return {host.spec.name: host.request("statistics") for host in self._hosts}
 
     def shared_states(self) -> list[SharedStates]:
-        """Return the memory into which each group of devices publishes its states.
-
-        A program that shows the rig, such as the console, hands it to a process of its own, which reads it there. It is
-        for reading only.
+        """Return the memory into which each group of devices publishes its states, for reading in another process.
 
         Returns:
             One record for each group, in the order in which the groups were started.

@@ -73,7 +73,7 @@ class _Named(IntEnum):
 
 
 class RobotStatus(_Named):
-    """What an arm is doing."""
+    """Status of an arm."""
 
     IDLE = 0
     """No control session; the device holds by itself."""

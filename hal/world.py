@@ -79,11 +79,21 @@ class World:
         self._edit("remove", name=name)
 
     def set_color(self, name: str, rgba: Sequence[float]) -> None:
-        """Change the colour of a body: red, green, blue, alpha in 0..1."""
+        """Change the colour of a body.
+
+        Args:
+            name: Name of the body.
+            rgba: Red, green, blue and opacity, 0..1.
+        """
         self._edit("set_color", name=name, rgba=[float(value) for value in rgba])
 
     def pose(self, name: str, link: str | None = None) -> Pose:
-        """Return the true pose of a body's base, or of one of its links, in the world."""
+        """Return the true pose of a body in the world.
+
+        Args:
+            name: Name of the body.
+            link: Name of a link; None for the base.
+        """
         return _pose(self._call("pose", name=name, link=link))
 
     def poses(self, names: Collection[str] | None = None) -> Poses:
@@ -114,7 +124,16 @@ class World:
         return dict(self._call("dynamics", name=name, link=link))
 
     def set_dynamics(self, name: str, link: str | None = None, **values: float) -> dict[str, Any]:
-        """Change some of the values of :meth:`dynamics`; return these values as they were before."""
+        """Change properties of a body or link.
+
+        Args:
+            name: Name of the body.
+            link: Name of a link; None for the base.
+            **values: Properties by the names of :meth:`dynamics`.
+
+        Returns:
+            These properties as they were before, for a later call.
+        """
         return dict(self._call("set_dynamics", name=name, link=link, **values))
 
     @contextmanager
@@ -127,7 +146,12 @@ class World:
             self.set_dynamics(name, link, **before)
 
     def contacts(self, a: str | None = None, b: str | None = None) -> tuple[Contact, ...]:
-        """Return all contacts, those of body ``a``, or those between ``a`` and ``b``."""
+        """Return the present contacts.
+
+        Args:
+            a: Only those of this body.
+            b: Only those between ``a`` and this body.
+        """
         found = self._call("contacts", a=a, b=b)
         return tuple(
             Contact(**(contact | {"position": frozen(contact["position"]), "normal": frozen(contact["normal"])}))

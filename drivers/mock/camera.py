@@ -9,8 +9,8 @@ from typing import ClassVar, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from hal.camera import CameraDriver, RawFrame
 from hal.clock import Clock, RealClock
+from hal.driver import CameraDriver, RawFrame
 from hal.errors import CommandError, ConnectionLost
 from hal.geometry import Pose
 from hal.specs import CameraSpec

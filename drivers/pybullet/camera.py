@@ -16,8 +16,7 @@ from typing import Any, ClassVar, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from hal.camera import CameraDriver, RawFrame
-from hal.driver import CameraInfo, nominal_info
+from hal.driver import CameraDriver, CameraInfo, RawFrame, nominal_info
 from hal.errors import ConfigError, ConnectionLost, DriverMissing, NotSupported, Problem
 from hal.geometry import Pose
 from hal.host.hosts import SNAPSHOT_CAPACITY, Host, LocalHost, RemoteHost

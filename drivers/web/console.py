@@ -17,8 +17,8 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, replace
 from typing import TYPE_CHECKING, Any
 
-from hal.camera import Camera, RawFrame
-from hal.driver import PadReading
+from hal.camera import Camera
+from hal.driver import PadReading, RawFrame
 from hal.errors import ConnectionLost, HalError
 from hal.gamepad import Gamepad
 from hal.host.process import Channel, Child, SharedMemory

@@ -18,7 +18,7 @@ import numpy as np
 import simplejpeg
 from numpy.typing import NDArray
 
-from hal.camera import RawFrame
+from hal.driver import RawFrame
 from hal.host.ring import FrameRing
 from hal.specs import CameraSpec
 

@@ -12,9 +12,8 @@ from typing import Any
 import aiohttp
 import numpy as np
 
-from hal.camera import RawFrame
 from hal.commands import DeadmanRecord
-from hal.driver import GripperReading, Reading
+from hal.driver import GripperReading, RawFrame, Reading
 from hal.host.process import Child, SharedMemory
 from hal.host.records import GroupMemory, ServoRecord
 from hal.host.ring import frame_rings, frame_rings_size

@@ -13,7 +13,7 @@ from errors_kit import raises_code
 from pictures_kit import box, camera, look_at, renderer, world
 from specs import data, panda, world_spec
 
-from hal.camera import RawFrame
+from hal.driver import RawFrame
 from hal.drivers.pybullet.camera import (
     DirectSource,
     PyBulletCamera,
