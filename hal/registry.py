@@ -82,7 +82,7 @@ class DriverSpec:
     viewer3d: str | None = None
     """A page with the arms in 3D: :class:`~hal.views.Viewer3D`."""
     pictures: str | None = None
-    """Renderer of all simulated cameras of a rig: :class:`~hal.views.Pictures`."""
+    """Renderer of all simulated cameras of a rig: :class:`~hal.views.CameraRenderer`."""
     console: str | None = None
     """A page in a browser that displays a rig and drives it: :class:`~hal.views.Console`."""
     pad_input: PadInput | None = None

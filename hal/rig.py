@@ -30,7 +30,7 @@ from .world import NoWorld, World
 
 if TYPE_CHECKING:
     from .specs import Plan
-    from .views import Pictures, Viewer, Viewer3D
+    from .views import CameraRenderer, Viewer, Viewer3D
 
 __all__ = [
     "Devices",
@@ -122,7 +122,7 @@ class Rig:
         """The page in a browser; None if it is not served."""
         self.viewer3d: Viewer3D | None = None
         """The page with the arms in 3D; None if it is not served."""
-        self._pictures: Pictures | None = None
+        self._pictures: CameraRenderer | None = None
         self._viewer: Viewer | None = None
         self._devices: dict[str, Any] = {}
         self._observer = Observer(self)
@@ -167,7 +167,7 @@ class Rig:
         self._open_cameras()
         if self.console is not None:
             for camera in self.cameras.values():
-                self.console.show(camera)
+                self.console.show_camera(camera)
         self._open_pads(pads)
         for host in self._hosts:
             host.request("reset_statistics")  # leave out the start

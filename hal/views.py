@@ -25,10 +25,10 @@ __all__ = [
     "Listen",
     "PHASES",
     "PORT",
-    "Pictures",
+    "CameraRenderer",
     "RecordingView",
     "SETTINGS",
-    "Shown",
+    "WorldView",
     "Viewer",
     "Viewer3D",
 ]
@@ -81,7 +81,7 @@ class Console(ABC):
         """Command that makes the link work on another computer; empty if none is needed."""
 
     @abstractmethod
-    def show(self, camera: Camera) -> None:
+    def show_camera(self, camera: Camera) -> None:
         """Display a camera's frames to the pages that show it."""
 
     @abstractmethod
@@ -260,7 +260,7 @@ class RecordingView:
             raise CommandError(f"seconds must be finite and at least 0, not {self.seconds}")
 
 
-class Shown(ABC):
+class WorldView(ABC):
     """A view that mirrors the simulated world of a host, in real time in a process of its own."""
 
     notes: tuple[str, ...] = ()
@@ -289,7 +289,7 @@ class Shown(ABC):
         """Stop it. Idempotent."""
 
 
-class Pictures(Shown):
+class CameraRenderer(WorldView):
     """The renderer of all simulated cameras of a world.
 
     Args:
@@ -311,7 +311,7 @@ class Pictures(Shown):
         """Return what the driver of this camera takes its images from."""
 
 
-class Viewer(Shown):
+class Viewer(WorldView):
     """A window with the simulated world.
 
     Args:
@@ -322,7 +322,7 @@ class Viewer(Shown):
         self.host = host
 
 
-class Viewer3D(Shown):
+class Viewer3D(WorldView):
     """A page with a rig's arms in 3D, and a draggable handle on each tcp.
 
     Args:

@@ -25,7 +25,7 @@ from hal.host.process import Channel, Child, SharedMemory, serve
 from hal.host.ring import FrameRing, frame_rings, frame_rings_size
 from hal.host.scheduling import yield_to_others
 from hal.specs import CameraSpec, WorldSpec, from_json, to_json
-from hal.views import Pictures
+from hal.views import CameraRenderer
 
 from .exposure import Exposure, check_view, noise_of
 from .mirror import WorldMirror
@@ -155,7 +155,7 @@ class SharedSource:
         return frame
 
 
-class PyBulletPictures(Pictures):
+class PyBulletPictures(CameraRenderer):
     """Draws the pictures of all simulated cameras of one world."""
 
     def __init__(self, host: Host, cameras: Sequence[CameraSpec], renderer: str) -> None:

@@ -159,7 +159,7 @@ class WebConsole(Console):
     def show_recording(self, view: RecordingView) -> None:
         self._channel.send_newest("recording", t=time.monotonic(), view=recording_message(view))
 
-    def show(self, camera: Camera) -> None:
+    def show_camera(self, camera: Camera) -> None:
         spec = next((spec for spec in self._shown if spec.name == camera.name), None)
         if spec is not None:
             self._detach.append(camera.on_frame(lambda frame: self._show_frame(spec, frame)))
