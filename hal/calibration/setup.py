@@ -300,7 +300,7 @@ def _value(node: Any, key: str) -> Any:
 
 
 def _end(node: Any) -> int:
-    """Index behind a value's last character. (The end mark of a block is behind the comments that follow it.)"""
+    """Return the index behind a value's last character; the end mark of a block is behind the comments after it."""
     if isinstance(node, yaml.CollectionNode) and not node.flow_style and node.value:
         last = node.value[-1]
         return _end(last[1] if isinstance(last, tuple) else last)

@@ -410,8 +410,7 @@ class Cycle:
         return resting
 
     def request(self, method: str, params: dict[str, Any]) -> Any:
-        """Serve a request of the app between two steps: one of the ``_do_`` methods, or ``world.`` and a world's
-        request."""
+        """Serve a request between two steps: one of the ``_do_`` methods, or ``world.`` and a world's request."""
         if method.startswith("world."):
             return self._world_request(method.removeprefix("world."), params)
         handler = getattr(self, f"_do_{method}", None)

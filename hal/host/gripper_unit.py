@@ -115,8 +115,7 @@ class GripperUnit:
             traceback.print_exception(error)
 
     def publish(self, now: float) -> None:
-        """Publish the newest state. For a gripper that does not answer this is an old one, with the reason as its
-        fault."""
+        """Publish the newest state; if the gripper does not answer, an old one with the reason as its fault."""
         lost: Fault | None = None
         try:
             reading = self.driver.read(now)

@@ -238,8 +238,7 @@ class History(Generic[State]):
         return [self._decode(record) for record in found if record is not None]
 
     def around(self, t: float) -> tuple[State, State] | None:
-        """Return the last state at or before ``t`` (s) and the first one after it, or the newest twice if none is
-        after.
+        """Return the last state at or before ``t`` (s) and the first after it, or the newest twice.
 
         None if ``t`` is older than what is kept, and before the first state.
         """

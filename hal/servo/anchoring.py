@@ -78,8 +78,7 @@ class Anchoring:
     """Learns from its reports what one device does with its set-points; corrects the smoother of one arm."""
 
     def __init__(self, smoother: JointSmoother, repeats: bool = False) -> None:
-        """Make it for one smoother. ``repeats``: the device repeats its last set-point if one is lost, so that no loss
-        is corrected."""
+        """Anchor one smoother; with ``repeats`` the device repeats a lost set-point, and no loss is corrected."""
         self._smoother = smoother
         self._repeats = repeats
         self.fault: Fault | None = None
@@ -155,8 +154,7 @@ class Anchoring:
         self._rested = () if q is None else q
 
     def start_position(self, q: Floats) -> Floats:
-        """Return the position to start from if the device last reported ``q``, rad: without the noise, if it is only
-        noise."""
+        """Return the position (n,) to start from if the device last reported ``q``, rad: without mere noise."""
         rest = self._rest
         if len(rest) != len(q) or _apart(q, rest) > min(NOISIEST, 3.0 * self._steps):
             return q
@@ -429,8 +427,7 @@ class Anchoring:
         return Setpoint(track[0], dq, ddq)
 
     def _allows(self, at: Setpoint) -> bool:
-        """Return whether the arm can continue from here inside the limits, or at least not farther outside than it is
-        now."""
+        """Return whether the arm can continue from here within the limits, or not farther outside than now."""
         smoother = self._smoother
         for q, v, a, q0, v0, a0, low, high, most, A, J in zip(
             *at[:3],
@@ -459,8 +456,11 @@ class Anchoring:
         return True
 
     def _count_lost(self, q: Floats) -> bool:
-        """Count a lost set-point after which the device reported ``q``; returns False, and sets the fault, if there are
-        too many."""
+        """Count a lost set-point after which the device reported ``q``.
+
+        Returns:
+            False, with the fault set, if there are too many.
+        """
         lost = self._lost
         lost.append(self._cycle)
         while lost[0] <= self._cycle - _WINDOW:

@@ -146,8 +146,10 @@ class TcpReference:
         return [sum(map(mul, row, dq)) for row in self._rows]
 
     def surely_slower(self, dq: Floats, cap: float) -> bool:
-        """Return whether the tcp surely keeps below ``cap`` (m/s) while each joint changes its speed by itself, in
-        whatever order, between the present one, ``dq`` and rest. False: not proven."""
+        """Return whether the tcp provably stays below ``cap`` (m/s) while the joints change their speeds.
+
+        Each changes by itself, in any order, between its present speed, ``dq`` (rad/s) and rest. False: not proven.
+        """
         smoother = self._smoother
         now = smoother.dq
         speed = self._root * hypot(*dq, *now)
@@ -158,8 +160,11 @@ class TcpReference:
         return self._around(0.0, dist(now, dq)) + speed * self._moved() <= cap
 
     def _around(self, *distances: float) -> float:
-        """Greatest speed of the tcp (m/s) at the reference when each joint moves at any share of its speed at the
-        centre, plus what it may be away from there: in all, joint speeds of these lengths (rad/s)."""
+        """Return a bound of the tcp's speed, m/s, at the reference.
+
+        Each joint moves at any share of its speed at the centre, plus what it may be away from there: in all, joint
+        speeds of these lengths (rad/s).
+        """
         return self._centre_speed + self._stretch * hypot(*distances)
 
     def _put_centre(self, dq: Floats) -> None:
@@ -374,8 +379,7 @@ class Envelope:
         return self.far_from_faces()
 
     def cap_joints(self, dq: list[float]) -> list[float]:
-        """Return goal velocities (n,), each cut to the session's speed and to what can still brake before a limit,
-        rad/s."""
+        """Return goal velocities (n,), rad/s, cut to the session's speed and to braking before a limit."""
         if hypot(*dq) <= self._slowest and self.smoother.is_free(self.smoother.q):
             return dq
         state = zip(dq, self.velocity, self.smoother.q, self.smoother.free, strict=True)
@@ -396,8 +400,7 @@ class Envelope:
         return dq if scale == 1.0 else [scale * v for v in dq]
 
     def cap_tcp(self, dq: list[float]) -> tuple[list[float], bool]:
-        """Scale a goal velocity so that the tcp keeps its speed limit, also in a stop from there, and slows down before
-        the workspace's faces.
+        """Scale a goal velocity to the limits of the tcp's speed and of the workspace, also in a stop from there.
 
         Returns:
             The goal, and whether the joints must change their speeds in proportion on the way there: each by itself,
@@ -445,8 +448,7 @@ class Envelope:
         return self._tcp.pose_and_jacobian()
 
     def stop_speed(self, dq: list[float], places: Sequence[Floats]) -> float:
-        """Greatest speed (m/s) of the tcp that moves with joint speeds ``dq`` at any of these joint positions, or stops
-        from there."""
+        """Return the tcp's greatest speed, m/s, with joint speeds ``dq`` at any of these positions or in a stop."""
         return self._tcp.stop_speed(dq, np.array([self.kinematics.jacobian(q)[:3].T for q in places]))
 
     def far_from_faces(self) -> bool:
@@ -472,8 +474,7 @@ class Envelope:
     # Hard checks of a proposed step.
 
     def stays_inside(self, smoother: JointSmoother) -> bool:
-        """Return whether a stop after the proposed step ends inside the workspace, or no farther outside than one from
-        now."""
+        """Return whether a stop after the proposed step ends in the workspace, or no farther outside than from now."""
         box = self.workspace
         if box is None or self._tcp.surely_stays_inside():
             return True

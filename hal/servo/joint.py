@@ -178,8 +178,7 @@ class JointTargetMotion(ServoMotion):
         self._follow_each(self._approach(q, dq, age))
 
     def _approach(self, q: list[float], dq: list[float], age: float) -> list[float]:
-        """Return the speed (n,) of the target ``age`` s on, plus what closes the error and can still brake in time,
-        rad/s."""
+        """Return the target's speed (n,) ``age`` s on, plus what closes the error and still brakes in time, rad/s."""
         smoother = self.smoother
         braking = self._direct_braking if self._direct else self._stream_braking
         ahead = 2.0 * smoother.dt

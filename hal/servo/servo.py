@@ -291,8 +291,7 @@ class Servo:
         return self.spec.attended and before is not None and not now - before <= SILENCE
 
     def device_lost(self, now: float) -> Setpoint | None:
-        """Trip and continue braking, because the device did not answer in this cycle. Returns the next set-point or
-        None."""
+        """Trip and continue braking, because the device did not answer; return the next set-point or None."""
         self._t_tick = now
         ready, self._ready = self._ready, None
         self._envelope.limited = Limited.NONE

@@ -356,16 +356,14 @@ class JointSmoother:
         return [v if -cap <= v <= cap else (cap if v > 0.0 else -cap) for v, cap in zip(dq, self.velocity, strict=True)]
 
     def is_free(self, q: Floats) -> bool:
-        """Return whether these positions (n,), rad, are surely where no limit matters to joints within their speed
-        limits.
+        """Return whether no limit matters at these positions (n,), rad, to joints within their speed limits.
 
         One distance instead of two comparisons a joint: none has moved farther than all of them together.
         """
         return dist(q, self._free_at) <= self._free_room
 
     def _violations(self) -> frozenset[int]:
-        """Return the joints whose stop after the proposed step would end beyond a limit, and farther than a stop from
-        now."""
+        """Return the joints whose stop after the proposed step would end beyond a limit, and farther than from now."""
         q_next, dq_next = self.q_next, self.dq_next
         if hypot(*dq_next) <= self.slowest and self.is_free(q_next):
             return self._none

@@ -201,8 +201,7 @@ class TorqueBounds:
         return max(0.0, min(1.0, (sqrt(max(0.0, ab * ab + bb * rest)) - ab) / bb))
 
     def _surely_slower(self, speeds: Floats, cap: float) -> bool:
-        """Return whether the tcp surely stays below ``cap`` (m/s) while its joints are no faster than ``speeds`` (n,)
-        >= 0."""
+        """Return whether the tcp provably stays below ``cap`` (m/s) at joint speeds up to ``speeds`` (n,) >= 0."""
         return cap >= _UNLIMITED or sum(map(mul, self._reach, speeds)) <= cap
 
     def towards(self, tau: Floats, goal: Floats) -> list[float]:
@@ -254,9 +253,11 @@ class TorqueBounds:
     # What is too far.
 
     def overrun(self, tau: Floats, arm: ArmInMotion) -> Limited | None:
-        """Return the limit that the arm runs into: its measured speed is above the session's, or a stop that begins now
-        would end beyond a limit of position or a face of the workspace. None if it keeps all. ``tau`` (n,) drives it,
-        Nm."""
+        """Return the limit that the arm exceeds while ``tau`` (n,), Nm, drives it; None if it keeps all.
+
+        It does if its measured speed is above the session's, or if a stop that begins now would end beyond a limit of
+        position or a face of the workspace.
+        """
         envelope, dq = self._envelope, arm.dq
         speeds = [abs(v) for v in dq]
         if any(v > most for v, most in zip(speeds, envelope.velocity, strict=True)):
@@ -411,8 +412,7 @@ class TorqueMotion(ServoMotion):
 
     @property
     def blind(self) -> bool:
-        """Whether the arm's state has been unknown for so long that nothing should be sent; the device then holds by
-        itself."""
+        """Whether the arm's state has been unknown for so long that the device should hold by itself."""
         return self._unseen > SILENCE
 
     @property
