@@ -37,6 +37,7 @@ _SOON, _LATER = 0.2, 2.0
 _MINUTE = 60.0
 GIVE_UP = 1800.0
 """Time after which a lost camera is given up, s."""
+_Detach = Callable[[], None]
 Place = Callable[[float], "Pose | None"]
 """Returns the pose of the colour sensor in the world at a time on the rig's clock, s; None if unknown."""
 
@@ -73,8 +74,8 @@ class Camera:
         self._closing = threading.Event()
         self._grabbing = threading.RLock()
         self._thread: threading.Thread | None = None
-        self._listeners: dict[object, Callable[[Frame], None]] = {}
-        self._watchers: dict[object, Callable[[ConnectionLost | None], None]] = {}
+        self._listeners: dict[object, Callable[[Any], None]] = {}
+        self._watchers: dict[object, Callable[[Any], None]] = {}
         self._ages = Histogram(5e-4, 2000)
         self._first = self._last = 0.0
         self._frames = self._dropped = self._reconnects = 0
@@ -159,15 +160,7 @@ class Camera:
         Returns:
             A function that ends the calls.
         """
-        token = object()
-        with self._news:
-            self._listeners[token] = callback
-
-        def detach() -> None:
-            with self._news:
-                self._listeners.pop(token, None)
-
-        return detach
+        return self._attach(self._listeners, callback)
 
     def on_connection(self, callback: Callable[[ConnectionLost | None], None]) -> Callable[[], None]:
         """Call a function when the camera is lost, with the error, and when it is back, with None.
@@ -177,13 +170,16 @@ class Camera:
         Returns:
             A function that ends the calls.
         """
+        return self._attach(self._watchers, callback)
+
+    def _attach(self, listeners: dict[object, Callable[[Any], None]], callback: Callable[[Any], None]) -> _Detach:
         token = object()
         with self._news:
-            self._watchers[token] = callback
+            listeners[token] = callback
 
         def detach() -> None:
             with self._news:
-                self._watchers.pop(token, None)
+                listeners.pop(token, None)
 
         return detach
 

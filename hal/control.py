@@ -68,9 +68,11 @@ FIRST_STEP_TURN = 0.2
 """Greatest angle between a first pose and the set-point, rad."""
 _SHORTEST_DEADLINE = 0.1
 _PERIODS = 2.5
+"""Deadline of the next command after one: so many periods of the session's rate, at least the shortest, s."""
 _MOST_AT_ONCE = 100
 """Number of commands in a row without any passing of time that counts as a mistake: a lock-step clock stands still."""
 _REST_LIMIT = 5.0
+"""Longest wait for the arm to come to rest at the end of a session, s."""
 
 
 class Control:
@@ -125,7 +127,7 @@ class Control:
         self._refused = 0
         self._t_sent = -math.inf
         self._at_once = 0
-        """Commands that were sent at the time of the last one."""
+        """Number of commands that were sent without any time passing."""
         self._checks = CommandChecks(robot)
 
     # Opening and closing.
