@@ -28,17 +28,9 @@ CAMERA: dict[str, Any] = {
     "type": "Camera",
     "camera_type": "fixed",
     "streams": {"color": {"enable": True, "format": "bgr8"}},
-    "sim_config": {
-        "fix": {
-            "camera_target_position": [0, 0, 0],
-            "distance": 1,
-            "yaw": 0,
-            "pitch": -30,
-            "roll": 0,
-            "up_axis_index": 2,
-        }
-    },
 }
+FIX = {"camera_target_position": [0, 0, 0], "distance": 1, "yaw": 0, "pitch": -30, "roll": 0, "up_axis_index": 2}
+CAMERA["sim_config"] = {"fix": FIX}
 BALL: dict[str, Any] = {
     "source": "primitive",
     "collision": {"shape_type": "GEOM_SPHERE", "collision_shape": {"radius": 0.05}},

@@ -94,35 +94,29 @@ class Watched:
         self.memory = GroupMemory(SharedMemory(fd=descriptor).buffer, joints, told["grippers"])
 
     def servo(self) -> ServoRecord:
-        """What the servo says now."""
-        found = self.memory.robots["panda"].peek()
-        assert found is not None
-        return found
+        """Return the newest report of the servo."""
+        return self.memory.robots["panda"].peek()
 
     def speed(self) -> float:
         """Greatest joint speed of the set-point, rad/s."""
         return max(abs(value) for value in self.servo().dq_set)
 
     def end(self, how: str) -> float:
-        """Do that to the app; returns when, on the monotonic clock."""
+        """End or stop the app in this way; return when, on the monotonic clock."""
         when = time.monotonic()
-        if how == "kill -9":
-            os.kill(self.pid, signal.SIGKILL)
-        elif how == "SIGSTOP":
-            os.kill(self.pid, signal.SIGSTOP)
-        elif how == "SIGTERM":
-            os.kill(self.pid, signal.SIGTERM)
-        elif how == "Ctrl-C":
-            os.write(self.terminal, b"\x03")
-        elif how == "Ctrl-Z":
-            os.write(self.terminal, b"\x1a")
+        signals = {"kill -9": signal.SIGKILL, "SIGSTOP": signal.SIGSTOP, "SIGTERM": signal.SIGTERM}
+        keys = {"Ctrl-C": b"\x03", "Ctrl-Z": b"\x1a"}
+        if how in signals:
+            os.kill(self.pid, signals[how])
+        elif how in keys:
+            os.write(self.terminal, keys[how])
         elif how == "closed terminal":
             os.close(self.terminal)
             self.terminal = -1
         return when
 
     def wait_for(self, condition: Callable[[], bool], timeout: float = 10.0) -> float:
-        """When the condition first held; TimeoutError when it did not within ``timeout`` s."""
+        """Return when the condition first held; TimeoutError if it did not within ``timeout`` s."""
         deadline = time.monotonic() + timeout
         while not condition():
             if time.monotonic() > deadline:
@@ -131,11 +125,11 @@ class Watched:
         return time.monotonic()
 
     def at_rest(self) -> bool:
-        """Does the set-point stand still?"""
+        """Whether the set-point stands still."""
         return self.speed() < 1e-9
 
     def nobody_left(self) -> bool:
-        """Have all processes of the rig ended?"""
+        """Whether all processes of the rig have ended."""
         self.process.poll()
         return not any(_runs(pid) for pid in self.children)
 

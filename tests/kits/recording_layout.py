@@ -50,7 +50,7 @@ PER_FILE = 1000
 
 
 def check_layout(root: Path) -> dict[str, Any]:
-    """All of it; ``info`` comes back."""
+    """Check a whole dataset; return its ``info``."""
     info = strict_json(root / "meta/info.json")
     check_info(info)
     total, features = info["total_episodes"], info["features"]
@@ -105,7 +105,7 @@ def strict_json(path: Path) -> dict[str, Any]:
 
 
 def check_info(info: dict[str, Any]) -> None:
-    """What ``meta/info.json`` says of the whole, and of each column."""
+    """Check ``meta/info.json``: the whole, and each column."""
     assert {key: type(info[key]) for key in INFO} == INFO
     assert info["codebase_version"] == "v3.0"
     assert info["chunks_size"] == PER_FILE
@@ -199,7 +199,7 @@ def check_stats(stats: dict[str, Any], feature: dict[str, Any], key: str) -> Non
 
 
 def check_video(path: Path, feature: dict[str, Any], fps: int, length: int) -> None:
-    """It is what its feature says, and every picture is there, at its time to within LeRobot's tolerance of 0.1 ms."""
+    """Check that a video is as its feature describes, with every picture at its time to within 0.1 ms (as LeRobot)."""
     height, width, _ = feature["shape"]
     with av.open(str(path)) as container:
         (stream,) = container.streams

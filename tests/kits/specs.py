@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -26,10 +27,26 @@ def data(path: str) -> str:
 PANDA_HOME = (0.0, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785)
 
 
+def _arm(name: str, urdf: str, limits: LimitsSpec, tcp_link: str, tcp_z: float, values: dict[str, Any]) -> RobotSpec:
+    """Return an arm at the origin; ``values`` has at least its model, joints and home."""
+    kinematics = KinematicsSpec(
+        urdf=urdf,
+        joints=values["joints"],
+        lower=limits.lower,
+        upper=limits.upper,
+        home=values["home"],
+        base_link=None,
+        tcp_link=tcp_link,
+        tcp_position=(0.0, 0.0, tcp_z),
+        tcp_orientation=(0.0, 0.0, 0.0, 1.0),
+    )
+    rest = {"driver": "pybullet", "rate_hz": 240.0, "urdf": urdf, "initial": values["home"], "limits": limits}
+    base = {"base_position": (0.0, 0.0, 0.0), "base_orientation": (0.0, 0.0, 0.0, 1.0)}
+    return RobotSpec(**({"name": name, "kinematics": kinematics, **rest, **base} | values))
+
+
 def panda(name: str = "panda", **changes: Any) -> RobotSpec:
     """A Franka Emika Panda with its hand. Limits: Franka's control parameters of the FER."""
-    urdf = data("franka_panda/panda.urdf")
-    joints = tuple(f"panda_joint{k}" for k in range(1, 8))
     limits = LimitsSpec(
         lower=(-2.8973, -1.7628, -2.8973, -3.0718, -2.8973, -0.0175, -2.8973),
         upper=(2.8973, 1.7628, 2.8973, -0.0698, 2.8973, 3.7525, 2.8973),
@@ -38,39 +55,12 @@ def panda(name: str = "panda", **changes: Any) -> RobotSpec:
         jerk=(7500.0, 3750.0, 5000.0, 6250.0, 7500.0, 10000.0, 10000.0),
         torque=(87.0, 87.0, 87.0, 87.0, 12.0, 12.0, 12.0),
     )
-    values: dict[str, Any] = {
-        "name": name,
-        "model": "panda",
-        "driver": "pybullet",
-        "rate_hz": 240.0,
-        "urdf": urdf,
-        "joints": joints,
-        "home": PANDA_HOME,
-        "initial": PANDA_HOME,
-        "limits": limits,
-        "kinematics": KinematicsSpec(
-            urdf=urdf,
-            joints=joints,
-            lower=limits.lower,
-            upper=limits.upper,
-            home=PANDA_HOME,
-            base_link=None,
-            tcp_link="panda_hand",
-            tcp_position=(0.0, 0.0, 0.1034),
-            tcp_orientation=(0.0, 0.0, 0.0, 1.0),
-        ),
-        "base_position": (0.0, 0.0, 0.0),
-        "base_orientation": (0.0, 0.0, 0.0, 1.0),
-        "gripper": GripperSpec(
-            name=name,
-            driver="pybullet",
-            width_max=0.08,
-            speed=0.1,
-            force=40.0,
-            joints=("panda_finger_joint1", "panda_finger_joint2"),
-        ),
-    }
-    return RobotSpec(**(values | changes))
+    fingers = ("panda_finger_joint1", "panda_finger_joint2")
+    gripper = GripperSpec(name, "pybullet", width_max=0.08, speed=0.1, force=40.0, joints=fingers)
+    joints = tuple(f"panda_joint{k}" for k in range(1, 8))
+    values: dict[str, Any] = {"model": "panda", "joints": joints, "home": PANDA_HOME, "gripper": gripper}
+    arm = _arm(name, data("franka_panda/panda.urdf"), limits, "panda_hand", 0.1034, values)
+    return replace(arm, **changes)
 
 
 IIWA_HOME = (0.0, 0.5, 0.0, -1.4, 0.0, 1.0, 0.0)
@@ -78,8 +68,6 @@ IIWA_HOME = (0.0, 0.5, 0.0, -1.4, 0.0, 1.0, 0.0)
 
 def iiwa(name: str = "iiwa", **changes: Any) -> RobotSpec:
     """A KUKA LBR iiwa 7 R800 without a hand. Limits: its data sheet; acceleration and jerk are this test's choice."""
-    urdf = data("kuka_iiwa/model.urdf")
-    joints = tuple(f"lbr_iiwa_joint_{k}" for k in range(1, 8))
     reach = (2.967, 2.094, 2.967, 2.094, 2.967, 2.094, 3.054)
     limits = LimitsSpec(
         lower=tuple(-value for value in reach),
@@ -89,31 +77,10 @@ def iiwa(name: str = "iiwa", **changes: Any) -> RobotSpec:
         jerk=(1000.0,) * 7,
         torque=(176.0, 176.0, 110.0, 110.0, 110.0, 40.0, 40.0),
     )
-    values: dict[str, Any] = {
-        "name": name,
-        "model": "iiwa",
-        "driver": "pybullet",
-        "rate_hz": 240.0,
-        "urdf": urdf,
-        "joints": joints,
-        "home": IIWA_HOME,
-        "initial": IIWA_HOME,
-        "limits": limits,
-        "kinematics": KinematicsSpec(
-            urdf=urdf,
-            joints=joints,
-            lower=limits.lower,
-            upper=limits.upper,
-            home=IIWA_HOME,
-            base_link=None,
-            tcp_link="lbr_iiwa_link_7",
-            tcp_position=(0.0, 0.0, 0.0),
-            tcp_orientation=(0.0, 0.0, 0.0, 1.0),
-        ),
-        "base_position": (0.0, 0.0, 0.0),
-        "base_orientation": (0.0, 0.0, 0.0, 1.0),
-    }
-    return RobotSpec(**(values | changes))
+    joints = tuple(f"lbr_iiwa_joint_{k}" for k in range(1, 8))
+    values: dict[str, Any] = {"model": "iiwa", "joints": joints, "home": IIWA_HOME}
+    arm = _arm(name, data("kuka_iiwa/model.urdf"), limits, "lbr_iiwa_link_7", 0.0, values)
+    return replace(arm, **changes)
 
 
 def box(name: str, position: tuple[float, float, float], half: tuple[float, float, float], **changes: Any) -> BodySpec:

@@ -23,12 +23,12 @@ __all__ = ["FarEnd", "InTerminal", "wait_for"]
 _QUERY = re.compile(rb"\x1b\[([<>=?]?)([0-9;]*)(\$p|[uhlc])")
 
 
-def wait_for(condition: Callable[[], bool], what: str, timeout: float = 20.0) -> None:
+def wait_for(condition: Callable[[], bool], what: str, timeout: float = 20.0, every: float = 0.002) -> None:
     """Wait until ``condition`` holds; AssertionError after ``timeout`` s."""
     deadline = time.monotonic() + timeout
     while not condition():
         assert time.monotonic() < deadline, f"{what} did not happen within {timeout:g} s"
-        time.sleep(0.002)
+        time.sleep(every)
 
 
 class FarEnd:
@@ -163,11 +163,8 @@ class InTerminal:
     def shows(self, text: str, timeout: float = 30.0) -> None:
         """Wait until the screen shows ``text``."""
 
-        def condition() -> bool:
-            return text.encode() in self.far.screen
-
         try:
-            wait_for(condition, f"{text!r} on the screen", timeout)
+            wait_for(lambda: text.encode() in self.far.screen, f"{text!r} on the screen", timeout)
         except AssertionError as error:
             raise AssertionError(f"{error}; it shows {self.far.screen[-2000:]!r}") from None
 
@@ -189,9 +186,13 @@ class InTerminal:
                         found.append((process / "cmdline").read_text().replace("\0", " "))
         return found
 
+    def is_released(self) -> None:
+        """Wait until no process has the terminal open."""
+        wait_for(lambda: not self.holders(), "closing of the terminal", every=0.05)
+
     def is_put_back(self) -> None:
         """Wait until no process has the terminal open and its settings are as before."""
-        wait_for(lambda: not self.holders(), "closing of the terminal")
+        self.is_released()
         wait_for(lambda: self.far.flags == [0] and not self.far.focus, "resetting the terminal")
         assert self.far.settings == self.before
         assert self.far.unread() == 0, "no input is left for the shell"

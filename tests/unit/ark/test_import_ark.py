@@ -89,8 +89,7 @@ def test_the_tutorials_rig_opens_and_the_arm_moves_home_among_its_objects(tutori
             assert frame.color.shape == (256, 256, 3)
             assert frame.depth.shape == (256, 256)
             focal = 128.0 / np.tan(np.radians(30.0))
-            assert frame.K[0, 0] == pytest.approx(focal)
-            assert frame.K[1, 1] == pytest.approx(focal)
+            assert (frame.K[0, 0], frame.K[1, 1]) == (pytest.approx(focal), pytest.approx(focal))
             assert len(np.unique(frame.color.reshape(-1, 3), axis=0)) > 10, "something is in the picture"
         # They were dropped a few centimetres above the table, whose top is at 0.625 m, and lie on it.
         for name, half in (("Cube", 0.03), ("ball", 0.05), ("Mug", 0.06), ("BluePlate", 0.01)):
@@ -132,7 +131,7 @@ def test_views_are_those_that_ark_computes(tmp_path: Path, with_urdf: bool) -> N
             assert rig.cameras[name].read().T_world_camera.matrix() == pytest.approx(expected, abs=2e-6)
 
 
-def test_what_is_written_is_readable_and_says_what_changed(tutorial: Path) -> None:
+def test_the_written_rig_is_readable_and_notes_changes(tutorial: Path) -> None:
     text = tutorial.read_text()
     assert "model: panda    # its joints have that arm's names" in text
     assert "base: {position: [-0.55, 0, 0.6]}" in text
@@ -164,22 +163,17 @@ def test_names_that_a_rig_cannot_have_are_changed(tmp_path: Path) -> None:
     )
 
 
-def test_a_key_that_nobody_reads_is_unknown(tmp_path: Path) -> None:
+def test_a_key_without_a_reader_is_unknown(tmp_path: Path) -> None:
     _, result = imported(tmp_path, objects={"ball": changed(BALL, wobble=3)}, text="Pick it up", ground_plane={"a": 1})
     assert row(result, "objects.0.config.wobble") == ("unknown", "nothing here reads it")
-    assert row(result, "text")[0] == "unknown"
-    assert row(result, "ground_plane")[0] == "ignored"
+    assert (row(result, "text")[0], row(result, "ground_plane")[0]) == ("unknown", "ignored")
 
 
 def test_simulator(tmp_path: Path) -> None:
     source = write(tmp_path, objects={"ball": BALL})
     data = yaml.safe_load(source.read_text())
-    data["simulator"] = {
-        "name": "lab",
-        "backend_type": "mujoco",
-        "node_frequency": 240,
-        "config": {"connection_mode": "GUI", "sim_frequency": 500, "gravity": [0, 0, -1.6]},
-    }
+    config = {"connection_mode": "GUI", "sim_frequency": 500, "gravity": [0, 0, -1.6]}
+    data["simulator"] = {"name": "lab", "backend_type": "mujoco", "node_frequency": 240, "config": config}
     source.write_text(yaml.safe_dump(data))
     result = import_ark(source)
     rig = load(saved(result, tmp_path / "rig.yaml"))
@@ -191,7 +185,7 @@ def test_simulator(tmp_path: Path) -> None:
     assert row(result, "simulator.node_frequency")[0] == "ignored"
 
 
-def test_things_can_be_left_out(tmp_path: Path) -> None:
+def test_items_can_be_left_out(tmp_path: Path) -> None:
     data, result = imported(
         tmp_path,
         ArkOptions(without=frozenset({"imu", "ball"})),

@@ -30,12 +30,10 @@ def test_the_arms_joints_are_the_first_of_7_9_10_or_12(tmp_path: Path, more: int
     data, result = imported(tmp_path, robots={"Franka": changed(PANDA, initial_configuration=HOME + [0] * more)})
     assert "initial" not in data["robots"]["Franka"], "it is the model's home"
     outcome, here = row(result, key)
-    assert outcome == "kept"
-    assert ("the first 7 of" in here) == (more > 0)
+    assert (outcome, "the first 7 of" in here) == ("kept", more > 0)
 
     data, result = imported(tmp_path, robots={"Franka": changed(PANDA, initial_configuration=OTHER + [0.04] * more)})
-    assert data["robots"]["Franka"]["initial"] == OTHER
-    assert row(result, key)[0] == "changed"
+    assert (data["robots"]["Franka"]["initial"], row(result, key)[0]) == (OTHER, "changed")
     assert load(tmp_path / "rig.yaml").resolve().robots[0].initial == tuple(OTHER)
 
 
@@ -52,7 +50,7 @@ def test_frankas_are_known_by_their_joints(tmp_path: Path, keys: dict[str, Any],
     assert data["robots"]["arm"]["model"] == model
 
 
-def test_a_person_may_say_which_arm_it_is(tmp_path: Path) -> None:
+def test_an_option_names_the_arm(tmp_path: Path) -> None:
     data, result = imported(tmp_path, ArkOptions(arms={"arm": "fr3"}), robots={"arm": PANDA})
     assert data["robots"]["arm"]["model"] == "fr3"
     assert "from --arm" in row(result, "robots.0.config.urdf_path")[1]
@@ -75,27 +73,19 @@ def test_base(tmp_path: Path) -> None:
 
 
 def test_a_real_arms_address_is_kept_and_nothing_becomes_real_or_faster_by_it(tmp_path: Path) -> None:
-    real = {
-        "robot_ip": "172.16.0.2",
-        "gripper_ip": "172.16.0.2",
-        "relative_dynamics_factor": 0.9,
-        "gripper_speed": 0.5,
-    }
+    real = {"robot_ip": "172.16.0.2", "gripper_ip": "172.16.0.2"}
+    real |= {"relative_dynamics_factor": 0.9, "gripper_speed": 0.5}
     data, result = imported(tmp_path, robots={"arm": changed(PANDA, real_config=real)})
     assert data["sim"] is True
-    assert data["robots"]["arm"] == {
-        "model": "panda",
-        "base": {"position": [0, 0, 0]},
-        "real": {"host": "172.16.0.2"},
-    }
+    real_arm = {"model": "panda", "base": {"position": [0, 0, 0]}, "real": {"host": "172.16.0.2"}}
+    assert data["robots"]["arm"] == real_arm
     assert row(result, "robots.0.config.real_config.relative_dynamics_factor") == (
         "changed",
         "robots.arm.speed stays 0.3 of the joint speeds: more is for you to write",
     )
     assert row(result, "robots.0.config.real_config.gripper_speed")[0] == "changed"
     spec = load(tmp_path / "rig.yaml", sim=False).resolve().robots[0]
-    assert spec.options["host"] == "172.16.0.2"
-    assert spec.speed == 0.3
+    assert (spec.options["host"], spec.speed) == ("172.16.0.2", 0.3)
 
     real |= {"gripper_ip": "172.16.0.3", "relative_dynamics_factor": 0.1, "gripper_speed": 0.05}
     data, _ = imported(tmp_path, robots={"arm": changed(PANDA, real_config=real)})
@@ -104,7 +94,7 @@ def test_a_real_arms_address_is_kept_and_nothing_becomes_real_or_faster_by_it(tm
     load(tmp_path / "rig.yaml", sim=False)
 
 
-def test_where_ark_has_its_tcp_is_told(tmp_path: Path) -> None:
+def test_the_tcp_of_ark_is_reported(tmp_path: Path) -> None:
     robot = changed(PANDA, ee_index=11)
     for options in (ArkOptions(), ArkOptions(urdfs={"arm": PANDA_URDF})):
         _, result = imported(tmp_path, options, robots={"arm": robot})
@@ -128,16 +118,8 @@ def test_joints_are_numbered_as_pybullet_does(file: str, merged: bool) -> None:
 
 
 def xarm(**keys: Any) -> dict[str, Any]:
-    return changed(
-        {
-            "urdf_path": "xarm6_robot.urdf",
-            "class_dir": str(XARM),
-            "base_position": [0, 0, 0],
-            "initial_configuration": [0, -0.3, -1.2, 0, 1.5, 0],
-            "ee_index": 5,
-        },
-        **keys,
-    )
+    arm = {"urdf_path": "xarm6_robot.urdf", "class_dir": str(XARM), "base_position": [0, 0, 0], "ee_index": 5}
+    return changed(arm | {"initial_configuration": [0, -0.3, -1.2, 0, 1.5, 0]}, **keys)
 
 
 def test_a_model_is_made_of_another_urdf_and_the_arm_runs(tmp_path: Path) -> None:
@@ -146,8 +128,7 @@ def test_a_model_is_made_of_another_urdf_and_the_arm_runs(tmp_path: Path) -> Non
     text = (tmp_path / "rig_my_arm.yaml").read_text()
     model = parse_yaml(text)
     assert model["joints"] == [f"joint{k}" for k in range(1, 7)]
-    assert model["home"] == [0, -0.3, -1.2, 0, 1.5, 0]
-    assert model["tcp"]["link"] == "link6"
+    assert (model["home"], model["tcp"]["link"]) == ([0, -0.3, -1.2, 0, 1.5, 0], "link6")
     assert model["drivers"] == {"sim": "pybullet"}, "no arm moves by guessed limits"
     speed, acceleration, jerk = (np.array(model["limits"][key]) for key in ("velocity", "acceleration", "jerk"))
     assert acceleration == pytest.approx(speed / 0.3, rel=1e-3)
@@ -185,16 +166,15 @@ def test_fixed_joints_of_a_group_are_no_joints_of_the_arm(tmp_path: Path) -> Non
     assert "without those that are fixed" in row(result, "robots.0.config.joint_groups.all.joints")[1]
 
 
-def test_numbers_are_those_of_the_arms_joints_whatever_stands_between(tmp_path: Path) -> None:
+def test_numbers_are_those_of_the_arms_joints_also_with_other_joints_between(tmp_path: Path) -> None:
     """Without merging, PyBullet counts the fixed joint to the world too."""
     robot = xarm(merge_fixed_links=False, initial_configuration=[9, 0, -0.3, -1.2, 0, 1.5, 0], ee_index=6)
     imported(tmp_path, robots={"arm": robot})
     model = parse_yaml((tmp_path / "rig_arm.yaml").read_text())
-    assert model["home"] == [0, -0.3, -1.2, 0, 1.5, 0]
-    assert model["tcp"]["link"] == "link6"
+    assert (model["home"], model["tcp"]["link"]) == ([0, -0.3, -1.2, 0, 1.5, 0], "link6")
 
 
-def test_speeds_that_a_urdf_lacks_or_makes_up_are_told(tmp_path: Path) -> None:
+def test_missing_and_placeholder_speeds_of_a_urdf_are_reported(tmp_path: Path) -> None:
     urdf = tmp_path / "arm.urdf"
     text = (XARM / "xarm6_robot.urdf").read_text()
     assert text.count('velocity="3.14"') >= 2
@@ -206,7 +186,7 @@ def test_speeds_that_a_urdf_lacks_or_makes_up_are_told(tmp_path: Path) -> None:
     assert parse_yaml((tmp_path / "rig_arm.yaml").read_text())["limits"]["velocity"][:2] == [3.2, 0.5]
 
 
-def test_what_is_wrong_in_a_made_model_is_told_at_arks_line(tmp_path: Path) -> None:
+def test_problems_of_a_generated_model_are_reported_at_arks_line(tmp_path: Path) -> None:
     with pytest.raises(hal.ConfigError, match="joint 'joint2' is at 3, outside its limits") as caught:
         imported(tmp_path, robots={"arm": xarm(initial_configuration=[0, 3, 0, 0, 0, 0])})
     (problem,) = caught.value.problems
@@ -218,7 +198,7 @@ def test_what_is_wrong_in_a_made_model_is_told_at_arks_line(tmp_path: Path) -> N
     ("text", "said"),
     [("<robot", "is not valid XML"), ("<nonsense/>", "is not a URDF"), ('<robot name="x"/>', "has no links")],
 )
-def test_a_broken_urdf_is_told(tmp_path: Path, text: str, said: str) -> None:
+def test_a_broken_urdf_is_reported(tmp_path: Path, text: str, said: str) -> None:
     (tmp_path / "arm.urdf").write_text(text)
     with pytest.raises(hal.ConfigError, match=said):
         imported(tmp_path, robots={"arm": xarm(urdf_path="arm.urdf", class_dir=None)})

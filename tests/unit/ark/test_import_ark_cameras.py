@@ -84,15 +84,12 @@ def test_attached_to_a_panda(tmp_path: Path, link: str, attach: dict[str, Any], 
 def test_attached_to_a_link_whose_centre_of_mass_is_elsewhere(tmp_path: Path, attach: dict[str, Any]) -> None:
     q = [0.2, -0.3, -1.0, 0.4, 1.2, 0.3]
     attach = {"parent_name": "arm", "parent_link": "link5", **attach}
-    imported(
-        tmp_path,
-        robots={"arm": {"urdf_path": str(XARM), "initial_configuration": q}},
-        sensors={"eye": camera(**attach)},
-    )
+    robot = {"urdf_path": str(XARM), "initial_configuration": q}
+    imported(tmp_path, robots={"arm": robot}, sensors={"eye": camera(**attach)})
     assert our_view(tmp_path / "rig.yaml", q) == pytest.approx(ark_view(XARM, q, attach, merged=True), abs=1e-5)
 
 
-def test_a_link_that_ark_merges_is_told(tmp_path: Path) -> None:
+def test_a_link_that_ark_merges_is_reported(tmp_path: Path) -> None:
     eye = camera(parent_name="arm", parent_link="camera_link")
     _, result = imported(tmp_path, robots={"arm": changed(PANDA, merge_fixed_links=True)}, sensors={"eye": eye})
     assert (
@@ -101,7 +98,7 @@ def test_a_link_that_ark_merges_is_told(tmp_path: Path) -> None:
     )
 
 
-def test_a_link_that_is_gone_from_arks_urdf_is_told(tmp_path: Path) -> None:
+def test_a_link_that_arks_urdf_lacks_is_reported(tmp_path: Path) -> None:
     """The camera's and the tcp's links left ark_franka's URDF in August 2025."""
     text = PANDA_URDF.read_text()
     start = text.index('  <link name="camera_link">')
@@ -120,18 +117,15 @@ def test_a_link_that_is_gone_from_arks_urdf_is_told(tmp_path: Path) -> None:
     )
 
 
-def test_without_a_link_it_is_the_base(tmp_path: Path) -> None:
+def test_without_a_link_it_is_the_base_and_on_an_fr3_its_own_hand(tmp_path: Path) -> None:
     data, _ = imported(tmp_path, robots={"arm": PANDA}, sensors={"eye": camera(parent_name="arm")})
     assert data["cameras"]["eye"]["attached"]["link"] == "panda_link0"
-
-
-def test_on_an_fr3_the_hand_is_that_ones(tmp_path: Path) -> None:
     eye = camera(parent_name="arm", parent_link="camera_link")
     data, _ = imported(tmp_path, ArkOptions(arms={"arm": "fr3"}), robots={"arm": PANDA}, sensors={"eye": eye})
     assert data["cameras"]["eye"]["attached"]["link"] == "fr3_hand"
 
 
-def test_degrees_are_told(tmp_path: Path) -> None:
+def test_probable_degrees_are_reported(tmp_path: Path) -> None:
     eye = camera(parent_name="arm", parent_link="panda_hand", offset_rotation=[0.0, 90.0, 45.0])
     _, result = imported(tmp_path, robots={"arm": PANDA}, sensors={"eye": eye})
     outcome, here = row(result, "sensors.0.config.sim_config.attach.offset_rotation")
@@ -144,14 +138,8 @@ def test_degrees_are_told(tmp_path: Path) -> None:
     ("yaw", "pitch", "roll"), [(0, 0, 0), (-90, 215, 0), (30, -40, 0), (200, -100, 25), (15, 89, -10)]
 )
 def test_fixed(tmp_path: Path, yaw: float, pitch: float, roll: float, up: int) -> None:
-    fix = {
-        "camera_target_position": [0.1, 0.2, 0.3],
-        "distance": 0.9,
-        "yaw": yaw,
-        "pitch": pitch,
-        "roll": roll,
-        "up_axis_index": up,
-    }
+    fix = {"camera_target_position": [0.1, 0.2, 0.3], "distance": 0.9, "yaw": yaw, "pitch": pitch}
+    fix |= {"roll": roll, "up_axis_index": up}
     _, result = imported(tmp_path, robots={"arm": PANDA}, sensors={"eye": changed(CAMERA, sim_config={"fix": fix})})
     view = load(tmp_path / "rig.yaml").resolve().cameras[0].view
     expected = optical(p.computeViewMatrixFromYawPitchRoll([0.1, 0.2, 0.3], 0.9, yaw, pitch, roll, up))
@@ -169,12 +157,8 @@ def test_what_arks_file_leaves_out_is_what_ark_takes(tmp_path: Path) -> None:
 
 
 def test_streams(tmp_path: Path) -> None:
-    streams = {
-        "depth": {"enable": True, "format": "z16"},
-        "color": {"enable": True, "format": "bgr8"},
-        "infrared": {"enable": False, "format": "y8"},
-        "segmentation": {"enable": True},
-    }
+    streams = {"depth": {"enable": True, "format": "z16"}, "color": {"enable": True, "format": "bgr8"}}
+    streams |= {"infrared": {"enable": False, "format": "y8"}, "segmentation": {"enable": True}}
     data, result = imported(tmp_path, robots={"arm": PANDA}, sensors={"eye": changed(CAMERA, streams=streams)})
     assert data["cameras"]["eye"]["streams"] == ["color", "depth", "segmentation"]
     assert row(result, "sensors.0.config.streams.color.format") == (

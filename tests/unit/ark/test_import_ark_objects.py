@@ -25,22 +25,16 @@ def primitive(kind: str, sizes: dict[str, Any], drawn: dict[str, Any] | None = N
     )
 
 
+BOX, TALL, LONG = {"halfExtents": [0.1, 0.2, 0.3]}, {"radius": 0.1, "height": 0.3}, {"radius": 0.1, "length": 0.3}
+
+
 @pytest.mark.parametrize(
     ("config", "expected"),
     [
-        (
-            primitive("GEOM_BOX", {"halfExtents": [0.1, 0.2, 0.3]}),
-            {"shape": "box", "half_extents": [0.1, 0.2, 0.3]},
-        ),
+        (primitive("GEOM_BOX", BOX), {"shape": "box", "half_extents": [0.1, 0.2, 0.3]}),
         (primitive("GEOM_SPHERE", {"radius": 0.1}), {"shape": "sphere", "radius": 0.1}),
-        (
-            primitive("GEOM_CYLINDER", {"radius": 0.1, "height": 0.3}, {"radius": 0.1, "length": 0.3}),
-            {"shape": "cylinder", "radius": 0.1, "length": 0.3},
-        ),
-        (
-            primitive("geom_capsule", {"radius": 0.1, "height": 0.3}, {"radius": 0.1, "length": 0.3}),
-            {"shape": "capsule", "radius": 0.1, "length": 0.3},
-        ),
+        (primitive("GEOM_CYLINDER", TALL, LONG), {"shape": "cylinder", **LONG}),
+        (primitive("geom_capsule", TALL, LONG), {"shape": "capsule", **LONG}),
         (primitive("GEOM_PLANE", {}), {"shape": "plane"}),
     ],
 )
@@ -77,7 +71,7 @@ def test_a_shape_that_looks_different_is_drawn_as_it_is_touched(tmp_path: Path) 
     assert row(result, key) == ("changed", "objects.0.half_extents; what is drawn here is the collision shape")
 
 
-def test_a_mass_of_nothing_stands_still_and_dynamics_are_told(tmp_path: Path) -> None:
+def test_a_body_without_mass_stands_still_and_its_dynamics_are_reported(tmp_path: Path) -> None:
     config = changed(BALL, multi_body__baseMass=0, dynamics={"lateralFriction": 0.7, "jointDamping": 1})
     data, result = imported(tmp_path, objects={"ball": config})
     assert data["objects"][0]["mass"] == 0
@@ -138,7 +132,7 @@ def test_urdfs_of_pybullet_are_named_by_their_package(tmp_path: Path) -> None:
         assert np.isfinite(rig.world.pose("duck").position).all()
 
 
-def test_a_file_that_lists_its_things_is_read_too(tmp_path: Path) -> None:
+def test_a_file_with_a_list_of_items_is_read(tmp_path: Path) -> None:
     """As the example files of Ark's own drivers do."""
     (tmp_path / "balls.yaml").write_text(yaml.safe_dump({"objects": [{"name": "a", "config": BALL}, "balls.yaml"]}))
     source = write(tmp_path)
@@ -150,7 +144,7 @@ def test_a_file_that_lists_its_things_is_read_too(tmp_path: Path) -> None:
     assert [thing["name"] for thing in import_ark(source).entries["objects"]] == ["a"]
 
 
-def test_a_name_that_is_given_twice_is_told(tmp_path: Path) -> None:
+def test_a_duplicate_name_is_reported(tmp_path: Path) -> None:
     for name in ("one", "two"):
         (tmp_path / f"{name}.yaml").write_text("name: ball\nconfig: {source: urdf, urdf_path: duck_vhacd.urdf}\n")
     source = tmp_path / "global.yaml"

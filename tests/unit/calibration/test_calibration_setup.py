@@ -109,8 +109,7 @@ def test_a_file_is_written_whole_and_keeps_its_permissions(tmp_path: Path, monke
     link.symlink_to(real)
     write_file(link, "new\r\n")
     assert link.is_symlink()
-    assert real.read_bytes() == b"new\r\n"
-    assert real.stat().st_mode & 0o777 == 0o640
+    assert (real.read_bytes(), real.stat().st_mode & 0o777) == (b"new\r\n", 0o640)
 
     def full(descriptor: int) -> None:
         raise OSError(28, "No space left on device")
@@ -172,8 +171,7 @@ def test_a_rig_that_would_not_load_is_not_written(tmp_path: Path) -> None:
     before = path.read_bytes()
     with pytest.raises(ConfigError):
         RigFileOutput(path, path, "wrist").write("attached", f"{{robot: nobody, link: hand, pose: {VALUE}}}")
-    assert path.read_bytes() == before
-    assert os.listdir(tmp_path) == ["rig.yaml"]
+    assert (path.read_bytes(), os.listdir(tmp_path)) == (before, ["rig.yaml"])
 
 
 def test_a_built_in_rig_and_a_missing_folder_are_not_written_to(tmp_path: Path) -> None:

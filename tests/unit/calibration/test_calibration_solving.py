@@ -15,7 +15,7 @@ from hal.calibration.solving import inverse, motion
 from hal.geometry import Pose
 
 EYES: tuple[Eye, ...] = ("in-hand", "to-hand")
-SEEDS = range(5 if os.environ.get("HAL_SOAK") == "1" else 2)
+SEEDS = range(5 if os.environ.get("HAL_SOAK") == "1" else 1)
 
 
 def refused(views: list[View], eye: Eye) -> str:
@@ -28,9 +28,7 @@ def refused(views: list[View], eye: Eye) -> str:
 @pytest.mark.parametrize("eye", EYES)
 def test_perfect_views_give_the_camera_exactly(eye: Eye) -> None:
     found = solve(views(eye, poses(8)), eye)
-    distance, angle = found.camera.distance(CAMERA)
-    assert distance < 1e-8
-    assert angle < 1e-7
+    assert found.camera.distance(CAMERA) == pytest.approx((0.0, 0.0), abs=1e-8)
     assert max(found.rms()) < 1e-5
     assert found.warnings == ()
 
@@ -51,7 +49,7 @@ def test_noise_is_averaged_and_the_uncertainty_covers_the_error(eye: Eye, seed: 
 
 def test_a_slightly_wrong_K_has_a_small_effect() -> None:
     wrong = K + np.array([[1.5, 0.0, 2.0], [0.0, 1.5, -2.0], [0.0, 0.0, 0.0]])
-    found = solve(views("in-hand", poses(20), noise_px=0.3, believed=wrong), "in-hand")
+    found = solve(views("in-hand", poses(14), noise_px=0.3, believed=wrong), "in-hand")
     distance, angle = found.camera.distance(CAMERA)
     assert distance < 4e-3
     assert degrees(angle) < 0.4
@@ -105,10 +103,9 @@ def test_outlying_corners_have_little_weight() -> None:
 
 @pytest.mark.parametrize("share", [1.02, 0.98])
 def test_a_board_of_another_size_gives_a_warning(share: float) -> None:
-    found = solve(views("in-hand", poses(20), noise_px=0.1, real_board=BOARD.measured(share * 0.035)), "in-hand")
+    found = solve(views("in-hand", poses(14), noise_px=0.1, real_board=BOARD.measured(share * 0.035)), "in-hand")
     assert found.uncertainty.scale == pytest.approx(share - 1.0, abs=1e-3)
-    assert len(found.warnings) == 1
-    assert found.doubts == found.warnings
+    assert (len(found.warnings), found.doubts) == (1, found.warnings)
 
 
 @pytest.mark.parametrize("eye", EYES)
@@ -150,26 +147,15 @@ def test_a_board_that_moved_half_as_far_gives_a_warning(eye: Eye) -> None:
 def test_the_result_is_the_colour_sensor_whichever_sensor_took_the_images(eye: Eye) -> None:
     stereo = Pose([0.015, 0.001, -0.002], [0.0, 0.01, 0.0, 1.0])
     taken = [replace(view, T_color_eye=stereo) for view in views(eye, poses(8))]
-    distance, angle = (solve(taken, eye).camera @ stereo).distance(CAMERA)
-    assert distance < 1e-8
-    assert angle < 1e-7
+    assert (solve(taken, eye).camera @ stereo).distance(CAMERA) == pytest.approx((0.0, 0.0), abs=1e-7)
 
 
-@pytest.mark.parametrize(
-    ("turns", "code"),
-    [
-        ((0.6, 0.0, 0.0), "one_rotation_axis"),
-        ((0.0, 0.0, 0.8), "one_rotation_axis"),
-        ((0.01, 0.01, 0.01), "too_little_rotation"),
-    ],
-)
 @pytest.mark.parametrize("eye", EYES)
-def test_too_little_rotation_is_refused(eye: Eye, turns: tuple[float, float, float], code: str) -> None:
-    assert refused(views(eye, poses(15, turns=turns), noise_px=0.1), eye) == code
-
-
-def test_too_few_views_are_refused() -> None:
-    assert refused(views("in-hand", poses(5)), "in-hand") == "too_few_views"
+def test_too_few_views_and_too_little_rotation_are_refused(eye: Eye) -> None:
+    assert refused(views(eye, poses(5)), eye) == "too_few_views"
+    for turns in ((0.6, 0.0, 0.0), (0.0, 0.0, 0.8)):
+        assert refused(views(eye, poses(15, turns=turns), noise_px=0.1), eye) == "one_rotation_axis"
+    assert refused(views(eye, poses(15, turns=(0.01,) * 3), noise_px=0.1), eye) == "too_little_rotation"
 
 
 def test_views_of_another_arm_are_refused() -> None:

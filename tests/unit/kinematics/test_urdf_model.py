@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
-from specs import PANDA_HOME, data, panda
+from specs import iiwa, panda
 
 from hal.geometry import Pose
 from hal.kinematics.arm import Kinematics
 from hal.kinematics.urdf import parse_xml, read_urdf
-from hal.specs import KinematicsSpec
+from hal.specs import KinematicsSpec, RobotSpec
 
 SMALL = """
 <robot name="small">
@@ -35,29 +36,13 @@ SMALL = """
 """
 
 
-def iiwa() -> KinematicsSpec:
-    joints = tuple(f"lbr_iiwa_joint_{k}" for k in range(1, 8))
-    nothing = (0.0,) * 7
-    return KinematicsSpec(
-        urdf=data("kuka_iiwa/model.urdf"),
-        joints=joints,
-        lower=(-2.9,) * 7,
-        upper=(2.9,) * 7,
-        home=nothing,
-        base_link=None,
-        tcp_link="lbr_iiwa_link_7",
-        tcp_position=(0.0, 0.0, 0.0),
-        tcp_orientation=(0.0, 0.0, 0.0, 1.0),
-    )
-
-
-@pytest.mark.parametrize("arm", ["panda", "iiwa"])
-def test_links_agree_with_the_kinematics(arm: str) -> None:
-    spec = panda().kinematics if arm == "panda" else iiwa()
+@pytest.mark.parametrize("arm", [panda, iiwa])
+def test_links_agree_with_the_kinematics(arm: Callable[[], RobotSpec]) -> None:
+    spec = arm().kinematics
     kinematics, tree = Kinematics(spec), read_urdf(Path(spec.urdf))
     tcp = Pose(spec.tcp_position, spec.tcp_orientation)
     random = np.random.default_rng(3)
-    for q in [np.array(PANDA_HOME), *random.uniform(spec.lower, spec.upper, (20, 7))]:
+    for q in [np.array(spec.home), *random.uniform(spec.lower, spec.upper, (20, 7))]:
         poses = tree.poses(dict(zip(spec.joints, q.tolist(), strict=True)))
         base = poses[spec.base_link or tree.root].inverse()
         for found, wanted in (

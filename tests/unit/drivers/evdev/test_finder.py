@@ -4,18 +4,12 @@ from __future__ import annotations
 
 import os
 import select
-import sys
 import time
 from collections.abc import Callable
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
-
-if sys.platform != "linux":
-    pytest.skip("inotify is Linux only", allow_module_level=True)
-
-from itertools import pairwise
-
 from evdev_kit import DS4, FakeInput, FakeNode
 
 from hal.drivers.evdev import finder as finder_module

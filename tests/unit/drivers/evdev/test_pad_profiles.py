@@ -5,15 +5,10 @@ The tables are stated independently from the sources, and not read from ``sensor
 
 from __future__ import annotations
 
-import sys
 from typing import NamedTuple
 
 import pytest
-
-if sys.platform != "linux":
-    pytest.skip("evdev is Linux only", allow_module_level=True)
-
-from evdev_kit import ROOT, FakeInput, FakeNode, MakePad, poll
+from evdev_kit import ROOT, FakeNode, poll
 
 from hal.config.mapping import load_mapping
 from hal.errors import NotSupported
@@ -87,50 +82,35 @@ F710_D = Sent(
     ),
 )
 
-# (vendor, product, bus, kernel driver, codes, model, whether it may be the dead-man without a motion sensor)
+FAMILIES = [
+    (U, "sony", SONY, "dualshock4", "054c:05c4", "054c:0ba0"),
+    (U, "playstation", SONY, "dualshock4", "054c:09cc", ""),
+    (B, "playstation", SONY, "dualshock4", "", "054c:09cc"),
+    (U, "playstation", SONY, "dualsense", "054c:0ce6 054c:0df2", ""),
+    (B, "playstation", SONY, "dualsense", "", "054c:0ce6"),
+    (U, "xpad", XPAD, "xbox360", "045e:028e 045e:028f", "045e:0291 045e:02a9 045e:0719 1234:5678"),
+    (U, "xpad", XPAD, "xbox360", "2dc8:2000 046d:c21d 046d:c21e", "2dc8:3106 2dc8:310a 2dc8:ffff 046d:c21f"),
+    (U, "xpad", XPAD, "xbox_one", "045e:02d1 045e:02ea 045e:0b12", ""),
+    (B, "microsoft", XBOX_BT, "xbox_bluetooth", "", "045e:02fd 045e:0b05"),
+    (B, "microsoft", XBOX_BLE, "xbox_bluetooth", "", "045e:0b20 045e:0b22"),
+    (B, "hid-generic", XBOX_BLE, "xbox_bluetooth", "", "045e:0b13"),
+    (B, "microsoft", XBOX_2016, "xbox_bluetooth_2016", "", "045e:02e0"),
+    (B, "xpadneo", XPAD, "xbox_xpadneo", "", "045e:028e 045e:02e0"),
+    (U, "hid-generic", BITDO_PRO, "8bitdo_pro", "2dc8:6003", "2dc8:6006"),
+    (B, "hid-generic", BITDO_PRO, "8bitdo_pro", "", "2dc8:6006"),
+    (U, "hid-generic", BITDO_SN30, "8bitdo_sn30", "2dc8:6001", ""),
+    (B, "hid-generic", BITDO_SN30, "8bitdo_sn30", "", "2dc8:6101"),
+    (U, "hid-generic", BITDO_ULTIMATE, "8bitdo_ultimate", "2dc8:3011", "2dc8:3012 2dc8:3013 2dc8:6012"),
+    (U, "logitech", F310_D, "logitech_d", "046d:c216", ""),
+    (U, "logitech", F710_D, "logitech_f710_d", "", "046d:c219"),
+]
+"""Bus, kernel driver, codes, model, vendor and product of the pads that may be the dead-man of a real arm without a
+motion sensor, and of those that may not."""
 PADS = [
-    (0x054C, 0x05C4, U, "sony", SONY, "dualshock4", True),
-    (0x054C, 0x09CC, U, "playstation", SONY, "dualshock4", True),
-    (0x054C, 0x09CC, B, "playstation", SONY, "dualshock4", False),
-    (0x054C, 0x0BA0, U, "sony", SONY, "dualshock4", False),
-    (0x054C, 0x0CE6, U, "playstation", SONY, "dualsense", True),
-    (0x054C, 0x0CE6, B, "playstation", SONY, "dualsense", False),
-    (0x054C, 0x0DF2, U, "playstation", SONY, "dualsense", True),
-    (0x045E, 0x028E, U, "xpad", XPAD, "xbox360", True),
-    (0x045E, 0x028F, U, "xpad", XPAD, "xbox360", True),
-    (0x045E, 0x0291, U, "xpad", XPAD, "xbox360", False),
-    (0x045E, 0x02A9, U, "xpad", XPAD, "xbox360", False),
-    (0x045E, 0x0719, U, "xpad", XPAD, "xbox360", False),
-    (0x1234, 0x5678, U, "xpad", XPAD, "xbox360", False),
-    (0x045E, 0x02D1, U, "xpad", XPAD, "xbox_one", True),
-    (0x045E, 0x02EA, U, "xpad", XPAD, "xbox_one", True),
-    (0x045E, 0x0B12, U, "xpad", XPAD, "xbox_one", True),
-    (0x045E, 0x02FD, B, "microsoft", XBOX_BT, "xbox_bluetooth", False),
-    (0x045E, 0x0B05, B, "microsoft", XBOX_BT, "xbox_bluetooth", False),
-    (0x045E, 0x0B13, B, "hid-generic", XBOX_BLE, "xbox_bluetooth", False),
-    (0x045E, 0x0B20, B, "microsoft", XBOX_BLE, "xbox_bluetooth", False),
-    (0x045E, 0x0B22, B, "microsoft", XBOX_BLE, "xbox_bluetooth", False),
-    (0x045E, 0x02E0, B, "microsoft", XBOX_2016, "xbox_bluetooth_2016", False),
-    (0x045E, 0x028E, B, "xpadneo", XPAD, "xbox_xpadneo", False),
-    (0x045E, 0x02E0, B, "xpadneo", XPAD, "xbox_xpadneo", False),
-    (0x2DC8, 0x6003, U, "hid-generic", BITDO_PRO, "8bitdo_pro", True),
-    (0x2DC8, 0x6006, B, "hid-generic", BITDO_PRO, "8bitdo_pro", False),
-    (0x2DC8, 0x6006, U, "hid-generic", BITDO_PRO, "8bitdo_pro", False),
-    (0x2DC8, 0x6001, U, "hid-generic", BITDO_SN30, "8bitdo_sn30", True),
-    (0x2DC8, 0x6101, B, "hid-generic", BITDO_SN30, "8bitdo_sn30", False),
-    (0x2DC8, 0x3011, U, "hid-generic", BITDO_ULTIMATE, "8bitdo_ultimate", True),
-    (0x2DC8, 0x3012, U, "hid-generic", BITDO_ULTIMATE, "8bitdo_ultimate", False),
-    (0x2DC8, 0x3013, U, "hid-generic", BITDO_ULTIMATE, "8bitdo_ultimate", False),
-    (0x2DC8, 0x6012, U, "hid-generic", BITDO_ULTIMATE, "8bitdo_ultimate", False),
-    (0x2DC8, 0x2000, U, "xpad", XPAD, "xbox360", True),
-    (0x2DC8, 0x3106, U, "xpad", XPAD, "xbox360", False),
-    (0x2DC8, 0x310A, U, "xpad", XPAD, "xbox360", False),
-    (0x2DC8, 0xFFFF, U, "xpad", XPAD, "xbox360", False),
-    (0x046D, 0xC21D, U, "xpad", XPAD, "xbox360", True),
-    (0x046D, 0xC21E, U, "xpad", XPAD, "xbox360", True),
-    (0x046D, 0xC21F, U, "xpad", XPAD, "xbox360", False),
-    (0x046D, 0xC216, U, "logitech", F310_D, "logitech_d", True),
-    (0x046D, 0xC219, U, "logitech", F710_D, "logitech_f710_d", False),
+    (*(int(number, 16) for number in ids.split(":")), bus, driver, sent, model, guards)
+    for bus, driver, sent, model, trusted, others in FAMILIES
+    for guards, pads in ((True, trusted), (False, others))
+    for ids in pads.split()
 ]
 IDS = [
     f"{vendor:04x}:{product:04x} {'usb' if bus == U else 'bt'} {driver}" for vendor, product, bus, driver, *_ in PADS
@@ -146,10 +126,7 @@ def gamepad(sent: Sent) -> FakeNode:
 
 
 @pytest.mark.parametrize(("vendor", "product", "bus", "driver", "sent", "model", "guards"), PADS, ids=IDS)
-def test_controls_and_trust_of_every_pad(
-    vendor: int, product: int, bus: int, driver: str, sent: Sent, model: str, guards: bool,
-    system: FakeInput, make_pad: MakePad,
-) -> None:  # fmt: skip
+def test_controls_and_trust_of_every_pad(vendor, product, bus, driver, sent, model, guards, system, make_pad):
     identity = Identity("A pad", vendor, product, bus, driver)
     node = system.put(gamepad(sent), identity, pad="BTN_SOUTH" in sent.buttons.values(), joystick=True)
     pad = make_pad()
@@ -199,20 +176,10 @@ def test_controls_and_trust_of_every_pad(
 # SpaceMice.
 
 
-SPACEMICE = [
-    (0x046D, 0xC621, U, True),
-    (0x046D, 0xC626, U, True),
-    (0x046D, 0xC62B, U, True),
-    (0x256F, 0xC62E, U, True),
-    (0x256F, 0xC62F, U, False),
-    (0x256F, 0xC631, U, True),
-    (0x256F, 0xC632, U, False),
-    (0x256F, 0xC633, U, True),
-    (0x256F, 0xC635, U, True),
-    (0x256F, 0xC63A, B, False),
-    (0x256F, 0xC652, U, False),
-    (0x256F, 0xFFFF, U, False),
-]
+SPACEMICE = [(0x046D, product, U, True) for product in (0xC621, 0xC626, 0xC62B)]
+SPACEMICE += [(0x256F, product, U, True) for product in (0xC62E, 0xC631, 0xC633, 0xC635)]
+SPACEMICE += [(0x256F, product, U, False) for product in (0xC62F, 0xC632, 0xC652, 0xFFFF)]
+SPACEMICE += [(0x256F, 0xC63A, B, False)]
 
 
 @pytest.mark.parametrize(("vendor", "product", "bus", "guards"), SPACEMICE)

@@ -2,14 +2,9 @@
 
 from __future__ import annotations
 
-import sys
 import time
 
 import pytest
-
-if sys.platform != "linux":
-    pytest.skip("evdev is Linux only", allow_module_level=True)
-
 from evdev_kit import FakeInput, FakeNode, MakePad, poll, poll_until
 
 import hal

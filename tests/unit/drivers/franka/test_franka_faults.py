@@ -24,8 +24,7 @@ def fits(fault: Fault) -> bool:
 
 
 def test_every_flag_has_its_own_cause_and_a_remedy() -> None:
-    assert len(FLAGS) == 41
-    assert set(FLAG_TEXTS) == set(FLAGS)
+    assert (len(FLAGS), set(FLAG_TEXTS)) == (41, set(FLAGS))
     assert len({cause for cause, _ in FLAG_TEXTS.values()}) == len(FLAGS)
     assert all(text.isascii() and text.isprintable() for texts in FLAG_TEXTS.values() for text in texts)
 

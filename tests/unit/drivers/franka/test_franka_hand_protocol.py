@@ -44,12 +44,12 @@ def test_requests_are_cut_from_a_stream_however_it_arrives():
 @pytest.mark.parametrize(
     "stream", [struct.pack("<HII", 9, 0, 10), struct.pack("<HII", 3, 0, 10), b"GET / HTTP/1.1\r\n"]
 )
-def test_what_no_client_says_is_refused(stream):
+def test_unknown_requests_are_refused(stream):
     with pytest.raises(ValueError, match=r"valid HandCode|bytes"):
         list(HandRequestParser().feed(stream))
 
 
-def test_answers_and_states_have_the_sizes_that_the_client_wants():
+def test_responses_and_states_have_the_sizes_that_the_client_expects():
     assert hand_response(HandRequest(HandCode.MOVE, 8, ()), HandStatus.UNSUCCESSFUL) == struct.pack(
         "<HIIH", 3, 8, 12, 2
     )
@@ -61,7 +61,7 @@ def test_answers_and_states_have_the_sizes_that_the_client_wants():
     assert struct.unpack("<IddBH", packed) == (5, 0.03, 0.08, 1, 31)
 
 
-def test_fingers_move_at_the_speed_that_was_asked_for_and_no_faster_than_they_can():
+def test_fingers_move_at_the_commanded_speed_up_to_their_limit():
     fingers = Fingers()
     fingers.width = 0.0
     assert fingers.start(FingerMotion(FingerMotionKind.MOVE, 0.05, 0.02)) is None
@@ -85,7 +85,7 @@ def test_a_grasp_closes_on_what_is_there_and_is_judged_by_its_width(inner, outer
     assert fingers.force == (40.0 if fingers.is_grasped else 0.0)
 
 
-def test_a_grasp_of_nothing_closes_all_the_way_unless_it_is_told_to_end_at_its_width():
+def test_a_grasp_of_nothing_closes_all_the_way_unless_set_to_end_at_its_width():
     for ends_at_width, rest in ((False, 0.0), (True, 0.02)):
         fingers = Fingers()
         fingers.grasp_ends_at_width = ends_at_width

@@ -44,8 +44,7 @@ def checked(spec: RobotSpec) -> dict[str, CheckResult]:
 
 def test_a_refused_port_ends_the_check_with_the_way_to_start_the_emulator_or_fci() -> None:
     found = checked(rig())
-    assert list(found) == ["route", "robot"]
-    assert found["robot"].level == "fail"
+    assert (list(found), found["robot"].level) == (["route", "robot"], "fail")
     assert f"emulator --host {EMPTY}" in found["robot"].remedy
     assert "FCI" in checked(replace(rig(), emulated=False))["robot"].remedy
 
@@ -61,8 +60,7 @@ def test_a_robot_that_accepts_and_never_answers_is_a_failure(monkeypatch: pytest
     monkeypatch.setattr(preflight, "PATIENCE", 1.0)
     with socket.create_server((MUTE, 1337)):
         found = checked(rig(MUTE))
-    assert found["robot"].level == "fail"
-    assert found["hand"].level == "fail"
+    assert (found["robot"].level, found["hand"].level) == ("fail", "fail")
 
 
 def test_an_arm_that_another_program_uses_is_not_checked_further() -> None:
@@ -104,8 +102,7 @@ def test_only_a_direct_cable_is_ok(monkeypatch: pytest.MonkeyPatch, route: Route
 )
 def test_round_trips_are_rated_by_the_budget_of_a_cycle(trips: RoundTrips, level: str) -> None:
     found = rate_round_trips(trips)
-    assert found.level == level
-    assert (level in ("warn", "fail")) == bool(found.remedy)
+    assert (found.level, level in ("warn", "fail")) == (level, bool(found.remedy))
 
 
 # The network.
@@ -179,8 +176,7 @@ def test_without_permission_the_ping_program_measures(tmp_path: Path, monkeypatc
     program.chmod(0o755)
     monkeypatch.setenv("PATH", f"{tmp_path}:/usr/bin:/bin")
     trips = measure_round_trips("127.0.5.1", 0.5)
-    assert trips == RoundTrips(3, [0.000224, 0.000279])
-    assert trips.lost == 1
+    assert (trips, trips.lost) == (RoundTrips(3, [0.000224, 0.000279]), 1)
     assert "-s 1200" in (tmp_path / "ping.log").read_text()
 
 

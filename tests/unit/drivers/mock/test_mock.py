@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import replace
+from math import exp
 
 import numpy as np
 import pytest
@@ -14,7 +15,7 @@ from hal.clock import LockStepClock, RealClock
 from hal.driver import Setpoint
 from hal.drivers.mock.camera import STEP, MockCamera, read_picture
 from hal.drivers.mock.gamepad import MockPad
-from hal.drivers.mock.robot import MockGripper, MockRobot
+from hal.drivers.mock.robot import FRICTION, INERTIA, KEEP_UP, MockGripper, MockRobot
 from hal.errors import CommandError, ConnectionLost
 from hal.specs import CameraSpec, GripperSpec, PadSpec, RobotSpec
 from hal.types import GripperOutcome
@@ -110,8 +111,7 @@ def test_robot_following_error(arm: MockRobot, error: object, expected: tuple[fl
     arm.read(0.0)
     arm.write(at(0.4))
     reading = arm.read(0.01)
-    assert reading.q == pytest.approx(expected)
-    assert reading.q_commanded == (0.4,) * 3
+    assert (reading.q, reading.q_commanded) == (pytest.approx(expected), (0.4,) * 3)
 
 
 def test_robot_disconnect(arm: MockRobot) -> None:
@@ -163,8 +163,7 @@ def test_robot_halt_drops_what_was_still_due(arm: MockRobot) -> None:
     arm.read(0.0)
     arm.write(at(0.4))
     arm.halt()
-    assert arm.read(1.0).q == HERE
-    assert arm.read(1.1).q_commanded == HERE
+    assert (arm.read(1.0).q, arm.read(1.1).q_commanded) == (HERE, HERE)
 
 
 # Faults.
@@ -229,27 +228,6 @@ def test_gripper_closes_further_when_the_object_slips_out(gripper: MockGripper) 
     gripper.inject(object_width=None)
     assert gripper.read(1.1).width == pytest.approx(0.02)
     assert gripper.read(1.1).grasped is False
-
-
-def test_gripper_grasps_an_object_or_closes_completely(gripper: MockGripper) -> None:
-    gripper.grasp(0.03, 0.1, 15.0, 0.005, 0.005)
-    closed = gripper.read(2.0)
-    assert (closed.width, closed.width_target, closed.grasped) == (0.0, 0.03, False)
-    gripper.move(0.08, 0.1, 15.0)
-    gripper.read(4.0)
-    gripper.inject(object_width=0.03)
-    gripper.grasp(0.03, 0.1, 15.0, 0.005, 0.005)
-    held = gripper.read(6.0)
-    assert (held.width, held.grasped, held.force) == (0.03, True, 15.0)
-    assert gripper.log[-1] == (0.03, 0.1, 15.0)
-
-
-def test_gripper_homing_opens(gripper: MockGripper) -> None:
-    gripper.move(0.02, 0.1, 15.0)
-    gripper.read(2.0)
-    gripper.home()
-    assert gripper.read(2.1).moving
-    assert (gripper.read(4.0).width, gripper.homed) == (0.08, 1)
 
 
 def test_failing_gripper_reports_its_fault_and_does_not_move(gripper: MockGripper) -> None:
@@ -377,8 +355,7 @@ def test_pad_events_have_the_time_of_their_poll(pad: MockPad) -> None:
     pad.press("south", "l1")
     pad.stick("left_x", -0.5)
     pressed = pad.poll(2.0, 0.0)
-    assert pressed.buttons == {"south", "l1"}
-    assert pressed.axes["left_x"] == -0.5
+    assert (pressed.buttons, pressed.axes["left_x"]) == ({"south", "l1"}, -0.5)
     assert (pressed.t, pressed.t_alive, pressed.seq) == (2.0, 2.0, rest.seq + 1)
     pad.release("l1")
     released = pad.poll(3.0, 0.0)
@@ -423,3 +400,40 @@ def test_pad_refuses_unknown_controls_and_values(pad: MockPad, move: Callable[[M
     with pytest.raises(CommandError):
         move(pad)
     assert pad.poll(1.0, 0.0).buttons == frozenset()
+
+
+# An arm driven by torques: wheels with friction.
+
+DT = 1e-3
+
+
+def drive(arm: MockRobot, tau: tuple[float, ...], ticks: int, start: int = 0) -> None:
+    for k in range(start, start + ticks):
+        reading = arm.read(k * DT)
+        arm.write(Setpoint(reading.q, reading.dq, ZERO, tau))
+
+
+def test_torque_turns_a_wheel_with_friction(arm: MockRobot) -> None:
+    drive(arm, (2.0, 0.0, -1.0), 500)
+    reading = arm.read(0.5)
+    rate = FRICTION / INERTIA
+    speed = 2.0 / FRICTION * (1.0 - exp(-0.5 * rate))
+    assert reading.dq == pytest.approx((speed, 0.0, -0.5 * speed), rel=2e-3)
+    way = 2.0 / FRICTION * (0.5 - (1.0 - exp(-0.5 * rate)) / rate)
+    assert np.subtract(reading.q, HERE) == pytest.approx((way, 0.0, -0.5 * way), rel=5e-3)
+
+
+def test_arm_stops_when_torques_stop_coming(arm: MockRobot) -> None:
+    drive(arm, (2.0, 0.0, 0.0), 100)
+    speeds = [arm.read((100 + k) * DT).dq[0] for k in range(60)]
+    kept_up = round(KEEP_UP / DT)
+    assert all(speed > 0.0 for speed in speeds[: kept_up - 1])
+    assert speeds[kept_up - 1] > speeds[0]
+    assert (speeds[kept_up + 3 :], arm.read(0.2).q) == ([0.0] * (60 - kept_up - 3), arm.read(0.3).q)
+
+
+def test_dropped_torque_repeats_the_one_before(arm: MockRobot) -> None:
+    drive(arm, (2.0, 0.0, 0.0), 100)
+    arm.inject(drop=1)
+    drive(arm, (-50.0, 0.0, 0.0), 5, start=100)
+    assert 0.0 < arm.read(105 * DT).dq[0] < 0.25

@@ -52,22 +52,6 @@ def direct(scene: PyBulletWorld, spec: object) -> PyBulletCamera:
 class TestDirect:
     """Lock-step."""
 
-    def test_frame_shows_and_stamps_the_present_state(self) -> None:
-        scene = world(ball("ball", 0.0))
-        driver = direct(scene, camera(view=FROM_ABOVE))
-        first = driver.grab(0.0)
-        for _ in range(48):
-            scene.step()
-        later = driver.grab(0.0)
-        assert (first.t, first.t_device) == (10.0, 0.0)
-        assert later.seq == first.seq + 1
-        assert later.t_device == pytest.approx(0.2)
-        assert later.t == pytest.approx(10.2)
-        middle = (60, 80)
-        fall = later.depth[middle] - first.depth[middle]
-        assert fall == pytest.approx(0.5 * 9.81 * 0.2**2, rel=0.1)
-        scene.close()
-
     def test_an_attached_camera_follows_its_link(self) -> None:
         view = ViewSpec((0.02, -0.05, 0.1), (0.0, 0.38268343, 0.0, 0.92387953), "panda", "panda_hand")
         scene = world(robots=(panda(),))
@@ -119,6 +103,15 @@ class Bench:
         self.t += 0.01
         self.box.write(self.t, self.world.revision, self.world.snapshot())
 
+    def drawn(self) -> RawFrame | None:
+        """Let the worker draw; return its frame, if it drew one."""
+        self.worker.run_once()
+        return self.source.grab(0.0)
+
+    def next_frame(self) -> RawFrame | None:
+        self.publish()
+        return self.drawn()
+
     def edit(self, method: str, **params: object) -> tuple[str, dict[str, object], int]:
         return method, params, self.world.request(method, params)
 
@@ -139,41 +132,26 @@ class TestWorker:
 
     def test_worker_draws_published_snapshots(self, bench: Bench) -> None:
         bench.worker.warm_up()
-        bench.worker.run_once()
-        assert bench.source.grab(0.0) is None  # nothing was published yet
-        bench.publish()
-        bench.worker.run_once()
-        first = bench.source.grab(0.0)
+        assert bench.drawn() is None  # nothing was published yet
+        first = bench.next_frame()
         assert first.t == bench.t
-        bench.worker.run_once()
-        assert bench.source.grab(0.0) is None  # the world stands still: no new picture of the same moment
+        assert bench.drawn() is None  # the world stands still: no new picture of the same moment
         bench.world.set_pose("ball", {"position": [0.3, 0.0, 0.1], "orientation": list(STILL)})
-        bench.publish()
-        bench.worker.run_once()
-        second = bench.source.grab(0.0)
+        second = bench.next_frame()
         assert second.t == bench.t
-        assert first.segmentation is not None
-        assert second.segmentation is not None
         assert (first.segmentation == 1).any()
         rows = [np.flatnonzero((image == 1).any(axis=1)).mean() for image in (first.segmentation, second.segmentation)]
         assert rows[0] - rows[1] > 5  # +x is up in this picture
 
     def test_edit_is_made_before_its_snapshot_is_shown(self, bench: Bench) -> None:
-        bench.publish()
-        bench.worker.run_once()
-        assert bench.source.grab(0.0) is not None
+        assert bench.next_frame() is not None
         add = bench.edit("add", spec=to_json(ball("second", 0.3, rgba=(1.0, 0.0, 0.0, 1.0))))
         paint = bench.edit("set_color", name="second", rgba=[0.0, 0.0, 1.0, 1.0])
-        bench.publish()
-        bench.worker.run_once()
-        assert bench.source.grab(0.0) is None  # the snapshot overtook the edits
+        assert bench.next_frame() is None  # the snapshot overtook the edits
         bench.mirror.edited(*paint)  # and these overtook each other
-        bench.worker.run_once()
-        assert bench.source.grab(0.0) is None
+        assert bench.drawn() is None
         bench.mirror.edited(*add)
-        bench.worker.run_once()
-        frame = bench.source.grab(0.0)
-        assert frame.segmentation is not None
+        frame = bench.drawn()
         seen = frame.segmentation == 2
         assert seen.sum() > 20
         red, _, blue = frame.color[seen].mean(axis=0)
@@ -183,12 +161,9 @@ class TestWorker:
         bench.publish()
         remove = bench.edit("remove", name="ball")
         bench.mirror.edited(*remove)
-        bench.worker.run_once()  # the snapshot still has the ball
-        frame = bench.source.grab(0.0)
+        frame = bench.drawn()  # the snapshot still has the ball
         assert 1 in np.unique(frame.segmentation)
-        bench.publish()
-        bench.worker.run_once()
-        frame = bench.source.grab(0.0)
+        frame = bench.next_frame()
         assert 1 not in np.unique(frame.segmentation)
         assert 0 in np.unique(frame.segmentation)
 

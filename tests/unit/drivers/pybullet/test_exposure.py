@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from typing import Any
 
@@ -21,7 +21,7 @@ from hal.drivers.pybullet.world import PyBulletWorld
 from hal.geometry import Pose
 from hal.host.memory import SeriesBox
 from hal.host.ring import FrameRing, frame_rings
-from hal.specs import BodySpec, CameraSpec
+from hal.specs import CameraSpec
 from hal.types import Frame
 
 EYE = look_at((0.0, 0.0, 1.0), (0.0, 0.0, 0.0), (0.0, 1.0, 0.0))  # straight down: x is right, y up in the picture
@@ -36,9 +36,13 @@ def camera(model: str = "realsense_d435", **keys: Any) -> CameraSpec:
     return spec
 
 
-def things() -> tuple[BodySpec, ...]:
+@pytest.fixture
+def scene() -> Iterator[PyBulletWorld]:
     floor = box("floor", (3.0, 3.0, 0.05), (0.0, 0.0, -0.05), rgba=(0.3, 0.3, 0.3, 1.0))
-    return floor, box("brick", (0.05, 0.05, 0.05), (0.0, 0.0, 0.05), rgba=(1.0, 1.0, 1.0, 1.0))
+    brick = box("brick", (0.05, 0.05, 0.05), (0.0, 0.0, 0.05), rgba=(1.0, 1.0, 1.0, 1.0))
+    made = world(floor, brick)
+    yield made
+    made.close()
 
 
 def middle_of(bright: np.ndarray) -> tuple[float, float]:
@@ -56,8 +60,7 @@ def face(spec: CameraSpec, K: Any, x: float) -> tuple[float, float]:
 @pytest.mark.parametrize("draws", ["tiny", "gl"])
 @pytest.mark.parametrize("model", ["realsense_d435", "realsense_d455", "realsense_d405"])
 @pytest.mark.parametrize("align", ["color", "depth"])
-def test_each_picture_is_taken_from_where_its_sensor_is(draws: str, model: str, align: str) -> None:
-    scene = world(*things())
+def test_each_picture_is_taken_from_where_its_sensor_is(scene, draws, model, align):
     spec = camera(model, align=align)
     drawing = renderer(draws, scene)
     frame = Exposure(spec).capture(scene, drawing, 1.0, 2.0, 3)
@@ -80,7 +83,6 @@ def test_each_picture_is_taken_from_where_its_sensor_is(draws: str, model: str, 
     assert point[2] == pytest.approx(0.1, abs=0.002)
     assert np.abs(point[:2]).max() < 0.055
     drawing.close()
-    scene.close()
 
 
 class Counting(Renderer):
@@ -116,19 +118,16 @@ class Counting(Renderer):
         ("pinhole", {"streams": ["color", "infrared"]}, [("color", "infrared")]),
     ],
 )
-def test_only_the_streams_of_the_spec_are_drawn(model: str, keys: dict[str, Any], asked: list[Any]) -> None:
-    scene = world(*things())
+def test_only_the_streams_of_the_spec_are_drawn(scene, model, keys, asked):
     drawing, spec = Counting(), camera(model, **keys)
     frame = Exposure(spec).capture(scene, drawing, 0.0, 0.0, 1)
     assert drawing.asked == asked
     for stream in EVERYTHING:
         assert (getattr(frame, stream) is not None) == (stream in spec.streams)
     assert (frame.skew is None) == (not {"color", "depth"} <= set(spec.streams))
-    scene.close()
 
 
-def test_without_noise_depth_is_as_it_is_drawn() -> None:
-    scene = world(*things())
+def test_without_noise_depth_is_as_it_is_drawn(scene: PyBulletWorld) -> None:
     drawing = TinyRenderer(scene)
     spec = camera(streams=["color", "depth"])
     plain = drawing.render(spec, EYE).depth
@@ -143,11 +142,9 @@ def test_without_noise_depth_is_as_it_is_drawn() -> None:
     assert both.mean() > 0.8
     assert 0.0005 < np.abs(captured[0] - plain)[both].mean() < 0.01
     assert np.array_equal(drawing.render(spec, EYE).depth, plain), "the picture that was drawn is not written to"
-    scene.close()
 
 
-def test_in_lock_step_a_picture_of_one_state_of_the_world_is_drawn_once() -> None:
-    scene = world(*things())
+def test_in_lock_step_a_picture_of_one_state_of_the_world_is_drawn_once(scene: PyBulletWorld) -> None:
     drawing, spec = Counting(), camera(streams=["color", "depth"])
     clock = LockStepClock(lambda: scene.t, lambda t: None)
     public = Camera(PyBulletCamera(spec, DirectSource(scene, drawing, spec, clock.now)), clock, threaded=False)
@@ -170,7 +167,6 @@ def test_in_lock_step_a_picture_of_one_state_of_the_world_is_drawn_once() -> Non
         assert public.read() is frame
         assert public.latest() is frame
         assert len(drawing.asked) == len(heard) == public.counts().frames == number
-    scene.close()
 
 
 class FakeTime:
@@ -183,10 +179,9 @@ class FakeTime:
 
 
 @pytest.mark.parametrize("rate", [6.0, 15.0, 60.0, 90.0])
-def test_frames_come_at_the_rate_that_was_asked_for(rate: float, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_frames_come_at_the_configured_rate(scene, rate, monkeypatch):
     clock = FakeTime()
     monkeypatch.setattr("hal.drivers.pybullet.camera.time", clock)
-    scene = world(*things())
     streams = ["color", "depth", "infrared_right"] if rate <= 60 else ["depth", "infrared_right"]
     spec = replace(
         camera(
@@ -218,4 +213,3 @@ def test_frames_come_at_the_rate_that_was_asked_for(rate: float, monkeypatch: py
     assert frames[0].skew == (0.0 if "color" in streams else None)
     assert not np.array_equal(frames[0].depth, frames[1].depth), "each frame has noise of its own"
     mirrored.close()
-    scene.close()

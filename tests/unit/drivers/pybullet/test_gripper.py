@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 import numpy as np
 import pytest
@@ -80,20 +80,24 @@ class Bench:
         self.arm.write(Setpoint(q.tolist(), dq.tolist(), [0.0] * 7))
 
 
+@pytest.fixture
+def bench() -> Iterator[Bench]:
+    made = Bench()
+    yield made
+    made.world.close()
+
+
 class TestMoving:
-    def test_widths_and_speeds_are_clipped(self) -> None:
-        bench = Bench()
+    def test_widths_and_speeds_are_clipped(self, bench: Bench) -> None:
         bench.hand.move(-1.0, 99.0, 20.0)
         readings = bench.run(1.5)
         widths = np.array([reading.width for reading in readings])
-        assert readings[-1].width_target == 0.0
-        assert widths[-1] == pytest.approx(0.0, abs=1e-4)
+        assert (readings[-1].width_target, widths[-1]) == (0.0, pytest.approx(0.0, abs=1e-4))
         assert np.abs(np.diff(widths)).max() / bench.world.dt <= 0.1 * 1.02
         bench.hand.move(1.0, 0.1, 20.0)
         assert bench.run(1.5)[-1].width == pytest.approx(0.08, abs=1e-4)
 
-    def test_reset_opens_it(self) -> None:
-        bench = Bench()
+    def test_reset_opens_it(self, bench: Bench) -> None:
         bench.hand.move(0.0, 0.1, 20.0)
         assert bench.run(1.0)[-1].width < 0.01
         bench.world.reset()
@@ -105,8 +109,7 @@ class TestMoving:
 
 class TestCoupling:
     @pytest.mark.parametrize("speed", [0.02, 0.1])
-    def test_a_finger_that_is_blocked_holds_back_the_other(self, speed: float) -> None:
-        bench = Bench()
+    def test_a_finger_that_is_blocked_holds_back_the_other(self, bench: Bench, speed: float) -> None:
         hand = bench.world.pose("panda", "panda_hand")["position"]
         bench.world.add(box("block", (hand[0], hand[1] - 0.01, hand[2] - 0.1), (0.008, 0.008, 0.008)))
         bench.hand.move(0.0, speed, 20.0)
@@ -119,9 +122,8 @@ class TestCoupling:
         assert 0.005 < min(bench.fingers()) < 0.03  # both moved, and neither closed
         assert max(apart) < 5e-4
 
-    def test_a_push_against_one_of_two_idle_fingers_moves_both(self) -> None:
+    def test_a_push_against_one_of_two_idle_fingers_moves_both(self, bench: Bench) -> None:
         """A hand that idles is uncoupled, and coupled again before its motors give way, read 20 times a second."""
-        bench = Bench()
         bench.hand.move(0.04, 0.1, 20.0)
         bench.run(1.0)
         world, body = bench.world, bench.world.body("panda")
@@ -138,8 +140,7 @@ class TestCoupling:
         assert max(apart) < 5e-4
         assert max(bench.fingers()) < 0.01, "both gave way in the end"
 
-    def test_fingers_move_together(self) -> None:
-        bench = Bench()
+    def test_fingers_move_together(self, bench: Bench) -> None:
         bench.hand.move(0.0, 0.1, 20.0)
         apart: list[float] = []
         readings = bench.run(1.5, lambda t: apart.append(abs(np.subtract(*bench.fingers()))))
@@ -172,8 +173,7 @@ class TestGrasping:
             bench.world.step()
         assert abs(bench.world.pose("cube")["position"][2] - after[2]) < 1e-3
 
-    def test_a_grasp_of_the_right_width_presses_and_holds(self) -> None:
-        bench = Bench()
+    def test_a_grasp_of_the_right_width_presses_and_holds(self, bench: Bench) -> None:
         bench.put_cube()
         bench.hand.grasp(0.03, 0.1, 40.0, 0.005, 0.005)
         held = bench.run(1.0)[-1]
@@ -183,8 +183,7 @@ class TestGrasping:
         assert bench.world.pose("cube")["position"][2] > 0.5
 
     @pytest.mark.parametrize("yaw", [-2.9, 0.6, 2.0])
-    def test_oscillating_fingers_count_as_at_rest(self, yaw: float) -> None:
-        bench = Bench()
+    def test_oscillating_fingers_count_as_at_rest(self, bench: Bench, yaw: float) -> None:
         bench.put_duck(yaw)
         bench.hand.grasp(0.03, 0.1, 70.0, 0.05, 0.05)
         readings = bench.run(2.0)[-120:]
@@ -200,22 +199,19 @@ class TestGrasping:
             bench.world.step()
         assert bench.hand.read(0.0).grasped, "also where the fingers were not read on their way"
 
-    def test_slow_motion_counts_as_moving(self) -> None:
-        bench = Bench()
+    def test_slow_motion_counts_as_moving(self, bench: Bench) -> None:
         bench.hand.move(0.075, 0.001, 20.0)
         readings = bench.run(3.0)
         assert all(reading.moving for reading in readings)
         assert readings[-1].width == pytest.approx(0.077, abs=5e-4)
 
-    def test_a_grasp_of_nothing_closes(self) -> None:
-        bench = Bench()
+    def test_a_grasp_of_nothing_closes(self, bench: Bench) -> None:
         bench.hand.grasp(0.03, 0.1, 40.0, 0.005, 0.005)
         reading = bench.run(1.5)[-1]
         assert (reading.moving, reading.grasped) == (False, False)
         assert reading.width < 1e-3
 
-    def test_object_slips_with_too_little_force(self) -> None:
-        bench = Bench()
+    def test_object_slips_with_too_little_force(self, bench: Bench) -> None:
         bench.put_cube()
         bench.hand.move(0.0, 0.1, 10.0)  # friction needs 20 N
         assert bench.run(1.0)[-1].grasped
@@ -224,8 +220,7 @@ class TestGrasping:
         assert not lifted.grasped
         assert bench.world.pose("cube")["position"][2] - before < 0.01
 
-    def test_open_releases_the_object(self) -> None:
-        bench = Bench()
+    def test_open_releases_the_object(self, bench: Bench) -> None:
         bench.put_cube()
         bench.hand.move(0.0, 0.1, 40.0)
         bench.run(1.0)

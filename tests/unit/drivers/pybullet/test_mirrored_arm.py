@@ -52,8 +52,7 @@ def test_stays_at_its_start_until_the_first_state(world: PyBulletWorld) -> None:
 def test_takes_the_state_of_the_arm_at_once(world: PyBulletWorld) -> None:
     q = [0.3, -0.2, 0.4, -1.5, 0.2, 1.2, -0.6]
     world.follow("arm", q, REST, 0.03)
-    assert joints(world) == pytest.approx(q)
-    assert joints(world, FINGERS) == pytest.approx(0.015)
+    assert (joints(world), joints(world, FINGERS)) == (pytest.approx(q), pytest.approx(0.015))
     hand = Kinematics(replace(panda().kinematics, tcp_position=(0.0, 0.0, 0.0))).pose(q)
     assert world.pose("arm", "panda_hand")["position"] == pytest.approx(hand.position, abs=1e-5)
 

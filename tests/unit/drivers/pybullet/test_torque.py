@@ -43,15 +43,6 @@ class TestServed:
     """With the servo above it."""
 
     @RATES
-    def test_without_torques_it_floats_where_it_is(self, rate_hz: float) -> None:
-        arm = simulated(rate_hz=rate_hz)
-        start = arm.q
-        arm.drive(2.0)
-        assert arm.by_torques
-        assert np.abs(arm.q - start).max() < 2e-3
-        assert np.abs(arm.dq).max() < 2e-3
-
-    @RATES
     def test_a_small_torque_turns_the_wrist_and_a_release_stops_and_holds_it(self, rate_hz: float) -> None:
         arm = simulated(rate_hz=rate_hz)
         start = arm.q

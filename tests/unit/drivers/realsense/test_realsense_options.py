@@ -57,30 +57,23 @@ def test_the_folder_of_a_recording_must_exist(tmp_path: Path) -> None:
     assert [key for key, _ in found] == ["real.record"]
 
 
+WRONG: dict[str, list[dict[str, Any]]] = {
+    "serial": [{"serial": 123456789}, {"serial": ""}],
+    "serail": [{"serail": "1"}],
+    "record": [{"record": "today.bag"}],
+    "play": [{"play": "today"}],
+    "": [{"play": "a.db3", **more} for more in ({"record": "b.db3"}, {"emulated": True}, {"options": {"gain": 1}})],
+    "stall_s": [{"stall_s": 0}],
+    "warm_up_s": [{"warm_up_s": -1}],
+    "options": [{"options": k} for k in ([1], {"gain": None}, {"color": 3}, {"depth": {"gain": [1]}})],
+    "emulated": [{"emulated": {"patern": "test"}}, {"emulated": "yes"}],
+    "paced": [{"paced": "no"}],
+}
+WRONG[""] += [{"paced": False}, {"repeat": True, "emulated": True}, {"overwrite": True}]
+
+
 @pytest.mark.parametrize(
-    ("options", "key"),
-    [
-        ({"serial": 123456789}, "real.serial"),
-        ({"serial": ""}, "real.serial"),
-        ({"serail": "1"}, "real.serail"),
-        ({"record": "today.bag"}, "real.record"),
-        ({"play": "today"}, "real.play"),
-        ({"play": "a.db3", "record": "b.db3"}, "real"),
-        ({"play": "a.db3", "emulated": True}, "real"),
-        ({"play": "a.db3", "options": {"laser_power": 150}}, "real"),
-        ({"paced": False}, "real"),
-        ({"repeat": True, "emulated": True}, "real"),
-        ({"overwrite": True}, "real"),
-        ({"stall_s": 0}, "real.stall_s"),
-        ({"warm_up_s": -1}, "real.warm_up_s"),
-        ({"options": [1]}, "real.options"),
-        ({"options": {"gain": None}}, "real.options"),
-        ({"options": {"color": 3}}, "real.options"),
-        ({"options": {"depth": {"gain": [1]}}}, "real.options"),
-        ({"emulated": {"patern": "test"}}, "real.emulated"),
-        ({"emulated": "yes"}, "real.emulated"),
-        ({"paced": "no"}, "real.paced"),
-    ],
+    ("options", "key"), [(one, f"real.{key}".rstrip(".")) for key, wrong in WRONG.items() for one in wrong]
 )
 def test_wrong_options(options: dict[str, Any], key: str) -> None:
     assert [place for place, _ in problems(camera(**options))] == [key]

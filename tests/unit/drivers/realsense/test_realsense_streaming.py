@@ -79,8 +79,7 @@ def test_the_time_of_day_is_converted_to_the_monotonic_clock(domain: str) -> Non
     times = CaptureTimes()
     for taken, arrival in arrivals(2.0):
         t, t_device = times(EPOCH + taken, domain, arrival, EPOCH + arrival)
-        assert t == pytest.approx(taken, abs=1e-6)
-        assert t_device == EPOCH + taken
+        assert (t, t_device) == (pytest.approx(taken, abs=1e-6), EPOCH + taken)
 
 
 def test_setting_the_clock_moves_no_capture_far() -> None:

@@ -72,6 +72,12 @@ def bench() -> Iterator[Callable[..., Bench]]:
         yield make
 
 
+@pytest.fixture
+def it(bench: Callable[..., Bench]) -> Bench:
+    """A plain terminal."""
+    return bench()
+
+
 @pytest.fixture(autouse=True)
 def _terminal(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("TERM", "xterm-256color")
@@ -92,8 +98,7 @@ def _terminal(monkeypatch: pytest.MonkeyPatch) -> None:
         ("\x1b[6~", None, 0.0, {"l2", "r1"}, 0.05),
     ],
 )
-def test_key_press_holds_the_deadman_for_one_bounded_step(bench, key, axis, share, buttons, longest):
-    it = bench()
+def test_key_press_holds_the_deadman_for_one_bounded_step(it, key, axis, share, buttons, longest):
     it.press(key)
     state = it.pad.state()
     assert it.deadman.held
@@ -101,15 +106,13 @@ def test_key_press_holds_the_deadman_for_one_bounded_step(bench, key, axis, shar
     away = {name: value for name, value in state.axes.items() if value and name != "l2"}
     assert away == ({} if axis is None else {axis: pytest.approx(share)}), "behind the dead zone"
     it.run(1.0)
-    assert it.held() == pytest.approx(longest, abs=2 * DT)
-    assert it.presses() == 1
+    assert (it.held(), it.presses()) == (pytest.approx(longest, abs=2 * DT), 1)
     state = it.pad.state()
     assert not state.buttons
     assert not any(state.axes.values())
 
 
-def test_burst_makes_one_step_and_auto_repeat_many(bench) -> None:
-    it = bench()
+def test_burst_makes_one_step_and_auto_repeat_many(it: Bench) -> None:
     it.press(300 * UP + "a" + 300 * DOWN)
     it.run(1.0)
     assert it.presses() == 1
@@ -122,16 +125,14 @@ def test_burst_makes_one_step_and_auto_repeat_many(bench) -> None:
     assert len(released) * DT > 0.06 * it.presses(), "released in between, for the arm to come to rest"
 
 
-def test_late_poll_does_not_join_two_steps(bench) -> None:
-    it = bench()
+def test_late_poll_does_not_join_two_steps(it: Bench) -> None:
     it.press(UP)
     it.now += 0.4  # no poll
     it.press(UP)
     assert not it.deadman.held, "the release is reported first"
 
 
-def test_proof_of_life_of_a_step_is_its_key_press(bench) -> None:
-    it = bench()
+def test_proof_of_life_of_a_step_is_its_key_press(it: Bench) -> None:
     it.press(UP)
     pressed = it.now
     it.run(0.05)
@@ -143,8 +144,7 @@ def test_proof_of_life_of_a_step_is_its_key_press(bench) -> None:
 
 
 @pytest.mark.parametrize("key", ["\x7f", "\x1b"])
-def test_backspace_and_esc_stop_the_rig_and_a_later_key_continues(bench, key: str) -> None:
-    it = bench()
+def test_backspace_and_esc_stop_the_rig_and_a_later_key_continues(it: Bench, key: str) -> None:
     it.press(UP)
     it.press(key)
     if key == "\x1b":  # what may still become a sequence takes a moment
@@ -161,23 +161,19 @@ def test_backspace_and_esc_stop_the_rig_and_a_later_key_continues(bench, key: st
     assert it.presses() == 2
 
 
-def test_space_does_nothing_in_step_mode(bench) -> None:
-    it = bench()
+def test_space_does_nothing_in_step_mode(it: Bench) -> None:
     it.press(" ")
     it.run(0.2)
     assert (it.stops, it.presses()) == (0, 0)
 
 
-def test_stop_in_a_burst_counts(bench) -> None:
-    it = bench()
+def test_stop_in_a_burst_counts(it: Bench) -> None:
     it.press(20 * UP + "\x7f" + 20 * UP)
     it.run(0.4)
-    assert it.stops == 1
-    assert it.held() == 0.0
+    assert (it.stops, it.held()) == (1, 0.0)
 
 
-def test_gripper_is_taken_over_at_its_width_before_it_moves(bench) -> None:
-    it = bench()
+def test_gripper_is_taken_over_at_its_width_before_it_moves(it: Bench) -> None:
     seen = []
     for key, wanted in [("g", 0.1), ("g", 0.2), ("h", 0.1), ("h", 0.0), ("h", 0.0)]:
         before = it.pad.state().axis("r2")
@@ -193,8 +189,7 @@ def test_gripper_is_taken_over_at_its_width_before_it_moves(bench) -> None:
 
 
 @pytest.mark.parametrize(("key", "button"), [("1", "south"), ("4", "north"), ("\r", "start"), ("\x1b[H", "home")])
-def test_other_buttons_are_pressed_without_the_deadman(bench, key: str, button: str) -> None:
-    it = bench()
+def test_other_buttons_are_pressed_without_the_deadman(it: Bench, key: str, button: str) -> None:
     it.press(key)
     assert it.pad.state().buttons == {button}
     assert not it.deadman.held
@@ -203,8 +198,7 @@ def test_other_buttons_are_pressed_without_the_deadman(bench, key: str, button: 
 
 
 @pytest.mark.parametrize("key", ["\x1b[1;5A", "\x1b[1;3A", "x", "\x7f", "\x01", "\u00e4"])
-def test_other_keys_move_nothing(bench, key: str) -> None:
-    it = bench()
+def test_other_keys_move_nothing(it: Bench, key: str) -> None:
     it.press(key)
     it.run(0.2)
     assert it.held() == 0.0
@@ -382,16 +376,6 @@ def test_own_options_are_checked_and_others_ignored() -> None:
     with pytest.raises(ConfigError) as caught:
         TerminalPad(PadSpec(name="pad", driver="terminal", model=None, options={"step_s": 0.2}))
     assert [problem.key for problem in caught.value.problems] == ["step_s"]
-
-
-def test_closing_the_terminal_disconnects_the_pad(bench) -> None:
-    it = bench()
-    it.press(UP)
-    it.far.hang_up()
-    it.run(0.05)
-    assert not it.pad.state().connected
-    assert not it.deadman.held
-    assert it.pad.notes
 
 
 @pytest.mark.parametrize("kitty", [False, True])

@@ -5,11 +5,11 @@ from __future__ import annotations
 import random
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hal.drivers.web.messages import CLOCK_AHEAD, MESSAGES_LATE, PAGE_SILENT, MalformedMessage, PadMessage
-from hal.drivers.web.session import DriveLease, PadVerdict, PadWatch
+from hal.drivers.web.session import PadVerdict, PadWatch
 from hal.servo.watchdog import PAD_SILENCE
 
 T = 100.0
@@ -54,12 +54,6 @@ def test_a_late_message_loses_the_pad() -> None:
     assert pad.connected
 
 
-def test_a_gap_between_two_messages_loses_the_pad_once() -> None:
-    pad = connected()
-    assert pad.judge(message(T, 0.25), T + 0.25) == PadVerdict(PAGE_SILENT, T + 0.25)
-    assert pad.connected
-
-
 def test_no_gap_no_loss() -> None:
     pad = connected()
     for k in range(1, 50):
@@ -96,12 +90,6 @@ def test_a_page_whose_clock_jumped_ahead_does_not_count() -> None:
     assert not pad.connected
 
 
-def test_a_disconnect_is_reported_once() -> None:
-    pad = connected()
-    assert pad.disconnect("the page was hidden") == "the page was hidden"
-    assert pad.disconnect("the page was hidden") is None
-
-
 def test_a_backlog_after_a_stall_counts_only_from_where_it_is_fresh_and_after_a_loss() -> None:
     """One second without a network, then everything at once."""
     pad = connected()
@@ -113,8 +101,9 @@ def test_a_backlog_after_a_stall_counts_only_from_where_it_is_fresh_and_after_a_
     assert all(verdict.lost is None for verdict in verdicts[1:])
 
 
+@settings(deadline=None)
 @given(st.randoms(use_true_random=False), st.floats(0.0, 0.4), st.floats(0.0, 0.4))
-def test_whatever_the_network_does_only_recent_messages_count(chance: random.Random, up: float, down: float) -> None:
+def test_over_any_network_only_recent_messages_count(chance: random.Random, up: float, down: float) -> None:
     """Messages and beats arrive in order, each after some time; sometimes the page freezes. What counts is young, and
     between two that count without a loss there is no silence."""
     pad, page, now = watch(), T, T
@@ -141,37 +130,3 @@ def test_whatever_the_network_does_only_recent_messages_count(chance: random.Ran
             assert verdict.t_alive - last_alive <= PAD_SILENCE
             assert page - last_said <= 2 * PAD_SILENCE
         last_alive, last_said = verdict.t_alive, page
-
-
-# Who drives.
-
-
-def test_control_belongs_to_the_page_that_took_it_last() -> None:
-    lease = DriveLease()
-    assert lease.driver is None
-    assert lease.watch_of("page 1") is None
-    first = lease.grant("page 1", T)
-    assert first == (None, "page 1", T, "")
-    assert lease.grant("page 1", T + 1) is None
-    mine = lease.watch_of("page 1")
-    assert mine is not None
-    assert lease.watch_of("page 2") is None
-    assert lease.grant("page 2", T + 2) == ("page 1", "page 2", T + 2, "page 2 took control")
-    assert lease.watch_of("page 1") is None
-    assert lease.release("page 1", T + 3, "it is gone") is None, "not its own any more"
-    assert lease.release("page 2", T + 4, "it is gone") == ("page 2", None, T + 4, "it is gone")
-    assert (lease.driver, lease.watch) == (None, None)
-
-
-def test_a_new_lease_ignores_stamps_of_the_last_one() -> None:
-    lease = DriveLease()
-    lease.grant("page 1", T)
-    before = lease.watch
-    before.judge(message(T, 0.01), T + 0.01)
-    lease.release("page 1", T + 0.02, "")
-    lease.grant("page 1", T + 0.03)
-    now = lease.watch
-    assert now is not before
-    assert not now.connected
-    assert now.judge(message(T, 0.04), T + 0.04) == PadVerdict(None, None), "sent with a stamp of the last time"
-    assert now.judge(message(T + 0.03, 0.01), T + 0.04) == PadVerdict(None, T + 0.04)

@@ -1,0 +1,240 @@
+"""What the console serves and shows: its files, the view of a recording, states and pictures."""
+
+from __future__ import annotations
+
+import io
+import json
+import logging
+import re
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from errors_kit import raises_code
+from PIL import Image
+from web_kit import camera, frame
+
+from hal.driver import GripperReading, Reading
+from hal.drivers.web.console import recording_message
+from hal.drivers.web.pictures import PictureCredit, compress, smoothed
+from hal.drivers.web.process import LogLimit
+from hal.drivers.web.server import read_page_files
+from hal.drivers.web.telemetry import Telemetry
+from hal.errors import CommandError, DriverMissing
+from hal.host.records import GroupMemory, ServoRecord
+from hal.pads.keyboard import keyboard_table
+from hal.types import Limited, RobotStatus, Trip
+from hal.views import ACTIONS, PHASES, RecordingView
+
+
+def test_the_page_names_the_keys_of_the_table() -> None:
+    """The buttons' shortcuts are static text in index.html; the keys themselves come from sensors/keyboard.yaml."""
+    page = read_page_files()["index.html"][0].decode()
+    found = dict(re.findall(r'data-button="(\w+)" aria-keyshortcuts="([^"]+)"', page))
+    wanted: dict[str, list[str]] = {}
+    for key, control in keyboard_table("browser").buttons.items():
+        wanted.setdefault(control, []).append(key.removeprefix("Key").removeprefix("Digit"))
+    assert {control: sorted(keys.split()) for control, keys in found.items()} == {
+        control: sorted(keys) for control, keys in wanted.items()
+    }
+
+
+def test_only_files_of_a_page_are_read(tmp_path: Path) -> None:
+    for name in ("index.html", "pad.js", "page.css", "icon.svg", "icon.png", "__init__.py", "notes.txt", ".hidden"):
+        (tmp_path / name).write_text(name)
+    (tmp_path / "folder.js").mkdir()
+    files = read_page_files(tmp_path)
+    assert sorted(files) == ["index.html", "pad.js", "page.css"]
+    assert files["pad.js"] == (b"pad.js", "text/javascript; charset=utf-8")
+
+
+def test_without_its_page_it_does_not_start(tmp_path: Path) -> None:
+    (tmp_path / "pad.js").write_text("")
+    for folder in (tmp_path, tmp_path / "nowhere"):
+        with raises_code(DriverMissing, "page_missing"):
+            read_page_files(folder)
+
+
+def test_the_log_of_libraries_is_limited() -> None:
+    written = io.StringIO()
+    handler = logging.StreamHandler(written)
+    handler.addFilter(LogLimit(3))
+    for k in range(1000):
+        try:
+            raise OSError(f"no more files, {k}")
+        except OSError as error:
+            record = logging.LogRecord("asyncio", logging.ERROR, "", 0, "said %d", (k,), (OSError, error, None))
+        handler.handle(record)
+    lines = written.getvalue().splitlines()
+    assert lines[0] == "said 0"
+    assert "OSError: no more files, 2" in lines
+    assert lines[-1] == "further records of this kind are not shown"
+    assert not any("3" in line for line in lines)
+
+
+VIEW = RecordingView(
+    phase="recording",
+    prompt="put the cube on the plate, then save",
+    task="the cube on the plate",
+    episode=22,
+    saved=2,
+    wanted=10,
+    succeeded=1,
+    failed=1,
+    discarded=3,
+    seconds=12.345,
+    frames=370,
+    dropped=0,
+    free_bytes=41_200_000_000,
+    trouble="",
+    actions=("finish", "fail", "discard"),
+)
+
+
+def test_a_view_reaches_the_pages_whole() -> None:
+    message = recording_message(VIEW)
+    assert message.keys() == set(RecordingView.__slots__)
+    assert message | {"seconds": 12.345, "actions": VIEW.actions} == {
+        name: getattr(VIEW, name) for name in RecordingView.__slots__
+    }
+    assert (message["seconds"], message["actions"]) == (12.35, ["finish", "fail", "discard"])
+
+
+def test_numbers_may_be_numpy_scalars() -> None:
+    view = replace(VIEW, frames=np.int64(3), free_bytes=np.uint64(1 << 40), seconds=np.float32(0.5))
+    message = json.loads(json.dumps(recording_message(view)))
+    assert (message["frames"], message["free_bytes"], message["seconds"]) == (3, 1 << 40, 0.5)
+
+
+def test_texts_become_one_line_of_limited_length() -> None:
+    message = recording_message(replace(VIEW, prompt="two\nlines  of it", trouble="no space left " * 1000))
+    assert (message["prompt"], len(message["trouble"])) == ("two lines of it", 300)
+
+
+@pytest.mark.parametrize("phase", PHASES)
+def test_every_phase(phase: str) -> None:
+    assert replace(VIEW, phase=phase, actions=ACTIONS).phase == phase
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"phase": "paused"},
+        {"actions": ("record", "erase")},
+        {"actions": "record"},
+        {"seconds": float("nan")},
+        {"seconds": float("inf")},
+        {"seconds": -0.1},
+    ],
+)
+def test_invalid_views(wrong: dict[str, Any]) -> None:
+    with pytest.raises(CommandError):
+        replace(VIEW, **wrong)
+
+
+ARM = {"name": "arm", "rate_hz": 240.0, "joints": [["arm", 3]], "grippers": [], "gripper_of": {"arm": "arm.gripper"}}
+HAND = {"name": "arm.gripper", "rate_hz": 100.0, "joints": [], "grippers": ["arm.gripper"], "gripper_of": {}}
+
+
+def test_a_gripper_of_another_process_is_shown_with_its_arm_until_it_is_silent() -> None:
+    memories = [
+        memoryview(bytearray(GroupMemory.size([("arm", 3)]))),
+        memoryview(bytearray(GroupMemory.size([], ["arm.gripper"]))),
+    ]
+    arm = GroupMemory(memories[0], [("arm", 3)]).robots["arm"]
+    hand = GroupMemory(memories[1], [], ["arm.gripper"]).grippers["arm.gripper"]
+    telemetry = Telemetry([ARM, HAND], memories)
+
+    def gripper(now: float) -> object:
+        zero = (0.0, 0.0, 0.0)
+        servo = ServoRecord(RobotStatus.IDLE, Trip.NONE, Limited.NONE, 0, 0, False, 0, now, now, zero, zero)
+        tcp = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
+        arm.put_state(Reading(now, now, 1, zero, zero), servo, tcp, tcp, (0.0,) * 6)
+        return telemetry.snapshot(now)["robots"]["arm"]["gripper"]
+
+    assert gripper(1.0) is None
+    hand.put(GripperReading(1.0, 1.0, 1, 0.03, 0.0, False, True))
+    shown = {"width": 0.03, "width_target": 0.0, "moving": False, "grasped": True}
+    assert (gripper(1.1), gripper(1.4)) == (shown, shown)
+    assert gripper(1.6) is None
+
+
+@pytest.mark.parametrize("order", [1, -1])
+def test_the_order_of_the_processes_does_not_matter(order: int) -> None:
+    memories = [memoryview(bytearray(GroupMemory.size([("arm", 3)], ["arm.gripper"]))) for _ in range(2)]
+    telemetry = Telemetry([ARM, HAND][::order], memories)
+    assert set(telemetry.snapshot(0.0)["hosts"]) == {"arm", "arm.gripper"}
+
+
+def pixels(jpeg: bytes) -> np.ndarray:
+    return np.asarray(Image.open(io.BytesIO(jpeg))).astype(int)
+
+
+def test_depth_is_bright_where_it_is_near_and_black_where_nothing_was_measured() -> None:
+    spec = camera("depth", 64, 16, "depth")  # 0.2 to 2.2 m
+    depth = frame(spec, 0.0)
+    for k, value in enumerate((0.0, 0.2, 1.2, 2.2, 9.0, float("nan"), float("inf"), -1.0)):
+        depth.depth[:, 8 * k : 8 * k + 8] = value
+    row = pixels(compress(depth, spec))[8, 4::8]
+    assert np.abs(row - [0, 255, 147, 40, 40, 0, 40, 0]).max() <= 2
+
+
+def test_infrared_is_grey() -> None:
+    spec = camera("ir", 32, 16, "infrared")
+    image = pixels(compress(frame(spec, 90), spec))
+    assert image.shape == (16, 32)
+    assert np.abs(image - 90).max() <= 2
+
+
+def test_colours_are_not_swapped() -> None:
+    spec = camera("color", 32, 16)
+    red = frame(spec, 0)
+    red.color[:, :, 0] = 250
+    assert np.abs(pixels(compress(red, spec)) - [250, 0, 0]).max() <= 4
+
+
+def test_a_page_gets_the_newest_picture_once_it_has_drawn_the_last() -> None:
+    newest = {"a": 0, "b": 3}
+    credit = PictureCredit()
+    assert list(credit.due(newest.__getitem__)) == []
+    credit.watch(("a", "b"))
+    assert list(credit.due(newest.__getitem__)) == ["b"]
+    credit.spend("b", 3)
+    newest["b"] = 5
+    assert list(credit.due(newest.__getitem__)) == []
+    credit.watch(("b",))
+    assert list(credit.due(newest.__getitem__)) == [], "asking again for the same gives no credit"
+    credit.give_back("b")
+    credit.give_back("b")
+    credit.give_back("a")
+    assert list(credit.due(newest.__getitem__)) == ["b"]
+    credit.spend("b", 5)
+    credit.give_back("b")
+    assert list(credit.due(newest.__getitem__)) == [], "it has the newest one"
+
+
+def test_a_small_picture_has_no_staircases_and_no_lone_pixels_and_is_not_changed_itself() -> None:
+    """A steep edge as it is drawn with one sample a pixel, and a glint."""
+    row, column = np.mgrid[:60, :80]
+    picture = np.where((row > 0.3 * column + 10)[:, :, None], 200, 60).astype(np.uint8).repeat(3, axis=2)
+    picture[5, 60] = 255
+    before = picture.copy()
+    found = smoothed(picture)
+    assert (picture == before).all(), "what others get of this frame stays as it is"
+    steps = np.unique(found[:, 20:60, 0])
+    assert len(steps) > 6, "an edge passes through values in between"
+    assert steps.min() >= 60
+    assert steps.max() <= 200
+    assert found[5, 60].max() < 100, "a lone pixel becomes like those around it"
+    far = abs(row - 0.3 * column - 10) > 8
+    far[3:8, 58:63] = False
+    assert (found[far] == picture[far]).all(), "surfaces stay as they are"
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (2, 5), (3, 3), (48, 64)])
+def test_any_size_and_any_noise_can_be_smoothed(shape: tuple[int, int]) -> None:
+    noise = np.random.default_rng(1).integers(0, 256, (*shape, 3), np.uint8)
+    found = smoothed(noise)
+    assert (found.shape, found.dtype) == (noise.shape, noise.dtype)
