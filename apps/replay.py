@@ -209,7 +209,7 @@ class ReplayRun:
                 f"ENDED at {player.place:.1f} of {player.course.duration:.1f} s: {reason}; the arm is at rest"
             )
         if player.limited is not Limited.NONE:
-            self._announce(f"speed limits were hit ({player.limited}); a lower --speed may follow more exactly")
+            self._announce(f"limits were hit ({player.limited}); a lower --speed may follow more exactly")
         if missed > MANY_MISSED * ticks:
             self._announce(f"the servo missed {missed} of {ticks} ticks: this computer is overloaded")
         self._announce("deviation of the measured motion from the recorded one:")

@@ -113,7 +113,7 @@ def test_cut_link_trips_the_arm_while_a_key_is_held() -> None:
         wait_for(lambda: it.moved(start), "driving")
         far.silent = True  # no release and no reply arrives any more
         it.shows("STOPPED", 5.0)
-        it.shows("no sign of life")
+        it.shows("the pad of the dead-man sent nothing")
         stopped = it.at_rest()
         far.silent = False
         time.sleep(0.5)

@@ -123,7 +123,7 @@ class Bench:
         return self.speed() < 1e-3
 
     def close(self) -> None:
-        self.app.end_time = self.rig.clock.now()
+        self.args.duration = self.app.end_time = self.rig.clock.now()
         self._thread.join(PATIENCE)
         self.rig.close()
         assert not self._thread.is_alive()
