@@ -213,10 +213,15 @@ def function(name: str, place: str | None) -> Callable[..., Any] | None:
     return found
 
 
-def checked(name: str, kind: str, record: object) -> list[tuple[str, str]]:
-    """Return the mistakes that a driver finds in a device's record: (key in the device's entry of the rig, message)."""
+def checked(name: str, kind: str, record: object) -> list[tuple[str, str, str]]:
+    """Return the mistakes that a driver finds in a device's record.
+
+    Returns:
+        (key in the device's entry of the rig, message, code) of each mistake. A check that yields no code has
+        ``invalid``.
+    """
     check = function(name, driver(name).checks.get(kind))
-    return list(check(record)) if check is not None else []
+    return [(key, message, *(code or ("invalid",))) for key, message, *code in check(record)] if check else []
 
 
 def missing(name: str) -> dict[str, str]:

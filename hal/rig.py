@@ -471,9 +471,9 @@ def check_opening(plan: Plan, pad: str | None, viewer: str, console: bool) -> li
     known = {"attended": plan.attended, "emulated": plan.emulated, "lock_step": lock_step}
     pads = [] if pad == "none" else [choose_pad(spec, pad, **known) for spec in plan.pads]
     wrong = [
-        Problem("--pad", "", message)
+        Problem("--pad", "", message, code)
         for chosen in pads
-        for _, message in registry.checked(chosen.spec.driver, "gamepad", chosen.spec)
+        for _, message, code in registry.checked(chosen.spec.driver, "gamepad", chosen.spec)
     ]
     if wrong:
         raise ConfigError(wrong)

@@ -1,7 +1,7 @@
-"""What a driver is made from: plain, checked, resolved records, with no configuration file behind them.
+"""Records of devices, resolved and checked, that drivers are created from; none refers to a configuration file.
 
-The rig's configuration (:mod:`hal.config`) is resolved into these once. They travel as JSON to the process that owns
-a device (:func:`to_json`, :func:`from_json`), so they hold only numbers, texts, tuples and each other.
+The rig's configuration (:mod:`hal.config`) is resolved into a :class:`Plan` of them. They are sent as JSON to the
+process that owns a device (:func:`to_json`, :func:`from_json`), so they hold only numbers, text, tuples and each other.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ class LimitsSpec:
 
 @dataclass(frozen=True)
 class KinematicsSpec:
-    """What forward and inverse kinematics need."""
+    """Input of forward and inverse kinematics."""
 
     urdf: str
     """Absolute path."""
@@ -70,7 +70,7 @@ class KinematicsSpec:
 
 @dataclass(frozen=True)
 class WorkspaceSpec:
-    """Where the tcp may be, in the arm's base frame, m."""
+    """Box that the tcp may be in, in the arm's base frame, m."""
 
     lower: Vector3
     upper: Vector3
@@ -117,23 +117,22 @@ class RobotSpec:
     speed: float = 0.3
     """Greatest share of the joint speed limits in a control session."""
     move_speed: float = 0.1
-    """Share of the joint speed limits in ``move_to`` unless told otherwise."""
+    """Default share of the joint speed limits in ``move_to``."""
     tcp_speed: float = 0.25
     """Greatest speed of the tcp, m/s."""
     attended: bool = False
-    """True where something real moves, the arm or its gripper: a person must be there (a dead-man, or
-    ``unattended=True``)."""
+    """Whether the arm or its gripper is real, so that a user must be present (a dead-man, or ``unattended=True``)."""
     emulated: bool = False
-    """True where a program stands in for all that counts as real, and nothing really moves."""
+    """Whether all its real devices are emulators, so that nothing physical moves."""
     deadline_max: float = 1.0
     """Longest deadline that a command may have, s (0.3 where something real moves)."""
     options: dict[str, Any] = field(default_factory=dict)
-    """What only this driver needs (``real:`` or ``simulated:`` of the rig's file)."""
+    """Options of the driver (``real:`` or ``simulated:`` of the rig's file)."""
 
 
 @dataclass(frozen=True)
 class RangesSpec:
-    """Where a thing may start in an episode: anywhere between two ends, each (6,)."""
+    """Range of the start poses of an object in an episode: its two ends, each (6,)."""
 
     lower: Floats
     """x, y, z in the world, m; roll, pitch, yaw: a turn about the world's axes on top of its orientation, rad."""
@@ -142,7 +141,7 @@ class RangesSpec:
 
 @dataclass(frozen=True)
 class BodySpec:
-    """A thing in the simulated world that is not a robot."""
+    """An object of the simulated world."""
 
     name: str
     position: Vector3
@@ -157,22 +156,22 @@ class BodySpec:
     urdf: str | None = None
     scale: float = 1.0
     mass: float = 0.0
-    """kg; 0 stands still. A URDF brings its own."""
+    """kg; an object of mass 0 does not move. A URDF has its own masses."""
     fixed: bool = False
     rgba: tuple[float, float, float, float] = (0.7, 0.7, 0.7, 1.0)
     collision: bool = True
     visible: bool = True
     robot: str | None = None
-    """The arm that carries it on ``link``: it goes where that goes, and touches nothing. ``position`` and
-    ``orientation`` are then in the frame of the link."""
+    """The arm that carries it on ``link``: it moves with the link and touches nothing. ``position`` and ``orientation``
+    are then in the frame of the link."""
     link: str | None = None
     random: RangesSpec | None = None
-    """Where :func:`hal.learning.episode.draw_poses` may put it, if it is one of the rig's own things."""
+    """Range of :func:`hal.learning.episode.draw_poses`; None for a fixed start pose."""
 
 
 @dataclass(frozen=True)
 class ViewSpec:
-    """Where a camera is: fixed in the world, or attached to a link of a robot.
+    """Pose of a camera: fixed in the world, or attached to a link of a robot.
 
     The pose is that of the camera's optical frame (OpenCV's axes: x right, y down, z forward) in the world, or in
     the frame of the link.
@@ -186,15 +185,15 @@ class ViewSpec:
 
 @dataclass(frozen=True)
 class SensorSpec:
-    """One stream of a camera as its sensor takes it, by the figures of the camera's model."""
+    """One stream of a camera as its sensor captures it, from the camera's model."""
 
     width: int
     height: int
     rate_hz: float
     K: tuple[Vector3, Vector3, Vector3]
-    """The centre of the upper left pixel is (0, 0)."""
+    """Camera matrix; the centre of the upper left pixel is (0, 0)."""
     format: str | None = None
-    """Of the real camera; None for its driver's choice."""
+    """Format of the real camera; None for its driver's default."""
     position: Vector3 = (0.0, 0.0, 0.0)
     orientation: Quaternion = (0.0, 0.0, 0.0, 1.0)
     """Pose of this sensor's optical frame in that of the colour sensor, m."""
@@ -202,14 +201,14 @@ class SensorSpec:
 
 @dataclass(frozen=True)
 class DepthSensorSpec:
-    """How a camera measures depth: what a simulation of its noise needs to know."""
+    """How a camera measures depth; needed to simulate its noise."""
 
     kind: str
     """``stereo`` or ``lidar``."""
     unit: float
-    """Metres in one unit of the raw picture."""
+    """m per unit of the raw image."""
     baseline: float = 0.0
-    """From the left imager to the right one, m; 0 where there is no pair."""
+    """Distance from the left imager to the right one, m; 0 without a pair."""
 
 
 @dataclass(frozen=True)
@@ -222,11 +221,11 @@ class CameraSpec:
     capture_width: int
     capture_height: int
     width: int
-    """Of the frames handed out, after the centre crop and the scaling, pixels."""
+    """Size of the frames, after the centre crop and the scaling, pixels."""
     height: int
     rate_hz: float
     K: tuple[Vector3, Vector3, Vector3]
-    """Of the frames handed out; the centre of the upper left pixel is (0, 0)."""
+    """Camera matrix of the frames; the centre of the upper left pixel is (0, 0)."""
     distortion: Floats
     depth_min: float
     """Nearest and farthest depth that the camera measures, m; outside it reports 0."""
@@ -234,21 +233,21 @@ class CameraSpec:
     streams: tuple[str, ...]
     """Some of ``color``, ``depth``, ``infrared`` (the left one of two), ``infrared_right``, ``segmentation``."""
     view: ViewSpec | None
-    """Where the colour sensor's optical frame is."""
+    """Pose of the colour sensor's optical frame; None if it is unknown."""
     options: dict[str, Any] = field(default_factory=dict)
     align: str = "color"
-    """Whose view colour and depth are handed out in: ``color`` or ``depth``. Infrared keeps its own."""
+    """Stream whose view colour and depth are returned in: ``color`` or ``depth``. Infrared keeps its own."""
     sensors: dict[str, SensorSpec] = field(default_factory=dict)
-    """The streams before alignment, crop and scaling, by name; empty where colour, depth and all others are one view
-    of the captured size."""
+    """The streams before alignment, crop and scaling, by name; empty if all streams have one view and the captured
+    size."""
     K_infrared: tuple[Vector3, Vector3, Vector3] | None = None
-    """Of both infrared pictures as they are handed out; None where they have the view of K."""
+    """Camera matrix of both infrared images of a frame; None if they have the view of ``K``."""
     depth_sensor: DepthSensorSpec | None = None
-    """None where the model does not say."""
+    """None if the model has none."""
 
     @property
     def reference(self) -> str:
-        """The stream whose sensor's view the frames have: ``K`` and ``T_world_camera`` are of that."""
+        """The stream whose view the frames have: ``K`` and ``T_world_camera`` are those of its sensor."""
         if self.align == "depth" or {"color", "depth", "segmentation"} & set(self.streams):
             return self.align
         return next((name for name in ("infrared", "infrared_right") if name in self.streams), "color")
@@ -270,7 +269,7 @@ class PadSpec:
 
 @dataclass(frozen=True)
 class GroupSpec:
-    """What shares one clock and one process: all simulated devices of a rig, or one real arm."""
+    """Devices that share one clock and one process: all simulated devices of a rig, or one real arm."""
 
     name: str
     clock: str
@@ -279,7 +278,7 @@ class GroupSpec:
     robots: tuple[RobotSpec, ...]
     world: WorldSpec | None = None
     grippers: tuple[GripperSpec, ...] = ()
-    """Grippers whose driver runs in this group: those of its arms, or one that has a process of its own."""
+    """Grippers that run in this group: those of its arms, or one that has a process of its own."""
 
 
 @dataclass(frozen=True)
@@ -291,19 +290,50 @@ class WorldSpec:
     gravity: Vector3
     bodies: tuple[BodySpec, ...]
     robots: tuple[RobotSpec, ...]
-    """Every arm that stands in the world."""
+    """Every arm in the world."""
+
+
+@dataclass(frozen=True)
+class Plan:
+    """A resolved rig: every device with its driver. ``hal.open`` opens it."""
+
+    sim: bool
+    """The rig's flag."""
+    clock: str
+    """``real_time`` or ``lock_step``."""
+    world: WorldSpec | None
+    """The simulated world; None without a simulated device."""
+    robots: tuple[RobotSpec, ...]
+    cameras: tuple[CameraSpec, ...]
+    pads: tuple[PadSpec, ...]
+    renderer: str
+    """Renderer of simulated images: ``auto``, ``gl`` or ``tiny``."""
+    warnings: tuple[str, ...]
+    """Messages for the user that are not errors."""
+    source: str
+    """The rig's file, or ``<dict>``."""
+
+    @property
+    def attended(self) -> bool:
+        """Whether a real device moves, so that a user must be present."""
+        return any(robot.attended for robot in self.robots)
+
+    @property
+    def emulated(self) -> bool:
+        """Whether all real devices are emulators, so that nothing physical moves."""
+        return self.attended and all(robot.emulated for robot in self.robots if robot.attended)
 
 
 _T = TypeVar("_T")
 
 
 def to_json(spec: Any) -> dict[str, Any]:
-    """A spec as plain lists, dicts and numbers."""
+    """Return a spec as plain lists, dicts and numbers."""
     return asdict(spec)
 
 
 def from_json(cls: type[_T], data: dict[str, Any]) -> _T:
-    """The inverse of :func:`to_json`."""
+    """Return the spec of class ``cls`` that :func:`to_json` made ``data`` of."""
     hints = typing.get_type_hints(cls)
     return cls(**{f.name: _revive(hints[f.name], data[f.name]) for f in fields(cls) if f.name in data})  # type: ignore[arg-type]
 
@@ -323,37 +353,3 @@ def _revive(hint: Any, value: Any) -> Any:
         inner = args[0] if len(args) == 2 and args[1] is Ellipsis else None
         return tuple(_revive(inner or args[k], item) for k, item in enumerate(value))
     return value
-
-
-# [plan.py] What a rig's configuration comes to: every device with its driver, checked, nothing opened.
-
-
-@dataclass(frozen=True)
-class Plan:
-    """What ``hal.open`` opens."""
-
-    sim: bool
-    """The rig's flag."""
-    clock: str
-    """``real_time`` or ``lock_step``."""
-    world: WorldSpec | None
-    """The simulated world, where a device stands in one."""
-    robots: tuple[RobotSpec, ...]
-    cameras: tuple[CameraSpec, ...]
-    pads: tuple[PadSpec, ...]
-    renderer: str
-    """What draws simulated pictures: ``auto``, ``gl`` or ``tiny``."""
-    warnings: tuple[str, ...]
-    """What a person should know, though it is not wrong."""
-    source: str
-    """The rig's file, or ``<dict>``."""
-
-    @property
-    def attended(self) -> bool:
-        """Whether something real moves, so that a person must be there."""
-        return any(robot.attended for robot in self.robots)
-
-    @property
-    def emulated(self) -> bool:
-        """Whether a program stands in for everything that counts as real, so that nothing can be hurt."""
-        return self.attended and all(robot.emulated for robot in self.robots if robot.attended)

@@ -211,12 +211,12 @@ _OPTIONS: dict[str, type[StereoNoiseOptions] | type[LidarNoiseOptions]] = {
 }
 
 
-def check(spec: CameraSpec) -> Iterator[tuple[str, str]]:
-    """Yield (key in the camera's entry of the rig, message) for each problem in a simulated camera's options."""
+def check(spec: CameraSpec) -> Iterator[tuple[str, ...]]:
+    """Yield (key in the camera's entry of the rig, message, code) for each problem in a simulated camera's options."""
     problems = Problems()
     _read_options(spec, problems)
     for problem in problems.found:
-        yield problem.key, problem.message
+        yield problem.key, problem.message, problem.code
 
 
 def noise_of(spec: CameraSpec) -> NoiseOptions | None:
@@ -234,12 +234,13 @@ def _read_options(spec: CameraSpec, problems: Problems) -> NoiseOptions | None:
         return None
     key = "simulated.depth_noise"
     if spec.depth_sensor is None:
-        problems.add("", key, f"is not known for model {spec.model!r}, which has no depth_sensor")
+        problems.add("", key, f"is not known for model {spec.model!r}, which has no depth_sensor", "conflict")
         return None
     kind = _OPTIONS[spec.depth_sensor.kind]
     if given is not True and not isinstance(given, Mapping):
         keys = ", ".join(kind.model_fields)
-        problems.add("", key, f"must be true, false or keys and values, not {describe(given)}; keys: {keys}")
+        message = f"must be true, false or keys and values, not {describe(given)}; keys: {keys}"
+        problems.add("", key, message, "wrong_type")
         return None
     found = validate(kind, {} if given is True else given, "", problems, key)
     return None if problems.found else found

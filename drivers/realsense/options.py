@@ -145,16 +145,16 @@ class RealSenseSettings(Strict):
         return settings
 
 
-def problems(spec: CameraSpec) -> Iterator[tuple[str, str]]:
+def problems(spec: CameraSpec) -> Iterator[tuple[str, ...]]:
     """Check a camera's record.
 
     Yields:
-        Key in the camera's entry of the rig file (``real.serial``), and what is wrong there.
+        Key in the camera's entry of the rig file (``real.serial``), message, and code where there is one.
     """
     found = Problems()
     validate(RealSenseSettings, spec.options, "", found, "real")
     for problem in found.found:
-        yield problem.key, problem.message
+        yield problem.key, problem.message, problem.code
     played = spec.options.get("play")
     if isinstance(played, str) and not found.found and not Path(played).expanduser().is_file():
         yield "real.play", f"there is no recording {played}"

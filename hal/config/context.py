@@ -1,11 +1,14 @@
-"""What resolving a rig needs besides the rig's own words, and what it finds out on the way."""
+"""The state of one resolving of a rig: the caller's choices, the problems so far, and what robots have in common.
+
+Also the lookups that every kind of device needs: its model, its driver, the driver's options and checks, and URDFs.
+"""
 
 from __future__ import annotations
 
 import os
 import platform
 import sys
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -14,7 +17,7 @@ from typing import Any, TypeVar
 from .. import registry
 from ..errors import HalError
 from ..kinematics.mesh_files import package_folder
-from ..kinematics.urdf import UrdfModel
+from ..kinematics.urdf import UrdfModel, read_urdf
 from ..specs import CameraSpec, RobotSpec
 from .data_files import user_path
 from .files import Problems, nearest, read_yaml, validate, with_holes
@@ -22,63 +25,24 @@ from .models import CameraModel, GripperModel, RobotModel, UrdfSource, find_mode
 from .rigfile import CameraConfig, Device, GripperConfig, RigFile, RobotConfig
 from .schema import Unknown
 
-__all__ = [
-    "Context",
-    "SHARED",
-    "ask_camera_driver",
-    "ask_driver",
-    "is_emulated",
-    "locate_urdf",
-    "options_of",
-]
-
-# [sources.py] Where URDFs come from: a file of the user's, or one inside an installed Python package.
-
-_HAS_WHEEL = sys.version_info < (3, 12) and (sys.platform, platform.machine()) == ("linux", "x86_64")
-_NO_WHEEL = (
-    f"PyBullet has no wheel for Python {platform.python_version()} on {platform.machine()}: use Python 3.11 on x86-64 "
-    "Linux (uv venv --seed --python 3.11 .venv, then install again), or build it (C++ compiler): pip install pybullet"
-)
-INSTALL = {
-    "pybullet_data": "pip install pybullet" if _HAS_WHEEL else _NO_WHEEL,
-    "example_robot_data": "pip install example-robot-data",
-    "airo_models": "pip install airo-models",
-}
-"""The command that brings a package, where it is not simply its name."""
-
-
-def locate_urdf(source: UrdfSource, base: Path, file: Path | str, key: str, problems: Problems) -> Path | None:
-    """Absolute path of a URDF; None, and a problem noted, where it is not there. Imports nothing."""
-    if source.package is None:
-        path = user_path(source.path, base)
-    else:
-        folder = package_folder(source.package)
-        if folder is None:
-            command = INSTALL.get(source.package, f"pip install {source.package.replace('_', '-')}")
-            message = f"package {source.package!r} is not installed; {command}"
-            if all(problem.message != message for problem in problems.found):  # robot and objects may share a package
-                problems.add(file, f"{key}.package", message)
-            return None
-        path = user_path(source.path, folder)
-    if not os.path.isfile(path):
-        there = [p.name for p in path.parent.glob("*.urdf")] if path.parent.is_dir() else []
-        problems.add(file, key, f"there is no file {path}{nearest(path.name, there) if there else ''}")
-        return None
-    return path
-
+__all__ = ["SHARED", "Context", "check_camera_spec", "check_robot_spec", "is_emulated", "load_urdf", "options_of"]
 
 Model = TypeVar("Model", RobotModel, CameraModel)
-HasDrivers = RobotModel | CameraModel | GripperModel
+Config = RobotConfig | GripperConfig | CameraConfig
+DrivenModel = RobotModel | GripperModel | CameraModel
+
+SHARED = ("host",)
+"""Options of a real arm that apply to its gripper, too, unless the gripper has its own."""
 
 
 @dataclass
 class Context:
-    """What resolving needs besides the file's own words."""
+    """What resolving a rig needs besides the file's content, and what it finds out on the way."""
 
     source: str
     """The rig's file, or ``<dict>``."""
     base: Path
-    """What its paths are relative to."""
+    """Folder that the rig's paths are relative to."""
     rig: RigFile
     sim: bool | None
     driver: str | None
@@ -90,23 +54,27 @@ class Context:
     links: dict[str, dict[str, str]] = field(default_factory=dict)
     """Other names of links, by the robot's name; those that are known."""
     emulated: set[str] = field(default_factory=set)
-    """Keys in the rig of the arms that count as real, but have programs in the place of all that is."""
+    """Keys in the rig of the arms that count as real, but whose real devices are all emulators."""
     drivers: dict[str, str] = field(default_factory=dict)
     """Drivers of the arms, grippers and cameras, by their keys in the rig; those that are known."""
 
     @property
     def rig_sim(self) -> bool:
-        """The rig's flag, after the caller's word."""
+        """The rig's flag, or the caller's instead."""
         return self.rig.sim if self.sim is None else self.sim
 
     @property
     def time(self) -> str:
-        """The clock, after the caller's word: ``real_time`` or ``lock_step``."""
+        """The clock: ``real_time`` or ``lock_step``."""
         default = "lock_step" if self.driver is not None else self.rig.simulation.clock or "real_time"
         return self.clock or default
 
+    def problem(self, key: str, message: str, code: str = "invalid") -> None:
+        """Add a problem in the rig's file; the arguments are those of :meth:`.files.Problems.add`."""
+        self.problems.add(self.source, key, message, code)
+
     def simulated(self, device: Device, parent: Device | None = None) -> bool:
-        """Is this device simulated? ``parent`` is the arm of a gripper."""
+        """Return whether a device is simulated; ``parent`` is the arm of a gripper."""
         if self.sim is True or self.driver is not None:
             return True
         for owner in (device, parent):
@@ -117,7 +85,7 @@ class Context:
     def read_model(
         self, kind: type[Model], key: str, config: RobotConfig | CameraConfig, folder: str, *parts: str
     ) -> tuple[Model, Path]:
-        """A device's model and its file; a model of nothing but holes where there is none, which is then noted."""
+        """Return a device's model and its file; without one, a model of holes only, and the problem is added."""
         with suppress(Unknown):
             found = find_model(config.model, folder, parts, self.base)
             if isinstance(found, Path):
@@ -125,13 +93,21 @@ class Context:
                 if data is not None:
                     return validate(kind, data, found, self.problems), found
             else:
-                self.problem(f"{key}.model", found)
+                self.problem(f"{key}.model", found, "unknown_model")
         return with_holes(kind, None, ()), self.base
 
     def choose_driver(
-        self, kind: str, key: str, config: Device, model: HasDrivers, parent: Device | None = None
+        self, kind: str, key: str, config: Device, model: DrivenModel, parent: Device | None = None
     ) -> str:
-        """Name of the driver, which stands in ``drivers`` too; empty, and a problem noted, where there is none."""
+        """Return the name of a device's driver and keep it in :attr:`drivers`; "" and a problem if there is none.
+
+        Args:
+            kind: ``robot``, ``gripper`` or ``camera``.
+            key: The device's key in the rig.
+            config: The device's entry.
+            model: Its model.
+            parent: The arm of a gripper.
+        """
         with suppress(Unknown):
             name = self.driver or self._named_driver(kind, key, config, model, parent)
             if name is not None and self.check_driver(name, kind, key):
@@ -140,48 +116,101 @@ class Context:
         return ""
 
     def _named_driver(
-        self, kind: str, key: str, config: Device, model: HasDrivers, parent: Device | None
+        self, kind: str, key: str, config: Device, model: DrivenModel, parent: Device | None
     ) -> str | None:
         flag, state = ("sim", "simulated") if self.simulated(config, parent) else ("real", "real")
         own: str | None = getattr(config.drivers, flag) if config.drivers is not None else None
         chosen: str | None = own or getattr(model.drivers, flag)
         if chosen is None:
-            self.problem(key, f"its model has no driver for a {state} {kind}; name one in {key}.drivers.{flag}")
+            message = f"its model has no driver for a {state} {kind}; name one in {key}.drivers.{flag}"
+            self.problem(key, message, "no_driver")
         return chosen
 
     def check_driver(self, name: str, kind: str, key: str) -> bool:
-        """Is there such a driver, and does it do this kind of device? If not, that is noted."""
+        """Return whether there is such a driver with this kind of device; if not, the problem is added."""
         try:
             found = registry.driver(name)
         except HalError as error:
-            self.problem(key, str(error))
+            self.problem(key, str(error), "unknown_driver")
             return False
         if getattr(found, kind) is None:
-            self.problem(key, f"driver {name!r} has no {kind}; it has: {', '.join(found.kinds) or 'nothing'}")
+            message = f"driver {name!r} has no {kind}; it has: {', '.join(found.kinds) or 'nothing'}"
+            self.problem(key, message, "wrong_driver")
             return False
         return True
 
-    def problem(self, key: str, message: str) -> None:
-        """Note a problem in the rig's file."""
-        self.problems.add(self.source, key, message)
+
+# URDFs: a file of the user's, or one inside an installed Python package.
+
+_HAS_WHEEL = sys.version_info < (3, 12) and (sys.platform, platform.machine()) == ("linux", "x86_64")
+_NO_WHEEL = (
+    f"PyBullet has no wheel for Python {platform.python_version()} on {platform.machine()}: use Python 3.11 on x86-64 "
+    "Linux (uv venv --seed --python 3.11 .venv, then install again), or build it (C++ compiler): pip install pybullet"
+)
+INSTALL = {
+    "pybullet_data": "pip install pybullet" if _HAS_WHEEL else _NO_WHEEL,
+    "example_robot_data": "pip install example-robot-data",
+    "airo_models": "pip install airo-models",
+}
+"""The command that installs a package, where it is not ``pip install`` and the package's name."""
 
 
-# [driver_options.py] What only one driver needs: its options in the rig and the model, and what that driver says
-# of them.
+def load_urdf(
+    source: UrdfSource, base: Path, file: Path | str, key: str, problems: Problems, warnings: list[str]
+) -> UrdfModel | None:
+    """Return a checked URDF; None, and a problem, if it is missing or wrong. Imports no package.
 
-Config = RobotConfig | GripperConfig | CameraConfig
-DrivenModel = RobotModel | GripperModel | CameraModel
+    Args:
+        source: The path or the package that names it.
+        base: Folder that a path is relative to.
+        file: The file that names it, and ``key`` its key there, for the problems.
+        key: See ``file``.
+        problems: Gets the problems.
+        warnings: Gets a warning about links without mass.
+    """
+    path = _locate_urdf(source, base, file, key, problems)
+    if path is None:
+        return None
+    try:
+        urdf = read_urdf(path)
+    except (ValueError, OSError) as error:
+        problems.add(path, "", str(error), "bad_urdf")
+        return None
+    if urdf.without_mass():
+        links = ", ".join(urdf.without_mass())
+        warnings.append(f"{path}: no <inertial> in {links}; the simulator makes up a mass")
+    return urdf
 
-SHARED = ("host",)
-"""Options of a real arm that its gripper has too, unless it has its own."""
+
+def _locate_urdf(source: UrdfSource, base: Path, file: Path | str, key: str, problems: Problems) -> Path | None:
+    if source.package is None:
+        path = user_path(source.path, base)
+    else:
+        folder = package_folder(source.package)
+        if folder is None:
+            command = INSTALL.get(source.package, f"pip install {source.package.replace('_', '-')}")
+            message = f"package {source.package!r} is not installed; {command}"
+            if all(problem.message != message for problem in problems.found):  # robot and objects may share a package
+                problems.add(file, f"{key}.package", message, "missing_package")
+            return None
+        path = user_path(source.path, folder)
+    if not os.path.isfile(path):
+        there = [p.name for p in path.parent.glob("*.urdf")] if path.parent.is_dir() else []
+        hint = nearest(path.name, there) if there else ""
+        problems.add(file, key, f"there is no file {path}{hint}", "missing_file")
+        return None
+    return path
+
+
+# What only one driver needs: its options, and its own check of a device's record.
 
 
 def options_of(
     config: Config, model: DrivenModel, simulated: bool, driver: str, base: Path | None = None, file: Path | None = None
 ) -> dict[str, Any]:
-    """The rig's options for this driver, on top of the model's. The latter are for the model's own driver only.
+    """Return the rig's options for a driver, on top of the model's, which apply to the model's own driver only.
 
-    Those that are paths become absolute: ``base`` is the folder of the rig's file, ``file`` that of the model.
+    Options that are paths become absolute: ``base`` is the folder of the rig's file, ``file`` the model's file.
     """
     own = model.drivers.sim if simulated else model.drivers.real
     of_model = (model.simulated if simulated else model.real) if driver == own else {}
@@ -193,7 +222,7 @@ def options_of(
 
 
 def _absolute(options: Mapping[str, Any], paths: Collection[str], folder: Path) -> dict[str, Any]:
-    """What is no text is left as it is: the driver's own check says what is wrong with it."""
+    """Make the options in ``paths`` absolute; values that are not text are left to the driver's check."""
     return {
         name: str(user_path(value, folder)) if name in paths and isinstance(value, str) else value
         for name, value in options.items()
@@ -201,56 +230,72 @@ def _absolute(options: Mapping[str, Any], paths: Collection[str], folder: Path) 
 
 
 def is_emulated(driver: str, options: Mapping[str, Any]) -> bool:
-    """Does the driver say that a program stands in for the real device with these options?"""
+    """Return whether the driver uses an emulator in place of the real device with these options."""
     found = registry.function(driver, registry.driver(driver).emulated)
     return found is not None and bool(found(options))
 
 
-def ask_driver(context: Context, key: str, spec: RobotSpec, config: RobotConfig, model: RobotModel, file: Path) -> None:
-    """Note what the drivers of an arm and of its gripper find wrong in their records."""
-    for relative, message in registry.checked(spec.driver, "robot", spec):
-        _note(context, key, "", relative, message, config, model, file)
+def check_robot_spec(
+    context: Context, key: str, spec: RobotSpec, config: RobotConfig, model: RobotModel, file: Path
+) -> None:
+    """Add the problems that the drivers of an arm and of its gripper find in their records.
+
+    Args:
+        context: Gets the problems.
+        key: The arm's key in the rig.
+        spec: The arm's record.
+        config: The arm's entry in the rig.
+        model: The arm's model.
+        file: The model's file.
+    """
+    _add(context, key, "", registry.checked(spec.driver, "robot", spec), config, model, file)
     gripper, kind = spec.gripper, model.gripper
     if gripper is None or kind is None:
         return
-    arms = {f"real.{name}" for name in SHARED if name not in {**kind.real, **config.gripper.real}}
-    for relative, message in registry.checked(gripper.driver, "gripper", gripper):
-        if gripper.driver != spec.driver or relative not in arms:  # what is the arm's was told there
-            _note(context, key, "gripper.", relative, message, config.gripper, kind, file)
+    found = registry.checked(gripper.driver, "gripper", gripper)
+    if gripper.driver == spec.driver:  # problems in the arm's own options were added above
+        arms = {f"real.{name}" for name in SHARED if name not in {**kind.real, **config.gripper.real}}
+        found = [problem for problem in found if problem[0] not in arms]
+    _add(context, key, "gripper.", found, config.gripper, kind, file)
 
 
-def ask_camera_driver(
+def check_camera_spec(
     context: Context, key: str, spec: CameraSpec, config: CameraConfig, model: CameraModel, file: Path
 ) -> None:
-    """Note what the driver of a camera finds wrong in its record."""
-    for relative, message in registry.checked(spec.driver, "camera", spec):
-        _note(context, key, "", relative, message, config, model, file)
+    """Add the problems that the driver of a camera finds in its record; arguments as in :func:`check_robot_spec`."""
+    _add(context, key, "", registry.checked(spec.driver, "camera", spec), config, model, file)
 
 
-def _note(
+def _add(
     context: Context,
     key: str,
     part: str,
-    relative: str,
-    message: str,
+    found: Iterable[tuple[str, str, str]],
     config: Config,
     model: DrivenModel,
     file: Path,
 ) -> None:
-    """In the rig's file, unless what is wrong stands in the model's. ``relative`` is a key of the device's entry."""
+    """Add problems (key in the entry, message, code) to the rig's file, or to the model's if that has the key."""
+    for relative, message, code in found:
+        in_model = _key_in_model(relative, config, model, context)
+        if in_model is not None:
+            context.problems.add(file, f"{part}{in_model}", message, code)
+        else:
+            context.problem(f"{key}.{part}{relative}", message, code)
+
+
+def _key_in_model(relative: str, config: Config, model: DrivenModel, context: Context) -> str | None:
+    """Return the key of the model that has the value of the key ``relative`` of an entry; None if the entry has it."""
     section, _, rest = relative.partition(".")
     name = rest.partition(".")[0]
-    in_model = False
     if section in ("real", "simulated"):
-        in_model = name in getattr(model, section) and name not in getattr(config, section)
-    elif section == "limits" and isinstance(model, RobotModel) and isinstance(config, RobotConfig):
+        return relative if name in getattr(model, section) and name not in getattr(config, section) else None
+    if section == "limits" and isinstance(model, RobotModel) and isinstance(config, RobotConfig):
         given = config.limits.model_fields_set
-        in_model = name not in given if name else not given
-        if in_model and name in model.real_limits.model_fields_set and not context.simulated(config):
-            relative = f"real_{relative}"
-    elif section in ("capture", "depth", "field_of_view") and isinstance(config, CameraConfig):
-        in_model = getattr(config, section) is None
-    if in_model:
-        context.problems.add(file, f"{part}{relative}", message)
-    else:
-        context.problem(f"{key}.{part}{relative}", message)
+        if name in given if name else given:
+            return None
+        tighter = name in model.real_limits.model_fields_set and not context.simulated(config)
+        return f"real_{relative}" if tighter else relative
+    if section in ("capture", "depth", "field_of_view") and isinstance(config, CameraConfig):
+        return relative if getattr(config, section) is None else None
+    return None

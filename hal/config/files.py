@@ -1,4 +1,14 @@
-"""YAML files into plain data, gathering every problem on the way instead of stopping at the first."""
+"""Read YAML files into checked records, and collect every problem on the way instead of stopping at the first.
+
+:class:`Problems` collects, :func:`read_yaml` reads a file, :func:`validate` makes a record of its data, and
+:func:`apply_overrides` puts ``KEY=VALUE`` on top of it. Codes of problems (:attr:`hal.errors.Problem.code`)::
+
+    unknown_key     missing_key    duplicate_key   a key
+    wrong_type      wrong_count    out_of_range    a value
+    invalid_choice  conflict       invalid
+    missing_file    unreadable     bad_yaml        a file
+    too_large
+"""
 
 from __future__ import annotations
 
@@ -12,7 +22,7 @@ import yaml
 from pydantic import BaseModel, TypeAdapter, ValidationError
 
 from ..errors import ConfigError, Problem
-from .schema import describe, keys_at, kind_inside, record_in
+from .schema import ValueProblem, describe, keys_at, kind_inside, record_in
 
 __all__ = [
     "PlacedErrors",
@@ -31,7 +41,7 @@ __all__ = [
 
 
 class Problems:
-    """What was found to be wrong so far, each thing once."""
+    """The problems found so far, each once."""
 
     def __init__(self) -> None:
         self.found: list[Problem] = []
@@ -41,12 +51,19 @@ class Problems:
         self.written: dict[tuple[str, str], str] = {}
         """File and dotted key as it should be spelt -> the last part of that key as the file spells it."""
 
-    def add(self, file: Path | str, key: str, message: str) -> None:
-        """Note a problem. One in a key that an override set is the override's, not the file's."""
+    def add(self, file: Path | str, key: str, message: str, code: str = "invalid") -> None:
+        """Add a problem. One in a key that an override set is reported in ``--set`` instead of the file.
+
+        Args:
+            file: The file, or a description such as ``<dict>``.
+            key: Dotted key in it; empty for the whole file.
+            message: The problem, and what would be right.
+            code: Stable identifier of the kind of problem (see the module's docstring).
+        """
         right = key.split(".")
         key = ".".join(self.written.get((str(file), ".".join(right[: k + 1])), part) for k, part in enumerate(right))
         by_override = any(key == path or key.startswith(path + ".") for path in self.overridden)
-        problem = Problem("--set" if by_override else str(file), key, message)
+        problem = Problem("--set" if by_override else str(file), key, message, code)
         if problem not in self._known:
             self._known.add(problem)
             self.found.append(problem)
@@ -58,46 +75,52 @@ class Problems:
 
 
 def closest(word: str, choices: Iterable[str]) -> str | None:
-    """The one of ``choices`` that was probably meant by ``word``."""
+    """Return the one of ``choices`` that ``word`` probably means; None if none is near."""
     return next(iter(difflib.get_close_matches(word, sorted(choices), n=1)), None)
 
 
 def nearest(word: str, choices: Iterable[str]) -> str:
-    """``"; did you mean ...? there are: ..."`` for a name that is not among ``choices``."""
+    """Return ``"; did you mean ...? available: ..."`` for a name that is not among ``choices``."""
     known = sorted(choices)
     close = closest(word, known)
     hint = f"; did you mean {close!r}?" if close else ";"
-    return f"{hint} there are: {', '.join(known)}" if known else "; there are none"
+    return f"{hint} available: {', '.join(known)}" if known else "; none are available"
 
 
 def plain_copy(value: Any) -> Any:
-    """A copy of nested dicts and lists, down to the values in them."""
+    """Return a deep copy of nested dicts and lists; the values in them are not copied."""
     if isinstance(value, Mapping):
         return {key: plain_copy(item) for key, item in value.items()}
     return [plain_copy(item) for item in value] if isinstance(value, (list, tuple)) else value
 
 
-# The one in C is ten times as fast; PyYAML can be built without it.
+# YAML
+
+# The loader in C is ten times as fast; PyYAML can be built without it.
 _SafeLoader: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+
+MAX_BYTES, MAX_DEPTH, MAX_VALUES = 1 << 20, 50, 20_000
+"""Limits of one document: a rig needs a hundredth of each. Aliases count as often as they are used."""
 
 
 class PlacedErrors:
-    """Part of a loader: a value that cannot be built (``2001-99-99``, ``!!int x``) is a YAMLError with its place.
+    """Mix-in of a loader: a value that cannot be built (``2001-99-99``, ``!!int x``) is a YAMLError with its place.
 
     PyYAML lets the ValueError, KeyError or AttributeError of the constructor through.
     """
 
     def construct_object(self, node: yaml.Node, deep: bool = False) -> Any:
+        """Return the value of a node. Raises yaml.constructor.ConstructorError if it cannot be built."""
         try:
             return super().construct_object(node, deep)  # type: ignore[misc]  # that of the loader beside it
         except (ValueError, TypeError, LookupError, AttributeError, ArithmeticError) as error:
             tag = str(node.tag).rpartition(":")[2]
-            problem = f"{describe(node.value)} is no {tag}: {error}"
+            problem = f"{describe(node.value)} is not a valid {tag}: {error}"
             raise yaml.constructor.ConstructorError(None, None, problem, node.start_mark) from None
 
 
 class _Loader(PlacedErrors, _SafeLoader):  # type: ignore[misc]  # one of two bases
-    """Safe YAML in which 1e-3 is a number, as YAML 1.2 has it (PyYAML wants 1.0e-3)."""
+    """Safe YAML in which 1e-3 is a number, as in YAML 1.2 (PyYAML requires 1.0e-3)."""
 
 
 _Loader.add_implicit_resolver(
@@ -107,19 +130,71 @@ _Loader.add_implicit_resolver(
 )
 
 
-MAX_BYTES, MAX_DEPTH, MAX_VALUES = 1 << 20, 50, 20_000
-"""Limits of one document: a rig needs a hundredth of each. Aliases count as often as they are used."""
+def read_yaml(path: Path, problems: Problems) -> dict[str, Any] | None:
+    """Return the mapping in a YAML file; None, with all problems added, if there is none.
+
+    A key that is given twice is a problem, too.
+    """
+    try:
+        with path.open("rb") as file:
+            text = file.read(MAX_BYTES + 1).decode("utf-8")
+    except FileNotFoundError:
+        siblings = [p.name for p in path.parent.glob("*.y*ml")] if path.parent.is_dir() else []
+        hint = nearest(path.name, siblings) if siblings else ""
+        problems.add(path, "", f"there is no such file{hint}", "missing_file")
+        return None
+    except (OSError, UnicodeDecodeError) as error:
+        problems.add(path, "", f"cannot be read: {error}", "unreadable")
+        return None
+    try:
+        check_size(text)
+        loader = _Loader(text)
+        try:
+            node = loader.get_single_node()
+            if node is None:
+                problems.add(path, "", "is empty", "wrong_type")
+                return None
+            _find_duplicates(node, (), path, problems, set())
+            data = plain_copy(loader.construct_document(node))
+        finally:
+            loader.dispose()
+    except yaml.YAMLError as error:
+        problems.add(path, "", yaml_problem(error), getattr(error, "code", "bad_yaml"))
+        return None
+    if not isinstance(data, dict):
+        problems.add(path, "", f"must be keys and values, not {describe(data)}", "wrong_type")
+        return None
+    return data
+
+
+def parse_yaml(text: str) -> Any:
+    """Return the data of one YAML document. Raises yaml.YAMLError for everything that is wrong with it."""
+    check_size(text)
+    return yaml.load(text, Loader=_Loader)
+
+
+def yaml_problem(error: yaml.YAMLError) -> str:
+    """Return the problem in a YAML document, with line and column where they are known."""
+    mark = getattr(error, "problem_mark", None) or getattr(error, "context_mark", None)
+    problem = getattr(error, "problem", None) or getattr(error, "context", None) or str(error)
+    place = f" (line {mark.line + 1}, column {mark.column + 1})" if mark is not None else ""
+    return f"is not valid YAML: {' '.join(problem.split())}{place}"
+
+
+class _TooLarge(yaml.MarkedYAMLError):
+    code = "too_large"
 
 
 def check_size(text: str, loader: Any = _SafeLoader) -> None:
-    """Check depth, aliases and number of values of a YAML document before anything is built of it.
+    """Check depth, aliases and number of values of a YAML document before it is loaded.
 
     libyaml's composer is recursive and has no limit of its own: deep nesting would end the process.
 
-    Raises yaml.YAMLError for what is not YAML, too.
+    Raises:
+        yaml.YAMLError: The document exceeds a limit, or is not valid YAML.
     """
     if len(text) > MAX_BYTES:
-        raise yaml.MarkedYAMLError(problem=f"is larger than {MAX_BYTES // 1024} KiB")
+        raise _TooLarge(problem=f"is larger than {MAX_BYTES // 1024} KiB")
     mark: Any
     open_nodes: list[tuple[str | None, int, int]] = [(None, 0, 0)]  # anchor, values, levels below
     anchors: dict[str, tuple[int, int] | None] = {}  # values and levels; None while it is open
@@ -137,7 +212,7 @@ def check_size(text: str, loader: Any = _SafeLoader) -> None:
         elif isinstance(event, yaml.AliasEvent):
             known = anchors.get(str(event.anchor), (1, 0))
             if known is None:
-                raise yaml.MarkedYAMLError(problem=f"alias *{event.anchor} stands inside itself", problem_mark=mark)
+                raise _TooLarge(problem=f"alias *{event.anchor} is inside itself", problem_mark=mark)
             values, levels = known
         elif isinstance(event, yaml.ScalarEvent):
             values, levels = 1, 0
@@ -148,61 +223,9 @@ def check_size(text: str, loader: Any = _SafeLoader) -> None:
         anchor, before, below = open_nodes[-1]
         open_nodes[-1] = anchor, before + values, max(below, levels + 1)
         if len(open_nodes) + levels > MAX_DEPTH + 1:
-            raise yaml.MarkedYAMLError(problem=f"nested more than {MAX_DEPTH} deep", problem_mark=mark)
+            raise _TooLarge(problem=f"nested more than {MAX_DEPTH} deep", problem_mark=mark)
         if before + values > MAX_VALUES:
-            raise yaml.MarkedYAMLError(
-                problem=f"more than {MAX_VALUES} values, those behind aliases included", problem_mark=mark
-            )
-
-
-def yaml_problem(error: yaml.YAMLError) -> str:
-    """Return what is wrong in a YAML document, with line and column where they are known."""
-    mark = getattr(error, "problem_mark", None) or getattr(error, "context_mark", None)
-    said = getattr(error, "problem", None) or getattr(error, "context", None) or str(error)
-    place = f" (line {mark.line + 1}, column {mark.column + 1})" if mark is not None else ""
-    return f"is not valid YAML: {' '.join(said.split())}{place}"
-
-
-def parse_yaml(text: str) -> Any:
-    """Return the data of one YAML document. Raises yaml.YAMLError for everything that is wrong with it."""
-    check_size(text)
-    return yaml.load(text, Loader=_Loader)
-
-
-def read_yaml(path: Path, problems: Problems) -> dict[str, Any] | None:
-    """Return the mapping in a YAML file; None where there is none.
-
-    Everything that is wrong is noted, keys that are given twice too.
-    """
-    try:
-        with path.open("rb") as file:
-            text = file.read(MAX_BYTES + 1).decode("utf-8")
-    except FileNotFoundError:
-        siblings = [p.name for p in path.parent.glob("*.y*ml")] if path.parent.is_dir() else []
-        problems.add(path, "", "there is no such file" + (nearest(path.name, siblings) if siblings else ""))
-        return None
-    except (OSError, UnicodeDecodeError) as error:
-        problems.add(path, "", f"cannot be read: {error}")
-        return None
-    try:
-        check_size(text)
-        loader = _Loader(text)
-        try:
-            node = loader.get_single_node()
-            if node is None:
-                problems.add(path, "", "is empty")
-                return None
-            _find_duplicates(node, (), path, problems, set())
-            data = plain_copy(loader.construct_document(node))
-        finally:
-            loader.dispose()
-    except yaml.YAMLError as error:
-        problems.add(path, "", yaml_problem(error))
-        return None
-    if not isinstance(data, dict):
-        problems.add(path, "", f"must hold keys and values, not {describe(data)}")
-        return None
-    return data
+            raise _TooLarge(problem=f"more than {MAX_VALUES} values, those behind aliases included", problem_mark=mark)
 
 
 def _find_duplicates(node: yaml.Node, place: tuple[str, ...], path: Path, problems: Problems, seen: set[int]) -> None:
@@ -214,8 +237,8 @@ def _find_duplicates(node: yaml.Node, place: tuple[str, ...], path: Path, proble
         for key, value in node.value:
             name, line = str(getattr(key, "value", key)), key.start_mark.line + 1
             if name in lines and name != "<<":
-                where = ".".join((*place, name))
-                problems.add(path, where, f"is given twice, in lines {lines[name]} and {line}; the names must differ")
+                message = f"is given twice, in lines {lines[name]} and {line}; names must be unique"
+                problems.add(path, ".".join((*place, name)), message, "duplicate_key")
             lines.setdefault(name, line)
             _find_duplicates(value, (*place, name), path, problems, seen)
     elif isinstance(node, yaml.SequenceNode):
@@ -223,32 +246,39 @@ def _find_duplicates(node: yaml.Node, place: tuple[str, ...], path: Path, proble
             _find_duplicates(item, (*place, str(k)), path, problems, seen)
 
 
-# [validation.py] Plain data into checked records. What is wrong leaves holes, so that everything else can still
-# be checked.
+# Records. A wrong value leaves a hole in its record, so that everything else can still be checked.
 
 M = TypeVar("M", bound=BaseModel)
 Place = tuple[Any, ...]
-"""Keys and numbers of items, from the outside in."""
+"""Keys and indices of items, from the outermost inwards."""
 
 
 def validate(model: type[M], data: Any, file: Path | str, problems: Problems, prefix: str = "") -> M:
-    """A record from plain data, every problem noted. What has one is a hole in the record: asking for it is Unknown.
+    """Return plain data as a record, and add every problem in them.
 
-    Keys that do not exist are noted, and then taken for the nearest ones that do and are not given: so a misspelt key
-    is not missing as well, and what is wrong in its value is found too. ``prefix`` is where the data stand in the file.
+    A value with a problem is a hole in the record: reading it raises :class:`~hal.config.schema.Unknown`. An unknown
+    key is taken for the nearest known one that is not given: so a misspelt key is not reported as missing as well, and
+    its value is checked, too.
+
+    Args:
+        model: The class of the record.
+        data: Nested dicts, lists, texts and numbers.
+        file: Where the data are from, for the problems.
+        problems: Gets the problems.
+        prefix: Dotted key of the data in the file.
     """
     data = plain_copy(data)
     guessed: set[Place] = set()
-    while True:  # each round spells some keys right
+    while True:  # each round respells some keys
         try:
             return model.model_validate(data)
         except ValidationError as error:
             found = error.errors(include_url=False)
         unknown = [one for one in found if one["type"] == "extra_forbidden"]
         for one in unknown or found:
-            # That a value does not fit a key that was only guessed is no mistake of anybody's.
+            # A value that does not fit a key that was only guessed is not a problem.
             if one["loc"] not in guessed or isinstance(one["input"], dict):
-                problems.add(file, _dotted(prefix, one["loc"]), _sentence(model, one))
+                problems.add(file, _dotted(prefix, one["loc"]), *_message_and_code(model, one))
         if not unknown:
             return with_holes(model, data, [one["loc"] for one in found])
         for one in unknown:
@@ -259,7 +289,7 @@ def validate(model: type[M], data: Any, file: Path | str, problems: Problems, pr
 
 
 def with_holes(model: type[M], data: Any, wrong: Collection[Place]) -> M:
-    """A record of what is right in ``data``: all but the places ``wrong``. Nothing but holes if ``data`` is no dict."""
+    """Return a record of ``data`` without the places in ``wrong``; of holes only if ``data`` is not a dict."""
     values: dict[str, Any] = {}
     holes: set[str] = set()
     for name, field in model.model_fields.items():
@@ -281,7 +311,7 @@ def with_holes(model: type[M], data: Any, wrong: Collection[Place]) -> M:
 
 
 def _rest(kind: Any, value: Any, wrong: Collection[Place]) -> Any:
-    """What is right in a value, as a record or a dict of records; None where it is neither."""
+    """Return the valid part of a record or of a dict of records; None for any other kind of value."""
     if not isinstance(value, dict):
         return None
     record, item = record_in(kind), record_in(kind_inside(kind, ""))
@@ -297,7 +327,7 @@ def _inside(places: Collection[Place], key: Any) -> list[Place]:
 
 
 def _respell(model: type[BaseModel], data: Any, place: Place) -> Place | None:
-    """Spell an unknown key right, in ``data``, and return its new place; take it out if nobody knows what it means."""
+    """Correct the spelling of an unknown key in ``data`` and return its new place; remove the key if none is near."""
     *outer, given = place
     for part in outer:
         data = data[part]
@@ -313,27 +343,33 @@ def _dotted(prefix: str, place: Place) -> str:
     return ".".join(str(part) for part in (*filter(None, [prefix]), *place) if part != "[key]")
 
 
-def _sentence(model: type[BaseModel], found: Any) -> str:
+def _message_and_code(model: type[BaseModel], found: Any) -> tuple[str, str]:
+    """Return message and code of one of pydantic's errors."""
     kind, loc, given = found["type"], found["loc"], found["input"]
     if kind == "missing":
-        return "is missing"
+        return "is missing", "missing_key"
     if kind == "extra_forbidden":
-        return f"is no key here{nearest(str(loc[-1]), keys_at(model, loc[:-1]))}"
+        return f"unknown key{nearest(str(loc[-1]), keys_at(model, loc[:-1]))}", "unknown_key"
     if kind == "value_error":
-        return str(found["ctx"]["error"])
+        error = found["ctx"]["error"]
+        return str(error), error.code if isinstance(error, ValueProblem) else "invalid"
     if kind == "literal_error":
-        choices = _choices(found["ctx"]["expected"])
-        return f"{describe(given)} is not possible{nearest(str(given), choices)}"
+        choices = [part.strip("' ") for part in found["ctx"]["expected"].replace(" or ", ", ").split(",")]
+        return f"{describe(given)} is not possible{nearest(str(given), choices)}", "invalid_choice"
     if kind in ("model_type", "dict_type", "model_attributes_type"):
-        keys = keys_at(model, loc)
-        return f"must hold keys and values, not {describe(given)}" + (f"; keys: {', '.join(keys)}" if keys else "")
-    if kind == "too_long":
-        return f"must have at most {found['ctx']['max_length']} entries, not {len(given)}"
-    wanted = _WANTED.get(kind) or found["msg"].replace("Input should be", "must be").replace("String should", "must")
-    return f"{wanted}, not {describe(given)}"
+        keys = ", ".join(keys_at(model, loc))
+        return f"must be keys and values, not {describe(given)}" + (f"; keys: {keys}" if keys else ""), "wrong_type"
+    if kind in ("too_long", "too_short"):
+        bounds = found["ctx"]
+        many = f"at most {bounds['max_length']}" if kind == "too_long" else f"at least {bounds['min_length']}"
+        return f"must have {many} entries, not {len(given)}", "wrong_count"
+    if kind in _WRONG_TYPES:
+        return f"{_WRONG_TYPES[kind]}, not {describe(given)}", "wrong_type"
+    message = found["msg"].replace("Input should be", "must be").replace("String should", "must")
+    return f"{message}, not {describe(given)}", _CODES.get(kind, "invalid")
 
 
-_WANTED = {
+_WRONG_TYPES = {
     "bool_type": "must be true or false",
     "float_type": "must be a number",
     "int_type": "must be a whole number",
@@ -343,22 +379,30 @@ _WANTED = {
     "list_type": "must be a list",
     "tuple_type": "must be a list",
 }
+_CODES = {
+    "greater_than": "out_of_range",
+    "greater_than_equal": "out_of_range",
+    "less_than": "out_of_range",
+    "less_than_equal": "out_of_range",
+}
 
 
-def _choices(expected: str) -> Sequence[str]:
-    return [part.strip("' ") for part in expected.replace(" or ", ", ").split(",")]
-
-
-# [overrides.py] ``KEY=VALUE``: any key of a rig, set from outside its file.
+# Overrides: ``KEY=VALUE`` sets any key of a rig from outside its file.
 
 SET = "--set"
-DEVICES = {"robots": "robot", "cameras": "camera", "gamepads": "gamepad"}
+SECTIONS = {"robots": "robot", "cameras": "camera", "gamepads": "gamepad"}
 
 
 def apply_overrides(
     data: dict[str, Any], overrides: Sequence[str] | Mapping[str, Any], problems: Problems
 ) -> dict[str, Any]:
-    """A copy of the rig's data with the overrides in it; what is wrong with their form is noted."""
+    """Return a copy of the rig's data with the overrides in it.
+
+    Args:
+        data: The rig as its file has it.
+        overrides: ``"KEY=VALUE"`` with dotted keys and the values in YAML, or a mapping from dotted keys to values.
+        problems: Gets the problems in the form of the overrides.
+    """
     result = plain_copy(data)
     for key, value in _pairs(overrides, problems):
         _put(result, key, value, problems)
@@ -377,27 +421,29 @@ def _pairs(overrides: Sequence[str] | Mapping[str, Any], problems: Problems) -> 
         try:
             pairs.append((key.strip(), parse_yaml(value)))
         except yaml.YAMLError as error:
-            problems.add(SET, key.strip(), f"the value {yaml_problem(error)}")
+            problems.add(SET, key.strip(), f"the value {yaml_problem(error)}", "bad_yaml")
     return pairs
 
 
 def _put(data: dict[str, Any], key: str, value: Any, problems: Problems) -> None:
-    """Set one key, and note what the override is to blame for: the key, and what it made on the way there."""
+    """Set one key, and note which keys the override set: this one, and those that it created on the way."""
     parts = key.split(".")
     if "" in parts:
         problems.add(SET, key, "has an empty part between its dots")
         return
-    if len(parts) > 2 and parts[0] in DEVICES:
+    if len(parts) > 2 and parts[0] in SECTIONS:
         known = data.get(parts[0]) or {}
         if isinstance(known, dict) and parts[1] not in known:
-            problems.add(SET, key, f"this rig has no {DEVICES[parts[0]]} {parts[1]!r}{nearest(parts[1], known)}")
+            message = f"this rig has no {SECTIONS[parts[0]]} {parts[1]!r}{nearest(parts[1], known)}"
+            problems.add(SET, key, message, "unknown_device")
             return
     place: Any = data
     for k, part in enumerate(parts):
         last = k == len(parts) - 1
         if isinstance(place, list):
             if not part.isdecimal() or int(part) >= len(place):
-                problems.add(SET, key, f"{'.'.join(parts[:k])} is a list of {len(place)}; {part!r} is no place in it")
+                message = f"{'.'.join(parts[:k])} is a list of {len(place)}; {part!r} is not an index of it"
+                problems.add(SET, key, message, "unknown_key")
                 return
             index: Any = int(part)
         elif isinstance(place, dict):
@@ -406,7 +452,7 @@ def _put(data: dict[str, Any], key: str, value: Any, problems: Problems) -> None
                 place[part] = {}
                 problems.overridden.add(".".join(parts[: k + 1]))
         else:
-            problems.add(SET, key, f"{'.'.join(parts[:k])} holds no keys")
+            problems.add(SET, key, f"{'.'.join(parts[:k])} has no keys", "unknown_key")
             return
         if last:
             place[index] = value

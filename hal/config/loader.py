@@ -1,7 +1,7 @@
-"""A rig's configuration: read, checked as a whole, and resolved into a plan.
+"""Read a rig's configuration, check it as a whole, and resolve it into a plan.
 
-One :class:`~hal.errors.ConfigError` tells everything that is wrong in the rig's file, the models and objects that it
-names, their URDFs and the caller's overrides.
+One :class:`~hal.errors.ConfigError` lists every problem in the rig's file, the models and objects that it names, their
+URDFs and the caller's overrides.
 """
 
 from __future__ import annotations
@@ -26,12 +26,12 @@ CLOCKS = ("real_time", "lock_step")
 
 
 class RigConfig(RigFile):
-    """A rig's file, checked. :meth:`resolve` gives what is opened."""
+    """A checked rig file. :meth:`resolve` returns the plan that is opened."""
 
     _plan: Plan = PrivateAttr()
 
     def resolve(self) -> Plan:
-        """Every device with its driver."""
+        """Return every device with its driver."""
         return self._plan
 
 
@@ -43,14 +43,19 @@ def load(
     clock: str | None = None,
     overrides: Sequence[str] | Mapping[str, Any] = (),
 ) -> RigConfig:
-    """Read a rig: a file (its path has a slash or ends in .yaml), the name of a built-in one, or a dict.
+    """Read and check a rig.
 
-    ``sim=True`` makes every arm, gripper and camera simulated, whatever its own flag; ``sim=False`` sets the rig's
-    flag and leaves each device its own; None leaves all of them. ``driver`` replaces every driver (``"mock"``), and
-    then lock-step is the default clock. ``overrides`` are ``"KEY=VALUE"`` with the value in YAML, or a mapping.
-    Paths in a dict are relative to the working directory.
+    Args:
+        config: A file (its path has a slash or ends in .yaml), the name of a built-in rig, or a dict. Paths in a dict
+            are relative to the working directory.
+        sim: True makes every arm, gripper and camera simulated, whatever its own flag; False sets the rig's flag and
+            leaves each device its own; None changes nothing.
+        driver: Replaces every driver (``"mock"``); then lock-step is the default clock.
+        clock: ``"real_time"`` or ``"lock_step"``; None for the rig's.
+        overrides: ``"KEY=VALUE"`` with the value in YAML, or a mapping from dotted keys to values.
 
-    Raises ConfigError with every problem.
+    Raises:
+        ConfigError: The rig has problems; all are listed.
     """
     problems = Problems()
     _check_arguments(sim, clock, problems)
@@ -67,9 +72,9 @@ def load(
 
 def _check_arguments(sim: object, clock: str | None, problems: Problems) -> None:
     if sim is not None and not isinstance(sim, bool):
-        problems.add("<arguments>", "sim", f"must be true, false or nothing, not {sim!r}")
+        problems.add("<arguments>", "sim", f"must be true, false or None, not {sim!r}", "wrong_type")
     if clock is not None and clock not in CLOCKS:
-        problems.add("<arguments>", "clock", f"{clock!r} is not possible{nearest(clock, CLOCKS)}")
+        problems.add("<arguments>", "clock", f"{clock!r} is not possible{nearest(clock, CLOCKS)}", "invalid_choice")
 
 
 def _stand_in(driver: str | None, problems: Problems) -> str | None:
@@ -79,7 +84,8 @@ def _stand_in(driver: str | None, problems: Problems) -> str | None:
     fit = [name for name in registry.BUILT_IN if registry.driver(name).stands_in]
     if driver in fit:
         return driver
-    problems.add("<arguments>", "driver", f"only {', '.join(fit)} can stand in for every device, not {driver!r}")
+    message = f"only {', '.join(fit)} can replace every driver, not {driver!r}"
+    problems.add("<arguments>", "driver", message, "wrong_driver")
     return fit[0]
 
 
@@ -92,7 +98,8 @@ def _read(config: str | Path | Mapping[str, Any], problems: Problems) -> tuple[d
         return read_yaml(path, problems), str(path), path.parent
     rigs = list_data("config")
     if name not in rigs:
-        problems.add("<arguments>", "config", f"there is no rig {name!r}{nearest(name, rigs)}, or a path to your own")
+        message = f"there is no rig {name!r}{nearest(name, rigs)}, or a path to your own"
+        problems.add("<arguments>", "config", message, "unknown_rig")
         return None, name, Path.cwd()
     path = data_folder("config") / f"{name}.yaml"
     return read_yaml(path, problems), str(path), path.parent

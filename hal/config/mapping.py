@@ -1,6 +1,6 @@
-"""What the controls of a gamepad do in teleoperation: a YAML file that anybody may edit.
+"""Gamepad mappings: what each control does in teleoperation, as YAML files in ``config/teleop/`` or of your own.
 
-Controls have names that are the same for every pad (:data:`hal.types.AXES`, :data:`hal.types.BUTTONS`): up and right
+Names of controls are the same for every pad (:data:`hal.types.AXES`, :data:`hal.types.BUTTONS`): up and right
 are positive, buttons are named by their place (``south`` is Cross on a Sony pad, A on an Xbox pad).
 """
 
@@ -15,13 +15,13 @@ from pydantic import Field, field_validator, model_validator
 from ..types import AXES, BUTTONS, PadState
 from .data_files import data_folder, is_path, list_data, user_path
 from .files import Problems, nearest, read_yaml, validate
-from .schema import Flag, Quantity, Strict
+from .schema import Flag, Quantity, Strict, ValueProblem
 
 __all__ = ["AxisMapping", "DirectionsMapping", "GripperMapping", "TeleopMapping", "TurnsMapping", "load_mapping"]
 
 
 class AxisMapping(Strict):
-    """One direction of motion: an axis, or a pair of buttons, and the speed at its end."""
+    """One direction of motion: an axis, or a pair of buttons, and the greatest speed."""
 
     axis: str | None = None
     """Name of an axis: -1..1 for sticks and d-pad, 0..1 for triggers."""
@@ -34,7 +34,7 @@ class AxisMapping(Strict):
     @model_validator(mode="after")
     def _one_control(self) -> AxisMapping:
         if (self.axis is None) == (self.buttons is None):
-            raise ValueError("needs an axis, or two buttons [backwards, forwards]")
+            raise ValueProblem("needs an axis, or two buttons [backwards, forwards]", "missing_key")
         if self.axis is not None:
             _known(self.axis, AXES, "axis")
         for button in self.buttons or ():
@@ -43,11 +43,11 @@ class AxisMapping(Strict):
 
     @property
     def controls(self) -> tuple[str, ...]:
-        """Names of the controls that it uses."""
+        """Names of the controls that are used."""
         return (self.axis,) if self.axis is not None else self.buttons or ()
 
     def value(self, pad: PadState) -> float:
-        """The commanded speed, m/s or rad/s."""
+        """Return the commanded speed, m/s or rad/s."""
         if self.axis is not None:
             share = pad.axis(self.axis)
         else:
@@ -58,7 +58,7 @@ class AxisMapping(Strict):
 
 
 class DirectionsMapping(Strict):
-    """Motion along x, y and z, m/s; what is left out does not move."""
+    """Motion along x, y and z, m/s; a direction that is left out does not move."""
 
     x: AxisMapping | None = None
     y: AxisMapping | None = None
@@ -66,7 +66,7 @@ class DirectionsMapping(Strict):
 
 
 class TurnsMapping(Strict):
-    """Turning about x (roll), y (pitch) and z (yaw), rad/s; what is left out does not turn."""
+    """Rotation about x (roll), y (pitch) and z (yaw), rad/s; an axis that is left out does not turn."""
 
     roll: AxisMapping | None = None
     pitch: AxisMapping | None = None
@@ -74,7 +74,7 @@ class TurnsMapping(Strict):
 
 
 class GripperMapping(Strict):
-    """An axis whose place is how far the gripper is closed (0 open, 1 closed), two buttons, or one for both."""
+    """Control of the gripper: an axis (0 open, 1 closed), two buttons, or one button for both."""
 
     axis: str | None = None
     open: str | None = None
@@ -88,13 +88,13 @@ class GripperMapping(Strict):
     def _one_control(self) -> GripperMapping:
         ways = (self.axis is not None, self.open is not None or self.close is not None, self.toggle is not None)
         if sum(ways) != 1:
-            raise ValueError("needs an axis, or the buttons open and close, or one button: toggle")
+            raise ValueProblem("needs an axis, or the buttons open and close, or one button: toggle", "conflict")
         if self.axis is not None:
             _known(self.axis, AXES, "axis")
         elif self.toggle is not None:
             _known(self.toggle, BUTTONS, "button")
         elif self.open is None or self.close is None:
-            raise ValueError("needs both buttons, open and close")
+            raise ValueProblem("needs both buttons, open and close", "missing_key")
         else:
             _known(self.open, BUTTONS, "button")
             _known(self.close, BUTTONS, "button")
@@ -102,25 +102,25 @@ class GripperMapping(Strict):
 
     @property
     def controls(self) -> tuple[str, ...]:
-        """Names of the controls that it uses."""
+        """Names of the controls that are used."""
         return tuple(c for c in (self.axis, self.open, self.close, self.toggle) if c is not None)
 
 
 class TeleopMapping(Strict):
-    """The whole pad."""
+    """The mapping of a whole gamepad."""
 
     description: str = ""
     frame: Literal["base", "tcp"] = "base"
-    """Whose axes the motion is along: the arm's base's, or the tool's own."""
+    """Frame of the motion: the arm's base, or the tool."""
     deadman: str
-    """Trigger or button: the arm moves only while it is held."""
+    """Trigger or button that must be held for the arm to move."""
     linear: DirectionsMapping = DirectionsMapping()
     angular: TurnsMapping = TurnsMapping()
     gripper: GripperMapping | None = None
     go_home: str | None = None
-    """Button that drives the arm to its home position while the dead-man is held."""
+    """Button that moves the arm to its home position while the dead-man is held."""
     actions: dict[str, str] = Field(default_factory=dict)
-    """What an app does when a button is pressed, for example ``record: south``; the app says which it knows."""
+    """Action of an app -> its button, for example ``record: south``; each app documents its actions."""
 
     @field_validator("deadman", "go_home")
     @classmethod
@@ -143,28 +143,33 @@ class TeleopMapping(Strict):
         alone = [self.deadman, *self.actions.values()] + ([self.go_home] if self.go_home else [])
         for control in alone:
             if control in moving or alone.count(control) > 1:
-                raise ValueError(f"{control!r} has two meanings; the dead-man and every button need one of their own")
+                message = f"{control!r} is used twice; the dead-man and every action need a control of their own"
+                raise ValueProblem(message, "duplicate_name")
         return self
 
     def axes(self) -> tuple[AxisMapping | None, ...]:
-        """The six directions: x, y, z, roll, pitch, yaw."""
+        """Return the six directions: x, y, z, roll, pitch, yaw."""
         linear, angular = self.linear, self.angular
         return (linear.x, linear.y, linear.z, angular.roll, angular.pitch, angular.yaw)
 
     def speeds(self) -> tuple[float, float]:
-        """The greatest speed along an axis, m/s, and about one, rad/s; 0 where nothing moves."""
+        """Return the greatest speed along an axis, m/s, and about an axis, rad/s; 0 without any."""
         scales = [0.0 if axis is None else axis.scale for axis in self.axes()]
         return max(scales[:3]), max(scales[3:])
 
     def twist(self, pad: PadState) -> tuple[float, ...]:
-        """The commanded twist (6,): m/s, then rad/s."""
+        """Return the commanded twist (6,): m/s, then rad/s."""
         return tuple(0.0 if mapping is None else mapping.value(pad) for mapping in self.axes())
 
 
 def load_mapping(mapping: str | Path | Mapping[str, Any] | TeleopMapping = "default") -> TeleopMapping:
-    """A mapping from a file, the name of a built-in one, or a dict of the same shape.
+    """Return a checked mapping.
 
-    Raises ConfigError with every problem.
+    Args:
+        mapping: The path of a file, the name of a built-in mapping, a dict with the same keys, or a mapping.
+
+    Raises:
+        ConfigError: It has problems; all are listed.
     """
     if isinstance(mapping, TeleopMapping):
         return mapping
@@ -182,7 +187,7 @@ def load_mapping(mapping: str | Path | Mapping[str, Any] | TeleopMapping = "defa
             data = read_yaml(Path(source), problems)
         else:
             text = f"there is no mapping {mapping!r}{nearest(str(mapping), there)}, or a path to your own"
-            problems.add("<arguments>", "mapping", text)
+            problems.add("<arguments>", "mapping", text, "unknown_mapping")
     result = validate(TeleopMapping, data, source, problems) if data is not None else None
     problems.raise_any()
     assert result is not None
@@ -191,4 +196,4 @@ def load_mapping(mapping: str | Path | Mapping[str, Any] | TeleopMapping = "defa
 
 def _known(name: str, choices: tuple[str, ...], kind: str) -> None:
     if name not in choices:
-        raise ValueError(f"there is no {kind} {name!r}{nearest(name, choices)}")
+        raise ValueProblem(f"there is no {kind} {name!r}{nearest(name, choices)}", "unknown_control")

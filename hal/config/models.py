@@ -1,5 +1,6 @@
-"""Robot models: what is the same for every one of its kind. YAML files in ``robots/``; cameras' are in
-:mod:`.camera_models`. A model of your own is a file of the same shape; a rig names it by its path.
+"""Models of arms and cameras (``robots/``, ``sensors/cameras/``): what is the same for every device of one kind.
+
+A model of your own is a file with the same keys, which a rig names by its path.
 """
 
 from __future__ import annotations
@@ -33,6 +34,7 @@ from .schema import (
     Strict,
     Torques,
     Unknown,
+    ValueProblem,
     Velocities,
     ViewAngle,
 )
@@ -60,7 +62,7 @@ __all__ = [
 
 
 class Drivers(Strict):
-    """Which driver does the work, in simulation and for real; None where there is none."""
+    """Names of the drivers, in simulation and for a real device; None if there is none."""
 
     sim: str | None = None
     real: str | None = None
@@ -79,9 +81,9 @@ class UrdfSource(Strict):
 
 
 class LimitsModel(Strict):
-    """Per joint, or one number for all: rad, rad/s, rad/s2, rad/s3, Nm (m and N for joints that slide).
+    """Limits per joint, or one number for all joints: rad, rad/s, rad/s2, rad/s3, Nm (m and N for joints that slide).
 
-    Position, speed and torque come from the URDF where they are left out; acceleration and jerk must be given.
+    Position, speed and torque default to those of the URDF; acceleration and jerk must be given.
     """
 
     lower: JointLimits | None = None
@@ -101,51 +103,55 @@ class TcpModel(Strict):
 
 
 class GripperModel(Strict):
-    """A parallel gripper: fingers that move together, each half the width."""
+    """A parallel gripper: its fingers move together, each by half the width."""
 
     joints: tuple[str, ...] = ()
     drivers: Drivers = Drivers()
     width_max: Size
-    """m"""
+    """Greatest width, m."""
     speed: Speed
-    """Of the width, m/s."""
+    """Greatest speed of the width, m/s."""
     force: Force
-    """N"""
+    """Grip force, N."""
     real: dict[str, Any] = Field(default_factory=dict)
     simulated: dict[str, Any] = Field(default_factory=dict)
 
 
 class RobotModel(Strict):
-    """An arm, and its gripper if it has one."""
+    """An arm, with its gripper if it has one."""
 
     description: str = ""
     urdf: UrdfSource
     drivers: Drivers = Drivers()
     rate_hz: RateHz = 1000.0
-    """Of the real arm's control cycle. A simulated one runs at the rig's ``physics_hz``."""
+    """Rate of the real arm's control cycle. A simulated arm runs at the rig's ``physics_hz``."""
     joints: tuple[Name, ...] = Field(min_length=1)
-    """Of the arm, from base to tip; the fingers are the gripper's."""
+    """Joints of the arm, from base to tip; those of the fingers belong to the gripper."""
     base_link: str | None = None
-    """The URDF's root when left out."""
+    """Link whose frame is the base frame; default: the URDF's root."""
     tcp: TcpModel
     home: JointPositions
-    """rad"""
+    """Home position, rad."""
     links: dict[Name, str] = Field(default_factory=dict)
-    """Other names for links, which a rig can use in ``attached`` whatever the model: ``{hand: panda_hand}``."""
+    """Other names of links, so that a rig can use one name for every model: ``{hand: panda_hand}``."""
     limits: LimitsModel = LimitsModel()
-    """What the arm can do."""
+    """Limits of the arm."""
     real_limits: LimitsModel = LimitsModel()
-    """Tighter ones, kept where the arm is real; those that are left out are as above."""
+    """Tighter limits of a real arm; those that are left out are as in ``limits``."""
     gripper: GripperModel | None = None
     real: dict[str, Any] = Field(default_factory=dict)
-    """What only the real driver needs; a rig adds to it."""
+    """Options of the real driver; a rig can add to them."""
     simulated: dict[str, Any] = Field(default_factory=dict)
 
 
 def find_model(name: str, folder: str, parts: tuple[str, ...], base: Path) -> Path | str:
-    """Path of a model: the user's when ``name`` is a path (relative to ``base``), else one that comes with the hal.
+    """Return the path of a model, or a message if there is none.
 
-    Returns a sentence where there is none.
+    Args:
+        name: A path, or the name of a built-in model.
+        folder: Data folder of the built-in models, and ``parts`` the folders below it.
+        parts: See ``folder``.
+        base: Folder that a path is relative to.
     """
     if is_path(name):
         return user_path(name, base)
@@ -156,7 +162,7 @@ def find_model(name: str, folder: str, parts: tuple[str, ...], base: Path) -> Pa
 
 
 def load_pad_models(problems: Problems) -> dict[str, dict[str, Any]]:
-    """All pad models that come with the hal, by name, as plain data. The pads' driver knows what is in them."""
+    """Return all built-in models of gamepads as plain data, by name; :mod:`hal.pads.model` has their schema."""
     models = {}
     for name in list_data("sensors", "gamepads"):
         data = read_yaml(data_folder("sensors") / "gamepads" / f"{name}.yaml", problems)
@@ -165,21 +171,17 @@ def load_pad_models(problems: Problems) -> dict[str, dict[str, Any]]:
     return models
 
 
-# [camera_models.py] Camera models: what is the same for every camera of its kind. YAML files in
-# ``sensors/cameras/``.
-#
-# A model of your own is a file of the same shape; a rig names it by its path.
-#
+# Cameras
 
 
 class Mode(Strict):
-    """A size of picture and the rates that it comes at."""
+    """An image size and its frame rates."""
 
     width: Pixels
     height: Pixels
     rates_hz: tuple[CameraRate, ...] = Field(min_length=1)
     depth_min: Distance | None = None
-    """Nearest depth in this mode, m; the model's when left out."""
+    """Nearest depth in this mode, m; default: the model's."""
 
     def __str__(self) -> str:
         return f"{self.width}x{self.height} at {', '.join(f'{rate:g}' for rate in self.rates_hz)} Hz"
@@ -188,8 +190,8 @@ class Mode(Strict):
 class FieldOfView(Strict):
     """Angles of view of the whole sensor, from edge to edge of its outermost pixels, deg.
 
-    ``width`` and ``height`` are those of the picture that shows the whole sensor; a mode of another shape is its
-    centre. Left out, every mode shows the same angles. One angle alone means square pixels.
+    ``width`` and ``height`` are the size of an image of the whole sensor; a mode of another shape is its centre.
+    Without them every mode has the same angles. With one angle only, pixels are square.
     """
 
     horizontal_deg: ViewAngle | None = None
@@ -200,14 +202,14 @@ class FieldOfView(Strict):
     @model_validator(mode="after")
     def _complete(self) -> FieldOfView:
         if self.horizontal_deg is None and self.vertical_deg is None:
-            raise ValueError("needs horizontal_deg, vertical_deg or both")
+            raise ValueProblem("needs horizontal_deg, vertical_deg or both", "missing_key")
         if (self.width is None) != (self.height is None):
-            raise ValueError("needs width and height of the whole sensor's picture, or neither")
+            raise ValueProblem("needs width and height of an image of the whole sensor, or neither", "missing_key")
         return self
 
 
 class Depth(Strict):
-    """What can be measured, m."""
+    """Range of depth, m."""
 
     min: Distance
     max: Annotated[float, Quantity("m", 0.0, 1000.0, above=True)]
@@ -215,12 +217,12 @@ class Depth(Strict):
     @model_validator(mode="after")
     def _ordered(self) -> Depth:
         if self.min >= self.max:
-            raise ValueError(f"min must be less than max, not {self.min:g} and {self.max:g}")
+            raise ValueProblem(f"min must be less than max, not {self.min:g} and {self.max:g}", "empty_range")
         return self
 
 
 class Capture(Strict):
-    """What a camera takes."""
+    """Size and rate of the captured images."""
 
     width: Pixels
     height: Pixels
@@ -231,7 +233,7 @@ class Capture(Strict):
 
 
 def by_name(value: Any) -> Any:
-    """``[color, depth]`` as ``{color: {}, depth: {}}``, and a name with nothing after it likewise."""
+    """Return ``[color, depth]`` as ``{color: {}, depth: {}}``; a name without a value becomes ``{}``, too."""
     if isinstance(value, (list, tuple)):
         return {str(name): {} for name in value}
     if isinstance(value, dict):
@@ -240,14 +242,14 @@ def by_name(value: Any) -> Any:
 
 
 class StreamModel(Strict):
-    """One stream of a camera, where it differs from what the model says for all of them.
+    """One stream of a camera, where it differs from the model's common values.
 
-    What is left out is for ``infrared_right`` as for ``infrared``, and for that as for ``depth``.
+    ``infrared_right`` defaults to ``infrared``, which defaults to ``depth``.
     """
 
     modes: tuple[Mode, ...] | None = None
     formats: tuple[str, ...] | None = None
-    """Names of librealsense (``z16``); None where anything goes."""
+    """Names of librealsense (``z16``); None allows any."""
     field_of_view: FieldOfView | None = None
     position: Offset | None = None
     orientation: QuaternionConfig | None = None
@@ -255,12 +257,12 @@ class StreamModel(Strict):
 
 
 class DepthSensor(Strict):
-    """How depth is measured: what a simulation of its noise needs to know."""
+    """How depth is measured; needed to simulate its noise."""
 
     kind: Literal["stereo", "lidar"]
-    """``stereo``: from ``infrared`` and ``infrared_right``, seen from the former."""
+    """``stereo``: from ``infrared`` and ``infrared_right``, in the view of ``infrared``."""
     unit: Size
-    """Metres in one unit of the raw picture."""
+    """m per unit of the raw image."""
 
 
 SensorStream = Literal["color", "depth", "infrared", "infrared_right"]
@@ -277,11 +279,11 @@ class CameraModel(Strict):
     description: str = ""
     drivers: Drivers = Drivers()
     modes: tuple[Mode, ...] | None = None
-    """What every stream can take that has no modes of its own; None where anything goes."""
+    """Modes of every stream that has none of its own; None allows any size and rate."""
     capture: Capture
-    """What it takes unless a rig says otherwise."""
+    """Default size and rate."""
     field_of_view: FieldOfView | None = None
-    """Of every stream that has none of its own."""
+    """Angles of every stream that has none of its own."""
     distortion: Annotated[tuple[float, ...], Several(Quantity("", -1e3, 1e3), 5, "k1, k2, p1, p2, k3")] = (
         0.0,
         0.0,
@@ -292,10 +294,10 @@ class CameraModel(Strict):
     """k1, k2, p1, p2, k3 (OpenCV's order)."""
     depth: Depth
     streams: Annotated[dict[SensorStream, StreamModel], BeforeValidator(by_name)] = Field(default_factory=_three)
-    """What it can give: ``[color, depth]``, or ``{color: {modes: ...}, ...}`` where streams differ."""
+    """The camera's streams: ``[color, depth]``, or ``{color: {modes: ...}, ...}`` where they differ."""
     depth_sensor: DepthSensor | None = None
     adjustable: Flag = False
-    """May a rig choose the field of view and the range of depth? (A real camera's are what they are.)"""
+    """Whether a rig may choose the field of view and the range of depth."""
     real: dict[str, Any] = Field(default_factory=dict)
     simulated: dict[str, Any] = Field(default_factory=dict)
 
@@ -303,23 +305,24 @@ class CameraModel(Strict):
     def _complete(self) -> CameraModel:
         for name in self.streams:
             if self._of(name, "field_of_view") is None:
-                raise ValueError(f"needs field_of_view, or one in streams.{name}")
+                raise ValueProblem(f"needs field_of_view, or one in streams.{name}", "missing_key")
         if self.depth_sensor is not None and self.depth_sensor.kind == "stereo" and self.baseline <= 0.0:
-            raise ValueError("stereo: streams.infrared_right needs a position, to the right of that of streams.depth")
+            message = "stereo: streams.infrared_right needs a position, to the right of that of streams.depth"
+            raise ValueProblem(message, "missing_key")
         return self
 
     @property
     def baseline(self) -> float:
-        """From the left imager to the right one, m; 0 where there is no pair."""
+        """Distance from the left imager to the right one, m; 0 without a pair."""
         if not {"depth", "infrared_right"} <= set(self.streams):
             return 0.0
         return self.stream("infrared_right").position[0] - self.stream("depth").position[0]
 
     def stream(self, name: str) -> CompleteStream:
-        """All figures of one stream; those of the colour picture for what is none of the camera's own streams."""
+        """Return all values of one stream; those of colour for a stream that the camera lacks. Raises Unknown."""
         view = self._of(name, "field_of_view")
         if view is None:
-            raise Unknown("field_of_view")  # only in a model with mistakes, which were noted
+            raise Unknown("field_of_view")  # only in a model with problems
         return CompleteStream(
             self._of(name, "modes"),
             self._of(name, "formats"),
@@ -331,7 +334,7 @@ class CameraModel(Strict):
     def _of(self, name: str, key: str) -> Any:
         place: str | None = name if name in self.streams else "color"
         while place is not None:
-            own = getattr(self.streams.get(place), key, None)  # type: ignore[call-overload]  # any name may be asked for
+            own = getattr(self.streams.get(place), key, None)  # type: ignore[call-overload]  # any name is allowed
             if own is not None:
                 return own
             place = _MADE_FROM.get(place)
@@ -339,7 +342,7 @@ class CameraModel(Strict):
 
 
 class CompleteStream(NamedTuple):
-    """What a model says of one stream, all told."""
+    """The values of one stream, with all defaults resolved."""
 
     modes: tuple[Mode, ...] | None
     formats: tuple[str, ...] | None
@@ -348,7 +351,7 @@ class CompleteStream(NamedTuple):
     orientation: tuple[float, float, float, float]
 
     def mode(self, capture: Capture) -> Mode | None:
-        """The mode that takes this; None where there is none, or anything goes."""
+        """Return the mode with this size and rate; None if there is none, or if any is allowed."""
         for mode in self.modes or ():
             if (mode.width, mode.height) == (capture.width, capture.height) and capture.rate_hz in mode.rates_hz:
                 return mode

@@ -1,4 +1,4 @@
-"""Things in the simulated world: primitives and URDFs, in files of their own or in the rig's."""
+"""Objects of the simulated world: primitives and URDFs, in files of their own or in the rig's file."""
 
 from __future__ import annotations
 
@@ -7,14 +7,13 @@ import os
 from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
-from types import MappingProxyType
 from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, model_validator
 
-from ..kinematics.urdf import UrdfModel, read_urdf
+from ..kinematics.urdf import UrdfModel
 from ..specs import BodySpec, RangesSpec, Vector3
-from .context import locate_urdf
+from .context import Context, load_urdf
 from .data_files import data_folder, is_path, list_data, user_path
 from .files import Problems, nearest, read_yaml, validate
 from .models import UrdfSource
@@ -33,17 +32,11 @@ from .schema import (
     Sizes,
     Strict,
     Unknown,
+    ValueProblem,
     describe,
 )
 
-__all__ = [
-    "ObjectConfig",
-    "RandomPose",
-    "load_objects",
-]
-
-# [random_poses.py] Where a thing starts in each episode: ranges, of which a pose is drawn with the episode's
-# seed.
+__all__ = ["CarriedBy", "ObjectConfig", "RandomPose", "load_objects"]
 
 _ENDS = "the least and the greatest"
 
@@ -51,7 +44,7 @@ _ENDS = "the least and the greatest"
 def _ordered(ends: tuple[float, float]) -> tuple[float, float]:
     least, greatest = ends
     if least > greatest:
-        raise ValueError(f"must be {_ENDS}; {least:g} is above {greatest:g}")
+        raise ValueProblem(f"must be {_ENDS}; {least:g} is above {greatest:g}", "empty_range")
     return ends
 
 
@@ -61,25 +54,25 @@ Turn = Annotated[_Two, Several(Quantity("deg", -360.0, 360.0), 2, _ENDS), AfterV
 
 
 class RandomPose(Strict):
-    """Ranges ``[least, greatest]``; what is left out stays as it is configured."""
+    """Ranges ``[least, greatest]`` that the start pose of each episode is drawn from; others stay as configured."""
 
     x: Range | None = None
     """m, in the world; likewise y and z."""
     y: Range | None = None
     z: Range | None = None
     roll_deg: Turn | None = None
-    """Turned by so much about the world's x axis, then about y by pitch and about z by yaw, after its orientation."""
+    """A turn about the world's x axis, then about y by pitch and about z by yaw, on top of the orientation."""
     pitch_deg: Turn | None = None
     yaw_deg: Turn | None = None
 
     @model_validator(mode="after")
     def _something(self) -> RandomPose:
         if all(getattr(self, key) is None for key in type(self).model_fields):
-            raise ValueError(f"holds no range; keys: {', '.join(type(self).model_fields)}")
+            raise ValueProblem(f"has no range; keys: {', '.join(type(self).model_fields)}", "missing_key")
         return self
 
     def around(self, position: Vector3) -> RangesSpec:
-        """The ranges of a thing that is configured at ``position``."""
+        """Return the ranges of an object whose configured position is ``position`` (3,), m."""
         places = [given or (value, value) for given, value in zip((self.x, self.y, self.z), position, strict=True)]
         turns = [given or (0.0, 0.0) for given in (self.roll_deg, self.pitch_deg, self.yaw_deg)]
         ends = [*places, *((math.radians(least), math.radians(greatest)) for least, greatest in turns)]
@@ -94,28 +87,27 @@ SIZES = {
     "plane": (),
     "urdf": ("urdf",),
 }
-"""What each shape needs, and what no other shape may have."""
+"""The keys that each shape needs, and that no other shape may have."""
 PLACES = frozenset({"position", "pose", "attached"})
-"""Keys that say where a thing is. The random ranges of its file are for the place that the file gives it."""
-_NONE: Mapping[str, Any] = MappingProxyType({})
+"""Keys that place an object. The random ranges of its file are for the place that the file gives it."""
 
 
 class CarriedBy(Strict):
-    """What an arm carries: it goes where the link goes, weighs nothing and touches nothing."""
+    """An object on a link of an arm: it moves with the link, has no weight and touches nothing."""
 
     robot: str
     link: str
-    """Of the URDF, or a name that the robot's model gives one."""
+    """A link of the URDF, or the name that the robot's model gives one."""
     pose: PoseConfig = PoseConfig()
-    """In the link's frame."""
+    """Pose in the link's frame."""
 
 
 class ObjectConfig(Strict):
-    """One thing. Lengths in m."""
+    """One object. Lengths in m."""
 
     name: Name
     shape: Literal["box", "sphere", "cylinder", "capsule", "plane", "urdf"]
-    """May be left out where ``urdf`` is given."""
+    """May be left out if ``urdf`` is given."""
     half_extents: Sizes | None = None
     """Of a box."""
     radius: Size | None = None
@@ -124,18 +116,18 @@ class ObjectConfig(Strict):
     """Of a cylinder, or of a capsule without its caps."""
     urdf: UrdfSource | None = None
     scale: Factor | None = None
-    """Of a URDF."""
+    """Scale of a URDF."""
     mass: Mass | None = None
-    """kg; 0, or left out, stands still. A URDF brings its own."""
+    """kg; an object of mass 0, the default, does not move. A URDF has its own masses."""
     fixed: Flag = False
     position: Position = (0.0, 0.0, 0.0)
     orientation: QuaternionConfig = (0.0, 0.0, 0.0, 1.0)
     pose: PoseConfig | None = None
-    """Both in one."""
+    """Position and orientation in one."""
     attached: CarriedBy | None = None
-    """In the place of all three: in the hand of an arm."""
+    """Instead of a pose in the world: on a link of an arm."""
     random: RandomPose | None = None
-    """Where it starts in each episode; at its pose without."""
+    """Start poses of the episodes; without it the object starts at its pose."""
     rgba: Rgba = (0.7, 0.7, 0.7, 1.0)
     collision: Flag = True
     visible: Flag = True
@@ -151,65 +143,57 @@ class ObjectConfig(Strict):
         given = [key for key in ("half_extents", "radius", "length", "urdf") if getattr(self, key) is not None]
         missing, extra = [k for k in needed if k not in given], [k for k in given if k not in needed]
         if missing or extra:
-            wants = ", ".join(needed) or "no size"
-            wrong = [*(f"{key} is missing" for key in missing), *(f"{key} has no meaning" for key in extra)]
-            raise ValueError(f"a {self.shape} has {wants}: {', '.join(wrong)}")
+            keys = ", ".join(needed) or "no size"
+            wrong = [*(f"{key} is missing" for key in missing), *(f"{key} does not apply" for key in extra)]
+            code = "missing_key" if missing else "conflict"
+            raise ValueProblem(f"a {self.shape} has {keys}: {', '.join(wrong)}", code)
         if self.mass is not None and self.shape == "urdf":
-            raise ValueError("a urdf brings its own mass")
+            raise ValueProblem("mass does not apply to a urdf, which has its own", "conflict")
         if self.scale is not None and self.shape != "urdf":
-            raise ValueError(f"scale is for a urdf; a {self.shape} has its size in m")
-        if self.attached is not None and self.shape == "plane":
-            raise ValueError("a plane has no end; nobody can carry it")
-        if self.random is not None and self.shape == "plane":
-            raise ValueError("a plane has no end; it has no random place")
+            raise ValueProblem(f"scale applies to a urdf only; a {self.shape} has its size in m", "conflict")
+        if self.shape == "plane" and (self.attached is not None or self.random is not None):
+            raise ValueProblem("a plane is infinite; it cannot have attached or random", "conflict")
         if self.random is not None and self.attached is not None:
-            raise ValueError("attached and random exclude each other: it is where the arm is")
+            raise ValueProblem("attached and random exclude each other: the object is where the arm is", "conflict")
         return self
 
 
-def load_objects(
-    entries: list[Any],
-    source: str,
-    base: Path,
-    taken: dict[str, str],
-    problems: Problems,
-    warnings: list[str],
-    urdfs: Mapping[str, UrdfModel] = _NONE,
-    links: Mapping[str, Mapping[str, str]] = _NONE,
-) -> tuple[BodySpec, ...]:
-    """The bodies of a rig.
+def load_objects(context: Context) -> tuple[BodySpec, ...]:
+    """Return the objects of a rig. Problems are added to ``context``; then the objects may be incomplete.
 
-    ``taken`` are the names of its robots, with the key where each stands; ``urdfs`` and ``links`` their URDFs, and
-    other names of their links, as far as they are known.
+    The robots of the rig have been resolved before, so that their URDFs and other names of links are known.
     """
     bodies = []
+    problems, source = context.problems, context.source
+    taken = {name: f"robots.{name} in {source}" for name in getattr(context.rig, "robots", ())}
     robots = tuple(taken)
-    for k, entry in enumerate(entries):
+    for k, entry in enumerate(context.rig.objects):
         key = f"objects.{k}"
-        loaded = _load(entry, source, base, key, problems)
+        loaded = _load(entry, source, context.base, key, problems)
         if loaded is None:
             continue
         config, file, prefix = loaded
+        prefix = f"{prefix}." if prefix else ""
         with suppress(Unknown):
             if config.name in taken:
-                text = f"{config.name!r} is also the name of {taken[config.name]}; names must differ"
-                problems.add(file, f"{prefix}.name" if prefix else "name", text)
+                text = f"{config.name!r} is also the name of {taken[config.name]}; names must be unique"
+                problems.add(file, f"{prefix}name", text, "duplicate_name")
             taken.setdefault(config.name, f"{key} in {source}")
-        folder = base if file == source else Path(file).parent
-        urdf: Path | None = None
+        folder = context.base if file == source else Path(file).parent
+        urdf: UrdfModel | None = None
         with suppress(Unknown):
-            urdf = _urdf(config, folder, file, f"{prefix}.urdf" if prefix else "urdf", problems, warnings)
+            if config.urdf is not None:
+                urdf = load_urdf(config.urdf, folder, file, f"{prefix}urdf", problems, context.warnings)
         with suppress(Unknown):
             if config.attached is not None:
-                where = f"{prefix}.attached" if prefix else "attached"
-                _check_attached(config.attached, robots, urdfs, links, file, where, problems)
+                _check_attached(context, config.attached, robots, file, f"{prefix}attached")
         if not problems.found:
-            bodies.append(_body(config, urdf, links))
+            bodies.append(_body(config, urdf, context.links))
     return tuple(bodies)
 
 
 def _load(entry: Any, source: str, base: Path, key: str, problems: Problems) -> tuple[ObjectConfig, str, str] | None:
-    """The object, the file that it is in, and the key that it has there."""
+    """Return an object, the file that it is in, and its key in that file."""
     changes: dict[str, Any] = {}
     if isinstance(entry, dict) and "file" in entry:
         changes = {name: value for name, value in entry.items() if name != "file"}
@@ -217,18 +201,21 @@ def _load(entry: Any, source: str, base: Path, key: str, problems: Problems) -> 
     if isinstance(entry, dict):
         return validate(ObjectConfig, entry, source, problems, key), source, key
     if not isinstance(entry, str):
-        problems.add(source, key, f"must be a file, a name or keys and values, not {describe(entry)}")
+        message = f"must be a file, a name or keys and values, not {describe(entry)}"
+        problems.add(source, key, message, "wrong_type")
         return None
     if is_path(entry):
         path = user_path(entry, base)
         if not os.path.isfile(path):
             there = [f"{path.parent.name}/{p.name}" for p in path.parent.glob("*.yaml")] if path.parent.is_dir() else []
-            problems.add(source, key, f"there is no file {path}{nearest(f'{path.parent.name}/{path.name}', there)}")
+            hint = nearest(f"{path.parent.name}/{path.name}", there)
+            problems.add(source, key, f"there is no file {path}{hint}", "missing_file")
             return None
     else:
         there = list(list_data("config", "objects"))
         if entry not in there:
-            problems.add(source, key, f"there is no object {entry!r}{nearest(entry, there)}, or a path to your own")
+            message = f"there is no object {entry!r}{nearest(entry, there)}, or a path to your own"
+            problems.add(source, key, message, "unknown_object")
             return None
         path = data_folder("config") / "objects" / f"{entry}.yaml"
     data = read_yaml(path, problems)
@@ -241,53 +228,27 @@ def _load(entry: Any, source: str, base: Path, key: str, problems: Problems) -> 
     if "pose" in changes:
         gone |= {"position", "orientation"}
     data = {name: value for name, value in data.items() if name not in gone}
-    # The file stood on its own first, so that a mistake is reported where it is, and here not again.
+    # The file was checked alone first, so that a mistake in it is reported there, and not here again.
     in_order = all(problem.file != str(path) for problem in problems.found)
-    noted = Problems()
-    changed = validate(ObjectConfig, {**data, **changes}, source, noted, key)
-    for problem in noted.found:
+    of_changed = Problems()
+    changed = validate(ObjectConfig, {**data, **changes}, source, of_changed, key)
+    for problem in of_changed.found:
         if in_order or problem.key.removeprefix(f"{key}.").partition(".")[0] in changes:
-            problems.add(source, problem.key, problem.message)
+            problems.add(source, problem.key, problem.message, problem.code)
     return changed, str(path), ""
 
 
-def _urdf(
-    config: ObjectConfig, base: Path, file: str, key: str, problems: Problems, warnings: list[str]
-) -> Path | None:
-    """Path of the object's URDF, if it has one and that can be read."""
-    path = locate_urdf(config.urdf, base, file, key, problems) if config.urdf is not None else None
-    if path is None:
-        return None
-    try:
-        model = read_urdf(path)
-    except (ValueError, OSError) as error:
-        problems.add(path, "", str(error))
-        return None
-    if model.without_mass():
-        links = ", ".join(model.without_mass())
-        warnings.append(f"{path}: no <inertial> in {links}; the simulator makes up a mass")
-    return path
-
-
-def _check_attached(
-    carried: CarriedBy,
-    robots: tuple[str, ...],
-    urdfs: Mapping[str, UrdfModel],
-    links: Mapping[str, Mapping[str, str]],
-    file: str,
-    key: str,
-    problems: Problems,
-) -> None:
+def _check_attached(context: Context, carried: CarriedBy, robots: tuple[str, ...], file: str, key: str) -> None:
     if carried.robot not in robots:
         text = f"this rig has no robot {carried.robot!r}{nearest(carried.robot, robots)}"
-        problems.add(file, f"{key}.robot", text)
-    urdf, others = urdfs.get(carried.robot), links.get(carried.robot, {})
+        context.problems.add(file, f"{key}.robot", text, "unknown_device")
+    urdf, others = context.urdfs.get(carried.robot), context.links.get(carried.robot, {})
     if urdf is not None and carried.link not in urdf.links and carried.link not in others:
         text = f"robot {carried.robot!r} has no link {carried.link!r}{nearest(carried.link, (*urdf.links, *others))}"
-        problems.add(file, f"{key}.link", text)
+        context.problems.add(file, f"{key}.link", text, "unknown_link")
 
 
-def _body(config: ObjectConfig, urdf: Path | None, links: Mapping[str, Mapping[str, str]]) -> BodySpec:
+def _body(config: ObjectConfig, urdf: UrdfModel | None, links: Mapping[str, Mapping[str, str]]) -> BodySpec:
     carried = config.attached
     if carried is not None:
         pose, given = carried.pose, set[str]()
@@ -302,7 +263,7 @@ def _body(config: ObjectConfig, urdf: Path | None, links: Mapping[str, Mapping[s
         half_extents=config.half_extents,
         radius=config.radius,
         length=config.length,
-        urdf=str(urdf) if urdf is not None else None,
+        urdf=str(urdf.path) if urdf is not None else None,
         scale=config.scale or 1.0,
         mass=config.mass or 0.0,
         fixed=config.fixed,

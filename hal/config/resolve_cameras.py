@@ -1,4 +1,4 @@
-"""A camera of a rig: model, modes, crop and place into one :class:`~hal.specs.CameraSpec`."""
+"""Resolve a camera of a rig: model, modes, crop and place become one :class:`~hal.specs.CameraSpec`."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import Any, NamedTuple, get_args
 from ..geometry import Pose
 from ..images import Intrinsics, centre_crop, from_field_of_view
 from ..specs import CameraSpec, DepthSensorSpec, SensorSpec, ViewSpec
-from .context import Context, ask_camera_driver, options_of
+from .context import Context, check_camera_spec, options_of
 from .files import nearest
 from .models import CameraModel, Capture
 from .rigfile import CameraConfig, Output, Stream, StreamConfig, view_of
@@ -23,118 +23,14 @@ __all__ = [
     "resolve_streams",
 ]
 
-# [resolve_streams.py] The streams of a camera: which of its model's modes each one is taken in, and how its
-# sensor sees.
-
 _ONE_SENSOR: tuple[Stream, ...] = ("depth", "infrared", "infrared_right")
-"""Streams that a depth camera makes of the same pictures: of one size, at one rate."""
-_DRAWN = "segmentation"
-"""The stream that no camera has."""
-
-
-class Streams(NamedTuple):
-    """How a camera takes its pictures."""
-
-    sensors: dict[str, SensorSpec]
-    align: str
-    """Whose view colour and depth are handed out in: ``color`` or ``depth``."""
-    reference: SensorSpec
-    """That view, as its sensor takes it; infrared's where there is neither colour nor depth."""
-    depth_min: float
-    """m"""
-
-
-def resolve_streams(context: Context, key: str, config: CameraConfig, model: CameraModel) -> Streams | None:
-    """The streams, or None with the problems noted."""
-    before = len(context.problems.found)
-    on = [name for name in config.streams if name != _DRAWN and name in model.streams]
-    captures = _captures(on, config.streams, config.capture or model.capture)
-    _check_modes(context, key, config, model, captures)
-    _check_formats(context, key, config, model, on)
-    _check_together(context, key, model, captures)
-    align = config.align or ("color" if "color" in on or "depth" not in on else "depth")
-    if config.align is not None and align not in on:
-        context.problem(f"{key}.align", f"is {align}, which is none of the streams that are on: {', '.join(on)}")
-    if len(context.problems.found) > before:
-        return None
-    sensors: dict[str, SensorSpec] = {name: _sensor(config, model, name, took) for name, took in captures.items()}
-    reference = sensors.get(align) or next(iter(sensors.values()), None)
-    if reference is None:
-        reference = _sensor(config, model, "color", config.capture or model.capture)
-    depth = captures.get("depth")
-    mode = model.stream("depth").mode(depth) if depth is not None and config.depth is None else None
-    nearest_depth = mode.depth_min if mode is not None else None
-    return Streams(sensors, align, reference, nearest_depth or (config.depth or model.depth).min)
-
-
-def _captures(on: Sequence[Stream], configs: Mapping[Stream, StreamConfig], default: Capture) -> dict[Stream, Capture]:
-    """What each stream takes. Infrared takes what depth does, unless it says otherwise."""
-    found: dict[Stream, Capture] = {}
-    for name in sorted(on, key=[*_ONE_SENSOR, "color"].index):
-        own = configs[name]
-        alike = next((found[other] for other in _ONE_SENSOR if other in found and name in _ONE_SENSOR), default)
-        width, height = (own.width, own.height) if own.width and own.height else (alike.width, alike.height)
-        found[name] = Capture(width=width, height=height, rate_hz=own.rate_hz or alike.rate_hz)
-    return {name: found[name] for name in on}
-
-
-def _check_modes(
-    context: Context, key: str, config: CameraConfig, model: CameraModel, captures: Mapping[Stream, Capture]
-) -> None:
-    wrong: dict[str, list[str]] = {}
-    for name, capture in captures.items():
-        modes = model.stream(name).modes
-        if modes is not None and model.stream(name).mode(capture) is None:
-            own = config.streams[name].model_fields_set & {"width", "height", "rate_hz"}
-            text = f"{capture} of {name}; it has: {'; '.join(map(str, modes))}"
-            wrong.setdefault(f"{key}.streams.{name}" if own else f"{key}.capture", []).append(text)
-    for place, texts in wrong.items():
-        context.problem(place, f"model {config.model!r} has no mode {'. And no mode '.join(texts)}")
-
-
-def _check_formats(context: Context, key: str, config: CameraConfig, model: CameraModel, on: Sequence[Stream]) -> None:
-    for name in on:
-        asked, formats = config.streams[name].format, model.stream(name).formats
-        if asked is not None and formats is not None and asked not in formats:
-            text = f"model {config.model!r} gives no {name} as {asked!r}{nearest(asked, formats)}"
-            context.problem(f"{key}.streams.{name}.format", text)
-
-
-def _check_together(context: Context, key: str, model: CameraModel, captures: Mapping[Stream, Capture]) -> None:
-    made = {name: captures[name] for name in _ONE_SENSOR if name in captures}
-    if model.depth_sensor is not None and len(set(made.values())) > 1:
-        texts = ", ".join(f"{name} {capture}" for name, capture in made.items())
-        context.problem(f"{key}.streams", f"one sensor makes all of these, of one size and at one rate: {texts}")
-        return
-    slowest = min((capture.rate_hz for capture in captures.values()), default=0.0)
-    if any(abs(capture.rate_hz / slowest - round(capture.rate_hz / slowest)) > 1e-6 for capture in captures.values()):
-        texts = ", ".join(f"{name} at {capture.rate_hz:g} Hz" for name, capture in captures.items())
-        text = f"{texts}: each rate must be a whole multiple of the slowest, at which frames are handed out"
-        context.problem(f"{key}.streams", text)
-
-
-def _sensor(config: CameraConfig, model: CameraModel, name: Stream, capture: Capture) -> SensorSpec:
-    stream = model.stream(name)
-    own = config.streams.get(name)  # None for colour where it is not on: the view of a segmentation alone
-    return SensorSpec(
-        width=capture.width,
-        height=capture.height,
-        rate_hz=capture.rate_hz,
-        K=_intrinsics(config, model, name, capture).matrix(),
-        format=own.format if own is not None else None,
-        position=stream.position,
-        orientation=stream.orientation,
-    )
-
-
-def _intrinsics(config: CameraConfig, model: CameraModel, name: str, capture: Capture) -> Intrinsics:
-    angles = (config.field_of_view if model.adjustable else None) or model.stream(name).field_of_view
-    sensor = (angles.width, angles.height) if angles.width is not None and angles.height is not None else None
-    return from_field_of_view(capture.width, capture.height, angles.horizontal_deg, angles.vertical_deg, sensor)
+"""Streams that a depth camera computes from the same images: of one size, at one rate."""
+_RENDERED = "segmentation"
+"""The stream that only simulated cameras have."""
 
 
 def resolve_camera(context: Context, name: str, config: CameraConfig) -> CameraSpec | None:
-    """The camera, or None with the problems noted."""
+    """Return the record of a camera; None, with the problems added, if there are any."""
     key = f"cameras.{name}"
     model, file = context.read_model(CameraModel, key, config, "sensors", "cameras")
     for check in (_check_attached, _check_place):
@@ -151,13 +47,13 @@ def resolve_camera(context: Context, name: str, config: CameraConfig) -> CameraS
         return None
     with suppress(Unknown):
         spec = _spec(context, name, config, model, driver, streams, file)
-        ask_camera_driver(context, key, spec, config, model, file)
+        check_camera_spec(context, key, spec, config, model, file)
         return spec
     return None
 
 
 def _has_problems(context: Context, key: str, file: Path) -> bool:
-    """Is anything wrong in the camera's entry, or in its model's file?"""
+    """Return whether there is a problem in the camera's entry or in its model's file."""
     return any(f"{found.key}.".startswith(f"{key}.") or found.file == str(file) for found in context.problems.found)
 
 
@@ -179,7 +75,7 @@ def _spec(
         height=output.height,
         rate_hz=min((sensor.rate_hz for sensor in streams.sensors.values()), default=reference.rate_hz),
         K=_through(reference, output),
-        distortion=(0.0,) * 5 if simulated else model.distortion,  # what is drawn has none
+        distortion=(0.0,) * 5 if simulated else model.distortion,  # rendered images have none
         depth_min=streams.depth_min,
         depth_max=(config.depth or model.depth).max,
         streams=tuple(config.streams),
@@ -197,7 +93,7 @@ def _same_view(one: SensorSpec, other: SensorSpec) -> bool:
 
 
 def _through(sensor: SensorSpec, output: Output) -> Any:
-    """The camera matrix of a sensor's pictures after crop and scaling."""
+    """Return the camera matrix (3, 3) of a sensor's images after crop and scaling."""
     (fx, _, cx), (_, fy, cy), _ = sensor.K
     crop = centre_crop(sensor.width, sensor.height, output.width, output.height)
     return Intrinsics(fx, fy, cx, cy).through(crop, output.width, output.height).matrix()
@@ -206,7 +102,7 @@ def _through(sensor: SensorSpec, output: Output) -> Any:
 def _check_place(context: Context, key: str, config: CameraConfig) -> None:
     somewhere = config.look_at or config.pose or config.attached
     if somewhere is None and context.driver is None and context.simulated(config):
-        context.problem(key, "is simulated and stands nowhere: give look_at, pose or attached")
+        context.problem(key, "is simulated and has no pose: give look_at, pose or attached", "missing_key")
 
 
 def _check_attached(context: Context, key: str, config: CameraConfig) -> None:
@@ -214,33 +110,35 @@ def _check_attached(context: Context, key: str, config: CameraConfig) -> None:
         return
     robot, robots = config.attached.robot, context.rig.robots
     if robot not in robots:
-        context.problem(f"{key}.attached.robot", f"this rig has no robot {robot!r}{nearest(robot, robots)}")
-    urdf = context.urdfs.get(robot)  # None where the robot itself is wrong
+        message = f"this rig has no robot {robot!r}{nearest(robot, robots)}"
+        context.problem(f"{key}.attached.robot", message, "unknown_device")
+    urdf = context.urdfs.get(robot)  # None if the robot itself has problems
     link, aliases = config.attached.link, context.links.get(robot, {})
     if urdf is not None and link not in urdf.links and link not in aliases:
         text = f"robot {robot!r} has no link {link!r}{nearest(link, (*urdf.links, *aliases))}"
-        context.problem(f"{key}.attached.link", text)
+        context.problem(f"{key}.attached.link", text, "unknown_link")
 
 
 def _check_adjustable(context: Context, key: str, config: CameraConfig, model: CameraModel) -> None:
     for part in ("field_of_view", "depth"):
         if not model.adjustable and getattr(config, part, None) is not None:
-            text = f"belongs to model {config.model!r}; only adjustable models leave it open"
-            context.problem(f"{key}.{part}", text)
+            text = f"is fixed by model {config.model!r}; only adjustable models leave it to the rig"
+            context.problem(f"{key}.{part}", text, "not_adjustable")
 
 
 def _check_streams(context: Context, key: str, config: CameraConfig, model: CameraModel) -> None:
     if not config.streams:
-        context.problem(f"{key}.streams", f"must name at least one of {', '.join(model.streams)}")
+        context.problem(f"{key}.streams", f"must name at least one of {', '.join(model.streams)}", "missing_key")
     simulated = context.simulated(config)
     allowed = (*model.streams, "segmentation") if simulated else tuple(model.streams)
     for stream in config.streams:
-        if stream not in allowed and stream in get_args(Stream):  # others are noted already
+        if stream not in allowed and stream in get_args(Stream):  # others are already problems
             hint = "; only simulated cameras have it" if stream == "segmentation" else ""
-            context.problem(f"{key}.streams.{stream}", f"model {config.model!r} has {', '.join(allowed)}{hint}")
+            message = f"model {config.model!r} has only {', '.join(allowed)}{hint}"
+            context.problem(f"{key}.streams.{stream}", message, "unknown_stream")
     drawn = config.streams.get("segmentation")
     if simulated and drawn is not None and drawn.model_fields_set:
-        context.problem(f"{key}.streams.segmentation", "is drawn with the frame: there is nothing to choose")
+        context.problem(f"{key}.streams.segmentation", "is rendered with the frame and has no options", "conflict")
 
 
 def _view(context: Context, config: CameraConfig) -> ViewSpec | None:
@@ -253,3 +151,109 @@ def _view(context: Context, config: CameraConfig) -> ViewSpec | None:
         return None
     link = context.links.get(attached.robot, {}).get(attached.link, attached.link)
     return view_of(attached.optical(), attached.robot, link)
+
+
+# Streams: the mode that each one is captured in, and the view of its sensor
+
+
+class Streams(NamedTuple):
+    """The streams of a camera."""
+
+    sensors: dict[str, SensorSpec]
+    align: str
+    """Stream whose view colour and depth are returned in: ``color`` or ``depth``."""
+    reference: SensorSpec
+    """That view, as its sensor captures it; infrared's where there is neither colour nor depth."""
+    depth_min: float
+    """Nearest depth, m."""
+
+
+def resolve_streams(context: Context, key: str, config: CameraConfig, model: CameraModel) -> Streams | None:
+    """Return the streams and the view of the frames; None, with the problems added, if there are any."""
+    before = len(context.problems.found)
+    on = [name for name in config.streams if name != _RENDERED and name in model.streams]
+    captures = _captures(on, config.streams, config.capture or model.capture)
+    _check_modes(context, key, config, model, captures)
+    _check_formats(context, key, config, model, on)
+    _check_together(context, key, model, captures)
+    align = config.align or ("color" if "color" in on or "depth" not in on else "depth")
+    if config.align is not None and align not in on:
+        message = f"is {align}, which is not one of the enabled streams: {', '.join(on)}"
+        context.problem(f"{key}.align", message, "conflict")
+    if len(context.problems.found) > before:
+        return None
+    sensors: dict[str, SensorSpec] = {name: _sensor(config, model, name, capture) for name, capture in captures.items()}
+    reference = sensors.get(align) or next(iter(sensors.values()), None)
+    if reference is None:
+        reference = _sensor(config, model, "color", config.capture or model.capture)
+    depth = captures.get("depth")
+    mode = model.stream("depth").mode(depth) if depth is not None and config.depth is None else None
+    nearest_depth = mode.depth_min if mode is not None else None
+    return Streams(sensors, align, reference, nearest_depth or (config.depth or model.depth).min)
+
+
+def _captures(on: Sequence[Stream], configs: Mapping[Stream, StreamConfig], default: Capture) -> dict[Stream, Capture]:
+    """Return size and rate of each stream. Infrared has those of depth, unless the rig gives it its own."""
+    found: dict[Stream, Capture] = {}
+    for name in sorted(on, key=[*_ONE_SENSOR, "color"].index):
+        own = configs[name]
+        alike = next((found[other] for other in _ONE_SENSOR if other in found and name in _ONE_SENSOR), default)
+        width, height = (own.width, own.height) if own.width and own.height else (alike.width, alike.height)
+        found[name] = Capture(width=width, height=height, rate_hz=own.rate_hz or alike.rate_hz)
+    return {name: found[name] for name in on}
+
+
+def _check_modes(
+    context: Context, key: str, config: CameraConfig, model: CameraModel, captures: Mapping[Stream, Capture]
+) -> None:
+    wrong: dict[str, list[str]] = {}
+    for name, capture in captures.items():
+        modes = model.stream(name).modes
+        if modes is not None and model.stream(name).mode(capture) is None:
+            own = config.streams[name].model_fields_set & {"width", "height", "rate_hz"}
+            text = f"{capture} of {name}; it has: {'; '.join(map(str, modes))}"
+            wrong.setdefault(f"{key}.streams.{name}" if own else f"{key}.capture", []).append(text)
+    for place, texts in wrong.items():
+        context.problem(place, f"model {config.model!r} has no mode {'. And no mode '.join(texts)}", "unknown_mode")
+
+
+def _check_formats(context: Context, key: str, config: CameraConfig, model: CameraModel, on: Sequence[Stream]) -> None:
+    for name in on:
+        wanted, formats = config.streams[name].format, model.stream(name).formats
+        if wanted is not None and formats is not None and wanted not in formats:
+            text = f"model {config.model!r} has no {name} format {wanted!r}{nearest(wanted, formats)}"
+            context.problem(f"{key}.streams.{name}.format", text, "unknown_format")
+
+
+def _check_together(context: Context, key: str, model: CameraModel, captures: Mapping[Stream, Capture]) -> None:
+    made = {name: captures[name] for name in _ONE_SENSOR if name in captures}
+    if model.depth_sensor is not None and len(set(made.values())) > 1:
+        texts = ", ".join(f"{name} {capture}" for name, capture in made.items())
+        message = f"one sensor makes all of these, so they must have one size and one rate: {texts}"
+        context.problem(f"{key}.streams", message, "conflict")
+        return
+    slowest = min((capture.rate_hz for capture in captures.values()), default=0.0)
+    if any(abs(capture.rate_hz / slowest - round(capture.rate_hz / slowest)) > 1e-6 for capture in captures.values()):
+        texts = ", ".join(f"{name} at {capture.rate_hz:g} Hz" for name, capture in captures.items())
+        text = f"{texts}: each rate must be a whole multiple of the slowest, which is that of the frames"
+        context.problem(f"{key}.streams", text, "conflict")
+
+
+def _sensor(config: CameraConfig, model: CameraModel, name: Stream, capture: Capture) -> SensorSpec:
+    stream = model.stream(name)
+    own = config.streams.get(name)  # None for colour that is off: the view of a segmentation alone
+    return SensorSpec(
+        width=capture.width,
+        height=capture.height,
+        rate_hz=capture.rate_hz,
+        K=_intrinsics(config, model, name, capture).matrix(),
+        format=own.format if own is not None else None,
+        position=stream.position,
+        orientation=stream.orientation,
+    )
+
+
+def _intrinsics(config: CameraConfig, model: CameraModel, name: str, capture: Capture) -> Intrinsics:
+    angles = (config.field_of_view if model.adjustable else None) or model.stream(name).field_of_view
+    sensor = (angles.width, angles.height) if angles.width is not None and angles.height is not None else None
+    return from_field_of_view(capture.width, capture.height, angles.horizontal_deg, angles.vertical_deg, sensor)

@@ -1,4 +1,7 @@
-"""An arm of a rig: model, URDF and the rig's own words into one :class:`~hal.specs.RobotSpec`."""
+"""Resolve an arm of a rig: its model, its URDF and the rig's entry become one :class:`~hal.specs.RobotSpec`.
+
+Limits are the model's, completed from the URDF, tightened by ``real_limits`` where the arm is real, then by the rig.
+"""
 
 from __future__ import annotations
 
@@ -8,22 +11,15 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from ..kinematics.urdf import UrdfModel, read_urdf
+from ..kinematics.urdf import TURNING, UrdfModel
 from ..specs import Floats, GripperSpec, KinematicsSpec, LimitsSpec, RobotSpec, Vector3, WorkspaceSpec
-from .context import SHARED, Context, ask_driver, is_emulated, locate_urdf, options_of
+from .context import SHARED, Context, check_robot_spec, is_emulated, load_urdf, options_of
 from .files import Problems, nearest
 from .models import LimitsModel, RobotModel
 from .rigfile import LimitsConfig, RobotConfig, WorkspaceConfig
 from .schema import Quantity, Unknown
 
-__all__ = [
-    "resolve_limits",
-    "resolve_robot",
-    "spread",
-]
-
-# [resolve_limits.py] An arm's limits: the model's, filled in from the URDF, tightened where the arm is real, and
-# by the rig.
+__all__ = ["resolve_limits", "resolve_robot", "spread"]
 
 UNITS = {
     "lower": "rad",
@@ -39,174 +35,12 @@ MOST_REAL = {
     "jerk": Quantity("rad/s3", 0.0, 20000.0, above=True),
     "torque": Quantity("Nm", 0.0, 1000.0, above=True),
 }
-"""What no file can loosen on a real arm, wherever a limit is from. The fastest joints of arms on a bench reach about
+"""Bounds on the limits of a real arm, which no file can loosen. The fastest joints of arms on a bench reach about
 12 rad/s; a Panda's jerk limit is 10000 rad/s3."""
 MOST_REAL_TCP_SPEED = Quantity("m/s", 0.0, 1.5, above=True)
 """Below the 1.7 m/s at which a Panda stops by itself; 0.25 m/s is ISO 10218's reduced speed."""
 ENDLESS = 1e4
 """rad; the limit of a joint that turns without end."""
-
-
-def spread(
-    values: Floats, n: int, file: Path | str, key: str, unit: str, problems: Problems, *, one_for_all: bool = False
-) -> Floats | None:
-    """``values`` with one number for each of ``n`` joints; None, and a problem noted, for another count."""
-    if one_for_all and len(values) == 1:
-        return values * n
-    if len(values) != n:
-        problems.add(file, key, f"must have {n} numbers ({unit}), one for each joint, not {len(values)}")
-        return None
-    return values
-
-
-def resolve_limits(
-    model: RobotModel,
-    urdf: UrdfModel | None,
-    file: Path,
-    config: RobotConfig,
-    source: str,
-    key: str,
-    real: bool,
-    problems: Problems,
-) -> LimitsSpec:
-    """The limits that the servo keeps. Numbers that nobody knows are NaN, which is neither too large nor too small.
-
-    They are noted as missing here, or what keeps them from being known was noted before. ``real``: the model's
-    ``real_limits`` count. Raises Unknown where the number of joints is not known.
-    """
-    with suppress(Unknown):
-        for name in ("acceleration", "jerk"):
-            if getattr(model.limits, name, ()) is None:
-                text = f"is missing: {UNITS[name]}, one number for each joint or one for all; a URDF does not hold it"
-                problems.add(file, f"limits.{name}", text)
-    limits = {name: _of_model(model, urdf, name, file, problems) for name in UNITS}
-    _check_order(limits, model.joints, file, "limits", problems)
-    own = dict(limits)  # looked at in simulation, too, so that mistakes are found there
-    with suppress(Unknown):
-        _tighten(own, model.real_limits, model.joints, file, "real_limits", problems, _LOOSER_THAN_OWN)
-    if real:
-        limits = own
-    with suppress(Unknown):
-        rule = None if getattr(config.limits, "allow_looser_limits", True) else _LOOSER_THAN_MODEL
-        _tighten(limits, config.limits, model.joints, source, key, problems, rule)
-    if real:
-        given = getattr(config, "limits", LimitsConfig()).model_fields_set
-        for name, most in MOST_REAL.items():
-            fast = [value for value in limits[name] or () if value > most.most]
-            if fast:
-                text = f"must be {most} for every joint of a real arm, not {max(fast):g}"
-                if name in given:
-                    problems.add(source, f"{key}.{name}", text)
-                else:
-                    problems.add(file, f"limits.{name}", text)
-    return LimitsSpec(**limits)  # type: ignore[arg-type]  # None only for torque, which may be
-
-
-_LOOSER_THAN_OWN = "{value:g} is looser than limits.{name}, {limit:g}, for joint {joint!r}", ""
-_LOOSER_THAN_MODEL = (
-    "{value:g} is looser than the model's {limit:g} for joint {joint!r}",
-    "; only allow_looser_limits: true beside it permits that",
-)
-"""What is said of each number that is too loose, and after them."""
-
-
-def _tighten(
-    limits: dict[str, Floats | None],
-    changes: LimitsModel | LimitsConfig,
-    joints: Sequence[str],
-    file: Path | str,
-    key: str,
-    problems: Problems,
-    rule: tuple[str, str] | None,
-) -> None:
-    """Put ``changes`` in place of those of ``limits``, in place; where there is a ``rule``, looser ones are noted."""
-    for name, unit in UNITS.items():
-        changed: Floats | None = getattr(changes, name, None)
-        if changed is None:
-            continue
-        values = spread(changed, len(joints), file, f"{key}.{name}", unit, problems, one_for_all=True)
-        if values is None:
-            continue
-        if rule is not None:
-            _check_tighter(values, limits[name], joints, name, file, f"{key}.{name}", problems, rule)
-        limits[name] = values
-    if not {"lower", "upper"}.isdisjoint(changes.model_fields_set):
-        _check_order(limits, joints, file, key, problems)
-
-
-def _check_tighter(
-    values: Floats,
-    limits: Floats | None,
-    joints: Sequence[str],
-    name: str,
-    file: Path | str,
-    key: str,
-    problems: Problems,
-    rule: tuple[str, str],
-) -> None:
-    each, after = rule
-    looser = [
-        each.format(value=value, limit=limit, joint=joint, name=name)
-        for value, limit, joint in zip(values, limits or values, joints, strict=True)
-        if (value < limit if name == "lower" else value > limit)
-    ]
-    if looser:
-        problems.add(file, key, f"{'; '.join(looser)} ({UNITS[name]}){after}")
-
-
-def _check_order(
-    limits: dict[str, Floats | None], joints: Sequence[str], file: Path | str, key: str, problems: Problems
-) -> None:
-    """Lower below upper. Where they are not, nobody knows what is between them, so they are NaN afterwards."""
-    lower, upper = list(limits["lower"] or ()), list(limits["upper"] or ())
-    empty: list[str] = []
-    for k, joint in enumerate(joints):
-        if lower[k] >= upper[k]:
-            empty.append(f"joint {joint!r} has {lower[k]:g} and {upper[k]:g}")
-            lower[k] = upper[k] = math.nan
-    if empty:
-        problems.add(file, key, f"lower must be below upper: {'; '.join(empty)}")
-    limits["lower"], limits["upper"] = tuple(lower), tuple(upper)
-
-
-def _of_model(model: RobotModel, urdf: UrdfModel | None, name: str, file: Path, problems: Problems) -> Floats | None:
-    n = len(model.joints)
-    unknown = (math.nan,) * n
-    with suppress(Unknown):
-        own: Floats | None = getattr(model.limits, name)
-        if own is not None:
-            return spread(own, n, file, f"limits.{name}", UNITS[name], problems, one_for_all=True) or unknown
-        if urdf is not None and name not in ("acceleration", "jerk"):
-            return _from_urdf(model, urdf, name, file, problems)
-    return unknown
-
-
-def _from_urdf(model: RobotModel, urdf: UrdfModel, name: str, file: Path, problems: Problems) -> Floats | None:
-    joints = [urdf.joints.get(joint) for joint in model.joints]
-    if name == "torque":
-        efforts = [joint.effort for joint in joints if joint is not None and joint.effort and joint.effort > 0.0]
-        # An effort of 0 stands in many files for "unknown".
-        return tuple(efforts) if len(efforts) == len(joints) else None
-    values: list[float] = []
-    lacking: list[str] = []
-    for joint in joints:
-        value: float | None = getattr(joint, name, None)
-        if joint is None or not joint.movable:  # noted where joints are looked up
-            value = math.nan
-        elif value is None and joint.kind == "continuous" and name in ("lower", "upper"):
-            value = math.copysign(ENDLESS, -1.0 if name == "lower" else 1.0)
-        elif value is None or (name == "velocity" and value <= 0.0):
-            lacking.append(joint.name)
-            value = math.nan
-        values.append(value)
-    if lacking:
-        text = f"is missing ({UNITS[name]}), and {urdf.path.name} gives none for {', '.join(map(repr, lacking))}"
-        problems.add(file, f"limits.{name}", text)
-    return tuple(values)
-
-
-TURNING = ("revolute", "continuous")
-"""Joints whose positions are angles."""
 FAR = 10.0
 """m; where a workspace is open."""
 DEADLINE_SIMULATED, DEADLINE_REAL = 1.0, 0.3
@@ -214,16 +48,15 @@ DEADLINE_SIMULATED, DEADLINE_REAL = 1.0, 0.3
 
 
 def resolve_robot(context: Context, name: str, config: RobotConfig) -> RobotSpec | None:
-    """The arm, or None with the problems noted."""
+    """Return the record of an arm; None, with the problems added, if there are any."""
     key = f"robots.{name}"
     model, file = context.read_model(RobotModel, key, config, "robots")
-    urdf = _urdf(model, file, context.problems)
+    urdf: UrdfModel | None = None
+    with suppress(Unknown):
+        urdf = load_urdf(model.urdf, file.parent, file, "urdf", context.problems, context.warnings)
     if urdf is not None:
         context.urdfs[name] = urdf
         _check_names(model, urdf, file, context.problems)
-        if urdf.without_mass():
-            links = ", ".join(urdf.without_mass())
-            context.warnings.append(f"{urdf.path}: no <inertial> in {links}; the simulator makes up a mass")
     with suppress(Unknown):
         context.links[name] = model.links
     simulated = True
@@ -231,9 +64,8 @@ def resolve_robot(context: Context, name: str, config: RobotConfig) -> RobotSpec
         simulated = context.simulated(config)
     with suppress(Unknown):
         if not simulated and config.tcp_speed not in MOST_REAL_TCP_SPEED:
-            context.problem(
-                f"{key}.tcp_speed", f"must be {MOST_REAL_TCP_SPEED} on a real arm, not {config.tcp_speed:g}"
-            )
+            message = f"must be {MOST_REAL_TCP_SPEED} on a real arm, not {config.tcp_speed:g}"
+            context.problem(f"{key}.tcp_speed", message, "out_of_range")
     limits, home, initial = _joint_numbers(context, key, config, model, file, urdf, simulated)
     driver = context.choose_driver("robot", key, config, model)
     gripper_driver = _check_gripper(context, f"{key}.gripper", config, model)
@@ -272,7 +104,7 @@ def resolve_robot(context: Context, name: str, config: RobotConfig) -> RobotSpec
             )
             if spec.emulated:
                 context.emulated.add(key)
-            ask_driver(context, key, spec, config, model, file)
+            check_robot_spec(context, key, spec, config, model, file)
             return spec
     return None
 
@@ -286,7 +118,7 @@ def _joint_numbers(
     urdf: UrdfModel | None,
     simulated: bool,
 ) -> tuple[LimitsSpec | None, Floats | None, Floats | None]:
-    """Limits, home and initial positions; None for what is not known, or not given."""
+    """Return limits, home and initial positions; None for those that are unknown or not given."""
     limits: LimitsSpec | None = None
     home: Floats | None = None
     initial: Floats | None = None
@@ -316,19 +148,11 @@ def _kinematics(model: RobotModel, urdf: UrdfModel, limits: LimitsSpec, home: Fl
     )
 
 
-def _urdf(model: RobotModel, file: Path, problems: Problems) -> UrdfModel | None:
-    with suppress(Unknown):
-        path = locate_urdf(model.urdf, file.parent, file, "urdf", problems)
-        if path is not None:
-            try:
-                return read_urdf(path)
-            except (ValueError, OSError) as error:
-                problems.add(path, "", str(error))
-    return None
+# Names of joints and links
 
 
 def _check_names(model: RobotModel, urdf: UrdfModel, file: Path, problems: Problems) -> None:
-    """Every joint and link that the model names is in the URDF, and can do what it is named for."""
+    """Check that every joint and link that the model names is in the URDF, and fits its purpose."""
     with suppress(Unknown):
         _check_joints(model.joints, "joints", urdf, file, problems)
     with suppress(Unknown):
@@ -337,23 +161,22 @@ def _check_names(model: RobotModel, urdf: UrdfModel, file: Path, problems: Probl
         for k, name in enumerate(fingers):
             kind = urdf.joints[name].kind if name in urdf.joints else ""
             if kind in TURNING and name not in model.joints:
-                message = (
-                    f"joint {name!r} turns ({kind}); fingers that turn are not supported yet, only ones that slide"
-                )
+                message = f"joint {name!r} turns ({kind}); only fingers that slide (prismatic) are supported"
                 remedy = "remove the model's gripper, and its joints stay where they start"
-                problems.add(file, f"gripper.joints.{k}", f"{message} (prismatic): {remedy}")
+                problems.add(file, f"gripper.joints.{k}", f"{message}: {remedy}", "wrong_joint")
     with suppress(Unknown):
         if model.base_link is not None:
             _check_link(model.base_link, "base_link", urdf, file, problems)
             above = [joint.name for joint in urdf.above(model.base_link) if joint.name in model.joints]
             if above:
                 text = f"{model.base_link!r} moves with the arm's own joints: {', '.join(above)}"
-                problems.add(file, "base_link", text)
+                problems.add(file, "base_link", text, "wrong_link")
     with suppress(Unknown):
         for alias, link in model.links.items():
             _check_link(link, f"links.{alias}", urdf, file, problems)
             if alias in urdf.links and alias != link:
-                problems.add(file, f"links.{alias}", f"{urdf.path.name} has a link of that name; take another one")
+                message = f"{urdf.path.name} has a link of that name; choose another name"
+                problems.add(file, f"links.{alias}", message, "duplicate_name")
     with suppress(Unknown):
         _check_link(model.tcp.link, "tcp.link", urdf, file, problems)
         if model.tcp.link in urdf.links:
@@ -364,26 +187,196 @@ def _check_joints(names: tuple[str, ...], key: str, urdf: UrdfModel, file: Path,
     movable = [name for name, joint in urdf.joints.items() if joint.movable]
     for k, name in enumerate(names):
         if name not in urdf.joints:
-            problems.add(file, f"{key}.{k}", f"{urdf.path.name} has no joint {name!r}{nearest(name, movable)}")
+            message = f"{urdf.path.name} has no joint {name!r}{nearest(name, movable)}"
+            problems.add(file, f"{key}.{k}", message, "unknown_joint")
         elif name not in movable:
-            kind = urdf.joints[name].kind
-            problems.add(file, f"{key}.{k}", f"joint {name!r} is {kind}; those that move: {', '.join(movable)}")
+            message = f"joint {name!r} is {urdf.joints[name].kind}; movable joints: {', '.join(movable)}"
+            problems.add(file, f"{key}.{k}", message, "wrong_joint")
         if name in names[:k]:
-            problems.add(file, f"{key}.{k}", f"{name!r} is given twice; names must differ")
+            problems.add(file, f"{key}.{k}", f"{name!r} is given twice; names must be unique", "duplicate_name")
 
 
 def _check_chain(model: RobotModel, urdf: UrdfModel, file: Path, problems: Problems) -> None:
     chain = {joint.name for joint in urdf.above(model.tcp.link)}
     for k, name in enumerate(model.joints):
         if name in urdf.joints and name not in chain:
-            problems.add(file, f"joints.{k}", f"joint {name!r} does not move the tcp's link {model.tcp.link!r}")
+            message = f"joint {name!r} does not move the tcp's link {model.tcp.link!r}"
+            problems.add(file, f"joints.{k}", message, "wrong_joint")
     for name in sorted(chain.intersection(model.joints, model.gripper.joints if model.gripper else ())):
-        problems.add(file, "gripper.joints", f"{name!r} is also one of the arm's joints")
+        problems.add(file, "gripper.joints", f"{name!r} is also one of the arm's joints", "wrong_joint")
 
 
 def _check_link(link: str, key: str, urdf: UrdfModel, file: Path, problems: Problems) -> None:
     if link not in urdf.links:
-        problems.add(file, key, f"{urdf.path.name} has no link {link!r}{nearest(link, urdf.links)}")
+        problems.add(file, key, f"{urdf.path.name} has no link {link!r}{nearest(link, urdf.links)}", "unknown_link")
+
+
+# Limits and positions of the joints
+
+
+def resolve_limits(
+    model: RobotModel,
+    urdf: UrdfModel | None,
+    file: Path,
+    config: RobotConfig,
+    source: str,
+    key: str,
+    real: bool,
+    problems: Problems,
+) -> LimitsSpec:
+    """Return the limits that the servo keeps.
+
+    Unknown limits are NaN, so comparisons with them are always false; a problem is added for each of them.
+
+    Args:
+        model: The arm's model.
+        urdf: Its URDF; None if that could not be read.
+        file: The model's file.
+        config: The arm's entry in the rig.
+        source: The rig's file.
+        key: Key of the entry's limits in it.
+        real: Whether the arm is real: then the model's ``real_limits`` and :data:`MOST_REAL` apply.
+        problems: Gets the problems.
+
+    Raises:
+        Unknown: The number of joints is unknown.
+    """
+    with suppress(Unknown):
+        for name in ("acceleration", "jerk"):
+            if getattr(model.limits, name, ()) is None:
+                text = f"is missing: {UNITS[name]}, one number for each joint or one for all; a URDF does not have it"
+                problems.add(file, f"limits.{name}", text, "missing_key")
+    limits = {name: _of_model(model, urdf, name, file, problems) for name in UNITS}
+    _check_order(limits, model.joints, file, "limits", problems)
+    tightened = dict(limits)  # checked in simulation, too, so that mistakes are found there
+    with suppress(Unknown):
+        _tighten(tightened, model.real_limits, model.joints, file, "real_limits", problems, _LOOSER_THAN_OWN)
+    if real:
+        limits = tightened
+    with suppress(Unknown):
+        rule = None if getattr(config.limits, "allow_looser_limits", True) else _LOOSER_THAN_MODEL
+        _tighten(limits, config.limits, model.joints, source, key, problems, rule)
+    if real:
+        given = getattr(config, "limits", LimitsConfig()).model_fields_set
+        for name, most in MOST_REAL.items():
+            fast = [value for value in limits[name] or () if value > most.most]
+            if fast:
+                text = f"must be {most} for every joint of a real arm, not {max(fast):g}"
+                place = (source, f"{key}.{name}") if name in given else (file, f"limits.{name}")
+                problems.add(place[0], place[1], text, "out_of_range")
+    return LimitsSpec(**limits)  # type: ignore[arg-type]  # None only for torque, which may be
+
+
+def spread(
+    values: Floats, n: int, file: Path | str, key: str, unit: str, problems: Problems, *, one_for_all: bool = False
+) -> Floats | None:
+    """Return one number for each of ``n`` joints; None, with a problem added, if ``values`` has another count.
+
+    Args:
+        values: (n,), or (1,) with ``one_for_all``.
+        n: Number of joints.
+        file: File of the values, for the problem.
+        key: Their key in it.
+        unit: Their unit.
+        problems: Gets the problem.
+        one_for_all: Whether one number stands for all joints.
+    """
+    if one_for_all and len(values) == 1:
+        return values * n
+    if len(values) != n:
+        problems.add(file, key, f"must be {n} numbers ({unit}), one for each joint, not {len(values)}", "wrong_count")
+        return None
+    return values
+
+
+_LOOSER_THAN_OWN = "{value:g} is looser than limits.{name}, {limit:g}, for joint {joint!r}", ""
+_LOOSER_THAN_MODEL = (
+    "{value:g} is looser than the model's {limit:g} for joint {joint!r}",
+    "; only allow_looser_limits: true beside it permits that",
+)
+"""Message for each number that is too loose, and the end of the sentence."""
+
+
+def _tighten(
+    limits: dict[str, Floats | None],
+    changes: LimitsModel,
+    joints: Sequence[str],
+    file: Path | str,
+    key: str,
+    problems: Problems,
+    rule: tuple[str, str] | None,
+) -> None:
+    """Replace ``limits`` by ``changes``, in place; with a ``rule``, looser ones are problems."""
+    for name, unit in UNITS.items():
+        changed: Floats | None = getattr(changes, name, None)
+        if changed is None:
+            continue
+        values = spread(changed, len(joints), file, f"{key}.{name}", unit, problems, one_for_all=True)
+        if values is None:
+            continue
+        if rule is not None:
+            each, after = rule
+            looser = [
+                each.format(value=value, limit=limit, joint=joint, name=name)
+                for value, limit, joint in zip(values, limits[name] or values, joints, strict=True)
+                if (value < limit if name == "lower" else value > limit)
+            ]
+            if looser:
+                problems.add(file, f"{key}.{name}", f"{'; '.join(looser)} ({unit}){after}", "looser_limit")
+        limits[name] = values
+    if not {"lower", "upper"}.isdisjoint(changes.model_fields_set):
+        _check_order(limits, joints, file, key, problems)
+
+
+def _check_order(
+    limits: dict[str, Floats | None], joints: Sequence[str], file: Path | str, key: str, problems: Problems
+) -> None:
+    """Check that lower is below upper. Where it is not, the range is unknown, so both become NaN."""
+    lower, upper = list(limits["lower"] or ()), list(limits["upper"] or ())
+    empty: list[str] = []
+    for k, joint in enumerate(joints):
+        if lower[k] >= upper[k]:
+            empty.append(f"joint {joint!r} has {lower[k]:g} and {upper[k]:g}")
+            lower[k] = upper[k] = math.nan
+    if empty:
+        problems.add(file, key, f"lower must be below upper: {'; '.join(empty)}", "empty_range")
+    limits["lower"], limits["upper"] = tuple(lower), tuple(upper)
+
+
+def _of_model(model: RobotModel, urdf: UrdfModel | None, name: str, file: Path, problems: Problems) -> Floats | None:
+    n = len(model.joints)
+    unknown = (math.nan,) * n
+    with suppress(Unknown):
+        own: Floats | None = getattr(model.limits, name)
+        if own is not None:
+            return spread(own, n, file, f"limits.{name}", UNITS[name], problems, one_for_all=True) or unknown
+        if urdf is not None and name not in ("acceleration", "jerk"):
+            return _from_urdf(model, urdf, name, file, problems)
+    return unknown
+
+
+def _from_urdf(model: RobotModel, urdf: UrdfModel, name: str, file: Path, problems: Problems) -> Floats | None:
+    joints = [urdf.joints.get(joint) for joint in model.joints]
+    if name == "torque":
+        efforts = [joint.effort for joint in joints if joint is not None and joint.effort and joint.effort > 0.0]
+        # In many files an effort of 0 means "unknown".
+        return tuple(efforts) if len(efforts) == len(joints) else None
+    values: list[float] = []
+    lacking: list[str] = []
+    for joint in joints:
+        value: float | None = getattr(joint, name, None)
+        if joint is None or not joint.movable:  # already a problem of the names
+            value = math.nan
+        elif value is None and joint.kind == "continuous" and name in ("lower", "upper"):
+            value = math.copysign(ENDLESS, -1.0 if name == "lower" else 1.0)
+        elif value is None or (name == "velocity" and value <= 0.0):
+            lacking.append(joint.name)
+            value = math.nan
+        values.append(value)
+    if lacking:
+        text = f"is missing ({UNITS[name]}), and {urdf.path.name} gives none for {', '.join(map(repr, lacking))}"
+        problems.add(file, f"limits.{name}", text, "missing_key")
+    return tuple(values)
 
 
 def _initial(context: Context, key: str, model: RobotModel, config: RobotConfig) -> Floats | None:
@@ -392,11 +385,11 @@ def _initial(context: Context, key: str, model: RobotModel, config: RobotConfig)
         return given
     fingers = model.gripper.joints if model.gripper else ()
     if fingers and len(given) == n + len(fingers):
-        context.warnings.append(
-            f"{context.source}: {key} has {len(given)} numbers; the fingers' {len(fingers)} are not used"
-        )
+        message = f"{context.source}: {key} has {len(given)} numbers; those of the {len(fingers)} fingers are not used"
+        context.warnings.append(message)
         return given[:n]
-    context.problem(key, f"must have {n} numbers, one for each of {', '.join(model.joints)}, not {len(given)}")
+    message = f"must be {n} numbers, one for each of {', '.join(model.joints)}, not {len(given)}"
+    context.problem(key, message, "wrong_count")
     return None
 
 
@@ -411,23 +404,29 @@ def _check_inside(
         if value < lower or value > upper
     ]
     if outside:
-        problems.add(file, key, f"{'; '.join(outside)}; positions are in rad (m for joints that slide)")
+        message = f"{'; '.join(outside)}; positions are in rad (m for joints that slide)"
+        problems.add(file, key, message, "out_of_range")
+
+
+# Gripper and workspace
 
 
 def _check_gripper(context: Context, key: str, config: RobotConfig, model: RobotModel) -> str:
-    """Its driver; empty where there is no gripper or no such driver."""
+    """Return the gripper's driver; "" if there is no gripper or no such driver."""
     with suppress(Unknown):
         own, kind = config.gripper, model.gripper
         if kind is None:
             if own.model_fields_set:
-                context.problem(key, f"model {config.model!r} has no gripper")
+                context.problem(key, f"model {config.model!r} has no gripper", "no_gripper")
             return ""
         with suppress(Unknown):
             if own.enabled and own.speed is not None and own.speed > kind.speed:
-                context.problem(f"{key}.speed", f"must be at most {kind.speed:g} m/s, the model's, not {own.speed:g}")
+                message = f"must be at most {kind.speed:g} m/s, the model's, not {own.speed:g}"
+                context.problem(f"{key}.speed", message, "looser_limit")
         if own.enabled:
             if context.simulated(own, config) and not context.simulated(config):
-                context.problem(key, "is simulated, and its arm is real: its fingers would stand in another world")
+                message = "is simulated, but its arm is real: its fingers would be in another world"
+                context.problem(key, message, "two_worlds")
             return context.choose_driver("gripper", key, own, kind, config)
     return ""
 
@@ -435,7 +434,7 @@ def _check_gripper(context: Context, key: str, config: RobotConfig, model: Robot
 def _gripper(
     context: Context, name: str, config: RobotConfig, model: RobotModel, driver: str, arm: Mapping[str, Any]
 ) -> GripperSpec | None:
-    """``arm``: options of the arm, where the same driver drives both."""
+    """Return the gripper's record; ``arm`` has the arm's options if the same driver runs both."""
     own, kind = config.gripper, model.gripper
     if kind is None or not own.enabled or not driver:
         return None
@@ -467,4 +466,5 @@ def _check_workspace(context: Context, key: str, config: RobotConfig) -> None:
         return
     box = _workspace(config.workspace)
     if any(low >= high for low, high in zip(box.lower, box.upper, strict=True)):
-        context.problem(key, f"is empty: lower {list(box.lower)} must be below upper {list(box.upper)}")
+        message = f"is empty: lower {list(box.lower)} must be below upper {list(box.upper)}"
+        context.problem(key, message, "empty_range")

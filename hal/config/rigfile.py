@@ -1,4 +1,4 @@
-"""The keys of a rig's file. Units stand beside them; what is left out has a good default.
+"""The schema of a rig's file: every key with its unit and default.
 
 .. code-block:: yaml
 
@@ -24,9 +24,8 @@ from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
 from ..geometry import Pose, matrix_to_quaternion, quaternion_to_matrix, rpy_to_matrix
 from ..specs import ViewSpec
-from .models import Capture, Depth, Drivers, FieldOfView, by_name
+from .models import Capture, Depth, Drivers, FieldOfView, LimitsModel, by_name
 from .schema import (
-    Accelerations,
     CameraRate,
     Coordinate,
     Degrees,
@@ -35,8 +34,6 @@ from .schema import (
     Flag,
     Force,
     Gravity,
-    Jerks,
-    JointLimits,
     JointPositions,
     Name,
     Offset,
@@ -50,8 +47,7 @@ from .schema import (
     Speed,
     Strict,
     TcpSpeed,
-    Torques,
-    Velocities,
+    ValueProblem,
     describe,
 )
 
@@ -71,19 +67,15 @@ __all__ = [
     "view_of",
 ]
 
-# [views.py] Where cameras stand: three ways to say it, each made into the pose of the optical frame (OpenCV's
-# axes).
-
 Array = NDArray[np.float64]
 
 
 class LookAt(Strict):
-    """A fixed camera that looks at a point, as PyBullet's ``computeViewMatrixFromYawPitchRoll`` means the numbers.
+    """A fixed camera that is aimed at a point, as by PyBullet's ``computeViewMatrixFromYawPitchRoll``.
 
-    With yaw, pitch and roll 0 and ``up_axis: z`` the camera stands at ``distance`` m from ``target`` towards -y,
-    upright. Pitch turns that about x (-30: the camera stands 30 degrees above the target and looks down), roll about
-    y, then yaw about z. Pitch beyond +-90 goes over the top: the picture is then upside down, as in PyBullet. World
-    frame.
+    With yaw, pitch and roll 0 and ``up_axis: z`` the camera is at ``distance`` m from ``target`` towards -y, upright.
+    Pitch turns that about x (-30: the camera is 30 degrees above the target and points down), roll about y, then yaw
+    about z. With a pitch beyond +-90 the image is upside down, as in PyBullet. World frame.
     """
 
     target: Position
@@ -94,12 +86,12 @@ class LookAt(Strict):
     up_axis: Literal["y", "z"] = "z"
 
     def pose(self) -> Pose:
-        """Of the optical frame in the world."""
+        """Return the pose of the optical frame (x right, y down, z forward) in the world."""
         yaw, pitch, roll = (math.radians(angle) for angle in (self.yaw_deg, self.pitch_deg, self.roll_deg))
         if self.up_axis == "z":
             turn = rpy_to_matrix(0, 0, yaw) @ rpy_to_matrix(0, roll, 0) @ rpy_to_matrix(pitch, 0, 0)
             back, up = np.array([0.0, -1.0, 0.0]), np.array([0.0, 0.0, 1.0])
-        else:  # PyBullet turns in another order here
+        else:  # PyBullet's order of rotations differs here
             turn = rpy_to_matrix(0, 0, roll) @ rpy_to_matrix(0, yaw, 0) @ rpy_to_matrix(-pitch, 0, 0)
             back, up = np.array([0.0, 0.0, -1.0]), np.array([0.0, 1.0, 0.0])
         eye = np.asarray(self.target) + self.distance * (turn @ back)
@@ -113,21 +105,22 @@ _ROTATION = Several(
 
 def _three_or_unit(rotation: tuple[float, ...]) -> tuple[float, ...]:
     if len(rotation) not in (3, 4):
-        raise ValueError(f"must be roll, pitch, yaw in rad, or a quaternion x, y, z, w, not {len(rotation)} numbers")
+        message = f"must be roll, pitch, yaw in rad, or a quaternion x, y, z, w, not {len(rotation)} numbers"
+        raise ValueProblem(message, "wrong_count")
     if len(rotation) == 4 and abs(math.hypot(*rotation) - 1.0) > 0.01:
-        raise ValueError("must be a unit quaternion x, y, z, w, or three angles in rad")
+        raise ValueProblem("must be a unit quaternion x, y, z, w, or three angles in rad")
     return rotation
 
 
 class Attached(Strict):
     """A camera on a link of a robot.
 
-    It sits at ``translation`` (m, in the frame of the link). ``rotation`` (roll, pitch, yaw in rad, or a quaternion)
-    turns a bracket there; in the bracket's frame the optical axis points along ``target`` and ``up`` is upwards in
-    the picture (z when left out, or x for a camera that looks along z). So, without a rotation, a camera that looks
-    along the fingers of a hand has ``target: [0, 0, 1]``.
+    The camera is at ``translation`` (m, in the frame of the link). ``rotation`` (roll, pitch, yaw in rad, or a
+    quaternion) turns a bracket there; in the bracket's frame the optical axis points along ``target``, and ``up`` is
+    upwards in the image (default: z, or x for a camera that points along z). A camera that points along the fingers of
+    a hand has no rotation and ``target: [0, 0, 1]``.
 
-    Or ``pose`` alone: of the optical frame (x right, y down, z forward) in the frame of the link, as calibration
+    Or ``pose`` alone: that of the optical frame (x right, y down, z forward) in the frame of the link, as calibration
     writes it.
     """
 
@@ -143,17 +136,17 @@ class Attached(Strict):
     def _one_way(self) -> Attached:
         others = sorted(self.model_fields_set & {"translation", "rotation", "target", "up"})
         if self.pose is not None and others:
-            raise ValueError(f"pose says everything; it cannot stand beside {', '.join(others)}")
+            raise ValueProblem(f"pose is complete; it excludes {', '.join(others)}", "conflict")
         return self
 
     @model_validator(mode="after")
     def _directions(self) -> Attached:
         if self.up is not None and np.linalg.norm(np.cross(self.target, self.up)) < 1e-6:
-            raise ValueError("up must not lie along target")
+            raise ValueProblem("up must not be parallel to target", "conflict")
         return self
 
     def optical(self) -> Pose:
-        """Pose of the optical frame in the frame of the link."""
+        """Return the pose of the optical frame in the frame of the link."""
         if self.pose is not None:
             return Pose(self.pose.position, self.pose.orientation)
         target = np.asarray(self.target) / np.linalg.norm(self.target)
@@ -163,7 +156,13 @@ class Attached(Strict):
 
 
 def optical_pose(position: ArrayLike, forward: Array, up: Array) -> Pose:
-    """Pose of a camera (x right, y down, z forward) from where it is, where it looks and what is upwards."""
+    """Return the pose of an optical frame (x right, y down, z forward).
+
+    Args:
+        position: (3,) m.
+        forward: (3,) direction of the optical axis.
+        up: (3,) direction that is upwards in the image.
+    """
     z = forward / np.linalg.norm(forward)
     x = np.cross(z, up)
     x /= np.linalg.norm(x)
@@ -171,49 +170,43 @@ def optical_pose(position: ArrayLike, forward: Array, up: Array) -> Pose:
 
 
 def view_of(pose: Pose, robot: str | None = None, link: str | None = None) -> ViewSpec:
-    """A pose as the record that drivers get."""
+    """Return a camera's pose, in the world or in a link's frame, as the record that drivers get."""
     x, y, z = pose.position.tolist()
     a, b, c, d = pose.orientation.tolist()
     return ViewSpec((x, y, z), (a, b, c, d), robot, link)
 
 
 DEVICES, OBJECTS = 64, 1000
-"""Most devices of one kind, and most objects, in a rig; more would take minutes to check."""
+"""Greatest number of devices of one kind, and of objects, in a rig; more would take minutes to check."""
 
 
 class Device(Strict):
-    """What robots, grippers and cameras share."""
+    """Keys of every robot, gripper and camera."""
 
     sim: Flag | None = None
-    """This device's own flag; the rig's when left out."""
+    """This device's own flag; default: the rig's."""
     drivers: Drivers | None = None
-    """Other drivers than the model's."""
+    """Drivers instead of the model's."""
     real: dict[str, Any] = Field(default_factory=dict)
-    """What only the real driver needs."""
+    """Options of the real driver."""
     simulated: dict[str, Any] = Field(default_factory=dict)
-    """What only the simulated driver needs."""
+    """Options of the simulated driver."""
 
 
-class LimitsConfig(Strict):
+class LimitsConfig(LimitsModel):
     """Tighter limits than the model's, per joint or one number for all; rad, rad/s, rad/s2, rad/s3, Nm."""
 
-    lower: JointLimits | None = None
-    upper: JointLimits | None = None
-    velocity: Velocities | None = None
-    acceleration: Accelerations | None = None
-    jerk: Jerks | None = None
-    torque: Torques | None = None
     allow_looser_limits: Flag = False
-    """Without it a limit may only be tighter than the model's."""
+    """Whether limits may be looser than the model's."""
 
 
 class WorkspaceConfig(Strict):
-    """Where the tcp may be, in the arm's base frame, m."""
+    """The space that the tcp may be in, in the arm's base frame, m."""
 
     lower: Position | None = None
     upper: Position | None = None
     table_height: Coordinate | None = None
-    """Of a plane that the tcp stays above."""
+    """Height of a plane that the tcp stays above."""
 
 
 class GripperConfig(Device):
@@ -221,9 +214,9 @@ class GripperConfig(Device):
 
     enabled: Flag = True
     speed: Speed | None = None
-    """Of the width, m/s; at most the model's."""
+    """Speed of the width, m/s; at most the model's."""
     force: Force | None = None
-    """N"""
+    """Grip force, N."""
 
 
 class RobotConfig(Device):
@@ -232,16 +225,16 @@ class RobotConfig(Device):
     model: str
     """A name in ``robots/``, or the path of a file of your own."""
     base: PoseConfig = PoseConfig()
-    """Of the base link in the world."""
+    """Pose of the base link in the world."""
     initial: JointPositions | None = None
-    """Joint positions at the start of a simulation, rad; home when left out."""
+    """Joint positions at the start of a simulation, rad; default: home."""
     rate_hz: RateHz | None = None
-    """Of a real arm's control cycle; the model's when left out."""
+    """Rate of a real arm's control cycle; default: the model's."""
     gripper: GripperConfig = GripperConfig()
     speed: Share = 0.3
     """Greatest share of the joint speed limits in a control session."""
     move_speed: Share = 0.1
-    """Share of the joint speed limits in ``move_to`` unless told otherwise."""
+    """Default share of the joint speed limits in ``move_to``."""
     tcp_speed: TcpSpeed = 0.25
     """Greatest speed of the tcp, m/s (ISO 10218's reduced speed)."""
     limits: LimitsConfig = LimitsConfig()
@@ -249,17 +242,17 @@ class RobotConfig(Device):
 
 
 class Output(Strict):
-    """Size of the frames handed out, pixels."""
+    """Size of the frames, pixels."""
 
     width: Pixels
     height: Pixels
 
 
 class StreamConfig(Strict):
-    """One kind of picture. What is left out is as in ``capture``."""
+    """One stream. Size and rate default to those of ``capture``."""
 
     format: str | None = None
-    """Of the real camera (``bgr8``, ``z16``, ...). Frames are RGB and metres whatever it is."""
+    """Format of the real camera (``bgr8``, ``z16``, ...). Frames are always in RGB and metres."""
     width: Pixels | None = None
     height: Pixels | None = None
     rate_hz: CameraRate | None = None
@@ -267,7 +260,7 @@ class StreamConfig(Strict):
     @model_validator(mode="after")
     def _whole_size(self) -> StreamConfig:
         if (self.width is None) != (self.height is None):
-            raise ValueError("needs width and height, or neither")
+            raise ValueProblem("needs width and height, or neither", "missing_key")
         return self
 
 
@@ -279,24 +272,24 @@ def _color_and_depth() -> dict[Stream, StreamConfig]:
 
 
 class CameraConfig(Device):
-    """A camera. It stands where ``look_at``, ``pose`` or ``attached`` says."""
+    """A camera. One of ``look_at``, ``pose`` and ``attached`` gives its pose."""
 
     model: str
     """A name in ``sensors/cameras/``, or the path of a file of your own."""
     capture: Capture | None = None
-    """One of the model's modes, for every stream that does not say otherwise."""
+    """One of the model's modes, for every stream without its own size and rate."""
     output: Output | None = None
-    """Centre crop and scaling of what was captured; none when left out."""
+    """Size after a centre crop and scaling; default: the captured size."""
     streams: Annotated[
         dict[Stream, StreamConfig],
         BeforeValidator(by_name, json_schema_input_type=dict[Stream, StreamConfig | None] | list[Stream]),
     ] = Field(default_factory=_color_and_depth)
     """``{color: {format: bgr8}, ...}`` or just ``[color, depth]``."""
     align: Literal["color", "depth"] | None = None
-    """Whose view colour and depth are handed out in; colour's when left out, where there is colour."""
+    """Stream whose view colour and depth are returned in; default: colour's, if there is colour."""
     look_at: LookAt | None = None
     pose: PoseConfig | None = None
-    """Of the optical frame (x right, y down, z forward) in the world, as calibration writes it."""
+    """Pose of the optical frame (x right, y down, z forward) in the world, as calibration writes it."""
     attached: Attached | None = None
     field_of_view: FieldOfView | None = None
     """Only for models that leave it to the rig (``pinhole``)."""
@@ -307,7 +300,7 @@ class CameraConfig(Device):
     def _one_place(self) -> CameraConfig:
         given = [key for key in ("look_at", "pose", "attached") if getattr(self, key) is not None]
         if len(given) > 1:
-            raise ValueError(f"stands in one place: give one of {', '.join(given)}")
+            raise ValueProblem(f"has more than one pose: give one of {', '.join(given)}", "conflict")
         return self
 
 
@@ -319,11 +312,11 @@ class PadConfig(Strict):
     driver: str = "auto"
     """``auto``, ``evdev``, ``web``, ``terminal``, ``playback`` or another driver."""
     file: str | None = None
-    """The recording that ``playback`` plays."""
+    """Recording for the driver ``playback``."""
     dead_zone: Annotated[float, Quantity("", 0.0, 0.9)] = 0.08
-    """Share of a stick's way that counts as its rest."""
+    """Share of a stick's travel that counts as rest."""
     options: dict[str, Any] = Field(default_factory=dict)
-    """What only this driver needs."""
+    """Options of the driver."""
 
 
 class SimulationConfig(Strict):
@@ -334,21 +327,22 @@ class SimulationConfig(Strict):
     gravity: Gravity = (0.0, 0.0, -9.81)
     """m/s2"""
     clock: Literal["real_time", "lock_step"] | None = None
-    """``lock_step``: time stands still until somebody waits. Left out: real time, and lock-step for the mock."""
+    """``lock_step``: time advances only while the program waits. Default: real time; lock-step for the mock."""
     renderer: Literal["auto", "gl", "tiny"] = "auto"
-    """``gl`` is moderngl, ``tiny`` PyBullet's own; ``auto`` takes the first that works."""
+    """``gl`` is moderngl, ``tiny`` PyBullet's own; ``auto`` is the first that works."""
 
 
 def _objects(value: Any) -> Any:
-    if value is None:  # "objects:" with nothing after it
+    if value is None:  # "objects:" without a value
         return []
     if not isinstance(value, (list, tuple)):
-        raise ValueError(f"must be a list of files, names or {{name, shape, ...}}, not {describe(value)}")
+        message = f"must be a list of files, names or {{name, shape, ...}}, not {describe(value)}"
+        raise ValueProblem(message, "wrong_type")
     return value
 
 
 def _section(value: Any) -> Any:
-    """A key with nothing after it is an empty section."""
+    """Return a section; a key without a value is an empty one."""
     return {} if value is None else value
 
 
@@ -360,15 +354,15 @@ class RigFile(Strict):
 
     description: str = ""
     sim: Flag = True
-    """The one flag: is everything simulated that does not say otherwise?"""
+    """Whether every device without a flag of its own is simulated."""
     robots: Annotated[dict[Name, RobotConfig], BeforeValidator(_section), _FEW] = Field(default_factory=dict)
     cameras: Annotated[dict[Name, CameraConfig], BeforeValidator(_section), _FEW] = Field(default_factory=dict)
     gamepads: Annotated[dict[Name, PadConfig], BeforeValidator(_section), _FEW] = Field(default_factory=dict)
     objects: Annotated[list[Any], BeforeValidator(_objects)] = Field(default_factory=list, max_length=OBJECTS)
-    """Of the simulated world: names in ``config/objects/``, paths, or ``{name, shape, ...}``."""
+    """Objects of the simulated world: names in ``config/objects/``, paths, or ``{name, shape, ...}``."""
     simulation: Annotated[SimulationConfig, BeforeValidator(_section)] = SimulationConfig()
 
 
 def rig_schema() -> dict[str, Any]:
-    """Return the JSON schema of a rig's file: what an editor completes, explains and underlines."""
+    """Return the JSON schema of a rig's file: an editor uses it for completion and checks."""
     return {"$schema": "https://json-schema.org/draft/2020-12/schema"} | RigFile.model_json_schema()

@@ -1,4 +1,4 @@
-"""What the schemas of all YAML files are built from: strict records, quantities with their units, vectors, poses."""
+"""Building blocks of all YAML schemas: strict records, quantities with units and ranges, vectors, poses."""
 
 from __future__ import annotations
 
@@ -53,6 +53,7 @@ __all__ = [
     "TcpSpeed",
     "Torques",
     "Unknown",
+    "ValueProblem",
     "Velocities",
     "ViewAngle",
     "describe",
@@ -64,11 +65,20 @@ __all__ = [
 
 
 class Unknown(AttributeError):
-    """A key was asked for whose value is wrong or missing, which has been noted: leave out what needs it."""
+    """A key was read whose value is wrong or missing, which is already a problem: skip what needs it."""
+
+
+class ValueProblem(ValueError):
+    """A value that a record's own check refuses."""
+
+    def __init__(self, message: str, code: str = "invalid") -> None:
+        super().__init__(message)
+        self.code = code
+        """Stable identifier of the kind of problem (see :mod:`.files`)."""
 
 
 class Strict(BaseModel):
-    """A record that knows all its keys. One from a file with mistakes can have holes, which raise :class:`Unknown`."""
+    """A record without unknown keys. One from a file with mistakes can have holes, which raise :class:`Unknown`."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, use_attribute_docstrings=True)
 
@@ -81,7 +91,7 @@ class Strict(BaseModel):
 
 
 def describe(value: Any) -> str:
-    """A wrong value, short enough for a message."""
+    """Return a wrong value in words short enough for a message."""
     if isinstance(value, bool):
         return "true" if value else "false"
     if value is None:
@@ -97,7 +107,7 @@ def describe(value: Any) -> str:
 
 
 def is_number(value: Any) -> bool:
-    """A number that any of the quantities here can be: finite, and no whole number beyond what floats hold."""
+    """Return whether a value is a number that a quantity can have: finite, and within what floats represent exactly."""
     return isinstance(value, (int, float)) and not isinstance(value, bool) and -1e12 < value < 1e12
 
 
@@ -108,14 +118,14 @@ _SMALLER = {
     "rad": ("deg", math.pi / 180.0),
     "rad/s": ("deg/s", math.pi / 180.0),
 }
-"""Units that are mistaken for others: what a value out of range was probably written in, and how much that is."""
+"""Unit -> the unit that a value out of range was probably written in, and its factor."""
 
 
 @dataclass(frozen=True)
 class Quantity:
-    """A physical quantity: its unit, and the range outside which a value is a mistake (mostly a wrong unit).
+    """A physical quantity: its unit, and the range outside which a value is a mistake, usually a wrong unit.
 
-    Stands in an ``Annotated`` type: it checks the value, and puts range and unit into the JSON schema.
+    Used in an ``Annotated`` type: it checks the value, and adds range and unit to the JSON schema.
     """
 
     unit: str
@@ -132,15 +142,16 @@ class Quantity:
         return (value > self.least if self.above else value >= self.least) and value <= self.most
 
     def check(self, value: Any) -> float:
-        """Return the value as a float. Raises ValueError with the range and the unit."""
+        """Return the value as a float. Raises ValueProblem, whose message has the range and the unit."""
         if not is_number(value):
-            raise ValueError(f"must be a number{f' in {self.unit}' if self.unit else ''}, not {describe(value)}")
+            unit = f" in {self.unit}" if self.unit else ""
+            raise ValueProblem(f"must be a number{unit}, not {describe(value)}", "wrong_type")
         if value not in self:
-            raise ValueError(f"must be {self}, not {value:g}{self.hint(value)}")
+            raise ValueProblem(f"must be {self}, not {value:g}{self.hint(value)}", "out_of_range")
         return float(value)
 
     def hint(self, value: float) -> str:
-        """Return what a value out of range is in the unit that was probably meant; empty where there is none."""
+        """Return a value out of range in the unit that was probably meant; "" if there is no such unit."""
         name, factor = _SMALLER.get(self.unit, ("", 0.0))
         return f"; {value:g} {name} would be {value * factor:.4g}" if name and value * factor in self else ""
 
@@ -159,7 +170,7 @@ class Quantity:
 
 @dataclass(frozen=True)
 class Several:
-    """A list of numbers of one quantity; stands in an ``Annotated`` type, as :class:`Quantity` does."""
+    """A list of numbers of one quantity; used in an ``Annotated`` type, as :class:`Quantity` is."""
 
     quantity: Quantity
     count: int | None
@@ -170,21 +181,22 @@ class Several:
     """Whether one number may stand for all of them."""
 
     def check(self, value: Any) -> tuple[float, ...]:
-        """Return the numbers as floats. Raises ValueError that names the first wrong one."""
+        """Return the numbers as floats. Raises ValueProblem, which names the first wrong one."""
         if self.single and is_number(value):
             value = (value,)
         count = f"{self.count} numbers" if self.count is not None else "numbers"
         what = f"{self.what} in {self.quantity.unit}" if self.quantity.unit else self.what
         if not isinstance(value, (list, tuple)):
-            raise ValueError(f"must be a list of {count} ({what}), not {describe(value)}")
+            raise ValueProblem(f"must be a list of {count} ({what}), not {describe(value)}", "wrong_type")
         if self.count is not None and len(value) != self.count:
-            raise ValueError(f"must be {count} ({what}), not {len(value)}")
+            raise ValueProblem(f"must be {count} ({what}), not {len(value)}", "wrong_count")
         for k, item in enumerate(value):
             if not is_number(item):
-                raise ValueError(f"must be {count} ({what}); item {k + 1} is {describe(item)}")
+                raise ValueProblem(f"must be {count} ({what}); item {k + 1} is {describe(item)}", "wrong_type")
             if item not in self.quantity:
                 which = f"; item {k + 1} is {item:g}" if len(value) > 1 else f", not {item:g}"
-                raise ValueError(f"must be {self.quantity} ({self.what}){which}{self.quantity.hint(item)}")
+                message = f"must be {self.quantity} ({self.what}){which}{self.quantity.hint(item)}"
+                raise ValueProblem(message, "out_of_range")
         return tuple(float(item) for item in value)
 
     def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
@@ -194,7 +206,7 @@ class Several:
         return self.json_schema()
 
     def json_schema(self) -> dict[str, Any]:
-        """Return the JSON schema of the list, or of the one number in its place."""
+        """Return the JSON schema of the list, or of the one number in place of it."""
         item = self.quantity.json_schema()
         size = {"minItems": self.count, "maxItems": self.count} if self.count is not None else {}
         several = {"type": "array", "items": item, "description": self.what, **size}
@@ -204,13 +216,13 @@ class Several:
 def _unit_quaternion(q: tuple[float, ...]) -> tuple[float, ...]:
     norm = math.hypot(*q)
     if abs(norm - 1.0) > 0.01:
-        raise ValueError(f"must be a unit quaternion x, y, z, w; the length of this one is {norm:.3g}")
+        raise ValueProblem(f"must be a unit quaternion x, y, z, w; the length of this one is {norm:.3g}")
     return tuple(item / norm for item in q)
 
 
 def _with_length(direction: tuple[float, ...]) -> tuple[float, ...]:
     if math.hypot(*direction) < 1e-6:
-        raise ValueError("must be a direction; its length may be any but 0")
+        raise ValueProblem("must be a direction, of any length but 0", "out_of_range")
     return direction
 
 
@@ -218,8 +230,8 @@ Flag = Annotated[bool, Field(strict=True)]
 Name = Annotated[str, Field(pattern=r"^[A-Za-z_][A-Za-z0-9_-]*$")]
 Pixels = Annotated[int, Field(strict=True, gt=0, le=16384)]
 
-# Every number of a rig, a model, an object or a mapping is one of these. The ranges hold what can stand on one bench;
-# what a real arm may be given at most is in resolve_limits.py.
+# Every number of a rig, a model, an object or a mapping is one of these. The ranges include everything that fits on one
+# bench; bounds for a real arm are in resolve_robots.py.
 Share = Annotated[float, Quantity("", 0.0, 1.0, above=True)]
 Factor = Annotated[float, Quantity("", 0.0, 1000.0, above=True)]
 Size = Annotated[float, Quantity("m", 0.0, 5.0, above=True)]
@@ -252,7 +264,7 @@ Rgba = Annotated[_Four, Several(Quantity("", 0.0, 1.0), 4, "red, green, blue, al
 _Any = tuple[float, ...]
 _EACH = "one for each joint"
 _OR_ALL = "one for each joint, or one for all of them"
-# Joints that slide have m in the place of rad.
+# Joints that slide have m instead of rad.
 JointPositions = Annotated[_Any, Several(Quantity("rad", -1e4, 1e4), None, _EACH)]
 """Compared with the limits of the joints later."""
 JointLimits = Annotated[_Any, Several(Quantity("rad", -30.0, 30.0), None, _OR_ALL, single=True)]
@@ -272,7 +284,7 @@ class PoseConfig(Strict):
 
     @classmethod
     def __get_pydantic_json_schema__(cls, core_schema: Any, handler: Any) -> dict[str, Any]:
-        """Both ways to write it."""
+        """Return the schema of both ways to write a pose."""
         own = handler(core_schema)
         return {
             "description": own.pop("description", ""),
@@ -289,7 +301,7 @@ class PoseConfig(Strict):
 
 
 def keys_at(model: type[BaseModel], loc: Sequence[Any]) -> tuple[str, ...]:
-    """The keys that are allowed at a place in a record: what an unknown key is compared with."""
+    """Return the keys that are allowed at a place (keys and indices, from the outermost inwards) in a record."""
     kind: Any = model
     for part in loc:
         kind = kind_inside(kind, part)
@@ -298,7 +310,7 @@ def keys_at(model: type[BaseModel], loc: Sequence[Any]) -> tuple[str, ...]:
 
 
 def kind_inside(kind: Any, part: Any) -> Any:
-    """The type of what stands at ``part`` in a record, a dict or a list of the type ``kind``; None where unknown."""
+    """Return the type of the value at ``part`` of a record, a dict or a list of the type ``kind``; None if unknown."""
     record = record_in(kind)
     if record is not None:
         found = record.model_fields.get(str(part))
@@ -311,12 +323,12 @@ def kind_inside(kind: Any, part: Any) -> Any:
 
 
 def record_in(kind: Any) -> type[BaseModel] | None:
-    """The record that a value of the type ``kind`` is, where it is one."""
+    """Return the class of record that a value of the type ``kind`` is; None if it is not a record."""
     return next((k for k in _options(kind) if isinstance(k, type) and issubclass(k, BaseModel)), None)
 
 
 def _options(kind: Any) -> tuple[Any, ...]:
-    """``X | None`` and ``Annotated[X, ...]`` hold X."""
+    """Return the types in ``X | None`` and ``Annotated[X, ...]``: X."""
     if typing.get_origin(kind) is Annotated:
         return _options(typing.get_args(kind)[0])
     if type(None) in typing.get_args(kind):

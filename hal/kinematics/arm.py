@@ -1,7 +1,7 @@
 """Kinematics of one arm: forward, differential and inverse, by pinocchio. Poses are in the arm's base frame.
 
-The model is reduced to the arm's joints, in the order of the spec; every other joint (fingers, a second arm) stands
-at zero. Continuous joints are treated as revolute joints without an end, so that a configuration is always n angles.
+The model is reduced to the arm's joints, in the order of the spec; every other joint (fingers, a second arm) is at
+zero. Continuous joints are treated as revolute joints without an end, so that a configuration is always n angles.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 from ..arguments import vector
 from ..errors import CommandError
 from ..geometry import Pose, difference
+from . import ik
 from .urdf import parse_xml
 
 if TYPE_CHECKING:
@@ -39,9 +40,11 @@ POSTURE_SPEED = 0.5
 class Kinematics:
     """Forward, differential and inverse kinematics of one arm with ``n`` joints.
 
-    Holds scratch memory: one object per thread. Joint positions are n numbers in rad, in the order of
-    ``spec.joints``; angles of continuous joints may take any value. Raises ValueError when the URDF does not have
-    what the spec names.
+    Joint positions are n numbers in rad, in the order of ``spec.joints``; angles of continuous joints may take any
+    value. An object has scratch memory, so every thread needs its own.
+
+    Raises:
+        ValueError: The URDF lacks a joint or a link of the spec.
     """
 
     def __init__(self, spec: KinematicsSpec) -> None:
@@ -61,7 +64,7 @@ class Kinematics:
         self._model: Any = _reduced_model(spec, pin)
         self._tcp: int = _tcp_frame(self._model, spec, pin)
         self._data: Any = self._model.createData()
-        # These are views: they show whatever was computed last.
+        # These are views of what was computed last.
         self._tcp_placement: Any = self._data.oMf[self._tcp]
         self._axes: Any = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
         self._eigen: Any = eigenpy.SelfAdjointEigenSolver(np.eye(6))
@@ -69,7 +72,7 @@ class Kinematics:
         self._gram: Array = np.empty((6, 6))
         self._regular_at: Sequence[float] = (inf,) * self.n
         self._regular_room = 0.0
-        # Column of pinocchio's model for each joint of the spec; None where the orders agree, which is usual.
+        # Column of pinocchio's model for each joint of the spec; None if the orders agree, as they usually do.
         columns = [int(self._model.joints[self._model.getJointId(name)].idx_q) for name in spec.joints]
         self._columns: NDArray[np.intp] | None = None
         self._inverse_columns: NDArray[np.intp] | None = None
@@ -77,24 +80,24 @@ class Kinematics:
             self._columns, self._inverse_columns = np.array(columns), np.argsort(columns)
         ranks = np.array([self._model.getJointId(name) for name in spec.joints])
         self._inner = (ranks[:, None] <= ranks)[:, :, None]
-        """Is joint i nearer to the base than joint j, or the same? (n, n, 1)"""
+        """(n, n, 1): whether joint i is joint j or nearer to the base."""
         # Greatest change of the Jacobian (Frobenius norm) for a turn of the joints of length 1.
         self._change = sqrt(self.n) * hypot(*self.reach(), sqrt(self.n))
 
     def fk(self, q: Sequence[float] | Array) -> Pose7:
-        """Pose of the tcp as seven plain floats."""
+        """Return the pose of the tcp as seven plain floats."""
         self._forward(q)
         self._pin.updateFramePlacement(self._model, self._data, self._tcp)
         pose: Pose7 = self._pin.SE3ToXYZQUATtuple(self._tcp_placement)
         return pose
 
     def pose(self, q: Sequence[float] | Array) -> Pose:
-        """Pose of the tcp."""
+        """Return the pose of the tcp."""
         values = self.fk(q)
         return Pose(values[:3], values[3:])
 
     def link_pose(self, link: str, q: Sequence[float] | Array) -> Pose:
-        """Pose of any link of the URDF (its own frame, not its centre of mass). KeyError for an unknown link."""
+        """Return the pose of a link's frame (not its centre of mass). Raises KeyError for an unknown link."""
         frame = self._model.getFrameId(link)
         if frame >= self._model.nframes or self._model.frames[frame].type != self._pin.FrameType.BODY:
             links = [f.name for f in self._model.frames if f.type == self._pin.FrameType.BODY]
@@ -106,30 +109,30 @@ class Kinematics:
         return Pose(values[:3], values[3:])
 
     def jacobian(self, q: Sequence[float] | Array) -> Array:
-        """(6, n): joint speeds to the tcp's velocity in m/s and rad/s, along the base's axes, linear rows first."""
+        """Return the Jacobian (6, n) from joint speeds to the tcp's velocity, m/s then rad/s, along the base's axes."""
         jacobian: Array = self._pin.computeFrameJacobian(
             self._model, self._data, self._ordered(q), self._tcp, self._axes
         )
         return jacobian if self._columns is None else jacobian[:, self._columns]
 
     def fk_and_jacobian(self, q: Sequence[float] | Array) -> tuple[Pose7, Array]:
-        """:meth:`fk` and :meth:`jacobian` together, for little more than one of them."""
+        """Return :meth:`fk` and :meth:`jacobian`; together they take little longer than one of them."""
         jacobian = self.jacobian(q)  # has done the forward kinematics of the joints
         self._pin.updateFramePlacement(self._model, self._data, self._tcp)
         pose: Pose7 = self._pin.SE3ToXYZQUATtuple(self._tcp_placement)
         return pose, jacobian
 
     def curvature(self, jacobian: Array) -> Array:
-        """(n, n, 3): change of the linear Jacobian's column j, in m/rad, for each rad that joint i turns.
+        """Return (n, n, 3), m/rad: change of column j of the linear Jacobian for each rad that joint i turns.
 
-        ``jacobian`` (6, n) is that of the place in question. Turning joint i turns the levers of all joints from i to
+        ``jacobian`` (6, n) is that of the present position. Turning joint i turns the levers of all joints from i to
         the tip; the rest follows, since second derivatives of the tcp's position are symmetric.
         """
         turned = np.cross(jacobian[3:].T[:, None], jacobian[:3].T)
         return np.where(self._inner, turned, turned.transpose(1, 0, 2))
 
     def mass_matrix(self, q: Sequence[float] | Array) -> Array:
-        """(n, n) joint-space inertia, kg m2, as the URDF says: some invent it, and then it is good for nothing."""
+        """Return the joint-space inertia (n, n), kg m2, of the URDF, which in some files has made-up values."""
         mass: Array = self._pin.crba(self._model, self._data, self._ordered(q))
         return mass if self._columns is None else mass[np.ix_(self._columns, self._columns)]
 
@@ -142,12 +145,11 @@ class Kinematics:
     ) -> tuple[list[float], bool]:
         """Return the joint speeds (n,) in rad/s for a twist (6,) of the tcp, and whether the arm is near a singularity.
 
-        What the twist leaves free moves towards home at ``posture_gain`` (1/s) times the distance, at most
-        :data:`POSTURE_SPEED`; that motion is in the null space and does not move the tcp. Callers that have the
-        Jacobian at ``q`` already can pass it.
+        The null space of the twist moves towards home at ``posture_gain`` (1/s) times the distance, at most at
+        :data:`POSTURE_SPEED`; that does not move the tcp. Callers that have the Jacobian at ``q`` can pass it.
 
-        Far from singularities a twist is met exactly. Near one, the component along each direction whose singular
-        value s is below :data:`NEAR_SINGULAR` (e) is met to the share (s/e)^2, so that joint speeds stay below
+        Far from singularities a twist is tracked exactly. Near one, the component along each direction whose singular
+        value s is below :data:`NEAR_SINGULAR` (e) is tracked to the share (s/e)^2, so that joint speeds stay below
         |twist| / e: damped least squares with numerical filtering (Maciejewski and Klein, J. Robotic Systems 5(6),
         1988) with the damping s^2 + l^2 = max(s, e)^2. All other directions stay exact.
         """
@@ -155,13 +157,13 @@ class Kinematics:
             jacobian = self.jacobian(q)
         gram = np.dot(jacobian, jacobian.T, self._gram)
         near = not self._is_surely_regular(q) and self._is_near_singular(q, gram)
-        home = self._pull(q, posture_gain) if self.n > 6 else None  # else nothing is left free for a posture
+        home = self._pull(q, posture_gain) if self.n > 6 else None  # else there is no null space
         wanted = np.array(twist, float)
         if not near:
             self._llt.compute(gram)
             if home is None:
                 speeds = self._llt.solve(wanted).dot(jacobian)
-            else:  # the way home, less what it would move the tcp
+            else:  # the motion home, without the part that would move the tcp
                 speeds = self._llt.solve(wanted - jacobian.dot(home)).dot(jacobian) + home
         else:
             squares = self._eigen.eigenvalues()  # of the singular values, in ascending order
@@ -169,14 +171,14 @@ class Kinematics:
             along = vectors.T.dot(jacobian)
             speeds = (vectors.T.dot(wanted) / np.maximum(squares, NEAR_SINGULAR**2)).dot(along)
             if home is not None:
-                # The null space is taken undamped, or the posture would creep along the singular direction.
+                # The null space is undamped, or the posture would creep along the singular direction.
                 regular = squares > 1e-12
                 speeds += home - (along[regular].dot(home) / squares[regular]).dot(along[regular])
         result: list[float] = speeds.tolist()
         return result, near
 
     def _pull(self, q: Sequence[float] | Array, gain: float) -> Array | None:
-        """Return the speeds (n,) towards home, rad/s; None where there are none."""
+        """Return the speeds (n,) towards home, rad/s; None if they are all 0."""
         way = [x - y for x, y in zip(self._home, q, strict=True)]
         farthest = max(map(abs, way))
         if gain == 0.0 or farthest == 0.0:
@@ -185,14 +187,14 @@ class Kinematics:
         return np.array([gain * x for x in way])
 
     def _is_near_singular(self, q: Sequence[float] | Array, gram: Array) -> bool:
-        """Is a singular value of the Jacobian at ``q`` below :data:`NEAR_SINGULAR`? Its ``gram`` matrix is J J^T."""
+        """Return whether the Jacobian at ``q`` has a singular value below :data:`NEAR_SINGULAR`; ``gram`` is J J^T."""
         self._eigen.compute(gram)
         square = float(self._eigen.eigenvalues()[0])
         self._regular_at, self._regular_room = tuple(q), sqrt(max(0.0, square)) - NEAR_SINGULAR
         return square < NEAR_SINGULAR**2
 
     def _is_surely_regular(self, q: Sequence[float] | Array) -> bool:
-        """Is the arm surely not near a singularity, because it was not when one was looked for last? False: not proven.
+        """Return whether the arm cannot be near a singularity, by its distance from the last position that was checked.
 
         No singular value of J changes by more than the Frobenius norm of the change of J (Weyl). A turn of the joints
         by d changes the linear part of each of its n columns by at most |reach| |d| (see :meth:`reach`), the angular
@@ -201,7 +203,7 @@ class Kinematics:
         return dist(q, self._regular_at) * self._change <= self._regular_room
 
     def pose_error(self, q: Sequence[float] | Array, pose: Sequence[float] | Array) -> Array:
-        """(6,) the constant twist along the base's axes that takes the tcp from ``fk(q)`` to ``pose`` in 1 s.
+        """Return the constant twist (6,) along the base's axes that moves the tcp from ``fk(q)`` to ``pose`` in 1 s.
 
         Linear part: the difference of the positions, m. Angular part: the rotation vector (the logarithm) of the
         rotation between them, rad, never longer than pi.
@@ -217,41 +219,46 @@ class Kinematics:
         rotation_tolerance: float = 1e-5,
         starts: int = 24,
     ) -> Array:
-        """Joint positions (n,) inside the limits that bring the tcp to ``pose``, near ``q_seed`` (home when None).
+        """Return joint positions (n,) inside the limits that bring the tcp to ``pose``.
 
-        Searches from the seed, then from points ever farther from it, at most ``starts`` of them, the same ones every
-        time. Raises :class:`~hal.errors.Unreachable` with the distance of the closest position found, computed from
-        its forward kinematics, and CommandError for a seed of the wrong shape.
+        Args:
+            pose: In the base frame.
+            q_seed: (n,) rad; the search starts there, then at points ever farther from it. None: home.
+            position_tolerance: m.
+            rotation_tolerance: rad.
+            starts: Most points to search from; they are the same in every call.
+
+        Raises:
+            Unreachable: No position was found; it has the distance of the closest one, from its forward kinematics.
+            CommandError: A seed of the wrong shape.
         """
-        from .ik import solve
-
         if not isinstance(pose, Pose):
             raise CommandError(f"pose must be a hal.Pose, not a {type(pose).__name__}")
         seed = self.home if q_seed is None else vector("q_seed", q_seed, self.n)
-        return solve(self, pose, seed, position_tolerance, rotation_tolerance, starts)
+        return ik.solve(self, pose, seed, position_tolerance, rotation_tolerance, starts)
 
     def reach(self) -> tuple[float, ...]:
-        """Per joint, a speed of the tcp (m/s) that 1 rad/s (or 1 m/s) of it never exceeds, wherever the arm is.
+        """Return for each joint the greatest speed of the tcp, m/s, at 1 rad/s (or 1 m/s) of it, for all positions.
 
-        The way from a joint's axis to the tcp along the links is at least as long as any lever arm. The numbers do not
-        grow from base to tip, and bound the change of the Jacobian as well: turning joint j by x rad turns or shifts
+        The distance from a joint's axis to the tcp along the links is at least as long as any lever arm. The numbers do
+        not grow from base to tip, and bound the change of the Jacobian, too: turning joint j by x rad turns or shifts
         every column of the linear part by at most ``reach[j] * x``.
         """
         return self._levers()[0]
 
     def farthest(self) -> float:
-        """A distance of the tcp from the base frame's origin that no joint position exceeds, m."""
+        """Return a bound on the distance of the tcp from the base frame's origin, m."""
         return self._levers()[1]
 
     def _levers(self) -> tuple[tuple[float, ...], float]:
-        """The way along the links from each joint, and from the base, to the tcp, at most."""
+        """Return bounds on the distances along the links from each joint, and from the base, to the tcp, m."""
         model = self._model
         frame = model.frames[self._tcp]
         joint, distance, least = int(frame.parentJoint), float(np.linalg.norm(frame.placement.translation)), 0.0
         reach = dict.fromkeys(self.spec.joints, 0.0)
         while joint > 0:
             name = str(model.names[joint])
-            if "JointModelP" in model.joints[joint].shortname():  # it slides: 1 m/m, and it makes the way longer
+            if "JointModelP" in model.joints[joint].shortname():  # it slides: 1 m/m, and it makes the distance longer
                 least = 1.0
                 k = self.spec.joints.index(name)
                 distance += max(abs(self.spec.lower[k]), abs(self.spec.upper[k]))
@@ -269,7 +276,7 @@ class Kinematics:
 
 
 def _reduced_model(spec: KinematicsSpec, pin: Any) -> Any:
-    """Pinocchio's model of the arm's joints alone, its world frame moved into the base link."""
+    """Return pinocchio's model of the arm's joints alone, with the base link as its world frame."""
     full = pin.buildModelFromXML(_bounded_joints(spec.urdf))
     missing = [name for name in spec.joints if not full.existJointName(name)]
     if missing:
@@ -293,7 +300,7 @@ def _reduced_model(spec: KinematicsSpec, pin: Any) -> Any:
 
 
 def _bounded_joints(urdf: str) -> str:
-    """The URDF's text with continuous joints made revolute: pinocchio gives the former two numbers each."""
+    """Return the URDF's text with continuous joints made revolute: pinocchio has two numbers for a continuous one."""
     robot = parse_xml(urdf)
     for joint in robot.iter("joint"):
         if joint.get("type") == "continuous":
@@ -312,7 +319,7 @@ def _frame(model: Any, link: str, spec: KinematicsSpec) -> int:
 
 
 def _tcp_frame(model: Any, spec: KinematicsSpec, pin: Any) -> int:
-    """Add the tool centre point to the model as a frame of its own."""
+    """Add the tool centre point to the model as a frame, and return its index."""
     link = model.frames[_frame(model, spec.tcp_link, spec)]
     offset = pin.XYZQUATToSE3(np.array([*spec.tcp_position, *Pose((0, 0, 0), spec.tcp_orientation).orientation]))
     frame = pin.Frame("hal_tcp", link.parentJoint, 0, link.placement * offset, pin.FrameType.OP_FRAME)

@@ -1,1 +1,1 @@
-"""Gamepads behind the public class: models as data, from event codes to named controls, and which pad drives."""
+"""Gamepads below :class:`hal.Gamepad`: models as data, conversion of events into controls, and the choice of a pad."""

@@ -1,7 +1,7 @@
 """Names and numbers of the input events that gamepads send.
 
-Source: the Linux kernel's ``include/uapi/linux/input-event-codes.h``. They stand here as well, though python-evdev has
-them too, because pad models and recordings name them on machines that have no evdev.
+Source: the Linux kernel's ``include/uapi/linux/input-event-codes.h``. python-evdev has them, too, but pad models and
+recordings use them on machines without evdev.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ ABS: Mapping[str, int] = MappingProxyType(_abs())
 REL: Mapping[str, int] = MappingProxyType(
     {f"REL_{name}": code for code, name in enumerate(("X", "Y", "Z", "RX", "RY", "RZ"))}
 )
-"""Axes that say how far, and nothing when they are let go of: name -> code."""
+"""Axes that report a displacement, and nothing when they are released: name -> code."""
 KEY: Mapping[str, int] = MappingProxyType(_key())
 """Buttons: name -> code."""
 ABS_NAME: Mapping[int, str] = MappingProxyType({code: name for name, code in ABS.items()})

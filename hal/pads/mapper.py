@@ -1,4 +1,4 @@
-"""From a pad's raw events to the canonical axes and buttons."""
+"""Convert the raw events of a gamepad into the axes and buttons that are the same for every pad."""
 
 from __future__ import annotations
 
@@ -14,22 +14,22 @@ if TYPE_CHECKING:
 __all__ = ["REL_SILENCE", "AxisRange", "PadMapper"]
 
 REL_SILENCE = 0.1
-"""s without an event after which a ``REL_`` axis is at rest: nothing is sent when it is let go of. A cap that is pushed
-reports at the pace of USB, every 8 or 16 ms, so a motion does not stutter when some reports are late. And it is less
-than the 120 ms after which a pad that says nothing at all trips the arm."""
+"""Time without an event after which a ``REL_`` axis is at rest, s: no event is sent when it is released. A pushed cap
+reports at the rate of USB, every 8 or 16 ms, so late reports do not interrupt a motion. The time is shorter than the
+120 ms after which a silent pad stops the arm."""
 _TRIGGERS = ("l2", "r2")
 
 
 class AxisRange(NamedTuple):
-    """What a pad says about one of its axes, in its own numbers."""
+    """Range of one axis, in the pad's own units."""
 
     minimum: int
     maximum: int
     flat: int = 0
-    """Values this near to the middle mean nothing."""
+    """Distance from the middle that counts as rest."""
 
     def normalised(self, value: int, trigger: bool) -> float:
-        """-1..1 for a stick, 0..1 for a trigger."""
+        """Return a value from -1 to 1 for a stick, from 0 to 1 for a trigger."""
         share = (value - self.minimum) / (self.maximum - self.minimum)
         share = min(1.0, max(0.0, share))
         return share if trigger else 2.0 * share - 1.0
@@ -41,18 +41,20 @@ class _Axis(NamedTuple):
     range: AxisRange
 
     def value(self, raw: int) -> float:
-        """The canonical value."""
+        """Return the canonical value."""
         return self.sign * self.range.normalised(raw, self.control in _TRIGGERS) + 0.0  # no -0.0
 
 
 class PadMapper:
-    """Keeps the canonical state of one pad: feed it events, or what the system says is the present state.
+    """The canonical state of one pad, updated from its events or from the state that the kernel reports.
 
-    ``ranges`` holds what the pad says about its ``ABS_`` axes, by event code, and ``rels`` the codes of its ``REL_``
-    axes; an axis of the model that is in neither does not exist. An axis counts as unknown, and shows 0, until its
-    first event, or until :meth:`sync`.
+    An axis is unknown, with the value 0, until its first event or until :meth:`sync`. If the triggers of a pad are only
+    axes, or only buttons, the other is computed.
 
-    A pad whose triggers are only axes, or only buttons, gets the other one computed.
+    Args:
+        model: The pad's model.
+        ranges: Event code -> range of the ``ABS_`` axes that the pad reports.
+        rels: Event codes of its ``REL_`` axes. An axis of the model that is in neither does not exist.
     """
 
     def __init__(self, model: PadModel, ranges: Mapping[int, AxisRange], rels: Collection[int] = ()) -> None:
@@ -83,19 +85,19 @@ class PadMapper:
             axis.control: axis.range.flat / (axis.range.maximum - axis.range.minimum) * _spread(axis.control)
             for axis in axes
         }
-        """Share of each axis' travel from neutral that the pad says means nothing."""
+        """Share of each axis' travel from neutral that the pad declares as rest."""
         self._heard: dict[int, float] = {}
-        """When each ``REL_`` axis spoke last, or could have first."""
+        """Time of the last event of each ``REL_`` axis, or of the first check without one."""
         self._fed: set[str] = set()
-        """Controls that an event spoke of."""
+        """Controls that an event has set."""
         self.axes: dict[str, float] = {}
         self.buttons: frozenset[str] = frozenset()
         self.unknown: frozenset[str] = frozenset()
-        """Axes that the pad has not spoken of yet; they show 0."""
+        """Axes without an event yet; their value is 0."""
         self.release()
 
     def release(self) -> None:
-        """Everything neutral, and no axis known."""
+        """Make every control neutral and every axis unknown."""
         self.axes = dict.fromkeys(self._controls, 0.0)
         self.buttons = frozenset()
         self.unknown = frozenset(axis.control for axis in (*self._axes.values(), *self._rels.values()))
@@ -105,7 +107,7 @@ class PadMapper:
             threshold.held = False
 
     def feed(self, kind: int, code: int, value: int, t: float = 0.0) -> bool:
-        """Take one event of the time ``t`` (s, the clock of :meth:`expire`); True when the model knows its control."""
+        """Apply an event of time ``t`` (s, the clock of :meth:`expire`); return whether the model has its control."""
         if kind == EV_ABS and code in self._axes:
             axis = self._axes[code]
             self._fed.add(axis.control)
@@ -123,7 +125,7 @@ class PadMapper:
         return True
 
     def expire(self, now: float) -> bool:
-        """Let go of the ``REL_`` axes that have said nothing for :data:`REL_SILENCE`; True when one changed."""
+        """Reset the ``REL_`` axes that have had no event for :data:`REL_SILENCE`; return whether one changed."""
         changed = False
         for code, axis in self._rels.items():
             silent = now - self._heard.setdefault(code, now) >= REL_SILENCE
@@ -133,13 +135,16 @@ class PadMapper:
         return changed
 
     def sync(self, values: Mapping[int, int], keys: Iterable[int], *, rest: bool = False) -> None:
-        """Take the state that the system shows: axis code -> value, and the codes of the pressed buttons.
+        """Apply the state that the kernel reports.
 
-        With ``rest``, only of the controls that no event spoke of yet.
+        Only for a pad that has sent a report: before the first one the kernel's state is wrong (hid-sony: 0, a stick
+        held to the left; hid-playstation and xpad: a pad at rest). The kernel has no state of ``REL_`` axes: they are
+        reset until their next event.
 
-        Only for a pad that has spoken: before its first report the system shows what is not so (hid-sony 0, which is a
-        stick held to the left; hid-playstation and xpad a pad at rest). Of ``REL_`` axes the system knows nothing: they
-        are let go of until they speak again.
+        Args:
+            values: Event code -> value of the axes.
+            keys: Event codes of the pressed buttons.
+            rest: Only set the controls that no event has set yet.
         """
         for code, value in values.items():
             axis = self._axes.get(code)
@@ -152,11 +157,11 @@ class PadMapper:
         for control in set(self._keys.values()):
             if rest and control in self._fed:
                 continue
-            if control in down or control[1:] not in self._reported:  # else the d-pad's axis has said it
+            if control in down or control[1:] not in self._reported:  # else the d-pad's axis has set it
                 self._set_key(control, control in down)
 
     def press(self, control: str, down: bool) -> None:
-        """A button that another device of the pad reports is pressed, or let go of."""
+        """Press or release a button that another device of the pad reports."""
         self._set_button(control, down)
 
     def _set_axis(self, control: str, value: float) -> None:
@@ -183,5 +188,5 @@ class PadMapper:
 
 
 def _spread(control: str) -> float:
-    """Length of an axis' canonical range."""
+    """Return the length of an axis' canonical range."""
     return 1.0 if control in _TRIGGERS else 2.0

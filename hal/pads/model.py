@@ -1,6 +1,6 @@
-"""What a gamepad's event codes mean: the model of ``sensors/gamepads/*.yaml``, and how to choose one.
+"""Models of gamepads (``sensors/gamepads/*.yaml``): event code -> control, and how the model of a pad is chosen.
 
-A model is data only; :class:`~hal.pads.mapper.PadMapper` applies it.
+A model is data only; :class:`~hal.pads.mapper.PadMapper` applies it. :func:`guess_model` makes one for an unknown pad.
 """
 
 from __future__ import annotations
@@ -9,9 +9,10 @@ import re
 from collections.abc import Collection, Iterable, Mapping
 from typing import Annotated, Any, NamedTuple, TypeVar
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import AfterValidator, BaseModel, Field, model_validator
 
-from ..errors import ConfigError, Problem
+from ..config.files import Problems, nearest, validate
+from ..config.schema import Strict, ValueProblem
 from ..types import AXES, BUTTONS
 from .codes import ABS, BUS_BLUETOOTH, BUS_USB, KEY, REL
 
@@ -70,7 +71,7 @@ _AXIS_CODES = (*ABS, *REL)
 
 
 class Identity(NamedTuple):
-    """What the system says about a pad that is plugged in."""
+    """What the kernel reports about a connected pad."""
 
     name: str
     vendor: int
@@ -78,7 +79,7 @@ class Identity(NamedTuple):
     bus: int
     """``BUS_USB``, ``BUS_BLUETOOTH`` or another of the kernel's bus numbers."""
     driver: str
-    """The kernel's driver, for example ``xpad``; empty where it is not known."""
+    """The kernel's driver, for example ``xpad``; empty if it is unknown."""
 
     @property
     def bus_name(self) -> str:
@@ -89,7 +90,7 @@ class Identity(NamedTuple):
 def _known(kind: str, names: Collection[str]) -> AfterValidator:
     def check(name: str) -> str:
         if name not in names:
-            raise ValueError(f"{name!r} is no {kind}; there are: {', '.join(names)}")
+            raise ValueProblem(f"{name!r} is not a known {kind}{nearest(name, names)}", "unknown_control")
         return name
 
     return AfterValidator(check)
@@ -98,37 +99,35 @@ def _known(kind: str, names: Collection[str]) -> AfterValidator:
 def _axis(text: str) -> str:
     name = text.removeprefix("-")
     if name not in AXES:
-        raise ValueError(f"{name!r} is no axis; axes: {', '.join(AXES)}; with '-' in front where it is reversed")
+        message = f"{name!r} is not an axis; axes: {', '.join(AXES)}, with '-' in front for a reversed one"
+        raise ValueProblem(message, "unknown_control")
     return text
 
 
 def _button(text: str) -> str:
     if text in BUTTONS or text in ("+dpad_x", "-dpad_x", "+dpad_y", "-dpad_y"):
         return text
-    raise ValueError(f"{text!r} is no button; buttons: {', '.join(BUTTONS)}, or a d-pad's +dpad_x, -dpad_x ...")
+    message = f"{text!r} is not a button; buttons: {', '.join(BUTTONS)}, or a d-pad's +dpad_x, -dpad_x ..."
+    raise ValueProblem(message, "unknown_control")
 
 
-class _Strict(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-
-class MatchRule(_Strict):
-    """A pad matches when everything that the rule names is right."""
+class MatchRule(Strict):
+    """A rule that a pad matches if every property that the rule names is the pad's."""
 
     vendor: Annotated[int, Field(ge=0, le=0xFFFF)] | None = None
     product: Annotated[int, Field(ge=0, le=0xFFFF)] | None = None
     name: str | None = None
-    """Part of the device's name, in any case of letters."""
+    """Part of the device's name; the case does not matter."""
     driver: str | None = None
-    """The kernel's driver: pads with the same buttons report them differently through different drivers."""
+    """The kernel's driver: the same pad has other event codes with another driver."""
     bus: Annotated[str, _known("bus", ("usb", "bluetooth"))] | None = None
     wireless: bool = False
-    """What is plugged in is only the receiver of a wireless pad, so unplugging says nothing about the pad."""
+    """Whether the device is only the receiver of a wireless pad, so that it stays when the pad is gone."""
     title: str | None = None
-    """For people, where the model's own title is not this pad's."""
+    """Name to display, if it is not the model's title."""
 
     def fits(self, pad: Identity) -> int:
-        """How many of the pad's properties the rule names, all of them right; 0 when it does not match."""
+        """Return the number of properties that the rule names; 0 if the pad does not match."""
         wanted = (self.vendor, self.product, self.driver, self.bus)
         found = (pad.vendor, pad.product, pad.driver, pad.bus_name)
         if any(w is not None and w != f for w, f in zip(wanted, found, strict=True)):
@@ -138,30 +137,32 @@ class MatchRule(_Strict):
         return sum(w is not None for w in (*wanted, self.name))
 
 
-class PadModel(_Strict):
+class PadModel(Strict):
     """One kind of gamepad, as in ``sensors/gamepads/<name>.yaml``."""
 
     name: str
     """The file's name without ``.yaml``."""
     title: str
-    """For people."""
+    """Name to display."""
     match: tuple[MatchRule, ...] = ()
     axes: dict[Annotated[str, _known("event code of an axis", _AXIS_CODES)], Annotated[str, AfterValidator(_axis)]]
-    """Event code -> axis, ``-axis`` where the kernel's value grows the other way (on sticks, downwards). Codes that a
-    pad does not send may stand here too."""
+    """Event code -> axis, or ``-axis`` where the kernel's value grows the other way (on sticks, downwards). Codes that
+    a pad does not send are allowed."""
     buttons: dict[Annotated[str, _known("event code of a button", KEY)], Annotated[str, AfterValidator(_button)]]
-    """Event code -> button; ``+dpad_y`` and its like where the d-pad's directions are buttons."""
-    ranges: dict[Annotated[str, _known("event code of an axis", _AXIS_CODES)], tuple[int, int]] = {}
-    """Event code -> (minimum, maximum): of every ``REL_`` axis, for nobody can be asked, and of the axes of a pad whose
-    own answer is wrong."""
+    """Event code -> button; ``+dpad_y`` etc. where the directions of the d-pad are buttons."""
+    ranges: dict[Annotated[str, _known("event code of an axis", _AXIS_CODES)], tuple[int, int]] = Field(
+        default_factory=dict
+    )
+    """Event code -> (minimum, maximum): required for ``REL_`` axes, which report none, and for axes whose reported
+    range is wrong."""
     motion_node: str | None = None
-    """End of the name of the pad's motion sensor, which speaks all the time and so shows that the pad is alive."""
+    """End of the name of the pad's motion sensor, which reports all the time and so shows that the pad is connected."""
     touch_node: str | None = None
-    """End of the name of the pad's touchpad, a device of its own; pressing it down is the button ``touchpad``."""
+    """End of the name of the pad's touchpad, a separate device; pressing it is the button ``touchpad``."""
     printed: Annotated[str, _known("family of pads", PRINTED)] | None = None
     """Family of pads (of :data:`PRINTED`) whose names of the controls this pad has; None for plain names."""
     mapping: str | None = None
-    """Teleoperation mapping that is meant for this pad (``config/teleop``); the default one when left out."""
+    """Teleoperation mapping for this pad (``config/teleop``); default: ``default``."""
 
     @property
     def control_names(self) -> Mapping[str, str]:
@@ -172,16 +173,16 @@ class PadModel(_Strict):
     def _has_ranges(self) -> PadModel:
         missing = [code for code in self.axes if code in REL and code not in self.ranges]
         if missing:
-            raise ValueError(f"needs ranges of {', '.join(missing)}, such as [-350, 350]")
+            raise ValueProblem(f"needs ranges of {', '.join(missing)}, such as [-350, 350]", "missing_key")
         return self
 
     def rule_for(self, pad: Identity) -> MatchRule | None:
-        """The rule that describes ``pad`` best; None when the model does not match."""
+        """Return the rule with the most matching properties; None if the model does not match."""
         best = max(self.match, key=lambda rule: rule.fits(pad), default=None)
         return best if best is not None and best.fits(pad) else None
 
     def to_yaml(self) -> str:
-        """The model as a file to put into ``sensors/gamepads`` or into a rig."""
+        """Return the model as the text of a file in ``sensors/gamepads`` or beside a rig."""
         import yaml
 
         text: str = yaml.safe_dump(self.model_dump(exclude_defaults=True, mode="json"), sort_keys=False)
@@ -189,25 +190,20 @@ class PadModel(_Strict):
 
 
 def validated(cls: type[_M], data: Mapping[str, Any], file: str) -> _M:
-    """``data`` as a ``cls``. Raises ConfigError, which lists every problem; ``file`` is what it calls the place."""
-    try:
-        return cls.model_validate(dict(data))
-    except ValidationError as error:
-        raise ConfigError(
-            [
-                Problem(file, ".".join(str(part) for part in found["loc"]), found["msg"].removeprefix("Value error, "))
-                for found in error.errors()
-            ]
-        ) from None
+    """Return ``data`` as a record. Raises ConfigError, which lists every problem; ``file`` is the name in them."""
+    problems = Problems()
+    record = validate(cls, data, file, problems)
+    problems.raise_any()
+    return record
 
 
 def pad_model(data: Mapping[str, Any], file: str = "<gamepad model>") -> PadModel:
-    """A checked model. Raises ConfigError, which lists every problem; ``file`` is what it calls the place."""
+    """Return a checked model. Raises ConfigError, which lists every problem; ``file`` is its name in them."""
     return validated(PadModel, data, file)
 
 
 def choose_model(models: Iterable[PadModel], pad: Identity) -> tuple[PadModel, MatchRule] | None:
-    """The model with the most exact rule for ``pad``, and that rule; the first of equals, None for an unknown pad."""
+    """Return the model with the most specific rule for a pad, and that rule; None for an unknown pad."""
     best: tuple[PadModel, MatchRule] | None = None
     for model in models:
         rule = model.rule_for(pad)
@@ -216,7 +212,7 @@ def choose_model(models: Iterable[PadModel], pad: Identity) -> tuple[PadModel, M
     return best
 
 
-# [guess.py] A model for a pad that no model knows, from what it can send.
+# Models of unknown pads
 
 # The kernel's rules for gamepads (Documentation/input/gamepad.rst) give these; many pads keep them only in part.
 _BUTTONS = {
@@ -249,14 +245,20 @@ _CAP_REACH = (-350, 350)
 
 
 def guess_model(pad: Identity, axes: Collection[int], keys: Collection[int], rels: Collection[int] = ()) -> PadModel:
-    """A model from the event codes that the pad can send.
+    """Return a model from the event codes that the pad can send.
 
-    Where there are RX and RY they are the right stick and Z and RZ the triggers; otherwise Z and RZ are the right
-    stick, and BRAKE and GAS the triggers (Xbox pads over Bluetooth, 8BitDo). Six axes and no gamepad's buttons are a
+    If there are RX and RY, they are the right stick and Z and RZ the triggers; otherwise Z and RZ are the right stick,
+    and BRAKE and GAS the triggers (Xbox pads over Bluetooth, 8BitDo). Six axes without a gamepad's buttons are a
     SpaceMouse.
+
+    Args:
+        pad: The pad.
+        axes: Its ``ABS_`` codes.
+        keys: Its ``BTN_`` and ``KEY_`` codes.
+        rels: Its ``REL_`` codes.
     """
     bus = pad.bus_name if pad.bus_name != "other" else None
-    # What hangs on USB may be a receiver; whoever keeps the model knows whether the pad has a cable.
+    # A device on USB may be a receiver; the user corrects this if the pad has a cable.
     rule = MatchRule(vendor=pad.vendor, product=pad.product, bus=bus, wireless=True)
     file = re.sub(r"[^a-z0-9]+", "_", pad.name.lower()).strip("_") or "gamepad"
     title = pad.name or "unknown pad"
@@ -284,10 +286,10 @@ def guess_model(pad: Identity, axes: Collection[int], keys: Collection[int], rel
 
 
 def guess_warning(model: PadModel) -> str:
-    """What a person should know about a guessed model, with the file to start from."""
+    """Return the warning about a guessed model, with the file to start from."""
     return (
         f"{model.title!r} is an unknown gamepad: its controls are guessed. Upper and left face button may be swapped, "
-        "and a trigger may be a stick. Check each control with hal-check --pads, say 'wireless: false' if it has a "
-        f"cable, and keep this as a model file, {model.name}.yaml, which the rig names (model: {model.name}.yaml):\n"
+        "and a trigger may be a stick. Check each control with hal-check --pads, set 'wireless: false' if it has a "
+        f"cable, and save this as a model file, {model.name}.yaml, which the rig names (model: {model.name}.yaml):\n"
         f"{model.to_yaml()}"
     )

@@ -1,4 +1,4 @@
-"""Mistakes in configuration files: all of them at once, each with file, key, what is right and the nearest spelling."""
+"""Mistakes in configuration files: all of them are reported at once, each with its file, key and code."""
 
 from __future__ import annotations
 
@@ -49,177 +49,180 @@ def camera(**keys: Any) -> dict[str, Any]:
     return {"robots": {"arm": ROBOT}, "cameras": {"eye": {**CAMERA, **keys}}}
 
 
+def held(**keys: Any) -> dict[str, Any]:
+    return camera(look_at=None, attached={"robot": "arm", "link": "panda_hand", **keys})
+
+
 def thing(**keys: Any) -> dict[str, Any]:
     return {"objects": [{"name": "brick", "shape": "box", "half_extents": [1, 1, 1], **keys}]}
 
 
 @pytest.mark.parametrize(
-    ("config", "key", "words"),
+    ("config", "key", "code"),
     [
         # Unknown keys, with the nearest right one.
-        ({"robtos": {}}, "robtos", ["did you mean 'robots'"]),
-        (robot(sped=0.2), "robots.arm.sped", ["did you mean 'speed'", "tcp_speed"]),
-        (robot(base={"positon": [0, 0, 0]}), "robots.arm.base.positon", ["did you mean 'position'"]),
-        (robot(gripper={"sped": 0.05}), "robots.arm.gripper.sped", ["did you mean 'speed'"]),
-        (camera(look_at={**LOOK, "yaw": 3}), "cameras.eye.look_at.yaw", ["did you mean 'yaw_deg'"]),
-        (camera(streams={"colour": {}}), "cameras.eye.streams.colour", ["did you mean 'color'"]),
-        (camera(streams={"color": {"fromat": "bgr8"}}), "cameras.eye.streams.color.fromat", ["'format'"]),
-        ({"simulation": {"physics_rate": 1}}, "simulation.physics_rate", ["physics_hz"]),
-        (thing(half_extent=[1, 1, 1]), "objects.0.half_extent", ["did you mean 'half_extents'"]),
+        ({"robtos": {}}, "robtos", "unknown_key"),
+        (robot(sped=0.2), "robots.arm.sped", "unknown_key"),
+        (robot(base={"positon": [0, 0, 0]}), "robots.arm.base.positon", "unknown_key"),
+        (robot(gripper={"sped": 0.05}), "robots.arm.gripper.sped", "unknown_key"),
+        (camera(look_at={**LOOK, "yaw": 3}), "cameras.eye.look_at.yaw", "unknown_key"),
+        (camera(streams={"colour": {}}), "cameras.eye.streams.colour", "invalid_choice"),
+        (camera(streams={"color": {"fromat": "bgr8"}}), "cameras.eye.streams.color.fromat", "unknown_key"),
+        ({"simulation": {"physics_rate": 1}}, "simulation.physics_rate", "unknown_key"),
+        (thing(half_extent=[1, 1, 1]), "objects.0.half_extent", "unknown_key"),
         # Unknown names, with the nearest right one.
-        ({"robots": {"arm": {"model": "pnada"}}}, "robots.arm.model", ["did you mean 'panda'", "iiwa"]),
-        (
-            {"cameras": {"e": {**CAMERA, "model": "realsens_d435"}}},
-            "cameras.e.model",
-            ["mean 'realsense_d435'", "pinhole"],
-        ),
-        ({"gamepads": {"p": {"model": "dualshok4"}}}, "gamepads.p.model", ["did you mean 'dualshock4'", "auto"]),
-        ({"gamepads": {"p": {"driver": "evdve"}}}, "gamepads.p.driver", ["did you mean 'evdev'"]),
-        ({"objects": ["cub"]}, "objects.0", ["did you mean 'cube'", "table"]),
-        (robot(drivers={"sim": "pybulet"}), "robots.arm", ["did you mean 'pybullet'"]),
-        (robot(drivers={"sim": "evdev"}), "robots.arm", ["'evdev' has no robot", "gamepad"]),
-        ({"simulation": {"clock": "lockstep"}}, "simulation.clock", ["did you mean 'lock_step'"]),
-        ({"simulation": {"renderer": "opengl"}}, "simulation.renderer", ["auto", "gl", "tiny"]),
+        ({"robots": {"arm": {"model": "pnada"}}}, "robots.arm.model", "unknown_model"),
+        ({"cameras": {"e": {**CAMERA, "model": "realsens_d435"}}}, "cameras.e.model", "unknown_model"),
+        ({"gamepads": {"p": {"model": "dualshok4"}}}, "gamepads.p.model", "unknown_model"),
+        ({"gamepads": {"p": {"driver": "evdve"}}}, "gamepads.p.driver", "unknown_driver"),
+        ({"objects": ["cub"]}, "objects.0", "unknown_object"),
+        (robot(drivers={"sim": "pybulet"}), "robots.arm", "unknown_driver"),
+        (robot(drivers={"sim": "evdev"}), "robots.arm", "wrong_driver"),
+        ({"simulation": {"clock": "lockstep"}}, "simulation.clock", "invalid_choice"),
+        ({"simulation": {"renderer": "opengl"}}, "simulation.renderer", "invalid_choice"),
         # A camera on a robot or a link that is not there.
         (
-            camera(look_at=None, attached={"robot": "arn", "link": "panda_hand"}),
+            held(robot="arn"),
             "cameras.eye.attached.robot",
-            ["no robot 'arn'", "did you mean 'arm'"],
+            "unknown_device",
         ),
         (
-            camera(look_at=None, attached={"robot": "arm", "link": "panda_hnad"}),
+            held(link="panda_hnad"),
             "cameras.eye.attached.link",
-            ["did you mean 'panda_hand'"],
+            "unknown_link",
         ),
         # A mode or a stream that the model lacks.
-        (
-            camera(capture={"width": 640, "height": 480, "rate_hz": 31}),
-            "cameras.eye.capture",
-            ["no mode 640x480 at 31 Hz", "640x480 at 6, 15, 30, 60 Hz", "1280x720"],
-        ),
-        (
-            camera(capture={"width": 641, "height": 480, "rate_hz": 30}),
-            "cameras.eye.capture",
-            ["641x480", "848x480"],
-        ),
-        (camera(depth={"min": 0.1, "max": 1.0}), "cameras.eye.depth", ["realsense_d435", "adjustable"]),
-        (camera(streams=[]), "cameras.eye.streams", ["at least one"]),
+        (camera(capture={"width": 640, "height": 480, "rate_hz": 31}), "cameras.eye.capture", "unknown_mode"),
+        (camera(capture={"width": 641, "height": 480, "rate_hz": 30}), "cameras.eye.capture", "unknown_mode"),
+        (camera(depth={"min": 0.1, "max": 1.0}), "cameras.eye.depth", "not_adjustable"),
+        (camera(streams=[]), "cameras.eye.streams", "missing_key"),
         # Wrong types and wrong counts.
-        ({"sim": "yes"}, "sim", ["true or false", "'yes'"]),
-        ({"robots": ["panda"]}, "robots", ["keys and values"]),
-        ({"robots": {"arm": "panda"}}, "robots.arm", ["keys and values", "'panda'"]),
-        ({"objects": {"cube": 1}}, "objects", ["a list"]),
-        ({"objects": [7]}, "objects.0", ["a file, a name"]),
-        (robot(speed="fast"), "robots.arm.speed", ["a number", "'fast'"]),
-        (robot(speed=1.5), "robots.arm.speed", ["at most 1", "1.5"]),
-        (robot(speed=True), "robots.arm.speed", ["a number"]),
-        (robot(model=5), "robots.arm.model", ["text"]),
-        ({"robots": {"arm": {}}}, "robots.arm.model", ["is missing"]),
-        ({"robots": {"my arm": ROBOT}}, "robots.my arm", ["match pattern"]),
-        (camera(output={"width": 256.5, "height": 256}), "cameras.eye.output.width", ["whole number"]),
-        (camera(output={"width": "256", "height": 256}), "cameras.eye.output.width", ["whole number"]),
-        (camera(output={"width": 0, "height": 256}), "cameras.eye.output.width", ["greater than 0"]),
-        ({"simulation": {"physics_hz": float("nan")}}, "simulation.physics_hz", ["number"]),
-        ({"simulation": {"gravity": -9.81}}, "simulation.gravity", ["3 numbers"]),
-        ({"simulation": {"gravity": [0, 0, "down"]}}, "simulation.gravity", ["item 3 is 'down'"]),
+        ({"sim": "yes"}, "sim", "wrong_type"),
+        ({"robots": ["panda"]}, "robots", "wrong_type"),
+        ({"robots": {"arm": "panda"}}, "robots.arm", "wrong_type"),
+        ({"objects": {"cube": 1}}, "objects", "wrong_type"),
+        ({"objects": [7]}, "objects.0", "wrong_type"),
+        (robot(speed="fast"), "robots.arm.speed", "wrong_type"),
+        (robot(speed=1.5), "robots.arm.speed", "out_of_range"),
+        (robot(speed=True), "robots.arm.speed", "wrong_type"),
+        (robot(model=5), "robots.arm.model", "wrong_type"),
+        ({"robots": {"arm": {}}}, "robots.arm.model", "missing_key"),
+        ({"robots": {"my arm": ROBOT}}, "robots.my arm", "invalid"),
+        (camera(output={"width": 256.5, "height": 256}), "cameras.eye.output.width", "wrong_type"),
+        (camera(output={"width": "256", "height": 256}), "cameras.eye.output.width", "wrong_type"),
+        (camera(output={"width": 0, "height": 256}), "cameras.eye.output.width", "out_of_range"),
+        ({"simulation": {"physics_hz": float("nan")}}, "simulation.physics_hz", "wrong_type"),
+        ({"simulation": {"gravity": -9.81}}, "simulation.gravity", "wrong_type"),
+        ({"simulation": {"gravity": [0, 0, "down"]}}, "simulation.gravity", "wrong_type"),
         # Wrong units: a pose of 3 numbers where 7 are due, degrees, a quaternion that is none.
-        (camera(look_at=None, pose=[0, 0, 1]), "cameras.eye.pose", ["7 numbers", "not 3", "quaternion"]),
-        (robot(base=[0, 0, 0]), "robots.arm.base", ["7 numbers", "not 3"]),
-        (robot(base={"position": [0, 0]}), "robots.arm.base.position", ["3 numbers", "in m", "not 2"]),
-        (robot(base={"orientation": [0, 0, 90]}), "robots.arm.base.orientation", ["4 numbers", "not 3"]),
-        (robot(base={"orientation": [0, 0, 90, 1]}), "robots.arm.base.orientation", ["unit quaternion", "90"]),
-        (robot(initial=[0, -45, 0, -135, 0, 90, 45]), "robots.arm.initial", ["panda_joint2", "-45", "rad"]),
-        (robot(initial=[0, 0, 0]), "robots.arm.initial", ["7 numbers", "panda_joint7", "not 3"]),
+        (camera(look_at=None, pose=[0, 0, 1]), "cameras.eye.pose", "wrong_count"),
+        (robot(base=[0, 0, 0]), "robots.arm.base", "wrong_count"),
+        (robot(base={"position": [0, 0]}), "robots.arm.base.position", "wrong_count"),
+        (robot(base={"orientation": [0, 0, 90]}), "robots.arm.base.orientation", "wrong_count"),
+        (robot(base={"orientation": [0, 0, 90, 1]}), "robots.arm.base.orientation", "invalid"),
+        (robot(initial=[0, -45, 0, -135, 0, 90, 45]), "robots.arm.initial", "out_of_range"),
+        (robot(initial=[0, 0, 0]), "robots.arm.initial", "wrong_count"),
         (
-            camera(look_at=None, attached={"robot": "arm", "link": "panda_hand", "rotation": [1, 2]}),
+            held(rotation=[1, 2]),
             "cameras.eye.attached.rotation",
-            ["roll, pitch, yaw in rad", "quaternion"],
+            "wrong_count",
         ),
         (
-            camera(look_at=None, attached={"robot": "arm", "link": "panda_hand", "target": [0, 0, 0]}),
+            held(target=[0, 0, 0]),
             "cameras.eye.attached.target",
-            ["direction"],
+            "out_of_range",
         ),
         # A simulated camera must stand somewhere, and in one place.
-        (camera(look_at=None), "cameras.eye", ["look_at, pose or attached"]),
-        (camera(pose={}), "cameras.eye", ["one place", "look_at", "pose"]),
+        (camera(look_at=None), "cameras.eye", "missing_key"),
+        (camera(pose={}), "cameras.eye", "conflict"),
         # Numbers that are out of every plausible range are mostly in another unit.
-        (robot(tcp_speed=250), "robots.arm.tcp_speed", ["at most 10 m/s", "250 mm/s would be 0.25"]),
-        (camera(look_at={**LOOK, "distance": 1200}), "cameras.eye.look_at.distance", ["50 m", "1200 mm would be 1.2"]),
-        (camera(look_at={**LOOK, "target": [0, 500, 0]}), "cameras.eye.look_at.target", ["50 m", "item 2 is 500"]),
-        (camera(look_at={**LOOK, "pitch_deg": 1e9}), "cameras.eye.look_at.pitch_deg", ["-360 to 360 deg"]),
-        (thing(half_extents=[1, 10, 1]), "objects.0.half_extents", ["at most 5 m", "item 2 is 10", "10 mm would be"]),
-        (thing(half_extents=[1, 0, 1]), "objects.0.half_extents", ["above 0"]),
-        (thing(mass=100), "objects.0.mass", ["0 to 50 kg", "100 g would be 0.1"]),
-        (thing(position=[0, 0, 600]), "objects.0.position", ["-50 to 50 m", "item 3 is 600", "0.6"]),
-        (robot(base={"position": [-550, 0, 0]}), "robots.arm.base.position", ["-550 mm would be -0.55"]),
-        (robot(limits={"velocity": 150}), "robots.arm.limits.velocity", ["50 rad/s", "150 deg/s would be 2.618"]),
-        (robot(limits={"upper": 170, "allow_looser_limits": True}), "robots.arm.limits.upper", ["30 rad", "2.967"]),
-        (robot(workspace={"table_height": 200}), "robots.arm.workspace.table_height", ["50 m"]),
-        (robot(gripper={"speed": 50}), "robots.arm.gripper.speed", ["50 mm/s would be 0.05"]),
-        (robot(rate_hz=1e6), "robots.arm.rate_hz", ["10 to 10000 Hz"]),
-        ({"simulation": {"gravity": [0, 0, -981]}}, "simulation.gravity", ["-100 to 100 m/s2"]),
+        (robot(tcp_speed=250), "robots.arm.tcp_speed", "out_of_range"),
+        (camera(look_at={**LOOK, "distance": 1200}), "cameras.eye.look_at.distance", "out_of_range"),
+        (camera(look_at={**LOOK, "target": [0, 500, 0]}), "cameras.eye.look_at.target", "out_of_range"),
+        (camera(look_at={**LOOK, "pitch_deg": 1e9}), "cameras.eye.look_at.pitch_deg", "out_of_range"),
+        (thing(half_extents=[1, 10, 1]), "objects.0.half_extents", "out_of_range"),
+        (thing(half_extents=[1, 0, 1]), "objects.0.half_extents", "out_of_range"),
+        (thing(mass=100), "objects.0.mass", "out_of_range"),
+        (thing(position=[0, 0, 600]), "objects.0.position", "out_of_range"),
+        (robot(base={"position": [-550, 0, 0]}), "robots.arm.base.position", "out_of_range"),
+        (robot(limits={"velocity": 150}), "robots.arm.limits.velocity", "out_of_range"),
+        (robot(limits={"upper": 170, "allow_looser_limits": True}), "robots.arm.limits.upper", "out_of_range"),
+        (robot(workspace={"table_height": 200}), "robots.arm.workspace.table_height", "out_of_range"),
+        (robot(gripper={"speed": 50}), "robots.arm.gripper.speed", "out_of_range"),
+        (robot(rate_hz=1e6), "robots.arm.rate_hz", "out_of_range"),
+        ({"simulation": {"gravity": [0, 0, -981]}}, "simulation.gravity", "out_of_range"),
         (
-            camera(look_at=None, attached={"robot": "arm", "link": "panda_hand", "rotation": [0, 90, 0]}),
+            held(rotation=[0, 90, 0]),
             "cameras.eye.attached.rotation",
-            ["rad", "item 2 is 90", "90 deg would be 1.571"],
+            "out_of_range",
         ),
         (
-            camera(look_at=None, attached={"robot": "arm", "link": "panda_hand", "translation": [90, 0, 0]}),
+            held(translation=[90, 0, 0]),
             "cameras.eye.attached.translation",
-            ["5 m", "90 mm would be 0.09"],
+            "out_of_range",
         ),
         # Limits.
-        (robot(limits={"velocity": [1, 1]}), "robots.arm.limits.velocity", ["7 numbers", "rad/s", "not 2"]),
-        (robot(limits={"velocity": 3.0}), "robots.arm.limits.velocity", ["looser", "allow_looser_limits", "2.175"]),
-        (robot(limits={"lower": -3.0}), "robots.arm.limits.lower", ["looser"]),
-        (robot(limits={"velocity": -1.0}), "robots.arm.limits.velocity", ["above 0"]),
-        (robot(gripper={"speed": 0.9}), "robots.arm.gripper.speed", ["at most 0.1"]),
-        ({"robots": {"a": {"model": "iiwa", "gripper": {"speed": 0.1}}}}, "robots.a.gripper", ["no gripper"]),
-        (
-            robot(workspace={"upper": [1, 1, 0.1], "table_height": 0.2}),
-            "robots.arm.workspace",
-            ["empty"],
-        ),
+        (robot(limits={"velocity": [1, 1]}), "robots.arm.limits.velocity", "wrong_count"),
+        (robot(limits={"velocity": 3.0}), "robots.arm.limits.velocity", "looser_limit"),
+        (robot(limits={"lower": -3.0}), "robots.arm.limits.lower", "looser_limit"),
+        (robot(limits={"velocity": -1.0}), "robots.arm.limits.velocity", "out_of_range"),
+        (robot(gripper={"speed": 0.9}), "robots.arm.gripper.speed", "looser_limit"),
+        ({"robots": {"a": {"model": "iiwa", "gripper": {"speed": 0.1}}}}, "robots.a.gripper", "no_gripper"),
+        (robot(workspace={"upper": [1, 1, 0.1], "table_height": 0.2}), "robots.arm.workspace", "empty_range"),
         # Objects.
-        (thing(half_extents=None), "objects.0", ["a box has half_extents", "missing"]),
-        (thing(radius=1), "objects.0", ["radius has no meaning"]),
-        (thing(shape="cone"), "objects.0.shape", ["'cone'", "cylinder"]),
-        (thing(mass=-1), "objects.0.mass", ["0 to 50 kg"]),
-        (thing(rgba=[255, 0, 0, 1]), "objects.0.rgba", ["0 to 1"]),
-        ({"objects": ["cube", "cube"]}, "name", ["'cube' is also the name of objects.0", "differ"]),
-        ({"robots": {"cube": ROBOT}, "objects": ["cube"]}, "name", ["robots.cube"]),
-        ({"objects": ["cubes/brick.yaml"]}, "objects.0", ["there is no file"]),
-        (thing(random={"x": [0.1, -0.1]}), "objects.0.random.x", ["the least and the greatest", "0.1 is above -0.1"]),
-        (thing(random={"y": 0.3}), "objects.0.random.y", ["2 numbers", "0.3"]),
-        (thing(random={"z": [1, 2, 3]}), "objects.0.random.z", ["2 numbers", "not 3"]),
-        (thing(random={"x": [0, float("nan")]}), "objects.0.random.x", ["2 numbers", "nan"]),
-        (thing(random={"x": [0, "far"]}), "objects.0.random.x", ["2 numbers", "'far'"]),
-        (thing(random={"yaw_deg": [-400, 0]}), "objects.0.random.yaw_deg", ["-360 to 360 deg"]),
-        (thing(random={"yaw": [-1, 1]}), "objects.0.random.yaw", ["did you mean 'yaw_deg'"]),
-        (thing(random={}), "objects.0.random", ["no range", "yaw_deg"]),
-        (thing(random=[-1, 1]), "objects.0.random", ["keys and values"]),
-        ({"objects": [{"name": "f", "shape": "plane", "random": {"x": [0, 1]}}]}, "objects.0", ["plane", "random"]),
+        (thing(half_extents=None), "objects.0", "missing_key"),
+        (thing(radius=1), "objects.0", "conflict"),
+        (thing(shape="cone"), "objects.0.shape", "invalid_choice"),
+        (thing(mass=-1), "objects.0.mass", "out_of_range"),
+        (thing(rgba=[255, 0, 0, 1]), "objects.0.rgba", "out_of_range"),
+        ({"objects": ["cube", "cube"]}, "name", "duplicate_name"),
+        ({"robots": {"cube": ROBOT}, "objects": ["cube"]}, "name", "duplicate_name"),
+        ({"objects": ["cubes/brick.yaml"]}, "objects.0", "missing_file"),
+        (thing(random={"x": [0.1, -0.1]}), "objects.0.random.x", "empty_range"),
+        (thing(random={"y": 0.3}), "objects.0.random.y", "wrong_type"),
+        (thing(random={"z": [1, 2, 3]}), "objects.0.random.z", "wrong_count"),
+        (thing(random={"x": [0, float("nan")]}), "objects.0.random.x", "wrong_type"),
+        (thing(random={"x": [0, "far"]}), "objects.0.random.x", "wrong_type"),
+        (thing(random={"yaw_deg": [-400, 0]}), "objects.0.random.yaw_deg", "out_of_range"),
+        (thing(random={"yaw": [-1, 1]}), "objects.0.random.yaw", "unknown_key"),
+        (thing(random={}), "objects.0.random", "missing_key"),
+        (thing(random=[-1, 1]), "objects.0.random", "wrong_type"),
+        ({"objects": [{"name": "f", "shape": "plane", "random": {"x": [0, 1]}}]}, "objects.0", "conflict"),
         (
             {"objects": [{"file": "cube", "attached": {"robot": "arm", "link": "hand"}, "random": {"x": [0, 1]}}]}
             | robot(),
             "objects.0",
-            ["attached and random"],
+            "conflict",
         ),
         # Pads.
-        ({"gamepads": {"p": {"driver": "playback"}}}, "gamepads.p.file", ["is missing", "recording"]),
-        ({"gamepads": {"p": {"driver": "playback", "file": "no.jsonl"}}}, "gamepads.p.file", ["there is no file"]),
-        ({"gamepads": {"p": {"driver": "keyboard"}}}, "gamepads.p.driver", ["web", "terminal"]),
-        ({"gamepads": {"p": {"file": "a.jsonl"}}}, "gamepads.p.file", ["playback"]),
+        ({"gamepads": {"p": {"driver": "playback"}}}, "gamepads.p.file", "missing_key"),
+        ({"gamepads": {"p": {"driver": "playback", "file": "no.jsonl"}}}, "gamepads.p.file", "missing_file"),
+        ({"gamepads": {"p": {"driver": "keyboard"}}}, "gamepads.p.driver", "unknown_driver"),
+        ({"gamepads": {"p": {"file": "a.jsonl"}}}, "gamepads.p.file", "conflict"),
         # Names of devices.
-        ({"robots": {"a": ROBOT}, "cameras": {"a": CAMERA}}, "cameras.a", ["robots.a has the same name"]),
+        ({"robots": {"a": ROBOT}, "cameras": {"a": CAMERA}}, "cameras.a", "duplicate_name"),
     ],
 )
-def test_one_mistake_is_one_problem_with_its_key(config: dict[str, Any], key: str, words: list[str]) -> None:
+def test_one_mistake_is_one_problem_with_its_key(config: dict[str, Any], key: str, code: str) -> None:
     problem = only(config)
-    assert problem.key == key
-    for word in words:
-        assert word in problem.message
+    assert (problem.key, problem.code) == (key, code)
+
+
+@pytest.mark.parametrize(
+    ("config", "words"),
+    [
+        (robot(sped=0.2), "did you mean 'speed'"),
+        ({"robots": {"arm": {"model": "pnada"}}}, "did you mean 'panda'"),
+        (robot(drivers={"sim": "pybulet"}), "did you mean 'pybullet'"),
+        (robot(drivers={"sim": "evdev"}), "it has: gamepad"),
+        (camera(capture={"width": 640, "height": 480, "rate_hz": 31}), "640x480 at 6, 15, 30, 60 Hz"),
+        (robot(tcp_speed=250), "250 mm/s would be 0.25"),
+        (thing(half_extents=[1, 10, 1]), "item 2 is 10; 10 mm would be 0.01"),
+        (robot(initial=[0, -45, 0, -135, 0, 90, 45]), "'panda_joint2' is at -45"),
+    ],
+)
+def test_messages_name_the_nearest_choice_the_unit_and_the_place(config: dict[str, Any], words: str) -> None:
+    assert words in only(config).message
 
 
 @pytest.mark.parametrize(
@@ -245,27 +248,17 @@ REAL = {"model": "panda", "sim": False, "drivers": {"real": "mock"}}
 
 
 @pytest.mark.parametrize(
-    ("keys", "place", "words"),
+    ("keys", "place", "code"),
     [
-        ({"tcp_speed": 3.0}, "robots.arm.tcp_speed", ["at most 1.5 m/s on a real arm", "3"]),
-        (
-            {"limits": {"velocity": 20, "allow_looser_limits": True}},
-            "robots.arm.limits.velocity",
-            ["at most 15 rad/s for every joint of a real arm", "20"],
-        ),
-        (
-            {"limits": {"jerk": 30000, "allow_looser_limits": True}},
-            "robots.arm.limits.jerk",
-            ["at most 20000 rad/s3"],
-        ),
+        ({"tcp_speed": 3.0}, "robots.arm.tcp_speed", "out_of_range"),
+        ({"limits": {"velocity": 20, "allow_looser_limits": True}}, "robots.arm.limits.velocity", "out_of_range"),
+        ({"limits": {"jerk": 30000, "allow_looser_limits": True}}, "robots.arm.limits.jerk", "out_of_range"),
     ],
 )
-def test_what_a_simulation_may_do_a_real_arm_may_not(keys: dict[str, Any], place: str, words: list[str]) -> None:
+def test_what_a_simulation_may_do_a_real_arm_may_not(keys: dict[str, Any], place: str, code: str) -> None:
     config = {"robots": {"arm": {**REAL, **keys}}}
     load(config, sim=True)
-    found = {problem.key: problem.message for problem in problems(config)}
-    for word in words:
-        assert word in found[place]
+    assert (place, code) in {(problem.key, problem.code) for problem in problems(config)}
 
 
 def test_the_hard_limits_of_a_real_arm_hold_for_its_model_too(own_model: Callable[..., Path]) -> None:
@@ -322,64 +315,62 @@ objects: [bad_brick.yaml, missing.yaml, cub]
 def test_missing_file_and_unknown_rig(tmp_path: Path) -> None:
     (tmp_path / "panda_bench.yaml").write_text("{}")
     problem = only(tmp_path / "panda_bnech.yaml")
-    assert problem.file == str(tmp_path / "panda_bnech.yaml")
-    assert "there is no such file" in problem.message
+    assert (problem.file, problem.code) == (str(tmp_path / "panda_bnech.yaml"), "missing_file")
     assert "'panda_bench.yaml'" in problem.message
-    assert "did you mean 'panda_table'" in only("panda_tabel").message
+    assert only("panda_tabel").code == "unknown_rig"
 
 
 @pytest.mark.parametrize(
-    ("text", "words"),
+    ("text", "code"),
     [
-        ("robots: {arm: [", ["not valid YAML", "line"]),
-        ("- a\n- b\n", ["keys and values", "a list of 2"]),
-        ("", ["is empty"]),
-        ("robots: !!python/object/apply:os.system ['true']", ["not valid YAML"]),
-        ("a: 1\n---\nb: 2\n", ["not valid YAML"]),
-        ("objects: &all [*all]", ["alias *all"]),
+        ("robots: {arm: [", "bad_yaml"),
+        ("- a\n- b\n", "wrong_type"),
+        ("", "wrong_type"),
+        ("robots: !!python/object/apply:os.system ['true']", "bad_yaml"),
+        ("a: 1\n---\nb: 2\n", "bad_yaml"),
+        ("objects: &all [*all]", "too_large"),
     ],
 )
-def test_files_that_are_no_rig(tmp_path: Path, text: str, words: list[str]) -> None:
+def test_files_that_are_no_rig(tmp_path: Path, text: str, code: str) -> None:
     (tmp_path / "rig.yaml").write_text(text)
-    problem = only(tmp_path / "rig.yaml")
-    for word in words:
-        assert word in problem.message
+    assert only(tmp_path / "rig.yaml").code == code
 
 
 def test_keys_that_are_given_twice(tmp_path: Path) -> None:
     (tmp_path / "rig.yaml").write_text("robots:\n  arm: {model: panda}\n  arm: {model: iiwa, speed: 0.1, speed: 0.2}\n")
-    found = {problem.key: problem.message for problem in problems(tmp_path / "rig.yaml")}
-    assert set(found) == {"robots.arm", "robots.arm.speed"}
-    assert "given twice, in lines 2 and 3" in found["robots.arm"]
+    found = problems(tmp_path / "rig.yaml")
+    assert {(problem.key, problem.code) for problem in found} == {
+        ("robots.arm", "duplicate_key"),
+        ("robots.arm.speed", "duplicate_key"),
+    }
+    assert "lines 2 and 3" in found[0].message
 
 
 def test_a_folder_in_place_of_a_file(tmp_path: Path) -> None:
     (tmp_path / "rig.yaml").mkdir()
-    assert "cannot be read" in only(tmp_path / "rig.yaml").message
+    assert only(tmp_path / "rig.yaml").code == "unreadable"
 
 
 # Overrides and arguments.
 
 
 @pytest.mark.parametrize(
-    ("override", "key", "words"),
+    ("override", "key", "code"),
     [
-        ("cameras.wrist.output.widht=320", "cameras.wrist.output.widht", ["did you mean 'width'"]),
-        ("cameras.wrsit.output.width=320", "cameras.wrsit.output.width", ["no camera 'wrsit'", "did you mean 'wrist'"]),
-        ("cameras.wrist.output.width=wide", "cameras.wrist.output.width", ["whole number", "'wide'"]),
-        ("cameras.wrist.output.width=[", "cameras.wrist.output.width", ["not valid YAML"]),
-        ("simulaton.physics_hz=1000", "simulaton", ["did you mean 'simulation'"]),
-        ("sim", "", ["KEY=VALUE"]),
-        ("sim.deep=1", "sim.deep", ["sim holds no keys"]),
-        ("objects.9=cube", "objects.9", ["list of 4"]),
-        ("robots..speed=1", "robots..speed", ["empty part"]),
+        ("cameras.wrist.output.widht=320", "cameras.wrist.output.widht", "unknown_key"),
+        ("cameras.wrsit.output.width=320", "cameras.wrsit.output.width", "unknown_device"),
+        ("cameras.wrist.output.width=wide", "cameras.wrist.output.width", "wrong_type"),
+        ("cameras.wrist.output.width=[", "cameras.wrist.output.width", "bad_yaml"),
+        ("simulaton.physics_hz=1000", "simulaton", "unknown_key"),
+        ("sim", "", "invalid"),
+        ("sim.deep=1", "sim.deep", "unknown_key"),
+        ("objects.9=cube", "objects.9", "unknown_key"),
+        ("robots..speed=1", "robots..speed", "invalid"),
     ],
 )
-def test_overrides_are_to_blame_for_their_own_mistakes(override: str, key: str, words: list[str]) -> None:
+def test_overrides_are_to_blame_for_their_own_mistakes(override: str, key: str, code: str) -> None:
     problem = only("panda_table", overrides=[override])
-    assert (problem.file, problem.key) == ("--set", key)
-    for word in words:
-        assert word in problem.message
+    assert (problem.file, problem.key, problem.code) == ("--set", key, code)
 
 
 NONSENSE = [None, -1, 2.5, "x", [], {}, [1, 2], True, float("nan"), float("inf"), 10**400, {1: 2}, [None] * 7]
@@ -411,15 +402,16 @@ def test_nonsense_anywhere_is_a_config_error_or_nothing_worse() -> None:
 
 def test_arguments() -> None:
     found = problems("panda_table", clock="lockstep", driver="mok")
-    assert {problem.key for problem in found} == {"clock", "driver"}
-    assert any("did you mean 'lock_step'" in problem.message for problem in found)
+    assert {(problem.key, problem.code) for problem in found} == {
+        ("clock", "invalid_choice"),
+        ("driver", "wrong_driver"),
+    }
 
 
 def test_a_real_arm_without_a_driver_for_it() -> None:
-    found = problems({"robots": {"arm": {"model": "iiwa"}}}, sim=False)
-    assert [problem.key for problem in found] == ["robots.arm"]
-    assert "no driver for a real robot" in found[0].message
-    assert "robots.arm.drivers.real" in found[0].message
+    problem = only({"robots": {"arm": {"model": "iiwa"}}}, sim=False)
+    assert (problem.key, problem.code) == ("robots.arm", "no_driver")
+    assert "robots.arm.drivers.real" in problem.message
 
 
 # Models and URDFs.
@@ -447,71 +439,42 @@ def test_the_copied_model_is_in_order(own_model: Callable[..., Path]) -> None:
 
 
 @pytest.mark.parametrize(
-    ("change", "key", "words"),
+    ("change", "key", "code"),
     [
-        (lambda m: m["joints"].__setitem__(2, "panda_jiont3"), "joints.2", ["did you mean 'panda_joint"]),
-        (lambda m: m["joints"].__setitem__(6, "panda_joint8"), "joints.6", ["is fixed", "panda_joint7"]),
-        (lambda m: m["joints"].__setitem__(6, "panda_joint1"), "joints.6", ["given twice"]),
-        (lambda m: m["joints"].__setitem__(6, "panda_finger_joint1"), "joints.6", ["does not move the tcp's link"]),
-        (lambda m: m["gripper"]["joints"].__setitem__(0, "finger"), "gripper.joints.0", ["panda_finger_joint1"]),
-        (lambda m: m["tcp"].update(link="panda_hnad"), "tcp.link", ["did you mean 'panda_hand'"]),
-        (lambda m: m.update(base_link="base"), "base_link", ["no link 'base'", "panda_link0"]),
-        (lambda m: m["limits"].pop("acceleration"), "limits.acceleration", ["is missing", "rad/s2"]),
-        (lambda m: m["limits"].pop("jerk"), "limits.jerk", ["is missing", "rad/s3"]),
-        (lambda m: m["limits"].update(jerk=0), "limits.jerk", ["above 0"]),
-        (lambda m: m["limits"]["upper"].pop(), "limits.upper", ["7 numbers", "not 6"]),
-        (lambda m: m["limits"]["lower"].__setitem__(0, 3.0), "limits", ["lower must be below upper", "panda_joint1"]),
-        (lambda m: m["home"].pop(), "home", ["7 numbers", "not 6"]),
-        (lambda m: m["home"].__setitem__(3, 0.5), "home", ["panda_joint4", "outside its limits", "rad"]),
-        (lambda m: m.update(urdf={"package": "no_such_robots", "path": "a.urdf"}), "urdf.package", ["pip install"]),
-        (lambda m: m.update(urdf="amr.urdf"), "urdf", ["there is no file", "did you mean 'arm.urdf'"]),
-        (lambda m: m.update(urdf={"package": "yaml", "path": "a.urdf"}), "urdf", ["there is no file"]),
-        (lambda m: m.pop("tcp"), "tcp", ["is missing"]),
-        (lambda m: m.update(joints=[]), "joints", ["at least 1"]),
-        (lambda m: m["gripper"].update(width=0.08), "gripper.width", ["did you mean 'width_max'"]),
-        (lambda m: m.update(driver="franka"), "driver", ["did you mean 'drivers'"]),
+        (lambda m: m["joints"].__setitem__(2, "panda_jiont3"), "joints.2", "unknown_joint"),
+        (lambda m: m["joints"].__setitem__(6, "panda_joint8"), "joints.6", "wrong_joint"),
+        (lambda m: m["joints"].__setitem__(6, "panda_joint1"), "joints.6", "duplicate_name"),
+        (lambda m: m["joints"].__setitem__(6, "panda_finger_joint1"), "joints.6", "wrong_joint"),
+        (lambda m: m["gripper"]["joints"].__setitem__(0, "finger"), "gripper.joints.0", "unknown_joint"),
+        (lambda m: m["tcp"].update(link="panda_hnad"), "tcp.link", "unknown_link"),
+        (lambda m: m.update(base_link="base"), "base_link", "unknown_link"),
+        (lambda m: m["limits"].pop("acceleration"), "limits.acceleration", "missing_key"),
+        (lambda m: m["limits"].pop("jerk"), "limits.jerk", "missing_key"),
+        (lambda m: m["limits"].update(jerk=0), "limits.jerk", "out_of_range"),
+        (lambda m: m["limits"]["upper"].pop(), "limits.upper", "wrong_count"),
+        (lambda m: m["limits"]["lower"].__setitem__(0, 3.0), "limits", "empty_range"),
+        (lambda m: m["home"].pop(), "home", "wrong_count"),
+        (lambda m: m["home"].__setitem__(3, 0.5), "home", "out_of_range"),
+        (lambda m: m.update(urdf={"package": "no_such_robots", "path": "a.urdf"}), "urdf.package", "missing_package"),
+        (lambda m: m.update(urdf="amr.urdf"), "urdf", "missing_file"),
+        (lambda m: m.update(urdf={"package": "yaml", "path": "a.urdf"}), "urdf", "missing_file"),
+        (lambda m: m.pop("tcp"), "tcp", "missing_key"),
+        (lambda m: m.update(joints=[]), "joints", "wrong_count"),
+        (lambda m: m["gripper"].update(width=0.08), "gripper.width", "unknown_key"),
+        (lambda m: m.update(driver="franka"), "driver", "unknown_key"),
     ],
 )
 def test_mistakes_in_a_robot_model(
-    own_model: Callable[..., Path], change: Callable[[dict[str, Any]], object], key: str, words: list[str]
+    own_model: Callable[..., Path], change: Callable[[dict[str, Any]], object], key: str, code: str
 ) -> None:
     rig = own_model(change)
     problem = only(rig)
-    assert (problem.file, problem.key) == (str(rig.parent / "arm.yaml"), key)
-    for word in words:
-        assert word in problem.message
-
-
-@pytest.mark.parametrize(
-    ("urdf", "words"),
-    [
-        ("<robot name='x'><link name='a'></robot>", ["not valid XML"]),
-        ("<sdf/>", ["not a URDF", "<sdf>"]),
-        ("<robot/>", ["no links"]),
-        ("<robot><link name='a'/><joint name='j' type='fixed'><parent link='a'/></joint></robot>", ["'j' lacks"]),
-        (
-            "<robot><link name='a'/><joint name='j' type='fixed'><parent link='a'/><child link='b'/></joint></robot>",
-            ["'j' names link 'b'"],
-        ),
-        (
-            "<robot><link name='a'/><link name='b'/><joint name='j' type='revolute'><parent link='a'/><child link='b'/>"
-            "<limit lower='low'/></joint></robot>",
-            ["lower='low' is no number"],
-        ),
-    ],
-)
-def test_a_urdf_that_does_not_parse(own_model: Callable[..., Path], urdf: str, words: list[str]) -> None:
-    rig = own_model(urdf=urdf)
-    problem = only(rig)
-    assert problem.file == str(rig.parent / "arm.urdf")
-    for word in words:
-        assert word in problem.message
+    assert (problem.file, problem.key, problem.code) == (str(rig.parent / "arm.yaml"), key, code)
 
 
 def test_one_of_the_arms_own_joints_is_no_finger(own_model: Callable[..., Path]) -> None:
     problem = only(own_model(lambda model: model["gripper"]["joints"].__setitem__(0, "panda_joint7")))
-    assert problem.key == "gripper.joints"
-    assert "one of the arm's joints" in problem.message
+    assert (problem.key, problem.code) == ("gripper.joints", "wrong_joint")
 
 
 def test_a_finger_that_turns_is_refused(own_model: Callable[..., Path], tmp_path: Path) -> None:
@@ -520,9 +483,8 @@ def test_a_finger_that_turns_is_refused(own_model: Callable[..., Path], tmp_path
     (finger,) = (joint for joint in urdf.iter("joint") if joint.get("name") == "panda_finger_joint2")
     finger.set("type", "revolute")
     problem = only(own_model(urdf=ElementTree.tostring(urdf.getroot(), "unicode")))
-    assert (problem.file, problem.key) == (str(tmp_path / "arm.yaml"), "gripper.joints.1")
-    for word in ("panda_finger_joint2", "revolute", "prismatic"):
-        assert word in problem.message
+    place = (str(tmp_path / "arm.yaml"), "gripper.joints.1", "wrong_joint")
+    assert (problem.file, problem.key, problem.code) == place
 
 
 def test_a_model_and_a_urdf_without_speed_limits(own_model: Callable[..., Path], tmp_path: Path) -> None:
@@ -530,8 +492,7 @@ def test_a_model_and_a_urdf_without_speed_limits(own_model: Callable[..., Path],
     load(rig)  # the URDF has them
     text = (tmp_path / "arm.urdf").read_text().replace('velocity="2.1750"', 'velocity="0"')
     problem = only(own_model(lambda model: model["limits"].pop("velocity"), text))
-    assert problem.key == "limits.velocity"
-    assert "panda_joint1" in problem.message
+    assert (problem.key, problem.code) == ("limits.velocity", "missing_key")
 
 
 def test_an_object_whose_urdf_is_broken(tmp_path: Path) -> None:
@@ -546,8 +507,7 @@ def test_an_object_whose_urdf_is_broken(tmp_path: Path) -> None:
 
 def test_a_driver_whose_package_does_not_import() -> None:
     problem = only(robot(drivers={"sim": "no_such_lab.arm:DRIVER"}))
-    assert problem.key == "robots.arm"
-    assert "no_such_lab" in problem.message
+    assert (problem.key, problem.code) == ("robots.arm", "unknown_driver")
 
 
 # Many mistakes at once: what each one alone is told, all together are told, and nothing else.

@@ -35,23 +35,23 @@ def problems(text: str | bytes, folder: Path) -> list[Problem]:
 
 
 @pytest.mark.parametrize(
-    ("text", "words"),
+    ("text", "code"),
     [
-        ("robots: " + "[" * 100_000, "nested more than 50 deep (line 1, column"),
-        ("robots: " + "{a: " * 100_000, "nested more than 50 deep (line 1, column"),
-        ("\n".join(" " * k + "a:" for k in range(200)), "nested more than 50 deep (line 51"),
-        (BOMB, "values"),
-        (CHAIN, "nested more than 50 deep"),
-        ("robots: &a\n  arm: *a\n", "inside itself (line 2, column 8)"),
-        ("a: *nowhere", "undefined alias"),
-        ("description: " + "x" * 2_000_000, "larger than"),
-        ("a: [" + "1," * 60_000 + "1]", "values"),
+        ("robots: " + "[" * 100_000, "too_large"),
+        ("robots: " + "{a: " * 100_000, "too_large"),
+        ("\n".join(" " * k + "a:" for k in range(200)), "too_large"),
+        (BOMB, "too_large"),
+        (CHAIN, "too_large"),
+        ("robots: &a\n  arm: *a\n", "too_large"),
+        ("a: *nowhere", "bad_yaml"),
+        ("description: " + "x" * 2_000_000, "too_large"),
+        ("a: [" + "1," * 60_000 + "1]", "too_large"),
     ],
     ids=["brackets", "braces", "indents", "aliases", "chain", "itself", "undefined", "large", "many"],
 )
-def test_a_file_that_grows_without_end_is_refused(text: str, words: str, tmp_path: Path) -> None:
+def test_a_file_that_grows_without_end_is_refused(text: str, code: str, tmp_path: Path) -> None:
     (problem,) = problems(text, tmp_path)
-    assert words in problem.message
+    assert problem.code == code
 
 
 @pytest.mark.parametrize(

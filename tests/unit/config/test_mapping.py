@@ -66,35 +66,33 @@ def test_a_mapping_of_ones_own(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("changes", "key", "words"),
+    ("changes", "key", "code"),
     [
-        ({"linear": {"x": {"axis": "dpad", "scale": 1.0}}}, "linear.x", ["no axis 'dpad'", "dpad_x"]),
-        ({"linear": {"x": {"buttons": ["l1", "cross"], "scale": 1.0}}}, "linear.x", ["no button 'cross'", "south"]),
-        ({"linear": {"x": {"scale": 1.0}}}, "linear.x", ["needs an axis"]),
-        ({"linear": {"x": {"axis": "dpad_x"}}}, "linear.x.scale", ["is missing"]),
-        ({"linear": {"x": {"axis": "dpad_x", "scale": 0.0}}}, "linear.x.scale", ["above 0"]),
-        ({"linear": {"roll": {}}}, "linear.roll", ["no key here", "x, y, z"]),
-        ({"frame": "tool"}, "frame", ["'tool'", "base, tcp"]),
-        ({"deadman": "l4"}, "deadman", ["no button 'l4'"]),
-        ({"gripper": {"open": "east"}}, "gripper", ["open and close"]),
-        ({"gripper": {"toggle": "r9"}}, "gripper", ["no button 'r9'"]),
-        ({"gripper": {"toggle": "r1", "axis": "r2"}}, "gripper", ["needs an axis, or", "toggle"]),
-        ({"gripper": {"toggle": "l2"}}, "", ["'l2' has two meanings"]),
-        ({"linear": {"x": {"axis": "l2", "scale": 1.0}}}, "", ["'l2' has two meanings"]),
-        ({"go_home": "north", "actions": {"record": "north"}}, "", ["'north' has two meanings"]),
+        ({"linear": {"x": {"axis": "dpad", "scale": 1.0}}}, "linear.x", "unknown_control"),
+        ({"linear": {"x": {"buttons": ["l1", "cross"], "scale": 1.0}}}, "linear.x", "unknown_control"),
+        ({"linear": {"x": {"scale": 1.0}}}, "linear.x", "missing_key"),
+        ({"linear": {"x": {"axis": "dpad_x"}}}, "linear.x.scale", "missing_key"),
+        ({"linear": {"x": {"axis": "dpad_x", "scale": 0.0}}}, "linear.x.scale", "out_of_range"),
+        ({"linear": {"roll": {}}}, "linear.roll", "unknown_key"),
+        ({"frame": "tool"}, "frame", "invalid_choice"),
+        ({"deadman": "l4"}, "deadman", "unknown_control"),
+        ({"gripper": {"open": "east"}}, "gripper", "missing_key"),
+        ({"gripper": {"toggle": "r9"}}, "gripper", "unknown_control"),
+        ({"gripper": {"toggle": "r1", "axis": "r2"}}, "gripper", "conflict"),
+        ({"gripper": {"toggle": "l2"}}, "", "duplicate_name"),
+        ({"linear": {"x": {"axis": "l2", "scale": 1.0}}}, "", "duplicate_name"),
+        ({"go_home": "north", "actions": {"record": "north"}}, "", "duplicate_name"),
     ],
 )
-def test_mistakes_in_a_mapping(changes: dict[str, Any], key: str, words: list[str]) -> None:
+def test_mistakes_in_a_mapping(changes: dict[str, Any], key: str, code: str) -> None:
     with pytest.raises(ConfigError) as caught:
         load_mapping({"deadman": "l2", **changes})
     (problem,) = caught.value.problems
-    assert problem.key == key
-    for word in words:
-        assert word in problem.message
+    assert (problem.key, problem.code) == (key, code)
 
 
 def test_missing_mappings(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match="did you mean 'default'"):
-        load_mapping("defualt")
-    with pytest.raises(ConfigError, match="there is no such file"):
-        load_mapping(tmp_path / "mine.yaml")
+    for mapping, code in (("defualt", "unknown_mapping"), (tmp_path / "mine.yaml", "missing_file")):
+        with pytest.raises(ConfigError) as caught:
+            load_mapping(mapping)
+        assert [problem.code for problem in caught.value.problems] == [code]

@@ -79,7 +79,26 @@ def test_what_is_wrong_in_a_urdf_is_one_sentence(old: str, new: str, words: str,
         read_urdf(path)
     with pytest.raises(ConfigError) as refused:
         load({"objects": [{"name": "it", "urdf": str(path)}]})
-    assert [problem.file for problem in refused.value.problems] == [str(path)]
+    assert [(problem.file, problem.code) for problem in refused.value.problems] == [(str(path), "bad_urdf")]
+
+
+LINKS = "<robot><link name='a'/><link name='b'/><joint name='j' type='fixed'>{}</joint></robot>"
+
+
+@pytest.mark.parametrize(
+    ("urdf", "words"),
+    [
+        ("<robot name='x'><link name='a'></robot>", "is not valid XML"),
+        ("<sdf/>", "<sdf>"),
+        ("<robot/>", "has no links"),
+        (LINKS.format("<parent link='a'/>"), "'j' has no parent or no child"),
+        (LINKS.format("<parent link='a'/><child link='c'/>"), "'j' refers to link 'c'"),
+        (LINKS.format("<parent link='a'/><child link='b'/><limit lower='low'/>"), "<limit lower='low'>"),
+    ],
+)
+def test_files_that_are_not_a_urdf(tmp_path: Path, urdf: str, words: str) -> None:
+    with pytest.raises(ValueError, match=re.escape(words)):
+        read_urdf(arm(tmp_path, urdf))
 
 
 @pytest.mark.parametrize(
