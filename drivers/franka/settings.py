@@ -227,8 +227,8 @@ def is_emulated(options: Mapping[str, Any]) -> bool:
         return host == "localhost"
 
 
-def check_arm(spec: RobotSpec) -> Iterator[tuple[str, ...]]:
-    """Yield the problems in an arm's record: key in the arm's entry of the rig file, message, and perhaps code."""
+def check_arm(spec: RobotSpec) -> Iterator[tuple[str, str]]:
+    """Yield the problems in an arm's record: key in the arm's entry of the rig file, and message."""
     yield from _check_options(ArmSettings, spec.options)
     limits = LIMITS.get(str(spec.options.get("arm")))
     if len(spec.joints) != 7:
@@ -239,18 +239,17 @@ def check_arm(spec: RobotSpec) -> Iterator[tuple[str, ...]]:
         yield "rate_hz", f"must be 1000 Hz, the arm's own rate, not {spec.rate_hz:g}"
 
 
-def check_hand(spec: GripperSpec) -> Iterator[tuple[str, ...]]:
-    """Yield the problems in a hand's record: key in the gripper's entry of the rig file, message, and code."""
+def check_hand(spec: GripperSpec) -> Iterator[tuple[str, str]]:
+    """Yield the problems in a hand's record: key in the gripper's entry of the rig file, and message."""
     yield from _check_options(HandSettings, spec.options)
 
 
-def _check_options(model: type[BaseModel], options: Mapping[str, Any]) -> Iterator[tuple[str, ...]]:
+def _check_options(model: type[BaseModel], options: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
     problems = Problems()
     validate(model, options, "", problems, "real")
     for problem in problems.found:
         missing = problem.key == "real.host" and "host" not in options
-        message = "is missing: the robot's address, for example 172.16.0.2" if missing else problem.message
-        yield problem.key, message, problem.code
+        yield problem.key, "is missing: the robot's address, for example 172.16.0.2" if missing else problem.message
 
 
 def _check_limits(spec: RobotSpec, official: ArmLimits) -> Iterator[tuple[str, str]]:
