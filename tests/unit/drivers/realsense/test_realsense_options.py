@@ -76,7 +76,7 @@ WRONG[""] += [{"paced": False}, {"repeat": True, "emulated": True}, {"overwrite"
     ("options", "key"), [(one, f"real.{key}".rstrip(".")) for key, wrong in WRONG.items() for one in wrong]
 )
 def test_wrong_options(options: dict[str, Any], key: str) -> None:
-    assert [place for place, _ in problems(camera(**options))] == [key]
+    assert [place for place, *_ in problems(camera(**options))] == [key]
     with pytest.raises(ConfigError) as caught:
         RealSenseSettings.from_spec(camera(**options))
     assert {problem.file for problem in caught.value.problems} == {"cameras.wrist.real"}
