@@ -144,33 +144,6 @@ class RobotModel(Strict):
     simulated: dict[str, Any] = Field(default_factory=dict)
 
 
-def find_model(name: str, folder: str, parts: tuple[str, ...], base: Path) -> Path | str:
-    """Return the path of a model, or a message if there is none.
-
-    Args:
-        name: A path, or the name of a built-in model.
-        folder: Data folder of the built-in models, and ``parts`` the folders below it.
-        parts: See ``folder``.
-        base: Folder that a path is relative to.
-    """
-    if is_path(name):
-        return user_path(name, base)
-    there = list_data(folder, *parts)
-    if name not in there:
-        return f"there is no {'/'.join((folder, *parts))} model {name!r}{nearest(name, there)}, or a path to your own"
-    return data_folder(folder).joinpath(*parts, f"{name}.yaml")
-
-
-def load_pad_models(problems: Problems) -> dict[str, dict[str, Any]]:
-    """Return all built-in models of gamepads as plain data, by name; :mod:`hal.pads.model` has their schema."""
-    models = {}
-    for name in list_data("sensors", "gamepads"):
-        data = read_yaml(data_folder("sensors") / "gamepads" / f"{name}.yaml", problems)
-        if data is not None:
-            models[name] = data
-    return models
-
-
 # Cameras
 
 
@@ -356,3 +329,33 @@ class CompleteStream(NamedTuple):
             if (mode.width, mode.height) == (capture.width, capture.height) and capture.rate_hz in mode.rates_hz:
                 return mode
         return None
+
+
+# Files
+
+
+def find_model(name: str, folder: str, parts: tuple[str, ...], base: Path) -> Path | str:
+    """Return the path of a model, or a message if there is none.
+
+    Args:
+        name: A path, or the name of a built-in model.
+        folder: Data folder of the built-in models, and ``parts`` the folders below it.
+        parts: See ``folder``.
+        base: Folder that a path is relative to.
+    """
+    if is_path(name):
+        return user_path(name, base)
+    there = list_data(folder, *parts)
+    if name not in there:
+        return f"there is no {'/'.join((folder, *parts))} model {name!r}{nearest(name, there)}, or a path to your own"
+    return data_folder(folder).joinpath(*parts, f"{name}.yaml")
+
+
+def load_pad_models(problems: Problems) -> dict[str, dict[str, Any]]:
+    """Return all built-in models of gamepads as plain data, by name; :mod:`hal.pads.model` has their schema."""
+    models = {}
+    for name in list_data("sensors", "gamepads"):
+        data = read_yaml(data_folder("sensors") / "gamepads" / f"{name}.yaml", problems)
+        if data is not None:
+            models[name] = data
+    return models
