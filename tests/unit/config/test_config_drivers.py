@@ -200,24 +200,23 @@ def test_real_limits_count_where_the_arm_is_real(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("real_limits", "key", "words"),
+    ("real_limits", "key", "code"),
     [
-        ({"jerk": 8000}, "real_limits.jerk", "8000 is looser than limits.jerk, 7500, for joint 'panda_joint1'"),
-        ({"lower": -3.0}, "real_limits.lower", "-3 is looser than limits.lower, -2.8973"),
-        ({"velocity": [1, 1]}, "real_limits.velocity", "must have 7 numbers"),
-        ({"acceleration": 0}, "real_limits.acceleration", "must be above 0"),
-        ({"jrek": 100}, "real_limits.jrek", "did you mean 'jerk'"),
-        ({"lower": 0.5, "upper": 0.4}, "real_limits", "lower must be below upper"),
+        ({"jerk": 8000}, "real_limits.jerk", "looser_limit"),
+        ({"lower": -3.0}, "real_limits.lower", "looser_limit"),
+        ({"velocity": [1, 1]}, "real_limits.velocity", "wrong_count"),
+        ({"acceleration": 0}, "real_limits.acceleration", "out_of_range"),
+        ({"jrek": 100}, "real_limits.jrek", "unknown_key"),
+        ({"lower": 0.5, "upper": 0.4}, "real_limits", "empty_range"),
     ],
 )
 def test_mistakes_in_real_limits_are_found_in_simulation_too(
-    tmp_path: Path, real_limits: dict[str, Any], key: str, words: str
+    tmp_path: Path, real_limits: dict[str, Any], key: str, code: str
 ) -> None:
     model = own_model(tmp_path, real_limits=real_limits)
     with pytest.raises(ConfigError) as caught:
         load({"robots": {"arm": {"model": model, "drivers": {"sim": "pybullet"}, "gripper": {"enabled": False}}}})
-    said = {problem.key: problem.message for problem in caught.value.problems}
-    assert words in said[key]
+    assert (key, code) in {(problem.key, problem.code) for problem in caught.value.problems}
 
 
 def test_links_have_names_that_fit_every_model() -> None:

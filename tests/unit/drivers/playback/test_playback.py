@@ -162,8 +162,8 @@ def test_missing_files_unknown_models_and_wrong_options_are_refused(write: Write
     wrong: list[tuple[Callable[[], object], str, str]] = [
         (lambda: player(tmp_path / "nowhere.jsonl"), "unreadable", ""),
         (lambda: player(write(model="wheel")), "unknown_model", "line 1"),
-        (lambda: player(write(), freez_at=1.0), "invalid", "freez_at"),
-        (lambda: PlaybackPad(PadSpec("pad", "playback", None, MODELS)), "invalid", "file"),
+        (lambda: player(write(), freez_at=1.0), "unknown_key", "freez_at"),
+        (lambda: PlaybackPad(PadSpec("pad", "playback", None, MODELS)), "missing_key", "file"),
     ]
     for make, code, key in wrong:
         with pytest.raises(ConfigError) as caught:
