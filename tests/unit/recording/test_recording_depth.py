@@ -39,8 +39,8 @@ def test_what_a_camera_measured_in_its_unit_comes_back_to_the_bit(tmp_path: Path
 
 
 def test_what_was_not_measured_is_nought(tmp_path: Path) -> None:
-    odd = np.array([0.0, np.nan, np.inf, -np.inf, -1.0, 65.5354, 65.5356, 1e30], np.float32)
-    assert to_units(odd, 0.001).tolist() == [0, 0, 0, 0, 0, 65535, 0, 0]
+    odd = np.array([0.0, np.nan, np.inf, -np.inf, -1.0, 65.5354, 65.5356, 70.0, 1e30], np.float32)
+    assert to_units(odd, 0.001).tolist() == [0, 0, 0, 0, 0, 65535, 0, 0, 0]
 
 
 @pytest.mark.parametrize(("reach", "unit"), [(3.0, 0.0001), (6.5, 0.0001), (10.0, 0.00025), (100.0, 0.002)])
