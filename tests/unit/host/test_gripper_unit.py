@@ -216,6 +216,14 @@ def test_a_stop_ends_what_is_under_way_and_only_that(bench: Bench) -> None:
     assert bench.outcome() is GripperOutcome.DONE
 
 
+def test_a_command_that_was_sent_before_a_stop_moves_nothing_after_it(bench: Bench) -> None:
+    bench.tell(GripperAct.MOVE, 0.02, 0.05, 10.0)
+    bench.stops += 1  # both are seen in the same cycle
+    assert bench.outcome() is GripperOutcome.STOPPED
+    bench.report()
+    assert bench.driver.calls == [("stop",)]
+
+
 def test_a_stop_that_fails_is_told(bench: Bench) -> None:
     bench.tell(GripperAct.MOVE, 0.02, 0.05, 10.0)
     bench.report(moving=True)

@@ -211,7 +211,7 @@ def test_quaternions(a, turn, vector):
     assert difference([0.0, 0.0, 0.0, *start], [1.0, 2.0, 3.0, *end]) == pytest.approx([1, 2, 3, *turn], abs=1e-7)
 
 
-@pytest.mark.parametrize("values", [[1.5, 0, 0, 0, 0, 0, 0], [0, 1.5, 0, 1.0, 0, 0, 0]])
+@pytest.mark.parametrize("values", [[1.5, 0, 0, 0, 0, 0, 0], [-1.5, 0, 0, 0, 0, 0, 0], [0, 1.5, 0, 1.0, 0, 0, 0]])
 def test_an_arm_that_brakes_badly_keeps_the_workspace_too(values: list[float]) -> None:
     """The slow-down before the faces does not suffice here; the check of where the stop would end must act."""
     spec = panda(workspace=WorkspaceSpec((0.0, -0.3, 0.2), (0.5, 0.3, 0.7)))
