@@ -84,18 +84,18 @@ def _main(args: argparse.Namespace) -> int:
     from hal.apps._display import banner
     from hal.apps.check import may_open
     from hal.config.data_files import data_folder
-    from hal.learning.policy import found
+    from hal.learning.policy import load_object
     from hal.recording import Recorder, recover
-    from hal.recording.layout import require
+    from hal.recording.layout import require_libraries
 
     _check_options(args)
     if os.getcwd() not in sys.path:
         sys.path.insert(0, os.getcwd())
-    judge = found(args.success, "--success") if args.success else None
+    judge = load_object(args.success, "--success") if args.success else None
     cameras = None if args.cameras is None else [name.strip() for name in args.cameras.split(",") if name.strip()]
     dataset = f"dataset  {args.out}: {args.episodes} episode(s) at {args.fps} rows/s"
     plan = resolve_plan(args, dataset, cameras=cameras or ())
-    require()
+    require_libraries()
     if plan is None:
         return 0
     if not may_open(plan):

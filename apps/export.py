@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 from hal.apps._common import run_app
 
 if TYPE_CHECKING:
-    from hal.recording.exporters import Progress
+    from hal.recording.exporters import ExportProgress
 
 __all__ = ["main", "parser"]
 
@@ -109,11 +109,11 @@ def _size(text: str | None) -> tuple[int, int] | None:
     return int(match[1]), int(match[2])
 
 
-def _show_progress() -> Callable[[Progress], None]:
+def _show_progress() -> Callable[[ExportProgress], None]:
     """Return a function that shows the progress in one line of the terminal."""
     last = 0.0
 
-    def show(progress: Progress) -> None:
+    def show(progress: ExportProgress) -> None:
         nonlocal last
         now = time.monotonic()
         if now - last > _PROGRESS_PERIOD or progress.share >= 1.0:

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from hal.deadman import Deadman
-    from hal.learning.replay import Player
+    from hal.learning.replay import TrajectoryPlayer
     from hal.recording import Episode
     from hal.rig import Rig
     from hal.robot import Robot
@@ -94,10 +94,10 @@ def _main(args: argparse.Namespace) -> int:
 
 def _driven(rig: Rig, episode: Episode) -> str:
     """Return the arm that was driven, else the rig's first one in the recording, else the rig's first one."""
-    from hal.learning.replay import arms_of
+    from hal.learning.replay import recorded_arms
 
     driven = str(episode.info.get("info", {}).get("robot"))
-    recorded = arms_of(episode)
+    recorded = recorded_arms(episode)
     if driven in rig.robots:
         return driven
     return next((name for name in rig.robots if name in recorded), next(iter(rig.robots)))
@@ -106,14 +106,14 @@ def _driven(rig: Rig, episode: Episode) -> str:
 def _replayed(robot: Robot, episode: Episode) -> Iterator[str]:
     """Yield lines for the banner: the arm, other arms that moved in the recording, and damaged images."""
     from hal.errors import DatasetError
-    from hal.learning.replay import moved_besides
+    from hal.learning.replay import other_moving_arms
 
     yield f"replays  {robot.name}"
     try:
         episode.check_pictures()
     except DatasetError as error:
         yield f"damaged  {error}; images are not needed here"
-    for name in moved_besides(episode, robot.name):
+    for name in other_moving_arms(episode, robot.name):
         yield f"still    {name} moved in the recording; it is not replayed"
 
 
@@ -125,13 +125,13 @@ class ReplayRun:
     ) -> None:
         """Check the episode against the arm. ``button`` is the name of the dead-man's control; empty without one."""
         from hal.apps._display import StatusLine
-        from hal.learning.replay import Player, RecordedTrajectory
+        from hal.learning.replay import RecordedTrajectory, TrajectoryPlayer
 
         self.rig, self.robot, self.episode, self.args, self.button = rig, robot, episode, args, button
         self.line = StatusLine()
-        course = RecordedTrajectory.of(episode, robot)
-        self.player = Player(
-            rig, robot, course, speed=args.speed, deadman=deadman, unattended=args.unattended or not button
+        trajectory = RecordedTrajectory.from_episode(episode, robot)
+        self.player = TrajectoryPlayer(
+            rig, robot, trajectory, speed=args.speed, deadman=deadman, unattended=args.unattended or not button
         )
         self.start = rig.clock.now()
         self.servo = self._servo()
@@ -175,7 +175,7 @@ class ReplayRun:
         self.rig.say(text)
 
     def _play(self) -> None:
-        objects = self.player.course.objects
+        objects = self.player.trajectory.objects
         if objects and not self.rig.has_world:
             self._announce("place the objects as in the recording, x y z in m:")
             for name, pose in objects.items():
@@ -189,10 +189,10 @@ class ReplayRun:
         self.start, self.servo = self.rig.clock.now(), self._servo()
         self.player.play(self._show)
 
-    def _show(self, player: Player, plays: bool) -> None:
+    def _show(self, player: TrajectoryPlayer, plays: bool) -> None:
         def text() -> str:
             does = "replaying" if plays else f"paused: hold {self.button}" if self.button else "starting"
-            return f"  {player.place:6.1f} of {player.course.duration:.1f} s  {does}"
+            return f"  {player.progress:6.1f} of {player.trajectory.duration:.1f} s  {does}"
 
         self.line.update(text)
 
@@ -202,11 +202,11 @@ class ReplayRun:
         player = self.player
         if player.finished:
             self._announce(
-                f"replayed {player.course.duration:.1f} s at {100 * player.speed:g} % speed; the arm is at rest"
+                f"replayed {player.trajectory.duration:.1f} s at {100 * player.speed:g} % speed; the arm is at rest"
             )
         else:
             self._announce(
-                f"ENDED at {player.place:.1f} of {player.course.duration:.1f} s: {reason}; the arm is at rest"
+                f"ENDED at {player.progress:.1f} of {player.trajectory.duration:.1f} s: {reason}; the arm is at rest"
             )
         if player.limited is not Limited.NONE:
             self._announce(f"limits were hit ({player.limited}); a lower --speed may follow more exactly")
@@ -227,8 +227,8 @@ class ReplayRun:
             "speed": player.speed,
             "finished": player.finished,
             "reason": reason,
-            "place_s": player.place,
-            "duration_s": player.course.duration,
+            "place_s": player.progress,
+            "duration_s": player.trajectory.duration,
             "took_s": self.rig.clock.now() - self.start,
             "pauses": player.pauses,
             "held_back": str(player.limited),

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from hal.recording.dataset import Dataset, Episode
-    from hal.recording.review import Spread, Summary
+    from hal.recording.review import ColumnSpread, DatasetSummary
 
 __all__ = ["main", "parser"]
 
@@ -72,8 +72,8 @@ def main(argv: list[str] | None = None) -> int:
 
 def _main(args: argparse.Namespace) -> int:
     from hal.recording import Dataset
-    from hal.recording.exporters.content import chosen
-    from hal.recording.review import as_json, summary
+    from hal.recording.exporters.content import select_episodes
+    from hal.recording.review import summarize, summary_as_json
 
     if args.repair:
         return _repair(args)
@@ -83,11 +83,11 @@ def _main(args: argparse.Namespace) -> int:
     if args.episode is None:
         if args.png or args.rrd:
             raise CommandError("--png and --rrd show one episode: select it with --episode N")
-        found = summary(dataset)
+        found = summarize(dataset)
     else:
-        (episode,) = chosen(dataset, [args.episode], successful_only=False)
-        found = summary(dataset, [episode])
-    print(as_json(found) if args.json else "\n".join(_table(found)))
+        (episode,) = select_episodes(dataset, [args.episode], successful_only=False)
+        found = summarize(dataset, [episode])
+    print(summary_as_json(found) if args.json else "\n".join(_table(found)))
     if args.episode is None:
         _warn_of_index(dataset, found)
     if args.episode is not None and not found.broken:
@@ -98,19 +98,19 @@ def _main(args: argparse.Namespace) -> int:
 
 def _check(args: argparse.Namespace, dataset: Dataset) -> int:
     from hal.recording.checking import check_dataset
-    from hal.recording.exporters.content import chosen
+    from hal.recording.exporters.content import select_episodes
     from hal.recording.index import repair_command
-    from hal.recording.layout import Layout
+    from hal.recording.layout import DatasetLayout
 
     if args.png or args.rrd:
         raise CommandError("--check cannot be used with --png or --rrd")
     wanted = None if args.episode is None else [args.episode]
-    count = len(chosen(dataset, wanted, successful_only=False))
+    count = len(select_episodes(dataset, wanted, successful_only=False))
     found = list(dict.fromkeys(str(error) for error in check_dataset(dataset, wanted)))
     if args.json:
         print(json.dumps({"path": str(dataset.root), "episodes": count, "wrong": found}, indent=2))
     else:
-        remedy = f"; next: {repair_command(Layout(dataset.root))}" if found else ""
+        remedy = f"; next: {repair_command(DatasetLayout(dataset.root))}" if found else ""
         end = f"{count} episode{'' if count == 1 else 's'} checked, {len(found)} problem(s){remedy}"
         print("\n".join([*found, end]))
     return ACTION_NEEDED if found else 0
@@ -118,7 +118,7 @@ def _check(args: argparse.Namespace, dataset: Dataset) -> int:
 
 def _repair(args: argparse.Namespace) -> int:
     from hal.recording import Dataset, repair
-    from hal.recording.review import summary
+    from hal.recording.review import summarize
 
     if args.episode is not None or args.png or args.rrd or args.json:
         raise CommandError("--repair is for the whole dataset and cannot be used with other options")
@@ -126,7 +126,7 @@ def _repair(args: argparse.Namespace) -> int:
     try:
         done = repair(args.dataset)
         with suppress(CommandError):  # no episode
-            damaged = summary(Dataset(args.dataset)).broken
+            damaged = summarize(Dataset(args.dataset)).broken
     except DatasetError as error:
         if error.episode is None:
             raise
@@ -138,13 +138,13 @@ def _repair(args: argparse.Namespace) -> int:
     return ACTION_NEEDED if damaged else 0
 
 
-def _warn_of_index(dataset: Dataset, found: Summary) -> None:
+def _warn_of_index(dataset: Dataset, found: DatasetSummary) -> None:
     """Print the first problem in ``meta/``, apart from the episodes that cannot be read."""
     from hal.recording.checking import check_index
     from hal.recording.index import repair_command
-    from hal.recording.layout import Layout
+    from hal.recording.layout import DatasetLayout
 
-    layout = Layout(dataset.root)
+    layout = DatasetLayout(dataset.root)
     wrong = next((str(error) for error in check_index(layout) if str(error) not in found.broken), None)
     if wrong is not None:
         print(f"warning: the index is damaged: {wrong}; rebuild it with: {repair_command(layout)}", file=sys.stderr)
@@ -152,13 +152,13 @@ def _warn_of_index(dataset: Dataset, found: Summary) -> None:
 
 def _drawn(args: argparse.Namespace, root: Path, episode: Episode) -> Iterator[Path]:
     """Write the picture or the .rrd file of an episode; yield its path."""
-    from hal.recording.exporters.output import fresh
+    from hal.recording.exporters.output import write_atomically
 
     if args.rrd:
         from hal.recording.exporters.rrd import write_rrd
 
         path = Path(args.rrd).expanduser().absolute()
-        with fresh(path, force=args.force, is_ours=Path.is_file) as new:
+        with write_atomically(path, force=args.force, is_ours=Path.is_file) as new:
             write_rrd(episode, new)
         yield path
     if args.png or not args.rrd:
@@ -166,14 +166,14 @@ def _drawn(args: argparse.Namespace, root: Path, episode: Episode) -> Iterator[P
 
         beside = root.with_name(f"{root.name}_episode_{episode.number:06d}.png")
         path = Path(args.png or beside).expanduser().absolute()
-        with fresh(path, force=args.force, is_ours=Path.is_file) as new:
+        with write_atomically(path, force=args.force, is_ours=Path.is_file) as new:
             draw_sheet(episode).save(new, format="png")
         yield path
 
 
-def _table(found: Summary) -> Iterator[str]:
+def _table(found: DatasetSummary) -> Iterator[str]:
     """Yield the statistics, line by line."""
-    from hal.recording.layout import SLOW
+    from hal.recording.metadata import SLOW_PACE
 
     count = len(found.episodes)
     many = f"{count} episode{'' if count == 1 else 's'}"
@@ -188,7 +188,7 @@ def _table(found: Summary) -> Iterator[str]:
         end = f"{line.dropped:7d}  {line.trips:5d}  {line.task}" + (f"  [{line.trouble}]" if line.trouble else "")
         yield f"{line.number:7d}  {line.rows:6d}  {line.seconds:7.2f}  {_MARK[line.success]:8}  {end}"
     for line in found.episodes:
-        if line.pace is not None and line.pace < SLOW:
+        if line.pace is not None and line.pace < SLOW_PACE:
             yield f"episode {line.number}: the simulation ran at {line.pace:.2f} of real time; its speeds are too low"
     yield from (f"cannot be read: {line}" for line in found.broken)
     if found.broken:
@@ -210,7 +210,7 @@ def _table(found: Summary) -> Iterator[str]:
         yield f"{each.source:{width}}  {' '.join(f'{value:8.2f}' for value in values)}  {each.repeated:8d}"
 
 
-def _numbers(spread: Spread) -> str:
+def _numbers(spread: ColumnSpread) -> str:
     return " ".join(f"{value:8.4f}" for value in (spread.min, spread.max, spread.mean, spread.std))
 
 

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from hal.config.mapping import TeleopMapping
     from hal.deadman import Deadman
     from hal.geometry import Pose
-    from hal.learning.policy import Outcome
+    from hal.learning.policy import PolicyOutcome
     from hal.recording import Recorder
     from hal.rig import Rig
     from hal.robot import Robot
@@ -88,7 +88,7 @@ def _main(args: argparse.Namespace) -> int:
     from hal.apps._display import banner, list_links
     from hal.apps.check import may_open
     from hal.errors import CommandError
-    from hal.learning.policy import found
+    from hal.learning.policy import load_object
 
     for name in ("rate", "episodes", "seconds", "history"):
         if not getattr(args, name) > 0:
@@ -100,7 +100,7 @@ def _main(args: argparse.Namespace) -> int:
         sys.path.insert(0, os.getcwd())
     for what in ("policy", "reset", "success"):
         if getattr(args, what):
-            found(getattr(args, what), f"--{what}")
+            load_object(getattr(args, what), f"--{what}")
     plan = resolve_plan(args, f"policy   {args.policy}")
     if plan is None:
         return 0
@@ -143,7 +143,7 @@ class RolloutRun:
     ) -> None:
         """Load the policy. ``deadman`` and ``mapping`` are those of the pad; None without a dead-man."""
         from hal.apps._display import StatusLine
-        from hal.learning.policy import PolicyRunner, found, load_policy
+        from hal.learning.policy import PolicyRunner, load_object, load_policy
 
         self.rig, self.robot, self.args, self.recorder = rig, robot, args, recorder
         self.deadman = deadman
@@ -154,7 +154,7 @@ class RolloutRun:
         self.marks = {actions[action]: mark for action, mark in MARKS.items() if action in actions}
         """Button -> how it marks an episode."""
         self.line = StatusLine()
-        self.reset_function: Any = found(args.reset, "--reset") if args.reset else None
+        self.reset_function: Any = load_object(args.reset, "--reset") if args.reset else None
         self.runner = PolicyRunner(
             rig,
             load_policy(args.policy, rig),
@@ -164,12 +164,12 @@ class RolloutRun:
             deadman=deadman,
             unattended=args.unattended or mapping is None,
             history=args.history,
-            success=found(args.success, "--success") if args.success else None,
+            success=load_object(args.success, "--success") if args.success else None,
             mark=self._mark,
         )
         self.pressed: set[str] = set()
         """Marking buttons that are pressed. Each press marks once."""
-        self.outcomes: list[Outcome] = []
+        self.outcomes: list[PolicyOutcome] = []
 
     def run(self) -> int:
         """Run all episodes, or until one is stopped. Return the exit status."""
@@ -203,13 +203,13 @@ class RolloutRun:
         self.pressed = {name for name in self.marks if any(pad.state().pressed(name) for pad in pads)}
         return next((self.marks[name] for name in self.pressed - before), None)
 
-    def _episode(self, seed: int) -> Outcome:
+    def _episode(self, seed: int) -> PolicyOutcome:
         number = len(self.outcomes)
         self._reset(number, seed)
         self.pressed = set(self.marks)
         if self.recorder is not None:
             self.recorder.start(seed=seed, info=self._info())
-        outcome: Outcome | None = None
+        outcome: PolicyOutcome | None = None
         try:
             outcome = self.runner.run(seed, lambda seconds: self._show(number, seconds))
         finally:
@@ -296,7 +296,7 @@ def _ms(seconds: float | None) -> float | None:
     return None if seconds is None else 1e3 * seconds
 
 
-def _describe(outcome: Outcome) -> str:
+def _describe(outcome: PolicyOutcome) -> str:
     """Return the result of an episode in one line."""
     p50, p99 = (_ms(outcome.inference[name]) or 0.0 for name in ("p50", "p99"))
     how = {"time": "time limit reached", "stopped": "STOPPED", "error": "the policy raised an error"}

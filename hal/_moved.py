@@ -51,7 +51,10 @@ RENAMED: Mapping[str, Mapping[str, str]] = MappingProxyType(
     {
         "hal.calibration.collecting": {"drive": "collect_views", "take_and_tell": "add_view"},
         "hal.calibration.setup": {"guess_of": "initial_guess", "setting_of": "find_setup"},
-        "hal.learning.episode": {"put_back": "reset_scene"},
+        "hal.learning.episode": {"draw_poses": "sample_poses", "put_back": "reset_scene"},
+        "hal.learning.gym": {"Action": "ActionKind", "Spaces": "ObservationDict"},
+        "hal.learning.policy": {"Answer": "PolicyAnswer", "Outcome": "PolicyOutcome", "found": "load_object"},
+        "hal.learning.replay": {"Player": "TrajectoryPlayer"},
     }
 )
 """Module -> names of 0.1.0 -> their new names."""

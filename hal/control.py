@@ -310,6 +310,29 @@ class Control:
             self._send_width(target, waiting, reasons)
         return Sent(command, tuple(reasons))
 
+    def hold_until_following(self) -> bool:
+        """Return whether the arm follows commands; if not, command it to stay where it is. Call it once per turn.
+
+        For programs that play a motion which starts at a certain time: start it, or continue it after a pause, only
+        when this is True. A command that was sent before the servo noticed a new press of the dead-man has no effect.
+
+        Raises:
+            MotionStopped: As for :meth:`send`, with the other errors that it raises.
+        """
+        held = self.deadman is None or self.deadman.held
+        if held and self.status is RobotStatus.FOLLOWING:
+            return True
+        self.send(JointTarget(self.robot.state().q_set))
+        return False
+
+    def hold_for(self, seconds: float) -> None:
+        """Command the arm to stay where it is for up to ``seconds``, at most 3, until the next command.
+
+        Without a further command the session trips at the end of that time, as at the end of any chunk.
+        """
+        now, q_set = self.robot.clock.now(), self.robot.state().q_set
+        self.send(JointChunk([now, now + seconds], [q_set, q_set]))
+
     def _check_time(self, now: float) -> None:
         """Refuse a loop in which the time of a lock-step clock never passes: its arm would not move."""
         self._at_once = self._at_once + 1 if now == self._t_sent else 0

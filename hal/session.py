@@ -398,7 +398,7 @@ class TeleopSession:
                 deadman=deadman,
                 since=since,
                 patience=HOMING_PATIENCE,
-                hand=False,
+                open_gripper=False,
             )
         except MotionStopped:
             if deadman.held or not deadman.connected or not self.drives_home:

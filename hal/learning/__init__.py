@@ -1,1 +1,1 @@
-"""What learning needs around a rig: episodes, policies, replay of recordings, and a Gymnasium environment."""
+"""Tools for learning with a rig: episodes, policies, replay of recordings, and a Gymnasium environment."""

@@ -1,4 +1,4 @@
-"""Before an episode: everything back to where it starts."""
+"""Reset a scene before an episode: objects to their start poses or to random ones, the arm to its start position."""
 
 from __future__ import annotations
 
@@ -26,98 +26,103 @@ __all__ = [
     "stands_in_world",
 ]
 
-# [placement.py] Where things start in an episode: poses drawn from the random ranges that the rig gives them.
-
 Array = NDArray[np.float64]
 
 _TRIES = 100
-"""Poses drawn for one thing before all are drawn anew."""
+"""Poses sampled for one object before all are sampled again."""
 _ROUNDS = 20
-"""How often that is done: where one thing took the room of the next, other poses of both may fit."""
-_MARGINS = 0.005
-"""m: boxes around things that only touch may overlap by so much."""
+"""How often all are sampled again: if one object took the room of the next, other poses of both may fit."""
+_TOUCHING = 0.005
+"""Overlap of the boxes around objects that only touch, m."""
 _ROUNDING = 1e-6
-"""m"""
-_ENDLESS = 1e6
-"""m: what reaches farther is a plane."""
-_LOOKS = 20
-"""At something that moves, at most."""
+"""Tolerance of an overlap, m."""
+_INFINITE = 1e6
+"""Size above which a body is a plane, m."""
+_READS = 20
+"""Attempts to read a consistent pose and box of a moving object."""
 
 
 class _Box(NamedTuple):
-    """Along the world's axes, m."""
+    """A box along the world's axes, m."""
 
     lower: Array
     upper: Array
 
     def corners(self) -> Array:
-        """(8, 3)"""
+        """Return the corners (8, 3), m."""
         return np.array(list(product(*zip(self.lower, self.upper, strict=True))))
 
-    def depth(self, box: _Box) -> float:
-        """By how much the two overlap along the axis on which it is least, m; 0 or less where they do not."""
+    def overlap(self, box: _Box) -> float:
+        """Return by how much two boxes overlap along the axis on which it is least, m; 0 or less if they do not."""
         return float(np.minimum(self.upper - box.lower, box.upper - self.lower).min())
 
 
 class _Plane(NamedTuple):
-    """Everything below it is solid."""
+    """A plane; everything below it is solid."""
 
     position: Array
     normal: Array
 
-    def depth(self, box: _Box) -> float:
-        """By how much a box reaches below it, m; 0 or less where it does not."""
+    def overlap(self, box: _Box) -> float:
+        """Return how far a box reaches below the plane, m; 0 or less if it does not."""
         return float(((self.position - box.corners()) @ self.normal).max())
 
 
 _Solids = dict[str, "_Box | _Plane"]
 
 
-class _Thing(NamedTuple):
-    """One that has ranges."""
+class _RandomBody(NamedTuple):
+    """An object with random ranges."""
 
     name: str
     orientation: Sequence[float]
     ranges: RangesSpec
     corners: Array | None
-    """(8, 3) of a box that holds it, in its own frame, m; None for what nothing collides with."""
+    """(8, 3) of a box around it, in its own frame, m; None if nothing collides with it."""
     allowed: Mapping[str, float]
-    """By how much more it may overlap some of those that stand still, m."""
+    """Additional overlap with some of the bodies that do not move, m."""
 
-    def draw(self, random: np.random.Generator) -> tuple[Pose, _Box | None]:
-        """A pose, and the box around the thing there."""
+    def sample(self, random: np.random.Generator) -> tuple[Pose, _Box | None]:
+        """Return a random pose, and the box around the object there."""
         numbers = random.uniform(self.ranges.lower, self.ranges.upper)
         pose = Pose.from_rpy(numbers[:3], numbers[3:].tolist()) @ Pose(orientation=self.orientation)
         return pose, None if self.corners is None else _box_around(pose.transform(self.corners))
 
-    def met(self, box: _Box | None, solids: _Solids) -> set[str]:
-        """What it would overlap there."""
+    def overlaps(self, box: _Box | None, solids: _Solids) -> set[str]:
+        """Return the names of the solids that it would overlap there."""
         if box is None:
             return set()
-        return {name for name, solid in solids.items() if solid.depth(box) > _ROUNDING + self.allowed.get(name, 0.0)}
+        return {name for name, solid in solids.items() if solid.overlap(box) > _ROUNDING + self.allowed.get(name, 0.0)}
 
 
 class _NoRoom(Exception):
-    """Every pose that was drawn for a thing overlaps something."""
+    """Every pose sampled for an object overlaps something."""
 
-    def __init__(self, name: str, met: set[str]) -> None:
-        self.name, self.met = name, met
+    def __init__(self, name: str, overlapped: set[str]) -> None:
+        self.name, self.overlapped = name, overlapped
 
 
 def sample_poses(rig: Rig, random: np.random.Generator, given: Collection[str] = ()) -> dict[str, Pose]:
-    """A pose for each of the rig's things that have random ranges, in the order in which they are configured.
+    """Sample a pose for each object of the rig that has random ranges. Nothing is moved.
 
-    Nothing is moved. Call it after ``rig.world.reset()``: what has no ranges counts where it is now, and so do things
-    that are ``given`` a place by somebody else. The same seed gives the same poses.
+    Call it after ``rig.world.reset()``: objects without ranges, and those in ``given``, count at their present pose.
 
-    At these poses the boxes around things, along the world's axes, overlap neither each other, nor those around the
-    other things, nor a plane. Except: what is configured to stand *inside* the box around a thing without ranges (in a
-    bin, on a shelf) may be anywhere in it, and what is configured to rest on one may be drawn to rest on it. What an
-    arm carries, and what nothing collides with, is in nobody's way.
+    At these poses the boxes around objects, along the world's axes, overlap neither each other, nor those around other
+    objects, nor a plane. Exceptions: an object configured to stand *inside* the box around one without ranges (in a
+    bin, on a shelf) may be anywhere in it, and one configured to rest on another may touch it. Objects that an arm
+    carries, and those without collision shapes, are ignored. **Arms are ignored too**, since the box around one covers
+    half the bench: ranges must keep clear of their start positions.
 
-    **Arms are not looked at**: the box around one covers half the bench. Ranges must keep clear of where arms start.
+    Args:
+        rig: The rig; without a simulated world the result is empty.
+        random: Source of random numbers; the same seed gives the same poses.
+        given: Names of objects that the caller places.
 
-    Raises CommandError, which says what was in the way, where a bounded number of draws finds no such poses.
+    Returns:
+        The pose of each object in the world, in the order of the configuration.
+
+    Raises:
+        CommandError: No such poses were found in a bounded number of samples (code ``no_room``).
     """
     plan = rig.plan.world
     if plan is None or not rig.has_world:
@@ -130,54 +135,62 @@ def sample_poses(rig: Rig, random: np.random.Generator, given: Collection[str] =
     rest = sorted(there - free - {body.name for body, _ in drawn})
     still = {name: solid for name in rest if (solid := _solid(rig.world, name)) is not None}
     home = {body.name: still[body.name] for body in plan.bodies if body.name in still and body.name not in given}
-    things = [_thing(rig.world, body, ranges, None if body.name in free else home) for body, ranges in drawn]
+    movers = [_random_body(rig.world, body, ranges, None if body.name in free else home) for body, ranges in drawn]
     for _ in range(_ROUNDS):
         try:
-            return _arranged(things, random, still)
+            return _arrange(movers, random, still)
         except _NoRoom as found:
             tight = found
     raise CommandError(
-        f"there is no room for {tight.name!r} in its random ranges: wherever it was drawn, it overlapped "
-        f"{' or '.join(map(repr, sorted(tight.met)))}; change its `random`, in the rig's objects"
+        f"there is no room for {tight.name!r} in its random ranges: every sampled pose overlapped "
+        f"{' or '.join(map(repr, sorted(tight.overlapped)))}; change its `random` in the rig's objects",
+        code="no_room",
     )
 
 
-def _arranged(things: Sequence[_Thing], random: np.random.Generator, still: _Solids) -> dict[str, Pose]:
-    """A pose for each thing, one after the other. Raises _NoRoom."""
+def _arrange(movers: Sequence[_RandomBody], random: np.random.Generator, still: _Solids) -> dict[str, Pose]:
+    """Sample a pose for each object, one after the other. Raises _NoRoom."""
     poses: dict[str, Pose] = {}
     solids = dict(still)
-    for thing in things:
-        met: set[str] = set()
+    for body in movers:
+        overlapped: set[str] = set()
         for _ in range(_TRIES):
-            pose, box = thing.draw(random)
-            if not (new := thing.met(box, solids)):
+            pose, box = body.sample(random)
+            if not (new := body.overlaps(box, solids)):
                 break
-            met |= new
+            overlapped |= new
         else:
-            raise _NoRoom(thing.name, met)
-        poses[thing.name] = pose
+            raise _NoRoom(body.name, overlapped)
+        poses[body.name] = pose
         if box is not None:
-            solids[thing.name] = box
+            solids[body.name] = box
     return poses
 
 
-def _thing(world: World, body: BodySpec, ranges: RangesSpec, home: _Solids | None) -> _Thing:
-    """``home``: what stands still where it is configured; None for what nothing collides with."""
+def _random_body(world: World, body: BodySpec, ranges: RangesSpec, home: _Solids | None) -> _RandomBody:
+    """Return an object with what its poses depend on.
+
+    Args:
+        world: The simulated world.
+        body: The object.
+        ranges: Its random ranges.
+        home: Bodies that stand where they are configured; None for an object that nothing collides with.
+    """
     if home is None:
-        return _Thing(body.name, body.orientation, ranges, None, {})
+        return _RandomBody(body.name, body.orientation, ranges, None, {})
     corners = _own_corners(world, body)
     box = _box_around(Pose(body.position, body.orientation).transform(corners))
-    touched = {name: depth for name, solid in home.items() if (depth := solid.depth(box)) > 0.0}
-    allowed = {name: np.inf if depth > _MARGINS else depth for name, depth in touched.items()}
-    return _Thing(body.name, body.orientation, ranges, corners, allowed)
+    touched = {name: depth for name, solid in home.items() if (depth := solid.overlap(box)) > 0.0}
+    allowed = {name: np.inf if depth > _TOUCHING else depth for name, depth in touched.items()}
+    return _RandomBody(body.name, body.orientation, ranges, corners, allowed)
 
 
 def _own_corners(world: World, body: BodySpec) -> Array:
-    """(8, 3) of a box that holds a thing, in its own frame, m."""
+    """Return the corners (8, 3) of a box around an object, in its own frame, m."""
     half = _half(body)
     if half is not None:
         return _Box(-half, half).corners()
-    for _ in range(_LOOKS):  # in real time it may be falling meanwhile, and both must be of one moment
+    for _ in range(_READS):  # it may be falling, and both must be of the same time
         pose = world.pose(body.name)
         box = _Box(*world.aabb(body.name))
         if world.pose(body.name) == pose:
@@ -186,7 +199,7 @@ def _own_corners(world: World, body: BodySpec) -> Array:
 
 
 def _half(body: BodySpec) -> Array | None:
-    """Half the size (3,) of a simple shape, m: known without asking."""
+    """Return half the size (3,) of a simple shape, m; None for other shapes."""
     radius, length = body.radius or 0.0, body.length or 0.0
     sizes = {
         "box": body.half_extents,
@@ -199,11 +212,11 @@ def _half(body: BodySpec) -> Array | None:
 
 
 def _solid(world: World, name: str) -> _Box | _Plane | None:
-    """Where a thing is now; None where nothing collides with it."""
+    """Return the space that a body takes now; None if nothing collides with it."""
     lower, upper = world.aabb(name)
     if not (lower < upper).any():
         return None
-    if (upper - lower).max() < _ENDLESS:
+    if (upper - lower).max() < _INFINITE:
         return _Box(lower, upper)
     pose = world.pose(name)
     return _Plane(pose.position, pose.transform([0.0, 0.0, 1.0]) - pose.position)
@@ -213,12 +226,15 @@ def _box_around(points: Array) -> _Box:
     return _Box(points.min(axis=0), points.max(axis=0))
 
 
-_LOOKS_HZ = 50.0
-"""At the dead-man."""
+_POLL_HZ = 50.0
+"""How often the dead-man is polled, Hz."""
 
 
 def stands_in_world(rig: Rig, robot: Robot) -> bool:
-    """Is this arm a part of the simulated world, and no copy of a real one? Then it need not drive to be elsewhere."""
+    """Return whether this arm is part of the simulated world, so that it can be placed without driving.
+
+    The mirror of a real arm is not.
+    """
     world = rig.plan.world
     return world is not None and robot.spec.driver == world.driver
 
@@ -234,28 +250,41 @@ def reset_scene(
     unattended: bool = False,
     since: int | None = None,
     patience: float = 60.0,
-    hand: bool = True,
+    open_gripper: bool = True,
 ) -> dict[str, Pose]:
-    """A simulated world as it began, and the arm at ``q`` (n,), rad. Returns where things are that began elsewhere.
+    """Bring a scene to its start: objects at their start poses and the arm at its start position.
 
-    With ``random``, objects with random ranges are placed at poses drawn from it (:func:`draw_poses`);
-    those named in ``poses`` are put there instead. On a real bench nobody puts things anywhere.
+    A simulated arm is placed. Any other arm **drives** as ``move_to`` does, then opens its gripper. With a dead-man
+    that takes a new press: a press that began before this call, or that followed a stop, does not start the motion.
 
-    An arm of that world is put there (where it began, without ``q``). Any other arm **drives**, as ``move_to`` does,
-    and then opens its gripper, which drops what it holds, unless ``hand`` is False; without ``q`` it drives home. With
-    a dead-man that takes a new press: more than ``since`` in all, or than there were at this call. What is held for
-    something else, or after a stop, drives nobody home.
+    Args:
+        rig: The rig. Without a simulated world only the arm is moved.
+        robot: The arm.
+        q: Its start position (n,), rad; None for its initial position in a simulated world, else home.
+        poses: Poses of objects in the world, instead of sampled ones.
+        random: Sample poses of objects with random ranges, see :func:`sample_poses`; None leaves them where they are
+            configured.
+        deadman: Dead-man for a real arm.
+        unattended: Let a real arm drive without a dead-man.
+        since: Count of presses that a new press must exceed; None for the count at this call.
+        patience: Longest time to wait for the dead-man, s.
+        open_gripper: Whether a real gripper opens, which drops what it holds.
 
-    Raises what ``move_to`` raises: MotionStopped, too, as long as nobody has acknowledged ``rig.stop()``, and when the
-    dead-man was not pressed, or held, for ``patience`` s.
+    Returns:
+        The poses of the objects that were placed.
+
+    Raises:
+        MotionStopped: ``rig.stop()`` is not acknowledged, or the dead-man was not pressed or held within ``patience``
+            (code ``deadman_not_pressed``). Other errors are those of ``move_to``.
+        CommandError: There is no room for the objects (code ``no_room``).
     """
     inside = stands_in_world(rig, robot)
-    if not inside:  # first: on its way its copy would push what is put there
+    if not inside:  # before the objects are placed: its mirror would push them
         if deadman is not None:
             _wait_for_press(rig.clock, deadman, deadman.record.presses if since is None else since, patience)
         target = robot.home if q is None else np.asarray(q, float)
         robot.move_to(target, deadman=deadman, unattended=unattended, patience=patience)
-        if hand and robot.gripper is not None:
+        if open_gripper and robot.gripper is not None:
             robot.gripper.open()
     if not rig.has_world:
         return {}
@@ -274,9 +303,13 @@ def reset_scene(
 
 
 def _wait_for_press(clock: Clock, deadman: Deadman, since: int, patience: float) -> None:
-    for tick in clock.rate(_LOOKS_HZ):
+    for tick in clock.rate(_POLL_HZ):
         record = deadman.record
         if record.held and record.presses > since:
             return
         if tick.elapsed > patience:
-            raise MotionStopped(f"nobody pressed the dead-man for {patience:g} s", "let go of it, and hold it")
+            raise MotionStopped(
+                f"the dead-man was not pressed for {patience:g} s",
+                "release it, then hold it",
+                code="deadman_not_pressed",
+            )

@@ -1,4 +1,4 @@
-"""A rig as a Gymnasium environment: the same file on the simulated and on the real arm.
+"""A rig as a Gymnasium environment, the same for the simulated and for the real arm::
 
     from hal.learning.gym import RigEnv
 
@@ -6,8 +6,8 @@
     observation, info = env.reset(seed=1)
     observation, reward, terminated, truncated, info = env.step(env.action_space.sample())
 
-Simulated rigs run in lock-step, as fast as the machine can; real ones in real time, under the same dead-man, limits and
-watchdog as a person with a pad. Needs ``pip install 'robot-hal[gym]'``.
+Simulated rigs run in lock-step, as fast as the machine allows; real ones in real time, with the same dead-man, limits
+and watchdog as teleoperation. Needs ``pip install 'robot-hal[gym]'``.
 """
 
 from __future__ import annotations
@@ -33,29 +33,37 @@ from ..specs import CameraSpec
 from .episode import reset_scene
 
 __all__ = [
-    "Action",
+    "ActionKind",
     "RigEnv",
-    "Spaces",
+    "ObservationDict",
     "action_space",
-    "as_numbers",
-    "key",
+    "pose_array",
+    "entry_key",
     "numbers_and_pictures",
     "observation_space",
 ]
 
-# [gym_spaces.py] What the actions and observations of :class:`~hal.learning.gym.RigEnv` are made of.
+ActionKind = Literal["joint", "tcp_delta", "twist"]
+"""``joint``: positions (n,), rad; more than 0.1 rad from the set-point they are clipped, and ``info["clipped"]`` is
+True. ``tcp_delta``: translation (m) and rotation vector (rad) of the tcp's goal in this step, along the base's axes.
+``twist``: velocity of the tcp, m/s and rad/s, along the base's axes. With a gripper one more number follows, 0 (open)
+to 1 (closed)."""
 
-Action = Literal["joint", "tcp_delta", "twist"]
-"""``joint``: positions (n,), rad; farther than 0.1 rad from the set-point they are cut to that, and
-``info["clipped"]`` says so. ``tcp_delta``: by how much the tcp's goal moves (m) and turns (rotation vector, rad)
-in this step, along the base's axes. ``twist``: speed of the tcp, m/s and rad/s, along the base's axes. With a gripper
-one more number follows, 0 (open) to 1 (closed)."""
-
-Spaces = dict[str, NDArray[Any]]
+ObservationDict = dict[str, NDArray[Any]]
 
 
-def action_space(robot: Robot, kind: Action, rate_hz: float, speeds: tuple[float, float]) -> spaces.Box:
-    """``speeds`` are the greatest of the tcp, m/s and rad/s. CommandError for a ``kind`` that there is not."""
+def action_space(robot: Robot, kind: ActionKind, rate_hz: float, speeds: tuple[float, float]) -> spaces.Box:
+    """Return the box of actions.
+
+    Args:
+        robot: The arm.
+        kind: Kind of action.
+        rate_hz: Steps per second.
+        speeds: Greatest speeds of the tcp, m/s and rad/s.
+
+    Raises:
+        CommandError: An unknown ``kind`` (code ``unknown_action``).
+    """
     linear, angular = speeds
     if kind == "joint":
         low, high = list(robot.limits.lower), list(robot.limits.upper)
@@ -64,7 +72,7 @@ def action_space(robot: Robot, kind: Action, rate_hz: float, speeds: tuple[float
         high = [linear * share] * 3 + [angular * share] * 3
         low = [-value for value in high]
     else:
-        raise CommandError(f"action must be joint, tcp_delta or twist, not {kind!r}")
+        raise CommandError(f"action must be joint, tcp_delta or twist, not {kind!r}", code="unknown_action")
     if robot.gripper is not None:
         low, high = [*low, 0.0], [*high, 1.0]
     return spaces.Box(np.array(low, np.float32), np.array(high, np.float32), dtype=np.float32)
@@ -73,10 +81,10 @@ def action_space(robot: Robot, kind: Action, rate_hz: float, speeds: tuple[float
 def observation_space(
     robot: Robot, cameras: Iterable[Camera], streams: Collection[str], objects: Collection[str]
 ) -> spaces.Dict:
-    """Return a box for each entry of what :func:`numbers_and_pictures` gives, and for the pose of each of ``objects``.
+    """Return a box for each entry of :func:`numbers_and_pictures`, and for the pose of each of ``objects``.
 
     Raises:
-        CommandError: Two entries would have the same key.
+        CommandError: Two entries would have the same key (code ``duplicate_name``).
     """
 
     def free(size: int) -> spaces.Box:
@@ -87,12 +95,13 @@ def observation_space(
         parts.append(("gripper", free(1)))
     for camera in cameras:
         found = [stream for stream in streams if stream in camera.spec.streams]
-        parts += [(key(camera.name, stream), _picture_space(camera.spec, stream)) for stream in found]
-    parts += [(key("object", name), free(7)) for name in objects]
+        parts += [(entry_key(camera.name, stream), _picture_space(camera.spec, stream)) for stream in found]
+    parts += [(entry_key("object", name), free(7)) for name in objects]
     keys = [name for name, _ in parts]
     if twice := sorted({name for name in keys if keys.count(name) > 1}):
         raise CommandError(
-            f"two parts of the observation would be called {', '.join(twice)}: rename a camera or an object"
+            f"two parts of the observation would be called {', '.join(twice)}: rename a camera or an object",
+            code="duplicate_name",
         )
     return spaces.Dict(dict(parts))
 
@@ -111,10 +120,10 @@ def _picture_space(camera: CameraSpec, stream: str) -> spaces.Box:
 
 def numbers_and_pictures(
     observation: Observation, robot: Robot, cameras: Collection[str], streams: Collection[str]
-) -> Spaces:
-    """Return what an observation holds of the arm, its gripper and these streams of these cameras."""
+) -> ObservationDict:
+    """Return the entries of an observation: the arm, its gripper and these streams of these cameras."""
     state = observation.robots[robot.name]
-    shown: Spaces = {"q": np.array(state.q), "dq": np.array(state.dq), "tcp": as_numbers(state.tcp)}
+    shown: ObservationDict = {"q": np.array(state.q), "dq": np.array(state.dq), "tcp": pose_array(state.tcp)}
     if robot.gripper is not None:
         shown["gripper"] = np.array([observation.grippers[robot.name].width])
     for name in cameras:
@@ -122,17 +131,17 @@ def numbers_and_pictures(
         for stream in streams:
             picture = getattr(frame, stream)
             if picture is not None:
-                shown[key(name, stream)] = picture if picture.ndim == 3 else picture[..., None]
+                shown[entry_key(name, stream)] = picture if picture.ndim == 3 else picture[..., None]
     return shown
 
 
-def key(*parts: str) -> str:
+def entry_key(*parts: str) -> str:
     """Return the key of an entry: an identifier, because PyTorch modules that are named by keys allow no dots."""
     return "_".join(parts).replace("-", "_")
 
 
-def as_numbers(pose: Pose) -> NDArray[np.float64]:
-    """(7,): position in m, and quaternion xyzw."""
+def pose_array(pose: Pose) -> NDArray[np.float64]:
+    """Return a pose as (7,): position in m, and quaternion xyzw."""
     return np.concatenate([pose.position, pose.orientation])
 
 
@@ -144,26 +153,26 @@ except ImportError as error:
     raise DriverMissing(text, name="gymnasium") from error
 
 
-Result = tuple[Spaces, dict[str, Any]]
+Result = tuple[ObservationDict, dict[str, Any]]
 
-_LEAD = (0.03, 0.12)
-"""A goal that is ahead of the set-point by more is given up, m and rad."""
-_FARTHEST = 0.999 * FIRST_STEP_ANGLE  # what rounds to more would be refused
+_MAX_LEAD = (0.03, 0.12)
+"""Distance of a goal ahead of the set-point above which it is reset, m and rad."""
+_MAX_STEP = 0.999 * FIRST_STEP_ANGLE  # the servo refuses more, also after rounding
 
 
-class RigEnv(gymnasium.Env[Spaces, NDArray[np.float32]]):
-    """One arm of a rig, its gripper and its cameras.
+class RigEnv(gymnasium.Env[ObservationDict, NDArray[np.float32]]):
+    """One arm of a rig, its gripper and its cameras, as a Gymnasium environment.
 
     Observations are a dict: ``q`` and ``dq`` (n,), rad and rad/s; ``tcp`` (7,), position in m and quaternion xyzw in
-    the arm's base frame; ``gripper`` (1,), width in m; per camera, of the streams that it has, ``<name>_color``
-    (H, W, 3) uint8, ``<name>_depth`` (H, W, 1) float32 in m, ``<name>_infrared`` and ``<name>_infrared_right``
-    (H, W, 1) uint8, ``<name>_segmentation`` (H, W, 1) int32 (see :class:`~hal.types.Frame`); per object that was asked
-    for ``object_<name>`` (7,), its pose in the world. A dash in a name becomes an underscore. :attr:`observation` is
-    the whole record behind it, with every stamp; ``info["elapsed"]`` is its time since the reset, s.
+    the arm's base frame; ``gripper`` (1,), width in m; per camera, of the streams that it has, ``<name>_color`` (H, W,
+    3) uint8, ``<name>_depth`` (H, W, 1) float32 in m, ``<name>_infrared`` and ``<name>_infrared_right`` (H, W, 1)
+    uint8, ``<name>_segmentation`` (H, W, 1) int32 (see :class:`~hal.types.Frame`); per observed object
+    ``object_<name>`` (7,), its pose in the world. A dash in a name becomes an underscore. :attr:`observation` is the
+    complete record behind it, with every stamp; ``info["elapsed"]`` is its time since the reset, s.
 
-    ``step`` sends the action, lets one period pass and waits for an observation that was taken after that: none is ever
-    handed out twice. When the arm is stopped (a released dead-man is no stop), the episode is truncated and
-    ``info["stopped"]`` says why.
+    ``step`` sends the action, lets one period pass and waits for an observation that was taken after that, so that no
+    observation is returned twice. If the arm is stopped (releasing the dead-man is not a stop), the episode is
+    truncated and ``info["stopped"]`` has the reason.
     """
 
     metadata = {"render_modes": ["rgb_array"]}  # noqa: RUF012  # Gymnasium's own name and type
@@ -175,7 +184,7 @@ class RigEnv(gymnasium.Env[Spaces, NDArray[np.float32]]):
         sim: bool | None = None,
         driver: str | None = None,
         robot: str | None = None,
-        action: Action = "joint",
+        action: ActionKind = "joint",
         cameras: Collection[str] | None = None,
         streams: Collection[str] | None = None,
         objects: Collection[str] = (),
@@ -190,18 +199,41 @@ class RigEnv(gymnasium.Env[Spaces, NDArray[np.float32]]):
         overrides: tuple[str, ...] = (),
         render_mode: str | None = None,
     ) -> None:
-        """``cameras`` are the names of those that are observed, else all; ``streams`` the streams of these that are:
-        some of ``color``, ``depth``, ``infrared``, ``infrared_right`` and ``segmentation``, else colour and depth.
-        ``objects`` are the names of things of the simulated world whose poses are observed. ``speeds`` are the
-        greatest of the tcp in ``twist`` and, per step, in ``tcp_delta``: m/s and rad/s.
+        """Open the rig.
 
-        ``on_reset(env, options)`` runs after the reset and before the first observation: where a person puts things
-        back on a real bench, or a task moves objects with ``env.rig.world`` and ``env.np_random``. ``deadman`` is made
-        from the open rig, for example ``lambda rig: rig.gamepads["pad"].hold("l2")``; something that really moves needs
-        it, or ``unattended=True``.
+        Args:
+            config: The rig's configuration, as for :func:`hal.open`.
+            sim: True for simulated drivers, as for :func:`hal.open`.
+            driver: Driver of all devices, as for :func:`hal.open`.
+            robot: Name of the arm; None for the rig's first.
+            action: Kind of action, see :data:`ActionKind`.
+            cameras: Names of the observed cameras; None for all.
+            streams: Observed streams: some of ``color``, ``depth``, ``infrared``, ``infrared_right`` and
+                ``segmentation``; None for colour and depth.
+            objects: Names of the objects of the simulated world whose poses are observed.
+            rate_hz: Steps per second.
+            max_steps: Steps after which an episode is truncated; None for no limit.
+            speeds: Greatest speeds of the tcp for ``twist`` and, per step, for ``tcp_delta``: m/s and rad/s.
+            reward: Called as ``reward(env, observation)`` after each step; None for a reward of 0.
+            terminated: Called as ``terminated(env, observation)`` after each step.
+            on_reset: Called as ``on_reset(env, options)`` after the reset and before the first observation: time for
+                the operator to arrange a real bench, or for a task to move objects with ``env.rig.world`` and
+                ``env.np_random``.
+            deadman: Makes the dead-man from the open rig, for example ``lambda rig: rig.gamepads["pad"].hold("l2")``;
+                something that really moves needs it, or ``unattended=True``.
+            unattended: Let a real arm move without a dead-man.
+            overrides: Changes of the configuration, ``key=value``.
+            render_mode: None or ``rgb_array``.
+
+        Raises:
+            CommandError: An argument is wrong.
+            NotSupported: The rig lacks a stream (code ``unknown_stream``) or a world (``no_world``).
+            DriverMissing: gymnasium is not installed.
         """
         if render_mode not in (None, "rgb_array"):
-            raise NotSupported(f"render_mode {render_mode!r}: there is rgb_array, the first camera's picture")
+            raise NotSupported(
+                f"render_mode {render_mode!r}: use rgb_array, the first camera's picture", code="render_mode"
+            )
         self.render_mode = render_mode
         self._reward, self._terminated, self._on_reset = reward, terminated, on_reset
         self._kind, self._rate, self._max_steps, self._speeds = action, rate_hz, max_steps, speeds
@@ -229,7 +261,7 @@ class RigEnv(gymnasium.Env[Spaces, NDArray[np.float32]]):
         self._start = 0.0
         self._clipped = False
         self.observation: Observation | None = None
-        """The whole record behind the newest observation."""
+        """The complete record behind the newest observation."""
 
     @staticmethod
     def _open(
@@ -246,22 +278,27 @@ class RigEnv(gymnasium.Env[Spaces, NDArray[np.float32]]):
         clock = None if attended or pads else "lock_step"
         return open_rig(config, sim=sim, driver=driver, overrides=overrides, clock=clock, pad=None if pads else "none")
 
-    # An episode.
-
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Result:
-        """Everything back to where the rig says that it starts; a real arm drives there, and opens its gripper.
+        """Reset the scene; a real arm drives to its start, and opens its gripper.
 
-        Things that have random ranges start at poses drawn from ``np_random``: with the same ``seed`` at the same ones,
-        without a seed at the next ones. ``options``: ``q`` (n,) to start from, rad; ``poses``, name of an object ->
-        :class:`~hal.geometry.Pose`, in the place of a drawn one. ``info["poses"]`` holds the drawn poses, if any:
-        name -> (7,), position in m and quaternion xyzw in the world.
+        Objects with random ranges start at poses sampled from ``np_random``.
 
-        Raises MotionStopped after ``rig.stop()``, whoever called it: only a person, or a program that knows better, may
-        call ``env.rig.rearm()``.
+        Args:
+            seed: Seed of ``np_random``; None continues its sequence.
+            options: ``q`` (n,), start position, rad; ``poses``, name of an object -> :class:`~hal.geometry.Pose`,
+                instead of a sampled one.
+
+        Returns:
+            The observation and ``info``; ``info["poses"]`` has the poses of the placed objects, if any: name -> (7,),
+            position in m and quaternion xyzw in the world.
+
+        Raises:
+            MotionStopped: After ``rig.stop()``. Only the operator, or a program that is responsible for safety, may
+                call ``env.rig.rearm()``.
         """
         super().reset(seed=seed)
         options = options or {}
-        self._end()
+        self._close_session()
         q, poses = options.get("q", self.robot.spec.initial), options.get("poses")
         put = reset_scene(
             self.rig,
@@ -274,7 +311,7 @@ class RigEnv(gymnasium.Env[Spaces, NDArray[np.float32]]):
         )
         if self._on_reset is not None:
             self._on_reset(self, options)
-        self._begin()
+        self._open_session()
         self.rig.forget_observations()
         observation = self.rig.observe(after=self.rig.clock.now(), cameras=self._cameras)
         self._goal = observation.robots[self.robot.name].tcp_set
@@ -284,22 +321,27 @@ class RigEnv(gymnasium.Env[Spaces, NDArray[np.float32]]):
         self._start = observation.t
         info = self._info(observation)
         if put:
-            info["poses"] = {name: as_numbers(pose) for name, pose in put.items()}
-        return self._shown(observation), info
+            info["poses"] = {name: pose_array(pose) for name, pose in put.items()}
+        return self._observation_dict(observation), info
 
-    def _begin(self) -> None:
+    def _open_session(self) -> None:
         control = self.robot.control(deadman=self._deadman, rate_hz=self._rate, unattended=self._unattended)
         self._control = control.__enter__()
 
-    def _end(self) -> None:
+    def _close_session(self) -> None:
         control, self._control = self._control, None
         if control is not None:
             control.close()
 
-    def step(self, action: NDArray[np.float32]) -> tuple[Spaces, float, bool, bool, dict[str, Any]]:
-        """One period; ``action`` as the action space says."""
+    def step(self, action: NDArray[np.float32]) -> tuple[ObservationDict, float, bool, bool, dict[str, Any]]:
+        """Send an action and wait one period; returns Gymnasium's five values.
+
+        Raises:
+            CommandError: ``reset`` was not called (code ``not_reset``), or the action's shape is wrong
+                (``bad_action``).
+        """
         if self._control is None:
-            raise CommandError("call reset before step")
+            raise CommandError("call reset before step", code="not_reset")
         command, grip = self._command(np.asarray(action, float))
         clock = self.rig.clock
         stopped = ""
@@ -308,7 +350,7 @@ class RigEnv(gymnasium.Env[Spaces, NDArray[np.float32]]):
         except MotionStopped as stop:
             stopped = str(stop)
         now = clock.now()
-        self._due = max(self._due + 1.0 / self._rate, now)  # a turn that came late is not caught up
+        self._due = max(self._due + 1.0 / self._rate, now)  # a late turn is not caught up
         clock.sleep_until(self._due)
         observation = self.rig.observe(after=self._fresh_from(now), cameras=self._cameras)
         self._steps += 1
@@ -318,11 +360,14 @@ class RigEnv(gymnasium.Env[Spaces, NDArray[np.float32]]):
         if stopped:
             info["stopped"] = stopped
         reward = float(self._reward(self, observation)) if self._reward is not None else 0.0
-        return self._shown(observation), reward, terminated, truncated, info
+        return self._observation_dict(observation), reward, terminated, truncated, info
 
     def _fresh_from(self, sent: float) -> float | None:
-        """A picture that may be handed out is no older than this: later than the action, and as new as its camera's
-        rate lets it be. None in lock-step, where every picture shows the present."""
+        """Return the oldest time of an acceptable picture, s: after the action, and as new as its camera's rate
+        allows.
+
+        None in lock-step, where every picture shows the present.
+        """
         if self.rig.lock_step:
             return None
         slowest = min((self.rig.cameras[name].spec.rate_hz for name in self._cameras), default=np.inf)
@@ -330,12 +375,12 @@ class RigEnv(gymnasium.Env[Spaces, NDArray[np.float32]]):
 
     def _command(self, action: NDArray[np.float64]) -> tuple[Command, float | None]:
         if action.shape != self.action_space.shape:
-            raise CommandError(f"an action has shape {self.action_space.shape}, not {action.shape}")
+            raise CommandError(f"an action has shape {self.action_space.shape}, not {action.shape}", code="bad_action")
         grip = min(max(float(action[-1]), 0.0), 1.0) if self.robot.gripper is not None else None
         numbers = action if grip is None else action[:-1]
         if self._kind == "joint":
             q_set = self.robot.state().q_set
-            q = np.minimum(np.maximum(numbers, q_set - _FARTHEST), q_set + _FARTHEST)
+            q = np.minimum(np.maximum(numbers, q_set - _MAX_STEP), q_set + _MAX_STEP)
             q = np.minimum(np.maximum(q, self._lower), self._upper)
             self._clipped = bool((q != numbers).any())
             return JointTarget(q), grip
@@ -343,18 +388,18 @@ class RigEnv(gymnasium.Env[Spaces, NDArray[np.float32]]):
             return Twist(numbers[:3], numbers[3:]), grip
         reached = self.robot.state().tcp_set
         distance, turn = reached.distance(self._goal)
-        if distance > _LEAD[0] or turn > _LEAD[1]:  # the arm was held back: no goal runs away from it
+        if distance > _MAX_LEAD[0] or turn > _MAX_LEAD[1]:  # the arm was held back: the goal must not run ahead
             self._goal = reached
         turned = after_rotation(self._goal.orientation.tolist(), numbers[3:].tolist())
         self._goal = Pose(self._goal.position + numbers[:3], turned)
         return CartesianTarget(self._goal), grip
 
-    def _shown(self, observation: Observation) -> Spaces:
+    def _observation_dict(self, observation: Observation) -> ObservationDict:
         self.observation = observation
         shown = numbers_and_pictures(observation, self.robot, self._cameras, self._streams)
         if self._objects and self.rig.world is not None:
             poses = self.rig.world.poses(self._objects).poses
-            shown |= {key("object", name): as_numbers(poses[name]) for name in self._objects}
+            shown |= {entry_key("object", name): pose_array(poses[name]) for name in self._objects}
         return shown
 
     def _info(self, observation: Observation) -> dict[str, Any]:
@@ -362,7 +407,7 @@ class RigEnv(gymnasium.Env[Spaces, NDArray[np.float32]]):
         return info | {"clipped": True} if self._clipped else info
 
     def render(self) -> NDArray[np.uint8] | None:
-        """The first camera's newest picture."""
+        """Return the first camera's newest colour picture (H, W, 3)."""
         if self.observation is None or not self._cameras:
             return None
         color = self.observation.cameras[self._cameras[0]].frame.color
@@ -371,26 +416,28 @@ class RigEnv(gymnasium.Env[Spaces, NDArray[np.float32]]):
     def close(self) -> None:
         """Bring the arm to rest and close the rig. Idempotent."""
         try:
-            self._end()
+            self._close_session()
         finally:
             self.rig.close()
 
 
 def _known(objects: Collection[str], rig: Rig) -> tuple[str, ...]:
-    """Names of things whose poses can be observed. NotSupported, DeviceNotFound where they cannot."""
+    """Return the names of objects whose poses can be observed. Raises NotSupported or DeviceNotFound."""
     if not objects:
         return ()
     if rig.world is None:
-        raise NotSupported("objects=: only a simulated world knows where things are")
+        raise NotSupported("objects=: only a simulated world has the poses of objects", code="no_world")
     return tuple(rig.world.poses(objects).poses)
 
 
 def _streamed(streams: Collection[str], cameras: Collection[Camera]) -> tuple[str, ...]:
-    """Return the streams that are observed. Raises NotSupported for one that none of the cameras has."""
+    """Return the observed streams. Raises NotSupported for one that none of the cameras has."""
     there = {stream for camera in cameras for stream in camera.spec.streams}
     if missing := [stream for stream in streams if stream not in there]:
         message = (
             f"streams=: no observed camera has {', '.join(missing)}; they have: {', '.join(sorted(there)) or 'none'}"
         )
-        raise NotSupported(f"{message}. The streams of a camera are chosen in its entry of the rig")
+        raise NotSupported(
+            f"{message}. The streams of a camera are chosen in its entry of the rig", code="unknown_stream"
+        )
     return tuple(streams)

@@ -1,4 +1,4 @@
-"""Policies: what one is, where it comes from, and one episode of it under the limits that a person has, too."""
+"""Policies: load one, and run one episode of it, with the limits and the dead-man that teleoperation has."""
 
 from __future__ import annotations
 
@@ -12,12 +12,11 @@ from typing import TYPE_CHECKING, Any, Protocol, TypeAlias, cast
 
 import numpy as np
 
-from ..commands import Command, JointChunk, JointTarget
+from ..commands import Command
 from ..control import CommandChecks
 from ..errors import CommandError, ConnectionLost, MotionStopped, RobotFault, StaleStateError
 from ..histogram import Histogram
 from ..observation import Observation
-from ..types import RobotStatus
 
 if TYPE_CHECKING:
     from collections.abc import Collection
@@ -28,45 +27,21 @@ if TYPE_CHECKING:
     from ..robot import Robot
 
 __all__ = [
-    "Answer",
-    "Outcome",
+    "PolicyAnswer",
+    "PolicyOutcome",
     "Policy",
     "PolicyRunner",
-    "follows",
-    "found",
+    "load_object",
     "load_policy",
-    "wait_here",
 ]
 
-# [handover.py] From a person's hand to a program's: when may a program's motion begin, or go on after a pause?
-
-
-def follows(control: Control) -> bool:
-    """Does the arm follow commands now? Until it does, it is told to stay where it is; call it once a turn.
-
-    A command that was sent before the servo has seen a new press of the dead-man does not count. Nothing of a motion
-    that has a beginning is lost so, for it is sent only when this is True. Raises what ``control.send`` raises.
-    """
-    held = control.deadman is None or control.deadman.held
-    if held and control.status is RobotStatus.FOLLOWING:
-        return True
-    control.send(JointTarget(control.robot.state().q_set))
-    return False
-
-
-def wait_here(control: Control, seconds: float) -> None:
-    """Stay, for up to so many s (3 at most): until a motion that is not known yet begins. Later than that is a trip."""
-    now, q_set = control.robot.clock.now(), control.robot.state().q_set
-    control.send(JointChunk([now, now + seconds], [q_set, q_set]))
-
-
-Answer: TypeAlias = "Command | tuple[Command | None, float | None] | None"
-"""A command; or a command and a grip from 0 (open) to 1 (closed), either of which may be None. None goes on with the
+PolicyAnswer: TypeAlias = "Command | tuple[Command | None, float | None] | None"
+"""A command; or a command and a grip from 0 (open) to 1 (closed), either of which may be None. None continues the
 chunk that was sent before."""
 
 
 FIRST_ANSWER = 2.5
-"""s that a policy may take for its first command, of an episode or after a pause: the arm stands still until then."""
+"""Time for a policy's first command of an episode or after a pause, s; the arm stands still until then."""
 
 
 class Policy(Protocol):
@@ -76,59 +51,71 @@ class Policy(Protocol):
     ``rig.clock``, as ``observation.t`` is.
     """
 
-    def __call__(self, observation: Observation, /) -> Answer:
-        """What to do now."""
+    def __call__(self, observation: Observation, /) -> PolicyAnswer:
+        """Return the next command."""
 
 
-def found(place: str, what: str) -> Any:
-    """The object at ``module:name``. CommandError, which names ``what`` was looked for, where there is none."""
+def load_object(place: str, what: str) -> Any:
+    """Return the callable at ``module:name``.
+
+    Args:
+        place: ``module:name``; the name may have dots.
+        what: What it is, for the message of an error.
+
+    Raises:
+        CommandError: It cannot be imported (code ``not_importable``) or called (``not_callable``).
+    """
     module, _, name = place.partition(":")
     if not (module and name):
-        raise CommandError(f"{what} {place!r}: write module:name, for example my_policy:act")
+        raise CommandError(f"{what} {place!r}: write module:name, for example my_policy:act", code="not_importable")
     try:
-        thing: Any = importlib.import_module(module)
+        target: Any = importlib.import_module(module)
         for part in name.split("."):
-            thing = getattr(thing, part)
+            target = getattr(target, part)
     except (ImportError, AttributeError) as error:
-        raise CommandError(f"{what} {place!r}: {error}") from error
-    if not callable(thing):
-        raise CommandError(f"{what} {place!r} cannot be called: it is a {type(thing).__name__}")
-    return thing
+        raise CommandError(f"{what} {place!r}: {error}", code="not_importable") from error
+    if not callable(target):
+        raise CommandError(f"{what} {place!r} cannot be called: it is a {type(target).__name__}", code="not_callable")
+    return target
 
 
 def load_policy(place: str, rig: Rig) -> Policy:
-    """The policy at ``module:name``. A class is made once: with the open rig where it takes an argument, else without.
+    """Return the policy at ``module:name``. A class is instantiated, with the rig if its constructor takes an
+    argument.
 
-    Raises CommandError where there is none.
+    Raises:
+        CommandError: It cannot be imported (code ``not_importable``) or called (``not_callable``).
     """
-    thing: Any = found(place, "policy")
-    if isinstance(thing, type):
-        parameters = inspect.signature(thing).parameters.values()
+    target: Any = load_object(place, "policy")
+    if isinstance(target, type):
+        parameters = inspect.signature(target).parameters.values()
         takes = [p for p in parameters if p.kind in (p.POSITIONAL_ONLY, p.POSITIONAL_OR_KEYWORD)]
-        thing = cast(Any, thing)(*([rig] if takes else []))
-        if not callable(thing):
-            raise CommandError(f"policy {place!r}: an object of this class cannot be called; give it a __call__")
-    return cast(Policy, thing)
+        target = cast(Any, target)(*([rig] if takes else []))
+        if not callable(target):
+            raise CommandError(
+                f"policy {place!r}: an object of this class cannot be called; give it a __call__", code="not_callable"
+            )
+    return cast(Policy, target)
 
 
 @dataclass(frozen=True, slots=True)
-class Outcome:
-    """How an episode went."""
+class PolicyOutcome:
+    """Result of one episode."""
 
     success: bool | None
-    """None where nobody said; False where time ran out before ``success`` was true."""
+    """Whether it succeeded; None if that is not known. False if time ran out before ``success`` was true."""
     ended: str
-    """``success``, ``failure`` (somebody marked it), ``time``, ``stopped`` or ``error``."""
+    """``success``, ``failure`` (marked by the operator), ``time``, ``stopped`` or ``error``."""
     reason: str
     """Why it was stopped, or what the policy raised."""
     seconds: float
-    """That the policy drove; pauses do not count."""
+    """Time that the policy drove, without pauses, s."""
     turns: int
-    """In which it was asked."""
+    """Turns in which the policy was called."""
     missed: int
-    """Turns that were skipped, since the policy, or the observation, took too long."""
+    """Turns that were skipped because the policy, or the observation, took too long."""
     repeated: int
-    """Turns in which there was nothing newer to observe than in the turn before."""
+    """Turns without a newer observation than in the turn before."""
     pauses: int
     inference: dict[str, float | None]
     """p50, p99 and max of the policy's time per call, s."""
@@ -137,11 +124,11 @@ class Outcome:
 
 
 class PolicyRunner:
-    """Asks a policy once a turn, and sends its answer.
+    """Calls a policy once per turn and sends its answer.
 
-    Its commands have the deadline of anybody's (2.5 turns; a chunk: its end), so a policy that is late trips the arm;
-    the first one may take longer.
-    While the dead-man is not held it is not asked, and its time stands still.
+    Commands have the usual deadline (2.5 turns; a chunk: its end), so a policy that is late trips the arm; only the
+    first one may take :data:`FIRST_ANSWER`. While the dead-man is not held, the policy is not called and its time
+    stands still.
     """
 
     def __init__(
@@ -159,8 +146,24 @@ class PolicyRunner:
         success: Callable[[Rig, Observation], bool] | None = None,
         mark: Callable[[], bool | None] | None = None,
     ) -> None:
-        """``success(rig, observation)`` is asked in each turn before the policy is: True ends the episode. ``mark()``,
-        a person's, says True or False to end it so. ``cameras`` are those that are observed, else all."""
+        """Prepare to run a policy.
+
+        Args:
+            rig: An open rig.
+            policy: The policy.
+            robot: The arm; None for the rig's first.
+            rate_hz: Turns per second.
+            seconds: Longest time of an episode, without pauses, s.
+            deadman: Dead-man; something that really moves needs it, or ``unattended``.
+            unattended: Let a real arm move without a dead-man.
+            cameras: Names of the observed cameras; None for all.
+            history: Number of states per observation.
+            success: Called as ``success(rig, observation)`` in each turn, before the policy; True ends the episode.
+            mark: Called in each turn; True or False, the operator's mark, ends the episode.
+
+        Raises:
+            CommandError: ``seconds`` is not positive.
+        """
         if not seconds > 0.0:
             raise CommandError(f"an episode's seconds must be positive, not {seconds:g}")
         self.rig, self.policy = rig, policy
@@ -171,20 +174,27 @@ class PolicyRunner:
         self._success, self._mark = success, mark
 
     def rehearse(self) -> None:
-        """Ask once, before anything moves, and throw the answer away: the first call is mostly the slowest.
+        """Call the policy once before anything moves, and discard the answer: the first call is usually the slowest.
 
-        What is wrong with the policy then shows before the first episode: whatever it raises is raised.
+        Raises whatever the policy raises, so that its errors show before the first episode; CommandError for an answer
+        that is not a command (code ``bad_answer``).
         """
         self._reset(None)
         command, _ = _parts(self.policy(self._observe()))
         if command is not None and not isinstance(command, Command):
-            raise CommandError(f"the policy answers with a {type(command).__name__}, which is no command")
+            raise CommandError(
+                f"the policy answers with a {type(command).__name__}, which is not a command", code="bad_answer"
+            )
 
-    def run(self, seed: int | None = None, on_turn: Callable[[float], None] = lambda seconds: None) -> Outcome:
-        """One episode, from where the arm is. ``on_turn(seconds)`` is called in each turn, also in pauses.
+    def run(self, seed: int | None = None, on_turn: Callable[[float], None] = lambda seconds: None) -> PolicyOutcome:
+        """Run one episode from the arm's present position; the arm is at rest afterwards.
 
-        What the policy raises, and what stops the arm, ends the episode and is told in the outcome. The arm is at rest
-        then. Ctrl-C, and what is wrong with the session itself, is raised.
+        Errors of the policy, and stops of the arm, end the episode and are part of the outcome. Ctrl-C and errors of
+        the session itself are raised.
+
+        Args:
+            seed: Passed to the policy's ``reset``.
+            on_turn: Called with the policy's driving time, s, in each turn, also in pauses.
         """
         self._reset(seed)
         self.rig.forget_observations()
@@ -194,10 +204,10 @@ class PolicyRunner:
             with control:
                 self._drive(control, tally, on_turn)
         except (MotionStopped, RobotFault, ConnectionLost, StaleStateError) as stop:
-            tally.end("stopped", getattr(stop, "reason", str(stop)))
+            tally.end_as("stopped", getattr(stop, "reason", str(stop)))
         except _PolicyError as wrong:
             error = wrong.__cause__
-            tally.end("error", f"{type(error).__name__}: {error}", error)
+            tally.end_as("error", f"{type(error).__name__}: {error}", error)
         return tally.outcome()
 
     def _reset(self, seed: int | None) -> None:
@@ -214,23 +224,23 @@ class PolicyRunner:
             on_turn(tally.seconds)
             mark = self._mark() if self._mark is not None else None
             if mark is not None:
-                return tally.end("success" if mark else "failure")
-            if not follows(control):
-                tally.pause()
+                return tally.end_as("success" if mark else "failure")
+            if not control.hold_until_following():
+                tally.count_pause()
                 begun = False
                 continue
-            tally.turn(tick.dt, tick.missed)
+            tally.count_turn(tick.dt, tick.missed)
             if tally.seconds > self._seconds - 1e-9:
-                return tally.end("time")
+                return tally.end_as("time")
             observation = self._observe()
             tally.repeated += observation.t <= seen
             seen = observation.t
             if self._success is not None and self._success(self.rig, observation):
-                return tally.end("success")
+                return tally.end_as("success")
             if not begun:
-                wait_here(control, FIRST_ANSWER)
+                control.hold_for(FIRST_ANSWER)
             command, grip = self._answer(observation, tally)
-            with _blamed(CommandError):
+            with _policy_errors(CommandError):
                 self._send(control, command, grip, first=not begun)
             begun = begun or command is not None
         return None
@@ -238,25 +248,26 @@ class PolicyRunner:
     def _send(self, control: Control, command: Command | None, grip: float | None, first: bool) -> None:
         if command is None and grip is None:
             return
-        if command is not None and first:  # a first target that is far away is refused, as anybody's is
+        if command is not None and first:  # a first target that is far away is refused, as in any session
             checks, now = CommandChecks(self.robot), self.rig.clock.now()
             checks.check_first(checks.checked(command, now, []), now, self.robot.state().q_set.tolist())
         control.send(command, grip=grip)
 
     def _answer(self, observation: Observation, tally: _Tally) -> tuple[Command | None, float | None]:
         start = time.perf_counter()
-        with _blamed(Exception):
+        with _policy_errors(Exception):
             answer = _parts(self.policy(observation))
         tally.inference.add(time.perf_counter() - start)
         return answer
 
 
 class _PolicyError(Exception):
-    """The policy raised what is the cause of this."""
+    """The policy raised the error that is the cause of this one."""
 
 
 @contextlib.contextmanager
-def _blamed(kind: type[Exception]) -> Iterator[None]:
+def _policy_errors(kind: type[Exception]) -> Iterator[None]:
+    """Raise errors of this kind as a :class:`_PolicyError`."""
     try:
         yield
     except kind as error:
@@ -264,7 +275,7 @@ def _blamed(kind: type[Exception]) -> Iterator[None]:
 
 
 class _Tally:
-    """Counts while an episode lasts."""
+    """Counts of one episode."""
 
     def __init__(self, judged: bool) -> None:
         self._judged = judged
@@ -276,22 +287,22 @@ class _Tally:
         self._ended, self._reason = "time", ""
         self._error: BaseException | None = None
 
-    def turn(self, dt: float, missed: int) -> None:
+    def count_turn(self, dt: float, missed: int) -> None:
         if self._driving:
             self._missed += missed
             self.seconds += dt
         self._driving = True
 
-    def pause(self) -> None:
+    def count_pause(self) -> None:
         self._pauses += self._driving
         self._driving = False
 
-    def end(self, ended: str, reason: str = "", error: BaseException | None = None) -> None:
+    def end_as(self, ended: str, reason: str = "", error: BaseException | None = None) -> None:
         self._ended, self._reason, self._error = ended, reason, error
 
-    def outcome(self) -> Outcome:
+    def outcome(self) -> PolicyOutcome:
         marks = {"success": True, "failure": False, "error": False, "time": False if self._judged else None}
-        return Outcome(
+        return PolicyOutcome(
             success=marks.get(self._ended),
             ended=self._ended,
             reason=self._reason,
@@ -306,10 +317,13 @@ class _Tally:
 
 
 def _parts(answer: Any) -> tuple[Command | None, float | None]:
-    """A policy's answer, taken apart. CommandError for what cannot be one."""
+    """Return command and grip of a policy's answer. Raises CommandError for anything else."""
     if not isinstance(answer, tuple):
         return answer, None
     if len(answer) != 2:
-        raise CommandError(f"a policy answers with a command, or with (command, grip), not with {len(answer)} things")
+        raise CommandError(
+            f"a policy answers with a command, or with (command, grip), not with {len(answer)} values",
+            code="bad_answer",
+        )
     command, grip = answer
     return command, None if grip is None else float(np.clip(grip, 0.0, 1.0))

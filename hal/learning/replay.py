@@ -1,4 +1,4 @@
-"""A recorded episode once more: through the servo, under the same limits and the same dead-man as a person."""
+"""Replay of a recorded episode on an arm, through the servo, with its limits and the dead-man."""
 
 from __future__ import annotations
 
@@ -15,7 +15,6 @@ from ..control import Control
 from ..errors import CommandError, DatasetError
 from ..geometry import Pose
 from ..types import Limited, RobotStatus
-from .policy import follows
 
 if TYPE_CHECKING:
     from ..deadman import Deadman
@@ -25,64 +24,66 @@ if TYPE_CHECKING:
 
 __all__ = [
     "Deviation",
-    "Player",
+    "TrajectoryPlayer",
     "RecordedTrajectory",
-    "arms_of",
-    "moved_besides",
+    "recorded_arms",
+    "other_moving_arms",
 ]
-
-# [course.py] What one arm did in a recorded episode, ready to be done again, and whether this rig's arm may do
-# it.
 
 Array = NDArray[np.float64]
 
 _ROUNDED = 1e-5
-"""rad; recordings hold positions as 32-bit numbers."""
+"""Rounding of recorded positions, which are 32-bit numbers, rad."""
 _SPEED_ROOM = 1.02
-"""Speeds are differences of rounded positions."""
+"""Tolerance of a speed, which is a difference of rounded positions."""
 _SPANS = (0.1, 1.0)
-"""s over which a speed is measured: in a burst, and for long."""
+"""Spans over which a speed is measured, s: in a burst, and in the long run."""
 _JITTER = 0.010
-"""s by which the stamps of rows may be off: a tick of the servo that came late is followed by one that came in time, so
-between two neighbours a set-point seems faster than it was."""
+"""Error of the rows' stamps, s: a late tick of the servo is followed by one on time, so a set-point seems to have
+moved faster between two neighbours than it did."""
 _MOVED = 0.01
-"""rad, or m of a gripper; less is an arm that stood still."""
+"""Motion below which an arm counts as standing still, rad, or m of a gripper."""
 _OBJECT = "observation.object."
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RecordedTrajectory:
-    """Rows of an episode, ``k`` of them, of one arm with ``n`` joints."""
+    """The joint trajectory of one arm in an episode: ``k`` rows of ``n`` joints, with the gripper and the scene."""
 
     joints: tuple[str, ...]
     model: str
-    """The arm's model; empty where the recording does not say."""
+    """The arm's model; empty if the recording lacks it."""
     t: Array
-    """(k,) s since the first row, increasing."""
+    """(k,) since the first row, increasing, s."""
     q_set: Array
     """(k, n) set-points, rad."""
     q: Array
-    """(k, n) measured, rad."""
+    """(k, n) measured positions, rad."""
     tcp: Array
-    """(k, 3) measured, in the base frame, m."""
+    """(k, 3) measured positions of the tcp in the base frame, m."""
     width: Array | None
-    """(k,) what the gripper was told, m; None without one."""
+    """(k,) commanded widths of the gripper, m; None without one."""
     objects: Mapping[str, Pose]
-    """Where things lay in the first row, in the world; simulation only."""
+    """Poses of the objects in the first row, in the world; simulation only."""
 
     @classmethod
-    def of(cls, episode: Episode, robot: Robot) -> RecordedTrajectory:
-        """That of ``robot``, or of the only arm in the recording. CommandError for an episode without such an arm."""
+    def from_episode(cls, episode: Episode, robot: Robot) -> RecordedTrajectory:
+        """Read the trajectory of ``robot``, or of the only arm in the recording.
+
+        Raises:
+            CommandError: The episode has no such arm (code ``no_such_arm``).
+            DatasetError: The episode lacks the columns of an arm.
+        """
         places, names = episode.names("observation.tcp"), episode.names("observation.setpoint")
         several = "x" not in places  # then the arm's name leads every other name
         lead = f"{robot.name}." if several else ""
         if f"{lead}x" not in places:
             arms = dict.fromkeys(name.partition(".")[0] for name in places)
-            raise CommandError(f"the episode has no arm {robot.name!r}; it has: {', '.join(arms)}")
+            raise CommandError(f"the episode has no arm {robot.name!r}; it has: {', '.join(arms)}", code="no_such_arm")
         own = [k for k, name in enumerate(names) if name.startswith(lead)]
         labels = [names[k].removeprefix(lead) for k in own]
-        hand = "gripper" in labels
-        joints = labels[:-1] if hand else labels
+        has_gripper = "gripper" in labels
+        joints = labels[:-1] if has_gripper else labels
         n, first = len(joints), places.index(f"{lead}x")
 
         clocks = [key for key in episode.stamps if key.startswith("robot.")]
@@ -105,24 +106,32 @@ class RecordedTrajectory:
             q_set=setpoint[:, :n],
             q=rows("state", own)[:, :n],
             tcp=rows("tcp", slice(first, first + 3)),
-            width=setpoint[:, n] if hand else None,
+            width=setpoint[:, n] if has_gripper else None,
             objects=_objects(episode.columns),
         )
 
     @property
     def duration(self) -> float:
-        """s"""
+        """Time from the first row to the last, s."""
         return float(self.t[-1])
 
     def check(self, robot: Robot, speed: float) -> None:
-        """Raise CommandError, which says everything that is in the way, where ``robot`` cannot do it at ``speed``."""
+        """Check whether an arm can follow the trajectory.
+
+        Args:
+            robot: The arm.
+            speed: Share of the recorded speed, above 0 and at most 1.
+
+        Raises:
+            CommandError: It cannot; the message lists every reason (code ``cannot_replay``, or ``bad_speed``).
+        """
         if not 0.0 < speed <= 1.0:
-            raise CommandError(f"speed must be above 0 and at most 1, not {speed:g}")
+            raise CommandError(f"speed must be above 0 and at most 1, not {speed:g}", code="bad_speed")
         problems = self._other_arm(robot)
         if not problems:
             problems = self._broken() or [*self._outside(robot), *self._too_fast(robot, speed)]
         if problems:
-            raise CommandError(f"{robot.name} cannot replay this: " + "; ".join(problems))
+            raise CommandError(f"{robot.name} cannot replay this: " + "; ".join(problems), code="cannot_replay")
 
     def _other_arm(self, robot: Robot) -> list[str]:
         if self.model and self.model != robot.spec.model:
@@ -135,7 +144,7 @@ class RecordedTrajectory:
 
     def _broken(self) -> list[str]:
         if len(self.t) < 2:
-            return [f"it has {len(self.t)} row(s); there is nothing to replay"]
+            return [f"it has {len(self.t)} row(s); nothing to replay"]
         if not np.isfinite(self.q_set).all():
             row = int(np.flatnonzero(~np.isfinite(self.q_set).all(axis=1))[0])
             return [f"its set-point at {self.t[row]:.3f} s is not a number"]
@@ -150,7 +159,7 @@ class RecordedTrajectory:
         return found
 
     def _too_fast(self, robot: Robot, speed: float) -> list[str]:
-        """The servo would hold it back, and the arm would not be where it was."""
+        """Describe a speed at which the servo would limit the motion, so that the arm would lag behind."""
         most = robot.spec.speed * np.asarray(robot.limits.velocity)
         share, row, worst = max(self._fastest(span, most) for span in _SPANS)
         if share * speed <= _SPEED_ROOM:
@@ -161,41 +170,39 @@ class RecordedTrajectory:
         ]
 
     def _fastest(self, span: float, most: Array) -> tuple[float, int, int]:
-        """The highest mean speed over ``span`` s, as a share of ``most``; the row in which it begins, and the joint."""
+        """Return the highest mean speed over ``span`` s, as a share of ``most``, with its first row and its joint."""
         last = len(self.t) - 1
         ends = np.minimum(np.searchsorted(self.t, self.t + span - _ROUNDED), last)
-        starts = np.flatnonzero(np.append(True, ends[:-1] < last))  # one of the spans that reach the end will do
+        starts = np.flatnonzero(np.append(True, ends[:-1] < last))  # one span that reaches the end is enough
         ends = ends[starts]
         took = self.t[ends] - self.t[starts] + _JITTER
         shares = np.abs(self.q_set[ends] - self.q_set[starts]) / took[:, None] / most
         row, joint = np.unravel_index(int(shares.argmax()), shares.shape)
         return float(shares[row, joint]), int(starts[row]), int(joint)
 
-    # At a time.
-
     def at(self, values: Array, s: float) -> Array:
-        """Rows of one of the arrays above, at ``s`` in between, s since the first row."""
+        """Return the row of ``values``, one of the arrays above, interpolated at ``s``, s since the first row."""
         k = min(max(int(np.searchsorted(self.t, s, side="right")), 1), len(self.t) - 1)
         share = min(max((s - self.t[k - 1]) / (self.t[k] - self.t[k - 1]), 0.0), 1.0)
         mixed: Array = values[k - 1] + share * (values[k] - values[k - 1])
         return mixed
 
     def width_at(self, s: float) -> float | None:
-        """What the gripper had been told last, m; None without one."""
+        """Return the gripper's last commanded width at ``s``, m; None without one."""
         if self.width is None:
             return None
         value = float(self.width[max(0, int(np.searchsorted(self.t, s, side="right")) - 1)])
         return value if np.isfinite(value) else None
 
 
-def arms_of(episode: Episode) -> list[str]:
-    """Names of the arms in the recording."""
+def recorded_arms(episode: Episode) -> list[str]:
+    """Return the names of the arms in the recording."""
     return [key.removeprefix("robot.") for key in episode.stamps if key.startswith("robot.")]
 
 
-def moved_besides(episode: Episode, name: str) -> list[str]:
-    """The other arms of the recording that did more than stand still: the replay of one arm leaves them out."""
-    arms, names = arms_of(episode), episode.names("observation.setpoint")
+def other_moving_arms(episode: Episode, name: str) -> list[str]:
+    """Return the names of the other arms that moved in the recording, which a replay of arm ``name`` leaves out."""
+    arms, names = recorded_arms(episode), episode.names("observation.setpoint")
     setpoint = np.asarray(episode.columns["observation.setpoint"], float)
     found = []
     for arm in arms if len(arms) > 1 else ():
@@ -215,9 +222,6 @@ def _objects(columns: Mapping[str, NDArray[Any]]) -> dict[str, Pose]:
     return {name: Pose(row[:3], row[3:]) for name, row in first.items() if np.isfinite(row).all()}
 
 
-# [deviation.py] How far an arm was from where it should have been, measured along the way.
-
-
 class Deviation:
     """Root mean square and greatest deviation of each joint, rad, and of the tcp, m."""
 
@@ -228,7 +232,7 @@ class Deviation:
         self._most = np.zeros(len(self.joints) + 1)
 
     def add(self, joints: Array, tcp: Array) -> None:
-        """One sample: by how much the joints (n,) are off, rad, and the tcp (3,), m."""
+        """Add a sample: deviation of the joints (n,), rad, and of the tcp (3,), m."""
         off = np.append(np.abs(joints), np.linalg.norm(tcp))
         self._squares += off * off
         np.maximum(self._most, off, out=self._most)
@@ -236,13 +240,13 @@ class Deviation:
 
     @property
     def rms(self) -> Array:
-        """(n,) rad; zeros where nothing was measured (see :attr:`samples`)."""
+        """Root mean square of each joint (n,), rad; zeros without samples."""
         found: Array = np.sqrt(self._squares[:-1] / max(1, self.samples))
         return found
 
     @property
     def most(self) -> Array:
-        """(n,) rad"""
+        """Greatest deviation of each joint (n,), rad."""
         return self._most[:-1]
 
     @property
@@ -251,7 +255,7 @@ class Deviation:
         return float(np.sqrt(self._squares[-1] / max(1, self.samples))), float(self._most[-1])
 
     def lines(self) -> list[str]:
-        """For people."""
+        """Return the table as lines of text."""
         if not self.samples:
             return ["nothing was measured"]
         pairs = zip(self.joints, self.rms, self.most, strict=True)
@@ -260,7 +264,7 @@ class Deviation:
         return [*lines, f"{'tcp':16s} rms {1e3 * rms:6.2f} mm    max {1e3 * most:6.2f} mm"]
 
     def as_json(self) -> dict[str, Any]:
-        """For programs; None where nothing was measured."""
+        """Return the same as plain data; None for what was not measured."""
         if not self.samples:
             return {"samples": 0, "joints_rad": None, "tcp_mm": None}
         pairs = zip(self.joints, self.rms.tolist(), self.most.tolist(), strict=True)
@@ -273,168 +277,194 @@ class Deviation:
 
 
 RATE_HZ = 50.0
+"""Turns per second."""
 _EVERY = 5
-"""A chunk is sent every so many turns."""
+"""Turns between two chunks."""
 _AHEAD = 0.4
-"""s of set-points in a chunk: the longest that the arm goes on while this program does not turn."""
+"""Span of a chunk, s: the longest that the arm continues if this program stalls."""
 _RAMP = 0.3
-"""s in which playing comes to its speed: a pause may have been in the middle of a motion."""
+"""Time in which playback reaches its speed, s: a pause may have been in the middle of a motion."""
 _JOIN = 0.3
-"""s, at least, in which the arm is brought from where it rests to where it goes on."""
+"""Shortest time in which the arm is brought from rest to the point at which it continues, s."""
 _SETTLE = 0.5
-"""s that the last set-point is held."""
+"""Time for which the last set-point is held, s."""
 
 
 @dataclass(frozen=True, slots=True)
-class Stretch:
-    """Playing without a pause: the episode's time ``s`` against the clock's ``t``."""
+class TimeScaling:
+    """Time scaling of playback without a pause: progress ``s`` in the episode against the clock's time ``t``."""
 
     t: float
-    """When it begins, s on the clock."""
+    """Start, s on the clock."""
     s: float
-    """Where, s since the first row."""
+    """Progress at the start, s since the first row."""
     speed: float
+    """Share of the recorded speed."""
 
-    def place(self, t: float) -> float:
-        """``s`` at ``t``; before the beginning, the beginning."""
+    def progress_at(self, t: float) -> float:
+        """Return the progress at time ``t``, s; before the start, that of the start."""
         spent = t - self.t
         if spent <= 0.0:
             return self.s
         return self.s + self.speed * (spent * spent / (2.0 * _RAMP) if spent < _RAMP else spent - _RAMP / 2.0)
 
-    def time(self, s: float) -> float:
-        """``t`` at ``s``."""
+    def time_at(self, s: float) -> float:
+        """Return the time at which the progress is ``s``, s on the clock."""
         ahead = max(0.0, s - self.s) / self.speed
         return self.t + (math.sqrt(2.0 * _RAMP * ahead) if ahead < _RAMP / 2.0 else ahead + _RAMP / 2.0)
 
 
-class Player:
-    """Plays one episode.
+class TrajectoryPlayer:
+    """Plays one recorded trajectory on an arm.
 
     While the dead-man is not held, the episode's time stands still: what was sent ahead is dropped, and after a new
-    press the arm goes back to where it was let go of, and on from there. A trip ends it: MotionStopped.
+    press the arm returns to where it stopped and continues from there. A trip ends the playback with MotionStopped.
     """
 
     def __init__(
         self,
         rig: Rig,
         robot: Robot,
-        course: RecordedTrajectory,
+        trajectory: RecordedTrajectory,
         *,
         speed: float = 1.0,
         deadman: Deadman | None = None,
         unattended: bool = False,
     ) -> None:
-        """``speed`` is above 0 and at most 1. Raises CommandError where the arm cannot do it."""
-        course.check(robot, speed)
-        self.rig, self.robot, self.course, self.speed = rig, robot, course, speed
+        """Check the trajectory.
+
+        Args:
+            rig: An open rig.
+            robot: The arm.
+            trajectory: The trajectory.
+            speed: Share of the recorded speed, above 0 and at most 1.
+            deadman: Dead-man; something that really moves needs it, or ``unattended``.
+            unattended: Let a real arm move without a dead-man.
+
+        Raises:
+            CommandError: The arm cannot follow it (code ``cannot_replay``, or ``bad_speed``).
+        """
+        trajectory.check(robot, speed)
+        self.rig, self.robot, self.trajectory, self.speed = rig, robot, trajectory, speed
         self._deadman, self._unattended = deadman, unattended
-        self.deviation = Deviation(course.joints)
-        """Of what was measured from what was measured then, at the same times of the episode."""
+        self.deviation = Deviation(trajectory.joints)
+        """Difference between the measured and the recorded motion at the same progress."""
         self.limited = Limited.NONE
-        """What the servo held back."""
+        """Limits that the servo applied."""
         self.pauses = 0
-        self.place = 0.0
-        """How far it is, s since the first row."""
+        self.progress = 0.0
+        """Progress in the episode, s since the first row."""
         self.finished = False
 
     def approach(self, patience: float = 60.0) -> None:
-        """Drive to the first set-point, and put the things of a simulated world where they lay.
+        """Drive to the first set-point, and place the objects of a simulated world where they were recorded.
 
-        Raises what :meth:`hal.robot.Robot.move_to` raises, and CommandError where a thing is not there.
+        Raises:
+            CommandError: An object is missing in this world (code ``missing_object``). Other errors are those of
+                :meth:`hal.robot.Robot.move_to`.
         """
-        there = set(self.rig.world.bodies) if self.rig.has_world else set(self.course.objects)
-        if missing := [name for name in self.course.objects if name not in there]:
-            raise CommandError(f"the episode's world has {', '.join(missing)}, and this one has not")
+        there = set(self.rig.world.bodies) if self.rig.has_world else set(self.trajectory.objects)
+        if missing := [name for name in self.trajectory.objects if name not in there]:
+            raise CommandError(
+                f"the episode's world has {', '.join(missing)}, and this one does not", code="missing_object"
+            )
         spec = self.robot.spec
         self.robot.move_to(
-            self._inside(self.course.q_set[0]),
+            self._inside(self.trajectory.q_set[0]),
             deadman=self._deadman,
             unattended=self._unattended,
             speed=None if spec.attended else spec.speed,
             patience=patience,
         )
         if self.rig.has_world:
-            for name, pose in self.course.objects.items():
+            for name, pose in self.trajectory.objects.items():
                 self.rig.world.reset(name, pose=pose)
 
-    def play(self, on_turn: Callable[[Player, bool], None] = lambda player, plays: None) -> None:
-        """To the end. ``on_turn(player, does it play?)`` is called 50 times a second.
+    def play(self, on_turn: Callable[[TrajectoryPlayer, bool], None] = lambda player, playing: None) -> None:
+        """Play to the end; the arm is at rest afterwards.
 
-        Raises MotionStopped after a trip, RobotFault, ConnectionLost; the arm is at rest then.
+        Args:
+            on_turn: Called with the player, and whether it is playing, in each turn.
+
+        Raises:
+            MotionStopped: After a trip.
+            RobotFault: The robot reports a fault.
+            ConnectionLost: The arm is lost.
         """
-        clock, stretch, turn = self.rig.clock, None, 0
+        clock, scaling, turn = self.rig.clock, None, 0
         seen = clock.now()
         control = self.robot.control(deadman=self._deadman, rate_hz=RATE_HZ, unattended=self._unattended)
         with control:
             for tick in clock.rate(RATE_HZ):
-                if not follows(control):
-                    if stretch is not None:
-                        self._measure(stretch, seen)
+                if not control.hold_until_following():
+                    if scaling is not None:
+                        self._measure(scaling, seen)
                         self.pauses += 1
-                    stretch, seen = None, tick.t
+                    scaling, seen = None, tick.t
                     on_turn(self, False)
                     continue
-                if stretch is None:
-                    stretch, turn = self._begin(tick.t), 0
+                if scaling is None:
+                    scaling, turn = self._begin(tick.t), 0
                 if turn % _EVERY == 0:
-                    self._send(control, stretch, tick.t, first=turn == 0)
+                    self._send(control, scaling, tick.t, first=turn == 0)
                 turn += 1
-                seen = self._measure(stretch, seen)
+                seen = self._measure(scaling, seen)
                 self._grip(control)
                 on_turn(self, True)
-                if tick.t >= stretch.time(self.course.duration) + _SETTLE / 2.0:
+                if tick.t >= scaling.time_at(self.trajectory.duration) + _SETTLE / 2.0:
                     self.finished = True
                     return
 
     def _inside(self, q: Array) -> Array:
-        """Rounding may have brought a set-point out of the limits."""
+        """Return ``q`` within the limits: rounding may have moved a recorded set-point out of them."""
         limits = self.robot.limits
         found: Array = np.clip(q, limits.lower, limits.upper)
         return found
 
-    def _begin(self, now: float) -> Stretch:
-        """Go on from ``place``; the arm rests near it, and gets the time that it needs to be brought there slowly."""
+    def _begin(self, now: float) -> TimeScaling:
+        """Return the scaling that continues from :attr:`progress`, with the time that the arm needs to get there
+        slowly.
+        """
         state, spec = self.robot.state(), self.robot.spec
-        away = np.abs(self.course.at(self.course.q_set, self.place) - state.q_set)
+        away = np.abs(self.trajectory.at(self.trajectory.q_set, self.progress) - state.q_set)
         slowly = spec.move_speed * np.asarray(spec.limits.velocity)
-        return Stretch(now + _JOIN + 2.0 * float((away / slowly).max()), self.place, self.speed)
+        return TimeScaling(now + _JOIN + 2.0 * float((away / slowly).max()), self.progress, self.speed)
 
-    def _send(self, control: Control, stretch: Stretch, now: float, first: bool) -> None:
-        """The rows that are due from now on, and the one before."""
-        course = self.course
-        begin = max(0, int(np.searchsorted(course.t, stretch.place(now), side="right")) - 1)
-        last = int(np.searchsorted(course.t, stretch.place(now + _AHEAD), side="right")) + 1
+    def _send(self, control: Control, scaling: TimeScaling, now: float, first: bool) -> None:
+        """Send the rows that are due from now on, and the one before."""
+        trajectory = self.trajectory
+        begin = max(0, int(np.searchsorted(trajectory.t, scaling.progress_at(now), side="right")) - 1)
+        last = int(np.searchsorted(trajectory.t, scaling.progress_at(now + _AHEAD), side="right")) + 1
         times, points = [], []
         if first:
             times, points = [now], [self.robot.state().q_set]
-        if now < stretch.t:  # from where it rests to where it begins
-            times.append(stretch.t)
-            points.append(course.at(course.q_set, stretch.s))
-        for k in range(begin, min(last, len(course.t))):
-            if course.t[k] > stretch.s:
-                times.append(stretch.time(float(course.t[k])))
-                points.append(course.q_set[k])
-        if last >= len(course.t):
-            times.append(max(now, stretch.time(course.duration)) + _SETTLE)
-            points.append(course.q_set[-1])
+        if now < scaling.t:  # from where it rests to where it begins
+            times.append(scaling.t)
+            points.append(trajectory.at(trajectory.q_set, scaling.s))
+        for k in range(begin, min(last, len(trajectory.t))):
+            if trajectory.t[k] > scaling.s:
+                times.append(scaling.time_at(float(trajectory.t[k])))
+                points.append(trajectory.q_set[k])
+        if last >= len(trajectory.t):
+            times.append(max(now, scaling.time_at(trajectory.duration)) + _SETTLE)
+            points.append(trajectory.q_set[-1])
         control.send(JointChunk(times, points))
 
-    def _measure(self, stretch: Stretch, seen: float) -> float:
-        """Compare what was measured since ``seen`` with the recording; returns the time of the newest state."""
-        course = self.course
-        for state in self.robot.states(after=max(seen, stretch.t)):
+    def _measure(self, scaling: TimeScaling, seen: float) -> float:
+        """Compare the states measured since ``seen`` with the recording. Return the time of the newest state."""
+        trajectory = self.trajectory
+        for state in self.robot.states(after=max(seen, scaling.t)):
             seen = state.stamp.t
             if state.status is not RobotStatus.FOLLOWING:
-                continue  # braking, for a pause or for good
-            self.place = min(stretch.place(seen), course.duration)
-            if stretch.place(seen) <= course.duration:
-                off = state.q - course.at(course.q, self.place)
-                self.deviation.add(off, state.tcp.position - course.at(course.tcp, self.place))
+                continue  # braking
+            self.progress = min(scaling.progress_at(seen), trajectory.duration)
+            if scaling.progress_at(seen) <= trajectory.duration:
+                off = state.q - trajectory.at(trajectory.q, self.progress)
+                self.deviation.add(off, state.tcp.position - trajectory.at(trajectory.tcp, self.progress))
             self.limited |= state.limited
         return seen
 
     def _grip(self, control: Control) -> None:
-        gripper, width = self.robot.gripper, self.course.width_at(self.place)
+        gripper, width = self.robot.gripper, self.trajectory.width_at(self.progress)
         if gripper is not None and width is not None:
             control.send(None, width=float(np.clip(width, 0.0, gripper.width_max)))

@@ -1,18 +1,17 @@
-"""Demonstrations on disk: a crash-safe recorder, what repairs after a crash, and a reader.
+"""Recordings of demonstrations: a crash-safe recorder, recovery after a crash, and a reader.
 
     from hal.recording import Dataset, Recorder, recover
 
     recorder = Recorder(rig, out="data/demo", fps=30, task="lift the cube")
     recorder.start(seed=1)
-    ...                                    # drive; the recorder looks on
+    ...                                    # drive; the recorder runs in the background
     recorder.save(success=True)
     recorder.close()
 
-    for episode in Dataset("data/demo").episodes:
-        print(episode.length, episode.columns["action"].shape)
+    for episode in Dataset("data/demo").episodes: print(episode.length, episode.columns["action"].shape)
 
-What lies on disk is a LeRobotDataset v3.0, with lossless depth, the true time stamps and the rig's whole configuration
-beside it (docs/record.md). Needs ``pip install 'robot-hal[record]'``; importing this package does not.
+The format is LeRobotDataset v3.0, with lossless depth, the true time stamps and the rig's whole configuration in
+further files (docs/record.md). Needs ``pip install 'robot-hal[record]'``; importing this package does not.
 """
 
 from __future__ import annotations

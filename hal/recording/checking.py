@@ -1,39 +1,51 @@
-"""Compare every file of a dataset with its index: rows, pictures, depth, time stamps."""
+"""Checks of a dataset: every file against its index, and whether a new recording has the same format."""
 
 from __future__ import annotations
 
 import contextlib
 import json
+import math
 from collections import deque
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from ..errors import DatasetError
+from ..errors import CommandError, DatasetError
 from .dataset import Dataset, Episode
-from .index import read_about, read_entry, read_index, read_tasks, reading
-from .layout import BOOKKEEPING, STATE, Layout
+from .index import check_next_episode, dataset_errors, read_about, read_entry, read_index, read_tasks
+from .layout import (
+    BOOKKEEPING,
+    SEGMENTATION,
+    STATE,
+    VERSION,
+    CameraSetup,
+    DatasetLayout,
+)
 
-__all__ = ["check_dataset", "check_index", "check_rows"]
-
-# [index.py] The JSON files of a dataset, read as untrusted input: shapes, sizes and names are checked before they
-# are used.
+__all__ = [
+    "check_compatible",
+    "check_dataset",
+    "check_index",
+    "check_rows",
+]
 
 
 _CLOSE = 1e-4
-"""s by which LeRobot lets a time stamp differ."""
+"""Difference of a time stamp that LeRobot tolerates, s."""
 
 
 def check_dataset(dataset: Dataset, episodes: Collection[int] | None = None) -> Iterator[DatasetError]:
-    """Yield everything that is wrong with a dataset, or with these episodes of it.
+    """Yield every error in a dataset, or in some of its episodes. Reads every row and decodes every picture.
 
-    Every row is read and every picture is decoded. The index is checked where ``episodes`` is None.
+    Args:
+        dataset: The dataset.
+        episodes: Numbers of the episodes; None for all, and for the index too.
     """
     if episodes is None:
-        yield from check_index(Layout(dataset.root))
+        yield from check_index(DatasetLayout(dataset.root))
     start: int | None = 0
     for episode in dataset.episodes:
         first = start
@@ -62,9 +74,11 @@ def _read_all(episode: Episode, camera: str, stream: str) -> None:
 
 
 def check_rows(episode: Episode, start: int | None) -> None:
-    """Raise DatasetError where an episode's rows are not numbered as the index counts them, or times go backwards.
+    """Raise DatasetError if an episode's rows are not numbered as in the index, or times run backwards.
 
-    ``start`` is the number of its first row in the whole dataset; None where it is not known.
+    Args:
+        episode: The episode.
+        start: Number of its first row in the whole dataset; None if unknown.
     """
     columns, rows = episode.columns, np.arange(episode.length)
     file = episode.data_file
@@ -89,8 +103,8 @@ def check_rows(episode: Episode, start: int | None) -> None:
             need(np.diff(times[np.isfinite(times)]) >= 0.0, f"observation.time.{name} goes backwards")
 
 
-def check_index(layout: Layout) -> Iterator[DatasetError]:
-    """Yield everything in ``meta/`` that is wrong in itself, or does not fit the episodes' own files."""
+def check_index(layout: DatasetLayout) -> Iterator[DatasetError]:
+    """Yield every error in ``meta/``, in itself or against the episodes' own files."""
     try:
         info = read_index(layout)
     except DatasetError as error:
@@ -111,7 +125,7 @@ def check_index(layout: Layout) -> Iterator[DatasetError]:
             yield wrong(path, "is not in the index", number)
     tasks: list[str] = []
     try:
-        with reading(layout.root, layout.tasks):
+        with dataset_errors(layout.root, layout.tasks):
             tasks = read_tasks(layout.tasks)
         if len(tasks) != info.get("total_tasks"):
             yield wrong(layout.tasks, f"has {len(tasks)} tasks, and meta/info.json lists {info.get('total_tasks')}")
@@ -127,7 +141,7 @@ def check_index(layout: Layout) -> Iterator[DatasetError]:
     if start is not None and start != info["total_frames"]:
         yield wrong(layout.info, f"lists {info['total_frames']} rows, and the episodes have {start}")
     try:
-        with reading(layout.root, layout.stats):
+        with dataset_errors(layout.root, layout.stats):
             stats = json.loads(layout.stats.read_text(encoding="utf-8"), parse_constant=_no_constant)
             if start is not None and stats[STATE]["count"] != [start]:
                 yield wrong(layout.stats, f"counts {stats[STATE]['count']} rows, and there are {start}")
@@ -135,8 +149,8 @@ def check_index(layout: Layout) -> Iterator[DatasetError]:
         yield error
 
 
-def _check_entry(layout: Layout, number: int, start: int, tasks: list[str]) -> int:
-    """Check an episode's row in ``meta/episodes``; return where the next episode begins."""
+def _check_entry(layout: DatasetLayout, number: int, start: int, tasks: list[str]) -> int:
+    """Check an episode's row in ``meta/episodes``. Return the number of the next episode's first row."""
     about, path = read_about(layout, number), layout.entry(number)
     end = start + int(about["length"])
     expected = {
@@ -146,7 +160,7 @@ def _check_entry(layout: Layout, number: int, start: int, tasks: list[str]) -> i
         "dataset_to_index": end,
         "tasks": [about["task"]],
     }
-    with reading(layout.root, path, number):
+    with dataset_errors(layout.root, path, number):
         row = read_entry(path)
         for key, value in expected.items():
             if row[key] != value:
@@ -164,3 +178,106 @@ def _check_entry(layout: Layout, number: int, start: int, tasks: list[str]) -> i
 
 def _no_constant(name: str) -> Any:
     raise ValueError(f"{name} is not JSON")
+
+
+_SAID_ELSEWHERE = ("video.fps", "video.width", "video.height")
+"""Entries of a video that the dataset's own fps, and the video's shape, repeat."""
+
+
+def check_compatible(
+    layout: DatasetLayout, features: Mapping[str, Any], fps: int, robot_type: str, cameras: Sequence[CameraSetup]
+) -> None:
+    """Check whether episodes of this format can be added to a dataset.
+
+    Args:
+        layout: The dataset; its folder may not exist yet.
+        features: Columns of the new episodes.
+        fps: Their rows per second.
+        robot_type: Their arms.
+        cameras: Their cameras.
+
+    Raises:
+        CommandError: The dataset has another format (code ``other_dataset``; the message lists all differences), or
+            the folder holds something else (``foreign_dataset``).
+        DatasetError: The dataset is damaged.
+    """
+    root = layout.root
+    if root.exists() and not root.is_dir():
+        raise CommandError(f"{root} is a file; a recording needs a folder", code="foreign_dataset")
+    if layout.info.exists() and not layout.numbers():
+        raise CommandError(
+            f"the dataset in {root} was not recorded by this program; choose a new folder", code="foreign_dataset"
+        )
+    info = read_index(layout)
+    if info is None:
+        if root.is_dir() and not layout.episodes.is_dir() and any(root.iterdir()):
+            raise CommandError(
+                f"{root} holds other files than a recording; choose a new folder", code="foreign_dataset"
+            )
+        return
+    last = int(info["total_episodes"]) - 1
+    if not layout.interrupted:
+        check_next_episode(layout, info)
+    if info["codebase_version"] != VERSION:
+        raise CommandError(
+            f"the dataset in {root} was not recorded by this program; choose a new folder", code="foreign_dataset"
+        )
+    found = [*_settings(info, fps, robot_type), *_features(info["features"], features)]
+    if last >= 0:
+        found += _depth(read_about(layout, last)["cameras"], cameras)
+    if found:
+        raise CommandError(
+            f"the dataset in {root} has another format: {'; '.join(found)}; choose a new folder", code="other_dataset"
+        )
+
+
+def _settings(info: Mapping[str, Any], fps: int, robot_type: str) -> Iterator[str]:
+    for name, new in (("fps", fps), ("robot_type", robot_type)):
+        if info.get(name) != new:
+            yield f"{name} is {info.get(name)} there, and {new} here"
+
+
+def _features(old: Mapping[str, Any], new: Mapping[str, Any]) -> Iterator[str]:
+    if missing := [key for key in old if key not in new]:
+        yield f"only there: {', '.join(missing)}"
+    if added := [key for key in new if key not in old]:
+        yield f"only here: {', '.join(added)}"
+    for key in (key for key in old if key in new):
+        there, here = old[key], new[key]
+        for what in ("dtype", "shape"):
+            if there.get(what) != here.get(what):
+                yield f"{what} of {key} is {there.get(what)} there, and {here.get(what)} here"
+        if there.get("names") != here.get("names"):
+            yield _names(key, there.get("names") or [], here.get("names") or [])
+        video, ours = there.get("info") or {}, here.get("info") or {}
+        for what in dict.fromkeys([*video, *ours]):
+            if what not in _SAID_ELSEWHERE and video.get(what) != ours.get(what):
+                yield f"{what} of {key} is {video.get(what)} there, and {ours.get(what)} here"
+
+
+def _names(key: str, old: Sequence[str], new: Sequence[str]) -> str:
+    """Describe in which names a column differs, with at most three on each side."""
+    parts = []
+    for where, names, others in (("there", old, new), ("here", new, old)):
+        if own := [name for name in names if name not in others]:
+            parts.append(f"only {where} it has {', '.join(own[:3])}{' and more' if len(own) > 3 else ''}")
+    return f"the names of {key} differ: {'; '.join(parts) or 'their order is another'}"
+
+
+def _depth(old: Mapping[str, Any], new: Sequence[CameraSetup]) -> Iterator[str]:
+    """Yield the cameras in both whose depth or segmentation is recorded differently; no feature of the dataset shows
+    it.
+    """
+    for camera in new:
+        if camera.name not in old:
+            continue
+        kept = SEGMENTATION in old[camera.name].get("streams", ()), SEGMENTATION in camera.more
+        if kept[0] != kept[1]:
+            yield f"segmentation of {camera.name} is kept {'there, and not here' if kept[0] else 'here, and not there'}"
+        there, here = old[camera.name].get("depth_unit_m"), camera.depth_unit
+        if there is None and here is not None:
+            yield f"depth of {camera.name} is not kept there, and is here"
+        elif there is not None and here is None:
+            yield f"depth of {camera.name} is kept there, and not here"
+        elif there is not None and here is not None and not math.isclose(there, here, rel_tol=1e-6):
+            yield f"depth of {camera.name} is in units of {1e3 * there:g} mm there, and {1e3 * here:g} mm here"

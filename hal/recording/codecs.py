@@ -1,4 +1,4 @@
-"""Colour pictures as video: what encodes them, how a video that was cut off is mended, how it is read."""
+"""Coding of pictures: depth files without loss, colour as video, and statistics of both."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from ..errors import CommandError, NotSupported
 __all__ = [
     "DepthFile",
     "DepthReader",
-    "Encoder",
+    "VideoEncoder",
     "PictureStats",
     "Stats",
     "VideoFile",
@@ -29,26 +29,22 @@ __all__ = [
     "choose_encoder",
     "column_stats",
     "count_frames",
-    "mend",
-    "merged",
-    "numbers_to_units",
+    "truncate_to_last_fragment",
+    "merge_stats",
+    "ids_to_units",
     "picture_stats",
-    "plain",
+    "stats_as_lists",
     "read_video",
     "remux",
     "to_units",
-    "unit_for",
+    "depth_unit_for",
 ]
 
-# [depth.py] Depth pictures in a file of their own, without loss: zstd over differences of neighbours, low and
-# high bytes apart.
+# Depth files: zstd over the differences of neighbouring pixels, low and high bytes apart.
 #
-# A file is one line of JSON (size, unit), then a record per row of the episode: length and checksum of what
-# follows, and
-# that. A record of no length says that the row shows the same picture as the one before. Records are appended and
-# flushed
-# one by one, so a program that is killed leaves whole ones, and at most half of one, which is cut off.
-#
+# A file is one line of JSON (size, unit), then a record per row of the episode: length, checksum, data. An empty record
+# means that the row shows the same picture as the one before. Records are appended and flushed one by one, so a killed
+# program leaves complete ones, and at most one that is cut off.
 
 _RECORD = struct.Struct("<II")  # length, checksum
 _LEVEL = 1
@@ -60,21 +56,21 @@ _UNITS = (0.0001, 0.00025, 0.0005, 0.001, 0.002, 0.005, 0.01)
 Units = NDArray[np.uint16]
 
 
-def unit_for(depth_max: float) -> float:
-    """The finest unit, in m, in which 16 bits reach as far as a simulated camera sees."""
+def depth_unit_for(depth_max: float) -> float:
+    """Return the finest unit, m, in which 16 bits reach ``depth_max``, m, of a simulated camera."""
     return next((unit for unit in _UNITS if depth_max <= _MOST * unit), depth_max / _MOST)
 
 
 def to_units(depth: NDArray[np.float32], unit: float) -> Units:
-    """Metres in whole units, rounded to the nearest one; 0 for what was not measured, or does not fit."""
+    """Return depth (H, W) in m as whole units, rounded to nearest; 0 for what was not measured or does not fit."""
     whole = np.rint(depth / np.float32(unit))
-    whole[~((whole >= 0.0) & (whole <= _MOST))] = 0.0  # what is not a number, too
+    whole[~((whole >= 0.0) & (whole <= _MOST))] = 0.0  # also true for NaN
     units: Units = whole.astype("<u2")
     return units
 
 
-def numbers_to_units(numbers: NDArray[np.int32]) -> Units:
-    """Return numbers of bodies (H, W), -1 for none, as units. ValueError for a number above 65534."""
+def ids_to_units(numbers: NDArray[np.int32]) -> Units:
+    """Return numbers of bodies (H, W), -1 for none, as units. Raises ValueError for a number above 65534."""
     if numbers.size and not (numbers.min() >= -1 and numbers.max() < _MOST):
         raise ValueError("a number of a body does not fit into 16 bits")
     units: Units = (numbers + 1).astype("<u2")
@@ -94,17 +90,17 @@ class DepthFile:
         self._unit = unit
 
     def add(self, depth: NDArray[np.float32] | None) -> None:
-        """One row's picture (H, W) in m; None for the same one again."""
+        """Append one row's picture (H, W), m; None repeats the one before."""
         self.add_units(None if depth is None else to_units(depth, self._unit))
 
     def add_units(self, units: Units | None) -> None:
-        """One row's picture (H, W) in units of the file; None for the same one again."""
+        """Append one row's picture (H, W), in the file's units; None repeats the one before."""
         payload = b"" if units is None else self._compressor.compress(_shuffled(units))
         _write(self._file, _RECORD.pack(len(payload), crc32(payload)) + payload)
 
 
 class DepthReader:
-    """The whole records of a file; reads them one by one."""
+    """Reads the complete records of a depth file. Raises ValueError or KeyError for a damaged first line."""
 
     def __init__(self, path: str | Path) -> None:
         self.path = Path(path)
@@ -120,7 +116,7 @@ class DepthReader:
         return len(self._places)
 
     def end_of(self, count: int) -> int:
-        """Where the first ``count`` records end in the file, bytes."""
+        """Return the position in the file at which the first ``count`` records end, bytes."""
         if count == 0:
             with self.path.open("rb") as file:
                 return len(file.readline())
@@ -128,7 +124,7 @@ class DepthReader:
         return start + length
 
     def units(self) -> Iterator[Units]:
-        """Yield every row's picture (H, W), in units of :attr:`unit` m. ValueError for a damaged one."""
+        """Yield every row's picture (H, W), in units of :attr:`unit` m. Raises ValueError for a damaged one."""
         import zstandard
 
         expand = zstandard.ZstdDecompressor()
@@ -145,13 +141,13 @@ class DepthReader:
                 yield picture
 
     def __iter__(self) -> Iterator[NDArray[np.float32]]:
-        """Every row's picture (H, W) in m; 0 where nothing was measured."""
+        """Yield every row's picture (H, W), m; 0 for what was not measured."""
         unit = np.float32(self.unit)
         return (units.astype(np.float32) * unit for units in self.units())
 
 
 def _records(file: io.BufferedReader, size: int) -> Iterator[tuple[int, int]]:
-    """Start and length of each whole record, from where the file stands."""
+    """Yield start and length of each complete record, from the file's current position."""
     while True:
         head = file.read(_RECORD.size)
         if len(head) < _RECORD.size:
@@ -180,19 +176,19 @@ def _unshuffled(data: bytes, shape: tuple[int, int]) -> Units:
 
 
 def _write(file: io.RawIOBase, data: bytes) -> None:
-    """All of it: an unbuffered file may take only a part. OSError when the disk is full."""
+    """Write all of ``data``: an unbuffered file may accept only a part at a time."""
     rest = memoryview(data)
     while rest:
         written = file.write(rest)
         rest = rest[written or 0 :]
 
 
-def cut(path: Path, count: int) -> None:
-    """Leave the first ``count`` records."""
+def truncate_records(path: Path, count: int) -> None:
+    """Cut a depth file after its first ``count`` records."""
     os.truncate(path, DepthReader(path).end_of(count))
 
 
-# [stats.py] Statistics of columns and pictures, as a LeRobotDataset keeps them: for training to normalise by.
+# Statistics of columns and pictures, as a LeRobotDataset keeps them to normalise by.
 
 Stats = dict[str, NDArray[Any]]
 """``min``, ``max``, ``mean``, ``std``, ``q01`` ... ``q99``, each of the column's shape, and ``count`` (1,)."""
@@ -200,11 +196,11 @@ Stats = dict[str, NDArray[Any]]
 _QUANTILES = {"q01": 0.01, "q10": 0.10, "q50": 0.50, "q90": 0.90, "q99": 0.99}
 _LEVELS = 256
 _FINE = 120
-"""Rows of pixels of a picture that count, at least: as good for statistics as all of them, and far quicker."""
+"""Rows of pixels that are counted per picture, at least; as accurate as all of them, and far quicker."""
 
 
 def column_stats(values: NDArray[Any]) -> Stats:
-    """Of a column (rows, n). What was not known (NaN) is left out; where nothing was, NaN stays."""
+    """Return the statistics of a column (rows, n), without unknown values (NaN); NaN if there are only those."""
     table = np.asarray(values, np.float64)
     known = np.isfinite(table)
     found: Stats = {key: np.full(table.shape[1], np.nan) for key in ("min", "max", "mean", "std", *_QUANTILES)}
@@ -219,21 +215,23 @@ def column_stats(values: NDArray[Any]) -> Stats:
 
 
 class PictureStats:
-    """Of pictures, by a histogram of each colour."""
+    """Statistics of pictures, by a histogram of each colour."""
 
     def __init__(self) -> None:
         self._seen = np.zeros((3, _LEVELS), np.int64)
         self._pictures = 0
 
     def add(self, picture: NDArray[np.uint8]) -> None:
-        """One picture (H, W, 3) RGB."""
+        """Add one picture (H, W, 3) RGB."""
         step = max(1, min(picture.shape[:2]) // _FINE)
         for k in range(3):
             self._seen[k] += np.bincount(picture[::step, ::step, k].ravel(), minlength=_LEVELS)
         self._pictures += 1
 
     def stats(self) -> Stats:
-        """Colours in 0..1, each of shape (3, 1, 1); ``count`` are the pictures that were looked at."""
+        """Return the statistics of the colours, scaled to 0..1, each of shape (3, 1, 1); ``count`` is the number of
+        pictures.
+        """
         levels = np.arange(_LEVELS) / (_LEVELS - 1)
         total = np.maximum(1, self._seen.sum(axis=1))
         mean = self._seen @ levels / total
@@ -250,8 +248,8 @@ class PictureStats:
         return {key: value.reshape(3, 1, 1) for key, value in found.items()} | {"count": np.array([self._pictures])}
 
 
-def merged(old: Mapping[str, Any] | None, new: Stats) -> Stats:
-    """Statistics of both together. Exact but for the quantiles, which are averaged by how much each part counts."""
+def merge_stats(old: Mapping[str, Any] | None, new: Stats) -> Stats:
+    """Return the statistics of both parts together: exact except for the quantiles, which are averaged by row count."""
     if not old:
         return new
     before = {key: np.asarray(value, np.float64) for key, value in old.items()}
@@ -274,58 +272,65 @@ def merged(old: Mapping[str, Any] | None, new: Stats) -> Stats:
     }
 
 
-def plain(stats: Mapping[str, Stats]) -> dict[str, dict[str, list[Any]]]:
+def stats_as_lists(stats: Mapping[str, Stats]) -> dict[str, dict[str, list[Any]]]:
     """Return the statistics of each column as lists, ready for JSON.
 
-    A column of which a number was never known in any row has none: JSON has no NaN, and a made-up number would mislead.
+    A column in which a number was never known is left out: JSON has no NaN, and an invented number would mislead.
     """
     complete = {key: found for key, found in stats.items() if all(np.isfinite(each).all() for each in found.values())}
     return {key: {name: each.tolist() for name, each in found.items()} for key, found in complete.items()}
 
 
+# Videos.
+
 Picture = NDArray[np.uint8]
 
 _LIVE = {"movflags": "frag_keyframe+empty_moov+default_base_moof", "flush_packets": "1"}
-"""In fragments, each written as soon as it is whole: a file that ends anywhere can be read up to its last fragment."""
+"""Fragments, each written as soon as it is complete: a file cut off anywhere can be read up to its last fragment."""
 _SAMPLES = 50
-"""Pictures of a video that are looked at, at least."""
+"""Pictures of a video that are decoded for statistics, at least."""
 _BOX = struct.Struct(">I4s")
 
 
-class Encoder(NamedTuple):
-    """What compresses."""
+class VideoEncoder(NamedTuple):
+    """A video encoder and its settings."""
 
     library: str
-    """FFmpeg's name of it."""
+    """FFmpeg's name of the encoder."""
     codec: str
-    """As ``info.json`` names what comes out."""
+    """Name of the codec in ``info.json``."""
     options: dict[str, str]
 
     @property
     def feature(self) -> dict[str, Any]:
-        """For ``info`` of a video in ``info.json``."""
+        """The encoder's entries in ``info`` of a video in ``info.json``."""
         return {"video.codec": self.codec, "video.pix_fmt": "yuv420p"}
 
 
-# Every second picture stands for itself (g = 2), so any picture is found at once, as people train on them in random
-# order. No picture refers to a later one (bf = 0, pred-struct = 1): it is on disk soon, and readers do not see the
-# first one late.
+# Every second picture is a key frame (g = 2), so that any picture is read quickly, as training reads them in random
+# order. No picture refers to a later one (bf = 0, pred-struct = 1), so that it reaches the disk soon and the first one
+# is shown on time.
 _ENCODERS = (
-    Encoder("libx264", "h264", {"preset": "veryfast", "crf": "23", "g": "2", "bf": "0"}),
-    Encoder("libsvtav1", "av1", {"preset": "12", "crf": "30", "g": "2", "svtav1-params": "lp=1:pred-struct=1"}),
+    VideoEncoder("libx264", "h264", {"preset": "veryfast", "crf": "23", "g": "2", "bf": "0"}),
+    VideoEncoder("libsvtav1", "av1", {"preset": "12", "crf": "30", "g": "2", "svtav1-params": "lp=1:pred-struct=1"}),
 )
 
 
-def choose_encoder(codec: str) -> Encoder:
-    """``h264``, ``av1``, or ``auto`` for the first of them that is there.
+def choose_encoder(codec: str) -> VideoEncoder:
+    """Return the encoder of a codec.
 
-    Raises CommandError for another word, NotSupported where this build of PyAV cannot encode it.
+    Args:
+        codec: ``h264``, ``av1``, or ``auto`` for the first that is available.
+
+    Raises:
+        CommandError: Another codec.
+        NotSupported: This build of PyAV cannot encode it.
     """
     import av
 
     known = [encoder.codec for encoder in _ENCODERS]
     if codec not in ("auto", *known):
-        raise CommandError(f"codec must be auto, {' or '.join(known)}, not {codec!r}")
+        raise CommandError(f"codec must be auto, {' or '.join(known)}, not {codec!r}", code="bad_codec")
     for encoder in _ENCODERS:
         if codec in ("auto", encoder.codec) and encoder.library in av.codecs_available:
             return encoder
@@ -335,20 +340,20 @@ def choose_encoder(codec: str) -> Encoder:
 class VideoFile:
     """Appends pictures to an open, unbuffered file."""
 
-    def __init__(self, file: io.RawIOBase, encoder: Encoder, width: int, height: int, fps: int) -> None:
+    def __init__(self, file: io.RawIOBase, encoder: VideoEncoder, width: int, height: int, fps: int) -> None:
         import av
 
         self._av = av
         self._container = av.open(file, "w", format="mp4", options=_LIVE)
         stream: Any = self._container.add_stream(encoder.library, rate=fps, options=encoder.options)
         stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
-        stream.thread_count = 1  # more would hold pictures back
+        stream.thread_count = 1  # more threads would delay pictures
         self._stream = stream
         self._period = Fraction(1, fps)
         self._count = 0
 
     def add(self, picture: Picture) -> None:
-        """One row's picture (H, W, 3) RGB."""
+        """Append one row's picture (H, W, 3) RGB."""
         frame = self._av.VideoFrame.from_ndarray(picture, format="rgb24")
         frame.pts, frame.time_base = self._count, self._period
         self._count += 1
@@ -361,12 +366,12 @@ class VideoFile:
 
 
 def as_rgb(picture: Picture) -> Picture:
-    """Return a copy (H, W, 3) of a picture, which may be a grey one (H, W)."""
+    """Return a copy (H, W, 3) of a colour picture (H, W, 3) or a grey one (H, W)."""
     return picture.copy() if picture.ndim == 3 else np.repeat(picture[:, :, None], 3, axis=2)
 
 
-def mend(path: Path) -> None:
-    """Cut a live file off behind its last whole fragment."""
+def truncate_to_last_fragment(path: Path) -> None:
+    """Cut a live video after its last complete fragment."""
     size, place, whole = path.stat().st_size, 0, 0
     with path.open("rb") as file:
         while place + _BOX.size <= size:
@@ -391,12 +396,12 @@ def count_frames(path: Path) -> int:
 
 
 def remux(source: Path, target: Path, length: int) -> None:
-    """Write the first ``length`` pictures of a live file as a plain one, without encoding them anew."""
+    """Write the first ``length`` pictures of a live video as a plain one, without encoding them again."""
     import av
 
     with av.open(str(source)) as live, av.open(str(target), "w", options={"movflags": "faststart"}) as plain:
         read = live.streams.video[0]
-        write = plain.add_stream_from_template(read, opaque=True)  # what is read is written, whatever encoded it
+        write = plain.add_stream_from_template(read, opaque=True)  # packets are copied, whatever encoded them
         packets = (packet for packet in live.demux(read) if packet.size)
         for _, packet in zip(range(length), packets, strict=False):
             packet.stream = write
@@ -404,7 +409,7 @@ def remux(source: Path, target: Path, length: int) -> None:
 
 
 def picture_stats(path: Path, length: int, fps: int) -> PictureStats:
-    """Return statistics of a picture per second, or of more in a short video. Only key frames are decoded."""
+    """Return statistics of one picture per second, or of more in a short video. Only key frames are decoded."""
     import av
 
     stats = PictureStats()
@@ -424,7 +429,7 @@ def picture_stats(path: Path, length: int, fps: int) -> PictureStats:
 
 
 def read_video(path: Path) -> Iterator[Picture]:
-    """Every picture (H, W, 3) RGB, in order."""
+    """Yield every picture (H, W, 3) RGB, in order."""
     import av
 
     with av.open(str(path)) as container:

@@ -1,9 +1,8 @@
-"""Read a recording: columns as arrays, pictures one by one."""
+"""Read a dataset: columns as arrays, pictures one by one."""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator
 from functools import cached_property
 from pathlib import Path
 from typing import Any, TypeVar
@@ -13,103 +12,17 @@ from numpy.typing import NDArray
 
 from ..errors import CommandError, DatasetError, DeviceNotFound
 from .codecs import DepthReader, count_frames, read_video
-from .index import check_next, read_about, read_index, reading, repair_command
-from .layout import MORE_STREAMS, SEGMENTATION, TIMES, VERSION, CameraSetup, Layout, require, video_key
+from .index import dataset_errors, read_about, read_index, repair_command
+from .layout import MORE_STREAMS, SEGMENTATION, TIMES, DatasetLayout, require_libraries, video_key
 
-__all__ = [
-    "Dataset",
-    "Episode",
-    "check_compatible",
-]
-
-# [compatible.py] Does what is to be recorded fit a dataset that is there already?
-
-_SAID_ELSEWHERE = ("video.fps", "video.width", "video.height")
-"""Of a video: the dataset's own fps, and its shape, say it."""
-
-
-def check_compatible(
-    layout: Layout, features: Mapping[str, Any], fps: int, robot_type: str, cameras: Sequence[CameraSetup]
-) -> None:
-    """Raise CommandError, with everything that differs, where episodes of this kind cannot be added; DatasetError where
-    the dataset is damaged."""
-    root = layout.root
-    if root.exists() and not root.is_dir():
-        raise CommandError(f"{root} is a file; a recording needs a folder")
-    if layout.info.exists() and not layout.numbers():
-        raise CommandError(f"the dataset in {root} was not recorded by this program; choose a new folder")
-    info = read_index(layout)
-    if info is None:
-        if root.is_dir() and not layout.episodes.is_dir() and any(root.iterdir()):
-            raise CommandError(f"{root} holds other things than a recording; choose a new folder")
-        return
-    last = int(info["total_episodes"]) - 1
-    if not layout.interrupted:
-        check_next(layout, info)
-    if info["codebase_version"] != VERSION:
-        raise CommandError(f"the dataset in {root} was not recorded by this program; choose a new folder")
-    found = [*_settings(info, fps, robot_type), *_features(info["features"], features)]
-    if last >= 0:
-        found += _depth(read_about(layout, last)["cameras"], cameras)
-    if found:
-        raise CommandError(f"the dataset in {root} is another kind: {'; '.join(found)}; choose a new folder")
-
-
-def _settings(info: Mapping[str, Any], fps: int, robot_type: str) -> Iterator[str]:
-    for name, new in (("fps", fps), ("robot_type", robot_type)):
-        if info.get(name) != new:
-            yield f"{name} is {info.get(name)} there, and {new} here"
-
-
-def _features(old: Mapping[str, Any], new: Mapping[str, Any]) -> Iterator[str]:
-    if missing := [key for key in old if key not in new]:
-        yield f"only there: {', '.join(missing)}"
-    if added := [key for key in new if key not in old]:
-        yield f"only here: {', '.join(added)}"
-    for key in (key for key in old if key in new):
-        there, here = old[key], new[key]
-        for what in ("dtype", "shape"):
-            if there.get(what) != here.get(what):
-                yield f"{what} of {key} is {there.get(what)} there, and {here.get(what)} here"
-        if there.get("names") != here.get("names"):
-            yield _names(key, there.get("names") or [], here.get("names") or [])
-        video, ours = there.get("info") or {}, here.get("info") or {}
-        for what in dict.fromkeys([*video, *ours]):
-            if what not in _SAID_ELSEWHERE and video.get(what) != ours.get(what):
-                yield f"{what} of {key} is {video.get(what)} there, and {ours.get(what)} here"
-
-
-def _names(key: str, old: Sequence[str], new: Sequence[str]) -> str:
-    """In which numbers a column differs, at most three of each."""
-    parts = []
-    for where, names, others in (("there", old, new), ("here", new, old)):
-        if own := [name for name in names if name not in others]:
-            parts.append(f"only {where} it has {', '.join(own[:3])}{' and more' if len(own) > 3 else ''}")
-    return f"the names of {key} differ: {'; '.join(parts) or 'their order is another'}"
-
-
-def _depth(old: Mapping[str, Any], new: Sequence[CameraSetup]) -> Iterator[str]:
-    """Cameras, in both, whose depth is not kept alike; no feature of the dataset says so."""
-    for camera in new:
-        if camera.name not in old:
-            continue
-        kept = SEGMENTATION in old[camera.name].get("streams", ()), SEGMENTATION in camera.more
-        if kept[0] != kept[1]:
-            yield f"segmentation of {camera.name} is kept {'there, and not here' if kept[0] else 'here, and not there'}"
-        there, here = old[camera.name].get("depth_unit_m"), camera.depth_unit
-        if there is None and here is not None:
-            yield f"depth of {camera.name} is not kept there, and is here"
-        elif there is not None and here is None:
-            yield f"depth of {camera.name} is kept there, and not here"
-        elif there is not None and here is not None and not math.isclose(there, here, rel_tol=1e-6):
-            yield f"depth of {camera.name} is in units of {1e3 * there:g} mm there, and {1e3 * here:g} mm here"
+__all__ = ["Dataset", "Episode"]
 
 
 P = TypeVar("P", bound=NDArray[Any])
 
 
 class _Columns(dict[str, NDArray[Any]]):
-    """Columns by their keys; a key that the episode lacks raises DatasetError."""
+    """Columns by key; a key that the episode lacks raises DatasetError."""
 
     def __init__(self, file: str, episode: int) -> None:
         super().__init__()
@@ -121,13 +34,13 @@ class _Columns(dict[str, NDArray[Any]]):
 
 
 class Episode:
-    """One episode. Nothing is read before it is asked for.
+    """One finished episode. Files are read only when an attribute or method needs them.
 
-    Whatever reads a file raises DatasetError where that file is missing, truncated or damaged, or does not have what
-    ``meta/info.json`` and ``episodes/N.json`` say; the error names the file and the episode.
+    Everything that reads a file raises DatasetError if the file is missing, truncated or damaged, or lacks what
+    ``meta/info.json`` and ``episodes/N.json`` list; the error names the file and the episode.
     """
 
-    def __init__(self, layout: Layout, number: int, meta: dict[str, Any]) -> None:
+    def __init__(self, layout: DatasetLayout, number: int, meta: dict[str, Any]) -> None:
         self._layout = layout
         self._meta = meta
         self.number = number
@@ -135,7 +48,7 @@ class Episode:
 
     @cached_property
     def info(self) -> dict[str, Any]:
-        """Seed, cameras, gaps, versions, the rig's whole configuration: the content of ``episodes/N.json``."""
+        """Content of ``episodes/N.json``: seed, cameras, gaps, versions, the rig's whole configuration."""
         return read_about(self._layout, self.number)
 
     @property
@@ -145,7 +58,7 @@ class Episode:
 
     @property
     def task(self) -> str:
-        """What was to be done."""
+        """Description of the task."""
         return str(self.info["task"])
 
     @property
@@ -161,14 +74,14 @@ class Episode:
 
     @cached_property
     def columns(self) -> dict[str, NDArray[Any]]:
-        """Every column by its key: (rows, n), or (rows,) where it is one number."""
+        """Every column by its key: (rows, n), or (rows,) for a single number."""
         import pyarrow.parquet as pq
 
         path = self._layout.data(self.number)
         found = _Columns(self.data_file, self.number)
         features = {key: each for key, each in self._meta["features"].items() if each["dtype"] != "video"}
         with (
-            reading(self._layout.root, path, self.number),
+            dataset_errors(self._layout.root, path, self.number),
             pq.ParquetFile(path, page_checksum_verification=True) as file,
         ):
             if file.metadata.num_rows != self.length:
@@ -186,15 +99,16 @@ class Episode:
         return found
 
     def names(self, key: str) -> list[str]:
-        """Return what the numbers of a column are called. DatasetError for a column that the dataset lacks."""
+        """Return the names of a column's numbers. Raises DatasetError for a column that the dataset lacks."""
         if key not in self._meta["features"]:
             raise DatasetError(f"has no column {key}", file="meta/info.json")
         return list(self._meta["features"][key]["names"] or [key])
 
     @cached_property
     def stamps(self) -> dict[str, NDArray[np.float64]]:
-        """True times (rows,) on the rig's clock, s: ``grid``, when each row was due, and of each source
-        (``robot.panda``, ``camera.wrist``) when it measured what stands in the row. NaN where it never did."""
+        """True times (rows,) on the rig's clock, s: ``grid``, when each row was due, and for each source
+        (``robot.panda``, ``camera.wrist``) when the row's values were measured; NaN if that is unknown.
+        """
         start = float(self.info["t_start"])
         found = _Columns(self.data_file, self.number)
         for key, value in self.columns.items():
@@ -204,28 +118,29 @@ class Episode:
 
     @property
     def cameras(self) -> tuple[str, ...]:
-        """Names of the cameras whose pictures were kept."""
+        """Names of the recorded cameras."""
         return tuple(self.info["cameras"])
 
     def frames(self, camera: str) -> Iterator[NDArray[np.uint8]]:
-        """Return the colour picture (H, W, 3) RGB of every row. DeviceNotFound where none was kept."""
+        """Yield the colour picture (H, W, 3) RGB of every row. Raises DeviceNotFound if none was recorded."""
         return self.pictures(camera, "color")
 
     def depth(self, camera: str) -> Iterator[NDArray[np.float32]]:
-        """Return the depth picture (H, W) of every row, m; 0 for what was not measured. DeviceNotFound where none was
-        kept."""
+        """Yield the depth picture (H, W) of every row, m; 0 for what was not measured. Raises DeviceNotFound if none
+        was recorded.
+        """
         return self.pictures(camera, "depth")
 
     def pictures(self, camera: str, stream: str) -> Iterator[NDArray[Any]]:
-        """Return a stream's picture of every row, of the type and shape that it has in :class:`~hal.types.Frame`.
+        """Yield a stream's picture of every row, with the type and shape that it has in :class:`~hal.types.Frame`.
 
         Args:
             camera: Name of the camera.
-            stream: ``color``, ``depth``, ``infrared``, ``infrared_right`` or ``segmentation``. Colour and infrared
-                are kept as video, so their values are off by some units.
+            stream: ``color``, ``depth``, ``infrared``, ``infrared_right`` or ``segmentation``. Colour and infrared are
+                stored as video, so their values differ slightly from the camera's.
 
         Raises:
-            DeviceNotFound: No such stream was kept.
+            DeviceNotFound: That stream was not recorded.
             DatasetError: The file is missing, or its first line is damaged. Further damage is raised by the iterator.
         """
         path = self.files(camera).get(stream)
@@ -240,14 +155,14 @@ class Episode:
             if stream == "color":
                 return self._each(path, read_video(path), (height, width, 3))
             return self._each(path, (picture[:, :, 0] for picture in read_video(path)), (height, width))
-        with reading(self._layout.root, path, self.number):
+        with dataset_errors(self._layout.root, path, self.number):
             reader = DepthReader(path)
         if stream == "depth":
             return self._each(path, iter(reader), reader.shape)
         return self._each(path, (units.astype(np.int32) - 1 for units in reader.units()), reader.shape)
 
     def files(self, camera: str) -> dict[str, Path]:
-        """Return where the pictures of each stream of a camera are; empty for a camera that was not kept."""
+        """Return the file of each stream of a camera; empty for a camera that was not recorded."""
         known, features = self.info["cameras"].get(camera), self._meta["features"]
         if known is None:
             return {}
@@ -264,18 +179,18 @@ class Episode:
         return found
 
     def check_pictures(self) -> None:
-        """Raise DatasetError where a video or depth file is missing or does not have a picture per row.
+        """Raise DatasetError if a video or depth file is missing or does not have one picture per row.
 
-        Pictures are counted and not decoded, which takes milliseconds.
+        Pictures are counted, not decoded, which takes milliseconds.
         """
         for path in (path for camera in self.cameras for path in self.files(camera).values()):
-            with reading(self._layout.root, path, self.number):
+            with dataset_errors(self._layout.root, path, self.number):
                 self._check_count(path, count_frames(path) if path.suffix == ".mp4" else len(DepthReader(path)))
 
     def _each(self, path: Path, pictures: Iterator[P], shape: tuple[int, ...]) -> Iterator[P]:
         """Yield one picture per row, each of ``shape``."""
         count = 0
-        with reading(self._layout.root, path, self.number):
+        with dataset_errors(self._layout.root, path, self.number):
             for picture in pictures:
                 if picture.shape != shape:
                     raise self._wrong(path, f"has a picture of {picture.shape}, not {shape}")
@@ -306,18 +221,21 @@ class Episode:
 class Dataset:
     """The finished episodes in a folder.
 
+    Args:
+        out: The folder.
+
     Raises:
-        CommandError: There are no episodes in the folder.
+        CommandError: There are no episodes in the folder (code ``no_episodes``).
         DatasetError: ``meta/info.json`` is damaged, or missing although there are episodes.
         DriverMissing: A library is not installed.
     """
 
     def __init__(self, out: str | Path) -> None:
-        require()
-        layout = Layout(out)
+        require_libraries()
+        layout = DatasetLayout(out)
         info = read_index(layout)
         if info is None:
-            raise CommandError(f"there is no episode in {layout.root}{_hint(layout)}")
+            raise CommandError(f"there is no episode in {layout.root}{_hint(layout)}", code="no_episodes")
         self.root = layout.root
         self.info: dict[str, Any] = info
         """``meta/info.json``."""
@@ -331,8 +249,8 @@ class Dataset:
         return f"<Dataset {self.root}: {len(self.episodes)} episodes, {self.info['total_frames']} rows>"
 
 
-def _hint(layout: Layout) -> str:
-    """Return the command that finishes what was not finished; an empty text where all was."""
+def _hint(layout: DatasetLayout) -> str:
+    """Return the command that finishes unfinished episodes; an empty text if there are none."""
     left = len(layout.partials())
     if not left:
         return ""

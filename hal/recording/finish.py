@@ -1,9 +1,9 @@
-"""From a live folder to an episode of the dataset. Killed at any moment, it can be done again.
+"""Make an episode of a live folder, recover interrupted ones, and rebuild a lost index.
 
-First everything is made inside the folder, in ``final/``: the episode's files, and ``meta/`` as it will be. Then a list
-of what goes where is written: from here on the episode counts as saved. Then each file is renamed to its place,
-``info.json`` last, and the folder is removed. Whoever finds the list does what is left of it; whoever finds none
-starts anew.
+Finishing can be interrupted at any moment and repeated. All files are made inside the partial folder, in ``final/``:
+the episode's own, and ``meta/`` as it will be. Then a list of destinations is written: from here on the episode counts
+as saved. Then each file is renamed to its place, ``info.json`` last, and the folder is removed. If the list exists,
+only the renaming is completed; if not, everything is made again.
 """
 
 from __future__ import annotations
@@ -20,34 +20,34 @@ from numpy.typing import NDArray
 
 from ..errors import CommandError, DatasetError, HalError
 from .checking import check_index, check_rows
-from .codecs import Stats, column_stats, merged, picture_stats, plain, remux
+from .codecs import Stats, column_stats, merge_stats, picture_stats, remux, stats_as_lists
 from .dataset import Episode
-from .index import _TASK, check_next, read_about, read_index, read_tasks, reading, validated_info
+from .index import _TASK, check_next_episode, dataset_errors, read_about, read_index, read_tasks, validated_info
 from .layout import (
     ACTION,
     CHUNK,
     GRID,
-    LIST,
+    MOVES,
     SETPOINT,
     STATE,
     TIMES,
     VERSION,
-    Layout,
-    Pace,
-    locked,
+    DatasetLayout,
+    lock_dataset,
     read_json,
-    require,
-    sync,
+    require_libraries,
+    sync_to_disk,
     video_key,
     write_json,
 )
-from .live import Rest, read_rest
+from .live import LiveContent, read_live
+from .metadata import ClockPace
 
 __all__ = [
     "CLOSING",
     "entry_table",
     "finalise",
-    "keep_mark",
+    "write_mark",
     "new_info",
     "recover",
     "recover_all",
@@ -57,11 +57,9 @@ __all__ = [
     "write_table",
 ]
 
-# [tables.py] The tables of a LeRobotDataset v3.0: rows, episodes, tasks, and what ``info.json`` says of them.
-
 
 def new_info(features: Mapping[str, Any], fps: int, robot_type: str) -> dict[str, Any]:
-    """``meta/info.json`` of a dataset without any episode."""
+    """Return ``meta/info.json`` of a dataset without episodes."""
     videos = any(feature["dtype"] == "video" for feature in features.values())
     place = "chunk-{chunk_index:03d}/file-{file_index:03d}"
     return {
@@ -82,7 +80,7 @@ def new_info(features: Mapping[str, Any], fps: int, robot_type: str) -> dict[str
 
 
 def rows_table(columns: Mapping[str, NDArray[Any]], features: Mapping[str, Any]) -> Any:
-    """The rows of an episode, columns (rows, n), in the order and the types of ``features``."""
+    """Return the Arrow table of an episode's rows, from columns (rows, n), in the order and types of ``features``."""
     import pyarrow as pa
 
     arrays = {}
@@ -98,7 +96,17 @@ def rows_table(columns: Mapping[str, NDArray[Any]], features: Mapping[str, Any])
 def entry_table(
     number: int, length: int, start: int, task: str, cameras: list[str], fps: int, stats: Mapping[str, Stats]
 ) -> Any:
-    """The one row of ``meta/episodes`` for an episode whose first row is number ``start`` of the whole dataset."""
+    """Return the one row of ``meta/episodes`` for an episode.
+
+    Args:
+        number: Number of the episode.
+        length: Its rows.
+        start: Number of its first row in the whole dataset.
+        task: Description of the task.
+        cameras: Names of the videos.
+        fps: Rows per second.
+        stats: Statistics of each column and video.
+    """
     import pyarrow as pa
 
     chunk, file = pa.array([number // CHUNK]), pa.array([number % CHUNK])
@@ -129,13 +137,13 @@ def write_table(path: Path, table: Any) -> None:
     beside = path.with_name(path.name + ".new")
     beside.unlink(missing_ok=True)
     pq.write_table(table, beside, use_dictionary=False, write_statistics=False)
-    sync(beside)
+    sync_to_disk(beside)
     beside.replace(path)
-    sync(path.parent)
+    sync_to_disk(path.parent)
 
 
 def tasks_table(tasks: list[str]) -> Any:
-    """``meta/tasks.parquet``: a pandas frame whose index is the text, as LeRobot reads it."""
+    """Return ``meta/tasks.parquet``: a pandas frame whose index is the task's text, as LeRobot reads it."""
     import pyarrow as pa
 
     table = pa.table({"task_index": pa.array(range(len(tasks)), pa.int64()), _TASK: pa.array(tasks, pa.string())})
@@ -152,8 +160,10 @@ def tasks_table(tasks: list[str]) -> Any:
     return table.replace_schema_metadata({b"pandas": json.dumps(pandas).encode()})
 
 
+# From a live folder to an episode.
+
 CLOSING = "closing.json"
-"""In the live folder: what was said when the episode was closed."""
+"""File in the live folder with the metadata of the episode's end."""
 _FINAL = "final"
 _UNCLOSED: dict[str, Any] = {
     "success": None,
@@ -161,76 +171,79 @@ _UNCLOSED: dict[str, Any] = {
     "late": None,
     "gaps": [],
     "repeated": {},
-    "trouble": "nobody closed it: the program ended, or its writer",
+    "trouble": "it was not closed: the program or its writer ended",
 }
 
 
-def keep_mark(partial: Path, success: bool) -> None:
-    """Write a person's mark into a partial folder, where it outlives the process that writes the episode."""
-    with contextlib.suppress(OSError):  # a full disk, or a folder that was moved: the writer tries once more
+def write_mark(partial: Path, success: bool) -> None:
+    """Write the operator's mark into a partial folder, where it survives the writer's process."""
+    with contextlib.suppress(OSError):  # a full disk or a moved folder: the writer tries again
         write_json(partial / CLOSING, {"success": success})
 
 
-def finalise(layout: Layout, partial: Path, *, recovered: bool = False) -> int | None:
+def finalise(layout: DatasetLayout, partial: Path, *, recovered: bool = False) -> int | None:
     """Make an episode of a partial folder.
 
     Args:
         layout: The dataset, which must be locked.
         partial: The folder; its content is not trusted.
-        recovered: Whether the program that recorded it did not get to finish it.
+        recovered: Whether the program that recorded it was interrupted.
 
     Returns:
-        The episode's number; None where the folder holds no row: then it is removed.
+        The episode's number; None if the folder held no row, and was removed.
 
     Raises:
-        DatasetError: The dataset's index is missing or damaged, or the folder would write over a finished episode or
-            outside of the dataset.
-        OSError: The disk does not take it; the folder stays as it is then.
+        DatasetError: The dataset's index is missing or damaged, or the folder would overwrite a finished episode (code
+            ``would_overwrite``).
+        ValueError: The folder is damaged, contains a link or points outside of the dataset.
+        OSError: The disk refuses; the folder stays as it is.
     """
     _check_no_links(partial)
-    if not (partial / LIST).exists():
-        rest = read_rest(partial)
+    if not (partial / MOVES).exists():
+        rest = read_live(partial)
         if rest is None or rest.length == 0:
             layout.remove(partial)
             return None
         moves = _prepare(layout, rest, recovered)
-        write_json(partial / LIST, moves)
+        write_json(partial / MOVES, moves)
     return _move(layout, partial)
 
 
 def _check_no_links(partial: Path) -> None:
-    """A link would let what is written or cut off here change a file elsewhere."""
+    """Raise ValueError for a link, through which writing or truncating here would change a file elsewhere."""
     for path in (partial, *partial.rglob("*")):
         if path.is_symlink():
             raise ValueError(f"{path.name} is a link")
 
 
-def _move(layout: Layout, partial: Path) -> int:
+def _move(layout: DatasetLayout, partial: Path) -> int:
     shared = {layout.info, layout.stats, layout.tasks}
     moves = []
-    for source, target in read_json(partial / LIST):
+    for source, target in read_json(partial / MOVES):
         here, there = partial / source, layout.target(target)
         if Path(source).is_absolute() or ".." in Path(source).parts:
             raise ValueError(f"{source!r} is not a file of this folder")
         if here.exists():
             if there.exists() and there not in shared:
-                raise DatasetError("belongs to a finished episode; it is not written over", file=target)
+                raise DatasetError(
+                    "belongs to a finished episode; it is not overwritten", file=target, code="would_overwrite"
+                )
             moves.append((here, there))
     for here, there in moves:
         there.parent.mkdir(parents=True, exist_ok=True)
         here.replace(there)
-        sync(there.parent)
+        sync_to_disk(there.parent)
     layout.remove(partial)
     return int(read_json(layout.info)["total_episodes"]) - 1
 
 
-def _prepare(layout: Layout, rest: Rest, recovered: bool) -> list[tuple[str, str]]:
-    """Make everything; which file of the folder goes where comes back, in that order."""
+def _prepare(layout: DatasetLayout, rest: LiveContent, recovered: bool) -> list[tuple[str, str]]:
+    """Make all files. Return (source, destination) of each, in the order in which they are to be moved."""
     import pyarrow.parquet as pq
 
     about = rest.about
     there = read_index(layout)
-    check_next(layout, there)
+    check_next_episode(layout, there)
     info = there or new_info(about["features"], about["fps"], about["robot_type"])
     number, start, fps = int(info["total_episodes"]), int(info["total_frames"]), int(info["fps"])
     final = rest.folder / _FINAL
@@ -272,21 +285,22 @@ def _prepare(layout: Layout, rest: Rest, recovered: bool) -> list[tuple[str, str
     pq.write_table(tasks_table(tasks), final / "tasks.parquet")
     made.append((final / "tasks.parquet", layout.tasks))
     before = read_json(layout.stats) if layout.stats.exists() else {}
-    write_json(final / "stats.json", plain({key: merged(before.get(key), found) for key, found in stats.items()}))
+    write_json(
+        final / "stats.json", stats_as_lists({key: merge_stats(before.get(key), found) for key, found in stats.items()})
+    )
     made.append((final / "stats.json", layout.stats))
     total = {"total_episodes": number + 1, "total_frames": start + rows, "total_tasks": len(tasks)}
     write_json(final / "info.json", info | total | {"splits": {"train": f"0:{number + 1}"}})
     made.append((final / "info.json", layout.info))
     for source, _ in made:
-        sync(source)
-    sync(final)
+        sync_to_disk(source)
+    sync_to_disk(final)
     return [(str(source.relative_to(rest.folder)), str(target.relative_to(layout.root))) for source, target in made]
 
 
-def _columns(rest: Rest, t_start: float) -> dict[str, NDArray[Any]]:
-    """Columns (rows, n) of a live folder, and the action: what the arm was told to be at by the next row.
-
-    Times count from the first row on.
+def _columns(rest: LiveContent, t_start: float) -> dict[str, NDArray[Any]]:
+    """Return the columns (rows, n) of a live folder, with times since the first row, and the action: the set-point one
+    row later.
     """
     columns: dict[str, NDArray[Any]] = {}
     place = 0
@@ -303,13 +317,13 @@ def _columns(rest: Rest, t_start: float) -> dict[str, NDArray[Any]]:
 
 
 def _place(columns: list[list[Any]], key: str) -> int:
-    """Where a column begins in a row."""
+    """Return the index of a column's first number in a row."""
     keys = [column[0] for column in columns]
     return sum(len(names) for _, _, names in columns[: keys.index(key)])
 
 
-def _about(rest: Rest, number: int, t_start: float, recovered: bool) -> dict[str, Any]:
-    """Return the content of the episode's own file: what was known at its start and at its end."""
+def _about(rest: LiveContent, number: int, t_start: float, recovered: bool) -> dict[str, Any]:
+    """Return the content of the episode's metadata file: what was known at its start and at its end."""
     closing = rest.folder / CLOSING
     closed = _UNCLOSED | (read_json(closing) if closing.exists() else {})
     about = {key: value for key, value in rest.about.items() if key not in ("columns", "cameras_kept")}
@@ -317,42 +331,43 @@ def _about(rest: Rest, number: int, t_start: float, recovered: bool) -> dict[str
     return found | closed | {"recovered": recovered} | about
 
 
-def _pace(rest: Rest) -> dict[str, float]:
-    """How fast the time of each arm's own clock passed, as a share of the rig's; in lock-step they are one clock."""
-    pace = Pace(() if rest.about["clock"] == "lock_step" else rest.about["columns"])
+def _pace(rest: LiveContent) -> dict[str, float]:
+    """Return the pace of each arm's own clock relative to the rig's; empty in lock-step, where they are one clock."""
+    pace = ClockPace(() if rest.about["clock"] == "lock_step" else rest.about["columns"])
     for row in rest.rows:
         pace.add(row)
     return pace.as_json()
 
 
-# [recovery.py] ``recover`` finishes episodes that were interrupted; ``repair`` also rebuilds a lost index from
-# the episodes.
+# Recovery.
 
 
 def recover(out: str | Path) -> list[str]:
-    """Finish every episode of the dataset in the folder ``out`` that was begun and not finished.
+    """Finish every interrupted episode of the dataset in the folder ``out``.
 
-    Such an episode ends with its last whole row. Its mark is the one that a person gave, else ``success`` is None.
+    Such an episode ends with its last complete row. It keeps the mark that was given; without one, ``success`` is
+    None.
 
     Returns:
         What was done, a line per episode.
 
     Raises:
         DriverMissing: A library is not installed.
-        CommandError: There is no such folder, or another program is recording into it.
+        CommandError: There is no such folder (code ``no_folder``), or another program is recording into it
+            (``dataset_locked``).
         DatasetError: The dataset's index is missing or damaged; see :func:`repair`.
-        HalError: A folder of an unfinished episode is damaged.
-        OSError: The disk.
+        HalError: An unfinished episode is damaged (code ``damaged_episode``).
+        OSError: The disk refuses.
     """
     layout = _layout(out)
     if not layout.episodes.is_dir():
         return []
-    with locked(layout):
+    with lock_dataset(layout):
         return recover_all(layout)
 
 
 def repair(out: str | Path) -> list[str]:
-    """Rebuild the index of the dataset in the folder ``out`` where it does not fit the episodes, then recover it.
+    """Rebuild the index of the dataset in the folder ``out`` if it does not match the episodes, then recover it.
 
     The index is all of ``meta/``. It is rebuilt from ``episodes/``, ``data/`` and ``videos/``, which are only read.
     Arguments, return value and errors are those of :func:`recover`; DatasetError names the file of an episode without
@@ -360,8 +375,11 @@ def repair(out: str | Path) -> list[str]:
     """
     layout = _layout(out)
     if not layout.episodes.is_dir():
-        raise DatasetError(f"{layout.root} has no folder episodes: no recording of this program to be repaired")
-    with locked(layout):
+        raise DatasetError(
+            f"{layout.root} has no folder episodes: there is no recording of this program to repair",
+            code="foreign_dataset",
+        )
+    with lock_dataset(layout):
         done = [_finished(layout, partial) for partial in layout.interrupted]
         if (wrong := next(check_index(layout), None)) is not None:
             count = _rebuild(layout)
@@ -371,8 +389,8 @@ def repair(out: str | Path) -> list[str]:
         return done + recover_all(layout)
 
 
-def recover_all(layout: Layout) -> list[str]:
-    """Do the same as :func:`recover` for a dataset that is locked."""
+def recover_all(layout: DatasetLayout) -> list[str]:
+    """Do the same as :func:`recover`, for a dataset that is locked already."""
     layout.sweep()
     done = [_finished(layout, partial) for partial in layout.interrupted]
     if layout.partials():
@@ -380,32 +398,34 @@ def recover_all(layout: Layout) -> list[str]:
     return done + [_finished(layout, partial) for partial in layout.partials()]
 
 
-def _finished(layout: Layout, partial: Path) -> str:
+def _finished(layout: DatasetLayout, partial: Path) -> str:
     try:
         number = finalise(layout, partial, recovered=True)
     except OSError:
         raise
     except Exception as error:
         why = str(error) if isinstance(error, DatasetError) else f"{type(error).__name__}: {error}"
-        raise HalError(f"{partial} cannot be made an episode ({why}); move it elsewhere, and go on") from error
+        raise HalError(
+            f"{partial} cannot be made an episode ({why}); move it elsewhere and retry", code="damaged_episode"
+        ) from error
     if number is None:
         return f"{partial.name} held no whole row and was removed"
     return f"{partial.name} was not finished: recovered as episode {number}"
 
 
-def _layout(out: str | Path) -> Layout:
-    require()
-    layout = Layout(out)
+def _layout(out: str | Path) -> DatasetLayout:
+    require_libraries()
+    layout = DatasetLayout(out)
     if not layout.root.is_dir():
-        raise CommandError(f"there is no folder {layout.root}")
+        raise CommandError(f"there is no folder {layout.root}", code="no_folder")
     return layout
 
 
 # The index.
 
 
-def _rebuild(layout: Layout) -> int:
-    """Write all of ``meta/`` anew from the episodes, ``info.json`` last; return how many episodes there are."""
+def _rebuild(layout: DatasetLayout) -> int:
+    """Write all of ``meta/`` again from the episodes, ``info.json`` last. Return the number of episodes."""
     recorded = [path for path in layout.finished() if not path.is_relative_to(layout.info.parent)]
     count = max(map(layout.number_of, recorded), default=-1) + 1
     info = _info(layout, count)
@@ -421,18 +441,18 @@ def _rebuild(layout: Layout) -> int:
         videos = [key.removeprefix(video_key("")) for key in stats if key not in episode.columns]
         entry = entry_table(episode.number, episode.length, start, task, videos, episode.fps, stats)
         write_table(layout.entry(episode.number), entry)
-        total = {key: merged(total.get(key), found) for key, found in stats.items()}
+        total = {key: merge_stats(total.get(key), found) for key, found in stats.items()}
         start += episode.length
     if sorted(tasks) != list(range(len(tasks))):
         raise DatasetError(f"the episodes have tasks of the numbers {sorted(tasks)}", file="data")
     write_table(layout.tasks, tasks_table([tasks[k] for k in sorted(tasks)]))
-    write_json(layout.stats, plain(total))
+    write_json(layout.stats, stats_as_lists(total))
     counts = {"total_episodes": count, "total_frames": start, "total_tasks": len(tasks)}
     write_json(layout.info, info | counts | {"splits": {"train": f"0:{count}"}})
     return count
 
 
-def _info(layout: Layout, count: int) -> dict[str, Any]:
+def _info(layout: DatasetLayout, count: int) -> dict[str, Any]:
     """Return ``meta/info.json`` with the columns that all episodes have; its counts are not up to date."""
     if count == 0:
         raise DatasetError("there is no episode from which the index could be rebuilt", file="episodes")
@@ -444,7 +464,7 @@ def _info(layout: Layout, count: int) -> dict[str, Any]:
     if kept:
         return new_info(*kept[0])
     try:
-        with reading(layout.root, layout.info):
+        with dataset_errors(layout.root, layout.info):
             return validated_info(read_json(layout.info))
     except DatasetError as error:
         raise DatasetError(
@@ -454,12 +474,12 @@ def _info(layout: Layout, count: int) -> dict[str, Any]:
         ) from error
 
 
-def _stats(layout: Layout, episode: Episode) -> dict[str, Stats]:
+def _stats(layout: DatasetLayout, episode: Episode) -> dict[str, Stats]:
     rows = episode.length
     stats = {key: column_stats(values.reshape(rows, -1)) for key, values in episode.columns.items()}
     episode.check_pictures()
     for path in (path for camera in episode.cameras for path in episode.files(camera).values()):
         if path.suffix == ".mp4":
-            with reading(layout.root, path, episode.number):
+            with dataset_errors(layout.root, path, episode.number):
                 stats[path.parent.parent.name] = picture_stats(path, rows, episode.fps).stats()
     return stats

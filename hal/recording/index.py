@@ -1,4 +1,4 @@
-"""Read and validate what stands in the files of a recording, before anything uses it."""
+"""Read the JSON and Parquet files of a dataset, and validate their content before it is used."""
 
 from __future__ import annotations
 
@@ -11,37 +11,35 @@ from typing import Annotated, Any, Literal
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, FiniteFloat, ValidationError, model_validator
 
 from ..errors import DatasetError, HalError
-from .layout import (
-    CHUNK,
-    Layout,
-    read_json,
-)
+from .layout import CHUNK, DatasetLayout, read_json
 
 __all__ = [
     "CameraName",
-    "check_next",
-    "plain_name",
+    "check_next_episode",
+    "checked_name",
     "read_about",
     "read_entry",
     "read_index",
     "read_tasks",
-    "reading",
+    "dataset_errors",
     "repair_command",
     "validated_info",
 ]
 
 _SIDE = 16384
 """Pixels; no picture is larger."""
+_TASK = "__index_level_0__"
+"""LeRobot's name of the column of texts in ``meta/tasks.parquet``."""
 
 
-def plain_name(name: str) -> str:
-    """Return ``name``, which becomes part of a file's name. ValueError for one that would lead to another folder."""
+def checked_name(name: str) -> str:
+    """Return ``name``, a part of a file name. Raises ValueError for one that would lead to another folder."""
     if not name or "/" in name or "\0" in name or name in (".", ".."):
         raise ValueError("must be a name without slashes")
     return name
 
 
-CameraName = Annotated[str, AfterValidator(plain_name)]
+CameraName = Annotated[str, AfterValidator(checked_name)]
 
 
 class _Model(BaseModel):
@@ -133,14 +131,14 @@ class _About(_Model):
     """Missing in episodes of older versions."""
 
 
-def repair_command(layout: Layout) -> str:
+def repair_command(layout: DatasetLayout) -> str:
     """Return the command that repairs a dataset."""
     return f"hal-review {shlex.quote(str(layout.root))} --repair"
 
 
 @contextlib.contextmanager
-def reading(root: Path, path: Path, episode: int | None = None) -> Iterator[None]:
-    """Raise whatever a missing or damaged file leads to as a DatasetError that names the file and the episode."""
+def dataset_errors(root: Path, path: Path, episode: int | None = None) -> Iterator[None]:
+    """Raise any error of a missing or damaged file as a DatasetError that names the file and the episode."""
     try:
         yield
     except HalError:
@@ -167,15 +165,16 @@ def _validated(model: type[BaseModel], data: Any) -> dict[str, Any]:
 
 
 def validated_info(data: Any) -> dict[str, Any]:
-    """Return ``data`` once it is known to be a ``meta/info.json``. Raises pydantic's ValidationError."""
+    """Return ``data`` if it is a valid ``meta/info.json``. Raises pydantic's ValidationError."""
     return _validated(_Info, data)
 
 
-def read_index(layout: Layout) -> dict[str, Any] | None:
+def read_index(layout: DatasetLayout) -> dict[str, Any] | None:
     """Return ``meta/info.json``; None for a folder that holds no episode yet.
 
     Raises:
-        DatasetError: The file is damaged, or is missing although there are finished episodes.
+        DatasetError: The file is damaged, or is missing although there are finished episodes (code ``index_missing``),
+            lists episodes that are not there (``index_wrong``), or belongs to another program (``foreign_dataset``).
     """
     if not layout.info.exists():
         found = next(layout.finished(), None)
@@ -185,12 +184,15 @@ def read_index(layout: Layout) -> dict[str, Any] | None:
             f"is missing, but there are finished episodes ({found.relative_to(layout.root)}); nothing is recorded "
             f"over them. Rebuild the index from the episodes with: {repair_command(layout)}",
             file="meta/info.json",
+            code="index_missing",
         )
     if not layout.episodes.is_dir():
         raise DatasetError(
-            f"{layout.root} was not recorded by this program: it has no folder episodes", file="meta/info.json"
+            f"{layout.root} was not recorded by this program: it has no folder episodes",
+            file="meta/info.json",
+            code="foreign_dataset",
         )
-    with reading(layout.root, layout.info):
+    with dataset_errors(layout.root, layout.info):
         info = validated_info(read_json(layout.info))
     last = info["total_episodes"] - 1
     if last >= 0 and not any(path.exists() for path in layout.files_of(last)):
@@ -198,12 +200,15 @@ def read_index(layout: Layout) -> dict[str, Any] | None:
             f"lists {last + 1} episodes, and there is no file of episode {last}; to rebuild it: "
             f"{repair_command(layout)}",
             file="meta/info.json",
+            code="index_wrong",
         )
     return info
 
 
-def check_next(layout: Layout, info: dict[str, Any] | None) -> None:
-    """Raise DatasetError where the next episode would be written over a finished one, or the index is not whole."""
+def check_next_episode(layout: DatasetLayout, info: dict[str, Any] | None) -> None:
+    """Raise DatasetError (``index_wrong``) if the next episode would overwrite a finished one or the index is
+    incomplete.
+    """
     number = int(info["total_episodes"]) if info is not None else 0
     for path in layout.files_of(number):
         if path.exists():
@@ -212,23 +217,28 @@ def check_next(layout: Layout, info: dict[str, Any] | None) -> None:
                 f"index from the episodes with: {repair_command(layout)}",
                 file=str(path.relative_to(layout.root)),
                 episode=number,
+                code="index_wrong",
             )
     for path in (layout.stats, layout.tasks) if number else ():
         if not path.exists():
             raise DatasetError(
-                f"is missing; rebuild it with: {repair_command(layout)}", file=str(path.relative_to(layout.root))
+                f"is missing; rebuild it with: {repair_command(layout)}",
+                file=str(path.relative_to(layout.root)),
+                code="index_wrong",
             )
 
 
-def read_about(layout: Layout, number: int) -> dict[str, Any]:
+def read_about(layout: DatasetLayout, number: int) -> dict[str, Any]:
     """Return ``episodes/N.json`` of an episode. Raises DatasetError."""
     path = layout.about(number)
-    with reading(layout.root, path, number):
+    with dataset_errors(layout.root, path, number):
         return _validated(_About, read_json(path))
 
 
 def read_entry(path: Path) -> dict[str, Any]:
-    """Return the one row of an episode's :func:`entry_table`. ValueError where there is not one."""
+    """Return the one row of an episode's :func:`~hal.recording.finish.entry_table`. Raises ValueError for another
+    count.
+    """
     import pyarrow.parquet as pq
 
     (row,) = pq.ParquetFile(path).read().to_pylist()
@@ -236,7 +246,7 @@ def read_entry(path: Path) -> dict[str, Any]:
 
 
 def read_tasks(path: Path) -> list[str]:
-    """All tasks, by their number."""
+    """Return all tasks, in the order of their numbers."""
     if not path.exists():
         return []
     import pyarrow.parquet as pq
@@ -244,6 +254,3 @@ def read_tasks(path: Path) -> list[str]:
     table = pq.ParquetFile(path).read()
     numbered = sorted(zip(table["task_index"].to_pylist(), table[_TASK].to_pylist(), strict=True))
     return [text for _, text in numbered]
-
-
-_TASK = "__index_level_0__"

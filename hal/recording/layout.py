@@ -1,4 +1,6 @@
-"""Where everything of a dataset lies, and how a file or a folder is brought there so that a crash leaves it whole."""
+"""The format of a dataset: its columns, the place of every file, and how a file is written so that a crash leaves it
+whole.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +12,7 @@ import math
 import os
 import shutil
 import time
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -25,43 +27,38 @@ __all__ = [
     "CameraSetup",
     "Column",
     "GRID",
-    "LIST",
-    "Layout",
+    "MOVES",
+    "DatasetLayout",
     "MORE_STREAMS",
     "PAD",
-    "Pace",
     "SEGMENTATION",
     "SETPOINT",
-    "SLOW",
     "STATE",
     "TIMES",
     "VERSION",
     "features_of",
-    "locked",
+    "lock_dataset",
     "read_json",
-    "require",
-    "simulated_pace",
-    "sync",
+    "require_libraries",
+    "sync_to_disk",
     "video_key",
     "write_json",
 ]
 
-# [columns.py] The columns of a recording: one row of plain numbers per grid time, and how a dataset announces
-# them.
 
 STATE = "observation.state"
 SETPOINT = "observation.setpoint"
 ACTION = "action"
 PAD = "observation.pad"
-"""No ``action.pad``: LeRobot takes every column whose name begins with ``action`` for an action."""
+"""Not ``action.pad``: LeRobot treats every column whose name begins with ``action`` as an action."""
 TIMES = "observation.time."
-"""What stands first in these columns is a time, s: on the rig's clock while it is recorded, in the dataset since the
-episode's first row."""
+"""Prefix of the columns whose first number is a time, s: on the rig's clock while it is recorded, in the dataset since
+the episode's first row."""
 GRID = f"{TIMES}grid"
 
 SEGMENTATION = "segmentation"
 MORE_STREAMS = ("infrared", "infrared_right", SEGMENTATION)
-"""Streams of a camera that are recorded on request."""
+"""Streams of a camera that are recorded only on request."""
 BOOKKEEPING: dict[str, str] = {
     "timestamp": "float32",
     "frame_index": "int64",
@@ -77,30 +74,30 @@ class Column(NamedTuple):
 
     key: str
     dtype: str
-    """``float32``, ``float64`` or ``int64``, on disk; while a row is on its way, every number is a double."""
+    """``float32``, ``float64`` or ``int64`` on disk; in the queue every number is a double."""
     names: tuple[str, ...]
 
     @property
     def feature(self) -> dict[str, Any]:
-        """As ``meta/info.json`` says it."""
+        """The column's entry in ``features`` of ``meta/info.json``."""
         return {"dtype": self.dtype, "shape": [len(self.names)], "names": list(self.names)}
 
 
 class CameraSetup(NamedTuple):
-    """How the pictures of one camera are kept."""
+    """Which pictures of one camera are recorded, and how."""
 
     name: str
     width: int
     height: int
     color: bool
     depth_unit: float | None
-    """Metres in one unit of the stored depth; None where no depth is kept."""
+    """Metres per unit of the stored depth; None if no depth is recorded."""
     depth_lossless: bool
-    """Does the camera itself measure in that unit?"""
+    """Whether the camera itself measures in that unit."""
     seq: int
-    """Which number of a row counts this camera's frames."""
+    """Index of the number in a row that counts this camera's frames."""
     more: Sequence[str] = ()
-    """Streams that are kept besides colour and depth: some of :data:`MORE_STREAMS`."""
+    """Streams that are recorded besides colour and depth: some of :data:`MORE_STREAMS`."""
 
     @property
     def videos(self) -> dict[str, str]:
@@ -123,7 +120,14 @@ def video_key(video: str) -> str:
 def features_of(
     columns: Sequence[Column], cameras: Sequence[CameraSetup], fps: int, video: dict[str, Any]
 ) -> dict[str, dict[str, Any]]:
-    """``features`` of ``meta/info.json``; ``video`` is what the encoder says of itself."""
+    """Return ``features`` of ``meta/info.json``.
+
+    Args:
+        columns: Columns of a row.
+        cameras: The recorded cameras.
+        fps: Rows per second.
+        video: The encoder's own entries of a video's ``info``.
+    """
     found = {column.key: column.feature for column in columns}
     features = {STATE: found.pop(STATE), ACTION: {**found[SETPOINT]}, **found}
     for camera in cameras:
@@ -146,13 +150,11 @@ def features_of(
     return features
 
 
-# [library.py] The libraries that recording needs, and what to say where they are missing.
-
 _LIBRARIES = ("pyarrow", "av", "zstandard")
 
 
-def require() -> None:
-    """Raise DriverMissing, with the command that installs them, where a library is missing. Imports none of them."""
+def require_libraries() -> None:
+    """Raise DriverMissing, with the command that installs them, if a library is missing. Imports none of them."""
     missing = [name for name in _LIBRARIES if importlib.util.find_spec(name) is None]
     if missing:
         raise DriverMissing(
@@ -163,90 +165,23 @@ def require() -> None:
 # [pace.py] Does the time of an arm's own clock pass as fast as that of the rig? A simulation that cannot keep up
 # is slower.
 
-SLOW = 0.97
-"""Of real time: below it, speeds in a recording are noticeably too low."""
-_ENOUGH = 2.0
-"""s of an episode before anything is said."""
-_CHANGED = 0.02
-"""By less the number that a person was told is not corrected."""
-_ROBOT = f"{TIMES}robot."
-
-
-class Pace:
-    """That of each arm, over the rows of one episode so far."""
-
-    def __init__(self, columns: Iterable[Sequence[Any]], simulated: Collection[str] = ()) -> None:
-        """``columns`` (key, type, names) are those of a row; ``simulated`` are the arms in a simulated world."""
-        self._places: dict[str, int] = {}
-        self._simulated = simulated
-        self._told = 1.0
-        place = 0
-        for key, _, names in columns:
-            if key.startswith(_ROBOT):
-                self._places[key.removeprefix(_ROBOT)] = place
-            place += len(names)
-        self._last: dict[str, tuple[float, float]] = {}
-        self._passed: dict[str, tuple[float, float]] = {}
-        """s on the rig's clock, and on the arm's own, while both went on."""
-
-    def add(self, row: Sequence[float]) -> None:
-        """One more row. An arm whose clock is not known, or begins anew, is left out as long as that is so."""
-        for name, place in self._places.items():
-            now = float(row[place]), float(row[place + 1])
-            before, self._last[name] = self._last.get(name, now), now
-            t, own = now[0] - before[0], now[1] - before[1]
-            if t > 0.0 and own >= 0.0:  # false for NaN, too
-                sums = self._passed.get(name, (0.0, 0.0))
-                self._passed[name] = sums[0] + t, sums[1] + own
-
-    def as_json(self) -> dict[str, float]:
-        """By the arms' names; those are missing whose own clock is not known."""
-        return {name: round(own / t, 4) for name, (t, own) in self._passed.items() if math.isfinite(own)}
-
-    @property
-    def trouble(self) -> str:
-        """What a person should know of a simulation that is too slow; empty where it keeps up."""
-        found = [
-            own / t
-            for name, (t, own) in self._passed.items()
-            if name in self._simulated and t >= _ENOUGH and own < t * SLOW
-        ]
-        if not found:
-            self._told = 1.0
-            return ""
-        if self._told == 1.0 or abs(min(found) - self._told) >= _CHANGED:
-            self._told = min(found)
-        return (
-            f"the simulation runs at {self._told:.2f} of real time: speeds in this recording are too low; fewer or "
-            "smaller cameras help"
-        )
-
-
-def simulated_pace(info: Mapping[str, Any]) -> float | None:
-    """The slowest arm of a simulated world in an episode's own file; None where there is none, or it is not known."""
-    resolved = info.get("rig", {}).get("resolved", {})
-    driver = (resolved.get("world") or {}).get("driver")
-    simulated = {robot["name"] for robot in resolved.get("robots", ()) if driver and robot["driver"] == driver}
-    found = [float(pace) for name, pace in (info.get("pace") or {}).items() if name in simulated]
-    return min(found, default=None)
-
 
 # [about.py] What an episode's own file says besides its rows: where they come from, and with what they were made.
 
 
 CHUNK = 1000
 """Files in a folder."""
-LIST = "list.json"
-"""In a partial folder: which of its files goes where. From then on the episode counts as saved."""
+MOVES = "list.json"
+"""Name of the file in a partial folder that lists where its files go. Once it exists, the episode counts as saved."""
 _DIGITS = "[0-9]" * 3
 _ABOUT_FILES = f"{_DIGITS}{_DIGITS}.json"
 _CHUNK_FILES = f"chunk-{_DIGITS}/file-{_DIGITS}"
 _PATIENCE = 5.0
-"""s that somebody else may take to let go of a dataset: the writer of a program that was killed just ends."""
+"""Time to wait for another process to release a dataset, s: the writer of a program that was killed is about to end."""
 
 
-class Layout:
-    """The files of one dataset. One file of each kind per episode, so that no episode can harm another."""
+class DatasetLayout:
+    """Paths of the files of one dataset. Every episode has files of its own, so that no episode can damage another."""
 
     def __init__(self, root: str | Path) -> None:
         self.root = Path(root).expanduser().absolute()
@@ -254,47 +189,47 @@ class Layout:
         self.stats = self.root / "meta" / "stats.json"
         self.tasks = self.root / "meta" / "tasks.parquet"
         self.episodes = self.root / "episodes"
-        """Ours: a JSON file per episode, and what is being recorded."""
+        """This project's own folder: a JSON file per episode, and the episode that is being recorded."""
 
     @staticmethod
     def _file(number: int) -> str:
         return f"chunk-{number // CHUNK:03d}/file-{number % CHUNK:03d}"
 
     def data(self, number: int) -> Path:
-        """Rows of an episode."""
+        """Return the path of an episode's rows."""
         return self.root / "data" / f"{self._file(number)}.parquet"
 
     def entry(self, number: int) -> Path:
-        """What LeRobot knows of an episode: one row."""
+        """Return the path of an episode's row in LeRobot's index."""
         return self.root / "meta" / "episodes" / f"{self._file(number)}.parquet"
 
     def video(self, camera: str, number: int) -> Path:
-        """Colour of a camera."""
+        """Return the path of a video; ``camera`` is one of :attr:`CameraSetup.videos`."""
         return self.root / "videos" / video_key(camera) / f"{self._file(number)}.mp4"
 
     def depth(self, camera: str, number: int) -> Path:
-        """Depth of a camera."""
+        """Return the path of a depth file; ``camera`` is one of :attr:`CameraSetup.depths`."""
         return self.root / "depth" / camera / f"{self._file(number)}.depth"
 
     def about(self, number: int) -> Path:
-        """What else is known of an episode."""
+        """Return the path of an episode's metadata."""
         return self.episodes / f"{number:06d}.json"
 
     def partial(self, number: int) -> Path:
-        """The folder of an episode that is not part of the dataset yet."""
+        """Return the folder of an episode that is not part of the dataset yet."""
         return self.episodes / f"{number:06d}.partial"
 
     def partials(self) -> list[Path]:
-        """All of them, oldest first."""
+        """Return all partial folders, oldest first."""
         return sorted(self.episodes.glob("*.partial"))
 
     @property
     def interrupted(self) -> list[Path]:
-        """Partial folders of episodes that count as saved, and whose files are not all in their places yet."""
-        return [partial for partial in self.partials() if (partial / LIST).exists()]
+        """Partial folders of episodes that count as saved, but whose files are not all in their places yet."""
+        return [partial for partial in self.partials() if (partial / MOVES).exists()]
 
     def files_of(self, number: int) -> list[Path]:
-        """Return where an episode's files are, or would be; of videos and depth those that exist."""
+        """Return the paths of an episode's files, existing or not; of videos and depth only those that exist."""
         file = self._file(number)
         found = [self.data(number), self.about(number), self.entry(number)]
         return found + [path for kind in ("videos", "depth") for path in self.root.glob(f"{kind}/*/{file}.*")]
@@ -318,14 +253,16 @@ class Layout:
         return CHUNK * int(path.parent.name.removeprefix("chunk-")) + int(path.stem.removeprefix("file-"))
 
     def numbers(self) -> list[int]:
-        """Return the numbers of the episodes whose own file is there, in order."""
+        """Return the numbers of the episodes whose metadata file exists, in order."""
         return sorted(int(path.stem) for path in self.episodes.glob(_ABOUT_FILES))
 
     def target(self, name: str) -> Path:
-        """Return where a file of a partial folder's list goes. ValueError for a place outside of the dataset."""
+        """Return the destination of a file in a partial folder's list. Raises ValueError for a path outside of the
+        dataset.
+        """
         path = self.root / name
         if Path(name).is_absolute() or ".." in Path(name).parts or path == self.root:
-            raise ValueError(f"{name!r} is not a place in the dataset")
+            raise ValueError(f"{name!r} is outside of the dataset")
         there = path.parent
         while not there.exists():
             there = there.parent
@@ -334,25 +271,30 @@ class Layout:
         return path
 
     def remove(self, partial: Path) -> None:
-        """Remove a partial folder as a whole: whoever dies in the middle leaves nothing that looks like an episode."""
+        """Remove a partial folder by renaming it first, so that a crash leaves nothing that looks like an episode."""
         gone = partial.with_suffix(".removed")
         shutil.rmtree(gone, ignore_errors=True)
         partial.rename(gone)
-        sync(self.episodes)
+        sync_to_disk(self.episodes)
         shutil.rmtree(gone, ignore_errors=True)
 
     def sweep(self) -> None:
-        """Remove what a program that was killed did not get to."""
+        """Remove folders whose removal was interrupted."""
         for gone in self.episodes.glob("*.removed"):
             shutil.rmtree(gone, ignore_errors=True)
 
 
 @contextlib.contextmanager
-def locked(layout: Layout) -> Iterator[None]:
-    """Nobody else adds to this dataset meanwhile; the lock goes with the process. CommandError where somebody does."""
+def lock_dataset(layout: DatasetLayout) -> Iterator[None]:
+    """Hold the dataset's lock, so that no other process adds to it. The lock ends with the process.
+
+    Raises:
+        CommandError: Another process holds it (code ``dataset_locked``), or ``episodes/`` is a link
+            (``dataset_link``).
+    """
     layout.episodes.mkdir(parents=True, exist_ok=True)
     if layout.episodes.is_symlink():
-        raise CommandError(f"{layout.episodes} is a link; nothing is recorded through it")
+        raise CommandError(f"{layout.episodes} is a link; nothing is recorded through it", code="dataset_link")
     fd = os.open(layout.episodes / ".lock", os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o666)
     with os.fdopen(fd, "w") as file:
         deadline = time.monotonic() + _PATIENCE
@@ -362,13 +304,15 @@ def locked(layout: Layout) -> Iterator[None]:
                 break
             except BlockingIOError:
                 if time.monotonic() > deadline:
-                    raise CommandError(f"another program is recording into {layout.root}") from None
+                    raise CommandError(
+                        f"another program is recording into {layout.root}", code="dataset_locked"
+                    ) from None
                 time.sleep(0.05)
         yield
 
 
-def sync(path: Path) -> None:
-    """Wait until a file or a folder is on the disk."""
+def sync_to_disk(path: Path) -> None:
+    """Block until a file or folder is on the disk."""
     fd = os.open(path, os.O_RDONLY)
     try:
         os.fsync(fd)
@@ -377,7 +321,7 @@ def sync(path: Path) -> None:
 
 
 def read_json(path: Path) -> Any:
-    """Return what a JSON file holds."""
+    """Return the content of a JSON file."""
     return json.loads(path.read_text(encoding="utf-8"))
 
 
@@ -387,9 +331,9 @@ def write_json(path: Path, data: Any) -> None:
     beside.unlink(missing_ok=True)
     with beside.open("x", encoding="utf-8") as file:
         file.write(json.dumps(_finite(data), indent=1, default=str, allow_nan=False) + "\n")
-    sync(beside)
+    sync_to_disk(beside)
     beside.replace(path)
-    sync(path.parent)
+    sync_to_disk(path.parent)
 
 
 def _finite(data: Any) -> Any:

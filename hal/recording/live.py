@@ -1,10 +1,12 @@
-"""The live folder of an episode: every row is on its way to the disk as soon as it is there, and can be read back.
+"""An episode while it is recorded: the queue of rows from the app to the writer's process, and the folder on disk.
 
-about.json          what is known when it begins: features, cameras, encoder, the rig's configuration
-rows.arrow          an Arrow stream, a batch per row
-CAMERA.mp4          a fragmented video of the colour; CAMERA_infrared.mp4 of the infrared
-CAMERA.depth        depth, see :mod:`.depth`; CAMERA_segmentation.depth, numbers of bodies
-reserve             room for the last word, should the disk be full by then
+Every row is written to the live folder as soon as it arrives, so that it can be read back after a crash::
+
+    about.json          metadata at the start: features, cameras, encoder, the rig's configuration
+    rows.arrow          an Arrow stream, one batch per row
+    CAMERA.mp4          a fragmented video of the colour; CAMERA_infrared.mp4 of the infrared
+    CAMERA.depth        depth, see codecs.py; CAMERA_segmentation.depth: numbers of bodies
+    reserve             space for the last files, in case the disk is full at the end
 """
 
 from __future__ import annotations
@@ -12,43 +14,172 @@ from __future__ import annotations
 import contextlib
 import io
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import DTypeLike, NDArray
 
-from .codecs import DepthFile, DepthReader, Encoder, VideoFile, as_rgb, count_frames, cut, mend, numbers_to_units
-from .index import plain_name
-from .layout import MORE_STREAMS, SEGMENTATION, CameraSetup, read_json, sync, write_json
-from .ring import Slot
+from ..host.memory import Mailbox
+from ..host.ring import STREAM_TYPES, ArrayRing, Images
+from .codecs import (
+    DepthFile,
+    DepthReader,
+    VideoEncoder,
+    VideoFile,
+    as_rgb,
+    count_frames,
+    ids_to_units,
+    truncate_records,
+    truncate_to_last_fragment,
+)
+from .index import checked_name
+from .layout import MORE_STREAMS, SEGMENTATION, CameraSetup, read_json, sync_to_disk, write_json
 
-__all__ = ["ABOUT", "RESERVE", "ROWS", "LiveFolder", "Rest", "read_rest"]
+__all__ = [
+    "ABOUT",
+    "Images",
+    "LiveContent",
+    "LiveFolder",
+    "RESERVE",
+    "ROWS",
+    "RowQueue",
+    "RowSlot",
+    "read_live",
+]
+
+# The queue.
+
+_STATUS = "dH2000s"  # free space in bytes, length of the trouble's text, the text
+_TEXT = 2000
+_VALUES = -1, ""
+"""Key of a row's numbers; a picture's is the index of its camera, and its stream."""
+
+_Key = tuple[int, str]
+
+
+class RowSlot(NamedTuple):
+    """One row in the queue."""
+
+    values: NDArray[np.float64]
+    images: tuple[Images, ...]
+    """By stream, in the order of the cameras; a picture that is not new keeps the slot's former content."""
+
+
+class RowQueue:
+    """A queue of rows in shared memory, each with ``width`` numbers and the pictures of ``cameras``; read in place."""
+
+    def __init__(self, buffer: memoryview, width: int, cameras: Sequence[CameraSetup], slots: int) -> None:
+        """Lay the queue out in ``buffer``, which has :meth:`size` bytes and starts as zeros."""
+        self._status = Mailbox(buffer, _STATUS)
+        self._reported: tuple[float, str] = (0.0, "")
+        self._ring = ArrayRing(buffer[_status_size() :], _arrays(width, cameras), slots)
+        indices = range(len(cameras))
+        self._slots = {
+            id(slot): RowSlot(
+                slot[_VALUES],
+                tuple({stream: a for (k, stream), a in slot.items() if k == camera} for camera in indices),
+            )
+            for slot in self._ring.slots
+        }
+
+    @staticmethod
+    def size(width: int, cameras: Sequence[CameraSetup], slots: int) -> int:
+        """Return the number of bytes that the queue needs."""
+        return _status_size() + ArrayRing.bytes_of(_arrays(width, cameras), slots)
+
+    # In the app.
+
+    @property
+    def waiting(self) -> int:
+        """Number of rows that the writer has not released yet."""
+        return self._ring.waiting
+
+    @property
+    def is_full(self) -> bool:
+        """Whether there is no free slot."""
+        return self._ring.is_full
+
+    def open_slot(self) -> RowSlot:
+        """Return the free slot to be filled; call it only if the queue is not full."""
+        return self._slots[id(self._ring.open_slot())]
+
+    def publish(self) -> None:
+        """Publish the slot that was filled."""
+        self._ring.publish()
+
+    @property
+    def free_bytes(self) -> int:
+        """Free space on the disk in the writer's last report, bytes; 0 before the first."""
+        found = self._status.read()
+        return int(found[1][0]) if found is not None else 0
+
+    @property
+    def trouble(self) -> str:
+        """Why the writer has stopped writing; empty while it writes."""
+        found = self._status.read()
+        return found[1][2][: found[1][1]].decode(errors="replace") if found is not None else ""
+
+    # In the writer's process.
+
+    def oldest(self) -> RowSlot | None:
+        """Return the next row to be written; None if there is none."""
+        slot = self._ring.oldest()
+        return None if slot is None else self._slots[id(slot)]
+
+    def release_oldest(self) -> None:
+        """Free the slot of the oldest row."""
+        self._ring.release_oldest()
+
+    def report(self, free_bytes: int | None = None, trouble: str | None = None) -> None:
+        """Report free space, trouble or both to the app; what is None keeps its value."""
+        free, text = self._reported
+        self._reported = free, text = (
+            free if free_bytes is None else float(free_bytes),
+            text if trouble is None else trouble,
+        )
+        data = text.encode()[:_TEXT]
+        self._status.write(free, len(data), data)
+
+
+def _status_size() -> int:
+    return -(-Mailbox.size(_STATUS) // 64) * 64  # the arrays stay aligned
+
+
+def _arrays(width: int, cameras: Sequence[CameraSetup]) -> dict[_Key, tuple[tuple[int, ...], DTypeLike]]:
+    """Return shape and type of every array of a row."""
+    arrays: dict[_Key, tuple[tuple[int, ...], DTypeLike]] = {_VALUES: ((width,), np.float64)}
+    for index, camera in enumerate(cameras):
+        for stream in (*camera.videos.values(), *camera.depths.values()):
+            dtype, more = STREAM_TYPES[stream]
+            arrays[index, stream] = (camera.height, camera.width, *more), dtype
+    return arrays
+
 
 ABOUT, ROWS, RESERVE = "about.json", "rows.arrow", "reserve"
-_ROOM = 65536
+_RESERVED_BYTES = 65536
 
 
 class LiveFolder:
-    """Writes one episode. OSError when the disk does not take it; what was written before stays."""
+    """Writes one episode to its live folder. Raises OSError if the disk refuses; what was written before stays."""
 
     def __init__(self, folder: Path, about: dict[str, Any], width: int) -> None:
         import pyarrow as pa
 
         self.folder = folder
         self.count = 0
-        """Rows so far."""
+        """Rows written."""
         self.cameras = [CameraSetup(*camera) for camera in about["cameras_kept"]]
         self._about = about
         folder.mkdir(parents=True)
         write_json(folder / ABOUT, about)
-        (folder / RESERVE).write_bytes(bytes(_ROOM))
+        (folder / RESERVE).write_bytes(bytes(_RESERVED_BYTES))
         self._files: dict[str, io.FileIO] = {}
         self._pa = pa
         self._schema = pa.schema([("row", pa.list_(pa.float64(), width))])
         self._rows = pa.ipc.new_stream(self._open(ROWS), self._schema)
-        encoder, fps = Encoder(*about["encoder"]), int(about["fps"])
+        encoder, fps = VideoEncoder(*about["encoder"]), int(about["fps"])
         self._videos = {
             name: VideoFile(self._open(f"{name}.mp4"), encoder, camera.width, camera.height, fps)
             for camera in self.cameras
@@ -60,18 +191,18 @@ class LiveFolder:
             for name in camera.depths
         }
         self._seen: dict[str, float] = {}
-        """Each camera's newest frame."""
+        """Sequence number of each camera's newest frame."""
         self._colors: dict[str, NDArray[np.uint8]] = {}
         self._closed = False
-        sync(folder)
+        sync_to_disk(folder)
         self._inode = os.stat(folder).st_ino
 
     def _open(self, name: str) -> io.FileIO:
         self._files[name] = io.FileIO(self.folder / name, "w+")
         return self._files[name]
 
-    def add(self, slot: Slot) -> None:
-        """One row. Its numbers come last, so that no row lacks its pictures."""
+    def add(self, slot: RowSlot) -> None:
+        """Write one row, its numbers last, so that no row that can be read back lacks its pictures."""
         for camera, images in zip(self.cameras, slot.images, strict=True):
             new = self._seen.get(camera.name) != slot.values[camera.seq]
             self._seen[camera.name] = float(slot.values[camera.seq])
@@ -81,7 +212,7 @@ class LiveFolder:
                 self._videos[name].add(self._colors[name])
             for name, stream in camera.depths.items():
                 if stream == SEGMENTATION:
-                    self._depths[name].add_units(numbers_to_units(images[stream]) if new else None)
+                    self._depths[name].add_units(ids_to_units(images[stream]) if new else None)
                 else:
                     self._depths[name].add(images[stream] if new else None)
         row = self._pa.FixedSizeListArray.from_arrays(self._pa.array(slot.values), len(slot.values))
@@ -90,14 +221,14 @@ class LiveFolder:
 
     @property
     def in_place(self) -> bool:
-        """Is the folder still where it was?"""
+        """Whether the folder is still where it was created."""
         try:
             return os.stat(self.folder).st_ino == self._inode
         except OSError:
             return False
 
     def rescue(self) -> bool:
-        """Write files that somebody has deleted once more, from what is still open. False where they were moved."""
+        """Write files that were deleted again, from their open handles. Return False if they were moved instead."""
         if any(os.fstat(file.fileno()).st_nlink for file in self._files.values()):
             return False
         self.folder.mkdir(parents=True, exist_ok=True)
@@ -109,9 +240,9 @@ class LiveFolder:
         return True
 
     def close(self) -> None:
-        """Write what the encoders hold. What cannot be written is left out: reading back finds the last whole row.
+        """Write what the encoders still hold, and close all files. Idempotent.
 
-        Idempotent.
+        Data that cannot be written is left out: reading back finds the last complete row.
         """
         if self._closed:
             return
@@ -127,48 +258,52 @@ class LiveFolder:
             file.close()
 
 
-class Rest:
-    """What a live folder holds: rows of which every part is there."""
+class LiveContent:
+    """Content of a live folder: the rows of which every part is there.
+
+    Raises DatasetError-free built-in errors (ValueError, KeyError, OSError) for a damaged ``about.json``.
+    """
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         self.about: dict[str, Any] = read_json(folder / ABOUT)
         self.cameras = [CameraSetup(*camera) for camera in self.about["cameras_kept"]]
         for camera in self.cameras:
-            plain_name(camera.name)
+            checked_name(camera.name)
             if not set(camera.more) <= set(MORE_STREAMS):
                 raise ValueError(f"{camera.name} has unknown streams: {camera.more}")
         rows = list(_rows(folder / ROWS))
-        lengths = [len(rows), *(self._pictures(camera) for camera in self.cameras)]
+        """(length, width) numbers."""
+        lengths = [len(rows), *(self._count_pictures(camera) for camera in self.cameras)]
         self.length = min(lengths)
         self.rows = np.array(rows[: self.length])
         """(rows, numbers)"""
         for camera in self.cameras:
             for name in camera.depths if self.length else ():
-                cut(folder / f"{name}.depth", self.length)
+                truncate_records(folder / f"{name}.depth", self.length)
 
-    def _pictures(self, camera: CameraSetup) -> int:
-        """Of how many rows this camera's pictures are there."""
+    def _count_pictures(self, camera: CameraSetup) -> int:
+        """Return for how many rows this camera's pictures are there."""
         found = []
         try:
             for name in camera.videos:
                 video = self.folder / f"{name}.mp4"
-                mend(video)
+                truncate_to_last_fragment(video)
                 found.append(count_frames(video))
             for name in camera.depths:
                 found.append(len(DepthReader(self.folder / f"{name}.depth")))
-        except (FileNotFoundError, ValueError):  # it was killed before there was any
+        except (FileNotFoundError, ValueError):  # killed before the file was complete enough to read
             return 0
         return min(found, default=1 << 62)
 
 
-def read_rest(folder: Path) -> Rest | None:
-    """Return what can be read back; None for a folder that was not even begun."""
-    return Rest(folder) if (folder / ABOUT).exists() else None
+def read_live(folder: Path) -> LiveContent | None:
+    """Return the content of a live folder; None if not even its metadata was written."""
+    return LiveContent(folder) if (folder / ABOUT).exists() else None
 
 
 def _rows(path: Path) -> Iterator[NDArray[np.float64]]:
-    """Every whole row of a stream that may end anywhere."""
+    """Yield every complete row of a stream that may end anywhere."""
     import pyarrow as pa
 
     try:

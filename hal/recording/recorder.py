@@ -1,4 +1,8 @@
-"""The recorder: looks on while somebody drives, and keeps what it sees."""
+"""Record the episodes of a rig into a dataset: the public :class:`Recorder`, and what it does during one episode.
+
+A :class:`~hal.recording.sampling.SampleClock` calls :class:`EpisodeRecorder` at every due time; each becomes a row in
+the queue to the writer's process (writer.py), or a dropped row with its reason.
+"""
 
 from __future__ import annotations
 
@@ -13,315 +17,93 @@ from ..errors import CommandError, ConnectionLost, HalError, StaleStateError
 from ..host.hosts import groups_of
 from ..host.process import Child, SharedMemory
 from ..learning.episode import stands_in_world
-from .codecs import Encoder
-from .dataset import check_compatible
-from .finish import keep_mark
+from .checking import check_compatible
+from .codecs import VideoEncoder
+from .finish import write_mark
 from .index import read_index
-from .layout import MORE_STREAMS, TIMES, Layout, Pace, features_of, locked, require
-from .ring import RowRing
-from .sampling import (
-    CameraTrack,
-    Grid,
-    LockStepGrid,
-    RealTimeGrid,
-    Sampler,
-    about_call,
-    about_rig,
-    about_start,
-    movable,
-)
+from .layout import MORE_STREAMS, TIMES, DatasetLayout, features_of, lock_dataset, require_libraries
+from .live import RowQueue
+from .metadata import ClockPace, caller_metadata, rig_metadata, start_metadata
+from .sampling import CameraBuffer, LockStepSampleClock, RealTimeSampleClock, RowSampler, SampleClock, movable_objects
 
 if TYPE_CHECKING:
     from ..rig import Rig
-    from .sampling import Moment
+    from .sampling import RowSnapshot
 
 __all__ = [
     "EpisodeRecorder",
-    "Gaps",
+    "DroppedRows",
     "Recorder",
     "RecorderStatus",
-    "Saving",
+    "BackgroundSave",
     "check_rate",
-    "chosen",
+    "select_devices",
 ]
 
-# [saving.py] An episode that is being finished in the background.
-
 _LOG = logging.getLogger("hal.recording")
-
-
-class Saving:
-    """Runs ``work`` in a thread of its own, which a program that ends waits for; a failure is kept, and logged."""
-
-    def __init__(self, work: Callable[[], None]) -> None:
-        self.error: Exception | None = None
-        self._work = work
-        self._thread = threading.Thread(target=self._run, name="hal-recorder-save")
-        self._thread.start()
-
-    def _run(self) -> None:
-        try:
-            self._work()
-        except Exception as error:
-            self.error = error
-            _LOG.warning("%s", error)
-
-    @property
-    def done(self) -> bool:
-        """Is it over, well or not?"""
-        return not self._thread.is_alive()
-
-    def wait(self) -> None:
-        """Return when it is over."""
-        self._thread.join()
-
-    def result(self) -> None:
-        """The same; raises what went wrong."""
-        self.wait()
-        if self.error is not None:
-            raise self.error
-
-
-# [gaps.py] Grid times of which there is no row, and why.
-
-
-class Gaps:
-    """Those of one episode; neighbours with one reason are one gap."""
-
-    def __init__(self, fps: int) -> None:
-        self.rows = 0
-        """Rows that are missing."""
-        self.lasting = 0.0
-        """How long there has been no row now, s."""
-        self.why = ""
-        """The newest reason."""
-        self._fps = fps
-        self._found: list[dict[str, Any]] = []
-        self._open = False
-
-    def add(self, t: float, why: str) -> None:
-        """No row at ``t``, s since the episode's first one."""
-        self.rows += 1
-        self.lasting += 1.0 / self._fps
-        self.why = why
-        if not self._open:
-            self._found.append({"from_s": round(t, 6), "rows": 0, "why": why})
-            self._open = True
-        self._found[-1]["rows"] += 1
-        self._found[-1]["to_s"] = round(t, 6)
-
-    def over(self) -> None:
-        """There is a row again."""
-        self._open = False
-        self.lasting = 0.0
-
-    def as_json(self) -> list[dict[str, Any]]:
-        """As the episode's file lists them."""
-        return self._found
-
-
-# [take.py] One episode while it is recorded: every grid time becomes a row for the writer, or a gap with a
-# reason.
-
-_HOPELESS = 1.0
-"""s without a single row after which an episode takes no more."""
-_PATIENCE = 30.0
-"""s that a lock-step recording waits for a slow writer; time stands still meanwhile."""
+_GIVE_UP = 1.0
+"""Time without a single row after which an episode records no more, s."""
+_WRITER_PATIENCE = 30.0
+"""Time that a lock-step recording waits for a slow writer, s; simulated time stands still meanwhile."""
 _STEP = 0.001
-_WORD = 1.0
-"""s that the writer may take to hear of a row; it reads such words in between two rows."""
-
-
-class EpisodeRecorder:
-    """Looks on from :meth:`start` to :meth:`end`."""
-
-    def __init__(
-        self, rig: Rig, fps: int, sampler: Sampler, tracks: Sequence[CameraTrack], ring: RowRing, child: Child
-    ) -> None:
-        self.frames = 0
-        """Rows so far."""
-        self.seconds = 0.0
-        """From the first row to the newest one."""
-        self.trouble = ""
-        """Why there are no more rows; empty while there are."""
-        self.gaps = Gaps(fps)
-        in_world = {robot.name for robot in rig.robots.values() if stands_in_world(rig, robot)}
-        self.pace = Pace(() if rig.lock_step else sampler.columns, in_world)
-        self._lock_step = rig.lock_step
-        self._sampler = sampler
-        self._tracks = tracks
-        self._ring = ring
-        self._child = child
-        kind = LockStepGrid if rig.lock_step else RealTimeGrid
-        self.grid: Grid = kind(rig.clock, fps, self._look, self._make)
-
-    def start(self) -> None:
-        """The first row is one of the present."""
-        self.grid.start()
-
-    def end(self) -> None:
-        """No rows of later times, and nothing is looked at any more; those that are due are still made. Idempotent."""
-        self.grid.end()
-
-    def stop(self) -> None:
-        """The same; returns when the writer has been handed every row."""
-        self.grid.stop()
-
-    def closing(self, success: bool | None) -> dict[str, Any]:
-        """What is known of the episode at its end."""
-        return {
-            "success": success,
-            "recovered": False,
-            "dropped": self.gaps.rows,
-            "late": self.grid.late,
-            "gaps": self.gaps.as_json(),
-            "repeated": {track.camera.name: track.repeated for track in self._tracks},
-            "trouble": self.trouble,
-        }
-
-    def _look(self) -> Moment | Exception:
-        try:
-            return self._sampler.look()
-        except Exception as error:  # the row, when it is made, says so
-            return error
-
-    def _make(self, t: float, moment: Moment | Exception) -> bool:
-        """The row of one grid time. False where the episode cannot go on."""
-        try:
-            if isinstance(moment, Exception):
-                raise moment
-            self._child.check()
-            self.trouble = self._ring.trouble
-            why = self.trouble or self._put(t, moment)
-        except (HalError, ValueError) as error:
-            why = self.trouble = str(error)
-        except Exception as error:  # nothing of a recording may be lost without a word
-            why = self.trouble = f"{type(error).__name__}: {error}"
-        if why:
-            self.gaps.add(t - self.grid.start_time, why)
-            if self.gaps.lasting > _HOPELESS:
-                self.trouble = why
-        return not self.trouble
-
-    def _put(self, t: float, moment: Moment) -> str:
-        """Hand a row to the writer; why that cannot be, or nothing."""
-        try:
-            frames = {track.camera.name: track.frame(t) for track in self._tracks}
-            values = self._sampler.row(t, moment, frames)
-        except StaleStateError as error:
-            return str(error)
-        if self._ring.full and not (self._lock_step and self._wait_for_slot()):
-            return "the writer cannot keep up: the processor or the disk is too slow"
-        slot = self._ring.next()
-        slot.values[:] = values
-        self.pace.add(values)
-        for track, images in zip(self._tracks, slot.images, strict=True):
-            track.fill(frames[track.camera.name], images)
-        self._ring.announce()
-        self._child.notify("row", timeout=_WORD)
-        self.frames += 1
-        self.seconds = t - self.grid.start_time
-        self.gaps.over()
-        return ""
-
-    def _wait_for_slot(self) -> bool:
-        pause = threading.Event()
-        for _ in range(round(_PATIENCE / _STEP)):
-            if not self._ring.full or self._ring.trouble:
-                break
-            self._child.check()
-            pause.wait(_STEP)
-        return not self._ring.full
-
-
-# [devices.py] Which devices of a rig are recorded, and whether they can be.
-
-
-def check_rate(rig: Rig, fps: int) -> None:
-    """Raise CommandError where a simulation in lock-step makes fewer steps than rows are wanted."""
-    if rig.lock_step and fps > (steps := groups_of(rig.plan)[0].rate_hz):
-        raise CommandError(f"fps must be at most {steps:g}, the steps of this simulation in a second, not {fps}")
-
-
-def chosen(
-    rig: Rig, cameras: Collection[str] | None, streams: Collection[str]
-) -> tuple[Sampler, list[CameraTrack], list[str]]:
-    """Return the sampler of every arm and pad, a track per camera of these names, else of all, and notes for a person.
-
-    Raises CommandError for what cannot be recorded, DeviceNotFound, StaleStateError, ConnectionLost.
-    """
-    if unknown := [stream for stream in streams if stream not in ("color", "depth", *MORE_STREAMS)]:
-        known = ", ".join(("color", "depth", *MORE_STREAMS))
-        raise CommandError(f"there is no stream {unknown[0]!r}; streams: {known}")
-    if not rig.robots:
-        raise CommandError("this rig has no arm to record")
-    if odd := [name for name in movable(rig) if "/" in name]:
-        raise CommandError(f"an object's name becomes that of a column, which has no slash: {odd[0]!r}")
-    names = tuple(rig.cameras) if cameras is None else tuple(dict.fromkeys(cameras))
-    tracks, notes = [], []
-    for name in names:
-        track = CameraTrack(rig.cameras[name], streams=streams, lock_step=rig.lock_step)
-        setup = track.setup
-        if setup.videos and (setup.width % 2 or setup.height % 2):
-            size = f"{setup.width}x{setup.height}"
-            raise CommandError(f"a video has even sizes: change cameras.{name}.output, which is {size}")
-        if setup.videos or setup.depths:
-            tracks.append(track)
-        own = rig.cameras[name].spec.streams
-        if left := [stream for stream in own if stream in MORE_STREAMS and stream not in streams]:
-            notes.append(f"camera {name}: {', '.join(left)} not recorded")
-        if missing := [stream for stream in streams if stream in MORE_STREAMS and stream not in own]:
-            notes.append(f"camera {name} has no {', '.join(missing)}")
-    for files in ([track.setup.videos for track in tracks], [track.setup.depths for track in tracks]):
-        file_names = [name for each in files for name in each]
-        if double := [name for name in file_names if file_names.count(name) > 1]:
-            raise CommandError(f"two streams would be called {double[0]}: rename a camera")
-    sampler = Sampler(rig, [track.camera.name for track in tracks])
-    for track in tracks:
-        seq = sampler.place_of(f"{TIMES}camera.{track.camera.name}") + 2
-        track.setup = track.setup._replace(seq=seq)
-    return sampler, tracks, notes
-
-
+"""Pause between two checks of the queue, s."""
+_NOTIFY_TIMEOUT = 1.0
+"""Time that the writer may take to receive a notification, s; it reads them between two rows."""
 _QUEUE = 0.6
-"""s of rows that may wait for the writer."""
+"""Span of rows that may wait for the writer, s."""
 _SAVING = 600.0
-"""s that finishing an episode may take."""
+"""Longest time that finishing an episode may take, s."""
 _FASTEST = 240
+"""Highest rate, rows per second."""
 
 
 class RecorderStatus(NamedTuple):
-    """How it goes."""
+    """State of a recorder."""
 
     state: str
     """``idle``, ``recording`` or ``saving``."""
     episode: int
-    """Number of the present episode, or of the last one; -1 before the first."""
+    """Number of the current episode, or of the last one; -1 before the first."""
     frames: int
-    """Its rows so far."""
+    """Rows recorded in it."""
     seconds: float
-    """Time from its first row to its newest one."""
+    """Time from its first row to its newest one, s."""
     dropped: int
-    """Grid times of which there is no row; the episode's file says when and why."""
+    """Rows that are missing; the episode's file lists when and why."""
     late: int
-    """Grid times that were noticed late. Nothing is missing in those rows."""
+    """Rows whose due time was noticed late. No data is missing in them."""
     free_bytes: int
-    """Free space on the disk."""
+    """Free space on the disk, bytes."""
     trouble: str
-    """What a person should look at; empty where all is well. An episode that cannot go on takes no more rows, and can
-    be saved, or discarded, with those that it has."""
+    """What needs the operator's attention; empty if nothing does. An episode that cannot continue records no more
+    rows, and can be saved or discarded with those that it has."""
 
 
 class Recorder:
-    """Records episodes of ``rig`` into the dataset in the folder ``out``, ``fps`` rows a second.
+    """Records episodes of a rig into a dataset. Nothing is written before :meth:`start`.
 
-    ``cameras`` are the names of those that are kept, else all. ``streams`` are those that are kept of each camera that
-    has them: some of ``color``, ``depth``, ``infrared``, ``infrared_right``, ``segmentation``; ``depth=False`` leaves
-    depth out. ``codec`` is ``h264``, ``av1`` or ``auto``. Below ``warn_free`` bytes of free disk :meth:`status` says
-    so, below ``stop_free`` an episode ends. Nothing is written before :meth:`start`. Use it in a ``with`` statement,
-    inside that of the rig.
+    Use it in a ``with`` statement, inside that of the rig.
 
-    Raises DriverMissing, CommandError for whatever would not work later, StaleStateError, ConnectionLost.
+    Args:
+        rig: An open rig.
+        out: Folder of the dataset; episodes are added to one that exists.
+        fps: Rows per second, 1 to 240; in lock-step at most the simulation's steps per second.
+        task: Description of the task, stored with each episode.
+        depth: False leaves depth out.
+        cameras: Names of the cameras to record; None for all.
+        streams: Streams to record of each camera that has them: some of ``color``, ``depth``, ``infrared``,
+            ``infrared_right``, ``segmentation``.
+        codec: ``h264``, ``av1``, or ``auto`` for the first that is available.
+        warn_free: Free disk space below which :meth:`status` warns, bytes.
+        stop_free: Free disk space below which an episode ends, bytes.
+
+    Raises:
+        DriverMissing: A library is not installed.
+        CommandError: An argument is wrong, or the folder holds another kind of dataset (code ``other_dataset``).
+        DatasetError: The dataset in the folder is damaged.
+        NotSupported: The video library cannot encode ``codec``.
+        StaleStateError: An arm or an object has no current state.
+        ConnectionLost: A device is lost.
     """
 
     def __init__(
@@ -338,24 +120,24 @@ class Recorder:
         warn_free: int = 5_000_000_000,
         stop_free: int = 1_000_000_000,
     ) -> None:
-        require()
+        require_libraries()
         if not (1 <= fps <= _FASTEST and int(fps) == fps):
-            raise CommandError(f"fps must be a whole number from 1 to {_FASTEST}, not {fps!r}")
+            raise CommandError(f"fps must be a whole number from 1 to {_FASTEST}, not {fps!r}", code="bad_fps")
         check_rate(rig, fps)
         self.rig = rig
         self.fps = fps = int(fps)
         self.task = task
-        """Of the episodes to come."""
-        self.root = Layout(out).root
-        self._sampler, self._tracks, self.notes = chosen(
+        """Task of the next episodes."""
+        self.root = DatasetLayout(out).root
+        self._sampler, self._buffers, self.notes = select_devices(
             rig, cameras, [stream for stream in streams if depth or stream != "depth"]
         )
-        """``notes``: what a person should know. What is not kept, what was recovered."""
+        """What the operator should know: streams that are not recorded, episodes that were recovered."""
         self._warn_free = warn_free
-        setups = [track.setup for track in self._tracks]
+        setups = [buffer.setup for buffer in self._buffers]
         width, slots = self._sampler.width, max(4, round(_QUEUE * fps))
-        self._memory = SharedMemory(RowRing.size(width, setups, slots))
-        self._ring = RowRing(self._memory.buffer, width, setups, slots)
+        self._memory = SharedMemory(RowQueue.size(width, setups, slots))
+        self._queue = RowQueue(self._memory.buffer, width, setups, slots)
         self._config = {
             "out": str(self.root),
             "cameras": setups,
@@ -370,7 +152,7 @@ class Recorder:
             self._memory.close()
             raise
         try:
-            encoder = Encoder(*self._child.ready["encoder"])
+            encoder = VideoEncoder(*self._child.ready["encoder"])
             self._about = {
                 "fps": fps,
                 "robot_type": "+".join(robot.spec.model for robot in rig.robots.values()),
@@ -378,20 +160,20 @@ class Recorder:
                 "columns": self._sampler.columns,
                 "cameras_kept": setups,
                 "encoder": encoder,
-                **about_rig(rig),
+                **rig_metadata(rig),
             }
-            check_compatible(Layout(out), self._about["features"], fps, self._about["robot_type"], setups)
+            check_compatible(DatasetLayout(out), self._about["features"], fps, self._about["robot_type"], setups)
         except BaseException:
             self._child.close()
             self._memory.close()
             raise
         self._lock = threading.RLock()
-        self._take: EpisodeRecorder | None = None
-        """The present episode, or the last one."""
-        self._open = False
-        """Is it being recorded?"""
-        self._saving: Saving | None = None
-        """Of the last episode that was saved."""
+        self._current: EpisodeRecorder | None = None
+        """The current episode, or the last one."""
+        self._is_open = False
+        """Whether it is being recorded."""
+        self._saving: BackgroundSave | None = None
+        """Background saving of the last episode that was saved."""
         self._episode = -1
         self._closed = False
 
@@ -406,26 +188,36 @@ class Recorder:
 
     @property
     def episodes(self) -> int:
-        """How many are in the dataset by now, those that are being saved left out."""
-        info = read_index(Layout(self.root))
+        """Number of finished episodes in the dataset."""
+        info = read_index(DatasetLayout(self.root))
         return int(info["total_episodes"]) if info is not None else 0
 
-    # An episode.
-
     def start(self, seed: int | None = None, info: Mapping[str, Any] | None = None) -> None:
-        """Begin an episode. ``seed`` and ``info`` (plain numbers, texts, lists, dicts) are kept with it.
+        """Start an episode. Blocks while the previous one is still being saved.
 
-        Waits for one that is still being saved; where that failed, :attr:`notes` say why. What was left unfinished in
-        the folder is recovered first, see there, too.
+        If that failed, :attr:`notes` has the reason. Unfinished episodes in the folder are recovered first, which
+        :attr:`notes` lists too.
 
-        Raises CommandError (the folder, the disk, what is to be kept), StaleStateError and ConnectionLost (a camera).
+        Args:
+            seed: Random seed, stored with the episode.
+            info: Further metadata, stored with the episode: plain numbers, texts, lists and dicts.
+
+        Raises:
+            CommandError: An episode is open (code ``episode_open``), the recorder is closed (``recorder_closed``),
+                metadata cannot be stored (``bad_metadata``), the disk is full (``disk_full``) or the folder cannot be
+                used.
+            DatasetError: The dataset in the folder is damaged.
+            StaleStateError: A camera has no current picture.
+            ConnectionLost: A camera, or the writer's process, is lost.
         """
-        said = about_call(self.task, seed, info)
+        given = caller_metadata(self.task, seed, info)
         with self._lock:
             if self._closed:
-                raise CommandError("the recorder is closed")
-            if self._open:
-                raise CommandError(f"episode {self._episode} is still being recorded: save or discard it first")
+                raise CommandError("the recorder is closed", code="recorder_closed")
+            if self._is_open:
+                raise CommandError(
+                    f"episode {self._episode} is still being recorded: save or discard it first", code="episode_open"
+                )
             if self._saving is not None:
                 self._saving.wait()
                 if self._saving.error is not None:
@@ -434,100 +226,108 @@ class Recorder:
             if self._child.process.poll() is not None:
                 self._child.close()
                 self._child = self._start_child()
-            take = None
+            episode = None
             try:
-                for track in self._tracks:
-                    track.begin()
-                about = said | about_start(self.rig, self._tracks) | self._about
+                for buffer in self._buffers:
+                    buffer.start()
+                about = given | start_metadata(self.rig, self._buffers) | self._about
                 begun = self._child.request("begin", {"about": about}, _SAVING)
                 self.notes.extend(begun["notes"])
                 self._episode = begun["episode"]
-                take = EpisodeRecorder(self.rig, self.fps, self._sampler, self._tracks, self._ring, self._child)
-                take.start()
+                episode = EpisodeRecorder(self.rig, self.fps, self._sampler, self._buffers, self._queue, self._child)
+                episode.start()
             except BaseException:
-                if take is not None:
-                    take.stop()
-                self._end_tracks()
+                if episode is not None:
+                    episode.stop()
+                self._stop_cameras()
                 raise
-            self._take, self._open = take, True
+            self._current, self._is_open = episode, True
 
     def status(self) -> RecorderStatus:
-        """How it goes; never waits."""
-        take, saving = self._take, self._saving
+        """Return the current state. Never blocks."""
+        episode, saving = self._current, self._saving
         busy = saving is not None and not saving.done
-        state = "saving" if busy else "recording" if self._open else "idle"
-        free = self._ring.free_bytes or int(self._child.ready["free_bytes"])
+        state = "saving" if busy else "recording" if self._is_open else "idle"
+        free = self._queue.free_bytes or int(self._child.ready["free_bytes"])
         failure = saving.error if saving is not None else None
-        trouble = str(failure or (take.trouble if take is not None else ""))
+        trouble = str(failure or (episode.trouble if episode is not None else ""))
         if not trouble and free < self._warn_free:
             trouble = f"only {free / 1e9:.1f} GB are free on the disk of {self.root}"
-        if not trouble and take is not None:
-            trouble = take.pace.trouble
-        if take is None:
+        if not trouble and episode is not None:
+            trouble = episode.pace.trouble
+        if episode is None:
             return RecorderStatus(state, self._episode, 0, 0.0, 0, 0, free, trouble)
-        counts = take.frames, take.seconds, take.gaps.rows, take.grid.late
+        counts = episode.frames, episode.seconds, episode.dropped.rows, episode.clock.late
         return RecorderStatus(state, self._episode, *counts, free, trouble)
 
     def save(self, success: bool | None = None, wait: bool = False) -> None:
-        """End the episode with the rows until now and make it part of the dataset, in the background unless ``wait``.
+        """End the episode now and make it part of the dataset.
 
-        ``success`` is the mark that it gets; it is written at once and stays where the writer is killed. Until the
-        episode is saved ``status().state`` is ``saving``; where that fails, ``status().trouble`` says why,
-        :meth:`wait_saved` raises it, and the next :meth:`start`, or :func:`~hal.recording.recover`, tries it again.
+        Until it is saved ``status().state`` is ``saving``. If saving fails in the background, ``status().trouble`` has
+        the reason, :meth:`wait_saved` raises it, and the next :meth:`start`, or :func:`~hal.recording.recover`, tries
+        again.
+
+        Args:
+            success: Mark of the episode; written at once, so that it survives if the writer is killed.
+            wait: Block until the episode is saved.
+
+        Raises:
+            CommandError: No episode is open (code ``no_episode``); with ``wait``, no row was recorded (``no_rows``).
+            HalError: With ``wait``: it cannot be saved now (code ``save_failed``).
         """
         with self._lock:
-            take, partial = self._end(), Layout(self.root).partial(self._episode)
-            saving = self._saving = Saving(lambda: self._save(take, partial, success))
+            episode, partial = self._end(), DatasetLayout(self.root).partial(self._episode)
+            saving = self._saving = BackgroundSave(lambda: self._save(episode, partial, success))
         if wait:
             saving.result()
 
     def wait_saved(self) -> None:
-        """Wait until the last episode is saved; raises what kept it from that."""
+        """Block until the last episode is saved. Raises the error that prevented it."""
         saving = self._saving
         if saving is not None:
             saving.result()
 
-    def _save(self, take: EpisodeRecorder, partial: Path, success: bool | None) -> None:
+    def _save(self, episode: EpisodeRecorder, partial: Path, success: bool | None) -> None:
         if success is not None:
-            keep_mark(partial, success)
-        take.stop()
-        self._end_tracks()
-        if self._child.request("save", {"closing": take.closing(success)}, _SAVING) is None:
-            why = take.gaps.why or "it ended at once"
-            raise CommandError(f"nothing was recorded, so there is nothing to save: {why}")
+            write_mark(partial, success)
+        episode.stop()
+        self._stop_cameras()
+        if self._child.request("save", {"closing": episode.final_metadata(success)}, _SAVING) is None:
+            why = episode.dropped.why or "it ended at once"
+            raise CommandError(f"no row was recorded, so there is nothing to save: {why}", code="no_rows")
 
     def discard(self) -> None:
-        """End the episode and remove it."""
+        """End the episode and delete it. Raises CommandError if none is open (code ``no_episode``)."""
         with self._lock:
             self._end().stop()
-            self._end_tracks()
+            self._stop_cameras()
             try:
                 self._child.request("discard", {}, _SAVING)
-            except ConnectionLost:  # the writer is gone, and its lock with it
-                layout = Layout(self.root)
-                with locked(layout):
+            except ConnectionLost:  # the writer has ended, and released its lock
+                layout = DatasetLayout(self.root)
+                with lock_dataset(layout):
                     if (partial := layout.partial(self._episode)).exists():
                         layout.remove(partial)
 
     def _end(self) -> EpisodeRecorder:
-        """The episode that is open ends here and now, whatever is still to be done with it."""
-        if self._take is None or not self._open:
-            raise CommandError("no episode is being recorded: call start first")
-        self._open = False
-        self._take.end()
-        return self._take
+        """End the open episode now, and return it to be saved or discarded."""
+        if self._current is None or not self._is_open:
+            raise CommandError("no episode is being recorded: call start first", code="no_episode")
+        self._is_open = False
+        self._current.end()
+        return self._current
 
-    def _end_tracks(self) -> None:
-        for track in self._tracks:
-            track.end()
+    def _stop_cameras(self) -> None:
+        for buffer in self._buffers:
+            buffer.stop()
 
     def close(self) -> None:
-        """End the writer. An episode that is still open is kept, unmarked. Idempotent."""
+        """End the writer's process. An episode that is still open is saved without a mark. Idempotent."""
         with self._lock:
             if self._closed:
                 return
             self._closed = True
-            if self._open:
+            if self._is_open:
                 self.save()
             if self._saving is not None:
                 self._saving.wait()
@@ -541,3 +341,233 @@ class Recorder:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.close()
+
+
+class EpisodeRecorder:
+    """Makes the rows of one episode, from :meth:`start` to :meth:`end`."""
+
+    def __init__(
+        self, rig: Rig, fps: int, sampler: RowSampler, buffers: Sequence[CameraBuffer], queue: RowQueue, child: Child
+    ) -> None:
+        self.frames = 0
+        """Rows recorded."""
+        self.seconds = 0.0
+        """Time from the first row to the newest one, s."""
+        self.trouble = ""
+        """Why no more rows are recorded; empty while they are."""
+        self.dropped = DroppedRows(fps)
+        in_world = {robot.name for robot in rig.robots.values() if stands_in_world(rig, robot)}
+        self.pace = ClockPace(() if rig.lock_step else sampler.columns, in_world)
+        self._lock_step = rig.lock_step
+        self._sampler = sampler
+        self._buffers = buffers
+        self._queue = queue
+        self._child = child
+        clock = LockStepSampleClock if rig.lock_step else RealTimeSampleClock
+        self.clock: SampleClock = clock(rig.clock, fps, self._read, self._make)
+
+    def start(self) -> None:
+        """Record the first row, of the present time, and start the clock."""
+        self.clock.start()
+
+    def end(self) -> None:
+        """Stop reading; rows that are due are still made. Idempotent."""
+        self.clock.end()
+
+    def stop(self) -> None:
+        """Stop reading, and block until the writer has received every row."""
+        self.clock.stop()
+
+    def final_metadata(self, success: bool | None) -> dict[str, Any]:
+        """Return the metadata that is known at the end of the episode."""
+        return {
+            "success": success,
+            "recovered": False,
+            "dropped": self.dropped.rows,
+            "late": self.clock.late,
+            "gaps": self.dropped.as_json(),
+            "repeated": {buffer.camera.name: buffer.repeated for buffer in self._buffers},
+            "trouble": self.trouble,
+        }
+
+    def _read(self) -> RowSnapshot | Exception:
+        try:
+            return self._sampler.read_snapshot()
+        except Exception as error:  # raised when the row is made
+            return error
+
+    def _make(self, t: float, snapshot: RowSnapshot | Exception) -> bool:
+        """Make the row that was due at ``t``, or count it as dropped. Return False if the episode cannot continue."""
+        try:
+            if isinstance(snapshot, Exception):
+                raise snapshot
+            self._child.check()
+            self.trouble = self._queue.trouble
+            why = self.trouble or self._send(t, snapshot)
+        except (HalError, ValueError) as error:
+            why = self.trouble = str(error)
+        except Exception as error:  # no row may be lost without a reason
+            why = self.trouble = f"{type(error).__name__}: {error}"
+        if why:
+            self.dropped.add(t - self.clock.start_time, why)
+            if self.dropped.lasting > _GIVE_UP:
+                self.trouble = why
+        return not self.trouble
+
+    def _send(self, t: float, snapshot: RowSnapshot) -> str:
+        """Send a row to the writer. Return the reason if that is impossible, or an empty text."""
+        try:
+            frames = {buffer.camera.name: buffer.frame(t) for buffer in self._buffers}
+            values = self._sampler.row(t, snapshot, frames)
+        except StaleStateError as error:
+            return str(error)
+        if self._queue.is_full and not (self._lock_step and self._wait_for_slot()):
+            return "the writer cannot keep up: the processor or the disk is too slow"
+        slot = self._queue.open_slot()
+        slot.values[:] = values
+        self.pace.add(values)
+        for buffer, images in zip(self._buffers, slot.images, strict=True):
+            buffer.copy_into(frames[buffer.camera.name], images)
+        self._queue.publish()
+        self._child.notify("row", timeout=_NOTIFY_TIMEOUT)
+        self.frames += 1
+        self.seconds = t - self.clock.start_time
+        self.dropped.row_made()
+        return ""
+
+    def _wait_for_slot(self) -> bool:
+        pause = threading.Event()
+        for _ in range(round(_WRITER_PATIENCE / _STEP)):
+            if not self._queue.is_full or self._queue.trouble:
+                break
+            self._child.check()
+            pause.wait(_STEP)
+        return not self._queue.is_full
+
+
+class DroppedRows:
+    """Rows of one episode that could not be made; neighbours with the same cause form one gap."""
+
+    def __init__(self, fps: int) -> None:
+        self.rows = 0
+        """Number of missing rows."""
+        self.lasting = 0.0
+        """Time since the last row that could be made, s."""
+        self.why = ""
+        """The newest reason."""
+        self._fps = fps
+        self._found: list[dict[str, Any]] = []
+        self._is_open = False
+
+    def add(self, t: float, why: str) -> None:
+        """Count the row at ``t``, s since the episode's first one, as dropped."""
+        self.rows += 1
+        self.lasting += 1.0 / self._fps
+        self.why = why
+        if not self._is_open:
+            self._found.append({"from_s": round(t, 6), "rows": 0, "why": why})
+            self._is_open = True
+        self._found[-1]["rows"] += 1
+        self._found[-1]["to_s"] = round(t, 6)
+
+    def row_made(self) -> None:
+        """End the current gap."""
+        self._is_open = False
+        self.lasting = 0.0
+
+    def as_json(self) -> list[dict[str, Any]]:
+        """Return the gaps as the episode's file lists them."""
+        return self._found
+
+
+class BackgroundSave:
+    """Runs ``work`` in a thread that the program waits for at its end; logs an error and keeps it."""
+
+    def __init__(self, work: Callable[[], None]) -> None:
+        self.error: Exception | None = None
+        self._work = work
+        self._thread = threading.Thread(target=self._run, name="hal-recorder-save")
+        self._thread.start()
+
+    def _run(self) -> None:
+        try:
+            self._work()
+        except Exception as error:
+            self.error = error
+            _LOG.warning("%s", error)
+
+    @property
+    def done(self) -> bool:
+        """Whether it has finished, successfully or not."""
+        return not self._thread.is_alive()
+
+    def wait(self) -> None:
+        """Block until it has finished."""
+        self._thread.join()
+
+    def result(self) -> None:
+        """Block until it has finished, and raise its error, if any."""
+        self.wait()
+        if self.error is not None:
+            raise self.error
+
+
+def check_rate(rig: Rig, fps: int) -> None:
+    """Raise CommandError if a lock-step simulation makes fewer steps per second than ``fps``."""
+    if rig.lock_step and fps > (steps := groups_of(rig.plan)[0].rate_hz):
+        raise CommandError(
+            f"fps must be at most {steps:g}, the steps of this simulation per second, not {fps}", code="bad_fps"
+        )
+
+
+def select_devices(
+    rig: Rig, cameras: Collection[str] | None, streams: Collection[str]
+) -> tuple[RowSampler, list[CameraBuffer], list[str]]:
+    """Return what is recorded of a rig.
+
+    Args:
+        rig: An open rig.
+        cameras: Names of the cameras; None for all.
+        streams: Streams to record of the cameras that have them.
+
+    Returns:
+        The sampler of all arms and pads, a buffer per camera, and notes for the operator.
+
+    Raises:
+        CommandError: Something cannot be recorded.
+        StaleStateError: The state of an arm is not available.
+        ConnectionLost: A device is lost.
+    """
+    if unknown := [stream for stream in streams if stream not in ("color", "depth", *MORE_STREAMS)]:
+        known = ", ".join(("color", "depth", *MORE_STREAMS))
+        raise CommandError(f"there is no stream {unknown[0]!r}; streams: {known}", code="unknown_stream")
+    if not rig.robots:
+        raise CommandError("this rig has no arm to record", code="no_arm")
+    if odd := [name for name in movable_objects(rig) if "/" in name]:
+        raise CommandError(f"the name of an object must not contain a slash: {odd[0]!r}", code="bad_name")
+    names = tuple(rig.cameras) if cameras is None else tuple(dict.fromkeys(cameras))
+    buffers, notes = [], []
+    for name in names:
+        buffer = CameraBuffer(rig.cameras[name], streams=streams, lock_step=rig.lock_step)
+        setup = buffer.setup
+        if setup.videos and (setup.width % 2 or setup.height % 2):
+            size = f"{setup.width}x{setup.height}"
+            raise CommandError(
+                f"the size of a video must be even: change cameras.{name}.output, which is {size}", code="odd_size"
+            )
+        if setup.videos or setup.depths:
+            buffers.append(buffer)
+        own = rig.cameras[name].spec.streams
+        if left := [stream for stream in own if stream in MORE_STREAMS and stream not in streams]:
+            notes.append(f"camera {name}: {', '.join(left)} not recorded")
+        if missing := [stream for stream in streams if stream in MORE_STREAMS and stream not in own]:
+            notes.append(f"camera {name} has no {', '.join(missing)}")
+    for files in ([buffer.setup.videos for buffer in buffers], [buffer.setup.depths for buffer in buffers]):
+        file_names = [name for each in files for name in each]
+        if double := [name for name in file_names if file_names.count(name) > 1]:
+            raise CommandError(f"two streams would be called {double[0]}: rename a camera", code="duplicate_name")
+    sampler = RowSampler(rig, [buffer.camera.name for buffer in buffers])
+    for buffer in buffers:
+        seq = sampler.place_of(f"{TIMES}camera.{buffer.camera.name}") + 2
+        buffer.setup = buffer.setup._replace(seq=seq)
+    return sampler, buffers, notes

@@ -1,4 +1,4 @@
-"""One episode on one sheet: pictures in time, what the arms did when, every joint as commanded and as measured."""
+"""Review of a dataset: its statistics, and a sheet per episode with pictures, status, and every joint over time."""
 
 from __future__ import annotations
 
@@ -17,37 +17,38 @@ from PIL import Image, ImageDraw, ImageFont
 from ..errors import DatasetError
 from ..types import Limited, RobotStatus, Trip
 from .dataset import Dataset, Episode
-from .exporters.content import Arm, EpisodeContent, Pictures
-from .layout import ACTION, SETPOINT, STATE, simulated_pace
+from .exporters.content import ArmColumns, EpisodeContent, PictureStream
+from .layout import ACTION, SETPOINT, STATE
+from .metadata import simulated_pace
 
 __all__ = [
     "BLACK",
-    "Canvas",
+    "SheetCanvas",
     "Colour",
-    "EpisodeLine",
+    "EpisodeSummary",
     "GREY",
     "LIGHT",
-    "Spread",
-    "Summary",
-    "Timing",
-    "as_json",
+    "ColumnSpread",
+    "DatasetSummary",
+    "SourceTiming",
+    "summary_as_json",
     "draw_sheet",
-    "summary",
+    "summarize",
     "ticks",
 ]
 
-# [canvas.py] A picture to draw curves and words on, with nothing but Pillow.
+# Drawing.
 
 Colour = tuple[int, int, int]
 BLACK: Colour = (30, 30, 30)
 GREY: Colour = (120, 120, 120)
 LIGHT: Colour = (225, 225, 225)
 _FINE = 3
-"""Shapes are drawn so many times larger, and scaled down, so that slanted lines are smooth."""
+"""Scale at which shapes are drawn before they are scaled down, so that slanted lines are smooth."""
 
 
-class Canvas:
-    """White. Places are in pixels from the upper left corner."""
+class SheetCanvas:
+    """A white picture to draw on with Pillow alone. Coordinates are in pixels from the upper left corner."""
 
     def __init__(self, width: int, height: int) -> None:
         self.width, self.height = width, height
@@ -57,32 +58,32 @@ class Canvas:
         self._photos: list[tuple[int, int, Image.Image]] = []
 
     def line(self, points: Sequence[tuple[float, float]], colour: Colour, width: float = 1.0) -> None:
-        """From point to point."""
+        """Draw a line from point to point."""
         if len(points) > 1:
             fine = [(x * _FINE, y * _FINE) for x, y in points]
             self._draw.line(fine, fill=colour, width=round(width * _FINE), joint="curve")
 
     def box(self, x: float, y: float, width: float, height: float, colour: Colour) -> None:
-        """A filled rectangle, one pixel wide at least."""
+        """Draw a filled rectangle, at least one pixel wide."""
         right, bottom = x + max(1.0, width), y + max(1.0, height)
         self._draw.rectangle((x * _FINE, y * _FINE, right * _FINE - 1, bottom * _FINE - 1), fill=colour)
 
     def text(self, x: float, y: float, words: str, size: int = 13, colour: Colour = BLACK, anchor: str = "la") -> None:
-        """Words; ``anchor`` is Pillow's: left, middle or right, then ascender, middle or baseline."""
+        """Draw a text; ``anchor`` is Pillow's: left, middle or right, then ascender, middle or baseline."""
         self._words.append((x, y, words, size, colour, anchor))
 
     def photo(self, x: int, y: int, picture: NDArray[np.uint8], width: int, height: int) -> None:
-        """A picture (H, W, 3) RGB, scaled."""
+        """Draw a picture (H, W, 3) RGB, scaled."""
         image = Image.fromarray(picture).resize((width, height), Image.Resampling.BOX)
         self._photos.append((x, y, image))
 
     @staticmethod
     def length(words: str, size: int = 13) -> float:
-        """How wide these words are."""
+        """Return the width of a text, pixels."""
         return float(_font(size).getlength(words))
 
-    def finished(self) -> Image.Image:
-        """The picture."""
+    def image(self) -> Image.Image:
+        """Return the picture."""
         image = self._fine.resize((self.width, self.height), Image.Resampling.BOX)
         for left, top, photo in self._photos:
             image.paste(photo, (left, top))
@@ -97,7 +98,7 @@ def _font(size: int) -> Any:
 
 
 def ticks(low: float, high: float, most: int) -> list[float]:
-    """Round numbers in a range, at most so many."""
+    """Return round numbers in a range, at most ``most``."""
     span = high - low
     for exponent in range(-9, 10):
         for mantissa in (1.0, 2.0, 5.0):
@@ -109,16 +110,15 @@ def ticks(low: float, high: float, most: int) -> list[float]:
     return [low, high]
 
 
-# [summary.py] What a dataset is like, in numbers: how much, how well it went, how the joints moved, how even the
-# times are.
+# Summary of a dataset.
 
 _WATCHED = ("robot.", "gripper.", "camera.")
-"""Sources that measure all the time; a pad speaks when it is touched."""
+"""Sources that measure continuously; a pad reports only changes."""
 
 
 @dataclass(frozen=True)
-class Spread:
-    """One number of a column, over all rows: rad, or m of a gripper's width."""
+class ColumnSpread:
+    """Statistics of one number of a column over all rows: rad, or m of a gripper's width."""
 
     name: str
     min: float
@@ -128,25 +128,25 @@ class Spread:
 
 
 @dataclass(frozen=True)
-class Timing:
-    """How even the true times of a source are, ms."""
+class SourceTiming:
+    """Regularity of the true times of a source, ms."""
 
     source: str
     period: float
     """Mean time between two samples that differ."""
     jitter: float
-    """Standard deviation of that."""
+    """Standard deviation of the period."""
     longest: float
     age: float
-    """How old a sample was when its row was due, on average."""
+    """Mean age of a sample when its row was due."""
     oldest: float
     repeated: int
     """Rows with the same sample as the row before."""
 
 
 @dataclass(frozen=True)
-class EpisodeLine:
-    """One episode."""
+class EpisodeSummary:
+    """One episode in numbers."""
 
     number: int
     rows: int
@@ -154,21 +154,21 @@ class EpisodeLine:
     success: bool | None
     dropped: int
     trips: int
-    """How often a stop was latched in it."""
+    """Number of stops that were latched."""
     task: str
     trouble: str
     pace: float | None
-    """How fast a simulation's time passed, as a share of real time; None in lock-step, and without one."""
+    """Pace of a simulation as a share of real time; None in lock-step, and without a simulation."""
 
 
 @dataclass(frozen=True)
-class Summary:
-    """All of a dataset, or of the episodes that were asked for."""
+class DatasetSummary:
+    """A dataset, or some of its episodes, in numbers."""
 
     path: str
     fps: int
     robot_type: str
-    episodes: list[EpisodeLine]
+    episodes: list[EpisodeSummary]
     rows: int
     seconds: float
     successes: int
@@ -176,16 +176,16 @@ class Summary:
     unmarked: int
     dropped: int
     bytes: int
-    state: list[Spread]
-    action: list[Spread]
-    timing: list[Timing]
+    state: list[ColumnSpread]
+    action: list[ColumnSpread]
+    timing: list[SourceTiming]
     broken: list[str] = field(default_factory=list)
-    """Episodes that cannot be read, and why."""
+    """Errors of episodes that cannot be read."""
 
 
-def summary(dataset: Dataset, episodes: Iterable[Episode] | None = None) -> Summary:
-    """Read every row of these episodes, else of all. Pictures are counted, not decoded."""
-    lines: list[EpisodeLine] = []
+def summarize(dataset: Dataset, episodes: Iterable[Episode] | None = None) -> DatasetSummary:
+    """Read every row of these episodes, or of all, and return their statistics. Pictures are counted, not decoded."""
+    lines: list[EpisodeSummary] = []
     broken: list[str] = []
     states, actions = _Moments(), _Moments()
     names: list[str] = []
@@ -205,7 +205,7 @@ def summary(dataset: Dataset, episodes: Iterable[Episode] | None = None) -> Summ
         for source, stamp in stamps.items():
             if source.startswith(_WATCHED):
                 times.setdefault(source, _Times()).add(stamp, stamps["grid"])
-    return Summary(
+    return DatasetSummary(
         path=str(dataset.root),
         fps=dataset.fps,
         robot_type=str(dataset.info.get("robot_type")),
@@ -224,8 +224,8 @@ def summary(dataset: Dataset, episodes: Iterable[Episode] | None = None) -> Summ
     )
 
 
-def as_json(found: Summary) -> str:
-    """As one JSON object; what is not known is null."""
+def summary_as_json(found: DatasetSummary) -> str:
+    """Return a summary as one JSON object; unknown numbers are null."""
 
     def plain(value: Any) -> Any:
         if isinstance(value, float):
@@ -239,14 +239,14 @@ def as_json(found: Summary) -> str:
     return json.dumps(plain(asdict(found)), indent=2)
 
 
-def _line(episode: Episode) -> EpisodeLine:
+def _line(episode: Episode) -> EpisodeSummary:
     status, names = episode.columns["observation.status"], episode.names("observation.status")
     trips = 0
     for k, name in enumerate(names):
         if name.split(".")[-1] == "trip":
             tripped = status[:, k] != 0
             trips += int(tripped[0]) + int(np.sum(tripped[1:] & ~tripped[:-1]))
-    return EpisodeLine(
+    return EpisodeSummary(
         number=episode.number,
         rows=episode.length,
         seconds=float(np.ptp(episode.stamps["grid"])) + 1.0 / episode.fps,
@@ -264,7 +264,7 @@ def _bytes(folder: Path) -> int:
 
 
 class _Moments:
-    """Least, most, mean and spread of columns that come in parts. What was not known (NaN) does not count."""
+    """Least, greatest, mean and standard deviation of columns that are added in parts, without unknown values (NaN)."""
 
     def __init__(self) -> None:
         self._parts: list[NDArray[np.float64]] = []
@@ -272,11 +272,11 @@ class _Moments:
     def add(self, values: NDArray[Any]) -> None:
         self._parts.append(np.asarray(values, np.float64))
 
-    def spreads(self, names: list[str]) -> list[Spread]:
+    def spreads(self, names: list[str]) -> list[ColumnSpread]:
         if not self._parts:
             return []
         table = np.concatenate(self._parts)
-        return [Spread(name, *_of(table[:, k])) for k, name in enumerate(names)]
+        return [ColumnSpread(name, *_of(table[:, k])) for k, name in enumerate(names)]
 
 
 def _of(values: NDArray[np.float64]) -> Iterator[float]:
@@ -286,7 +286,7 @@ def _of(values: NDArray[np.float64]) -> Iterator[float]:
 
 
 class _Times:
-    """Of one source."""
+    """Times of one source."""
 
     def __init__(self) -> None:
         self._periods: list[NDArray[np.float64]] = []
@@ -300,11 +300,11 @@ class _Times:
         self._periods.append(steps[steps != 0.0])
         self._ages.append((grid - stamps)[known])
 
-    def timing(self, source: str) -> Timing:
+    def timing(self, source: str) -> SourceTiming:
         periods, ages = np.concatenate(self._periods) * 1e3, np.concatenate(self._ages) * 1e3
         _, longest, period, jitter = _of(periods)
         _, oldest, age, _ = _of(ages)
-        return Timing(source, period, jitter, longest, age, oldest, self._repeated)
+        return SourceTiming(source, period, jitter, longest, age, oldest, self._repeated)
 
 
 _WIDTH, _MARGIN = 1600, 40
@@ -332,8 +332,8 @@ class _Curve(NamedTuple):
     measured: NDArray[np.float64]
     commanded: NDArray[np.float64]
     least: float
-    """The axis spans no less, so that noise does not look like motion."""
-    arm: Arm
+    """Smallest span of the axis, so that noise does not look like motion."""
+    arm: ArmColumns
 
 
 class _Run(NamedTuple):
@@ -345,7 +345,7 @@ class _Run(NamedTuple):
 
 
 def draw_sheet(episode: Episode) -> Image.Image:
-    """The sheet, 1600 pixels wide. Errors are those of reading the episode."""
+    """Return the sheet of an episode, 1600 pixels wide. Errors are those of reading the episode."""
     content = EpisodeContent(episode)
     streams = [stream for stream in content.pictures if stream.what == "rgb"]
     curves = list(_curves(content))
@@ -353,16 +353,16 @@ def draw_sheet(episode: Episode) -> Image.Image:
     heights = [round(photo * stream.shape[0] / stream.shape[1]) for stream in streams]
     rows = (len(curves) + 1) // 2
     height = 96 + sum(each + 30 for each in heights) + 70 + len(content.arms) * 44 + rows * (_PANEL + 40) + 20
-    canvas = Canvas(_WIDTH, height)
+    canvas = SheetCanvas(_WIDTH, height)
     y = _title(canvas, content)
     for stream, each in zip(streams, heights, strict=True):
         y = _photos(canvas, content, stream, y, photo, each)
     y = _statuses(canvas, content, y)
     _panels(canvas, content, curves, y)
-    return canvas.finished()
+    return canvas.image()
 
 
-def _title(canvas: Canvas, content: EpisodeContent) -> float:
+def _title(canvas: SheetCanvas, content: EpisodeContent) -> float:
     episode = content.episode
     info = episode.info
     mark = {True: "success", False: "failure", None: "not marked"}[episode.success]
@@ -377,8 +377,10 @@ def _title(canvas: Canvas, content: EpisodeContent) -> float:
     return 104
 
 
-def _photos(canvas: Canvas, content: EpisodeContent, stream: Pictures, y: float, width: int, height: int) -> float:
-    """Pictures evenly in time, the first and the last among them."""
+def _photos(
+    canvas: SheetCanvas, content: EpisodeContent, stream: PictureStream, y: float, width: int, height: int
+) -> float:
+    """Draw pictures evenly spaced in time, the first and the last among them."""
     shown = np.unique(np.linspace(0, content.rows - 1, _PHOTOS).round().astype(int)).tolist()
     canvas.text(_MARGIN, y, stream.camera, 14)
     place = 0
@@ -391,10 +393,7 @@ def _photos(canvas: Canvas, content: EpisodeContent, stream: Pictures, y: float,
     return y + height + 30
 
 
-# What the arms did when.
-
-
-def _statuses(canvas: Canvas, content: EpisodeContent, y: float) -> float:
+def _statuses(canvas: SheetCanvas, content: EpisodeContent, y: float) -> float:
     y = _legend(canvas, content, y) + 6
     for arm in content.arms:
         status = content.of(arm, "observation.status").astype(int)
@@ -414,7 +413,7 @@ def _statuses(canvas: Canvas, content: EpisodeContent, y: float) -> float:
     return y + 8
 
 
-def _legend(canvas: Canvas, content: EpisodeContent, y: float) -> float:
+def _legend(canvas: SheetCanvas, content: EpisodeContent, y: float) -> float:
     x: float = _MARGIN
     there = {int(value) for arm in content.arms for value in content.of(arm, "observation.status")[:, 0]}
     limited = Limited(0)
@@ -432,16 +431,16 @@ def _legend(canvas: Canvas, content: EpisodeContent, y: float) -> float:
     return y + 20
 
 
-def _limits(content: EpisodeContent, arm: Arm) -> NDArray[np.int64]:
+def _limits(content: EpisodeContent, arm: ArmColumns) -> NDArray[np.int64]:
     return content.of(arm, "observation.status")[:, 2].astype(np.int64)
 
 
-def _trips(content: EpisodeContent, arm: Arm) -> NDArray[np.int64]:
+def _trips(content: EpisodeContent, arm: ArmColumns) -> NDArray[np.int64]:
     return content.of(arm, "observation.status")[:, 1].astype(np.int64)
 
 
 def _runs(content: EpisodeContent, values: NDArray[np.int64]) -> Iterator[_Run]:
-    """Each lasts until the next one begins."""
+    """Yield the runs of equal values; each lasts until the next one begins."""
     edges = [0, *(np.flatnonzero(np.diff(values)) + 1).tolist(), len(values)]
     times = [*content.grid.tolist(), _end(content)]
     for first, after in pairwise(edges):
@@ -453,12 +452,9 @@ def _end(content: EpisodeContent) -> float:
 
 
 def _span(content: EpisodeContent, run: _Run, left: float = _MARGIN, width: float = _INSIDE) -> tuple[float, float]:
-    """Where a run begins, and how wide it is, on an axis from ``left`` on."""
+    """Return start and width of a run on an axis that begins at ``left``."""
     scale = width / _end(content)
     return left + run.start * scale, (run.end - run.start) * scale
-
-
-# Joints and grippers.
 
 
 def _curves(content: EpisodeContent) -> Iterator[_Curve]:
@@ -472,14 +468,14 @@ def _curves(content: EpisodeContent) -> Iterator[_Curve]:
             yield _Curve(f"{lead}gripper, mm", width * 1e3, target * 1e3, 2.0, arm)
 
 
-def _panels(canvas: Canvas, content: EpisodeContent, curves: list[_Curve], y: float) -> None:
+def _panels(canvas: SheetCanvas, content: EpisodeContent, curves: list[_Curve], y: float) -> None:
     column = (_INSIDE - _GUTTER) / 2
     for k, curve in enumerate(curves):
         left = _MARGIN + (k % 2) * (column + _GUTTER) + _LEFT
         _panel(canvas, content, curve, left, y + (k // 2) * (_PANEL + 40) + 16, column - _LEFT)
 
 
-def _panel(canvas: Canvas, content: EpisodeContent, curve: _Curve, left: float, top: float, width: float) -> None:
+def _panel(canvas: SheetCanvas, content: EpisodeContent, curve: _Curve, left: float, top: float, width: float) -> None:
     canvas.text(left, top - 4, curve.title, 13, BLACK, "ls")
     canvas.box(left, top, width, _PANEL, (250, 250, 250))
     for flags, colour in ((_limits(content, curve.arm), _HELD_BACK), (_trips(content, curve.arm), _STOPPED)):
@@ -517,7 +513,7 @@ def _range(curve: _Curve) -> tuple[float, float]:
 
 
 def _known(values: NDArray[np.float64]) -> Iterator[list[int]]:
-    """Stretches of rows that hold a number."""
+    """Yield runs of rows that hold a number."""
     part: list[int] = []
     for k, known in enumerate(np.isfinite(values).tolist()):
         if known:

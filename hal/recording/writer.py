@@ -1,7 +1,7 @@
-"""The process that writes an episode: it encodes, compresses and appends, so that neither the app nor a servo waits.
+"""The process that writes episodes: it encodes, compresses and appends, so that neither the app nor a servo waits.
 
-When the app is gone it writes what still lies in the queue, closes the files and ends: nothing of what was recorded
-before is lost. When the disk fails it says so, closes what it has, and writes no more.
+If the app ends unexpectedly, the process writes the rows that are left in the queue, closes the files and exits:
+nothing recorded before is lost. If the disk fails, it reports that, closes what it has, and writes no more.
 """
 
 from __future__ import annotations
@@ -16,37 +16,36 @@ from typing import Any
 from ..errors import CommandError, HalError
 from ..host.process import Channel, SharedMemory, serve
 from ..host.scheduling import yield_to_others
+from .checking import check_compatible
 from .codecs import choose_encoder
-from .dataset import check_compatible
 from .finish import CLOSING, finalise, recover_all
-from .index import check_next, read_index
-from .layout import CameraSetup, Layout, locked, require, write_json
-from .live import RESERVE, LiveFolder
-from .ring import RowRing
+from .index import check_next_episode, read_index
+from .layout import CameraSetup, DatasetLayout, lock_dataset, require_libraries, write_json
+from .live import RESERVE, LiveFolder, RowQueue
 
 __all__ = ["free_bytes", "main"]
 
 _NICE = 2
-"""After the servo, before the renderer: a picture that is drawn late is late, a row that is not written is lost."""
-_WAIT = 0.2
-"""s without a word from the app after which the disk is looked at all the same."""
-_LOOK = 1.0
-"""s between two looks at the disk."""
+"""Niceness, between the servo's and the renderer's: a late picture is late, a row that is not written is lost."""
+_IDLE_TIMEOUT = 0.2
+"""Time without a message from the app after which the disk is checked, s."""
+_CHECK_PERIOD = 1.0
+"""Time between two checks of the disk, s."""
 
 
-class Writer:
+class EpisodeWriter:
     """Serves one recorder."""
 
     def __init__(self, channel: Channel, memory: SharedMemory, config: dict[str, Any]) -> None:
         self.channel = channel
-        self.layout = Layout(config["out"])
+        self.layout = DatasetLayout(config["out"])
         cameras = [CameraSetup(*camera) for camera in config["cameras"]]
-        self.ring = RowRing(memory.buffer, config["width"], cameras, config["slots"])
+        self.queue = RowQueue(memory.buffer, config["width"], cameras, config["slots"])
         self.width: int = config["width"]
         self.stop_free: int = config["stop_free"]
         self.live: LiveFolder | None = None
         self.failed = False
-        self._looked = 0.0
+        self._checked_at = 0.0
         self._lock = contextlib.ExitStack()
 
     def run(self) -> None:
@@ -67,34 +66,34 @@ class Writer:
 
     def _drain_and_wait(self) -> float:
         self.drain()
-        return _WAIT
+        return _IDLE_TIMEOUT
 
     # Rows.
 
     def drain(self) -> None:
-        """Write every row that waits."""
-        while (slot := self.ring.oldest()) is not None:
+        """Write every row in the queue."""
+        while (slot := self.queue.oldest()) is not None:
             if self.live is not None and not self.failed:
                 try:
                     self.live.add(slot)
-                except Exception as error:  # a disk that is full, and whatever an encoder makes of that
-                    self._fail(f"{self.layout.root} does not take it any more: {error}")
-            self.ring.used()
-            self._look()
-        self._look()
+                except Exception as error:  # a full disk, in any form in which an encoder reports it
+                    self._fail(f"{self.layout.root} cannot be written any more: {error}")
+            self.queue.release_oldest()
+            self._check_disk()
+        self._check_disk()
 
-    def _look(self) -> None:
-        """At the disk, now and then."""
+    def _check_disk(self) -> None:
+        """Check the folder and the free space, at most once per :data:`_CHECK_PERIOD`."""
         now = time.monotonic()
-        if self.live is None or self.failed or now - self._looked < _LOOK:
+        if self.live is None or self.failed or now - self._checked_at < _CHECK_PERIOD:
             return
-        self._looked = now
+        self._checked_at = now
         if not self.live.in_place:
             kept = self.live.rescue()
-            self._fail(f"{self.live.folder} is gone" + ("; what was recorded was written there anew" if kept else ""))
+            self._fail(f"{self.live.folder} is gone" + ("; the recorded rows were written there again" if kept else ""))
             return
         free = free_bytes(self.layout.root)
-        self.ring.say(free_bytes=free)
+        self.queue.report(free_bytes=free)
         if free < self.stop_free:
             self._fail(f"only {free / 1e9:.2f} GB are free on the disk of {self.layout.root}; free some")
 
@@ -102,67 +101,69 @@ class Writer:
         self.failed = True
         if self.live is not None:
             self.live.close()
-        self.ring.say(trouble=trouble)
+        self.queue.report(trouble=trouble)
 
-    # What the app asks for.
+    # Requests of the app.
 
     def _do_begin(self, about: dict[str, Any]) -> dict[str, Any]:
         self.drain()
-        if self.live is not None:  # the app gave up in the middle of a start
-            self._closed()
+        if self.live is not None:  # the app was interrupted during a start
+            self._close_live()
         try:
             return self._begin(about)
         except Exception as error:
-            self._lock.close()  # whoever mends it needs it
+            self._lock.close()  # so that another process can repair the dataset
             if isinstance(error, OSError):
-                raise CommandError(f"cannot record into {self.layout.root}: {error}") from error
+                raise CommandError(f"cannot record into {self.layout.root}: {error}", code="cannot_write") from error
             raise
 
     def _begin(self, about: dict[str, Any]) -> dict[str, Any]:
         layout = self.layout
         free = free_bytes(layout.root)
         if free < self.stop_free:
-            raise CommandError(f"only {free / 1e9:.2f} GB are free on the disk of {layout.root}; free some")
+            raise CommandError(
+                f"only {free / 1e9:.2f} GB are free on the disk of {layout.root}; free some", code="disk_full"
+            )
         self._lock.close()  # the folder may have been deleted meanwhile, and the lock with it
-        self._lock.enter_context(locked(layout))
+        self._lock.enter_context(lock_dataset(layout))
         notes = recover_all(layout)
         cameras = [CameraSetup(*camera) for camera in about["cameras_kept"]]
         check_compatible(layout, about["features"], about["fps"], about["robot_type"], cameras)
         info = read_index(layout)
-        check_next(layout, info)
+        check_next_episode(layout, info)
         number = int(info["total_episodes"]) if info is not None else 0
         self.failed = False
-        self.ring.say(free_bytes=free, trouble="")
+        self.queue.report(free_bytes=free, trouble="")
         self.live = LiveFolder(layout.partial(number), about, self.width)
         return {"episode": number, "notes": notes}
 
     def _do_save(self, closing: dict[str, Any]) -> int | None:
         self.drain()
-        live = self._closed()
+        live = self._close_live()
         try:
             (live.folder / RESERVE).unlink(missing_ok=True)
             write_json(live.folder / CLOSING, closing)
             return finalise(self.layout, live.folder)
-        except Exception as error:  # a disk that is full, and whatever a library makes of that
-            stays = f"what was recorded stays in {live.folder}: mend that, then record on, or call recover()"
-            raise HalError(f"the episode cannot be finished now: {error}; {stays}") from error
+        except Exception as error:  # a full disk, in any form in which a library reports it
+            stays = f"its rows stay in {live.folder}: fix the cause, then start the next episode or call recover()"
+            raise HalError(f"the episode cannot be finished now: {error}; {stays}", code="save_failed") from error
 
     def _do_discard(self) -> None:
         self.drain()
-        live = self._closed()
+        live = self._close_live()
         if live.folder.exists():
             self.layout.remove(live.folder)
 
-    def _closed(self) -> LiveFolder:
+    def _close_live(self) -> LiveFolder:
         live, self.live = self.live, None
         if live is None:
-            raise CommandError("no episode is open")
+            raise CommandError("no episode is open", code="no_episode")
         live.close()
         return live
 
 
 def free_bytes(path: Path) -> int:
-    """Free space where ``path`` is, or will be."""
+    """Return the free space of the file system that holds ``path``, or will hold it, bytes."""
     while not path.exists() and path != path.parent:
         path = path.parent
     found = os.statvfs(path)
@@ -170,12 +171,12 @@ def free_bytes(path: Path) -> int:
 
 
 def main(channel: Channel, memories: Sequence[SharedMemory], config: dict[str, Any]) -> None:
-    """Entry point of the child process; the memory is that of the rows."""
-    require()
+    """Run the child process; ``memories`` has one block, that of the queue."""
+    require_libraries()
     encoder = choose_encoder(config["codec"])
-    import pyarrow.parquet  # noqa: F401  # before anything is recorded, not in the middle of it
+    import pyarrow.parquet  # noqa: F401  # slow: import it before anything is recorded
 
     yield_to_others(_NICE)
-    writer = Writer(channel, memories[0], config)
+    writer = EpisodeWriter(channel, memories[0], config)
     channel.send({"ready": {"encoder": encoder, "free_bytes": free_bytes(writer.layout.root)}})
     writer.run()

@@ -81,9 +81,8 @@ def record(recorder: Recorder, seconds: float, success: bool | None = True) -> N
 
 def kill_writer(recorder: Recorder) -> None:
     """Kill the process that writes the present episode, once some rows are on the disk."""
-    (rows,) = recorder.root.glob("episodes/*.partial/rows.arrow")
     deadline = time.monotonic() + 30.0
-    while rows.stat().st_size < 20_000 and time.monotonic() < deadline:
+    while (recorder.status().frames < 5 or recorder._queue.waiting) and time.monotonic() < deadline:
         time.sleep(0.01)
     recorder._child.process.kill()
     recorder._child.process.wait()

@@ -1,11 +1,11 @@
-"""Recordings in the forms that other programs train on.
+"""Export recordings to the formats that other programs train on.
 
     from hal.recording.exporters import export
 
     made = export("data/demo", "zarr", "data/demo.zarr", size=(96, 96), successful_only=True)
     print(made.path, made.episodes, made.rows, *made.notes)
 
-LeRobot needs none of this: it reads a recording as it is (docs/export.md).
+LeRobot reads a recording without any export (docs/export.md).
 """
 
 from __future__ import annotations
@@ -17,42 +17,45 @@ from typing import NamedTuple
 
 from ...errors import CommandError
 from ..dataset import Dataset
-from .content import EpisodeContent, chosen
-from .output import Job, Progress, fresh
+from .content import EpisodeContent, select_episodes
+from .output import ExportJob, ExportProgress, write_atomically
 
-__all__ = ["KINDS", "Exported", "Kind", "Progress", "default_path", "export"]
+__all__ = ["KINDS", "ExportResult", "ExportFormat", "ExportProgress", "default_path", "export"]
 
 
-class Kind(NamedTuple):
-    """A form, and the module that writes it: ``write(job, path)``, and ``is_one(path)`` knows what it wrote before."""
+class ExportFormat(NamedTuple):
+    """A format, and the module that writes it.
+
+    The module has ``write(job, path)``, and ``is_export(path)``, which recognises what it wrote before.
+    """
 
     module: str
     ending: str
-    """Of the name that it gets beside the dataset."""
+    """Appended to the dataset's name for the default path."""
     what: str
 
 
 KINDS = {
-    "robomimic": Kind("robomimic", ".robomimic.hdf5", "one HDF5 file as robomimic reads it"),
-    "zarr": Kind("diffusion_policy", ".zarr", "a zarr folder as diffusion policy's replay buffer reads it"),
-    "npz": Kind("npz", "_npz", "a folder with one .npz per episode"),
+    "robomimic": ExportFormat("robomimic", ".robomimic.hdf5", "one HDF5 file as robomimic reads it"),
+    "zarr": ExportFormat("diffusion_policy", ".zarr", "a zarr folder as diffusion policy's replay buffer reads it"),
+    "npz": ExportFormat("npz", "_npz", "a folder with one .npz per episode"),
 }
 
 
-class Exported(NamedTuple):
-    """What was made."""
+class ExportResult(NamedTuple):
+    """What was written."""
 
     path: Path
     episodes: int
     rows: int
     size: int
-    """Bytes on the disk."""
+    """Size on the disk, bytes."""
     notes: tuple[str, ...]
-    """What a person should know before training on it."""
+    """Warnings to read before training on it."""
 
 
 def default_path(dataset: str | Path, kind: str) -> Path:
-    """Where a form goes unless told otherwise: beside the dataset."""
+    """Return the default path of an export: beside the dataset."""
     folder = Path(dataset).expanduser().absolute()
     return folder.with_name(folder.name + KINDS[kind].ending)
 
@@ -71,28 +74,41 @@ def export(
     gripper_camera: str | None = None,
     valid: float = 0.1,
     force: bool = False,
-    progress: Callable[[Progress], None] | None = None,
-) -> Exported:
-    """Write episodes of ``dataset`` as ``kind`` (a key of :data:`KINDS`) to ``out``.
+    progress: Callable[[ExportProgress], None] | None = None,
+) -> ExportResult:
+    """Write episodes of a dataset in another format. The output appears only when complete.
 
-    ``episodes`` are numbers, or a text such as ``0,3-5``; ``successful_only`` leaves out what was not marked a success.
-    ``cameras`` are the names of those that are taken along, else all. ``size`` (width, height) crops pictures to that
-    shape about their middle and scales them. ``camera`` and ``gripper_camera`` say which cameras an ``.npz`` calls so;
-    ``valid`` is the share of episodes that robomimic's filter ``valid`` names. What is there is only overwritten with
-    ``force``, and only where it is such an export.
+    Args:
+        dataset: The dataset, or its folder.
+        kind: A key of :data:`KINDS`.
+        out: File or folder to write; None for :func:`default_path`.
+        episodes: Numbers, or a text such as ``0,3-5``; None for all.
+        successful_only: Leave out episodes that are not marked a success.
+        cameras: Names of the cameras to export; None for all.
+        depth: False leaves depth out.
+        size: Width and height; pictures are cropped about their centre to that shape, and scaled.
+        camera: Camera that ``npz`` calls ``camera``.
+        gripper_camera: Camera that ``npz`` calls ``gripper_camera``.
+        valid: Share of the episodes in robomimic's filter ``valid``, at least 0 and below 1.
+        force: Overwrite an existing export; other files are never overwritten.
+        progress: Called as the export advances.
 
-    Whole or not at all: it is written under another name and renamed at the end. Raises CommandError for what does not
-    fit, DriverMissing, OSError.
+    Raises:
+        CommandError: An argument is wrong, the episodes differ, or something exists at ``out`` (codes ``bad_export``,
+            ``no_episodes``, ``episodes_differ``, ``exists``).
+        DatasetError: The dataset is damaged.
+        DriverMissing: A library is not installed.
+        OSError: The disk refuses.
     """
     if kind not in KINDS:
-        raise CommandError(f"kind must be one of {', '.join(KINDS)}, not {kind!r}")
+        raise CommandError(f"kind must be one of {', '.join(KINDS)}, not {kind!r}", code="bad_export")
     if not 0.0 <= valid < 1.0:
-        raise CommandError(f"valid must be at least 0 and below 1, not {valid:g}")
+        raise CommandError(f"valid must be at least 0 and below 1, not {valid:g}", code="bad_export")
     if size is not None and not all(1 <= side <= 8192 for side in size):
-        raise CommandError(f"size must be from 1x1 to 8192x8192, not {size[0]}x{size[1]}")
+        raise CommandError(f"size must be from 1x1 to 8192x8192, not {size[0]}x{size[1]}", code="bad_export")
     source = dataset if isinstance(dataset, Dataset) else Dataset(dataset)
-    wanted = chosen(source, episodes, successful_only=successful_only)
-    job = Job(
+    wanted = select_episodes(source, episodes, successful_only=successful_only)
+    job = ExportJob(
         source=source.root,
         contents=tuple(EpisodeContent(episode, cameras, depth=depth, size=size) for episode in wanted),
         camera=camera,
@@ -103,10 +119,10 @@ def export(
     job.check()
     writer = import_module(f".{KINDS[kind].module}", __name__)
     path = default_path(source.root, kind) if out is None else Path(out).expanduser().absolute()
-    with fresh(path, force=force, is_ours=writer.is_one) as beside:
+    with write_atomically(path, force=force, is_ours=writer.is_export) as beside:
         writer.write(job, beside)
     rows = sum(content.rows for content in job.contents)
-    return Exported(path, len(job.contents), rows, _bytes(path), tuple(job.notes))
+    return ExportResult(path, len(job.contents), rows, _bytes(path), tuple(job.notes))
 
 
 def _bytes(path: Path) -> int:

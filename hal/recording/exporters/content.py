@@ -1,4 +1,4 @@
-"""What an episode holds, taken apart: arms, numbers, pictures."""
+"""Content of an episode for exports and reviews: its arms, columns and pictures, and which episodes are selected."""
 
 from __future__ import annotations
 
@@ -17,72 +17,85 @@ from ..dataset import Dataset, Episode
 from ..layout import STATE
 
 __all__ = [
-    "Arm",
+    "ArmColumns",
     "CAMERA",
     "EpisodeContent",
     "GRIPPER_CAMERA",
-    "Pictures",
-    "chosen",
-    "episode_numbers",
+    "PictureStream",
+    "select_episodes",
+    "parse_episodes",
     "observations",
     "picture_name",
-    "roles",
+    "camera_roles",
     "with_channel",
 ]
 
-# [selection.py] Which episodes.
 
 _PART = re.compile(r"\s*(\d+)\s*(?:-\s*(\d+)\s*)?")
 
 
-def episode_numbers(text: str) -> list[int]:
-    """Numbers out of a text such as ``0,3-5``. CommandError for anything else."""
+def parse_episodes(text: str) -> list[int]:
+    """Return the numbers in a text such as ``0,3-5``. Raises CommandError for anything else (code ``bad_episodes``)."""
     found: list[int] = []
     for part in text.split(","):
         match = _PART.fullmatch(part)
         if match is None:
-            raise CommandError(f"episodes are numbers and ranges such as 0,3-5, not {text!r}")
+            raise CommandError(f"episodes are numbers and ranges such as 0,3-5, not {text!r}", code="bad_episodes")
         first = int(match[1])
         last = first if match[2] is None else int(match[2])
         if last < first or last - first > 1_000_000:
-            raise CommandError(f"{part.strip()} is no range of episodes")
+            raise CommandError(f"{part.strip()} is not a range of episodes", code="bad_episodes")
         found.extend(range(first, last + 1))
     return found
 
 
-def chosen(dataset: Dataset, wanted: str | Collection[int] | None, *, successful_only: bool) -> tuple[Episode, ...]:
-    """Those episodes, each once, in the dataset's order. CommandError where there are none."""
+def select_episodes(
+    dataset: Dataset, wanted: str | Collection[int] | None, *, successful_only: bool
+) -> tuple[Episode, ...]:
+    """Return the selected episodes, each once, in the dataset's order.
+
+    Args:
+        dataset: The dataset.
+        wanted: Numbers, or a text such as ``0,3-5``; None for all.
+        successful_only: Leave out episodes that are not marked a success.
+
+    Raises:
+        CommandError: There is no such episode, or none is left (code ``no_episodes``).
+    """
     there = range(len(dataset.episodes))
-    numbers = there if wanted is None else set(episode_numbers(wanted) if isinstance(wanted, str) else wanted)
+    numbers = there if wanted is None else set(parse_episodes(wanted) if isinstance(wanted, str) else wanted)
     if unknown := sorted(set(numbers) - set(there)):
-        raise CommandError(f"there is no episode {unknown[0]} in {dataset.root}; there are {len(there)}, from 0 on")
+        raise CommandError(
+            f"there is no episode {unknown[0]} in {dataset.root}; there are {len(there)}, from 0 on", code="no_episodes"
+        )
     found = [dataset.episodes[number] for number in sorted(numbers)]
     if successful_only:
         found = [episode for episode in found if episode.success]
     if not found:
-        raise CommandError("none of these episodes is marked a success" if successful_only else "no episode was chosen")
+        why = "none of these episodes is marked a success" if successful_only else "no episode was selected"
+        raise CommandError(why, code="no_episodes")
     return tuple(found)
 
 
 _ARM_TIME = "observation.time.robot."
 _OBJECT = "observation.object."
-_HAND = "gripper"
+_GRIPPER = "gripper"
 
 
-class Arm(NamedTuple):
-    """One arm of the rig, and what its numbers are called in columns that all arms share."""
+class ArmColumns(NamedTuple):
+    """One arm of a recording, and how its numbers are named in columns that all arms share."""
 
     name: str
     lead: str
-    """Before each name; empty where there is only one arm."""
+    """Prefix of each name; empty if there is only one arm."""
 
     def owns(self, name: str) -> bool:
-        """Is this number of a shared column the arm's?"""
+        """Return whether this number of a shared column is the arm's."""
         return name.startswith(self.lead)
 
 
 @dataclass(frozen=True)
-class Pictures:
+class PictureStream:
     """One stream of pictures, one per row."""
 
     camera: str
@@ -95,14 +108,21 @@ class Pictures:
     read: Callable[[], Iterator[NDArray[Any]]]
 
     def __iter__(self) -> Iterator[NDArray[Any]]:
-        """Return every picture. DatasetError where there is not one per row."""
+        """Iterate over the pictures. Raises DatasetError if there is not one per row."""
         return self.read()
 
 
 class EpisodeContent:
-    """One episode, with the cameras that are taken along, their pictures of ``size`` (width, height).
+    """One episode, with the selected cameras.
 
-    CommandError for a camera that it does not have.
+    Args:
+        episode: The episode.
+        cameras: Names of the cameras; None for all.
+        depth: False leaves depth out.
+        size: Width and height to which pictures are cropped and scaled; None leaves them as they are.
+
+    Raises:
+        CommandError: The episode lacks a camera (code ``no_such_camera``).
     """
 
     def __init__(
@@ -118,67 +138,65 @@ class EpisodeContent:
         self._size = size
         if unknown := [name for name in cameras or () if name not in episode.cameras]:
             there = ", ".join(episode.cameras) or "none"
-            raise CommandError(f"episode {episode.number} has no camera {unknown[0]}; cameras: {there}")
+            raise CommandError(
+                f"episode {episode.number} has no camera {unknown[0]}; cameras: {there}", code="no_such_camera"
+            )
         self.cameras = tuple(name for name in episode.cameras if cameras is None or name in cameras)
         self._depth = depth
 
-    # Numbers.
-
     @cached_property
-    def arms(self) -> tuple[Arm, ...]:
-        """The rig's arms, in its order."""
+    def arms(self) -> tuple[ArmColumns, ...]:
+        """The arms, in the order of the columns."""
         names = [key.removeprefix(_ARM_TIME) for key in self.episode.columns if key.startswith(_ARM_TIME)]
-        return tuple(Arm(name, f"{name}." if len(names) > 1 else "") for name in names)
+        return tuple(ArmColumns(name, f"{name}." if len(names) > 1 else "") for name in names)
 
-    def of(self, arm: Arm, key: str) -> NDArray[Any]:
-        """The arm's part (rows, n) of a column; without the gripper, where that is in it."""
+    def of(self, arm: ArmColumns, key: str) -> NDArray[Any]:
+        """Return the arm's part (rows, n) of a column, without its gripper."""
         names = self.episode.names(key)
-        wanted = [k for k, name in enumerate(names) if arm.owns(name) and name != arm.lead + _HAND]
+        wanted = [k for k, name in enumerate(names) if arm.owns(name) and name != arm.lead + _GRIPPER]
         found: NDArray[Any] = self._table(key)[:, wanted]
         return found
 
     def _table(self, key: str) -> NDArray[Any]:
-        """A column (rows, n), also where n is 1."""
+        """Return a column (rows, n), also if n is 1."""
         return self.episode.columns[key].reshape(self.rows, -1)
 
-    def joints(self, arm: Arm) -> list[str]:
-        """Names of its joints."""
+    def joints(self, arm: ArmColumns) -> list[str]:
+        """Return the names of the arm's joints."""
         return [name.removeprefix(arm.lead) for name in self.episode.names(STATE) if self._is_joint(arm, name)]
 
     @staticmethod
-    def _is_joint(arm: Arm, name: str) -> bool:
-        return arm.owns(name) and name != arm.lead + _HAND
+    def _is_joint(arm: ArmColumns, name: str) -> bool:
+        return arm.owns(name) and name != arm.lead + _GRIPPER
 
-    def width(self, arm: Arm, key: str = STATE) -> NDArray[Any] | None:
-        """Width (rows,) of its gripper, m; None where it has none."""
+    def width(self, arm: ArmColumns, key: str = STATE) -> NDArray[Any] | None:
+        """Return the width (rows,) of the arm's gripper, m; None without one."""
         names = self.episode.names(key)
-        if arm.lead + _HAND not in names:
+        if arm.lead + _GRIPPER not in names:
             return None
-        found: NDArray[Any] = self._table(key)[:, names.index(arm.lead + _HAND)]
+        found: NDArray[Any] = self._table(key)[:, names.index(arm.lead + _GRIPPER)]
         return found
 
     def has(self, key: str) -> bool:
-        """Is there such a column?"""
+        """Return whether the episode has a column."""
         return key in self.episode.columns
 
     @property
     def objects(self) -> dict[str, NDArray[Any]]:
-        """Poses (rows, 7) in the world of what can move in a simulated one."""
+        """Poses (rows, 7) in the world of the simulated objects that can move, by name."""
         columns = self.episode.columns
         return {key.removeprefix(_OBJECT): column for key, column in columns.items() if key.startswith(_OBJECT)}
 
     @property
     def grid(self) -> NDArray[np.float64]:
-        """Times (rows,) at which the rows were due, from the first one on, s."""
+        """Due times (rows,) of the rows, since the first, s."""
         times = self.episode.stamps["grid"]
         found: NDArray[np.float64] = times - times[0]
         return found
 
-    # Pictures.
-
     @cached_property
-    def pictures(self) -> tuple[Pictures, ...]:
-        """Every stream of pictures that is taken along."""
+    def pictures(self) -> tuple[PictureStream, ...]:
+        """Every selected stream of pictures."""
         found = []
         for camera in self.cameras:
             for what in ("rgb", "depth") if self._depth else ("rgb",):
@@ -186,28 +204,28 @@ class EpisodeContent:
                     found.append(stream)
         return tuple(found)
 
-    def _stream(self, camera: str, what: str) -> Pictures | None:
+    def _stream(self, camera: str, what: str) -> PictureStream | None:
         episode = self.episode
 
-        def plain() -> Iterator[NDArray[Any]]:
+        def read() -> Iterator[NDArray[Any]]:
             return episode.frames(camera) if what == "rgb" else episode.depth(camera)
 
         try:
-            first = next(plain())
-        except DeviceNotFound:  # this one was not kept
+            first = next(read())
+        except DeviceNotFound:  # this stream was not recorded
             return None
         scaling = self._scaling(first.shape[1], first.shape[0])
         if scaling is None:
-            return Pictures(camera, what, first.shape, first.dtype, self.rows, plain)
+            return PictureStream(camera, what, first.shape, first.dtype, self.rows, read)
         scaled = scaling.color if what == "rgb" else scaling.depth
         shape = (*reversed(scaling.size), *first.shape[2:])
-        return Pictures(camera, what, shape, first.dtype, self.rows, lambda: map(scaled, plain()))
+        return PictureStream(camera, what, shape, first.dtype, self.rows, lambda: map(scaled, read()))
 
     def _scaling(self, width: int, height: int) -> Cropping | None:
         return None if self._size is None else Cropping(width, height, *self._size)
 
     def lenses(self) -> dict[str, dict[str, Any]]:
-        """Of each camera: size, and matrix and distortion of its pictures as they are written."""
+        """Return size, camera matrix and distortion of each camera's pictures as they are exported."""
         found: dict[str, dict[str, Any]] = {}
         for stream in self.pictures:
             if stream.camera in found:
@@ -256,8 +274,11 @@ _OF_AN_ARM = {
 
 
 def observations(content: EpisodeContent) -> dict[str, NDArray[Any]]:
-    """``robot0_joint_pos``, ``robot0_eef_pos`` and so on, each (rows, n), SI units, quaternions xyzw; a second arm is
-    ``robot1``. ``object`` has the poses of all objects of a simulation, one after the other."""
+    """Return the arrays of an episode under robomimic's names, each (rows, n), SI units, quaternions xyzw.
+
+    ``robot0_joint_pos``, ``robot0_eef_pos`` and so on; a second arm is ``robot1``. ``object`` has the poses of all
+    simulated objects, one after the other.
+    """
     found: dict[str, NDArray[Any]] = {}
     for k, arm in enumerate(content.arms):
         lead = f"robot{k}_"
@@ -274,45 +295,58 @@ def observations(content: EpisodeContent) -> dict[str, NDArray[Any]]:
     return found
 
 
-def picture_name(stream: Pictures) -> str:
-    """``wrist_image`` or ``wrist_depth``."""
+def picture_name(stream: PictureStream) -> str:
+    """Return ``wrist_image`` or ``wrist_depth``."""
     return f"{stream.camera}_{'image' if stream.what == 'rgb' else 'depth'}"
 
 
 def with_channel(picture: NDArray[Any]) -> NDArray[Any]:
-    """Channels last, for depth too: (H, W, 3) or (H, W, 1)."""
+    """Return a picture with channels last: (H, W, 3), or (H, W, 1) for depth."""
     return picture if picture.ndim == 3 else picture[:, :, None]
 
-
-# [roles.py] Which camera is *the camera*, and which one the gripper's.
 
 CAMERA, GRIPPER_CAMERA = "camera", "gripper_camera"
 
 
-def roles(content: EpisodeContent, camera: str | None = None, gripper_camera: str | None = None) -> dict[str, str]:
-    """What each camera of an episode is called in an export.
+def camera_roles(
+    content: EpisodeContent, camera: str | None = None, gripper_camera: str | None = None
+) -> dict[str, str]:
+    """Return the name of each camera in an export.
 
-    Unless told otherwise, the first one on an arm is ``gripper_camera``, the first one that is not on an arm is
-    ``camera``, and all others keep their names. CommandError for a name that is not there, or where two would be called
-    the same.
+    By default the first camera on an arm is ``gripper_camera``, the first that is not on an arm is ``camera``, and all
+    others keep their names.
+
+    Args:
+        content: The episode.
+        camera: Name of the camera that becomes ``camera``; None for the default.
+        gripper_camera: Name of the camera that becomes ``gripper_camera``; None for the default.
+
+    Raises:
+        CommandError: There is no such camera (code ``no_such_camera``), or two would have the same name
+            (``duplicate_name``).
     """
     there = content.cameras
     for name in (camera, gripper_camera):
         if name is not None and name not in there:
-            raise CommandError(f"there is no camera {name} in this export; cameras: {', '.join(there) or 'none'}")
+            raise CommandError(
+                f"there is no camera {name} in this export; cameras: {', '.join(there) or 'none'}",
+                code="no_such_camera",
+            )
     if camera is not None and camera == gripper_camera:
-        raise CommandError(f"{camera} cannot be both the camera and the gripper's")
+        raise CommandError(f"{camera} cannot be both camera and gripper camera", code="duplicate_name")
     carried = _carried(content)
     free = [name for name in there if name not in (camera, gripper_camera)]
     gripper_camera = gripper_camera or next((name for name in free if name in carried), None)
     camera = camera or next((name for name in free if name not in carried), None)
     found = {name: CAMERA if name == camera else GRIPPER_CAMERA if name == gripper_camera else name for name in there}
     if len(set(found.values())) < len(found):
-        raise CommandError("two cameras would be called the same; choose with --camera and --gripper-camera")
+        raise CommandError(
+            "two cameras would have the same name; choose with --camera and --gripper-camera", code="duplicate_name"
+        )
     return found
 
 
 def _carried(content: EpisodeContent) -> set[str]:
-    """Cameras that an arm carries, by the rig's configuration."""
+    """Return the cameras that an arm carries in the rig's configuration."""
     cameras = content.episode.info["rig"]["resolved"]["cameras"]
     return {spec["name"] for spec in cameras if (spec["view"] or {}).get("robot") is not None}

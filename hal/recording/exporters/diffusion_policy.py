@@ -1,4 +1,4 @@
-"""A zarr folder as diffusion policy's replay buffer reads it: all episodes one after the other, and where each ends."""
+"""Write a zarr folder for diffusion policy's replay buffer: all episodes one after the other, and where each ends."""
 
 from __future__ import annotations
 
@@ -13,34 +13,29 @@ from numpy.typing import NDArray
 
 from ..layout import ACTION
 from .content import EpisodeContent, observations, picture_name, with_channel
-from .output import Job
+from .output import ExportJob
 
 __all__ = [
     "GROUP",
     "ZarrArray",
-    "is_one",
+    "is_export",
     "make_group",
     "write",
 ]
 
-# [zarr_folder.py] Arrays as a folder in the zarr format, version 2: read by every zarr library, old and new, and
-# written without any.
-#
-# An array is a JSON file (``.zarray``) and a file per chunk; a group is a folder with another JSON file. Chunks
-# are
-# compressed with zstd, and numbers of several bytes have their bytes sorted first, which both halves what they
-# take.
-#
+# The zarr format, version 2, which every zarr library reads: an array is a JSON file (``.zarray``) and a file per
+# chunk; a group is a folder with another JSON file. Chunks are compressed with zstd after their bytes are shuffled,
+# which halves them.
 
 GROUP, _ARRAY, _ATTRIBUTES = ".zgroup", ".zarray", ".zattrs"
 _VERSION = 2
 _LEVEL = 3
 _CHUNK = 2_000_000
-"""Bytes, before they are compressed."""
+"""Size of a chunk before compression, bytes."""
 
 
 def make_group(folder: Path, attributes: dict[str, Any] | None = None) -> Path:
-    """A group, with what is to be known of it."""
+    """Create a group with its attributes."""
     folder.mkdir()
     _write_json(folder / GROUP, {"zarr_format": _VERSION})
     if attributes:
@@ -49,10 +44,17 @@ def make_group(folder: Path, attributes: dict[str, Any] | None = None) -> Path:
 
 
 class ZarrArray:
-    """An array (rows, ...) that grows row by row, and is whole when it is closed."""
+    """An array (rows, ...) that grows row by row, and is complete when it is closed."""
 
     def __init__(self, folder: Path, shape: tuple[int, ...], dtype: np.dtype[Any], rows: int) -> None:
-        """``shape`` is that of one row, ``rows`` how many will come: a chunk is never longer."""
+        """Create the array.
+
+        Args:
+            folder: Its folder, which must not exist.
+            shape: Shape of one row.
+            dtype: Type of the numbers.
+            rows: Rows that will be added; no chunk is longer.
+        """
         import zstandard
 
         folder.mkdir()
@@ -65,7 +67,7 @@ class ZarrArray:
         self._compressor = zstandard.ZstdCompressor(level=_LEVEL)
 
     def add(self, values: NDArray[Any]) -> None:
-        """One row more."""
+        """Add one row."""
         place = self._rows % self._length
         self._chunk[place] = values
         self._rows += 1
@@ -73,7 +75,7 @@ class ZarrArray:
             self._write_chunk()
 
     def close(self) -> None:
-        """Write the rest, and say what is there."""
+        """Write the remaining rows and the header."""
         if rest := self._rows % self._length:
             self._chunk[rest:] = 0
             self._write_chunk()
@@ -101,13 +103,13 @@ def _write_json(path: Path, data: Any) -> None:
     path.write_text(json.dumps(data, indent=1) + "\n", encoding="utf-8")
 
 
-def is_one(path: Path) -> bool:
-    """Is this folder a replay buffer?"""
+def is_export(path: Path) -> bool:
+    """Return whether this folder is a replay buffer."""
     return (path / GROUP).is_file() and (path / "meta" / "episode_ends").is_dir()
 
 
-def write(job: Job, path: Path) -> None:
-    """Make the folder."""
+def write(job: ExportJob, path: Path) -> None:
+    """Write the folder."""
     about = job.about() | {"episodes": [content.about() for content in job.contents]}
     make_group(path, about)
     data, meta = make_group(path / "data"), make_group(path / "meta")
@@ -128,7 +130,7 @@ def write(job: Job, path: Path) -> None:
 
 
 def _columns(
-    job: Job, content: EpisodeContent
+    job: ExportJob, content: EpisodeContent
 ) -> Iterator[tuple[str, np.dtype[Any], tuple[int, ...], Iterator[NDArray[Any]]]]:
     numbers = observations(content) | {"action": content.episode.columns[ACTION], "timestamp": content.grid}
     job.unknown(content, numbers)

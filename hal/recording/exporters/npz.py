@@ -1,7 +1,7 @@
-"""A folder with one ``.npz`` per episode: plain arrays that ``numpy.load`` reads without pickle.
+"""Write a folder with one ``.npz`` per episode: plain arrays that ``numpy.load`` reads without pickle.
 
-The names are those of the tutorial that people come from; beside them stands every column of the dataset under its own
-key, so nothing of the numbers is lost.
+The names are those of the tutorial that many users start from. Every column of the dataset is there too, under its own
+key, so that no number is lost.
 """
 
 from __future__ import annotations
@@ -17,36 +17,39 @@ from numpy.typing import NDArray
 
 from ...errors import CommandError
 from ..layout import ACTION
-from .content import EpisodeContent, roles
-from .output import Job
+from .content import EpisodeContent, camera_roles
+from .output import ExportJob
 
-__all__ = ["is_one", "write"]
+__all__ = ["is_export", "write"]
 
 _ABOUT = "export.json"
-_LEVEL = 1  # higher ones take far longer and save little
+_LEVEL = 1  # higher levels take far longer and save little
 
 
-def is_one(path: Path) -> bool:
-    """Was this folder written here?"""
+def is_export(path: Path) -> bool:
+    """Return whether this folder was written here."""
     return path.is_dir() and (path / _ABOUT).is_file()
 
 
-def write(job: Job, path: Path) -> None:
-    """Make the folder."""
+def write(job: ExportJob, path: Path) -> None:
+    """Write the folder."""
     path.mkdir()
     files = []
     for content in job.contents:
         name = f"episode_{content.episode.number:06d}.npz"
         _write_episode(job, content, path / name)
         files.append({"file": name, **content.about()})
-    about = job.about() | {"camera_names": roles(job.contents[0], job.camera, job.gripper_camera), "episodes": files}
+    about = job.about() | {
+        "camera_names": camera_roles(job.contents[0], job.camera, job.gripper_camera),
+        "episodes": files,
+    }
     (path / _ABOUT).write_text(json.dumps(about, indent=1) + "\n", encoding="utf-8")
 
 
-def _write_episode(job: Job, content: EpisodeContent, path: Path) -> None:
+def _write_episode(job: ExportJob, content: EpisodeContent, path: Path) -> None:
     numbers = _numbers(content)
     job.unknown(content, {name: numbers[name] for name in ("joint_states", "action") if name in numbers})
-    called = roles(content, job.camera, job.gripper_camera)
+    called = camera_roles(content, job.camera, job.gripper_camera)
     texts: dict[str, str | list[str]] = {
         "info": json.dumps(content.episode.info | {"cameras_written": content.lenses()})
     }
@@ -56,7 +59,9 @@ def _write_episode(job: Job, content: EpisodeContent, path: Path) -> None:
         numbers[f"{name}_stamps"] = content.episode.stamps[f"camera.{camera}"]
     streams = {f"{called[stream.camera]}_{stream.what}": stream for stream in content.pictures}
     if double := sorted(set(streams) & set(numbers)):
-        raise CommandError(f"two things would be called {double[0]}; choose with --camera and --gripper-camera")
+        raise CommandError(
+            f"two arrays would be called {double[0]}; choose with --camera and --gripper-camera", code="duplicate_name"
+        )
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED, compresslevel=_LEVEL) as file:
         for name, values in (numbers | {name: np.array(text) for name, text in texts.items()}).items():
             _add(file, name, values.shape, values.dtype, iter([values]))
@@ -83,7 +88,7 @@ def _numbers(content: EpisodeContent) -> dict[str, NDArray[Any]]:
 def _add(
     file: zipfile.ZipFile, name: str, shape: tuple[int, ...], dtype: np.dtype[Any], parts: Iterator[NDArray[Any]]
 ) -> None:
-    """One array, part by part: an episode's pictures need not fit into memory."""
+    """Write one array part by part: an episode's pictures need not fit into memory."""
     head = {"descr": np.lib.format.dtype_to_descr(dtype), "fortran_order": False, "shape": shape}
     with file.open(f"{name}.npy", "w", force_zip64=True) as entry:
         np.lib.format.write_array_header_1_0(entry, head)

@@ -1,4 +1,6 @@
-"""A file or folder that appears when it is whole, and takes nobody's place unasked."""
+"""An export while it is written: what it consists of, its progress, and a file or folder that appears only when
+complete.
+"""
 
 from __future__ import annotations
 
@@ -16,79 +18,80 @@ from numpy.typing import NDArray
 
 from ...errors import CommandError
 from ..layout import ACTION, STATE
-from .content import EpisodeContent, Pictures
+from .content import EpisodeContent, PictureStream
 
 __all__ = [
-    "Job",
-    "Progress",
-    "fresh",
+    "ExportJob",
+    "ExportProgress",
+    "write_atomically",
 ]
 
-# [job.py] All that an export is made of, and how far it is.
 
-
-class Progress(NamedTuple):
-    """How far an export is."""
+class ExportProgress(NamedTuple):
+    """Progress of an export."""
 
     episode: int
     """Number of the episode that is being written."""
     share: float
-    """Of all of it, 0..1."""
+    """Share of the whole export, 0 to 1."""
 
 
 @dataclass
-class Job:
-    """What is to be written, for the module that writes it."""
+class ExportJob:
+    """What a format's module is to write."""
 
     source: Path
     contents: tuple[EpisodeContent, ...]
     camera: str | None = None
     gripper_camera: str | None = None
     valid: float = 0.1
-    report: Callable[[Progress], None] | None = None
+    report: Callable[[ExportProgress], None] | None = None
     notes: list[str] = field(default_factory=list)
-    """What a person should know before training on it."""
+    """Warnings to read before training on it."""
     _done: int = 0
 
     def check(self) -> None:
-        """CommandError where the episodes do not have the same pictures, or none of the arms' numbers."""
+        """Raise CommandError if an episode has no arm, or the episodes have different pictures (code
+        ``episodes_differ``).
+        """
         first = self.contents[0]
         kept = _streams(first)
         for content in self.contents:
             number = content.episode.number
             if not content.arms:
-                raise CommandError(f"episode {number} has no arm in it")
+                raise CommandError(f"episode {number} has no arm", code="no_arm")
             if (found := _streams(content)) != kept:
                 odd = sorted(found.keys() ^ kept.keys()) or sorted(key for key in kept if found[key] != kept[key])
                 raise CommandError(
                     f"episodes {first.episode.number} and {number} differ in {', '.join(odd)}; "
-                    "leave some out with --episodes, --cameras or --no-depth"
+                    "leave some out with --episodes, --cameras or --no-depth",
+                    code="episodes_differ",
                 )
 
     def unknown(self, content: EpisodeContent, columns: dict[str, NDArray[Any]]) -> None:
-        """Note what holds values that were never known: training on them fails without a word."""
+        """Note columns with unknown values (NaN): training on them fails silently."""
         for name, values in columns.items():
             if np.issubdtype(values.dtype, np.floating) and not np.isfinite(values).all():
-                self.notes.append(f"{name} of episode {content.episode.number} has values that were not known (NaN)")
+                self.notes.append(f"{name} of episode {content.episode.number} has unknown values (NaN)")
 
-    def pictures(self, content: EpisodeContent, stream: Pictures) -> Iterator[NDArray[Any]]:
-        """The pictures of a stream, one by one, while the person is told how far it is."""
+    def pictures(self, content: EpisodeContent, stream: PictureStream) -> Iterator[NDArray[Any]]:
+        """Yield the pictures of a stream, and report progress."""
         for picture in stream:
             yield picture
             self._step(content, 1)
 
     def numbers_done(self, content: EpisodeContent) -> None:
-        """The numbers of an episode are written."""
+        """Report that the numbers of an episode are written."""
         self._step(content, content.rows)
 
     def _step(self, content: EpisodeContent, count: int) -> None:
         self._done += count
         if self.report is not None:
             total = sum(each.rows * (1 + len(each.pictures)) for each in self.contents)
-            self.report(Progress(content.episode.number, min(1.0, self._done / max(1, total))))
+            self.report(ExportProgress(content.episode.number, min(1.0, self._done / max(1, total))))
 
     def about(self) -> dict[str, Any]:
-        """What a form says of all episodes together."""
+        """Return the metadata of all episodes together."""
         first = self.contents[0]
         episode = first.episode
         return {
@@ -109,10 +112,16 @@ def _streams(content: EpisodeContent) -> dict[str, tuple[int, ...]]:
 
 
 @contextlib.contextmanager
-def fresh(path: Path, *, force: bool, is_ours: Callable[[Path], bool]) -> Iterator[Path]:
-    """Another name beside ``path``, to write to; it is renamed at the end, and removed when something fails.
+def write_atomically(path: Path, *, force: bool, is_ours: Callable[[Path], bool]) -> Iterator[Path]:
+    """Yield a temporary path beside ``path``. It is renamed at the end, and removed after an error.
 
-    CommandError where something is there already, unless ``force`` is given and ``is_ours`` knows it.
+    Args:
+        path: File or folder to write.
+        force: Replace an export that exists.
+        is_ours: Returns whether a path is such an export.
+
+    Raises:
+        CommandError: Something exists at ``path`` (code ``exists``), or it is not an export (``not_an_export``).
     """
     _check(path, force=force, is_ours=is_ours)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -145,9 +154,12 @@ def _check(path: Path, *, force: bool, is_ours: Callable[[Path], bool]) -> None:
     if not path.exists():
         return
     if not force:
-        raise CommandError(f"{path} is there already; --force overwrites it")
+        raise CommandError(f"{path} exists; overwrite it with --force", code="exists")
     if path.is_symlink() or not is_ours(path):
-        raise CommandError(f"{path} was not written by this program, so it is not overwritten; choose another name")
+        raise CommandError(
+            f"{path} was not written by this program, so it is not overwritten; choose another name",
+            code="not_an_export",
+        )
 
 
 def _beside(path: Path, what: str) -> Path:
@@ -155,7 +167,7 @@ def _beside(path: Path, what: str) -> Path:
 
 
 def _sweep(path: Path) -> None:
-    """Remove what a program that was killed did not get to, and put back what it had just moved away."""
+    """Remove the temporary files of a killed program, and restore what it had just moved away."""
     name = re.compile(rf"\.{re.escape(path.name)}\.(\d+)\.(partial|old)")
     for file in path.parent.iterdir():
         match = name.fullmatch(file.name)

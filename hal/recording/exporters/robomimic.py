@@ -1,4 +1,4 @@
-"""One HDF5 file as robomimic reads it: a group per episode, and lists of episodes to train and to validate with."""
+"""Write one HDF5 file for robomimic: a group per episode, and lists of episodes for training and validation."""
 
 from __future__ import annotations
 
@@ -11,28 +11,28 @@ from numpy.typing import NDArray
 
 from ...errors import DriverMissing
 from ..layout import ACTION
-from .content import EpisodeContent, Pictures, observations, picture_name, with_channel
-from .output import Job
+from .content import EpisodeContent, PictureStream, observations, picture_name, with_channel
+from .output import ExportJob
 
-__all__ = ["is_one", "write"]
+__all__ = ["is_export", "write"]
 
 _GYM = 2
-"""robomimic's number of a Gymnasium environment: of its kinds the one that needs no simulator of theirs."""
+"""robomimic's number of a Gymnasium environment, the only kind that needs none of its simulators."""
 _MAGIC = b"\x89HDF\r\n\x1a\n"
 
 
-def is_one(path: Path) -> bool:
-    """Is this an HDF5 file?"""
+def is_export(path: Path) -> bool:
+    """Return whether this is an HDF5 file."""
     if not path.is_file():
         return False
     with path.open("rb") as file:
         return file.read(len(_MAGIC)) == _MAGIC
 
 
-def write(job: Job, path: Path) -> None:
-    """Make the file. DriverMissing."""
+def write(job: ExportJob, path: Path) -> None:
+    """Write the file. Raises DriverMissing without h5py."""
     h5py = _library()
-    with h5py.File(path, "w") as file:  # in HDF5's oldest form: the newest one is read by the newest library only
+    with h5py.File(path, "w") as file:  # in HDF5's oldest version, which every library reads
         data = file.create_group("data")
         for k, content in enumerate(job.contents):
             _write_episode(job, content, data.create_group(f"demo_{k}"), h5py)
@@ -53,7 +53,7 @@ def _library() -> Any:
     return h5py
 
 
-def _write_episode(job: Job, content: EpisodeContent, group: Any, h5py: Any) -> None:
+def _write_episode(job: ExportJob, content: EpisodeContent, group: Any, h5py: Any) -> None:
     actions = content.episode.columns[ACTION]
     seen = observations(content)
     job.unknown(content, seen | {"actions": actions})
@@ -72,21 +72,21 @@ def _write_episode(job: Job, content: EpisodeContent, group: Any, h5py: Any) -> 
         _write_pictures(job, content, stream, group, h5py)
 
 
-def _write_pictures(job: Job, content: EpisodeContent, stream: Pictures, group: Any, h5py: Any) -> None:
+def _write_pictures(job: ExportJob, content: EpisodeContent, stream: PictureStream, group: Any, h5py: Any) -> None:
     name = picture_name(stream)
     shape = stream.shape if len(stream.shape) == 3 else (*stream.shape, 1)
     pictures = group["obs"].create_dataset(
         name,
         (stream.rows, *shape),
         stream.dtype,
-        chunks=(1, *shape),  # a batch takes pictures from everywhere
+        chunks=(1, *shape),  # training reads pictures in random order
         compression="gzip",
         compression_opts=1,
         shuffle=stream.dtype.itemsize > 1,
     )
     for k, picture in enumerate(job.pictures(content, stream)):
         pictures[k] = with_channel(picture)
-    # The next picture is already there, a row further on: a view of it instead of a copy.
+    # The next picture is already in the file, one row further: a view of it instead of a copy.
     view = h5py.VirtualLayout(pictures.shape, pictures.dtype)
     source = h5py.VirtualSource(".", pictures.name, shape=pictures.shape, dtype=pictures.dtype)
     if stream.rows > 1:
@@ -95,19 +95,19 @@ def _write_pictures(job: Job, content: EpisodeContent, stream: Pictures, group: 
     group["next_obs"].create_virtual_dataset(name, view)
 
 
-def _environment(job: Job) -> dict[str, Any]:
-    """What robomimic would make an environment from. It has none for a rig, and needs none to train."""
+def _environment(job: ExportJob) -> dict[str, Any]:
+    """Return robomimic's description of an environment. There is none for a rig, and training needs none."""
     about = job.about()
     return {"env_name": about["robot_type"] or "rig", "type": _GYM, "env_kwargs": {"fps": about["fps"]}}
 
 
-def _filters(job: Job) -> dict[str, list[int]]:
-    """Lists of episodes by the names of their filters. The same episodes are split in the same way every time."""
+def _filters(job: ExportJob) -> dict[str, list[int]]:
+    """Return the episodes of each filter, by name. The same episodes are split in the same way every time."""
     count = len(job.contents)
     order: NDArray[np.int64] = np.random.default_rng(count).permutation(count)
     held = min(max(1, round(job.valid * count)), count - 1) if job.valid > 0.0 else 0
     found = {"train": sorted(order[held:].tolist()), "valid": sorted(order[:held].tolist())}
     found["successful"] = [k for k, content in enumerate(job.contents) if content.episode.success]
     if job.valid > 0.0 and held == 0:
-        job.notes.append("one episode cannot be split: there is no filter valid")
+        job.notes.append("one episode cannot be split: the filter valid is missing")
     return {name: demos for name, demos in found.items() if demos}

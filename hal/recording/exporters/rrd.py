@@ -1,4 +1,4 @@
-"""One episode as an ``.rrd`` file, for the rerun viewer: pictures, curves, and where everything was in the world."""
+"""Write one episode as an ``.rrd`` file for the rerun viewer: pictures, curves, and the poses in the world."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ from ...geometry import Pose
 from ...types import RobotStatus, Trip
 from ..dataset import Episode
 from ..layout import SETPOINT, STATE
-from .content import Arm, EpisodeContent, Pictures
+from .content import ArmColumns, EpisodeContent, PictureStream
 
 __all__ = ["write_rrd"]
 
 _TIMELINE = "episode"
 _QUALITY = 90
 _DEPTH_UNITS = 10_000.0
-"""Steps of depth in a metre: 0.1 mm, and 16 bits reach 6.5 m."""
+"""Steps of depth per metre: 0.1 mm, so that 16 bits reach 6.5 m."""
 
 
 def write_rrd(episode: Episode, path: Path) -> None:
-    """Make the file. DriverMissing, OSError, and the errors of reading the episode."""
+    """Write the file. Raises DriverMissing without rerun-sdk, OSError, and the errors of reading the episode."""
     rr = _library()
     content = EpisodeContent(episode)
     recording = rr.RecordingStream("robot-hal", recording_id=f"episode {episode.number}")
@@ -43,7 +43,7 @@ def write_rrd(episode: Episode, path: Path) -> None:
         for stream in content.pictures:
             _log_pictures(rr, recording, content, stream)
     finally:
-        recording.disconnect()  # writes what is left, and closes the file
+        recording.disconnect()  # writes the rest and closes the file
 
 
 def _library() -> Any:
@@ -58,14 +58,14 @@ def _library() -> Any:
 
 
 def _blueprint(content: EpisodeContent) -> Any:
-    """How the viewer's window is divided: the world and the pictures to the left, all curves to the right."""
+    """Return the layout of the viewer's window: world and pictures on the left, all curves on the right."""
     import rerun.blueprint as rrb
 
     pictures = [
         rrb.Spatial2DView(origin=f"world/cameras/{stream.camera}/{stream.what}", name=f"{stream.camera} {stream.what}")
         for stream in content.pictures
     ]
-    logs = rrb.TextLogView(origin="status", name="what the arm did")
+    logs = rrb.TextLogView(origin="status", name="arm status")
     left: list[Any] = [
         rrb.Spatial3DView(origin="world", name="world"),
         *([rrb.Grid(*pictures)] if pictures else []),
@@ -87,10 +87,7 @@ def _blueprint(content: EpisodeContent) -> Any:
     )
 
 
-# Numbers.
-
-
-def _log_arm(rr: Any, recording: Any, content: EpisodeContent, arm: Arm) -> None:
+def _log_arm(rr: Any, recording: Any, content: EpisodeContent, arm: ArmColumns) -> None:
     grid = content.grid
     measured, commanded = content.of(arm, STATE), content.of(arm, SETPOINT)
     for k, joint in enumerate(content.joints(arm)):
@@ -122,7 +119,7 @@ def _log_curves(
         recording.send_columns(f"{place}/{name}", times, rr.Scalars.columns(scalars=values.astype(np.float64)))
 
 
-def _base(content: EpisodeContent, arm: Arm) -> Pose:
+def _base(content: EpisodeContent, arm: ArmColumns) -> Pose:
     for robot in content.episode.info["rig"]["resolved"]["robots"]:
         if robot["name"] == arm.name:
             return Pose(robot["base_position"], robot["base_orientation"])
@@ -135,17 +132,14 @@ def _in_world(base: Pose, row: NDArray[Any]) -> NDArray[np.float64]:
 
 
 def _log_poses(rr: Any, recording: Any, place: str, grid: NDArray[Any], poses: NDArray[Any]) -> None:
-    """Poses (rows, 7) in the world; rows that are not known keep the last one."""
+    """Log poses (rows, 7) in the world; rows with unknown poses keep the last one."""
     known = np.isfinite(poses).all(axis=1)
     if known.any():
         columns = rr.Transform3D.columns(translation=poses[known, :3], quaternion=poses[known, 3:])
         recording.send_columns(place, [rr.TimeColumn(_TIMELINE, duration=grid[known])], columns)
 
 
-# Pictures.
-
-
-def _log_pictures(rr: Any, recording: Any, content: EpisodeContent, stream: Pictures) -> None:
+def _log_pictures(rr: Any, recording: Any, content: EpisodeContent, stream: PictureStream) -> None:
     place = f"world/cameras/{stream.camera}"
     if stream is next(each for each in content.pictures if each.camera == stream.camera):
         _log_lens(rr, recording, content, stream, place)
@@ -154,7 +148,7 @@ def _log_pictures(rr: Any, recording: Any, content: EpisodeContent, stream: Pict
         recording.log(f"{place}/{stream.what}", _picture(rr, stream, picture))
 
 
-def _log_lens(rr: Any, recording: Any, content: EpisodeContent, stream: Pictures, place: str) -> None:
+def _log_lens(rr: Any, recording: Any, content: EpisodeContent, stream: PictureStream, place: str) -> None:
     K = np.array(content.lenses()[stream.camera]["K"])
     height, width = stream.shape[:2]
     lens = rr.Pinhole(
@@ -166,7 +160,7 @@ def _log_lens(rr: Any, recording: Any, content: EpisodeContent, stream: Pictures
         _log_poses(rr, recording, place, content.grid, content.episode.columns[key])
 
 
-def _picture(rr: Any, stream: Pictures, picture: NDArray[Any]) -> Any:
+def _picture(rr: Any, stream: PictureStream, picture: NDArray[Any]) -> Any:
     if stream.what == "rgb":
         import simplejpeg
 
@@ -176,7 +170,7 @@ def _picture(rr: Any, stream: Pictures, picture: NDArray[Any]) -> Any:
 
 
 def _png(depth: NDArray[np.float32]) -> bytes:
-    """Depth (H, W) in m as a 16-bit PNG."""
+    """Return depth (H, W), m, as a 16-bit PNG."""
     from PIL import Image
 
     whole = np.clip(np.rint(depth * np.float32(_DEPTH_UNITS)), 0, 65535).astype(np.uint16)

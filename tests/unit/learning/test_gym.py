@@ -8,6 +8,7 @@ import re
 
 import numpy as np
 import pytest
+from errors_kit import raises_code
 
 import hal
 from hal.drivers.mock.camera import read_picture
@@ -57,13 +58,13 @@ def test_keys_are_identifiers_and_every_stream_can_be_chosen() -> None:
     finally:
         env.close()
     for wrong in (["color", "thermal"], ["segmentation"]):
-        with pytest.raises(hal.NotSupported, match=wrong[-1]):
+        with raises_code(hal.NotSupported, "unknown_stream"):
             RigEnv("panda_table", driver="mock", streams=wrong)
 
 
 def test_two_parts_of_an_observation_never_share_a_key() -> None:
     twins = ("cameras.scene-2={model: realsense_d435}", "cameras.scene_2={model: realsense_d435}")
-    with pytest.raises(hal.CommandError, match="scene_2_color"):
+    with raises_code(hal.CommandError, "duplicate_name"):
         RigEnv("panda_table", driver="mock", overrides=twins)
 
 
@@ -200,9 +201,9 @@ def test_poses_of_things_are_observed_where_they_are_asked_for() -> None:
         assert (after["object_cube"][:3] == env.rig.world.pose("cube").position).all()
     finally:
         env.close()
-    with pytest.raises(hal.DeviceNotFound, match="cube"):
+    with pytest.raises(hal.DeviceNotFound):
         RigEnv("panda_table", sim=True, objects=["cup"], overrides=BARE)
-    with pytest.raises(hal.NotSupported, match="simulated world"):
+    with raises_code(hal.NotSupported, "no_world"):
         RigEnv("panda_table", driver="mock", objects=["cube"], overrides=BARE)
 
 
@@ -211,7 +212,7 @@ def test_ranges_that_leave_no_room_are_told() -> None:
     here = "objects.2={file: cube, random: {x: [0, 0], y: [0, 0]}}"
     env = RigEnv("panda_table", sim=True, overrides=(*BARE, full, here))
     try:
-        with pytest.raises(hal.CommandError, match="no room for 'duck'.*'cube'"):
+        with raises_code(hal.CommandError, "no_room"):
             env.reset(seed=1)
     finally:
         env.close()
@@ -248,7 +249,7 @@ def test_a_stop_truncates_says_why_and_is_not_acknowledged_by_a_reset() -> None:
         assert "rig.stop()" in info["stopped"]
         before = env.robot.state().q
         for _ in range(2):  # a training loop that knows nothing of the person who stopped it
-            with pytest.raises(hal.MotionStopped, match="rearm"):
+            with raises_code(hal.MotionStopped, "stop"):
                 env.reset()
         assert env.robot.state().q == pytest.approx(before)
         env.rig.rearm()
@@ -265,7 +266,7 @@ def test_a_stop_stays_in_a_simulated_world_too() -> None:
     try:
         env.reset()
         env.rig.stop()
-        with pytest.raises(hal.MotionStopped, match="rearm"):
+        with raises_code(hal.MotionStopped, "stop"):
             env.reset()
     finally:
         env.close()
@@ -302,10 +303,10 @@ def test_what_cannot_be_is_refused_before_anything_is_left_open() -> None:
             RigEnv("panda_table", driver="mock", **wrong)
     env = RigEnv("panda_table", driver="mock", overrides=BARE)
     try:
-        with pytest.raises(hal.CommandError, match="reset"):
+        with raises_code(hal.CommandError, "not_reset"):
             env.step(np.zeros(8, np.float32))
         env.reset()
-        with pytest.raises(hal.CommandError, match="shape"):
+        with raises_code(hal.CommandError, "bad_action"):
             env.step(np.zeros(3, np.float32))
     finally:
         env.close()

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from errors_kit import raises_code
 
 import hal
 from hal.learning.policy import PolicyRunner, load_policy
@@ -94,19 +95,19 @@ def test_a_class_is_made_once_with_the_rig_where_it_takes_one(rig: Rig, module: 
 
 
 @pytest.mark.parametrize(
-    ("place", "text"),
+    ("place", "code"),
     [
-        ("some_policies", "module:name"),
-        ("some_policies:", "module:name"),
-        ("nowhere_at_all:act", "nowhere_at_all"),
-        ("some_policies:acct", "acct"),
-        ("some_policies:number", "int"),
-        ("some_policies:Dumb", "__call__"),
-        ("lacking_policies:act", "a_library_that_nobody_has"),
+        ("some_policies", "not_importable"),
+        ("some_policies:", "not_importable"),
+        ("nowhere_at_all:act", "not_importable"),
+        ("some_policies:acct", "not_importable"),
+        ("some_policies:number", "not_callable"),
+        ("some_policies:Dumb", "not_callable"),
+        ("lacking_policies:act", "not_importable"),
     ],
 )
-def test_what_is_no_policy_is_told(rig: Rig, module: Any, place: str, text: str) -> None:
-    with pytest.raises(hal.CommandError, match=text):
+def test_what_is_not_a_policy_is_refused(rig: Rig, module: Any, place: str, code: str) -> None:
+    with raises_code(hal.CommandError, code):
         load_policy(place, rig)
 
 
@@ -155,15 +156,15 @@ def test_reset_gets_the_seed_and_a_rehearsal_moves_nothing(rig: Rig) -> None:
 
 
 @pytest.mark.parametrize(
-    ("policy", "text"),
+    ("policy", "error"),
     [
-        (lambda o: np.zeros(7), "ndarray"),
-        (lambda o: (UP, 0.0, 1.0), "3 things"),
-        (lambda o: 1 / 0, "division"),
+        (lambda o: np.zeros(7), hal.CommandError),
+        (lambda o: (UP, 0.0, 1.0), hal.CommandError),
+        (lambda o: 1 / 0, ZeroDivisionError),
     ],
 )
-def test_a_rehearsal_shows_what_is_wrong(rig: Rig, policy: Callable[[Any], Any], text: str) -> None:
-    with pytest.raises((hal.CommandError, ZeroDivisionError), match=text):
+def test_a_rehearsal_shows_what_is_wrong(rig: Rig, policy: Callable[[Any], Any], error: type[Exception]) -> None:
+    with pytest.raises(error):
         PolicyRunner(rig, policy).rehearse()
 
 

@@ -8,9 +8,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+from errors_kit import raises_code
 
 import hal
-from hal.learning.replay import Deviation, Player, RecordedTrajectory, arms_of, moved_besides
+from hal.learning.replay import Deviation, RecordedTrajectory, TrajectoryPlayer, other_moving_arms, recorded_arms
 
 FPS = 30
 BARE = ["cameras={}"]
@@ -35,7 +36,7 @@ def opened(driver: str, **options: Any) -> hal.Rig:
 
 
 def course_of(episode: Recorded, robot: hal.Robot) -> RecordedTrajectory:
-    return RecordedTrajectory.of(episode, robot)  # type: ignore[arg-type]
+    return RecordedTrajectory.from_episode(episode, robot)  # type: ignore[arg-type]
 
 
 def twist(t: float) -> hal.Twist:
@@ -86,21 +87,21 @@ def test_a_replay_is_where_the_recording_was(driver: str, speed: float) -> None:
     episode = record(driver)
     with opened(driver) as rig:
         arm = rig.robots["panda"]
-        player = Player(rig, arm, course_of(episode, arm), speed=speed)
+        player = TrajectoryPlayer(rig, arm, course_of(episode, arm), speed=speed)
         player.approach()
         start, widths = rig.clock.now(), []
-        player.play(lambda player, plays: widths.append((player.place, arm.gripper.state().width)))
+        player.play(lambda player, plays: widths.append((player.progress, arm.gripper.state().width)))
         took = rig.clock.now() - start
     assert player.finished
     assert player.deviation.samples > 150
     assert player.deviation.rms.max() < 0.01
     assert player.deviation.tcp[0] < 0.01
     assert player.deviation.most.max() > 0.0, "it was measured"
-    assert took == pytest.approx(player.course.duration / speed, abs=1.5)
+    assert took == pytest.approx(player.trajectory.duration / speed, abs=1.5)
     recorded = episode.columns["observation.state"][:, -1]
     for place, width in widths:
         if not 1.9 < place < 2.8:  # not while the fingers are on their way, at a speed of their own
-            assert width == pytest.approx(np.interp(place, player.course.t, recorded), abs=0.012)
+            assert width == pytest.approx(np.interp(place, player.trajectory.t, recorded), abs=0.012)
 
 
 def test_things_are_put_back_where_they_lay() -> None:
@@ -109,12 +110,12 @@ def test_things_are_put_back_where_they_lay() -> None:
         arm = rig.robots["panda"]
         away = rig.world.pose("cube").position[:2] - [0.15, 0.2]
         assert np.linalg.norm(away) > 0.05
-        player = Player(rig, arm, course_of(episode, arm))
+        player = TrajectoryPlayer(rig, arm, course_of(episode, arm))
         player.approach()
-        assert rig.world.pose("cube").position == pytest.approx(player.course.objects["cube"].position, abs=1e-6)
+        assert rig.world.pose("cube").position == pytest.approx(player.trajectory.objects["cube"].position, abs=1e-6)
         assert rig.world.pose("cube").position[:2] == pytest.approx([0.15, 0.2], abs=0.01)
         rig.world.remove("cube")
-        with pytest.raises(hal.CommandError, match="cube"):
+        with raises_code(hal.CommandError, "missing_object"):
             player.approach()
 
 
@@ -124,18 +125,18 @@ def test_things_are_put_back_where_they_lay() -> None:
 def test_while_the_dead_man_is_released_time_stands_still_and_a_press_goes_on(episode: Recorded) -> None:
     with opened("mock", pad=None, overrides=[*BARE, "gamepads.pad.model=auto"]) as rig:
         arm, hand = rig.robots["panda"], rig.driver("pad")
-        player = Player(rig, arm, course_of(episode, arm), deadman=rig.gamepads["pad"].hold("l2"))
+        player = TrajectoryPlayer(rig, arm, course_of(episode, arm), deadman=rig.gamepads["pad"].hold("l2"))
         rig.clock.sleep(0.1)
         hand.press("l2")
         player.approach()
         before = arm.state().q
         turns, rest, places = 0, [], []
 
-        def on_turn(player: Player, plays: bool) -> None:
+        def on_turn(player: TrajectoryPlayer, plays: bool) -> None:
             nonlocal turns
             turns += 1
             if turns == 25:  # what was held through the approach moves nothing
-                assert player.place == 0.0
+                assert player.progress == 0.0
                 assert np.abs(arm.state().q - before).max() < 1e-6
                 hand.release("l2")
             elif turns == 30:
@@ -144,7 +145,7 @@ def test_while_the_dead_man_is_released_time_stands_still_and_a_press_goes_on(ep
                 hand.release("l2")
             elif 150 < turns < 200:
                 rest.append(arm.state().q)
-                places.append(player.place)
+                places.append(player.progress)
                 assert not plays
             elif turns == 200:
                 hand.press("l2")
@@ -155,7 +156,7 @@ def test_while_the_dead_man_is_released_time_stands_still_and_a_press_goes_on(ep
     assert player.pauses == 1
     assert np.ptp(rest, axis=0).max() < 1e-6, "at rest"
     assert len(set(places)) == 1
-    assert 0.5 < places[0] < player.course.duration - 0.5, "in the middle"
+    assert 0.5 < places[0] < player.trajectory.duration - 0.5, "in the middle"
     assert player.deviation.rms.max() < 0.01, "and on from there"
 
 
@@ -163,14 +164,14 @@ def test_while_the_dead_man_is_released_time_stands_still_and_a_press_goes_on(ep
 def test_a_trip_ends_it(episode: Recorded, cause: str) -> None:
     with opened("mock", pad=None, overrides=[*BARE, "gamepads.pad.model=auto"]) as rig:
         arm, hand = rig.robots["panda"], rig.driver("pad")
-        player = Player(rig, arm, course_of(episode, arm), deadman=rig.gamepads["pad"].hold("l2"))
+        player = TrajectoryPlayer(rig, arm, course_of(episode, arm), deadman=rig.gamepads["pad"].hold("l2"))
         rig.clock.sleep(0.1)
         hand.press("l2")
         player.approach()
         hand.release("l2")
         turns = 0
 
-        def on_turn(player: Player, plays: bool) -> None:
+        def on_turn(player: TrajectoryPlayer, plays: bool) -> None:
             nonlocal turns
             turns += 1
             assert turns < 500
@@ -213,31 +214,31 @@ def test_what_cannot_be_replayed_is_refused_with_the_reason(episode: Recorded) -
             (replace(good, q_set=moved(20, 3, np.nan)), "not a number"),
             (replace(good, t=good.t[:1], q_set=good.q_set[:1]), "nothing to replay"),
         ]
-        for course, text in wrong:
+        for trajectory, text in wrong:
             with pytest.raises(hal.CommandError, match=text):
-                Player(rig, arm, course)
+                TrajectoryPlayer(rig, arm, trajectory)
         for speed in (0.0, -1.0, 1.5, np.nan):
-            with pytest.raises(hal.CommandError, match="speed"):
-                Player(rig, arm, good, speed=speed)
+            with raises_code(hal.CommandError, "bad_speed"):
+                TrajectoryPlayer(rig, arm, good, speed=speed)
 
 
 def test_what_is_too_fast_here_names_the_speed_that_is_not(episode: Recorded) -> None:
     with opened("mock", overrides=[*BARE, "robots.panda.speed=0.05"]) as rig:
         arm = rig.robots["panda"]
-        course = course_of(episode, arm)
+        trajectory = course_of(episode, arm)
         with pytest.raises(hal.CommandError, match="at speed [0-9.]+ it could") as refused:
-            Player(rig, arm, course)
+            TrajectoryPlayer(rig, arm, trajectory)
         possible = float(str(refused.value).rpartition("at speed ")[2].split()[0])
-        Player(rig, arm, course, speed=possible)
+        TrajectoryPlayer(rig, arm, trajectory, speed=possible)
 
 
 def test_an_arm_without_a_gripper_does_not_replay_one_that_has_it(episode: Recorded) -> None:
     with opened("mock") as rig:
         arm = rig.robots["panda"]
-        course = course_of(episode, arm)
+        trajectory = course_of(episode, arm)
         arm.gripper = None
-        with pytest.raises(hal.CommandError, match="gripper"):
-            course.check(arm, 1.0)
+        with raises_code(hal.CommandError, "cannot_replay"):
+            trajectory.check(arm, 1.0)
 
 
 def test_one_arm_of_two_is_found_by_its_name(episode: Recorded) -> None:
@@ -253,16 +254,16 @@ def test_one_arm_of_two_is_found_by_its_name(episode: Recorded) -> None:
 
         both = {key: np.hstack([0.0 * rows, rows]) for key, rows in episode.columns.items()}
         two = Two(both, {"robot.left": 0.0 * episode.stamps["robot.panda"], **episode.stamps}, {}, episode.joints)
-        course = course_of(two, arm)
-        assert course.joints == single.joints
+        trajectory = course_of(two, arm)
+        assert trajectory.joints == single.joints
         for name in ("t", "q_set", "q", "tcp", "width"):
-            assert getattr(course, name) == pytest.approx(getattr(single, name))
-        assert arms_of(two) == ["left", "panda"]  # type: ignore[arg-type]
-        assert moved_besides(two, "panda") == [], "the other one stood still"  # type: ignore[arg-type]
-        assert moved_besides(two, "left") == ["panda"]  # type: ignore[arg-type]
-        assert moved_besides(episode, "left") == [], "there is no other"  # type: ignore[arg-type]
+            assert getattr(trajectory, name) == pytest.approx(getattr(single, name))
+        assert recorded_arms(two) == ["left", "panda"]  # type: ignore[arg-type]
+        assert other_moving_arms(two, "panda") == [], "the other one stood still"  # type: ignore[arg-type]
+        assert other_moving_arms(two, "left") == ["panda"]  # type: ignore[arg-type]
+        assert other_moving_arms(episode, "left") == [], "there is no other"  # type: ignore[arg-type]
         arm.name = "right"
-        with pytest.raises(hal.CommandError, match="no arm 'right'; it has: left, panda"):
+        with raises_code(hal.CommandError, "no_such_arm"):
             course_of(two, arm)
 
 
@@ -278,15 +279,15 @@ def test_the_deviation_is_what_it_says() -> None:
 
 
 def test_every_stretch_is_monotone_and_its_two_ways_agree() -> None:
-    from hal.learning.replay import Stretch
+    from hal.learning.replay import TimeScaling
 
-    stretch = Stretch(t=10.0, s=2.0, speed=0.5)
-    times: Callable[[float], float] = stretch.time
-    places = [stretch.place(t) for t in np.arange(9.5, 14.0, 0.01)]
+    scaling = TimeScaling(t=10.0, s=2.0, speed=0.5)
+    times: Callable[[float], float] = scaling.time_at
+    places = [scaling.progress_at(t) for t in np.arange(9.5, 14.0, 0.01)]
     assert (np.diff(places) >= 0.0).all()
     assert places[0] == 2.0
     for s in np.arange(2.0, 4.0, 0.01):
-        assert stretch.place(times(s)) == pytest.approx(s)
+        assert scaling.progress_at(times(s)) == pytest.approx(s)
     assert np.diff(places)[-1] == pytest.approx(0.005)
 
 
@@ -313,10 +314,10 @@ def test_rows_whose_stamps_jitter_are_no_faster_than_they_were() -> None:
     with opened("mock") as rig:
         arm = rig.robots["panda"]
         most = arm.spec.speed * arm.limits.velocity[-1]
-        course = course_of(driven(most, late=0.008), arm)
-        rows = np.abs(np.diff(course.q_set[:, -1])) / np.diff(course.t)
+        trajectory = course_of(driven(most, late=0.008), arm)
+        rows = np.abs(np.diff(trajectory.q_set[:, -1])) / np.diff(trajectory.t)
         assert rows.max() > 1.1 * most, "from row to row it seems to be"
-        course.check(arm, 1.0)
+        trajectory.check(arm, 1.0)
 
 
 @pytest.mark.parametrize("times", [1.06, 1.5, 5.0])
@@ -325,20 +326,20 @@ def test_what_is_really_faster_is_refused(times: float, late: float) -> None:
     with opened("mock") as rig:
         arm = rig.robots["panda"]
         most = arm.spec.speed * arm.limits.velocity[-1]
-        course = course_of(driven(times * most, late, seconds=2.4 / times), arm)
+        trajectory = course_of(driven(times * most, late, seconds=2.4 / times), arm)
         with pytest.raises(hal.CommandError, match=r"panda_joint7 moves at .* at speed [0-9.]+ it could") as refused:
-            course.check(arm, 1.0)
+            trajectory.check(arm, 1.0)
         possible = float(str(refused.value).rpartition("at speed ")[2].split()[0])
         assert possible == pytest.approx(1.0 / times, rel=0.15)
-        course.check(arm, possible)
+        trajectory.check(arm, possible)
 
 
 @pytest.mark.parametrize("row", [1, 40, -1])
 def test_a_leap_is_refused_wherever_it_is(row: int) -> None:
     with opened("mock") as rig:
         arm = rig.robots["panda"]
-        course = course_of(driven(0.1), arm)
-        q = course.q_set.copy()
+        trajectory = course_of(driven(0.1), arm)
+        q = trajectory.q_set.copy()
         q[row:, -1] += 0.2
-        with pytest.raises(hal.CommandError, match="panda_joint7 moves at"):
-            replace(course, q_set=q).check(arm, 1.0)
+        with raises_code(hal.CommandError, "cannot_replay"):
+            replace(trajectory, q_set=q).check(arm, 1.0)

@@ -10,14 +10,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from errors_kit import raises_code
 from recording_kit import SIZE, make_recording, pictures
 
 import hal
 from hal.errors import CommandError, DatasetError
 from hal.recording import Dataset, Recorder
 from hal.recording.exporters import default_path, export
-from hal.recording.exporters.content import episode_numbers
-from hal.recording.exporters.output import fresh
+from hal.recording.exporters.content import parse_episodes
+from hal.recording.exporters.output import write_atomically
 
 
 @pytest.fixture(scope="module")
@@ -26,10 +27,10 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
 
 
 def test_episodes_are_numbers_and_ranges() -> None:
-    assert episode_numbers("0, 3-5,7") == [0, 3, 4, 5, 7]
+    assert parse_episodes("0, 3-5,7") == [0, 3, 4, 5, 7]
     for wrong in ("", "1-", "a", "3-1", "-1", "1,,2"):
-        with pytest.raises(CommandError, match="range"):
-            episode_numbers(wrong)
+        with raises_code(CommandError, "bad_episodes"):
+            parse_episodes(wrong)
 
 
 @pytest.mark.parametrize(
@@ -53,25 +54,25 @@ def test_the_chosen_episodes_are_written_in_their_order(
 
 
 @pytest.mark.parametrize(
-    ("kind", "wrong", "says"),
+    ("kind", "wrong", "code"),
     [
-        ("npz", {"episodes": "0-3"}, "no episode 3 .* there are 3"),
-        ("npz", {"episodes": "1", "successful_only": True}, "marked a success"),
-        ("npz", {"episodes": []}, "no episode was chosen"),
-        ("zarr", {"cameras": ["front"]}, "no camera front; cameras: scene, wrist"),
-        ("npz", {"camera": "front"}, "no camera front"),
-        ("npz", {"camera": "wrist", "gripper_camera": "wrist"}, "both"),
-        ("zarr", {"size": (0, 4)}, "size"),
-        ("robomimic", {"valid": 1.0}, "valid"),
-        ("tfds", {}, "robomimic, zarr, npz"),
+        ("npz", {"episodes": "0-3"}, "no_episodes"),
+        ("npz", {"episodes": "1", "successful_only": True}, "no_episodes"),
+        ("npz", {"episodes": []}, "no_episodes"),
+        ("zarr", {"cameras": ["front"]}, "no_such_camera"),
+        ("npz", {"camera": "front"}, "no_such_camera"),
+        ("npz", {"camera": "wrist", "gripper_camera": "wrist"}, "duplicate_name"),
+        ("zarr", {"size": (0, 4)}, "bad_export"),
+        ("robomimic", {"valid": 1.0}, "bad_export"),
+        ("tfds", {}, "bad_export"),
     ],
 )
 def test_what_does_not_fit_is_refused_and_nothing_is_left(
-    dataset: Dataset, tmp_path: Path, kind: str, wrong: dict[str, object], says: str
+    dataset: Dataset, tmp_path: Path, kind: str, wrong: dict[str, object], code: str
 ) -> None:
     if kind == "robomimic":
         pytest.importorskip("h5py", reason="pip install 'robot-hal[export]'")
-    with pytest.raises(CommandError, match=says):
+    with raises_code(CommandError, code):
         export(dataset, kind, tmp_path / "out", **wrong)  # type: ignore[arg-type]
     assert list(tmp_path.iterdir()) == []
 
@@ -92,16 +93,16 @@ def test_only_such_an_export_is_overwritten_and_only_when_asked(dataset: Dataset
         pytest.importorskip("h5py", reason="pip install 'robot-hal[export]'")
     path = tmp_path / "out"
     first = export(dataset, kind, path, cameras=[])
-    with pytest.raises(CommandError, match="there already; --force"):
+    with raises_code(CommandError, "exists"):
         export(dataset, kind, path, cameras=[], episodes="0")
     assert export(dataset, kind, path, cameras=[], episodes="0", force=True).size < first.size
     strange = tmp_path / "mine"
     strange.mkdir()
     (strange / "thesis.txt").write_text("years of work")
-    with pytest.raises(CommandError, match="not written by this program"):
+    with raises_code(CommandError, "not_an_export"):
         export(dataset, kind, strange, cameras=[], force=True)
     assert (strange / "thesis.txt").read_text() == "years of work"
-    with pytest.raises(CommandError, match="not written by this program"):
+    with raises_code(CommandError, "not_an_export"):
         export(dataset, kind, dataset.root, cameras=[], force=True)
     assert sorted(file.name for file in tmp_path.iterdir()) == ["mine", "out"]
 
@@ -129,7 +130,7 @@ def test_what_a_killed_program_left_is_removed_and_what_runs_is_left_alone(tmp_p
     (old / "kept").touch()
     other = tmp_path / f".out.{os.getppid()}.partial"
     other.mkdir()
-    with pytest.raises(ZeroDivisionError), fresh(tmp_path / "out", force=False, is_ours=Path.is_dir):
+    with pytest.raises(ZeroDivisionError), write_atomically(tmp_path / "out", force=False, is_ours=Path.is_dir):
         raise ZeroDivisionError
     assert sorted(file.name for file in tmp_path.iterdir()) == [other.name, "out"]
     assert (tmp_path / "out" / "kept").exists(), "it was killed between two renames: the old one is back"
@@ -187,7 +188,7 @@ def test_episodes_with_other_pictures_are_told_apart(tmp_path: Path) -> None:
         camera |= {"depth_unit_m": None, "depth_lossless": None}
         (tmp_path / f"demo/depth/{name}/chunk-000/file-001.depth").unlink()
     file.write_text(json.dumps(about))
-    with pytest.raises(CommandError, match="episodes 0 and 1 differ in depth of scene, depth of wrist.*--no-depth"):
+    with raises_code(CommandError, "episodes_differ"):
         export(tmp_path / "demo", "zarr", tmp_path / "out")
     assert export(tmp_path / "demo", "zarr", tmp_path / "out", depth=False).episodes == 2
 
@@ -196,6 +197,8 @@ def test_a_video_that_is_too_short_is_an_error(tmp_path: Path) -> None:
     dataset = make_recording(tmp_path / "demo")
     short = dataset.root / "videos/observation.images.wrist/chunk-000"
     (short / "file-000.mp4").write_bytes((short / "file-002.mp4").read_bytes())
-    with pytest.raises(DatasetError, match="episode 0: videos/.*/file-000.mp4: has 7 pictures, for 14 rows"):
+    with pytest.raises(
+        DatasetError, check=lambda error: error.episode == 0 and str(error.file).endswith("file-000.mp4")
+    ):
         export(dataset, "zarr", tmp_path / "out")
     assert [file.name for file in tmp_path.iterdir()] == ["demo"]

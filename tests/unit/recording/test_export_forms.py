@@ -221,4 +221,4 @@ def test_values_that_were_not_known_are_told(dataset: Dataset, tmp_path: Path) -
     columns = silent.episodes[1].columns
     columns["observation.velocity"] = np.where(np.arange(7) == 2, np.nan, columns["observation.velocity"])
     made = export(silent, "zarr", tmp_path / "out", cameras=[])
-    assert made.notes == ("robot0_joint_vel of episode 1 has values that were not known (NaN)",)
+    assert made.notes == ("robot0_joint_vel of episode 1 has unknown values (NaN)",)

@@ -10,7 +10,7 @@ import pytest
 from recording_kit import make_recording
 
 from hal.recording import Dataset, review
-from hal.recording.review import Canvas, as_json, draw_sheet, summary, ticks
+from hal.recording.review import SheetCanvas, draw_sheet, summarize, summary_as_json, ticks
 
 RED, BLUE, ORANGE, PINK = (215, 60, 50), (0, 90, 181), (240, 140, 30), (250, 205, 200)
 
@@ -21,7 +21,7 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
 
 
 def test_the_numbers_are_those_of_the_rows(dataset: Dataset) -> None:
-    found = summary(dataset)
+    found = summarize(dataset)
     assert (found.successes, found.failures, found.unmarked) == (1, 1, 1)
     assert found.rows == sum(episode.length for episode in dataset.episodes)
     assert found.seconds == pytest.approx(found.rows / 20)
@@ -45,7 +45,7 @@ def test_times_that_are_not_even_are_told(dataset: Dataset) -> None:
     wrist[8] = wrist[7]  # and one not at all
     scene[:2] = np.nan
     episode.columns.update({"observation.time.camera.wrist": wrist, "observation.time.camera.scene": scene})
-    found = {each.source: each for each in summary(dataset, [episode]).timing}
+    found = {each.source: each for each in summarize(dataset, [episode]).timing}
     told = found["camera.wrist"]
     assert told.repeated == 1
     assert told.longest == pytest.approx(100.0)
@@ -58,7 +58,7 @@ def test_times_that_are_not_even_are_told(dataset: Dataset) -> None:
 def test_an_episode_that_cannot_be_read_does_not_hide_the_others(tmp_path: Path) -> None:
     dataset = make_recording(tmp_path / "demo")
     (dataset.root / "data/chunk-000/file-001.parquet").write_bytes(b"nothing")
-    found = summary(Dataset(dataset.root))
+    found = summarize(Dataset(dataset.root))
     assert [line.number for line in found.episodes] == [0, 2]
     assert len(found.broken) == 1
     assert found.broken[0].startswith("episode 1: ")
@@ -68,7 +68,7 @@ def test_json_has_no_number_that_json_does_not_have(dataset: Dataset) -> None:
     def refuse(text: str) -> None:
         raise AssertionError(text)
 
-    found = json.loads(as_json(summary(dataset, dataset.episodes[:1])), parse_constant=refuse)
+    found = json.loads(summary_as_json(summarize(dataset, dataset.episodes[:1])), parse_constant=refuse)
     assert found["rows"] == dataset.episodes[0].length
     assert found["state"][0]["name"] == "panda_joint1"
 
@@ -97,16 +97,16 @@ def test_the_sheet_shows_pictures_curves_and_stops(dataset: Dataset) -> None:
 
 
 def test_a_curve_goes_through_its_points() -> None:
-    paper = Canvas(100, 50)
+    paper = SheetCanvas(100, 50)
     paper.line([(10, 40), (90, 10)], BLUE, 2.0)
     paper.box(0, 0, 5, 5, RED)
     paper.text(60, 30, "x", 12)
-    image = np.asarray(paper.finished())
+    image = np.asarray(paper.image())
     assert tuple(image[25, 50]) == BLUE
     assert tuple(image[2, 2]) == RED
     assert tuple(image[40, 90]) == (255, 255, 255)
     assert image[30:46, 58:72].min() < 100, "a word is there"
-    assert review.Canvas.length("xx") > review.Canvas.length("x") > 0
+    assert review.SheetCanvas.length("xx") > review.SheetCanvas.length("x") > 0
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,7 @@ from recording_kit import check_layout, drive, kill_writer, mock_rig, record
 
 from hal.errors import ConnectionLost
 from hal.recording import Dataset, Recorder, finish, layout, recover
-from hal.recording.live import Rest
+from hal.recording.live import LiveContent
 
 
 @pytest.fixture(scope="module")
@@ -87,13 +87,13 @@ def test_a_live_file_may_end_at_any_byte(torn: Path, tmp_path: Path, name: str) 
         with (folder / name).open("rb+") as file:
             file.truncate(end)
         try:
-            lengths.append(Rest(folder).length)
+            lengths.append(LiveContent(folder).length)
         except ValueError:  # not even its first line
             lengths.append(0)
         shutil.rmtree(folder)
     assert lengths == sorted(lengths)
     assert lengths[0] == 0
-    assert lengths[-1] == Rest(Path(shutil.copytree(whole, tmp_path / "again"))).length >= 10
+    assert lengths[-1] == LiveContent(Path(shutil.copytree(whole, tmp_path / "again"))).length >= 10
     assert len(set(lengths)) > 5
 
 
@@ -125,7 +125,7 @@ def test_it_may_be_killed_at_every_step_of_finishing(
 
         return step
 
-    monkeypatch.setattr(layout, "sync", counted(layout.sync))
+    monkeypatch.setattr(layout, "sync", counted(layout.sync_to_disk))
     monkeypatch.setattr(finish, "sync", counted(finish.sync))
     monkeypatch.setattr(Path, "replace", counted(Path.replace))
     monkeypatch.setattr(Path, "rename", counted(Path.rename))

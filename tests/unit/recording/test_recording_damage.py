@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from errors_kit import raises_code
 from recording_kit import check_layout, drive, kill_writer, make_recording, mock_rig, record
 
 from hal.errors import CommandError, ConnectionLost, DatasetError, DeviceNotFound, HalError
@@ -20,7 +21,7 @@ from hal.recording import Dataset, Episode, Recorder, recover, repair
 from hal.recording.checking import check_dataset, check_rows
 from hal.recording.exporters import export
 from hal.recording.index import read_tasks
-from hal.recording.review import draw_sheet, summary
+from hal.recording.review import draw_sheet, summarize
 from hal.rig import Rig
 
 FLIPS = int(os.environ.get("HAL_TEST_FLIPS", "60"))
@@ -85,7 +86,7 @@ def exported(episode: Episode, folder: Path, rig: Rig) -> Arrays:
 
 def replayed(episode: Episode, folder: Path, rig: Rig) -> Arrays:
     check_rows(episode, None)
-    course = RecordedTrajectory.of(episode, rig.robots["panda"])
+    course = RecordedTrajectory.from_episode(episode, rig.robots["panda"])
     assert course.width is not None
     return {"t": course.t, "q_set": course.q_set, "width": course.width}
 
@@ -112,7 +113,7 @@ def read_all(root: Path, number: int, right: list[list[Arrays]], folder: Path, r
     """Read an episode in every way. What comes out is right, or a DatasetError; those are returned."""
     try:
         dataset = Dataset(root)
-        broken = summary(dataset).broken
+        broken = summarize(dataset).broken
         episode = dataset.episodes[number]
     except DatasetError as error:
         return [str(error)]
@@ -225,8 +226,9 @@ def test_nothing_is_recorded_over_episodes_whose_index_is_lost(out: Path, rig: R
     before = {path: path.read_bytes() for path in files(out)}
     path = out / lost
     shutil.rmtree(path) if path.is_dir() else path.unlink()
-    with pytest.raises(DatasetError, match="is missing.*hal-review .*demo --repair") as caught:
+    with pytest.raises(DatasetError) as caught:
         Recorder(rig, out, fps=20)
+    assert caught.value.code in ("index_missing", "index_wrong")
     assert caught.value.file is not None
     assert caught.value.file.startswith("meta/")
     assert recover(out) == [], "no unfinished episode, and the index is nobody's but repair's"
@@ -258,7 +260,7 @@ def test_the_index_comes_back_as_it_was(whole: Path, out: Path) -> None:
 def test_an_index_that_lists_fewer_episodes_than_there_are(out: Path, rig: Rig) -> None:
     file = out / "meta/info.json"
     file.write_text(json.dumps(json.loads(file.read_text()) | {"total_episodes": 1, "total_frames": 14}))
-    with pytest.raises(DatasetError, match="episode 1: .*does not list this episode; nothing is recorded over it"):
+    with raises_code(DatasetError, "index_wrong"):
         Recorder(rig, out, fps=20)
     assert any("is not in the index" in text for text in checked(out))
     assert "rebuilt from 3 episodes" in repair(out)[0]
@@ -268,7 +270,7 @@ def test_an_index_that_lists_fewer_episodes_than_there_are(out: Path, rig: Rig) 
 def test_an_index_cannot_be_rebuilt_without_every_episode(out: Path) -> None:
     (out / "meta/info.json").unlink()
     (out / "data/chunk-000/file-001.parquet").unlink()
-    with pytest.raises(DatasetError, match="episode 1: data/chunk-000/file-001.parquet: is missing"):
+    with pytest.raises(DatasetError, check=lambda error: error.file == "data/chunk-000/file-001.parquet"):
         repair(out)
     assert not (out / "meta/info.json").exists()
 
@@ -279,7 +281,7 @@ def test_episodes_of_an_older_version_need_the_names_of_their_columns(whole: Pat
         del about["features"]
         file.write_text(json.dumps(about))
     (out / "meta/info.json").unlink()
-    with pytest.raises(DatasetError, match="copy that file from a dataset that was recorded with the same rig"):
+    with pytest.raises(DatasetError, check=lambda error: error.file == "episodes/000000.json"):
         repair(out)
     info = json.loads((whole / "meta/info.json").read_text())
     (out / "meta/info.json").write_text(json.dumps(info | {"total_episodes": 1}))
@@ -334,9 +336,9 @@ def test_a_list_moves_nothing_out_of_the_dataset(trap: tuple[Path, Path], rig: R
     (partial,) = out.glob("episodes/*.partial")
     place = place.replace("{absolute}", str(precious))
     (partial / "list.json").write_text(json.dumps([["rows.arrow", place]]))
-    with pytest.raises(HalError, match="cannot be made an episode .*move it elsewhere"):
+    with raises_code(HalError, "damaged_episode"):
         recover(out)
-    with pytest.raises(HalError, match="cannot be made an episode"), Recorder(rig, out) as recorder:
+    with raises_code(HalError, "damaged_episode"), Recorder(rig, out) as recorder:
         recorder.start()
     assert precious.read_bytes() == before
     assert (partial / "rows.arrow").exists()
@@ -348,7 +350,7 @@ def test_a_list_takes_nothing_from_elsewhere(trap: tuple[Path, Path], source: st
     (partial,) = out.glob("episodes/*.partial")
     moves = [[source.replace("{absolute}", str(precious)), "videos/x.mp4"]]
     (partial / "list.json").write_text(json.dumps(moves))
-    with pytest.raises(HalError, match="cannot be made an episode"):
+    with raises_code(HalError, "damaged_episode"):
         recover(out)
     assert precious.exists()
 
@@ -360,7 +362,7 @@ def test_a_list_moves_nothing_over_a_finished_episode(out: Path, target: str) ->
     partial.mkdir()
     (partial / "new").write_bytes(b"not an episode")
     (partial / "list.json").write_text(json.dumps([["new", target]]))
-    with pytest.raises(HalError, match="belongs to a finished episode"):
+    with pytest.raises(HalError):
         recover(out)
     assert (out / target).read_bytes() == before
 
@@ -394,7 +396,7 @@ def test_no_file_elsewhere_is_cut_off_or_written(trap: tuple[Path, Path], what: 
 def test_an_unfinished_episode_whose_description_is_damaged_is_kept(trap: tuple[Path, Path]) -> None:
     (partial,) = trap[0].glob("episodes/*.partial")
     (partial / "about.json").write_text("{")
-    with pytest.raises(HalError, match="cannot be made an episode"):
+    with raises_code(HalError, "damaged_episode"):
         recover(trap[0])
     assert (partial / "rows.arrow").stat().st_size > 0
 
@@ -420,7 +422,7 @@ def test_an_unfinished_episode_whose_description_is_damaged_is_kept(trap: tuple[
 def test_json_of_another_shape_is_one_clear_error(out: Path, file: str, change: dict[str, Any]) -> None:
     path = out / file
     path.write_text(json.dumps(json.loads(path.read_text()) | change))
-    with pytest.raises(DatasetError, match=f"{file}|data/chunk-000/file-000.parquet: has 14 rows"):
+    with pytest.raises(DatasetError, check=lambda error: error.file in (file, "data/chunk-000/file-000.parquet")):
         rows(Dataset(out).episodes[0], out, None)  # type: ignore[arg-type]
     assert checked(out)
 
@@ -430,7 +432,7 @@ def test_what_is_no_json_is_one_clear_error(out: Path, text: str) -> None:
     for file in ("meta/info.json", "episodes/000000.json"):
         before = (out / file).read_text()
         (out / file).write_text(text)
-        with pytest.raises(DatasetError, match=file):
+        with pytest.raises(DatasetError, check=lambda error, file=file: error.file == file):
             rows(Dataset(out).episodes[0], out, None)  # type: ignore[arg-type]
         (out / file).write_text(before)
 
@@ -438,5 +440,5 @@ def test_what_is_no_json_is_one_clear_error(out: Path, text: str) -> None:
 @pytest.mark.parametrize("head", [b'{"width": 1000000, "height": 1000000, "unit_m": 0.001}', b"[]", b"x" * 10_000_000])
 def test_a_depth_file_that_claims_too_much(out: Path, head: bytes) -> None:
     (out / "depth/wrist/chunk-000/file-000.depth").write_bytes(head + b"\n")
-    with pytest.raises(DatasetError, match="episode 0: depth/wrist/chunk-000/file-000.depth"):
+    with pytest.raises(DatasetError, check=lambda error: error.file == "depth/wrist/chunk-000/file-000.depth"):
         list(Dataset(out).episodes[0].depth("wrist"))

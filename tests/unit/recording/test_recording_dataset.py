@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from errors_kit import raises_code
 from recording_kit import CAMERAS, check_layout, drive, mock_rig, record, small
 
 import hal
@@ -88,7 +89,7 @@ def test_pictures_and_depth_come_back(made: Path) -> None:
             assert near.any(), "the square is nearer than the background"
             assert np.unique(depth).size == 2
             assert np.isclose(np.unique(depth), [0.9, 1.0], atol=2e-4).all()
-    with pytest.raises(DeviceNotFound, match="cameras: scene, wrist"):
+    with pytest.raises(DeviceNotFound):
         episode.frames("nose")
 
 
@@ -109,7 +110,8 @@ def test_what_differs_is_said_before_anything_is_written(made: Path) -> None:
     before = sorted(str(path) for path in made.rglob("*"))
     with mock_rig("lock_step", "cameras.wrist.output.width=80") as rig, pytest.raises(CommandError) as caught:
         Recorder(rig, made, fps=15, depth=False)
-    said = str(caught.value).partition("another kind: ")[2].split("; ")
+    assert caught.value.code == "other_dataset"
+    said = str(caught.value).partition("another format: ")[2].split("; ")
     assert said == [
         "fps is 30 there, and 15 here",
         "shape of observation.images.wrist is [48, 64, 3] there, and [48, 80, 3] here",
@@ -124,7 +126,7 @@ def test_depth_is_kept_by_all_episodes_or_by_none(tmp_path: Path) -> None:
     with mock_rig() as rig:
         with Recorder(rig, tmp_path, depth=False) as recorder:
             record(recorder, 0.1)
-        with pytest.raises(CommandError, match=r"kind: depth of scene is not kept there, and is here; depth of wrist"):
+        with raises_code(CommandError, "other_dataset"):
             Recorder(rig, tmp_path)
         with Recorder(rig, tmp_path, depth=False) as recorder:
             record(recorder, 0.1)
@@ -139,10 +141,8 @@ def test_depth_in_another_unit_is_another_kind(made: Path, tmp_path: Path) -> No
         unit = about["cameras"]["wrist"]["depth_unit_m"]
         about["cameras"]["wrist"]["depth_unit_m"] = 2.0 * unit
         file.write_text(json.dumps(about))
-    with mock_rig() as rig, pytest.raises(CommandError) as caught:
+    with mock_rig() as rig, raises_code(CommandError, "other_dataset"):
         Recorder(rig, copy)
-    told = f"depth of wrist is in units of {2e3 * unit:g} mm there, and {1e3 * unit:g} mm here; choose a new folder"
-    assert str(caught.value).endswith(f"another kind: {told}")
 
 
 def test_names_that_differ_are_told_without_the_others(made: Path, tmp_path: Path) -> None:
@@ -157,7 +157,7 @@ def test_names_that_differ_are_told_without_the_others(made: Path, tmp_path: Pat
     said = str(caught.value)
     assert "the names of action differ: only there it has elbow; only here it has panda_joint1;" in said
     assert re.search(r"video\.codec of observation\.images\.scene is vp9 there, and \w+ here", said)
-    assert len(said.partition("another kind")[2]) < 250
+    assert len(said.partition("another format")[2]) < 250
 
 
 def test_how_to_mend_an_unfinished_episode_can_be_typed(tmp_path: Path) -> None:
@@ -181,7 +181,7 @@ def test_how_to_mend_an_unfinished_episode_can_be_typed(tmp_path: Path) -> None:
 
 def test_a_folder_of_something_else_is_left_alone(tmp_path: Path) -> None:
     (tmp_path / "thesis.tex").write_text("important")
-    with mock_rig() as rig, pytest.raises(CommandError, match="holds other things"):
+    with mock_rig() as rig, raises_code(CommandError, "foreign_dataset"):
         Recorder(rig, tmp_path)
     with mock_rig() as rig, Recorder(rig, tmp_path / "new"):
         assert not (tmp_path / "new").exists(), "before the first episode nothing is written"
@@ -200,14 +200,14 @@ def test_a_discarded_episode_is_gone_and_one_that_is_left_open_is_kept(tmp_path:
             recorder.start()
             drive(rig, 0.3)
             assert recorder.status().state == "recording"
-            with pytest.raises(CommandError, match="save or discard it first"):
+            with raises_code(CommandError, "episode_open"):
                 recorder.start()
             recorder.discard()
             assert not list(out.rglob("*.parquet"))
             recorder.start()
             drive(rig, 0.3)
         assert recorder.status().state == "idle"
-        with pytest.raises(CommandError, match="closed"):
+        with raises_code(CommandError, "recorder_closed"):
             recorder.start()
     check_layout(out)
     assert [episode.success for episode in Dataset(out).episodes] == [None]
@@ -217,7 +217,7 @@ def test_a_discarded_episode_is_gone_and_one_that_is_left_open_is_kept(tmp_path:
 def test_two_programs_do_not_record_into_one_folder(tmp_path: Path) -> None:
     with mock_rig() as rig, Recorder(rig, tmp_path / "out") as first, Recorder(rig, tmp_path / "out") as second:
         first.start()
-        with pytest.raises(CommandError, match="another program is recording"):
+        with raises_code(CommandError, "dataset_locked"):
             second.start()
         drive(rig, 0.2)
         first.save(wait=True)
@@ -235,7 +235,7 @@ def test_only_depth_and_only_colour(tmp_path: Path) -> None:
         record(recorder, 0.3)
     info = check_layout(tmp_path / "b")
     assert info["features"]["observation.images.scene"]["info"]["video.codec"] == "av1"
-    with pytest.raises(DeviceNotFound, match="no depth"):
+    with pytest.raises(DeviceNotFound):
         Dataset(tmp_path / "b").episodes[0].depth("scene")
 
 
@@ -273,9 +273,9 @@ def test_infrared_and_segmentation_are_recorded_on_request(tmp_path: Path) -> No
                 drawn.append(rig.cameras["scene"].read())
                 rig.clock.sleep(1 / 30)
             recorder.save(wait=True)
-        with pytest.raises(CommandError, match="infrared.*segmentation of scene is kept there, and not here"):
+        with raises_code(CommandError, "other_dataset"):
             Recorder(rig, out, streams=["color"])
-        with pytest.raises(CommandError, match="no stream 'thermal'; streams: color, depth, infrared"):
+        with raises_code(CommandError, "unknown_stream"):
             Recorder(rig, out, streams=["thermal"])
     info = check_layout(out)
     assert info["features"]["observation.images.scene_infrared"]["shape"] == [48, 64, 3]
@@ -291,7 +291,7 @@ def test_infrared_and_segmentation_are_recorded_on_request(tmp_path: Path) -> No
     assert np.abs(infrared[0].astype(float) - drawn[0].infrared).mean() < 6.0
     assert np.ptp(infrared[0]) > 30
     for camera, stream in (("scene", "depth"), ("wrist", "segmentation"), ("wrist", "infrared")):
-        with pytest.raises(DeviceNotFound, match=f"no {stream} of a camera '{camera}'"):
+        with pytest.raises(DeviceNotFound):
             episode.pictures(camera, stream)
     assert list(check_dataset(Dataset(out))) == []
     (out / "meta/info.json").unlink()

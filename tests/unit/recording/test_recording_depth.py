@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 pytest.importorskip("zstandard", reason="pip install 'robot-hal[record]'")
 
-from hal.recording.codecs import DepthFile, DepthReader, cut, to_units, unit_for
+from hal.recording.codecs import DepthFile, DepthReader, depth_unit_for, to_units, truncate_records
 
 
 def pictures(count: int) -> list[NDArray[np.float32]]:
@@ -45,7 +45,7 @@ def test_what_was_not_measured_is_nought(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(("reach", "unit"), [(3.0, 0.0001), (6.5, 0.0001), (10.0, 0.00025), (100.0, 0.002)])
 def test_the_unit_of_a_simulated_camera_is_the_finest_that_reaches_as_far(reach: float, unit: float) -> None:
-    assert unit_for(reach) == unit
+    assert depth_unit_for(reach) == unit
     depth = np.linspace(0.0, reach, 1000, dtype=np.float32)
     back = to_units(depth, unit) * np.float32(unit)
     assert np.abs(back - depth).max() <= 0.5 * unit + 1e-6 * reach
@@ -80,7 +80,7 @@ def test_a_last_picture_that_was_half_written_is_noticed(tmp_path: Path) -> None
     data[-20:] = bytes(20)  # its length is on the disk, what it held is not
     path.write_bytes(data)
     assert len(DepthReader(path)) == 2
-    cut(path, 1)
+    truncate_records(path, 1)
     assert len(DepthReader(path)) == 1
-    cut(path, 0)
+    truncate_records(path, 0)
     assert len(DepthReader(path)) == 0

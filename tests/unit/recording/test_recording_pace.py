@@ -11,7 +11,7 @@ import pytest
 from recording_kit import mock_rig, record
 
 from hal.recording import Dataset, Recorder
-from hal.recording.layout import Pace, simulated_pace
+from hal.recording.metadata import ClockPace, simulated_pace
 
 COLUMNS = [
     ("observation.time.grid", "float64", ("t",)),
@@ -27,8 +27,8 @@ def rows(seconds: float, left: float, right: float, start: float = 100.0) -> Ite
         yield [start + t, start + t, 7.0 + left * t, k, start + t, right * t, k]
 
 
-def measured(seconds: float, left: float, right: float, simulated: tuple[str, ...] = ("left",)) -> Pace:
-    pace = Pace(COLUMNS, simulated)
+def measured(seconds: float, left: float, right: float, simulated: tuple[str, ...] = ("left",)) -> ClockPace:
+    pace = ClockPace(COLUMNS, simulated)
     for row in rows(seconds, left, right):
         pace.add(row)
     return pace
@@ -55,17 +55,17 @@ def test_nothing_is_said_of(seconds: float, left: float, right: float, simulated
 
 
 def test_a_clock_that_is_not_known_or_begins_anew_is_left_out() -> None:
-    pace = Pace(COLUMNS, ("left",))
+    pace = ClockPace(COLUMNS, ("left",))
     for row in rows(2.0, 0.9, math.nan):
         pace.add(row)
     for row in rows(2.0, 0.9, math.nan, start=200.0):  # 98 s later: its clock is at 7 s again
         pace.add(row)
     assert pace.as_json() == {"left": 0.9}
-    assert Pace(COLUMNS).as_json() == {}
+    assert ClockPace(COLUMNS).as_json() == {}
 
 
 def test_what_a_person_is_told_does_not_change_with_every_row() -> None:
-    pace, told = Pace(COLUMNS, ("left",)), []
+    pace, told = ClockPace(COLUMNS, ("left",)), []
     for k in range(3000):
         t = k / 30
         pace.add([t, t, 0.9 * t + 0.01 * math.sin(t), k, t, t, k])

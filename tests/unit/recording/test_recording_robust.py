@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from errors_kit import raises_code
 from recording_kit import check_layout, check_stamps, drive, mock_rig, record
 
 import hal
@@ -87,7 +88,7 @@ def test_ten_seconds_may_pass_in_one_go(rig: Rig, out: Path) -> None:
 def test_a_simulation_cannot_be_recorded_faster_than_it_steps(rig: Rig, out: Path) -> None:
     with hal.open("panda_table", driver="mock", overrides=["simulation.physics_hz=100"]) as slow:
         steps = 1.0 / _step(slow)
-        with pytest.raises(CommandError, match="steps of this simulation"):
+        with raises_code(CommandError, "bad_fps"):
             Recorder(slow, out, fps=math.ceil(steps) + 1)
     with Recorder(rig, out, fps=24.0) as recorder:  # type: ignore[arg-type]
         record(recorder, 0.2)
@@ -171,7 +172,7 @@ def test_an_episode_of_one_row_and_one_of_none(rig: Rig, out: Path) -> None:
         rig.clock.sleep(0.1)
         recorder.start()
         assert (recorder.status().frames, recorder.status().dropped) == (0, 1)
-        with pytest.raises(CommandError, match="nothing was recorded, so there is nothing to save: panda"):
+        with raises_code(CommandError, "no_rows"):
             recorder.save(wait=True)
         recorder.start()
         recorder.save()
@@ -212,7 +213,7 @@ def test_a_rig_that_is_closed_first(out: Path) -> None:
         recorder.start()
         rig.clock.sleep(0.3)
     recorder.save(wait=True)
-    with pytest.raises(ConnectionLost, match="not open"):
+    with pytest.raises(ConnectionLost):
         recorder.start()
     assert recorder.status().state == "idle"
     recorder.close()
@@ -248,7 +249,7 @@ def test_a_folder_that_cannot_be_made_is_said_and_may_be_mended(rig: Rig, tmp_pa
     (tmp_path / "a").write_text("a file")
     with Recorder(rig, tmp_path / "a" / "b") as recorder:
         for _ in range(2):
-            with pytest.raises(CommandError, match="cannot record into .*a/b"):
+            with raises_code(CommandError, "cannot_write"):
                 recorder.start()
             assert recorder.status().state == "idle"
         rig.clock.sleep(0.1)
@@ -266,14 +267,14 @@ def test_a_task_may_be_any_text_and_a_seed_any_whole_number(rig: Rig, out: Path)
             recorder.save(wait=True)
         for wrong in ("caf\udce9", None, 3):
             recorder.task = wrong  # type: ignore[assignment]
-            with pytest.raises(CommandError, match="task"):
+            with raises_code(CommandError, "bad_metadata"):
                 recorder.start()
         recorder.task = "fine"
         for seed in (1.5, "one"):
-            with pytest.raises(CommandError, match="seed"):
+            with raises_code(CommandError, "bad_metadata"):
                 recorder.start(seed=seed)  # type: ignore[arg-type]
         for value in (math.nan, np.float32(1.0), b"raw"):
-            with pytest.raises(CommandError, match="info"):
+            with raises_code(CommandError, "bad_metadata"):
                 recorder.start(info={"value": value})
         assert recorder.status().state == "idle"
     assert check_layout(out)["total_tasks"] == len(tasks)
@@ -282,7 +283,7 @@ def test_a_task_may_be_any_text_and_a_seed_any_whole_number(rig: Rig, out: Path)
 
 @pytest.mark.parametrize("fps", [math.nan, math.inf, -30, 241, 29.97])
 def test_a_rate_that_cannot_be(rig: Rig, out: Path, fps: float) -> None:
-    with pytest.raises(CommandError, match="fps"):
+    with raises_code(CommandError, "bad_fps"):
         Recorder(rig, out, fps=fps)  # type: ignore[arg-type]
 
 
@@ -297,7 +298,7 @@ def test_an_object_whose_name_can_be_no_column(out: Path) -> None:
     pytest.importorskip("pybullet", reason="pip install 'robot-hal[sim]'")
     with hal.open("panda_table", sim=True, clock="lock_step", pad="none", overrides=["cameras={}"]) as rig:
         rig.world.add(hal.BodySpec("ball/1", (0, 0, 1), (0, 0, 0, 1), "sphere", radius=0.03, mass=0.1))
-        with pytest.raises(CommandError, match=r"no slash: 'ball/1'"):
+        with raises_code(CommandError, "bad_name"):
             Recorder(rig, out)
 
 
@@ -316,7 +317,7 @@ def test_an_unfinished_episode_that_is_damaged_is_named(rig: Rig, out: Path) -> 
         about = json.loads((partial / "about.json").read_text())
         (partial / "about.json").write_text(json.dumps({"features": about["features"]}))
         for use in (recorder.start, lambda: recover(out)):
-            with pytest.raises(HalError, match=r"000000.partial cannot be made an episode .*move it elsewhere"):
+            with raises_code(HalError, "damaged_episode"):
                 use()
         partial.rename(out.parent / "broken")
         record(recorder, 0.1)
