@@ -425,7 +425,7 @@ def _known(objects: Collection[str], rig: Rig) -> tuple[str, ...]:
     """Return the names of objects whose poses can be observed. Raises NotSupported or DeviceNotFound."""
     if not objects:
         return ()
-    if rig.world is None:
+    if not rig.has_world:
         raise NotSupported("objects=: only a simulated world has the poses of objects", code="no_world")
     return tuple(rig.world.poses(objects).poses)
 

@@ -49,7 +49,7 @@ def test_a_file_that_is_there_is_written_over_only_by_force(tmp_path: Path, monk
     mine.write_text("mine\n")
     done = import_(tmp_path, monkeypatch, str(TUTORIAL), "-o", str(mine))
     assert done.returncode == 2
-    assert "exists; --force overwrites it" in done.stderr
+    assert "exists; --force" in done.stderr
     assert mine.read_text() == "mine\n"
     done = import_(tmp_path, monkeypatch, str(TUTORIAL), "-o", str(mine), "--force")
     assert done.returncode == 0, done.stderr

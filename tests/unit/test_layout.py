@@ -97,7 +97,7 @@ def test_hal_names_no_driver() -> None:
     """Only the registry does, and what ships for tests. Ark's configurations use such names themselves."""
     quoted = re.compile(rf"""["']({"|".join(DRIVERS)})["']""")
     texts = re.compile(r'"""(?:.|\n)*?"""')  # docstrings show how a driver is chosen
-    libraries = {"hal.recording.sampling"}  # names the Python packages whose versions an episode keeps
+    libraries = {"hal.recording.metadata"}  # names the Python packages whose versions an episode keeps
     wrong = {
         f"{module}: {found[0]}"
         for module, path in sources().items()

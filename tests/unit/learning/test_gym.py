@@ -249,7 +249,7 @@ def test_a_stop_truncates_says_why_and_is_not_acknowledged_by_a_reset() -> None:
         assert "rig.stop()" in info["stopped"]
         before = env.robot.state().q
         for _ in range(2):  # a training loop that knows nothing of the person who stopped it
-            with raises_code(hal.MotionStopped, "stop"):
+            with raises_code(hal.MotionStopped, hal.Trip.STOP.code):
                 env.reset()
         assert env.robot.state().q == pytest.approx(before)
         env.rig.rearm()
@@ -266,7 +266,7 @@ def test_a_stop_stays_in_a_simulated_world_too() -> None:
     try:
         env.reset()
         env.rig.stop()
-        with raises_code(hal.MotionStopped, "stop"):
+        with raises_code(hal.MotionStopped, hal.Trip.STOP.code):
             env.reset()
     finally:
         env.close()

@@ -179,7 +179,7 @@ def test_an_episode_of_one_row_and_one_of_none(rig: Rig, out: Path) -> None:
         rig.driver("panda").inject(disconnect=False)
         rig.clock.sleep(0.2)
         recorder.start()
-        assert "nothing was recorded" in recorder.notes[-1], "also where nobody asked"
+        assert "no row was recorded" in recorder.notes[-1], "the reason of a failure in the background"
         rig.clock.sleep(0.1)
         recorder.save(wait=True)
     assert check_layout(out)["total_episodes"] == 2
