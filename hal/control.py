@@ -1,7 +1,6 @@
 """Control sessions: exclusive, dead-man-guarded streaming of commands to one arm.
 
-:class:`Control` is the session. Every command passes :class:`CommandChecks` before it is sent. :class:`StopLatch` holds
-``rig.stop()`` until it is acknowledged.
+:class:`Control` is the session. Every command passes :class:`CommandChecks` before it is sent.
 """
 
 from __future__ import annotations
@@ -51,14 +50,7 @@ if TYPE_CHECKING:
     from .host.records import ServoRecord
     from .robot import Robot
 
-__all__ = [
-    "CommandChecks",
-    "Control",
-    "FIRST_STEP_ANGLE",
-    "FIRST_STEP_DISTANCE",
-    "FIRST_STEP_TURN",
-    "StopLatch",
-]
+__all__ = ["CommandChecks", "Control", "FIRST_STEP_ANGLE", "FIRST_STEP_DISTANCE", "FIRST_STEP_TURN"]
 
 FIRST_STEP_ANGLE = 0.1
 """Greatest distance of a first joint target from the set-point, rad per joint."""
@@ -603,17 +595,3 @@ def _target_at(chunk: JointChunk, t: float) -> NDArray[np.float64]:
         share = (t - chunk.t[k - 1]) / (chunk.t[k] - chunk.t[k - 1])
         due = chunk.q[k - 1] + share * (due - chunk.q[k - 1])
     return due
-
-
-class StopLatch:
-    """Holds a call of ``rig.stop()`` until it is acknowledged."""
-
-    def __init__(self) -> None:
-        self.stopped = False
-
-    def check(self) -> None:
-        """Raise MotionStopped while the stop is not acknowledged."""
-        if self.stopped:
-            raise MotionStopped(
-                "rig.stop() was called", "call rig.rearm() when it is safe to move again", code=Trip.STOP.code
-            )

@@ -1,4 +1,4 @@
-"""The dead-man switch: a control that must be held for the arm to move."""
+"""The dead-man switch, a control that must be held for the arm to move, and the latch of ``rig.stop()``."""
 
 from __future__ import annotations
 
@@ -7,9 +7,10 @@ import threading
 from collections.abc import Callable
 
 from .commands import DeadmanRecord
-from .errors import NotSupported
+from .errors import MotionStopped, NotSupported
+from .types import Trip
 
-__all__ = ["Deadman", "Threshold"]
+__all__ = ["Deadman", "StopLatch", "Threshold"]
 
 Sink = Callable[[DeadmanRecord], None]
 
@@ -149,3 +150,17 @@ class Deadman:
 
     def __repr__(self) -> str:
         return f"<Deadman {self.name}: {'held' if self.held else 'released'}>"
+
+
+class StopLatch:
+    """Holds a call of ``rig.stop()`` until it is acknowledged."""
+
+    def __init__(self) -> None:
+        self.stopped = False
+
+    def check(self) -> None:
+        """Raise MotionStopped while the stop is not acknowledged."""
+        if self.stopped:
+            raise MotionStopped(
+                "rig.stop() was called", "call rig.rearm() when it is safe to move again", code=Trip.STOP.code
+            )

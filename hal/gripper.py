@@ -14,7 +14,7 @@ from .types import GripperOutcome, GripperState
 
 if TYPE_CHECKING:
     from .clock import Clock
-    from .control import StopLatch
+    from .deadman import StopLatch
     from .host.hosts import Host
     from .specs import GripperSpec
 

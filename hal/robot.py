@@ -21,8 +21,7 @@ from .types import RobotState, RobotStatus
 
 if TYPE_CHECKING:
     from .clock import Clock
-    from .control import StopLatch
-    from .deadman import Deadman
+    from .deadman import Deadman, StopLatch
     from .gripper import Gripper
     from .host.hosts import Host
     from .kinematics.arm import Kinematics

@@ -10,7 +10,7 @@ from unittest.mock import patch
 
 from .. import registry
 from ..clock import LockStepClock
-from ..control import StopLatch
+from ..deadman import StopLatch
 from ..gripper import Gripper
 from ..host.cycle import ArmUnit
 from ..host.gripper_unit import GripperUnit
