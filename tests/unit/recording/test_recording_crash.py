@@ -125,8 +125,8 @@ def test_it_may_be_killed_at_every_step_of_finishing(
 
         return step
 
-    monkeypatch.setattr(layout, "sync", counted(layout.sync_to_disk))
-    monkeypatch.setattr(finish, "sync", counted(finish.sync))
+    monkeypatch.setattr(layout, "sync_to_disk", counted(layout.sync_to_disk))
+    monkeypatch.setattr(finish, "sync_to_disk", counted(finish.sync_to_disk))
     monkeypatch.setattr(Path, "replace", counted(Path.replace))
     monkeypatch.setattr(Path, "rename", counted(Path.rename))
     monkeypatch.setattr(shutil, "rmtree", counted(shutil.rmtree))
