@@ -166,7 +166,7 @@ class BodySpec:
     are then in the frame of the link."""
     link: str | None = None
     random: RangesSpec | None = None
-    """Range of :func:`hal.learning.episode.draw_poses`; None for a fixed start pose."""
+    """Range of :func:`hal.learning.episode.sample_poses`; None for a fixed start pose."""
 
 
 @dataclass(frozen=True)

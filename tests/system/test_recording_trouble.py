@@ -104,7 +104,7 @@ def test_a_disk_that_is_full(rig: Rig, out: Path) -> None:
         begin(recorder)
         largest = max(path.stat().st_size for path in out.glob("episodes/*.partial/*"))
         limit(recorder, largest + 2000)
-        wait(lambda: "does not take it any more" in recorder.status().trouble)
+        wait(lambda: "cannot be written" in recorder.status().trouble)
         rows = recorder.status().frames
         time.sleep(0.3)
         assert recorder.status().frames - rows <= 1, "no further rows"
@@ -151,7 +151,7 @@ def test_a_folder_that_is_deleted_is_written_anew(rig: Rig, out: Path) -> None:
     with Recorder(rig, out) as recorder:
         begin(recorder)
         shutil.rmtree(out)
-        wait(lambda: "is gone; what was recorded was written there anew" in recorder.status().trouble)
+        wait(lambda: "written there again" in recorder.status().trouble)
         recorder.save(True, wait=True)
     usable(out, 15)
     assert "is gone" in Dataset(out).episodes[0].info["trouble"]
