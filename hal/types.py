@@ -10,7 +10,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import IntEnum, IntFlag
 from types import MappingProxyType
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -293,25 +292,3 @@ class PadState:
         if name not in BUTTONS:
             raise KeyError(f"{name!r} is no button; buttons: {', '.join(BUTTONS)}")
         return name in self.buttons
-
-
-def as_dict(record: Any) -> dict[str, Any]:
-    """Return a record as nested dicts of plain lists, numbers and texts, ready for JSON."""
-    from dataclasses import fields, is_dataclass
-
-    def plain(value: Any) -> Any:
-        if is_dataclass(value) and not isinstance(value, type):
-            return {f.name: plain(getattr(value, f.name)) for f in fields(value)}
-        if isinstance(value, np.ndarray):
-            return value.tolist()
-        if isinstance(value, IntFlag):
-            return str(value)
-        if isinstance(value, IntEnum):
-            return value.name
-        if isinstance(value, Mapping):
-            return {key: plain(item) for key, item in value.items()}
-        if isinstance(value, (frozenset, set)):
-            return sorted(value)
-        return value
-
-    return {f.name: plain(getattr(record, f.name)) for f in fields(record)}

@@ -13,7 +13,7 @@ ROOT = Path(__file__).parents[2]
 LARGEST_FILE = 600
 CIRCLES = 3
 """At most so many import circles, TYPE_CHECKING included, and none of more modules than this."""
-SHARED_CLASS_NAMES = 5
+SHARED_CLASS_NAMES = 3
 DRIVERS = tuple(sorted(path.parent.name for path in (ROOT / "drivers").glob("*/__init__.py")))
 
 
@@ -150,6 +150,17 @@ def test_class_names_are_unique() -> None:
     )
     shared = [name for name, count in names.items() if count > 1]
     assert len(shared) <= SHARED_CLASS_NAMES, shared
+
+
+def test_no_docstring_is_a_question() -> None:
+    wrong = [
+        f"{module}:{node.lineno}"
+        for module, path in sources().items()
+        for node in ast.walk(tree(path))
+        if isinstance(node, (ast.FunctionDef, ast.ClassDef))
+        and (ast.get_docstring(node) or "").split("\n")[0].rstrip().endswith("?")
+    ]
+    assert not wrong
 
 
 def test_no_file_is_too_long() -> None:
