@@ -17,7 +17,7 @@ from hal.apps.teleop import main as teleop
 from ..wire.franka_kit import Emulator, free_host
 
 ROOT = Path(__file__).resolve().parents[2]
-EMPTY = free_host(4)
+EMPTY = free_host()
 needs_libraries = pytest.mark.skipif(
     importlib.util.find_spec("pylibfranka") is None or importlib.util.find_spec("panda_py") is None,
     reason="needs the Python packages pylibfranka and panda-python",

@@ -9,6 +9,7 @@ with Emulator("--lockstep", robot="fr3") as emulator:     # ready when the line 
 from __future__ import annotations
 
 import contextlib
+import itertools
 import json
 import os
 import signal
@@ -32,17 +33,24 @@ START_LIMIT = 20.0
 END_LIMIT = 5.0
 
 
-def free_host(block: int = 1) -> str:
-    """Return an address 127.0.block.x with free Franka ports; different test processes start at different ones."""
-    for k in range(250):
-        host = f"127.0.{block}.{(os.getpid() + k) % 250 + 1}"
+_hosts = itertools.cycle(range(1, 251))
+
+
+def free_host() -> str:
+    """Return a loopback address with free Franka ports, which this process has not used yet, and no other one uses.
+
+    A new address each time: the process of an arm that a test left behind may still hold the lock on the old one.
+    """
+    block = f"127.{1 + os.getpid() // 256 % 250}.{os.getpid() % 256}"
+    for last in itertools.islice(_hosts, 250):
+        host = f"{block}.{last}"
         with contextlib.suppress(OSError), contextlib.ExitStack() as stack:
             for port in PORTS:
                 listener = stack.enter_context(socket.socket())
                 listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
                 listener.bind((host, port))
             return host
-    raise RuntimeError(f"no free address in 127.0.{block}.x")
+    raise RuntimeError(f"no free address in {block}.x")
 
 
 class Emulator:

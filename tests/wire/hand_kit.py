@@ -28,7 +28,7 @@ class HandBench:
 
     def __init__(self, connect: bool = True, **options: Any) -> None:
         """``options`` are those of the server; ``connect`` False leaves opening the driver to the test."""
-        self.host = free_host(2)
+        self.host = free_host()
         self.server = HandServer(self.host, **options)
         self.server.start()
         spec = GripperSpec("panda.gripper", "franka", 0.08, 0.1, 40.0, options={"host": self.host})

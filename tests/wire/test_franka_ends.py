@@ -50,6 +50,15 @@ def emulator(request: pytest.FixtureRequest) -> Iterator[Emulator]:
         yield started
 
 
+def runs(pid: int) -> bool:
+    """Whether a process exists and is no zombie."""
+    try:
+        with open(f"/proc/{pid}/stat") as file:
+            return file.read().rpartition(")")[2].split()[0] != "Z"
+    except OSError:
+        return False
+
+
 class App:
     """A program that moves the arm."""
 
@@ -64,14 +73,17 @@ class App:
         assert line, self.process.stderr.read()
         self.children: list[int] = json.loads(line)["children"]
 
-    def nobody_left(self) -> bool:
+    def has_ended(self) -> bool:
+        """Whether the app and its children have ended."""
         self.process.poll()
-        return not any(os.path.exists(f"/proc/{pid}") for pid in [self.process.pid, *self.children])
+        return not any(map(runs, [self.process.pid, *self.children]))
 
     def close(self) -> None:
+        """Kill the app in any state, and wait until its children have ended, which hold the arm's lock."""
         if self.process.poll() is None:
-            self.process.kill()  # also if it is stopped
+            self.process.kill()
         self.process.wait(10.0)
+        wait_until(self.has_ended, "ended")
         for stream in (self.process.stdout, self.process.stderr):
             if stream is not None:
                 stream.close()
@@ -94,7 +106,7 @@ def test_an_app_that_ends_leaves_an_arm_at_rest(emulator: Emulator, app: App, ho
     app.process.send_signal(how)
     ended = emulator.wait_event("motion ended")
     assert "success (finished)" in ended["text"], "in order, not cut off"
-    wait_until(app.nobody_left, "gone")
+    wait_until(app.has_ended, "ended")
     assert max(map(abs, emulator.control.send("state")["dq"])) < 1e-9
     assert not emulator.events("reflex")
 
@@ -215,14 +227,6 @@ def test_an_arm_is_ready_while_another_thread_works(emulator: Emulator) -> None:
 
 LONGEST = 40.0
 """s: what docs/safety.md gives an app that is silent (30), and some."""
-
-
-def runs(pid: int) -> bool:
-    try:
-        with open(f"/proc/{pid}/stat") as file:
-            return file.read().rpartition(")")[2].split()[0] != "Z"
-    except OSError:
-        return False
 
 
 @contextlib.contextmanager

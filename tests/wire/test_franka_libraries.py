@@ -74,7 +74,7 @@ def run_library(library: str, host: str, actions: dict[str, str]) -> dict[str, d
 def test_every_exception_becomes_its_fault(library: str) -> None:
     if importlib.util.find_spec(library) is None:
         pytest.skip(f"needs the Python package {library}")
-    version, host = LIBRARIES[library], free_host(6)
+    version, host = LIBRARIES[library], free_host()
     chosen = {name: a for name, a in tries(version).items() if a.only in ("", library)}
     says = [{"layout": version, "version": version, **a.says} for a in chosen.values()]
     command = [sys.executable, str(HERE / "lying_robot.py"), json.dumps({"host": host, "says": says})]
@@ -96,7 +96,7 @@ def test_every_exception_becomes_its_fault(library: str) -> None:
 def test_a_refused_connection(library: str) -> None:
     if importlib.util.find_spec(library) is None:
         pytest.skip(f"needs the Python package {library}")
-    host = free_host(6)
+    host = free_host()
     found = run_library(library, host, {"nobody": "read"})["nobody"]
     assert found["fault"][0] == "refused"
     assert f"{host}:1337" in found["fault"][1]

@@ -81,7 +81,7 @@ def test_another_arm_than_the_rigs_is_a_failure(robot: Emulator) -> None:
 
 
 def test_a_missing_hand_is_a_failure(robot: Emulator) -> None:
-    found = checked(rig(robot, f"robots.arm.gripper.real.host={free_host(2)}"))
+    found = checked(rig(robot, f"robots.arm.gripper.real.host={free_host()}"))
     assert found["hand"].level == "fail"
     assert "gripper: {enabled: false}" in found["hand"].remedy
 
