@@ -15,6 +15,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 from ._moved import install as _install_aliases
+from ._moved import names_of as _names_of
 
 if TYPE_CHECKING:
     from .camera import Camera
@@ -165,6 +166,7 @@ _MODULES = {
     ),
 }
 _install_aliases()
+_find_moved = _names_of(__name__)
 _HOME = {name: module for module, names in _MODULES.items() for name in names}
 
 
@@ -178,7 +180,7 @@ def __getattr__(name: str) -> Any:
     elif name in _HOME:
         value = getattr(import_module(f".{_HOME[name]}", __name__), name)
     else:
-        raise AttributeError(f"module 'hal' has no attribute {name!r}")
+        return _find_moved(name)
     globals()[name] = value
     return value
 

@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from numpy.typing import NDArray
 
 from ._moved import names_of
-from .driver import CameraDriver, RawFrame
 from .errors import ConnectionLost, HalError, StaleStateError
 from .geometry import Pose
 from .histogram import Histogram
@@ -24,7 +23,7 @@ if TYPE_CHECKING:
     import numpy as np
 
     from .clock import Clock
-    from .driver import CameraInfo
+    from .driver import CameraDriver, CameraInfo, RawFrame
     from .robot import Robot
 
 __all__ = ["Camera", "CameraCounts", "MovingCamera", "frame_from_color", "place_of"]

@@ -10,12 +10,16 @@ import math
 import threading
 from collections.abc import Callable, Collection, Mapping
 from types import MappingProxyType
+from typing import TYPE_CHECKING
 
 from ._moved import names_of
 from .deadman import Deadman, Threshold
-from .driver import GamepadDriver, PadReading
+from .driver import PadReading
 from .errors import DeviceNotFound
 from .types import AXES, BUTTONS, PadState, Stamp
+
+if TYPE_CHECKING:
+    from .driver import GamepadDriver
 
 __all__ = [
     "CONTROL_NAMES",

@@ -9,6 +9,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+from ._moved import RenamedAttribute
 from .errors import CommandError
 from .geometry import Pose
 from .host.hosts import Host
@@ -84,6 +85,8 @@ class Console(ABC):
     def show_camera(self, camera: Camera) -> None:
         """Display a camera's frames to the pages that show it."""
 
+    show = RenamedAttribute("show_camera")
+
     @abstractmethod
     def say(self, text: str) -> None:
         """Display a line on every page."""
@@ -104,8 +107,7 @@ class Console(ABC):
             changed: Gets the setting and its value: the name of an arm, a share of the mapping's speeds, a frame, or
                 ``"reset"`` for ``scene``. It must only note them and return, as with :meth:`on_action`. The program
                 decides: it must change the arm or the frame only while the dead-man is released, and stop the arm
-                    before it resets the
-                scene. Its next :class:`DrivingView` shows the result.
+                before it resets the scene. Its next :class:`DrivingView` shows the result.
         """
 
     @abstractmethod

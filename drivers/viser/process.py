@@ -24,7 +24,7 @@ from hal.specs import GroupSpec, WorldSpec, from_json
 from hal.types import Limited, Trip
 
 from .guard import HOST, start_server
-from .scene import ArmView, WorldView
+from .scene import ArmView, BodiesView
 
 __all__ = ["PORT", "StatusPanel", "ViewerPage", "arm_status", "main"]
 
@@ -104,7 +104,7 @@ class ViewerPage:
         """Set when *Stop* was pressed."""
         self._server = server
         self._due = 0.0
-        self.world: WorldView | None = None
+        self.world: BodiesView | None = None
         arms: list[tuple[ArmView, GroupMemory]] = []
         found = [GroupMemory.of(shared.buffer, group) for group, shared in zip(groups, memories, strict=True)]
         grippers = {name: mail for memory in found for name, mail in memory.grippers.items()}
@@ -117,7 +117,7 @@ class ViewerPage:
                     raise HalError(f"{robot.name} cannot be drawn: {error}", code="not_drawable") from error
             if group.world is not None:
                 snapshots = SeriesBox(shared.buffer[GroupMemory.size_of(group) :], SNAPSHOT_CAPACITY)
-                self.world = WorldView(server.scene, group.world, snapshots, self.notes)
+                self.world = BodiesView(server.scene, group.world, snapshots, self.notes)
         self.arms = [arm for arm, _ in arms]
         if not any(group.world is not None and _has_floor(group.world) for group in groups):
             server.scene.add_grid("/grid", 6.0, 6.0, cell_size=0.25)

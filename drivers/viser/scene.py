@@ -26,7 +26,7 @@ from hal.types import RobotState, Trip
 from .goals import HandleDrag
 from .meshes import visual_glb
 
-__all__ = ["ArmView", "WorldView", "workspace_lines"]
+__all__ = ["ArmView", "BodiesView", "workspace_lines"]
 
 _OPEN_SIDE = 0.8
 """Distance from the base at which an open side of a workspace is drawn, m."""
@@ -187,7 +187,7 @@ def workspace_lines(workspace: WorkspaceSpec) -> NDArray[np.float32]:
     return np.asarray(segments, np.float32).reshape(-1, 2, 3)
 
 
-class WorldView:
+class BodiesView:
     """All bodies of a simulated world, drawn from their specs and moved by a mirror of the world.
 
     Bodies that can move are left out where the world's driver has no mirrors.

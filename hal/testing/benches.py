@@ -16,6 +16,7 @@ from typing import Any, ClassVar, TypeVar
 
 import pytest
 
+from .._moved import RenamedAttribute
 from ..clock import Clock, RealClock
 from ..driver import CameraDriver, GamepadDriver, GripperDriver, RobotDriver
 from ..errors import ConnectionLost, HalError, StaleStateError
@@ -92,6 +93,8 @@ class Bench:
     def was_given(self, ability: str) -> bool:
         """Return whether the bench was made with a function for an ability."""
         return callable(getattr(self, ability, None)) and self.has(ability)
+
+    gave = RenamedAttribute("was_given")
 
     def pass_time(self) -> float:
         """Let one cycle pass, and return the time after it, s."""

@@ -92,8 +92,9 @@ def test_the_changelog_has_every_moved_name() -> None:
     rows = re.findall(r"^\| (`.*) \| (`.*) \|$", (ROOT / "CHANGELOG.md").read_text(encoding="utf-8"), re.MULTILINE)
     shown = [(set(re.findall(r"`(.*?)`", old)), set(re.findall(r"`(.*?)`", new))) for old, new in rows]
     moved = [({old}, {new}) for old, new in _moved.MODULES.items()]
-    moved += [({module, name}, {new}) for module, names in _moved.NAMES.items() for name, new in names.items()]
-    moved += [({old}, {module, new}) for module, names in _moved.RENAMED.items() for old, new in names.items()]
+    for module, names in _moved.NAMES.items():
+        for old, (home, _, new) in ((old, path.rpartition(".")) for old, path in names.items()):
+            moved.append(({module, old}, {home} if new == old else {home, new}))
     missing = [(old, new) for old, new in moved if not any(old <= left and new <= right for left, right in shown)]
     assert not missing
 
