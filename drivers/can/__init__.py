@@ -1,0 +1,1 @@
+"""Arms on a CAN bus, through python-can."""

@@ -1,0 +1,589 @@
+"""Frames of an AgileX PiPER arm and its gripper, in both directions: pure functions and records, no bus.
+
+The arm has a controller on board, which takes position targets and reports its state without being asked. Frames are
+classic CAN with 11-bit ids and at most 8 bytes; numbers are big-endian integers. The layouts are those of the vendor's
+``piper_sdk`` (protocol V2, firmware V1.5-2 and later), and are tested against it.
+
+Records hold SI units and radians. ``frame()`` encodes a record; :func:`decode_command` (for an emulator) and
+:func:`decode_feedback` (for the driver) are the reverse. A number that is not finite, or that its field cannot hold,
+raises ValueError: nothing is clamped here.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from math import pi
+from typing import NamedTuple
+
+__all__ = [
+    "ACKNOWLEDGEMENT",
+    "ALL_JOINTS",
+    "ARM_STATUS",
+    "CAN_CONTROL",
+    "COLLISION",
+    "DRIVER_HOT",
+    "ENABLED",
+    "ERROR",
+    "FEEDBACK_IDS",
+    "FIRMWARE",
+    "HOMED",
+    "JOINTS",
+    "LOW_VOLTAGE",
+    "MOTOR_HOT",
+    "MOVE_J",
+    "OVER_CURRENT",
+    "STALLED",
+    "STANDBY",
+    "TORQUE_PER_AMPERE",
+    "AccelerationLimit",
+    "Acknowledgement",
+    "ArmStatus",
+    "Command",
+    "EnableRequest",
+    "Feedback",
+    "FirmwarePiece",
+    "FirmwareQuery",
+    "Frame",
+    "GripperRequest",
+    "GripperStatus",
+    "GripperStroke",
+    "JointAngles",
+    "JointRequest",
+    "JointTargets",
+    "LimitQuery",
+    "ModeRequest",
+    "MotorLimits",
+    "MotorMotion",
+    "MotorStatus",
+    "ParameterQuery",
+    "PoseNumbers",
+    "StopRequest",
+    "decode_command",
+    "decode_feedback",
+    "encode_joint_angles",
+    "encode_joint_targets",
+    "encode_pose",
+    "find_firmware",
+    "firmware_pieces",
+]
+
+JOINTS = 6
+ALL_JOINTS = 7
+"""Motor number that stands for all six joints in :class:`EnableRequest` and :class:`JointRequest`."""
+
+STANDBY = 0
+CAN_CONTROL = 1
+"""Control modes of :class:`ModeRequest` and :class:`ArmStatus`: waiting, and driven over CAN."""
+MOVE_J = 1
+"""Move mode: joint targets."""
+
+ARM_STATUS = {
+    0x0: "normal",
+    0x1: "emergency_stop",
+    0x2: "no_solution",
+    0x3: "singularity",
+    0x4: "target_beyond_limit",
+    0x5: "joint_communication",
+    0x6: "brake_closed",
+    0x7: "collision",
+    0x8: "overspeed_in_teaching",
+    0x9: "joint_status",
+    0xA: "other",
+    0xB: "teaching_record",
+    0xC: "teaching_execution",
+    0xD: "teaching_pause",
+    0xE: "controller_hot",
+    0xF: "brake_resistor_hot",
+}
+"""Names of :attr:`ArmStatus.status`."""
+
+LOW_VOLTAGE, MOTOR_HOT, OVER_CURRENT, DRIVER_HOT = 0x01, 0x02, 0x04, 0x08
+COLLISION, ERROR, ENABLED, STALLED = 0x10, 0x20, 0x40, 0x80
+"""Bits of :attr:`MotorStatus.flags`. A gripper has the same, with two exceptions: 0x10 is an error of its sensor, and
+0x80 is HOMED."""
+HOMED = 0x80
+"""Bit of :attr:`GripperStatus.flags`: the gripper's zero is set."""
+
+TORQUE_PER_AMPERE = (1.18125, 1.18125, 1.18125, 0.95844, 0.95844, 0.95844)
+"""Joint torque over motor current, Nm/A, as the vendor's SDK computes it."""
+
+_STOP, _MODE, _TARGETS, _GRIPPER = 0x150, 0x151, 0x155, 0x159
+_ENABLE, _LIMIT_QUERY, _LIMITS, _JOINT = 0x471, 0x472, 0x473, 0x475
+_PARAMETER_QUERY, _ACCELERATION, _STROKE = 0x477, 0x47C, 0x47E
+_STATUS, _POSE, _ANGLES, _GRIPPER_STATUS, _MOTION, _MOTOR_STATUS = 0x2A1, 0x2A2, 0x2A5, 0x2A8, 0x251, 0x261
+ACKNOWLEDGEMENT = 0x476
+"""Id of the answer to a command with an id of 0x470 and above."""
+FIRMWARE = 0x4AF
+"""Id of both the question for the firmware's version and its answer."""
+FEEDBACK_IDS = (
+    *range(_MOTION, _MOTION + JOINTS),
+    *range(_MOTOR_STATUS, _MOTOR_STATUS + JOINTS),
+    *range(_STATUS, _GRIPPER_STATUS + 1),
+)
+"""Ids of the frames that the arm sends without being asked."""
+
+_MILLIDEGREES = 180_000.0 / pi
+"""Millidegrees per radian."""
+_SET = 0xAE
+"""Value that makes a setting effective."""
+_PAIR = struct.Struct(">ii")
+
+Frame = tuple[int, bytes]
+"""(11-bit id, data of at most 8 bytes)."""
+
+
+# Commands: what a program sends to the arm
+
+
+class StopRequest(NamedTuple):
+    """Emergency stop, trajectory and teaching requests (0x150), which this package never sends.
+
+    ``resume`` cuts the power of the motors: a raised arm falls.
+    """
+
+    emergency: int
+    """0 nothing, 1 stop, 2 resume."""
+    trajectory: int
+    teaching: int
+
+    def frame(self) -> Frame:
+        """Return the frame of this record."""
+        return _STOP, bytes((*self, 0, 0, 0, 0, 0))
+
+
+class ModeRequest(NamedTuple):
+    """Control mode, move mode and speed (0x151)."""
+
+    control: int = CAN_CONTROL
+    """0 standby, 1 CAN, 3 Ethernet, 4 Wi-Fi, 7 offline trajectory."""
+    move: int = MOVE_J
+    """0 P, 1 J, 2 L, 3 C, 4 M (MIT), 5 CPV."""
+    speed_percent: int = 100
+    """Speed of the arm's own motion to a target, percent of each joint's largest."""
+    mit: int = 0
+    """0x00 position and speed, 0xAD MIT."""
+    dwell_s: int = 0
+    mounting: int = 0
+    """0 unchanged, 1 upright, 2 on its left side, 3 on its right side; seen with the cables behind."""
+
+    def frame(self) -> Frame:
+        """Return the frame of this record."""
+        return _MODE, bytes((*self, 0, 0))
+
+
+class JointTargets(NamedTuple):
+    """Targets of two neighbouring joints (0x155 to 0x157)."""
+
+    first: int
+    """Index of the first of the two joints: 0, 2 or 4."""
+    q: tuple[float, float]
+    """rad, exact to 0.001 degrees."""
+
+    def frame(self) -> Frame:
+        """Return the frame of this record."""
+        return _TARGETS + self.first // 2, _pair(self.q, _MILLIDEGREES)
+
+
+class GripperRequest(NamedTuple):
+    """Target of the gripper (0x159)."""
+
+    width: float
+    """Distance between the fingers, m; exact to a micrometre."""
+    torque: float
+    """Largest torque of the gripper's motor, Nm: 0 to 5."""
+    enabled: bool = True
+    clear_error: bool = False
+    set_zero: bool = False
+    """Whether the present position becomes the zero."""
+
+    def frame(self) -> Frame:
+        """Return the frame of this record."""
+        code = int(self.enabled) | int(self.clear_error) << 1
+        return _GRIPPER, _packed(">iHBB", self.width * 1e6, self.torque * 1e3, code, _SET if self.set_zero else 0)
+
+
+class EnableRequest(NamedTuple):
+    """Switch the power of motors on or off (0x471). An arm that is switched off falls."""
+
+    motor: int = ALL_JOINTS
+    """1 to 6, 7 for all six joints, 255 for these and the gripper."""
+    enabled: bool = True
+
+    def frame(self) -> Frame:
+        """Return the frame of this record."""
+        return _ENABLE, bytes((self.motor, 2 if self.enabled else 1, 0, 0, 0, 0, 0, 0))
+
+
+class LimitQuery(NamedTuple):
+    """Question for a joint's limits (0x472), answered by :class:`MotorLimits` or :class:`AccelerationLimit`."""
+
+    motor: int
+    """1 to 6."""
+    content: int = 1
+    """1 range and speed, 2 acceleration."""
+
+    def frame(self) -> Frame:
+        """Return the frame of this record."""
+        return _LIMIT_QUERY, bytes((*self, 0, 0, 0, 0, 0, 0))
+
+
+class JointRequest(NamedTuple):
+    """Settings of a joint (0x475); here only to clear its error."""
+
+    motor: int = ALL_JOINTS
+    """1 to 6, 7 for all."""
+    clear_error: bool = True
+    set_zero: bool = False
+
+    def frame(self) -> Frame:
+        """Return the frame of this record. The joint's acceleration stays as it is (0x7FFF)."""
+        zero, clear = (_SET if flag else 0 for flag in (self.set_zero, self.clear_error))
+        return _JOINT, bytes((self.motor, zero, 0, 0x7F, 0xFF, clear, 0, 0))
+
+
+class ParameterQuery(NamedTuple):
+    """Question for parameters (0x477); 4, the gripper's stroke, is answered by :class:`GripperStroke`."""
+
+    content: int = 4
+
+    def frame(self) -> Frame:
+        """Return the frame of this record. Nothing is set: 3 stands for an unchanged load."""
+        return _PARAMETER_QUERY, bytes((self.content, 0, 0, 0, 3, 0, 0, 0))
+
+
+class FirmwareQuery(NamedTuple):
+    """Question for the firmware's version (0x4AF), answered by :class:`FirmwarePiece` frames."""
+
+    def frame(self) -> Frame:
+        """Return the frame of this record."""
+        return FIRMWARE, bytes((1, 0, 0, 0, 0, 0, 0, 0))
+
+
+Command = (
+    StopRequest
+    | ModeRequest
+    | JointTargets
+    | GripperRequest
+    | EnableRequest
+    | LimitQuery
+    | JointRequest
+    | ParameterQuery
+    | FirmwareQuery
+)
+
+
+def encode_joint_targets(q: Sequence[float]) -> list[Frame]:
+    """Return the three frames of the targets (6,) of all joints, rad."""
+    return [(_TARGETS + k // 2, _pair(q[k : k + 2], _MILLIDEGREES)) for k in (0, 2, 4)]
+
+
+def decode_command(frame_id: int, data: bytes) -> Command | None:
+    """Return the command in a frame; None for any other frame, of this arm or not."""
+    decoder = _COMMANDS.get(frame_id)
+    return None if decoder is None or len(data) != 8 else decoder(frame_id, bytes(data))
+
+
+_COMMANDS: dict[int, Callable[[int, bytes], Command | None]] = {
+    _STOP: lambda _, data: StopRequest(*data[:3]),
+    _MODE: lambda _, data: ModeRequest(*data[:6]),
+    _GRIPPER: lambda _, data: _gripper_request(*struct.unpack(">iHBB", data)),
+    _ENABLE: lambda _, data: EnableRequest(data[0], data[1] == 2) if data[1] in (1, 2) else None,
+    _LIMIT_QUERY: lambda _, data: LimitQuery(*data[:2]),
+    _JOINT: lambda _, data: JointRequest(data[0], data[5] == _SET, data[1] == _SET),
+    _PARAMETER_QUERY: lambda _, data: ParameterQuery(data[0]),
+    FIRMWARE: lambda _, data: FirmwareQuery() if (FIRMWARE, data) == FirmwareQuery().frame() else None,
+    **dict.fromkeys(
+        range(_TARGETS, _TARGETS + 3), lambda frame_id, data: JointTargets(2 * (frame_id - _TARGETS), _radians(data))
+    ),
+}
+
+
+def _gripper_request(width: int, torque: int, code: int, zero: int) -> GripperRequest:
+    return GripperRequest(width * 1e-6, torque * 1e-3, bool(code & 1), bool(code & 2), zero == _SET)
+
+
+# Feedback: what the arm sends
+
+
+class ArmStatus(NamedTuple):
+    """State of the whole arm (0x2A1), 200 times a second."""
+
+    control: int = STANDBY
+    """As in :class:`ModeRequest`; also 2 teaching, 5 remote control, 6 leader of a pair of arms."""
+    status: int = 0
+    """See ``ARM_STATUS``."""
+    move: int = MOVE_J
+    teaching: int = 0
+    moving: int = 0
+    """0 at the target, 1 not yet."""
+    point: int = 0
+    beyond_limit: int = 0
+    """Bit k: joint k + 1 is beyond its range."""
+    no_communication: int = 0
+    """Bit k: the motor of joint k + 1 does not answer the arm's controller."""
+
+    def frame(self) -> Frame:
+        """Return the frame of this record."""
+        return _STATUS, bytes(self)
+
+
+class PoseNumbers(NamedTuple):
+    """Two of the six numbers of the flange's pose (0x2A2 to 0x2A4): x, y; z, roll; pitch, yaw."""
+
+    first: int
+    """0, 2 or 4."""
+    values: tuple[float, float]
+    """m, exact to a micrometre, and rad, exact to 0.001 degrees."""
+
+    def frame(self) -> Frame:
+        """Return the frame of this record."""
+        return _POSE + self.first // 2, _pair(self.values, *_POSE_SCALES[self.first])
+
+
+class JointAngles(NamedTuple):
+    """Measured positions of two neighbouring joints (0x2A5 to 0x2A7), 200 times a second."""
+
+    first: int
+    """0, 2 or 4."""
+    q: tuple[float, float]
+    """rad, exact to 0.001 degrees."""
+
+    def frame(self) -> Frame:
+        """Return the frame of this record."""
+        return _ANGLES + self.first // 2, _pair(self.q, _MILLIDEGREES)
+
+
+class GripperStatus(NamedTuple):
+    """State of the gripper (0x2A8), 200 times a second."""
+
+    width: float
+    """m."""
+    torque: float
+    """Torque of its motor, Nm."""
+    flags: int = 0
+    """ENABLED, HOMED, ERROR and so on."""
+
+    def frame(self) -> Frame:
+        """Return the frame of this record."""
+        return _GRIPPER_STATUS, _packed(">ihBx", self.width * 1e6, self.torque * 1e3, self.flags)
+
+
+class MotorMotion(NamedTuple):
+    """Speed and current of a joint (0x251 to 0x256), 200 times a second."""
+
+    joint: int
+    """Index of the joint, from 0."""
+    dq: float
+    """rad/s, exact to 0.001."""
+    current: float
+    """A, exact to 0.001. See ``TORQUE_PER_AMPERE``."""
+    position: float = 0.0
+    """rad, exact to 0.001. Real arms are reported to fill this field in different units: use :class:`JointAngles`."""
+
+    def frame(self) -> Frame:
+        """Return the frame of this record."""
+        return _MOTION + self.joint, _packed(">hhi", *(value * 1e3 for value in self[1:]))
+
+
+class MotorStatus(NamedTuple):
+    """Voltage, temperatures and flags of a joint (0x261 to 0x266), 40 times a second."""
+
+    joint: int
+    """Index of the joint, from 0."""
+    voltage: float
+    """V, exact to 0.1."""
+    driver_temperature: int
+    """Degrees Celsius."""
+    motor_temperature: int
+    """Degrees Celsius."""
+    flags: int
+    """ENABLED, ERROR and so on."""
+    current: float = 0.0
+    """Supply current, A; small motors always report 0."""
+
+    def frame(self) -> Frame:
+        """Return the frame of this record."""
+        _, voltage, driver, motor, flags, current = self
+        data = _packed(">HhbBH", voltage * 10, driver, motor, flags, current * 1e3)
+        return _MOTOR_STATUS + self.joint, data
+
+
+class MotorLimits(NamedTuple):
+    """Range and speed of a joint as set in the arm (0x473)."""
+
+    motor: int
+    """1 to 6."""
+    upper: float
+    """rad, exact to 0.1 degrees."""
+    lower: float
+    """rad, exact to 0.1 degrees."""
+    velocity: float
+    """rad/s, exact to 0.001."""
+
+    def frame(self) -> Frame:
+        """Return the frame of this record."""
+        tenths = _MILLIDEGREES * 1e-2
+        return _LIMITS, _packed(">BhhHx", self.motor, self.upper * tenths, self.lower * tenths, self.velocity * 1e3)
+
+
+class AccelerationLimit(NamedTuple):
+    """Acceleration of a joint as set in the arm (0x47C)."""
+
+    motor: int
+    """1 to 6."""
+    acceleration: float
+    """rad/s2, exact to 0.001."""
+
+    def frame(self) -> Frame:
+        """Return the frame of this record."""
+        return _ACCELERATION, _packed(">BH5x", self.motor, self.acceleration * 1e3)
+
+
+class Acknowledgement(NamedTuple):
+    """Answer to a command with an id of 0x470 and above (0x476)."""
+
+    command: int
+    """Last byte of the command's id."""
+    zero_set: bool = False
+
+    def frame(self) -> Frame:
+        """Return the frame of this record."""
+        return ACKNOWLEDGEMENT, bytes((self.command, int(self.zero_set), 0, 0, 0, 0, 0, 0))
+
+
+class GripperStroke(NamedTuple):
+    """Parameters of the gripper (0x47E)."""
+
+    stroke_mm: int
+    """Largest width: 70 or 100 mm; 0 if it is not set."""
+    teaching_percent: int = 100
+    teaching_friction: int = 1
+
+    def frame(self) -> Frame:
+        """Return the frame of this record."""
+        return _STROKE, bytes((self.teaching_percent, self.stroke_mm, self.teaching_friction, 0, 0, 0, 0, 0))
+
+
+class FirmwarePiece(NamedTuple):
+    """Piece of the answer to :class:`FirmwareQuery` (0x4AF); :func:`find_firmware` reads all pieces together."""
+
+    text: bytes
+
+    def frame(self) -> Frame:
+        """Return the frame of this record."""
+        return FIRMWARE, self.text.ljust(8, b"\0")
+
+
+Feedback = (
+    ArmStatus
+    | PoseNumbers
+    | JointAngles
+    | GripperStatus
+    | MotorMotion
+    | MotorStatus
+    | MotorLimits
+    | AccelerationLimit
+    | Acknowledgement
+    | GripperStroke
+    | FirmwarePiece
+)
+
+
+def encode_joint_angles(q: Sequence[float]) -> list[Frame]:
+    """Return the three frames of the measured positions (6,) of all joints, rad."""
+    return [(_ANGLES + k // 2, _pair(q[k : k + 2], _MILLIDEGREES)) for k in (0, 2, 4)]
+
+
+def encode_pose(position: Sequence[float], roll_pitch_yaw: Sequence[float]) -> list[Frame]:
+    """Return the three frames of the flange's pose: position (3,), m, and roll, pitch, yaw, rad."""
+    values = (*position, *roll_pitch_yaw)
+    return [PoseNumbers(k, (values[k], values[k + 1])).frame() for k in (0, 2, 4)]
+
+
+def firmware_pieces(version: str) -> Iterator[Frame]:
+    """Yield the frames of an arm's answer to :class:`FirmwareQuery`, 8 characters each."""
+    text = version.encode("ascii")
+    return (FirmwarePiece(text[k : k + 8]).frame() for k in range(0, len(text), 8))
+
+
+def find_firmware(pieces: Iterable[bytes]) -> str | None:
+    """Return the firmware's version, for example ``S-V1.8-5``; None if it is not (yet) complete."""
+    text = b"".join(pieces)
+    start = text.find(b"S-V")
+    version = text[start : start + 8] if start >= 0 else b""
+    return version.decode("ascii", "replace").rstrip("\0") if len(version) == 8 else None
+
+
+def decode_feedback(frame_id: int, data: bytes) -> Feedback | None:
+    """Return what the arm reports in a frame; None for any other frame, of this arm or not."""
+    decoder = _FEEDBACK.get(frame_id)
+    return None if decoder is None or len(data) != 8 else decoder(frame_id, bytes(data))
+
+
+def _motion(frame_id: int, data: bytes) -> MotorMotion:
+    dq, current, position = struct.unpack(">hhi", data)
+    return MotorMotion(frame_id - _MOTION, dq * 1e-3, current * 1e-3, position * 1e-3)
+
+
+def _motor_status(frame_id: int, data: bytes) -> MotorStatus:
+    voltage, driver, motor, flags, current = struct.unpack(">HhbBH", data)
+    return MotorStatus(frame_id - _MOTOR_STATUS, voltage * 0.1, driver, motor, flags, current * 1e-3)
+
+
+def _gripper_status(_: int, data: bytes) -> GripperStatus:
+    width, torque, flags = struct.unpack(">ihBx", data)
+    return GripperStatus(width * 1e-6, torque * 1e-3, flags)
+
+
+def _limits(_: int, data: bytes) -> MotorLimits:
+    motor, upper, lower, velocity = struct.unpack(">BhhHx", data)
+    return MotorLimits(motor, upper * 100 / _MILLIDEGREES, lower * 100 / _MILLIDEGREES, velocity * 1e-3)
+
+
+def _pose(frame_id: int, data: bytes) -> PoseNumbers:
+    first = 2 * (frame_id - _POSE)
+    values, scales = _PAIR.unpack(data), _POSE_SCALES[first]
+    return PoseNumbers(first, (values[0] / scales[0], values[1] / scales[1]))
+
+
+def _joint_angles(frame_id: int, data: bytes) -> JointAngles:
+    return JointAngles(2 * (frame_id - _ANGLES), _radians(data))
+
+
+_FEEDBACK: dict[int, Callable[[int, bytes], Feedback | None]] = {
+    _STATUS: lambda _, data: ArmStatus(*data),
+    _GRIPPER_STATUS: _gripper_status,
+    _LIMITS: _limits,
+    _ACCELERATION: lambda _, data: AccelerationLimit(data[0], int.from_bytes(data[1:3], "big") * 1e-3),
+    ACKNOWLEDGEMENT: lambda _, data: Acknowledgement(data[0], data[1] == 1),
+    _STROKE: lambda _, data: GripperStroke(data[1], data[0], data[2]),
+    FIRMWARE: lambda _, data: None if (FIRMWARE, data) == FirmwareQuery().frame() else FirmwarePiece(data),
+    **dict.fromkeys(range(_POSE, _POSE + 3), _pose),
+    **dict.fromkeys(range(_ANGLES, _ANGLES + 3), _joint_angles),
+    **dict.fromkeys(range(_MOTION, _MOTION + JOINTS), _motion),
+    **dict.fromkeys(range(_MOTOR_STATUS, _MOTOR_STATUS + JOINTS), _motor_status),
+}
+_POSE_SCALES = {0: (1e6, 1e6), 2: (1e6, _MILLIDEGREES), 4: (_MILLIDEGREES, _MILLIDEGREES)}
+
+
+# Numbers
+
+
+def _pair(values: Sequence[float], scale: float, second: float | None = None) -> bytes:
+    """Return two numbers as integers of 32 bits, after multiplication by ``scale`` (and ``second``)."""
+    a, b = values
+    return _packed(">ii", a * scale, b * (scale if second is None else second))
+
+
+def _radians(data: bytes) -> tuple[float, float]:
+    a, b = _PAIR.unpack(data)
+    return a / _MILLIDEGREES, b / _MILLIDEGREES
+
+
+def _packed(layout: str, *numbers: float) -> bytes:
+    """Return the rounded numbers in a frame's layout. Raises ValueError for one that is not finite or does not fit."""
+    try:
+        return struct.pack(layout, *map(round, numbers))
+    except (struct.error, OverflowError, ValueError) as error:
+        raise ValueError(f"{numbers} does not fit into a frame: {error}") from None
