@@ -6,11 +6,14 @@ import errno
 import socket
 import struct
 import time
+from pathlib import Path
 
 from .errors import ControlTaken
 
-__all__ = ["DeviceLock"]
+__all__ = ["APP_MARK", "DeviceLock"]
 
+APP_MARK = "hal-app="
+"""Argument of a device's own process, followed by the process number of the program that started it."""
 _LONGEST = 100
 """Greatest length of a socket's name; Linux has 108 bytes for it."""
 
@@ -27,7 +30,8 @@ class DeviceLock:
             just ended may need a moment.
 
     Raises:
-        ControlTaken: Another program holds the lock; the message has its process number.
+        ControlTaken: Another program holds the lock; the message has its process number. ``code`` is ``still_closing``
+            if that program has ended and only its process for the device is left.
     """
 
     def __init__(self, name: str, what: str, patience: float = 0.0) -> None:
@@ -37,7 +41,7 @@ class DeviceLock:
         while not self._bind(address):
             if time.monotonic() > deadline:
                 self._socket.close()
-                raise ControlTaken(f"{what} is in use by another program on this computer{_owner(address)}")
+                raise _error(what, _holder(address))
             time.sleep(0.02)
 
     def _bind(self, address: str) -> bool:
@@ -56,22 +60,40 @@ class DeviceLock:
         self._socket.close()
 
 
-def _owner(address: str) -> str:
-    """Return the process that listens at this address, in words."""
+def _holder(address: str) -> int:
+    """Return the number of the process that listens at this address; 0 if it cannot be found out."""
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as client:
         client.settimeout(0.2)
         try:
             client.connect(address)
-            pid = struct.unpack("iII", client.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, 12))[0]
+            pid: int = struct.unpack("iII", client.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, 12))[0]
         except OSError:
-            return ""
-    return f" (process {_app_of(pid)})"
+            return 0
+    return pid
 
 
-def _app_of(pid: int) -> int:
-    """Return the program behind a device's own process: its parent."""
+def _error(what: str, holder: int) -> ControlTaken:
+    """Return the error for a device that the process ``holder`` uses, named by the program behind that process."""
+    program = holder
     try:
-        with open(f"/proc/{pid}/status") as file:
-            return next((int(line.split()[1]) for line in file if line.startswith("PPid:")), pid)
-    except OSError:
-        return pid
+        arguments = Path(f"/proc/{holder}/cmdline").read_text().split("\0")
+        app = next((argument.removeprefix(APP_MARK) for argument in arguments if argument.startswith(APP_MARK)), None)
+        if app is not None:
+            parent = _status(holder, "PPid")
+            if _status(int(parent), "NSpid") != app:  # another process has adopted it
+                return ControlTaken(
+                    f"{what} is still in use by process {holder}, the rest of a program that has ended: wait until it "
+                    "has stopped the device, a few seconds",
+                    code="still_closing",
+                )
+            program = int(parent)
+    except OSError:  # it has just ended, or belongs to another user
+        pass
+    number = f" (process {program})" if program else ""
+    return ControlTaken(f"{what} is in use by another program on this computer{number}")
+
+
+def _status(pid: int, key: str) -> str:
+    """Return the last value of ``key`` in a process's status: the one in its own container, if that has one."""
+    lines = Path(f"/proc/{pid}/status").read_text().splitlines()
+    return next((line.split()[-1] for line in lines if line.startswith(f"{key}:")), "")

@@ -22,10 +22,12 @@ import threading
 import time
 import traceback
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import Any
 
 from .. import errors
 from ..errors import ConnectionLost, HalError, NotSupported, Problem
+from ..lock import APP_MARK
 
 __all__ = [
     "Channel",
@@ -234,7 +236,7 @@ class Child:
         fds = [theirs.fileno(), *(memory.fd for memory in memories)]
         path = [os.path.abspath(entry) for entry in sys.path]
         self.process = subprocess.Popen(
-            [sys.executable, "-I", "-u", "-c", _BOOT, json.dumps([fds, path, target])],
+            [sys.executable, "-I", "-u", "-c", _BOOT, json.dumps([fds, path, target]), f"{APP_MARK}{os.getpid()}"],
             pass_fds=fds,
             stdin=subprocess.DEVNULL,
             stdout=self._log,
@@ -306,14 +308,14 @@ class Child:
         Raises:
             ConnectionLost: If the child has ended.
         """
-        return self._listen(timeout, None)
+        return self._listen(timeout)
 
-    def _listen(self, timeout: float, until: tuple[int | None, ...] | None) -> bool:
-        """Receive one message, unless an answer to one of ``until`` is here already."""
+    def _listen(self, timeout: float, answered: Callable[[], object] | None = None) -> bool:
+        """Receive one message, unless ``answered`` returns that another thread has received the answer."""
         if not self._listening.acquire(timeout=max(timeout, 1e-3)):
             return False
         try:
-            if until is not None and any(number in self._answers for number in until):
+            if answered is not None and answered():
                 return True
             message = self.channel.receive(timeout)
             if message is None:
@@ -339,18 +341,21 @@ class Child:
         elif self._on_message is not None:
             self._on_message(message)
 
+    def _answer(self, number: int | None) -> dict[str, Any] | None:
+        """Return the answer to a request, or the error with which the process failed; None while there is neither."""
+        outcome = self._answers.get(None, {})
+        return self._answers.get(number) or (outcome if "error" in outcome else None)
+
     def _wait_answer(self, number: int | None, timeout: float, task: str) -> dict[str, Any]:
         deadline = time.monotonic() + timeout
         while True:
-            answer = self._answers.pop(number, None)
-            if answer is None and number is not None and "error" in self._answers.get(None, ()):
-                answer = self._answers[None]  # the process failed
+            answer = self._answer(number)
             if answer is not None:
                 if "error" in answer:
                     raise unpack_error(answer["error"])
                 return answer
             left = deadline - time.monotonic()
-            if not self._listen(min(_SLICE, max(0.0, left)), (number, None)) and left <= 0.0:
+            if not self._listen(min(_SLICE, max(0.0, left)), partial(self._answer, number)) and left <= 0.0:
                 raise ConnectionLost(
                     f"the {self.name} process did not {task} within {timeout:g} s{self._tail()}", code="process_silent"
                 )
@@ -358,10 +363,10 @@ class Child:
     def _raise_last_error(self) -> None:
         """Raise the error that ended the process, if it sent one that was not read yet."""
         with contextlib.suppress(ConnectionLost):
-            while self._listen(0.0, None):
+            while self._listen(0.0):
                 pass
-        failure = self._answers.get(None, {})
-        if "error" in failure:
+        failure = self._answer(None)
+        if failure is not None and "error" in failure:
             raise unpack_error(failure["error"])
 
     def _wait_end(self, timeout: float) -> bool:

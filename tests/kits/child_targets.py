@@ -34,6 +34,16 @@ def echo(channel, memories, config):
     serve(channel, {"say": lambda **params: params, "fail": fail, "die": die, "news": news, "sleep": sleep})
 
 
+def lock_holder(channel, memories, config):
+    """Hold the lock on a device, also after the app is gone, until the process is killed."""
+    from hal.lock import DeviceLock
+
+    lock = DeviceLock(config["name"], "the arm")
+    channel.send({"ready": os.getpid()})
+    time.sleep(60.0)
+    lock.release()
+
+
 HURRY = 2.5
 """So many times sooner than any other does an impatient console show out whoever is too slow."""
 

@@ -183,7 +183,7 @@ def test_the_error_lists_the_connected_cameras() -> None:
 
 def test_a_locked_camera_is_refused_and_its_process_named() -> None:
     lock = lock_camera("test-refused")
-    with pytest.raises(ControlTaken, match=rf"process {os.getppid()}\b"):
+    with pytest.raises(ControlTaken, match=rf"process {os.getpid()}\b"):
         lock_camera("test-refused")
     lock.release()
     lock_camera("test-refused").release()

@@ -100,6 +100,13 @@ def test_requests_from_many_threads_get_their_own_answers() -> None:
     assert wrong == []
 
 
+def test_a_request_before_the_child_is_ready_gets_its_answer() -> None:
+    child = Child("echo", "child_targets:echo", {})
+    assert child.request("say", {"a": 1}) == {"a": 1}
+    assert child.wait_ready(20.0)["pid"] == child.process.pid
+    child.close()
+
+
 def test_an_answer_that_takes_too_long_is_dropped() -> None:
     child = start()
     with pytest.raises(ConnectionLost) as caught:
