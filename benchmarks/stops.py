@@ -60,34 +60,34 @@ def measure(way: str, folder: Path) -> tuple[float, float]:
     overrides = ["cameras={}", f"gamepads.pad={json.dumps(pad_config)}"]
     with hal.open("panda_table", sim=True, clock="real_time", overrides=overrides) as rig:
         arm, pad = rig.robots["panda"], rig.gamepads["pad"]
-        start = rig._devices["pad"]._t0
         teleop = hal.Teleop(arm)
-        event = start + EVENT
         moved = False
         with arm.control(deadman=pad.hold("l2"), rate_hz=50) as control:
             for tick in rig.clock.rate(50):
-                motion, _ = teleop.step(pad.state(), tick.dt)
+                state = pad.state()
+                event = state.stamp.t - state.stamp.t_device + EVENT  # the recording's start on the clock, then EVENT
+                motion, _ = teleop.step(state, tick.dt)
                 with contextlib.suppress(MotionStopped):
                     control.send(motion)
                 moved = moved or arm.state().tcp_twist[0] > 0.05
                 if tick.t >= event:
                     break
             assert moved, "the arm moves before"
+            sends_on = way not in ("commands stop", "rig.stop() (reference)")
             if way == "rig.stop() (reference)":
                 event = time.monotonic()
                 rig.stop()
             elif way == "commands stop":
-                event = tick.t  # the last command went out with this turn
-            else:
-                event = start + EVENT
+                event = tick.t  # the time of the last command
             deadline = time.monotonic() + 2.0
             while time.monotonic() < deadline:
-                servo = control._peek()
-                if way not in ("commands stop", "rig.stop() (reference)"):
+                if sends_on:
                     with contextlib.suppress(MotionStopped):
-                        control.send(motion)  # a program that goes on as if nothing had happened
-                if servo.t_stop >= event - 0.01 and max(map(abs, servo.dq_set)) < 1e-6:
-                    return servo.t_stop - event, time.monotonic() - event
+                        control.send(motion)  # a program that continues as if nothing had happened
+                braking = [s for s in arm.states(event) if s.status is not hal.RobotStatus.FOLLOWING]
+                rest = next((s for s in braking if abs(s.dq_set).max() < 1e-6), None)
+                if rest is not None:
+                    return braking[0].stamp.t - event, rest.stamp.t - event
                 time.sleep(0.002)
     raise RuntimeError(f"{way}: the arm did not stop")
 

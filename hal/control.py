@@ -444,6 +444,7 @@ class CommandChecks:
 
     def __init__(self, robot: Robot) -> None:
         self._robot = robot
+        self._n = robot.n
         self._lower, self._upper = np.array(robot.limits.lower), np.array(robot.limits.upper)
         self._takes_torques = False
         """Whether the driver is known to take torques."""
@@ -509,7 +510,6 @@ class CommandChecks:
                 )
 
     def _check_kind(self, command: Command) -> None:
-        robot, n = self._robot, self._robot.n
         if isinstance(command, JointChunk):
             count = command.q.shape[1]
         elif (size := _JOINTS.get(type(command))) is not None:
@@ -520,9 +520,10 @@ class CommandChecks:
             meant = _MEANT.get(type(command))
             hint = f"; did you mean {meant}?" if meant else ""
             raise CommandError(f"{type(command).__name__} is not a command{hint}", code="not_a_command")
-        if count != n:
+        if count != self._n:
             raise CommandError(
-                f"{robot.name} has {n} joints; {type(command).__name__} has {count}", code="wrong_joint_count"
+                f"{self._robot.name} has {self._n} joints; {type(command).__name__} has {count}",
+                code="wrong_joint_count",
             )
 
     def _check_reach(self, command: CartesianTarget) -> None:

@@ -483,7 +483,7 @@ class TeleopSession:
     def _use_other_robot(self) -> None:
         """Drive the arm that was chosen on the page; its dead-man must be pressed again."""
         self.robot = self.rig.robots[self._next_robot]
-        self.stopped = ""
+        self.stopped = self.gripper_trouble = ""
         self.state = None
         self._load_mapping()
         self.announce(f"driving {self.robot.name}", "robot_changed")

@@ -44,8 +44,62 @@ def tightened(limits: LimitsSpec, acceleration: float, jerk: float) -> LimitsSpe
     )
 
 
-class Bench:
-    """One servo, ticked by hand. Whatever the test does not set is as it should be: app alive, pad alive."""
+class HandTicked:
+    """Base of a servo that is ticked by hand: the app's side, with the app and the pad alive until a test says no."""
+
+    servo: Servo
+
+    def __init__(self, spec: RobotSpec, rate_hz: float, now: float, deadman: bool) -> None:
+        self.spec = spec
+        self.dt = 1.0 / rate_hz
+        self.audit = SetpointAudit(spec.limits, self.dt)
+        self.now = self.t_app = now
+        self.seq = 0
+        self.command: CommandRecord | None = None
+        self.deadman = DeadmanRecord(False, True, 0, 0.0) if deadman else None
+        self.pad_alive = self.app_alive = True
+        self.stops = self.rearms = 0
+        self.limited = Limited.NONE
+
+    def press(self) -> None:
+        self.deadman = self.deadman._replace(held=True, presses=self.deadman.presses + 1)
+
+    def release(self) -> None:
+        self.deadman = self.deadman._replace(held=False)
+
+    def press_again(self) -> None:
+        """Release the dead-man for a tick, and press it."""
+        self.release()
+        self.tick()
+        self.press()
+
+    def send(self, kind: Kind, values: Sequence[float], deadline: float = 0.1) -> int:
+        self.seq += 1
+        self.command = CommandRecord(self.seq, 1, self.now, self.now + deadline, kind, tuple(values))
+        return self.seq
+
+    def inbox(self) -> Inbox:
+        if self.app_alive:
+            self.t_app = self.now
+        if self.deadman is not None and self.pad_alive:
+            self.deadman = self.deadman._replace(t_alive=self.now)
+        return Inbox(self.command, self.deadman, self.stops, self.rearms, self.t_app)
+
+    def tick(self) -> Setpoint | None:
+        raise NotImplementedError
+
+    def run(self, seconds: float) -> None:
+        """Tick without new commands."""
+        for _ in range(round(seconds / self.dt)):
+            self.tick()
+
+    def assert_within_limits(self) -> None:
+        for name, peak in self.audit.peaks().items():
+            assert peak <= 1.0, f"{name} reached {peak} of its limit"
+
+
+class Bench(HandTicked):
+    """One servo whose device takes every set-point."""
 
     def __init__(
         self,
@@ -60,32 +114,22 @@ class Bench:
         repeats: bool = False,
         kinematics: Kinematics | None = None,
     ) -> None:
-        self.spec = panda() if spec is None else spec
-        self.dt = 1.0 / rate_hz
+        super().__init__(panda() if spec is None else spec, rate_hz, 50.0, deadman)
         self.servo = Servo(self.spec, self.dt, kinematics, repeats=repeats)
         self.repeats = repeats
-        self.audit = SetpointAudit(self.spec.limits, self.dt)
-        self.now = 50.0
         self.ticks = 0
         self.q: list[float] = list(self.spec.home)
-        self.command: CommandRecord | None = None
-        self.seq = 0
-        self.deadman = DeadmanRecord(False, True, 0, 0.0) if deadman else None
-        self.pad_alive = self.app_alive = True
-        self.stops = self.rearms = 0
-        self.t_app = self.now
         self.late = False
-        """Was there a pause that the clock does not show?"""
+        """Whether there was a pause that the clock does not show."""
         self.prepares = False
-        """Does the host have set-points computed ahead?"""
+        """Whether set-points are computed ahead."""
         self.delays = False
-        """Does the servo hear what the app says one tick later?"""
+        """Whether the app's records reach the servo one tick later."""
         self._heard: Inbox | None = None
         self.fault: Fault | None = None
         self.reading: dict[str, Any] = {}
-        """What the next readings say instead of the truth."""
+        """Values of the next readings that are not the truth."""
         self.history: list[list[float]] = []
-        self.limited = Limited.NONE
         self.session = Session(1, speed, tcp_speed, deadman, None if move_to is None else tuple(move_to))
         self.servo.anchor(self.q)
         if begin:
@@ -108,32 +152,8 @@ class Bench:
     def moving(self) -> bool:
         return any(abs(v) > 1e-6 for v in self.servo.report.dq_set)
 
-    def press(self) -> None:
-        self.deadman = self.deadman._replace(held=True, presses=self.deadman.presses + 1)
-
-    def release(self) -> None:
-        self.deadman = self.deadman._replace(held=False)
-
-    def press_again(self) -> None:
-        """Release the dead-man for a tick, and press it."""
-        self.release()
-        self.tick()
-        self.press()
-
-    def send(self, kind: Kind, values: Sequence[float], deadline: float = 0.1) -> int:
-        self.seq += 1
-        self.command = CommandRecord(self.seq, 1, self.now, self.now + deadline, kind, tuple(values))
-        return self.seq
-
     def target(self, q: Sequence[float], dq: Sequence[float] = STILL) -> int:
         return self.send(Kind.JOINT_TARGET, (*q, *dq))
-
-    def inbox(self) -> Inbox:
-        if self.app_alive:
-            self.t_app = self.now
-        if self.deadman is not None and self.pad_alive:
-            self.deadman = self.deadman._replace(t_alive=self.now)
-        return Inbox(self.command, self.deadman, self.stops, self.rearms, self.t_app)
 
     def tick(self) -> Setpoint | None:
         self.now += self.dt
@@ -161,11 +181,6 @@ class Bench:
             self.history.append(self.q)
         return setpoint
 
-    def run(self, seconds: float) -> None:
-        """Ticks without new commands."""
-        for _ in range(round(seconds / self.dt)):
-            self.tick()
-
     def stream(self, seconds: float, kind: Kind, values: Sequence[float], every: int = 5) -> None:
         """The same command again and again."""
         for k in range(round(seconds / self.dt)):
@@ -184,7 +199,3 @@ class Bench:
             self.tick()
             assert self.now < begun + most, "the arm did not come to rest"
         return self.now - begun
-
-    def assert_within_limits(self) -> None:
-        for name, peak in self.audit.peaks().items():
-            assert peak <= 1.0, f"{name} reached {peak} of its limit"

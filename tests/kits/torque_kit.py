@@ -8,23 +8,23 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from servo_kit import HandTicked
 from specs import panda, world_spec
 
-from hal.commands import CommandRecord, DeadmanRecord, Inbox, Kind, Session
+from hal.commands import Kind, Session
 from hal.driver import Reading, Setpoint
 from hal.drivers.mock.robot import MockRobot
 from hal.drivers.pybullet.robot import PyBulletRobot
 from hal.drivers.pybullet.world import PyBulletWorld
-from hal.servo.audit import SetpointAudit
 from hal.servo.servo import Servo
-from hal.specs import RobotSpec, WorkspaceSpec
-from hal.types import Limited, RobotStatus, Trip
+from hal.specs import WorkspaceSpec
+from hal.types import RobotStatus, Trip
 
 N = 7
 NOTHING = (0.0,) * N
 
 
-class Driven:
+class Driven(HandTicked):
     """One arm under its servo. Its dead-man is held, unless it has none; the app and the pad are alive."""
 
     def __init__(
@@ -39,26 +39,16 @@ class Driven:
         mass_matrix: Callable[[Sequence[float]], Any] | None = None,
     ) -> None:
         self.driver, self.world = driver, world
-        self.spec: RobotSpec = driver.spec
-        self.dt = 1.0 / rate_hz
+        super().__init__(driver.spec, rate_hz, 20.0, deadman)
         self.servo = Servo(self.spec, self.dt, None, mass_matrix or driver.mass_matrix)
-        self.audit = SetpointAudit(self.spec.limits, self.dt)
-        self.now = 20.0
-        self.seq = 0
-        self.command: CommandRecord | None = None
-        self.deadman = DeadmanRecord(False, True, 0, 0.0) if deadman else None
-        self.stops = self.rearms = 0
-        self.t_app = self.now
-        self.app_alive = True
-        self.limited = Limited.NONE
         self.silent = False
-        """Does the device not answer?"""
+        """Whether the device does not answer."""
         self.tamper: Callable[[Reading], Reading] = lambda reading: reading
-        """What becomes of a reading on its way."""
+        """Changes a reading on its way to the servo."""
         self.prepared = True
         self.setpoint: Setpoint | None = None
         self.given: list[Setpoint] = []
-        """What the driver was given."""
+        """Set-points that the driver got."""
         self.readings: list[Reading] = []
         driver.open()
         self.reading: Reading = driver.read(self.now)
@@ -70,7 +60,7 @@ class Driven:
 
     @property
     def tau(self) -> Sequence[float]:
-        """What the driver was given last, Nm."""
+        """Torques that the driver got last, Nm."""
         assert self.setpoint.tau is not None
         return self.setpoint.tau
 
@@ -92,32 +82,11 @@ class Driven:
 
     @property
     def tcp_speed(self) -> float:
-        """m/s"""
+        """Measured speed of the tcp, m/s."""
         return float(np.linalg.norm((self.servo.kinematics.jacobian(self.q) @ self.dq)[:3]))
 
-    def press(self) -> None:
-        self.deadman = self.deadman._replace(held=True, presses=self.deadman.presses + 1)
-
-    def release(self) -> None:
-        self.deadman = self.deadman._replace(held=False)
-
-    def press_again(self) -> None:
-        """Release the dead-man for a tick, and press it."""
-        self.release()
-        self.tick()
-        self.press()
-
-    def inbox(self) -> Inbox:
-        if self.app_alive:
-            self.t_app = self.now
-        if self.deadman is not None:
-            self.deadman = self.deadman._replace(t_alive=self.now)
-        return Inbox(self.command, self.deadman, self.stops, self.rearms, self.t_app)
-
     def send(self, values: Sequence[float], kind: Kind = Kind.JOINT_TORQUE, deadline: float = 0.1) -> int:
-        self.seq += 1
-        self.command = CommandRecord(self.seq, 1, self.now, self.now + deadline, kind, tuple(values))
-        return self.seq
+        return super().send(kind, values, deadline)
 
     def tick(self) -> Setpoint | None:
         self.now += self.dt
@@ -138,11 +107,6 @@ class Driven:
             self.servo.prepare(self.inbox())
         return self.setpoint
 
-    def run(self, seconds: float) -> None:
-        """Ticks without new commands."""
-        for _ in range(round(seconds / self.dt)):
-            self.tick()
-
     def drive(self, seconds: float, tau: Sequence[float] = NOTHING) -> None:
         """The same torques again and again."""
         for _ in range(round(seconds / self.dt)):
@@ -156,10 +120,6 @@ class Driven:
             self.tick()
             assert self.now < begun + most, "positions did not take over"
         return self.now - begun
-
-    def assert_within_limits(self) -> None:
-        for name, peak in self.audit.peaks().items():
-            assert peak <= 1.0, f"{name} reached {peak} of its limit"
 
 
 def one(joint: int, tau: float) -> list[float]:

@@ -27,6 +27,26 @@ def held() -> Bench:
     return bench
 
 
+def assert_a_new_press_continues(bench: Bench) -> None:
+    bench.press_again()
+    bench.drive(0.3)
+    assert bench.trip is Trip.NONE
+    assert bench.moving
+    bench.assert_within_limits()
+
+
+def assert_only_a_new_press_continues(bench: Bench, trip: Trip) -> None:
+    """Check that neither new commands, a rearm nor the release of the dead-man clear the stop."""
+    bench.until_rest(0.5)
+    bench.drive(0.3)
+    bench.rearms += 1
+    bench.drive(0.3)
+    bench.release()
+    bench.run(0.1)
+    assert (bench.trip, bench.moving) == (trip, False)
+    assert_a_new_press_continues(bench)
+
+
 def test_nothing_moves_before_a_command() -> None:
     bench = Bench()
     start = list(bench.q)
@@ -110,20 +130,7 @@ def test_a_late_command_trips_and_only_a_new_press_goes_on() -> None:
     assert (bench.status, bench.trip) == (RobotStatus.TRIPPED, Trip.COMMAND_LATE)
     assert bench.servo.report.t_trip == pytest.approx(sent + 0.1, abs=2 * bench.dt)
     assert bench.servo.report.t_stop == bench.servo.report.t_trip
-    bench.until_rest(0.5)
-    bench.drive(0.3)  # new commands alone change nothing, and neither does a rearm
-    bench.rearms += 1
-    bench.drive(0.3)
-    assert bench.trip is Trip.COMMAND_LATE
-    assert not bench.moving
-    bench.release()
-    bench.run(0.1)
-    assert bench.trip is Trip.COMMAND_LATE
-    bench.press()
-    bench.drive(0.3)
-    assert bench.trip is Trip.NONE
-    assert bench.moving
-    bench.assert_within_limits()
+    assert_only_a_new_press_continues(bench, Trip.COMMAND_LATE)
 
 
 def test_a_command_that_came_meanwhile_is_in_time() -> None:
@@ -173,11 +180,7 @@ def test_every_trip_stops_latches_and_is_left_by_a_new_press(break_it, mend_it, 
     if trip is not Trip.STOP:  # a stop is over at once; the press above was a new one
         assert bench.trip is trip
         assert not bench.moving
-    bench.press_again()
-    bench.drive(0.3)
-    assert bench.trip is Trip.NONE
-    assert bench.moving
-    bench.assert_within_limits()
+    assert_a_new_press_continues(bench)
 
 
 def test_a_lost_device_trips_at_once_and_braking_goes_on() -> None:
@@ -292,15 +295,7 @@ def test_a_servo_that_could_not_run_trips_an_arm_that_really_moves() -> None:
     bench.now += PATIENCE
     bench.drive(bench.dt)
     assert (bench.status, bench.trip) == (RobotStatus.TRIPPED, Trip.HOST_LATE)
-    bench.until_rest(0.5)
-    bench.drive(0.3)
-    assert bench.trip is Trip.HOST_LATE
-    assert not bench.moving
-    bench.press_again()
-    bench.drive(0.3)
-    assert bench.trip is Trip.NONE
-    assert bench.moving
-    bench.assert_within_limits()
+    assert_only_a_new_press_continues(bench, Trip.HOST_LATE)
 
 
 def test_a_shorter_pause_and_one_in_which_nothing_may_move_are_no_trip() -> None:
