@@ -38,13 +38,13 @@ __all__ = [
     "TORQUE_PER_AMPERE",
     "AccelerationLimit",
     "Acknowledgement",
-    "ArmStatus",
-    "Command",
+    "PiperStatus",
+    "PiperCommand",
     "EnableRequest",
-    "Feedback",
+    "PiperFeedback",
     "FirmwarePiece",
     "FirmwareQuery",
-    "Frame",
+    "CanFrame",
     "GripperRequest",
     "GripperStatus",
     "GripperStroke",
@@ -53,9 +53,9 @@ __all__ = [
     "JointTargets",
     "LimitQuery",
     "ModeRequest",
-    "MotorLimits",
-    "MotorMotion",
-    "MotorStatus",
+    "JointLimits",
+    "JointMotion",
+    "JointStatus",
     "ParameterQuery",
     "PoseNumbers",
     "StopRequest",
@@ -74,7 +74,7 @@ ALL_JOINTS = 7
 
 STANDBY = 0
 CAN_CONTROL = 1
-"""Control modes of :class:`ModeRequest` and :class:`ArmStatus`: waiting, and driven over CAN."""
+"""Control modes of :class:`ModeRequest` and :class:`PiperStatus`: waiting, and driven over CAN."""
 MOVE_J = 1
 """Move mode: joint targets."""
 
@@ -96,11 +96,11 @@ ARM_STATUS = {
     0xE: "controller_hot",
     0xF: "brake_resistor_hot",
 }
-"""Names of :attr:`ArmStatus.status`."""
+"""Names of :attr:`PiperStatus.status`."""
 
 LOW_VOLTAGE, MOTOR_HOT, OVER_CURRENT, DRIVER_HOT = 0x01, 0x02, 0x04, 0x08
 COLLISION, ERROR, ENABLED, STALLED = 0x10, 0x20, 0x40, 0x80
-"""Bits of :attr:`MotorStatus.flags`. A gripper has the same, with two exceptions: 0x10 is an error of its sensor, and
+"""Bits of :attr:`JointStatus.flags`. A gripper has the same, with two exceptions: 0x10 is an error of its sensor, and
 0x80 is HOMED."""
 HOMED = 0x80
 """Bit of :attr:`GripperStatus.flags`: the gripper's zero is set."""
@@ -129,7 +129,7 @@ _SET = 0xAE
 """Value that makes a setting effective."""
 _PAIR = struct.Struct(">ii")
 
-Frame = tuple[int, bytes]
+CanFrame = tuple[int, bytes]
 """(11-bit id, data of at most 8 bytes)."""
 
 
@@ -147,7 +147,7 @@ class StopRequest(NamedTuple):
     trajectory: int
     teaching: int
 
-    def frame(self) -> Frame:
+    def frame(self) -> CanFrame:
         """Return the frame of this record."""
         return _STOP, bytes((*self, 0, 0, 0, 0, 0))
 
@@ -167,7 +167,7 @@ class ModeRequest(NamedTuple):
     mounting: int = 0
     """0 unchanged, 1 upright, 2 on its left side, 3 on its right side; seen with the cables behind."""
 
-    def frame(self) -> Frame:
+    def frame(self) -> CanFrame:
         """Return the frame of this record."""
         return _MODE, bytes((*self, 0, 0))
 
@@ -180,7 +180,7 @@ class JointTargets(NamedTuple):
     q: tuple[float, float]
     """rad, exact to 0.001 degrees."""
 
-    def frame(self) -> Frame:
+    def frame(self) -> CanFrame:
         """Return the frame of this record."""
         return _TARGETS + self.first // 2, _pair(self.q, _MILLIDEGREES)
 
@@ -197,7 +197,7 @@ class GripperRequest(NamedTuple):
     set_zero: bool = False
     """Whether the present position becomes the zero."""
 
-    def frame(self) -> Frame:
+    def frame(self) -> CanFrame:
         """Return the frame of this record."""
         code = int(self.enabled) | int(self.clear_error) << 1
         return _GRIPPER, _packed(">iHBB", self.width * 1e6, self.torque * 1e3, code, _SET if self.set_zero else 0)
@@ -210,20 +210,20 @@ class EnableRequest(NamedTuple):
     """1 to 6, 7 for all six joints, 255 for these and the gripper."""
     enabled: bool = True
 
-    def frame(self) -> Frame:
+    def frame(self) -> CanFrame:
         """Return the frame of this record."""
         return _ENABLE, bytes((self.motor, 2 if self.enabled else 1, 0, 0, 0, 0, 0, 0))
 
 
 class LimitQuery(NamedTuple):
-    """Question for a joint's limits (0x472), answered by :class:`MotorLimits` or :class:`AccelerationLimit`."""
+    """Question for a joint's limits (0x472), answered by :class:`JointLimits` or :class:`AccelerationLimit`."""
 
     motor: int
     """1 to 6."""
     content: int = 1
     """1 range and speed, 2 acceleration."""
 
-    def frame(self) -> Frame:
+    def frame(self) -> CanFrame:
         """Return the frame of this record."""
         return _LIMIT_QUERY, bytes((*self, 0, 0, 0, 0, 0, 0))
 
@@ -236,7 +236,7 @@ class JointRequest(NamedTuple):
     clear_error: bool = True
     set_zero: bool = False
 
-    def frame(self) -> Frame:
+    def frame(self) -> CanFrame:
         """Return the frame of this record. The joint's acceleration stays as it is (0x7FFF)."""
         zero, clear = (_SET if flag else 0 for flag in (self.set_zero, self.clear_error))
         return _JOINT, bytes((self.motor, zero, 0, 0x7F, 0xFF, clear, 0, 0))
@@ -247,7 +247,7 @@ class ParameterQuery(NamedTuple):
 
     content: int = 4
 
-    def frame(self) -> Frame:
+    def frame(self) -> CanFrame:
         """Return the frame of this record. Nothing is set: 3 stands for an unchanged load."""
         return _PARAMETER_QUERY, bytes((self.content, 0, 0, 0, 3, 0, 0, 0))
 
@@ -255,12 +255,12 @@ class ParameterQuery(NamedTuple):
 class FirmwareQuery(NamedTuple):
     """Question for the firmware's version (0x4AF), answered by :class:`FirmwarePiece` frames."""
 
-    def frame(self) -> Frame:
+    def frame(self) -> CanFrame:
         """Return the frame of this record."""
         return FIRMWARE, bytes((1, 0, 0, 0, 0, 0, 0, 0))
 
 
-Command = (
+PiperCommand = (
     StopRequest
     | ModeRequest
     | JointTargets
@@ -273,18 +273,18 @@ Command = (
 )
 
 
-def encode_joint_targets(q: Sequence[float]) -> list[Frame]:
+def encode_joint_targets(q: Sequence[float]) -> list[CanFrame]:
     """Return the three frames of the targets (6,) of all joints, rad."""
     return [(_TARGETS + k // 2, _pair(q[k : k + 2], _MILLIDEGREES)) for k in (0, 2, 4)]
 
 
-def decode_command(frame_id: int, data: bytes) -> Command | None:
+def decode_command(frame_id: int, data: bytes) -> PiperCommand | None:
     """Return the command in a frame; None for any other frame, of this arm or not."""
     decoder = _COMMANDS.get(frame_id)
     return None if decoder is None or len(data) != 8 else decoder(frame_id, bytes(data))
 
 
-_COMMANDS: dict[int, Callable[[int, bytes], Command | None]] = {
+_COMMANDS: dict[int, Callable[[int, bytes], PiperCommand | None]] = {
     _STOP: lambda _, data: StopRequest(*data[:3]),
     _MODE: lambda _, data: ModeRequest(*data[:6]),
     _GRIPPER: lambda _, data: _gripper_request(*struct.unpack(">iHBB", data)),
@@ -303,10 +303,10 @@ def _gripper_request(width: int, torque: int, code: int, zero: int) -> GripperRe
     return GripperRequest(width * 1e-6, torque * 1e-3, bool(code & 1), bool(code & 2), zero == _SET)
 
 
-# Feedback: what the arm sends
+# PiperFeedback: what the arm sends
 
 
-class ArmStatus(NamedTuple):
+class PiperStatus(NamedTuple):
     """State of the whole arm (0x2A1), 200 times a second."""
 
     control: int = STANDBY
@@ -323,7 +323,7 @@ class ArmStatus(NamedTuple):
     no_communication: int = 0
     """Bit k: the motor of joint k + 1 does not answer the arm's controller."""
 
-    def frame(self) -> Frame:
+    def frame(self) -> CanFrame:
         """Return the frame of this record."""
         return _STATUS, bytes(self)
 
@@ -336,7 +336,7 @@ class PoseNumbers(NamedTuple):
     values: tuple[float, float]
     """m, exact to a micrometre, and rad, exact to 0.001 degrees."""
 
-    def frame(self) -> Frame:
+    def frame(self) -> CanFrame:
         """Return the frame of this record."""
         return _POSE + self.first // 2, _pair(self.values, *_POSE_SCALES[self.first])
 
@@ -349,7 +349,7 @@ class JointAngles(NamedTuple):
     q: tuple[float, float]
     """rad, exact to 0.001 degrees."""
 
-    def frame(self) -> Frame:
+    def frame(self) -> CanFrame:
         """Return the frame of this record."""
         return _ANGLES + self.first // 2, _pair(self.q, _MILLIDEGREES)
 
@@ -364,12 +364,12 @@ class GripperStatus(NamedTuple):
     flags: int = 0
     """ENABLED, HOMED, ERROR and so on."""
 
-    def frame(self) -> Frame:
+    def frame(self) -> CanFrame:
         """Return the frame of this record."""
         return _GRIPPER_STATUS, _packed(">ihBx", self.width * 1e6, self.torque * 1e3, self.flags)
 
 
-class MotorMotion(NamedTuple):
+class JointMotion(NamedTuple):
     """Speed and current of a joint (0x251 to 0x256), 200 times a second."""
 
     joint: int
@@ -381,12 +381,12 @@ class MotorMotion(NamedTuple):
     position: float = 0.0
     """rad, exact to 0.001. Real arms are reported to fill this field in different units: use :class:`JointAngles`."""
 
-    def frame(self) -> Frame:
+    def frame(self) -> CanFrame:
         """Return the frame of this record."""
         return _MOTION + self.joint, _packed(">hhi", *(value * 1e3 for value in self[1:]))
 
 
-class MotorStatus(NamedTuple):
+class JointStatus(NamedTuple):
     """Voltage, temperatures and flags of a joint (0x261 to 0x266), 40 times a second."""
 
     joint: int
@@ -402,14 +402,14 @@ class MotorStatus(NamedTuple):
     current: float = 0.0
     """Supply current, A; small motors always report 0."""
 
-    def frame(self) -> Frame:
+    def frame(self) -> CanFrame:
         """Return the frame of this record."""
         _, voltage, driver, motor, flags, current = self
         data = _packed(">HhbBH", voltage * 10, driver, motor, flags, current * 1e3)
         return _MOTOR_STATUS + self.joint, data
 
 
-class MotorLimits(NamedTuple):
+class JointLimits(NamedTuple):
     """Range and speed of a joint as set in the arm (0x473)."""
 
     motor: int
@@ -421,7 +421,7 @@ class MotorLimits(NamedTuple):
     velocity: float
     """rad/s, exact to 0.001."""
 
-    def frame(self) -> Frame:
+    def frame(self) -> CanFrame:
         """Return the frame of this record."""
         tenths = _MILLIDEGREES * 1e-2
         return _LIMITS, _packed(">BhhHx", self.motor, self.upper * tenths, self.lower * tenths, self.velocity * 1e3)
@@ -435,7 +435,7 @@ class AccelerationLimit(NamedTuple):
     acceleration: float
     """rad/s2, exact to 0.001."""
 
-    def frame(self) -> Frame:
+    def frame(self) -> CanFrame:
         """Return the frame of this record."""
         return _ACCELERATION, _packed(">BH5x", self.motor, self.acceleration * 1e3)
 
@@ -447,7 +447,7 @@ class Acknowledgement(NamedTuple):
     """Last byte of the command's id."""
     zero_set: bool = False
 
-    def frame(self) -> Frame:
+    def frame(self) -> CanFrame:
         """Return the frame of this record."""
         return ACKNOWLEDGEMENT, bytes((self.command, int(self.zero_set), 0, 0, 0, 0, 0, 0))
 
@@ -460,7 +460,7 @@ class GripperStroke(NamedTuple):
     teaching_percent: int = 100
     teaching_friction: int = 1
 
-    def frame(self) -> Frame:
+    def frame(self) -> CanFrame:
         """Return the frame of this record."""
         return _STROKE, bytes((self.teaching_percent, self.stroke_mm, self.teaching_friction, 0, 0, 0, 0, 0))
 
@@ -470,19 +470,19 @@ class FirmwarePiece(NamedTuple):
 
     text: bytes
 
-    def frame(self) -> Frame:
+    def frame(self) -> CanFrame:
         """Return the frame of this record."""
         return FIRMWARE, self.text.ljust(8, b"\0")
 
 
-Feedback = (
-    ArmStatus
+PiperFeedback = (
+    PiperStatus
     | PoseNumbers
     | JointAngles
     | GripperStatus
-    | MotorMotion
-    | MotorStatus
-    | MotorLimits
+    | JointMotion
+    | JointStatus
+    | JointLimits
     | AccelerationLimit
     | Acknowledgement
     | GripperStroke
@@ -490,18 +490,18 @@ Feedback = (
 )
 
 
-def encode_joint_angles(q: Sequence[float]) -> list[Frame]:
+def encode_joint_angles(q: Sequence[float]) -> list[CanFrame]:
     """Return the three frames of the measured positions (6,) of all joints, rad."""
     return [(_ANGLES + k // 2, _pair(q[k : k + 2], _MILLIDEGREES)) for k in (0, 2, 4)]
 
 
-def encode_pose(position: Sequence[float], roll_pitch_yaw: Sequence[float]) -> list[Frame]:
+def encode_pose(position: Sequence[float], roll_pitch_yaw: Sequence[float]) -> list[CanFrame]:
     """Return the three frames of the flange's pose: position (3,), m, and roll, pitch, yaw, rad."""
     values = (*position, *roll_pitch_yaw)
     return [PoseNumbers(k, (values[k], values[k + 1])).frame() for k in (0, 2, 4)]
 
 
-def firmware_pieces(version: str) -> Iterator[Frame]:
+def firmware_pieces(version: str) -> Iterator[CanFrame]:
     """Yield the frames of an arm's answer to :class:`FirmwareQuery`, 8 characters each."""
     text = version.encode("ascii")
     return (FirmwarePiece(text[k : k + 8]).frame() for k in range(0, len(text), 8))
@@ -515,20 +515,20 @@ def find_firmware(pieces: Iterable[bytes]) -> str | None:
     return version.decode("ascii", "replace").rstrip("\0") if len(version) == 8 else None
 
 
-def decode_feedback(frame_id: int, data: bytes) -> Feedback | None:
+def decode_feedback(frame_id: int, data: bytes) -> PiperFeedback | None:
     """Return what the arm reports in a frame; None for any other frame, of this arm or not."""
     decoder = _FEEDBACK.get(frame_id)
     return None if decoder is None or len(data) != 8 else decoder(frame_id, bytes(data))
 
 
-def _motion(frame_id: int, data: bytes) -> MotorMotion:
+def _motion(frame_id: int, data: bytes) -> JointMotion:
     dq, current, position = struct.unpack(">hhi", data)
-    return MotorMotion(frame_id - _MOTION, dq * 1e-3, current * 1e-3, position * 1e-3)
+    return JointMotion(frame_id - _MOTION, dq * 1e-3, current * 1e-3, position * 1e-3)
 
 
-def _motor_status(frame_id: int, data: bytes) -> MotorStatus:
+def _motor_status(frame_id: int, data: bytes) -> JointStatus:
     voltage, driver, motor, flags, current = struct.unpack(">HhbBH", data)
-    return MotorStatus(frame_id - _MOTOR_STATUS, voltage * 0.1, driver, motor, flags, current * 1e-3)
+    return JointStatus(frame_id - _MOTOR_STATUS, voltage * 0.1, driver, motor, flags, current * 1e-3)
 
 
 def _gripper_status(_: int, data: bytes) -> GripperStatus:
@@ -536,9 +536,9 @@ def _gripper_status(_: int, data: bytes) -> GripperStatus:
     return GripperStatus(width * 1e-6, torque * 1e-3, flags)
 
 
-def _limits(_: int, data: bytes) -> MotorLimits:
+def _limits(_: int, data: bytes) -> JointLimits:
     motor, upper, lower, velocity = struct.unpack(">BhhHx", data)
-    return MotorLimits(motor, upper * 100 / _MILLIDEGREES, lower * 100 / _MILLIDEGREES, velocity * 1e-3)
+    return JointLimits(motor, upper * 100 / _MILLIDEGREES, lower * 100 / _MILLIDEGREES, velocity * 1e-3)
 
 
 def _pose(frame_id: int, data: bytes) -> PoseNumbers:
@@ -551,8 +551,8 @@ def _joint_angles(frame_id: int, data: bytes) -> JointAngles:
     return JointAngles(2 * (frame_id - _ANGLES), _radians(data))
 
 
-_FEEDBACK: dict[int, Callable[[int, bytes], Feedback | None]] = {
-    _STATUS: lambda _, data: ArmStatus(*data),
+_FEEDBACK: dict[int, Callable[[int, bytes], PiperFeedback | None]] = {
+    _STATUS: lambda _, data: PiperStatus(*data),
     _GRIPPER_STATUS: _gripper_status,
     _LIMITS: _limits,
     _ACCELERATION: lambda _, data: AccelerationLimit(data[0], int.from_bytes(data[1:3], "big") * 1e-3),

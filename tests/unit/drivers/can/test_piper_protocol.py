@@ -15,7 +15,6 @@ from hal.drivers.can.piper_protocol import (
     FIRMWARE,
     AccelerationLimit,
     Acknowledgement,
-    ArmStatus,
     EnableRequest,
     FirmwarePiece,
     FirmwareQuery,
@@ -23,14 +22,15 @@ from hal.drivers.can.piper_protocol import (
     GripperStatus,
     GripperStroke,
     JointAngles,
+    JointLimits,
+    JointMotion,
     JointRequest,
+    JointStatus,
     JointTargets,
     LimitQuery,
     ModeRequest,
-    MotorLimits,
-    MotorMotion,
-    MotorStatus,
     ParameterQuery,
+    PiperStatus,
     PoseNumbers,
     StopRequest,
     decode_command,
@@ -58,8 +58,8 @@ COMMANDS = [
     (FirmwareQuery(), 0x4AF, "0100000000000000"),
 ]
 FEEDBACK = [
-    (ArmStatus(), 0x2A1, "0000010000000000"),
-    (ArmStatus(1, 9, 1, 0, 1, 255, 0b100000, 0b000011), 0x2A1, "0109010001ff2003"),
+    (PiperStatus(), 0x2A1, "0000010000000000"),
+    (PiperStatus(1, 9, 1, 0, 1, 255, 0b100000, 0b000011), 0x2A1, "0109010001ff2003"),
     (PoseNumbers(0, (0.3, -0.000001)), 0x2A2, "000493e0ffffffff"),
     (PoseNumbers(2, (0.2, pi)), 0x2A3, "00030d400002bf20"),
     (PoseNumbers(4, (-pi / 2, 0.0)), 0x2A4, "fffea07000000000"),
@@ -67,12 +67,12 @@ FEEDBACK = [
     (JointAngles(2, (radians(-0.001), radians(0.001))), 0x2A6, "ffffffff00000001"),
     (JointAngles(4, (radians(-70), 0.0)), 0x2A7, "fffeee9000000000"),
     (GripperStatus(0.05, -0.5, FULL), 0x2A8, "0000c350fe0cc000"),
-    (MotorMotion(0, -0.5, 1.25, 0.7), 0x251, "fe0c04e2000002bc"),
-    (MotorMotion(5, 32.767, -0.001, -1.0), 0x256, "7fffffff" + "fffffc18"),
-    (MotorStatus(0, 24.1, 31, -5, piper.ENABLED, 0.5), 0x261, "00f1001ffb4001f4"),
-    (MotorStatus(5, 0.0, -10, 127, 0xFF, 65.535), 0x266, "0000fff67fffffff"),
-    (MotorLimits(2, pi, 0.0, 3.0), 0x473, "02070800000bb800"),
-    (MotorLimits(3, 0.0, radians(-170), 3.0), 0x473, "030000f95c0bb800"),
+    (JointMotion(0, -0.5, 1.25, 0.7), 0x251, "fe0c04e2000002bc"),
+    (JointMotion(5, 32.767, -0.001, -1.0), 0x256, "7fffffff" + "fffffc18"),
+    (JointStatus(0, 24.1, 31, -5, piper.ENABLED, 0.5), 0x261, "00f1001ffb4001f4"),
+    (JointStatus(5, 0.0, -10, 127, 0xFF, 65.535), 0x266, "0000fff67fffffff"),
+    (JointLimits(2, pi, 0.0, 3.0), 0x473, "02070800000bb800"),
+    (JointLimits(3, 0.0, radians(-170), 3.0), 0x473, "030000f95c0bb800"),
     (AccelerationLimit(6, 5.0), 0x47C, "0613880000000000"),
     (Acknowledgement(0x71), 0x476, "7100000000000000"),
     (Acknowledgement(0x75, True), 0x476, "7501000000000000"),
@@ -198,7 +198,7 @@ def test_the_vendors_sdk_encodes_the_same_commands(record: Any, frame_id: int, d
 
 def numbers_of(record: Any, message: Any) -> tuple[list[float], list[float]]:
     """Return the numbers of a feedback record in the vendor's units, and those that the SDK decoded."""
-    if isinstance(record, ArmStatus):
+    if isinstance(record, PiperStatus):
         status = message.arm_status_msgs
         flags = record.beyond_limit << 8 | record.no_communication
         found = [status.ctrl_mode, status.arm_status, status.mode_feed, status.teach_status, status.motion_status]
@@ -216,14 +216,14 @@ def numbers_of(record: Any, message: Any) -> tuple[list[float], list[float]]:
         gripper = message.gripper_feedback
         ours = [record.width * 1e6, record.torque * 1e3, record.flags]
         return ours, [gripper.grippers_angle, gripper.grippers_effort, gripper.status_code]
-    if isinstance(record, MotorMotion):
+    if isinstance(record, JointMotion):
         motor = getattr(message, f"arm_high_spd_feedback_{record.joint + 1}")
         return [value * 1e3 for value in record[1:]], [motor.motor_speed, motor.current, motor.pos]
-    if isinstance(record, MotorStatus):
+    if isinstance(record, JointStatus):
         motor = getattr(message, f"arm_low_spd_feedback_{record.joint + 1}")
         found = [motor.vol, motor.foc_temp, motor.motor_temp, motor.foc_status_code, motor.bus_current]
         return [record.voltage * 10, *record[2:5], record.current * 1e3], found
-    if isinstance(record, MotorLimits):
+    if isinstance(record, JointLimits):
         motor = message.arm_feedback_current_motor_angle_limit_max_spd
         ours = [record.motor, *(angle * 1800 / pi for angle in record[1:3]), record.velocity * 1e3]
         return ours, [motor.motor_num, motor.max_angle_limit, motor.min_angle_limit, motor.max_joint_spd]
