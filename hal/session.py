@@ -249,14 +249,16 @@ class TeleopSession:
         Raises:
             ConnectionLost: The arm's process is gone.
         """
-        presses = self.deadman.record.presses
+        deadman, presses = self.deadman, self.deadman.record.presses
         while keep_waiting():
-            record = self.deadman.record
+            if deadman is not self.deadman:  # of another pad, which counts its own presses
+                deadman, presses = self.deadman, self.deadman.record.presses
+            record = deadman.record
             if not self.drives_home or (record.held and record.presses > presses):
                 if self.guard(partial(self._try_reset, seed, presses)):
                     self._open_gripper()
                     return True
-                presses = self.deadman.record.presses  # stopped on the way: a new press is needed
+                presses = deadman.record.presses  # stopped on the way: a new press is needed
             else:
                 self.use_plugged_pad()
                 self.rig.clock.sleep(RETRY_DELAY)

@@ -38,18 +38,18 @@ __all__ = [
 class RobotMirror:
     """Kinematic copy, in a simulated world, of an arm that another group moves."""
 
-    def __init__(self, name: str, mail: RobotMail, hand: GripperMail | None) -> None:
+    def __init__(self, name: str, mail: RobotMail, gripper: GripperMail | None) -> None:
         self.name = name
         self._mail = mail
-        self._hand = hand
+        self._gripper = gripper
 
     def follow(self, world: Any) -> None:
         """Move the copy to the arm's newest state. Before the first state it stays where the rig's file puts it."""
         state = self._mail.get_state()
         if state is None:
             return
-        hand = self._hand.get() if self._hand is not None else None
-        world.follow(self.name, state.q, state.dq, hand.state.width if hand is not None else None)
+        gripper = self._gripper.get() if self._gripper is not None else None
+        world.follow(self.name, state.q, state.dq, gripper.state.width if gripper is not None else None)
 
 
 def mirrors_of(group: GroupSpec, memories: Iterable[GroupMemory]) -> tuple[RobotMirror, ...]:
@@ -57,17 +57,16 @@ def mirrors_of(group: GroupSpec, memories: Iterable[GroupMemory]) -> tuple[Robot
     if group.world is None:
         return ()
     robots: dict[str, RobotMail] = {}
-    hands: dict[str, GripperMail] = {}
+    grippers: dict[str, GripperMail] = {}
     for memory in memories:
         robots |= memory.robots
-        hands |= memory.grippers
+        grippers |= memory.grippers
     own = {robot.name for robot in group.robots}
     others = [robot for robot in group.world.robots if robot.name not in own and robot.name in robots]
-    return tuple(RobotMirror(robot.name, robots[robot.name], _hand_of(robot, hands)) for robot in others)
-
-
-def _hand_of(robot: RobotSpec, hands: dict[str, GripperMail]) -> GripperMail | None:
-    return hands.get(robot.gripper.name) if robot.gripper is not None else None
+    return tuple(
+        RobotMirror(robot.name, robots[robot.name], grippers.get(robot.gripper.name) if robot.gripper else None)
+        for robot in others
+    )
 
 
 TCP_APART, TCP_TURNED = 0.002, 0.02
@@ -317,7 +316,7 @@ class Cycle:
         """
         self.spec = spec
         self.memory = memory
-        self._copies = mirrors_of(spec, others)
+        self._mirrors = mirrors_of(spec, others)
         self.dt = 1.0 / spec.rate_hz
         self.ticks = 0
         self.t = 0.0
@@ -328,44 +327,44 @@ class Cycle:
             # In real time, a process of its own draws a copy of the world.
             self.world = registry.load(spec.world.driver, "world")(spec.world, drawn=spec.clock == "lock_step")
         self.arms = {r.name: ArmUnit(r, self.dt, memory.robots[r.name], self.world) for r in spec.robots}
-        self._units = tuple(self.arms.values())
+        self._arm_units = tuple(self.arms.values())
         self.grippers: dict[str, GripperUnit] = {}
         for gripper in spec.grippers:
             driver = registry.load(gripper.driver, "gripper")(gripper, self.world)
             self.grippers[gripper.name] = GripperUnit(driver, memory.grippers[gripper.name])
-        self._hands = tuple(self.grippers.values())
+        self._gripper_units = tuple(self.grippers.values())
 
     @property
     def paces_itself(self) -> bool:
         """Whether a device sets the pace."""
-        return any(unit.driver.paces_itself for unit in self._units)
+        return any(unit.driver.paces_itself for unit in self._arm_units)
 
     @property
     def lost_cycles(self) -> int:
         """Number of missed cycles of the device that sets the pace."""
-        return sum(unit.lost_cycles for unit in self._units)
+        return sum(unit.lost_cycles for unit in self._arm_units)
 
     @property
     def attended(self) -> bool:
         """Whether the group has a real arm."""
-        return any(unit.spec.attended for unit in self._units)
+        return any(unit.spec.attended for unit in self._arm_units)
 
     def looping_driver(self) -> RobotDriver | None:
         """Return a driver whose library needs to own the loop now; None if there is none."""
-        return next((unit.driver for unit in self._units if unit.driver.wants_loop), None)
+        return next((unit.driver for unit in self._arm_units if unit.driver.wants_loop), None)
 
     def open(self, now: float) -> None:
         """Connect to every device and publish a first state. Nothing moves."""
         self.t = now
-        for unit in self._units:
+        for unit in self._arm_units:
             unit.open(now)
-        for hand in self._hands:
-            hand.open()
+        for gripper in self._gripper_units:
+            gripper.open()
         self.publish(now)
 
     def wait(self) -> None:
         """Block until the device that sets the pace has something new."""
-        for unit in self._units:
+        for unit in self._arm_units:
             if unit.driver.paces_itself:
                 unit.driver.wait()
 
@@ -380,30 +379,30 @@ class Cycle:
         self.ticks += 1
         self.t = now
         if self.world is not None:
-            for copy in self._copies:
-                copy.follow(self.world)
+            for mirror in self._mirrors:
+                mirror.follow(self.world)
             self.world.step()
-        for unit in self._units:
+        for unit in self._arm_units:
             unit.read(now)
             unit.tick(now, app, late)
-        for unit in self._units:
+        for unit in self._arm_units:
             unit.write(now)
             unit.finish_session()
             unit.prepare(app)
-        for hand in self._hands:
-            hand.serve(app)
+        for gripper in self._gripper_units:
+            gripper.serve(app)
 
     def publish(self, now: float) -> None:
         """Publish what every device reports."""
-        for unit in self._units:
+        for unit in self._arm_units:
             unit.publish(now)
-        for hand in self._hands:
-            hand.publish(now)
+        for gripper in self._gripper_units:
+            gripper.publish(now)
 
     def stop_sessions(self) -> bool:
         """Bring every arm to rest; call it between steps until it returns True. Grippers keep what they hold."""
         resting = True
-        for unit in self._units:
+        for unit in self._arm_units:
             if not unit.finish_session():
                 unit.servo.close_session()
                 resting = False
@@ -458,7 +457,7 @@ class Cycle:
 
     def _do_reset_statistics(self) -> None:
         self._counted_from = self.ticks
-        for unit in self._units:
+        for unit in self._arm_units:
             unit.reset_statistics()
 
     def _world_request(self, method: str, params: dict[str, Any]) -> Any:
@@ -469,7 +468,7 @@ class Cycle:
             result["t"] = self.t  # a world only counts its steps
         if method == "reset":
             name = params.get("name")
-            for unit in self._units:
+            for unit in self._arm_units:
                 if name is None or name == unit.spec.name:
                     unit.anchor_again()
         return result
@@ -477,7 +476,7 @@ class Cycle:
     def close(self) -> None:
         """Close every device. Idempotent."""
         errors = []
-        for close in (*(unit.close for unit in self._units), *(hand.close for hand in self._hands)):
+        for close in (*(unit.close for unit in self._arm_units), *(gripper.close for gripper in self._gripper_units)):
             try:
                 close()
             except Exception as error:

@@ -41,7 +41,7 @@ class GripperUnit:
         """Connect. Nothing moves.
 
         Raises:
-            ConnectionLost: If the gripper does not answer; the message says how to open the rig without it.
+            ConnectionLost: If the gripper does not answer; the message has the way to open the rig without it.
         """
         try:
             self.driver.open()

@@ -1,6 +1,6 @@
 """Where a group's cycle runs: in the caller's process, stepped by its clock, or in a process of its own.
 
-Both look the same to the public classes: mailboxes in memory, requests, and a check that somebody is there.
+Both look the same to the public classes: mailboxes in memory, requests, and a check that the host is alive.
 """
 
 from __future__ import annotations

@@ -52,7 +52,7 @@ class Pace(ABC):
 
     @property
     def pausing(self) -> bool:
-        """Whether time stands still until the app asks for more cycles."""
+        """Whether time stands still until the app requests more cycles."""
         return False
 
     @abstractmethod
@@ -107,7 +107,7 @@ class DevicePace(Pace):
 
 
 class StepPace(Pace):
-    """Lock-step: runs as many cycles as the app asks for, then time stands still."""
+    """Lock-step: runs as many cycles as the app requests, then time stands still."""
 
     def __init__(self, cycle: Cycle, attend: Callable[[float], None]) -> None:
         """Make the pace. ``attend(timeout)`` serves a request of the app, if one comes."""
@@ -236,7 +236,7 @@ class HostProcess:
         self._resting = False
         self._give_up_at = math.inf
         self._owed: int | None = None
-        """Number of the request that is answered when the cycles that it asked for are done."""
+        """Number of the request for cycles that is answered when they are done."""
         self._suspension = SuspensionWatch() if self.cycle.attended else None
         self.pace: Pace
         if spec.clock == "lock_step":

@@ -24,7 +24,7 @@ __all__ = [
     "newest",
 ]
 
-_HEADER = 8  # bytes: the announced number, in the machine's own order; nobody else reads this memory
+_HEADER = 8  # bytes: the announced number, in the machine's own order: this memory is never sent
 _SLOT = struct.Struct("<QQ")  # number, checksum
 _TRIES = 16
 

@@ -424,12 +424,12 @@ class RobotMail:
 
     def _command(self, values: tuple[Any, ...]) -> CommandRecord:
         seq, t, deadline, kind, t_event, session, count, *rest = values
-        told = tuple(rest[:count])
+        numbers = tuple(rest[:count])
         if kind == Kind.JOINT_CHUNK:
             chunk = self._chunk.read()
             # Another number: overtaken by the next chunk, whose command comes in a moment.
-            told = tuple(chunk[3]) if chunk is not None and chunk[2] == seq else ()
-        return CommandRecord(seq, session, t, deadline, Kind(kind), told, t_event)
+            numbers = tuple(chunk[3]) if chunk is not None and chunk[2] == seq else ()
+        return CommandRecord(seq, session, t, deadline, Kind(kind), numbers, t_event)
 
     # From the servo to the app.
 

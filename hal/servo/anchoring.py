@@ -253,7 +253,7 @@ class Anchoring:
                 self._took()
                 self._hints = self._as_measured = 0
                 return False
-        elif q is given[0] is not given[1]:  # it hands back what it was given
+        elif q is given[0] is not given[1]:  # it reports the very object
             self.lag = 0
             self._took()
             return False
@@ -283,10 +283,10 @@ class Anchoring:
         the motion may begin again from there.
         """
         given, rests = self._given[0], self._track[0]
-        said = None if self._last is None else self._last.q_commanded
+        before = None if self._last is None else self._last.q_commanded
         if self._waits >= LATEST or given == rests:
             return False
-        if _apart(q, said or rests) > min(_SAME, 0.5 * _apart(q, given)) or _apart(q, rests) > _SAME:
+        if _apart(q, before or rests) > min(_SAME, 0.5 * _apart(q, given)) or _apart(q, rests) > _SAME:
             return False
         self._waits += 1
         self._smoother.anchor(given)
@@ -351,12 +351,12 @@ class Anchoring:
         else:
             self._fail(reading.q_commanded, f"{MISMATCHES + 1} of {_WINDOW} reports fit no set-point")
 
-    def _fail(self, told: Floats | None, what: str) -> None:
+    def _fail(self, reported: Floats | None, what: str) -> None:
         sent = self._given[0]
         detail = ""
-        if told is not None and len(told) == len(sent):
-            k = max(range(len(sent)), key=lambda i: abs(told[i] - sent[i]))
-            detail = f": joint {k + 1} was sent {sent[k]:.6f} rad and reported {told[k]:.6f} rad"
+        if reported is not None and len(reported) == len(sent):
+            k = max(range(len(sent)), key=lambda i: abs(reported[i] - sent[i]))
+            detail = f": joint {k + 1} was sent {sent[k]:.6f} rad and reported {reported[k]:.6f} rad"
         self.fault = Fault(
             "SETPOINT_MISMATCH",
             f"by its reports, the arm does not follow its set-points: {what}{detail}",
@@ -378,7 +378,7 @@ class Anchoring:
         dt = self._smoother.dt
         track, exact = self._refined()
         best = _continued(track, cycles)
-        if cycles == 1 and exact and dq is not None:  # speeds tell a small loss from none, and from noise
+        if cycles == 1 and exact and dq is not None:  # speeds distinguish a small loss from none, and from noise
             missed = max([abs(x - y - dt * v) for x, y, v in zip(best[0], track[0], dq, strict=True)])
             took = max([abs(x - y - dt * v) for x, y, v in zip(self._motion[0], track[0], dq, strict=True)])
             limit = limit if missed <= 0.25 * took else 0.0
@@ -398,7 +398,7 @@ class Anchoring:
         return True
 
     def _refined(self) -> tuple[list[Floats], bool]:
-        """Where the device was, newest first, and whether its speeds say so.
+        """Return where the device was, newest first, and whether its speeds confirm that.
 
         A loss may have been too small to be noticed. Speeds that are the differences of positions are more exact than
         these, which were rounded.

@@ -61,7 +61,7 @@ class SetpointAudit:
         if setpoint.tau is not None:
             self._add_torques(setpoint.tau)
             return
-        if self._tau is not None:  # positions begin anew, where the torques have brought the arm
+        if self._tau is not None:  # positions start again from where torques moved the arm
             self.reset()
         self.add(setpoint.q)
 

@@ -200,7 +200,7 @@ class PoseMotion(_CartesianMotion):
     def _brake(self, dq: list[float]) -> list[float]:
         """Slow the whole motion to what the joint with the least reserve can still brake.
 
-        At ``dq`` the goal would be reached in 1 / rate seconds, which tells how far each joint still has to go.
+        At ``dq`` the goal would be reached in 1 / rate seconds, which gives the way that each joint still has to go.
         """
         smoother = self.smoother
         slowest = 1.0

@@ -1,6 +1,6 @@
 """From a wanted motion to set-points that keep every limit: Ruckig, and a check that the arm could still stop.
 
-The free Ruckig knows no position limits, and clipping a position breaks the limits of acceleration and jerk. So the
+The free Ruckig has no position limits, and clipping a position breaks the limits of acceleration and jerk. So the
 smoother keeps an invariant instead: **after every tick the time-optimal stop still ends inside every limit**. A step
 that would break it is replaced by the first tick of that stop, which keeps it by construction. An arm that starts
 outside a limit may only come back in: what counts is max(limit, where the stop would end now).
@@ -41,7 +41,7 @@ __all__ = [
 
 
 def stop_distance(v: float, A: float, J: float) -> float:
-    """Distance (rad) of a stop from speed ``v >= 0`` and no acceleration.
+    """Return the distance (rad) of a stop from speed ``v >= 0`` and no acceleration.
 
     The profile is symmetric in time, so the distance is the mean speed v/2 times its duration: 2 sqrt(v/J) when the
     braking never reaches A (v J <= A^2), else v/A + A/J.
@@ -52,7 +52,7 @@ def stop_distance(v: float, A: float, J: float) -> float:
 
 
 def speed_for(d: float, A: float, J: float) -> float:
-    """Greatest speed (rad/s), with no acceleration, that can still stop within ``d`` rad: inverts `stop_distance`."""
+    """Return the greatest speed (rad/s) at no acceleration that can stop within ``d`` rad: inverts `stop_distance`."""
     if d <= 0.0:
         return 0.0
     if d * J * J <= A * A * A:
@@ -62,11 +62,11 @@ def speed_for(d: float, A: float, J: float) -> float:
 
 
 def stop_displacement(v: float, a: float, A: float, J: float) -> float:
-    """Where a stop from speed ``v`` and acceleration ``a`` ends, relative to where it begins, rad.
+    """Return the end of a stop from speed ``v`` and acceleration ``a``, relative to its start, rad.
 
-    Releasing ``a`` at jerk J leaves the speed s = v + a |a| / (2 J); its sign tells which way the stop must brake. For
-    s > 0 the profile is part of the one that brakes from v1 = v + a^2 / (2 J) with no acceleration: that began t = a/J
-    from now (in the past when a < 0) and t (v + a t / 3) away. For s < 0 the same holds mirrored.
+    Releasing ``a`` at jerk J leaves the speed s = v + a |a| / (2 J), against whose sign the stop must brake. For s > 0
+    the profile is part of the one that brakes from v1 = v + a^2 / (2 J) with no acceleration: that began t = a/J from
+    now (in the past when a < 0) and t (v + a t / 3) away. For s < 0 the same holds mirrored.
     """
     if v + 0.5 * a * abs(a) / J < 0.0:
         return -stop_displacement(-v, -a, A, J)
@@ -75,7 +75,7 @@ def stop_displacement(v: float, a: float, A: float, J: float) -> float:
 
 
 def stop_peak(v: float, a: float, A: float, J: float) -> float:
-    """How far in the positive direction (>= 0, rad) a stop from speed ``v`` and acceleration ``a`` gets at most.
+    """Return the greatest way (>= 0, rad) in the positive direction of a stop from speed ``v`` and acceleration ``a``.
 
     Mirror with (-v, -a) for the negative direction. A joint that is braked harder than its speed needs
     (s = v + a |a| / (2 J) < 0) turns back while it releases the brake, at the first root of v + a s + J s^2 / 2 = 0.
@@ -85,13 +85,13 @@ def stop_peak(v: float, a: float, A: float, J: float) -> float:
     if a < 0.0 and v * J < 0.5 * a * a:
         s = (-a - sqrt(a * a - 2.0 * J * v)) / J
         return s * (v + s * (0.5 * a + s * J / 6.0))
-    if v + 0.5 * a * abs(a) / J <= 0.0:  # a > 0, and the joint goes on backwards all the same
+    if v + 0.5 * a * abs(a) / J <= 0.0:  # a > 0, and the joint still continues backwards
         return 0.0
     return max(0.0, stop_displacement(v, a, A, J))
 
 
 def stop_phases(v: float, a: float, A: float, J: float) -> tuple[float, float, float, float]:
-    """Jerk of the first phase of the stop from speed ``v`` and acceleration ``a``, and when each of its phases ends.
+    """Return the first jerk of the stop from speed ``v`` and acceleration ``a``, and the ends of its phases.
 
     Returns:
         The first phase's jerk, rad/s3 (the second phase has none, the third the opposite one), and the times after
@@ -105,9 +105,9 @@ def stop_phases(v: float, a: float, A: float, J: float) -> tuple[float, float, f
 
 
 def stop_step(q: float, v: float, a: float, A: float, J: float, dt: float) -> tuple[float, float, float]:
-    """Position, speed and acceleration ``dt`` seconds into the stop from (q, v, a); |a| <= A.
+    """Return position, speed and acceleration ``dt`` seconds into the stop from (q, v, a); |a| <= A.
 
-    What Ruckig's velocity interface with target 0 answers, by hand: the servo falls back on it should Ruckig refuse.
+    The same as Ruckig's velocity interface with target 0, for the case that Ruckig fails.
     """
     if v + 0.5 * a * abs(a) / J < 0.0:
         q, v, a = stop_step(-q, -v, -a, A, J, dt)
@@ -136,7 +136,7 @@ def _phases(v: float, a: float, A: float, J: float) -> tuple[float, float, float
 
 Floats = Sequence[float]
 
-# Members of an enumeration that every tick names: to find one there takes longer than to hand it over.
+# Members of an enumeration that every tick uses: looking one up takes longer than passing it.
 _VELOCITY, _POSITION = ControlInterface.Velocity, ControlInterface.Position
 
 Guard = Callable[["JointSmoother"], bool]
@@ -330,7 +330,7 @@ class JointSmoother:
         inputs = self._input
         inputs.control_interface = _VELOCITY
         inputs.target_velocity = dq
-        if not self._propose():  # never seen, but an arm that moves must not depend on it: stop by hand
+        if not self._propose():  # never seen, but an arm that moves must not depend on it: stop without Ruckig
             state = zip(self.q, self.dq, self.ddq, self.acceleration, self.jerk, strict=True)
             steps = [stop_step(q, v, a, A, J, self.dt) for q, v, a, A, J in state]
             self.q_next, self.dq_next, self.ddq_next = (list(column) for column in zip(*steps, strict=True))

@@ -147,18 +147,18 @@ class TorqueBounds:
         if workspace is not None:
             self._box = _around(workspace.lower, workspace.upper, self._kinematics.fk(q)[:3])
 
-    # How great.
+    # Torques within the bounds.
 
-    def allowed(self, wanted: list[float], arm: ArmInMotion) -> list[float]:
-        """The torques (n,) to go for, Nm, when ``wanted`` is commanded.
+    def allowed(self, commanded: list[float], arm: ArmInMotion) -> list[float]:
+        """Return the torques (n,) to move towards, Nm, when ``commanded`` is commanded.
 
-        They keep the torque limits, and are only as great as the arm could be rid of before it is faster than the
-        session allows. First each joint is looked at by itself, as though the others were free; what they do to each
-        other, and to the tcp, makes all torques smaller alike.
+        They keep the torque limits, and can be removed before the arm is faster than the session allows. First each
+        joint is bounded by itself, as though the others were free; for the effect of the joints on each other, and on
+        the tcp, all torques are then scaled alike.
         """
         envelope = self._envelope
-        tau = [max(-limit, min(limit, x)) for x, limit in zip(wanted, self._torque, strict=True)]
-        if tau != wanted:
+        tau = [max(-limit, min(limit, x)) for x, limit in zip(commanded, self._torque, strict=True)]
+        if tau != commanded:
             envelope.limited |= Limited.TORQUE
         most, coupled = [_SHARE * v for v in envelope.velocity], [_COUPLED * v for v in envelope.velocity]
         slowed = list(map(self._slowed, tau, arm.dq, arm.inertia.alone, most, self._torque))
@@ -173,9 +173,9 @@ class TorqueBounds:
         return slowed if share == 1.0 else [share * x for x in slowed]
 
     def _slowed(self, tau: float, v: float, inertia: float, most: float, limit: float) -> float:
-        """Not more than what leaves this joint at ``most`` rad/s: inertia (most - v) = tau T + tau^2 / (2 R).
+        """Return ``tau`` cut to what leaves this joint at ``most`` rad/s: inertia (most - v) = tau T + tau^2 / (2 R).
 
-        One that is faster is braked, at least.
+        A joint that is faster is braked at least.
         """
         if abs(v) > most:
             brake = min(limit, self._decay * inertia * (abs(v) - most))
@@ -186,7 +186,7 @@ class TorqueBounds:
         return max(-greatest, min(greatest, tau))
 
     def _tcp_share(self, arm: ArmInMotion, added: list[float]) -> float:
-        """The greatest share (0..1) of what torques add that leaves the tcp below its speed, or slows it to that.
+        """Return the greatest share (0..1) of what torques add that leaves the tcp below its speed, or slows it.
 
         With a the tcp's velocity and b what they add to it, the greater root of |a + s b| = cap.
         """
@@ -209,16 +209,21 @@ class TorqueBounds:
         step = self._step
         return [old + max(-step, min(step, new - old)) for old, new in zip(tau, goal, strict=True)]
 
-    # What brakes.
+    # Braking.
 
     def brake(self, tau: Floats, arm: ArmInMotion, share: float) -> tuple[list[float], float]:
-        """One tick of braking, and how much of the brake is on now; ``share`` is how much was (0..1).
+        """Return the torques (n,) after one more tick of braking, Nm, and the share of the brake that is applied now.
 
-        The brake is -g M dq, which takes the same share g of every joint's speed away: the arm goes on along its way
+        The brake is -g M dq, which takes the same share g of every joint's speed away, so that the arm keeps its path
         until it rests. It never adds energy as long as its torques are not cut one by one, so g is cut instead, and all
-        of them grow in proportion. What drove the arm goes first, and each torque by itself: a rest of it that is
-        little for a shoulder is much for a wrist. (Torques of -D dq with a D for each joint brake longer, since each
-        joint has the others to push; and a D that suits the torque limits makes a wrist of little inertia swing.)
+        of them grow in proportion. The torques that drove the arm are removed first, each by itself: a rest that is
+        small for a shoulder is large for a wrist. (Torques of -D dq with a D for each joint brake longer, since each
+        joint is pushed by the others; and a D that suits the torque limits makes a wrist of little inertia swing.)
+
+        Args:
+            tau: Torques before (n,), Nm.
+            arm: Measured state.
+            share: Share of the brake that was applied before (0..1).
         """
         step = self._step
         goal, _ = self._braking(arm, arm.dq)
@@ -250,7 +255,7 @@ class TorqueBounds:
                 share = sqrt(_UNWIND / p)
         return [-share * p for p in momentum], share
 
-    # What is too far.
+    # Limits that are exceeded.
 
     def overrun(self, tau: Floats, arm: ArmInMotion) -> Limited | None:
         """Return the limit that the arm exceeds while ``tau`` (n,), Nm, drives it; None if it keeps all.
@@ -366,7 +371,7 @@ class TorqueMotion(ServoMotion):
         self._unseen = self._still = self._braking = 0.0
         """Durations, s: state unknown, no motion measured, braking."""
 
-    # What the servo tells it.
+    # Input from the servo.
 
     def open(self) -> None:
         """Open a session, at rest."""
@@ -408,7 +413,7 @@ class TorqueMotion(ServoMotion):
             self._arm = ArmInMotion(self.q, self.dq, self._inertia)
             self._unseen = 0.0
 
-    # What it says.
+    # Output to the servo.
 
     @property
     def blind(self) -> bool:

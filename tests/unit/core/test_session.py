@@ -195,6 +195,26 @@ def test_a_pad_that_is_plugged_in_later_brings_its_mapping(bench: Bench) -> None
     assert bench.kinds.count("pad_changed") == 2
 
 
+def test_a_pad_that_is_plugged_in_before_a_reset_needs_one_press(bench: Bench) -> None:
+    """The dead-man of the other pad counts its own presses."""
+    bench.arm.move_to(bench.arm.home + 0.1)
+    for _ in range(3):
+        bench.hand.press("l2")
+        bench.rig.clock.sleep(0.1)
+        bench.hand.release("l2")
+        bench.rig.clock.sleep(0.1)
+
+    def plug() -> None:
+        bench.hand.meant_for = "spacemouse"
+        bench.hand.clear()
+
+    bench.script((0.2, lambda: bench.hand.inject(disconnect=True)), (0.5, plug), (1.0, bench.press("l1")))
+    end = bench.rig.clock.now() + 5.0
+    assert bench.session.reset_scene(0, lambda: bench.rig.clock.now() < end) is True
+    assert bench.kinds.count("pad_changed") == 1
+    assert bench.away() < 1e-3
+
+
 def test_settings_of_a_page_wait_for_the_release_of_the_dead_man() -> None:
     arms = {name: {"model": "panda", "base": {"position": [0, y, 0]}} for name, y in (("panda", 0.5), ("other", -0.5))}
     with hal.open({"robots": arms, "gamepads": {"pad": {}}}, driver="mock") as rig:
