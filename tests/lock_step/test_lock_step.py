@@ -109,11 +109,15 @@ def test_dynamics_are_read_back_and_restored(rig: hal.Rig) -> None:
     assert rig.world.dynamics("cube") == before
 
 
-def test_a_second_arm_is_only_data() -> None:
-    with hal.open("iiwa_table", sim=True, clock="lock_step", pad="none", overrides=["cameras={}"]) as rig:
-        arm = next(iter(rig.robots.values()))
-        assert arm.spec.model == "iiwa"
-        assert arm.gripper is None
-        goal = arm.home.copy()
-        goal[0] += 0.2
-        assert arm.move_to(goal, speed=0.3).q == pytest.approx(goal, abs=2e-3)
+@pytest.mark.parametrize("name", ["iiwa_table", "yam", "piper", "openarm"])
+def test_another_arm_is_only_data(name: str) -> None:
+    with hal.open(name, sim=True, clock="lock_step", pad="none", overrides=["cameras={}"]) as rig:
+        for arm in rig.robots.values():
+            goal = arm.home.copy()
+            goal[0] += 0.2
+            goal[3] += 0.1
+            assert arm.move_to(goal, speed=0.3).q == pytest.approx(goal, abs=2e-3)
+            if arm.gripper is not None:
+                width = 0.4 * arm.gripper.width_max
+                arm.gripper.move(width)
+                assert arm.gripper.state().width == pytest.approx(width, abs=2e-3)
