@@ -48,6 +48,7 @@ GROUP = "hal.drivers"
 
 BUILT_IN: Mapping[str, str] = MappingProxyType(
     {
+        "damiao": "hal.drivers.can:DAMIAO",
         "evdev": "hal.drivers.evdev:DRIVER",
         "franka": "hal.drivers.franka:DRIVER",
         "mock": "hal.drivers.mock:DRIVER",

@@ -1,1 +1,21 @@
-"""Arms on a CAN bus, through python-can."""
+"""Drivers of arms on a CAN bus, through python-can: chains of Damiao motors, and AgileX PiPER. See docs/can.md."""
+
+from __future__ import annotations
+
+from hal.registry import DriverSpec
+
+__all__ = ["DAMIAO"]
+
+_REQUIRES = {"can": "pip install 'robot-hal[can]'"}
+
+DAMIAO = DriverSpec(
+    name="damiao",
+    robot="hal.drivers.can.damiao:DamiaoArm",
+    gripper="hal.drivers.can.damiao_gripper:DamiaoGripper",
+    checks={
+        "robot": "hal.drivers.can.settings:check_damiao_arm",
+        "gripper": "hal.drivers.can.settings:check_damiao_gripper",
+    },
+    emulated="hal.drivers.can.settings:is_emulated",
+    requires=_REQUIRES,
+)

@@ -1,0 +1,353 @@
+"""Frames of Damiao motors: pure functions that encode and decode every command and reply. No bus, no time.
+
+The driver encodes commands and decodes replies; the emulator does the opposite with the same functions.
+
+A motor listens at its own id. Whatever it is sent, it answers with one feedback frame at its master id. Frames have
+8 bytes. In commands and feedback, numbers are unsigned integers of 12 or 16 bits, big-endian, that map linearly onto
+a range around zero; the ranges are the motor's registers PMAX, VMAX and TMAX. Registers are read and written at the
+common id 0x7FF.
+
+    command (to the motor's id)           feedback (from the master id)
+    position   16 bits, -PMAX..PMAX       status      4 bits, see Status
+    velocity   12 bits, -VMAX..VMAX       motor id    4 bits, the lowest
+    kp         12 bits, 0..500 Nm/rad     position   16 bits
+    kd         12 bits, 0..5 Nm s/rad     velocity   12 bits
+    torque     12 bits, -TMAX..TMAX       torque     12 bits
+                                          temperatures of MOSFETs and rotor, 8 bits each, deg C
+
+A motor in MIT mode applies kp (q - q_measured) + kd (dq - dq_measured) + torque. Sources: openarm_can (Enactic),
+i2rt (I2RT Robotics), LeRobot (Hugging Face), and Damiao's manuals.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Mapping
+from enum import IntEnum
+from types import MappingProxyType
+from typing import NamedTuple
+
+__all__ = [
+    "CLEAR_ERROR",
+    "DISABLE",
+    "ENABLE",
+    "KD_MAX",
+    "KP_MAX",
+    "MASTER_OFFSET",
+    "MIT_MODE",
+    "MOTOR_RANGES",
+    "READ_REGISTER",
+    "REGISTER_ID",
+    "SAVE_REGISTERS",
+    "SET_ZERO",
+    "STATE_REQUEST",
+    "TIMEOUT_UNIT",
+    "WRITE_REGISTER",
+    "MotorCodec",
+    "MotorCommand",
+    "MotorFeedback",
+    "MotorRange",
+    "MotorRegister",
+    "MotorStatus",
+    "RegisterReply",
+    "RegisterRequest",
+    "decode_register_reply",
+    "decode_register_request",
+    "encode_register_read",
+    "encode_register_reply",
+    "encode_register_write",
+    "encode_save",
+    "encode_state_request",
+]
+
+KP_MAX, KD_MAX = 500.0, 5.0
+"""Largest gains of a command, Nm/rad and Nm s/rad. The smallest are 0."""
+MASTER_OFFSET = 0x10
+"""Usual distance of a motor's master id from its own id."""
+REGISTER_ID = 0x7FF
+"""Id at which all motors take requests of their registers and of their state."""
+ENABLE = b"\xff" * 7 + b"\xfc"
+"""Data of the command that switches a motor on. It then holds nothing until it gets its first command."""
+DISABLE = b"\xff" * 7 + b"\xfd"
+"""Data of the command that switches a motor off: it applies no torque any more."""
+SET_ZERO = b"\xff" * 7 + b"\xfe"
+"""Data of the command that makes the present position the zero."""
+CLEAR_ERROR = b"\xff" * 7 + b"\xfb"
+"""Data of the command that clears an error; the motor is then off."""
+TIMEOUT_UNIT = 50e-6
+"""Unit of the register TIMEOUT, s."""
+MIT_MODE = 1
+"""Value of the register CTRL_MODE in which commands have position, velocity, gains and torque."""
+READ_REGISTER, WRITE_REGISTER, SAVE_REGISTERS, STATE_REQUEST = 0x33, 0x55, 0xAA, 0xCC
+"""Operations at REGISTER_ID: the third byte of a request."""
+
+
+class MotorRange(NamedTuple):
+    """Ranges onto which a motor maps the numbers of its frames: from minus to plus these values."""
+
+    position: float
+    """PMAX, rad."""
+    velocity: float
+    """VMAX, rad/s."""
+    torque: float
+    """TMAX, Nm."""
+
+
+MOTOR_RANGES: Mapping[str, MotorRange] = MappingProxyType(
+    {
+        "DM3507": MotorRange(12.5, 50.0, 5.0),
+        "DM4310": MotorRange(12.5, 30.0, 10.0),
+        "DM4310_48V": MotorRange(12.5, 50.0, 10.0),
+        "DM4340": MotorRange(12.5, 10.0, 28.0),
+        "DM4340_48V": MotorRange(12.5, 10.0, 28.0),
+        "DM6006": MotorRange(12.5, 45.0, 20.0),
+        "DM8006": MotorRange(12.5, 45.0, 40.0),
+        "DM8009": MotorRange(12.5, 45.0, 54.0),
+        "DM10010L": MotorRange(12.5, 25.0, 200.0),
+        "DM10010": MotorRange(12.5, 20.0, 200.0),
+        "DMH3510": MotorRange(12.5, 280.0, 1.0),
+        "DMH6215": MotorRange(12.5, 45.0, 10.0),
+        "DMG6220": MotorRange(12.5, 45.0, 10.0),
+    }
+)
+"""Type of a motor -> its ranges as it leaves the factory (openarm_can). They are registers, so a user can change them,
+and other public tables differ: the driver compares them with the registers of every motor."""
+
+
+class MotorStatus(IntEnum):
+    """Status in a feedback frame. A motor with a status of 8 or more has a fault and applies no position control."""
+
+    DISABLED = 0x0
+    ENABLED = 0x1
+    OVER_VOLTAGE = 0x8
+    UNDER_VOLTAGE = 0x9
+    OVER_CURRENT = 0xA
+    MOSFET_TOO_HOT = 0xB
+    ROTOR_TOO_HOT = 0xC
+    LOST_COMMUNICATION = 0xD
+    """It heard nothing for TIMEOUT, and damps."""
+    OVERLOAD = 0xE
+
+
+class MotorRegister(IntEnum):
+    """Registers that the driver reads, by their number (RID)."""
+
+    OT_VALUE = 2
+    """Temperature of the rotor at which the motor switches itself off, deg C."""
+    MST_ID = 7
+    ESC_ID = 8
+    """The motor's own id."""
+    TIMEOUT = 9
+    """Silence after which the motor damps, in units of TIMEOUT_UNIT; 0 is never."""
+    CTRL_MODE = 10
+    HW_VERSION = 13
+    SW_VERSION = 14
+    SERIAL = 15
+    PMAX = 21
+    VMAX = 22
+    TMAX = 23
+    CAN_BR = 35
+    """Code of the bit rate: 0..9 for 125k, 200k, 250k, 500k, 1M, 2M, 2.5M, 3.2M, 4M, 5M."""
+
+
+_INTEGERS = frozenset({*range(7, 11), *range(13, 17), 35, 36})
+"""Registers that hold a uint32; the others hold a float32."""
+
+
+class MotorCommand(NamedTuple):
+    """Content of a command in MIT mode, on the motor's side: without direction and offset of a joint."""
+
+    q: float
+    dq: float
+    kp: float
+    kd: float
+    tau: float
+
+
+class MotorFeedback(NamedTuple):
+    """Content of a feedback frame, on the motor's side: without direction and offset of a joint."""
+
+    motor: int
+    """The lowest 4 bits of the motor's id."""
+    status: int
+    """See :class:`MotorStatus`; other values are not documented."""
+    q: float
+    dq: float
+    tau: float
+    mosfet: int
+    """Temperature of the MOSFETs, deg C."""
+    rotor: int
+    """Temperature of the rotor, deg C."""
+
+
+class MotorCodec:
+    """Encoder and decoder of the commands and the feedback of motors with one range.
+
+    Values beyond the range are clamped. A number is truncated to the next lower step, so zero is half a step below
+    zero (0x7FFF, 0x7FF), and a value comes back at most one step lower.
+    """
+
+    def __init__(self, limits: MotorRange) -> None:
+        self.limits = limits
+        p, v, t = limits
+        if not (0.0 < p < 1e4 and 0.0 < v < 1e4 and 0.0 < t < 1e4):
+            raise ValueError(f"the ranges of a motor must be positive, not {limits}")
+        self._p, self._v, self._t = p, v, t
+        self._p2, self._v2, self._t2 = 2.0 * p, 2.0 * v, 2.0 * t
+        self._p_step, self._v_step, self._t_step = 2.0 * p / 65535.0, 2.0 * v / 4095.0, 2.0 * t / 4095.0
+
+    def encode_command(self, q: float, dq: float, kp: float, kd: float, tau: float) -> bytes:
+        """Return the data of a command.
+
+        Args:
+            q: Position, rad.
+            dq: Velocity, rad/s.
+            kp: Gain of the position, Nm/rad.
+            kd: Gain of the velocity, Nm s/rad.
+            tau: Torque that is added, Nm.
+
+        Raises:
+            ValueError: One of them is NaN.
+        """
+        p, v, t = self._p, self._v, self._t
+        position = 65535 if q >= p else 0 if q <= -p else int((q + p) * 65535.0 / self._p2)
+        velocity = 4095 if dq >= v else 0 if dq <= -v else int((dq + v) * 4095.0 / self._v2)
+        torque = 4095 if tau >= t else 0 if tau <= -t else int((tau + t) * 4095.0 / self._t2)
+        stiffness = 4095 if kp >= KP_MAX else 0 if kp <= 0.0 else int(kp * 4095.0 / KP_MAX)
+        damping = 4095 if kd >= KD_MAX else 0 if kd <= 0.0 else int(kd * 4095.0 / KD_MAX)
+        return (position << 48 | velocity << 36 | stiffness << 24 | damping << 12 | torque).to_bytes(8, "big")
+
+    def decode_command(self, data: bytes | bytearray) -> MotorCommand:
+        """Return the content of a command; its special forms (:data:`ENABLE`, ...) have to be recognised before.
+
+        Raises:
+            ValueError: It has not 8 bytes.
+        """
+        bits = _bits(data)
+        return MotorCommand(
+            (bits >> 48) * self._p_step - self._p,
+            (bits >> 36 & 0xFFF) * self._v_step - self._v,
+            (bits >> 24 & 0xFFF) * (KP_MAX / 4095.0),
+            (bits >> 12 & 0xFFF) * (KD_MAX / 4095.0),
+            (bits & 0xFFF) * self._t_step - self._t,
+        )
+
+    def encode_feedback(
+        self, motor: int, status: int, q: float, dq: float, tau: float, mosfet: int = 30, rotor: int = 30
+    ) -> bytes:
+        """Return the data of a feedback frame; ``motor`` is the motor's id, the others are as in MotorFeedback.
+
+        Raises:
+            ValueError: A number is NaN.
+        """
+        p, v, t = self._p, self._v, self._t
+        position = 65535 if q >= p else 0 if q <= -p else int((q + p) * 65535.0 / self._p2)
+        velocity = 4095 if dq >= v else 0 if dq <= -v else int((dq + v) * 4095.0 / self._v2)
+        torque = 4095 if tau >= t else 0 if tau <= -t else int((tau + t) * 4095.0 / self._t2)
+        head = (status & 15) << 60 | (motor & 15) << 56
+        heat = min(max(int(mosfet), 0), 255) << 8 | min(max(int(rotor), 0), 255)
+        return (head | position << 40 | velocity << 28 | torque << 16 | heat).to_bytes(8, "big")
+
+    def decode_feedback(self, data: bytes | bytearray) -> MotorFeedback:
+        """Return the content of a feedback frame.
+
+        Raises:
+            ValueError: It has not 8 bytes.
+        """
+        bits = _bits(data)
+        return MotorFeedback(
+            bits >> 56 & 15,
+            bits >> 60,
+            (bits >> 40 & 0xFFFF) * self._p_step - self._p,
+            (bits >> 28 & 0xFFF) * self._v_step - self._v,
+            (bits >> 16 & 0xFFF) * self._t_step - self._t,
+            bits >> 8 & 0xFF,
+            bits & 0xFF,
+        )
+
+
+def _bits(data: bytes | bytearray) -> int:
+    if len(data) != 8:
+        raise ValueError(f"a frame of a Damiao motor has 8 bytes, not {len(data)}")
+    return int.from_bytes(data, "big")
+
+
+# Registers. Requests and replies: id low, id high, operation, register, then its value in 4 bytes, little-endian.
+
+
+class RegisterRequest(NamedTuple):
+    """A request at REGISTER_ID."""
+
+    motor: int
+    """Id of the motor that it is for."""
+    operation: int
+    """READ_REGISTER, WRITE_REGISTER, SAVE_REGISTERS or STATE_REQUEST; others are not documented."""
+    register: int
+    value: float
+    """New value, when writing; an int where the register holds one."""
+
+
+class RegisterReply(NamedTuple):
+    """Value of a register, from a motor."""
+
+    register: int
+    value: float
+    """An int where the register holds one."""
+
+
+def encode_state_request(motor: int) -> bytes:
+    """Return the data of a request for feedback, to be sent to REGISTER_ID. It changes nothing at the motor."""
+    return bytes((motor & 0xFF, motor >> 8, STATE_REQUEST, 0, 0, 0, 0, 0))
+
+
+def encode_register_read(motor: int, register: int) -> bytes:
+    """Return the data of a request for a register's value, to be sent to REGISTER_ID."""
+    return bytes((motor & 0xFF, motor >> 8, READ_REGISTER, register, 0, 0, 0, 0))
+
+
+def encode_register_write(motor: int, register: int, value: float) -> bytes:
+    """Return the data of a request to change a register, to be sent to REGISTER_ID. It lasts until power is cut."""
+    return bytes((motor & 0xFF, motor >> 8, WRITE_REGISTER, register)) + _pack(register, value)
+
+
+def encode_save(motor: int) -> bytes:
+    """Return the data of a request to keep all registers without power, to be sent to REGISTER_ID."""
+    return bytes((motor & 0xFF, motor >> 8, SAVE_REGISTERS, 1, 0, 0, 0, 0))
+
+
+def encode_register_reply(motor: int, register: int, value: float, operation: int = READ_REGISTER) -> bytes:
+    """Return the data of the reply, at the master id, to a request with this ``operation``."""
+    return bytes((motor & 0xFF, motor >> 8, operation, register)) + _pack(register, value)
+
+
+def decode_register_request(data: bytes | bytearray) -> RegisterRequest | None:
+    """Return the content of a request at REGISTER_ID; None for a frame with less than 3 bytes."""
+    if len(data) < 3:
+        return None
+    padded = bytes(data).ljust(8, b"\0")
+    register = padded[3]
+    return RegisterRequest(padded[0] | padded[1] << 8, padded[2], register, _unpack(register, padded[4:8]))
+
+
+def decode_register_reply(data: bytes | bytearray, motor: int) -> RegisterReply | None:
+    """Return the content of a register's reply; None for every other frame.
+
+    Replies come at the same id as feedback. As feedback, this would be a motor that is off, one step away from -PMAX,
+    where no joint can be.
+
+    Args:
+        data: Data of a frame from the motor's master id.
+        motor: The motor's id.
+    """
+    if len(data) == 8 and data[2] in (READ_REGISTER, WRITE_REGISTER) and data[0] | data[1] << 8 == motor:
+        return RegisterReply(data[3], _unpack(data[3], bytes(data[4:8])))
+    return None
+
+
+def _pack(register: int, value: float) -> bytes:
+    return struct.pack("<I", int(value)) if register in _INTEGERS else struct.pack("<f", value)
+
+
+def _unpack(register: int, data: bytes) -> float:
+    value: float = struct.unpack("<I" if register in _INTEGERS else "<f", data)[0]
+    return value

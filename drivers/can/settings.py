@@ -1,0 +1,298 @@
+"""Settings of arms on a CAN bus: the ``real:`` part of a model or a rig, checked before a device is opened.
+
+Nothing here imports python-can.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator, Mapping
+from functools import cached_property
+from typing import Annotated, Any, TypeVar
+
+from pydantic import BaseModel, BeforeValidator, Field, model_validator
+
+from hal.config.files import Problems, closest, validate
+from hal.config.schema import Flag, Quantity, Size, Strict, describe, is_number
+from hal.specs import GripperSpec, RobotSpec
+
+from .damiao_protocol import KD_MAX, KP_MAX, MASTER_OFFSET, MOTOR_RANGES, MotorRange
+
+__all__ = [
+    "BusSettings",
+    "DamiaoArmSettings",
+    "DamiaoGripperSettings",
+    "DamiaoMotorSettings",
+    "check_damiao_arm",
+    "check_damiao_gripper",
+    "is_emulated",
+]
+
+EMULATED_INTERFACES = frozenset({"virtual", "udp_multicast"})
+"""Interfaces of python-can behind which there is no hardware."""
+_LARGEST_ID = 0x7FE
+_LARGEST_MOTOR_ID = 0xFF
+"""Ids of commands in other modes begin above it."""
+_MISFIT = 2.0
+"""Largest factor between ranges that the rig gives and those of the motor's type: public tables differ by up to 2."""
+
+
+def is_emulated(options: Mapping[str, Any]) -> bool:
+    """Return whether the bus in these options is one without hardware, so that an emulator answers."""
+    return str(options.get("interface", "")).strip().lower() in EMULATED_INTERFACES
+
+
+# Values.
+
+
+def _text(meaning: str) -> BeforeValidator:
+    def check(value: Any) -> str:
+        if not isinstance(value, str) or not value.strip():
+            raise ValueError(f"must be {meaning}, not {describe(value)}")
+        return value.strip()
+
+    return BeforeValidator(check)
+
+
+def _whole(meaning: str, least: int, most: int) -> BeforeValidator:
+    def check(value: Any) -> int:
+        if not isinstance(value, int) or isinstance(value, bool) or not least <= value <= most:
+            raise ValueError(f"must be {meaning}, {least} to {most} ({most:#x}), not {describe(value)}")
+        return value
+
+    return BeforeValidator(check)
+
+
+def _direction(value: Any) -> float:
+    if not is_number(value) or value not in (1, -1):
+        raise ValueError(f"must be 1 or -1, not {describe(value)}")
+    return float(value)
+
+
+def _motor_type(value: Any) -> str:
+    if isinstance(value, str) and value in MOTOR_RANGES:
+        return value
+    near = closest(value.upper(), MOTOR_RANGES) if isinstance(value, str) else None
+    hint = f"; did you mean {near!r}?" if near else ""
+    raise ValueError(f"there is no motor type {describe(value)}{hint}; types: {', '.join(MOTOR_RANGES)}")
+
+
+def _ranges(value: Any) -> Any:
+    if value is None:
+        return None
+    if not isinstance(value, (list, tuple)) or len(value) != 3 or not all(is_number(x) and x > 0 for x in value):
+        raise ValueError("must be three positive numbers: PMAX in rad, VMAX in rad/s and TMAX in Nm")
+    return MotorRange(*map(float, value))
+
+
+def _width_table(value: Any) -> Any:
+    rows = "rows [angle in rad, width in m]"
+    if not isinstance(value, (list, tuple)) or len(value) < 2:
+        raise ValueError(f"must be a list of at least two {rows}, not {describe(value)}")
+    for row in value:
+        if not isinstance(row, (list, tuple)) or len(row) != 2 or not all(map(is_number, row)):
+            raise ValueError(f"must be a list of {rows}; one row is {describe(row)}")
+    table = sorted((float(angle), float(width)) for angle, width in value)
+    steps = [(second[0] - first[0], second[1] - first[1]) for first, second in itertools.pairwise(table)]
+    if not all(angle > 0.0 for angle, _ in steps):
+        raise ValueError("has the same angle twice")
+    if not (all(width > 0.0 for _, width in steps) or all(width < 0.0 for _, width in steps)):
+        raise ValueError("must rise or fall all along: each width belongs to one angle")
+    if table[0][1] < 0.0 or table[-1][1] < 0.0:
+        raise ValueError("has a negative width")
+    return tuple(table)
+
+
+Id = Annotated[int, _whole("an 11-bit id", 0, _LARGEST_ID)]
+MotorId = Annotated[int, _whole("a motor's id", 1, _LARGEST_MOTOR_ID)]
+BitRate = Annotated[int, _whole("a bit rate in bit/s", 10_000, 10_000_000)]
+Angle = Annotated[float, Quantity("rad", -100.0, 100.0)]
+Stiffness = Annotated[float, Quantity("Nm/rad", 0.0, KP_MAX, above=True)]
+Damping = Annotated[float, Quantity("Nm s/rad", 0.0, KD_MAX, above=True)]
+Temperature = Annotated[float, Quantity("deg C", 30.0, 200.0)]
+WidthTable = Annotated[tuple[tuple[float, float], ...], BeforeValidator(_width_table)]
+
+
+# Records.
+
+
+class BusSettings(Strict):
+    """A CAN bus, as python-can opens it."""
+
+    interface: Annotated[str, _text("an interface of python-can, for example socketcan")]
+    channel: Annotated[str, _text("a channel of the interface, for example can0")]
+    fd: Flag = False
+    """Whether frames are sent as CAN-FD, with the faster bit rate for their data."""
+    bus: dict[str, Any] = Field(default_factory=dict)
+    """Further arguments of ``can.Bus``, for example ``bitrate`` of a serial adapter."""
+    bit_rate: BitRate = 1_000_000
+    """Bit rate, bit/s. SocketCAN's is set by ``ip link``; this one is used for its command and for the bus load."""
+    data_bit_rate: BitRate = 5_000_000
+    """Bit rate of the data of CAN-FD frames, bit/s."""
+
+    @property
+    def key(self) -> tuple[str, str]:
+        """Interface and channel, by which a bus is identified on this computer."""
+        return self.interface, self.channel
+
+    @property
+    def shared(self) -> BusSettings:
+        """These settings without those of a device."""
+        return BusSettings(**{name: getattr(self, name) for name in BusSettings.model_fields})
+
+
+class DamiaoMotorSettings(Strict):
+    """One motor of a chain, and how its joint is mounted on it."""
+
+    id: MotorId
+    """Id that the motor listens at (its register ESC_ID)."""
+    type: Annotated[str, BeforeValidator(_motor_type)]
+    kp: Stiffness
+    """Gain of the position, Nm/rad."""
+    kd: Damping
+    """Gain of the velocity, Nm s/rad."""
+    direction: Annotated[float, BeforeValidator(_direction)] = 1.0
+    """1 if the joint turns in the motor's direction, -1 if in the opposite one."""
+    offset: Angle = 0.0
+    """Position of the joint at the motor's zero, rad: joint = direction * motor + offset."""
+    master: Id | None = None
+    """Id that the motor answers with (its register MST_ID); the motor's id + 0x10 if it is left out."""
+    ranges: Annotated[MotorRange | None, BeforeValidator(_ranges)] = None
+    """PMAX, VMAX and TMAX of this motor, rad, rad/s and Nm, if they are not those of its type."""
+
+    @property
+    def reply_id(self) -> int:
+        """Id that the motor answers with."""
+        return self.id + MASTER_OFFSET if self.master is None else self.master
+
+    @cached_property
+    def limits(self) -> MotorRange:
+        """Ranges of the numbers in the motor's frames."""
+        return self.ranges or MOTOR_RANGES[self.type]
+
+    @model_validator(mode="after")
+    def _fitting(self) -> DamiaoMotorSettings:
+        usual = MOTOR_RANGES[self.type]
+        for name, unit in (("velocity", "rad/s"), ("torque", "Nm")):
+            ours, theirs = getattr(self.limits, name), getattr(usual, name)
+            if not 1.0 / _MISFIT <= ours / theirs <= _MISFIT:
+                raise ValueError(
+                    f"ranges: a {self.type} has a {name} of {theirs:g} {unit}, not {ours:g}: another motor's table?"
+                )
+        return self
+
+
+class DamiaoArmSettings(BusSettings):
+    """Settings under ``real:`` of an arm with Damiao motors."""
+
+    motors: tuple[DamiaoMotorSettings, ...] = Field(min_length=1)
+    """The motors, one for each joint, from base to tip."""
+    mosfet_limit: Temperature = 120.0
+    """Temperature at which the motors' electronics switch off, deg C (Damiao's manuals). The rotor's is a register."""
+
+    @classmethod
+    def of(cls, spec: RobotSpec) -> DamiaoArmSettings:
+        """Return the settings in an arm's record. Raises ConfigError, which lists every problem."""
+        return _of(cls, spec.options, f"robots.{spec.name}.real")
+
+
+class DamiaoGripperSettings(BusSettings):
+    """Settings under ``real:`` of a gripper with a Damiao motor; those of the bus default to the arm's."""
+
+    motor: DamiaoMotorSettings
+    widths: WidthTable
+    """Angle of the motor's joint, rad, and distance between the fingers, m, in rising order of the angle; linear in
+    between."""
+    mosfet_limit: Temperature = 120.0
+    """As in the arm's settings."""
+    tolerance: Size = 0.001
+    """Largest distance from the target width at which the fingers count as arrived, m."""
+
+    @classmethod
+    def of(cls, spec: GripperSpec) -> DamiaoGripperSettings:
+        """Return the settings in a gripper's record. Raises ConfigError, which lists every problem."""
+        return _of(cls, spec.options, f"{spec.name}.real")
+
+
+_Settings = TypeVar("_Settings", bound=BaseModel)
+
+
+def _of(model: type[_Settings], options: Mapping[str, Any], where: str) -> _Settings:
+    problems = Problems()
+    settings = validate(model, options, where, problems)
+    problems.raise_any()
+    return settings
+
+
+# Checks of a rig. Keys are relative to the device's entry.
+
+
+def check_damiao_arm(spec: RobotSpec) -> Iterator[tuple[str, str, str]]:
+    """Yield the problems in an arm's record: key in the arm's entry of the rig, message and code."""
+    settings, problems = _checked(DamiaoArmSettings, spec.options)
+    yield from problems
+    if settings is None:
+        return
+    if len(settings.motors) != len(spec.joints):
+        message = f"has {len(settings.motors)} motors for {len(spec.joints)} joints ({', '.join(spec.joints)})"
+        yield "real.motors", message, "wrong_count"
+        return
+    gripper = spec.gripper
+    shared = gripper is not None and gripper.driver == spec.driver
+    other = _checked(DamiaoGripperSettings, gripper.options)[0] if gripper is not None and shared else None
+    motors = [*settings.motors, *([other.motor] if other is not None and other.key == settings.key else [])]
+    yield from _collisions(motors)
+    for k, (joint, motor) in enumerate(zip(spec.joints, settings.motors, strict=True)):
+        ends = [motor.direction * (q - motor.offset) for q in (spec.limits.lower[k], spec.limits.upper[k])]
+        if max(map(abs, ends)) >= motor.limits.position:
+            message = (
+                f"the limits of {joint} are {min(ends):.4g} to {max(ends):.4g} rad at the motor, beyond its range of "
+                f"{motor.limits.position:g} rad"
+            )
+            yield f"real.motors.{k}.offset", message, "out_of_range"
+        if spec.limits.velocity[k] > motor.limits.velocity:
+            message = f"is {spec.limits.velocity[k]:g} rad/s for {joint}, beyond VMAX, {motor.limits.velocity:g} rad/s"
+            yield "limits.velocity", message, "out_of_range"
+
+
+def check_damiao_gripper(spec: GripperSpec) -> Iterator[tuple[str, str, str]]:
+    """Yield the problems in a gripper's record: key in the gripper's entry of the rig, message and code."""
+    settings, problems = _checked(DamiaoGripperSettings, spec.options)
+    yield from problems
+    if settings is None:
+        return
+    yield from _collisions([settings.motor])
+    widest = max(width for _, width in settings.widths)
+    if widest < spec.width_max - 1e-6:
+        yield "real.widths", f"ends at {widest:g} m, below the greatest width, {spec.width_max:g} m", "out_of_range"
+    beyond = [angle for angle, _ in settings.widths if abs(angle - settings.motor.offset) >= settings.motor.limits[0]]
+    if beyond:
+        yield "real.widths", f"has an angle beyond the motor's range: {beyond[0]:g} rad", "out_of_range"
+
+
+def _checked(model: type[_Settings], options: Mapping[str, Any]) -> tuple[_Settings | None, list[tuple[str, str, str]]]:
+    """Return the settings, None if they have problems, and the problems."""
+    problems = Problems()
+    settings = validate(model, options, "", problems, "real")
+    found = [(problem.key, problem.message, problem.code) for problem in problems.found]
+    return (None if found else settings), found
+
+
+def _collisions(motors: list[DamiaoMotorSettings]) -> Iterator[tuple[str, str, str]]:
+    """Yield the ids that two motors on one bus have, or that are used to command and to answer."""
+    commands: dict[int, int] = {}
+    replies: dict[int, int] = {}
+    for k, motor in enumerate(motors):
+        key = f"real.motors.{k}" if len(motors) > 1 else "real.motor"
+        if motor.id in commands:
+            yield f"{key}.id", f"{motor.id} is also the id of motor {commands[motor.id] + 1}", "id_collision"
+        if motor.reply_id in replies:
+            other = replies[motor.reply_id] + 1
+            message = f"{motor.reply_id:#x} is also the master id of motor {other}: their replies cannot be told apart"
+            yield f"{key}.master", message, "id_collision"
+        commands.setdefault(motor.id, k)
+        replies.setdefault(motor.reply_id, k)
+    for id in sorted(commands.keys() & replies.keys()):
+        key = f"real.motors.{replies[id]}.master" if len(motors) > 1 else "real.motor.master"
+        message = f"{id:#x} is also the id of motor {commands[id] + 1}: its commands look like replies"
+        yield key, message, "id_collision"
