@@ -151,8 +151,9 @@ class RobotDriver(DeviceDriver):
     """Driver of one arm.
 
     All methods are called from one thread of the process that runs the arm's servo. ``wait`` (where the device sets
-    the pace), ``read`` and ``write`` are called once per cycle. A device that stops getting set-points must hold by
-    itself, because the process may be killed.
+    the pace) and ``read`` are called once per cycle, ``write`` once per cycle while a control session is open. Between
+    sessions an arm may still need frames, to hold or to report its state: ``read`` sends them. A device that hears
+    nothing any more must come to rest by itself, because the process may be killed, and hold if it can.
 
     Args:
         spec: Record of the arm: joints, limits, rate, options.
@@ -167,6 +168,9 @@ class RobotDriver(DeviceDriver):
     """Whether the device repeats the last set-point when one is lost. False if it extrapolates at constant
     acceleration (a Franka), or if none can be lost. Only an extrapolation is corrected, because it looks different from
     a report that is late."""
+    engaged: bool = True
+    """Whether the drives are on, so that the arm holds and follows set-points. A driver that has to switch them on sets
+    it to False until that is done (see :meth:`engage`), and again when they went off: by a fault, a lost link."""
 
     def __init__(self, spec: RobotSpec, world: object | None = None) -> None:
         self.spec = spec
@@ -193,9 +197,22 @@ class RobotDriver(DeviceDriver):
                 reconnect does it here.
         """
 
+    def engage(self) -> None:  # most arms are ready as soon as they are open
+        """Switch the drives on, or continue to: the arm then holds where it is. Nothing moves.
+
+        While :attr:`engaged` is False it is called once per cycle, each time before a :meth:`read`: when a control
+        session opens, and when the arm is to move again after a fault or a lost link. It may take many cycles, about
+        0.3 s, while the group's other devices continue; after 1 s the host gives up. ``open`` and ``recover`` engage
+        nothing, since a user may be holding the arm; :meth:`halt` keeps it engaged.
+
+        Raises:
+            RobotFault: A drive does not switch on; the message names it. No session is opened.
+            ConnectionLost: The device does not answer.
+        """
+
     @abstractmethod
     def write(self, setpoint: Setpoint) -> bool | None:
-        """Send the next set-point to the device.
+        """Send the next set-point to the device. Not called while :attr:`engaged` is False.
 
         Returns:
             False if it was not passed on, for example because the device has to start a motion first: the servo then
@@ -207,7 +224,7 @@ class RobotDriver(DeviceDriver):
 
     @abstractmethod
     def halt(self) -> None:
-        """End streaming: the device stops and holds by its own means. Idempotent."""
+        """End streaming: the device stops, and holds where it is. Idempotent."""
 
     def recover(self) -> None:
         """Clear a fault of the device, only on the user's request. Devices without faults need nothing."""

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import traceback
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import numpy as np
@@ -16,7 +16,7 @@ import numpy as np
 from .. import registry
 from ..commands import Inbox, Session
 from ..driver import Reading, RobotDriver
-from ..errors import ConnectionLost, ControlTaken, DeviceNotFound, Fault, NotSupported
+from ..errors import ConnectionLost, ControlTaken, DeviceNotFound, Fault, NotSupported, RobotFault
 from ..geometry import Pose
 from ..histogram import Histogram
 from ..kinematics.arm import Kinematics
@@ -71,6 +71,8 @@ def mirrors_of(group: GroupSpec, memories: Iterable[GroupMemory]) -> tuple[Robot
 
 TCP_APART, TCP_TURNED = 0.002, 0.02
 """Largest distance of a device's own tcp from the model's, m and rad."""
+ENGAGE_LIMIT = 1.0
+"""Longest time for switching an arm's drives on, s."""
 
 
 class ArmUnit:
@@ -160,6 +162,9 @@ class ArmUnit:
         if isinstance(error, ConnectionLost):
             self.error = error
             return
+        if isinstance(error, RobotFault):  # a drive that does not switch on
+            self.error = ConnectionLost(str(error), code=error.code)
+            return
         if self.error is None:
             traceback.print_exception(error)  # into the process's log: a bug in the driver
         self.error = ConnectionLost(f"{self.spec.name}: {type(error).__name__}: {error}")
@@ -196,13 +201,19 @@ class ArmUnit:
         return Inbox(self.mail.get_command(), self.mail.get_deadman(), app.stops, marks.rearms, app.t)
 
     def write(self, now: float) -> None:
-        """Write the set-point to the device."""
+        """Write the set-point to the device, or switch its drives on where it has to move."""
         setpoint = self._setpoint
         failed, self._write_failed = self._write_failed, False
         if setpoint is None or (self.error is not None and not failed):
             return
+        driver = self.driver
         try:
-            if self.driver.write(setpoint) is False:
+            if not driver.engaged:  # they went off during the session
+                if self.servo.report.status is RobotStatus.FOLLOWING:
+                    driver.engage()
+                self.servo.note_withheld()
+                return
+            if driver.write(setpoint) is False:
                 self.servo.note_withheld()
         except Exception as error:
             self._write_failed = True
@@ -270,23 +281,45 @@ class ArmUnit:
 
     # Requests.
 
-    def open_session(self, session: Session, app: AppRecord) -> None:
-        """Open a control session.
+    def open_session(self, session: Session, app: AppRecord, turn: Callable[[], None]) -> None:
+        """Open a control session. The arm's drives are switched on first.
+
+        Args:
+            session: The terms of the session.
+            app: The app's newest record.
+            turn: Runs one whole cycle of the group, so that its other devices continue meanwhile.
 
         Raises:
             ControlTaken: While another one is open.
             ConnectionLost: While the arm does not answer.
+            RobotFault: Its drives do not switch on.
         """
+        if self._session:
+            raise ControlTaken(f"{self.spec.name} is under the control of session {self._session}")
+        if self.mail.get_marks().ended != session.id:
+            self._engage(turn)
         marks = self.mail.get_marks()
         if marks.ended == session.id:
             return  # the app gave up while this request was on its way
-        if self._session:
-            raise ControlTaken(f"{self.spec.name} is under the control of session {self._session}")
-        if self.error is not None:
-            raise self.error
         self._anchor()
         self.servo.open_session(session, self._inbox(app, marks))
         self._session = session.id
+
+    def _engage(self, turn: Callable[[], None]) -> None:
+        """Switch the drives on, and read the arm again; nothing if they are on."""
+        for _ in range(max(1, round(ENGAGE_LIMIT / self.dt))):
+            if self.error is not None:
+                raise self.error
+            if self.driver.engaged:
+                return
+            self.driver.engage()
+            turn()
+        if not self.driver.engaged:
+            raise RobotFault(
+                f"{self.spec.name}: its drives did not switch on within {ENGAGE_LIMIT:g} s",
+                "check its power supply and its emergency stop",
+                code="not_engaged",
+            )
 
     def recover(self) -> None:
         """Clear a fault of the device, or of how it follows its set-points."""
@@ -322,6 +355,8 @@ class Cycle:
         self.t = 0.0
         """Time of the newest cycle on the group's clock, s."""
         self._counted_from = 0
+        self.turn: Callable[[], None] = lambda: self.step(self.t + self.dt, self.memory.get_app())
+        """Runs one whole cycle, in the middle of a request; the host sets its own, which waits for the cycle's time."""
         self.world: Any = None
         if spec.world is not None:
             # In real time, a process of its own draws a copy of the world.
@@ -425,7 +460,7 @@ class Cycle:
     def _do_begin(self, robot: str, session: list[Any]) -> None:
         fields = Session(*session)
         goal = tuple(fields.move_to) if fields.move_to is not None else None
-        self._arm(robot).open_session(fields._replace(move_to=goal), self.memory.get_app())
+        self._arm(robot).open_session(fields._replace(move_to=goal), self.memory.get_app(), self.turn)
 
     def _do_recover(self, robot: str) -> None:
         self._arm(robot).recover()

@@ -123,6 +123,7 @@ class LocalHost(Host):
         self.memory = GroupMemory.of(memoryview(bytearray(GroupMemory.size_of(spec))), spec)
         self._others = others
         self.cycle = Cycle(spec, self.memory, [other.memory for other in others])
+        self.cycle.turn = self._step
         self.pollers: list[Callable[[float], object]] = []
         """Functions (pads) that are called with the time, every :data:`PAD_PERIOD` of simulated time."""
         self._stops = 0

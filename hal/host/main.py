@@ -228,6 +228,7 @@ class HostProcess:
         others = [from_json(GroupSpec, group) for group in config.get("others", ())]
         pairs = zip(memories[1:], others, strict=True)
         self.cycle = Cycle(spec, self.memory, [GroupMemory.of(memory.buffer, other) for memory, other in pairs])
+        self.cycle.turn = self._run_granted_cycle
         self.realtime = bool(config.get("realtime", False))
         # A fast servo publishes less often than it ticks: no reader could follow.
         self._state_every = max(1, round(spec.rate_hz / STATES_HZ))
@@ -305,13 +306,22 @@ class HostProcess:
                 if driver is not None:
                     driver.halt()
                 return
+        self._run_cycle()
+        self._settle_up()
+        self._attend(0.0)
+
+    def _run_cycle(self) -> None:
         self._alarm()
         now = self.pace.wait()
         late = self._suspension is not None and self._suspension.ended()
-        cycle.step(now, self.pace.heard(self.memory.get_app()), late)
+        self.cycle.step(now, self.pace.heard(self.memory.get_app()), late)
         self._publish(now)
-        self._settle_up()
-        self._attend(0.0)
+
+    def _run_granted_cycle(self) -> None:
+        """Run one cycle in the middle of a request, for which an app in lock-step has granted none."""
+        if isinstance(self.pace, StepPace):
+            self.pace.grant(1)
+        self._run_cycle()
 
     def _settle_up(self) -> None:
         """In lock-step, answer the request for cycles that are done."""

@@ -135,7 +135,7 @@ class RobotBench(Bench):
     def has(self, ability: str) -> bool:
         if ability == "torque":
             return "torque" in self.driver.modes
-        return ability in ("rest", "returns") or super().has(ability)
+        return ability in ("rest", "holds", "returns") or super().has(ability)
 
     def pass_time(self) -> float:
         if not self.driver.paces_itself:

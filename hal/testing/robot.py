@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from ..driver import Reading, Setpoint
-from ..errors import CommandError, ConnectionLost, HalError, NotSupported, StaleStateError
+from ..errors import CommandError, ConnectionLost, HalError, NotSupported, RobotFault, StaleStateError
 from .benches import Contract, RobotBench, needs, run_in_thread, wait_lost, wait_restored
 from .hosting import HostedRobot
 
@@ -29,6 +29,8 @@ _SPEED_TOLERANCE = 0.1
 """Relative tolerance of that speed."""
 _STILL = 2e-3
 """rad; an arm without commands may settle by this."""
+_ENGAGE_LIMIT = 1.0
+"""s in which the drives must be on; that of the host."""
 _SETTLING = 0.05
 """s in which an arm that lags a little reaches its last set-point."""
 
@@ -38,11 +40,26 @@ def _run(bench: RobotBench, count: int) -> list[Reading]:
     return [bench.driver.read(bench.pass_time()) for _ in range(count)]
 
 
+def _engage(bench: RobotBench) -> None:
+    """Switch the drives on as the host does, if they are off."""
+    for _ in bench.turns(_ENGAGE_LIMIT):
+        if bench.driver.engaged:
+            return
+        bench.driver.engage()
+        _run(bench, 1)
+    assert bench.driver.engaged, f"engage, called once per cycle, must end with engaged = True in {_ENGAGE_LIMIT:g} s"
+
+
 def _ramp(bench: RobotBench, rise: float) -> list[Reading]:
     """Move one joint by ``rise`` rad along a smooth curve, from rest to rest, as a servo would.
 
     It starts at the set-point that the device reports, as every control session does.
     """
+    _engage(bench)
+    return _write_ramp(bench, rise)
+
+
+def _write_ramp(bench: RobotBench, rise: float) -> list[Reading]:
     first = bench.driver.read(bench.pass_time())
     start = np.array(first.q if first.q_commanded is None else first.q_commanded)
     readings = []
@@ -65,6 +82,7 @@ def _settle(bench: RobotBench) -> Reading:
 
 def _apply_torque(bench: RobotBench, joint: int, tau: float, seconds: float) -> list[Reading]:
     """Apply a torque (Nm) to one joint, with the measured state as set-point, as a servo does."""
+    _engage(bench)
     readings = _run(bench, 1)
     still = (0.0,) * len(readings[0].q)
     for _ in bench.turns(seconds):
@@ -84,11 +102,12 @@ class RobotContract(Contract):
     """Checks of an arm's driver. The bench is a :class:`~hal.testing.RobotBench`.
 
     ``left_out`` may name ``lose``, ``restore``, ``freeze``, ``fail`` (a fault that ``recover`` clears), ``torque`` (the
-    driver takes none), ``rest`` (it faults when set-points stop coming, instead of holding) and ``returns`` (a lost
-    device is found again only by opening it again, not by reading).
+    driver takes none), ``rest`` (it faults when set-points stop coming, instead of holding), ``holds`` (an arm without
+    brakes, which sinks when the program that drives it is gone) and ``returns`` (a lost device is found again only by
+    opening it again, not by reading).
     """
 
-    abilities = ("lose", "restore", "freeze", "fail", "torque", "rest", "returns")
+    abilities = ("lose", "restore", "freeze", "fail", "torque", "rest", "holds", "returns")
 
     # Opening and reading.
 
@@ -130,6 +149,7 @@ class RobotContract(Contract):
 
     def test_read_and_write_do_not_block(self, bench: RobotBench) -> None:
         bench.driver.open()
+        _engage(bench)
         took: dict[str, list[float]] = {"read": [], "write": []}
         write = _hold(bench, bench.driver.write)
         for _ in range(30):
@@ -153,6 +173,23 @@ class RobotContract(Contract):
         assert (last.t, last.t_device, last.seq) == (first.t, first.t_device, first.seq), repeat
 
     # Moving.
+
+    def test_engage_moves_nothing_and_halt_keeps_it(self, bench: RobotBench) -> None:
+        bench.driver.open()
+        first, *_ = _run(bench, 3)
+        took: list[float] = []
+        while not bench.driver.engaged and len(took) < len(bench.turns(_ENGAGE_LIMIT)):
+            began = time.perf_counter()
+            bench.driver.engage()
+            took.append(time.perf_counter() - began)
+            _run(bench, 1)
+        assert bench.driver.engaged, "engage must switch the drives on"
+        assert not took or statistics.median(took) < _SLOW, "engage must not block: the host calls it again"
+        last = _run(bench, 100)[-1]
+        assert np.abs(np.subtract(last.q, first.q)).max() < _STILL, "engage holds the arm where it is"
+        bench.driver.halt()
+        assert _run(bench, 2)[-1].fault is None
+        assert bench.driver.engaged, "halt keeps the drives on"
 
     def test_set_points_are_followed(self, bench: RobotBench) -> None:
         bench.driver.open()
@@ -178,7 +215,17 @@ class RobotContract(Contract):
         bench.driver.open()
         _ramp(bench, _RISE)
         first, *_, last = _run(bench, 100)
-        assert np.abs(np.subtract(last.q, first.q)).max() < _STILL, "it must hold by itself: a host may be killed"
+        assert np.abs(np.subtract(last.q, first.q)).max() < _STILL, "read must keep it holding while nothing is written"
+
+    @needs("holds")
+    def test_without_a_host_the_arm_holds(self, bench: RobotBench) -> None:
+        bench.driver.open()
+        _ramp(bench, _RISE)
+        bench.driver.halt()
+        before = _settle(bench).q
+        for _ in bench.turns(1.0):
+            bench.pass_time()
+        assert _run(bench, 1)[-1].q == pytest.approx(before, abs=_STILL), "it must hold by itself: a host may be killed"
 
     def test_halt_holds_and_may_be_repeated(self, bench: RobotBench) -> None:
         bench.driver.open()
@@ -321,7 +368,11 @@ class RobotContract(Contract):
         assert fault.code, "a fault has a code by which it can be looked up"
         assert fault.remedy, "a fault has a remedy: what a user can do about it"
         before = _run(bench, 1)[-1].q
-        assert _ramp(bench, _RISE)[-1].q == pytest.approx(before, abs=_STILL), "a faulted arm does not move"
+        if bench.driver.engaged:
+            assert _write_ramp(bench, _RISE)[-1].q == pytest.approx(before, abs=_STILL), "a faulted arm does not move"
+        else:
+            with pytest.raises(RobotFault):
+                _engage(bench)
         bench.driver.recover()
         assert _run(bench, 2)[-1].fault is None, "recover clears the fault"
         assert _ramp(bench, _RISE)[-1].q[bench.joint] == pytest.approx(before[bench.joint] + _RISE, abs=0.01)

@@ -16,6 +16,7 @@ from hal.drivers.mock.robot import MockGripper, MockRobot
 from hal.specs import BodySpec, CameraSpec, GroupSpec, ViewSpec, WorldSpec
 from hal.testing import CameraBench, GripperBench, RobotBench, camera_spec, gripper_spec, robot_spec
 
+from ..kits.drives import ArmWithDrives
 from ..kits.specs import data, panda
 
 __all__ = [
@@ -24,6 +25,7 @@ __all__ = [
     "mock_camera_in_lock_step",
     "mock_gripper",
     "mock_robot",
+    "mock_robot_with_drives",
     "played_realsense",
     "pybullet_camera_in_lock_step",
     "pybullet_gripper",
@@ -58,6 +60,13 @@ def _robot_bench(driver: Any, **more: Any) -> RobotBench:
 @contextmanager
 def mock_robot() -> Iterator[RobotBench]:
     driver = MockRobot(panda(driver="mock"))
+    yield _robot_bench(driver)
+    driver.close()
+
+
+@contextmanager
+def mock_robot_with_drives() -> Iterator[RobotBench]:
+    driver = ArmWithDrives(panda(driver="mock"))
     yield _robot_bench(driver)
     driver.close()
 

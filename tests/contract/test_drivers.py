@@ -26,6 +26,7 @@ from .benches import (
     mock_camera_in_lock_step,
     mock_gripper,
     mock_robot,
+    mock_robot_with_drives,
     played_realsense,
     pybullet_camera_in_lock_step,
     pybullet_gripper,
@@ -45,6 +46,10 @@ NO_LINK = dict.fromkeys(("lose", "restore", "freeze"), "it is part of the simula
 
 class TestMockRobot(RobotContract):
     bench = bench_of(mock_robot)
+
+
+class TestMockRobotWithDrives(RobotContract):
+    bench = bench_of(mock_robot_with_drives)
 
 
 class TestArmWithoutUrdf(RobotContract):

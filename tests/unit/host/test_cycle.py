@@ -1,15 +1,18 @@
-"""One arm in its group's cycle, driven by the mock: the comparison of the tools, and an arm that does not answer."""
+"""An arm in its group's cycle, driven by the mock: its tool, lost links, and drives that must be switched on."""
 
 from __future__ import annotations
 
 import pytest
+from drives import ArmWithDrives
 from specs import panda
 
+from hal import registry
 from hal.commands import CommandRecord, Kind, Session
-from hal.errors import ConnectionLost
+from hal.errors import ConnectionLost, RobotFault
 from hal.geometry import Pose
-from hal.host.cycle import TCP_APART, TCP_TURNED, ArmUnit
-from hal.host.records import AppRecord, RobotMail
+from hal.host.cycle import TCP_APART, TCP_TURNED, ArmUnit, Cycle
+from hal.host.records import AppRecord, GroupMemory, RobotMail
+from hal.specs import GroupSpec
 from hal.types import RobotStatus, Trip
 
 DT = 1.0 / 240.0
@@ -60,11 +63,15 @@ def cycle(arm: ArmUnit, now: float, late: bool = False) -> None:
     arm.publish(now)
 
 
+def never() -> None:
+    raise AssertionError("this arm needs no cycle to be ready")
+
+
 def driving() -> tuple[ArmUnit, float]:
     """An arm that follows velocities, and the time."""
     arm = unit()
     arm.open(1.0)
-    arm.open_session(Session(1, 1.0, 100.0, False), AppRecord(1.0, 0))
+    arm.open_session(Session(1, 1.0, 100.0, False), AppRecord(1.0, 0), never)
     for k in range(1, 20):
         cycle(arm, 1.0 + k * DT)
     assert arm.servo.report.status is RobotStatus.FOLLOWING
@@ -104,3 +111,108 @@ def test_a_pause_of_the_process_trips_the_arm() -> None:
     arm, now = driving()
     cycle(arm, now, late=True)
     assert arm.mail.get_state().trip is Trip.HOST_LATE
+
+
+# Drives that must be switched on. Two arms share one group, as they do on one serial adapter.
+
+
+class TwoArms:
+    """A group of a left arm that is driven and a right arm whose drives are off, both with a user in front of them."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr(registry, "load", lambda name, kind: ArmWithDrives)
+        arms = tuple(panda(name, driver="mock", gripper=None, attended=True) for name in ("left", "right"))
+        spec = GroupSpec("bus", "real_time", 1.0 / DT, arms)
+        memory = GroupMemory.of(memoryview(bytearray(GroupMemory.size_of(spec))), spec)
+        self.cycle = Cycle(spec, memory)
+        self.cycle.turn = self.turn
+        self.cycle.open(1.0)
+        self.left, self.right = self.cycle.arms["left"], self.cycle.arms["right"]
+        self.seq = 0
+
+    def turn(self) -> None:
+        now = self.cycle.t + DT
+        self.seq += 1
+        velocity = (0.05,) + (0.0,) * 6
+        for arm in (self.left, self.right):
+            arm.mail.put_command(CommandRecord(self.seq, 1, now, now + 0.1, Kind.JOINT_VELOCITY, velocity))
+        self.cycle.step(now, AppRecord(now, 0))
+
+    def begin(self, name: str) -> None:
+        self.cycle.request("begin", {"robot": name, "session": list(Session(1, 1.0, 100.0, False))})
+
+    def drive(self, arm: ArmUnit) -> None:
+        """Run cycles until the arm follows its commands."""
+        for _ in range(30):
+            self.turn()
+        assert arm.servo.report.status is RobotStatus.FOLLOWING
+
+
+def test_another_arm_of_the_group_moves_on_while_drives_are_switched_on(monkeypatch: pytest.MonkeyPatch) -> None:
+    arms = TwoArms(monkeypatch)
+    arms.begin("left")
+    arms.drive(arms.left)
+    ticks, written = arms.cycle.ticks, len(arms.left.driver.log)
+    arms.begin("right")
+    taken = arms.cycle.ticks - ticks
+    assert taken == 7  # one for each drive
+    assert len(arms.left.driver.log) == written + taken
+    arms.drive(arms.right)
+    assert arms.left.servo.report.trip is Trip.NONE
+
+
+def test_a_session_begins_where_the_arm_is_once_its_drives_are_on(monkeypatch: pytest.MonkeyPatch) -> None:
+    arms = TwoArms(monkeypatch)
+    monkeypatch.setattr(arms.right.driver, "engage", lambda: sink(arms.right.driver))
+
+    def sink(driver: ArmWithDrives) -> None:
+        driver._follows = driver._follows._replace(q=tuple(x + 0.01 for x in driver._follows.q))
+        ArmWithDrives.engage(driver)
+
+    arms.begin("right")
+    assert arms.right.servo.report.q_set == pytest.approx(arms.right.driver.read(arms.cycle.t).q, abs=1e-12)
+    assert arms.right.servo.report.q_set[0] == pytest.approx(arms.right.spec.initial[0] + 0.07)
+
+
+@pytest.mark.parametrize(("broken", "code"), [(3, "drive_off"), (None, "not_engaged")])
+def test_without_its_drives_no_session_opens(broken: int | None, code: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    arms = TwoArms(monkeypatch)
+    arms.right.driver.broken = broken
+    if broken is None:
+        monkeypatch.setattr(arms.right.driver, "engage", lambda: None)
+    with pytest.raises(RobotFault) as caught:
+        arms.begin("right")
+    assert caught.value.code == code
+    arms.turn()
+    assert not arms.right.servo.active
+    assert arms.cycle.stop_sessions()
+
+
+def test_drives_that_went_off_are_switched_on_again_when_the_arm_has_to_move(monkeypatch: pytest.MonkeyPatch) -> None:
+    arms = TwoArms(monkeypatch)
+    arms.begin("right")
+    arms.drive(arms.right)
+    driver = arms.right.driver
+    driver.inject(fault="too hot")
+    arms.turn()
+    driver.recover()
+    written = len(driver.log)
+    for _ in range(60):
+        arms.turn()
+    assert arms.right.servo.report.trip is Trip.FAULT  # not before a user agrees
+    assert (driver.engaged, len(driver.log)) == (False, written)
+    arms.right.mail.rearm()
+    arms.drive(arms.right)
+    assert driver.engaged
+
+
+def test_drives_that_do_not_switch_on_during_a_session_stop_the_arm(monkeypatch: pytest.MonkeyPatch) -> None:
+    arms = TwoArms(monkeypatch)
+    arms.begin("right")
+    arms.drive(arms.right)
+    arms.right.driver._switch_off()
+    arms.right.driver.broken = 2
+    for _ in range(60):
+        arms.turn()
+    report = arms.right.servo.report
+    assert (report.status, report.trip) == (RobotStatus.TRIPPED, Trip.DEVICE_LOST)
