@@ -15,7 +15,7 @@ from .errors import ConnectionLost, HalError, StaleStateError
 from .geometry import Pose
 from .histogram import Histogram
 from .specs import CameraSpec, ViewSpec
-from .types import Frame, Stamp
+from .types import STREAMS, Frame, Stamp
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -332,7 +332,8 @@ class Camera:
                     listeners.pop(token, None)
 
     def _frame_of(self, raw: RawFrame) -> Frame:
-        for image in (raw.color, raw.depth, raw.infrared, raw.infrared_right, raw.segmentation):
+        images = {stream: getattr(raw, stream) for stream in STREAMS}
+        for image in images.values():
             if image is not None:
                 image.flags.writeable = False
         newest, info = self._newest, self._info
@@ -354,15 +355,11 @@ class Camera:
                 where = where @ seen_from.T_color_stream
         return Frame(
             stamp=Stamp(raw.t, raw.t_device, raw.seq + self._offset),
-            color=raw.color,
-            depth=raw.depth,
-            infrared=raw.infrared,
-            segmentation=raw.segmentation,
             K=info.K,
             distortion=info.distortion,
             T_world_camera=where,
-            infrared_right=raw.infrared_right,
             skew=raw.skew,
+            **images,
         )
 
     def close(self) -> None:

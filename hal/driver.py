@@ -416,12 +416,12 @@ class RawFrame(NamedTuple):
     """Time of the exposure on the device's own clock, s."""
     seq: int
     """Number of the capture; a gap is a lost capture. It may start again at any number after ``open``."""
-    color: NDArray[np.uint8] | None
-    depth: NDArray[np.float32] | None
-    infrared: NDArray[np.uint8] | None
-    segmentation: NDArray[np.int32] | None
+    color: NDArray[np.uint8] | None = None
+    depth: NDArray[np.float32] | None = None
+    infrared: NDArray[np.uint8] | None = None
+    segmentation: NDArray[np.int32] | None = None
     """Number of the body in each pixel, -1 for none; simulation only."""
-    T_world_camera: Pose | None
+    T_world_camera: Pose | None = None
     """Pose of the camera in the world; None if the driver does not know it: it is then computed from the rig file and
     the state of the arm that carries the camera."""
     infrared_right: NDArray[np.uint8] | None = None

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from math import hypot
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from .arguments import number
 from .commands import Twist
-from .config.mapping import TeleopMapping, load_mapping
+from .config.mapping import AxisMapping, TeleopMapping, load_mapping
 from .errors import CommandError
 from .geometry import Pose, difference
 from .types import PadState
@@ -39,6 +39,8 @@ _WORDS = (
 )
 """The six directions of :data:`_DIRECTIONS` in the arm's base frame (x forward, y left, z up), the negative one first.
 """
+_SIDEWAYS = ("left_x", "right_x", "dpad_x")
+_MOVES = (("move", "m/s"), ("turn", "rad/s"))
 _GAIN = 4.0
 """Share of the remaining distance that is covered per second near the goal, 1/s. Far slower than the servo brakes, so
 the tcp arrives without overshoot."""
@@ -163,12 +165,7 @@ class Teleop:
         """
         mapping = self.mapping
         controls: dict[str, list[str]] = {}
-        for name, words, axis in zip(_DIRECTIONS, _WORDS, mapping.axes(), strict=True):
-            if axis is None:
-                continue
-            low, high = words if self.frame == "base" else (f"tool {name} -", f"tool {name} +")
-            if axis.invert:
-                low, high = high, low
+        for axis, low, high, _ in self._directions():
             if axis.buttons is not None:
                 controls.update(zip(axis.buttons, ([low], [high]), strict=True))
             else:
@@ -192,6 +189,14 @@ class Teleop:
             "controls": controls,
         }
 
+    def _directions(self) -> Iterator[tuple[AxisMapping, str, str, str]]:
+        """Yield each mapped axis, what its low and its high end (or its two buttons) do, and the unit of its speed."""
+        units = 3 * ["m/s"] + 3 * ["rad/s"]
+        for name, words, axis, unit in zip(_DIRECTIONS, _WORDS, self.mapping.axes(), units, strict=True):
+            if axis is not None:
+                low, high = words if self.frame == "base" else (f"tool {name} -", f"tool {name} +")
+                yield (axis, high, low, unit) if axis.invert else (axis, low, high, unit)
+
     def help(self, pad: Gamepad) -> list[str]:
         """Return what the controls of ``pad`` do, in lines of text."""
         mapping, name = self.mapping, pad.control_name
@@ -200,14 +205,13 @@ class Teleop:
             lines = [f"hold {deadman} to move; release it to stop"]
         else:
             lines = [f"each key is one small step, with {deadman} included"]
-        moves = [
-            f"{direction} {'/'.join(map(name, axis.controls))} ({self.speed * axis.scale:g} {unit})"
-            for direction, axis, unit in zip(_DIRECTIONS, mapping.axes(), 3 * ["m/s"] + 3 * ["rad/s"], strict=True)
-            if axis is not None
-        ]
-        lines.append("move: " + ", ".join(moves[:3]))
-        if moves[3:]:
-            lines.append("turn: " + ", ".join(moves[3:]))
+        moves: dict[str, list[str]] = {"m/s": [], "rad/s": []}
+        for axis, low, high, unit in self._directions():
+            # Two buttons and sideways axes ("left/right") are named with the low end first, others ("up/down") last.
+            low_first = axis.buttons is not None or axis.axis in _SIDEWAYS
+            ways = f"{low}/{high}" if low_first else f"{high}/{low}"
+            moves[unit].append(f"{ways} by {'/'.join(map(name, axis.controls))} ({self.speed * axis.scale:g} {unit})")
+        lines += [f"{word}: " + ", ".join(moves[unit]) for word, unit in _MOVES if moves[unit]]
         if mapping.gripper is not None and self.robot.gripper is not None:
             lines.append("gripper: " + ", ".join(map(name, mapping.gripper.controls)))
         if mapping.go_home is not None and pad.can_hold:

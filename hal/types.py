@@ -12,7 +12,7 @@ from enum import IntEnum, IntFlag
 from types import MappingProxyType
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import DTypeLike, NDArray
 
 from .errors import Fault
 from .geometry import Pose
@@ -31,6 +31,7 @@ __all__ = [
     "RobotState",
     "RobotStatus",
     "STICK_AXES",
+    "STREAMS",
     "Stamp",
     "Trip",
 ]
@@ -50,6 +51,19 @@ AXES = STICK_AXES + CAP_AXES
 
 BUTTONS = ("south", "east", "west", "north", "l1", "r1", "l2", "r2", "select", "start", "l3", "r3", "home", "touchpad")
 """Buttons of a pad, named by position: ``south`` is Cross on a Sony pad and A on an Xbox pad."""
+
+
+STREAMS: Mapping[str, tuple[DTypeLike, tuple[int, ...]]] = MappingProxyType(
+    {
+        "color": (np.uint8, (3,)),
+        "depth": (np.float32, ()),
+        "infrared": (np.uint8, ()),
+        "infrared_right": (np.uint8, ()),
+        "segmentation": (np.int32, ()),
+    }
+)
+"""Every stream that a camera may have: the type of its images, and their shape after height and width. Each is a field
+of :class:`Frame`."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -88,10 +88,11 @@ class HandLink:
             self._child.wait_ready(_OPEN_TIMEOUT)
         except ConnectionLost as error:
             self._end()
-            text = str(error)
-            if "did not get ready" in text:
+            text, code = str(error), error.code
+            if code == "process_silent":  # the library hangs
                 text = f"{self._host} accepts a connection to the hand but sends nothing; is another program using it?"
-            raise ConnectionLost(f"{self._name}: {text}") from None
+                code = "silent"
+            raise ConnectionLost(f"{self._name}: {text}", code=code) from None
         except HalError as error:
             self._end()
             raise type(error)(f"{self._name}: {error}", code=error.code) from None

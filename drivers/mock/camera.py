@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from typing import ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -116,28 +116,23 @@ class MockCamera(CameraDriver):
         if self._clock is not None and not self._waits:
             t = self._clock.now() - self.faults.delay_s
         self._last = seq
-        color, depth, infrared, segmentation = self._draw(seq, t)
-        wanted = self.spec.streams
+        images = self._draw(seq, t)
         if self.faults.garbage == "shape":
-            color, depth, infrared, segmentation = color[:-1], depth[:-1], infrared[:-1], segmentation[:-1]
+            images = {stream: image[:-1] for stream, image in images.items()}
         elif self.faults.garbage == "nan":
-            depth = np.full_like(depth, np.nan)
+            images["depth"] = np.full_like(images["depth"], np.nan)
+        wanted = self.spec.streams
         return RawFrame(
             t=t,
             t_device=t - self._t_open,
             seq=seq,
-            color=color if "color" in wanted else None,
-            depth=depth if "depth" in wanted else None,
-            infrared=infrared if "infrared" in wanted else None,
-            segmentation=segmentation if "segmentation" in wanted else None,
             T_world_camera=self._view,
-            infrared_right=infrared.copy() if "infrared_right" in wanted else None,
             skew=0.0 if {"color", "depth"} <= set(wanted) else None,
+            **{stream: images[stream] for stream in wanted},
         )
 
-    def _draw(
-        self, seq: int, t: float
-    ) -> tuple[NDArray[np.uint8], NDArray[np.float32], NDArray[np.uint8], NDArray[np.int32]]:
+    def _draw(self, seq: int, t: float) -> dict[str, NDArray[Any]]:
+        """Return the image of every stream."""
         spec, width, height = self.spec, self.spec.width, self.spec.height
         plane = min(PLANE, spec.depth_max)
         near = max(plane - 0.1, spec.depth_min)
@@ -153,7 +148,13 @@ class MockCamera(CameraDriver):
         infrared = color.mean(axis=2).astype(np.uint8)
         head = seq.to_bytes(4, "little") + round(t * 1e6).to_bytes(8, "little", signed=True)
         color.reshape(-1)[:_HEAD] = np.frombuffer(head, np.uint8)
-        return color, depth, infrared, segmentation
+        return {
+            "color": color,
+            "depth": depth,
+            "infrared": infrared,
+            "infrared_right": infrared.copy(),
+            "segmentation": segmentation,
+        }
 
     def inject(self, **faults: object) -> None:
         """Set faults; those that are not named stay as they are.

@@ -123,12 +123,12 @@ class Exposure:
             t,
             t_device,
             number,
-            images.color,
-            depth,
-            sides.get("infrared", images.infrared),
-            images.segmentation,
-            view,
-            sides.get("infrared_right"),
+            color=images.color,
+            depth=depth,
+            infrared=sides.get("infrared", images.infrared),
+            infrared_right=sides.get("infrared_right"),
+            segmentation=images.segmentation,
+            T_world_camera=view,
             skew=0.0 if images.color is not None and depth is not None else None,
         )
 

@@ -169,7 +169,7 @@ class WebConsole(Console):
             return
         stamp = frame.stamp
         layers = {name: getattr(frame, name) for name in spec.streams}
-        raw = RawFrame(stamp.t, stamp.t_device, stamp.seq, None, None, None, None, None)._replace(**layers)
+        raw = RawFrame(stamp.t, stamp.t_device, stamp.seq, **layers)
         self._rings[spec.name].write(raw)
         self._channel.send_frame(spec.name)
 

@@ -18,7 +18,7 @@ from hal.pads.choice import tour
 from hal.pads.keyboard import keyboard_table
 from hal.servo.watchdog import PAD_SILENCE
 from hal.specs import PadSpec
-from hal.types import AXES, BUTTONS
+from hal.types import AXES, BUTTONS, STICK_AXES
 
 __all__ = ["PadQueue", "PadSource", "WebPad", "lost_reading", "pad_reading"]
 
@@ -45,7 +45,7 @@ def pad_reading(message: Mapping[str, Any], seq: int) -> PadReading:
         t_alive=t,
         t_device=t,
         seq=seq,
-        axes=MappingProxyType(dict(zip(AXES, map(float, message["axes"]), strict=False))),  # a page has the first ones
+        axes=MappingProxyType(dict(zip(STICK_AXES, map(float, message["axes"]), strict=True))),
         buttons=frozenset(name for bit, name in enumerate(BUTTONS) if mask >> bit & 1),
         connected=True,
     )

@@ -24,6 +24,8 @@ from hal.errors import ConnectionLost, DriverMissing, NotSupported
 from hal.host.process import Channel, SharedMemory
 from hal.host.ring import frame_rings
 from hal.specs import CameraSpec, from_json
+from hal.types import BUTTONS, STICK_AXES
+from hal.views import ACTIONS
 
 from .auth import Authenticator
 from .messages import MalformedMessage, StopRequest, encode, parse
@@ -258,8 +260,10 @@ def read_page_files(folder: Path = _PAGE) -> dict[str, PageFile]:
 
 
 def keys_module(table: Mapping[str, Any]) -> PageFile:
-    """Return ``keys.js``, the module of the page with the table of keys, a ``hal.pads.keyboard.KeyboardTable``."""
-    return f"export const KEYS = {json.dumps(table)};\n".encode(), _TYPES[".js"]
+    """Return ``keys.js``, a module of the page: its keys (a ``hal.pads.keyboard.KeyboardTable``), axes and buttons."""
+    constants = {"KEYS": table, "AXES": STICK_AXES, "BUTTONS": BUTTONS, "ACTIONS": ACTIONS}
+    text = "".join(f"export const {name} = {json.dumps(value)};\n" for name, value in constants.items())
+    return text.encode(), _TYPES[".js"]
 
 
 def make_app(

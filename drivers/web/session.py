@@ -15,7 +15,6 @@ from collections.abc import Awaitable, Callable, Mapping
 from typing import Any, NamedTuple, Protocol
 
 from hal.servo.watchdog import PAD_SILENCE
-from hal.types import BUTTONS, STICK_AXES
 
 from .messages import (
     CLOCK_AHEAD,
@@ -347,8 +346,7 @@ class WebSession:
         return page
 
     def _hello(self, page: WebPage) -> str:
-        hello = {"type": "hello", "page": page.number, "name": page.name, "axes": STICK_AXES, "buttons": BUTTONS}
-        return encode(hello | {"rig": self._rig})
+        return encode({"type": "hello", "page": page.number, "name": page.name, "rig": self._rig})
 
     def close_page(self, page: WebPage) -> None:
         """Remove a page and end its control. Idempotent."""

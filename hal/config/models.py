@@ -239,6 +239,7 @@ class DepthSensor(Strict):
 
 
 SensorStream = Literal["color", "depth", "infrared", "infrared_right"]
+"""Streams that a real camera may have; a simulated one may also have a segmentation."""
 _MADE_FROM = {"infrared_right": "infrared", "infrared": "depth"}
 
 

@@ -24,7 +24,7 @@ from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
 from ..geometry import Pose, matrix_to_quaternion, quaternion_to_matrix, rpy_to_matrix
 from ..specs import ViewSpec
-from .models import Capture, Depth, Drivers, FieldOfView, LimitsModel, by_name
+from .models import Capture, Depth, Drivers, FieldOfView, LimitsModel, SensorStream, by_name
 from .schema import (
     CameraRate,
     Coordinate,
@@ -234,7 +234,7 @@ class RobotConfig(Device):
     speed: Share = 0.3
     """Greatest share of the joint speed limits in a control session."""
     move_speed: Share = 0.1
-    """Default share of the joint speed limits in ``move_to``."""
+    """Default share of the joint speed limits in ``move_to``, and so of every move home."""
     tcp_speed: TcpSpeed = 0.25
     """Greatest speed of the tcp, m/s (ISO 10218's reduced speed)."""
     limits: LimitsConfig = LimitsConfig()
@@ -264,7 +264,7 @@ class StreamConfig(Strict):
         return self
 
 
-Stream = Literal["color", "depth", "infrared", "infrared_right", "segmentation"]
+Stream = Literal[SensorStream, "segmentation"]
 
 
 def _color_and_depth() -> dict[Stream, StreamConfig]:

@@ -21,21 +21,13 @@ from ..driver import CameraTally, RawFrame
 from ..errors import ConnectionLost
 from ..geometry import Pose
 from ..specs import CameraSpec
+from ..types import STREAMS
 
-__all__ = ["STREAM_TYPES", "ArrayRing", "FrameRing", "Images", "frame_rings", "frame_rings_size"]
+__all__ = ["ArrayRing", "FrameRing", "Images", "frame_rings", "frame_rings_size"]
 
 Images = Mapping[str, NDArray[Any]]
 """The pictures of one capture, by the names of their streams."""
 Key = TypeVar("Key", bound=Hashable)
-
-STREAM_TYPES: dict[str, tuple[DTypeLike, tuple[int, ...]]] = {
-    "color": (np.uint8, (3,)),
-    "depth": (np.float32, ()),
-    "infrared": (np.uint8, ()),
-    "infrared_right": (np.uint8, ()),
-    "segmentation": (np.int32, ()),
-}
-"""Type of each stream's pictures, and what their shape has after height and width."""
 
 _NUMBER = struct.Struct("<Q")
 _HEADER = struct.Struct(
@@ -201,13 +193,9 @@ class FrameRing(ArrayRing[str]):
                     t,
                     t_device,
                     seq,
-                    copies.get("color"),
-                    copies.get("depth"),
-                    copies.get("infrared"),
-                    copies.get("segmentation"),
-                    None if math.isnan(pose[0]) else Pose(pose[:3], pose[3:]),
-                    copies.get("infrared_right"),
-                    None if math.isnan(skew) else skew,
+                    T_world_camera=None if math.isnan(pose[0]) else Pose(pose[:3], pose[3:]),
+                    skew=None if math.isnan(skew) else skew,
+                    **copies,
                 )
             if every:
                 raise ConnectionLost(f"frame {number} was written over before it was read", code="frame_overwritten")
@@ -255,6 +243,6 @@ def _arrays_of(spec: CameraSpec) -> dict[str, tuple[tuple[int, ...], DTypeLike]]
     """Return shape and type of the pictures of each stream of a camera."""
     return {
         name: ((spec.height, spec.width, *more), dtype)
-        for name, (dtype, more) in STREAM_TYPES.items()
+        for name, (dtype, more) in STREAMS.items()
         if name in spec.streams
     }

@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from ..errors import CommandError, DriverMissing
+from ..types import STREAMS
 
 if TYPE_CHECKING:
     pass
@@ -46,6 +47,8 @@ __all__ = [
 ]
 
 
+VERSION = "v3.0"
+"""Version of LeRobot's format."""
 STATE = "observation.state"
 SETPOINT = "observation.setpoint"
 ACTION = "action"
@@ -57,7 +60,7 @@ the episode's first row."""
 GRID = f"{TIMES}grid"
 
 SEGMENTATION = "segmentation"
-MORE_STREAMS = ("infrared", "infrared_right", SEGMENTATION)
+MORE_STREAMS = tuple(stream for stream in STREAMS if stream not in ("color", "depth"))
 """Streams of a camera that are recorded only on request."""
 BOOKKEEPING: dict[str, str] = {
     "timestamp": "float32",
@@ -160,13 +163,6 @@ def require_libraries() -> None:
         raise DriverMissing(
             f"recordings need {', '.join(missing)}; install with: pip install 'robot-hal[record]'", name=missing[0]
         )
-
-
-# [pace.py] Does the time of an arm's own clock pass as fast as that of the rig? A simulation that cannot keep up
-# is slower.
-
-
-# [about.py] What an episode's own file says besides its rows: where they come from, and with what they were made.
 
 
 CHUNK = 1000
@@ -344,6 +340,3 @@ def _finite(data: Any) -> Any:
     if isinstance(data, (list, tuple)):
         return [_finite(value) for value in data]
     return data
-
-
-VERSION = "v3.0"

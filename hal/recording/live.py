@@ -22,7 +22,8 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 from ..host.memory import Mailbox
-from ..host.ring import STREAM_TYPES, ArrayRing, Images
+from ..host.ring import ArrayRing, Images
+from ..types import STREAMS
 from .codecs import (
     DepthFile,
     DepthReader,
@@ -152,7 +153,7 @@ def _arrays(width: int, cameras: Sequence[CameraSetup]) -> dict[_Key, tuple[tupl
     arrays: dict[_Key, tuple[tuple[int, ...], DTypeLike]] = {_VALUES: ((width,), np.float64)}
     for index, camera in enumerate(cameras):
         for stream in (*camera.videos.values(), *camera.depths.values()):
-            dtype, more = STREAM_TYPES[stream]
+            dtype, more = STREAMS[stream]
             arrays[index, stream] = (camera.height, camera.width, *more), dtype
     return arrays
 

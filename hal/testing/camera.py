@@ -12,7 +12,7 @@ import pytest
 from ..camera import Camera
 from ..driver import RawFrame
 from ..errors import CommandError, ConnectionLost, HalError, NotSupported, StaleStateError
-from ..types import Frame
+from ..types import STREAMS, Frame
 from .benches import CameraBench, Contract, needs, run_in_thread, wait_lost, wait_restored
 
 __all__ = ["CameraContract"]
@@ -34,8 +34,7 @@ _CLOCKS = ("hardware", "global", "system", "simulated")
 
 def _images(frame: RawFrame) -> dict[str, np.ndarray]:
     """Return the images that a frame has, by stream."""
-    streams = ("color", "depth", "infrared", "infrared_right", "segmentation")
-    found = {stream: getattr(frame, stream) for stream in streams}
+    found = {stream: getattr(frame, stream) for stream in STREAMS}
     return {stream: image for stream, image in found.items() if image is not None}
 
 
@@ -121,15 +120,13 @@ class CameraContract(Contract):
     def test_frames_have_the_streams_size_and_units_of_the_spec(self, bench: CameraBench) -> None:
         bench.driver.open()
         spec, frame = bench.driver.spec, _grab(bench)
-        size = (spec.height, spec.width)
-        expected = {"color": ((*size, 3), np.uint8), "depth": (size, np.float32), "segmentation": (size, np.int32)}
-        expected |= {"infrared": (size, np.uint8), "infrared_right": (size, np.uint8)}
         found = _images(frame)
         assert set(found) == set(spec.streams), "a frame has the streams of its spec, and None for all others"
         for stream, image in found.items():
-            shape, dtype = expected[stream]
+            dtype, more = STREAMS[stream]
+            shape = (spec.height, spec.width, *more)
             assert (image.shape, image.dtype) == (shape, np.dtype(dtype)), (
-                f"{stream}: must be {shape} of {dtype.__name__}"
+                f"{stream}: must be {shape} of {np.dtype(dtype).name}"
             )
         if frame.depth is not None:
             assert np.isfinite(frame.depth).all(), "depth is 0 without a measurement, never NaN"

@@ -65,7 +65,7 @@ def playback_pad() -> Iterator[PadBench]:
 def web_pad() -> Iterator[PadBench]:
     """The pad of a console page, which sends its state every 10 ms."""
     from hal.drivers.web.pad import PadQueue, WebPad, pad_reading
-    from hal.types import AXES
+    from hal.types import STICK_AXES
 
     class Page:
         queue = PadQueue()
@@ -80,7 +80,7 @@ def web_pad() -> Iterator[PadBench]:
             """No recording is played here."""
 
         def speak(self) -> None:
-            now, axes = bench.now, [0.0] * len(AXES)
+            now, axes = bench.now, [0.0] * len(STICK_AXES)
             message = {"connected": self.there, "t": now, "t_alive": now, "axes": axes, "buttons": self.mask}
             if not self.frozen:
                 self.queue.put(pad_reading(message, 0))

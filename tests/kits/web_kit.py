@@ -45,7 +45,7 @@ def frame(spec: CameraSpec, value: float, t: float | None = None) -> RawFrame:
     shape, kind = ((*flat, 3), np.uint8) if stream == "color" else (flat, np.float32 if stream == "depth" else np.uint8)
     images[stream] = np.full(shape, value, kind)
     now = time.monotonic() if t is None else t
-    return RawFrame(now, now, 0, **images, T_world_camera=None)
+    return RawFrame(now, now, 0, **images)
 
 
 class App:

@@ -21,7 +21,7 @@ from typing import Any, Protocol
 from hal.drivers.franka.flags import flag_index
 
 from .control import CONTROL_PORT
-from .faults import help_text
+from .faults import COMMANDS, help_text
 from .journal import Counters
 from .server import ArmServer, listen
 
@@ -140,6 +140,7 @@ def _readable_stdin() -> int | None:
 
 _MAX_DURATION = 600.0
 """Longest duration of a fault, s."""
+_NOTED = frozenset(command.usage.split()[0] for command in COMMANDS if command.noted)
 
 
 class HandCommands(Protocol):
@@ -192,7 +193,7 @@ class Executor:
             answer = self._verbs[verb](rest) or {}
         except (ValueError, IndexError) as error:
             raise ValueError(f"{verb}: {error}") from None
-        if verb in _FAULTS:
+        if verb in _NOTED:
             self._server.arm.journal.record("command", "command: " + " ".join(words))
         return answer
 
@@ -272,25 +273,6 @@ class Executor:
 
     def _log(self, words: Words) -> Answer:
         return {"events": self._server.arm.journal.events(int(words[0]) if words else 100)}
-
-
-_FAULTS = frozenset(
-    [
-        "silence",
-        "lose-states",
-        "lose-commands",
-        "report-lag",
-        "report-noise",
-        "report-measured",
-        "truncate",
-        "stall",
-        "slow-reply",
-        "no-move-reply",
-        "version",
-        "restart",
-    ],
-)
-"""Commands that are recorded as events; the others are visible by their effect, or change nothing."""
 
 
 def _exactly(words: Words, count: int) -> Words:

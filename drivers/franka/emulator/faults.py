@@ -19,27 +19,33 @@ class FaultCommand(NamedTuple):
 
     usage: str
     meaning: str
+    noted: bool = False
+    """Whether the event log notes the command itself; others are visible in it by their effect, or change nothing."""
 
 
 COMMANDS = (
-    FaultCommand("silence S", "send no states for S seconds; the client's library gives up after 1 s"),
-    FaultCommand("lose-states P | next N", "lose that share (0..1) of the states, or exactly the next N"),
-    FaultCommand("lose-commands P | next N", "the same for the client's commands"),
-    FaultCommand("report-lag N", "report q_d, dq_d and ddq_d N cycles late (0 to 10)"),
-    FaultCommand("report-noise S", "add noise to the reported q_d: normal, S rad"),
-    FaultCommand("report-measured on|off", "report measured positions and speeds as q_d and dq_d"),
-    FaultCommand("truncate on|off", "send states that are one byte too short"),
+    FaultCommand("silence S", "send no states for S seconds; the client's library gives up after 1 s", noted=True),
+    FaultCommand("lose-states P | next N", "lose that share (0..1) of the states, or exactly the next N", noted=True),
+    FaultCommand("lose-commands P | next N", "the same for the client's commands", noted=True),
+    FaultCommand("report-lag N", "report q_d, dq_d and ddq_d N cycles late (0 to 10)", noted=True),
+    FaultCommand("report-noise S", "add noise to the reported q_d: normal, S rad", noted=True),
+    FaultCommand("report-measured on|off", "report measured positions and speeds as q_d and dq_d", noted=True),
+    FaultCommand("truncate on|off", "send states that are one byte too short", noted=True),
     FaultCommand("reflex NAME|INDEX", "raise an error flag: a running motion is aborted, and recovery is required"),
     FaultCommand("user-stop on|off", "press or release the user stop"),
     FaultCommand("emergency-stop on|off", "press or release the emergency stop"),
     FaultCommand("guiding on|off", "guide the arm by hand (not during a motion)"),
     FaultCommand("place [Q1 ... Q7]", "put the arm there, rad, or at its start position (not during a motion)"),
-    FaultCommand("stall S", "stop the emulator itself for S seconds"),
-    FaultCommand("slow-reply S", "process requests S seconds after their arrival (0: at once)"),
-    FaultCommand("no-move-reply on|off", "never answer the end of a motion: the client's library then waits forever"),
-    FaultCommand("version N", "claim to speak protocol N from the next connection on (0: the true one)"),
+    FaultCommand("stall S", "stop the emulator itself for S seconds", noted=True),
+    FaultCommand("slow-reply S", "process requests S seconds after their arrival (0: at once)", noted=True),
+    FaultCommand(
+        "no-move-reply on|off", "never answer the end of a motion: the client's library then waits forever", noted=True
+    ),
+    FaultCommand("version N", "claim to speak protocol N from the next connection on (0: the true one)", noted=True),
     FaultCommand("kill", "kill the process"),
-    FaultCommand("restart [S]", "drop all connections, and return S seconds later (0) as after switching on"),
+    FaultCommand(
+        "restart [S]", "drop all connections, and return S seconds later (0) as after switching on", noted=True
+    ),
     FaultCommand("hand ...", "a command of the hand; `hand help` lists them"),
     FaultCommand("state", "present state of the arm"),
     FaultCommand("stats", "counters, times and the largest share of every limit since the last reset"),

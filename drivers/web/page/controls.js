@@ -1,8 +1,8 @@
 // The controls on the page: discs, slider and buttons; what they press, what they are called, what they show.
 
 import { byId, make, onPress, setAttribute, setData, setText, show } from "./dom.js";
-import { KEYS } from "./keys.js";
-import { ACTIONS, AXIS, BIT, DISCS } from "./pad.js";
+import { ACTIONS, KEYS } from "./keys.js";
+import { AXIS, BIT, DISCS } from "./pad.js";
 
 /** Dead zone per axis, as a share of the way to the rim. Sticks get theirs from the program. */
 const DEAD = 0.08;

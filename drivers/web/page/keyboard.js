@@ -1,6 +1,6 @@
 // The keyboard as a source of the pad.
 //
-// The server makes keys.js out of sensors/keyboard.yaml, the one table of keys, which the terminal uses too.
+// The server makes keys.js: KEYS is sensors/keyboard.yaml, the one table of keys, which the terminal uses too.
 
 import { KEYS } from "./keys.js";
 import { AXIS, BIT } from "./pad.js";

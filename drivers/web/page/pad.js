@@ -1,21 +1,15 @@
 // One pad out of everything that may drive at the same time: fingers on the page, keys, a gamepad.
+//
+// The server makes keys.js: AXES and BUTTONS are those of hal/types.py, in the order in which they are sent. Sticks and
+// d-pad are -1..1 (right and up positive), l2 and r2 are 0..1; bit k of a mask is button k.
 
-/** Axes in the order in which they are sent. Sticks and d-pad are -1..1 (right and up positive), l2 and r2 are 0..1. */
-export const AXES = ["left_x", "left_y", "right_x", "right_y", "l2", "r2", "dpad_x", "dpad_y"];
-
-/** Buttons; bit k of a mask is button k. */
-export const BUTTONS = [
-  "south", "east", "west", "north", "l1", "r1", "l2", "r2", "select", "start", "l3", "r3", "home", "touchpad",
-];
+import { AXES, BUTTONS } from "./keys.js";
 
 /** Name of an axis -> its place. */
 export const AXIS = Object.fromEntries(AXES.map((name, place) => [name, place]));
 
 /** Name of a button -> its bit, as a number with only that bit set. */
 export const BIT = Object.fromEntries(BUTTONS.map((name, place) => [name, 1 << place]));
-
-/** Meanings of a button that moves nothing: it steers a recording. */
-export const ACTIONS = ["record", "finish", "fail", "discard"];
 
 /** Name of a disc -> its two axes, across and up. */
 export const DISCS = { dpad: ["dpad_x", "dpad_y"], left: ["left_x", "left_y"], right: ["right_x", "right_y"] };

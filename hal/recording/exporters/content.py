@@ -263,9 +263,6 @@ class EpisodeContent:
         }
 
 
-# [observations.py] The numbers that a policy looks at, under the names that robomimic and diffusion policy use
-# for them.
-
 _OF_AN_ARM = {
     "joint_vel": "observation.velocity",
     "joint_effort": "observation.effort",

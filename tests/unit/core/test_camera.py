@@ -159,7 +159,7 @@ class Scripted(CameraDriver):
             raise error
         self.seq += 1
         now = time.monotonic()
-        return RawFrame(now, now, self.seq, None, None, None, None, None)
+        return RawFrame(now, now, self.seq)
 
     def close(self) -> None: ...
 
@@ -298,7 +298,7 @@ class Still(CameraDriver):
     def open(self) -> None: ...
 
     def grab(self, timeout: float) -> RawFrame:
-        return RawFrame(0.0, 0.0, 1, None, None, None, None, None)
+        return RawFrame(0.0, 0.0, 1)
 
     def close(self) -> None: ...
 

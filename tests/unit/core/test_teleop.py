@@ -167,7 +167,7 @@ def test_a_bad_mapping_lists_every_problem(arm: hal.Robot) -> None:
 def test_help_names_the_controls(rig: hal.Rig, arm: hal.Robot) -> None:
     text = "\n".join(hal.Teleop(arm).help(rig.gamepads["pad"]))
     assert "hold L2 to move" in text
-    assert "D-pad up/down (0.2 m/s)" in text
+    assert "move: forward/back by D-pad up/down (0.2 m/s), left/right by D-pad left/right (0.2 m/s), down/up by" in text
     assert "gripper: R2" in text
 
 

@@ -34,7 +34,7 @@ def frame(spec: CameraSpec, value: int, **more: Any) -> RawFrame:
         "segmentation": np.full(flat, value, np.int32),
     }
     kept = {name: image for name, image in images.items() if name in spec.streams}
-    plain = RawFrame(float(value), value + 0.5, 0, None, None, None, None, None)
+    plain = RawFrame(float(value), value + 0.5, 0)
     return plain._replace(**kept, **more)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,7 @@ from recording_kit import check_layout, mock_rig
 
 import hal
 from hal.recording import Dataset, Recorder
+from hal.recording.sampling import RowSampler
 
 TWO = {
     "robots": {
@@ -34,6 +36,16 @@ def test_two_arms_share_the_columns(tmp_path: Path) -> None:
     episode = Dataset(tmp_path / "out").episodes[0]
     assert episode.columns["observation.tcp"].shape == (episode.length, 14)
     assert set(episode.stamps) == {"grid", "robot.left", "robot.right", "gripper.left", "gripper.right"}
+
+
+def test_every_column_is_in_the_documentation() -> None:
+    text = (Path(__file__).parents[3] / "docs" / "record.md").read_text(encoding="utf-8")
+    table = "".join(re.findall(r"^\| (`(?:observation|action).*?) \|", text, re.MULTILINE))
+    keys = {f"observation.time{key}" if key.startswith(".") else key for key in re.findall(r"`([\w.]+)`", table)}
+    with mock_rig() as rig:
+        columns = RowSampler(rig, rig.cameras).columns
+    missing = [one.key for one in columns if not {one.key, re.sub(r"\.\w+$", ".NAME", one.key)} & keys]
+    assert not missing
 
 
 def test_an_object_that_is_taken_away_is_not_known_any_more(tmp_path: Path) -> None:

@@ -15,7 +15,7 @@ from hal.drivers.web.pad import PadQueue, WebPad, lost_reading, pad_reading
 from hal.errors import NotSupported
 from hal.gamepad import Gamepad
 from hal.specs import PadSpec
-from hal.types import AXES, BUTTONS
+from hal.types import BUTTONS, STICK_AXES
 
 L2 = 1 << BUTTONS.index("l2")
 SOUTH = 1 << BUTTONS.index("south")
@@ -37,7 +37,7 @@ class Page:
         self.playing.append(on)
 
     def send(self, t: float, mask: int = 0, **axes: float) -> None:
-        values = [axes.get(name, 1.0 if name == "l2" and mask & L2 else 0.0) for name in AXES]
+        values = [axes.get(name, 1.0 if name == "l2" and mask & L2 else 0.0) for name in STICK_AXES]
         message = {"connected": True, "t": t, "t_alive": t - 0.001, "axes": values, "buttons": mask}
         self.queue.put(pad_reading(message, 0))
 

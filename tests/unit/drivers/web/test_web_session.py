@@ -86,7 +86,6 @@ def test_a_page_that_opens_gets_everything_in_order(room: Room) -> None:
     told = inbox(room.page())
     hello, labels, lease, pad, *says = told
     assert (hello["type"], hello["page"], hello["name"], hello["rig"]) == ("hello", 2, "page 2", RIG)
-    assert (hello["axes"][0], hello["buttons"][0]) == ("left_x", "south")
     assert labels == {"type": "labels", "deadman": "l2", "controls": {}}
     assert lease == {"type": "lease", "driver": "page 1", "you": False, "t": 100.0, "why": ""}
     assert pad == {"type": "pad", "waiting": ["r2"]}
