@@ -42,6 +42,12 @@ CHUNK_POINTS = 256
 """Greatest number of targets in one chunk."""
 CHUNK_AHEAD = 3.0
 """Farthest that a chunk may reach into the future, s: for so long the arm may follow an old decision."""
+FIRST_STEP_ANGLE = 0.1
+"""Greatest distance of a first joint target from the set-point, rad per joint."""
+FIRST_STEP_DISTANCE = 0.05
+"""Greatest distance of a first pose from the set-point, m."""
+FIRST_STEP_TURN = 0.2
+"""Greatest angle between a first pose and the set-point, rad."""
 
 
 @dataclass(frozen=True, slots=True, eq=False, init=False)

@@ -18,6 +18,9 @@ from . import registry
 from .arguments import number
 from .commands import (
     CHUNK_AHEAD,
+    FIRST_STEP_ANGLE,
+    FIRST_STEP_DISTANCE,
+    FIRST_STEP_TURN,
     CartesianTarget,
     Command,
     CommandRecord,
@@ -50,14 +53,8 @@ if TYPE_CHECKING:
     from .host.records import ServoRecord
     from .robot import Robot
 
-__all__ = ["CommandChecks", "Control", "FIRST_STEP_ANGLE", "FIRST_STEP_DISTANCE", "FIRST_STEP_TURN"]
+__all__ = ["CommandChecks", "Control"]
 
-FIRST_STEP_ANGLE = 0.1
-"""Greatest distance of a first joint target from the set-point, rad per joint."""
-FIRST_STEP_DISTANCE = 0.05
-"""Greatest distance of a first pose from the set-point, m. The servo enforces the same bounds."""
-FIRST_STEP_TURN = 0.2
-"""Greatest angle between a first pose and the set-point, rad."""
 _SHORTEST_DEADLINE = 0.1
 _PERIODS = 2.5
 """Deadline of the next command after one: so many periods of the session's rate, at least the shortest, s."""

@@ -336,6 +336,10 @@ class ArmUnit:
         self.driver.close()
 
 
+STOP_LIMIT = 5.0
+"""Longest time for bringing the arms to rest before the devices are closed anyway, s."""
+
+
 class Cycle:
     """A group: its world, if any, its arms and its grippers."""
 

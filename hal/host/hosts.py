@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 from .. import registry
 from ..errors import ConnectionLost, HalError
 from ..specs import GripperSpec, GroupSpec, RobotSpec, to_json
-from .cycle import Cycle
+from .cycle import STOP_LIMIT, Cycle
 from .process import Child, SharedMemory
 from .records import AppRecord, GroupMemory
 
@@ -82,8 +82,6 @@ SILENT = 1.5
 state.)"""
 PAD_PERIOD = 0.01
 """Period at which pads are polled in lock-step, simulated s."""
-_STOP_LIMIT = 5.0
-"""Longest time for bringing the arms to rest before the devices are closed anyway, s."""
 
 
 class Host(ABC):
@@ -195,7 +193,7 @@ class LocalHost(Host):
                 return
             self._closed = True
             try:
-                for _ in range(round(_STOP_LIMIT / self.cycle.dt)):
+                for _ in range(round(STOP_LIMIT / self.cycle.dt)):
                     if self.cycle.stop_sessions():
                         break
                     self._step()
@@ -270,7 +268,7 @@ class RemoteHost(Host):
     def close(self) -> None:
         if self._closed.is_set():
             return
-        self.child.close(timeout=1.0 if self._silence() > SILENT else _STOP_LIMIT + 3.0)
+        self.child.close(timeout=1.0 if self._silence() > SILENT else STOP_LIMIT + 3.0)
         self._closed.set()
         self._thread.join(timeout=1.0)
         self.shared.close()

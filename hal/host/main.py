@@ -18,7 +18,7 @@ from typing import Any
 from ..errors import ConnectionLost
 from ..histogram import Histogram
 from ..specs import GroupSpec, from_json
-from .cycle import Cycle
+from .cycle import STOP_LIMIT, Cycle
 from .memory import SeriesBox
 from .process import Channel, SharedMemory, pack_error
 from .records import AppRecord, GroupMemory
@@ -209,8 +209,6 @@ STATES_HZ = 500.0
 """Highest rate at which states are published, about, Hz."""
 SNAPSHOTS_HZ = 250.0
 """The same for the world's poses, from which pictures are drawn."""
-STOP_LIMIT = 5.0
-"""Longest time for bringing the arms to rest before the devices are closed anyway, s."""
 
 
 class HostProcess:

@@ -21,8 +21,8 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from ..camera import Camera
-from ..commands import CartesianTarget, Command, JointTarget, Twist
-from ..control import FIRST_STEP_ANGLE, Control
+from ..commands import FIRST_STEP_ANGLE, CartesianTarget, Command, JointTarget, Twist
+from ..control import Control
 from ..deadman import Deadman
 from ..errors import CommandError, DriverMissing, MotionStopped, NotSupported
 from ..geometry import Pose, after_rotation

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from math import hypot, isfinite
 
-from ..commands import CommandRecord
+from ..commands import FIRST_STEP_DISTANCE, FIRST_STEP_TURN, CommandRecord
 from ..geometry import after_rotation, difference, rotate
 from ..types import Limited
 from .envelope import Envelope
@@ -19,9 +19,6 @@ from .smoothing import JointSmoother, speed_for
 __all__ = ["PoseMotion", "TwistMotion"]
 
 Floats = Sequence[float]
-
-FIRST_STEP = (0.05, 0.2)
-"""A first pose farther than this from the set-point is refused, m and rad."""
 
 _LEAD = (0.05, 0.2)
 """How far a goal may run ahead of the set-point, m and rad."""
@@ -178,7 +175,7 @@ class PoseMotion(_CartesianMotion):
 
     def too_far(self, values: Floats) -> bool:
         error = difference(self.envelope.kinematics.fk(self.smoother.q), values)
-        return hypot(*error[:3]) > FIRST_STEP[0] or hypot(*error[3:]) > FIRST_STEP[1]
+        return hypot(*error[:3]) > FIRST_STEP_DISTANCE or hypot(*error[3:]) > FIRST_STEP_TURN
 
     def accept(self, command: CommandRecord) -> None:
         self._pose = command.values

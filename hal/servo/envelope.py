@@ -321,7 +321,7 @@ class TcpReference:
 _TCP_SHARE = 0.97
 """Share of the tcp speed that goals use, for what the stale Jacobian and joints that change speed one by one add."""
 
-_UNLIMITED = 100.0
+UNLIMITED = 100.0
 """From this tcp speed on nothing is checked, m/s."""
 
 _FACE_GAIN = 4.0
@@ -364,7 +364,7 @@ class Envelope:
         self._tcp.open(self.velocity)
         self.tcp_speed = session.tcp_speed
         self.goal_tcp_speed = _TCP_SHARE * session.tcp_speed
-        self.guard = None if self.workspace is None and self.tcp_speed >= _UNLIMITED else self.allows
+        self.guard = None if self.workspace is None and self.tcp_speed >= UNLIMITED else self.allows
 
     # Goals: smooth caps, so that the hard checks below seldom have to act.
 
@@ -374,7 +374,7 @@ class Envelope:
         speed = hypot(*dq)
         if not (speed <= self._slowest and smoother.is_free(smoother.q)):
             return False
-        if self.tcp_speed < _UNLIMITED and not self._tcp.surely_slower(dq, self.goal_tcp_speed):
+        if self.tcp_speed < UNLIMITED and not self._tcp.surely_slower(dq, self.goal_tcp_speed):
             return False
         return self.far_from_faces()
 
@@ -406,7 +406,7 @@ class Envelope:
             The goal, and whether the joints must change their speeds in proportion on the way there: each by itself,
             they might move the tcp too fast in between.
         """
-        if self.tcp_speed >= _UNLIMITED and self.workspace is None:
+        if self.tcp_speed >= UNLIMITED and self.workspace is None:
             return dq, False
         fast = not self._tcp.surely_slower(dq, self.goal_tcp_speed)
         if not fast and self.far_from_faces():
@@ -490,7 +490,7 @@ class Envelope:
 
     def keeps_tcp_speed(self, smoother: JointSmoother) -> bool:
         """Return whether the tcp keeps its speed limit in the proposed step and in a stop after it."""
-        if self.tcp_speed >= _UNLIMITED or self._tcp.surely_stops_slower(self.tcp_speed):
+        if self.tcp_speed >= UNLIMITED or self._tcp.surely_stops_slower(self.tcp_speed):
             return True
         self._refused = Limited.TCP_SPEED
         return False

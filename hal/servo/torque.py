@@ -27,7 +27,7 @@ from ..commands import CommandRecord
 from ..driver import Reading, Setpoint
 from ..specs import LimitsSpec
 from ..types import Limited
-from .envelope import Envelope
+from .envelope import UNLIMITED, Envelope
 from .joint import ServoMotion
 from .smoothing import JointSmoother
 from .watchdog import SILENCE
@@ -71,9 +71,6 @@ _UNWIND = 1.6 * RATE
 
 _INSIDE = 1.0 - 1e-9
 """Share of the torque limits used for braking, so that rounding never shows as a violation."""
-
-_UNLIMITED = 100.0
-"""From this tcp speed on nothing is checked, m/s."""
 
 _SLACK = 5e-3
 """An arm that begins outside a limit may not move farther out than this, rad and m."""
@@ -202,7 +199,7 @@ class TorqueBounds:
 
     def _surely_slower(self, speeds: Floats, cap: float) -> bool:
         """Return whether the tcp provably stays below ``cap`` (m/s) at joint speeds up to ``speeds`` (n,) >= 0."""
-        return cap >= _UNLIMITED or sum(map(mul, self._reach, speeds)) <= cap
+        return cap >= UNLIMITED or sum(map(mul, self._reach, speeds)) <= cap
 
     def towards(self, tau: Floats, goal: Floats) -> list[float]:
         """Return ``tau`` (n,) moved by one tick towards ``goal``, each torque as fast as it may change, Nm."""

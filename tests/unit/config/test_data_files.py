@@ -59,7 +59,7 @@ def test_an_installed_copy_finds_its_own_data(tmp_path: Path) -> None:
 
 
 def test_importing_the_hal_loads_neither_pydantic_nor_yaml() -> None:
-    heavy = "('pydantic', 'yaml', 'pinocchio', 'ruckig', 'pybullet')"
+    heavy = "('pydantic', 'yaml', 'pinocchio', 'ruckig', 'pybullet', 'importlib.resources')"
     code = f"import sys, hal; print([m for m in {heavy} if m in sys.modules])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True)
     assert done.stdout.strip() == "[]"
