@@ -1,4 +1,4 @@
-"""A rig as a Gymnasium environment, the same for the simulated and for the real arm::
+"""A rig as a Gymnasium environment, the same for the simulated and for the real arm.
 
     from hal.learning.gym import RigEnv
 
@@ -363,10 +363,9 @@ class RigEnv(gymnasium.Env[ObservationDict, NDArray[np.float32]]):
         return self._observation_dict(observation), reward, terminated, truncated, info
 
     def _fresh_from(self, sent: float) -> float | None:
-        """Return the oldest time of an acceptable picture, s: after the action, and as new as its camera's rate
-        allows.
+        """Return the oldest time of an acceptable picture, s; None in lock-step, where all show the present.
 
-        None in lock-step, where every picture shows the present.
+        It is after the action, and as new as the rate of the slowest camera allows.
         """
         if self.rig.lock_step:
             return None

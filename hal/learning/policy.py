@@ -80,8 +80,9 @@ def load_object(place: str, what: str) -> Any:
 
 
 def load_policy(place: str, rig: Rig) -> Policy:
-    """Return the policy at ``module:name``. A class is instantiated, with the rig if its constructor takes an
-    argument.
+    """Return the policy at ``module:name``.
+
+    A class is instantiated, with the rig if its constructor takes an argument.
 
     Raises:
         CommandError: It cannot be imported (code ``not_importable``) or called (``not_callable``).

@@ -422,9 +422,7 @@ class TrajectoryPlayer:
         return found
 
     def _begin(self, now: float) -> TimeScaling:
-        """Return the scaling that continues from :attr:`progress`, with the time that the arm needs to get there
-        slowly.
-        """
+        """Return the scaling that continues from :attr:`progress`, after the time to get there slowly."""
         state, spec = self.robot.state(), self.robot.spec
         away = np.abs(self.trajectory.at(self.trajectory.q_set, self.progress) - state.q_set)
         slowly = spec.move_speed * np.asarray(spec.limits.velocity)

@@ -265,9 +265,7 @@ def _names(key: str, old: Sequence[str], new: Sequence[str]) -> str:
 
 
 def _depth(old: Mapping[str, Any], new: Sequence[CameraSetup]) -> Iterator[str]:
-    """Yield the cameras in both whose depth or segmentation is recorded differently; no feature of the dataset shows
-    it.
-    """
+    """Yield differences in depth or segmentation of the cameras in both, which no feature of the dataset shows."""
     for camera in new:
         if camera.name not in old:
             continue

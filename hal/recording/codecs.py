@@ -229,8 +229,9 @@ class PictureStats:
         self._pictures += 1
 
     def stats(self) -> Stats:
-        """Return the statistics of the colours, scaled to 0..1, each of shape (3, 1, 1); ``count`` is the number of
-        pictures.
+        """Return the statistics of the colours.
+
+        Each is of shape (3, 1, 1), scaled to 0..1; ``count`` is the number of pictures.
         """
         levels = np.arange(_LEVELS) / (_LEVELS - 1)
         total = np.maximum(1, self._seen.sum(axis=1))

@@ -106,8 +106,10 @@ class Episode:
 
     @cached_property
     def stamps(self) -> dict[str, NDArray[np.float64]]:
-        """True times (rows,) on the rig's clock, s: ``grid``, when each row was due, and for each source
-        (``robot.panda``, ``camera.wrist``) when the row's values were measured; NaN if that is unknown.
+        """True times (rows,) on the rig's clock, s.
+
+        ``grid`` is when each row was due; each source (``robot.panda``, ``camera.wrist``) has the times at which the
+        row's values were measured, NaN if that is unknown.
         """
         start = float(self.info["t_start"])
         found = _Columns(self.data_file, self.number)
@@ -126,8 +128,9 @@ class Episode:
         return self.pictures(camera, "color")
 
     def depth(self, camera: str) -> Iterator[NDArray[np.float32]]:
-        """Yield the depth picture (H, W) of every row, m; 0 for what was not measured. Raises DeviceNotFound if none
-        was recorded.
+        """Yield the depth picture (H, W) of every row, m; 0 for what was not measured.
+
+        Raises DeviceNotFound if none was recorded.
         """
         return self.pictures(camera, "depth")
 

@@ -299,8 +299,9 @@ def _prepare(layout: DatasetLayout, rest: LiveContent, recovered: bool) -> list[
 
 
 def _columns(rest: LiveContent, t_start: float) -> dict[str, NDArray[Any]]:
-    """Return the columns (rows, n) of a live folder, with times since the first row, and the action: the set-point one
-    row later.
+    """Return the columns (rows, n) of a live folder, with times since the first row.
+
+    The action is the set-point one row later.
     """
     columns: dict[str, NDArray[Any]] = {}
     place = 0

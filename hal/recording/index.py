@@ -206,8 +206,10 @@ def read_index(layout: DatasetLayout) -> dict[str, Any] | None:
 
 
 def check_next_episode(layout: DatasetLayout, info: dict[str, Any] | None) -> None:
-    """Raise DatasetError (``index_wrong``) if the next episode would overwrite a finished one or the index is
-    incomplete.
+    """Check that the index is complete, and that the next episode overwrites no finished one.
+
+    Raises:
+        DatasetError: It is not, or does (code ``index_wrong``).
     """
     number = int(info["total_episodes"]) if info is not None else 0
     for path in layout.files_of(number):
@@ -236,8 +238,9 @@ def read_about(layout: DatasetLayout, number: int) -> dict[str, Any]:
 
 
 def read_entry(path: Path) -> dict[str, Any]:
-    """Return the one row of an episode's :func:`~hal.recording.finish.entry_table`. Raises ValueError for another
-    count.
+    """Return the one row of an episode's :func:`~hal.recording.finish.entry_table`.
+
+    Raises ValueError for another count.
     """
     import pyarrow.parquet as pq
 

@@ -1,6 +1,4 @@
-"""The format of a dataset: its columns, the place of every file, and how a file is written so that a crash leaves it
-whole.
-"""
+"""The format of a dataset: its columns, the place of every file, and how to write files that survive a crash."""
 
 from __future__ import annotations
 
@@ -14,13 +12,10 @@ import shutil
 import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 from ..errors import CommandError, DriverMissing
 from ..types import STREAMS
-
-if TYPE_CHECKING:
-    pass
 
 __all__ = [
     "ACTION",
@@ -253,8 +248,9 @@ class DatasetLayout:
         return sorted(int(path.stem) for path in self.episodes.glob(_ABOUT_FILES))
 
     def target(self, name: str) -> Path:
-        """Return the destination of a file in a partial folder's list. Raises ValueError for a path outside of the
-        dataset.
+        """Return the destination of a file in a partial folder's list.
+
+        Raises ValueError for a path outside of the dataset.
         """
         path = self.root / name
         if Path(name).is_absolute() or ".." in Path(name).parts or path == self.root:

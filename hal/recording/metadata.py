@@ -44,13 +44,13 @@ class ClockPace:
     """How fast each arm's own clock passes, relative to the rig's, over the rows of one episode.
 
     A simulation that cannot keep up with real time is slower than 1.
+
+    Args:
+        columns: Columns of a row: (key, type, names).
+        simulated: Names of the arms in a simulated world.
     """
 
     def __init__(self, columns: Iterable[Sequence[Any]], simulated: Collection[str] = ()) -> None:
-        """Args:
-        columns: Columns of a row: (key, type, names).
-        simulated: Names of the arms in a simulated world.
-        """
         self._places: dict[str, int] = {}
         self._simulated = simulated
         self._reported = 1.0

@@ -12,7 +12,7 @@ import threading
 from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable, Collection, Iterable, Mapping
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -50,19 +50,19 @@ _LATE = 1.0
 history."""
 
 
+Read: TypeAlias = "Callable[[], RowSnapshot | Exception]"
+"""Reads what has no history. An error is returned, and raised when the row is made."""
+Make: TypeAlias = "Callable[[float, RowSnapshot | Exception], bool]"
+"""Makes the row that was due at a time; returns False if no further row is wanted."""
+
+
 class SampleClock(ABC):
     """Calls ``read`` at each due time of a row, and ``make`` once everything that belongs to that time is available.
 
     Subclasses differ in who calls: a thread in real time, the clock itself in lock-step.
     """
 
-    def __init__(
-        self,
-        clock: Clock,
-        fps: int,
-        read: Callable[[], RowSnapshot | Exception],
-        make: Callable[[float, RowSnapshot | Exception], bool],
-    ) -> None:
+    def __init__(self, clock: Clock, fps: int, read: Read, make: Make) -> None:
         self._clock = clock
         self._period = 1.0 / fps
         self._read = read
@@ -88,13 +88,7 @@ class SampleClock(ABC):
 class RealTimeSampleClock(SampleClock):
     """Makes the rows in a thread of its own, so that no control loop waits for them."""
 
-    def __init__(
-        self,
-        clock: Clock,
-        fps: int,
-        read: Callable[[], RowSnapshot | Exception],
-        make: Callable[[float, RowSnapshot | Exception], bool],
-    ) -> None:
+    def __init__(self, clock: Clock, fps: int, read: Read, make: Make) -> None:
         super().__init__(clock, fps, read, make)
         self._number = 0
         """Number of the next row."""
@@ -151,13 +145,7 @@ class RealTimeSampleClock(SampleClock):
 class LockStepSampleClock(SampleClock):
     """Makes each row exactly at its time: the lock-step clock stops there until the row is made."""
 
-    def __init__(
-        self,
-        clock: Clock,
-        fps: int,
-        read: Callable[[], RowSnapshot | Exception],
-        make: Callable[[float, RowSnapshot | Exception], bool],
-    ) -> None:
+    def __init__(self, clock: Clock, fps: int, read: Read, make: Make) -> None:
         super().__init__(clock, fps, read, make)
         assert isinstance(clock, LockStepClock)
         self._stepped = clock

@@ -1,6 +1,4 @@
-"""An export while it is written: what it consists of, its progress, and a file or folder that appears only when
-complete.
-"""
+"""An export while it is written: its contents and progress, and an output that appears only when complete."""
 
 from __future__ import annotations
 
@@ -51,8 +49,10 @@ class ExportJob:
     _done: int = 0
 
     def check(self) -> None:
-        """Raise CommandError if an episode has no arm, or the episodes have different pictures (code
-        ``episodes_differ``).
+        """Check that the episodes can be exported together.
+
+        Raises:
+            CommandError: An episode has no arm (code ``no_arm``), or other pictures than the first (``episodes_differ``).
         """
         first = self.contents[0]
         kept = _streams(first)
