@@ -15,7 +15,7 @@ import numpy as np
 from pydantic import BaseModel, BeforeValidator, Field, model_validator
 
 from hal.config.files import Problems, validate
-from hal.config.schema import Offset, PoseConfig, Size, Strict, describe, is_number
+from hal.config.schema import Offset, PoseConfig, Size, Strict, ValueProblem, describe, is_number
 from hal.errors import ConfigError
 from hal.geometry import Pose, matrix_to_quaternion
 from hal.specs import Floats, GripperSpec, RobotSpec
@@ -40,16 +40,16 @@ def _host(value: Any) -> str:
     """An IPv4 address or a host name."""
     advice = "must be the robot's address, for example 172.16.0.2, without scheme and port"
     if not isinstance(value, str):
-        raise ValueError(f"{advice}, not {describe(value)}")
+        raise ValueProblem(f"{advice}, not {describe(value)}", "bad_address")
     text = value.strip()
     labels = text.removesuffix(".").split(".")
     if labels[-1].isdecimal():  # no host name ends in a number
         try:
             return str(ipaddress.IPv4Address(text))
         except ValueError:
-            raise ValueError(f"{advice}, not {describe(value)}") from None
+            raise ValueProblem(f"{advice}, not {describe(value)}", "bad_address") from None
     if not all(_LABEL.fullmatch(label) for label in labels):
-        raise ValueError(f"{advice}, not {describe(value)}")
+        raise ValueProblem(f"{advice}, not {describe(value)}", "bad_address")
     return text
 
 
@@ -59,10 +59,11 @@ def _each(meaning: str, *ranges: tuple[float, float]) -> BeforeValidator:
     def check(value: Any) -> tuple[float, ...]:
         size = f"{len(ranges)} numbers ({meaning})"
         if not isinstance(value, (list, tuple)) or len(value) != len(ranges):
-            raise ValueError(f"must be a list of {size}, not {describe(value)}")
+            raise ValueProblem(f"must be a list of {size}, not {describe(value)}", "wrong_count")
         for k, (item, (lowest, highest)) in enumerate(zip(value, ranges, strict=True)):
             if not is_number(item) or not lowest <= item <= highest:
-                raise ValueError(f"must be {size}; item {k + 1} is {describe(item)}, outside {lowest:g} to {highest:g}")
+                message = f"must be {size}; item {k + 1} is {describe(item)}, outside {lowest:g} to {highest:g}"
+                raise ValueProblem(message, "out_of_range")
         return tuple(float(item) for item in value)
 
     return BeforeValidator(check)
@@ -98,13 +99,16 @@ class FrameSetting(PoseConfig):
         if len(data) != 4 or not all(
             isinstance(row, (list, tuple)) and len(row) == 4 and all(map(is_number, row)) for row in data
         ):
-            raise ValueError("must be four rows of four numbers, {position, orientation}, or seven numbers")
+            raise ValueProblem(
+                "must be four rows of four numbers, {position, orientation}, or seven numbers", "wrong_count"
+            )
         matrix = np.array(data, float)
         rotation = matrix[:3, :3]
         if not np.allclose(matrix[3], (0, 0, 0, 1)):
-            raise ValueError("the last row of the matrix must be 0, 0, 0, 1; the translation is the last column")
+            message = "the last row of the matrix must be 0, 0, 0, 1; the translation is the last column"
+            raise ValueProblem(message, "bad_matrix")
         if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3) or np.linalg.det(rotation) < 0:
-            raise ValueError("the matrix is not a rotation of a right-handed frame")
+            raise ValueProblem("the matrix is not a rotation of a right-handed frame", "bad_matrix")
         return {"position": matrix[:3, 3].tolist(), "orientation": matrix_to_quaternion(rotation).tolist()}
 
     def matrix(self) -> list[float]:
@@ -130,7 +134,8 @@ class CollisionBehavior(Strict):
             lower, upper = getattr(self, f"lower_{kind}"), getattr(self, f"upper_{kind}")
             for k, (low, high) in enumerate(zip(lower, upper, strict=True)):
                 if low > high:
-                    raise ValueError(f"lower_{kind} must not be above upper_{kind}; item {k + 1}: {low:g} and {high:g}")
+                    message = f"lower_{kind} must not be above upper_{kind}; item {k + 1}: {low:g} and {high:g}"
+                    raise ValueProblem(message, "empty_range")
         return self
 
     def arguments(self) -> tuple[list[float], list[float], list[float], list[float]]:
@@ -154,9 +159,8 @@ class LoadSetting(Strict):
     def _possible(self) -> LoadSetting:
         moments = np.linalg.eigvalsh(self._tensor())
         if moments[0] < -1e-9 or moments[2] > moments[0] + moments[1] + 1e-9:
-            raise ValueError(
-                f"inertia: impossible principal moments {', '.join(f'{value:.3g}' for value in moments)} kg m2"
-            )
+            values = ", ".join(f"{value:.3g}" for value in moments)
+            raise ValueProblem(f"inertia: impossible principal moments {values} kg m2", "bad_inertia")
         return self
 
     def _tensor(self) -> np.ndarray[Any, np.dtype[np.float64]]:
@@ -227,32 +231,33 @@ def is_emulated(options: Mapping[str, Any]) -> bool:
         return host == "localhost"
 
 
-def check_arm(spec: RobotSpec) -> Iterator[tuple[str, str]]:
-    """Yield the problems in an arm's record: key in the arm's entry of the rig file, and message."""
+def check_arm(spec: RobotSpec) -> Iterator[tuple[str, str, str]]:
+    """Yield the problems in an arm's record: key in the arm's entry of the rig file, message and code."""
     yield from _check_options(ArmSettings, spec.options)
     limits = LIMITS.get(str(spec.options.get("arm")))
     if len(spec.joints) != 7:
-        yield "model", f"must have 7 joints for a Franka arm, not {len(spec.joints)}"
+        yield "model", f"must have 7 joints for a Franka arm, not {len(spec.joints)}", "wrong_count"
     elif limits is not None:
         yield from _check_limits(spec, limits)
     if spec.rate_hz != 1000.0:
-        yield "rate_hz", f"must be 1000 Hz, the arm's own rate, not {spec.rate_hz:g}"
+        yield "rate_hz", f"must be 1000 Hz, the arm's own rate, not {spec.rate_hz:g}", "wrong_rate"
 
 
-def check_hand(spec: GripperSpec) -> Iterator[tuple[str, str]]:
-    """Yield the problems in a hand's record: key in the gripper's entry of the rig file, and message."""
+def check_hand(spec: GripperSpec) -> Iterator[tuple[str, str, str]]:
+    """Yield the problems in a hand's record: key in the gripper's entry of the rig file, message and code."""
     yield from _check_options(HandSettings, spec.options)
 
 
-def _check_options(model: type[BaseModel], options: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
+def _check_options(model: type[BaseModel], options: Mapping[str, Any]) -> Iterator[tuple[str, str, str]]:
     problems = Problems()
     validate(model, options, "", problems, "real")
     for problem in problems.found:
         missing = problem.key == "real.host" and "host" not in options
-        yield problem.key, "is missing: the robot's address, for example 172.16.0.2" if missing else problem.message
+        message = "is missing: the robot's address, for example 172.16.0.2" if missing else problem.message
+        yield problem.key, message, problem.code
 
 
-def _check_limits(spec: RobotSpec, official: ArmLimits) -> Iterator[tuple[str, str]]:
+def _check_limits(spec: RobotSpec, official: ArmLimits) -> Iterator[tuple[str, str, str]]:
     """Yield every limit of the servo that exceeds Franka's; ``allow_looser_limits`` does not change that."""
     name = official.model.upper()
     for kind, unit in _UNITS.items():
@@ -266,11 +271,16 @@ def _check_limits(spec: RobotSpec, official: ArmLimits) -> Iterator[tuple[str, s
             yield (
                 f"limits.{kind}",
                 f"{'; '.join(wrong)} {unit}, the limit of the {name}: the arm would stop with a reflex",
+                "out_of_range",
             )
     fast = list(_too_fast(spec, official))
     if fast:
         advice = "lower the speed, or keep a larger distance from the stops"
-        yield "limits", f"{'; '.join(fast)} (the limit of the {name} shrinks towards its stops); {advice}"
+        yield (
+            "limits",
+            f"{'; '.join(fast)} (the limit of the {name} shrinks towards its stops); {advice}",
+            "out_of_range",
+        )
 
 
 def _too_fast(spec: RobotSpec, official: ArmLimits) -> Iterator[str]:

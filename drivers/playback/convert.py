@@ -49,7 +49,7 @@ def convert(events: Path, ioctl: Path | None = None, *, model: str, about: str =
             if match:
                 found.append((float(match[1]), int(match[2], 16), int(match[3], 16), int(match[4])))
             else:
-                problems.append(Problem(str(events), f"line {number}", f"is not an event: {line}"))
+                problems.append(Problem(str(events), f"line {number}", f"is not an event: {line}", "bad_recording"))
         elif match := _RANGE.match(line):
             ranges[int(match[1], 16)] = AxisRange(int(match[2]), int(match[3]), int(match[5]))
     if ioctl is not None:
@@ -60,9 +60,9 @@ def convert(events: Path, ioctl: Path | None = None, *, model: str, about: str =
         if (kind == EV_KEY and code in KEY_NAME) or (kind == EV_ABS and code in ABS_NAME)
     ]
     for code in sorted({code for _, kind, code, _ in wanted if kind == EV_ABS} - set(ranges)):
-        problems.append(Problem(str(events), ABS_NAME[code], "has no range; name the .ioctl file too"))
+        problems.append(Problem(str(events), ABS_NAME[code], "has no range; name the .ioctl file too", "missing_range"))
     if not wanted and not problems:
-        problems.append(Problem(str(events), "", "has no event of a pad"))
+        problems.append(Problem(str(events), "", "has no event of a pad", "bad_recording"))
     if problems:
         raise ConfigError(problems)
     start = wanted[0][0]
@@ -74,7 +74,7 @@ def _lines(path: Path) -> list[str]:
     try:
         return path.read_text(encoding="utf-8", errors="replace").splitlines()
     except OSError as error:
-        raise ConfigError([Problem(str(path), "", f"cannot be read: {error.strerror}")]) from None
+        raise ConfigError([Problem(str(path), "", f"cannot be read: {error.strerror}", "unreadable")]) from None
 
 
 def _ioctl_ranges(lines: Iterable[str]) -> dict[int, AxisRange]:

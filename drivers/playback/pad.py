@@ -200,16 +200,16 @@ class PlaybackPad(GamepadDriver):
         self._mapper = None
 
 
-def check(spec: PadSpec) -> Iterator[tuple[str, str]]:
-    """Yield (key in the pad's entry of the rig, message) for each problem of a recorded pad."""
+def check(spec: PadSpec) -> Iterator[tuple[str, str, str]]:
+    """Yield (key in the pad's entry of the rig, message, code) for each problem of a recorded pad."""
     try:
         PlaybackPad(spec).open()  # reads the recording; there is no device
     except ConfigError as error:
         for problem in error.problems:
             if problem.file == f"gamepads.{spec.name}":
-                yield f"options.{problem.key}", problem.message
+                yield f"options.{problem.key}", problem.message, problem.code
             else:
-                yield "file", ": ".join(filter(None, [problem.file, problem.key, problem.message]))
+                yield "file", ": ".join(filter(None, [problem.file, problem.key, problem.message])), problem.code
 
 
 # The file format.
@@ -285,7 +285,7 @@ class _RecordingParser:
         self.problems: list[Problem] = []
 
     def _add_problem(self, line: int, message: str) -> None:
-        self.problems.append(Problem(self.file, f"line {line}", message))
+        self.problems.append(Problem(self.file, f"line {line}", message, "bad_recording"))
 
     def parse(self, lines: Sequence[str]) -> PadRecording:
         objects = [

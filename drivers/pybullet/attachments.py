@@ -37,12 +37,13 @@ class AttachedObjects:
             arms = [name for name, other in bodies.items() if other.is_robot]
             key = f"objects.{body.name}.attached"
             if spec.robot not in arms:
-                problems.append(Problem("objects", f"{key}.robot", f"no arm {spec.robot!r}{nearest(spec.robot, arms)}"))
+                text = f"no arm {spec.robot!r}{nearest(spec.robot, arms)}"
+                problems.append(Problem("objects", f"{key}.robot", text, "unknown_device"))
                 continue
             arm = bodies[spec.robot]
             if spec.link is not None and spec.link not in arm.links:
                 text = f"robot {spec.robot!r} has no link {spec.link!r}{nearest(spec.link, arm.links)}"
-                problems.append(Problem("objects", f"{key}.link", text))
+                problems.append(Problem("objects", f"{key}.link", text, "unknown_link"))
                 continue
             self._places.append((body, arm, -1 if spec.link is None else arm.links[spec.link]))
         if problems:

@@ -291,8 +291,8 @@ def choose_renderer(scene: PyBulletWorld, name: str = "auto") -> Renderer:
         DriverMissing: ``gl`` was required by name and is not available.
     """
     if name not in ("auto", "gl", "tiny"):
-        problem = Problem("simulation", "simulation.renderer", f"is {name!r}; renderers: auto, gl, tiny")
-        raise ConfigError([problem])
+        message = f"is {name!r}; renderers: auto, gl, tiny"
+        raise ConfigError([Problem("simulation", "simulation.renderer", message, "unknown_renderer")])
     reason = ""
     if name != "tiny":
         try:

@@ -165,7 +165,8 @@ def check_view(world: PosedWorld, spec: CameraSpec) -> None:
         try:
             world.pose(view.robot, view.link)
         except DeviceNotFound as error:
-            raise ConfigError([Problem("cameras", f"cameras.{spec.name}.attached", str(error))]) from None
+            key = f"cameras.{spec.name}.attached"
+            raise ConfigError([Problem("cameras", key, str(error), error.code)]) from None
 
 
 # --- options of the depth noise --------------------------------------------------------------------------------------
@@ -211,7 +212,7 @@ _OPTIONS: dict[str, type[StereoNoiseOptions] | type[LidarNoiseOptions]] = {
 }
 
 
-def check(spec: CameraSpec) -> Iterator[tuple[str, ...]]:
+def check(spec: CameraSpec) -> Iterator[tuple[str, str, str]]:
     """Yield (key in the camera's entry of the rig, message, code) for each problem in a simulated camera's options."""
     problems = Problems()
     _read_options(spec, problems)

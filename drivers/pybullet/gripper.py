@@ -174,5 +174,6 @@ def _owner(spec: GripperSpec, world: PyBulletWorld) -> Body:
     owners = [body for body in world.bodies.values() if isinstance(body.spec, RobotSpec) and body.spec.gripper == spec]
     if len(owners) != 1 or not spec.joints:
         message = f"{len(owners)} robots have it" if spec.joints else "names no finger joints"
-        raise ConfigError([Problem("grippers", spec.name, f"{message}; it needs one robot and its finger joints")])
+        message += "; it needs one robot and its finger joints"
+        raise ConfigError([Problem("grippers", spec.name, message, "wrong_count" if spec.joints else "missing_key")])
     return owners[0]

@@ -54,7 +54,7 @@ def load_object(client: PyBulletClient, spec: BodySpec, drawn: bool = True) -> t
         body = _describe(client, spec, number, key)
         return body, []
     if spec.urdf is None:
-        raise ConfigError([Problem("objects", f"{key}.urdf", "is missing, and the shape is urdf")])
+        raise ConfigError([Problem("objects", f"{key}.urdf", "is missing, and the shape is urdf", "missing_key")])
     urdf = _read_urdf(spec.urdf, f"{key}.urdf")
     massless = _massless(urdf)
     number = _load_urdf(client, spec.urdf, f"{key}.urdf", fixed=_is_fixed(spec), scale=spec.scale, drawn=drawn)
@@ -158,7 +158,7 @@ def _load_urdf(client: PyBulletClient, path: str, key: str, *, fixed: bool, scal
             pass  # reported below, with what PyBullet printed
     if number < 0:
         printed = " ".join(captured.text.split())
-        raise ConfigError([Problem(path, key, f"PyBullet cannot load it. {printed}".strip())])
+        raise ConfigError([Problem(path, key, f"PyBullet cannot load it. {printed}".strip(), "bad_urdf")])
     return number
 
 
@@ -166,13 +166,15 @@ def _make_shape(client: PyBulletClient, spec: BodySpec, key: str) -> int:
     def need(name: str) -> float:
         value = getattr(spec, name)
         if value is None:
-            raise ConfigError([Problem("objects", f"{key}.{name}", f"is missing, and a {spec.shape} needs it")])
+            message = f"is missing, and a {spec.shape} needs it"
+            raise ConfigError([Problem("objects", f"{key}.{name}", message, "missing_key")])
         return float(value)
 
     drawn_at: Sequence[float] = (0.0, 0.0, 0.0)
     if spec.shape == "box":
         if spec.half_extents is None:
-            raise ConfigError([Problem("objects", f"{key}.half_extents", "is missing, and a box needs it")])
+            message = "is missing, and a box needs it"
+            raise ConfigError([Problem("objects", f"{key}.half_extents", message, "missing_key")])
         solid = drawn = {"shapeType": client.GEOM_BOX, "halfExtents": spec.half_extents}
     elif spec.shape == "sphere":
         solid = drawn = {"shapeType": client.GEOM_SPHERE, "radius": need("radius")}
@@ -186,8 +188,8 @@ def _make_shape(client: PyBulletClient, spec: BodySpec, key: str) -> int:
         drawn = {"shapeType": client.GEOM_BOX, "halfExtents": (x, y, 0.005)}
         drawn_at = (0.0, 0.0, -0.005)
     else:
-        shapes = "box, sphere, cylinder, capsule, plane, urdf"
-        raise ConfigError([Problem("objects", f"{key}.shape", f"is {spec.shape!r}; shapes: {shapes}")])
+        message = f"is {spec.shape!r}; shapes: box, sphere, cylinder, capsule, plane, urdf"
+        raise ConfigError([Problem("objects", f"{key}.shape", message, "unknown_shape")])
     shape = client.createCollisionShape(**solid) if spec.collision else -1
     visual = (
         client.createVisualShape(**drawn, rgbaColor=spec.rgba, visualFramePosition=drawn_at) if spec.visible else -1
@@ -215,7 +217,7 @@ def _describe(client: PyBulletClient, spec: BodySpec | RobotSpec, number: int, k
             movable.append(joint)
         elif info[2] != client.JOINT_FIXED:
             message = f"joint {info[1].decode()!r} is neither fixed, revolute, continuous nor prismatic"
-            raise ConfigError([Problem(str(spec.urdf), key, message)])
+            raise ConfigError([Problem(str(spec.urdf), key, message, "wrong_joint")])
     dynamics = client.getDynamicsInfo(number, -1)
     fixed = isinstance(spec, RobotSpec) or _is_fixed(spec)
     base: Transform = ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
@@ -239,7 +241,12 @@ def _check_names(body: Body, spec: RobotSpec, fingers: Sequence[str], key: str) 
     """Raise ConfigError unless every joint that the record names exists and is movable, and its base link exists."""
     moving = {name for name, joint in body.joints.items() if joint in body.movable}
     problems = [
-        Problem(spec.urdf, f"{key}.{where}", f"has no movable joint {name!r}; movable: {', '.join(sorted(moving))}")
+        Problem(
+            spec.urdf,
+            f"{key}.{where}",
+            f"has no movable joint {name!r}; movable: {', '.join(sorted(moving))}",
+            "unknown_joint",
+        )
         for where, names in (("joints", spec.joints), ("gripper.joints", fingers))
         for name in names
         if name not in moving
@@ -247,7 +254,7 @@ def _check_names(body: Body, spec: RobotSpec, fingers: Sequence[str], key: str) 
     base_link = spec.kinematics.base_link
     if base_link is not None and base_link not in body.links:
         message = f"has no link {base_link!r}; links: {', '.join(body.links)}"
-        problems.append(Problem(spec.urdf, f"{key}.base_link", message))
+        problems.append(Problem(spec.urdf, f"{key}.base_link", message, "unknown_link"))
     if problems:
         raise ConfigError(problems)
 

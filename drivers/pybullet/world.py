@@ -151,13 +151,14 @@ class PyBulletWorld:
             if depth > OVERLAP:
                 message = f"starts {depth:.3f} m inside robot {a.name!r} (its {link_b} in {link_a})"
                 remedy = "change its base or initial; a URDF with two arms is loaded whole for every entry: split it"
-                problems.append(Problem("simulation", f"robots.{b.name}", f"{message}; {remedy}"))
+                problems.append(Problem("simulation", f"robots.{b.name}", f"{message}; {remedy}", "robots_overlap"))
         if problems:
             raise ConfigError(problems)
 
     def _place(self, spec: BodySpec | RobotSpec) -> Body:
         if spec.name in self.bodies:
-            raise ConfigError([Problem("world", spec.name, "names two bodies; names must be unique in the world")])
+            message = "names two bodies; names must be unique in the world"
+            raise ConfigError([Problem("world", spec.name, message, "duplicate_name")])
         if isinstance(spec, RobotSpec):
             body, warnings = load_robot(self.client, spec, self.drawn)
         else:

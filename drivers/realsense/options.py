@@ -15,7 +15,7 @@ from typing import Annotated, Any, NamedTuple, TypeAlias
 from pydantic import BeforeValidator, Field, model_validator
 
 from hal.config.files import Problems, validate
-from hal.config.schema import Flag, Quantity, Seconds, Strict, describe, is_number
+from hal.config.schema import Flag, Quantity, Seconds, Strict, ValueProblem, describe, is_number
 from hal.errors import CommandError, ConfigError, NotSupported
 from hal.specs import CameraSpec
 
@@ -50,9 +50,11 @@ def _check_serial(value: Any) -> Any:
     if value is None:
         return None
     if isinstance(value, int) and not isinstance(value, bool):
-        raise ValueError(f'must be text, because leading zeros count: write it in quotes, "{value}"')
+        raise ValueProblem(f'must be text, because leading zeros count: write it in quotes, "{value}"', "wrong_type")
     if not isinstance(value, str) or not value.strip():
-        raise ValueError(f"must be the number that is printed on the camera, in quotes, not {describe(value)}")
+        raise ValueProblem(
+            f"must be the number that is printed on the camera, in quotes, not {describe(value)}", "wrong_type"
+        )
     return value.strip()
 
 
@@ -60,17 +62,19 @@ def _check_recording(value: Any) -> Any:
     if value is None:
         return None
     if not isinstance(value, str) or not value.endswith(_SUFFIX):
-        raise ValueError(f"must be the path of a recording that ends in {_SUFFIX}, not {describe(value)}")
+        raise ValueProblem(
+            f"must be the path of a recording that ends in {_SUFFIX}, not {describe(value)}", "bad_suffix"
+        )
     return str(Path(value).expanduser())
 
 
 def _check_options(value: Any) -> Any:
     if not isinstance(value, dict):
-        raise ValueError(f"must hold names and values, not {describe(value)}")
+        raise ValueProblem(f"must hold names and values, not {describe(value)}", "wrong_type")
     for name, item in value.items():
         if name in _SENSORS:
             if not isinstance(item, dict):
-                raise ValueError(f"{name} must hold names and values, not {describe(item)}")
+                raise ValueProblem(f"{name} must hold names and values, not {describe(item)}", "wrong_type")
             for inner, setting in item.items():
                 _check_option(f"{name}.{inner}", setting)
         else:
@@ -80,7 +84,7 @@ def _check_options(value: Any) -> Any:
 
 def _check_option(name: str, value: Any) -> None:
     if not (is_number(value) or isinstance(value, (bool, str))):
-        raise ValueError(f"{name} must be a number, true, false or a word, not {describe(value)}")
+        raise ValueProblem(f"{name} must be a number, true, false or a word, not {describe(value)}", "wrong_type")
 
 
 def _check_emulated(value: Any) -> Any:
@@ -89,7 +93,7 @@ def _check_emulated(value: Any) -> Any:
     try:
         Emulation.from_options(value)
     except CommandError as error:
-        raise ValueError(str(error)) from None
+        raise ValueProblem(str(error), error.code) from None
     return {} if value is True else dict(value)
 
 
@@ -120,14 +124,16 @@ class RealSenseSettings(Strict):
     @model_validator(mode="after")
     def _check_source(self) -> RealSenseSettings:
         if self.play is not None and self.record is not None:
-            raise ValueError("plays a recording or makes one: give play or record")
+            raise ValueProblem("plays a recording or makes one: give play or record", "conflict")
         if self.play is not None and self.emulated is not None:
-            raise ValueError("has one source of frames: give play or emulated")
+            raise ValueProblem("has one source of frames: give play or emulated", "conflict")
         if self.play is not None and self.options:
-            raise ValueError("plays a recording, whose options were set when it was made: leave options out")
+            raise ValueProblem(
+                "plays a recording, whose options were set when it was made: leave options out", "conflict"
+            )
         for key, other in _NEEDS.items():
             if key in self.model_fields_set and getattr(self, other) is None:
-                raise ValueError(f"has {key}, which has no effect without {other}")
+                raise ValueProblem(f"has {key}, which has no effect without {other}", "missing_key")
         return self
 
     @property
@@ -145,11 +151,11 @@ class RealSenseSettings(Strict):
         return settings
 
 
-def problems(spec: CameraSpec) -> Iterator[tuple[str, ...]]:
+def problems(spec: CameraSpec) -> Iterator[tuple[str, str, str]]:
     """Check a camera's record.
 
     Yields:
-        Key in the camera's entry of the rig file (``real.serial``), message, and code where there is one.
+        Key in the camera's entry of the rig file (``real.serial``), message and code.
     """
     found = Problems()
     validate(RealSenseSettings, spec.options, "", found, "real")
@@ -157,18 +163,23 @@ def problems(spec: CameraSpec) -> Iterator[tuple[str, ...]]:
         yield problem.key, problem.message, problem.code
     played = spec.options.get("play")
     if isinstance(played, str) and not found.found and not Path(played).expanduser().is_file():
-        yield "real.play", f"there is no recording {played}"
+        yield "real.play", f"there is no recording {played}", "missing_file"
     recorded = spec.options.get("record")
     if isinstance(recorded, str) and not found.found and not Path(recorded).expanduser().parent.is_dir():
-        yield "real.record", f"there is no folder {Path(recorded).expanduser().parent} for the recording"
+        folder = Path(recorded).expanduser().parent
+        yield "real.record", f"there is no folder {folder} for the recording", "missing_folder"
     for stream in spec.streams:
         formats = FORMATS.get(stream)
         if formats is None:
-            yield f"streams.{stream}", f"a RealSense has no such stream; it has {', '.join(FORMATS)}"
+            yield (
+                f"streams.{stream}",
+                f"no such stream; streams: {', '.join(FORMATS)}",
+                "unknown_stream",
+            )
             continue
         wanted = spec.sensors[stream].format if stream in spec.sensors else None
         if wanted is not None and wanted not in formats:
-            yield f"streams.{stream}.format", f"{describe(wanted)} is none of {', '.join(formats)}"
+            yield f"streams.{stream}.format", f"{describe(wanted)} is none of {', '.join(formats)}", "unknown_format"
 
 
 # The camera's own options.

@@ -30,11 +30,6 @@ class ArkUrdf:
     def __init__(self, path: Path) -> None:
         self.model = read_urdf(path)
 
-    @property
-    def root(self) -> str:
-        """The link that is no joint's child."""
-        return self.model.root
-
     def is_fixed(self, link: str) -> bool:
         """Return whether a fixed joint connects it to its parent."""
         return any(joint.kind == "fixed" and joint.child == link for joint in self.model.joints.values())
@@ -46,9 +41,9 @@ class ArkUrdf:
         branches that it has merged in an order of its own.
         """
         if not merged:
-            return list(self._below(self.root))
+            return list(self._below(self.model.root))
         chain: list[UrdfJoint] = []
-        following = self._moving(self.root)
+        following = self._moving(self.model.root)
         while len(following) == 1:
             chain += following
             following = self._moving(following[0].child)
@@ -153,7 +148,7 @@ def arm_model(
 def _joints(
     node: ArkNode, urdf: ArkUrdf, order: list[UrdfJoint], reading: ArkReader, ledger: KeyReport
 ) -> list[UrdfJoint]:
-    """The arm's joints, from base to tip: those of the group ``arm``, or all outside a gripper."""
+    """Return the arm's joints, from base to tip: those of the group ``arm``, or all outside a gripper."""
     groups = node.get("joint_groups")
     named: dict[str, ArkNode] = {}
     for name, group in (groups.children if groups is not None else {}).items():
@@ -161,7 +156,8 @@ def _joints(
         named[name] = names
         for k, joint in enumerate(reading.words(names)):
             if joint not in urdf.model.joints:
-                raise reading.wrong(names, f"item {k + 1}: {urdf.model.path.name} has no joint {joint!r}")
+                message = f"item {k + 1}: {urdf.model.path.name} has no joint {joint!r}"
+                raise reading.wrong(names, message, "unknown_joint")
         ledger.changed(group.get("control_mode"), "", "chosen by each command: JointTarget, JointVelocity, ...")
     moving = [joint for joint in (order or urdf.model.joints.values()) if joint.movable]
     fingers = {joint for name, names in named.items() if "grip" in name.lower() for joint in names.data}
@@ -171,29 +167,30 @@ def _joints(
         joint for joint in moving if joint.kind != "prismatic" and joint.name not in fingers
     ]
     if not joints:
-        raise reading.wrong(node, f"{urdf.model.path.name} has no joints that could be an arm's")
+        message = f"{urdf.model.path.name} has no joints that could be an arm's"
+        raise reading.wrong(node, message, "unknown_joint")
     for name, names in named.items():
         if name == chosen:
             fixed = "; without those that are fixed" if any(not joint.movable for joint in wanted) else ""
             ledger.kept(names, "", f"joints, in the model made for it{fixed}")
         elif set(names.data) <= fingers:
-            ledger.ignored(names, "no gripper is made of them: width, speed and force are unknown")
+            ledger.ignored(names, "not imported as a gripper: width, speed and force are unknown")
         else:
-            ledger.ignored(names, "the arm and its gripper are commanded apart")
+            ledger.ignored(names, "arm and gripper are commanded separately")
     return joints
 
 
 def _tcp(
     node: ArkNode, urdf: ArkUrdf, order: list[UrdfJoint], joints: list[UrdfJoint], reading: ArkReader, ledger: KeyReport
 ) -> tuple[str, bool]:
-    """The tcp's link, and whether it is a guess."""
+    """Return the tcp's link, and whether it is a guess."""
     index = node.get("ee_index")
     last = joints[-1].child
     if index is None:
         return last, True
     number = reading.whole(index)
     if not 0 <= number < len(order):
-        ledger.changed(index, "", f"no joint of that number is known here: the tcp is at {last}; CHECK it in the model")
+        ledger.changed(index, "", f"there is no joint of that number: the tcp is at {last}; CHECK it in the model")
         return last, True
     link = order[number].child
     below = {joint.name for joint in urdf.model.above(link)}
@@ -218,14 +215,16 @@ def _home(
     places = [numbers.get(joint.name, len(values)) for joint in joints]
     if max(places) >= len(values):
         raise reading.wrong(
-            initial, f"has {len(values)} numbers, and {joints[-1].name} is none of the first as many joints"
+            initial,
+            f"has {len(values)} numbers, and {joints[-1].name} is not among the first {len(values)} joints",
+            "wrong_count",
         )
     ledger.changed(initial, "", f"home, in the model made for it: the {len(joints)} numbers of the arm's joints")
     return [values[place] for place in places]
 
 
 def _speeds(joints: list[UrdfJoint]) -> tuple[list[float], list[str]]:
-    """Speed of each joint, and notes on those that are not the URDF's."""
+    """Return the speed of each joint, and notes on those that are not the URDF's."""
     speeds, odd = [], []
     for joint in joints:
         least, most = SLOWEST.get(joint.kind, SLOW), FASTEST.get(joint.kind, FAST)

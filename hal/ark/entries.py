@@ -112,7 +112,7 @@ class ImportState:
         if listed is None:
             return
         if not isinstance(listed.data, list):
-            raise self.reading.wrong(listed, "must be a list of files, or of items with name and config")
+            raise self.reading.wrong(listed, "must be a list of files, or of items with name and config", "wrong_type")
         if not listed.children:
             self.ledger.kept(listed, RIG_SECTIONS[section], "the files are read")
         for k, entry in enumerate(listed.data):
@@ -132,11 +132,13 @@ class ImportState:
         elif isinstance(entry, dict) and node is not None:
             item = node
         else:
-            raise self.reading.wrong(node or listed, f"must be files, or items with name and config, not {entry!r}")
+            message = f"must be files, or items with name and config, not {entry!r}"
+            raise self.reading.wrong(node or listed, message, "wrong_type")
         name = self.reading.need(item, "name")
         given = self.reading.text(name)
         if given in self.given[section]:
-            raise self.reading.wrong(name, f"{given!r} is given twice among the {section}; Ark takes the last")
+            message = f"{given!r} is given twice among the {section}; Ark takes the last"
+            raise self.reading.wrong(name, message, "duplicate_name")
         self.given[section].append(given)
         config = self.reading.need(item, "config")
         if given in self.options.without:

@@ -179,7 +179,7 @@ def _check(imported: Imported, ledger: KeyReport) -> None:
 
 
 def _in_ark(problem: Problem, imported: Imported, rig: Path, ledger: KeyReport) -> Problem:
-    """A problem of the new rig, as one of the line in Ark's files that it comes from."""
+    """Return a problem of the new rig as one of the line in Ark's files that it comes from."""
     if problem.file == str(rig):
         node, where = ledger.origin(problem.key), f"as {problem.key} of the rig"
     else:
@@ -188,4 +188,4 @@ def _in_ark(problem: Problem, imported: Imported, rig: Path, ledger: KeyReport) 
             return problem
         node, where = ledger.origin(f"robots.{made[0]}.model"), f"as {problem.key} of the model made for it"
     place, key = (node.place, node.key) if node is not None else (str(imported.source), "")
-    return Problem(place, key, f"{problem.message} ({where})")
+    return Problem(place, key, f"{problem.message} ({where})", problem.code)

@@ -106,9 +106,9 @@ class ArkReader:
         self.files: dict[Path, ArkNode] = {}
         """Files read so far, in order."""
 
-    def wrong(self, node: ArkNode, message: str) -> InvalidValue:
+    def wrong(self, node: ArkNode, message: str, code: str) -> InvalidValue:
         """Note a problem and return the exception to raise."""
-        self.problems.add(node.place, node.key, message)
+        self.problems.add(node.place, node.key, message, code)
         return InvalidValue()
 
     def file(self, path: Path) -> ArkNode:
@@ -122,65 +122,69 @@ class ArkReader:
             text = path.read_text(encoding="utf-8")
         except FileNotFoundError:
             siblings = [p.name for p in path.parent.glob("*.y*ml")] if path.parent.is_dir() else []
-            self.problems.add(path, "", "there is no such file" + (nearest(path.name, siblings) if siblings else ""))
+            hint = nearest(path.name, siblings) if siblings else ""
+            self.problems.add(path, "", f"there is no such file{hint}", "missing_file")
             raise InvalidValue from None
         except (OSError, UnicodeDecodeError) as error:
-            self.problems.add(path, "", f"cannot be read: {error}")
+            self.problems.add(path, "", f"cannot be read: {error}", "unreadable")
             raise InvalidValue from None
         try:
             root, data = _parse(text)
         except yaml.YAMLError as error:
             line, message = _not_yaml(text, error)
-            self.problems.add(f"{path}:{line}", "", message)
+            self.problems.add(f"{path}:{line}", "", message, "bad_yaml")
             raise InvalidValue from None
         if not isinstance(data, dict) or root is None:
-            self.problems.add(path, "", f"must be keys and values, not {describe(data)}")
+            self.problems.add(path, "", f"must be keys and values, not {describe(data)}", "wrong_type")
             raise InvalidValue
-        for line, key, message in (*_long_quotes(root, ""), *_twice(root, "")):
-            self.problems.add(f"{path}:{line}", key, message)
+        for line, key, message in _long_quotes(root, ""):
+            self.problems.add(f"{path}:{line}", key, message, "bad_yaml")
+        for line, key, message in _twice(root, ""):
+            self.problems.add(f"{path}:{line}", key, message, "duplicate_key")
         return _node(path, 1, "", root, data)
 
     def need(self, node: ArkNode, key: str) -> ArkNode:
         """Return the value of a required key."""
         child = node.get(key)
         if child is None:
-            raise self.wrong(node, f"{key!r} is missing")
+            raise self.wrong(node, f"{key!r} is missing", "missing_key")
         return child
 
     def keys(self, node: ArkNode) -> ArkNode:
         """Return the same node if it is a mapping."""
         if not isinstance(node.data, dict):
-            raise self.wrong(node, f"must be keys and values, not {describe(node.data)}")
+            raise self.wrong(node, f"must be keys and values, not {describe(node.data)}", "wrong_type")
         return node
 
     def text(self, node: ArkNode) -> str:
         """Return a text that is not empty."""
         if not isinstance(node.data, str) or not node.data:
-            raise self.wrong(node, f"must be a text, not {describe(node.data)}")
+            raise self.wrong(node, f"must be a text, not {describe(node.data)}", "wrong_type")
         return node.data
 
     def words(self, node: ArkNode) -> list[str]:
         """Return a list of texts."""
         if not isinstance(node.data, list) or not all(isinstance(item, str) for item in node.data):
-            raise self.wrong(node, f"must be a list of names, not {describe(node.data)}")
+            raise self.wrong(node, f"must be a list of names, not {describe(node.data)}", "wrong_type")
         return list(node.data)
 
     def flag(self, node: ArkNode) -> bool:
         """Return true or false; 1 and 0 are accepted, as by PyBullet."""
         if node.data not in (True, False, 0, 1):
-            raise self.wrong(node, f"must be true or false, not {describe(node.data)}")
+            raise self.wrong(node, f"must be true or false, not {describe(node.data)}", "wrong_type")
         return bool(node.data)
 
     def whole(self, node: ArkNode) -> int:
         """Return a whole number."""
         if not isinstance(node.data, int) or isinstance(node.data, bool):
-            raise self.wrong(node, f"must be a whole number, not {describe(node.data)}")
+            raise self.wrong(node, f"must be a whole number, not {describe(node.data)}", "wrong_type")
         return node.data
 
     def number(self, node: ArkNode, *, positive: bool = False) -> float | int:
         """Return a number as written."""
         if not is_number(node.data) or (positive and not node.data > 0):
-            raise self.wrong(node, f"must be a {'positive ' if positive else ''}number, not {describe(node.data)}")
+            message = f"must be a {'positive ' if positive else ''}number, not {describe(node.data)}"
+            raise self.wrong(node, message, "out_of_range" if is_number(node.data) else "wrong_type")
         value: float | int = node.data
         return value
 
@@ -189,17 +193,17 @@ class ArkReader:
         data = node.data
         if not isinstance(data, list) or (counts and len(data) not in counts):
             size = f"{' or '.join(map(str, sorted(counts)))} numbers" if counts else "numbers"
-            raise self.wrong(node, f"must be a list of {size}, not {describe(data)}")
+            raise self.wrong(node, f"must be a list of {size}, not {describe(data)}", "wrong_count")
         for k, item in enumerate(data):
             if not is_number(item):
-                raise self.wrong(node, f"must be numbers; item {k + 1} is {describe(item)}")
+                raise self.wrong(node, f"must be numbers; item {k + 1} is {describe(item)}", "wrong_type")
         return list(data)
 
     def rotation(self, node: ArkNode) -> list[float | int]:
         """Return three angles, or a quaternion that is not zero."""
         values = self.numbers(node, (3, 4))
         if len(values) == 4 and math.hypot(*values) < 1e-6:
-            raise self.wrong(node, "is no rotation: a quaternion of nothing but zeros")
+            raise self.wrong(node, "is no rotation: all four numbers of the quaternion are zero", "bad_rotation")
         return values
 
     def raise_any(self) -> None:
@@ -239,7 +243,7 @@ def _node(file: Path, line: int, key: str, node: yaml.Node, data: Any) -> ArkNod
 
 
 def _twice(node: yaml.Node, key: str) -> Iterator[tuple[int, str, str]]:
-    """Repeated keys: line, key and message."""
+    """Yield line, key and message of each repeated key."""
     if isinstance(node, yaml.MappingNode):
         first: dict[str, int] = {}
         for name, value in node.value:
@@ -254,7 +258,7 @@ def _twice(node: yaml.Node, key: str) -> Iterator[tuple[int, str, str]]:
 
 
 def _long_quotes(node: yaml.Node, key: str) -> Iterator[tuple[int, str, str]]:
-    """Quoted texts that span several lines and contain YAML: line, key and message."""
+    """Yield line, key and message of each quoted text that spans several lines and contains YAML."""
     if isinstance(node, yaml.MappingNode):
         for name, value in node.value:
             yield from _long_quotes(value, f"{key}.{name.value}" if key else str(name.value))
@@ -264,28 +268,27 @@ def _long_quotes(node: yaml.Node, key: str) -> Iterator[tuple[int, str, str]]:
     elif isinstance(node, yaml.ScalarNode) and node.style in ('"', "'") and ":" in node.value:
         first, last = node.start_mark.line + 1, node.end_mark.line + 1
         if last > first:
-            yield first, key, f"the quote that opens in this line closes only in line {last}: is one missing?"
+            yield first, key, f"the quote that opens in this line closes only in line {last}; one may be missing"
 
 
 def _not_yaml(text: str, error: yaml.YAMLError) -> tuple[int, str]:
-    """Line and message of a syntax error. For an unclosed quote the line where it opens, not where parsing failed."""
+    """Return line and message of a syntax error; for an unclosed quote the line where it opens."""
     if isinstance(error, yaml.reader.ReaderError):
-        return text.count(
-            "\n", 0, error.position
-        ) + 1, f"holds a character that YAML does not allow: {error.character:#x}"
+        line = text.count("\n", 0, error.position) + 1
+        return line, f"has a character that YAML does not allow: {error.character:#x}"
     mark = getattr(error, "problem_mark", None) or getattr(error, "context_mark", None)
     line = mark.line + 1 if mark is not None else 1
-    said = getattr(error, "problem", None) or " ".join(str(error).split())
+    reason = getattr(error, "problem", None) or " ".join(str(error).split())
     lines = text.splitlines()
     for number, content in enumerate(lines[:line], start=1):
         if _open_quote(content):
-            return number, f"the quote that opens here is not closed: {content.strip()} (in line {line}: {said})"
+            return number, f"the quote that opens here is not closed: {content.strip()} (in line {line}: {reason})"
     shown = lines[line - 1].strip() if line <= len(lines) else ""
-    return line, f"is not valid YAML: {said}" + (f": {shown}" if shown else "")
+    return line, f"is not valid YAML: {reason}" + (f": {shown}" if shown else "")
 
 
 def _open_quote(line: str) -> bool:
-    """Whether a quoted text begins in this line and does not end in it."""
+    """Return whether a quoted text begins in this line and does not end in it."""
     quote = ""
     before = " "
     for letter in line:

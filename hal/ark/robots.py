@@ -158,7 +158,7 @@ class ArkArm:
         """
         links = self.known.links if self.known is not None else tuple(self.urdf.model.links) if self.urdf else ()
         if link is None:
-            base = self.known.base_link if self.known is not None else self.urdf.root if self.urdf else links[0]
+            base = self.known.base_link if self.known is not None else self.urdf.model.root if self.urdf else links[0]
             return base, Pose(), "Ark's file names no link, which means the base"
         found = self.urdf.place(link, links) if self.urdf is not None else None
         gone = found is None and self.urdf is not None and link not in self.urdf.model.links
@@ -200,6 +200,7 @@ def import_arm(item: ArkItem, work: ImportState) -> ArkArm:
             f"there is no file {reading.need(node, 'urdf_path').data!r}, in class_dir or in {places.searched()}, and "
             f"the joints are not those of {' or '.join(FRANKAS)}. Add --urdf {given}=FILE, or --arm {given}=MODEL for "
             f"a built-in model ({', '.join(list_data('robots'))}), or --without {given}",
+            "missing_file",
         )
     _base(arm, node, key, reading, ledger)
     if arm.known is not None:
@@ -213,12 +214,12 @@ def import_arm(item: ArkItem, work: ImportState) -> ArkArm:
 
 
 def _urdf(given: str, node: ArkNode, reading: ArkReader, places: FileFinder, options: ArkOptions) -> ArkUrdf | None:
-    """Ark's URDF, if it is found: in ``class_dir``, which is relative to where Ark starts."""
+    """Return Ark's URDF, from ``class_dir``, which is relative to where Ark starts; None if it is not found."""
     path, folder = node.get("urdf_path"), node.get("class_dir")
     if given in options.urdfs:
         found: Path | None = options.urdfs[given].resolve()
         if found is None or not found.is_file():
-            raise reading.wrong(path or node, f"there is no file {found}, which --urdf names")
+            raise reading.wrong(path or node, f"there is no file {found}, which --urdf names", "missing_file")
     elif path is None:
         return None
     else:
@@ -229,7 +230,7 @@ def _urdf(given: str, node: ArkNode, reading: ArkReader, places: FileFinder, opt
     try:
         return ArkUrdf(found)
     except (ValueError, OSError) as error:
-        raise reading.wrong(path or node, f"{found}: {error}") from None
+        raise reading.wrong(path or node, f"{found}: {error}", "bad_urdf") from None
 
 
 def _model(
@@ -239,7 +240,8 @@ def _model(
     if given in options.arms:
         model, there = options.arms[given], list_data("robots")
         if model not in there:
-            raise reading.wrong(node, f"--arm {given}={model}: there is no such model{nearest(model, there)}")
+            message = f"--arm {given}={model}: there is no such model{nearest(model, there)}"
+            raise reading.wrong(node, message, "unknown_model")
         return model, "from --arm"
     joints = set(urdf.model.joints) if urdf is not None else set()
     groups = node.get("joint_groups")
@@ -256,15 +258,17 @@ def _model(
 
 
 def _checks(node: ArkNode, reading: ArkReader, ledger: KeyReport) -> None:
-    """Keys that only must not say something else."""
+    """Check the keys whose only supported value is the default."""
     source = node.get("source")
     if source is not None and source.data != "urdf":
-        raise reading.wrong(source, f"only a urdf can be taken over, not {source.data!r}")
-    ledger.kept(source, "", "every arm has one")
+        raise reading.wrong(
+            source, f"must be urdf, not {source.data!r}; nothing else can be imported", "no_counterpart"
+        )
+    ledger.kept(source, "", "every arm is a URDF")
     fixed = node.get("use_fixed_base")
     if fixed is not None and not reading.flag(fixed):
-        raise reading.wrong(fixed, "an arm stands fixed here; a robot that drives or falls has no counterpart")
-    ledger.kept(fixed, "", "every arm is")
+        raise reading.wrong(fixed, "must be true: mobile and free robots have no counterpart", "no_counterpart")
+    ledger.kept(fixed, "", "every arm has a fixed base")
     ledger.ignored(node.children.get("class_dir"), "models and drivers are found by name")
     ledger.ignored(node.children.get("merge_fixed_links"), "links keep their names")
     ledger.ignored(
@@ -307,7 +311,9 @@ def _start(arm: ArkArm, known: KnownArm, node: ArkNode, key: str, reading: ArkRe
     values = reading.numbers(initial)
     if len(values) < len(home) or (known.is_franka and len(values) not in JOINT_COUNTS):
         counts = ", ".join(map(str, JOINT_COUNTS)) if known.is_franka else f"at least {len(home)}"
-        raise reading.wrong(initial, f"has {len(values)} numbers; in Ark {known.name} has {counts} joints")
+        raise reading.wrong(
+            initial, f"has {len(values)} numbers; in Ark {known.name} has {counts} joints", "wrong_count"
+        )
     q, rest = values[: len(home)], values[len(home) :]
     notes = [f"the first {len(q)} of {len(values)}; the others are fixed joints and fingers"] if rest else []
     if known.spec.gripper is not None and not any(rest):

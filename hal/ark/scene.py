@@ -62,7 +62,7 @@ class ObjectImport:
         said = self.work.options.urdfs.get(given_name)
         found = said.resolve() if said is not None else places.find(given, self.node.file.parent)
         if said is not None and (found is None or not found.is_file()):
-            raise self.reading.wrong(path, f"there is no file {found}, which --urdf names")
+            raise self.reading.wrong(path, f"there is no file {found}, which --urdf names", "missing_file")
         if found is None and (inside := places.in_package(given)) is not None:
             self.entry["urdf"] = inside
             self.ledger.changed(path, f"{self.key}.urdf", "PyBullet's own data")
@@ -71,6 +71,7 @@ class ObjectImport:
                 path,
                 f"there is no file {given!r} in {places.searched()}; Ark looks where it is started. Name that "
                 f"folder with --start or the file with --urdf {given_name}=FILE, or add --without {given_name}",
+                "missing_file",
             )
         else:
             self.entry["urdf"] = found
@@ -91,7 +92,7 @@ class ObjectImport:
             self._plain_box(size)
             return
         if touched is None and drawn is None:
-            raise self.reading.wrong(self.node, "has neither a collision nor a visual shape")
+            raise self.reading.wrong(self.node, "has neither a collision nor a visual shape", "missing_key")
         entry = {key: value for key, value in (touched or drawn or {}).items() if key != "rgba"}
         self.entry.update(entry)
         if touched is None:
@@ -127,8 +128,8 @@ class ObjectImport:
         kind = reading.need(reading.keys(node), "shape_type")
         word = reading.text(kind).upper()
         if word not in _SHAPES:
-            text = f"{word} has no counterpart; there are {', '.join(_SHAPES)}. Make a URDF of it"
-            raise reading.wrong(kind, f"{text}, or add --without {self.item.given}")
+            text = f"{word} has no counterpart; shapes: {', '.join(_SHAPES)}. Make a URDF of it"
+            raise reading.wrong(kind, f"{text}, or add --without {self.item.given}", "no_counterpart")
         shape, names = _SHAPES[word]
         found: dict[str, Any] = {"shape": shape}
         sizes = reading.keys(reading.need(node, f"{part}_shape"))
@@ -139,7 +140,8 @@ class ObjectImport:
                 found[key] = reading.numbers(size, (3,)) if many else reading.number(size, positive=True)
         missing = [name for name, key in names.items() if key not in found]
         if missing:
-            raise reading.wrong(sizes, f"{' or '.join(missing)} is missing: PyBullet would take its own default")
+            message = f"{' or '.join(missing)} is missing: PyBullet would take its own default"
+            raise reading.wrong(sizes, message, "missing_key")
         colour = sizes.get("rgbaColor")
         if colour is not None:
             found["rgba"] = reading.numbers(colour, (4,))
@@ -194,7 +196,9 @@ def import_object(item: ArkItem, work: ImportState) -> dict[str, Any]:
         thing.from_primitive()
     else:
         raise work.reading.wrong(
-            source, f"must be urdf or primitive, not {describe(source.data)}; --without {item.given} leaves it out"
+            source,
+            f"must be urdf or primitive, not {describe(source.data)}; --without {item.given} leaves it out",
+            "no_counterpart",
         )
     work.ledger.kept(source, f"{item.key}.shape")
     thing.place()
@@ -301,7 +305,9 @@ class CameraImport:
         kind = self.reading.need(self.node, "type")
         if str(kind.data).lower() != "camera":
             raise self.reading.wrong(
-                kind, f"a sensor of type {kind.data!r} has no counterpart; --without {self.given} leaves it out"
+                kind,
+                f"a sensor of type {kind.data!r} has no counterpart; --without {self.given} leaves it out",
+                "no_counterpart",
             )
         self.ledger.kept(kind, self.key)
         self.ledger.changed(self.node.get("class_dir"), f"{self.key}.model", "models and drivers are found by name")
@@ -330,7 +336,9 @@ class CameraImport:
         chosen: dict[str, Any] = {}
         for name, stream in self.reading.keys(node).children.items():
             if name not in STREAMS:
-                raise self.reading.wrong(stream, f"there is no such stream; there are {', '.join(STREAMS)}")
+                raise self.reading.wrong(
+                    stream, f"there is no such stream; streams: {', '.join(STREAMS)}", "unknown_stream"
+                )
             enabled = self.reading.keys(stream).get("enable")
             form = stream.get("format")
             on = enabled is not None and self.reading.flag(enabled)
@@ -339,14 +347,15 @@ class CameraImport:
                 self.ledger.kept(enabled, target, "left out")
                 self.ledger.ignored(form, "the stream is off")
                 continue
-            note = "drawn here; Ark draws none" if name == "infrared" else ""
+            note = "rendered here; Ark renders none" if name == "infrared" else ""
             self.ledger.kept(enabled, target, note)
             chosen[name] = Inline(format=self.reading.text(form)) if form is not None else Inline()
             frames = {"color": "frames are RGB", "depth": "frames are in metres"}.get(name, "frames have 8 bits")
             where = "depends on the model" if self.adjustable else "what the real camera sends"
             self.ledger.changed(form, "" if self.adjustable else f"{target}.{name}", f"{where}; {frames} in any case")
         if not chosen:
-            raise self.reading.wrong(node, f"every stream is off; --without {self.given} leaves the camera out")
+            message = f"every stream is off; --without {self.given} leaves the camera out"
+            raise self.reading.wrong(node, message, "missing_key")
         chosen = {name: chosen[name] for name in STREAMS if name in chosen}
         self.entry["streams"] = list(chosen) if self.adjustable else Inline(chosen)
 
@@ -384,7 +393,7 @@ class CameraImport:
         up = fix.get("up_axis_index")
         axis = UP.get(reading.whole(up)) if up is not None else "z"
         if up is not None and axis is None:
-            raise reading.wrong(up, "must be 2 (z) or 1 (y)")
+            raise reading.wrong(up, "must be 2 (z) or 1 (y)", "invalid_choice")
         if axis != "z":
             place["up_axis"] = axis
         self.ledger.kept(up, f"{look}.up_axis")
@@ -398,17 +407,19 @@ class CameraImport:
             raise InvalidValue
         if name not in arms:
             what = "an object" if name in objects else "nothing that is imported"
-            raise reading.wrong(parent, f"{name!r} is {what}; a camera goes on a robot here. --without {self.given}")
+            message = f"{name!r} is {what}; cameras are attached to robots only. --without {self.given}"
+            raise reading.wrong(parent, message, "unknown_device")
         arm = arms[name]
         link = attach.get("parent_link")
         found = arm.place(reading.text(link) if link is not None else None)
         if found is None:
-            raise reading.wrong(link or attach, f"robot {arm.given!r} has no link {link.data if link else None!r}")
+            message = f"robot {arm.given!r} has no link {link.data if link else None!r}"
+            raise reading.wrong(link or attach, message, "unknown_link")
         at, pose, note = found
         if arm.name == arm.given:
             ledger.kept(parent, f"{key}.robot")
         else:
-            ledger.changed(parent, f"{key}.robot", f"it is called {arm.name} here")
+            ledger.changed(parent, f"{key}.robot", f"its name here is {arm.name}")
         moved = note or pose != Pose()
         (ledger.changed if moved else ledger.kept)(link, f"{key}.link", f"{at}; {note}".rstrip("; ") if moved else "")
         place: dict[str, Any] = {}
@@ -419,7 +430,7 @@ class CameraImport:
         target = attach.get("rel_camera_target")
         direction = reading.numbers(target, (3,)) if target is not None else [1, 0, 0]
         if not any(direction):
-            raise reading.wrong(target or attach, "is no direction")
+            raise reading.wrong(target or attach, "is no direction", "out_of_range")
         place["target"] = direction
         along_up = not any(direction[:2])
         if not along_up:
@@ -488,7 +499,7 @@ def import_camera(item: ArkItem, work: ImportState, arms: Mapping[str, ArkArm], 
         camera.attached(reading.keys(reading.need(sim, "attach")), arms, all_arms, work.given["objects"])
         ledger.ignored(fix, "camera_type is attached")
     else:
-        raise reading.wrong(kind or node, f"must be fixed or attached, not {word!r}")
+        raise reading.wrong(kind or node, f"must be fixed or attached, not {word!r}", "invalid_choice")
     return camera.entry
 
 

@@ -17,7 +17,7 @@ from pydantic import Field, model_validator
 
 from ..config.data_files import data_folder, is_path, user_path
 from ..config.files import Problems, read_yaml, validate
-from ..config.schema import Pixels, Size, Strict
+from ..config.schema import Pixels, Size, Strict, ValueProblem
 from ..errors import CommandError, DriverMissing
 
 __all__ = ["BUILT_IN", "Board", "board_page", "load_board", "opencv", "print_board"]
@@ -140,7 +140,7 @@ class BoardConfig(Strict):
     @model_validator(mode="after")
     def _marker_fits(self) -> BoardConfig:
         if not self.marker < self.square:
-            raise ValueError("marker must be smaller than square; both are in m")
+            raise ValueProblem("marker must be smaller than square; both are in m", "out_of_range")
         return self
 
 
@@ -176,12 +176,13 @@ def _check_dictionary(config: BoardConfig, path: Path, problems: Problems) -> No
     aruco = opencv().aruco
     names = [name for name in dir(aruco) if name.startswith("DICT_")]
     if config.dictionary not in names:
-        problems.add(path, "dictionary", f"OpenCV has no such dictionary; available: {', '.join(names)}")
+        message = f"OpenCV has no such dictionary; available: {', '.join(names)}"
+        problems.add(path, "dictionary", message, "unknown_dictionary")
         return
     available = len(aruco.getPredefinedDictionary(getattr(aruco, config.dictionary)).bytesList)
     needed = config.columns * config.rows // 2
     if needed > available:
-        problems.add(path, "dictionary", f"has {available} markers, the board needs {needed}")
+        problems.add(path, "dictionary", f"has {available} markers, the board needs {needed}", "too_few_markers")
 
 
 def print_board(board: Board, path: str | Path) -> tuple[float, float]:

@@ -384,6 +384,7 @@ _CODES = {
     "greater_than_equal": "out_of_range",
     "less_than": "out_of_range",
     "less_than_equal": "out_of_range",
+    "string_pattern_mismatch": "bad_name",
 }
 
 
@@ -416,7 +417,8 @@ def _pairs(overrides: Sequence[str] | Mapping[str, Any], problems: Problems) -> 
     for text in (overrides,) if isinstance(overrides, str) else overrides:
         key, equals, value = text.partition("=")
         if not equals or not key.strip():
-            problems.add(SET, "", f"must be KEY=VALUE, for example cameras.wrist.output.width=320, not {text!r}")
+            message = f"must be KEY=VALUE, for example cameras.wrist.output.width=320, not {text!r}"
+            problems.add(SET, "", message, "bad_override")
             continue
         try:
             pairs.append((key.strip(), parse_yaml(value)))
@@ -429,7 +431,7 @@ def _put(data: dict[str, Any], key: str, value: Any, problems: Problems) -> None
     """Set one key, and note which keys the override set: this one, and those that it created on the way."""
     parts = key.split(".")
     if "" in parts:
-        problems.add(SET, key, "has an empty part between its dots")
+        problems.add(SET, key, "has an empty part between its dots", "bad_override")
         return
     if len(parts) > 2 and parts[0] in SECTIONS:
         known = data.get(parts[0]) or {}

@@ -108,7 +108,7 @@ def _three_or_unit(rotation: tuple[float, ...]) -> tuple[float, ...]:
         message = f"must be roll, pitch, yaw in rad, or a quaternion x, y, z, w, not {len(rotation)} numbers"
         raise ValueProblem(message, "wrong_count")
     if len(rotation) == 4 and abs(math.hypot(*rotation) - 1.0) > 0.01:
-        raise ValueProblem("must be a unit quaternion x, y, z, w, or three angles in rad")
+        raise ValueProblem("must be a unit quaternion x, y, z, w, or three angles in rad", "bad_rotation")
     return rotation
 
 

@@ -216,7 +216,9 @@ class Several:
 def _unit_quaternion(q: tuple[float, ...]) -> tuple[float, ...]:
     norm = math.hypot(*q)
     if abs(norm - 1.0) > 0.01:
-        raise ValueProblem(f"must be a unit quaternion x, y, z, w; the length of this one is {norm:.3g}")
+        raise ValueProblem(
+            f"must be a unit quaternion x, y, z, w; the length of this one is {norm:.3g}", "bad_rotation"
+        )
     return tuple(item / norm for item in q)
 
 

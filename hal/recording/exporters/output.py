@@ -52,7 +52,7 @@ class ExportJob:
         """Check that the episodes can be exported together.
 
         Raises:
-            CommandError: An episode has no arm (code ``no_arm``), or other pictures than the first (``episodes_differ``).
+            CommandError: An episode has no arm (code ``no_arm``), or pictures unlike the first (``episodes_differ``).
         """
         first = self.contents[0]
         kept = _streams(first)

@@ -54,8 +54,9 @@ def test_an_option_names_the_arm(tmp_path: Path) -> None:
     data, result = imported(tmp_path, ArkOptions(arms={"arm": "fr3"}), robots={"arm": PANDA})
     assert data["robots"]["arm"]["model"] == "fr3"
     assert "from --arm" in row(result, "robots.0.config.urdf_path")[1]
-    with pytest.raises(hal.ConfigError, match="--arm arm=fr4: there is no such model; did you mean 'fr3'"):
+    with pytest.raises(hal.ConfigError) as caught:
         imported(tmp_path, ArkOptions(arms={"arm": "fr4"}), robots={"arm": PANDA})
+    assert [problem.code for problem in caught.value.problems] == ["unknown_model"]
 
 
 def test_base(tmp_path: Path) -> None:
@@ -142,8 +143,9 @@ def test_a_model_is_made_of_another_urdf_and_the_arm_runs(tmp_path: Path) -> Non
         arm.move_to(arm.home + np.array([0.2, 0, 0, 0, 0, 0]), speed=0.5)
         arm.move_to(arm.home, speed=0.5)
         assert arm.state().q == pytest.approx(arm.home, abs=0.01)
-    with pytest.raises(hal.ConfigError, match="drivers.real"):
-        load(tmp_path / "rig.yaml", sim=False)
+    with pytest.raises(hal.ConfigError) as caught:
+        load(tmp_path / "rig.yaml", sim=False).resolve()
+    assert {problem.code for problem in caught.value.problems} == {"no_driver"}
 
 
 def test_fingers_are_no_joints_of_the_arm(tmp_path: Path) -> None:
@@ -180,25 +182,24 @@ def test_missing_and_placeholder_speeds_of_a_urdf_are_reported(tmp_path: Path) -
     assert text.count('velocity="3.14"') >= 2
     urdf.write_text(text.replace('velocity="3.14"', 'velocity="100"', 1).replace('velocity="3.14"', "", 1))
     _, result = imported(tmp_path, ArkOptions(urdfs={"arm": urdf}), robots={"arm": xarm(class_dir=None)})
-    told = result.models["arm"].to_fill_in
-    assert any("joint1 has 100 in the URDF, which looks like a placeholder" in one for one in told)
-    assert any("joint2 has none in the URDF" in one for one in told)
+    notes = " ".join(result.models["arm"].to_fill_in)
+    assert "joint1" in notes
+    assert "joint2" in notes
+    assert "joint3" not in notes
     assert parse_yaml((tmp_path / "rig_arm.yaml").read_text())["limits"]["velocity"][:2] == [3.2, 0.5]
 
 
 def test_problems_of_a_generated_model_are_reported_at_arks_line(tmp_path: Path) -> None:
-    with pytest.raises(hal.ConfigError, match="joint 'joint2' is at 3, outside its limits") as caught:
+    with pytest.raises(hal.ConfigError) as caught:
         imported(tmp_path, robots={"arm": xarm(initial_configuration=[0, 3, 0, 0, 0, 0])})
     (problem,) = caught.value.problems
     assert problem.file.startswith(str(tmp_path / "global_config.yaml:"))
+    assert problem.code == "out_of_range"
     assert problem.message.endswith("(as home of the model made for it)")
 
 
-@pytest.mark.parametrize(
-    ("text", "said"),
-    [("<robot", "is not valid XML"), ("<nonsense/>", "is not a URDF"), ('<robot name="x"/>', "has no links")],
-)
-def test_a_broken_urdf_is_reported(tmp_path: Path, text: str, said: str) -> None:
-    (tmp_path / "arm.urdf").write_text(text)
-    with pytest.raises(hal.ConfigError, match=said):
+def test_a_broken_urdf_is_reported(tmp_path: Path) -> None:
+    (tmp_path / "arm.urdf").write_text("<robot")
+    with pytest.raises(hal.ConfigError) as caught:
         imported(tmp_path, robots={"arm": xarm(urdf_path="arm.urdf", class_dir=None)})
+    assert [problem.code for problem in caught.value.problems] == ["bad_urdf"]

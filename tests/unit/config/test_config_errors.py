@@ -107,7 +107,7 @@ def thing(**keys: Any) -> dict[str, Any]:
         (robot(speed=True), "robots.arm.speed", "wrong_type"),
         (robot(model=5), "robots.arm.model", "wrong_type"),
         ({"robots": {"arm": {}}}, "robots.arm.model", "missing_key"),
-        ({"robots": {"my arm": ROBOT}}, "robots.my arm", "invalid"),
+        ({"robots": {"my arm": ROBOT}}, "robots.my arm", "bad_name"),
         (camera(output={"width": 256.5, "height": 256}), "cameras.eye.output.width", "wrong_type"),
         (camera(output={"width": "256", "height": 256}), "cameras.eye.output.width", "wrong_type"),
         (camera(output={"width": 0, "height": 256}), "cameras.eye.output.width", "out_of_range"),
@@ -119,7 +119,7 @@ def thing(**keys: Any) -> dict[str, Any]:
         (robot(base=[0, 0, 0]), "robots.arm.base", "wrong_count"),
         (robot(base={"position": [0, 0]}), "robots.arm.base.position", "wrong_count"),
         (robot(base={"orientation": [0, 0, 90]}), "robots.arm.base.orientation", "wrong_count"),
-        (robot(base={"orientation": [0, 0, 90, 1]}), "robots.arm.base.orientation", "invalid"),
+        (robot(base={"orientation": [0, 0, 90, 1]}), "robots.arm.base.orientation", "bad_rotation"),
         (robot(initial=[0, -45, 0, -135, 0, 90, 45]), "robots.arm.initial", "out_of_range"),
         (robot(initial=[0, 0, 0]), "robots.arm.initial", "wrong_count"),
         (
@@ -362,10 +362,10 @@ def test_a_folder_in_place_of_a_file(tmp_path: Path) -> None:
         ("cameras.wrist.output.width=wide", "cameras.wrist.output.width", "wrong_type"),
         ("cameras.wrist.output.width=[", "cameras.wrist.output.width", "bad_yaml"),
         ("simulaton.physics_hz=1000", "simulaton", "unknown_key"),
-        ("sim", "", "invalid"),
+        ("sim", "", "bad_override"),
         ("sim.deep=1", "sim.deep", "unknown_key"),
         ("objects.9=cube", "objects.9", "unknown_key"),
-        ("robots..speed=1", "robots..speed", "invalid"),
+        ("robots..speed=1", "robots..speed", "bad_override"),
     ],
 )
 def test_overrides_are_to_blame_for_their_own_mistakes(override: str, key: str, code: str) -> None:

@@ -45,7 +45,7 @@ def test_valid_options(options: dict[str, Any]) -> None:
 def test_options_of_a_recording(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("HOME", str(tmp_path))
     options = {"play": "~/today.db3", "repeat": False, "paced": False}
-    assert [key for key, _ in problems(camera(**options))] == ["real.play"]
+    assert [(key, code) for key, _, code in problems(camera(**options))] == [("real.play", "missing_file")]
     (tmp_path / "today.db3").touch()
     assert list(problems(camera(**options))) == []
     assert RealSenseSettings.from_spec(camera(**options)).play == str(tmp_path / "today.db3")
@@ -54,7 +54,7 @@ def test_options_of_a_recording(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
 def test_the_folder_of_a_recording_must_exist(tmp_path: Path) -> None:
     assert list(problems(camera(record=str(tmp_path / "today.db3")))) == []
     found = problems(camera(record=str(tmp_path / "none" / "today.db3")))
-    assert [key for key, _ in found] == ["real.record"]
+    assert [(key, code) for key, _, code in found] == [("real.record", "missing_folder")]
 
 
 WRONG: dict[str, list[dict[str, Any]]] = {
@@ -76,7 +76,9 @@ WRONG[""] += [{"paced": False}, {"repeat": True, "emulated": True}, {"overwrite"
     ("options", "key"), [(one, f"real.{key}".rstrip(".")) for key, wrong in WRONG.items() for one in wrong]
 )
 def test_wrong_options(options: dict[str, Any], key: str) -> None:
-    assert [place for place, *_ in problems(camera(**options))] == [key]
+    ((place, _, code),) = problems(camera(**options))
+    assert place == key
+    assert code != "invalid"
     with pytest.raises(ConfigError) as caught:
         RealSenseSettings.from_spec(camera(**options))
     assert {problem.file for problem in caught.value.problems} == {"cameras.wrist.real"}
@@ -86,7 +88,10 @@ def test_streams_and_formats_must_be_known() -> None:
     wrong = replace(
         camera(), streams=("color", "segmentation"), sensors={"color": SensorSpec(640, 480, 30.0, K, "y16")}
     )
-    assert {key for key, _ in problems(wrong)} == {"streams.segmentation", "streams.color.format"}
+    assert {key: code for key, _, code in problems(wrong)} == {
+        "streams.segmentation": "unknown_stream",
+        "streams.color.format": "unknown_format",
+    }
 
 
 @pytest.mark.parametrize("align", ["color", "depth"])
