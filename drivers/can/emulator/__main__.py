@@ -1,0 +1,55 @@
+"""The emulator as a program: ``python -m hal.drivers.can.emulator --config yam_emulator``."""
+
+from __future__ import annotations
+
+import argparse
+import signal
+import sys
+import threading
+from collections.abc import Sequence
+
+import can
+
+from hal.errors import HalError
+
+from .console import CommandPort, help_text, serve_prompt
+from .server import CanEmulator
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the program, and return its exit status."""
+    parser = argparse.ArgumentParser(
+        prog="python -m hal.drivers.can.emulator",
+        description="Emulates every arm on a CAN bus in a rig: Damiao motors or a PiPER, with mass, gravity and "
+        "friction. What the manuals leave open is assumed; it proves nothing about a real arm.",
+        epilog="commands, typed here or sent to the control port; with several arms, the arm's name first:\n"
+        + help_text(),
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("--config", required=True, help="the rig: a name in config/, or a path")
+    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="change a value of the rig")
+    parser.add_argument("--port", type=int, default=0, help="control port (a free one)")
+    parser.add_argument("--seed", type=int, default=0, help="seed of random losses (%(default)s)")
+    options = parser.parse_args(arguments)
+    end = threading.Event()
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, lambda *_: end.set())
+    try:
+        with CanEmulator(options.config, options.set, options.seed) as emulator:
+            port = CommandPort(emulator, options.port)
+            names = ", ".join(f"{arm.name} at {' '.join(arm.bus.key)}" for arm in emulator.arms.values())
+            print(f"ready: {names}; control port {port.number}; help lists the commands", flush=True)
+            serve_prompt(emulator)
+            while not end.wait(0.2):
+                for bus in emulator.buses:
+                    if bus.error is not None:
+                        raise bus.error
+            port.close()
+    except (HalError, can.CanError, OSError, ValueError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 1
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

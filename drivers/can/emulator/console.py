@@ -1,0 +1,317 @@
+"""Commands of the emulator: typed at its prompt, sent to its control port, or given to ``CanEmulator.execute``.
+
+Where a rig has several arms, a command begins with the arm's name: ``left status 3 A``. The control port listens on
+this computer only; a line holds a command, and its answer is a line of JSON.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import signal
+import socket
+import sys
+import threading
+import time
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+from .server import CanEmulator, EmulatedArm, EmulatedBus
+
+__all__ = ["COMMANDS", "CommandPort", "EmulatorControl", "execute", "help_text", "serve_prompt"]
+
+_FOREVER = 1e9
+"""Stands for no end, s."""
+
+
+class _Target(NamedTuple):
+    emulator: CanEmulator
+    arm: EmulatedArm
+    bus: EmulatedBus
+
+
+_Run = Callable[[_Target, list[str]], dict[str, Any] | None]
+
+
+class EmulatorCommand(NamedTuple):
+    """One command of the table."""
+
+    usage: str
+    meaning: str
+    run: _Run
+
+
+# Faults of the bus.
+
+
+def _lose(target: _Target, words: list[str]) -> None:
+    faults = target.bus.faults[target.arm.name]
+    if words[0] == "next":
+        faults.lose_next[int(words[2], 0) if len(words) > 2 else 0] = int(words[1])
+    else:
+        share = float(words[0])
+        if not 0.0 <= share <= 1.0:
+            raise ValueError("the share is 0 to 1")
+        faults.lost_share = share
+
+
+def _late(target: _Target, words: list[str]) -> None:
+    target.bus.faults[target.arm.name].delay = float(words[0])
+
+
+def _double(target: _Target, words: list[str]) -> None:
+    target.bus.faults[target.arm.name].copies = 2 if _switch(words[0]) else 1
+
+
+def _silent(target: _Target, words: list[str]) -> None:
+    number = 0 if words[0] == "all" else int(words[0], 0)
+    target.bus.faults[target.arm.name].silent_until[number] = _until(words[1])
+
+
+def _cut(target: _Target, words: list[str]) -> None:
+    target.bus.cut_until = _until(words[0])
+
+
+def _frame(target: _Target, words: list[str]) -> None:
+    id, data = int(words[0], 0), bytes.fromhex(words[1])
+    for _ in range(int(words[2]) if len(words) > 2 else 1):
+        target.bus.send(id, data)
+
+
+def _stall(target: _Target, words: list[str]) -> None:
+    target.bus.stall = float(words[0])
+
+
+# Faults of motors.
+
+
+def _status(target: _Target, words: list[str]) -> None:
+    target.arm.set_status(int(words[0], 0), int(words[1], 16))
+
+
+def _register(target: _Target, words: list[str]) -> None:
+    try:
+        target.arm.set_register(int(words[0], 0), words[1], float(words[2]))
+    except KeyError:
+        raise ValueError(f"no register {words[1]!r}") from None
+
+
+def _temperature(target: _Target, words: list[str]) -> None:
+    target.arm.set_temperature(int(words[0], 0), int(words[1]), int(words[2]))
+
+
+# Mechanics.
+
+
+def _masses(target: _Target, words: list[str]) -> None:
+    target.arm.plant.load(mass_factor=float(words[0]))
+
+
+def _payload(target: _Target, words: list[str]) -> None:
+    mass, *place = map(float, words)
+    target.arm.plant.load(payload=(mass, place if len(place) == 3 else (0.0, 0.0, 0.0)))
+
+
+def _place(target: _Target, words: list[str]) -> None:
+    q = [float(word) for word in words] or target.arm.plant.q.tolist()
+    if len(q) != len(target.arm.plant.q):
+        raise ValueError(f"takes {len(target.arm.plant.q)} positions")
+    target.arm.restart()
+    target.arm.plant.place(q)
+    target.arm.restart()
+
+
+def _push(target: _Target, words: list[str]) -> None:
+    target.arm.plant.push[int(words[0]) - 1] = float(words[1])
+
+
+def _object(target: _Target, words: list[str]) -> None:
+    target.arm.set_object(None if words[0] == "none" else float(words[0]))
+
+
+# Reports.
+
+
+def _state(target: _Target, words: list[str]) -> dict[str, Any]:
+    plant = target.arm.plant
+    return {
+        "t": time.monotonic(),
+        "q": plant.q.tolist(),
+        "dq": plant.dq.tolist(),
+        "tau": plant.tau.tolist(),
+        "held": plant.held,
+        **target.arm.report(),
+    }
+
+
+def _stats(target: _Target, words: list[str]) -> dict[str, Any]:
+    answer = {"peak_speed": list(target.arm.peak), "frames": target.bus.received, "steps_left_out": target.bus.late}
+    if words[:1] == ["reset"]:
+        target.arm.peak[:] = [0.0] * len(target.arm.peak)
+        target.bus.received = target.bus.late = 0
+    return answer
+
+
+def _reset(target: _Target, words: list[str]) -> None:
+    """Take every fault away; what was done to the motors' registers stays."""
+    target.bus.faults[target.arm.name].__init__()  # type: ignore[misc]
+    target.bus.cut_until = 0.0
+    target.arm.plant.load(mass_factor=1.0, payload=(0.0, (0.0, 0.0, 0.0)))
+    target.arm.plant.push[:] = 0.0
+
+
+COMMANDS = {
+    "lose": EmulatorCommand("lose P | next N [MOTOR]", "lose that share of the replies, or exactly the next N", _lose),
+    "late": EmulatorCommand("late S", "send replies S seconds late", _late),
+    "double": EmulatorCommand("double on|off", "send every reply twice", _double),
+    "silent": EmulatorCommand("silent MOTOR|all S|on|off", "neither hear nor answer", _silent),
+    "cut": EmulatorCommand("cut S|on|off", "let no frame pass, either way", _cut),
+    "frame": EmulatorCommand("frame ID HEX [N]", "send a frame of your own, N times", _frame),
+    "stall": EmulatorCommand("stall S", "stop the emulator itself", _stall),
+    "status": EmulatorCommand(
+        "status MOTOR CODE", "give a motor a status, hex: 8 to E; a PiPER: its joint's flags, or MOTOR 0", _status
+    ),
+    "register": EmulatorCommand("register MOTOR NAME VALUE", "change a register, as VMAX or TIMEOUT", _register),
+    "temperature": EmulatorCommand("temperature MOTOR C C", "report these: electronics, motor", _temperature),
+    "power": EmulatorCommand("power", "switch all motors off and on again", lambda target, _: target.arm.restart()),
+    "masses": EmulatorCommand("masses FACTOR", "multiply the masses of the arm", _masses),
+    "payload": EmulatorCommand("payload KG [X Y Z]", "fix a mass to the tool's link, m", _payload),
+    "place": EmulatorCommand("place [Q ...]", "switch off, and hold the arm there until its motors are on", _place),
+    "push": EmulatorCommand("push JOINT NM", "push a joint with this torque, until 0", _push),
+    "object": EmulatorCommand("object M|none", "put an object of this width between the fingers", _object),
+    "state": EmulatorCommand("state", "motion, motors, last commands", _state),
+    "stats": EmulatorCommand("stats [reset]", "greatest speeds and counters", _stats),
+    "reset": EmulatorCommand("reset", "end all faults of frames and mechanics", _reset),
+    "kill": EmulatorCommand("kill", "end this program at once", lambda _, __: os.kill(os.getpid(), signal.SIGKILL)),
+    "help": EmulatorCommand("help", "this table", lambda _, __: {"text": help_text()}),
+}
+
+
+def help_text() -> str:
+    """Return the table of commands."""
+    width = max(len(command.usage) for command in COMMANDS.values())
+    return "\n".join(f"  {command.usage:{width}}  {command.meaning}" for command in COMMANDS.values())
+
+
+def execute(emulator: CanEmulator, words: list[str]) -> dict[str, Any]:
+    """Execute a command, and return its answer. Raises ValueError if it is invalid."""
+    arms = emulator.arms
+    arm = arms[words[0]] if words and words[0] in arms else next(iter(arms.values()))
+    verb, *rest = words[1:] if words and words[0] in arms else words or [""]
+    command = COMMANDS.get(verb)
+    if command is None:
+        raise ValueError(f"no command {verb!r}; help lists them")
+    bus = emulator.bus_of(arm)
+    try:
+        with bus.lock:
+            return command.run(_Target(emulator, arm, bus), rest) or {}
+    except (ValueError, IndexError) as error:
+        reason = f"usage: {command.usage}" if isinstance(error, IndexError) else error
+        raise ValueError(f"{verb}: {reason}") from None
+
+
+def _until(word: str) -> float:
+    if word in ("on", "off"):
+        return time.monotonic() + _FOREVER if word == "on" else 0.0
+    return time.monotonic() + float(word)
+
+
+def _switch(word: str) -> bool:
+    if word not in ("on", "off"):
+        raise ValueError("takes on or off")
+    return word == "on"
+
+
+# Prompt and control port.
+
+
+def serve_prompt(emulator: CanEmulator) -> None:
+    """Execute the lines of standard input, in a thread, until it ends."""
+
+    def serve() -> None:
+        with contextlib.suppress(OSError, ValueError):
+            for line in sys.stdin:
+                if line.strip():
+                    answer = _answer(emulator, line)
+                    print(answer.get("text") or json.dumps(answer), flush=True)
+
+    threading.Thread(target=serve, name="prompt", daemon=True).start()
+
+
+class CommandPort:
+    """The control port: TCP on this computer, one thread for each client.
+
+    Attributes:
+        number: The port.
+    """
+
+    def __init__(self, emulator: CanEmulator, number: int = 0) -> None:
+        """Listen on a port, 0 for a free one. Raises OSError if it is taken."""
+        self._emulator = emulator
+        self._listener = socket.create_server(("127.0.0.1", number))
+        self.number: int = self._listener.getsockname()[1]
+        threading.Thread(target=self._accept, name="control-port", daemon=True).start()
+
+    def _accept(self) -> None:
+        with contextlib.suppress(OSError):
+            while True:
+                connection, _ = self._listener.accept()
+                threading.Thread(target=self._serve, args=(connection,), daemon=True).start()
+
+    def _serve(self, connection: socket.socket) -> None:
+        with contextlib.suppress(OSError), connection, connection.makefile("r", encoding="utf-8") as lines:
+            for line in lines:
+                connection.sendall(json.dumps(_answer(self._emulator, line)).encode() + b"\n")
+
+    def close(self) -> None:
+        """Close the port."""
+        self._listener.close()
+
+
+def _answer(emulator: CanEmulator, line: str) -> dict[str, Any]:
+    try:
+        return {"ok": True, **execute(emulator, line.split())}
+    except (ValueError, TypeError) as error:
+        return {"ok": False, "error": str(error)}
+
+
+class EmulatorControl:
+    """A connection to the control port of a running emulator, also as a context manager."""
+
+    def __init__(self, port: int, timeout: float = 10.0) -> None:
+        """Connect. Raises OSError if there is no emulator at this port."""
+        self._socket = socket.create_connection(("127.0.0.1", port), timeout)
+        self._reader = self._socket.makefile("r", encoding="utf-8")
+
+    def execute(self, line: str) -> dict[str, Any]:
+        """Execute a command and return its answer; empty after ``kill``.
+
+        Raises:
+            ValueError: The emulator refuses the command.
+            ConnectionError: The emulator has ended.
+        """
+        self._socket.sendall(line.encode() + b"\n")
+        try:
+            text = self._reader.readline()
+        except ConnectionError:
+            text = ""
+        if not text and line.strip().endswith("kill"):
+            return {}
+        if not text:
+            raise ConnectionError("the emulator has ended")
+        answer: dict[str, Any] = json.loads(text)
+        if not answer.pop("ok"):
+            raise ValueError(answer["error"])
+        return answer
+
+    def close(self) -> None:
+        """Disconnect."""
+        self._reader.close()
+        self._socket.close()
+
+    def __enter__(self) -> EmulatorControl:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()

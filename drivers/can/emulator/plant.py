@@ -1,0 +1,250 @@
+"""The emulated mechanics: a rigid-body arm with gravity, friction and motors, and a gripper with one motor.
+
+Both are integrated with the drives of their motors in the equation: the velocity at the end of a step solves
+
+    (M + A + dt (Kd + B) + dt^2 Kp) v = (M + A) v0 + dt (tau + Kp (q_target - q0) + Kd dq_target - c - g) + friction
+
+with the mass matrix M, the motors' inertia A and viscous friction B. Stiffness and damping act on the end of the step,
+so they may be as large as a motor allows, also on a light wrist. Coulomb friction is the torque within its bounds that
+brings each joint to rest, found by Gauss-Seidel iterations; a joint that it can hold does not creep.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+
+__all__ = ["ArmPlant", "Drive", "GripperPlant", "JointMechanics"]
+
+_STOP_STIFFNESS, _STOP_DAMPING = 2000.0, 50.0
+"""A joint's mechanical stop, Nm/rad and Nm s/rad."""
+_SWEEPS = 4
+"""Gauss-Seidel iterations per step; they start from the friction of the step before."""
+
+
+class Drive(NamedTuple):
+    """What a motor does: torque = kp (q - q_measured) + kd (dq - dq_measured) + tau, within its greatest torque."""
+
+    q: float = 0.0
+    dq: float = 0.0
+    kp: float = 0.0
+    kd: float = 0.0
+    tau: float = 0.0
+
+
+OFF = Drive()
+"""A motor without power."""
+
+
+class JointMechanics(NamedTuple):
+    """One joint's motor and gear, on the joint's side."""
+
+    inertia: float
+    """Inertia of the rotor behind the gear, kg m2."""
+    coulomb: float
+    """Coulomb friction, Nm."""
+    viscous: float
+    """Viscous friction, Nm s/rad."""
+    torque: float
+    """Greatest torque, Nm."""
+
+
+class ArmPlant:
+    """An arm of n joints. All arrays are (n,), in rad, rad/s and Nm.
+
+    Attributes:
+        q: Joint positions.
+        dq: Joint velocities.
+        tau: Torques of the motors in the last step.
+        held: Whether something outside holds the arm, so that it does not move: a stand, or a hand.
+        push: External torques.
+    """
+
+    def __init__(
+        self,
+        urdf: str | Path,
+        joints: Sequence[str],
+        mechanics: Sequence[JointMechanics],
+        q: Sequence[float],
+        tcp_link: str,
+        base_orientation: Sequence[float] = (0.0, 0.0, 0.0, 1.0),
+    ) -> None:
+        """Build it from a URDF, with every other joint locked where it is 0.
+
+        Args:
+            urdf: Path of the URDF.
+            joints: The arm's joints, from base to tip.
+            mechanics: One record for each joint.
+            q: Start position.
+            tcp_link: Link that a payload is fixed to.
+            base_orientation: Quaternion (xyzw) of the URDF's root in the world; gravity points down there.
+        """
+        full = pin.buildModelFromUrdf(str(urdf))
+        others = [k for k in range(1, full.njoints) if full.names[k] not in joints]
+        self._model: Any = pin.buildReducedModel(full, others, pin.neutral(full))
+        self._data: Any = self._model.createData()
+        self._order = [self._model.joints[self._model.getJointId(name)].idx_q for name in joints]
+        if self._order != list(range(len(joints))):
+            raise ValueError(f"{urdf}: the joints {', '.join(joints)} do not follow each other from base to tip")
+        rotation = pin.Quaternion(np.array(base_orientation, float)).toRotationMatrix()
+        self._model.gravity.linear = rotation.T @ np.array([0.0, 0.0, -9.81])
+        self._tcp = self._model.frames[self._model.getFrameId(tcp_link)]
+        self._inertias = [pin.Inertia(inertia) for inertia in self._model.inertias]
+        self.lower = [float(x) for x in self._model.lowerPositionLimit]
+        self.upper = [float(x) for x in self._model.upperPositionLimit]
+        self._mechanics = tuple(mechanics)
+        self._rotor = np.array([m.inertia for m in mechanics])
+        self._friction = [0.0] * len(joints)
+        self.mass_factor = 1.0
+        self.payload: tuple[float, tuple[float, ...]] = (0.0, (0.0, 0.0, 0.0))
+        self.held = True
+        self.place(q)
+
+    def place(self, q: Sequence[float]) -> None:
+        """Put the arm at rest at a position, and hold it there."""
+        self.q: NDArray[np.float64] = np.array(q, float)
+        self.dq: NDArray[np.float64] = np.zeros(len(self.q))
+        self.tau: NDArray[np.float64] = np.zeros(len(self.q))
+        self.push: NDArray[np.float64] = np.zeros(len(self.q))
+        self._friction = [0.0] * len(self.q)
+        self.held = True
+
+    def load(self, mass_factor: float | None = None, payload: tuple[float, Sequence[float]] | None = None) -> None:
+        """Change what the arm weighs; None leaves a value as it is.
+
+        Args:
+            mass_factor: Factor on the masses and inertias of all links.
+            payload: Mass, kg, and its place (3,) in the frame of the tcp's link, m.
+        """
+        if mass_factor is not None:
+            self.mass_factor = mass_factor
+        if payload is not None:
+            self.payload = payload[0], tuple(payload[1])
+        for k, inertia in enumerate(self._inertias):
+            self._model.inertias[k] = pin.Inertia(
+                inertia.mass * self.mass_factor, inertia.lever, inertia.inertia * self.mass_factor
+            )
+        mass, place = self.payload
+        if mass > 0.0:
+            point = self._tcp.placement.act(np.array(place))
+            carried = self._model.inertias[self._tcp.parentJoint]
+            self._model.inertias[self._tcp.parentJoint] = carried + pin.Inertia(mass, point, np.zeros((3, 3)))
+
+    def gravity(self) -> NDArray[np.float64]:
+        """Return the torques that hold the arm, without friction."""
+        torques: NDArray[np.float64] = pin.computeGeneralizedGravity(self._model, self._data, self.q).copy()
+        return torques
+
+    def flange(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return position (3,), m, and roll, pitch, yaw (3,), rad, of the last joint's frame in the base frame."""
+        pin.forwardKinematics(self._model, self._data, self.q)
+        pose = self._data.oMi[self._model.njoints - 1]
+        return pose.translation.copy(), pin.rpy.matrixToRpy(pose.rotation)
+
+    def step(self, dt: float, drives: Sequence[Drive]) -> None:
+        """Move the arm on by ``dt``, s, under these drives of its motors."""
+        if self.held:
+            self.dq[:] = 0.0
+            self.tau[:] = 0.0
+            return
+        upper = np.triu(pin.crba(self._model, self._data, self.q))
+        mass = upper + np.triu(upper, 1).T
+        mass[np.diag_indices_from(mass)] += self._rotor
+        bias = pin.nonLinearEffects(self._model, self._data, self.q, self.dq)
+        start = mass @ self.dq + dt * (self.push - bias)
+        active = list(drives)
+        velocity = self._solve(dt, mass, start, active)
+        torques = self._torques(dt, velocity, active)
+        beyond = [k for k, m in enumerate(self._mechanics) if abs(torques[k]) > m.torque]
+        if beyond:
+            for k in beyond:
+                limit = self._mechanics[k].torque
+                active[k] = Drive(tau=limit if torques[k] > 0.0 else -limit)
+            velocity = self._solve(dt, mass, start, active)
+            torques = self._torques(dt, velocity, active)
+        self.tau[:] = torques
+        self.dq[:] = velocity
+        self.q += dt * self.dq
+
+    def _solve(
+        self, dt: float, mass: NDArray[np.float64], start: NDArray[np.float64], drives: Sequence[Drive]
+    ) -> list[float]:
+        """Return the velocities after a step; ``start`` is the momentum that all but drives and friction give."""
+        left, right = mass.copy(), start.copy()
+        for k, (drive, joint) in enumerate(zip(drives, self._mechanics, strict=True)):
+            q = float(self.q[k])
+            stiffness, damping = drive.kp, drive.kd + joint.viscous
+            torque = drive.tau + drive.kp * (drive.q - q) + drive.kd * drive.dq
+            stop = min(max(q, self.lower[k]), self.upper[k])
+            if stop != q:
+                stiffness += _STOP_STIFFNESS
+                damping += _STOP_DAMPING
+                torque += _STOP_STIFFNESS * (stop - q)
+            left[k, k] += dt * (damping + dt * stiffness)
+            right[k] += dt * torque
+        inverse = np.linalg.inv(left)
+        friction = self._friction
+        velocity: list[float] = (inverse @ (right + np.array(friction))).tolist()
+        rows: list[list[float]] = inverse.tolist()
+        for _ in range(_SWEEPS):
+            for k, joint in enumerate(self._mechanics):
+                bound = dt * joint.coulomb
+                impulse = min(max(friction[k] - velocity[k] / rows[k][k], -bound), bound)
+                change = impulse - friction[k]
+                if change:
+                    friction[k] = impulse
+                    row = rows[k]  # the inverse is symmetric
+                    velocity = [v + change * r for v, r in zip(velocity, row, strict=True)]
+        return velocity
+
+    def _torques(self, dt: float, velocity: Sequence[float], drives: Sequence[Drive]) -> list[float]:
+        return [
+            d.tau + d.kp * (d.q - q - dt * v) + d.kd * (d.dq - v)
+            for d, q, v in zip(drives, self.q.tolist(), velocity, strict=True)
+        ]
+
+
+class GripperPlant:
+    """A gripper's motor with its fingers: one angle, between two stops and an object that it may close on.
+
+    Attributes:
+        q: Angle, rad.
+        dq: Speed, rad/s.
+        tau: Torque of the motor in the last step, Nm.
+    """
+
+    def __init__(self, mechanics: JointMechanics, q: float, lower: float, upper: float) -> None:
+        """Build one at ``q``, which can turn from ``lower`` to ``upper``, rad."""
+        self._mechanics = mechanics
+        self.q, self.dq, self.tau = q, 0.0, 0.0
+        self.lower, self.upper = lower, upper
+        """Where the fingers meet a stop or an object, rad."""
+
+    def step(self, dt: float, drive: Drive) -> None:
+        """Move the gripper on by ``dt``, s, under this drive of its motor."""
+        inertia, coulomb, viscous, limit = self._mechanics
+        velocity = self._solve(dt, drive, inertia, coulomb, viscous)
+        torque = drive.tau + drive.kp * (drive.q - self.q - dt * velocity) + drive.kd * (drive.dq - velocity)
+        if abs(torque) > limit:
+            torque = limit if torque > 0.0 else -limit
+            velocity = self._solve(dt, Drive(tau=torque), inertia, coulomb, viscous)
+        self.tau, self.dq = torque, velocity
+        self.q += dt * velocity
+
+    def _solve(self, dt: float, drive: Drive, inertia: float, coulomb: float, viscous: float) -> float:
+        stiffness, damping = drive.kp, drive.kd + viscous
+        torque = drive.tau + drive.kp * (drive.q - self.q) + drive.kd * drive.dq
+        stop = min(max(self.q, self.lower), self.upper)
+        if stop != self.q:
+            stiffness += _STOP_STIFFNESS
+            damping += _STOP_DAMPING
+            torque += _STOP_STIFFNESS * (stop - self.q)
+        left = inertia + dt * (damping + dt * stiffness)
+        right = inertia * self.dq + dt * torque
+        bound = dt * coulomb
+        return (right - min(max(right, -bound), bound)) / left

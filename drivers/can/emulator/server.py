@@ -1,0 +1,276 @@
+"""The emulator at work: one thread per bus, which steps its arms in real time, answers frames, and injects faults.
+
+with CanEmulator("yam_emulator") as emulator:
+    emulator.execute("status 3 A")           # any command of the console, from any thread
+"""
+
+from __future__ import annotations
+
+import contextlib
+import heapq
+import itertools
+import random
+import threading
+import time
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Protocol
+
+import can
+
+from hal.config.loader import load
+from hal.specs import RobotSpec
+
+from ..settings import BusSettings
+from .damiao import DamiaoArm
+from .piper import PiperArm
+from .plant import ArmPlant
+
+__all__ = ["CanEmulator", "EmulatedArm", "EmulatedBus", "FrameFaults"]
+
+_STEP = 1e-3
+"""Step of the mechanics, s."""
+_LONGEST_GAP = 0.25
+"""Time that the mechanics make up for after the machine had no time for them, s."""
+_ARMS: Mapping[str, Callable[[RobotSpec], EmulatedArm]] = {"damiao": DamiaoArm, "piper": PiperArm}
+
+
+class EmulatedArm(Protocol):
+    """An arm on a bus, as its bus and the console see it."""
+
+    name: str
+    bus: BusSettings
+    plant: ArmPlant
+    peak: list[float]
+
+    def take(self, id: int, data: bytes, send: Callable[[int, bytes, int], None]) -> None:
+        """Take a frame from the bus, and answer it."""
+
+    def step(self, dt: float, send: Callable[[int, bytes, int], None]) -> None:
+        """Let time pass."""
+
+    def restart(self) -> None:
+        """Switch the arm's power off and on again."""
+
+    def report(self) -> dict[str, Any]:
+        """Return its state."""
+
+    def set_status(self, number: int, status: int) -> None:
+        """Raise a fault at a motor."""
+
+    def set_register(self, number: int, name: str, value: float) -> None:
+        """Change a register of a motor."""
+
+    def set_temperature(self, number: int, driver: int, motor: int) -> None:
+        """Change what a motor reports, deg C."""
+
+    def set_object(self, width: float | None) -> None:
+        """Put an object between the fingers, or take it away."""
+
+
+class FrameFaults:
+    """What happens to the frames of one arm on their way."""
+
+    def __init__(self) -> None:
+        self.lost_share = 0.0
+        """Share of the replies that is lost."""
+        self.lose_next: dict[int, int] = {}
+        """Number of a motor, 0 for any -> how many of its next replies are lost."""
+        self.delay = 0.0
+        """Lateness of the replies, s."""
+        self.copies = 1
+        """How often each reply is sent."""
+        self.silent_until: dict[int, float] = {}
+        """Number of a motor, 0 for all -> time until which it neither hears nor answers, on the monotonic clock, s."""
+
+    def silent(self, motor: int, now: float) -> bool:
+        """Return whether a motor is silent."""
+        until = self.silent_until
+        return bool(until) and (until.get(0, 0.0) > now or until.get(motor, 0.0) > now)
+
+    def lose(self, motor: int, source: random.Random) -> bool:
+        """Return whether this reply is lost."""
+        for number in (motor, 0):
+            left = self.lose_next.get(number, 0)
+            if left > 0:
+                self.lose_next[number] = left - 1
+                return True
+        return self.lost_share > 0.0 and source.random() < self.lost_share
+
+
+class EmulatedBus:
+    """One bus with its arms, served by a thread.
+
+    Attributes:
+        arms: The arms on it, with the faults of their frames.
+        lock: Held while the thread works; hold it to change an arm.
+        cut_until: Time until which no frame passes, s on the monotonic clock.
+        stall: Time for which the thread stands still next, s.
+        received: Frames so far.
+        late: Steps that were left out because the machine had no time.
+    """
+
+    def __init__(self, settings: BusSettings, arms: Sequence[EmulatedArm], seed: int = 0) -> None:
+        self.settings = settings
+        self.arms = {arm.name: arm for arm in arms}
+        self.faults = {arm.name: FrameFaults() for arm in arms}
+        self.lock = threading.Lock()
+        self.cut_until = 0.0
+        self.stall = 0.0
+        self.received = self.late = 0
+        self.error: Exception | None = None
+        self._random = random.Random(seed)
+        self._waiting: list[tuple[float, int, int, bytes]] = []
+        """Late frames: time, order, id, data."""
+        self._order = itertools.count()
+        self._end = threading.Event()
+        self._bus: can.BusABC | None = None
+        self._thread = threading.Thread(target=self._run, name=f"can-emulator-{settings.channel}", daemon=True)
+
+    def start(self) -> None:
+        """Open the bus and start the thread. Raises what python-can raises if it cannot be opened."""
+        s = self.settings
+        more: dict[str, Any] = {"fd": s.fd} if s.interface == "udp_multicast" or s.fd else {}
+        if s.interface == "udp_multicast":
+            more["hop_limit"] = 0  # frames never leave this computer
+        self._bus = can.Bus(interface=s.interface, channel=s.channel, ignore_config=True, **{**more, **s.bus})
+        self._thread.start()
+
+    def stop(self) -> None:
+        """End the thread and close the bus."""
+        self._end.set()
+        if self._thread.is_alive():
+            self._thread.join(5.0)
+        if self._bus is not None:
+            self._bus.shutdown()
+
+    def send(self, id: int, data: bytes) -> None:
+        """Send a frame now, whatever the faults."""
+        fd = self.settings.fd
+        message = can.Message(arbitration_id=id, is_extended_id=False, data=data, is_fd=fd, bitrate_switch=fd)
+        if self._bus is not None:
+            with contextlib.suppress(can.CanError, OSError):  # a full queue, or a bus that is going down
+                self._bus.send(message)
+
+    def _run(self) -> None:
+        try:
+            self._serve()
+        except Exception as error:  # reported by whoever looks at it
+            self.error = error
+            raise
+
+    def _serve(self) -> None:
+        bus = self._bus
+        assert bus is not None
+        due = time.monotonic()
+        while not self._end.is_set():
+            if self.stall:
+                pause, self.stall = self.stall, 0.0
+                self._end.wait(pause)
+            now = time.monotonic()
+            with self.lock:
+                if now - due > _LONGEST_GAP:
+                    self.late += int((now - due) / _STEP)
+                    due = now
+                while due <= now:
+                    due += _STEP
+                    for name, arm in self.arms.items():
+                        arm.step(_STEP, self._sender(name))
+                self._flush(now)
+            message = bus.recv(max(0.0, due - time.monotonic()))
+            while message is not None:
+                if not message.is_error_frame:
+                    with self.lock:
+                        self._take(message.arbitration_id, bytes(message.data))
+                message = bus.recv(0.0)
+
+    def _take(self, id: int, data: bytes) -> None:
+        now = time.monotonic()
+        self.received += 1
+        if now < self.cut_until:
+            return
+        for name, arm in self.arms.items():
+            faults = self.faults[name]
+            motor = id if id < 0x7FF else data[0] if data else 0
+            if not faults.silent(motor, now):
+                arm.take(id, data, self._sender(name))
+
+    def _sender(self, name: str) -> Callable[[int, bytes, int], None]:
+        faults = self.faults[name]
+
+        def send(id: int, data: bytes, motor: int) -> None:
+            now = time.monotonic()
+            if now < self.cut_until or faults.silent(motor, now) or faults.lose(motor, self._random):
+                return
+            for _ in range(faults.copies):
+                if faults.delay > 0.0:
+                    heapq.heappush(self._waiting, (now + faults.delay, next(self._order), id, data))
+                else:
+                    self.send(id, data)
+
+        return send
+
+    def _flush(self, now: float) -> None:
+        while self._waiting and self._waiting[0][0] <= now:
+            _, _, id, data = heapq.heappop(self._waiting)
+            if now >= self.cut_until:
+                self.send(id, data)
+
+
+class CanEmulator:
+    """All CAN arms of a rig, each on its bus.
+
+    Attributes:
+        arms: The arms by name.
+        buses: Their buses.
+    """
+
+    def __init__(self, config: str | Path | Mapping[str, Any], overrides: Sequence[str] = (), seed: int = 0) -> None:
+        """Build the arms of a rig that have a CAN driver and are not simulated.
+
+        Args:
+            config: The rig, as for :func:`hal.open`.
+            overrides: Changes of it, as for :func:`hal.open`.
+            seed: Of random losses.
+
+        Raises:
+            ConfigError: The rig has problems.
+            ValueError: It has no arm on a CAN bus.
+        """
+        specs = [spec for spec in load(config, sim=False, overrides=overrides).resolve().robots if spec.driver in _ARMS]
+        if not specs:
+            raise ValueError("this rig has no arm on a CAN bus that is not simulated")
+        self.arms: dict[str, EmulatedArm] = {spec.name: _ARMS[spec.driver](spec) for spec in specs}
+        keys = {arm.bus.key: arm.bus for arm in self.arms.values()}
+        self.buses = [
+            EmulatedBus(settings, [arm for arm in self.arms.values() if arm.bus.key == key], seed)
+            for key, settings in keys.items()
+        ]
+
+    def execute(self, line: str | Sequence[object]) -> dict[str, Any]:
+        """Execute a command of the console, and return its answer. Raises ValueError if it is invalid."""
+        from .console import execute
+
+        words = line.split() if isinstance(line, str) else [str(word) for word in line]
+        return execute(self, words)
+
+    def bus_of(self, arm: EmulatedArm) -> EmulatedBus:
+        """Return the bus that an arm is on."""
+        return next(bus for bus in self.buses if arm.name in bus.arms)
+
+    def start(self) -> None:
+        """Open all buses and start to answer."""
+        for bus in self.buses:
+            bus.start()
+
+    def stop(self) -> None:
+        """End all threads and close the buses."""
+        for bus in self.buses:
+            bus.stop()
+
+    def __enter__(self) -> CanEmulator:
+        self.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.stop()
