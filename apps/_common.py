@@ -269,7 +269,8 @@ def find_deadman(rig: Rig) -> tuple[Deadman, TeleopMapping]:
 
     pad = next(iter(rig.gamepads.values()), None)
     if pad is None:
-        raise CommandError(f"{rig.plan.source} has no gamepad to hold as the dead-man; see --pad and --unattended")
+        message = f"{rig.plan.source} has no gamepad to hold as the dead-man; see --pad and --unattended"
+        raise CommandError(message, code="no_gamepad")
     mapping = load_mapping(pad.mapping or "default")
     return pad.hold(mapping.deadman), mapping
 

@@ -53,7 +53,7 @@ def parser() -> argparse.ArgumentParser:
         metavar="[x,y,z,qx,qy,qz,qw]",
         help="with --auto: approximate pose of the camera (default: from the rig file)",
     )
-    views.add_argument("--mapping", default="default", metavar="FILE", help="gamepad mapping (%(default)s)")
+    views.add_argument("--mapping", metavar="FILE", help="gamepad mapping (default: the pad's own)")
     result = made.add_argument_group("result")
     result.add_argument("--compare", action="store_true", help="show the difference from the rig file; write nothing")
     result.add_argument("--out", metavar="FILE", help="write a copy of the rig file instead of changing it")
@@ -113,7 +113,7 @@ def _main(args: argparse.Namespace) -> int:
 
     if args.views < calibration.LEAST_VIEWS:
         raise CommandError(f"--views must be at least {calibration.LEAST_VIEWS}, not {args.views}")
-    load_mapping(args.mapping)
+    load_mapping(args.mapping or "default")
     check_wanted(args.pad)
     config = load(args.config, sim=args.sim, overrides=args.overrides)
     plan = config.resolve()
@@ -155,11 +155,14 @@ def _collect(args: argparse.Namespace, rig: Rig, collector: Collector, guess: Po
         rig.say(text)
 
     pad = next(iter(rig.gamepads.values()), None)
-    teleop = hal.Teleop(collector.robot, mapping=args.mapping)
+    own = pad.mapping if pad is not None else None
+    teleop = hal.Teleop(collector.robot, mapping=args.mapping or own or "default")
     if guess is not None:
-        deadman = None if pad is None or args.unattended else pad.hold(teleop.mapping.deadman)
-        if deadman is not None:
-            print(f"  hold {teleop.mapping.deadman}: the arm moves only while it is held", flush=True)
+        deadman = None
+        if pad is not None and not args.unattended:
+            control = teleop.mapping.deadman
+            deadman = pad.hold(control)
+            print(f"  hold {pad.control_name(control)}: the arm moves only while it is held", flush=True)
         collect_views(collector, guess, args.views, report, deadman=deadman, unattended=args.unattended)
         return
     wait = wait_for_enter

@@ -173,10 +173,10 @@ class RolloutRun:
 
     def run(self) -> int:
         """Run all episodes, or until one is stopped. Return the exit status."""
-        from hal.errors import MotionStopped, RobotFault
+        from hal.errors import HalError, MotionStopped, RobotFault
 
         self.runner.rehearse()
-        ended = ""
+        ended, failed = "", False
         try:
             for number in range(self.args.episodes):
                 outcome = self._episode(self.args.seed + number)
@@ -187,11 +187,15 @@ class RolloutRun:
             ended = getattr(stop, "reason", str(stop))
         except KeyboardInterrupt:
             ended = "Ctrl-C"
+        except (HalError, OSError) as error:  # such as the end of the arm's process
+            if not self.outcomes:
+                raise
+            ended, failed = f"{type(error).__name__}: {error}", True
         self.line.clear()
         self._print_results(ended)
         if self.args.report:
             Path(self.args.report).write_text(json.dumps(self._report(ended), indent=2) + "\n")
-        return ENDED_EARLY if ended else 0
+        return ACTION_NEEDED if failed else ENDED_EARLY if ended else 0
 
     def _announce(self, text: str) -> None:
         self.line.event(f"  {text}")

@@ -41,7 +41,7 @@ class EvdevOptions(BaseModel):
 
 
 class EvdevPad(GamepadDriver):
-    """The first pad that is plugged in, or the one that the options name. It may be unplugged and come back
+    """The first pad that is plugged in, or the one that the options name. It may be unplugged and come back.
 
     Pads are recognised by the events that they can send. Each gets the model of ``spec.models`` that matches best, or
     a guessed one with a warning in ``notes``. With ``spec.model`` only a pad that matches it is used, unless the

@@ -193,7 +193,7 @@ class RealSenseDevice:
         return f"{camera} was reset, and will be back in some seconds"
 
     def inject(self, **faults: Any) -> None:
-        """Set faults of an emulated camera (:class:`.emulator.camera.CameraFaults`).
+        """Set faults of an emulated camera (:class:`.emulator.settings.CameraFaults`).
 
         Raises:
             NotSupported: For a real camera or a recording.

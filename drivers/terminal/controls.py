@@ -7,6 +7,7 @@ do. Both have the same methods. Which key is which control is the table ``sensor
 from __future__ import annotations
 
 import math
+import textwrap
 from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Literal, NamedTuple
@@ -35,21 +36,23 @@ STOP_KEYS = _TABLE.stop
 _SHOULDERS = ("l1", "r1")
 """Buttons that usually move something, so a step presses the dead-man with them. Other buttons are left to the app."""
 
-_KEYS = (
-    "    arrows: d-pad; Page Up/Down or Q/E: l1/r1; WASD, IJKL: left, right stick; G/H: r2, close/open\n"
-    "    1 2 3 4: south east west north; Enter: start; Tab: select; Home: home; Ctrl-C ends"
+_STOP = " or ".join(key.capitalize() for key in STOP_KEYS)
+_SLOW = " or ".join(key.capitalize() for key in _TABLE.slow)
+_HOLD = _TABLE.names["l2"]
+_KEYS = textwrap.indent(
+    textwrap.fill("; ".join(f"{keys}: {name}" for name, keys in _TABLE.names.items() if name != "l2"), 108), "    "
 )
 STEP_HELP = (
-    "keys of this terminal, one small step for each press (l2 is pressed with it)\n"
-    "    Backspace or Esc: STOP; the next key continues. While the arm steps, other keys are ignored\n"
+    "keys of this terminal, one small step for each press (l2 is pressed with it); Ctrl-C ends\n"
+    f"    {_STOP}: STOP; the next key continues. While the arm steps, other keys are ignored\n"
     f"{_KEYS}\n"
     "    buttons are pressed without l2, so functions that need l2 held, such as homing, are not available"
 )
 HOLD_HELP = (
-    "keys of this terminal, held down\n"
-    "    hold Space (l2) and other keys to move; release it to stop\n"
-    f"    Backspace or Esc: STOP; hold Space again to continue\n{_KEYS}\n"
-    "    Shift: slower. When the window loses the focus, or the link is slow, all keys count as released"
+    "keys of this terminal, held down; Ctrl-C ends\n"
+    f"    hold {_HOLD} (l2) and other keys to move; release it to stop\n"
+    f"    {_STOP}: STOP; hold {_HOLD} again to continue\n{_KEYS}\n"
+    f"    {_SLOW}: slower. When the window loses the focus, or the link is slow, all keys count as released"
 )
 
 

@@ -413,7 +413,8 @@ class ManualDrive:
 
     def help(self) -> list[str]:
         """Return a description of the controls, in lines."""
-        return [*self._teleop.help(self._pad), f"{self._record}: take a view, {self._finish}: finish"]
+        name = self._pad.control_name
+        return [*self._teleop.help(self._pad), f"{name(self._record)}: take a view, {name(self._finish)}: finish"]
 
     def wait(self) -> bool:
         """Drive until a view is requested (True) or the user finishes (False).

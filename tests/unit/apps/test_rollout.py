@@ -51,6 +51,11 @@ def check(rig, random):
         print(*rig.world.pose("cube").position, file=file)
 
 
+def unplugged(rig, random):
+    if rig.clock.now() > 0.5:
+        raise hal.ConnectionLost("no arm")
+
+
 def lost(observation):
     if observation.t > 1.0:
         raise ValueError("no idea")
@@ -151,6 +156,15 @@ def test_an_error_of_the_policy_ends_the_run(folder: Path) -> None:
     assert "the arm is at rest" in done.stdout
     for text in ("ValueError: no idea", "policies.py"):
         assert text in done.stderr
+
+
+def test_an_arm_that_is_lost_between_episodes_keeps_the_results(folder: Path) -> None:
+    options = ("--policy", "policies:Reach", "--reset", "policies:unplugged", "--seconds", 1.0, "--episodes", 3)
+    done = rollout(*options, *FAST)
+    assert done.returncode == 2, done.stderr
+    found = report(folder)
+    assert len(found["episodes"]) == 1
+    assert found["ended"] == "ConnectionLost: no arm"
 
 
 @pytest.mark.parametrize(
