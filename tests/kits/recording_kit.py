@@ -135,7 +135,7 @@ class Scene(NamedTuple):
 
 
 class Likeness(NamedTuple):
-    """How a recorded picture and one that was drawn anew differ."""
+    """The difference of a recorded picture and one that was rendered again."""
 
     psnr: float
     """Of the colours, dB."""

@@ -49,7 +49,7 @@ def write_pad(path: Path, held: Iterable[Held], seconds: float) -> Path:
     events = [(0.0, name, 128) for name in ("ABS_X", "ABS_Y", "ABS_RX", "ABS_RY")]
     for start, end, name, value, rest in held:
         events += [(start, name, value), (end, name, rest)]
-    # A pad in a hand is never quite still; one that says nothing counts as gone.
+    # A pad that is held is never quite still; a silent one counts as lost.
     events += [(0.1 * k, "ABS_Y", 128 + k % 2) for k in range(1, round(10 * seconds))]
     lines = [json.dumps(_HEAD)]
     for t, name, value in sorted(events):

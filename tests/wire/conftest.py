@@ -1,4 +1,4 @@
-"""Emulators that the tests of a module share; each test gets them as if switched on anew."""
+"""Emulators that the tests of a module share; each test gets them as if just switched on."""
 
 from __future__ import annotations
 

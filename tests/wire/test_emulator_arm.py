@@ -126,7 +126,7 @@ def test_what_is_refused_while_the_arm_is_led_by_hand_and_in_a_reflex() -> None:
     assert bench.state("reflex_reason")[6] == 0
 
 
-def test_a_move_that_makes_no_sense_is_an_invalid_argument() -> None:
+def test_an_impossible_move_is_an_invalid_argument() -> None:
     bench = Bench()
     rest = bytes(57)
     for modes in ((3, 0), (0, 5), (0, 4)):  # no such controller, no such generator, neither positions nor torques

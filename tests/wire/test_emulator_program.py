@@ -1,4 +1,4 @@
-"""The emulator as a program: how it starts, what it says, how it is told what to do, how it ends, and its pace."""
+"""The emulator as a program: its start, output, commands, end and pace."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ def client(arm: Emulator) -> Iterator[Client]:
     client.close()
 
 
-def test_it_says_when_it_is_ready_and_ends_when_it_is_told() -> None:
+def test_it_reports_ready_and_ends_on_request() -> None:
     for number in (signal.SIGTERM, signal.SIGINT):
         with Emulator() as emulator:
             (ready,) = [line for line in emulator.lines if "ready:" in line]
@@ -78,14 +78,14 @@ def test_it_says_when_it_is_ready_and_ends_when_it_is_told() -> None:
             assert not any("Traceback" in line for line in emulator.lines)
 
 
-def test_an_address_that_is_taken_or_nobodys_is_one_line(arm: Emulator) -> None:
+def test_an_address_that_is_taken_or_foreign_is_one_line(arm: Emulator) -> None:
     for host, reason in ((arm.host, "Address already in use"), ("192.0.2.1", "Cannot assign requested address")):
         done = subprocess.run([*PROGRAM, "--host", host, "--no-hand"], capture_output=True, text=True, timeout=20)
         assert done.returncode == 1
         assert done.stderr == f"error: cannot listen on {host}:1337: {reason}\n"
 
 
-def test_options_that_make_no_sense() -> None:
+def test_invalid_options_are_refused() -> None:
     for options in (["--host", "here"], ["--patience", "0"], ["--robot", "ur5"], ["--urdf", "/nowhere.urdf"]):
         done = subprocess.run([*PROGRAM, *options], capture_output=True, text=True, timeout=20)
         assert done.returncode != 0
@@ -120,7 +120,7 @@ def test_commands_that_are_typed(arm: Emulator) -> None:
     ["", "reflex", "reflex nothing", "silence", "silence -1", "silence x", "lose-states 2", "lose-states next", "log x",
      "version 70000", "place 1 2", "place 9 0 0 0 0 0 0", "guiding", "hand object none", "restart soon", "stall 1e9"],
 )  # fmt: skip
-def test_commands_that_make_no_sense_are_refused_in_words(arm: Emulator, line: str) -> None:
+def test_invalid_commands_are_refused_with_a_message(arm: Emulator, line: str) -> None:
     with pytest.raises(ValueError, match=r"\w"):
         arm.control.send(line)
     assert arm.control.send("state")["mode"] == "idle"
@@ -197,7 +197,7 @@ def test_a_client_that_is_killed_makes_room_at_once(arm: Emulator, client: Clien
         again.close()
 
 
-def test_who_never_introduces_himself_keeps_nobody_away(arm: Emulator) -> None:
+def test_a_client_that_never_connects_properly_blocks_no_other(arm: Emulator) -> None:
     with socket.create_connection((arm.host, 1337), 5.0):
         welcome = False
         deadline = time.monotonic() + 5.0
@@ -216,7 +216,7 @@ def test_kill_is_sudden() -> None:
         assert emulator.process.wait(5) == -signal.SIGKILL
 
 
-def test_nobody_reads_what_it_prints() -> None:
+def test_output_that_is_not_read_does_not_block_it() -> None:
     """A closed pipe is no reason to stop serving."""
     reading, writing = os.pipe()
     host = "127.0.1.251"

@@ -138,14 +138,14 @@ def opening_error(host: str, robot: str = "fr3", *more: str) -> hal.HalError:
 
 
 @pytest.mark.parametrize("robot", ["fr3", "panda"])
-def test_nobody_is_there(robot: str) -> None:
+def test_a_robot_that_does_not_answer_is_an_error(robot: str) -> None:
     host = free_host()
     error = opening_error(host, robot)
     assert (type(error), error.code) == (hal.ConnectionLost, "refused")
     assert f"python -m hal.drivers.franka.emulator --host {host}" in str(error)
 
 
-def test_a_name_that_nobody_has_is_named() -> None:
+def test_an_unknown_host_name_is_named() -> None:
     error = opening_error("no-such-robot.invalid")
     assert error.code == "unknown_host"
     assert "no-such-robot.invalid" in str(error)
@@ -169,7 +169,7 @@ def test_the_error_of_a_second_program_names_the_first_one(emulator: Emulator, a
     assert f"process {app.process.pid}" in str(error)
 
 
-def test_somebody_elses_client_holds_the_arm(emulator: Emulator) -> None:
+def test_a_client_of_another_program_holds_the_arm(emulator: Emulator) -> None:
     """Another computer's: there is no process here that could be named."""
     with socket.create_connection((emulator.host, 1337)):
         error = opening_error(emulator.host, model_of(emulator))

@@ -85,7 +85,7 @@ def table() -> Iterator[list[str]]:
 
 
 @pytest.mark.parametrize("case", CASES, ids=lambda case: case.command)
-def test_a_fault_is_named_and_the_arm_can_go_on(emulator: Emulator, rig: Rig, case: Case, table: list[str]) -> None:
+def test_a_fault_is_named_and_the_arm_can_continue(emulator: Emulator, rig: Rig, case: Case, table: list[str]) -> None:
     arm = arm_of(rig)
     drive = Drive(arm)
     struck: list[float] = []
@@ -140,7 +140,7 @@ def is_well(arm: hal.Robot) -> bool:
         return False
 
 
-def test_an_arm_does_not_go_on_by_itself(emulator: Emulator, rig: Rig) -> None:
+def test_an_arm_does_not_continue_by_itself(emulator: Emulator, rig: Rig) -> None:
     """A session that is open while the arm is in reflex and recovers stays stopped until it is armed again."""
     arm = arm_of(rig)
     with arm.control(rate_hz=50, unattended=True) as control:
@@ -163,7 +163,7 @@ def test_an_arm_does_not_go_on_by_itself(emulator: Emulator, rig: Rig) -> None:
         control.rearm()
         for _ in zip(range(40), rig.clock.rate(50), strict=False):
             control.send(hal.Twist([0.0, 0.05, 0.0]))
-        assert abs(arm.state().q - before).max() > 1e-3, "after rearm() it goes on"
+        assert abs(arm.state().q - before).max() > 1e-3, "after rearm() it continues"
 
 
 def test_the_docs_list_every_fault() -> None:

@@ -38,7 +38,7 @@ def bench() -> Iterator[HandBench]:
 
 @pytest.fixture
 def brisk(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Nobody has to wait as long as a real hand may need."""
+    """Shorter times than a real hand needs."""
     monkeypatch.setattr(hand_motions, "_CALL_MARGIN", 0.3)
     monkeypatch.setattr(hand_motions, "_STOP_TIMEOUT", 0.3)
     monkeypatch.setattr(hand_motions, "_SETTLE_TIME", 0.3)
@@ -107,7 +107,7 @@ def test_a_grasp_holds_what_has_the_right_width_only(bench):
     assert bench.command("state")["is_grasped"]
 
 
-def test_a_hand_that_is_not_homed_says_so_and_is_homed():
+def test_a_hand_that_is_not_homed_reports_it_and_is_homed():
     with HandBench(homed=False) as bench:
         bench.server.fingers.width = 0.01
         fault = bench.read().fault
@@ -134,7 +134,7 @@ def test_a_stop_leaves_the_fingers_where_they_are(bench, brisk):
     assert (bench.read().width, bench.read().fault, bench.requests["stop"]) == (width, None, 1)
 
 
-def test_a_stop_that_is_ignored_is_told_and_the_next_command_waits(bench, brisk):
+def test_an_ignored_stop_is_reported_and_the_next_command_waits(bench, brisk):
     bench.command("stop-ignored on")
     bench.hand.move(0.06, 0.02, 40.0)
     bench.wait(lambda r: r.width > 0.041)
@@ -145,8 +145,8 @@ def test_a_stop_that_is_ignored_is_told_and_the_next_command_waits(bench, brisk)
     assert bench.read().width == pytest.approx(0.07, abs=0.002)
 
 
-def test_a_stop_that_lets_go_is_told(bench, brisk):
-    """States and answers are late, so nobody can know that the fingers hold something when they are told to stop."""
+def test_a_stop_that_drops_the_object_is_reported(bench, brisk):
+    """States and answers are late, so at the stop it is unknown whether the fingers hold something."""
     for words in ("stop-releases on", "object 0.03", "slow-reply 0.8"):
         bench.command(words)
     bench.hand.grasp(0.03, 0.04, 40.0, 0.005, 0.005)
@@ -237,26 +237,26 @@ def test_closing_stops_fingers_that_are_on_their_way(bench):
     assert state["width"] < 0.06
 
 
-def test_nobody_there_is_told_in_one_line():
+def test_a_missing_hand_is_reported_in_one_line():
     spec = GripperSpec("panda.gripper", "franka", 0.08, 0.1, 40.0, options={"host": "127.0.2.255"})
     with pytest.raises(ConnectionLost, match="panda.gripper: .*127.0.2.255") as caught:
         FrankaHand(spec).open()
     assert "\n" not in str(caught.value)
 
 
-def test_another_protocol_is_told():
+def test_another_protocol_is_reported():
     with HandBench(connect=False, version=4) as bench, pytest.raises(NotSupported, match="protocol 4, .* 3"):
         bench.hand.open()
 
 
-def test_a_hand_that_another_program_uses_is_told(bench):
+def test_a_hand_in_use_by_another_program_is_reported(bench):
     other = FrankaHand(bench.hand.spec)
     with pytest.raises(ConnectionLost, match=bench.host):
         other.open()
     assert bench.do("move", 0.05, 0.1, 40.0).outcome is DONE
 
 
-def test_a_hand_that_takes_the_connection_and_says_nothing_is_told(monkeypatch):
+def test_a_hand_that_accepts_and_stays_silent_is_reported(monkeypatch):
     monkeypatch.setattr(hand_process, "_OPEN_TIMEOUT", 1.0)
     with HandBench(connect=False) as bench:
         bench.command("slow-reply 1000")
@@ -279,7 +279,7 @@ def test_numbers_beyond_the_hand_are_brought_into_its_range(bench):
     assert bench.command("state")["newest"]["move"] == [0.08, 0.1]
 
 
-def test_a_hand_that_sends_no_states_is_told(monkeypatch):
+def test_a_hand_without_states_is_reported(monkeypatch):
     monkeypatch.setattr(hand, "_FIRST_STATE_TIMEOUT", 0.3)
     with HandBench(connect=False) as bench:
         bench.command("silence 1000")
@@ -327,7 +327,7 @@ def test_the_emulated_hand_is_a_program_too():
         assert process.wait(LIMIT) == 0
 
 
-def test_words_of_the_emulated_hand_that_make_no_sense_are_refused(bench):
+def test_invalid_options_of_the_emulated_hand_are_refused(bench):
     for words in ("", "help"):
         assert "object W|none" in bench.command(words)["text"]
     for words in ("dance", "object", "object wide", "stop-ignored maybe", "silence -1", "drop it"):
@@ -335,7 +335,7 @@ def test_words_of_the_emulated_hand_that_make_no_sense_are_refused(bench):
             bench.command(words)
 
 
-def test_whoever_is_no_client_is_hung_up_on():
+def test_other_connections_are_closed():
     with HandBench(connect=False) as bench:
         with socket.create_connection((bench.host, 1338), timeout=5.0) as stranger:
             stranger.sendall(b"GET / HTTP/1.1\r\n\r\n")

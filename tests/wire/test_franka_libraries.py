@@ -97,7 +97,7 @@ def test_a_refused_connection(library: str) -> None:
     if importlib.util.find_spec(library) is None:
         pytest.skip(f"needs the Python package {library}")
     host = free_host()
-    found = run_library(library, host, {"nobody": "read"})["nobody"]
+    found = run_library(library, host, {"none": "read"})["none"]
     assert found["fault"][0] == "refused"
     assert f"{host}:1337" in found["fault"][1]
     assert found["lost"]

@@ -1,4 +1,4 @@
-"""What ended a motion is told at least once, however short it was, and what is told is true."""
+"""The reason of a motion's end is reported at least once, however short it was, and is true."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ class ScriptedLink(ArmLink):
     def configure(self, settings: object) -> None: ...
 
 
-def test_a_user_stop_that_is_over_at_once_is_still_told() -> None:
+def test_a_brief_user_stop_is_still_reported() -> None:
     """It was seen once, by the driver itself; in the next state it is released. The servo has to hear of it."""
     plan = load("franka_emulator", overrides=["robots.arm.model=panda", "cameras={}"]).resolve()
     arm = FrankaArm(plan.robots[0])
@@ -76,12 +76,12 @@ def test_a_user_stop_that_is_over_at_once_is_still_told() -> None:
     arm.loop(lambda: None)
     arm.wait()
     reading = arm.read(0.0)
-    assert reading.fault is not None, "nobody is told that the user stop ended the motion"
+    assert reading.fault is not None, "the user stop that ended the motion is not reported"
     arm.write(Setpoint(HOME, ZERO, ZERO))
-    assert link.started == 0, "it goes on by itself"
+    assert link.started == 0, "it continues by itself"
 
 
-def test_an_error_that_was_raised_is_no_stop_that_nobody_was_told_of() -> None:
+def test_a_raised_error_is_not_reported_again() -> None:
     with hal.open("panda_table", driver="mock") as rig:
         arm = rig.robots["panda"]
         with warnings.catch_warnings():

@@ -137,7 +137,7 @@ def test_a_model_is_made_of_another_urdf_and_the_arm_runs(tmp_path: Path) -> Non
     for key in ("acceleration", "jerk", "velocity", "tcp"):
         (line,) = [line for line in text.splitlines() if line.strip().startswith(f"{key}:")]
         assert "# CHECK" in line
-    assert any("acceleration" in told for told in result.models["my_arm"].to_fill_in)
+    assert any("acceleration" in note for note in result.models["my_arm"].to_fill_in)
     with hal.open(str(tmp_path / "rig.yaml"), sim=True, clock="lock_step", pad="none") as rig:
         arm = rig.robots["my_arm"]
         arm.move_to(arm.home + np.array([0.2, 0, 0, 0, 0, 0]), speed=0.5)

@@ -144,8 +144,8 @@ def test_fixed(tmp_path: Path, yaw: float, pitch: float, roll: float, up: int) -
     view = load(tmp_path / "rig.yaml").resolve().cameras[0].view
     expected = optical(p.computeViewMatrixFromYawPitchRoll([0.1, 0.2, 0.3], 0.9, yaw, pitch, roll, up))
     assert Pose(view.position, view.orientation).matrix() == pytest.approx(expected, abs=1e-5)
-    told = "upside down" in row(result, "sensors.0.config.sim_config.fix.pitch")[1]
-    assert told == (pitch in (215, -100))
+    noted = "upside down" in row(result, "sensors.0.config.sim_config.fix.pitch")[1]
+    assert noted == (pitch in (215, -100))
 
 
 def test_what_arks_file_leaves_out_is_what_ark_takes(tmp_path: Path) -> None:

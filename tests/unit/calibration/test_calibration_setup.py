@@ -170,7 +170,7 @@ def test_a_rig_that_would_not_load_is_not_written(tmp_path: Path) -> None:
     path = rig(tmp_path)
     before = path.read_bytes()
     with pytest.raises(ConfigError):
-        RigFileOutput(path, path, "wrist").write("attached", f"{{robot: nobody, link: hand, pose: {VALUE}}}")
+        RigFileOutput(path, path, "wrist").write("attached", f"{{robot: unknown, link: hand, pose: {VALUE}}}")
     assert (path.read_bytes(), os.listdir(tmp_path)) == (before, ["rig.yaml"])
 
 

@@ -215,7 +215,7 @@ AT = {"width": 640, "height": 480, "rate_hz": 30}
         ({"streams": ["depth"], "align": "color"}, "align", "conflict"),
         ({"align": "colour"}, "align", "invalid_choice"),
         ({"streams": {"depth": {}, "segmentation": {"rate_hz": 3}}}, "streams.segmentation", "conflict"),
-        # What only a simulated one is told.
+        # Keys of simulated cameras only.
         ({"simulated": {"depth_nois": True}}, "simulated.depth_nois", "unknown_key"),
         ({"simulated": {"depth_noise": "yes"}}, "simulated.depth_noise", "wrong_type"),
         ({"simulated": {"depth_noise": {"subpixl": 0.1}}}, "simulated.depth_noise.subpixl", "unknown_key"),
@@ -294,7 +294,7 @@ def test_what_a_driver_finds_stands_where_it_was_written(lab: str) -> None:
     mine = rig(lab, sim=False, real={"serial": "1", "preset": "odd"}, capture=mode("640x480@60"))
     assert places(mine) == {("<dict>", "cameras.eye.real.preset"), ("<dict>", "cameras.eye.capture.rate_hz")}
     assert load(rig(lab, sim=False, real={"serial": "1", "preset": "even"})).resolve().cameras[0].driver != "pybullet"
-    load(rig(lab))  # in simulation nobody asks the real driver
+    load(rig(lab))  # in simulation the real driver is not consulted
 
 
 def test_the_options_of_a_model_are_for_its_own_driver(lab: str) -> None:

@@ -44,7 +44,7 @@ def with_real_drivers(config: dict[str, Any]) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize("name", list_data("config"))
-def test_every_rig_that_comes_with_the_hal_is_in_order(name: str) -> None:
+def test_every_built_in_rig_is_valid(name: str) -> None:
     rig = plan(name)
     assert rig.robots
     assert rig.world is not None

@@ -1,4 +1,4 @@
-"""What a driver says of a rig before anything is opened, where each thing is told, and what counts as emulated."""
+"""Problems that a driver finds in a rig before anything is opened, where they are reported, and what is emulated."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ def own_model(folder: Path, **keys: Any) -> str:
     return str(folder / "mine.yaml")
 
 
-def test_what_a_driver_finds_is_told_with_everything_else() -> None:
+def test_problems_found_by_a_driver_are_reported_with_all_others() -> None:
     assert found(rig()) == set()
     wrong = rig(real={}, rate_hz=500) | {"cameras": {"eye": {"model": "pinhol"}}}
     assert found(wrong) == {
@@ -109,12 +109,12 @@ def test_an_override_is_to_blame_for_what_it_set() -> None:
     assert found(rig(), overrides=["robots.arm.real.tool=hammer"]) == {("--set", "robots.arm.real.tool.kind")}
 
 
-def test_in_simulation_nobody_asks_the_real_driver() -> None:
+def test_in_simulation_the_real_driver_is_not_consulted() -> None:
     assert found(rig(real={}), sim=True) == set()
     assert found(rig(real={}), driver="mock") == set()
 
 
-def test_what_the_model_says_is_told_of_its_file(tmp_path: Path) -> None:
+def test_problems_of_a_model_are_reported_for_its_file(tmp_path: Path) -> None:
     model = own_model(tmp_path, real={"tool": "hammer", "host": "there"}, real_limits={})
     config = rig(model=model, real={}, limits={})
     assert found(config) == {("mine.yaml", "real.tool.kind"), ("mine.yaml", "limits.jerk"), ("mine.yaml", "limits")}
@@ -149,7 +149,7 @@ def test_a_hand_has_the_host_of_its_arm_unless_it_has_its_own() -> None:
 
 def test_a_hand_is_checked_too() -> None:
     assert found(rig({"force": 60})) == {("<dict>", "robots.arm.gripper.force")}
-    # A host that is missing is the arm's, and is told once; with another driver it is the hand's own.
+    # A missing host is the arm's, reported once; with another driver it is the hand's own.
     assert found(rig(real={})) == {("<dict>", "robots.arm.real.host")}
     config = rig(drivers={"real": "lab_driver:OTHER"})
     assert found(config) == {("<dict>", "robots.arm.gripper.real.host")}
@@ -170,7 +170,7 @@ def test_an_arm_is_emulated_when_all_that_is_real_of_it_is() -> None:
     assert not arm(rig(real=here), sim=True).emulated
 
 
-def test_a_real_hand_on_a_simulated_arm_needs_a_person() -> None:
+def test_a_real_hand_on_a_simulated_arm_is_attended() -> None:
     config = rig({"sim": False, "real": {"host": "there"}}, sim=True)
     assert (arm(config).driver, arm(config).attended, arm(config).emulated) == ("pybullet", True, False)
     config = rig({"sim": False, "real": {"host": "here"}}, sim=True)
@@ -193,7 +193,7 @@ def test_real_limits_count_where_the_arm_is_real(tmp_path: Path) -> None:
     assert (real.jerk, real.velocity) == ((700.0,) * 7, (1.0,) * 4 + (2.0,) * 3)
     assert simulated.jerk[0] == 7500.0
     assert real.acceleration == simulated.acceleration  # not given
-    # The rig may be tighter than that; looser only when it says so.
+    # The rig may be tighter than that; looser only with allow_looser_limits.
     assert arm(rig(model=model, limits={**QUIET, "jerk": 600})).limits.jerk[0] == 600.0
     assert found(rig(model=model)) == {("<dict>", "robots.arm.limits.jerk")}
     assert arm(rig(model=model, limits={**QUIET, "allow_looser_limits": True})).limits.jerk[0] == 900.0

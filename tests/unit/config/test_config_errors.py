@@ -383,7 +383,7 @@ def places(value: Any, path: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
 
 
 def test_nonsense_anywhere_is_a_config_error_or_nothing_worse() -> None:
-    """Never a traceback for a person's mistake: nonsense in every place of a rig."""
+    """Nonsense in every place of a rig is a ConfigError, never another exception."""
     rig = yaml.safe_load(find_data("config", "panda_table.yaml").read_text())
     refused: list[Problem] = []
     for k, place in enumerate(places(rig)):
@@ -510,7 +510,7 @@ def test_a_driver_whose_package_does_not_import() -> None:
     assert (problem.key, problem.code) == ("robots.arm", "unknown_driver")
 
 
-# Many mistakes at once: what each one alone is told, all together are told, and nothing else.
+# Many mistakes at once: each is reported as it is alone, and nothing else is.
 
 
 class Bench:
@@ -535,7 +535,7 @@ class Bench:
         self.objects += ["cup.yaml", {"file": "cube", "name": "brick"}]
 
     def found(self) -> set[tuple[str, str]]:
-        """File and key of each problem; every one is told once."""
+        """File and key of each problem; every one is reported once."""
         for name in ("rig", "arm", "camera", "cup"):
             (self.folder / f"{name}.yaml").write_text(yaml.safe_dump(getattr(self, name)))
         (self.folder / "arm.urdf").write_text(self.urdf)
@@ -623,7 +623,7 @@ def test_each_mistake_alone_is_one_problem(tmp_path: Path, place: tuple[str, str
     assert bench.found() == {place}
 
 
-def test_all_mistakes_on_all_levels_are_told_at_once(tmp_path: Path) -> None:
+def test_all_mistakes_on_all_levels_are_reported_at_once(tmp_path: Path) -> None:
     bench = Bench(tmp_path)
     for make in MISTAKES.values():
         make(bench)
@@ -639,7 +639,7 @@ def test_no_mistake_hides_another_and_none_invents_one(tmp_path: Path, seed: int
     assert bench.found() == set(some)
 
 
-def test_what_stands_under_a_misspelt_key_is_checked_too_and_told_under_that_key(tmp_path: Path) -> None:
+def test_the_value_of_a_misspelt_key_is_checked_and_reported_under_that_key(tmp_path: Path) -> None:
     bench = Bench(tmp_path)
     bench.arm["limts"] = bench.arm.pop("limits") | {"jerk": 0, "velocity": "fast"}
     bench.overrides = ["robots.other.wrokspace.table_height=high"]
@@ -681,7 +681,7 @@ def test_a_joint_that_does_not_move_lacks_no_limits(tmp_path: Path) -> None:
     assert bench.found() == {("arm.yaml", "joints.6")}
 
 
-def test_a_mistake_in_an_objects_file_is_not_told_again_of_who_changes_it(tmp_path: Path) -> None:
+def test_a_mistake_in_an_objects_file_is_reported_once(tmp_path: Path) -> None:
     bench = Bench(tmp_path)
     bench.cup["rgba"] = [255, 0, 0, 1]
     bench.objects.append({"file": "cup.yaml", "name": "mug", "fixd": True})

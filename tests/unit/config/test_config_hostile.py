@@ -1,4 +1,4 @@
-"""Files that nobody meant to be rigs: each is one ConfigError that names the place, in bounded time."""
+"""Files that are no rigs: each is one ConfigError that names the place, in bounded time."""
 
 from __future__ import annotations
 

@@ -14,14 +14,14 @@ import pytest
 from hal.config.data_files import data_folder, find_data, is_path, list_data
 
 
-def test_finds_what_comes_with_the_hal() -> None:
+def test_finds_built_in_files() -> None:
     assert find_data("robots", "panda.yaml").is_file()
     assert find_data("config", "objects", "cube.yaml").is_file()
     assert {"panda", "iiwa"} <= set(list_data("robots"))
     assert "realsense_d435" in list_data("sensors", "cameras")
 
 
-def test_says_what_there_is_when_a_file_is_not() -> None:
+def test_a_missing_file_lists_what_exists() -> None:
     with pytest.raises(FileNotFoundError, match="panda"):
         find_data("robots", "pnada.yaml")
     with pytest.raises(LookupError, match="robots, sensors, config"):
@@ -58,7 +58,7 @@ def test_an_installed_copy_finds_its_own_data(tmp_path: Path) -> None:
     assert module.find_data("robots", "only_here.yaml").parent == package / "data" / "robots"
 
 
-def test_importing_the_hal_loads_neither_pydantic_nor_yaml() -> None:
+def test_importing_hal_loads_neither_pydantic_nor_yaml() -> None:
     heavy = "('pydantic', 'yaml', 'pinocchio', 'ruckig', 'pybullet', 'importlib.resources')"
     code = f"import sys, hal; print([m for m in {heavy} if m in sys.modules])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True)

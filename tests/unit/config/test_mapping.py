@@ -1,4 +1,4 @@
-"""What a pad's controls do, as a file says it."""
+"""Mappings of a pad's controls, read from files."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def test_the_defaults_other_controls() -> None:
     assert load_mapping(mapping) is mapping
 
 
-def test_every_built_in_mapping_is_sound_and_says_what_it_is_for() -> None:
+def test_every_built_in_mapping_is_valid_and_has_a_description() -> None:
     for name in list_data("config", "teleop"):
         mapping = load_mapping(name)
         assert mapping.description
@@ -55,7 +55,7 @@ def test_every_built_in_mapping_is_sound_and_says_what_it_is_for() -> None:
     assert {"default", "spacemouse"} <= set(list_data("config", "teleop"))
 
 
-def test_a_mapping_of_ones_own(tmp_path: Path) -> None:
+def test_a_mapping_of_the_user(tmp_path: Path) -> None:
     (tmp_path / "mine.yaml").write_text(
         "{deadman: l1, frame: tcp, linear: {z: {axis: left_y, scale: 0.1}}, gripper: {open: east, close: south}}"
     )

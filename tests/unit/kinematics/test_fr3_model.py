@@ -1,4 +1,4 @@
-"""The FR3's files: the URDF says what Franka publishes and loads everywhere; its limits hold in all its range."""
+"""The FR3's files: the URDF has Franka's published values and loads everywhere; its limits hold in its whole range."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ def test_every_link_stands_where_that_of_pybullets_panda_does() -> None:
     world.close()
 
 
-def test_pybullet_says_nothing_about_it() -> None:
+def test_pybullet_loads_it_without_messages() -> None:
     from hal.drivers.pybullet.engine import PyBulletClient, silenced
     from hal.drivers.pybullet.loading import loadable_urdf
 
@@ -165,13 +165,13 @@ def test_where_the_arm_is_real_one_lost_setpoint_keeps_the_jerk_below_the_arms_o
     assert max(real.jerk) <= 1250.0
 
 
-def test_a_panda_that_goes_on_by_itself_for_19_cycles_stays_below_its_own_speed_limit() -> None:
+def test_a_panda_that_extrapolates_for_19_cycles_stays_below_its_own_speed_limit() -> None:
     real = load("franka", overrides=["robots.arm.model=panda"], sim=False).resolve().robots[0].limits
     for speed, acceleration, official in zip(real.velocity, real.acceleration, LIMITS["fer"].velocity, strict=True):
         assert speed + 0.019 * acceleration <= official
 
 
-def test_the_simulated_hand_presses_as_hard_as_it_is_told() -> None:
+def test_the_simulated_hand_presses_with_the_commanded_force() -> None:
     from hal.drivers.pybullet.gripper import PyBulletGripper
     from hal.drivers.pybullet.world import PyBulletWorld
 

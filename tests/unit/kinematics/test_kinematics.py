@@ -268,7 +268,7 @@ def test_solve_is_deterministic(panda: Kinematics) -> None:
     assert np.array_equal(panda.solve(target), panda.solve(target))
 
 
-def test_unreachable_pose_tells_the_true_distance(panda: Kinematics) -> None:
+def test_an_unreachable_pose_has_its_true_distance(panda: Kinematics) -> None:
     target = Pose([2.0, 0.0, 0.4], panda.pose(panda.home).orientation)
     with pytest.raises(Unreachable) as caught:
         panda.solve(target)

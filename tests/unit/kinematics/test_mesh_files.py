@@ -40,7 +40,7 @@ def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """An installed package with a mesh in it; importing it fails."""
     folder = tmp_path / "site" / "lab_meshes"
     (folder / "parts").mkdir(parents=True)
-    (folder / "__init__.py").write_text("raise RuntimeError('nobody needs to import this')")
+    (folder / "__init__.py").write_text("raise RuntimeError('this must not be imported')")
     (folder / "parts" / "cube.obj").write_text(CUBE)
     monkeypatch.syspath_prepend(tmp_path / "site")
     return folder
@@ -53,7 +53,7 @@ def test_a_package_is_found_and_not_imported(package: Path) -> None:
     assert "lab_meshes" not in sys.modules
 
 
-def test_what_lies_beside_a_urdf_or_above_it_comes_first(package: Path, tmp_path: Path) -> None:
+def test_files_beside_a_urdf_or_above_it_come_first(package: Path, tmp_path: Path) -> None:
     folder = tmp_path / "robot" / "urdf"
     folder.mkdir(parents=True)
     name = "package://lab_meshes/parts/cube.obj"

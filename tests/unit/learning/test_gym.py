@@ -24,7 +24,7 @@ BARE = ("cameras={}",)
 
 @pytest.mark.filterwarnings("ignore:.*Box observation space.*")
 @pytest.mark.parametrize("action", ["joint", "tcp_delta", "twist"])
-def test_gymnasium_finds_nothing_wrong(action: str) -> None:
+def test_it_passes_gymnasiums_own_checks(action: str) -> None:
     env = RigEnv("panda_table", sim=True, action=action, max_steps=50, overrides=("cameras.scene.output.width=64",))
     try:
         check_env(env, skip_render_check=True)
@@ -104,7 +104,7 @@ def test_the_same_seed_and_actions_give_the_same_states_to_the_bit() -> None:
     assert run(200) == run(200)
 
 
-def test_an_action_does_what_it_says() -> None:
+def test_an_action_moves_the_arm_by_its_values() -> None:
     env = RigEnv("panda_table", sim=True, action="tcp_delta", overrides=BARE)
     try:
         before, _ = env.reset()
@@ -117,7 +117,7 @@ def test_an_action_does_what_it_says() -> None:
         env.close()
 
 
-def test_a_reset_puts_everything_back_or_where_it_is_told() -> None:
+def test_a_reset_restores_poses_or_sets_the_given_ones() -> None:
     calls = []
     env = RigEnv("panda_table", sim=True, action="twist", overrides=BARE, on_reset=lambda env, o: calls.append(o))
     try:
@@ -151,7 +151,7 @@ def test_the_same_seed_starts_at_the_same_poses_to_the_bit_and_without_one_come_
         start = info["poses"]["cube"][:3]
         beside = start - env.robot.base.position + [-0.1, 0.0, -0.05]
         trace = [np.concatenate(list(seen.values()))]
-        for step in range(100):  # down beside the cube, and on through where it lies
+        for step in range(100):  # down beside the cube, then through its place
             away = beside + [0.2 * (step > 70), 0.0, 0.0] - seen["tcp"][:3]
             twist = away * min(5.0, 0.25 / max(np.linalg.norm(away), 1e-9))
             seen, *_ = env.step(np.array([*twist, 0, 0, 0, 1], np.float32))
@@ -172,7 +172,7 @@ def test_the_same_seed_starts_at_the_same_poses_to_the_bit_and_without_one_come_
         env.close()
 
 
-def test_observations_show_things_where_they_were_drawn() -> None:
+def test_observations_show_objects_at_their_sampled_poses() -> None:
     env = RigEnv("panda_table", sim=True, cameras=["scene"])
     try:
         pictures = []
@@ -187,7 +187,7 @@ def test_observations_show_things_where_they_were_drawn() -> None:
         env.close()
 
 
-def test_poses_of_things_are_observed_where_they_are_asked_for() -> None:
+def test_poses_of_objects_are_observed_on_request() -> None:
     env = RigEnv("panda_table", sim=True, action="twist", objects=["duck", "cube"], overrides=BARE)
     try:
         seen, info = env.reset(seed=3)
@@ -207,7 +207,7 @@ def test_poses_of_things_are_observed_where_they_are_asked_for() -> None:
         RigEnv("panda_table", driver="mock", objects=["cube"], overrides=BARE)
 
 
-def test_ranges_that_leave_no_room_are_told() -> None:
+def test_ranges_without_room_are_an_error() -> None:
     full = "objects.3={file: duck, random: {x: [0, 0], y: [0, 0]}}"
     here = "objects.2={file: cube, random: {x: [0, 0], y: [0, 0]}}"
     env = RigEnv("panda_table", sim=True, overrides=(*BARE, full, here))
@@ -237,7 +237,7 @@ def test_the_hooks_decide_and_steps_are_counted() -> None:
         env.close()
 
 
-def test_a_stop_truncates_says_why_and_is_not_acknowledged_by_a_reset() -> None:
+def test_a_stop_truncates_with_its_reason_and_a_reset_does_not_acknowledge_it() -> None:
     env = RigEnv("panda_table", driver="mock", action="twist", overrides=BARE)
     try:
         env.reset()
@@ -248,7 +248,7 @@ def test_a_stop_truncates_says_why_and_is_not_acknowledged_by_a_reset() -> None:
         assert truncated
         assert "rig.stop()" in info["stopped"]
         before = env.robot.state().q
-        for _ in range(2):  # a training loop that knows nothing of the person who stopped it
+        for _ in range(2):  # a training loop that does not notice the stop
             with raises_code(hal.MotionStopped, hal.Trip.STOP.code):
                 env.reset()
         assert env.robot.state().q == pytest.approx(before)

@@ -54,7 +54,7 @@ def turns(pose: Pose) -> tuple[float, float, float]:
 # What is drawn.
 
 
-def test_what_has_a_range_is_anywhere_in_it_and_the_rest_stays() -> None:
+def test_values_with_a_range_are_sampled_and_the_rest_stays() -> None:
     ranges = {"x": [-0.3, 0.1], "z": [0.75, 0.8], "yaw_deg": [-30, 60]}
     with bench(brick("brick", position=[0.0, 0.2, 0.7], random=ranges), brick("other", position=[0, -0.3, 0.7])) as rig:
         found = [drawn(rig, seed) for seed in range(300)]
@@ -113,7 +113,7 @@ def test_a_rig_without_ranges_or_without_a_world_draws_nothing() -> None:
 # Never into each other.
 
 
-def test_things_are_never_drawn_into_each_other_nor_into_what_stands_there() -> None:
+def test_sampled_objects_overlap_neither_each_other_nor_fixed_bodies() -> None:
     """Half of the table is covered, so most first draws overlap something."""
     ranges = {"x": [-0.35, 0.35], "y": [-0.35, 0.35], "z": [0.66, 0.75], "yaw_deg": [-180, 180]}
     ranges |= {"roll_deg": [-20, 20], "pitch_deg": [-20, 20]}
@@ -151,7 +151,7 @@ def test_a_plane_is_solid_below_also_where_it_is_tilted() -> None:
     assert 0.5 < max(found) < 0.5700001
 
 
-def test_what_nothing_collides_with_is_in_nobodys_way() -> None:
+def test_bodies_without_collision_are_no_obstacles() -> None:
     ranges = {"x": [-0.04, 0.04], "y": [-0.04, 0.04]}  # too small for two
     goal = brick("goal", collision=False, random=ranges)
     with bench(goal, brick("here", collision=False), brick("brick", random=ranges)) as rig:
@@ -160,7 +160,7 @@ def test_what_nothing_collides_with_is_in_nobodys_way() -> None:
         assert list(drawn(rig, 1)) == ["goal", "brick"]
 
 
-def test_a_bench_that_is_too_full_is_told_with_what_is_in_the_way() -> None:
+def test_a_full_bench_is_an_error_that_names_the_obstacles() -> None:
     ranges = {"x": [-0.05, 0.05]}
     red, blue, wall = brick("red", random=ranges), brick("blue", random=ranges), brick("wall")
     message = r"no room for 'blue'.*overlapped 'red'; .*`random`"
@@ -171,7 +171,7 @@ def test_a_bench_that_is_too_full_is_told_with_what_is_in_the_way() -> None:
         drawn(rig, 1)
 
 
-def test_when_one_takes_the_room_of_the_next_both_are_drawn_anew() -> None:
+def test_when_one_takes_the_room_of_the_next_both_are_resampled() -> None:
     """The second fits only where the first is at one of the ends of its range."""
     first = brick("first", position=[0.3, 0.3, 0.7], random={"x": [-0.3, 0.3], "y": [0, 0]})
     second = brick("second", position=[0.3, 0.3, 0.7], random={"x": [-0.1, 0.1], "y": [0, 0]})
@@ -181,7 +181,7 @@ def test_when_one_takes_the_room_of_the_next_both_are_drawn_anew() -> None:
             assert abs(poses["first"].position[0] - poses["second"].position[0]) >= 0.2
 
 
-def test_a_thing_that_was_taken_out_is_not_drawn_and_one_that_was_added_is_in_the_way() -> None:
+def test_a_removed_object_is_not_sampled_and_an_added_one_is_an_obstacle() -> None:
     ranges = {"x": [-0.3, 0.3]}
     with bench(brick("red", random=ranges), brick("blue", random=ranges)) as rig:
         rig.world.remove("blue")
@@ -222,7 +222,7 @@ def test_in_real_time_the_same_seed_gives_the_same_poses() -> None:
     assert first == again
 
 
-def test_a_real_arm_beside_a_simulated_world_drives_first_and_then_things_are_put_there() -> None:
+def test_a_real_arm_beside_a_simulated_world_moves_before_objects_are_placed() -> None:
     mock = {"drivers": {"real": "mock"}}
     eye = {"model": "pinhole", "sim": True, "look_at": {"target": [0, 0, 0.6], "distance": 1.5, "pitch_deg": -40}}
     config = {

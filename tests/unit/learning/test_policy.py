@@ -78,7 +78,7 @@ number = 3
 @pytest.fixture
 def module(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
     (tmp_path / "some_policies.py").write_text(MODULE)
-    (tmp_path / "lacking_policies.py").write_text("import a_library_that_nobody_has")
+    (tmp_path / "lacking_policies.py").write_text("import a_missing_library")
     monkeypatch.syspath_prepend(str(tmp_path))
     import importlib
 
@@ -106,7 +106,7 @@ def test_a_class_is_made_once_with_the_rig_where_it_takes_one(rig: Rig, module: 
         ("lacking_policies:act", "not_importable"),
     ],
 )
-def test_what_is_not_a_policy_is_refused(rig: Rig, module: Any, place: str, code: str) -> None:
+def test_an_object_that_is_no_policy_is_refused(rig: Rig, module: Any, place: str, code: str) -> None:
     with raises_code(hal.CommandError, code):
         load_policy(place, rig)
 
@@ -114,12 +114,12 @@ def test_what_is_not_a_policy_is_refused(rig: Rig, module: Any, place: str, code
 # An episode.
 
 
-def test_it_is_asked_at_its_rate_until_the_time_is_over(rig: Rig) -> None:
+def test_the_policy_is_called_at_its_rate_until_the_time_is_over(rig: Rig) -> None:
     asked: list[float] = []
 
     def policy(observation: hal.Observation) -> tuple[hal.Twist, float]:
         asked.append(observation.t)
-        return UP, 1.7  # what a network says: it means closed
+        return UP, 1.7  # a network's output beyond 1 means closed
 
     before = height(rig)
     outcome = PolicyRunner(rig, policy, rate_hz=20, seconds=2.0).run()
@@ -168,7 +168,7 @@ def test_a_rehearsal_shows_what_is_wrong(rig: Rig, policy: Callable[[Any], Any],
         PolicyRunner(rig, policy).rehearse()
 
 
-def test_chunks_are_followed_and_none_goes_on_with_the_last_one(rig: Rig) -> None:
+def test_chunks_are_followed_and_none_continues_the_last_one(rig: Rig) -> None:
     chunks, turn = Chunks(rig, ahead=1.0, thinks=0.0), 0
     heard: list[np.ndarray] = []
 
@@ -183,7 +183,7 @@ def test_chunks_are_followed_and_none_goes_on_with_the_last_one(rig: Rig) -> Non
     assert np.ptp([q[0] for q in heard]) > 0.09
 
 
-def test_who_is_late_trips_as_anybody_would(rig: Rig) -> None:
+def test_a_late_policy_trips_like_any_program(rig: Rig) -> None:
     def policy(observation: hal.Observation) -> hal.Twist:
         if rig.clock.now() > 1.0:
             rig.clock.sleep(0.4)
@@ -269,7 +269,7 @@ def test_a_first_answer_may_take_longer_but_not_for_ever(rig: Rig) -> None:
     assert PolicyRunner(rig, thinks(3.0), seconds=4.0).run().ended == "stopped"
 
 
-def test_ctrl_c_is_nobodys_outcome(rig: Rig) -> None:
+def test_ctrl_c_is_not_an_outcome(rig: Rig) -> None:
     def policy(observation: hal.Observation) -> hal.Twist:
         if rig.clock.now() > 0.5:
             raise KeyboardInterrupt
@@ -293,7 +293,7 @@ def test_success_is_judged_or_marked(rig: Rig) -> None:
     assert (outcome.ended, outcome.success) == ("failure", False)
 
 
-def test_without_the_dead_man_it_is_not_asked_and_its_time_stands_still(rig: Rig) -> None:
+def test_without_the_dead_man_the_policy_is_not_called_and_time_pauses(rig: Rig) -> None:
     hand, asked = rig.driver("pad"), []
     start = rig.clock.now()
 

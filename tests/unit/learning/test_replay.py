@@ -104,7 +104,7 @@ def test_a_replay_is_where_the_recording_was(driver: str, speed: float) -> None:
             assert width == pytest.approx(np.interp(place, player.trajectory.t, recorded), abs=0.012)
 
 
-def test_things_are_put_back_where_they_lay() -> None:
+def test_objects_are_put_back_to_their_recorded_poses() -> None:
     episode = record("pybullet", seconds=1.0, cube=hal.Pose([0.15, 0.2, 0.63]))
     with opened("pybullet") as rig:
         arm = rig.robots["panda"]
@@ -122,7 +122,7 @@ def test_things_are_put_back_where_they_lay() -> None:
 # Under whose thumb.
 
 
-def test_while_the_dead_man_is_released_time_stands_still_and_a_press_goes_on(episode: Recorded) -> None:
+def test_releasing_the_dead_man_pauses_and_a_press_continues(episode: Recorded) -> None:
     with opened("mock", pad=None, overrides=[*BARE, "gamepads.pad.model=auto"]) as rig:
         arm, hand = rig.robots["panda"], rig.driver("pad")
         player = TrajectoryPlayer(rig, arm, course_of(episode, arm), deadman=rig.gamepads["pad"].hold("l2"))
@@ -267,7 +267,7 @@ def test_one_arm_of_two_is_found_by_its_name(episode: Recorded) -> None:
             course_of(two, arm)
 
 
-def test_the_deviation_is_what_it_says() -> None:
+def test_the_deviation_is_that_of_the_samples() -> None:
     deviation = Deviation(["a", "b"])
     assert deviation.as_json()["joints_rad"] is None
     for off in (0.03, -0.04):

@@ -31,7 +31,7 @@ def rig() -> Iterator[hal.Rig]:
 
 
 class Person:
-    """Does what is written for a time, whoever lets it pass; notes when the arm moves, and by which press."""
+    """Performs the scripted actions at their times; notes when the arm moves, and by which press."""
 
     def __init__(self, rig: hal.Rig, *does: tuple[float, Callable[[MockPad], object]]) -> None:
         hand = rig.driver("pad")
@@ -59,7 +59,7 @@ def release(name: str = "l2") -> Callable[[MockPad], object]:
     return lambda hand: hand.release(name)
 
 
-def test_what_was_held_before_drives_nobody_home(rig: hal.Rig) -> None:
+def test_a_press_that_began_before_the_prompt_does_not_start_the_move_home(rig: hal.Rig) -> None:
     person = Person(rig, (0.1, press()), (1.5, release()), (2.0, press()))
     rig.clock.sleep(0.5)
     assert person.deadman.held
@@ -70,7 +70,7 @@ def test_what_was_held_before_drives_nobody_home(rig: hal.Rig) -> None:
     assert person.arm.gripper.state().width > 0.07, "at home the gripper opens"
 
 
-def test_nobody_presses(rig: hal.Rig) -> None:
+def test_without_a_press_the_reset_times_out(rig: hal.Rig) -> None:
     person = Person(rig, (0.1, press()))
     rig.clock.sleep(0.5)
     with raises_code(hal.MotionStopped, "deadman_not_pressed"):
@@ -95,7 +95,7 @@ def end(hand: MockPad) -> None:
     raise KeyboardInterrupt
 
 
-def test_the_press_that_drove_an_episode_drives_nobody_home(rig: hal.Rig, tmp_path: Path) -> None:
+def test_the_press_of_an_episode_does_not_start_the_move_home(rig: hal.Rig, tmp_path: Path) -> None:
     """PS is pressed in mid-motion, with L2 held for three more seconds."""
     episode = [(12.0, press("south")), (12.2, release("south")), (12.5, press()), (14.0, press("home"))]
     person = Person(rig, (0.5, press()), (11.0, release()), *episode, (17.0, end))
@@ -122,13 +122,13 @@ def test_after_a_trip_on_the_way_home_it_takes_a_new_press(
     t0 = rig.clock.now()
     rig.clock.every(20.0, lambda: end(person.hand))
     assert collect(rig, tmp_path, "--episodes", "1") == 1
-    assert max(standing) < 1e-6, "nothing goes on by itself"
+    assert max(standing) < 1e-6, "nothing continues by itself"
     assert person.moved_by == {1, 2}
     assert np.abs(arm.state().q - arm.home).max() < 1e-3, "with a new press it went on"
     assert "FAULT: reflex" in capsys.readouterr().out
 
 
-def test_what_is_pressed_on_the_way_home_means_nothing_later(rig: hal.Rig, tmp_path: Path) -> None:
+def test_presses_during_the_move_home_are_ignored_later(rig: hal.Rig, tmp_path: Path) -> None:
     """Before the second episode Cross is pressed too early, and stays down."""
     episode = [(12.0, press("south")), (12.2, release("south")), (13.0, press("home")), (13.2, release("home"))]
     way_home = [(13.4, press("south")), (13.6, press()), (16.0, release())]

@@ -166,16 +166,16 @@ def test_pictures_are_cropped_and_scaled_and_the_lens_with_them(dataset: Dataset
 
 
 def test_progress_goes_from_nothing_to_all(dataset: Dataset, tmp_path: Path) -> None:
-    told = []
-    export(dataset, "npz", tmp_path / "out", progress=told.append)
-    shares = [progress.share for progress in told]
+    reports = []
+    export(dataset, "npz", tmp_path / "out", progress=reports.append)
+    shares = [progress.share for progress in reports]
     assert shares == sorted(shares)
     assert 0.0 < shares[0] < 0.2
     assert shares[-1] == 1.0
-    assert [progress.episode for progress in told] == sorted(progress.episode for progress in told)
+    assert [progress.episode for progress in reports] == sorted(progress.episode for progress in reports)
 
 
-def test_episodes_with_other_pictures_are_told_apart(tmp_path: Path) -> None:
+def test_episodes_with_different_pictures_are_refused(tmp_path: Path) -> None:
     """Depth is no column of the dataset, so one episode may have it and the next one not."""
     from recording_kit import mock_rig, record
 

@@ -216,7 +216,7 @@ def test_zarr_chunks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, rows: int,
 # What was never known.
 
 
-def test_values_that_were_not_known_are_told(dataset: Dataset, tmp_path: Path) -> None:
+def test_unknown_values_are_noted(dataset: Dataset, tmp_path: Path) -> None:
     silent = Dataset(dataset.root)
     columns = silent.episodes[1].columns
     columns["observation.velocity"] = np.where(np.arange(7) == 2, np.nan, columns["observation.velocity"])

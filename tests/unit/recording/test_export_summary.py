@@ -25,20 +25,22 @@ def test_the_numbers_are_those_of_the_rows(dataset: Dataset) -> None:
     assert (found.successes, found.failures, found.unmarked) == (1, 1, 1)
     assert found.rows == sum(episode.length for episode in dataset.episodes)
     assert found.seconds == pytest.approx(found.rows / 20)
-    assert [line.trips for line in found.episodes] == [1, 0, 0], "somebody stopped the first one"
+    assert [line.trips for line in found.episodes] == [1, 0, 0], "the first one was stopped"
     assert found.bytes == sum(file.stat().st_size for file in dataset.root.rglob("*") if file.is_file())
     for key, spreads in (("observation.state", found.state), ("action", found.action)):
         table = np.concatenate([episode.columns[key] for episode in dataset.episodes]).astype(float)
         assert [each.name for each in spreads] == dataset.episodes[0].names(key)
         for k, each in enumerate(spreads):
-            told = (each.min, each.max, each.mean, each.std)
-            assert told == pytest.approx((table[:, k].min(), table[:, k].max(), table[:, k].mean(), table[:, k].std()))
+            values = (each.min, each.max, each.mean, each.std)
+            assert values == pytest.approx(
+                (table[:, k].min(), table[:, k].max(), table[:, k].mean(), table[:, k].std())
+            )
     assert [each.source for each in found.timing] == ["robot.panda", "gripper.panda", "camera.scene", "camera.wrist"]
     assert all(each.period == pytest.approx(50.0) for each in found.timing), "lock-step is even"
     assert all(each.jitter == pytest.approx(0.0, abs=0.01) for each in found.timing)
 
 
-def test_times_that_are_not_even_are_told(dataset: Dataset) -> None:
+def test_uneven_times_are_reported(dataset: Dataset) -> None:
     (episode,) = Dataset(dataset.root).episodes[:1]
     wrist, scene = (episode.columns[f"observation.time.camera.{name}"].copy() for name in ("wrist", "scene"))
     wrist[4:, 0] -= 0.02  # one came 20 ms early, and all after it
@@ -46,11 +48,11 @@ def test_times_that_are_not_even_are_told(dataset: Dataset) -> None:
     scene[:2] = np.nan
     episode.columns.update({"observation.time.camera.wrist": wrist, "observation.time.camera.scene": scene})
     found = {each.source: each for each in summarize(dataset, [episode]).timing}
-    told = found["camera.wrist"]
-    assert told.repeated == 1
-    assert told.longest == pytest.approx(100.0)
-    assert told.oldest == pytest.approx(70.0)
-    assert told.jitter > 5.0
+    camera_times = found["camera.wrist"]
+    assert camera_times.repeated == 1
+    assert camera_times.longest == pytest.approx(100.0)
+    assert camera_times.oldest == pytest.approx(70.0)
+    assert camera_times.jitter > 5.0
     assert found["camera.scene"].repeated == 0, "what never spoke does not count"
     assert found["camera.scene"].period == pytest.approx(50.0)
 

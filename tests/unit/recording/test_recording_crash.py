@@ -55,7 +55,7 @@ def test_what_a_killed_writer_leaves_becomes_an_episode(out: Path) -> None:
 
 
 @pytest.mark.parametrize("mark", [True, False, None])
-def test_the_mark_of_a_person_outlives_the_writer(tmp_path: Path, mark: bool | None) -> None:
+def test_the_mark_survives_a_killed_writer(tmp_path: Path, mark: bool | None) -> None:
     with mock_rig() as rig, Recorder(rig, tmp_path / "out") as recorder:
         record(recorder, 0.3)
         recorder.start()

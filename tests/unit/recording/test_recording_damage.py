@@ -215,7 +215,7 @@ def flip(path: Path, dice: random.Random) -> None:
 
 
 def index_files(root: Path) -> dict[str, Any]:
-    """What ``meta/`` says, but for the order of bytes in files."""
+    """The content of ``meta/``, without the order of bytes in files."""
     info, stats = (json.loads((root / f"meta/{name}.json").read_text()) for name in ("info", "stats"))
     flat = {f"{key} {part}": np.array(value).ravel() for key, found in stats.items() for part, value in found.items()}
     return {"info": info, "tasks": read_tasks(root / "meta/tasks.parquet"), "stats": flat}
@@ -231,7 +231,7 @@ def test_nothing_is_recorded_over_episodes_whose_index_is_lost(out: Path, rig: R
     assert caught.value.code in ("index_missing", "index_wrong")
     assert caught.value.file is not None
     assert caught.value.file.startswith("meta/")
-    assert recover(out) == [], "no unfinished episode, and the index is nobody's but repair's"
+    assert recover(out) == [], "no unfinished episode, and only repair rebuilds the index"
     left = {path: path.read_bytes() for path in before if path.exists()}
     assert left == {path: before[path] for path in left}
 
@@ -322,7 +322,7 @@ def torn(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def trap(torn: Path, tmp_path: Path) -> tuple[Path, Path]:
-    """A copy of that, and a file beside it that is nobody else's."""
+    """A copy of that, and a file beside it that does not belong to it."""
     precious = tmp_path / "precious.mp4"
     precious.write_bytes(b"all my life" * 1000)
     return Path(shutil.copytree(torn, tmp_path / "demo")), precious

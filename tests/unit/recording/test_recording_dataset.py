@@ -1,4 +1,4 @@
-"""What lies on disk, and how it is read."""
+"""The files of a dataset, and how they are read."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def test_the_layout_is_that_of_a_lerobot_dataset(made: Path) -> None:
     assert info["features"]["observation.images.wrist"]["shape"] == [48, 64, 3]
 
 
-def test_an_episode_says_where_it_comes_from(made: Path) -> None:
+def test_an_episode_has_the_metadata_of_its_source(made: Path) -> None:
     episodes = Dataset(made).episodes
     assert [episode.task for episode in episodes] == ["lift", "lower", "lower"]
     assert [episode.success for episode in episodes] == [True, False, None]
@@ -65,11 +65,11 @@ def test_rows_are_at_their_times_and_nothing_is_missing(made: Path) -> None:
     assert set(episode.stamps) >= {"robot.panda", "gripper.panda", "camera.scene", "camera.wrist"}
 
 
-def test_the_action_is_where_the_arm_was_told_to_be_by_the_next_row(made: Path) -> None:
+def test_the_action_is_the_setpoint_of_the_next_row(made: Path) -> None:
     columns = Dataset(made).episodes[0].columns
-    action, told = columns["action"], columns["observation.setpoint"]
-    assert np.array_equal(action[:-1], told[1:])
-    assert np.array_equal(action[-1], told[-1])
+    action, setpoint = columns["action"], columns["observation.setpoint"]
+    assert np.array_equal(action[:-1], setpoint[1:])
+    assert np.array_equal(action[-1], setpoint[-1])
     assert np.ptp(action[:, :7], axis=0).max() > 0.01, "it moved"
     assert action[-1, -1] == pytest.approx(0.04, abs=1e-3), "half closed, m"
 
@@ -106,7 +106,7 @@ def test_statistics_are_those_of_all_rows(made: Path) -> None:
     assert np.allclose(np.ravel(stats["observation.images.scene"]["mean"]), pixels.mean(axis=(0, 1, 2)), atol=0.02)
 
 
-def test_what_differs_is_said_before_anything_is_written(made: Path) -> None:
+def test_differences_are_reported_before_anything_is_written(made: Path) -> None:
     before = sorted(str(path) for path in made.rglob("*"))
     with mock_rig("lock_step", "cameras.wrist.output.width=80") as rig, pytest.raises(CommandError) as caught:
         Recorder(rig, made, fps=15, depth=False)
@@ -145,7 +145,7 @@ def test_depth_in_another_unit_is_another_kind(made: Path, tmp_path: Path) -> No
         Recorder(rig, copy)
 
 
-def test_names_that_differ_are_told_without_the_others(made: Path, tmp_path: Path) -> None:
+def test_only_differing_names_are_reported(made: Path, tmp_path: Path) -> None:
     copy = tmp_path / "copy"
     shutil.copytree(made, copy)
     info = json.loads((copy / "meta/info.json").read_text())
@@ -160,7 +160,7 @@ def test_names_that_differ_are_told_without_the_others(made: Path, tmp_path: Pat
     assert len(said.partition("another format")[2]) < 250
 
 
-def test_how_to_mend_an_unfinished_episode_can_be_typed(tmp_path: Path) -> None:
+def test_the_suggested_command_recovers_an_unfinished_episode(tmp_path: Path) -> None:
     out = tmp_path / "it's here"
     with mock_rig() as rig, Recorder(rig, out) as recorder:
         recorder.start()
@@ -240,7 +240,7 @@ def test_only_depth_and_only_colour(tmp_path: Path) -> None:
 
 
 def test_the_package_imports_without_its_libraries() -> None:
-    """And says what to install when it is used."""
+    """An error names what to install when it is used."""
     code = (
         "import sys\n"
         "class No:\n"

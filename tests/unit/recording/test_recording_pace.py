@@ -1,4 +1,4 @@
-"""How fast an arm's own clock goes, in a recording: measured over its rows, told where a simulation is too slow."""
+"""The pace of an arm's own clock in a recording: measured over its rows, reported if a simulation is too slow."""
 
 from __future__ import annotations
 
@@ -44,17 +44,17 @@ def test_the_pace_is_that_of_each_arms_own_clock() -> None:
     ("seconds", "left", "right", "simulated"),
     [
         (1.9, 0.5, 1.0, ("left",)),  # too early to say
-        (4.0, 0.98, 1.0, ("left",)),  # nobody would notice
+        (4.0, 0.98, 1.0, ("left",)),  # not noticeable
         (4.0, 1.0, 0.5, ("left",)),  # a real arm, whose clock drifts
         (4.0, 0.5, 0.5, ()),
         (4.0, math.nan, math.nan, ("left", "right")),
     ],
 )
-def test_nothing_is_said_of(seconds: float, left: float, right: float, simulated: tuple[str, ...]) -> None:
+def test_no_trouble_is_reported(seconds: float, left: float, right: float, simulated: tuple[str, ...]) -> None:
     assert measured(seconds, left, right, simulated).trouble == ""
 
 
-def test_a_clock_that_is_not_known_or_begins_anew_is_left_out() -> None:
+def test_a_clock_that_is_unknown_or_restarts_is_left_out() -> None:
     pace = ClockPace(COLUMNS, ("left",))
     for row in rows(2.0, 0.9, math.nan):
         pace.add(row)
@@ -64,18 +64,18 @@ def test_a_clock_that_is_not_known_or_begins_anew_is_left_out() -> None:
     assert ClockPace(COLUMNS).as_json() == {}
 
 
-def test_what_a_person_is_told_does_not_change_with_every_row() -> None:
-    pace, told = ClockPace(COLUMNS, ("left",)), []
+def test_the_reported_trouble_does_not_change_with_every_row() -> None:
+    pace, troubles = ClockPace(COLUMNS, ("left",)), []
     for k in range(3000):
         t = k / 30
         pace.add([t, t, 0.9 * t + 0.01 * math.sin(t), k, t, t, k])
-        if pace.trouble not in told:
-            told.append(pace.trouble)
-    assert told[0] == ""
-    assert len(told) == 2, told
+        if pace.trouble not in troubles:
+            troubles.append(pace.trouble)
+    assert troubles[0] == ""
+    assert len(troubles) == 2, troubles
 
 
-def test_an_episode_in_real_time_says_its_pace_and_one_in_lock_step_has_none(tmp_path: Path) -> None:
+def test_an_episode_in_real_time_has_its_pace_and_one_in_lock_step_has_none(tmp_path: Path) -> None:
     for clock in ("real_time", "lock_step"):
         with mock_rig(clock) as rig, Recorder(rig, tmp_path / clock) as recorder:
             record(recorder, 0.5)

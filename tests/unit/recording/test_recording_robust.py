@@ -1,4 +1,4 @@
-"""What people, and programs, do to a recorder that they should not, or that nobody thought of."""
+"""Misuse of a recorder, and unusual but valid uses."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def out(tmp_path: Path) -> Path:
 
 
 @pytest.mark.parametrize("first", [0, 1])
-def test_two_recorders_look_on_at_once_and_end_in_any_order(rig: Rig, tmp_path: Path, first: int) -> None:
+def test_two_recorders_at_once_end_in_any_order(rig: Rig, tmp_path: Path, first: int) -> None:
     folders = [tmp_path / "a", tmp_path / "b"]
     with Recorder(rig, folders[0], fps=30) as a, Recorder(rig, folders[1], fps=20) as b:
         recorders = (a, b)
@@ -56,7 +56,7 @@ def test_two_recorders_look_on_at_once_and_end_in_any_order(rig: Rig, tmp_path: 
         assert np.allclose(np.diff(episode.stamps["grid"]), 1 / fps, atol=0.005)
 
 
-def test_what_happens_after_save_is_no_part_of_the_episode(rig: Rig, out: Path) -> None:
+def test_rows_after_save_are_not_part_of_the_episode(rig: Rig, out: Path) -> None:
     with Recorder(rig, out) as recorder:
         for _ in range(3):
             recorder.start()
@@ -74,7 +74,7 @@ def test_what_happens_after_save_is_no_part_of_the_episode(rig: Rig, out: Path) 
     assert check_layout(out)["total_episodes"] == 3
 
 
-def test_ten_seconds_may_pass_in_one_go(rig: Rig, out: Path) -> None:
+def test_ten_seconds_may_pass_in_one_step(rig: Rig, out: Path) -> None:
     with Recorder(rig, out) as recorder:
         recorder.start()
         rig.clock.sleep(10.0)
@@ -105,7 +105,7 @@ def _step(rig: Rig) -> float:
 
 
 def test_any_thread_may_start_save_and_discard(rig: Rig, out: Path) -> None:
-    """Each call does what it says, or says why not; what was saved is there."""
+    """Each call succeeds or raises its error; saved episodes exist."""
     saved: list[bool] = []
     odd: list[BaseException] = []
 
@@ -136,7 +136,7 @@ def test_any_thread_may_start_save_and_discard(rig: Rig, out: Path) -> None:
     assert recover(out) == []
 
 
-def test_an_episode_ends_while_another_thread_makes_time_go_on(rig: Rig, out: Path) -> None:
+def test_an_episode_ends_while_another_thread_advances_time(rig: Rig, out: Path) -> None:
     stop = threading.Event()
 
     def go_on() -> None:
@@ -161,10 +161,10 @@ def test_an_episode_ends_while_another_thread_makes_time_go_on(rig: Rig, out: Pa
     assert [episode.length for episode in Dataset(out).episodes] == lengths, "not a row is counted and not written"
 
 
-# Nothing to save, and failures that nobody waited for.
+# Nothing to save, and failures in the background.
 
 
-def test_an_episode_of_one_row_and_one_of_none(rig: Rig, out: Path) -> None:
+def test_episodes_of_one_row_and_of_none(rig: Rig, out: Path) -> None:
     with Recorder(rig, out) as recorder:
         recorder.start()
         recorder.save(wait=True)
@@ -224,7 +224,7 @@ def test_a_rig_that_is_closed_first(out: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["a b", "ä%03d?#&'\"", "x:y", "-rf", "{number}", "gone/far/away"])
-def test_a_folder_may_be_called_anything(rig: Rig, tmp_path: Path, name: str) -> None:
+def test_any_folder_name_works(rig: Rig, tmp_path: Path, name: str) -> None:
     with Recorder(rig, tmp_path / name, task="") as recorder:
         record(recorder, 0.1)
     check_layout(tmp_path / name)
@@ -245,7 +245,7 @@ def test_a_relative_folder_is_one_of_where_the_recorder_was_made(
     assert not list((tmp_path / "elsewhere").iterdir())
 
 
-def test_a_folder_that_cannot_be_made_is_said_and_may_be_mended(rig: Rig, tmp_path: Path) -> None:
+def test_a_folder_that_cannot_be_created_is_an_error_and_may_be_fixed(rig: Rig, tmp_path: Path) -> None:
     (tmp_path / "a").write_text("a file")
     with Recorder(rig, tmp_path / "a" / "b") as recorder:
         for _ in range(2):
