@@ -91,6 +91,8 @@ class ArmUnit:
         self.error: ConnectionLost | None = None
         """Reason why the device counts as lost; None while it answers."""
         self._write_failed = False
+        self._engaged = False
+        """Whether the drives were on in the last cycle."""
         self._sound: Reading | None = None
         self._setpoint: Any = None
         self._latest_target = 0
@@ -180,7 +182,7 @@ class ArmUnit:
         marks = self.mail.get_marks()
         if self._session and marks.ended == self._session:  # through memory, so that it waits for no answer
             self.servo.close_session()
-        if self.error is not None or self.reading is None:
+        if self.error is not None or self.reading is None or self._drives_went_off(self.reading):
             self._prepared = None
             self._setpoint = self.servo.device_lost(now)
             return
@@ -190,6 +192,14 @@ class ArmUnit:
             self._reanchored = self.servo.report.reanchored
             self.reanchored += 1
             self.audit.reset()  # the device's own set-points lie in between
+
+    def _drives_went_off(self, reading: Reading) -> bool:
+        """Return whether the drives went off without a fault, as by an emergency stop: that trips.
+
+        So they come on again only after a new press of the dead-man, or a rearm.
+        """
+        before, self._engaged = self._engaged, self.driver.engaged
+        return before and not self._engaged and reading.fault is None
 
     def prepare(self, app: AppRecord) -> None:
         """Compute the next set-point ahead, for a device that sets the pace and waits for its answer."""

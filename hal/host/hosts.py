@@ -277,16 +277,11 @@ class RemoteHost(Host):
 class SteppedHost(RemoteHost):
     """Lock-step with a process of its own, for a driver whose library cannot live in the app's."""
 
-    def __init__(self, spec: GroupSpec) -> None:
-        self._cycles = 0
-        super().__init__(spec)
-
     def advance_to(self, t: float) -> None:
         """Advance the process to the simulated time ``t`` (s), to within half a step."""
-        wanted = round(t * self.spec.rate_hz) - self._cycles
-        if wanted > 0:
-            self._cycles += wanted
-            self.request("advance", {"cycles": wanted})
+        cycles = round(t * self.spec.rate_hz) - self.memory.get_host().ticks  # a request may have run some, too
+        if cycles > 0:
+            self.request("advance", {"cycles": cycles})
 
     def _silence(self) -> float:
         return 0.0  # silent while it is not stepped; a request without an answer shows that it is gone

@@ -55,6 +55,20 @@ def test_the_tour_drives_it_in_lock_step() -> None:
         assert abs(arm.state().q - start).max() > 0.01
 
 
+def test_cycles_that_switch_its_drives_on_leave_its_time_with_the_clock(tmp_path: Path) -> None:
+    (tmp_path / "lab_arm.py").write_text(LAB.replace("hal.drivers.mock.robot:MockRobot", "drives:ArmWithDrives"))
+    with hal.open(rig(arm="here"), clock="lock_step", pad="none") as bench:
+        arm, clock = bench.robots["arm"], bench.clock
+        start = arm.state().q.copy()
+        with arm.control(rate_hz=50, unattended=True) as control:
+            for tick in clock.rate(50):
+                control.send(hal.JointVelocity([0.2] * arm.n))
+                if tick.elapsed > 0.5:
+                    break
+            assert arm.state().stamp.t <= clock.now() + 1e-6
+        assert abs(arm.state().q - start).max() > 0.01
+
+
 def test_it_still_needs_a_dead_man() -> None:
     with (
         hal.open(rig(arm="here"), clock="lock_step", pad="none") as bench,

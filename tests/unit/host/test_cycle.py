@@ -206,6 +206,20 @@ def test_drives_that_went_off_are_switched_on_again_when_the_arm_has_to_move(mon
     assert driver.engaged
 
 
+def test_drives_that_went_off_without_a_fault_come_on_only_after_a_rearm(monkeypatch: pytest.MonkeyPatch) -> None:
+    arms = TwoArms(monkeypatch)
+    arms.begin("right")
+    arms.drive(arms.right)
+    driver = arms.right.driver
+    driver._switch_off()
+    for _ in range(60):
+        arms.turn()
+    assert (arms.right.servo.report.trip, driver.engaged) == (Trip.DEVICE_LOST, False)
+    arms.right.mail.rearm()
+    arms.drive(arms.right)
+    assert driver.engaged
+
+
 def test_drives_that_do_not_switch_on_during_a_session_stop_the_arm(monkeypatch: pytest.MonkeyPatch) -> None:
     arms = TwoArms(monkeypatch)
     arms.begin("right")
