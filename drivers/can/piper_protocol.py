@@ -58,7 +58,7 @@ __all__ = [
     "JointStatus",
     "ParameterQuery",
     "PoseNumbers",
-    "StopRequest",
+    "EmergencyRequest",
     "decode_command",
     "decode_feedback",
     "encode_joint_angles",
@@ -136,7 +136,7 @@ CanFrame = tuple[int, bytes]
 # Commands: what a program sends to the arm
 
 
-class StopRequest(NamedTuple):
+class EmergencyRequest(NamedTuple):
     """Emergency stop, trajectory and teaching requests (0x150), which this package never sends.
 
     ``resume`` cuts the power of the motors: a raised arm falls.
@@ -261,7 +261,7 @@ class FirmwareQuery(NamedTuple):
 
 
 PiperCommand = (
-    StopRequest
+    EmergencyRequest
     | ModeRequest
     | JointTargets
     | GripperRequest
@@ -285,7 +285,7 @@ def decode_command(frame_id: int, data: bytes) -> PiperCommand | None:
 
 
 _COMMANDS: dict[int, Callable[[int, bytes], PiperCommand | None]] = {
-    _STOP: lambda _, data: StopRequest(*data[:3]),
+    _STOP: lambda _, data: EmergencyRequest(*data[:3]),
     _MODE: lambda _, data: ModeRequest(*data[:6]),
     _GRIPPER: lambda _, data: _gripper_request(*struct.unpack(">iHBB", data)),
     _ENABLE: lambda _, data: EnableRequest(data[0], data[1] == 2) if data[1] in (1, 2) else None,
@@ -303,7 +303,7 @@ def _gripper_request(width: int, torque: int, code: int, zero: int) -> GripperRe
     return GripperRequest(width * 1e-6, torque * 1e-3, bool(code & 1), bool(code & 2), zero == _SET)
 
 
-# PiperFeedback: what the arm sends
+# Feedback: what the arm sends
 
 
 class PiperStatus(NamedTuple):

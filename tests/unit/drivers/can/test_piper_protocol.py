@@ -15,6 +15,7 @@ from hal.drivers.can.piper_protocol import (
     FIRMWARE,
     AccelerationLimit,
     Acknowledgement,
+    EmergencyRequest,
     EnableRequest,
     FirmwarePiece,
     FirmwareQuery,
@@ -32,15 +33,14 @@ from hal.drivers.can.piper_protocol import (
     ParameterQuery,
     PiperStatus,
     PoseNumbers,
-    StopRequest,
     decode_command,
     decode_feedback,
 )
 
 FULL = piper.ENABLED | piper.STALLED
 COMMANDS = [
-    (StopRequest(1, 0, 0), 0x150, "0100000000000000"),
-    (StopRequest(2, 3, 6), 0x150, "0203060000000000"),
+    (EmergencyRequest(1, 0, 0), 0x150, "0100000000000000"),
+    (EmergencyRequest(2, 3, 6), 0x150, "0203060000000000"),
     (ModeRequest(), 0x151, "0101640000000000"),
     (ModeRequest(0, 4, 30, 0xAD, 7, 3), 0x151, "00041ead07030000"),
     (JointTargets(0, (radians(150), radians(-0.001))), 0x155, "000249f0ffffffff"),
@@ -150,7 +150,7 @@ def test_commands_and_feedback_do_not_overlap() -> None:
 def sdk_message(record: Any, messages: Any) -> tuple[str, Any]:
     """Return the vendor's record for a command: name of its kind, and the record."""
     transmit = messages
-    if isinstance(record, StopRequest):
+    if isinstance(record, EmergencyRequest):
         return "PiperMsgMotionCtrl_1", ("arm_motion_ctrl_1", transmit.ArmMsgMotionCtrl_1(*record))
     if isinstance(record, ModeRequest):
         return "PiperMsgMotionCtrl_2", ("arm_motion_ctrl_2", transmit.ArmMsgMotionCtrl_2(*record))
