@@ -52,6 +52,7 @@ BUILT_IN: Mapping[str, str] = MappingProxyType(
         "evdev": "hal.drivers.evdev:DRIVER",
         "franka": "hal.drivers.franka:DRIVER",
         "mock": "hal.drivers.mock:DRIVER",
+        "piper": "hal.drivers.can:PIPER",
         "playback": "hal.drivers.playback:DRIVER",
         "pybullet": "hal.drivers.pybullet:DRIVER",
         "realsense": "hal.drivers.realsense:DRIVER",

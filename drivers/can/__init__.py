@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from hal.registry import DriverSpec
 
-__all__ = ["DAMIAO"]
+__all__ = ["DAMIAO", "PIPER"]
 
 _REQUIRES = {"can": "pip install 'robot-hal[can]'"}
 
@@ -15,6 +15,18 @@ DAMIAO = DriverSpec(
     checks={
         "robot": "hal.drivers.can.settings:check_damiao_arm",
         "gripper": "hal.drivers.can.settings:check_damiao_gripper",
+    },
+    emulated="hal.drivers.can.settings:is_emulated",
+    requires=_REQUIRES,
+)
+
+PIPER = DriverSpec(
+    name="piper",
+    robot="hal.drivers.can.piper:PiperArm",
+    gripper="hal.drivers.can.piper_gripper:PiperGripper",
+    checks={
+        "robot": "hal.drivers.can.settings:check_piper_arm",
+        "gripper": "hal.drivers.can.settings:check_piper_gripper",
     },
     emulated="hal.drivers.can.settings:is_emulated",
     requires=_REQUIRES,

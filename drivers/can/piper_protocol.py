@@ -27,6 +27,7 @@ __all__ = [
     "ERROR",
     "FEEDBACK_IDS",
     "FIRMWARE",
+    "GRIPPER_IDS",
     "HOMED",
     "JOINTS",
     "LOW_VOLTAGE",
@@ -121,7 +122,9 @@ FEEDBACK_IDS = (
     *range(_MOTOR_STATUS, _MOTOR_STATUS + JOINTS),
     *range(_STATUS, _GRIPPER_STATUS + 1),
 )
-"""Ids of the frames that the arm sends without being asked."""
+"""Ids of the frames that the arm and its gripper send without being asked."""
+GRIPPER_IDS = (_GRIPPER_STATUS,)
+"""Those of them that are the gripper's."""
 
 _MILLIDEGREES = 180_000.0 / pi
 """Millidegrees per radian."""
@@ -281,7 +284,7 @@ def encode_joint_targets(q: Sequence[float]) -> list[CanFrame]:
 def decode_command(frame_id: int, data: bytes) -> PiperCommand | None:
     """Return the command in a frame; None for any other frame, of this arm or not."""
     decoder = _COMMANDS.get(frame_id)
-    return None if decoder is None or len(data) != 8 else decoder(frame_id, bytes(data))
+    return None if decoder is None or len(data) != 8 else decoder(frame_id, data)
 
 
 _COMMANDS: dict[int, Callable[[int, bytes], PiperCommand | None]] = {
@@ -518,7 +521,7 @@ def find_firmware(pieces: Iterable[bytes]) -> str | None:
 def decode_feedback(frame_id: int, data: bytes) -> PiperFeedback | None:
     """Return what the arm reports in a frame; None for any other frame, of this arm or not."""
     decoder = _FEEDBACK.get(frame_id)
-    return None if decoder is None or len(data) != 8 else decoder(frame_id, bytes(data))
+    return None if decoder is None or len(data) != 8 else decoder(frame_id, data)
 
 
 def _motion(frame_id: int, data: bytes) -> JointMotion:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Iterator, Mapping
 from functools import cached_property
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any, Literal, TypeVar
 
 from pydantic import BaseModel, BeforeValidator, Field, model_validator
 
@@ -17,14 +17,19 @@ from hal.config.schema import Flag, Quantity, Size, Strict, describe, is_number
 from hal.specs import GripperSpec, RobotSpec
 
 from .damiao_protocol import KD_MAX, KP_MAX, MASTER_OFFSET, MOTOR_RANGES, MotorRange
+from .piper_protocol import JOINTS
 
 __all__ = [
     "BusSettings",
     "DamiaoArmSettings",
     "DamiaoGripperSettings",
     "DamiaoMotorSettings",
+    "PiperArmSettings",
+    "PiperGripperSettings",
     "check_damiao_arm",
     "check_damiao_gripper",
+    "check_piper_arm",
+    "check_piper_gripper",
     "is_emulated",
 ]
 
@@ -214,6 +219,41 @@ class DamiaoGripperSettings(BusSettings):
         return _of(cls, spec.options, f"{spec.name}.real")
 
 
+class PiperArmSettings(BusSettings):
+    """Settings under ``real:`` of a PiPER."""
+
+    speed_percent: Annotated[int, _whole("a percentage", 1, 100)] = 100
+    """Speed at which the arm's own controller goes to a target, percent of each joint's largest. It must not be below
+    the speed of the set-points, or the arm lags behind."""
+    mounting: Literal["upright", "left", "right"] | None = None
+    """How the arm is mounted, seen with its cables behind; None leaves it as it is set in the arm."""
+
+    @property
+    def mounting_code(self) -> int:
+        """The mounting as a number of the protocol."""
+        return 0 if self.mounting is None else 1 + ("upright", "left", "right").index(self.mounting)
+
+    @classmethod
+    def of(cls, spec: RobotSpec) -> PiperArmSettings:
+        """Return the settings in an arm's record. Raises ConfigError, which lists every problem."""
+        return _of(cls, spec.options, f"robots.{spec.name}.real")
+
+
+class PiperGripperSettings(BusSettings):
+    """Settings under ``real:`` of a PiPER's gripper; those of the bus default to the arm's."""
+
+    force_per_torque: Annotated[float, Quantity("N/Nm", 1.0, 200.0)] = 40.0
+    """Grip force for each Nm of the motor, N/Nm. Not published: the vendor rates the gripper at 40 N, and its examples
+    set 1 Nm."""
+    tolerance: Size = 0.001
+    """Largest distance from the target width at which the fingers count as arrived, m."""
+
+    @classmethod
+    def of(cls, spec: GripperSpec) -> PiperGripperSettings:
+        """Return the settings in a gripper's record. Raises ConfigError, which lists every problem."""
+        return _of(cls, spec.options, f"{spec.name}.real")
+
+
 _Settings = TypeVar("_Settings", bound=BaseModel)
 
 
@@ -268,6 +308,38 @@ def check_damiao_gripper(spec: GripperSpec) -> Iterator[tuple[str, str, str]]:
     beyond = [angle for angle, _ in settings.widths if abs(angle - settings.motor.offset) >= settings.motor.limits[0]]
     if beyond:
         yield "real.widths", f"has an angle beyond the motor's range: {beyond[0]:g} rad", "out_of_range"
+
+
+_PIPER_RATE = 200.0
+"""Rate at which a PiPER takes targets and reports, Hz."""
+_PIPER_BIT_RATE = 1_000_000
+
+
+def check_piper_arm(spec: RobotSpec) -> Iterator[tuple[str, str, str]]:
+    """Yield the problems in an arm's record: key in the arm's entry of the rig, message and code."""
+    settings, problems = _checked(PiperArmSettings, spec.options)
+    yield from problems
+    if len(spec.joints) != JOINTS:
+        yield "model", f"must have {JOINTS} joints for a PiPER, not {len(spec.joints)}", "wrong_count"
+    if spec.rate_hz > _PIPER_RATE:
+        yield "rate_hz", f"must be at most {_PIPER_RATE:g} Hz for a PiPER, not {spec.rate_hz:g}", "out_of_range"
+    if settings is not None:
+        yield from _piper_bus(settings)
+
+
+def check_piper_gripper(spec: GripperSpec) -> Iterator[tuple[str, str, str]]:
+    """Yield the problems in a gripper's record: key in the gripper's entry of the rig, message and code."""
+    settings, problems = _checked(PiperGripperSettings, spec.options)
+    yield from problems
+    if settings is not None:
+        yield from _piper_bus(settings)
+
+
+def _piper_bus(settings: BusSettings) -> Iterator[tuple[str, str, str]]:
+    if settings.fd:
+        yield "real.fd", "must be false: a PiPER has classic CAN, and an FD frame would stop its bus", "not_supported"
+    if settings.bit_rate != _PIPER_BIT_RATE:
+        yield "real.bit_rate", f"must be {_PIPER_BIT_RATE}, a PiPER's only one, not {settings.bit_rate}", "out_of_range"
 
 
 def _checked(model: type[_Settings], options: Mapping[str, Any]) -> tuple[_Settings | None, list[tuple[str, str, str]]]:

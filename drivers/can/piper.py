@@ -1,0 +1,284 @@
+"""Driver of an AgileX PiPER arm.
+
+The arm's own controller takes joint targets and reports 200 times a second. It holds its last target for ever, so
+nothing is lost when a program stops to send, and nothing here ever switches its motors off: a raised arm would fall.
+
+* ``engage`` switches the motors on, and takes over control with the measured position as first target.
+* ``write`` sends the targets of all joints; ``halt`` and ``close`` send nothing.
+* An arm that reports an error, or that leaves CAN control, counts as not engaged until ``recover`` and ``engage``.
+"""
+
+from __future__ import annotations
+
+from math import inf
+from typing import Any, ClassVar
+
+from hal.driver import Reading, RobotDriver, Setpoint
+from hal.errors import ConnectionLost, Fault
+from hal.lock import DeviceLock
+from hal.specs import RobotSpec
+
+from .piper_link import SILENCE, PiperLink, arm_fault, control_fault, join_joints, refusal
+from .piper_protocol import (
+    ENABLED,
+    FEEDBACK_IDS,
+    GRIPPER_IDS,
+    JOINTS,
+    TORQUE_PER_AMPERE,
+    EnableRequest,
+    JointAngles,
+    JointMotion,
+    JointRequest,
+    JointStatus,
+    ModeRequest,
+    PiperFeedback,
+    PiperStatus,
+    encode_joint_targets,
+)
+from .settings import PiperArmSettings
+
+__all__ = ["PiperArm"]
+
+_PATIENCE = 2.0
+"""Longest time to wait for another program to release the arm, s."""
+_ASK_AGAIN = 0.02
+"""s between two commands to switch the motors on, or to take over control."""
+_SWITCHED_ON = 0.8
+"""Time in which all motors must be on, s."""
+_CLEARING = 0.15
+"""Time for which an error may still be reported after it was cleared, s: slow frames come every 25 ms."""
+_OWN_IDS = tuple(id for id in FEEDBACK_IDS if id not in GRIPPER_IDS)
+_ALL_PAIRS = 0b111
+_NO_JOINTS = (0.0,) * JOINTS
+
+
+class PiperArm(RobotDriver):
+    """A PiPER (settings: :class:`~.settings.PiperArmSettings`)."""
+
+    modes: ClassVar[frozenset[str]] = frozenset({"position"})
+    repeats: ClassVar[bool] = True
+
+    def __init__(self, spec: RobotSpec, world: object | None = None) -> None:
+        super().__init__(spec, world)
+        self.settings = PiperArmSettings.of(spec)
+        self.engaged = False
+        self._link = PiperLink(spec.name, self.settings, self._take, _OWN_IDS)
+        self._lock: DeviceLock | None = None
+        self.longest_gap = 0.0
+        """Longest time between two samples, s."""
+        self.faults = 0
+        """Number of errors that ended an engagement."""
+        self._forget()
+
+    def _forget(self) -> None:
+        """Forget everything that the arm has reported, and that it was asked for."""
+        self.engaged = False
+        self._now = -inf
+        self._status: PiperStatus | None = None
+        self._t_status = -inf
+        self._joints: list[JointStatus | None] = [None] * JOINTS
+        self._flags = [0] * JOINTS
+        self._q: tuple[float, ...] | None = None
+        self._t_q = -inf
+        """Time of the oldest of the three frames that ``_q`` is made of, s."""
+        self._seq = 0
+        self._dq = list(_NO_JOINTS)
+        self._tau = list(_NO_JOINTS)
+        self._pairs: list[tuple[float, float]] = [(0.0, 0.0)] * 3
+        self._pairs_come = 0
+        self._t_pairs = -inf
+        self._commanded: tuple[float, ...] | None = None
+        self._commanded_dq: tuple[float, ...] = _NO_JOINTS
+        self._fault: Fault | None = None
+        """Error that ended the engagement; kept until recover(), even if the arm no longer reports it."""
+        self._clearing_until = -inf
+        self._t_asked = self._t_engaging = self._t_last_try = -inf
+        self._confirmed = False
+
+    # Connection
+
+    def open(self) -> None:
+        """Connect, and wait until the arm has reported its state. Nothing is sent.
+
+        Raises:
+            DeviceNotFound: No arm reports on this bus, or a part of its reports is missing.
+            ControlTaken: Another program on this computer uses this arm.
+        """
+        if self._link.bus is not None:
+            return
+        self._forget()
+        where = " ".join(self.settings.key)
+        if self.settings.interface != "virtual":  # a bus of this process
+            self._lock = DeviceLock(f"piper-{where}", f"the PiPER on {where}", _PATIENCE)
+        try:
+            self._link.open(self._missing)
+        except BaseException:
+            self._release()
+            raise
+
+    def close(self) -> None:
+        """Give up the bus. The arm holds its last target: its motors stay on."""
+        self.engaged = False
+        self._link.close()
+        self._release()
+
+    def _release(self) -> None:
+        lock, self._lock = self._lock, None
+        if lock is not None:
+            lock.release()
+
+    def _missing(self) -> str:
+        """Return which reports have not come yet, in words; empty if the state is complete."""
+        silent = join_joints(k for k, joint in enumerate(self._joints) if joint is None)
+        parts = {"no arm status (0x2A1)": self._status is None, "no positions (0x2A5 to 0x2A7)": self._q is None}
+        if all(parts.values()) and self._joints == [None] * JOINTS:
+            return "no PiPER reports"
+        texts = [text for text, absent in parts.items() if absent]
+        return ", ".join([*texts, *([f"no motor status of {silent}"] if silent else [])])
+
+    # Every cycle
+
+    def read(self, now: float) -> Reading:
+        first = self._now == -inf
+        self._now = now
+        if first and self._q is not None:  # what came while it was opened
+            self._t_q = self._t_status = now
+        try:
+            self._link.poll()
+        except ConnectionLost:
+            self._disengage()
+            raise
+        q = self._q
+        if q is None or now - self._t_q > SILENCE or now - self._t_status > SILENCE:
+            self._disengage()
+            what = "positions" if q is None or now - self._t_q > SILENCE else "status"
+            raise self._link.lose(f"the arm has sent no {what} for {1e3 * SILENCE:.0f} ms")
+        self._link.lost = None
+        fault = self._present_fault()
+        commanded, commanded_dq = (self._commanded, self._commanded_dq) if self.engaged else (None, None)
+        return Reading(
+            self._t_q, self._t_q, self._seq, q, tuple(self._dq), tuple(self._tau), commanded, commanded_dq, fault=fault
+        )
+
+    def _take(self, record: PiperFeedback) -> None:
+        """Keep what a frame reports. It is stamped with the time of the last read: it may be younger, never older."""
+        if type(record) is JointMotion:
+            k = record.joint
+            self._dq[k] = record.dq
+            self._tau[k] = record.current * TORQUE_PER_AMPERE[k]
+        elif type(record) is JointAngles:
+            if not self._pairs_come:
+                self._t_pairs = self._now
+            k = record.first // 2
+            self._pairs[k] = record.q
+            self._pairs_come |= 1 << k
+            if self._pairs_come == _ALL_PAIRS:
+                self._pairs_come = 0
+                (a, b), (c, d), (e, f) = self._pairs
+                self._q = (a, b, c, d, e, f)
+                self.longest_gap = max(self.longest_gap, self._t_pairs - self._t_q if self._seq else 0.0)
+                self._t_q = self._t_pairs
+                self._seq += 1
+        elif type(record) is PiperStatus:
+            self._status = record
+            self._t_status = self._now
+        elif type(record) is JointStatus:
+            self._joints[record.joint] = record
+            self._flags[record.joint] = record.flags
+
+    def _present_fault(self) -> Fault | None:
+        """Return what keeps the arm from following; an engaged arm is then no longer engaged."""
+        status = self._status
+        assert status is not None
+        fault = arm_fault(status, self._flags)
+        if self.engaged:
+            fault = fault or control_fault(status, self._flags)
+            if fault is not None:
+                self._fault = fault
+                self._disengage()
+                self.faults += 1
+        elif self._now < self._clearing_until:
+            fault = None
+        return self._fault or fault
+
+    def write(self, setpoint: Setpoint) -> bool:
+        if not self.engaged:
+            self._link.send(())
+            return False
+        q = tuple(setpoint.q)
+        self._link.send(encode_joint_targets(q))
+        self._commanded, self._commanded_dq = q, tuple(setpoint.dq)
+        return True
+
+    def halt(self) -> None:
+        """Send nothing: the arm holds its last target."""
+
+    # Switching on
+
+    def engage(self) -> None:
+        """Switch the motors on, then take over control with the measured position as target. One step per call.
+
+        Raises:
+            RobotFault: The arm reports an error, or a motor does not switch on; the message names the joint.
+            ConnectionLost: The arm does not answer.
+        """
+        if self.engaged:
+            return
+        self._link.send(())
+        now, status, q = self._now, self._status, self._q
+        assert status is not None
+        assert q is not None
+        fault = self._fault or arm_fault(status, self._flags)
+        if fault is not None and (self._fault is not None or now >= self._clearing_until):
+            raise refusal(self.spec.name, fault)
+        if now - self._t_last_try > SILENCE:  # a new attempt
+            self._t_engaging, self._t_asked, self._confirmed = now, -inf, False
+        self._t_last_try = now
+        fault = fault or control_fault(status, self._flags)
+        if fault is None and self._confirmed and self._t_status > self._t_asked:
+            self.engaged = True
+            return
+        if fault is not None and now - self._t_engaging > _SWITCHED_ON:
+            raise refusal(self.spec.name, fault)
+        if now - self._t_asked < _ASK_AGAIN:
+            return
+        self._t_asked = now
+        if not all(flags & ENABLED for flags in self._flags):
+            self._link.send([EnableRequest().frame()])
+            return
+        mode = ModeRequest(speed_percent=self.settings.speed_percent, mounting=self.settings.mounting_code)
+        self._link.send([mode.frame(), *encode_joint_targets(q)])
+        self._commanded, self._commanded_dq, self._confirmed = q, _NO_JOINTS, True
+
+    def _disengage(self) -> None:
+        self.engaged, self._commanded, self._t_last_try = False, None, -inf
+
+    def recover(self) -> None:
+        """Clear the errors of the joints. It never sends the vendor's reset, which cuts the power of the motors.
+
+        Raises:
+            ConnectionLost: The arm does not answer.
+        """
+        self._link.send([JointRequest().frame()])
+        self._fault = None
+        self._clearing_until = self._now + _CLEARING
+
+    # Statistics
+
+    def reset_statistics(self) -> None:
+        self.faults = 0
+        self.longest_gap = 0.0
+        if self._link.bus is not None:
+            self._link.bus.reset_statistics()
+
+    def statistics(self) -> dict[str, Any]:
+        joints = [joint for joint in self._joints if joint is not None]
+        return {
+            "bus": self._link.statistics(),
+            "samples": self._seq,
+            "longest_gap_s": self.longest_gap,
+            "faults": self.faults,
+            "motor_temperatures": [joint.motor_temperature for joint in joints],
+            "driver_temperatures": [joint.driver_temperature for joint in joints],
+            "voltages": [round(joint.voltage, 1) for joint in joints],
+        }

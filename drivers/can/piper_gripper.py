@@ -1,0 +1,141 @@
+"""Driver of the gripper of an AgileX PiPER, on the bus of its arm."""
+
+from __future__ import annotations
+
+from math import inf
+
+from hal.driver import GripperDriver, GripperReading
+from hal.specs import GripperSpec
+
+from .piper_link import SILENCE, PiperLink, gripper_fault
+from .piper_protocol import ENABLED, GRIPPER_IDS, GripperRequest, GripperStatus, PiperFeedback
+from .settings import PiperGripperSettings
+
+__all__ = ["PiperGripper"]
+
+_AT_REST = 0.15
+"""Time without motion after which the fingers are at rest, s."""
+_STILL = 2e-4
+"""Largest change of the width of fingers at rest, m."""
+_LARGEST_TORQUE = 5.0
+"""Nm."""
+
+
+class PiperGripper(GripperDriver):
+    """The gripper of a PiPER (settings: :class:`~.settings.PiperGripperSettings`), on the bus of its arm.
+
+    The gripper has no speed of its own, so the target runs along at the speed of the command. It holds its last target
+    for ever, with the torque of the command.
+    """
+
+    def __init__(self, spec: GripperSpec, world: object | None = None) -> None:
+        super().__init__(spec, world)
+        self.settings = PiperGripperSettings.of(spec)
+        self._link = PiperLink(spec.name, self.settings, self._take, GRIPPER_IDS)
+        self._forget()
+
+    def _forget(self) -> None:
+        self._now = -inf
+        self._status: GripperStatus | None = None
+        self._t_status = -inf
+        self._seq = 0
+        self._target: float | None = None
+        """Width of the newest command, m; None before the first one."""
+        self._ramp = 0.0
+        """Width that the gripper was sent last, m."""
+        self._goal = 0.0
+        """Width at which the ramp ends, m."""
+        self._speed = 0.0
+        self._torque = 0.0
+        self._stopped = True
+        self._t_moved = -inf
+        """Last time at which the fingers moved, or should have, s."""
+        self._still_at = 0.0
+
+    def open(self) -> None:
+        """Connect, and wait until the gripper has reported. Nothing is sent."""
+        if self._link.bus is None:
+            self._forget()
+            self._link.open(lambda: "" if self._status is not None else "no gripper reports (0x2A8)")
+
+    def close(self) -> None:
+        """Give up the bus. The gripper holds its last target."""
+        self._link.close()
+
+    def read(self, now: float) -> GripperReading:
+        if self._now == -inf:
+            self._t_status = now
+        dt, self._now = max(0.0, now - self._now), now
+        self._link.poll()
+        status = self._status
+        if status is None or now - self._t_status > SILENCE:
+            self._stopped = True
+            raise self._link.lose(f"the gripper has sent nothing for {1e3 * SILENCE:.0f} ms")
+        self._link.lost = None
+        fault = gripper_fault(status)
+        if fault is not None:
+            self._stopped = True
+        if abs(status.width - self._still_at) > _STILL:
+            self._still_at, self._t_moved = status.width, now
+        self._advance(dt)
+        moving = not self._stopped and (self._ramp != self._goal or now - self._t_moved < _AT_REST)
+        blocked = status.width - self._goal > self.settings.tolerance
+        return GripperReading(
+            t=self._t_status,
+            t_device=self._t_status,
+            seq=self._seq,
+            width=status.width,
+            width_target=status.width if self._target is None else self._target,
+            moving=moving,
+            grasped=self._target is not None and not moving and not self._stopped and blocked,
+            force=abs(status.torque) * self.settings.force_per_torque,
+            fault=fault if self._target is not None else None,
+        )
+
+    def _advance(self, dt: float) -> None:
+        """Move the target along at the speed of the command, and send it."""
+        if self._stopped or self._ramp == self._goal:
+            return
+        step, rest = self._speed * min(dt, _AT_REST), self._goal - self._ramp
+        self._ramp = self._goal if abs(rest) <= step else self._ramp + (step if rest > 0.0 else -step)
+        self._t_moved = self._now
+        self._send(clear=False)
+
+    def _send(self, clear: bool) -> None:
+        self._link.send([GripperRequest(self._ramp, self._torque, clear_error=clear).frame()])
+
+    def _take(self, record: PiperFeedback) -> None:
+        if type(record) is GripperStatus:
+            self._status = record
+            self._t_status = self._now
+            self._seq += 1
+
+    def move(self, width: float, speed: float, force: float) -> None:
+        self._start(width, width, speed, force)
+
+    def grasp(self, width: float, speed: float, force: float, inner: float, outer: float) -> None:
+        """Close until an object, or the other finger, stops the fingers."""
+        self._start(width, 0.0, speed, force)
+
+    def _start(self, target: float, goal: float, speed: float, force: float) -> None:
+        self._link.send(())  # raises if it is lost
+        status = self._status
+        assert status is not None
+        widest = self.spec.width_max
+        self._target, self._goal = min(max(target, 0.0), widest), min(max(goal, 0.0), widest)
+        width = min(max(status.width, 0.0), widest)
+        if not status.flags & ENABLED:
+            self._ramp = width
+        elif self._goal > self._ramp:  # fingers that an object stopped start to open where they are
+            self._ramp = min(max(self._ramp, width), self._goal)
+        self._speed = min(speed, self.spec.speed)
+        self._torque = min(max(force / self.settings.force_per_torque, 0.0), _LARGEST_TORQUE)
+        self._stopped = False
+        self._t_moved = self._now
+        self._send(clear=gripper_fault(status) is not None)
+
+    def stop(self) -> None:
+        """Keep the fingers where they are; an object that they hold stays held with the same torque."""
+        self._link.send(())
+        if self._ramp != self._goal:
+            self._stopped = True
