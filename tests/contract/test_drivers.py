@@ -35,11 +35,14 @@ from .benches import (
     software_realsense,
     three_joints,
 )
+from .can_arms import piper_arm, piper_gripper
 from .evdev_pads import recorded_pad
 from .frankas import FR3, franka_hand
 from .pads import mock_pad, playback_pad, terminal_keys_held, terminal_steps, web_pad
 
 NO_LINK = dict.fromkeys(("lose", "restore", "freeze"), "it is part of the simulation: there is no link")
+
+PIPER_REPORTS = {"freeze": "it reports by itself: silence for 0.1 s counts as a lost link"}
 
 # Arms.
 
@@ -58,6 +61,12 @@ class TestArmWithoutUrdf(RobotContract):
 
 class TestPyBulletRobot(RobotContract):
     bench = bench_of(pybullet_robot)
+
+
+class TestEmulatedPiper(RobotContract, left_out=PIPER_REPORTS | {"torque": "its controller takes positions only"}):
+    """In memory, and in step with the bench's clock."""
+
+    bench = bench_of(piper_arm)
 
 
 @pytest.fixture(scope="module")
@@ -94,6 +103,10 @@ class TestMockGripper(GripperContract):
 
 class TestPyBulletGripper(GripperContract, left_out=NO_LINK):
     bench = bench_of(pybullet_gripper)
+
+
+class TestEmulatedPiperGripper(GripperContract, left_out=PIPER_REPORTS):
+    bench = bench_of(piper_gripper)
 
 
 @pytest.mark.slow

@@ -24,6 +24,7 @@ from ..piper_protocol import (
     TORQUE_PER_AMPERE,
     AccelerationLimit,
     Acknowledgement,
+    EmergencyRequest,
     EnableRequest,
     FirmwareQuery,
     GripperRequest,
@@ -38,7 +39,6 @@ from ..piper_protocol import (
     ModeRequest,
     ParameterQuery,
     PiperStatus,
-    StopRequest,
     decode_command,
     encode_joint_angles,
     encode_pose,
@@ -126,10 +126,10 @@ class PiperArm:
                 self._set_targets(first, q)
             case GripperRequest():
                 self._gripper = command
-            case StopRequest(emergency=1):
+            case EmergencyRequest(emergency=1):
                 self.status = _STOPPED
                 self.target = list(self._set_q)
-            case StopRequest(emergency=2):  # "resume": it cuts the power
+            case EmergencyRequest(emergency=2):  # "resume": it cuts the power
                 self._enable(ALL_JOINTS, False)
                 self.status, self.control = 0, STANDBY
             case JointRequest(clear_error=True):
