@@ -133,7 +133,7 @@ class PiperArm:
                 self._enable(ALL_JOINTS, False)
                 self.status, self.control = 0, STANDBY
             case JointRequest(clear_error=True):
-                self.status = 0
+                self.status, self.flags = 0, [0] * JOINTS
             case LimitQuery(motor, content) if 1 <= motor <= JOINTS:
                 k = motor - 1
                 answer = (
