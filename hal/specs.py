@@ -20,6 +20,7 @@ __all__ = [
     "KinematicsSpec",
     "LimitsSpec",
     "PadSpec",
+    "PayloadSpec",
     "Plan",
     "RangesSpec",
     "RobotSpec",
@@ -94,6 +95,16 @@ class GripperSpec:
 
 
 @dataclass(frozen=True)
+class PayloadSpec:
+    """What an arm carries besides its own gripper: a tool, a camera, an object. A point mass."""
+
+    mass: float
+    """kg"""
+    position: Vector3 = (0.0, 0.0, 0.0)
+    """Centre of mass in the frame of the tcp, m."""
+
+
+@dataclass(frozen=True)
 class RobotSpec:
     """One arm on a rig."""
 
@@ -114,6 +125,8 @@ class RobotSpec:
     """Pose of the base link in the world."""
     gripper: GripperSpec | None = None
     workspace: WorkspaceSpec | None = None
+    payload: PayloadSpec | None = None
+    """None where nothing is carried, or where it is not known."""
     speed: float = 0.3
     """Greatest share of the joint speed limits in a control session."""
     move_speed: float = 0.1

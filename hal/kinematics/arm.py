@@ -25,7 +25,7 @@ from .urdf import parse_xml
 if TYPE_CHECKING:
     from ..specs import KinematicsSpec
 
-__all__ = ["Kinematics", "Pose7"]
+__all__ = ["Kinematics", "Pose7", "add_tcp", "reduced_model"]
 
 Array = NDArray[np.float64]
 Pose7 = tuple[float, float, float, float, float, float, float]
@@ -61,8 +61,8 @@ class Kinematics:
             if values.shape != (self.n,):
                 raise ValueError(f"{name} has {values.size} numbers for {self.n} joints")
         self._pin: Any = pin
-        self._model: Any = _reduced_model(spec, pin)
-        self._tcp: int = _tcp_frame(self._model, spec, pin)
+        self._model: Any = reduced_model(spec, pin)
+        self._tcp: int = add_tcp(self._model, spec, pin)
         self._data: Any = self._model.createData()
         # These are views of what was computed last.
         self._tcp_placement: Any = self._data.oMf[self._tcp]
@@ -132,7 +132,10 @@ class Kinematics:
         return np.where(self._inner, turned, turned.transpose(1, 0, 2))
 
     def mass_matrix(self, q: Sequence[float] | Array) -> Array:
-        """Return the joint-space inertia (n, n), kg m2, of the URDF, which in some files has made-up values."""
+        """Return the joint-space inertia (n, n), kg m2, of the URDF, which in some files has made-up values.
+
+        :class:`hal.dynamics.Dynamics` refuses such files.
+        """
         mass: Array = self._pin.crba(self._model, self._data, self._ordered(q))
         return mass if self._columns is None else mass[np.ix_(self._columns, self._columns)]
 
@@ -275,7 +278,7 @@ class Kinematics:
         self._pin.forwardKinematics(self._model, self._data, self._ordered(q))
 
 
-def _reduced_model(spec: KinematicsSpec, pin: Any) -> Any:
+def reduced_model(spec: KinematicsSpec, pin: Any) -> Any:
     """Return pinocchio's model of the arm's joints alone, with the base link as its world frame."""
     full = pin.buildModelFromXML(_bounded_joints(spec.urdf))
     missing = [name for name in spec.joints if not full.existJointName(name)]
@@ -318,7 +321,7 @@ def _frame(model: Any, link: str, spec: KinematicsSpec) -> int:
     return frame
 
 
-def _tcp_frame(model: Any, spec: KinematicsSpec, pin: Any) -> int:
+def add_tcp(model: Any, spec: KinematicsSpec, pin: Any) -> int:
     """Add the tool centre point to the model as a frame, and return its index."""
     link = model.frames[_frame(model, spec.tcp_link, spec)]
     offset = pin.XYZQUATToSE3(np.array([*spec.tcp_position, *Pose((0, 0, 0), spec.tcp_orientation).orientation]))
