@@ -58,7 +58,6 @@ __all__ = [
     "RobotDriver",
     "Setpoint",
     "StreamInfo",
-    "nominal_info",
 ]
 
 Array = NDArray[np.float64]
@@ -152,8 +151,8 @@ class RobotDriver(DeviceDriver):
 
     All methods are called from one thread of the process that runs the arm's servo. ``wait`` (where the device sets
     the pace) and ``read`` are called once per cycle, ``write`` once per cycle while a control session is open. Between
-    sessions an arm may still need frames, to hold or to report its state: ``read`` sends them. A device that hears
-    nothing any more must come to rest by itself, because the process may be killed, and hold if it can.
+    sessions ``read`` sends what an arm needs to hold and to report its state. A device that hears nothing any more
+    must come to rest by itself, because the process may be killed, and hold if it can.
 
     Args:
         spec: Record of the arm: joints, limits, rate, options.
@@ -169,8 +168,8 @@ class RobotDriver(DeviceDriver):
     acceleration (a Franka), or if none can be lost. Only an extrapolation is corrected, because it looks different from
     a report that is late."""
     engaged: bool = True
-    """Whether the drives are on, so that the arm holds and follows set-points. A driver that has to switch them on sets
-    it to False until that is done (see :meth:`engage`), and again when they went off: by a fault, a lost link."""
+    """Whether the drives are on, so that the arm holds and follows. A driver that has to switch them on (see
+    :meth:`engage`) sets it to False until then, and again when a fault or a lost link switched them off."""
 
     def __init__(self, spec: RobotSpec, world: object | None = None) -> None:
         self.spec = spec
@@ -200,10 +199,9 @@ class RobotDriver(DeviceDriver):
     def engage(self) -> None:  # most arms are ready as soon as they are open
         """Switch the drives on, or continue to: the arm then holds where it is. Nothing moves.
 
-        While :attr:`engaged` is False it is called once per cycle, each time before a :meth:`read`: when a control
-        session opens, and when the arm is to move again after a fault or a lost link. It may take many cycles, about
-        0.3 s, while the group's other devices continue; after 1 s the host gives up. ``open`` and ``recover`` engage
-        nothing, since a user may be holding the arm; :meth:`halt` keeps it engaged.
+        It is called once per cycle, before a :meth:`read`, until :attr:`engaged` is True: when a control session opens,
+        and when the arm is to move again after a fault or a lost link. About 0.3 s is usual, 1 s the limit. Neither
+        ``open`` nor ``recover`` engages, since a user may be holding the arm; :meth:`halt` keeps it engaged.
 
         Raises:
             RobotFault: A drive does not switch on; the message names it. No session is opened.
@@ -469,7 +467,24 @@ class CameraDriver(DeviceDriver):
     @property
     def info(self) -> CameraInfo:
         """Identity and calibration; read after every ``open``, because another camera may have been plugged in."""
-        return nominal_info(self.spec, "simulated" if self.simulated else "hardware")
+        return self.nominal_info()
+
+    def nominal_info(self, title: str = "") -> CameraInfo:
+        """Return the figures of the model, for a camera that reports none itself; ``title`` is its make and model."""
+        spec, streams = self.spec, {}
+        distortion = frozen(spec.distortion)
+        for name, s in spec.sensors.items():
+            pose = Pose(s.position, s.orientation)
+            streams[name] = StreamInfo(s.format, s.width, s.height, s.rate_hz, frozen(s.K), distortion, pose)
+        infrared = spec.K_infrared or (spec.K if {"infrared", "infrared_right"} & set(spec.streams) else None)
+        return CameraInfo(
+            title or spec.model,
+            frozen(spec.K),
+            distortion,
+            frozen(infrared) if infrared is not None else None,
+            clock="simulated" if self.simulated else "hardware",
+            streams=MappingProxyType(streams),
+        )
 
     @abstractmethod
     def grab(self, timeout: float) -> RawFrame | None:
@@ -483,37 +498,6 @@ class CameraDriver(DeviceDriver):
         Raises:
             ConnectionLost: The device is gone, or has been silent for so long that it must be opened again.
         """
-
-
-def nominal_info(spec: CameraSpec, clock: str, title: str = "") -> CameraInfo:
-    """Return the info of a camera that does not report its own calibration, from the figures of its model.
-
-    Args:
-        spec: Record of the camera.
-        clock: See :attr:`CameraInfo.clock`.
-        title: Make and model; the model's name by default.
-    """
-    streams = {
-        name: StreamInfo(
-            format=stream.format,
-            width=stream.width,
-            height=stream.height,
-            rate_hz=stream.rate_hz,
-            K=frozen(stream.K),
-            distortion=frozen(spec.distortion),
-            T_color_stream=Pose(stream.position, stream.orientation),
-        )
-        for name, stream in spec.sensors.items()
-    }
-    infrared = spec.K_infrared or (spec.K if {"infrared", "infrared_right"} & set(spec.streams) else None)
-    return CameraInfo(
-        title=title or spec.model,
-        K=frozen(spec.K),
-        distortion=frozen(spec.distortion),
-        K_infrared=frozen(infrared) if infrared is not None else None,
-        clock=clock,
-        streams=MappingProxyType(streams),
-    )
 
 
 # Gamepads

@@ -16,7 +16,7 @@ from typing import Any, ClassVar, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from hal.driver import CameraDriver, CameraInfo, RawFrame, nominal_info
+from hal.driver import CameraDriver, CameraInfo, RawFrame
 from hal.errors import ConfigError, ConnectionLost, DriverMissing, NotSupported, Problem
 from hal.geometry import Pose
 from hal.host.hosts import SNAPSHOT_CAPACITY, Host, LocalHost, RemoteHost
@@ -68,7 +68,7 @@ class PyBulletCamera(CameraDriver):
     def __init__(self, spec: CameraSpec, source: object | None = None) -> None:
         super().__init__(spec, source)
         self._open = False
-        info = nominal_info(spec, "simulated", f"simulated {PurePath(spec.model).stem}")
+        info = self.nominal_info(f"simulated {PurePath(spec.model).stem}")
         sensor = spec.depth_sensor if noise_of(spec) is not None else None
         # With noise, depth comes in whole units, as from a real camera.
         self._info = replace(info, depth_scale=sensor.unit) if sensor is not None else info
