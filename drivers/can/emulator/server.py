@@ -129,11 +129,7 @@ class EmulatedBus:
 
     def start(self) -> None:
         """Open the bus and start the thread. Raises what python-can raises if it cannot be opened."""
-        s = self.settings
-        more: dict[str, Any] = {"fd": s.fd} if s.interface == "udp_multicast" or s.fd else {}
-        if s.interface == "udp_multicast":
-            more["hop_limit"] = 0  # frames never leave this computer
-        self._bus = can.Bus(interface=s.interface, channel=s.channel, ignore_config=True, **{**more, **s.bus})
+        self._bus = can.Bus(**self.settings.arguments())
         self._thread.start()
 
     def stop(self) -> None:
