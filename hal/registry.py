@@ -96,8 +96,16 @@ class DriverSpec:
     record of such a device before anything is opened. It yields (key, message) for each mistake; keys are relative to
     the device's entry in the rig, for example ``real.host``. It must not import the driver's libraries."""
     emulated: str | None = None
-    """"module:function" that returns whether the options of a real device name an emulator on this computer, which
-    ``rig.clock`` may step."""
+    """"module:function" that returns whether the options of a real device name an emulator on this computer."""
+    steppable: bool = True
+    """Whether ``rig.clock`` may step its emulators in lock-step; those on a bus live in real time."""
+    group: str | None = None
+    """"module:function" of the unchecked options of a real arm. Arms for which it returns the same key, a text, share
+    one process, because only one can open their adapter; None for a process of its own."""
+    shared_options: tuple[str, ...] = ()
+    """Options of a real arm that apply to its gripper, too, unless the gripper has its own."""
+    payload: bool = False
+    """Whether a real arm uses the rig's ``payload``. Simulated arms accept one, and need none."""
     preflight: str | None = None
     """"module:function" that checks a real arm before it moves (see :mod:`hal.preflight`)."""
     camera_preflight: str | None = None

@@ -137,6 +137,8 @@ class RobotSpec:
     """Whether the arm or its gripper is real, so that a user must be present (a dead-man, or ``unattended=True``)."""
     emulated: bool = False
     """Whether all its real devices are emulators, so that nothing physical moves."""
+    group: str | None = None
+    """Arms with the same one share a process in real time; None for a process of its own."""
     deadline_max: float = 1.0
     """Longest deadline that a command may have, s (0.3 where something real moves)."""
     options: dict[str, Any] = field(default_factory=dict)

@@ -17,6 +17,7 @@ DRIVER = DriverSpec(
     emulated="hal.drivers.franka.settings:is_emulated",
     preflight="hal.drivers.franka.preflight:check",
     own_process=frozenset({"gripper"}),
+    shared_options=("host",),
     requires={
         "pylibfranka": "pip install 'robot-hal[franka]'",
         "panda_py": "pip install 'robot-hal[panda]'",

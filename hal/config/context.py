@@ -25,14 +25,11 @@ from .models import CameraModel, GripperModel, RobotModel, UrdfSource, find_mode
 from .rigfile import CameraConfig, Device, GripperConfig, RigFile, RobotConfig
 from .schema import Unknown
 
-__all__ = ["SHARED", "Context", "check_camera_spec", "check_robot_spec", "is_emulated", "load_urdf", "options_of"]
+__all__ = ["Context", "check_camera_spec", "check_robot_spec", "is_emulated", "load_urdf", "options_of"]
 
 Model = TypeVar("Model", RobotModel, CameraModel)
 Config = RobotConfig | GripperConfig | CameraConfig
 DrivenModel = RobotModel | GripperModel | CameraModel
-
-SHARED = ("host",)
-"""Options of a real arm that apply to its gripper, too, unless the gripper has its own."""
 
 
 @dataclass
@@ -55,6 +52,8 @@ class Context:
     """Other names of links, by the robot's name; those that are known."""
     emulated: set[str] = field(default_factory=set)
     """Keys in the rig of the arms that count as real, but whose real devices are all emulators."""
+    real_time_only: set[str] = field(default_factory=set)
+    """Those of :attr:`emulated` that no clock can step."""
     drivers: dict[str, str] = field(default_factory=dict)
     """Drivers of the arms, grippers and cameras, by their keys in the rig; those that are known."""
 
@@ -254,7 +253,8 @@ def check_robot_spec(
         return
     found = registry.checked(gripper.driver, "gripper", gripper)
     if gripper.driver == spec.driver:  # problems in the arm's own options were added above
-        arms = {f"real.{name}" for name in SHARED if name not in {**kind.real, **config.gripper.real}}
+        own = {**kind.real, **config.gripper.real}
+        arms = {f"real.{name}" for name in registry.driver(spec.driver).shared_options if name not in own}
         found = [problem for problem in found if problem[0] not in arms]
     _add(context, key, "gripper.", found, config.gripper, kind, file)
 

@@ -7,14 +7,14 @@ what needs the value in a hole is skipped, everything else is still checked, and
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from contextlib import suppress
 from typing import Any, TypeVar
 
 from .. import registry
 from ..errors import ConfigError
 from ..pads.model import pad_model
-from ..specs import BodySpec, PadSpec, Plan, WorldSpec
+from ..specs import BodySpec, PadSpec, Plan, RobotSpec, WorldSpec
 from .context import Context
 from .data_files import user_path
 from .files import read_yaml
@@ -43,6 +43,7 @@ def resolve(context: Context) -> Plan:
     pads = _each(context, "gamepads", resolve_pad)
     with suppress(Unknown):
         _check_clock(context)
+    _check_rates(context, robots)
     driver = _world_driver(context)
     bodies: tuple[BodySpec, ...] = ()
     with suppress(Unknown):
@@ -147,9 +148,29 @@ def _check_clock(context: Context) -> None:
         for name, config in devices.items():
             with suppress(Unknown):
                 key = f"{section}.{name}"
-                if not context.simulated(config) and key not in context.emulated:
+                if context.simulated(config):
+                    continue
+                if key in context.real_time_only:
+                    text = "is emulated on a bus, where time cannot be stepped: use the clock real_time, or simulate it"
+                    context.problem(key, text, "emulated_in_lock_step")
+                elif key not in context.emulated:
                     text = "is real, and a real device cannot be stepped: use the clock real_time, or simulate it"
                     context.problem(key, text, "real_in_lock_step")
+
+
+def _check_rates(context: Context, robots: Iterable[RobotSpec]) -> None:
+    """Check that arms that share a process have one rate."""
+    first: dict[str, RobotSpec] = {}
+    for robot in robots:
+        if robot.group is None:
+            continue
+        other = first.setdefault(robot.group, robot)
+        if other.rate_hz != robot.rate_hz:
+            message = (
+                f"is {robot.rate_hz:g} Hz, and {other.name!r}, which shares its process, has {other.rate_hz:g} Hz: "
+                "they must be equal"
+            )
+            context.problem(f"robots.{robot.name}.rate_hz", message, "unequal_rates")
 
 
 def _world_driver(context: Context) -> str | None:

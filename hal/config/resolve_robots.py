@@ -11,9 +11,19 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+from .. import registry
 from ..kinematics.urdf import TURNING, UrdfModel
-from ..specs import Floats, GripperSpec, KinematicsSpec, LimitsSpec, RobotSpec, Vector3, WorkspaceSpec
-from .context import SHARED, Context, check_robot_spec, is_emulated, load_urdf, options_of
+from ..specs import (
+    Floats,
+    GripperSpec,
+    KinematicsSpec,
+    LimitsSpec,
+    PayloadSpec,
+    RobotSpec,
+    Vector3,
+    WorkspaceSpec,
+)
+from .context import Context, check_robot_spec, is_emulated, load_urdf, options_of
 from .files import Problems, nearest
 from .models import LimitsModel, RobotModel
 from .rigfile import LimitsConfig, RobotConfig, WorkspaceConfig
@@ -94,6 +104,8 @@ def resolve_robot(context: Context, name: str, config: RobotConfig) -> RobotSpec
                 base_orientation=config.base.orientation,
                 gripper=gripper,
                 workspace=_workspace(config.workspace) if config.workspace is not None else None,
+                payload=_payload(context, key, config, driver, simulated),
+                group=None if simulated else _group_key(driver, options),
                 speed=config.speed,
                 move_speed=config.move_speed,
                 tcp_speed=config.tcp_speed,
@@ -104,6 +116,8 @@ def resolve_robot(context: Context, name: str, config: RobotConfig) -> RobotSpec
             )
             if spec.emulated:
                 context.emulated.add(key)
+                if not all(registry.driver(name).steppable for name, _ in real):
+                    context.real_time_only.add(key)
             check_robot_spec(context, key, spec, config, model, file)
             return spec
     return None
@@ -408,7 +422,24 @@ def _check_inside(
         problems.add(file, key, message, "out_of_range")
 
 
-# Gripper and workspace
+# Payload, process, gripper and workspace
+
+
+def _payload(context: Context, key: str, config: RobotConfig, driver: str, simulated: bool) -> PayloadSpec | None:
+    """Return the payload; one that the driver of a real arm cannot use is a problem."""
+    if config.payload is None:
+        return None
+    if not simulated and not registry.driver(driver).payload:
+        message = f"cannot be used by the driver {driver!r}: remove it, or give the load in the arm's own settings"
+        context.problem(f"{key}.payload", message, "unused_payload")
+    return PayloadSpec(config.payload.mass, config.payload.position)
+
+
+def _group_key(driver: str, options: Mapping[str, Any]) -> str | None:
+    """Return the key of the real arms that share this one's process; None if no other may."""
+    find = registry.function(driver, registry.driver(driver).group)
+    key = find(options) if find is not None else None
+    return None if key is None else f"{driver}:{key}"
 
 
 def _check_gripper(context: Context, key: str, config: RobotConfig, model: RobotModel) -> str:
@@ -441,7 +472,8 @@ def _gripper(
     simulated = context.simulated(own, config)
     options = options_of(own, kind, simulated, driver)
     if not simulated:
-        options = {**{name: arm[name] for name in SHARED if name in arm}, **options}
+        shared = registry.driver(driver).shared_options
+        options = {**{name: arm[name] for name in shared if name in arm}, **options}
     return GripperSpec(
         name=f"{name}.gripper",
         driver=driver,

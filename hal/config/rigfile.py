@@ -35,6 +35,7 @@ from .schema import (
     Force,
     Gravity,
     JointPositions,
+    Mass,
     Name,
     Offset,
     Pixels,
@@ -58,6 +59,7 @@ __all__ = [
     "LimitsConfig",
     "LookAt",
     "PadConfig",
+    "PayloadConfig",
     "RigFile",
     "RobotConfig",
     "SimulationConfig",
@@ -209,6 +211,15 @@ class WorkspaceConfig(Strict):
     """Height of a plane that the tcp stays above."""
 
 
+class PayloadConfig(Strict):
+    """What an arm carries besides its own gripper: a tool, a camera. Its weight is held by the arm's motors."""
+
+    mass: Mass
+    """kg"""
+    position: Offset = (0.0, 0.0, 0.0)
+    """Centre of mass in the frame of the tcp, m."""
+
+
 class GripperConfig(Device):
     """The model's gripper on this arm."""
 
@@ -239,6 +250,8 @@ class RobotConfig(Device):
     """Greatest speed of the tcp, m/s (ISO 10218's reduced speed)."""
     limits: LimitsConfig = LimitsConfig()
     workspace: WorkspaceConfig | None = None
+    payload: PayloadConfig | None = None
+    """For real arms whose driver holds their weight. Others have settings of their own, such as ``real.load``."""
 
 
 class Output(Strict):

@@ -37,8 +37,9 @@ GRIPPER_HZ = 100.0
 def groups_of(plan: Plan) -> list[GroupSpec]:
     """Return the groups of a rig: the devices of its simulated world together, and each other arm alone.
 
-    In lock-step the first one runs in the caller's process, and the others, if there are any, keep in step with it. A
-    gripper is in the group of its arm, except for one whose driver needs a process of its own.
+    Arms with the same :attr:`.RobotSpec.group` are one group. A gripper is in the group of its arm, except for one
+    whose driver needs a process of its own. In lock-step the first group runs in the caller's process, and the others,
+    if there are any, keep in step with it.
     """
     world, clock = plan.world, plan.clock
     inside = tuple(r for r in plan.robots if world is not None and r.driver == world.driver)
@@ -48,8 +49,13 @@ def groups_of(plan: Plan) -> list[GroupSpec]:
         for r in plan.robots
         if r.gripper is not None and _is_apart(r.gripper)
     ]
+    shared: dict[str, list[RobotSpec]] = {}
+    for robot in outside:
+        if _is_alone(robot, clock):
+            shared.setdefault(robot.group or robot.name, []).append(robot)
     alone = [
-        GroupSpec(r.name, clock, r.rate_hz, (r,), grippers=_grippers((r,))) for r in outside if _is_alone(r, clock)
+        GroupSpec("+".join(r.name for r in arms), clock, arms[0].rate_hz, tuple(arms), grippers=_grippers(arms))
+        for arms in shared.values()
     ]
     if clock == "lock_step":
         robots = inside + tuple(r for r in outside if not r.emulated)

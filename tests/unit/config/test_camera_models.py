@@ -13,7 +13,7 @@ import yaml
 
 from hal.config import load
 from hal.config.data_files import find_data, list_data
-from hal.driver import nominal_info
+from hal.drivers.mock.camera import MockCamera
 from hal.errors import ConfigError, Problem
 from hal.specs import CameraSpec, from_json, to_json
 
@@ -124,7 +124,7 @@ def test_where_the_imagers_are(model: str, depth: tuple[float, ...], right: tupl
     assert places == {"color": (0, 0, 0), "depth": depth, "infrared": depth, "infrared_right": right}
     assert spec.depth_sensor is not None
     assert spec.depth_sensor.baseline == pytest.approx(right[0] - depth[0])
-    info = nominal_info(spec, "simulated")
+    info = MockCamera(spec).nominal_info()
     assert info.streams["infrared_right"].T_color_stream.position[0] == right[0]
     assert {name: stream.format for name, stream in info.streams.items()} == {
         "color": "bgr8",

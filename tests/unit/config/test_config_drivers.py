@@ -13,7 +13,8 @@ import yaml
 from hal.config import load
 from hal.config.data_files import find_data
 from hal.errors import ConfigError, DriverMissing
-from hal.specs import RobotSpec
+from hal.host.hosts import groups_of
+from hal.specs import PayloadSpec, RobotSpec, from_json, to_json
 
 LAB = """
 from hal.registry import DriverSpec
@@ -22,6 +23,10 @@ PLACES = {"robot": "hal.drivers.mock.robot:MockRobot", "gripper": "hal.drivers.m
 DRIVER = DriverSpec(
     name="lab", **PLACES,
     checks={"robot": "lab_driver:check_arm", "gripper": "lab_driver:check_hand"}, emulated="lab_driver:emulated",
+    shared_options=("host",),
+)
+BUS = DriverSpec(
+    name="bus", **PLACES, emulated="lab_driver:emulated", steppable=False, group="lab_driver:adapter", payload=True,
 )
 OTHER = DriverSpec(name="other", **PLACES)
 BROKEN = DriverSpec(name="broken", **PLACES, checks={"robot": "lab_driver:nowhere"})
@@ -46,6 +51,9 @@ def check_hand(spec):
 
 def emulated(options):
     return options.get("host") == "here"
+
+def adapter(options):
+    return options.get("adapter")
 """
 ME = {"real": "lab_driver:DRIVER"}
 QUIET = {"jerk": 900, "upper": [2, 1.7, 2, -0.1, 2, 3, 2]}
@@ -180,6 +188,61 @@ def test_a_real_hand_on_a_simulated_arm_is_attended() -> None:
 def test_only_an_emulated_arm_can_be_stepped() -> None:
     assert found(rig(), clock="lock_step") == {("<dict>", "robots.arm")}
     assert arm(rig(real={"host": "here"}), clock="lock_step").emulated
+
+
+def test_an_emulator_on_a_bus_is_emulated_and_cannot_be_stepped() -> None:
+    config = rig({"enabled": False}, drivers={"real": "lab_driver:BUS"}, real={"host": "here"})
+    assert arm(config).emulated
+    with pytest.raises(ConfigError) as caught:
+        load(config, clock="lock_step")
+    assert [(p.key, p.code) for p in caught.value.problems] == [("robots.arm", "emulated_in_lock_step")]
+
+
+def two_on_a_bus(*adapters: str | None, **second: Any) -> dict[str, Any]:
+    """A left and a right arm, each on its adapter; ``second`` are keys of the right one."""
+    arms = {}
+    for name, adapter in zip(("left", "right"), adapters, strict=True):
+        entry = {"model": "panda", "drivers": {"real": "lab_driver:BUS"}, "gripper": {"enabled": False}}
+        arms[name] = entry | {"real": {"adapter": adapter}} | (second if name == "right" else {})
+    return {"sim": False, "robots": arms}
+
+
+@pytest.mark.parametrize(
+    ("adapters", "groups"),
+    [
+        (("usb0", "usb0"), ["left+right"]),
+        (("usb0", "usb1"), ["left", "right"]),
+        ((None, None), ["left", "right"]),
+    ],
+)
+def test_arms_on_one_adapter_share_a_process(adapters: tuple[str | None, ...], groups: list[str]) -> None:
+    found = groups_of(load(two_on_a_bus(*adapters)).resolve())
+    assert [group.name for group in found] == groups
+    assert [robot.name for group in found for robot in group.robots] == ["left", "right"]
+    (simulated,) = groups_of(load(two_on_a_bus(*adapters), sim=True).resolve())
+    assert simulated.name == "simulation"
+
+
+def test_arms_that_share_a_process_have_one_rate() -> None:
+    with pytest.raises(ConfigError) as caught:
+        load(two_on_a_bus("usb0", "usb0", rate_hz=200))
+    assert [(p.key, p.code) for p in caught.value.problems] == [("robots.right.rate_hz", "unequal_rates")]
+    assert len(groups_of(load(two_on_a_bus("usb0", "usb1", rate_hz=200)).resolve())) == 2
+
+
+def test_a_payload_is_for_arms_whose_driver_carries_it() -> None:
+    payload = {"mass": 0.4, "position": [0, 0, 0.05]}
+    config = two_on_a_bus("usb0", "usb0", payload=payload)
+    left, right = load(config).resolve().robots
+    assert (left.payload, right.payload) == (None, PayloadSpec(0.4, (0.0, 0.0, 0.05)))
+    assert from_json(RobotSpec, to_json(right)) == right
+    with pytest.raises(ConfigError) as caught:
+        load(rig(payload=payload))
+    assert [(p.key, p.code) for p in caught.value.problems] == [("robots.arm.payload", "unused_payload")]
+    assert arm(rig(payload=payload), sim=True).payload == right.payload
+    with pytest.raises(ConfigError) as caught:
+        load(two_on_a_bus("usb0", "usb0", payload={"mass": -1}))
+    assert [(p.key, p.code) for p in caught.value.problems] == [("robots.right.payload.mass", "out_of_range")]
 
 
 def test_a_simulated_hand_does_not_fit_a_real_arm() -> None:

@@ -15,7 +15,7 @@ import pytest
 import hal
 from hal.camera import Camera, place_of
 from hal.clock import RealClock
-from hal.driver import CameraDriver, CameraInfo, RawFrame, nominal_info
+from hal.driver import CameraDriver, CameraInfo, RawFrame
 from hal.errors import ConnectionLost, DeviceNotFound, StaleStateError
 from hal.specs import CameraSpec
 
@@ -291,7 +291,7 @@ class Still(CameraDriver):
 
     @property
     def info(self) -> CameraInfo:
-        info = nominal_info(self.spec, "hardware")
+        info = self.nominal_info()
         depth = replace(info.streams["depth"], T_color_stream=hal.Pose([0.016, 0.0, 0.0]))
         return replace(info, streams={**info.streams, "depth": depth})
 
