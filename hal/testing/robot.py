@@ -305,6 +305,7 @@ class RobotContract(Contract):
         _run(bench, 2)
         run_in_thread(bench.driver.close)
 
+    @needs("holds")
     def test_close_and_open_do_not_move_the_arm(self, bench: RobotBench) -> None:
         bench.driver.open()
         _ramp(bench, _RISE)

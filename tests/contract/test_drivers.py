@@ -36,6 +36,7 @@ from .benches import (
     three_joints,
 )
 from .can_arms import piper_arm, piper_gripper
+from .damiaos import damiao_arm, damiao_gripper
 from .evdev_pads import recorded_pad
 from .frankas import FR3, franka_hand
 from .pads import mock_pad, playback_pad, terminal_keys_held, terminal_steps, web_pad
@@ -67,6 +68,19 @@ class TestEmulatedPiper(RobotContract, left_out=PIPER_REPORTS | {"torque": "its 
     """In memory, and in step with the bench's clock."""
 
     bench = bench_of(piper_arm)
+
+
+class TestEmulatedDamiaoArm(
+    RobotContract,
+    left_out={
+        "freeze": "a motor answers each frame: one that does not for 0.1 s is lost",
+        "holds": "it has no brakes: it sinks, damped by its motors (docs/safety.md)",
+        "torque": "speed is reported in steps of 5 mrad/s, without the rotors' inertia: tests/wire/test_can_torque.py",
+    },
+):
+    """A YAM, in memory, and in step with the bench's clock."""
+
+    bench = bench_of(damiao_arm)
 
 
 @pytest.fixture(scope="module")
@@ -107,6 +121,10 @@ class TestPyBulletGripper(GripperContract, left_out=NO_LINK):
 
 class TestEmulatedPiperGripper(GripperContract, left_out=PIPER_REPORTS):
     bench = bench_of(piper_gripper)
+
+
+class TestEmulatedDamiaoGripper(GripperContract, left_out={"freeze": "a silent motor is lost"}):
+    bench = bench_of(damiao_gripper)
 
 
 @pytest.mark.slow

@@ -34,7 +34,7 @@ from ..damiao_protocol import (
 from ..settings import DamiaoArmSettings, DamiaoGripperSettings, DamiaoMotorSettings
 from .plant import OFF, ArmPlant, Drive, GripperPlant, JointMechanics
 
-__all__ = ["DamiaoArm", "DamiaoMotor", "shorted_damping"]
+__all__ = ["EmulatedDamiaoArm", "DamiaoMotor", "shorted_damping"]
 
 Send = Callable[[int, bytes, int], None]
 """Sends a frame: id, data, and the number of the motor that it comes from."""
@@ -147,7 +147,7 @@ class DamiaoMotor:
         )
 
 
-class DamiaoArm:
+class EmulatedDamiaoArm:
     """An arm with Damiao motors, and its gripper if that has one on the same bus.
 
     Attributes:

@@ -22,7 +22,7 @@ from hal.config.loader import load
 from hal.specs import RobotSpec
 
 from ..settings import BusSettings
-from .damiao import DamiaoArm
+from .damiao import EmulatedDamiaoArm
 from .piper import PiperArm
 from .plant import ArmPlant
 
@@ -32,7 +32,7 @@ _STEP = 1e-3
 """Step of the mechanics, s."""
 _LONGEST_GAP = 0.25
 """Time that the mechanics make up for after the machine had no time for them, s."""
-_ARMS: Mapping[str, Callable[[RobotSpec], EmulatedArm]] = {"damiao": DamiaoArm, "piper": PiperArm}
+_ARMS: Mapping[str, Callable[[RobotSpec], EmulatedArm]] = {"damiao": EmulatedDamiaoArm, "piper": PiperArm}
 
 
 class EmulatedArm(Protocol):
@@ -129,8 +129,24 @@ class EmulatedBus:
 
     def start(self) -> None:
         """Open the bus and start the thread. Raises what python-can raises if it cannot be opened."""
-        self._bus = can.Bus(**self.settings.arguments())
+        self.open()
         self._thread.start()
+
+    def open(self) -> None:
+        """Open the bus, for a program that calls :meth:`advance` itself instead of :meth:`start`."""
+        s = self.settings
+        more: dict[str, Any] = {"fd": s.fd} if s.interface == "udp_multicast" or s.fd else {}
+        if s.interface == "udp_multicast":
+            more["hop_limit"] = 0  # frames never leave this computer
+        self._bus = can.Bus(interface=s.interface, channel=s.channel, ignore_config=True, **{**more, **s.bus})
+
+    def advance(self, seconds: float) -> None:
+        """Answer what has come, and let ``seconds`` pass at once."""
+        self._take_all(0.0)
+        with self.lock:
+            for _ in range(round(seconds / _STEP)):
+                self._step_arms()
+            self._flush(time.monotonic())
 
     def stop(self) -> None:
         """End the thread and close the bus."""
@@ -156,8 +172,6 @@ class EmulatedBus:
             raise
 
     def _serve(self) -> None:
-        bus = self._bus
-        assert bus is not None
         due = time.monotonic()
         while not self._end.is_set():
             if self.stall:
@@ -170,15 +184,24 @@ class EmulatedBus:
                     due = now
                 while due <= now:
                     due += _STEP
-                    for name, arm in self.arms.items():
-                        arm.step(_STEP, self._sender(name))
+                    self._step_arms()
                 self._flush(now)
-            message = bus.recv(max(0.0, due - time.monotonic()))
-            while message is not None:
-                if not message.is_error_frame:
-                    with self.lock:
-                        self._take(message.arbitration_id, bytes(message.data))
-                message = bus.recv(0.0)
+            self._take_all(max(0.0, due - time.monotonic()))
+
+    def _step_arms(self) -> None:
+        for name, arm in self.arms.items():
+            arm.step(_STEP, self._sender(name))
+
+    def _take_all(self, patience: float) -> None:
+        """Take every frame that has come, or that comes within ``patience`` seconds."""
+        bus = self._bus
+        assert bus is not None
+        message = bus.recv(patience)
+        while message is not None:
+            if not message.is_error_frame:
+                with self.lock:
+                    self._take(message.arbitration_id, bytes(message.data))
+            message = bus.recv(0.0)
 
     def _take(self, id: int, data: bytes) -> None:
         now = time.monotonic()

@@ -22,7 +22,8 @@ def torn(tmp_path_factory: pytest.TempPathFactory) -> Path:
         record(recorder, 0.3)
         recorder.start(seed=2)
         drive(rig, 0.5)
-        kill_writer(recorder)
+        recorder._child.process.kill()
+        recorder._child.process.wait()
         with pytest.raises(ConnectionLost, match="ended"):
             recorder.save(wait=True)
     (folder,) = out.glob("episodes/*.partial")

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import pytest
 
+from hal.config.data_files import find_data
 from hal.drivers.can.settings import (
     DamiaoArmSettings,
     DamiaoGripperSettings,
@@ -35,7 +38,9 @@ def gripper(**options: Any) -> GripperSpec:
 def arm(changes: dict[int, dict[str, Any]] | None = None, **options: Any) -> RobotSpec:
     """Return a valid arm of three motors, with changes of some, by their number from 0."""
     motors = [{**motor(k + 1), **(changes or {}).get(k, {})} for k in range(3)]
-    return robot_spec(3, driver="damiao", options={**BUS, "motors": motors, **options})
+    joints, urdf = ("joint1", "joint2", "joint3"), str(find_data("robots", "yam.urdf"))
+    spec = robot_spec(3, driver="damiao", urdf=urdf, options={**BUS, "motors": motors, **options})
+    return replace(spec, joints=joints)
 
 
 def test_a_valid_arm_and_gripper_have_no_problems() -> None:
@@ -90,6 +95,15 @@ def test_a_speed_limit_beyond_the_motors_range_is_refused() -> None:
     spec = arm()
     fast = replace(spec, limits=replace(spec.limits, velocity=(11.0, 2.0, 2.0)))
     assert [found[0] for found in check_damiao_arm(fast)] == ["limits.velocity"]
+
+
+def test_a_urdf_without_masses_is_refused_by_link(tmp_path: Path) -> None:
+    text = Path(arm().urdf).read_text()
+    bare = tmp_path / "bare.urdf"
+    bare.write_text(re.sub(r"<mass value=.*?/>", '<mass value="0"/>', text))
+    found = list(check_damiao_arm(replace(arm(), urdf=str(bare))))
+    assert {(key, code) for key, _, code in found} == {("model", "wrong_inertials")}
+    assert len(found) >= 3
 
 
 def test_ids_of_arm_and_gripper_on_one_bus_may_not_collide() -> None:

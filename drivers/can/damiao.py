@@ -1,0 +1,280 @@
+"""Driver of an arm made of Damiao motors on a CAN bus: OpenArm, I2RT YAM, and home-built chains.
+
+* ``engage`` switches the motors on one after the other; each holds its measured position from its first frame on.
+* ``write`` sends position, velocity, gains and the torque that the motion needs (gravity, inertia); in torque mode
+  torque only. Nothing waits: the replies are taken by the next ``read``.
+* ``read`` keeps the arm: a motor that is on gets the last set-point again in a cycle without a new one, and a motor
+  that is off is asked for its state.
+* A fault of one motor stops the arm; the others hold. The arm has no brakes: where nothing is sent any more, it sinks,
+  damped by its motors.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from math import isfinite
+from typing import Any, ClassVar
+
+from hal.driver import Reading, RobotDriver, Setpoint
+from hal.dynamics import Dynamics
+from hal.errors import ConnectionLost, Fault, RobotFault
+from hal.specs import RobotSpec
+
+from .damiao_chain import SWITCHING, ChainMotor, DamiaoChain
+from .settings import DamiaoArmSettings
+
+__all__ = ["DamiaoArm"]
+
+_ATTEMPTS = 3
+"""How often a motor is switched on until it counts as broken."""
+
+
+class DamiaoArm(RobotDriver):
+    """A chain of Damiao motors, as its settings describe it (:class:`~.settings.DamiaoArmSettings`)."""
+
+    modes: ClassVar[frozenset[str]] = frozenset({"position", "torque"})
+    repeats: ClassVar[bool] = True
+
+    def __init__(self, spec: RobotSpec, world: object | None = None) -> None:
+        super().__init__(spec, world)
+        self.settings = settings = DamiaoArmSettings.of(spec)
+        self.dynamics = Dynamics.of(spec)
+        self.chain = DamiaoChain(
+            spec.name,
+            f"robots.{spec.name}.real.motors",
+            settings,
+            settings.motors,
+            spec.joints,
+            settings.mosfet_limit,
+        )
+        self._motors = self.chain.motors
+        self.engaged = False
+        self._fault: Fault | None = None
+        """Fault of a motor; kept until recover()."""
+        zeros = (0.0,) * len(self._motors)
+        self._zeros: Sequence[float] = zeros
+        self._target: list[float] = list(zeros)
+        """Position of the last set-point of each joint, rad; of no meaning for a motor that is off."""
+        self._dq_sent: Sequence[float] = zeros
+        self._tau_sent: Sequence[float] | None = None
+        """Torques of the last set-point; None in position mode."""
+        self._holds: list[bytes] | None = None
+        """Commands that hold the target at rest; None until they are computed for it."""
+        self._written = False
+        """Whether a set-point was sent since the last reading."""
+        self._switching: ChainMotor | None = None
+        """The motor that is being switched on."""
+        self._attempts = 0
+        self._t_switched = 0.0
+        self._now = 0.0
+        self._seq = 0
+        self._reading: Reading | None = None
+
+    # Connection.
+
+    def open(self) -> None:
+        """Connect, and compare the registers of every motor with the rig. Nothing moves or is switched on."""
+        self.close()
+        self._fault = None
+        self._reading = None
+        self._written = False
+        self.chain.open()
+
+    def close(self) -> None:
+        """Let an arm that is engaged sink, damped, until it rests (3 s at most); switch it off and disconnect."""
+        self.engaged = False
+        self._switching = None
+        self.chain.lower()
+        self.chain.close()
+
+    # Every cycle.
+
+    def read(self, now: float) -> Reading:
+        chain = self.chain
+        self._now = now
+        chain.update(now)
+        self._note_state()
+        if not self._written:
+            self._send_idle()
+        self._written = False
+        if chain.lost is not None:
+            raise chain.lost
+        bus = chain.usable  # raises if it is not open
+        return self._read(bus.settings.interface)
+
+    def _read(self, interface: str) -> Reading:
+        motors = self._motors
+        t = min([motor.t for motor in motors])
+        if t < 0.0:
+            t = self._now if self._reading is None else self._reading.t  # the state from the opening
+        last = self._reading
+        if last is None or t > last.t:
+            self._seq += 1
+        engaged = self.engaged
+        self._reading = reading = Reading(
+            t,
+            t,
+            self._seq,
+            [motor.q for motor in motors],
+            [motor.dq for motor in motors],
+            [motor.tau for motor in motors],
+            self._target.copy() if engaged else None,
+            self._dq_sent if engaged else None,
+            fault=self._fault,
+            tau_commanded=self._tau_sent if engaged else None,
+        )
+        return reading
+
+    def _note_state(self) -> None:
+        """Follow what the motors report: which are on, and their faults."""
+        chain = self.chain
+        in_use = self.engaged or self._switching is not None
+        on = True
+        for motor in self._motors:
+            on = on and motor.on
+        if self._fault is None and chain.lost is None:
+            self._fault = chain.fault(engaged=self.engaged)
+            if self._fault is None and self.engaged and not on:
+                off = next(motor for motor in self._motors if not motor.on)
+                self._fault = Fault(
+                    "switched_off",
+                    f"{off.label} is off, though nothing here switched it off",
+                    "support the arm; check its power supply, and whether another program drives it; then recover",
+                )
+        if in_use and (chain.lost is not None or (self.engaged and not on)):
+            self.engaged = False
+            self._switching = None
+
+    def _send_idle(self) -> None:
+        """Send what keeps the arm as it is: the hold to motors that are on, a request for its state to each other."""
+        chain = self.chain
+        if chain.bus is None or chain.bus.fault is not None:
+            return
+        try:
+            if self._tau_sent is not None:
+                self._stop_torque()
+            self._dq_sent = self._zeros
+            holds = self._hold_commands() if any(motor.on for motor in self._motors) else ()
+            for k, motor in enumerate(self._motors):
+                if motor.on:
+                    chain.send(motor, holds[k])
+                else:
+                    chain.ask_state(motor)
+        except ConnectionLost as error:
+            chain.lost = error
+
+    def _hold_commands(self) -> list[bytes]:
+        """Return the commands that hold the target at rest, with the torques that carry the arm's weight there."""
+        if self._holds is not None and self.engaged:
+            return self._holds
+        motors = self._motors
+        self._target = [q if motor.on else motor.q for q, motor in zip(self._target, motors, strict=True)]
+        tau = self.dynamics.gravity(self._target)
+        self._holds = [
+            motor.command(self._target[k], 0.0, motor.kp, motor.kd, tau[k]) for k, motor in enumerate(motors)
+        ]
+        return self._holds
+
+    def _stop_torque(self) -> None:
+        """Leave torque mode: hold the measured position."""
+        self._tau_sent = None
+        self._target = [motor.q for motor in self._motors]
+        self._holds = None
+
+    def write(self, setpoint: Setpoint) -> bool:
+        chain, motors = self.chain, self._motors
+        if chain.lost is not None or chain.bus is None:
+            raise chain.lost or ConnectionLost(f"{self.spec.name} is not open", code="closed")
+        if self._fault is not None or not self.engaged:
+            return False
+        q, dq = setpoint.q, setpoint.dq
+        if setpoint.tau is None:
+            tau = self.dynamics.inverse(q, dq, setpoint.ddq)
+            if not isfinite(sum(q) + sum(dq) + sum(tau)):
+                raise ValueError(f"{self.spec.name}: a set-point is not finite: {setpoint}")
+            frames = [motor.command(q[k], dq[k], motor.kp, motor.kd, tau[k]) for k, motor in enumerate(motors)]
+        else:
+            weight = self.dynamics.gravity([motor.q for motor in motors])
+            frames = [motor.command(q[k], 0.0, 0.0, 0.0, setpoint.tau[k] + weight[k]) for k, motor in enumerate(motors)]
+        for motor, frame in zip(motors, frames, strict=True):  # all are encoded: none has NaN
+            chain.send(motor, frame)
+        self._written = True
+        self._target, self._dq_sent, self._tau_sent = list(q), dq, setpoint.tau
+        self._holds = None
+        return True
+
+    def halt(self) -> None:
+        """Hold the last set-point at rest; after torques, the measured position."""
+        if not self.engaged or self.chain.lost is not None:
+            return
+        self._written = False
+        self._send_idle()
+        self._written = True
+
+    # Switching on.
+
+    def engage(self) -> None:
+        chain = self.chain
+        chain.usable  # noqa: B018  # raises while there is no connection
+        if self._fault is not None:
+            raise RobotFault(self._fault.cause, self._fault.remedy, code=self._fault.code)
+        motor = self._switching
+        if motor is not None:
+            if motor.on and motor.status == 1 and motor.t >= self._t_switched:
+                motor = self._switching = None
+            elif self._now - self._t_switched < SWITCHING:
+                return
+        if motor is None:
+            motor = next((one for one in self._motors if not one.on), None)
+            self._attempts = 0
+        if motor is None:
+            self.engaged = True
+            self._dq_sent, self._tau_sent = self._zeros, None
+            return
+        self._attempts += 1
+        if self._attempts > _ATTEMPTS:
+            self._give_up(motor)
+        self._switch_on(motor)
+
+    def _switch_on(self, motor: ChainMotor) -> None:
+        """Switch a motor on where it is."""
+        motor.on = False  # so that it holds where it is measured
+        hold = self._hold_commands()[self._motors.index(motor)]
+        self._switching, self._t_switched = motor, self._now
+        self.chain.switch_on(motor, hold)
+
+    def _give_up(self, motor: ChainMotor) -> None:
+        """Leave the motors that are on to their own time-out, and raise RobotFault."""
+        self._switching = None
+        for one in self._motors:
+            one.on = False
+        raise RobotFault(
+            f"{self.spec.name}: {motor.label} does not switch on (status {motor.status:x})",
+            "check its power supply; switch the arm off and on again",
+            code="not_switched_on",
+        )
+
+    def recover(self) -> None:
+        """Clear the motors' errors. Nothing is switched on.
+
+        Raises:
+            RobotFault: An error stays, or a motor is still too hot; names the motor.
+            ConnectionLost: The arm does not answer.
+        """
+        self.chain.clear_errors()
+        fault = self.chain.fault(engaged=False)
+        if fault is not None:
+            raise RobotFault(fault.cause, fault.remedy, code=fault.code)
+        self._fault = None
+
+    # Model and statistics.
+
+    def mass_matrix(self, q: Sequence[float]) -> Any:
+        """Return the joint-space inertia (n, n), kg m2, at ``q`` (n,), rad, from the URDF's masses."""
+        return self.dynamics.mass_matrix(q)
+
+    def reset_statistics(self) -> None:
+        self.chain.reset_statistics()
+
+    def statistics(self) -> dict[str, Any]:
+        return self.chain.statistics()

@@ -1,0 +1,593 @@
+"""The Damiao motors of one device, an arm or a gripper: their states, registers, faults and links.
+
+The chain sends frames and takes what has come, once per cycle; nothing waits, except :meth:`DamiaoChain.open` and
+:meth:`DamiaoChain.lower`. A motor answers every frame with its state, so a motor that is asked in each cycle is known
+in each cycle, one cycle late.
+
+Every motor that this program switched on, and that still is on, has to get a command in each cycle: after TIMEOUT
+without one it damps, and what it carries sinks.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+from hal.errors import ConfigError, ConnectionLost, DeviceNotFound, Fault, HalError, Problem, RobotFault
+from hal.lock import DeviceLock
+
+from .bus import CanBus
+from .damiao_protocol import (
+    CLEAR_ERROR,
+    DISABLE,
+    ENABLE,
+    MIT_MODE,
+    READ_REGISTER,
+    REGISTER_ID,
+    TIMEOUT_UNIT,
+    WRITE_REGISTER,
+    MotorCodec,
+    MotorRegister,
+    MotorStatus,
+    decode_register_reply,
+    encode_register_read,
+    encode_state_request,
+)
+from .settings import BusSettings, DamiaoMotorSettings, is_emulated
+
+__all__ = ["CHECKED_REGISTERS", "SILENCE", "SWITCHING", "ChainMotor", "DamiaoChain", "register_problems"]
+
+SILENCE = 0.1
+"""Silence after which a motor counts as lost, s,"""
+_UNANSWERED = 5
+"""and the least number of frames in a row that it has not answered: after a pause of this program one tells nothing."""
+CHECKED_REGISTERS = (
+    MotorRegister.PMAX,
+    MotorRegister.VMAX,
+    MotorRegister.TMAX,
+    MotorRegister.TIMEOUT,
+    MotorRegister.CTRL_MODE,
+    MotorRegister.OT_VALUE,
+)
+"""Registers that are read before a motor may be switched on."""
+SWITCHING = 0.03
+"""Time in which a motor that was switched on must report it, s."""
+SHORTEST_TIMEOUT = 0.05
+"""Shortest TIMEOUT with which a busy computer can drive a motor, s."""
+_HEAT_MARGIN = 5.0
+"""Distance from the temperature at which a motor switches itself off that is a fault, K."""
+_OPENING = 1.5
+"""Longest time to read all registers, s,"""
+_FIRST_ANSWER = 0.5
+"""and until each motor has answered at all."""
+_ROUND = 0.01
+"""Longest time to wait for the answers of one round of requests, s."""
+_LOCK_PATIENCE = 2.0
+"""Longest time to wait for another program to release the motors, s."""
+_CLEARING = 0.2
+"""Longest time until an error is cleared, s."""
+_LOWERING = 3.0
+"""Longest time that an arm may sink, damped, before its motors are switched off, s."""
+_LOWERING_PERIOD = 0.004
+"""Time between two commands while it sinks, s."""
+_AT_REST = 2e-3
+"""Largest way of a joint at rest in :data:`_REST`, rad."""
+_REST = 0.2
+"""s."""
+
+_HOT = "let it cool down, with the arm supported; lower load or speed; then recover"
+_STATUS_FAULTS = {
+    MotorStatus.OVER_VOLTAGE: ("its supply voltage is too high", "check the power supply, also while braking"),
+    MotorStatus.UNDER_VOLTAGE: ("its supply voltage is too low", "check the power supply, its plugs and its cables"),
+    MotorStatus.OVER_CURRENT: ("it draws too much current", "check for a collision and for a short circuit"),
+    MotorStatus.MOSFET_TOO_HOT: ("its electronics are too hot", _HOT),
+    MotorStatus.ROTOR_TOO_HOT: ("its rotor is too hot", _HOT),
+    MotorStatus.LOST_COMMUNICATION: (
+        "it got no command for its TIMEOUT, and damps",
+        "check the cable, the bus load and the load of this computer",
+    ),
+    MotorStatus.OVERLOAD: ("it is overloaded", "check what the arm carries and touches"),
+}
+_SUPPORT = "support the arm by hand, for the joint is without power"
+
+
+class ChainMotor:
+    """State of one motor, in terms of its joint: direction and offset are applied.
+
+    Numbers in feedback are truncated by the motor, so half a step is added to each.
+    """
+
+    def __init__(self, settings: DamiaoMotorSettings, label: str) -> None:
+        self.settings = settings
+        self.label = label
+        """The motor in words, with its joint and its id."""
+        self.codec = MotorCodec(settings.limits)
+        self.id, self.kp, self.kd = settings.id, settings.kp, settings.kd
+        self.direction, self.offset = settings.direction, settings.offset
+        p, v, t = settings.limits
+        self._q_step = self.direction * 2.0 * p / 65535.0
+        self._q_0 = self.offset - self.direction * p + 0.5 * self._q_step
+        self._dq_step = self.direction * 2.0 * v / 4095.0
+        self._dq_0 = -self.direction * v + 0.5 * self._dq_step
+        self._tau_step = self.direction * 2.0 * t / 4095.0
+        self._tau_0 = -self.direction * t + 0.5 * self._tau_step
+        head = (self.id & 0xFF) << 16 | self.id >> 8 << 8
+        self._marks = frozenset((head | READ_REGISTER, head | WRITE_REGISTER))
+        """The first three bytes of a register's reply."""
+        self._low = self.id & 15
+        self.state_request = encode_state_request(self.id)
+        self.registers: dict[int, float] = {}
+        """Number -> value of the registers that were read."""
+        self.on = False
+        """Whether this program switched the motor on, and it still is on as far as its replies tell."""
+        self.switched_at = 0.0
+        """Time of that, s on the host's clock."""
+        self.status = 0
+        self.q = self.dq = self.tau = 0.0
+        """Position, velocity and torque of the joint, rad, rad/s and Nm."""
+        self.mosfet = self.rotor = 0
+        """Temperatures, deg C."""
+        self.t = -1.0
+        """Time of the frame that the newest reply answers, s on the host's clock; -1 before the first."""
+        self.bits = 0
+        self.replies = 0
+        """Number of feedback frames since the last update."""
+        self.asked = 0
+        """Number of frames that were sent to it since then."""
+        self.gap = 0
+        """Number of replies that were missing, and may still come."""
+        self.silent = 0
+        """Number of updates in a row without a reply."""
+        self.silent_since = 0.0
+        """Time of the first frame that the motor has not answered, s."""
+        self.reset_statistics()
+
+    def reset_statistics(self) -> None:
+        self.missing = self.late = self.doubled = self.foreign = 0
+
+    def receive(self, data: bytearray) -> None:
+        """Take a frame from the motor's master id."""
+        bits = int.from_bytes(data, "big")
+        if len(data) != 8:
+            self.foreign += 1
+        elif bits >> 40 in self._marks:
+            reply = decode_register_reply(data, self.id)
+            if reply is not None:
+                self.registers[reply.register] = reply.value
+        elif bits >> 56 & 15 != self._low:
+            self.foreign += 1
+        else:
+            self.bits = bits
+            self.replies += 1
+
+    def decode(self) -> None:
+        """Decode the newest feedback."""
+        bits = self.bits
+        self.status = bits >> 60
+        self.q = (bits >> 40 & 0xFFFF) * self._q_step + self._q_0
+        self.dq = (bits >> 28 & 0xFFF) * self._dq_step + self._dq_0
+        self.tau = (bits >> 16 & 0xFFF) * self._tau_step + self._tau_0
+        self.mosfet = bits >> 8 & 0xFF
+        self.rotor = bits & 0xFF
+
+    def command(self, q: float, dq: float, kp: float, kd: float, tau: float) -> bytes:
+        """Return the data of a command in terms of the joint; arguments as those of ``MotorCodec.encode_command``."""
+        d = self.direction
+        return self.codec.encode_command(d * (q - self.offset), d * dq, kp, kd, d * tau)
+
+    @property
+    def rotor_limit(self) -> float:
+        """Temperature at which the motor switches itself off because of its rotor, deg C."""
+        return self.registers.get(MotorRegister.OT_VALUE, 200.0)
+
+
+class DamiaoChain:
+    """The motors of one device on a bus.
+
+    Args:
+        name: The device's name, for messages.
+        where: Key of the motors in the rig, for messages.
+        settings: The bus.
+        motors: The motors' settings.
+        labels: The motors in words, for example "joint1".
+        mosfet_limit: Temperature at which their electronics switch off, deg C.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        where: str,
+        settings: BusSettings,
+        motors: Sequence[DamiaoMotorSettings],
+        labels: Sequence[str],
+        mosfet_limit: float,
+    ) -> None:
+        self.name = name
+        self.where = where
+        self.settings = settings.shared
+        self.motors = tuple(
+            ChainMotor(motor, f"{label} (motor {motor.id})") for motor, label in zip(motors, labels, strict=True)
+        )
+        self.mosfet_limit = mosfet_limit
+        self.lost: ConnectionLost | None = None
+        """Why the device counts as lost; None while it answers."""
+        self.bus: CanBus | None = None
+        self._subscribed = False
+        self._locks: list[DeviceLock] = []
+        self._asked = False
+        """Whether frames were sent since the last update."""
+        self._t_asked = 0.0
+        self._now = 0.0
+        self.cycles = self.incomplete = self.losses = 0
+
+    # Opening.
+
+    def open(self) -> None:
+        """Open the bus, and check the registers of every motor. Nothing moves, and nothing is switched on.
+
+        Raises:
+            ControlTaken: Another program on this computer uses one of the motors.
+            DeviceNotFound: There is no such bus, or a motor does not answer; names it.
+            ConnectionLost: The interface is down.
+            ConfigError: A register differs from what the rig says; names motor and register, all of them.
+        """
+        self.close()
+        try:
+            where = "-".join(self.settings.key)
+            for motor in self.motors:
+                what = f"{self.name}: {motor.label} on {self.settings.channel}"
+                self._locks.append(DeviceLock(f"can-{where}-{motor.id:#x}", what, _LOCK_PATIENCE))
+            bus = CanBus.acquire(self.settings)
+            self.bus = bus
+            bus.drain()  # frames from before
+            bus.subscribe(
+                {motor.settings.reply_id: motor.receive for motor in self.motors},
+                (REGISTER_ID, *(motor.id for motor in self.motors)),
+            )
+            self._subscribed = True
+            for motor in self.motors:
+                motor.registers.clear()
+                motor.on, motor.replies, motor.asked, motor.silent, motor.gap, motor.t = False, 0, 0, 0, 0, -1.0
+            self._read_registers(bus)
+            problems = [problem for motor in self.motors for problem in self._problems(motor)]
+            if problems:
+                raise ConfigError(problems)
+        except BaseException:
+            self.close()
+            raise
+        self.lost = None
+        self._asked = False
+
+    def _read_registers(self, bus: CanBus) -> None:
+        """Read the registers and the state of every motor, several at a time."""
+        began = time.monotonic()
+        while True:
+            left = [motor for motor in self.motors if self._ask_register(bus, motor)]
+            waiting = [motor for motor in self.motors if motor not in left and not motor.replies]
+            for motor in waiting:
+                bus.send(REGISTER_ID, motor.state_request)
+            if not left and not waiting:
+                break
+            elapsed = time.monotonic() - began
+            silent = [motor for motor in self.motors if not motor.registers]
+            if elapsed > _OPENING or (silent and elapsed > _FIRST_ANSWER):
+                raise self._not_found(bus, silent or left or waiting)
+            known = sum(len(motor.registers) + bool(motor.replies) for motor in self.motors)
+            until = time.monotonic() + _ROUND
+            while time.monotonic() < until:
+                if not bus.poll():
+                    raise bus.error(self.name)
+                if sum(len(m.registers) + bool(m.replies) for m in self.motors) - known >= len(left) + len(waiting):
+                    break
+                time.sleep(2e-4)
+        for motor in self.motors:
+            motor.decode()
+            motor.replies = 0
+
+    def _ask_register(self, bus: CanBus, motor: ChainMotor) -> bool:
+        """Ask a motor for the next register that is not known; return whether there is one."""
+        register = next((rid for rid in CHECKED_REGISTERS if rid not in motor.registers), None)
+        if register is None:
+            return False
+        bus.send(REGISTER_ID, encode_register_read(motor.id, register))
+        return True
+
+    def _not_found(self, bus: CanBus, silent: Sequence[ChainMotor]) -> DeviceNotFound:
+        s = self.settings
+        answer = [str(motor.id) for motor in self.motors if motor not in silent]
+        who = f"; motors that answer: {', '.join(answer)}" if answer else "; no motor answers"
+        if bus.unexpected_ids:
+            found = ", ".join(f"{id:#x}" for id in sorted(bus.unexpected_ids)[:8])
+            who += f"; unexpected ids: {found} (`master` is the id that a motor answers with)"
+        if is_emulated({"interface": s.interface}):
+            remedy = "start the emulator in another terminal: python -m hal.drivers.can.emulator --config YOUR_RIG.yaml"
+        elif answer:
+            remedy = "check its power, its plugs and its id"
+        else:
+            remedy = "check power, cable (CAN_H, CAN_L), termination and bit rate"
+        missing = ", ".join(motor.label for motor in silent)
+        return DeviceNotFound(
+            f"{self.name}: {missing} does not answer on {s.interface} {s.channel}{who}; {remedy}", code="motor_missing"
+        )
+
+    def _problems(self, motor: ChainMotor) -> Iterator[Problem]:
+        for register, message, code in register_problems(motor.settings, motor.registers):
+            yield Problem("<rig>", self.where, f"{motor.label}, register {register}: {message}", code)
+
+    def close(self) -> None:
+        """Give up the bus and the motors, without any frame. Idempotent."""
+        bus, self.bus = self.bus, None
+        if bus is not None:
+            if self._subscribed:
+                bus.unsubscribe(motor.settings.reply_id for motor in self.motors)
+            bus.release()
+        self._subscribed = False
+        for motor in self.motors:
+            motor.on = False
+        while self._locks:
+            self._locks.pop().release()
+
+    @property
+    def usable(self) -> CanBus:
+        """The bus of a chain that answers.
+
+        Raises:
+            ConnectionLost: It is not open, or lost.
+        """
+        if self.lost is not None:
+            raise self.lost
+        if self.bus is None:
+            raise ConnectionLost(f"{self.name} is not open", code="closed")
+        return self.bus
+
+    # Every cycle.
+
+    def update(self, now: float) -> None:
+        """Take what has come, and update the motors and :attr:`lost`. Never waits, never raises for a lost link."""
+        bus = self.bus
+        if bus is None:
+            self.lost = None
+            return
+        self._now = now
+        if not bus.poll() and not bus.try_reopen():
+            for motor in self.motors:
+                motor.on = False
+                motor.registers.clear()
+                motor.replies = motor.asked = motor.gap = 0
+            self._count_loss()
+            self.lost = bus.error(self.name)
+            return
+        complete = True
+        silent: list[ChainMotor] = []
+        for motor in self.motors:
+            count, asked = motor.replies, motor.asked
+            motor.replies = motor.asked = 0
+            if count:
+                motor.decode()
+                motor.silent = 0
+                motor.t = self._t_asked
+                if motor.on and motor.status != 1 and now - motor.switched_at > SWITCHING:
+                    motor.on = False
+            if count > asked:
+                late = min(count - asked, motor.gap)
+                motor.late += late
+                motor.doubled += count - asked - late
+                motor.gap = 0
+            elif count < asked:
+                motor.missing += asked - count
+                motor.gap += asked - count
+                if not count:
+                    complete = False
+                    if not motor.silent:
+                        motor.silent_since = self._t_asked
+                    motor.silent += 1
+                    if motor.silent >= _UNANSWERED and now - motor.silent_since > SILENCE:
+                        motor.on = False
+                        motor.registers.clear()  # it may come back as another one
+                        silent.append(motor)
+        if self._asked:
+            self._asked = False
+            self.cycles += 1
+            self.incomplete += not complete
+        if silent:
+            self._count_loss()
+            self.lost = self._silence_error(silent)
+        elif self.lost is not None:
+            self._check_return(bus)
+
+    def _count_loss(self) -> None:
+        self.losses += self.lost is None
+
+    def _silence_error(self, silent: Sequence[ChainMotor]) -> ConnectionLost:
+        names = "all motors" if len(silent) == len(self.motors) > 1 else ", ".join(motor.label for motor in silent)
+        fault = Fault(
+            "motor_silent",
+            f"no answer from {names} on {self.settings.channel} for {1e3 * SILENCE:.0f} ms",
+            "check its power and its cable; the arm may sink",
+        )
+        error = ConnectionLost(f"{self.name}: {fault.cause}; {fault.remedy}", code=fault.code)
+        error.fault = fault
+        return error
+
+    def _check_return(self, bus: CanBus) -> None:
+        """Ask motors that answer again for their registers, and end the loss when all fit."""
+        try:
+            waiting = [motor for motor in self.motors if self._ask_register(bus, motor) or motor.silent]
+        except ConnectionLost as error:
+            self.lost = error
+            return
+        problems = [problem for motor in self.motors for problem in self._problems(motor) if motor.registers]
+        if problems:
+            fault = Fault(problems[0].code, problems[0].message, "open the rig again")
+            self.lost = ConnectionLost(f"{self.name}: {fault.cause}; {fault.remedy}", code=fault.code)
+            self.lost.fault = fault
+        elif not waiting:
+            self.lost = None
+
+    def send(self, motor: ChainMotor, data: bytes) -> None:
+        """Send a command to a motor. Raises ConnectionLost."""
+        bus = self.bus
+        if bus is None:
+            raise ConnectionLost(f"{self.name} is not open", code="closed")
+        motor.asked += 1
+        self._asked = True
+        self._t_asked = self._now
+        bus.send(motor.id, data)
+
+    def ask_state(self, motor: ChainMotor) -> None:
+        """Ask a motor for its state, which changes nothing. Raises ConnectionLost."""
+        bus = self.bus
+        if bus is None:
+            raise ConnectionLost(f"{self.name} is not open", code="closed")
+        motor.asked += 1
+        self._asked = True
+        self._t_asked = self._now
+        bus.send(REGISTER_ID, motor.state_request)
+
+    # Faults.
+
+    def fault(self, *, engaged: bool) -> Fault | None:
+        """Return the fault of a motor, naming it; None without one.
+
+        Args:
+            engaged: Whether the motors are in use. One that is not may have lost communication: that is its rest.
+        """
+        for motor in self.motors:
+            status = motor.status
+            if status > 1 and (engaged or status != MotorStatus.LOST_COMMUNICATION):
+                cause, remedy = _STATUS_FAULTS.get(
+                    status,  # type: ignore[call-overload]  # any number is allowed
+                    (f"it reports the undocumented status {status:#x}", "see its manual"),
+                )
+                code = MotorStatus(status).name.lower() if status in _STATUS_FAULTS else f"status_{status:x}"
+                return Fault(code, f"{motor.label}: {cause}", f"{_SUPPORT}; {remedy}; then recover")
+            if motor.rotor >= motor.rotor_limit - _HEAT_MARGIN:
+                what = f"its rotor has {motor.rotor} deg C; at {motor.rotor_limit:g} it switches itself off"
+                return Fault("motor_hot", f"{motor.label}: {what}", _HOT)
+            if motor.mosfet >= self.mosfet_limit - _HEAT_MARGIN:
+                what = f"its electronics have {motor.mosfet} deg C; at {self.mosfet_limit:g} they switch off"
+                return Fault("motor_hot", f"{motor.label}: {what}", _HOT)
+        return None
+
+    def clear_errors(self) -> None:
+        """Clear the errors of all motors that have one; those are then off. Takes up to 0.2 s.
+
+        Raises:
+            RobotFault: An error stays; names the motor.
+            ConnectionLost: The chain does not answer.
+        """
+        bus = self.usable
+        deadline = time.monotonic() + _CLEARING
+        while wrong := [motor for motor in self.motors if motor.status > 1]:
+            if time.monotonic() > deadline:
+                fault = self.fault(engaged=True)
+                assert fault is not None
+                raise RobotFault(fault.cause, fault.remedy, code=fault.code)
+            for motor in wrong:
+                self.send(motor, CLEAR_ERROR)
+                self.ask_state(motor)
+            time.sleep(0.002)
+            bus.poll()
+            for motor in wrong:
+                if motor.replies:
+                    motor.decode()
+                    motor.replies = 0
+        for motor in self.motors:
+            motor.asked = 0
+
+    def switch_on(self, motor: ChainMotor, hold: bytes) -> None:
+        """Switch a motor on and give it its first command at once, so that nothing sags in between."""
+        if motor.status > 1:
+            self.send(motor, CLEAR_ERROR)
+        self.send(motor, ENABLE)
+        self.send(motor, hold)
+        motor.on, motor.switched_at = True, self._now
+
+    def lower(self) -> None:
+        """Let the motors that are on damp until they are at rest, 3 s at most, and switch them off. Never raises."""
+        bus = self.bus
+        on = [motor for motor in self.motors if motor.on]
+        if bus is None or not on:
+            return
+        try:
+            deadline = time.monotonic() + _LOWERING
+            at, since = [motor.q for motor in on], time.monotonic()
+            while (now := time.monotonic()) < deadline and now - since < _REST:
+                for motor in on:
+                    self.send(motor, motor.command(motor.q, 0.0, 0.0, motor.kd, 0.0))
+                time.sleep(_LOWERING_PERIOD)
+                if not bus.poll():
+                    return
+                for motor in on:
+                    if motor.replies:
+                        motor.decode()
+                        motor.replies = 0
+                if any(abs(motor.q - q) > _AT_REST for motor, q in zip(on, at, strict=True)):
+                    at, since = [motor.q for motor in on], now
+            for _ in range(2):  # one may be lost
+                for motor in on:
+                    self.send(motor, DISABLE)
+                time.sleep(_LOWERING_PERIOD)
+        except HalError:
+            return  # the motors damp by themselves after TIMEOUT
+
+    # Statistics.
+
+    def reset_statistics(self) -> None:
+        """Start the figures again from zero."""
+        self.cycles = self.incomplete = self.losses = 0
+        for motor in self.motors:
+            motor.reset_statistics()
+        if self.bus is not None:
+            self.bus.reset_statistics()
+
+    def statistics(self) -> dict[str, Any]:
+        """Return counters and temperatures.
+
+        ``incomplete`` counts cycles without the reply of every motor, ``missing`` the replies, of which ``late`` came
+        afterwards; ``doubled`` replies came twice; ``unexpected`` frames have an id that no device on the bus has.
+        """
+        motors = self.motors
+        return {
+            "cycles": self.cycles,
+            "incomplete": self.incomplete,
+            "missing": sum(motor.missing for motor in motors),
+            "late": sum(motor.late for motor in motors),
+            "doubled": sum(motor.doubled for motor in motors),
+            "foreign": sum(motor.foreign for motor in motors),
+            "losses": self.losses,
+            "rotor_deg_c": [motor.rotor for motor in motors],
+            "mosfet_deg_c": [motor.mosfet for motor in motors],
+            "bus": self.bus.statistics() if self.bus is not None else {},
+        }
+
+
+def register_problems(settings: DamiaoMotorSettings, registers: dict[int, float]) -> Iterator[tuple[str, str, str]]:
+    """Yield what is wrong with a motor's registers: name of the register, message, code.
+
+    Args:
+        settings: The motor as the rig describes it.
+        registers: Number -> value of the registers that were read.
+    """
+    limits = settings.limits
+    for register, wanted, unit in (
+        (MotorRegister.PMAX, limits.position, "rad"),
+        (MotorRegister.VMAX, limits.velocity, "rad/s"),
+        (MotorRegister.TMAX, limits.torque, "Nm"),
+    ):
+        value = registers.get(register)
+        if value is not None and not abs(value - wanted) <= 1e-4 * wanted:
+            yield (
+                register.name,
+                f"is {value:g} {unit}, the rig has {wanted:g} for a {settings.type}: every command would be scaled "
+                f"wrongly; correct `type`, or give the motor's own `ranges`",
+                "wrong_range",
+            )
+    timeout = registers.get(MotorRegister.TIMEOUT)
+    if timeout is not None and not timeout * TIMEOUT_UNIT >= SHORTEST_TIMEOUT:
+        what = "is 0: the motor would run on without this program" if timeout == 0 else f"is {timeout * TIMEOUT_UNIT} s"
+        yield "TIMEOUT", f"{what}; set it to 8000 (0.4 s), the factory's value", "no_timeout"
+    mode = registers.get(MotorRegister.CTRL_MODE)
+    if mode is not None and mode != MIT_MODE:
+        yield "CTRL_MODE", f"is {mode:g}, must be {MIT_MODE} (MIT)", "wrong_mode"

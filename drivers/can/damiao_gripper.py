@@ -1,0 +1,237 @@
+"""Driver of a gripper with one Damiao motor: fingers that the motor opens and closes through a linkage.
+
+A table gives the distance between the fingers at each angle of the motor; its slope turns forces into torques. The
+motor follows a ramp at the commanded speed. It applies no more than the commanded force, because its target never is
+farther ahead of the fingers than the force divided by its stiffness.
+
+The motor is switched on by the first command. When the program ends, it holds for its TIMEOUT (0.4 s), and then damps:
+a held object that pushes the fingers open comes loose.
+"""
+
+from __future__ import annotations
+
+from bisect import bisect_right
+from typing import Any
+
+from hal.driver import GripperDriver, GripperReading
+from hal.errors import Fault, RobotFault
+from hal.specs import GripperSpec
+from hal.types import GripperOutcome
+
+from .damiao_chain import DamiaoChain
+from .settings import DamiaoGripperSettings
+
+__all__ = ["DamiaoGripper", "FingerTable"]
+
+_STILL = 0.003
+"""Largest speed of the width at rest, m/s."""
+_REST = 0.06
+"""Time at rest after which a motion has ended, s."""
+_PRESSING = 0.5
+"""Share of the commanded force from which fingers at rest hold an object."""
+_FRICTION = 0.3
+"""Torque in motion beyond that of the commanded force, as a share of the motor's damping: for friction."""
+_LONGEST_STEP = 0.05
+"""Longest time that the ramp advances in one cycle, s."""
+_ATTEMPTS = 3
+"""How often the motor is switched on until it counts as broken."""
+
+
+class FingerTable:
+    """Width between the fingers as a function of the motor's angle, linear between the rows of a table.
+
+    Args:
+        rows: Angle, rad, and width, m, in rising order of the angle; the width rises or falls all along.
+    """
+
+    def __init__(self, rows: tuple[tuple[float, float], ...]) -> None:
+        self._angles = [angle for angle, _ in rows]
+        self._widths = [width for _, width in rows]
+        self._slopes = [
+            (self._widths[k + 1] - self._widths[k]) / (self._angles[k + 1] - self._angles[k])
+            for k in range(len(rows) - 1)
+        ]
+        self.opening = 1.0 if self._slopes[0] > 0.0 else -1.0
+        """Direction of the angle that opens the fingers."""
+
+    def _part(self, angle: float) -> int:
+        return min(max(bisect_right(self._angles, angle) - 1, 0), len(self._slopes) - 1)
+
+    def width(self, angle: float) -> float:
+        """Return the width, m, at an angle, rad; beyond the table it continues in a straight line."""
+        k = self._part(angle)
+        return self._widths[k] + (angle - self._angles[k]) * self._slopes[k]
+
+    def slope(self, angle: float) -> float:
+        """Return the change of the width for each rad at an angle, m/rad, without its sign."""
+        return abs(self._slopes[self._part(angle)])
+
+    def angle(self, width: float) -> float:
+        """Return the angle, rad, at a width, m, that is clamped to the table's."""
+        ends = self._widths[0], self._widths[-1]
+        width = min(max(width, min(ends)), max(ends))
+        for k, slope in enumerate(self._slopes):
+            if min(self._widths[k : k + 2]) <= width <= max(self._widths[k : k + 2]):
+                return self._angles[k] + (width - self._widths[k]) / slope
+        raise AssertionError("a table without gaps has every width between its ends")
+
+
+class DamiaoGripper(GripperDriver):
+    """A gripper with one Damiao motor, as its settings describe it (:class:`~.settings.DamiaoGripperSettings`)."""
+
+    def __init__(self, spec: GripperSpec, world: object | None = None) -> None:
+        super().__init__(spec, world)
+        self.settings = settings = DamiaoGripperSettings.of(spec)
+        self.table = FingerTable(settings.widths)
+        self.chain = DamiaoChain(
+            spec.name, f"{spec.name}.real.motor", settings, [settings.motor], ["fingers"], settings.mosfet_limit
+        )
+        self._motor = self.chain.motors[0]
+        self._start_over()
+
+    def _start_over(self) -> None:
+        self._active = False
+        """Whether there was a command, so that the motor has to be on."""
+        self._fault: Fault | None = None
+        self._attempts = 0
+        self._target: float | None = None
+        """Width of the newest command, m; None before the first."""
+        self._goal = self._ramp = 0.0
+        """Angle at the end of the ramp and at present, rad."""
+        self._speed = 0.0
+        """Speed of the width, m/s."""
+        self._force = 0.0
+        """Greatest force, N."""
+        self._resting = 0.0
+        """Time for which the fingers have been at rest, s."""
+        self._now: float | None = None
+        self._seq = 0
+        self._t = -1.0
+
+    def open(self) -> None:
+        """Connect, and compare the motor's registers with the rig. Nothing moves or is switched on."""
+        self.close()
+        self._start_over()
+        self.chain.open()
+
+    def close(self) -> None:
+        """Disconnect. The motor holds for its TIMEOUT, and damps afterwards. Idempotent."""
+        self._active = False
+        self.chain.close()
+
+    # Every cycle.
+
+    def read(self, now: float) -> GripperReading:
+        chain, motor = self.chain, self._motor
+        dt = min(max(now - self._now, 0.0), _LONGEST_STEP) if self._now is not None else 0.0
+        self._now = now
+        chain.update(now)
+        if chain.lost is not None:
+            self._active = False
+        elif self._fault is None:
+            self._fault = chain.fault(engaged=motor.on)
+        if chain.bus is not None and chain.bus.fault is None:
+            self._drive(now, dt)
+        if chain.lost is not None:
+            raise chain.lost
+        chain.usable  # noqa: B018  # raises if it is not open
+        return self._report(now)
+
+    def _drive(self, now: float, dt: float) -> None:
+        """Send the motor's command of this cycle, or a request for its state."""
+        chain, motor = self.chain, self._motor
+        if self._active and not motor.on and self._fault is None:
+            self._switch_on()
+        elif not motor.on:
+            chain.ask_state(motor)
+        elif motor.status != 1:  # it is being switched on
+            chain.send(motor, motor.command(self._ramp, 0.0, motor.kp, motor.kd, 0.0))
+        else:
+            self._attempts = 0
+            before = self._ramp
+            free = self._advance(now, dt)
+            speed = (self._ramp - before) / dt if dt > 0.0 else 0.0
+            if not free:  # damping is no force that presses
+                speed = min(max(speed, -abs(motor.dq)), abs(motor.dq))
+            chain.send(motor, motor.command(self._ramp, speed, motor.kp, motor.kd, 0.0))
+            still = abs(motor.dq) * self.table.slope(motor.q) < _STILL
+            done = self._ramp == self._goal or not free
+            self._resting = self._resting + dt if still and done else 0.0
+
+    def _advance(self, now: float, dt: float) -> bool:
+        """Advance the ramp; return whether the fingers follow it, without the greatest force."""
+        motor, table = self._motor, self.table
+        step = self._speed * dt / table.slope(self._ramp)
+        way = self._goal - self._ramp
+        ramp = self._goal if abs(way) <= step else self._ramp + (step if way > 0.0 else -step)
+        torque = self._force * table.slope(motor.q) + _FRICTION * motor.kd * abs(motor.dq)
+        ahead = min(torque, motor.settings.limits.torque) / motor.kp
+        at = motor.q + motor.dq * (now - motor.t)  # the state is a cycle old
+        self._ramp = min(max(ramp, at - ahead), at + ahead)
+        return self._ramp == ramp
+
+    def _switch_on(self) -> None:
+        """Switch the motor on where it is."""
+        motor = self._motor
+        self._attempts += 1
+        if self._attempts > _ATTEMPTS:
+            self._active, self._attempts = False, 0
+            cause = f"{motor.label} does not switch on (status {motor.status:x})"
+            self._fault = Fault("not_switched_on", cause, "check its power supply, and send the command again")
+            return
+        self._ramp = motor.q
+        self.chain.switch_on(motor, motor.command(self._ramp, 0.0, motor.kp, motor.kd, 0.0))
+
+    def _report(self, now: float) -> GripperReading:
+        motor, table = self._motor, self.table
+        t = motor.t if motor.t >= 0.0 else now
+        if t > self._t:
+            self._seq += 1
+        self._t = t
+        width = table.width(motor.q)
+        if self._target is None:
+            self._target = width
+        slope = table.slope(motor.q)
+        force = max(0.0, -table.opening * motor.tau / slope) if motor.on else 0.0
+        resting = self._resting >= _REST
+        grasped = resting and width > self.settings.tolerance and force >= _PRESSING * self._force > 0.0
+        return GripperReading(
+            t=t,
+            t_device=t,
+            seq=self._seq,
+            width=width,
+            width_target=self._target,
+            moving=self._active and self._fault is None and not resting,
+            grasped=grasped if motor.on else None,
+            force=force,
+            outcome=GripperOutcome.FAILED if self._fault is not None and self._active else None,
+            fault=self._fault,
+        )
+
+    # Commands.
+
+    def move(self, width: float, speed: float, force: float) -> None:
+        chain, motor = self.chain, self._motor
+        chain.usable  # noqa: B018  # raises if it is not open, or lost
+        fault = chain.fault(engaged=False)
+        if fault is not None and fault.code == "motor_hot":
+            raise RobotFault(fault.cause, fault.remedy, code=fault.code)
+        self._fault = None  # an error of the motor is cleared when it is switched on
+        self._attempts = 0
+        self._target = width
+        self._goal = self.table.angle(width)
+        self._speed = min(speed, self.spec.speed)
+        self._force = force
+        self._resting = 0.0
+        if not motor.on:
+            self._ramp = motor.q
+        self._active = True
+
+    def stop(self) -> None:
+        """Keep the fingers where they are; those that press on an object keep their force."""
+        self.chain.usable  # noqa: B018  # raises if it is not open, or lost
+        self._goal = self._ramp
+
+    def statistics(self) -> dict[str, Any]:
+        """Return figures about the connection, as those of the arm."""
+        return self.chain.statistics()
