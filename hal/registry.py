@@ -269,7 +269,7 @@ def _resolve(place: str, name: str, requires: Mapping[str, str]) -> Any:
 
 def _entry_points() -> dict[str, str]:
     """Return the drivers that installed packages announce, name -> "module:ATTRIBUTE"."""
-    from importlib.metadata import entry_points  # 25 ms, so only when it is needed
+    from importlib.metadata import entry_points  # slow to import, so only when it is needed
 
     return {point.name: point.value for point in entry_points(group=GROUP)}
 

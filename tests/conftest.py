@@ -38,7 +38,8 @@ OTHERS = {
 MARKERS = {
     "all": "every test: 'pytest -m all' runs everything",
     "fast": "tests of the fast tier (unit, contract and lock_step, without the slow ones): what 'pytest' runs",
-    "slow": "takes more than a few seconds, or needs the machine to itself; never in the fast tier",
+    "slow": "takes more than a few seconds; never in the fast tier",
+    "alone": "drives in real time what a busy computer would stop: CI runs nothing beside it, as with all of 'browser'",
 }
 
 

@@ -20,7 +20,7 @@ SLOW = 0.002
 """Speed below which fingers at their target have arrived, m/s."""
 STILL = 0.0005
 """A width that changes by less than this, m, counts as standing still. Pressed on a hard, uneven object, the joints of
-the fingers oscillate at up to 20 mm/s while the width moves by 0.1 mm, so their speed is no criterion."""
+the fingers oscillate fast while the width hardly moves, so their speed is no criterion."""
 SETTLE = 0.1
 """Time of standing still after which a motion has ended at any width, s. Slow motions take longer."""
 BLOCKED = 0.25

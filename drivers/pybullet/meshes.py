@@ -1,8 +1,8 @@
 """Mesh files as triangles, with fewer triangles where a file has far more than a picture can show.
 
-Parsing the meshes of one arm takes a second or two, reading them back some milliseconds: parsed meshes are kept in the
-user's cache folder. A cache that is missing, broken or not writable only costs that time. Drawing without a graphics
-card costs time per triangle, and the meshes of an arm are tessellated to a tenth of a millimetre.
+Parsing meshes takes much longer than reading them back (``benchmarks/render.py``): parsed meshes are kept in the user's
+cache folder. A cache that is missing, broken or not writable only costs that time. Without a graphics card, drawing
+costs time per triangle, and the meshes of an arm have far more triangles than a picture can show.
 """
 
 from __future__ import annotations
@@ -324,8 +324,6 @@ def _closed(mesh: Mesh) -> bool:
 
 
 # --- fewer triangles --------------------------------------------------------------------------------------------------
-# fast-simplification was compared: with as many triangles, pictures of a Panda and a table differ three times as much
-# from those of the full meshes (one object moves by 5 mm), and the first start takes 5 s longer.
 
 
 def simplified(mesh: Mesh) -> Mesh:

@@ -51,13 +51,13 @@ ENGINE: dict[str, Any] = {
 """Settings of PyBullet's solver.
 
 Each group of bodies that touch is solved by itself: PyBullet solves small groups together, which gives the same numbers
-and makes every group wait for the slowest. The solver iterates at most 100 times: with PyBullet's 50, fingers that
-grasp with 70 N reach half of it, and fast arms are 0.2 % over their speed limits."""
+and makes every group wait for the slowest. With PyBullet's own limit of 50 iterations, fingers do not reach a great
+force, and fast arms exceed their speed limits a little."""
 RESIDUAL = {"fine": 1e-7, "coarse": 3e-6}
 """The solver stops once no speed changes by more than the root of this in an iteration, m/s or rad/s: 0.3 and 1.7 mm/s.
 
-"fine" is PyBullet's own, and needed while fingers move slowly or hold something. With "coarse" a step takes a tenth
-less time, and a Panda follows a swing within 0.056 mrad instead of 0.041."""
+"fine" is PyBullet's own, and needed while fingers move slowly or hold something. With "coarse" a step takes less time,
+and an arm follows less exactly: ``benchmarks/world_tick.py`` prints both."""
 OVERLAP = 0.005
 """Depth, m, from which on two arms that overlap at the start are refused."""
 
@@ -73,8 +73,7 @@ class PyBulletWorld:
         spec: The record of the world.
         mirror: The world is posed by snapshots and never stepped.
         gui: Open PyBullet's window.
-        drawn: Load visual meshes, because this very world is drawn. Without them loading a Panda takes 0.2 s and 75 MB
-            less.
+        drawn: Load visual meshes, because this very world is drawn. Without them loading takes less time and memory.
 
     Raises:
         ConfigError: Something in the record cannot be loaded; lists every problem.

@@ -33,7 +33,7 @@ _HEADER = struct.Struct("<BBHIdf")  # camera, 0, 0, seq, t, age
 _SEQ_MASK = 0xFFFFFFFF
 _QUALITY = 80
 _SMALL = 100_000
-"""Pixels up to which a picture is smoothed, because pages enlarge it. That takes 2 ms for 256 x 256."""
+"""Pixels up to which a picture is smoothed, because pages enlarge it."""
 _LARGE = 50_000
 """Pixels from which a picture is smoothed and compressed in a thread of its own."""
 _EDGE = 28

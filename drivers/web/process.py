@@ -4,8 +4,7 @@ It only reads the memory that the hosts write, and sends everything else to the 
 waits for the other. When it is killed, stopped or too busy, the pad's newest proof of life grows old, as if a cable
 were pulled.
 
-It takes 3 % of a processor with a page that drives, and 2 ms for each small picture sent to a page. It keeps the app's
-priority: a stop from a page is as urgent as the app itself.
+It keeps the app's priority: a stop from a page is as urgent as the app itself.
 """
 
 from __future__ import annotations

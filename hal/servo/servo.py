@@ -60,7 +60,7 @@ class ServoReport:
     """Time at which the last braking began, s."""
 
 
-# Members of an enumeration that every tick names: to find one there takes Python 3.11 0.1 us.
+# Members of enumerations that every tick names: a global is found faster than a member.
 _NO_TRIP, _FAULT, _UNLIMITED, _FOLLOWING = Trip.NONE, Trip.FAULT, Limited.NONE, RobotStatus.FOLLOWING
 
 _ABSURD = 1e3

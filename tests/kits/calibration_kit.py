@@ -1,15 +1,30 @@
-"""Synthetic views and images of a board from known poses."""
+"""Synthetic views and images of a board from known poses, and simulated rigs whose camera's pose is hidden."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hal.calibration import Board, BoardDetection, Eye, View
+import hal
+from hal.calibration import (
+    Board,
+    BoardDetection,
+    Calibration,
+    Collector,
+    Detector,
+    Eye,
+    View,
+    collect_views,
+    find_setup,
+    load_board,
+    solve,
+)
 from hal.calibration.detection import flat_pose
 from hal.calibration.solving import inverse, motion
+from hal.config import load
 from hal.geometry import Pose
 from hal.images import distort_points, undistort_pixels
 
@@ -102,3 +117,43 @@ def picture(pose: Array, cv2: Any, lens: tuple[float, ...] = (0.0,) * 5, finer: 
 
 def degrees(angle: float) -> float:
     return float(np.degrees(angle))
+
+
+# Simulated rigs.
+
+
+def wrong(pose: Pose, seed: int) -> Pose:
+    """Return a pose that is 3 cm and 5 degrees away from another, in random directions."""
+    twist = np.random.default_rng(seed).normal(size=6)
+    twist[:3] *= 0.03 / np.linalg.norm(twist[:3])
+    twist[3:] *= np.radians(5.0) / np.linalg.norm(twist[3:])
+    return pose @ Pose.from_matrix(motion(twist))
+
+
+class CalibrationBench:
+    """An open rig, a collector without access to the camera's true pose, and that pose (``truth``)."""
+
+    def __init__(self, rig: hal.Rig, name: str) -> None:
+        config = load(name, sim=True)
+        setup = find_setup(config, config.resolve())
+        assert setup.known is not None
+        self.rig, self.truth = rig, setup.known
+        self.collector = Collector(rig, replace(setup, known=None), Detector(load_board()))
+        camera = self.collector.camera
+        read = camera.read
+
+        def blind(*arguments: Any, **options: Any) -> hal.Frame:
+            return replace(read(*arguments, **options), T_world_camera=None)
+
+        camera.read = blind
+        self.told: list[str] = []
+
+    def drive(self, wanted: int, seed: int = 0, **options: Any) -> Calibration:
+        """Take views, from an initial guess that is wrong, and solve."""
+        collect_views(self.collector, wrong(self.truth, seed), wanted, self.told.append, **options)
+        return solve(self.collector.views, self.collector.setup.eye)
+
+    def off(self, found: Calibration) -> tuple[float, float]:
+        """Return the error of a result, mm and degrees."""
+        distance, angle = found.camera.distance(self.truth)
+        return 1e3 * distance, degrees(angle)

@@ -9,86 +9,37 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Iterator
-from dataclasses import replace
 from itertools import pairwise
 from typing import Any
 
 import numpy as np
 import pytest
+from calibration_kit import CalibrationBench
 
 import hal
-from hal.calibration import (
-    Calibration,
-    CalibrationFailed,
-    Collector,
-    Detector,
-    ManualDrive,
-    add_view,
-    collect_views,
-    find_setup,
-    load_board,
-    solve,
-)
-from hal.calibration.solving import motion
-from hal.config import load
+from hal.calibration import CalibrationFailed, ManualDrive, add_view
 from hal.deadman import Deadman
-from hal.geometry import Pose
 
 pytest.importorskip("cv2", reason="pip install opencv-python-headless")
 
 MOST_MM, MOST_DEGREES = 2.0, 0.3
-CAMERAS = {"panda_calibration": "wrist", "panda_calibration_held": "scene"}
+RIGS = ("panda_calibration", "panda_calibration_held")
 
 
-def wrong(pose: Pose, seed: int) -> Pose:
-    """A pose that is 3 cm and 5 degrees away, in a direction that the seed says."""
-    twist = np.random.default_rng(seed).normal(size=6)
-    twist[:3] *= 0.03 / np.linalg.norm(twist[:3])
-    twist[3:] *= math.radians(5.0) / np.linalg.norm(twist[3:])
-    return pose @ Pose.from_matrix(motion(twist))
-
-
-class Bench:
-    """An open rig, a collector that cannot see the truth, and the truth."""
-
-    def __init__(self, rig: hal.Rig, name: str) -> None:
-        config = load(name, sim=True)
-        setting = find_setup(config, config.resolve())
-        assert setting.known is not None
-        self.rig, self.truth = rig, setting.known
-        self.collector = Collector(rig, replace(setting, known=None), Detector(load_board()))
-        camera = self.collector.camera
-        read = camera.read
-
-        def blind(*arguments: Any, **options: Any) -> hal.Frame:
-            return replace(read(*arguments, **options), T_world_camera=None)
-
-        camera.read = blind
-        self.told: list[str] = []
-
-    def drive(self, wanted: int, seed: int = 0, **options: Any) -> Calibration:
-        collect_views(self.collector, wrong(self.truth, seed), wanted, self.told.append, **options)
-        return solve(self.collector.views, self.collector.setup.eye)
-
-    def off(self, found: Calibration) -> tuple[float, float]:
-        distance, angle = found.camera.distance(self.truth)
-        return 1e3 * distance, math.degrees(angle)
-
-
-@pytest.fixture(params=list(CAMERAS))
+@pytest.fixture(params=RIGS)
 def name(request: pytest.FixtureRequest) -> str:
     return str(request.param)
 
 
 @pytest.fixture
-def bench(name: str) -> Iterator[Bench]:
+def bench(name: str) -> Iterator[CalibrationBench]:
     with hal.open(name, sim=True, clock="lock_step", pad="none") as rig:
         rig.clock.sleep(0.2)
-        yield Bench(rig, name)
+        yield CalibrationBench(rig, name)
 
 
 @pytest.mark.parametrize("seed", range(3 if os.environ.get("HAL_SOAK") == "1" else 1))
-def test_the_camera_is_found(bench: Bench, seed: int) -> None:
+def test_the_camera_is_found(bench: CalibrationBench, seed: int) -> None:
     arm = bench.collector.robot
     start = arm.state().q
     found = bench.drive(15, seed)
@@ -111,7 +62,7 @@ def test_images_of_another_sensor_give_the_pose_of_the_colour_sensor(options: li
     """Between the two are 15 mm."""
     with hal.open("panda_calibration", sim=True, clock="lock_step", pad="none", overrides=options) as rig:
         rig.clock.sleep(0.2)
-        bench = Bench(rig, "panda_calibration")
+        bench = CalibrationBench(rig, "panda_calibration")
         found = bench.drive(10)
         assert np.linalg.norm(bench.collector.views[0].T_color_eye.position) > 0.01
         millimetres, degrees = bench.off(found)
@@ -125,13 +76,13 @@ def test_with_pybullets_own_renderer(name: str) -> None:
     options = ["simulation.renderer=tiny"]
     with hal.open(name, sim=True, clock="lock_step", pad="none", overrides=options) as rig:
         rig.clock.sleep(0.2)
-        bench = Bench(rig, name)
+        bench = CalibrationBench(rig, name)
         millimetres, degrees = bench.off(bench.drive(8))
         assert millimetres <= MOST_MM
         assert degrees <= MOST_DEGREES
 
 
-def test_without_the_dead_man_nothing_moves(bench: Bench) -> None:
+def test_without_the_dead_man_nothing_moves(bench: CalibrationBench) -> None:
     deadman = Deadman("nobody")
     deadman.update(pressed=False, connected=True, t_alive=0.0)
     before = bench.collector.robot.state().q_set
@@ -142,7 +93,7 @@ def test_without_the_dead_man_nothing_moves(bench: Bench) -> None:
     assert len(bench.collector.views) == 1, "the picture from where it stood"
 
 
-def test_a_board_out_of_sight_is_refused_before_the_arm_moves(bench: Bench) -> None:
+def test_a_board_out_of_sight_is_refused_before_the_arm_moves(bench: CalibrationBench) -> None:
     arm = bench.collector.robot
     arm.move_to(arm.home + np.array([0.9, 0, 0, 0, 0, 0, -1.6]), speed=0.5)
     before = arm.state().q_set
@@ -153,14 +104,14 @@ def test_a_board_out_of_sight_is_refused_before_the_arm_moves(bench: Bench) -> N
     assert bench.collector.rejected
 
 
-def test_a_view_similar_to_another_is_rejected(bench: Bench) -> None:
+def test_a_view_similar_to_another_is_rejected(bench: CalibrationBench) -> None:
     assert add_view(bench.collector, bench.told.append) is not None
     assert add_view(bench.collector, bench.told.append) is None
     assert len(bench.collector.views) == 1
     assert len(bench.collector.rejected) == 1
 
 
-def test_the_arm_keeps_its_distance_and_its_workspace(bench: Bench) -> None:
+def test_the_arm_keeps_its_distance_and_its_workspace(bench: CalibrationBench) -> None:
     """Looked at in every step, by the world's own truth."""
     world, arm = bench.rig.world, bench.collector.robot
     box = arm.spec.workspace

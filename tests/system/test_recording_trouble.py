@@ -21,7 +21,7 @@ from hal.recording import Dataset, Recorder, recover
 from hal.rig import Rig
 from hal.types import Frame, RobotStatus, Trip
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.alone]
 
 SOON = 10.0
 

@@ -26,6 +26,8 @@ from hal.types import GripperOutcome
 from .franka_kit import free_host
 from .hand_kit import LIMIT, HandBench
 
+pytestmark = pytest.mark.alone
+
 DONE, MISSED, STOPPED, FAILED = (GripperOutcome[name] for name in ("DONE", "MISSED", "STOPPED", "FAILED"))
 
 

@@ -6,7 +6,7 @@ The vendor's own library between the servo and the emulator; one drive, once wit
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
@@ -31,8 +31,28 @@ def lagging() -> Iterator[Emulator]:
         yield emulator
 
 
-def drive(emulator: Emulator, *faults: str) -> tuple[Pose, float, dict[str, Any], str]:
-    """Where the same drive ends, how far the tcp went (m), the arm's statistics, and what ended the drive."""
+class Driven(NamedTuple):
+    """How a drive went."""
+
+    end: Pose
+    travel: float
+    """Way of the tcp, m."""
+    statistics: dict[str, Any]
+    error: str
+    """The fault that ended it, if one did."""
+
+
+@pytest.fixture(scope="module")
+def clean(_lockstep_fr3: Emulator) -> Driven:
+    """The drive with true reports."""
+    driven = drive(_lockstep_fr3)
+    assert driven.travel > 0.2
+    assert not driven.error
+    return driven
+
+
+def drive(emulator: Emulator, *faults: str) -> Driven:
+    """Drive along always the same path."""
     emulator.refresh()
     reflexes = len(emulator.events("reflex"))
     with rig_of(emulator.host, "fr3", lock_step=True) as rig:
@@ -59,7 +79,7 @@ def drive(emulator: Emulator, *faults: str) -> tuple[Pose, float, dict[str, Any]
         end = arm.state(max_age=1.0).tcp
         statistics = rig.statistics()["arm"]["robots"]["arm"]
     assert len(emulator.events("reflex")) == reflexes
-    return end, travel, statistics, ended
+    return Driven(end, travel, statistics, ended)
 
 
 @pytest.mark.parametrize(
@@ -72,14 +92,11 @@ def drive(emulator: Emulator, *faults: str) -> tuple[Pose, float, dict[str, Any]
         ("report-noise 1e-6", 0, 2e-5),
     ],
 )
-def test_late_and_noisy_reports_are_recognised(fr3: Emulator, fault: str, lag: int, noise: float) -> None:
-    clean, travelled, _, ended = drive(fr3)
-    assert travelled > 0.2
-    assert not ended
-    end, travel, statistics, ended = drive(fr3, fault)
-    assert not ended
-    assert end.distance(clean)[0] <= APART
-    assert travel == pytest.approx(travelled, rel=0.05)
+def test_late_and_noisy_reports_are_recognised(fr3: Emulator, clean: Driven, fault: str, lag: int, noise: float):
+    end, travel, statistics, error = drive(fr3, fault)
+    assert not error
+    assert end.distance(clean.end)[0] <= APART
+    assert travel == pytest.approx(clean.travel, rel=0.05)
     assert statistics["report_lag"] == lag
     assert statistics["report_noise"] <= noise
     assert statistics["reanchored"] <= 20
@@ -87,21 +104,21 @@ def test_late_and_noisy_reports_are_recognised(fr3: Emulator, fault: str, lag: i
 
 
 def test_measured_positions_are_recognised(lagging: Emulator) -> None:
-    clean, travelled, _, _ = drive(lagging)
-    end, travel, statistics, ended = drive(lagging, "report-measured on")
-    assert not ended
-    assert travel == pytest.approx(travelled, rel=0.05)
-    assert end.distance(clean)[0] <= APART
+    true = drive(lagging)
+    end, travel, statistics, error = drive(lagging, "report-measured on")
+    assert not error
+    assert travel == pytest.approx(true.travel, rel=0.05)
+    assert end.distance(true.end)[0] <= APART
     assert statistics["reports"] == "measured positions"
     assert statistics["reanchored"] <= 20
 
 
 def test_reports_that_fit_nothing_are_a_fault_with_a_name(fr3: Emulator) -> None:
-    _, _, statistics, ended = drive(fr3, "report-lag 9")
-    assert "was sent" in ended
-    assert "reported" in ended
+    _, _, statistics, error = drive(fr3, "report-lag 9")
+    assert "was sent" in error
+    assert "reported" in error
     assert statistics["mismatches"] > 20
     assert max(statistics["peak"].values()) <= 1.0
-    _, travel, _, ended = drive(fr3)  # nothing is left of it
-    assert travel > 0.2
-    assert not ended
+    again = drive(fr3)  # nothing is left of it
+    assert again.travel > 0.2
+    assert not again.error

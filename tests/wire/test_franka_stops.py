@@ -21,6 +21,7 @@ from .rig_kit import Drive, arm_of, rig_of, settled, wait_until
 
 pytest.importorskip("pylibfranka", reason="needs pylibfranka: pip install 'robot-hal[franka]'")
 pytest.importorskip("panda_py", reason="needs panda-python: pip install 'robot-hal[panda]'")
+pytestmark = pytest.mark.alone
 
 HOME = (0.0, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785)
 ZERO = (0.0,) * 7

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import subprocess
@@ -29,14 +30,11 @@ APART, TURNED = 0.002, 0.02
 """By how much the ends may differ, m and rad."""
 
 
-def teleop(tour: Path, report: Path, *arguments: str) -> dict[str, Any]:
-    """Run the app through the tour; its report."""
+def teleop(tour: Path, report: Path, *arguments: str) -> subprocess.Popen[str]:
+    """Start the app on the tour, in lock-step."""
     command = [sys.executable, str(APP), "--config", "franka_emulator", "--pad", str(tour), "--speed", "0.3"]
     command += ["--set", "cameras={}", "--set", "simulation.clock=lock_step", "--report", str(report), *arguments]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=100)
-    assert done.returncode == 0, done.stdout + done.stderr
-    found: dict[str, Any] = json.loads(report.read_text())
-    return found
+    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
 
 
 def end_of(report: dict[str, Any]) -> Pose:
@@ -46,11 +44,14 @@ def end_of(report: dict[str, Any]) -> Pose:
 
 def test_the_same_drive_ends_at_the_same_pose(fr3: Emulator, panda: Emulator, tmp_path: Path) -> None:
     tour = write_tour(tmp_path / "calm.jsonl")
-    reports = {
-        "simulated": teleop(tour, tmp_path / "sim.json", "--sim"),
-        "FR3": teleop(tour, tmp_path / "fr3.json", "--real", *at(fr3, "fr3")),
-        "Panda": teleop(tour, tmp_path / "panda.json", "--real", *at(panda, "panda")),
-    }
+    places = {"simulated": ["--sim"], "FR3": ["--real", *at(fr3, "fr3")], "Panda": ["--real", *at(panda, "panda")]}
+    reports: dict[str, Any] = {}
+    with contextlib.ExitStack() as stack:
+        apps = {name: stack.enter_context(teleop(tour, tmp_path / name, *where)) for name, where in places.items()}
+        for name, app in apps.items():
+            said, _ = app.communicate(timeout=100)
+            assert app.returncode == 0, said
+            reports[name] = json.loads((tmp_path / name).read_text())
     for name, report in reports.items():
         assert report["tcp_travel_m"] >= 0.3, name
         assert report["trips"] == report["faults"] == [], name

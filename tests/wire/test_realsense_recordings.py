@@ -15,10 +15,17 @@ from .realsense_bench import open_error, opened, read_again, read_until_lost, re
 
 from hal.drivers.realsense.emulator import read_number  # isort: skip  # needs the library
 
+FRAMES = 45
 
-def test_unpaced_every_frame_is_read_once_and_in_order(tmp_path: Path) -> None:
-    file = recording(tmp_path, spec(), 60)
-    played = spec(play=file, paced=False, repeat=False)
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> str:
+    """A recording of colour and depth, with FRAMES frames."""
+    return recording(tmp_path_factory.mktemp("recorded"), spec(), FRAMES)
+
+
+def test_unpaced_every_frame_is_read_once_and_in_order(recorded: str) -> None:
+    played = spec(play=recorded, paced=False, repeat=False)
     numbers, last = [], None
     with opened(played) as cam:
         with pytest.raises(ConnectionLost) as ended:
@@ -33,13 +40,12 @@ def test_unpaced_every_frame_is_read_once_and_in_order(tmp_path: Path) -> None:
         assert ended.value.code == again.value.code == "recording_ended"
         assert again.value.final
         assert cam.counts().dropped == cam.counts().repeated == 0
-    assert numbers == list(range(numbers[0], 61))
+    assert numbers == list(range(numbers[0], FRAMES + 1))
     assert numbers[0] <= 2
 
 
-def test_unpaced_the_time_of_a_frame_is_when_it_was_read(tmp_path: Path) -> None:
-    file = recording(tmp_path, spec(), 40)
-    with opened(spec(play=file, paced=False)) as cam:
+def test_unpaced_the_time_of_a_frame_is_when_it_was_read(recorded: str) -> None:
+    with opened(spec(play=recorded, paced=False)) as cam:
         for _ in range(12):
             time.sleep(0.1)  # slower than the recording, so that frames wait
             before = cam.clock.now()
@@ -57,9 +63,8 @@ def test_time_and_numbers_continue_when_it_repeats(tmp_path: Path) -> None:
     assert (np.diff([frame.stamp.seq for frame in frames]) > 0).all()
 
 
-def test_paced_it_takes_as_long_as_the_recording(tmp_path: Path) -> None:
-    file = recording(tmp_path, spec(), 45)
-    with opened(spec(play=file, repeat=False)) as cam:
+def test_paced_it_takes_as_long_as_the_recording(recorded: str) -> None:
+    with opened(spec(play=recorded, repeat=False)) as cam:
         first = last = cam.read(timeout=5.0)
         with pytest.raises(ConnectionLost) as ended:
             while True:
@@ -88,13 +93,12 @@ def test_a_recording_without_metadata_is_matched_by_the_driver(tmp_path: Path) -
     assert counts.repeated + counts.mismatched > 0, "else this recording shows nothing"
 
 
-def test_a_mode_that_it_lacks_is_an_error_that_lists_its_modes(tmp_path: Path) -> None:
-    file = recording(tmp_path, spec())
-    wrong = spec("color", "depth", size=(848, 480), play=file)
+def test_a_mode_that_it_lacks_is_an_error_that_lists_its_modes(recorded: str) -> None:
+    wrong = spec("color", "depth", size=(848, 480), play=recorded)
     error = open_error(wrong)
     assert error.code == "unknown_mode"
     assert "640x480 at 30 Hz (rgb8)" in str(error)
-    assert open_error(spec("color", "infrared", play=file)).code == "unknown_stream"
+    assert open_error(spec("color", "infrared", play=recorded)).code == "unknown_stream"
 
 
 def test_files_that_cannot_be_played(tmp_path: Path) -> None:

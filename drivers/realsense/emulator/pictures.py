@@ -336,7 +336,7 @@ class EmulatedImages:
     def prepare(self, name: str, mode: StreamMode) -> list[NDArray[Any]]:
         """Return the images of all phases in a mode, always the same arrays, to draw numbers into.
 
-        The first call for a mode takes some 50 ms.
+        The first call for a mode draws them, which takes long.
         """
         key = (name, (mode.width, mode.height), mode.format)
         if key not in self._prepared:
