@@ -1,4 +1,4 @@
-"""One rig and one browser for a whole module: both take seconds to start."""
+"""One browser for all tests, and one rig for a module: both take seconds to start."""
 
 from __future__ import annotations
 
@@ -19,9 +19,10 @@ def bench() -> Iterator[Bench]:
     bench.close()
 
 
-@pytest.fixture(scope="module")
-def browser(bench: Bench) -> Iterator[Browser]:
-    """A browser that may do as it likes."""
+@pytest.fixture(scope="session")
+def browser() -> Iterator[Browser]:
+    """A browser; a test that uses it directly leaves an empty page."""
+    need_browser()
     browser = Browser()
     yield browser
     browser.close()
