@@ -46,7 +46,7 @@ def show(what: str, results: list[tuple[float, float, float]]) -> None:
     """Print the range and the mean of each number."""
     low, high, mean = np.min(results, axis=0), np.max(results, axis=0), np.mean(results, axis=0)
     cells = [f"{a:.3f} to {b:.3f}, mean {m:.3f}" for a, b, m in zip(low, high, mean, strict=True)]
-    print(f"{what:44}{cells[0]:>28} mm{cells[1]:>28} deg   reported {cells[2]:>28} mm")
+    print(f"{what:48}{cells[0]:>28} mm{cells[1]:>28} deg   reported {cells[2]:>28} mm")
 
 
 def main() -> None:
@@ -67,7 +67,7 @@ def main() -> None:
         sets = [views("in-hand", poses(15, k), noise_px=0.2, arm=2e-4, seed=k, believed=believed) for k in seeds]
         found = [solve(one, "in-hand") for one in sets]
         show(f"synthetic, in-hand, {what}", [error(one) for one in found])
-        print(f"{'':44}the board appears {100 * np.mean([one.uncertainty.scale for one in found]):+.1f} % larger")
+        print(f"{'':48}the board appears {100 * np.mean([one.uncertainty.scale for one in found]):+.1f} % larger")
 
 
 if __name__ == "__main__":

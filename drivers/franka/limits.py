@@ -76,7 +76,7 @@ class ArmLimits:
     deceleration: Seven | None = None
     rectangle: Rectangle | None = None
     """Franka's suggestion for planners that support constant limits only. In the corners of the box its speeds exceed
-    :meth:`velocity_range` by up to 4.4 %, so somewhat lower speeds are needed."""
+    :meth:`velocity_range`, so somewhat lower speeds are needed."""
 
     def velocity_range(self, q: Sequence[float]) -> tuple[list[float], list[float]]:
         """Return the lowest (7,) and highest (7,) joint velocity at joint positions ``q`` (7,), rad/s.

@@ -187,7 +187,7 @@ class Gear:
             self._client.changeConstraint(self._number, **self._set)
 
     def release(self) -> None:
-        """Uncouple the joints, which makes a physics step 4 % shorter. Idempotent."""
+        """Uncouple the joints, which makes a physics step shorter. Idempotent."""
         if self._number is not None:
             self._client.removeConstraint(self._number)
             self._number = None

@@ -74,8 +74,7 @@ def describe() -> str:
 def yield_to_others(nice: int) -> None:
     """Give this process a lower priority, no claim to run at once, and all processors but the first.
 
-    The last of these matters most: a servo at 1 kHz beside two cameras on two cores missed 6 to 10 % of its ticks
-    without it, 0.3 to 0.4 % with it (benchmarks/real_time.py).
+    The last of these matters most for a servo at 1 kHz beside cameras (``benchmarks/real_time.py``).
     """
     os.nice(nice)
     with contextlib.suppress(AttributeError, OSError):  # Linux only

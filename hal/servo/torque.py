@@ -59,8 +59,8 @@ _LAG = 2.0
 """Ticks until a torque can be followed by a lower one: it acts for one, and its effect is measured after that."""
 
 _DECAY = 40.0
-"""The brake takes this share of each joint's speed away, 1/s: rest from 0.65 rad/s in about 0.13 s. Measured in the
-simulation: with 30, an inertia that is stated ten times too large still brakes; with 50, hardly."""
+"""The brake takes this share of each joint's speed away, 1/s. With a greater share, an arm whose inertia is stated much
+too large would hardly brake."""
 
 _STABLE = 0.25
 """The brake takes no more than this share per tick: the arm then comes to rest without turning back, also if the
