@@ -56,7 +56,7 @@ class ArkUrdf:
                 yield from self._below(joint.child)
 
     def _moving(self, link: str) -> list[UrdfJoint]:
-        """The next joints that are not fixed."""
+        """Return the next joints that are not fixed."""
         found = []
         for joint in self.model.joints.values():
             if joint.parent == link:

@@ -8,7 +8,7 @@ from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import yaml
 
@@ -137,12 +137,6 @@ def _relative(path: Path, folder: Path) -> str:
 
 
 Outcome = Literal["kept", "changed", "ignored", "unknown"]
-_MEANING: dict[Outcome, str] = {
-    "kept": "kept",
-    "changed": "changed",
-    "ignored": "ignored",
-    "unknown": "unknown",
-}
 _COLUMN = 62
 """Column of the right half of the table."""
 _WIDEST_VALUE = 26
@@ -246,7 +240,7 @@ def table(rows: Iterable[KeyRow], folder: Path, width: int = 120) -> list[str]:
 def summary(rows: Iterable[KeyRow]) -> str:
     """Return the number of keys of each outcome, as text."""
     counts = Counter(row.outcome for row in rows)
-    parts = [f"{counts[outcome]} {meaning}" for outcome, meaning in _MEANING.items() if counts[outcome]]
+    parts = [f"{counts[outcome]} {outcome}" for outcome in get_args(Outcome) if counts[outcome]]
     return f"{sum(counts.values())} keys: {', '.join(parts)}"
 
 

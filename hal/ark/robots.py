@@ -113,23 +113,23 @@ def import_real(
         entries["real"] = Inline(host=reading.text(host))
         ledger.kept(host, f"{key}.real.host")
     if own is not None and host is not None and own.data == host.data:
-        ledger.kept(own, f"{key}.real.host", "a hand has the arm's, unless it is given its own")
+        ledger.kept(own, f"{key}.real.host", "the default of the hand is the arm's")
     elif own is not None:
         gripper["real"] = Inline(host=reading.text(own))
         ledger.kept(own, f"{key}.gripper.real.host")
     share = real.get("relative_dynamics_factor")
     if share is not None and reading.number(share, positive=True) <= MOST_SPEED:
         entries["speed"] = Commented(share.data, "Ark's relative_dynamics_factor")
-        ledger.changed(share, f"{key}.speed", "share of the joint speeds, for commands; move_speed stays")
+        ledger.changed(share, f"{key}.speed", "share of the joint speeds for commands; move_speed is unchanged")
     else:
-        ledger.changed(share, "", f"{key}.speed stays {MOST_SPEED:g} of the joint speeds: more is for you to write")
+        ledger.changed(share, "", f"{key}.speed stays {MOST_SPEED:g} of the joint speeds; increase it by hand")
     speed = real.get("gripper_speed")
     if speed is not None and hand is not None:
         if reading.number(speed, positive=True) <= hand.speed:
             gripper["speed"] = speed.data
             ledger.kept(speed, f"{key}.gripper.speed")
         else:
-            ledger.changed(speed, "", f"{hand.speed:g} m/s, the most that the hand can do")
+            ledger.changed(speed, "", f"{hand.speed:g} m/s, the hand's maximum")
     if gripper:
         entries["gripper"] = gripper
     return entries
@@ -209,7 +209,7 @@ def import_arm(item: ArkItem, work: ImportState) -> ArkArm:
     if arm.known is not None and arm.known.is_franka:
         arm.entry.update(import_real(node, key, arm.known.spec.gripper, reading, ledger))
     else:
-        ledger.ignored(node.children.get("real_config"), "no driver here drives the real one")
+        ledger.ignored(node.children.get("real_config"), "there is no driver for the real one")
     return arm
 
 
@@ -236,7 +236,7 @@ def _urdf(given: str, node: ArkNode, reading: ArkReader, places: FileFinder, opt
 def _model(
     given: str, node: ArkNode, urdf: ArkUrdf | None, reading: ArkReader, options: ArkOptions
 ) -> tuple[str | None, str]:
-    """The robot's built-in model and the reason for the choice; None if there is none."""
+    """Return the robot's built-in model and the reason for the choice; None if there is none."""
     if given in options.arms:
         model, there = options.arms[given], list_data("robots")
         if model not in there:
@@ -278,14 +278,14 @@ def _checks(node: ArkNode, reading: ArkReader, ledger: KeyReport) -> None:
 
 
 def _groups(node: ArkNode, ledger: KeyReport) -> None:
-    """Joint groups of an arm with a built-in model."""
+    """Report the joint groups of an arm with a built-in model."""
     groups = node.get("joint_groups")
     for name, group in (groups.children if groups is not None else {}).items():
         hand = name == "gripper"
         if name in ("arm", "gripper"):
             ledger.kept(group.get("joints"), "", f"the {name}'s, in the model")
         else:
-            ledger.ignored(group.get("joints"), "one command has both: control.send(command, width=metres)")
+            ledger.ignored(group.get("joints"), "one command controls both: control.send(command, width=metres)")
         does = "arm.gripper.move(width in m)" if hand else "chosen by each command: JointTarget, JointVelocity, ..."
         ledger.changed(group.get("control_mode"), "", does)
 
@@ -303,7 +303,7 @@ def _base(arm: ArkArm, node: ArkNode, key: str, reading: ArkReader, ledger: KeyR
 
 
 def _start(arm: ArkArm, known: KnownArm, node: ArkNode, key: str, reading: ArkReader, ledger: KeyReport) -> None:
-    """The joints of a known arm are first in Ark's list, before fixed joints and fingers."""
+    """Convert the start position: a known arm's joints come first in Ark's list, before fixed joints and fingers."""
     initial = node.get("initial_configuration")
     if initial is None:
         return

@@ -108,7 +108,7 @@ class ObjectImport:
         self._mass(self.reading.keys(body).get("baseMass") if body is not None else None)
 
     def _plain_box(self, size: ArkNode) -> None:
-        """A box as in the files for Ark's newer simulators: whole sides and a mass."""
+        """Convert a box of the files for Ark's newer simulators: whole sides and a mass."""
         self.entry |= {"shape": "box", "half_extents": tidy([side / 2 for side in self.reading.numbers(size, (3,))])}
         self.ledger.changed(size, f"{self.key}.half_extents", "half of it")
         self._mass(self.node.get("mass"))
@@ -117,7 +117,7 @@ class ObjectImport:
         if mass is not None:
             value = self.reading.number(mass)
             self.entry["mass"] = Commented(0, "stands still") if value == 0 else value
-            self.ledger.kept(mass, f"{self.key}.mass", "0 stands still, as in PyBullet" if value == 0 else "")
+            self.ledger.kept(mass, f"{self.key}.mass", "0: fixed, as in PyBullet" if value == 0 else "")
 
     def _shape(self, part: str) -> dict[str, Any] | None:
         """Shape, sizes and colour of ``visual`` or ``collision`` as the rig's keys; None if it is missing."""
@@ -231,7 +231,7 @@ def import_simulator(root: ArkNode, reading: ArkReader, ledger: KeyReport) -> di
         name = node.get("name")
         if name is not None:
             entries["description"] = f"{reading.text(name)} (from Ark, {root.file.name})"
-            ledger.changed(name, "description", "for people; nothing is called by it")
+            ledger.changed(name, "description", "for readers only")
         _backend(node, ledger)
         ledger.ignored(node.children.get("node_frequency"), "one clock drives everything; see simulation.physics_hz")
         ledger.ignored(
@@ -251,7 +251,7 @@ def _backend(node: ArkNode, ledger: KeyReport) -> None:
     if backend is not None and backend.data == "pybullet":
         ledger.kept(backend, "", "PyBullet, from the drivers.sim of every model")
     else:
-        ledger.changed(backend, "", "PyBullet simulates here")
+        ledger.changed(backend, "", "the simulator is always PyBullet")
 
 
 def _config(node: ArkNode, reading: ArkReader, ledger: KeyReport) -> dict[str, Any]:
@@ -365,11 +365,11 @@ class CameraImport:
             self.entry["field_of_view"] = Inline(vertical_deg=fov)
             self.entry["depth"] = Commented(Inline(min=near, max=far), "m; 0 in a frame where it is nearer or farther")
             self.ledger.kept(sim.get("fov"), f"{self.key}.field_of_view.vertical_deg")
-            self.ledger.changed(sim.get("near_val"), f"{self.key}.depth.min", "depth is 0 where it is nearer")
-            self.ledger.changed(sim.get("far_val"), f"{self.key}.depth.max", "depth is 0 where it is farther")
+            self.ledger.changed(sim.get("near_val"), f"{self.key}.depth.min", "nearer depth is 0")
+            self.ledger.changed(sim.get("far_val"), f"{self.key}.depth.max", "farther depth is 0")
         else:
             for key in ("fov", "near_val", "far_val"):
-                self.ledger.ignored(sim.children.get(key), "the camera's own, simulated or real: its model has it")
+                self.ledger.ignored(sim.children.get(key), "from the camera's model")
         self.ledger.ignored(sim.children.get("visualize"), "cameras are not drawn")
         self.ledger.ignored(sim.children.get("urdf_path"), "cameras are not drawn")
 
@@ -435,7 +435,7 @@ class CameraImport:
         along_up = not any(direction[:2])
         if not along_up:
             place["up"] = [0, 0, 1]
-        ledger.kept(target, f"{key}.target", f"up is {'x: z lies along it' if along_up else 'z, as in Ark'}")
+        ledger.kept(target, f"{key}.target", f"up is {'x: z is along it' if along_up else 'z, as in Ark'}")
         self.entry["attached"] = place
 
     def _bracket(self, attach: ArkNode, pose: Pose, key: str) -> dict[str, Any]:
@@ -458,8 +458,8 @@ class CameraImport:
             return found | ({"rotation": rotation} if any(rotation[:3]) else {})
         matrix = rpy_to_matrix(*rotation) if euler else quaternion_to_matrix(rotation)
         bracket = pose @ Pose(translation, matrix_to_quaternion(matrix))
-        ledger.changed(offset, f"{key}.translation", "added to where Ark's link is in that frame")
-        ledger.changed(turn, f"{key}.rotation", "; ".join(filter(None, ["added to how Ark's link is turned", note])))
+        ledger.changed(offset, f"{key}.translation", "added to the position of Ark's link in that frame")
+        ledger.changed(turn, f"{key}.rotation", "; ".join(filter(None, ["added to the rotation of Ark's link", note])))
         return {
             "translation": Commented(tidy(bracket.position.tolist()), f"Ark: {translation} from its link"),
             "rotation": Commented(tidy(bracket.orientation.tolist()), f"x, y, z, w; Ark: {rotation}"),

@@ -250,7 +250,7 @@ class EpisodeContent:
         return first.shape[1], first.shape[0]
 
     def about(self) -> dict[str, Any]:
-        """What a form says of the episode beside its rows, in few words."""
+        """Return the short metadata that a format stores beside an episode's rows."""
         episode = self.episode
         return {
             "episode": episode.number,

@@ -82,7 +82,7 @@ def test_a_real_arms_address_is_kept_and_nothing_becomes_real_or_faster_by_it(tm
     assert data["robots"]["arm"] == real_arm
     assert row(result, "robots.0.config.real_config.relative_dynamics_factor") == (
         "changed",
-        "robots.arm.speed stays 0.3 of the joint speeds: more is for you to write",
+        "robots.arm.speed stays 0.3 of the joint speeds; increase it by hand",
     )
     assert row(result, "robots.0.config.real_config.gripper_speed")[0] == "changed"
     spec = load(tmp_path / "rig.yaml", sim=False).resolve().robots[0]
