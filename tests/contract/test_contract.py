@@ -26,6 +26,8 @@ NOTICED = {
     "TestNewStamps": "test_a_frozen_device_repeats_its_stamps",
     "TestSlowRead": "test_read_and_write_do_not_block",
     "TestLimp": "test_halt_holds_and_may_be_repeated",
+    "TestSinks": "test_without_a_host_the_arm_holds",
+    "TestJumpsWhenEngaged": "test_engage_moves_nothing_and_halt_keeps_it",
     "TestFaultWithoutRemedy": "test_a_fault_has_cause_code_and_remedy_until_recover",
     "TestOpensAtStop": "test_stop_holds_the_width",
     "TestFullSpeed": "test_moves_reach_their_width_at_their_speed[0.25]",

@@ -157,6 +157,28 @@ class TestLimp(WrongRobot):
             self._follows = self._commanded = self._follows._replace(q=q)
 
 
+class TestSinks(WrongRobot):
+    """An arm that sinks when its host is gone."""
+
+    class driver(MockRobot):  # noqa: N801
+        def read(self, now):
+            if now - self._now > 0.5:
+                q = [position - 0.1 for position in self._follows.q]
+                self._follows = self._commanded = self._follows._replace(q=q)
+            return super().read(now)
+
+
+class TestJumpsWhenEngaged(WrongRobot):
+    """An arm that goes to zero when its drives are switched on."""
+
+    class driver(MockRobot):  # noqa: N801
+        engaged = False
+
+        def engage(self):
+            self.engaged = True
+            self._follows = self._commanded = self._follows._replace(q=(0.0,) * len(self.spec.joints))
+
+
 class TestFaultWithoutRemedy(WrongRobot):
     class driver(MockRobot):  # noqa: N801
         def read(self, now):
