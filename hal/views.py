@@ -228,7 +228,7 @@ class RecordingView:
     phase: str
     """One of :data:`PHASES`."""
     prompt: str
-    """What the user should do now, one line."""
+    """Instruction to the user, one line."""
     task: str
     episode: int
     """Number in the dataset of the present episode, or of the next one."""

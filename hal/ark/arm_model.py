@@ -98,7 +98,7 @@ class ArmModel:
     """The robot's name in Ark's file."""
     entries: Mapping[str, Any]
     to_fill_in: tuple[str, ...]
-    """What the user must check, as text."""
+    """Values that the user must check, as text."""
 
 
 def arm_model(

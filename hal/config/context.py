@@ -34,7 +34,7 @@ DrivenModel = RobotModel | GripperModel | CameraModel
 
 @dataclass
 class Context:
-    """What resolving a rig needs besides the file's content, and what it finds out on the way."""
+    """The state of resolving a rig: the caller's arguments, the problems so far, and what is shared between devices."""
 
     source: str
     """The rig's file, or ``<dict>``."""

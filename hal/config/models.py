@@ -230,7 +230,7 @@ class StreamModel(Strict):
 
 
 class DepthSensor(Strict):
-    """How depth is measured; needed to simulate its noise."""
+    """Principle and figures of the depth measurement, to simulate its noise."""
 
     kind: Literal["stereo", "lidar"]
     """``stereo``: from ``infrared`` and ``infrared_right``, in the view of ``infrared``."""

@@ -28,7 +28,7 @@ CANDIDATES = 4
 
 
 class IkModel(Protocol):
-    """What the search needs of an arm with n joints; a :class:`~hal.kinematics.arm.Kinematics` has it."""
+    """An arm with n joints, as the search needs it; see :class:`~hal.kinematics.arm.Kinematics`."""
 
     lower: Array
     """(n,) rad."""

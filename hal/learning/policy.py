@@ -121,7 +121,7 @@ class PolicyOutcome:
     inference: dict[str, float | None]
     """p50, p99 and max of the policy's time per call, s."""
     error: BaseException | None = None
-    """What the policy raised."""
+    """Error of the policy."""
 
 
 class PolicyRunner:

@@ -41,7 +41,6 @@ __all__ = [
     "write_json",
 ]
 
-
 VERSION = "v3.0"
 """Version of LeRobot's format."""
 STATE = "observation.state"

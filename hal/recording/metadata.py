@@ -24,24 +24,17 @@ if TYPE_CHECKING:
 
 __all__ = ["SLOW_PACE", "ClockPace", "simulated_pace", "rig_metadata", "start_metadata", "caller_metadata"]
 
-
 _ENOUGH = 2.0
 """Length of an episode before its pace is reported, s."""
-
-
 _CHANGED = 0.02
 """Smallest change of the pace that is reported again."""
-
-
 _ROBOT = f"{TIMES}robot."
-
-
 SLOW_PACE = 0.97
 """Share of real time below which speeds in a recording are noticeably too low."""
 
 
 class ClockPace:
-    """How fast each arm's own clock passes, relative to the rig's, over the rows of one episode.
+    """Measures the pace of each arm's own clock, relative to the rig's, over the rows of one episode.
 
     A simulation that cannot keep up with real time is slower than 1.
 

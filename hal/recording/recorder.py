@@ -75,8 +75,8 @@ class RecorderStatus(NamedTuple):
     free_bytes: int
     """Free space on the disk, bytes."""
     trouble: str
-    """What needs the operator's attention; empty if nothing does. An episode that cannot continue records no more
-    rows, and can be saved or discarded with those that it has."""
+    """Problem that needs the operator's attention; empty if there is none. An episode that cannot continue records no
+    more rows, and can be saved or discarded with those that it has."""
 
 
 class Recorder:
@@ -132,7 +132,7 @@ class Recorder:
         self._sampler, self._buffers, self.notes = select_devices(
             rig, cameras, [stream for stream in streams if depth or stream != "depth"]
         )
-        """What the operator should know: streams that are not recorded, episodes that were recovered."""
+        """Messages for the operator: streams that are not recorded, episodes that were recovered."""
         self._warn_free = warn_free
         setups = [buffer.setup for buffer in self._buffers]
         width, slots = self._sampler.width, max(4, round(_QUEUE * fps))

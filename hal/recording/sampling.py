@@ -30,7 +30,6 @@ if TYPE_CHECKING:
     from ..rig import Rig
     from ..robot import Robot
 
-
 __all__ = [
     "CameraBuffer",
     "SampleClock",
@@ -42,16 +41,14 @@ __all__ = [
     "movable_objects",
 ]
 
-
 LAG = 0.1
 """Delay after its due time at which a row is made in real time, s: by then the picture of that time has arrived."""
 _LATE = 1.0
 """A due time noticed later than this many periods counts as late. No data is missing in such a row: states have a
 history."""
 
-
 Read: TypeAlias = "Callable[[], RowSnapshot | Exception]"
-"""Reads what has no history. An error is returned, and raised when the row is made."""
+"""Reads the values without a history. An error is returned, and raised when the row is made."""
 Make: TypeAlias = "Callable[[float, RowSnapshot | Exception], bool]"
 """Makes the row that was due at a time; returns False if no further row is wanted."""
 
@@ -291,7 +288,7 @@ _Put = Callable[[str, Iterable[float]], None]
 
 
 class RowSnapshot(NamedTuple):
-    """What has no history and must be read at the due time itself: pads and the poses of objects."""
+    """Values without a history, read at the due time itself: pads and the poses of objects."""
 
     pads: dict[str, PadState]
     objects: Mapping[str, Pose]

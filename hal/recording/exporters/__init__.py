@@ -44,7 +44,7 @@ KINDS = {
 
 
 class ExportResult(NamedTuple):
-    """What was written."""
+    """The result of an export."""
 
     path: Path
     episodes: int

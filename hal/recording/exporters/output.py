@@ -36,7 +36,7 @@ class ExportProgress(NamedTuple):
 
 @dataclass
 class ExportJob:
-    """What a format's module is to write."""
+    """The task of a format's module: episodes, options and progress of one export."""
 
     source: Path
     contents: tuple[EpisodeContent, ...]
