@@ -23,6 +23,7 @@ from aiohttp import web
 from hal.errors import ConnectionLost, DriverMissing, NotSupported
 from hal.host.process import Channel, SharedMemory
 from hal.host.ring import frame_rings
+from hal.servo.watchdog import PAD_SILENCE
 from hal.specs import CameraSpec, from_json
 from hal.types import BUTTONS, STICK_AXES
 from hal.views import ACTIONS
@@ -260,8 +261,18 @@ def read_page_files(folder: Path = _PAGE) -> dict[str, PageFile]:
 
 
 def keys_module(table: Mapping[str, Any]) -> PageFile:
-    """Return ``keys.js``, a module of the page: its keys (a ``hal.pads.keyboard.KeyboardTable``), axes and buttons."""
-    constants = {"KEYS": table, "AXES": STICK_AXES, "BUTTONS": BUTTONS, "ACTIONS": ACTIONS}
+    """Return ``keys.js``, the module of the page with constants of this project: keys, axes, buttons, a time limit.
+
+    Args:
+        table: The keys, a ``hal.pads.keyboard.KeyboardTable``.
+    """
+    constants = {
+        "KEYS": table,
+        "AXES": STICK_AXES,
+        "BUTTONS": BUTTONS,
+        "ACTIONS": ACTIONS,
+        "PAD_SILENCE": PAD_SILENCE,
+    }
     text = "".join(f"export const {name} = {json.dumps(value)};\n" for name, value in constants.items())
     return text.encode(), _TYPES[".js"]
 

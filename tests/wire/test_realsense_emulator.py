@@ -233,15 +233,15 @@ def test_a_restart_counts_from_one(bench: Bench) -> None:
 def test_a_stalled_camera_is_listed_and_silent(bench: Bench) -> None:
     client = bench.client()
     before = client.whole()["depth"].number
-    bench.camera.stall(True)
+    bench.camera.inject(freeze=True)
     assert client.silent(0.4)
     assert listed(bench.context) == [bench.camera.serial]
-    bench.camera.stall(False)
+    bench.camera.inject(freeze=False)
     assert client.whole()["depth"].number > before + 3, "it continued to take frames"
 
 
 def test_lost_frames_leave_gaps_in_the_numbers(bench: Bench) -> None:
-    bench.camera.drop(every=3)
+    bench.camera.inject(drop=3)
     client = bench.client()
     numbers = [client.whole()["depth"].number for _ in range(12)]
     assert not any(number % 3 == 0 for number in numbers)
@@ -249,7 +249,7 @@ def test_lost_frames_leave_gaps_in_the_numbers(bench: Bench) -> None:
 
 def test_one_stream_alone_may_lose_frames(bench: Bench) -> None:
     """How the library combines the rest (sets of two moments, or half as many) varies from run to run."""
-    bench.camera.drop(every=2, stream="color")
+    bench.camera.inject(drop=2, drop_stream="color")
     for stream, has_even in (("color", False), ("depth", True)):
         client = bench.client(stream)
         numbers = [client.set()[stream].number for _ in range(20)]
@@ -339,7 +339,7 @@ def test_stamps_are_on_the_reported_clock(clock: str, make_bench) -> None:
 
 
 def test_skew_stamps_color_later_than_depth(bench: Bench) -> None:
-    bench.camera.skew(0.004)
+    bench.camera.inject(skew=0.004)
     client = bench.client()
     found = client.whole()
     assert found["color"].stamp - found["depth"].stamp == pytest.approx(0.004, abs=1e-6)

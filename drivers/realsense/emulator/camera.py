@@ -78,18 +78,6 @@ class SoftwareCamera:
         """Plug it in again: the library lists and announces it, with the same serial number. Idempotent."""
         self.inject(disconnect=False)
 
-    def stall(self, on: bool = True) -> None:
-        """Stop sending while staying listed, until called with False; frame numbers continue."""
-        self.inject(freeze=on)
-
-    def drop(self, every: int, stream: str | None = None) -> None:
-        """Lose every n-th frame (0 for none), of all streams or of one. Raises CommandError."""
-        self.inject(drop=every, drop_stream=stream)
-
-    def skew(self, seconds: float) -> None:
-        """Stamp colour that much later than it was taken, s."""
-        self.inject(skew=seconds)
-
     def inject(self, **faults: object) -> None:
         """Set fields of :class:`~.settings.CameraFaults`; the others keep their values. Raises CommandError."""
         updated = self._feeder.faults.updated(faults)

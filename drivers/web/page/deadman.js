@@ -1,8 +1,10 @@
 // The page's side of the dead-man: its sign of life 50 times a second, and the cases in which it releases everything.
 
+import { PAD_SILENCE } from "./keys.js";
+
 const PERIOD = 20; // ms
 const SOONEST = 8; // ms between two messages while a stick is being moved
-const STALL = 120; // ms; the servo gives up after 150
+const STALL = 1000 * PAD_SILENCE; // ms; a page that hangs for longer loses its pad
 
 /**
  * Sends the whole pad regularly, and at once when it changes.

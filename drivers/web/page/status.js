@@ -1,8 +1,8 @@
 // What matters at once: the state of the arm and of the dead-man, stops and faults, the confirmation of STOP, the log.
 
 import { byId, make, setData, setText, show } from "./dom.js";
+import { PAD_SILENCE } from "./keys.js";
 
-const SILENT = 0.12; // s, as in the servo
 const OLD = 500; // ms without a state until the page says so
 const STOPPING = 1000; // ms within which a state shows the stop after the message that STOP was pressed
 const MOVING = 0.005; // rad/s; slower joints are at rest
@@ -22,7 +22,7 @@ const PAGE_TRIPS = {
 function deadmanWord(deadman) {
   if (!deadman) return "none";
   if (!deadman.connected) return "no pad";
-  if (deadman.age > SILENT) return "silent";
+  if (deadman.age > PAD_SILENCE) return "silent";
   return deadman.held ? "held" : "released";
 }
 

@@ -20,12 +20,13 @@ from hal.driver import GripperReading, Reading
 from hal.drivers.web.console import recording_message
 from hal.drivers.web.pictures import PictureCredit, compress, smoothed
 from hal.drivers.web.process import LogLimit
-from hal.drivers.web.server import read_page_files
+from hal.drivers.web.server import keys_module, read_page_files
 from hal.drivers.web.telemetry import Telemetry
 from hal.errors import CommandError, DriverMissing
 from hal.host.records import GroupMemory, ServoRecord
 from hal.pads.keyboard import keyboard_table
-from hal.types import Limited, RobotStatus, Trip
+from hal.servo.watchdog import PAD_SILENCE
+from hal.types import BUTTONS, STICK_AXES, Limited, RobotStatus, Trip
 from hal.views import ACTIONS, PHASES, RecordingView
 
 
@@ -39,6 +40,20 @@ def test_the_page_names_the_keys_of_the_table() -> None:
     assert {control: sorted(keys.split()) for control, keys in found.items()} == {
         control: sorted(keys) for control, keys in wanted.items()
     }
+
+
+def test_the_page_gets_the_constants_of_the_project() -> None:
+    lines = keys_module(keyboard_table("browser")._asdict())[0].decode().splitlines()
+    found = {
+        match[1]: json.loads(match[2]) for line in lines if (match := re.fullmatch(r"export const (\w+) = (.*);", line))
+    }
+    assert (found["AXES"], found["BUTTONS"], found["PAD_SILENCE"]) == ([*STICK_AXES], [*BUTTONS], PAD_SILENCE)
+    used = {
+        name
+        for text in read_page_files().values()
+        for name in re.findall(rb"import \{([^}]*)\} from \"./keys.js\"", text[0])
+    }
+    assert {name.strip() for names in used for name in names.decode().split(",")} <= set(found)
 
 
 def test_only_files_of_a_page_are_read(tmp_path: Path) -> None:
