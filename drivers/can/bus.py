@@ -136,12 +136,8 @@ class CanBus:
     # Opening.
 
     def _connect(self) -> None:
-        s = self.settings
-        more: dict[str, Any] = {"fd": True} if s.fd else {}
-        if s.interface == "udp_multicast":
-            more = {"fd": s.fd, "hop_limit": 0}  # frames never leave this computer
         try:
-            self._bus = can.Bus(interface=s.interface, channel=s.channel, ignore_config=True, **{**more, **s.bus})
+            self._bus = can.Bus(**self.settings.arguments())
         except Exception as error:  # interfaces raise errors of many kinds
             raise self._explain(error) from error
         self.fault = None

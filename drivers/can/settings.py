@@ -9,6 +9,7 @@ import itertools
 from collections.abc import Iterator, Mapping
 from functools import cached_property
 from typing import Annotated, Any, Literal, TypeVar
+from zlib import crc32
 
 from pydantic import BaseModel, BeforeValidator, Field, model_validator
 
@@ -36,6 +37,10 @@ __all__ = [
 
 EMULATED_INTERFACES = frozenset({"virtual", "udp_multicast"})
 """Interfaces of python-can behind which there is no hardware."""
+_USUAL_GROUP, _USUAL_PORT = "239.74.163.2", 43113
+"""Channel and port of python-can's own default for ``udp_multicast``."""
+_FIRST_PORT, _PORTS = 20_000, 12_000
+"""Range of the ports of other channels, below those that Linux gives to outgoing connections."""
 _LARGEST_ID = 0x7FE
 _LARGEST_MOTOR_ID = 0xFF
 """Ids of commands in other modes begin above it."""
@@ -140,6 +145,18 @@ class BusSettings(Strict):
     def key(self) -> tuple[str, str]:
         """Interface and channel, by which a bus is identified on this computer."""
         return self.interface, self.channel
+
+    def arguments(self) -> dict[str, Any]:
+        """Return the arguments with which ``can.Bus`` opens this bus.
+
+        Frames over ``udp_multicast`` never leave this computer. Each of its channels gets a port of its own: a socket
+        on a common port receives the frames of every group that a program on this computer has joined.
+        """
+        more: dict[str, Any] = {"fd": True} if self.fd else {}
+        if self.interface == "udp_multicast":
+            port = _USUAL_PORT if self.channel == _USUAL_GROUP else _FIRST_PORT + crc32(self.channel.encode()) % _PORTS
+            more = {"fd": self.fd, "hop_limit": 0, "port": port}
+        return {"interface": self.interface, "channel": self.channel, "ignore_config": True, **more, **self.bus}
 
     @property
     def shared(self) -> BusSettings:

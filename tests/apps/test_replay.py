@@ -8,43 +8,22 @@ import signal
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any
 
 import pytest
-
-import hal
+from recording_kit import record_tour
 
 for library in ("pyarrow", "av", "zstandard"):
     pytest.importorskip(library, reason="pip install 'robot-hal[record]'")
 
 ROOT = Path(__file__).resolve().parents[2]
 APP = ROOT / "apps" / "replay.py"
-TOUR = ROOT / "config" / "teleop" / "tour.jsonl"
 BARE = ("--sim", "--set", "cameras={}")
 
 
 @pytest.fixture(scope="module")
 def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The first three seconds of the recorded tour, driven in simulation."""
-    return drive(tmp_path_factory.mktemp("replay") / "beginning", 3.0)
-
-
-def drive(out: Path, seconds: float) -> Path:
-    from hal.recording import Recorder
-
-    options: dict[str, Any] = {"sim": True, "clock": "lock_step", "pad": str(TOUR), "overrides": ["cameras={}"]}
-    with hal.open("panda_table", **options) as rig, Recorder(rig, out, fps=30, task="a tour") as recorder:
-        arm, pad = rig.robots["panda"], rig.gamepads["pad"]
-        teleop = hal.Teleop(arm)
-        recorder.start(seed=1)
-        with arm.control(deadman=pad.hold("l2"), rate_hz=50) as control:
-            for tick in rig.clock.rate(50):
-                motion, grip = teleop.step(pad.state(), tick.dt)
-                control.send(motion, grip=grip)
-                if pad.finished or tick.elapsed > seconds:
-                    break
-        recorder.save(success=True, wait=True)
-    return out
+    return record_tour(tmp_path_factory.mktemp("replay") / "beginning", 3.0)
 
 
 @pytest.mark.slow

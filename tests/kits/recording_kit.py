@@ -15,6 +15,7 @@ import pytest
 from numpy.typing import NDArray
 
 import hal
+from hal.config.data_files import find_data
 from hal.geometry import Pose
 from hal.rig import Rig
 
@@ -41,6 +42,7 @@ __all__ = [
     "mock_rig",
     "pictures",
     "record",
+    "record_tour",
     "small",
 ]
 
@@ -77,6 +79,26 @@ def record(recorder: Recorder, seconds: float, success: bool | None = True) -> N
     recorder.start(seed=1)
     drive(recorder.rig, seconds)
     recorder.save(success, wait=True)
+
+
+def record_tour(out: Path, seconds: float = 60.0) -> Path:
+    """Record the built-in tour of a pad, at most so long of it, driven in simulation."""
+    tour = str(find_data("config", "teleop/tour.jsonl"))
+    with (
+        hal.open("panda_table", sim=True, clock="lock_step", pad=tour, overrides=["cameras={}"]) as rig,
+        Recorder(rig, out, fps=30, task="a tour") as recorder,
+    ):
+        arm, pad = rig.robots["panda"], rig.gamepads["pad"]
+        teleop = hal.Teleop(arm)
+        recorder.start(seed=1)
+        with arm.control(deadman=pad.hold("l2"), rate_hz=50) as control:
+            for tick in rig.clock.rate(50):
+                motion, grip = teleop.step(pad.state(), tick.dt)
+                control.send(motion, grip=grip)
+                if pad.finished or tick.elapsed > seconds:
+                    break
+        recorder.save(success=True, wait=True)
+    return out
 
 
 def kill_writer(recorder: Recorder) -> None:

@@ -134,11 +134,7 @@ class EmulatedBus:
 
     def open(self) -> None:
         """Open the bus, for a program that calls :meth:`advance` itself instead of :meth:`start`."""
-        s = self.settings
-        more: dict[str, Any] = {"fd": s.fd} if s.interface == "udp_multicast" or s.fd else {}
-        if s.interface == "udp_multicast":
-            more["hop_limit"] = 0  # frames never leave this computer
-        self._bus = can.Bus(interface=s.interface, channel=s.channel, ignore_config=True, **{**more, **s.bus})
+        self._bus = can.Bus(**self.settings.arguments())
 
     def advance(self, seconds: float) -> None:
         """Answer what has come, and let ``seconds`` pass at once."""

@@ -6,11 +6,11 @@ import json
 import re
 import shutil
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 from app_kit import run_here
+from recording_kit import record_tour
 
 import hal
 from hal.apps.replay import main
@@ -19,32 +19,13 @@ for library in ("pyarrow", "av", "zstandard"):
     pytest.importorskip(library, reason="pip install 'robot-hal[record]'")
 
 ROOT = Path(__file__).resolve().parents[3]
-TOUR = ROOT / "config" / "teleop" / "tour.jsonl"
 FAST = ("--sim", "--set", "cameras={}", "--set", "simulation.clock=lock_step")
 
 
 @pytest.fixture(scope="module")
 def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The recorded tour, driven in simulation."""
-    return drive(tmp_path_factory.mktemp("replay") / "demo")
-
-
-def drive(out: Path, seconds: float = 60.0) -> Path:
-    from hal.recording import Recorder
-
-    options: dict[str, Any] = {"sim": True, "clock": "lock_step", "pad": str(TOUR), "overrides": ["cameras={}"]}
-    with hal.open("panda_table", **options) as rig, Recorder(rig, out, fps=30, task="a tour") as recorder:
-        arm, pad = rig.robots["panda"], rig.gamepads["pad"]
-        teleop = hal.Teleop(arm)
-        recorder.start(seed=1)
-        with arm.control(deadman=pad.hold("l2"), rate_hz=50) as control:
-            for tick in rig.clock.rate(50):
-                motion, grip = teleop.step(pad.state(), tick.dt)
-                control.send(motion, grip=grip)
-                if pad.finished or tick.elapsed > seconds:
-                    break
-        recorder.save(success=True, wait=True)
-    return out
+    return record_tour(tmp_path_factory.mktemp("replay") / "demo")
 
 
 @pytest.mark.parametrize("speed", [1.0, 0.5])

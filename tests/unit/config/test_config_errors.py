@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import random
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -28,14 +28,14 @@ CAMERA = {"model": "realsense_d435", "look_at": LOOK}
 
 
 def problems(config: Any, **arguments: Any) -> list[Problem]:
-    """What is wrong; fails where nothing is."""
+    """The problems of a rig, which has some."""
     with pytest.raises(ConfigError) as caught:
         load(config, **arguments)
     return list(caught.value.problems)
 
 
 def only(config: Any, **arguments: Any) -> Problem:
-    """The one thing that is wrong."""
+    """The only problem of a rig."""
     found = problems(config, **arguments)
     assert len(found) == 1, "\n".join(map(str, found))
     return found[0]
@@ -261,54 +261,6 @@ def test_what_a_simulation_may_do_a_real_arm_may_not(keys: dict[str, Any], place
     assert (place, code) in {(problem.key, problem.code) for problem in problems(config)}
 
 
-def test_the_hard_limits_of_a_real_arm_hold_for_its_model_too(own_model: Callable[..., Path]) -> None:
-    rig = own_model(lambda m: m.update(real_limits={}, limits=m["limits"] | {"acceleration": 150}))
-    load(rig, sim=True)
-    found = problems(rig, sim=False, overrides=["robots.arm.drivers.real=mock"])
-    assert ("arm.yaml", "limits.acceleration") in {(Path(problem.file).name, problem.key) for problem in found}
-
-
-def test_every_mistake_in_every_file_is_listed(tmp_path: Path) -> None:
-    (tmp_path / "bad_arm.yaml").write_text("urdf: arm.urdf\njoints: [j1]\ntcp: {lnk: hand}\nhome: [0]\n")
-    (tmp_path / "bad_brick.yaml").write_text("name: brick\nshape: box\n")
-    (tmp_path / "rig.yaml").write_text(
-        """
-sim: maybe
-robots:
-  good: {model: panda, initial: [1]}
-  bad: {model: panda, sped: 1}
-  ugly: {model: bad_arm.yaml}
-cameras:
-  eye: {model: realsense_d435, attached: {robot: bad, link: anything}}
-  ear: {model: realsense_d435, attached: {robot: god, link: panda_hand}}
-  nose: {model: realsense_d435, attached: {robot: good, link: panda_hadn}}
-objects: [bad_brick.yaml, missing.yaml, cub]
-"""
-    )
-    found = problems(tmp_path / "rig.yaml", overrides=["cameras.wrsit.output.width=3", "robots.good.colour=red"])
-    rig, arm, brick = (str(tmp_path / name) for name in ("rig.yaml", "bad_arm.yaml", "bad_brick.yaml"))
-    assert {(problem.file, problem.key) for problem in found} == {
-        (rig, "sim"),
-        (rig, "robots.bad.sped"),
-        ("--set", "robots.good.colour"),
-        ("--set", "cameras.wrsit.output.width"),
-        (rig, "robots.good.initial"),
-        (arm, "tcp.lnk"),
-        (arm, "urdf"),
-        (arm, "limits.acceleration"),
-        (arm, "limits.jerk"),
-        (brick, ""),
-        (rig, "objects.1"),
-        (rig, "objects.2"),
-        (rig, "cameras.eye.attached.link"),
-        (rig, "cameras.ear.attached.robot"),
-        (rig, "cameras.nose.attached.link"),
-    }
-    text = str(ConfigError(found))
-    assert text.startswith("15 problems")
-    assert f"{rig}: robots.bad.sped: " in text
-
-
 # Files.
 
 
@@ -417,104 +369,8 @@ def test_a_real_arm_without_a_driver_for_it() -> None:
 # Models and URDFs.
 
 
-@pytest.fixture
-def own_model(tmp_path: Path) -> Callable[..., Path]:
-    """Writes a rig with a changed copy of the Panda's model, and a changed copy of its URDF."""
-    original = yaml.safe_load(find_data("robots", "panda.yaml").read_text())
-    text = Path(load("panda_table").resolve().robots[0].urdf).read_text()
-
-    def write(change: Callable[[dict[str, Any]], object] = lambda model: None, urdf: str | None = None) -> Path:
-        model = copy.deepcopy(original) | {"urdf": "arm.urdf"}
-        change(model)
-        (tmp_path / "arm.urdf").write_text(text if urdf is None else urdf)
-        (tmp_path / "arm.yaml").write_text(yaml.safe_dump(model))
-        (tmp_path / "rig.yaml").write_text("robots: {arm: {model: arm.yaml}}")
-        return tmp_path / "rig.yaml"
-
-    return write
-
-
-def test_the_copied_model_is_in_order(own_model: Callable[..., Path]) -> None:
-    load(own_model())
-
-
-@pytest.mark.parametrize(
-    ("change", "key", "code"),
-    [
-        (lambda m: m["joints"].__setitem__(2, "panda_jiont3"), "joints.2", "unknown_joint"),
-        (lambda m: m["joints"].__setitem__(6, "panda_joint8"), "joints.6", "wrong_joint"),
-        (lambda m: m["joints"].__setitem__(6, "panda_joint1"), "joints.6", "duplicate_name"),
-        (lambda m: m["joints"].__setitem__(6, "panda_finger_joint1"), "joints.6", "wrong_joint"),
-        (lambda m: m["gripper"]["joints"].__setitem__(0, "finger"), "gripper.joints.0", "unknown_joint"),
-        (lambda m: m["tcp"].update(link="panda_hnad"), "tcp.link", "unknown_link"),
-        (lambda m: m.update(base_link="base"), "base_link", "unknown_link"),
-        (lambda m: m["limits"].pop("acceleration"), "limits.acceleration", "missing_key"),
-        (lambda m: m["limits"].pop("jerk"), "limits.jerk", "missing_key"),
-        (lambda m: m["limits"].update(jerk=0), "limits.jerk", "out_of_range"),
-        (lambda m: m["limits"]["upper"].pop(), "limits.upper", "wrong_count"),
-        (lambda m: m["limits"]["lower"].__setitem__(0, 3.0), "limits", "empty_range"),
-        (lambda m: m["home"].pop(), "home", "wrong_count"),
-        (lambda m: m["home"].__setitem__(3, 0.5), "home", "out_of_range"),
-        (lambda m: m.update(urdf={"package": "no_such_robots", "path": "a.urdf"}), "urdf.package", "missing_package"),
-        (lambda m: m.update(urdf="amr.urdf"), "urdf", "missing_file"),
-        (lambda m: m.update(urdf={"package": "yaml", "path": "a.urdf"}), "urdf", "missing_file"),
-        (lambda m: m.pop("tcp"), "tcp", "missing_key"),
-        (lambda m: m.update(joints=[]), "joints", "wrong_count"),
-        (lambda m: m["gripper"].update(width=0.08), "gripper.width", "unknown_key"),
-        (lambda m: m.update(driver="franka"), "driver", "unknown_key"),
-    ],
-)
-def test_mistakes_in_a_robot_model(
-    own_model: Callable[..., Path], change: Callable[[dict[str, Any]], object], key: str, code: str
-) -> None:
-    rig = own_model(change)
-    problem = only(rig)
-    assert (problem.file, problem.key, problem.code) == (str(rig.parent / "arm.yaml"), key, code)
-
-
-def test_one_of_the_arms_own_joints_is_no_finger(own_model: Callable[..., Path]) -> None:
-    problem = only(own_model(lambda model: model["gripper"]["joints"].__setitem__(0, "panda_joint7")))
-    assert (problem.key, problem.code) == ("gripper.joints", "wrong_joint")
-
-
-def test_a_finger_that_turns_is_refused(own_model: Callable[..., Path], tmp_path: Path) -> None:
-    own_model()
-    urdf = ElementTree.parse(tmp_path / "arm.urdf")
-    (finger,) = (joint for joint in urdf.iter("joint") if joint.get("name") == "panda_finger_joint2")
-    finger.set("type", "revolute")
-    problem = only(own_model(urdf=ElementTree.tostring(urdf.getroot(), "unicode")))
-    place = (str(tmp_path / "arm.yaml"), "gripper.joints.1", "wrong_joint")
-    assert (problem.file, problem.key, problem.code) == place
-
-
-def test_a_model_and_a_urdf_without_speed_limits(own_model: Callable[..., Path], tmp_path: Path) -> None:
-    rig = own_model(lambda model: model["limits"].pop("velocity"))
-    load(rig)  # the URDF has them
-    text = (tmp_path / "arm.urdf").read_text().replace('velocity="2.1750"', 'velocity="0"')
-    problem = only(own_model(lambda model: model["limits"].pop("velocity"), text))
-    assert (problem.key, problem.code) == ("limits.velocity", "missing_key")
-
-
-def test_an_object_whose_urdf_is_broken(tmp_path: Path) -> None:
-    (tmp_path / "cup.urdf").write_text("<robot>")
-    (tmp_path / "rig.yaml").write_text("objects: [{name: cup, urdf: cup.urdf}, {name: mug, urdf: mug.urdf}]")
-    found = problems(tmp_path / "rig.yaml")
-    assert [(Path(problem.file).name, problem.key) for problem in found] == [
-        ("cup.urdf", ""),
-        ("rig.yaml", "objects.1.urdf"),
-    ]
-
-
-def test_a_driver_whose_package_does_not_import() -> None:
-    problem = only(robot(drivers={"sim": "no_such_lab.arm:DRIVER"}))
-    assert (problem.key, problem.code) == ("robots.arm", "unknown_driver")
-
-
-# Many mistakes at once: each is reported as it is alone, and nothing else is.
-
-
 class Bench:
-    """A rig in order, in files that mistakes can be made in."""
+    """A valid rig with its models, in files to be broken."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -534,20 +390,115 @@ class Bench:
         self.objects: list[Any] = self.rig["objects"]
         self.objects += ["cup.yaml", {"file": "cube", "name": "brick"}]
 
-    def found(self) -> set[tuple[str, str]]:
-        """File and key of each problem; every one is reported once."""
+    def attach(self, camera: str, **where: str) -> None:
+        """Add a camera on an arm."""
+        place = {"robot": "panda", "link": "panda_hand", **where}
+        self.rig["cameras"][camera] = {"model": "realsense_d435", "attached": place}
+
+    def load(self, **options: Any) -> Sequence[Problem]:
+        """Write the files and load the rig; the problems found."""
         for name in ("rig", "arm", "camera", "cup"):
             (self.folder / f"{name}.yaml").write_text(yaml.safe_dump(getattr(self, name)))
         (self.folder / "arm.urdf").write_text(self.urdf)
         (self.folder / "cup.urdf").write_text("<robot name='cup'><link name='cup'/></robot>")
         try:
-            load(self.folder / "rig.yaml", overrides=self.overrides)
-            found: tuple[Problem, ...] = ()
+            load(self.folder / "rig.yaml", overrides=self.overrides, **options)
         except ConfigError as error:
-            found = error.problems
+            return error.problems
+        return ()
+
+    def only(self) -> tuple[str, str, str]:
+        """File, key and code of the only problem."""
+        (problem,) = self.load()
+        return Path(problem.file).name, problem.key, problem.code
+
+    def found(self) -> set[tuple[str, str]]:
+        """File and key of each problem; every one is reported once."""
+        found = self.load()
         places = [(Path(problem.file).name, problem.key) for problem in found]
         assert len(places) == len(set(places)), "\n".join(map(str, found))
         return set(places)
+
+
+@pytest.fixture
+def bench(tmp_path: Path) -> Bench:
+    return Bench(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("change", "key", "code"),
+    [
+        (lambda m: m["joints"].__setitem__(2, "panda_jiont3"), "joints.2", "unknown_joint"),
+        (lambda m: m["joints"].__setitem__(6, "panda_joint8"), "joints.6", "wrong_joint"),
+        (lambda m: m["joints"].__setitem__(6, "panda_joint1"), "joints.6", "duplicate_name"),
+        (lambda m: m["joints"].__setitem__(6, "panda_finger_joint1"), "joints.6", "wrong_joint"),
+        (lambda m: m["gripper"]["joints"].__setitem__(0, "finger"), "gripper.joints.0", "unknown_joint"),
+        (lambda m: m["gripper"]["joints"].__setitem__(0, "panda_joint7"), "gripper.joints", "wrong_joint"),
+        (lambda m: m["tcp"].update(link="panda_hnad"), "tcp.link", "unknown_link"),
+        (lambda m: m.update(base_link="base"), "base_link", "unknown_link"),
+        (lambda m: m["limits"].pop("acceleration"), "limits.acceleration", "missing_key"),
+        (lambda m: m["limits"].pop("jerk"), "limits.jerk", "missing_key"),
+        (lambda m: m["limits"].update(jerk=0), "limits.jerk", "out_of_range"),
+        (lambda m: m["limits"]["upper"].pop(), "limits.upper", "wrong_count"),
+        (lambda m: m["limits"]["lower"].__setitem__(0, 3.0), "limits", "empty_range"),
+        (lambda m: m["home"].pop(), "home", "wrong_count"),
+        (lambda m: m["home"].__setitem__(3, 0.5), "home", "out_of_range"),
+        (lambda m: m.update(urdf={"package": "no_such_robots", "path": "a.urdf"}), "urdf.package", "missing_package"),
+        (lambda m: m.update(urdf="amr.urdf"), "urdf", "missing_file"),
+        (lambda m: m.update(urdf={"package": "yaml", "path": "a.urdf"}), "urdf", "missing_file"),
+        (lambda m: m.pop("tcp"), "tcp", "missing_key"),
+        (lambda m: m.update(joints=[]), "joints", "wrong_count"),
+        (lambda m: m["gripper"].update(width=0.08), "gripper.width", "unknown_key"),
+        (lambda m: m.update(driver="franka"), "driver", "unknown_key"),
+    ],
+)
+def test_mistakes_in_a_robot_model(
+    bench: Bench, change: Callable[[dict[str, Any]], object], key: str, code: str
+) -> None:
+    change(bench.arm)
+    assert bench.only() == ("arm.yaml", key, code)
+
+
+def test_the_hard_limits_of_a_real_arm_hold_for_its_model_too(bench: Bench) -> None:
+    bench.arm["real_limits"] = {}
+    bench.arm["limits"]["acceleration"] = 150
+    assert bench.load() == ()
+    bench.rig["robots"] = {"panda": bench.panda | {"drivers": {"real": "mock"}}}
+    found = bench.load(sim=False)
+    assert ("arm.yaml", "limits.acceleration") in {(Path(problem.file).name, problem.key) for problem in found}
+
+
+def test_a_finger_that_turns_is_refused(bench: Bench) -> None:
+    urdf = ElementTree.fromstring(bench.urdf)
+    (finger,) = (joint for joint in urdf.iter("joint") if joint.get("name") == "panda_finger_joint2")
+    finger.set("type", "revolute")
+    bench.urdf = ElementTree.tostring(urdf, "unicode")
+    assert bench.only() == ("arm.yaml", "gripper.joints.1", "wrong_joint")
+
+
+def test_a_model_and_a_urdf_without_speed_limits(bench: Bench) -> None:
+    del bench.arm["limits"]["velocity"]
+    assert bench.found() == set(), "the URDF has them"
+    bench.urdf = bench.urdf.replace('velocity="2.1750"', 'velocity="0"')
+    assert bench.only() == ("arm.yaml", "limits.velocity", "missing_key")
+
+
+def test_an_object_whose_urdf_is_broken(tmp_path: Path) -> None:
+    (tmp_path / "cup.urdf").write_text("<robot>")
+    (tmp_path / "rig.yaml").write_text("objects: [{name: cup, urdf: cup.urdf}, {name: mug, urdf: mug.urdf}]")
+    found = problems(tmp_path / "rig.yaml")
+    assert [(Path(problem.file).name, problem.key) for problem in found] == [
+        ("cup.urdf", ""),
+        ("rig.yaml", "objects.1.urdf"),
+    ]
+
+
+def test_a_driver_whose_package_does_not_import() -> None:
+    problem = only(robot(drivers={"sim": "no_such_lab.arm:DRIVER"}))
+    assert (problem.key, problem.code) == ("robots.arm", "unknown_driver")
+
+
+# Many mistakes at once: each is reported as it is alone, and nothing else is.
 
 
 def _hide_speed_limit(bench: Bench) -> None:
@@ -589,6 +540,8 @@ MISTAKES: dict[tuple[str, str], Callable[[Bench], object]] = {
     ("rig.yaml", "cameras.wrist.drivers.sim"): lambda b: b.wrist.update(drivers={"sim": 3}),
     ("rig.yaml", "cameras.scene.model"): lambda b: b.rig["cameras"]["scene"].update(model="realsense_d453"),
     ("rig.yaml", "cameras.scene.look_at.yaw"): lambda b: b.rig["cameras"]["scene"]["look_at"].update(yaw=3),
+    ("rig.yaml", "cameras.ear.attached.robot"): lambda b: b.attach("ear", robot="pnada"),
+    ("rig.yaml", "cameras.nose.attached.link"): lambda b: b.attach("nose", link="panda_hadn"),
     ("rig.yaml", "cameras.eye"): lambda b: b.rig["cameras"].update(eye={"model": "realsense_d435"}),
     ("camera.yaml", "mode"): lambda b: b.camera.update(mode=[]),
     ("camera.yaml", "distortion"): lambda b: b.camera.update(distortion=[0, 0]),
@@ -610,37 +563,35 @@ MISTAKES: dict[tuple[str, str], Callable[[Bench], object]] = {
 }
 
 
-def test_the_bench_is_in_order(tmp_path: Path) -> None:
-    bench = Bench(tmp_path)
+def test_the_bench_is_valid(bench: Bench) -> None:
     assert bench.found() == set()
-    assert len(load(tmp_path / "rig.yaml").resolve().robots) == 2
+    assert len(load(bench.folder / "rig.yaml").resolve().robots) == 2
 
 
 @pytest.mark.parametrize("place", MISTAKES, ids=" ".join)
-def test_each_mistake_alone_is_one_problem(tmp_path: Path, place: tuple[str, str]) -> None:
-    bench = Bench(tmp_path)
+def test_each_mistake_alone_is_one_problem(bench: Bench, place: tuple[str, str]) -> None:
     MISTAKES[place](bench)
     assert bench.found() == {place}
 
 
-def test_all_mistakes_on_all_levels_are_reported_at_once(tmp_path: Path) -> None:
-    bench = Bench(tmp_path)
+def test_all_mistakes_on_all_levels_are_reported_at_once(bench: Bench) -> None:
     for make in MISTAKES.values():
         make(bench)
     assert bench.found() == set(MISTAKES)
+    text = str(ConfigError(bench.load()))
+    assert text.startswith(f"{len(MISTAKES)} problems")
+    assert f"{bench.folder / 'rig.yaml'}: robots.panda.colour: " in text
 
 
 @pytest.mark.parametrize("seed", range(15))
-def test_no_mistake_hides_another_and_none_invents_one(tmp_path: Path, seed: int) -> None:
-    bench = Bench(tmp_path)
+def test_no_mistake_hides_another_and_none_invents_one(bench: Bench, seed: int) -> None:
     some = random.Random(seed).sample(list(MISTAKES), 2 + seed % 6)
     for place in some:
         MISTAKES[place](bench)
     assert bench.found() == set(some)
 
 
-def test_the_value_of_a_misspelt_key_is_checked_and_reported_under_that_key(tmp_path: Path) -> None:
-    bench = Bench(tmp_path)
+def test_the_value_of_a_misspelt_key_is_checked_and_reported_under_that_key(bench: Bench) -> None:
     bench.arm["limts"] = bench.arm.pop("limits") | {"jerk": 0, "velocity": "fast"}
     bench.overrides = ["robots.other.wrokspace.table_height=high"]
     assert bench.found() == {
@@ -652,15 +603,14 @@ def test_the_value_of_a_misspelt_key_is_checked_and_reported_under_that_key(tmp_
     }
 
 
-def test_a_key_that_only_looks_like_another_is_one_problem(tmp_path: Path) -> None:
-    bench = Bench(tmp_path)
+def test_a_key_that_only_looks_like_another_is_one_problem(bench: Bench) -> None:
     bench.wrist["depth_min"] = 0.1  # nearest: depth, which holds min and max
     assert bench.found() == {("rig.yaml", "cameras.wrist.depth_min")}
 
 
 @pytest.mark.parametrize("name", ["arm", "camera", "cup"])
-def test_nonsense_in_a_model_or_an_object_is_a_config_error_or_nothing_worse(tmp_path: Path, name: str) -> None:
-    bench, refused = Bench(tmp_path), 0
+def test_nonsense_in_a_model_or_an_object_is_a_config_error_or_nothing_worse(bench: Bench, name: str) -> None:
+    refused = 0
     good = getattr(bench, name)
     for k, place in enumerate(places(good)[::4]):
         setattr(bench, name, copy.deepcopy(good))
@@ -672,8 +622,7 @@ def test_nonsense_in_a_model_or_an_object_is_a_config_error_or_nothing_worse(tmp
     assert refused > len(places(good)) / 8
 
 
-def test_a_joint_that_does_not_move_lacks_no_limits(tmp_path: Path) -> None:
-    bench = Bench(tmp_path)
+def test_a_joint_that_does_not_move_lacks_no_limits(bench: Bench) -> None:
     bench.arm["limits"] = {"acceleration": 10, "jerk": 500}  # the rest is the URDF's, which has none for this joint
     bench.arm["real_limits"] = {}
     assert bench.found() == set()
@@ -681,8 +630,7 @@ def test_a_joint_that_does_not_move_lacks_no_limits(tmp_path: Path) -> None:
     assert bench.found() == {("arm.yaml", "joints.6")}
 
 
-def test_a_mistake_in_an_objects_file_is_reported_once(tmp_path: Path) -> None:
-    bench = Bench(tmp_path)
+def test_a_mistake_in_an_objects_file_is_reported_once(bench: Bench) -> None:
     bench.cup["rgba"] = [255, 0, 0, 1]
     bench.objects.append({"file": "cup.yaml", "name": "mug", "fixd": True})
     assert bench.found() == {("cup.yaml", "rgba"), ("rig.yaml", "objects.6.fixd")}

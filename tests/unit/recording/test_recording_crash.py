@@ -22,8 +22,7 @@ def torn(tmp_path_factory: pytest.TempPathFactory) -> Path:
         record(recorder, 0.3)
         recorder.start(seed=2)
         drive(rig, 0.5)
-        recorder._child.process.kill()
-        recorder._child.process.wait()
+        kill_writer(recorder)
         with pytest.raises(ConnectionLost, match="ended"):
             recorder.save(wait=True)
     (folder,) = out.glob("episodes/*.partial")

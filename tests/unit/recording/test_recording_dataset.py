@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from errors_kit import raises_code
-from recording_kit import CAMERAS, check_layout, drive, mock_rig, record, small
+from recording_kit import CAMERAS, check_layout, drive, kill_writer, mock_rig, record, small
 
 import hal
 from hal.errors import CommandError, DeviceNotFound, HalError
@@ -165,8 +165,7 @@ def test_the_suggested_command_recovers_an_unfinished_episode(tmp_path: Path) ->
     with mock_rig() as rig, Recorder(rig, out) as recorder:
         recorder.start()
         drive(rig, 1.5)
-        recorder._child.process.kill()
-        recorder._child.process.wait()
+        kill_writer(recorder)
         with pytest.raises(HalError):
             recorder.save(wait=True)
     with pytest.raises(CommandError, match="1 was not finished; finish with: hal-review ") as caught:

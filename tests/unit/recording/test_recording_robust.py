@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from errors_kit import raises_code
-from recording_kit import check_layout, check_stamps, drive, mock_rig, record
+from recording_kit import check_layout, check_stamps, drive, kill_writer, mock_rig, record
 
 import hal
 from hal.errors import CommandError, ConnectionLost, HalError
@@ -199,8 +199,7 @@ def test_a_discarded_episode_does_not_come_back(rig: Rig, out: Path) -> None:
     with Recorder(rig, out) as recorder:
         recorder.start()
         drive(rig, 0.2)
-        recorder._child.process.kill()
-        recorder._child.process.wait()
+        kill_writer(recorder)
         recorder.discard()
         record(recorder, 0.2)
         assert recorder.notes == []
@@ -309,8 +308,7 @@ def test_an_unfinished_episode_that_is_damaged_is_named(rig: Rig, out: Path) -> 
     with Recorder(rig, out) as recorder:
         recorder.start()
         drive(rig, 0.2)
-        recorder._child.process.kill()
-        recorder._child.process.wait()
+        kill_writer(recorder)
         with pytest.raises(ConnectionLost):
             recorder.save(wait=True)
         (partial,) = out.glob("episodes/*.partial")

@@ -10,7 +10,7 @@ import pytest
 from hal.drivers.can import piper_protocol as protocol
 from hal.drivers.can.piper_link import arm_fault, control_fault, gripper_fault
 from hal.drivers.can.piper_protocol import ENABLED, JOINTS, GripperStatus, PiperStatus
-from hal.drivers.can.settings import PiperArmSettings, check_piper_arm, check_piper_gripper
+from hal.drivers.can.settings import BusSettings, PiperArmSettings, check_piper_arm, check_piper_gripper
 from hal.testing import gripper_spec, robot_spec
 
 BUS = {"interface": "virtual", "channel": "piper"}
@@ -123,3 +123,15 @@ def test_a_grippers_own_flags_are_no_faults_of_the_arm() -> None:
     fault = gripper_fault(GripperStatus(0.05, 0.0, ENABLED | protocol.OVER_CURRENT))
     assert fault is not None
     assert fault.code == "over_current"
+
+
+def test_each_multicast_channel_has_a_port_of_its_own() -> None:
+    """On a common port a socket hears the groups of all other programs of this computer."""
+    ports = {
+        channel: BusSettings(interface="udp_multicast", channel=channel).arguments()["port"]
+        for channel in ("239.74.163.2", "239.74.163.3", "239.74.164.2")
+    }
+    assert ports["239.74.163.2"] == 43113  # python-can's own
+    assert len(set(ports.values())) == 3
+    assert BusSettings(interface="udp_multicast", channel="239.74.163.3", bus={"port": 5}).arguments()["port"] == 5
+    assert "port" not in BusSettings(interface="socketcan", channel="can0").arguments()
