@@ -43,22 +43,29 @@ def test_a_disc_moves_the_arm_its_way_at_its_speed(bench, page, right, up, expec
 
 def test_nothing_moves_without_the_dead_man(bench: Bench, page: Browser) -> None:
     before = bench.tcp.copy()
-    with page.drag("dpad", 0.0, 1.0):
-        wait_for(lambda: bench.session.pad.state().axis("dpad_y") > 0.9, "the disc to be heard")
-        time.sleep(0.3)
-        assert bench.status == "holding"
+
+    def push() -> None:
+        with page.drag("dpad", 0.0, 1.0):
+            wait_for(lambda: bench.session.pad.state().axis("dpad_y") > 0.9, "the disc to be heard", BRIEF)
+            time.sleep(0.3)
+            assert bench.status == "holding"
+
+    undisturbed(bench, page, push)
     assert abs(bench.tcp - before).max() < 1e-3
 
 
 def test_release_of_the_dead_man_stops_the_arm_while_the_disc_is_held(bench: Bench, page: Browser) -> None:
-    page.hold()
-    with page.drag("dpad", -0.8, 0.0):
-        wait_for(lambda: bench.speed() > 0.05, "motion")
-        page.let_go()
-        wait_for(bench.rests, "the arm to rest")
-        time.sleep(0.2)
-        assert bench.rests()
-        assert bench.trip == "none", "a release is no trip"
+    def drive() -> None:
+        page.hold()
+        with page.drag("dpad", -0.8, 0.0):
+            wait_for(lambda: bench.speed() > 0.05, "motion", BRIEF)
+            page.let_go()
+            wait_for(bench.rests, "the arm to rest")
+            time.sleep(0.2)
+            assert bench.rests()
+            assert bench.trip == "none", "a release is no trip"
+
+    undisturbed(bench, page, drive)
 
 
 def test_keys_and_the_button_do_the_same(bench: Bench, page: Browser) -> None:
