@@ -42,7 +42,8 @@ def can_overrides(interface: str, arms: tuple[str, ...] = ("arm",)) -> list[str]
         channel = f"239.{64 + number % 64}.{block // 256}.{block % 256}"
         if interface == "virtual":
             channel = f"test-{os.getpid()}-{number}"
-        found += [f"robots.{name}.real.interface={interface}", f"robots.{name}.real.channel={channel}"]
+        for device in (name, f"{name}.gripper"):
+            found += [f"robots.{device}.real.interface={interface}", f"robots.{device}.real.channel={channel}"]
     return found
 
 

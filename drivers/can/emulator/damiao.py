@@ -163,14 +163,10 @@ class EmulatedDamiaoArm:
         arm = [DamiaoMotor(motor) for motor in DamiaoArmSettings.of(spec).motors]
         self.motors = {motor.id: motor for motor in arm}
         self._arm = arm
-        self.plant = ArmPlant(
-            spec.urdf,
-            spec.joints,
-            [motor.mechanics for motor in arm],
-            spec.initial,
-            spec.kinematics.tcp_link,
-            spec.base_orientation,
-        )
+        mechanics = [motor.mechanics for motor in arm]
+        self.plant = ArmPlant(spec.kinematics, mechanics, spec.initial, spec.base_orientation)
+        if spec.payload is not None:
+            self.plant.load(payload=(spec.payload.mass, spec.payload.position))
         self.gripper: GripperPlant | None = None
         self._gripper_motor: DamiaoMotor | None = None
         self.widths: tuple[tuple[float, float], ...] = ()

@@ -44,7 +44,7 @@ from ..piper_protocol import (
     encode_pose,
     firmware_pieces,
 )
-from ..settings import BusSettings
+from ..settings import PiperArmSettings
 from .plant import OFF, ArmPlant, Drive, JointMechanics
 
 __all__ = ["PiperArm"]
@@ -81,10 +81,10 @@ class PiperArm:
     def __init__(self, spec: RobotSpec) -> None:
         """Build it from the arm's record in a rig."""
         self.name = spec.name
-        self.bus = BusSettings(**{k: v for k, v in spec.options.items() if k in BusSettings.model_fields})
-        self.plant = ArmPlant(
-            spec.urdf, spec.joints, _MECHANICS, spec.initial, spec.kinematics.tcp_link, spec.base_orientation
-        )
+        self.bus = PiperArmSettings.of(spec).shared
+        self.plant = ArmPlant(spec.kinematics, _MECHANICS, spec.initial, spec.base_orientation)
+        if spec.payload is not None:
+            self.plant.load(payload=(spec.payload.mass, spec.payload.position))
         self.firmware = "S-V1.8-5"
         self.gripper_width = 0.5 * self._stroke
         self._object = 0.0

@@ -12,12 +12,13 @@ brings each joint to rest, found by Gauss-Seidel iterations; a joint that it can
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
+
+from hal.specs import KinematicsSpec
 
 __all__ = ["ArmPlant", "Drive", "GripperPlant", "JointMechanics"]
 
@@ -67,33 +68,32 @@ class ArmPlant:
 
     def __init__(
         self,
-        urdf: str | Path,
-        joints: Sequence[str],
+        kinematics: KinematicsSpec,
         mechanics: Sequence[JointMechanics],
         q: Sequence[float],
-        tcp_link: str,
         base_orientation: Sequence[float] = (0.0, 0.0, 0.0, 1.0),
     ) -> None:
-        """Build it from a URDF, with every other joint locked where it is 0.
+        """Build it from a URDF, with every joint that is not the arm's locked where it is 0.
 
         Args:
-            urdf: Path of the URDF.
-            joints: The arm's joints, from base to tip.
+            kinematics: The arm's URDF, joints and tcp.
             mechanics: One record for each joint.
             q: Start position.
-            tcp_link: Link that a payload is fixed to.
             base_orientation: Quaternion (xyzw) of the URDF's root in the world; gravity points down there.
         """
-        full = pin.buildModelFromUrdf(str(urdf))
+        joints = kinematics.joints
+        full = pin.buildModelFromUrdf(kinematics.urdf)
         others = [k for k in range(1, full.njoints) if full.names[k] not in joints]
         self._model: Any = pin.buildReducedModel(full, others, pin.neutral(full))
         self._data: Any = self._model.createData()
-        self._order = [self._model.joints[self._model.getJointId(name)].idx_q for name in joints]
-        if self._order != list(range(len(joints))):
-            raise ValueError(f"{urdf}: the joints {', '.join(joints)} do not follow each other from base to tip")
+        if [str(name) for name in self._model.names][1:] != list(joints):
+            raise ValueError(f"{kinematics.urdf}: {', '.join(joints)} do not follow each other from base to tip")
         rotation = pin.Quaternion(np.array(base_orientation, float)).toRotationMatrix()
         self._model.gravity.linear = rotation.T @ np.array([0.0, 0.0, -9.81])
-        self._tcp = self._model.frames[self._model.getFrameId(tcp_link)]
+        link = self._model.frames[self._model.getFrameId(kinematics.tcp_link)]
+        turn = pin.Quaternion(np.array(kinematics.tcp_orientation, float)).toRotationMatrix()
+        self._tcp: Any = link.placement * pin.SE3(turn, np.array(kinematics.tcp_position, float))
+        self._tcp_joint = int(link.parentJoint)
         self._inertias = [pin.Inertia(inertia) for inertia in self._model.inertias]
         self.lower = [float(x) for x in self._model.lowerPositionLimit]
         self.upper = [float(x) for x in self._model.upperPositionLimit]
@@ -119,7 +119,7 @@ class ArmPlant:
 
         Args:
             mass_factor: Factor on the masses and inertias of all links.
-            payload: Mass, kg, and its place (3,) in the frame of the tcp's link, m.
+            payload: Mass, kg, and its place (3,) in the frame of the tcp, m.
         """
         if mass_factor is not None:
             self.mass_factor = mass_factor
@@ -131,9 +131,8 @@ class ArmPlant:
             )
         mass, place = self.payload
         if mass > 0.0:
-            point = self._tcp.placement.act(np.array(place))
-            carried = self._model.inertias[self._tcp.parentJoint]
-            self._model.inertias[self._tcp.parentJoint] = carried + pin.Inertia(mass, point, np.zeros((3, 3)))
+            point = pin.Inertia(mass, self._tcp.act(np.array(place)), np.zeros((3, 3)))
+            self._model.inertias[self._tcp_joint] = self._model.inertias[self._tcp_joint] + point
 
     def gravity(self) -> NDArray[np.float64]:
         """Return the torques that hold the arm, without friction."""

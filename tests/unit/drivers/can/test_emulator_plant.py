@@ -6,10 +6,11 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from hal.config.data_files import find_data
+from hal.config.loader import load
 from hal.drivers.can.emulator.damiao import shorted_damping
 from hal.drivers.can.emulator.plant import OFF, ArmPlant, Drive, GripperPlant, JointMechanics
 
+KINEMATICS = load("yam", overrides=["cameras={}"]).resolve().robots[0].kinematics
 HOME = (0.0, 1.5, 1.35, -1.42, 0.0, 0.0)
 BIG, SMALL = JointMechanics(0.03, 0.3, 0.15, 28.0), JointMechanics(0.0018, 0.06, 0.02, 10.0)
 SMOOTH = [joint._replace(coulomb=0.0, viscous=0.0) for joint in (BIG,) * 3 + (SMALL,) * 3]
@@ -17,9 +18,7 @@ DT = 1e-3
 
 
 def yam(mechanics=(BIG,) * 3 + (SMALL,) * 3, base=(0.0, 0.0, 0.0, 1.0)) -> ArmPlant:
-    plant = ArmPlant(
-        find_data("robots", "yam.urdf"), [f"joint{k}" for k in range(1, 7)], mechanics, HOME, "gripper", base
-    )
+    plant = ArmPlant(KINEMATICS, mechanics, HOME, base)
     plant.held = False
     return plant
 
@@ -66,7 +65,7 @@ def test_an_arm_that_is_heavier_than_its_model_sags_by_torque_over_stiffness() -
 def test_a_payload_adds_its_weight() -> None:
     plant = yam()
     before = plant.gravity()
-    plant.load(payload=(0.5, (0.0, 0.0, 0.1)))
+    plant.load(payload=(0.5, (0.0, 0.0, -0.05)))
     lever = (plant.gravity() - before)[1] / (0.5 * 9.81)
     assert abs(lever) == pytest.approx(0.253 - 0.02, abs=0.01)  # from the shoulder to the tool, horizontally
     plant.load(payload=(0.0, (0.0, 0.0, 0.0)))
