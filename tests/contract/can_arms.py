@@ -16,7 +16,7 @@ import can
 
 from hal.config import load
 from hal.driver import GripperDriver, RobotDriver
-from hal.drivers.can.emulator.piper import PiperArm as EmulatedPiper
+from hal.drivers.can.emulator.piper import EmulatedPiperArm as EmulatedPiper
 from hal.drivers.can.piper import PiperArm
 from hal.drivers.can.piper_gripper import PiperGripper
 from hal.specs import RobotSpec

@@ -47,7 +47,7 @@ from ..piper_protocol import (
 from ..settings import PiperArmSettings
 from .plant import OFF, ArmPlant, Drive, JointMechanics
 
-__all__ = ["PiperArm"]
+__all__ = ["EmulatedPiperArm"]
 
 Send = Callable[[int, bytes, int], None]
 """Sends a frame: id, data, and the number of the motor that it comes from (0 for the controller)."""
@@ -69,7 +69,7 @@ _BEYOND_LIMIT, _STOPPED = 0x4, 0x1
 """See ARM_STATUS."""
 
 
-class PiperArm:
+class EmulatedPiperArm:
     """An emulated PiPER with its gripper.
 
     Attributes:

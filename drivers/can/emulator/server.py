@@ -23,7 +23,7 @@ from hal.specs import RobotSpec
 
 from ..settings import BusSettings
 from .damiao import EmulatedDamiaoArm
-from .piper import PiperArm
+from .piper import EmulatedPiperArm
 from .plant import ArmPlant
 
 __all__ = ["CanEmulator", "EmulatedArm", "EmulatedBus", "FrameFaults"]
@@ -32,7 +32,7 @@ _STEP = 1e-3
 """Step of the mechanics, s."""
 _LONGEST_GAP = 0.25
 """Time that the mechanics make up for after the machine had no time for them, s."""
-_ARMS: Mapping[str, Callable[[RobotSpec], EmulatedArm]] = {"damiao": EmulatedDamiaoArm, "piper": PiperArm}
+_ARMS: Mapping[str, Callable[[RobotSpec], EmulatedArm]] = {"damiao": EmulatedDamiaoArm, "piper": EmulatedPiperArm}
 
 
 class EmulatedArm(Protocol):

@@ -20,8 +20,8 @@ from hal.drivers.can.damiao_protocol import (
 )
 from hal.drivers.can.emulator import piper as emulated_piper
 from hal.drivers.can.emulator.console import COMMANDS, execute
-from hal.drivers.can.emulator.damiao import DamiaoArm
-from hal.drivers.can.emulator.piper import PiperArm
+from hal.drivers.can.emulator.damiao import EmulatedDamiaoArm
+from hal.drivers.can.emulator.piper import EmulatedPiperArm
 from hal.drivers.can.emulator.server import CanEmulator
 from hal.drivers.can.piper_protocol import (
     ENABLED,
@@ -49,7 +49,7 @@ class Wire:
     def __init__(self, rig: str) -> None:
         overrides = can_overrides("virtual")
         spec = load(rig, sim=False, overrides=overrides).resolve().robots[0]
-        self.arm = DamiaoArm(spec) if spec.driver == "damiao" else PiperArm(spec)
+        self.arm = EmulatedDamiaoArm(spec) if spec.driver == "damiao" else EmulatedPiperArm(spec)
         self.sent: list[tuple[int, bytes, int]] = []
 
     def ask(self, id: int, data: bytes) -> list[bytes]:
