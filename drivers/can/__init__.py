@@ -6,6 +6,7 @@ from hal.registry import DriverSpec
 
 __all__ = ["DAMIAO", "PIPER"]
 
+_BUS_OPTIONS = ("interface", "channel", "fd", "bus", "bit_rate", "data_bit_rate")
 _REQUIRES = {"can": "pip install 'robot-hal[can]'"}
 
 DAMIAO = DriverSpec(
@@ -17,6 +18,7 @@ DAMIAO = DriverSpec(
         "gripper": "hal.drivers.can.settings:check_damiao_gripper",
     },
     emulated="hal.drivers.can.settings:is_emulated",
+    shared_options=_BUS_OPTIONS,
     requires=_REQUIRES,
 )
 
@@ -29,5 +31,6 @@ PIPER = DriverSpec(
         "gripper": "hal.drivers.can.settings:check_piper_gripper",
     },
     emulated="hal.drivers.can.settings:is_emulated",
+    shared_options=_BUS_OPTIONS,
     requires=_REQUIRES,
 )
