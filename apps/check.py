@@ -1,4 +1,4 @@
-"""Pre-flight check of this computer, the arm and the network between them; or a list of gamepads or cameras.
+"""Pre-flight check of this computer, the arm and the network between them; or a list of pads, cameras, CAN adapters.
 
 python apps/check.py --real --config my_rig.yaml
 python apps/check.py --pads
@@ -56,6 +56,29 @@ def show_cameras() -> bool:
         for camera in plugged or ("no camera",):
             print(f"{name:12s} {camera}")
         found = found or bool(plugged)
+    return found
+
+
+# --can: the CAN interfaces and adapters, as a rig file names them.
+
+
+def show_can() -> bool:
+    """Print the CAN interfaces and adapters that the drivers find; return whether there are any."""
+    from hal import registry
+    from hal.errors import HalError
+
+    found = False
+    places = {registry.driver(name).buses: name for name in registry.BUILT_IN}
+    for place, name in places.items():
+        try:
+            lines = registry.function(name, place)
+            for line in lines() if lines is not None else ():
+                print(line)
+                found = True
+        except (HalError, OSError) as error:
+            print(f"{name:12s} {type(error).__name__}: {error}")
+    if not found:
+        print("no CAN interface and no adapter; plug one in, and load its driver: sudo modprobe gs_usb")
     return found
 
 
@@ -331,6 +354,12 @@ def parser() -> argparse.ArgumentParser:
         action="store_true",
         help="instead, list the plugged-in cameras with their serial numbers. The exit status is 2 if there is none",
     )
+    made.add_argument(
+        "--can",
+        action="store_true",
+        help="instead, list the CAN interfaces and adapters, with the command that brings one up. The exit status is 2 "
+        "if there is none",
+    )
     return made
 
 
@@ -348,6 +377,8 @@ def _main(args: argparse.Namespace) -> int:
         return _pads(args)
     if args.cameras:
         return 0 if show_cameras() else ACTION_NEEDED
+    if args.can:
+        return 0 if show_can() else ACTION_NEEDED
     duration = _DURATION if args.duration is None else args.duration
     if not 0.0 < duration <= 60.0:
         raise CommandError(f"--duration must be above 0 and at most 60, not {duration:g}")

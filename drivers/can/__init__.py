@@ -18,7 +18,12 @@ DAMIAO = DriverSpec(
         "gripper": "hal.drivers.can.settings:check_damiao_gripper",
     },
     emulated="hal.drivers.can.settings:is_emulated",
+    steppable=False,
+    group="hal.drivers.can.settings:group_key",
     shared_options=_BUS_OPTIONS,
+    preflight="hal.drivers.can.preflight:check_damiao",
+    buses="hal.drivers.can.interfaces:list_buses",
+    payload=True,
     requires=_REQUIRES,
 )
 
@@ -31,6 +36,10 @@ PIPER = DriverSpec(
         "gripper": "hal.drivers.can.settings:check_piper_gripper",
     },
     emulated="hal.drivers.can.settings:is_emulated",
+    steppable=False,
+    group="hal.drivers.can.settings:group_key",
     shared_options=_BUS_OPTIONS,
+    preflight="hal.drivers.can.preflight:check_piper",
+    buses="hal.drivers.can.interfaces:list_buses",
     requires=_REQUIRES,
 )

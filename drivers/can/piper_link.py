@@ -11,7 +11,7 @@ from hal.errors import ConnectionLost, DeviceNotFound, Fault, HalError, RobotFau
 
 from . import piper_protocol as protocol
 from .bus import CanBus
-from .piper_protocol import ENABLED, JOINTS, GripperStatus, PiperFeedback, PiperStatus, decode_feedback
+from .piper_protocol import COMMAND_IDS, ENABLED, JOINTS, GripperStatus, PiperFeedback, PiperStatus, decode_feedback
 from .settings import EMULATED_INTERFACES, BusSettings
 
 __all__ = [
@@ -31,7 +31,6 @@ _OPENING = 1.0
 """Longest time to wait for a device's state when it is opened, s."""
 _LEADER_IDS = range(0x3A1, 0x3A9)
 """Ids at which an arm reports that is set up as the leader of a pair."""
-_SENT_IDS = (0x151, 0x155, 0x156, 0x157, 0x159, 0x471, 0x475)
 
 
 # Faults
@@ -165,7 +164,7 @@ class PiperLink:
         bus = CanBus.acquire(self.settings)
         try:
             bus.drain()  # what came before is old
-            bus.subscribe({id: partial(self._receive, id) for id in self._ids}, _SENT_IDS)
+            bus.subscribe({id: partial(self._receive, id) for id in self._ids}, COMMAND_IDS)
         except BaseException:
             bus.release()
             raise

@@ -21,6 +21,7 @@ __all__ = [
     "ALL_JOINTS",
     "ARM_STATUS",
     "CAN_CONTROL",
+    "COMMAND_IDS",
     "COLLISION",
     "DRIVER_HOT",
     "ENABLED",
@@ -33,6 +34,7 @@ __all__ = [
     "LOW_VOLTAGE",
     "MOTOR_HOT",
     "MOVE_J",
+    "PARAMETER_IDS",
     "OVER_CURRENT",
     "STALLED",
     "STANDBY",
@@ -125,6 +127,20 @@ FEEDBACK_IDS = (
 """Ids of the frames that the arm and its gripper send without being asked."""
 GRIPPER_IDS = (_GRIPPER_STATUS,)
 """Those of them that are the gripper's."""
+
+PARAMETER_IDS = (_LIMITS, _ACCELERATION, _STROKE, ACKNOWLEDGEMENT, FIRMWARE)
+"""Ids of the answers to questions and settings."""
+COMMAND_IDS = (
+    _MODE,
+    *range(_TARGETS, _TARGETS + 3),
+    _GRIPPER,
+    _ENABLE,
+    _LIMIT_QUERY,
+    _JOINT,
+    _PARAMETER_QUERY,
+    FIRMWARE,
+)
+"""Ids of the commands that this package sends."""
 
 _MILLIDEGREES = 180_000.0 / pi
 """Millidegrees per radian."""
@@ -300,6 +316,9 @@ _COMMANDS: dict[int, Callable[[int, bytes], PiperCommand | None]] = {
         range(_TARGETS, _TARGETS + 3), lambda frame_id, data: JointTargets(2 * (frame_id - _TARGETS), _radians(data))
     ),
 }
+
+COMMAND_IDS = tuple(frame_id for frame_id in _COMMANDS if frame_id != _STOP)
+"""Ids of the commands that this package sends."""
 
 
 def _gripper_request(width: int, torque: int, code: int, zero: int) -> GripperRequest:

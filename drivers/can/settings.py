@@ -32,11 +32,14 @@ __all__ = [
     "check_damiao_gripper",
     "check_piper_arm",
     "check_piper_gripper",
+    "group_key",
     "is_emulated",
 ]
 
 EMULATED_INTERFACES = frozenset({"virtual", "udp_multicast"})
 """Interfaces of python-can behind which there is no hardware."""
+_SHAREABLE = frozenset({"socketcan", "udp_multicast"})
+"""Interfaces that several processes of a computer can open at once."""
 _USUAL_GROUP, _USUAL_PORT = "239.74.163.2", 43113
 """Channel and port of python-can's own default for ``udp_multicast``."""
 _FIRST_PORT, _PORTS = 20_000, 12_000
@@ -51,6 +54,15 @@ _MISFIT = 2.0
 def is_emulated(options: Mapping[str, Any]) -> bool:
     """Return whether the bus in these options is one without hardware, so that an emulator answers."""
     return str(options.get("interface", "")).strip().lower() in EMULATED_INTERFACES
+
+
+def group_key(options: Mapping[str, Any]) -> str | None:
+    """Return a key that arms on one adapter share if only one process can open it; None if several can.
+
+    The options are not checked yet.
+    """
+    interface, channel = (str(options.get(key, "")).strip() for key in ("interface", "channel"))
+    return None if interface.lower() in _SHAREABLE else f"{interface} {channel}"
 
 
 # Values.

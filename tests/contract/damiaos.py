@@ -31,7 +31,6 @@ class SteppedEmulator:
 
     def __init__(self, rig: str) -> None:
         overrides = can_overrides("virtual")
-        overrides += [line.replace("arm.real", "arm.gripper.real") for line in overrides if "arm.real" in line]
         self.emulator = CanEmulator(rig, overrides)
         self.spec: RobotSpec = load(rig, sim=False, overrides=overrides).resolve().robots[0]
         self.arm = self.emulator.arms[self.spec.name]

@@ -7,10 +7,12 @@ from typing import Any
 
 import pytest
 
+from hal.config import load
 from hal.drivers.can import piper_protocol as protocol
 from hal.drivers.can.piper_link import arm_fault, control_fault, gripper_fault
 from hal.drivers.can.piper_protocol import ENABLED, JOINTS, GripperStatus, PiperStatus
-from hal.drivers.can.settings import BusSettings, PiperArmSettings, check_piper_arm, check_piper_gripper
+from hal.drivers.can.settings import BusSettings, PiperArmSettings, check_piper_arm, check_piper_gripper, group_key
+from hal.errors import ConfigError
 from hal.testing import gripper_spec, robot_spec
 
 BUS = {"interface": "virtual", "channel": "piper"}
@@ -135,3 +137,21 @@ def test_each_multicast_channel_has_a_port_of_its_own() -> None:
     assert len(set(ports.values())) == 3
     assert BusSettings(interface="udp_multicast", channel="239.74.163.3", bus={"port": 5}).arguments()["port"] == 5
     assert "port" not in BusSettings(interface="socketcan", channel="can0").arguments()
+
+
+@pytest.mark.parametrize("interface", ["virtual", "slcan", "gs_usb"])
+def test_arms_on_an_adapter_of_one_process_belong_together(interface: str) -> None:
+    left, right = ({"interface": interface, "channel": channel} for channel in ("a", "b"))
+    assert group_key(left) == group_key({**left, "motors": []}) is not None
+    assert group_key(left) != group_key(right)
+    assert group_key({"interface": "socketcan", "channel": "a"}) is None
+
+
+def test_a_gripper_takes_the_bus_from_its_arm_and_lock_step_is_refused() -> None:
+    bus = ["robots.arm.real.interface=virtual", "robots.arm.real.channel=group", "cameras={}"]
+    plan = load("piper", sim=False, overrides=bus).resolve()
+    gripper = plan.robots[0].gripper
+    assert gripper is not None
+    assert gripper.options == {"interface": "virtual", "channel": "group"}
+    with pytest.raises(ConfigError):
+        load("piper", sim=False, clock="lock_step", overrides=bus).resolve()
