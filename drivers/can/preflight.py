@@ -264,6 +264,7 @@ def _missing_motors(chain: DamiaoChain, bus: CanBus, error: str) -> CheckResult:
     found = f"{', '.join(motor.label for motor in silent)} does not answer"
     if answer:
         found += f"; {', '.join(str(motor.id) for motor in answer)} do"
+        remedy = "check its power, its plugs and its ids (ESC_ID is `id`, MST_ID is `master`)"
     return CheckResult("motors", "fail", found, remedy)
 
 
