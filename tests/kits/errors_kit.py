@@ -1,4 +1,4 @@
-"""An assertion about the code of an error."""
+"""Assertions about the codes of errors."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from contextlib import contextmanager
 
 import pytest
 
-from hal.errors import HalError
+from hal.errors import ConfigError, HalError
 
 
 @contextmanager
@@ -16,3 +16,11 @@ def raises_code(error: type[HalError], code: str) -> Iterator[None]:
     with pytest.raises(error) as caught:
         yield
     assert caught.value.code == code
+
+
+@contextmanager
+def raises_problems(*codes: str) -> Iterator[None]:
+    """Fail unless the block raises a ConfigError with problems of these codes, in their order."""
+    with pytest.raises(ConfigError) as caught:
+        yield
+    assert tuple(problem.code for problem in caught.value.problems) == codes

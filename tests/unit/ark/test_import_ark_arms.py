@@ -10,6 +10,7 @@ import pybullet as p
 import pybullet_data
 import pytest
 from ark_kit import CAMERA, PANDA, PANDA_URDF, changed, imported, row
+from errors_kit import raises_problems
 from pybullet_utils.bullet_client import BulletClient
 
 import hal
@@ -54,9 +55,8 @@ def test_an_option_names_the_arm(tmp_path: Path) -> None:
     data, result = imported(tmp_path, ArkOptions(arms={"arm": "fr3"}), robots={"arm": PANDA})
     assert data["robots"]["arm"]["model"] == "fr3"
     assert "from --arm" in row(result, "robots.0.config.urdf_path")[1]
-    with pytest.raises(hal.ConfigError) as caught:
+    with raises_problems("unknown_model"):
         imported(tmp_path, ArkOptions(arms={"arm": "fr4"}), robots={"arm": PANDA})
-    assert [problem.code for problem in caught.value.problems] == ["unknown_model"]
 
 
 def test_base(tmp_path: Path) -> None:
@@ -200,6 +200,5 @@ def test_problems_of_a_generated_model_are_reported_at_arks_line(tmp_path: Path)
 
 def test_a_broken_urdf_is_reported(tmp_path: Path) -> None:
     (tmp_path / "arm.urdf").write_text("<robot")
-    with pytest.raises(hal.ConfigError) as caught:
+    with raises_problems("bad_urdf"):
         imported(tmp_path, robots={"arm": xarm(urdf_path="arm.urdf", class_dir=None)})
-    assert [problem.code for problem in caught.value.problems] == ["bad_urdf"]

@@ -7,11 +7,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+from errors_kit import raises_problems
 
 from hal.config import load
 from hal.drivers.pybullet.camera import PyBulletCamera
 from hal.drivers.pybullet.exposure import DepthNoise, depth_noise
-from hal.errors import ConfigError
 from hal.specs import CameraSpec
 
 FB = 384.0 * 0.05
@@ -182,5 +182,5 @@ def test_lidar_noise_grows_with_the_distance() -> None:
 def test_no_noise_by_default() -> None:
     for spec in (camera(noise=False), camera(simulated={}), camera(streams=["color"], align="color")):
         assert depth_noise(spec) is None
-    with pytest.raises(ConfigError, match="subpixl"):
+    with raises_problems("unknown_key"):
         depth_noise(replace(camera(), options={**camera().options, "depth_noise": {"subpixl": 1}}))
