@@ -68,7 +68,7 @@ class Context:
         default = "lock_step" if self.driver is not None else self.rig.simulation.clock or "real_time"
         return self.clock or default
 
-    def problem(self, key: str, message: str, code: str = "invalid") -> None:
+    def problem(self, key: str, message: str, code: str) -> None:
         """Add a problem in the rig's file; the arguments are those of :meth:`.files.Problems.add`."""
         self.problems.add(self.source, key, message, code)
 

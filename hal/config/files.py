@@ -5,9 +5,13 @@
 
     unknown_key     missing_key    duplicate_key   a key
     wrong_type      wrong_count    out_of_range    a value
-    invalid_choice  conflict       invalid
+    invalid_choice  conflict       empty_range
+    bad_name        bad_rotation   invalid
     missing_file    unreadable     bad_yaml        a file
     too_large
+
+An unknown name has the code ``unknown_`` with its kind, for example ``unknown_model`` or ``unknown_link``; drivers add
+codes of their own.
 """
 
 from __future__ import annotations
@@ -51,7 +55,7 @@ class Problems:
         self.written: dict[tuple[str, str], str] = {}
         """File and dotted key as it should be spelt -> the last part of that key as the file spells it."""
 
-    def add(self, file: Path | str, key: str, message: str, code: str = "invalid") -> None:
+    def add(self, file: Path | str, key: str, message: str, code: str) -> None:
         """Add a problem. One in a key that an override set is reported in ``--set`` instead of the file.
 
         Args:

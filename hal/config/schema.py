@@ -71,7 +71,7 @@ class Unknown(AttributeError):
 class ValueProblem(ValueError):
     """A value that a record's own check refuses."""
 
-    def __init__(self, message: str, code: str = "invalid") -> None:
+    def __init__(self, message: str, code: str) -> None:
         super().__init__(message)
         self.code = code
         """Stable identifier of the kind of problem (see :mod:`.files`)."""
