@@ -52,7 +52,7 @@ class DeviceLock:
                 return False
             self._socket.close()
             raise
-        self._socket.listen(1)
+        self._socket.listen(socket.SOMAXCONN)  # each refused program stays in the queue: nothing is ever accepted
         return True
 
     def release(self) -> None:
