@@ -130,17 +130,6 @@ GRIPPER_IDS = (_GRIPPER_STATUS,)
 
 PARAMETER_IDS = (_LIMITS, _ACCELERATION, _STROKE, ACKNOWLEDGEMENT, FIRMWARE)
 """Ids of the answers to questions and settings."""
-COMMAND_IDS = (
-    _MODE,
-    *range(_TARGETS, _TARGETS + 3),
-    _GRIPPER,
-    _ENABLE,
-    _LIMIT_QUERY,
-    _JOINT,
-    _PARAMETER_QUERY,
-    FIRMWARE,
-)
-"""Ids of the commands that this package sends."""
 
 _MILLIDEGREES = 180_000.0 / pi
 """Millidegrees per radian."""
