@@ -106,6 +106,10 @@ def _other_adapters() -> list[dict[str, Any]]:
 
     import can
 
-    logging.getLogger("can").setLevel(logging.CRITICAL)  # each vendor's library that is not installed would be a line
+    before = logging.root.manager.disable
+    logging.disable(logging.CRITICAL)  # each vendor's library that is not installed would be a line
     known = sorted(set(can.VALID_INTERFACES) - {"socketcan", "virtual", "udp_multicast"})
-    return [dict(config) for config in can.detect_available_configs(known, timeout=1.0)]
+    try:
+        return [dict(config) for config in can.detect_available_configs(known, timeout=1.0)]
+    finally:
+        logging.disable(before)

@@ -20,6 +20,7 @@ from hal.specs import RobotSpec
 
 from .piper_link import SILENCE, PiperLink, arm_fault, control_fault, join_joints, refusal
 from .piper_protocol import (
+    ACKNOWLEDGEMENT,
     ENABLED,
     FEEDBACK_IDS,
     GRIPPER_IDS,
@@ -47,7 +48,7 @@ _SWITCHED_ON = 0.8
 """Time in which all motors must be on, s."""
 _CLEARING = 0.15
 """Time for which an error may still be reported after it was cleared, s: slow frames come every 25 ms."""
-_OWN_IDS = tuple(id for id in FEEDBACK_IDS if id not in GRIPPER_IDS)
+_OWN_IDS = (*(id for id in FEEDBACK_IDS if id not in GRIPPER_IDS), ACKNOWLEDGEMENT)
 _ALL_PAIRS = 0b111
 _NO_JOINTS = (0.0,) * JOINTS
 
