@@ -168,9 +168,9 @@ class PiperArm(RobotDriver):
             self._dq[k] = record.dq
             self._tau[k] = record.current * TORQUE_PER_AMPERE[k]
         elif type(record) is JointAngles:
-            if not self._pairs_come:
-                self._t_pairs = self._now
             k = record.first // 2
+            if k == 0:  # the arm sends them in order: a set that lacks one is dropped
+                self._t_pairs, self._pairs_come = self._now, 0
             self._pairs[k] = record.q
             self._pairs_come |= 1 << k
             if self._pairs_come == _ALL_PAIRS:

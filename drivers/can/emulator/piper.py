@@ -60,7 +60,7 @@ _LAG = 0.015
 """Time constant with which the set-point follows a target, s; chosen."""
 _STIFFNESS, _DAMPING = 60_000.0, 600.0
 """Of the position control, Nm/rad and Nm s/rad; so high that friction costs less than the 0.001 degrees of a report."""
-_MECHANICS = (JointMechanics(0.03, 0.3, 0.15, 40.0),) * 3 + (JointMechanics(0.002, 0.06, 0.02, 12.0),) * 3
+_MECHANICS = (JointMechanics(0.03, 0.3, 0.15, 36.0),) * 3 + (JointMechanics(0.002, 0.06, 0.02, 12.0),) * 3
 _REPORT, _SLOW_REPORT = 0.005, 0.025
 """Periods of the reports, s: 200 Hz, and 40 Hz for voltages and temperatures."""
 _FINGER_SPEED = 0.1
