@@ -11,6 +11,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Sequence
 from math import isfinite
 from typing import Any, ClassVar
@@ -18,6 +19,7 @@ from typing import Any, ClassVar
 from hal.driver import Reading, RobotDriver, Setpoint
 from hal.dynamics import Dynamics
 from hal.errors import ConnectionLost, Fault, RobotFault
+from hal.histogram import Histogram
 from hal.specs import RobotSpec
 
 from .damiao_chain import SWITCHING, ChainMotor, DamiaoChain
@@ -69,6 +71,9 @@ class DamiaoArm(RobotDriver):
         self._now = 0.0
         self._seq = 0
         self._reading: Reading | None = None
+        self._reading_took = 0.0
+        """Time that the last reading took, s."""
+        self.reset_statistics()
 
     # Connection.
 
@@ -90,6 +95,7 @@ class DamiaoArm(RobotDriver):
     # Every cycle.
 
     def read(self, now: float) -> Reading:
+        began = time.perf_counter()
         chain = self.chain
         self._now = now
         chain.update(now)
@@ -99,10 +105,12 @@ class DamiaoArm(RobotDriver):
         self._written = False
         if chain.lost is not None:
             raise chain.lost
-        bus = chain.usable  # raises if it is not open
-        return self._read(bus.settings.interface)
+        chain.usable  # noqa: B018  # raises if it is not open
+        reading = self._report()
+        self._reading_took = time.perf_counter() - began
+        return reading
 
-    def _read(self, interface: str) -> Reading:
+    def _report(self) -> Reading:
         motors = self._motors
         t = min([motor.t for motor in motors])
         if t < 0.0:
@@ -182,6 +190,7 @@ class DamiaoArm(RobotDriver):
         self._holds = None
 
     def write(self, setpoint: Setpoint) -> bool:
+        began = time.perf_counter()
         chain, motors = self.chain, self._motors
         if chain.lost is not None or chain.bus is None:
             raise chain.lost or ConnectionLost(f"{self.spec.name} is not open", code="closed")
@@ -201,6 +210,7 @@ class DamiaoArm(RobotDriver):
         self._written = True
         self._target, self._dq_sent, self._tau_sent = list(q), dq, setpoint.tau
         self._holds = None
+        self.cycle_times.add(time.perf_counter() - began + self._reading_took)
         return True
 
     def halt(self) -> None:
@@ -275,6 +285,8 @@ class DamiaoArm(RobotDriver):
 
     def reset_statistics(self) -> None:
         self.chain.reset_statistics()
+        self.cycle_times = Histogram(2e-6, 2500)
+        """Time that ``read`` and ``write`` of one cycle took together, s."""
 
     def statistics(self) -> dict[str, Any]:
-        return self.chain.statistics()
+        return {"read_and_write_s": self.cycle_times.summary(), **self.chain.statistics()}
