@@ -147,7 +147,7 @@ class DamiaoArm(RobotDriver):
                 self._fault = Fault(
                     "switched_off",
                     f"{off.label} is off, though nothing here switched it off",
-                    "support the arm; check its power supply, and whether another program drives it; then recover",
+                    "support the arm; check its power supply, and whether another program drives it",
                 )
         if in_use and (chain.lost is not None or (self.engaged and not on)):
             self.engaged = False

@@ -76,7 +76,7 @@ _AT_REST = 2e-3
 _REST = 0.2
 """s."""
 
-_HOT = "let it cool down, with the arm supported; lower load or speed; then recover"
+_HOT = "let it cool down, with the arm supported; lower its load or its speed"
 _STATUS_FAULTS = {
     MotorStatus.OVER_VOLTAGE: ("its supply voltage is too high", "check the power supply, also while braking"),
     MotorStatus.UNDER_VOLTAGE: ("its supply voltage is too low", "check the power supply, its plugs and its cables"),
@@ -89,7 +89,7 @@ _STATUS_FAULTS = {
     ),
     MotorStatus.OVERLOAD: ("it is overloaded", "check what the arm carries and touches"),
 }
-_SUPPORT = "support the arm by hand, for the joint is without power"
+_SUPPORT = "support the arm by hand, because the joint does not hold"
 
 
 class ChainMotor:
@@ -461,7 +461,7 @@ class DamiaoChain:
                     (f"it reports the undocumented status {status:#x}", "see its manual"),
                 )
                 code = MotorStatus(status).name.lower() if status in _STATUS_FAULTS else f"status_{status:x}"
-                return Fault(code, f"{motor.label}: {cause}", f"{_SUPPORT}; {remedy}; then recover")
+                return Fault(code, f"{motor.label}: {cause}", f"{_SUPPORT}; {remedy}")
             if motor.rotor >= motor.rotor_limit - _HEAT_MARGIN:
                 what = f"its rotor has {motor.rotor} deg C; at {motor.rotor_limit:g} it switches itself off"
                 return Fault("motor_hot", f"{motor.label}: {what}", _HOT)

@@ -1,0 +1,325 @@
+"""Faults of an arm with Damiao motors, in motion: what the program is told, the arm's state, and how it recovers.
+
+The arm is driven in lock-step: driver and emulator advance together, so the times in the table are exact. Print the
+table with ``pytest -s tests/lock_step/test_can_faults.py``.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from typing import Any
+from unittest.mock import patch
+
+import can
+import numpy as np
+import pytest
+from stepped_can import SteppedEmulator
+
+import hal
+from hal.clock import LockStepClock
+from hal.deadman import StopLatch
+from hal.drivers.can.bus import CanBus
+from hal.drivers.can.damiao import DamiaoArm
+from hal.drivers.can.damiao_protocol import MOTOR_RANGES, MotorCodec
+from hal.errors import ConfigError, DeviceNotFound, HalError, MotionStopped, RobotFault
+from hal.host.hosts import LocalHost
+from hal.robot import Robot
+from hal.specs import GroupSpec
+
+DT = 0.004
+"""Period of a YAM's cycle, s."""
+DETECTION = 0.15
+"""Longest time until a fault is reported, s."""
+SPEED = 0.4
+"""Speed of the moving joint, rad/s."""
+
+
+class Driven:
+    """A YAM in lock-step, moved by a session at 50 Hz."""
+
+    def __init__(self, far: SteppedEmulator) -> None:
+        self.far = far
+        spec = replace(far.spec, gripper=None, workspace=None)  # an arm that sank may be below the table
+        self.host = LocalHost(GroupSpec("arm", "lock_step", spec.rate_hz, (spec,)))
+        cycle = self.host.cycle
+        step = cycle.step
+
+        def step_both(*arguments: Any) -> None:
+            far.advance(DT)
+            step(*arguments)
+
+        cycle.step = step_both  # type: ignore[method-assign]
+        self.clock = LockStepClock(self.host.now, self.host.advance_to)
+        self.robot = Robot(spec, self.host, self.clock, StopLatch())
+        self.driver: DamiaoArm = cycle.arms[spec.name].driver  # type: ignore[assignment]
+        self.control = self.robot.control(rate_hz=50, unattended=True)
+
+    @property
+    def q(self) -> np.ndarray[Any, np.dtype[np.float64]]:
+        """The true position of the plant, rad."""
+        return np.array(self.far.arm.plant.q)
+
+    def run(self, seconds: float, speed: float | None = None) -> HalError | None:
+        """Let time pass; with a ``speed`` send it to the first joint, until the session raises. Return that error."""
+        velocity = np.zeros(self.robot.n)
+        for _ in range(round(seconds / 0.02)):
+            if speed is not None:
+                velocity[0] = speed
+                try:
+                    self.control.send(hal.JointVelocity(velocity))
+                except (MotionStopped, RobotFault, hal.ConnectionLost) as error:
+                    return error
+            self.clock.sleep(0.02)
+        return None
+
+
+@contextlib.contextmanager
+def driven() -> Iterator[Driven]:
+    """Yield a YAM that moves."""
+    with SteppedEmulator("yam") as far:
+        arm = Driven(far)
+        try:
+            with arm.control:
+                assert arm.run(0.4, SPEED) is None
+                yield arm
+                far.cut("on")  # so that the arm does not have to sink first
+        finally:
+            arm.host.close()
+
+
+# Faults: each begins, and ends.
+
+
+@dataclass
+class CanFault:
+    """A fault that is injected in motion."""
+
+    name: str
+    begin: Callable[[Driven], object]
+    end: Callable[[Driven], object]
+    told: tuple[type[HalError], str] | None
+    """Error that the program gets, and its code; None where the arm has to go on."""
+    cause: str = ""
+    """Code of the fault in the arm's state."""
+    recovers: bool = False
+    """Whether the user has to call ``recover``."""
+
+
+def line(text: str) -> Callable[[Driven], object]:
+    """Return a function that executes a command of the emulator's console."""
+    return lambda arm: arm.far.execute(text)
+
+
+def nothing(arm: Driven) -> None:
+    """Do nothing."""
+
+
+def starve(arm: Driven) -> None:
+    """Let the motors hear nothing for longer than TIMEOUT, while this program stands still."""
+    arm.far.advance(0.45)
+
+
+def take_interface_down(arm: Driven) -> None:
+    def fail(*_: Any) -> None:
+        raise can.CanOperationError("Failed to receive", errno.ENETDOWN)
+
+    bus = arm.driver.chain.bus
+    assert bus is not None
+    broken = contextlib.ExitStack()
+    broken.enter_context(patch.object(bus._bus, "recv", fail))
+    broken.enter_context(patch.object(can, "Bus", fail))
+    arm.broken = broken  # type: ignore[attr-defined]
+
+
+def bring_interface_up(arm: Driven) -> None:
+    arm.broken.close()  # type: ignore[attr-defined]
+    deadline = time.monotonic() + 5.0
+    while arm.driver.chain.lost is not None and time.monotonic() < deadline:
+        arm.run(0.02)
+        time.sleep(0.01)  # a thread opens the bus, at most every 0.2 s
+
+
+RESET = line("reset")
+STATUS = {
+    0x8: "over_voltage",
+    0x9: "under_voltage",
+    0xA: "over_current",
+    0xB: "mosfet_too_hot",
+    0xC: "rotor_too_hot",
+    0xD: "lost_communication",
+    0xE: "overload",
+}
+LOST = (MotionStopped, "device_lost")
+FAULT = (RobotFault, "robot_fault")
+FAULTS = [
+    CanFault("1 reply in 20 lost", line("lose 0.05"), RESET, None),
+    CanFault("replies 6 ms late", line("late 0.006"), RESET, None),
+    CanFault("replies doubled", line("double on"), RESET, None),
+    CanFault("200 frames of another device", line("frame 0x2ff 0011223344556677 200"), nothing, None),
+    CanFault("20 frames with another motor's number", line("frame 0x11 1500007ff7ff1e1e 20"), nothing, None),
+    CanFault("bus cut for 60 ms", line("cut 0.06"), RESET, None),
+    *(
+        CanFault(f"status {code:X}: {name}", line(f"status 1 {code:x}"), nothing, FAULT, name, recovers=True)
+        for code, name in STATUS.items()
+    ),
+    CanFault(
+        "rotor at 96 deg C", line("temperature 1 40 96"), line("temperature 1 40 60"), FAULT, "motor_hot", recovers=True
+    ),
+    CanFault("motors without power for a moment", line("power"), nothing, FAULT, "switched_off", recovers=True),
+    CanFault("TIMEOUT expired", starve, nothing, FAULT, "lost_communication", recovers=True),
+    CanFault("motor 1 silent", line("silent 1 on"), RESET, LOST, "motor_silent"),
+    CanFault("all motors silent", line("silent all on"), RESET, LOST, "motor_silent"),
+    CanFault("interface down", take_interface_down, bring_interface_up, LOST, "interface_down"),
+]
+
+
+TABLE: list[str] = []
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _table() -> Iterator[None]:
+    """Print the table of this file's tests at their end."""
+    yield
+    print(
+        "\n\n"
+        + "\n".join(["| fault | the program is told | after | the arm | recovery |", "|---|---|---|---|---|", *TABLE])
+    )
+
+
+def on(arm: Driven) -> int:
+    """Return how many motors are on."""
+    return sum(motor.on for motor in arm.driver.chain.motors)
+
+
+@pytest.mark.parametrize("fault", FAULTS, ids=[fault.name.replace(" ", "_") for fault in FAULTS])
+def test_a_fault_in_motion(fault: CanFault) -> None:
+    with driven() as arm:
+        began = arm.clock.now()
+        fault.begin(arm)
+        error = arm.run(0.6, SPEED)
+        took = arm.clock.now() - began
+        if fault.told is None:
+            assert error is None, "the arm has to continue"
+            assert arm.driver.engaged
+            TABLE.append(f"| {fault.name} | nothing | | continues | |")
+            return
+        state = arm.robot._mail.get_state()
+        assert isinstance(error, fault.told[0])
+        assert error.code == fault.told[1]
+        assert state is not None
+        assert state.fault is not None
+        assert state.fault.code == fault.cause
+        assert took <= DETECTION
+        at = arm.q
+        arm.run(0.3)
+        drift = np.abs(arm.q - at)
+        assert drift[0] < 0.1, "the joint that moved has stopped"
+        power = "holds" if arm.driver.engaged else f"{on(arm)} of 6 motors hold"
+        lost = fault.told == LOST
+        arm_text = f"{power}, moves by {drift.max():.2f} rad in 0.3 s"
+
+        fault.end(arm)
+        arm.run(0.1)
+        if lost:
+            assert arm.driver.chain.lost is None, "the arm is found again by reading"
+        if fault.recovers:
+            with pytest.raises(RobotFault):
+                arm.control.send(hal.JointVelocity(np.zeros(6)))
+            arm.robot.recover()
+            arm.run(0.02)
+            assert arm.robot.state(max_age=1.0).fault is None
+        held, engaged, at = on(arm), arm.driver.engaged, arm.q[0]
+        arm.run(0.3)
+        assert on(arm) == held, "nothing is switched on before a new press"
+        assert arm.driver.engaged is engaged
+        assert arm.q[0] == pytest.approx(at, abs=0.01)
+
+        arm.control.rearm()
+        assert arm.run(0.6, SPEED) is None
+        assert arm.driver.engaged, "a press switches the drives on again"
+        assert arm.q[0] > at + 0.05
+        recovery = "recover(), then a press" if fault.recovers else "a press"
+        TABLE.append(
+            f"| {fault.name} | {type(error).__name__}: {fault.cause} | {1e3 * took:.0f} ms | {arm_text} | {recovery} |"
+        )
+
+
+# Faults that are there before the arm is opened.
+
+
+@pytest.mark.parametrize(
+    ("command", "error", "code"),
+    [
+        ("register 2 VMAX 8", ConfigError, "wrong_range"),
+        ("register 4 PMAX 3.1416", ConfigError, "wrong_range"),
+        ("register 6 TMAX 7", ConfigError, "wrong_range"),
+        ("register 3 TIMEOUT 0", ConfigError, "no_timeout"),
+        ("register 5 CTRL_MODE 2", ConfigError, "wrong_mode"),
+        ("silent 3 on", DeviceNotFound, "motor_missing"),
+        ("silent all on", DeviceNotFound, "motor_missing"),
+    ],
+)
+def test_a_fault_before_the_start_is_refused_by_motor(command: str, error: type[HalError], code: str) -> None:
+    with SteppedEmulator("yam") as far:
+        far.execute(command)
+        driver = DamiaoArm(far.spec)
+        with pytest.raises(error) as raised:
+            driver.open()
+        found = raised.value.problems[0].code if isinstance(raised.value, ConfigError) else raised.value.code
+        assert found == code
+        number = "motor 1" if "all" in command else f"motor {command.split()[1]}"
+        assert number in str(raised.value), "the message names the motor"
+        assert all(state["status"] == "0" for state in far.execute("state")["motors"].values()), "nothing is energised"
+        TABLE.append(f"| {command}, before the start | {error.__name__}: {code}, names {number} | at once | off | |")
+
+
+def test_frames_from_before_the_connect_are_discarded() -> None:
+    with SteppedEmulator("yam") as far:
+        driver = DamiaoArm(far.spec)
+        bus = CanBus.acquire(driver.settings.shared)  # another device of this process has opened it before
+        stale = MotorCodec(MOTOR_RANGES["DM4340"]).encode_feedback(1, 1, 2.0, 5.0, 9.0)
+        far.execute(f"frame 0x11 {stale.hex()} 50")
+        driver.open()
+        reading = driver.read(0.0)
+        assert reading.q == pytest.approx(far.spec.initial, abs=1e-3)
+        assert driver.chain.motors[0].status == 0
+        driver.close()
+        bus.release()
+        TABLE.append("| 50 frames from before the connect | nothing | | discarded | |")
+
+
+# Closing.
+
+
+def test_close_lets_a_raised_arm_sink_damped_before_it_switches_it_off() -> None:
+    with SteppedEmulator("yam") as far:
+        arm = Driven(far)
+        with arm.control:
+            arm.run(0.2, SPEED)
+        arm.far.execute("stats reset")
+        began = far.passed
+        arm.host.close()
+        took = far.passed - began
+        assert all(state["status"] == "0" for state in far.execute("state")["motors"].values())
+        peak = max(far.execute("stats")["peak_speed"])
+        assert took < 3.2
+        TABLE.append(
+            f"| the program ends, arm raised | | | sinks, damped, at most {peak:.2f} rad/s, for {took:.1f} s | |"
+        )
+
+
+def test_an_arm_that_was_never_engaged_is_not_switched_off() -> None:
+    with SteppedEmulator("yam") as far:
+        driver = DamiaoArm(far.spec)
+        driver.open()
+        far.execute("status 2 1")  # another program left it on
+        for k in range(10):
+            far.advance(DT)
+            driver.read(k * DT)
+        assert not driver.engaged
+        driver.close()
+        assert far.execute("state")["motors"][2]["status"] == "1"
