@@ -86,10 +86,13 @@ class DamiaoArm(RobotDriver):
         self.chain.open()
 
     def close(self) -> None:
-        """Let an arm that is engaged sink, damped, until it rests (3 s at most); switch it off and disconnect."""
+        """Let an arm that is engaged sink slowly until it rests; switch it off and disconnect.
+
+        An arm that does not rest within 6 s is left to the damping of its motors (see ``DamiaoChain.lower``).
+        """
         self.engaged = False
         self._switching = None
-        self.chain.lower()
+        self.chain.lower(self.dynamics.gravity)
         self.chain.close()
 
     # Every cycle.

@@ -11,7 +11,7 @@ without one it damps, and what it carries sinks.
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 from hal.errors import ConfigError, ConnectionLost, DeviceNotFound, Fault, HalError, Problem, RobotFault
@@ -67,8 +67,10 @@ _LOCK_PATIENCE = 2.0
 """Longest time to wait for another program to release the motors, s."""
 _CLEARING = 0.2
 """Longest time until an error is cleared, s."""
-_LOWERING = 3.0
-"""Longest time that an arm may sink, damped, before its motors are switched off, s."""
+_LOWERING = 6.0
+"""Longest time that an arm is lowered before it is left to the damping of its motors, s."""
+_SINKING = 0.4
+"""Speed with which the joints of an arm that is lowered sink, rad/s."""
 _LOWERING_PERIOD = 0.004
 """Time between two commands while it sinks, s."""
 _AT_REST = 2e-3
@@ -504,33 +506,57 @@ class DamiaoChain:
         self.send(motor, hold)
         motor.on, motor.switched_at = True, self._now
 
-    def lower(self) -> None:
-        """Let the motors that are on damp until they are at rest, 3 s at most, and switch them off. Never raises."""
+    def lower(self, weight: Callable[[Sequence[float]], Sequence[float]] | None = None) -> None:
+        """Let the motors that are on sink to rest, slowly and damped, and switch them off. Never raises.
+
+        A motor's damping alone is too small for an arm's weight. So the part of the weight that would sink faster
+        than :data:`_SINKING` is carried, and let go of once everything rests. An arm that does not rest within 6 s is
+        left to its motors, which damp after TIMEOUT until they are switched off by hand: it is never dropped.
+
+        Args:
+            weight: Function that returns the torques (n,), Nm, that carry the device at joint positions (n,), rad; None
+                if it weighs nothing.
+        """
         bus = self.bus
-        on = [motor for motor in self.motors if motor.on]
+        on = [k for k, motor in enumerate(self.motors) if motor.on]
         if bus is None or not on:
             return
         try:
             deadline = time.monotonic() + _LOWERING
-            at, since = [motor.q for motor in on], time.monotonic()
-            while (now := time.monotonic()) < deadline and now - since < _REST:
-                for motor in on:
-                    self.send(motor, motor.command(motor.q, 0.0, 0.0, motor.kd, 0.0))
+            at, since = self._positions(), time.monotonic()
+            carried = True
+            while (now := time.monotonic()) < deadline:
+                q = self._positions()
+                if any(abs(q[k] - at[k]) > _AT_REST for k in on):
+                    at, since, carried = q, now, True
+                if now - since > _REST:
+                    if not carried or weight is None:
+                        break
+                    since, carried = now, False
+                tau = weight(q) if weight is not None and carried else (0.0,) * len(q)
+                for k in on:
+                    motor = self.motors[k]
+                    free = _SINKING * motor.kd
+                    held = tau[k] - min(max(tau[k], -free), free)
+                    self.send(motor, motor.command(motor.q, 0.0, 0.0, motor.kd, held))
                 time.sleep(_LOWERING_PERIOD)
                 if not bus.poll():
                     return
-                for motor in on:
+                for motor in self.motors:
                     if motor.replies:
                         motor.decode()
                         motor.replies = 0
-                if any(abs(motor.q - q) > _AT_REST for motor, q in zip(on, at, strict=True)):
-                    at, since = [motor.q for motor in on], now
+            else:
+                return
             for _ in range(2):  # one may be lost
-                for motor in on:
-                    self.send(motor, DISABLE)
+                for k in on:
+                    self.send(self.motors[k], DISABLE)
                 time.sleep(_LOWERING_PERIOD)
         except HalError:
             return  # the motors damp by themselves after TIMEOUT
+
+    def _positions(self) -> list[float]:
+        return [motor.q for motor in self.motors]
 
     # Statistics.
 
