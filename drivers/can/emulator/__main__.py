@@ -35,7 +35,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: end.set())
     try:
-        with CanEmulator(options.config, options.set, options.seed) as emulator:
+        with CanEmulator(options.config, options.set, options.seed, realtime=True) as emulator:
             port = CommandPort(emulator, options.port)
             names = ", ".join(f"{arm.name} at {' '.join(arm.bus.key)}" for arm in emulator.arms.values())
             print(f"ready: {names}; control port {port.number}; help lists the commands", flush=True)

@@ -108,6 +108,10 @@ def _masses(target: _Target, words: list[str]) -> None:
     target.arm.plant.load(mass_factor=float(words[0]))
 
 
+def _friction(target: _Target, words: list[str]) -> None:
+    target.arm.plant.friction = float(words[0])
+
+
 def _payload(target: _Target, words: list[str]) -> None:
     mass, *place = map(float, words)
     target.arm.plant.load(payload=(mass, place if len(place) == 3 else (0.0, 0.0, 0.0)))
@@ -157,6 +161,7 @@ def _reset(target: _Target, words: list[str]) -> None:
     """Take every fault away; what was done to the motors' registers stays."""
     target.bus.faults[target.arm.name].__init__()  # type: ignore[misc]
     target.bus.cut_until = 0.0
+    target.arm.plant.friction = 1.0
     target.arm.plant.load(mass_factor=1.0, payload=(0.0, (0.0, 0.0, 0.0)))
     target.arm.plant.push[:] = 0.0
 
@@ -176,6 +181,7 @@ COMMANDS = {
     "temperature": EmulatorCommand("temperature MOTOR C C", "report these: electronics, motor", _temperature),
     "power": EmulatorCommand("power", "switch all motors off and on again", lambda target, _: target.arm.restart()),
     "masses": EmulatorCommand("masses FACTOR", "multiply the masses of the arm", _masses),
+    "friction": EmulatorCommand("friction FACTOR", "multiply the Coulomb friction of the joints", _friction),
     "payload": EmulatorCommand("payload KG [X Y Z]", "fix a mass to the tool's link, m", _payload),
     "place": EmulatorCommand("place [Q ...]", "switch off, and hold the arm there until its motors are on", _place),
     "push": EmulatorCommand("push JOINT NM", "push a joint with this torque, until 0", _push),

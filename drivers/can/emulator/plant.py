@@ -99,9 +99,11 @@ class ArmPlant:
         self.upper = [float(x) for x in self._model.upperPositionLimit]
         self._mechanics = tuple(mechanics)
         self._rotor = np.array([m.inertia for m in mechanics])
-        self._friction = [0.0] * len(joints)
+        self._impulses = [0.0] * len(joints)
         self.mass_factor = 1.0
         self.payload: tuple[float, tuple[float, ...]] = (0.0, (0.0, 0.0, 0.0))
+        self.friction = 1.0
+        """Factor on the Coulomb friction of every joint."""
         self.held = True
         self.place(q)
 
@@ -111,7 +113,7 @@ class ArmPlant:
         self.dq: NDArray[np.float64] = np.zeros(len(self.q))
         self.tau: NDArray[np.float64] = np.zeros(len(self.q))
         self.push: NDArray[np.float64] = np.zeros(len(self.q))
-        self._friction = [0.0] * len(self.q)
+        self._impulses = [0.0] * len(self.q)
         self.held = True
 
     def load(self, mass_factor: float | None = None, payload: tuple[float, Sequence[float]] | None = None) -> None:
@@ -187,16 +189,16 @@ class ArmPlant:
             left[k, k] += dt * (damping + dt * stiffness)
             right[k] += dt * torque
         inverse = np.linalg.inv(left)
-        friction = self._friction
-        velocity: list[float] = (inverse @ (right + np.array(friction))).tolist()
+        impulses = self._impulses
+        velocity: list[float] = (inverse @ (right + np.array(impulses))).tolist()
         rows: list[list[float]] = inverse.tolist()
         for _ in range(_SWEEPS):
             for k, joint in enumerate(self._mechanics):
-                bound = dt * joint.coulomb
-                impulse = min(max(friction[k] - velocity[k] / rows[k][k], -bound), bound)
-                change = impulse - friction[k]
+                bound = dt * self.friction * joint.coulomb
+                impulse = min(max(impulses[k] - velocity[k] / rows[k][k], -bound), bound)
+                change = impulse - impulses[k]
                 if change:
-                    friction[k] = impulse
+                    impulses[k] = impulse
                     row = rows[k]  # the inverse is symmetric
                     velocity = [v + change * r for v, r in zip(velocity, row, strict=True)]
         return velocity

@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import heapq
 import itertools
+import os
 import random
 import threading
 import time
@@ -32,6 +33,8 @@ _STEP = 1e-3
 """Step of the mechanics, s."""
 _LONGEST_GAP = 0.25
 """Time that the mechanics make up for after the machine had no time for them, s."""
+_PRIORITY = 40
+"""Of a bus's thread among SCHED_FIFO threads; a host has 50."""
 _ARMS: Mapping[str, Callable[[RobotSpec], EmulatedArm]] = {"damiao": EmulatedDamiaoArm, "piper": EmulatedPiperArm}
 
 
@@ -110,8 +113,11 @@ class EmulatedBus:
         late: Steps that were left out because the machine had no time.
     """
 
-    def __init__(self, settings: BusSettings, arms: Sequence[EmulatedArm], seed: int = 0) -> None:
+    def __init__(
+        self, settings: BusSettings, arms: Sequence[EmulatedArm], seed: int = 0, realtime: bool = False
+    ) -> None:
         self.settings = settings
+        self._realtime = realtime
         self.arms = {arm.name: arm for arm in arms}
         self.faults = {arm.name: FrameFaults() for arm in arms}
         self.lock = threading.Lock()
@@ -161,6 +167,9 @@ class EmulatedBus:
                 self._bus.send(message)
 
     def _run(self) -> None:
+        if self._realtime:
+            with contextlib.suppress(AttributeError, OSError):  # Linux only, and only where it is allowed
+                os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(_PRIORITY))
         try:
             self._serve()
         except Exception as error:  # reported by whoever looks at it
@@ -240,13 +249,20 @@ class CanEmulator:
         buses: Their buses.
     """
 
-    def __init__(self, config: str | Path | Mapping[str, Any], overrides: Sequence[str] = (), seed: int = 0) -> None:
+    def __init__(
+        self,
+        config: str | Path | Mapping[str, Any],
+        overrides: Sequence[str] = (),
+        seed: int = 0,
+        realtime: bool = False,
+    ) -> None:
         """Build the arms of a rig that have a CAN driver and are not simulated.
 
         Args:
             config: The rig, as for :func:`hal.open`.
             overrides: Changes of it, as for :func:`hal.open`.
             seed: Of random losses.
+            realtime: Give its threads the priority of a servo, for a process that does nothing else.
 
         Raises:
             ConfigError: The rig has problems.
@@ -258,7 +274,7 @@ class CanEmulator:
         self.arms: dict[str, EmulatedArm] = {spec.name: _ARMS[spec.driver](spec) for spec in specs}
         keys = {arm.bus.key: arm.bus for arm in self.arms.values()}
         self.buses = [
-            EmulatedBus(settings, [arm for arm in self.arms.values() if arm.bus.key == key], seed)
+            EmulatedBus(settings, [arm for arm in self.arms.values() if arm.bus.key == key], seed, realtime)
             for key, settings in keys.items()
         ]
 

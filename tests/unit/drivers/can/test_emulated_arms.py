@@ -257,6 +257,7 @@ def emulator() -> CanEmulator:
         "temperature 4 80 90",
         "power",
         "masses 1.2",
+        "friction 0",
         "payload 0.5 0 0 0.1",
         "place",
         "push 1 2.0",
