@@ -110,6 +110,14 @@ class Deadman:
                 self._pass_to(token)
             return self._record
 
+    def disarm(self) -> None:
+        """Count as released, now and until the control was released: a stop for which a new press is needed."""
+        with self._lock:
+            self._armed = False
+            self._record = self._record._replace(held=False)
+            for token in tuple(self._sinks):
+                self._pass_to(token)
+
     def attach(self, sink: Sink) -> Callable[[], None]:
         """Call ``sink`` now and at every update, until the returned function is called.
 

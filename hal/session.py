@@ -1,15 +1,17 @@
-"""A teleoperation session: an arm driven with a gamepad, across stops, faults and changes of the pad."""
+"""A teleoperation session: arms driven with gamepads, across stops, faults and changes of the pad."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass
 from enum import Enum
 from functools import partial
-from typing import TYPE_CHECKING, Literal, TypeVar
+from typing import TYPE_CHECKING, Literal, NamedTuple, TypeVar
 
 import numpy as np
 
+from . import registry
 from .errors import (
     CommandError,
     ConnectionLost,
@@ -20,11 +22,11 @@ from .errors import (
     StaleStateError,
 )
 from .learning.episode import reset_scene, stands_in_world
-from .teleop import Teleop, twist_towards
+from .teleop import HOMING_PATIENCE, STILL, ArmTeleop, SessionEventKind, Teleop, share_pads
 from .views import DrivingView
 
 if TYPE_CHECKING:
-    from .commands import Twist
+    from .control import Control
     from .deadman import Deadman
     from .gamepad import Gamepad
     from .rig import Rig
@@ -35,45 +37,13 @@ __all__ = ["SessionEvent", "SessionEventKind", "TeleopSession"]
 
 RATE_HZ = 50.0
 """Rate at which the pad is read and commands are sent, Hz."""
-STATE_AGE = 2.0
-"""Greatest age of a state that is only shown, s."""
-HOMING_PATIENCE = 0.2
-"""Time without the dead-man after which a move home is cancelled, s."""
 RETRY_DELAY = 0.1
 """Pause after a stop, before the next control session is opened, s."""
+REOPEN_PERIOD = 1.0
+"""Time between two attempts to reach an independent arm that does not answer, s; made while no dead-man is held."""
 
 T = TypeVar("T")
 Until = Callable[["PadState"], str]
-
-SessionEventKind = Literal[
-    "stopped",
-    "fault",
-    "resumed",
-    "homing",
-    "homing_cancelled",
-    "home_reached",
-    "pad_changed",
-    "pad_refused",
-    "robot_changed",
-    "setting_refused",
-    "scene_reset",
-    "gripper_fault",
-    "gripper_recovered",
-    "message",
-]
-"""What happened:
-
-* ``stopped``, ``fault``: the arm does not follow the pad any more; :attr:`SessionEvent.reason` has the cause.
-* ``resumed``: it follows the pad again.
-* ``homing``, ``homing_cancelled``, ``home_reached``: the move home started, was cancelled by releasing the dead-man, or
-  is complete.
-* ``pad_changed``: a pad with another mapping was plugged in and is used from now on.
-* ``pad_refused``: it was plugged in, but may not be the dead-man of this arm.
-* ``robot_changed``, ``scene_reset``, ``setting_refused``: a page of the console chose another arm, reset the simulated
-  scene, or changed a setting while the dead-man was held, which has no effect.
-* ``gripper_fault``, ``gripper_recovered``: the gripper does not answer, or answers again; the arm continues without it.
-* ``message``: text of the program, see :meth:`TeleopSession.announce`.
-"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,24 +55,39 @@ class SessionEvent:
     """One line for the user."""
     reason: str = ""
     """Cause of a stop or a fault, without the remedy; else empty."""
+    robot: str = ""
+    """Name of the arm; empty for what concerns all of them."""
 
 
-class _Due(Enum):
-    """An action for which the control session has to end first."""
+class _Task(Enum):
+    """An action for which the control sessions have to end first."""
 
     HOME = "home"
     OTHER_PAD = "other pad"
     OTHER_ROBOT = "other robot"
     RESET_SCENE = "reset scene"
+    REOPEN = "reopen"
+
+
+class _Due(NamedTuple):
+    """A task, the arm that it concerns, and the arm to be driven instead."""
+
+    task: _Task
+    arm: ArmTeleop
+    robot: Robot | None = None
 
 
 class TeleopSession:
-    """Drive an arm with a gamepad until the program has a reason to end.
+    """Drive arms with gamepads until the program has a reason to end.
 
     A session opens one control session (:meth:`hal.Robot.control`) after another: when a stop or a fault ends one, the
     next follows as soon as the arm permits, and the arm moves again after a new press of the dead-man. The arm is at
     rest between them. The session also
 
+    * drives several arms at once, each with its own pad and dead-man; one that stops brings the others to rest, and
+      each of them then needs a new press (unless ``independent``);
+    * hands a pad that has several arms on to the next one with the mapping's button ``other_arm``, while the dead-man
+      is released; an arm that is not driven holds;
     * drives the arm home when the mapping's button is pressed with the dead-man held;
     * changes the mapping when another kind of pad is plugged in;
     * follows the gizmo of the 3D view while the sticks are at rest;
@@ -123,9 +108,10 @@ class TeleopSession:
     def __init__(
         self,
         rig: Rig,
-        robot: Robot | None = None,
-        pad: Gamepad | None = None,
+        robot: Robot | Sequence[Robot] | None = None,
+        pad: Gamepad | Sequence[Gamepad] | None = None,
         *,
+        independent: bool = False,
         mapping: str | None = None,
         speed: float = 1.0,
         actions: tuple[str, ...] = (),
@@ -137,8 +123,11 @@ class TeleopSession:
 
         Args:
             rig: Open rig.
-            robot: Arm to drive; None for the rig's first one.
-            pad: Gamepad that drives it; None for the rig's first one.
+            robot: Arm to drive, or several; None for the rig's first one.
+            pad: Gamepad that drives it, or several; None for as many of the rig's as there are arms. A pad drives the
+                arm that its entry in the rig names (``drives``), else the next one; a single pad drives one after
+                the other.
+            independent: Whether an arm that stops leaves the others moving.
             mapping: Name or file of the teleoperation mapping; None for the one that the plugged-in pad is meant for.
             speed: Share of the mapping's speeds, above 0, at most 1. The console cannot exceed it.
             actions: Actions of the mapping (``record``, ``finish``, ...) that the program handles, for the labels on
@@ -153,56 +142,94 @@ class TeleopSession:
             ConfigError: The mapping is wrong.
         """
         self.rig = rig
-        self.robot = _first(robot, rig.robots.values(), f"{rig.plan.source} has no robot", "no_robot")
+        robots = _listed(robot, list(rig.robots.values())[:1], f"{rig.plan.source} has no robot", "no_robot")
         missing = f"{rig.plan.source} has no gamepad; add 'gamepads: {{pad: {{model: auto}}}}'"
-        self.pad = _first(pad, rig.gamepads.values(), missing, "no_gamepad")
-        self.state: RobotState | None = None
-        """Newest state of the arm; None while it does not answer."""
-        self.stopped = ""
-        """Why the arm does not follow the pad; empty while it does."""
-        self.gripper_trouble = ""
-        """Why the gripper does not answer; empty while it does."""
-        self.mapping = ""
-        """Name or file of the mapping that is used."""
-        self._mapping_wanted = mapping
+        pads = _listed(pad, list(rig.gamepads.values()), missing, "no_gamepad")
+        self._several = len(robots) > 1
+        self.arms = tuple(
+            ArmTeleop(arms, pad, mapping, speed, self._announce) for pad, arms in share_pads(robots, pads)
+        )
+        """The arms that are driven at once, each with its pad."""
+        self._arm = self.arms[0]
+        """The arm that the next error concerns."""
+        self._independent = independent
         self._speed = self._speed_max = speed
         self._actions = actions
         self._on_event = on_event
         self._on_tick = on_tick
-        self._refused_pad = ""
         self._changes: dict[str, str | float] = {}
         """Settings that the page in control changed and that are not applied yet, the newest value of each."""
-        self._next_robot = ""
+        self._reopen_at = 0.0
+        """Time at which an arm that did not answer is tried again, s."""
         self._settings = self._available_settings() if adjustable else ()
-        self._load_mapping()
+        self._show_driving()
         if self._settings and rig.console is not None:
             rig.console.on_setting(self._changes.__setitem__)
 
+    # The first arm, which is the only one in most sessions.
+
+    @property
+    def robot(self) -> Robot:
+        """The first arm that is driven."""
+        return self.arms[0].robot
+
+    @property
+    def pad(self) -> Gamepad:
+        """The pad of the first arm."""
+        return self.arms[0].pad
+
     @property
     def teleop(self) -> Teleop:
-        """The present conversion of pad states into commands."""
-        return self._teleop
+        """The present conversion of its pad's states into commands."""
+        return self.arms[0].teleop
 
     @property
     def deadman(self) -> Deadman:
-        """The present dead-man."""
-        return self._deadman
+        """The present dead-man of the first arm."""
+        return self.arms[0].deadman
 
     @property
     def deadman_name(self) -> str:
         """Name of the dead-man's control as printed on the pad, for example ``L2``."""
-        return self.pad.control_name(self.teleop.mapping.deadman)
+        return self.arms[0].deadman_name
+
+    @property
+    def mapping(self) -> str:
+        """Name or file of the mapping that is used."""
+        return self.arms[0].mapping
+
+    @property
+    def state(self) -> RobotState | None:
+        """Newest state of the first arm; None while it does not answer."""
+        return self.arms[0].state
+
+    @property
+    def stopped(self) -> str:
+        """Why the first arm does not follow its pad; empty while it does."""
+        return self.arms[0].stopped
+
+    @property
+    def gripper_trouble(self) -> str:
+        """Why its gripper does not answer; empty while it does."""
+        return self.arms[0].gripper_trouble
+
+    @property
+    def held(self) -> bool:
+        """Whether the dead-man of any arm is held."""
+        return any(arm.deadman.held for arm in self.arms)
 
     @property
     def drives_home(self) -> bool:
-        """Whether :meth:`reset_scene` has to drive the arm home; a simulated arm is placed there."""
-        return not stands_in_world(self.rig, self.robot)
+        """Whether :meth:`reset_scene` has to drive an arm home; a simulated arm is placed there."""
+        return any(not stands_in_world(self.rig, robot) for arm in self.arms for robot in arm.robots)
 
     def help(self) -> str:
-        """Return what the controls of the pad do, in a few lines."""
-        about = self.teleop.mapping.description
-        lines = [f"drives {self.robot.name}"] if len(self.rig.robots) > 1 else []
-        lines += [f"mapping {self.mapping}{': ' if about else ''}{about}", *self.teleop.help(self.pad)]
+        """Return what the controls of the pads do, in a few lines."""
+        lines = []
+        for arm in self.arms:
+            if len(self.rig.robots) > 1:
+                lines.append(f"{arm.pad.name} drives {arm.robot.name}")
+            lines += arm.help()
         return "\n".join(f"  {line}" for line in lines)
 
     def run(self, until: Until | None = None) -> str:
@@ -221,17 +248,22 @@ class TeleopSession:
         """
         check = until or self._pad_finished
         while True:
-            due = self.guard(lambda: self._follow_pad(check)) or self._apply_settings()
-            if due is _Due.HOME:
-                self.guard(self._go_home)
-            elif due is _Due.OTHER_PAD:
-                self.use_plugged_pad()
-            elif due is _Due.OTHER_ROBOT:
-                self._use_other_robot()
-            elif due is _Due.RESET_SCENE:
-                self._reset_world()
+            due = self.guard(lambda: self._follow_pads(check)) or self._apply_settings()
+            if isinstance(due, _Due):
+                self._arm = due.arm
+                self._carry_out(due)
             elif reason := due or check(self.pad.state()):
                 return str(reason)
+
+    def _carry_out(self, due: _Due) -> None:
+        if due.task is _Task.HOME:
+            self.guard(due.arm.go_home)
+        elif due.task is _Task.OTHER_PAD:
+            self.use_plugged_pad()
+        elif due.task is _Task.OTHER_ROBOT and due.robot is not None:
+            self._use_other_robot(due.arm, due.robot)
+        elif due.task is _Task.RESET_SCENE:
+            self._reset_world()
 
     def reset_scene(self, seed: int, keep_waiting: Callable[[], bool] = lambda: True) -> bool:
         """Reset the scene for an episode: simulated objects and arms are placed, any other arm drives home.
@@ -249,14 +281,26 @@ class TeleopSession:
         Raises:
             ConnectionLost: The arm's process is gone.
         """
-        deadman, presses = self.deadman, self.deadman.record.presses
+        for arm in self.arms:
+            for robot in arm.robots:
+                if not self._reset_arm(arm, robot, seed, keep_waiting):
+                    return False
+        return True
+
+    def _reset_arm(self, arm: ArmTeleop, robot: Robot, seed: int, keep_waiting: Callable[[], bool]) -> bool:
+        """Reset the scene, and bring one arm home in it; return False if ``keep_waiting`` cancelled it."""
+        self._arm = arm
+        drives = not stands_in_world(self.rig, robot)
+        if drives and robot is not arm.robot:
+            self._use_other_robot(arm, robot)
+        deadman, presses = arm.deadman, arm.deadman.record.presses
         while keep_waiting():
-            if deadman is not self.deadman:  # of another pad, which counts its own presses
-                deadman, presses = self.deadman, self.deadman.record.presses
+            if deadman is not arm.deadman:  # of another pad, which counts its own presses
+                deadman, presses = arm.deadman, arm.deadman.record.presses
             record = deadman.record
-            if not self.drives_home or (record.held and record.presses > presses):
-                if self.guard(partial(self._try_reset, seed, presses)):
-                    self._open_gripper()
+            if not drives or (record.held and record.presses > presses):
+                if self.guard(partial(self._try_reset, arm, robot, seed, presses)):
+                    self._open_gripper(robot)
                     return True
                 presses = deadman.record.presses  # stopped on the way: a new press is needed
             else:
@@ -278,23 +322,21 @@ class TeleopSession:
         """
         try:
             return motion()
-        except MotionStopped as stop:  # a new control session needs the stop to be acknowledged first
-            self._note_stop(stop)
-        except RobotFault as fault:
-            self._note_fault(fault)
-        except (ConnectionLost, StaleStateError) as lost:
-            self._note_lost(lost)
-        except NotSupported as refusal:
-            if self.pad.state().connected:
-                raise
-            self._note_stop(refusal)  # an unplugged pad cannot be trusted as a dead-man
+        except (MotionStopped, RobotFault, ConnectionLost, StaleStateError, NotSupported) as error:
+            self._arm.note_trouble(error)
         self.rig.clock.sleep(RETRY_DELAY)
         return None
 
     def announce(self, text: str, kind: SessionEventKind = "message", reason: str = "") -> None:
         """Pass a line of text to ``on_event`` and to the pages of the console."""
+        self._announce("", text, kind, reason)
+
+    def _announce(self, robot: str, text: str, kind: SessionEventKind, reason: str) -> None:
+        """The same about an arm, whose name is put in front if there are several."""
+        if robot and self._several:
+            text = f"{robot}: {text}"
         if self._on_event is not None:
-            self._on_event(SessionEvent(kind, text, reason))
+            self._on_event(SessionEvent(kind, text, reason, robot))
         self.rig.say(text)
 
     def use_plugged_pad(self) -> None:
@@ -302,100 +344,123 @@ class TeleopSession:
 
         :meth:`run` does this by itself. The new dead-man counts once it was released.
         """
-        if self._other_pad_ready():
-            self._load_mapping()
-            self.announce(f"driving with {self.pad.describe()}", "pad_changed")
+        for arm in self.arms:
+            if arm.other_pad_ready():
+                arm.load_mapping()
+                self._show_driving()
+                arm.announce(f"driving with {arm.pad.describe()}", "pad_changed")
 
-    # One control session.
+    # One control session of each arm.
 
-    def _follow_pad(self, until: Until) -> str | _Due:
-        """Follow the pad in one control session; return why it ended."""
-        seen = -1
-        with self.robot.control(deadman=self.deadman, rate_hz=RATE_HZ) as control:
-            self.teleop.reset()
-            if self.rig.viewer3d is not None:
-                self.rig.viewer3d.clear_goal(self.robot.name)
+    def _follow_pads(self, until: Until) -> str | _Due:
+        """Follow the pads in one control session of each arm; return why they ended."""
+        with ExitStack() as sessions:
+            controls = self._open_controls(sessions)
             for tick in self.rig.clock.rate(RATE_HZ):
-                state = self.pad.state()
-                fresh, seen = state.stamp.seq != seen, state.stamp.seq
-                motion, grip = self.teleop.step(state, tick.dt)
-                motion = self._follow_gizmo(motion)
-                try:
-                    control.send(motion, grip=grip, t_event=state.stamp.t if fresh else 0.0)
-                    self._note_resumed()
-                except MotionStopped as stop:
-                    self._note_stop(stop)
-                except RobotFault as fault:
-                    self._note_fault(fault)
-                self._update_state()
+                for arm in self.arms:
+                    if arm in controls and not self._drive(arm, controls[arm], tick.dt):
+                        del controls[arm]
+                self._hold_others()
                 if self._on_tick is not None:
                     self._on_tick()
-                if due := until(state) or self._due(state):
+                if due := until(self.pad.state()) or self._due(len(controls) < len(self.arms)):
                     return due
         raise AssertionError("a paced loop does not end")
 
-    def _follow_gizmo(self, motion: Twist) -> Twist:
-        """Return the velocity towards the gizmo of the 3D view if it was dragged; moving a stick resets the gizmo."""
-        view, name = self.rig.viewer3d, self.robot.name
-        goal = view.goal(name) if view is not None else None
-        if view is None or goal is None:
-            return motion
-        if motion.linear.any() or motion.angular.any():
-            view.clear_goal(name)
-            return motion
-        linear, angular = self.teleop.mapping.speeds()
-        speed = self.teleop.speed
-        return twist_towards(goal, self.robot.state(max_age=STATE_AGE).tcp_set, speed * linear, speed * angular)
+    def _open_controls(self, sessions: ExitStack) -> dict[ArmTeleop, Control]:
+        """Open a control session of each arm. Only independent arms can do without another that does not answer."""
+        controls: dict[ArmTeleop, Control] = {}
+        for arm in self.arms:
+            self._arm = arm
+            try:
+                controls[arm] = sessions.enter_context(arm.robot.control(deadman=arm.deadman, rate_hz=RATE_HZ))
+            except (MotionStopped, RobotFault, ConnectionLost, StaleStateError, NotSupported) as error:
+                if not self._independent or (arm is self.arms[-1] and not controls):
+                    raise
+                self._give_up(arm, error)
+            arm.teleop.reset()
+            arm.seen = -1
+            if self.rig.viewer3d is not None:
+                self.rig.viewer3d.clear_goal(arm.robot.name)
+        return controls
 
-    def _update_state(self) -> None:
+    def _drive(self, arm: ArmTeleop, control: Control, dt: float) -> bool:
+        """Send an arm the command of its pad; return False if the arm is lost, and the others go on without it."""
+        self._arm = arm
+        state = arm.pad.state()
+        fresh, arm.seen = state.stamp.seq != arm.seen, state.stamp.seq
+        motion, grip = arm.teleop.step(state, dt)
+        if arm.held_for:
+            motion, grip = STILL, None
         try:
-            self.state = self.robot.state(max_age=STATE_AGE)
-        except (ConnectionLost, StaleStateError):
-            self.robot.check()
-            self.state = None
-            return
-        trouble = self.robot.gripper.trouble if self.robot.gripper is not None else ""
-        if trouble and not self.gripper_trouble:
-            self.announce(f"GRIPPER: {trouble}", "gripper_fault", trouble)
-        elif self.gripper_trouble and not trouble:
-            self.announce("the gripper answers again", "gripper_recovered")
-        self.gripper_trouble = trouble
+            motion = arm.follow_gizmo(motion, self.rig.viewer3d)
+            control.send(motion, grip=grip, t_event=state.stamp.t if fresh else 0.0)
+            arm.note_resumed()
+        except (MotionStopped, RobotFault) as stop:
+            arm.note_trouble(stop)
+        except (ConnectionLost, StaleStateError) as lost:
+            if not self._independent or len(self.arms) == 1:
+                raise
+            self._give_up(arm, lost)
+            return False
+        arm.update_state()
+        return True
 
-    def _due(self, state: PadState) -> str | _Due:
-        """Return what has to be done outside of a control session, if anything."""
-        if self.teleop.home_pressed(state) and self.deadman.held:
-            return _Due.HOME
-        return _Due.OTHER_PAD if self._other_pad_ready() else self._apply_settings()
+    def _give_up(self, arm: ArmTeleop, error: Exception) -> None:
+        """Go on without an arm that does not answer, and try it again later."""
+        arm.note_trouble(error)
+        self._reopen_at = self.rig.clock.now() + REOPEN_PERIOD
+
+    def _hold_others(self) -> None:
+        """Bring an arm to rest while another one is stopped; it needs a new press of its own dead-man."""
+        if self._independent:
+            return
+        for arm in self.arms:
+            other = next((other for other in self.arms if other is not arm and other.stopped), None)
+            if other is not None and not arm.stopped:
+                if not arm.held_for:
+                    arm.held_for = other.robot.name
+                    text = f"holds, because {other.robot.name} stopped: release {arm.deadman_name} and hold it again"
+                    arm.announce(text, "held")
+                arm.deadman.disarm()
+            elif arm.held_for:
+                arm.held_for = ""
+
+    def _due(self, lacking: bool) -> str | _Due:
+        """Return what has to be done outside of the control sessions, if anything; ``lacking``: an arm has none."""
+        for arm in self.arms:
+            state = arm.pad.state()
+            if arm.teleop.home_pressed(state) and arm.deadman.held:
+                return _Due(_Task.HOME, arm)
+            if arm.other_pad_ready():
+                return _Due(_Task.OTHER_PAD, arm)
+            if arm.teleop.other_arm_pressed(state) and len(arm.robots) > 1:
+                if not arm.deadman.held:
+                    return _Due(_Task.OTHER_ROBOT, arm, arm.next_robot)
+                self._refuse_setting(arm, "arm")
+        if lacking and not self.held and self.rig.clock.now() >= self._reopen_at:
+            return _Due(_Task.REOPEN, self._arm)
+        return self._apply_settings()
 
     def _pad_finished(self, state: PadState) -> str:
         return "the recorded pad has ended" if self.pad.finished else ""
 
     # The way home.
 
-    def _go_home(self) -> None:
-        self.announce(f"homing: hold {self.deadman_name} until the arm is there", "homing")
-        try:
-            self.robot.move_to(self.robot.home, deadman=self.deadman, patience=HOMING_PATIENCE)
-        except MotionStopped:
-            if self.deadman.held or not self.deadman.connected:
-                raise
-            self.announce(f"homing cancelled: {self.deadman_name} released", "homing_cancelled")
-        else:
-            name = self.deadman_name
-            self.announce(f"home reached: release {name}, then hold it again to drive", "home_reached")
-
-    def _try_reset(self, seed: int, since: int) -> bool:
+    def _try_reset(self, arm: ArmTeleop, robot: Robot, seed: int, since: int) -> bool:
         """Reset the scene; return False if the dead-man was released on the way home.
 
         Args:
+            arm: The pad, and the arm that it drives.
+            robot: The arm to bring home.
             seed: See :meth:`reset_scene`.
             since: Number of presses of the dead-man that do not count.
         """
-        deadman = self.deadman
+        deadman = arm.deadman
         try:
             reset_scene(
                 self.rig,
-                self.robot,
+                robot,
                 random=np.random.default_rng(seed),
                 deadman=deadman,
                 since=since,
@@ -403,60 +468,38 @@ class TeleopSession:
                 open_gripper=False,
             )
         except MotionStopped:
-            if deadman.held or not deadman.connected or not self.drives_home:
+            if deadman.held or not deadman.connected or stands_in_world(self.rig, robot):
                 raise
             return False
         return True
 
-    def _open_gripper(self) -> None:
+    def _open_gripper(self, robot: Robot) -> None:
         """Open the gripper of an arm that drove home; the arm continues without a gripper that cannot."""
-        if self.drives_home and self.robot.gripper is not None:
+        if robot.gripper is not None and not stands_in_world(self.rig, robot):
             try:
-                self.robot.gripper.open()
+                robot.gripper.open()
             except (HalError, OSError) as trouble:
-                self.announce(f"GRIPPER: {trouble}", "gripper_fault", str(trouble))
-
-    # The mapping, which depends on the pad that is plugged in.
-
-    def _due_mapping(self) -> str:
-        """Return the mapping to use: the wanted one, else that of the plugged-in pad, else the present one."""
-        if self._mapping_wanted or (self.mapping and not self.pad.state().connected):
-            return self._mapping_wanted or self.mapping
-        return self.pad.mapping or "default"
-
-    def _load_mapping(self) -> None:
-        """Use the mapping that is due. Its dead-man must be released and pressed before it counts."""
-        self.mapping = self._due_mapping()
-        self._teleop = Teleop(self.robot, mapping=self.mapping, speed=self._speed)
-        self._deadman = self.pad.hold(self._teleop.mapping.deadman)
-        self._show_driving()
-
-    def _other_pad_ready(self) -> bool:
-        """Whether a pad with another mapping is plugged in and may drive this arm."""
-        if self._due_mapping() == self.mapping:
-            return False
-        spec = self.robot.spec
-        why = (self.pad.distrust() or "") if spec.attended and not spec.emulated else ""
-        if why and why != self._refused_pad:
-            self.announce(why, "pad_refused", why)
-        self._refused_pad = why
-        return not why
+                self._arm.announce(f"GRIPPER: {trouble}", "gripper_fault", str(trouble))
 
     # Settings that a page of the console changes.
 
     def _available_settings(self) -> tuple[str, ...]:
-        """Return what a page may set: the arm if there are several, and the scene if nothing real moves."""
-        arms = ("robot",) if len(self.rig.robots) > 1 else ()
+        """Return what a page may set: the arm if one pad drives several, and the scene if nothing real moves."""
+        arms = ("robot",) if len(self.rig.robots) > 1 and len(self.arms) == 1 else ()
         scene = ("scene",) if self.rig.plan.world is not None and not self.rig.attended else ()
         return ("speed", "frame", *arms, *scene)
 
     def _show_driving(self) -> None:
-        """Show on the console which arm is driven, how fast, and what the controls do."""
-        console, teleop = self.rig.console, self.teleop
+        """Show on the console which arm its pad drives, else the first, how fast, and what the controls do."""
+        console = self.rig.console
         if console is not None:
-            console.explain(teleop.labels(actions=("home", *self._actions)))
-            view = DrivingView(self.robot.name, teleop.speed, self._speed_max, teleop.frame, self._settings)
-            console.show_driving(view)
+            page = registry.pad_driver("console")
+            arm = next((arm for arm in self.arms if arm.pad.driver.spec.driver == page), self.arms[0])
+            teleop, several = arm.teleop, ("other_arm",) if len(arm.robots) > 1 else ()
+            console.explain(teleop.labels(actions=("home", *several, *self._actions)))
+            console.show_driving(
+                DrivingView(arm.robot.name, teleop.speed, self._speed_max, teleop.frame, self._settings)
+            )
 
     def _apply_settings(self) -> Literal[""] | _Due:
         """Apply what the page in control has set; return what has to be done outside of a control session, if anything.
@@ -467,62 +510,43 @@ class TeleopSession:
         while self._changes:
             name, value = self._changes.popitem()
             if name == "speed":
-                self._speed = self.teleop.speed = min(float(value), self._speed_max)
+                self._speed = min(float(value), self._speed_max)
+                for arm in self.arms:
+                    arm.set_speed(self._speed)
                 self._show_driving()
             elif name == "scene":
-                return _Due.RESET_SCENE
-            elif self.deadman.held:
-                what = "arm" if name == "robot" else name
-                self.announce(f"the {what} was not changed: release {self.deadman_name} first", "setting_refused")
+                return _Due(_Task.RESET_SCENE, self.arms[0])
+            elif self.held:
+                self._refuse_setting(self.arms[0], "arm" if name == "robot" else name)
             elif name == "frame":
-                self.teleop.frame = "tcp" if value == "tcp" else "base"
+                for arm in self.arms:
+                    arm.teleop.frame = "tcp" if value == "tcp" else "base"
                 self._show_driving()
             elif value != self.robot.name:
-                self._next_robot = str(value)
-                return _Due.OTHER_ROBOT
+                return _Due(_Task.OTHER_ROBOT, self.arms[0], self.rig.robots[str(value)])
         return ""
 
-    def _use_other_robot(self) -> None:
-        """Drive the arm that was chosen on the page; its dead-man must be pressed again."""
-        self.robot = self.rig.robots[self._next_robot]
-        self.stopped = self.gripper_trouble = ""
-        self.state = None
-        self._load_mapping()
-        self.announce(f"driving {self.robot.name}", "robot_changed")
+    def _refuse_setting(self, arm: ArmTeleop, name: str) -> None:
+        arm.announce(f"the {name} was not changed: release {arm.deadman_name} first", "setting_refused")
+
+    def _use_other_robot(self, arm: ArmTeleop, robot: Robot) -> None:
+        """Drive another arm with this pad; the dead-man must be pressed again. The last one holds."""
+        arm.use_robot(robot)
+        self._show_driving()
+        self.announce(f"driving {robot.name}", "robot_changed")
 
     def _reset_world(self) -> None:
-        """Reset the simulated scene. The control session has ended, so the arm is at rest."""
+        """Reset the simulated scene. The control sessions have ended, so the arms are at rest."""
         self.rig.world.reset()
         self.announce(f"scene reset: hold {self.deadman_name} again to drive", "scene_reset")
 
-    # Stops and faults: one event for each.
 
-    def _note_stop(self, stop: Exception) -> None:
-        if self.stopped != str(stop):
-            self.stopped = str(stop)
-            self.announce(f"STOPPED: {stop}", "stopped", getattr(stop, "reason", str(stop)))
-
-    def _note_fault(self, fault: Exception) -> None:
-        if self.stopped != str(fault):
-            self.stopped = str(fault)
-            self.announce(f"FAULT: {fault}", "fault", getattr(fault, "cause", str(fault)))
-
-    def _note_lost(self, lost: Exception) -> None:
-        """Note that the arm does not answer. Raises ConnectionLost if its process is gone."""
-        self.robot.check()
-        self.state = None
-        if not self.stopped:  # the message counts the seconds, so it would be a new event each time
-            self._note_stop(lost)
-
-    def _note_resumed(self) -> None:
-        if self.stopped:
-            self.stopped = ""
-            self.announce("resumed", "resumed")
-
-
-def _first(given: T | None, devices: Iterable[T], missing: str, code: str) -> T:
-    """Return ``given``, else the first of ``devices``."""
-    found = given if given is not None else next(iter(devices), None)
-    if found is None:
+def _listed(given: T | Sequence[T] | None, default: Sequence[T], missing: str, code: str) -> list[T]:
+    """Return what was given as a list, else ``default``. Raises CommandError if it is empty."""
+    if given is None:
+        found = list(default)
+    else:
+        found = list(given) if isinstance(given, (list, tuple)) else [given]  # type: ignore[list-item]
+    if not found:
         raise CommandError(missing, code=code)
     return found

@@ -279,6 +279,8 @@ class PadSpec:
     models: tuple[dict[str, Any], ...] = ()
     """All known pad models, to choose from."""
     dead_zone: float = 0.08
+    drives: str | None = None
+    """Arm that it drives where several are driven at once; None for the first that no other pad drives."""
     options: dict[str, Any] = field(default_factory=dict)
 
 

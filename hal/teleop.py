@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from math import hypot
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
+from . import registry
 from .arguments import number
 from .commands import Twist
 from .config.mapping import AxisMapping, TeleopMapping, load_mapping
-from .errors import CommandError
+from .errors import CommandError, ConnectionLost, MotionStopped, NotSupported, RobotFault, StaleStateError
 from .geometry import Pose, difference
 from .types import PadState
 
@@ -18,9 +19,14 @@ if TYPE_CHECKING:
     from .gamepad import Gamepad
     from .gripper import Gripper
     from .robot import Robot
+    from .types import RobotState
+    from .views import Viewer3D
 
 __all__ = [
+    "ArmTeleop",
+    "SessionEventKind",
     "Teleop",
+    "share_pads",
     "twist_towards",
 ]
 
@@ -78,7 +84,7 @@ class Teleop:
         self._side = 0.0
         self._was_toggle = True
         self._toggled: float | None = None
-        self._was_home = True
+        self._was_home = self._was_other = True
         self._was_acting = frozenset(self.mapping.actions)
 
     def reset(self) -> None:
@@ -109,6 +115,14 @@ class Teleop:
         button = self.mapping.go_home
         pressed = button is not None and pad.pressed(button)
         fresh, self._was_home = pressed and not self._was_home, pressed
+        return fresh
+
+    def other_arm_pressed(self, pad: PadState) -> bool:
+        """Return whether the button that hands the pad on to the next arm was pressed since the last call."""
+        _check_state(pad)
+        button = self.mapping.other_arm
+        pressed = button is not None and pad.pressed(button)
+        fresh, self._was_other = pressed and not self._was_other, pressed
         return fresh
 
     def pressed(self, pad: PadState) -> frozenset[str]:
@@ -240,3 +254,254 @@ def twist_towards(goal: Pose, tcp: Pose, linear: float, angular: float) -> Twist
 def _capped(left: Sequence[float], most: float) -> list[float]:
     distance = hypot(*left)
     return [min(_GAIN, most / distance) * part for part in left] if distance > 0.0 else [0.0, 0.0, 0.0]
+
+
+SessionEventKind = Literal[
+    "stopped",
+    "fault",
+    "resumed",
+    "held",
+    "homing",
+    "homing_cancelled",
+    "home_reached",
+    "pad_changed",
+    "pad_refused",
+    "robot_changed",
+    "setting_refused",
+    "scene_reset",
+    "gripper_fault",
+    "gripper_recovered",
+    "message",
+]
+"""What happened:
+
+* ``stopped``, ``fault``: the arm does not follow the pad any more; :attr:`SessionEvent.reason` has the cause.
+* ``resumed``: it follows the pad again.
+* ``held``: it was brought to rest because another arm of the session stopped; it needs a new press of its dead-man.
+* ``homing``, ``homing_cancelled``, ``home_reached``: the move home started, was cancelled by releasing the dead-man, or
+  is complete.
+* ``pad_changed``: a pad with another mapping was plugged in and is used from now on.
+* ``pad_refused``: it was plugged in, but may not be the dead-man of this arm.
+* ``robot_changed``: the pad drives another arm, chosen with the mapping's button or on a page of the console.
+* ``scene_reset``, ``setting_refused``: a page of the console reset the simulated scene; the arm or the frame was to be
+  changed while the dead-man was held, which has no effect.
+* ``gripper_fault``, ``gripper_recovered``: the gripper does not answer, or answers again; the arm continues without it.
+* ``message``: text of the program, see :meth:`TeleopSession.announce`.
+"""
+
+Announce = Callable[[str, str, "SessionEventKind", str], None]
+"""Called with an arm's name, a line for the user, its kind and the reason."""
+STATE_AGE = 2.0
+"""Greatest age of a state that is only shown, s."""
+HOMING_PATIENCE = 0.2
+"""Time without the dead-man after which a move home is cancelled, s."""
+STILL = Twist((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+"""The command to stay."""
+
+
+class ArmTeleop:
+    """One of the arms that a :class:`hal.TeleopSession` drives at once: its pad, mapping, dead-man, state and stops.
+
+    Args:
+        robots: Arms that the pad drives, one at a time; the first one at first.
+        pad: The pad.
+        mapping: Name or file of the mapping; None for the one that the plugged-in pad is meant for.
+        speed: Share of the mapping's speeds, above 0, at most 1.
+        announce: Gets every event.
+    """
+
+    def __init__(
+        self, robots: Sequence[Robot], pad: Gamepad, mapping: str | None, speed: float, announce: Announce
+    ) -> None:
+        self.robots = tuple(robots)
+        self.robot = self.robots[0]
+        """The arm that is driven now."""
+        self.pad = pad
+        self.state: RobotState | None = None
+        """Newest state of the arm; None while it does not answer."""
+        self.stopped = ""
+        """Why the arm does not follow the pad; empty while it does."""
+        self.held_for = ""
+        """Name of the arm whose stop holds this one; empty while none does."""
+        self.gripper_trouble = ""
+        """Why the gripper does not answer; empty while it does."""
+        self.refused_pad = ""
+        """Why a pad that was plugged in may not drive this arm; empty if it may."""
+        self.seen = -1
+        """Number of the pad's newest event that was turned into a command."""
+        self.mapping = ""
+        """Name or file of the mapping that is used."""
+        self._mapping_wanted, self._speed, self._announce = mapping, speed, announce
+        self.load_mapping()
+
+    def announce(self, text: str, kind: SessionEventKind, reason: str = "") -> None:
+        """Report an event of this arm."""
+        self._announce(self.robot.name, text, kind, reason)
+
+    @property
+    def deadman_name(self) -> str:
+        """Name of the dead-man's control as printed on the pad, for example ``L2``."""
+        return self.pad.control_name(self.teleop.mapping.deadman)
+
+    @property
+    def next_robot(self) -> Robot:
+        """The arm to which the mapping's button ``other_arm`` hands the pad on."""
+        return self.robots[(self.robots.index(self.robot) + 1) % len(self.robots)]
+
+    def due_mapping(self) -> str:
+        """Return the mapping to use: the wanted one, else that of the plugged-in pad, else the present one."""
+        if self._mapping_wanted or (self.mapping and not self.pad.state().connected):
+            return self._mapping_wanted or self.mapping
+        return self.pad.mapping or "default"
+
+    def load_mapping(self) -> None:
+        """Use the mapping that is due. Its dead-man must be released and pressed before it counts."""
+        self.mapping = self.due_mapping()
+        self.teleop = Teleop(self.robot, mapping=self.mapping, speed=self._speed)
+        self.deadman = self.pad.hold(self.teleop.mapping.deadman)
+
+    def other_pad_ready(self) -> bool:
+        """Return whether a pad with another mapping is plugged in and may drive this arm."""
+        if self.due_mapping() == self.mapping:
+            return False
+        spec = self.robot.spec
+        why = (self.pad.distrust() or "") if spec.attended and not spec.emulated else ""
+        if why and why != self.refused_pad:
+            self.announce(why, "pad_refused", why)
+        self.refused_pad = why
+        return not why
+
+    def set_speed(self, speed: float) -> None:
+        """Change the share of the mapping's speeds, also for mappings that are loaded later."""
+        self._speed = self.teleop.speed = speed
+
+    def use_robot(self, robot: Robot) -> None:
+        """Drive another arm. One that is not among :attr:`robots` is the only one from then on."""
+        self.robot = robot
+        self.robots = self.robots if robot in self.robots else (robot,)
+        self.state = None
+        self.stopped = self.held_for = self.gripper_trouble = ""
+        self.load_mapping()
+
+    def follow_gizmo(self, motion: Twist, view: Viewer3D | None) -> Twist:
+        """Return the velocity towards the gizmo of the 3D view if it was dragged; moving a stick resets the gizmo."""
+        name = self.robot.name
+        goal = view.goal(name) if view is not None else None
+        if view is None or goal is None:
+            return motion
+        if motion.linear.any() or motion.angular.any() or self.held_for:
+            view.clear_goal(name)
+            return motion
+        linear, angular = self.teleop.mapping.speeds()
+        speed = self.teleop.speed
+        return twist_towards(goal, self.robot.state(max_age=STATE_AGE).tcp_set, speed * linear, speed * angular)
+
+    def go_home(self) -> None:
+        """Drive the arm home while the dead-man is held. Raises what stops it, except a released dead-man."""
+        name = self.deadman_name
+        self.announce(f"homing: hold {name} until the arm is there", "homing")
+        try:
+            self.robot.move_to(self.robot.home, deadman=self.deadman, patience=HOMING_PATIENCE)
+        except MotionStopped:
+            if self.deadman.held or not self.deadman.connected:
+                raise
+            self.announce(f"homing cancelled: {name} released", "homing_cancelled")
+        else:
+            self.announce(f"home reached: release {name}, then hold it again to drive", "home_reached")
+
+    # State, stops and faults: one event for each.
+
+    def update_state(self) -> None:
+        """Read the newest state of the arm and of its gripper. Raises ConnectionLost if the process is gone."""
+        try:
+            self.state = self.robot.state(max_age=STATE_AGE)
+        except (ConnectionLost, StaleStateError):
+            self.robot.check()
+            self.state = None
+            return
+        trouble = self.robot.gripper.trouble if self.robot.gripper is not None else ""
+        if trouble and not self.gripper_trouble:
+            self.announce(f"GRIPPER: {trouble}", "gripper_fault", trouble)
+        elif self.gripper_trouble and not trouble:
+            self.announce("the gripper answers again", "gripper_recovered")
+        self.gripper_trouble = trouble
+
+    def note_trouble(self, error: Exception) -> None:
+        """Report what stopped the arm; raise it if another attempt is pointless."""
+        if isinstance(error, RobotFault):
+            self._note_stop(error, "fault", f"FAULT: {error}", error.cause)
+        elif isinstance(error, (ConnectionLost, StaleStateError)):
+            self.robot.check()  # raises if its process is gone
+            self.state = None
+            if not self.stopped:  # the message counts the seconds, so it would be a new event each time
+                self._note_stop(error, "stopped", f"STOPPED: {error}", str(error))
+        elif isinstance(error, NotSupported) and self.pad.state().connected:
+            raise error  # else: an unplugged pad cannot be trusted as a dead-man
+        else:
+            self._note_stop(error, "stopped", f"STOPPED: {error}", getattr(error, "reason", str(error)))
+
+    def _note_stop(self, error: Exception, kind: SessionEventKind, text: str, reason: str) -> None:
+        if self.stopped != str(error):
+            self.stopped = str(error)
+            self.announce(text, kind, reason)
+
+    def note_resumed(self) -> None:
+        """Note that the arm follows the pad."""
+        if self.stopped:
+            self.stopped = ""
+            self.announce("resumed", "resumed")
+
+    def help(self) -> list[str]:
+        """Return what the controls of the pad do, in lines of text."""
+        mapping = self.teleop.mapping
+        about = mapping.description
+        lines = [f"mapping {self.mapping}{': ' if about else ''}{about}", *self.teleop.help(self.pad)]
+        if len(self.robots) > 1:
+            names = ", ".join(robot.name for robot in self.robots)
+            if mapping.other_arm is None:
+                lines.append(f"one pad for {names}: the mapping has no button other_arm")
+            else:
+                button = self.pad.control_name(mapping.other_arm)
+                lines.append(f"next arm of {names}: {button}, with {self.deadman_name} released")
+        return lines
+
+
+def share_pads(robots: Sequence[Robot], pads: Sequence[Gamepad]) -> list[tuple[Gamepad, list[Robot]]]:
+    """Return which pad drives which arms.
+
+    A pad drives the arm that its entry in the rig names (``drives``); the others get the arms that are left, in order.
+    Arms without a pad of their own are driven by the first pad, one at a time.
+
+    Args:
+        robots: The arms to drive, at least one.
+        pads: The pads, at least one; those that are not needed are left out.
+    """
+    pads = _distinct(pads)
+    left = {robot.name: robot for robot in robots}
+    shared: list[tuple[Gamepad, list[Robot]]] = []
+    for pad in pads:
+        name = pad.driver.spec.drives
+        if name in left:
+            shared.append((pad, [left.pop(name)]))
+    for pad in pads:
+        if left and pad.driver.spec.drives is None and pad not in [used for used, _ in shared]:
+            shared.append((pad, [left.pop(next(iter(left)))]))
+    if not shared:  # every pad is meant for another arm
+        shared.append((pads[0], []))
+    shared[0][1].extend(left.values())
+    order = list(robots)
+    return sorted(shared, key=lambda entry: order.index(entry[1][0]))
+
+
+def _distinct(pads: Sequence[Gamepad]) -> list[Gamepad]:
+    """Leave out further pads whose input is that of one before: the page, or the keys. One thumb, one dead-man."""
+    found: list[Gamepad] = []
+    inputs: set[str] = set()
+    for pad in pads:
+        source = registry.driver(pad.driver.spec.driver).pad_input
+        if source in ("console", "keys"):
+            if source in inputs:
+                continue
+            inputs.add(source)
+        found.append(pad)
+    return found

@@ -119,10 +119,12 @@ class TeleopMapping(Strict):
     gripper: GripperMapping | None = None
     go_home: str | None = None
     """Button that moves the arm to its home position while the dead-man is held."""
+    other_arm: str | None = None
+    """Button that hands the pad on to the next arm of a session with several, while the dead-man is released."""
     actions: dict[str, str] = Field(default_factory=dict)
     """Action of an app -> its button, for example ``record: south``; each app documents its actions."""
 
-    @field_validator("deadman", "go_home")
+    @field_validator("deadman", "go_home", "other_arm")
     @classmethod
     def _is_button(cls, name: str | None) -> str | None:
         if name is not None:
@@ -140,7 +142,7 @@ class TeleopMapping(Strict):
     def _controls(self) -> TeleopMapping:
         moving = {control for mapping in self.axes() if mapping is not None for control in mapping.controls}
         moving |= set(self.gripper.controls) if self.gripper else set()
-        alone = [self.deadman, *self.actions.values()] + ([self.go_home] if self.go_home else [])
+        alone = [self.deadman, *self.actions.values(), *filter(None, (self.go_home, self.other_arm))]
         for control in alone:
             if control in moving or alone.count(control) > 1:
                 message = f"{control!r} is used twice; the dead-man and every action need a control of their own"

@@ -17,7 +17,7 @@ from ..pads.model import pad_model
 from ..specs import BodySpec, PadSpec, Plan, RobotSpec, WorldSpec
 from .context import Context
 from .data_files import user_path
-from .files import read_yaml
+from .files import nearest, read_yaml
 from .models import find_model, load_pad_models
 from .objects import load_objects
 from .resolve_cameras import resolve_camera
@@ -74,6 +74,10 @@ def resolve_pad(context: Context, name: str, config: PadConfig) -> PadSpec | Non
         with suppress(Unknown):
             if config.driver == CHOSEN_LATER or context.check_driver(config.driver, "gamepad", f"{key}.driver"):
                 _check_recording(context, f"{key}.file", config)
+    with suppress(Unknown):
+        if config.drives is not None and config.drives not in context.rig.robots:
+            message = f"there is no robot {config.drives!r}{nearest(config.drives, context.rig.robots)}"
+            context.problem(f"{key}.drives", message, "unknown_robot")
     models = tuple(load_pad_models(context.problems).values())
     if context.problems.found:
         return None
@@ -86,6 +90,7 @@ def resolve_pad(context: Context, name: str, config: PadConfig) -> PadSpec | Non
         model=model,
         models=models,
         dead_zone=config.dead_zone,
+        drives=config.drives,
         options=options,
     )
     if spec.driver != CHOSEN_LATER:

@@ -326,6 +326,8 @@ class PadConfig(Strict):
     """``auto``, ``evdev``, ``web``, ``terminal``, ``playback`` or another driver."""
     file: str | None = None
     """Recording for the driver ``playback``."""
+    drives: str | None = None
+    """Arm that this pad drives where several arms are driven at once; default: the first that no other pad drives."""
     dead_zone: Annotated[float, Quantity("", 0.0, 0.9)] = 0.08
     """Share of a stick's travel that counts as rest."""
     options: dict[str, Any] = Field(default_factory=dict)
