@@ -19,7 +19,6 @@ from hal.views import ACTIONS, RecordingView
 
 if TYPE_CHECKING:
     from hal.config.mapping import TeleopMapping
-    from hal.gamepad import Gamepad
     from hal.observation import Observation
     from hal.recording import Recorder, RecorderStatus
     from hal.rig import Rig
@@ -51,8 +50,7 @@ class CollectRun:
     def __init__(
         self,
         rig: Rig,
-        robot: Robot,
-        pad: Gamepad,
+        robots: Sequence[Robot],
         recorder: Recorder,
         args: argparse.Namespace,
         judge: Judge | None = None,
@@ -61,17 +59,24 @@ class CollectRun:
 
         Args:
             rig: Open rig.
-            robot: Arm to drive.
-            pad: Gamepad that drives it.
+            robots: Arms to drive.
             recorder: Open recorder.
             args: Options of ``collect``.
             judge: Called with the rig and an observation when an episode is saved as a success; False saves it as a
                 failure.
         """
-        self.rig, self.robot, self.pad, self.recorder, self.args = rig, robot, pad, recorder, args
+        self.rig, self.robots, self.recorder, self.args = rig, tuple(robots), recorder, args
         self._judge = judge
-        self.display = TeleopDisplay(rig, robot, pad, mapping=args.mapping, speed=args.speed or 1.0, actions=ACTIONS)
+        self.display = TeleopDisplay(
+            rig,
+            robots,
+            independent=args.independent,
+            mapping=args.mapping,
+            speed=args.speed or 1.0,
+            actions=ACTIONS,
+        )
         self.session = self.display.session
+        self.pad = self.session.pad
         self.tape = BackgroundRecorder(recorder)
         self.phase = ""
         self.kept: list[SavedEpisode] = []
@@ -180,7 +185,7 @@ class CollectRun:
         for action in self._new_actions(state):
             if action in self._allowed and (reason := self._perform(action)):
                 return reason
-        if self.phase == "ready" and self.session.deadman.held and not self._warned:
+        if self.phase == "ready" and self.session.held and not self._warned:
             self._warned = True
             self.session.announce(f"not recording yet: {self._buttons(('record',))}")
         if self.rig.clock.now() >= self._next_show:
@@ -214,7 +219,7 @@ class CollectRun:
     def _new_actions(self, state: PadState) -> list[str]:
         """Return the actions of the pad's buttons and of the pages since the last call."""
         pressed = self.session.teleop.pressed(state)
-        if "discard" in pressed and self.phase == "recording" and self.session.deadman.held:
+        if "discard" in pressed and self.phase == "recording" and self.session.held:
             pressed -= {"discard"}  # pressed by accident while driving
             self.session.announce(f"to discard the episode, release {self.session.deadman_name} first")
         found = [action for action in ACTIONS if action in pressed]
@@ -227,7 +232,7 @@ class CollectRun:
     def _perform(self, action: str) -> str:
         """Perform an action; return why this attempt ends, or nothing."""
         if action == "record":
-            info = {"program": "collect", "robot": self.robot.name, "mapping": self.session.mapping}
+            info = {"program": "collect", "robot": self._names, "mapping": self.session.mapping}
             self._seed = self.seed
             self._record_time = self.rig.clock.now() - self.display.report.start
             self._starting = self.tape.start(self._seed, info | {"speed": self.args.speed or 1.0})
@@ -278,7 +283,11 @@ class CollectRun:
         for one in self.kept:
             if one.failure:
                 return f"episode {one.number} could not be saved: {one.failure}"
-        return "the recorded pad has ended" if self.pad.finished else ""
+        return "the recorded pad has ended" if self.session.finished else ""
+
+    @property
+    def _names(self) -> str:
+        return ",".join(robot.name for robot in self.robots)
 
     # Prompts, the live line and the console.
 
@@ -300,8 +309,9 @@ class CollectRun:
         if self._starting is not None:
             return "starting"
         if self.phase == "resetting":
-            then = "; then its gripper opens" if self.robot.gripper is not None else ""
-            home = f"release {session.deadman_name}, then hold it until the arm is home{then}"
+            then = "; then its gripper opens" if self.robots[0].gripper is not None else ""
+            each = "" if len(self.robots) == 1 else f", for each of {self._names}"
+            home = f"release {session.deadman_name}, then hold it until the arm is home{then}{each}"
             return home if session.drives_home else ""
         if not self._allowed:
             return ""
@@ -373,8 +383,8 @@ class CollectRun:
         if self.args.report:
             report = {
                 "out": str(self.recorder.root),
-                "robot": self.robot.name,
-                "backend": self.robot.spec.driver,
+                "robot": self._names,
+                "backend": self.robots[0].spec.driver,
                 "clock": self.rig.plan.clock,
                 "ended": ended,
                 "discarded": self.discarded,

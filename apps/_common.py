@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from hal.config.mapping import TeleopMapping
     from hal.deadman import Deadman
-    from hal.gamepad import Gamepad
     from hal.rig import Rig
     from hal.robot import Robot
     from hal.specs import Plan
@@ -34,8 +33,9 @@ __all__ = [
     "needs_deadman",
     "resolve_plan",
     "rig_options",
+    "robot_names",
     "run_app",
-    "select_devices",
+    "select_robots",
 ]
 
 ACTION_NEEDED = 2
@@ -96,7 +96,15 @@ def add_rig_options(parser: argparse.ArgumentParser) -> None:
 def add_driving_options(parser: argparse.ArgumentParser) -> argparse._ArgumentGroup:
     """Add the options of a program in which the user drives an arm."""
     drive = parser.add_argument_group("driving")
-    drive.add_argument("--robot", metavar="NAME", help="arm to drive (default: the first)")
+    drive.add_argument(
+        "--robot",
+        metavar="NAMES",
+        help="arm to drive (default: the first), or several, as left,right: at once with a pad each, one after the "
+        "other with one pad",
+    )
+    drive.add_argument(
+        "--independent", action="store_true", help="a stop of one of several arms does not hold the others"
+    )
     drive.add_argument("--mapping", metavar="FILE", help="gamepad mapping (default: the pad's own)")
     drive.add_argument("--speed", type=float, metavar="SCALE", help="speed scale, 0-1 (default: 1)")
     return drive
@@ -148,8 +156,9 @@ def resolve_plan(args: argparse.Namespace, *details: str, cameras: Iterable[str]
 
     plan = load(args.config, sim=args.sim, overrides=args.overrides).resolve()
     robots = [robot.name for robot in plan.robots]
-    if args.robot and args.robot not in robots:
-        raise DeviceNotFound(f"--robot: this rig has no robot {args.robot!r}{nearest(args.robot, robots)}")
+    for name in robot_names(args):
+        if name not in robots:
+            raise DeviceNotFound(f"--robot: this rig has no robot {name!r}{nearest(name, robots)}")
     known = [camera.name for camera in plan.cameras]
     for name in cameras:
         if name not in known:
@@ -236,21 +245,28 @@ def check_report(path: str | None) -> None:
         raise CommandError(f"--report {path}: the folder {folder} does not exist or cannot be written to")
 
 
-def select_devices(rig: Rig, args: argparse.Namespace) -> tuple[Robot, Gamepad]:
-    """Return the arm that ``--robot`` names, or the first, and the rig's first pad.
+def robot_names(args: argparse.Namespace) -> list[str]:
+    """Return the names of ``--robot``. Raises CommandError if one is given twice."""
+    from hal.errors import CommandError
+
+    names = [name.strip() for name in (args.robot or "").split(",") if name.strip()]
+    if len(set(names)) < len(names):
+        raise CommandError(f"--robot {args.robot}: an arm is named twice", code="duplicate_name")
+    return names
+
+
+def select_robots(rig: Rig, args: argparse.Namespace) -> list[Robot]:
+    """Return the arms that ``--robot`` names, or the first.
 
     Raises:
-        CommandError: The rig has no robot or no gamepad.
+        CommandError: The rig has no robot.
     """
     from hal.errors import CommandError
 
-    name = args.robot or next(iter(rig.robots), None)
-    if name is None:
+    names = robot_names(args) or list(rig.robots)[:1]
+    if not names:
         raise CommandError(f"{rig.plan.source} has no robot to drive", code="no_robot")
-    if not rig.gamepads:
-        message = f"{rig.plan.source} has no gamepad; add 'gamepads: {{pad: {{model: auto}}}}'"
-        raise CommandError(message, code="no_gamepad")
-    return rig.robots[name], next(iter(rig.gamepads.values()))
+    return [rig.robots[name] for name in names]
 
 
 def needs_deadman(plan: Plan, args: argparse.Namespace) -> bool:

@@ -6,17 +6,17 @@ import json
 import shutil
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
 from urllib.parse import urlsplit
 
 if TYPE_CHECKING:
-    from hal.gamepad import Gamepad
     from hal.rig import Rig
     from hal.robot import Robot
     from hal.session import SessionEvent
-    from hal.specs import CameraSpec, GripperSpec, Plan, RobotSpec
+    from hal.specs import CameraSpec, GripperSpec, PadSpec, Plan, RobotSpec
+    from hal.teleop import ArmTeleop
     from hal.types import RobotState
 
 __all__ = ["RunReport", "StatusLine", "TeleopDisplay", "banner", "list_devices", "list_links"]
@@ -58,12 +58,18 @@ def list_devices(plan: Plan) -> list[str]:
             f"camera   {camera.name:10s} {camera.model} ({camera.driver}{_image_source(camera)}), "
             f"{camera.width}x{camera.height} {streams} at {camera.rate_hz:g} Hz"
         )
-    lines.extend(f"gamepad  {pad.name:10s} {pad.driver}" for pad in plan.pads)
+    lines.extend(f"gamepad  {pad.name:10s} {_pad(pad)}" for pad in plan.pads)
     if plan.world is not None:
         bodies = ", ".join(body.name for body in plan.world.bodies) or "empty"
         lines.append(f"world    {plan.world.driver}, {plan.world.physics_hz:g} Hz: {bodies}")
     lines.append(f"clock    {plan.clock.replace('_', ' ')}")
     return lines
+
+
+def _pad(pad: PadSpec) -> str:
+    """Return the model of a gamepad if the rig names one, its driver, and the arm that it drives."""
+    model = "" if pad.model is None else f"{pad.model['title']}, "
+    return f"{model}{pad.driver}{'' if pad.drives is None else f', drives {pad.drives}'}"
 
 
 def _image_source(camera: CameraSpec) -> str:
@@ -161,15 +167,15 @@ class StatusLine:
 class TeleopDisplay:
     """A :class:`hal.TeleopSession` in a terminal: prints its events, draws the live line and measures the run."""
 
-    def __init__(self, rig: Rig, robot: Robot, pad: Gamepad, **options: Any) -> None:
+    def __init__(self, rig: Rig, robots: Sequence[Robot], **options: Any) -> None:
         """Create the session; ``options`` are keyword arguments of :class:`hal.TeleopSession`."""
         from hal.session import TeleopSession
 
         self.line = StatusLine()
-        self.report = RunReport(rig, robot)
+        self.report = RunReport(rig, robots)
         self.note = ""
         """First words of the live line."""
-        self.session = TeleopSession(rig, robot, pad, on_event=self._print_event, on_tick=self._draw, **options)
+        self.session = TeleopSession(rig, robots, on_event=self._print_event, on_tick=self._draw, **options)
 
     def _print_event(self, event: SessionEvent) -> None:
         self.line.event(event.text)
@@ -178,37 +184,44 @@ class TeleopDisplay:
         elif event.kind == "fault":
             self.report.add_fault(event.reason)
         elif event.kind == "robot_changed":
-            self.report.set_robot(self.session.robot)
+            self.report.set_robots([arm.robot for arm in self.session.arms])
         elif event.kind == "pad_changed":
             self.line.event(self.session.help())
 
     def _draw(self) -> None:
-        if self.session.state is not None:
-            self.report.add_state(self.session.state)
+        for arm in self.session.arms:
+            if arm.state is not None:
+                self.report.add_state(arm.robot, arm.state)
         self.line.update(self._text)
 
     def _text(self) -> str:
-        session, state = self.session, self.session.state
-        if state is None:
-            return f"  {self.note}{session.robot.name} does not answer"
-        held = "held" if session.deadman.held else "released"
-        if session.pad.waiting_for and session.pad.state().connected:
-            names = ", ".join(map(session.pad.control_name, session.pad.waiting_for))
-            held = f"waiting: release, or move once: {names}"
-        x, y, z = state.tcp.position
-        parts = [f"dead-man {held:8s}", f"{state.status.name.lower():9s}"]
+        arms = self.session.arms
+        parts = [part for arm in arms for part in self._of_arm(arm, named=len(arms) > 1)]
         if self.report.trips:
             parts.append(f"trips {len(self.report.trips)}")
-        parts.append(f"tcp {x:6.3f} {y:6.3f} {z:6.3f} m")
-        gripper = session.robot.gripper.newest() if session.robot.gripper is not None else None
-        if gripper is not None and not session.gripper_trouble:
-            parts.append(f"gripper {1e3 * gripper.width:4.0f} mm")
-        if state.limited:
-            parts.append(f"limited: {state.limited}")
-        for name, camera in session.rig.cameras.items():
+        for name, camera in self.session.rig.cameras.items():
             if (fps := camera.counts().fps) is not None:
                 parts.append(f"{name} {fps:.0f} fps")
         return f"  {self.note}{'  '.join(parts)}"
+
+    @staticmethod
+    def _of_arm(arm: ArmTeleop, named: bool) -> Iterator[str]:
+        """Yield the parts of the live line about one arm."""
+        state, pad, gripper = arm.state, arm.pad, arm.robot.gripper
+        if state is None:
+            yield f"{arm.robot.name} does not answer"
+            return
+        held = "held" if arm.deadman.held else "released"
+        if pad.waiting_for and pad.state().connected:
+            held = f"waiting: release, or move once: {', '.join(map(pad.control_name, pad.waiting_for))}"
+        yield f"{arm.robot.name if named else 'dead-man'} {held:8s}"
+        yield f"{state.status.name.lower():9s}"
+        yield "tcp {:6.3f} {:6.3f} {:6.3f} m".format(*state.tcp.position)
+        fingers = gripper.newest() if gripper is not None else None
+        if fingers is not None and not arm.gripper_trouble:
+            yield f"gripper {1e3 * fingers.width:4.0f} mm"
+        if state.limited:
+            yield f"limited: {state.limited}"
 
 
 # The report.
@@ -217,30 +230,31 @@ class TeleopDisplay:
 class RunReport:
     """Measurements of a run for ``--report``, as JSON. Times in ms, lengths in m."""
 
-    def __init__(self, rig: Rig, robot: Robot) -> None:
+    def __init__(self, rig: Rig, robots: Sequence[Robot]) -> None:
         from hal.histogram import Histogram
 
         self._rig = rig
-        self._robot = robot
+        self._robots = tuple(robots)
         self.start = rig.clock.now()
         self._ages = Histogram(1e-4, 5000)
         self._travel = 0.0
-        self._position: Any = None
+        self._positions: dict[str, Any] = {}
         self.trips: list[dict[str, Any]] = []
         self.faults: list[dict[str, Any]] = []
 
-    def set_robot(self, robot: Robot) -> None:
-        """Report about this arm from now on. The travel of all arms is added up."""
-        self._robot, self._position = robot, None
+    def set_robots(self, robots: Sequence[Robot]) -> None:
+        """Report about these arms from now on. The travel of all arms is added up."""
+        self._robots = tuple(robots)
+        self._positions.clear()
 
-    def add_state(self, state: RobotState) -> None:
-        """Add a state of the arm."""
+    def add_state(self, robot: Robot, state: RobotState) -> None:
+        """Add a state of an arm."""
         self._ages.add(self._rig.clock.now() - state.stamp.t)
-        position = state.tcp.position
-        if self._position is not None:
-            delta = position - self._position
+        position, before = state.tcp.position, self._positions.get(robot.name)
+        if before is not None:
+            delta = position - before
             self._travel += float(delta @ delta) ** 0.5
-        self._position = position
+        self._positions[robot.name] = position
 
     def add_trip(self, reason: str) -> None:
         """Add a trip."""
@@ -251,11 +265,12 @@ class RunReport:
         self.faults.append({"t_s": round(self._rig.clock.now() - self.start, 3), "cause": cause})
 
     def collect(self, clean_exit: bool) -> dict[str, Any]:
-        """Return everything so far. Call it while the rig is open."""
-        rig, robot = self._rig, self._robot
-        group = next(g for g in rig.statistics().values() if robot.name in g["robots"])
-        own = group["robots"][robot.name]
-        latency = own["latency_s"]
+        """Return everything so far. Call it while the rig is open.
+
+        Servo, latency and peaks are those of the first arm; with several, ``arms`` has those of each by name.
+        """
+        rig, first = self._rig, self._robots[0]
+        arms = {robot.name: self._of_arm(robot) for robot in self._robots}
         cameras = {}
         for name, camera in rig.cameras.items():
             counts = camera.counts()
@@ -265,10 +280,26 @@ class RunReport:
                 "age_ms_p50": _ms(counts.age_p50),
                 "dropped": counts.dropped,
             }
-        return {
-            "backend": robot.spec.driver,
+        report = {
+            "backend": first.spec.driver,
             "clock": rig.plan.clock,
             "duration_s": rig.clock.now() - self.start,
+            **arms[first.name],
+            "state_age_ms": _summary(self._ages.summary()),
+            "tcp_travel_m": self._travel,
+            "cameras": cameras,
+            "trips": self.trips,
+            "faults": self.faults,
+            "clean_exit": clean_exit,
+        }
+        return report | ({"arms": arms} if len(arms) > 1 else {})
+
+    def _of_arm(self, robot: Robot) -> dict[str, Any]:
+        """Return the measurements of one arm's servo, and the tcp's pose in its base frame, m and xyzw."""
+        group = next(g for g in self._rig.statistics().values() if robot.name in g["robots"])
+        own = group["robots"][robot.name]
+        latency, tcp = own["latency_s"], robot.state(max_age=float("inf")).tcp
+        return {
             "servo": {
                 "rate_hz": robot.spec.rate_hz,
                 "ticks": group["ticks"],
@@ -278,20 +309,9 @@ class RunReport:
                 "driver": own["driver"],
             },
             "latency_ms": {"p50": _ms(latency["p50"]), "p99": _ms(latency["p99"])},
-            "state_age_ms": _summary(self._ages.summary()),
-            "tcp_travel_m": self._travel,
-            "tcp_end": self._end(),
+            "tcp_end": {"position": tcp.position.tolist(), "orientation": tcp.orientation.tolist()},
             "peak": own["peak"],
-            "cameras": cameras,
-            "trips": self.trips,
-            "faults": self.faults,
-            "clean_exit": clean_exit,
         }
-
-    def _end(self) -> dict[str, list[float]]:
-        """Return the tcp's pose in the arm's base frame, m and xyzw."""
-        tcp = self._robot.state(max_age=float("inf")).tcp
-        return {"position": tcp.position.tolist(), "orientation": tcp.orientation.tolist()}
 
     @staticmethod
     def write(path: str, report: dict[str, Any]) -> None:

@@ -80,7 +80,7 @@ def _check_options(args: argparse.Namespace) -> None:
 def _main(args: argparse.Namespace) -> int:
     import hal
     from hal.apps._collecting import CollectRun, lifts_cube
-    from hal.apps._common import resolve_plan, select_devices
+    from hal.apps._common import resolve_plan, select_robots
     from hal.apps._display import banner
     from hal.apps.check import may_open
     from hal.config.data_files import data_folder
@@ -106,7 +106,7 @@ def _main(args: argparse.Namespace) -> int:
         options["pad"] = str(data_folder("config") / "teleop" / "demonstrations.jsonl")
     with hal.open(**options) as rig:
         print(banner(rig), flush=True)
-        robot, pad = select_devices(rig, args)
+        robots = select_robots(rig, args)
         recovered = recover(args.out) if Path(args.out).is_dir() else []
         streams = [name.strip() for name in args.streams.split(",")]
         with Recorder(
@@ -114,14 +114,14 @@ def _main(args: argparse.Namespace) -> int:
         ) as recorder:
             notes = [*recovered, *recorder.notes]
             if demo:
-                judge = judge or lifts_cube(rig, robot)
+                judge = judge or lifts_cube(rig, robots[0])
                 if judge is None:
-                    notes.append(f"--pad demo: whether {robot.name} lifts a cube is not checked; see --success")
+                    notes.append(f"--pad demo: whether {robots[0].name} lifts a cube is not checked; see --success")
                 if args.seed or recorder.episodes:
                     notes.append(DEMO_MISPLACED)
             for note in notes:
                 print(f"  note     {note}")
-            return CollectRun(rig, robot, pad, recorder, args, judge).run()
+            return CollectRun(rig, robots, recorder, args, judge).run()
 
 
 if __name__ == "__main__":

@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING
 from hal.apps._common import ACTION_NEEDED, add_driving_options, add_rig_options, rig_options, run_app
 
 if TYPE_CHECKING:
-    from hal.gamepad import Gamepad
+    from collections.abc import Sequence
+
     from hal.rig import Rig
     from hal.robot import Robot
     from hal.types import PadState
@@ -42,7 +43,7 @@ def main(argv: list[str] | None = None) -> int:
 
 def _main(args: argparse.Namespace) -> int:
     import hal
-    from hal.apps._common import check_driving_options, check_report, resolve_plan, select_devices
+    from hal.apps._common import check_driving_options, check_report, resolve_plan, select_robots
     from hal.apps._display import banner
     from hal.apps.check import may_open
     from hal.errors import CommandError
@@ -58,17 +59,24 @@ def _main(args: argparse.Namespace) -> int:
         return ACTION_NEEDED
     with hal.open(**rig_options(args)) as rig:
         print(banner(rig), flush=True)
-        return TeleopRun(rig, *select_devices(rig, args), args).run()
+        return TeleopRun(rig, select_robots(rig, args), args).run()
 
 
 class TeleopRun:
     """One run of the program on an open rig."""
 
-    def __init__(self, rig: Rig, robot: Robot, pad: Gamepad, args: argparse.Namespace) -> None:
+    def __init__(self, rig: Rig, robots: Sequence[Robot], args: argparse.Namespace) -> None:
         from hal.apps._display import TeleopDisplay
 
-        self.rig, self.pad, self.args = rig, pad, args
-        self.display = TeleopDisplay(rig, robot, pad, mapping=args.mapping, speed=args.speed or 1.0, adjustable=True)
+        self.rig, self.args = rig, args
+        self.display = TeleopDisplay(
+            rig,
+            robots,
+            independent=args.independent,
+            mapping=args.mapping,
+            speed=args.speed or 1.0,
+            adjustable=True,
+        )
         self.session = self.display.session
         self.end_time = rig.clock.now() + args.duration if args.duration else None
 
@@ -90,12 +98,13 @@ class TeleopRun:
             if self.args.report:
                 self._write_report(clean)
         seconds = self.rig.clock.now() - display.report.start
-        display.line.event(f"{reason} after {seconds:.1f} s; the arm is at rest")
+        at_rest = "the arm is at rest" if len(self.session.arms) == 1 else "the arms are at rest"
+        display.line.event(f"{reason} after {seconds:.1f} s; {at_rest}")
         return 0
 
     def _end_reason(self, state: PadState) -> str:
         """Return why the run has to end, or nothing."""
-        if self.pad.finished:
+        if self.session.finished:
             return "the recorded pad has ended"
         if self.end_time is not None and self.rig.clock.now() >= self.end_time:
             return f"finished (--duration {self.args.duration:g})"

@@ -219,6 +219,11 @@ class TeleopSession:
         return any(arm.deadman.held for arm in self.arms)
 
     @property
+    def finished(self) -> bool:
+        """Whether every pad is a recording that has ended."""
+        return all(arm.pad.finished for arm in self.arms)
+
+    @property
     def drives_home(self) -> bool:
         """Whether :meth:`reset_scene` has to drive an arm home; a simulated arm is placed there."""
         return any(not stands_in_world(self.rig, robot) for arm in self.arms for robot in arm.robots)
@@ -443,7 +448,7 @@ class TeleopSession:
         return self._apply_settings()
 
     def _pad_finished(self, state: PadState) -> str:
-        return "the recorded pad has ended" if self.pad.finished else ""
+        return "the recorded pad has ended" if self.finished else ""
 
     # The way home.
 

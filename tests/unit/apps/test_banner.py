@@ -41,3 +41,14 @@ def test_what_the_simulation_changed_in_a_file_is_a_note() -> None:
         assert duck.startswith("duck: inertia computed from the collision shapes")
         assert arm.startswith("panda: inertia computed from the collision shapes")
         assert f"note     {duck}" in banner(rig)
+
+
+def test_pads_of_fixed_models_are_named_with_the_arms_that_they_drive() -> None:
+    arms = {name: {"model": "panda", "base": {"position": [0, y, 0]}} for name, y in (("left", 0.5), ("right", -0.5))}
+    pads = {"one": {"model": "dualshock4", "drives": "right"}, "two": {"model": "xbox_one"}, "any": {}}
+    lines = list_devices(load({"robots": arms, "gamepads": pads}).resolve())
+    assert [line.split(maxsplit=2)[1:] for line in lines if line.startswith("gamepad")] == [
+        ["one", "DualShock 4, auto, drives right"],
+        ["two", "Xbox One pad, auto"],
+        ["any", "auto"],
+    ]

@@ -285,7 +285,7 @@ def run(
         page = Page(rig, press, None if by_page else "pad") if press is not None else None
         rig.console = page
         args = collect.parser().parse_args([*options])
-        status = CollectRun(rig, rig.robots["panda"], rig.gamepads["pad"], recorder, args).run()
+        status = CollectRun(rig, [rig.robots["panda"]], recorder, args).run()
         return status, page.views if page is not None else []
 
 
@@ -350,7 +350,7 @@ def test_an_arm_that_is_not_simulated_drives_home_while_l2_is_held(
         assert isinstance(hand, MockPad)
         arm.move_to(arm.home + 0.05)
         args = collect.parser().parse_args(["--episodes", "1"])
-        app = CollectRun(rig, arm, rig.gamepads["pad"], recorder, args)
+        app = CollectRun(rig, [arm], recorder, args)
 
         def until(true: Callable[[], object]) -> Iterator[None]:
             end = rig.clock.now() + 60.0
@@ -399,8 +399,7 @@ def test_a_stop_is_named_where_a_demonstration_fails(
 
         rig.console = Page(rig, stop)
         args = collect.parser().parse_args(["--episodes", "1"])
-        robot, gamepad = rig.robots["panda"], rig.gamepads["pad"]
-        assert CollectRun(rig, robot, gamepad, recorder, args, lambda *_: False).run() == 0
+        assert CollectRun(rig, [rig.robots["panda"]], recorder, args, lambda *_: False).run() == 0
     printed = capsys.readouterr().out
     assert "the cube was not lifted" in printed
     assert ("the arm was stopped in this episode" in printed) is stops
