@@ -19,6 +19,7 @@ from typing import Any
 
 import can
 
+from hal.config.files import closest
 from hal.errors import ConfigError, ConnectionLost, DeviceNotFound, DriverMissing, Fault, HalError, Problem
 
 from .settings import BusSettings
@@ -193,6 +194,11 @@ class CanBus:
         """Return the error of this package that an interface's exception stands for."""
         s = self.settings
         where = f"{s.interface} {s.channel}"
+        if s.interface not in can.VALID_INTERFACES:
+            near = closest(s.interface, can.VALID_INTERFACES)
+            hint = f"; did you mean {near!r}?" if near else ""
+            message = f"there is no interface {s.interface!r} in python-can{hint}"
+            return ConfigError([Problem("<rig>", "real.interface", message, "unknown_interface")])
         if isinstance(error, (ImportError, can.CanInterfaceNotImplementedError)):
             return DriverMissing(f"{where}: {error}; `pip install 'robot-hal[can]'`, or the interface's own library")
         code = _errno_of(error)

@@ -5,6 +5,7 @@ Nothing here imports python-can.
 
 from __future__ import annotations
 
+import ipaddress
 import itertools
 from collections.abc import Iterator, Mapping
 from functools import cached_property
@@ -152,6 +153,17 @@ class BusSettings(Strict):
     """Bit rate, bit/s. SocketCAN's is set by ``ip link``; this one is used for its command and for the bus load."""
     data_bit_rate: BitRate = 5_000_000
     """Bit rate of the data of CAN-FD frames, bit/s."""
+
+    @model_validator(mode="after")
+    def _channel_of_its_kind(self) -> BusSettings:
+        if self.interface == "udp_multicast":
+            try:
+                group = ipaddress.ip_address(self.channel).is_multicast
+            except ValueError:
+                group = False
+            if not group:
+                raise ValueError(f"channel: must be a multicast address such as {_USUAL_GROUP}, not {self.channel}")
+        return self
 
     @property
     def key(self) -> tuple[str, str]:

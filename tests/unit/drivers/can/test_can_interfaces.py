@@ -5,12 +5,16 @@ from __future__ import annotations
 import json
 from typing import Any
 
+import can
 import pytest
 
+from hal.apps.check import main as check_program
 from hal.drivers.can import interfaces, preflight
+from hal.drivers.can.bus import CanBus
 from hal.drivers.can.interfaces import CanInterface, list_buses, parse_links, read_interfaces
 from hal.drivers.can.preflight import bus_load, check_damiao, check_piper, judge_interface
-from hal.drivers.can.settings import BusSettings
+from hal.drivers.can.settings import BusSettings, check_piper_arm
+from hal.errors import ConfigError, DeviceNotFound, HalError
 from hal.testing import robot_spec
 
 
@@ -138,3 +142,49 @@ def test_the_bus_load_is_that_of_its_frames() -> None:
     assert bus_load(2 * 7 * 250, settings()) == pytest.approx(0.455)
     assert 0.38 < bus_load(3040, settings()) < 0.42
     assert bus_load(1000, settings(fd=True)) < 0.5 * bus_load(1000, settings())
+
+
+@pytest.mark.parametrize(
+    ("options", "error", "code"),
+    [
+        ({"interface": "socketcan", "channel": "can77"}, DeviceNotFound, {"no_interface", "no_socketcan"}),
+        ({"interface": "socketcam", "channel": "can0"}, ConfigError, {"unknown_interface"}),
+        ({"interface": "robotell", "channel": "COM1", "bus": {"nosuch": 1}}, HalError, {"bad_bus", "driver_missing"}),
+    ],
+)
+def test_a_bus_that_cannot_be_opened_is_named(options: Any, error: type[HalError], code: set[str]) -> None:
+    with pytest.raises(error) as caught:
+        CanBus.acquire(BusSettings(**options))
+    codes = {problem.code for problem in caught.value.problems} if isinstance(caught.value, ConfigError) else set()
+    assert (codes or {caught.value.code}) <= code
+    assert options["interface"] in str(caught.value)
+
+
+def test_a_bit_rate_that_the_adapter_cannot_do_is_a_mistake_of_the_rig(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As python-can's interface of serial adapters refuses it."""
+
+    def refuse(**_: Any) -> None:
+        raise ValueError("Invalid bitrate, choose one of 10000 20000 50000 100000 125000 250000 500000 750000 1000000")
+
+    monkeypatch.setattr(can, "Bus", refuse)
+    with pytest.raises(ConfigError) as caught:
+        CanBus.acquire(BusSettings(interface="slcan", channel="/dev/ttyACM0", bus={"bitrate": 300_000}))
+    assert [problem.code for problem in caught.value.problems] == ["bad_bus"]
+    assert "choose one of" in str(caught.value)
+
+
+def test_a_multicast_channel_must_be_a_multicast_address() -> None:
+    spec = robot_spec(6, rate_hz=200.0, options={"interface": "udp_multicast", "channel": "192.168.0.1"})
+    assert [(key, code) for key, _, code in check_piper_arm(spec)] == [("real", "invalid")]
+
+
+def test_the_program_lists_the_buses(
+    answer: Any, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(interfaces, "_other_adapters", list)
+    answer(link("can1", up=False))
+    assert check_program(["--can"]) == 0
+    assert "sudo ip link set can1 up" in capsys.readouterr().out
+    answer()
+    assert check_program(["--can"]) == 2
+    assert "no CAN interface" in capsys.readouterr().out
