@@ -4,14 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from unittest.mock import patch
 
-from hal.drivers.can import piper_link
+from stepped_can import SteppedEmulator
+
 from hal.drivers.can.piper import PiperArm
 from hal.drivers.can.piper_gripper import PiperGripper
 from hal.testing import GripperBench, RobotBench
-
-from .damiaos import SteppedEmulator
 
 __all__ = ["piper_arm", "piper_gripper"]
 
@@ -19,11 +17,11 @@ __all__ = ["piper_arm", "piper_gripper"]
 @contextmanager
 def piper_arm() -> Iterator[RobotBench]:
     """A PiPER at 200 Hz."""
-    with SteppedEmulator("piper") as far, patch.object(piper_link, "time", far.time):
+    with SteppedEmulator("piper") as far:
         driver = PiperArm(far.spec)
 
         def fail() -> str:
-            far.emulator.execute("status 0 7")
+            far.execute("status 0 7")
             return "collision"
 
         yield RobotBench(
@@ -40,9 +38,9 @@ def piper_arm() -> Iterator[RobotBench]:
 @contextmanager
 def piper_gripper() -> Iterator[GripperBench]:
     """The gripper of a PiPER, open."""
-    with SteppedEmulator("piper") as far, patch.object(piper_link, "time", far.time):
+    with SteppedEmulator("piper") as far:
         assert far.spec.gripper is not None
-        far.arm.gripper_width = far.spec.gripper.width_max  # type: ignore[attr-defined]  # of a PiPER
+        far.arm.gripper_width = far.spec.gripper.width_max
         far.arm.restart()
         driver = PiperGripper(far.spec.gripper)
         yield GripperBench(
@@ -52,6 +50,6 @@ def piper_gripper() -> Iterator[GripperBench]:
             patience=0.5,
             lose=lambda: far.cut("on"),
             restore=lambda: far.cut("off"),
-            put_object=lambda width: far.emulator.execute(f"object {width}") and None,
+            put_object=lambda width: far.execute(f"object {width}") and None,
         )
         driver.close()

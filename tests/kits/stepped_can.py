@@ -19,7 +19,7 @@ from unittest.mock import patch
 from can_kit import can_overrides
 
 from hal.config.loader import load
-from hal.drivers.can import damiao_chain
+from hal.drivers.can import damiao_chain, piper_link
 from hal.drivers.can.emulator import console, server
 from hal.specs import RobotSpec
 
@@ -61,7 +61,7 @@ class SteppedEmulator:
 
     def __enter__(self) -> SteppedEmulator:
         clock = SimpleNamespace(monotonic=lambda: 1000.0 + self.passed, sleep=self.advance)
-        for module in (damiao_chain, server, console):
+        for module in (damiao_chain, piper_link, server, console):
             self._patches.enter_context(patch.object(module, "time", clock))
         self.bus.open()
         return self
