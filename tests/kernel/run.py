@@ -50,7 +50,7 @@ def _parser() -> argparse.ArgumentParser:
     add("--kernel", action="append", choices=_SERIES, help="all checks on this series of kernels")
     add("-k", metavar="EXPRESSION", default="", help="only the checks whose names match, as pytest's -k")
     add("--refresh", action="store_true", help="download the newest kernels, though there are some in the cache")
-    add("--limit", type=float, default=240.0, help="end a machine after so many seconds (default: %(default)g)")
+    add("--limit", type=float, default=480.0, help="end a machine after so many seconds (default: %(default)g)")
     add("--console", action="store_true", help="show what each machine's kernel and pytest said, too")
     return parser
 

@@ -43,6 +43,13 @@ def _open() -> socket.socket:
     return opened
 
 
+def _receive(opened: socket.socket) -> tuple[int, bytes]:
+    """Return id and data of the next frame."""
+    opened.settimeout(2.0)
+    id, _, data = _FRAME.unpack(opened.recv(_FRAME.size))
+    return id, data
+
+
 def _set(state: str) -> None:
     subprocess.run(["ip", "link", "set", "vcan0", state], check=True)
 
@@ -60,10 +67,8 @@ def check_vcan() -> None:
     """vcan0 is up, and one program receives what another one sends."""
     assert int(Path("/sys/class/net/vcan0/flags").read_text(), 16) & 1, "the interface is up"
     with _open() as sender, _open() as receiver:
-        frame = _FRAME.pack(0x123, 8, b"setpoint")
-        sender.send(frame)
-        receiver.settimeout(2.0)
-        assert receiver.recv(_FRAME.size) == frame
+        sender.send(_FRAME.pack(0x123, 8, b"setpoint"))
+        assert _receive(receiver) == (0x123, b"setpoint")
     interfaces = read_interfaces()
     assert interfaces is not None
     assert [(one.name, one.up, one.virtual) for one in interfaces if one.name == "vcan0"] == [("vcan0", True, True)]
@@ -74,9 +79,8 @@ def check_frames_are_handed_out_by_id(bus: CanBus) -> None:
     got: list[bytes] = []
     bus.subscribe({0x11: lambda data: got.append(bytes(data))}, (0x01,))
     with _open() as other:
-        other.setblocking(False)
         bus.send(0x01, b"command.")
-        assert other.recv(_FRAME.size) == _FRAME.pack(0x01, 8, b"command.")
+        assert _receive(other) == (0x01, b"command.")
         for id, data in ((0x11, b"reply..1"), (0x345, b"stranger"), (0x11, b"reply..2")):
             other.send(_FRAME.pack(id, 8, data))
         assert bus.poll()
@@ -117,9 +121,8 @@ def check_an_interface_that_goes_down_and_up(bus: CanBus) -> None:
         assert time.monotonic() < end, "it was not opened again"
         time.sleep(0.01)
     with _open() as other:
-        other.setblocking(False)
         bus.send(0x01, b"again...")
-        assert other.recv(_FRAME.size) == _FRAME.pack(0x01, 8, b"again...")
+        assert _receive(other) == (0x01, b"again...")
 
 
 def check_an_interface_that_is_down_or_missing_is_named() -> None:
@@ -165,8 +168,8 @@ class _Damiao(
 
 
 _CHECKS = [
-    (name, contract, bench)
-    for contract, bench in ((_Damiao, damiao_arm), (_Piper, piper_arm))
+    pytest.param(name, contract, bench, id=f"{arm} {name.removeprefix('test_').replace('_', ' ')}")
+    for arm, contract, bench in (("damiao", _Damiao, damiao_arm), ("piper", _Piper, piper_arm))
     for name in dir(contract)
     if name.startswith("test_") and getattr(contract, name)
 ]
