@@ -22,7 +22,8 @@ from hal.errors import ConnectionLost, Fault, RobotFault
 from hal.histogram import Histogram
 from hal.specs import RobotSpec
 
-from .damiao_chain import SWITCHING, ChainMotor, DamiaoChain
+from .damiao_chain import SWITCHING, DamiaoChain
+from .damiao_motor import ChainMotor
 from .settings import DamiaoArmSettings
 
 __all__ = ["DamiaoArm"]

@@ -16,7 +16,8 @@ from hal.preflight import CheckResult
 from hal.specs import RobotSpec
 
 from .bus import CanBus, bring_up
-from .damiao_chain import DamiaoChain, register_problems
+from .damiao_chain import DamiaoChain
+from .damiao_motor import register_problems
 from .damiao_protocol import REGISTER_ID, TIMEOUT_UNIT, MotorRegister, encode_register_read
 from .interfaces import CanInterface, read_interfaces
 from .piper_link import PiperLink, arm_fault, gripper_fault

@@ -75,7 +75,7 @@ class TestEmulatedDamiaoArm(
     left_out={
         "freeze": "a motor answers each frame: one that does not for 0.1 s is lost",
         "holds": "it has no brakes: it sinks, damped by its motors (docs/safety.md)",
-        "torque": "speed is reported in steps of 5 mrad/s, without the rotors' inertia: tests/wire/test_can_torque.py",
+        "torque": "speed is reported in steps of 5 mrad/s: tests/lock_step/test_can_torque.py",
     },
 ):
     """A YAM, in memory, and in step with the bench's clock."""

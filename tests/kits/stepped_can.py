@@ -12,18 +12,30 @@ with SteppedEmulator("yam") as far:
 from __future__ import annotations
 
 import contextlib
+from collections.abc import Iterator
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 from unittest.mock import patch
 
+import numpy as np
 from can_kit import can_overrides
+from numpy.typing import NDArray
 
+from hal.clock import LockStepClock
+from hal.commands import Command
 from hal.config.loader import load
+from hal.deadman import StopLatch
 from hal.drivers.can import damiao_chain, piper_link
 from hal.drivers.can.emulator import console, server
-from hal.specs import RobotSpec
+from hal.errors import ConnectionLost, HalError, MotionStopped, RobotFault
+from hal.host.hosts import LocalHost
+from hal.robot import Robot
+from hal.specs import GroupSpec, RobotSpec
 
-__all__ = ["SteppedEmulator"]
+__all__ = ["SteppedArm", "SteppedEmulator", "stepped_arm"]
+
+Array = NDArray[np.float64]
 
 
 class SteppedEmulator:
@@ -69,3 +81,66 @@ class SteppedEmulator:
     def __exit__(self, *_: object) -> None:
         self.bus.stop()
         self._patches.close()
+
+
+class SteppedArm:
+    """An arm with Damiao motors in lock-step with its emulator, moved by a session at 50 Hz.
+
+    Attributes:
+        far: The emulator.
+        host: The arm's host.
+        robot: The arm, as a program has it.
+        driver: Its driver.
+        control: A session, which is not open.
+    """
+
+    def __init__(self, far: SteppedEmulator) -> None:
+        self.far = far
+        spec = replace(far.spec, gripper=None, workspace=None)  # an arm that sank may be below the table
+        self.host = LocalHost(GroupSpec("arm", "lock_step", spec.rate_hz, (spec,)))
+        cycle = self.host.cycle
+        step = cycle.step
+
+        def step_both(*arguments: Any) -> None:
+            far.advance(cycle.dt)
+            step(*arguments)
+
+        cycle.step = step_both  # type: ignore[method-assign]
+        self.clock = LockStepClock(self.host.now, self.host.advance_to)
+        self.robot = Robot(spec, self.host, self.clock, StopLatch())
+        self.driver: Any = cycle.arms[spec.name].driver
+        self.control = self.robot.control(rate_hz=50, unattended=True)
+
+    @property
+    def q(self) -> Array:
+        """The true position of the plant (n,), rad."""
+        return np.array(self.far.arm.plant.q)
+
+    @property
+    def dq(self) -> Array:
+        """The true velocity of the plant (n,), rad/s."""
+        return np.array(self.far.arm.plant.dq)
+
+    def run(self, seconds: float, command: Command | None = None) -> HalError | None:
+        """Let time pass; send ``command`` 50 times a second until the session raises, and return that error."""
+        for _ in range(round(seconds / 0.02)):
+            if command is not None:
+                try:
+                    self.control.send(command)
+                except (MotionStopped, RobotFault, ConnectionLost) as error:
+                    return error
+            self.clock.sleep(0.02)
+        return None
+
+
+@contextlib.contextmanager
+def stepped_arm(rig: str = "yam") -> Iterator[SteppedArm]:
+    """Yield an arm whose session is open."""
+    with SteppedEmulator(rig) as far:
+        arm = SteppedArm(far)
+        try:
+            with arm.control:
+                yield arm
+                far.cut("on")  # so that the arm does not have to sink first
+        finally:
+            arm.host.close()

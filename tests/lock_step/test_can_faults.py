@@ -10,85 +10,36 @@ import contextlib
 import errno
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 from unittest.mock import patch
 
 import can
 import numpy as np
 import pytest
-from stepped_can import SteppedEmulator
+from stepped_can import SteppedArm, SteppedEmulator, stepped_arm
 
 import hal
-from hal.clock import LockStepClock
-from hal.deadman import StopLatch
 from hal.drivers.can.bus import CanBus
 from hal.drivers.can.damiao import DamiaoArm
 from hal.drivers.can.damiao_protocol import MOTOR_RANGES, MotorCodec
 from hal.errors import ConfigError, DeviceNotFound, HalError, MotionStopped, RobotFault
-from hal.host.hosts import LocalHost
-from hal.robot import Robot
-from hal.specs import GroupSpec
 
 DT = 0.004
 """Period of a YAM's cycle, s."""
 DETECTION = 0.15
 """Longest time until a fault is reported, s."""
-SPEED = 0.4
-"""Speed of the moving joint, rad/s."""
-
-
-class Driven:
-    """A YAM in lock-step, moved by a session at 50 Hz."""
-
-    def __init__(self, far: SteppedEmulator) -> None:
-        self.far = far
-        spec = replace(far.spec, gripper=None, workspace=None)  # an arm that sank may be below the table
-        self.host = LocalHost(GroupSpec("arm", "lock_step", spec.rate_hz, (spec,)))
-        cycle = self.host.cycle
-        step = cycle.step
-
-        def step_both(*arguments: Any) -> None:
-            far.advance(DT)
-            step(*arguments)
-
-        cycle.step = step_both  # type: ignore[method-assign]
-        self.clock = LockStepClock(self.host.now, self.host.advance_to)
-        self.robot = Robot(spec, self.host, self.clock, StopLatch())
-        self.driver: DamiaoArm = cycle.arms[spec.name].driver  # type: ignore[assignment]
-        self.control = self.robot.control(rate_hz=50, unattended=True)
-
-    @property
-    def q(self) -> np.ndarray[Any, np.dtype[np.float64]]:
-        """The true position of the plant, rad."""
-        return np.array(self.far.arm.plant.q)
-
-    def run(self, seconds: float, speed: float | None = None) -> HalError | None:
-        """Let time pass; with a ``speed`` send it to the first joint, until the session raises. Return that error."""
-        velocity = np.zeros(self.robot.n)
-        for _ in range(round(seconds / 0.02)):
-            if speed is not None:
-                velocity[0] = speed
-                try:
-                    self.control.send(hal.JointVelocity(velocity))
-                except (MotionStopped, RobotFault, hal.ConnectionLost) as error:
-                    return error
-            self.clock.sleep(0.02)
-        return None
+TURN = hal.JointVelocity([0.4, 0.0, 0.0, 0.0, 0.0, 0.0])
+"""The motion in which the faults occur, rad/s: about the vertical axis."""
+STILL = hal.JointVelocity([0.0] * 6)
 
 
 @contextlib.contextmanager
-def driven() -> Iterator[Driven]:
+def driven() -> Iterator[SteppedArm]:
     """Yield a YAM that moves."""
-    with SteppedEmulator("yam") as far:
-        arm = Driven(far)
-        try:
-            with arm.control:
-                assert arm.run(0.4, SPEED) is None
-                yield arm
-                far.cut("on")  # so that the arm does not have to sink first
-        finally:
-            arm.host.close()
+    with stepped_arm() as arm:
+        assert arm.run(0.4, TURN) is None
+        yield arm
 
 
 # Faults: each begins, and ends.
@@ -99,8 +50,8 @@ class CanFault:
     """A fault that is injected in motion."""
 
     name: str
-    begin: Callable[[Driven], object]
-    end: Callable[[Driven], object]
+    begin: Callable[[SteppedArm], object]
+    end: Callable[[SteppedArm], object]
     told: tuple[type[HalError], str] | None
     """Error that the program gets, and its code; None where the arm has to go on."""
     cause: str = ""
@@ -109,21 +60,21 @@ class CanFault:
     """Whether the user has to call ``recover``."""
 
 
-def line(text: str) -> Callable[[Driven], object]:
+def line(text: str) -> Callable[[SteppedArm], object]:
     """Return a function that executes a command of the emulator's console."""
     return lambda arm: arm.far.execute(text)
 
 
-def nothing(arm: Driven) -> None:
+def nothing(arm: SteppedArm) -> None:
     """Do nothing."""
 
 
-def starve(arm: Driven) -> None:
+def starve(arm: SteppedArm) -> None:
     """Let the motors hear nothing for longer than TIMEOUT, while this program stands still."""
     arm.far.advance(0.45)
 
 
-def take_interface_down(arm: Driven) -> None:
+def take_interface_down(arm: SteppedArm) -> None:
     def fail(*_: Any) -> None:
         raise can.CanOperationError("Failed to receive", errno.ENETDOWN)
 
@@ -135,7 +86,7 @@ def take_interface_down(arm: Driven) -> None:
     arm.broken = broken  # type: ignore[attr-defined]
 
 
-def bring_interface_up(arm: Driven) -> None:
+def bring_interface_up(arm: SteppedArm) -> None:
     arm.broken.close()  # type: ignore[attr-defined]
     deadline = time.monotonic() + 5.0
     while arm.driver.chain.lost is not None and time.monotonic() < deadline:
@@ -190,7 +141,7 @@ def _table() -> Iterator[None]:
     )
 
 
-def on(arm: Driven) -> int:
+def on(arm: SteppedArm) -> int:
     """Return how many motors are on."""
     return sum(motor.on for motor in arm.driver.chain.motors)
 
@@ -200,7 +151,7 @@ def test_a_fault_in_motion(fault: CanFault) -> None:
     with driven() as arm:
         began = arm.clock.now()
         fault.begin(arm)
-        error = arm.run(0.6, SPEED)
+        error = arm.run(0.6, TURN)
         took = arm.clock.now() - began
         if fault.told is None:
             assert error is None, "the arm has to continue"
@@ -228,7 +179,7 @@ def test_a_fault_in_motion(fault: CanFault) -> None:
             assert arm.driver.chain.lost is None, "the arm is found again by reading"
         if fault.recovers:
             with pytest.raises(RobotFault):
-                arm.control.send(hal.JointVelocity(np.zeros(6)))
+                arm.control.send(STILL)
             arm.robot.recover()
             arm.run(0.02)
             assert arm.robot.state(max_age=1.0).fault is None
@@ -239,7 +190,7 @@ def test_a_fault_in_motion(fault: CanFault) -> None:
         assert arm.q[0] == pytest.approx(at, abs=0.01)
 
         arm.control.rearm()
-        assert arm.run(0.6, SPEED) is None
+        assert arm.run(0.6, TURN) is None
         assert arm.driver.engaged, "a press switches the drives on again"
         assert arm.q[0] > at + 0.05
         recovery = "recover(), then a press" if fault.recovers else "a press"
@@ -297,9 +248,9 @@ def test_frames_from_before_the_connect_are_discarded() -> None:
 
 def test_close_lets_a_raised_arm_sink_damped_before_it_switches_it_off() -> None:
     with SteppedEmulator("yam") as far:
-        arm = Driven(far)
+        arm = SteppedArm(far)
         with arm.control:
-            arm.run(0.2, SPEED)
+            arm.run(0.2, TURN)
         arm.far.execute("stats reset")
         began = far.passed
         arm.host.close()
