@@ -28,6 +28,8 @@ from .settings import DamiaoArmSettings
 
 __all__ = ["DamiaoArm"]
 
+_STICKING = 0.02
+"""Speed below which the friction that a command adds falls to zero, rad/s: it would make a joint at rest tremble."""
 _ATTEMPTS = 3
 """How often a motor is switched on until it counts as broken."""
 
@@ -54,6 +56,8 @@ class DamiaoArm(RobotDriver):
         self.engaged = False
         self._fault: Fault | None = None
         """Fault of a motor; kept until recover()."""
+        friction = [motor.friction for motor in settings.motors]
+        self._friction = friction if any(friction) else None
         zeros = (0.0,) * len(self._motors)
         self._zeros: Sequence[float] = zeros
         self._target: list[float] = list(zeros)
@@ -203,6 +207,10 @@ class DamiaoArm(RobotDriver):
         q, dq = setpoint.q, setpoint.dq
         if setpoint.tau is None:
             tau = self.dynamics.inverse(q, dq, setpoint.ddq)
+            if self._friction is not None:
+                tau = [
+                    t + f * min(max(v / _STICKING, -1.0), 1.0) for t, f, v in zip(tau, self._friction, dq, strict=True)
+                ]
             if not isfinite(sum(q) + sum(dq) + sum(tau)):
                 raise ValueError(f"{self.spec.name}: a set-point is not finite: {setpoint}")
             frames = [motor.command(q[k], dq[k], motor.kp, motor.kd, tau[k]) for k, motor in enumerate(motors)]

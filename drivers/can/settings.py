@@ -133,6 +133,7 @@ BitRate = Annotated[int, _whole("a bit rate in bit/s", 10_000, 10_000_000)]
 Angle = Annotated[float, Quantity("rad", -100.0, 100.0)]
 Stiffness = Annotated[float, Quantity("Nm/rad", 0.0, KP_MAX, above=True)]
 Damping = Annotated[float, Quantity("Nm s/rad", 0.0, KD_MAX, above=True)]
+Friction = Annotated[float, Quantity("Nm", 0.0, 10.0)]
 Temperature = Annotated[float, Quantity("deg C", 30.0, 200.0)]
 WidthTable = Annotated[tuple[tuple[float, float], ...], BeforeValidator(_width_table)]
 
@@ -202,6 +203,8 @@ class DamiaoMotorSettings(Strict):
     """1 if the joint turns in the motor's direction, -1 if in the opposite one."""
     offset: Angle = 0.0
     """Position of the joint at the motor's zero, rad: joint = direction * motor + offset."""
+    friction: Friction = 0.0
+    """Coulomb friction of the joint that a command adds in the direction of its motion, Nm: less than there is."""
     master: Id | None = None
     """Id that the motor answers with (its register MST_ID); the motor's id + 0x10 if it is left out."""
     ranges: Annotated[MotorRange | None, BeforeValidator(_ranges)] = None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pytest
+from can_kit import can_overrides
 
 from hal.config.loader import load
 from hal.drivers.can.damiao_protocol import (
@@ -37,8 +38,6 @@ from hal.drivers.can.piper_protocol import (
     encode_joint_targets,
     find_firmware,
 )
-
-from ....kits.can_kit import can_overrides
 
 DT = 1e-3
 
