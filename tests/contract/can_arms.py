@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 
 from stepped_can import SteppedEmulator
 
@@ -17,8 +17,7 @@ __all__ = ["piper_arm", "piper_gripper"]
 @contextmanager
 def piper_arm() -> Iterator[RobotBench]:
     """A PiPER at 200 Hz."""
-    with SteppedEmulator("piper") as far:
-        driver = PiperArm(far.spec)
+    with SteppedEmulator("piper") as far, closing(PiperArm(far.spec)) as driver:
 
         def fail() -> str:
             far.execute("status 0 7")
@@ -32,7 +31,6 @@ def piper_arm() -> Iterator[RobotBench]:
             restore=lambda: far.cut("off"),
             fail=fail,
         )
-        driver.close()
 
 
 @contextmanager
@@ -42,14 +40,13 @@ def piper_gripper() -> Iterator[GripperBench]:
         assert far.spec.gripper is not None
         far.arm.gripper_width = far.spec.gripper.width_max
         far.arm.restart()
-        driver = PiperGripper(far.spec.gripper)
-        yield GripperBench(
-            driver=driver,
-            dt=1.0 / far.spec.rate_hz,
-            advance=lambda: far.advance(1.0 / far.spec.rate_hz),
-            patience=0.5,
-            lose=lambda: far.cut("on"),
-            restore=lambda: far.cut("off"),
-            put_object=lambda width: far.execute(f"object {width}") and None,
-        )
-        driver.close()
+        with closing(PiperGripper(far.spec.gripper)) as driver:
+            yield GripperBench(
+                driver=driver,
+                dt=1.0 / far.spec.rate_hz,
+                advance=lambda: far.advance(1.0 / far.spec.rate_hz),
+                patience=0.5,
+                lose=lambda: far.cut("on"),
+                restore=lambda: far.cut("off"),
+                put_object=lambda width: far.execute(f"object {width}") and None,
+            )
