@@ -59,7 +59,7 @@ def main() -> None:
             print(
                 f"  {way:12s} {len(ends)} x: before {min(e.before for e in ends):.2f} to "
                 f"{max(e.before for e in ends):.2f}, afterwards at most {max(e.after for e in ends):.3f} rad/s, "
-                f"after 6 s {max(e.last for e in ends):.3f} rad/s; sunk {max(e.sunk for e in ends):.2f} rad",
+                f"after 5 s {max(e.last for e in ends):.3f} rad/s; sunk {max(e.sunk for e in ends):.2f} rad",
                 flush=True,
             )
 

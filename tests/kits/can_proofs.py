@@ -173,7 +173,7 @@ class End(NamedTuple):
     """Greatest joint speed at its end, rad/s."""
 
 
-def end(rig_name: str, way: str, seconds: float = 6.0, joint: int = 1, speed: float = SPEED) -> End:
+def end(rig_name: str, way: str, seconds: float = 5.0, joint: int = 1, speed: float = SPEED) -> End:
     """End a program while its arm moves, and watch the arm for some seconds."""
     with EmulatorProcess(rig_name) as emulator:
         arguments = json.dumps([rig_name, joint, speed, *emulator.overrides, "robots.arm.speed=0.5"])

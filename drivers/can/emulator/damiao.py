@@ -1,7 +1,7 @@
 """Emulated Damiao motors: registers, MIT mode, watchdog, faults and temperatures, on the mechanics of an arm.
 
-What the manuals leave open is assumed, and is said here: a motor with a fault or without communication damps as if its
-windings were shorted; only frames at a motor's own id feed its watchdog; a motor that is off applies no torque.
+What the manuals leave open is assumed: a motor without communication damps as if its windings were shorted; one with
+another fault applies no torque; only frames at a motor's own id feed its watchdog.
 """
 
 from __future__ import annotations
@@ -113,11 +113,9 @@ class DamiaoMotor:
         timeout = self.registers[MotorRegister.TIMEOUT] * TIMEOUT_UNIT
         if self.status == MotorStatus.ENABLED and 0.0 < timeout < self.silence:
             self.status = MotorStatus.LOST_COMMUNICATION
-        if self.status == MotorStatus.DISABLED:
-            return OFF
-        if self.status != MotorStatus.ENABLED:
+        if self.status == MotorStatus.LOST_COMMUNICATION:
             return Drive(kd=self._damping)
-        return self.drive or OFF
+        return (self.drive if self.status == MotorStatus.ENABLED else None) or OFF
 
     def command(self, data: bytes) -> None:
         """Take a frame at the motor's id."""
