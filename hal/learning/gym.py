@@ -12,7 +12,8 @@ and watchdog as teleoperation. Needs ``pip install 'robot-hal[gym]'``.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, Literal
 
@@ -30,7 +31,7 @@ from ..observation import Observation
 from ..rig import Rig, open_rig
 from ..robot import Robot
 from ..specs import CameraSpec
-from .episode import reset_scene
+from .episode import reset_scene, stands_in_world
 
 __all__ = [
     "ActionKind",
@@ -52,11 +53,11 @@ to 1 (closed)."""
 ObservationDict = dict[str, NDArray[Any]]
 
 
-def action_space(robot: Robot, kind: ActionKind, rate_hz: float, speeds: tuple[float, float]) -> spaces.Box:
-    """Return the box of actions.
+def action_space(robots: Sequence[Robot], kind: ActionKind, rate_hz: float, speeds: tuple[float, float]) -> spaces.Box:
+    """Return the box of actions: the numbers of each arm, one arm after the other.
 
     Args:
-        robot: The arm.
+        robots: The arms.
         kind: Kind of action.
         rate_hz: Steps per second.
         speeds: Greatest speeds of the tcp, m/s and rad/s.
@@ -65,21 +66,39 @@ def action_space(robot: Robot, kind: ActionKind, rate_hz: float, speeds: tuple[f
         CommandError: An unknown ``kind`` (code ``unknown_action``).
     """
     linear, angular = speeds
-    if kind == "joint":
-        low, high = list(robot.limits.lower), list(robot.limits.upper)
-    elif kind in ("tcp_delta", "twist"):
-        share = 1.0 / rate_hz if kind == "tcp_delta" else 1.0
-        high = [linear * share] * 3 + [angular * share] * 3
-        low = [-value for value in high]
-    else:
-        raise CommandError(f"action must be joint, tcp_delta or twist, not {kind!r}", code="unknown_action")
-    if robot.gripper is not None:
-        low, high = [*low, 0.0], [*high, 1.0]
+    low: list[float] = []
+    high: list[float] = []
+    for robot in robots:
+        if kind == "joint":
+            low += robot.limits.lower
+            high += robot.limits.upper
+        elif kind in ("tcp_delta", "twist"):
+            share = 1.0 / rate_hz if kind == "tcp_delta" else 1.0
+            most = [linear * share] * 3 + [angular * share] * 3
+            low += [-value for value in most]
+            high += most
+        else:
+            raise CommandError(f"action must be joint, tcp_delta or twist, not {kind!r}", code="unknown_action")
+        if robot.gripper is not None:
+            low.append(0.0)
+            high.append(1.0)
     return spaces.Box(np.array(low, np.float32), np.array(high, np.float32), dtype=np.float32)
 
 
+def action_names(robots: Sequence[Robot], kind: ActionKind, several: bool) -> tuple[str, ...]:
+    """Return the name of each number of an action; with ``several`` arms the arm's name leads, as in recordings."""
+    names: list[str] = []
+    for robot in robots:
+        own = [*(robot.joints if kind == "joint" else _TCP_NAMES), *(["gripper"] if robot.gripper is not None else [])]
+        names += [f"{robot.name}.{name}" if several else name for name in own]
+    return tuple(names)
+
+
+_TCP_NAMES = ("x", "y", "z", "roll", "pitch", "yaw")
+
+
 def observation_space(
-    robot: Robot, cameras: Iterable[Camera], streams: Collection[str], objects: Collection[str]
+    robots: Mapping[str, Robot], cameras: Iterable[Camera], streams: Collection[str], objects: Collection[str]
 ) -> spaces.Dict:
     """Return a box for each entry of :func:`numbers_and_pictures`, and for the pose of each of ``objects``.
 
@@ -90,9 +109,10 @@ def observation_space(
     def free(size: int) -> spaces.Box:
         return spaces.Box(-np.inf, np.inf, (size,), np.float64)
 
-    parts: list[tuple[str, spaces.Space[Any]]] = [("q", free(robot.n)), ("dq", free(robot.n)), ("tcp", free(7))]
-    if robot.gripper is not None:
-        parts.append(("gripper", free(1)))
+    parts: list[tuple[str, spaces.Space[Any]]] = []
+    for lead, robot in robots.items():
+        sizes = {"q": robot.n, "dq": robot.n, "tcp": 7} | ({"gripper": 1} if robot.gripper is not None else {})
+        parts += [(lead + name, free(size)) for name, size in sizes.items()]
     for camera in cameras:
         found = [stream for stream in streams if stream in camera.spec.streams]
         parts += [(entry_key(camera.name, stream), _picture_space(camera.spec, stream)) for stream in found]
@@ -100,7 +120,7 @@ def observation_space(
     keys = [name for name, _ in parts]
     if twice := sorted({name for name in keys if keys.count(name) > 1}):
         raise CommandError(
-            f"two parts of the observation would be called {', '.join(twice)}: rename a camera or an object",
+            f"two parts of the observation would be called {', '.join(twice)}: rename an arm, a camera or an object",
             code="duplicate_name",
         )
     return spaces.Dict(dict(parts))
@@ -119,13 +139,18 @@ def _picture_space(camera: CameraSpec, stream: str) -> spaces.Box:
 
 
 def numbers_and_pictures(
-    observation: Observation, robot: Robot, cameras: Collection[str], streams: Collection[str]
+    observation: Observation, robots: Mapping[str, Robot], cameras: Collection[str], streams: Collection[str]
 ) -> ObservationDict:
-    """Return the entries of an observation: the arm, its gripper and these streams of these cameras."""
-    state = observation.robots[robot.name]
-    shown: ObservationDict = {"q": np.array(state.q), "dq": np.array(state.dq), "tcp": pose_array(state.tcp)}
-    if robot.gripper is not None:
-        shown["gripper"] = np.array([observation.grippers[robot.name].width])
+    """Return the entries of an observation: the arms, their grippers and these streams of these cameras.
+
+    ``robots`` maps what leads the names of an arm's entries to the arm.
+    """
+    shown: ObservationDict = {}
+    for lead, robot in robots.items():
+        state = observation.robots[robot.name]
+        shown |= {f"{lead}q": np.array(state.q), f"{lead}dq": np.array(state.dq), f"{lead}tcp": pose_array(state.tcp)}
+        if robot.gripper is not None:
+            shown[f"{lead}gripper"] = np.array([observation.grippers[robot.name].width])
     for name in cameras:
         frame = observation.cameras[name].frame
         for stream in streams:
@@ -160,8 +185,47 @@ _MAX_LEAD = (0.03, 0.12)
 _MAX_STEP = 0.999 * FIRST_STEP_ANGLE  # the servo refuses more, also after rounding
 
 
+class _EnvArm:
+    """One arm of an environment: its control session, and the goal of its last action."""
+
+    def __init__(self, robot: Robot, kind: ActionKind) -> None:
+        self.robot = robot
+        self.control: Control | None = None
+        self.goal = Pose()
+        self.clipped = False
+        self.size = (robot.n if kind == "joint" else 6) + int(robot.gripper is not None)
+        """Count of numbers in an action."""
+        self._kind = kind
+        self._lower, self._upper = np.array(robot.limits.lower), np.array(robot.limits.upper)
+
+    def restart(self, observation: Observation) -> None:
+        """Begin an episode where the arm is."""
+        self.goal = observation.robots[self.robot.name].tcp_set
+        self.clipped = False
+
+    def command(self, action: NDArray[np.float64]) -> tuple[Command, float | None]:
+        """Return the command of an action, and the grip from 0 (open) to 1 (closed); None without a gripper."""
+        grip = min(max(float(action[-1]), 0.0), 1.0) if self.robot.gripper is not None else None
+        numbers = action if grip is None else action[:-1]
+        if self._kind == "joint":
+            q_set = self.robot.state().q_set
+            q = np.minimum(np.maximum(numbers, q_set - _MAX_STEP), q_set + _MAX_STEP)
+            q = np.minimum(np.maximum(q, self._lower), self._upper)
+            self.clipped = bool((q != numbers).any())
+            return JointTarget(q), grip
+        if self._kind == "twist":
+            return Twist(numbers[:3], numbers[3:]), grip
+        reached = self.robot.state().tcp_set
+        distance, turn = reached.distance(self.goal)
+        if distance > _MAX_LEAD[0] or turn > _MAX_LEAD[1]:  # the arm was held back: the goal must not run ahead
+            self.goal = reached
+        turned = after_rotation(self.goal.orientation.tolist(), numbers[3:].tolist())
+        self.goal = Pose(self.goal.position + numbers[:3], turned)
+        return CartesianTarget(self.goal), grip
+
+
 class RigEnv(gymnasium.Env[ObservationDict, NDArray[np.float32]]):
-    """One arm of a rig, its gripper and its cameras, as a Gymnasium environment.
+    """An arm of a rig, or several, with their grippers and cameras, as a Gymnasium environment.
 
     Observations are a dict: ``q`` and ``dq`` (n,), rad and rad/s; ``tcp`` (7,), position in m and quaternion xyzw in
     the arm's base frame; ``gripper`` (1,), width in m; per camera, of the streams that it has, ``<name>_color`` (H, W,
@@ -169,6 +233,9 @@ class RigEnv(gymnasium.Env[ObservationDict, NDArray[np.float32]]):
     uint8, ``<name>_segmentation`` (H, W, 1) int32 (see :class:`~hal.types.Frame`); per observed object
     ``object_<name>`` (7,), its pose in the world. A dash in a name becomes an underscore. :attr:`observation` is the
     complete record behind it, with every stamp; ``info["elapsed"]`` is its time since the reset, s.
+
+    With ``robots`` an action has the numbers of each arm, one arm after the other (:attr:`action_names`), and the arm's
+    name leads its entries of the observation: ``left_q``. A stop of one arm ends the episode for all.
 
     ``step`` sends the action, lets one period pass and waits for an observation that was taken after that, so that no
     observation is returned twice. If the arm is stopped (releasing the dead-man is not a stop), the episode is
@@ -184,6 +251,7 @@ class RigEnv(gymnasium.Env[ObservationDict, NDArray[np.float32]]):
         sim: bool | None = None,
         driver: str | None = None,
         robot: str | None = None,
+        robots: Sequence[str] | None = None,
         action: ActionKind = "joint",
         cameras: Collection[str] | None = None,
         streams: Collection[str] | None = None,
@@ -206,6 +274,7 @@ class RigEnv(gymnasium.Env[ObservationDict, NDArray[np.float32]]):
             sim: True for simulated drivers, as for :func:`hal.open`.
             driver: Driver of all devices, as for :func:`hal.open`.
             robot: Name of the arm; None for the rig's first.
+            robots: Names of several arms, instead of ``robot``.
             action: Kind of action, see :data:`ActionKind`.
             cameras: Names of the observed cameras; None for all.
             streams: Observed streams: some of ``color``, ``depth``, ``infrared``, ``infrared_right`` and
@@ -240,26 +309,28 @@ class RigEnv(gymnasium.Env[ObservationDict, NDArray[np.float32]]):
         self._unattended = unattended
         self.rig = self._open(config, sim, driver, overrides, deadman is not None)
         try:
-            self.robot: Robot = self.rig.robots[robot] if robot else next(iter(self.rig.robots.values()))
-            self._lower, self._upper = np.array(self.robot.limits.lower), np.array(self.robot.limits.upper)
+            chosen_robots = _chosen(self.rig, robot, robots)
+            self.robot: Robot = chosen_robots[0]
+            """The arm; the first of several."""
+            self._arms = tuple(_EnvArm(arm, action) for arm in chosen_robots)
+            self._leads = {"" if robots is None else entry_key(arm.name, ""): arm for arm in chosen_robots}
+            self.action_names = action_names(chosen_robots, action, robots is not None)
+            """Name of each number of an action; with ``robots`` after the arm's name, as in recordings."""
             self._deadman = deadman(self.rig) if deadman is not None else None
             self._cameras = tuple(self.rig.cameras) if cameras is None else tuple(cameras)
             self._objects = _known(objects, self.rig)
             chosen = [self.rig.cameras[name] for name in self._cameras]
             self._streams = ("color", "depth") if streams is None else _streamed(streams, chosen)
-            self.action_space: Box = action_space(self.robot, action, rate_hz, speeds)  # type: ignore[assignment]
+            self.action_space: Box = action_space(chosen_robots, action, rate_hz, speeds)  # type: ignore[assignment]
             self.observation_space: Dict = observation_space(  # type: ignore[assignment]  # invariant in their types
-                self.robot, chosen, self._streams, self._objects
+                self._leads, chosen, self._streams, self._objects
             )
         except BaseException:
             self.rig.close()
             raise
-        self._control: Control | None = None
-        self._goal = Pose()
         self._steps = 0
         self._due = 0.0
         self._start = 0.0
-        self._clipped = False
         self.observation: Observation | None = None
         """The complete record behind the newest observation."""
 
@@ -285,8 +356,8 @@ class RigEnv(gymnasium.Env[ObservationDict, NDArray[np.float32]]):
 
         Args:
             seed: Seed of ``np_random``; None continues its sequence.
-            options: ``q`` (n,), start position, rad; ``poses``, name of an object -> :class:`~hal.geometry.Pose`,
-                instead of a sampled one.
+            options: ``q`` (n,), start position, rad (with several arms: name -> position); ``poses``, name of an object
+                -> :class:`~hal.geometry.Pose`, instead of a sampled one.
 
         Returns:
             The observation and ``info``; ``info["poses"]`` has the poses of the placed objects, if any: name -> (7,),
@@ -298,25 +369,30 @@ class RigEnv(gymnasium.Env[ObservationDict, NDArray[np.float32]]):
         """
         super().reset(seed=seed)
         options = options or {}
-        self._close_session()
-        q, poses = options.get("q", self.robot.spec.initial), options.get("poses")
-        put = reset_scene(
-            self.rig,
-            self.robot,
-            q,
-            poses=poses,
-            random=self.np_random,
-            deadman=self._deadman,
-            unattended=self._unattended,
-        )
+        self._close_sessions()
+        q, put = options.get("q"), {}
+        starts = q if isinstance(q, Mapping) else {self.robot.name: q}
+        for k, arm in enumerate(self._arms):
+            robot, last = arm.robot, k == len(self._arms) - 1
+            start = starts.get(robot.name)
+            put = reset_scene(
+                self.rig,
+                robot,
+                robot.spec.initial if start is None else start,
+                poses=options.get("poses") if last else None,  # each reset places the objects again
+                random=self.np_random if last else None,
+                deadman=self._deadman,
+                unattended=self._unattended,
+            )
+        self._place(starts)
         if self._on_reset is not None:
             self._on_reset(self, options)
-        self._open_session()
+        self._open_sessions()
         self.rig.forget_observations()
         observation = self.rig.observe(after=self.rig.clock.now(), cameras=self._cameras)
-        self._goal = observation.robots[self.robot.name].tcp_set
+        for arm in self._arms:
+            arm.restart(observation)
         self._steps = 0
-        self._clipped = False
         self._due = self.rig.clock.now()
         self._start = observation.t
         info = self._info(observation)
@@ -324,14 +400,24 @@ class RigEnv(gymnasium.Env[ObservationDict, NDArray[np.float32]]):
             info["poses"] = {name: pose_array(pose) for name, pose in put.items()}
         return self._observation_dict(observation), info
 
-    def _open_session(self) -> None:
-        control = self.robot.control(deadman=self._deadman, rate_hz=self._rate, unattended=self._unattended)
-        self._control = control.__enter__()
+    def _place(self, starts: Mapping[str, Any]) -> None:
+        """Place the simulated arms that were given a start: the reset of the last arm put all others back."""
+        for arm in self._arms[:-1]:
+            q = starts.get(arm.robot.name)
+            if q is not None and stands_in_world(self.rig, arm.robot):
+                self.rig.world.reset(arm.robot.name, q=np.asarray(q, float))
 
-    def _close_session(self) -> None:
-        control, self._control = self._control, None
-        if control is not None:
-            control.close()
+    def _open_sessions(self) -> None:
+        for arm in self._arms:
+            control = arm.robot.control(deadman=self._deadman, rate_hz=self._rate, unattended=self._unattended)
+            arm.control = control.__enter__()
+
+    def _close_sessions(self) -> None:
+        with ExitStack() as closing:  # each is closed, whatever happens to the others
+            for arm in self._arms:
+                control, arm.control = arm.control, None
+                if control is not None:
+                    closing.callback(control.close)
 
     def step(self, action: NDArray[np.float32]) -> tuple[ObservationDict, float, bool, bool, dict[str, Any]]:
         """Send an action and wait one period; returns Gymnasium's five values.
@@ -340,15 +426,20 @@ class RigEnv(gymnasium.Env[ObservationDict, NDArray[np.float32]]):
             CommandError: ``reset`` was not called (code ``not_reset``), or the action's shape is wrong
                 (``bad_action``).
         """
-        if self._control is None:
-            raise CommandError("call reset before step", code="not_reset")
-        command, grip = self._command(np.asarray(action, float))
+        numbers = np.asarray(action, float)
+        if numbers.shape != self.action_space.shape:
+            raise CommandError(f"an action has shape {self.action_space.shape}, not {numbers.shape}", code="bad_action")
         clock = self.rig.clock
-        stopped = ""
-        try:
-            self._control.send(command, grip=grip)
-        except MotionStopped as stop:
-            stopped = str(stop)
+        stopped, first = "", 0
+        for arm in self._arms:
+            if arm.control is None:
+                raise CommandError("call reset before step", code="not_reset")
+            command, grip = arm.command(numbers[first : first + arm.size])
+            first += arm.size
+            try:
+                arm.control.send(command, grip=grip)
+            except MotionStopped as stop:
+                stopped = stopped or (f"{arm.robot.name}: {stop}" if len(self._arms) > 1 else str(stop))
         now = clock.now()
         self._due = max(self._due + 1.0 / self._rate, now)  # a late turn is not caught up
         clock.sleep_until(self._due)
@@ -372,30 +463,9 @@ class RigEnv(gymnasium.Env[ObservationDict, NDArray[np.float32]]):
         slowest = min((self.rig.cameras[name].spec.rate_hz for name in self._cameras), default=np.inf)
         return max(float(np.nextafter(sent, np.inf)), self._due - 1.0 / slowest)
 
-    def _command(self, action: NDArray[np.float64]) -> tuple[Command, float | None]:
-        if action.shape != self.action_space.shape:
-            raise CommandError(f"an action has shape {self.action_space.shape}, not {action.shape}", code="bad_action")
-        grip = min(max(float(action[-1]), 0.0), 1.0) if self.robot.gripper is not None else None
-        numbers = action if grip is None else action[:-1]
-        if self._kind == "joint":
-            q_set = self.robot.state().q_set
-            q = np.minimum(np.maximum(numbers, q_set - _MAX_STEP), q_set + _MAX_STEP)
-            q = np.minimum(np.maximum(q, self._lower), self._upper)
-            self._clipped = bool((q != numbers).any())
-            return JointTarget(q), grip
-        if self._kind == "twist":
-            return Twist(numbers[:3], numbers[3:]), grip
-        reached = self.robot.state().tcp_set
-        distance, turn = reached.distance(self._goal)
-        if distance > _MAX_LEAD[0] or turn > _MAX_LEAD[1]:  # the arm was held back: the goal must not run ahead
-            self._goal = reached
-        turned = after_rotation(self._goal.orientation.tolist(), numbers[3:].tolist())
-        self._goal = Pose(self._goal.position + numbers[:3], turned)
-        return CartesianTarget(self._goal), grip
-
     def _observation_dict(self, observation: Observation) -> ObservationDict:
         self.observation = observation
-        shown = numbers_and_pictures(observation, self.robot, self._cameras, self._streams)
+        shown = numbers_and_pictures(observation, self._leads, self._cameras, self._streams)
         if self._objects and self.rig.world is not None:
             poses = self.rig.world.poses(self._objects).poses
             shown |= {entry_key("object", name): pose_array(poses[name]) for name in self._objects}
@@ -403,7 +473,7 @@ class RigEnv(gymnasium.Env[ObservationDict, NDArray[np.float32]]):
 
     def _info(self, observation: Observation) -> dict[str, Any]:
         info: dict[str, Any] = {"elapsed": round(observation.t - self._start, 6)}
-        return info | {"clipped": True} if self._clipped else info
+        return info | {"clipped": True} if any(arm.clipped for arm in self._arms) else info
 
     def render(self) -> NDArray[np.uint8] | None:
         """Return the first camera's newest colour picture (H, W, 3)."""
@@ -413,11 +483,20 @@ class RigEnv(gymnasium.Env[ObservationDict, NDArray[np.float32]]):
         return None if color is None else np.array(color)
 
     def close(self) -> None:
-        """Bring the arm to rest and close the rig. Idempotent."""
+        """Bring the arms to rest and close the rig. Idempotent."""
         try:
-            self._close_session()
+            self._close_sessions()
         finally:
             self.rig.close()
+
+
+def _chosen(rig: Rig, robot: str | None, robots: Sequence[str] | None) -> list[Robot]:
+    """Return the arms of an environment. Raises CommandError if both arguments are given, or a name twice."""
+    if robots is None:
+        return [rig.robots[robot] if robot else next(iter(rig.robots.values()))]
+    if robot is not None or isinstance(robots, str) or len(set(robots)) < len(robots) or not robots:
+        raise CommandError("pass robot='left', or robots=['left', 'right']: each arm once", code="bad_robots")
+    return [rig.robots[name] for name in robots]
 
 
 def _known(objects: Collection[str], rig: Rig) -> tuple[str, ...]:

@@ -327,3 +327,45 @@ def test_several_in_processes_of_their_own() -> None:
         assert seen["tcp"][0, 0] - seen["tcp"][1, 0] > 0.01
     finally:
         envs.close()
+
+
+TWO_ARMS = {
+    "robots": {
+        name: {"model": "panda", "base": {"position": [0, y, 0]}} for name, y in (("left", 0.5), ("right", -0.5))
+    }
+}
+
+
+def test_two_arms_are_one_environment_with_their_names_in_front() -> None:
+    env = RigEnv(TWO_ARMS, sim=True, robots=["left", "right"], action="twist", max_steps=50)
+    try:
+        check_env(env, skip_render_check=True)
+        start, _ = env.reset(seed=1, options={"q": {"left": env.robot.home + 0.05}})
+        assert list(start) == [f"{arm}_{part}" for arm in ("left", "right") for part in ("q", "dq", "tcp", "gripper")]
+        assert start["left_q"] == pytest.approx(env.robot.home + 0.05, abs=1e-3)
+        assert start["right_q"] == pytest.approx(env.rig.robots["right"].home, abs=1e-3)
+        assert env.action_space.shape == (14,)
+        assert env.action_names[::7] == ("left.x", "right.x")
+        action = np.zeros(14)
+        action[2], action[9] = 0.1, -0.1
+        for _ in range(20):
+            seen, _, _, truncated, _ = env.step(action)
+        moved = {arm: seen[f"{arm}_tcp"] - start[f"{arm}_tcp"] for arm in ("left", "right")}
+        assert moved["left"][2] > 0.05
+        assert moved["right"][2] < -0.05
+        assert not truncated
+        env.rig.stop()
+        *_, truncated, info = env.step(action)
+        *_, truncated, info = env.step(action)
+        assert truncated
+        assert info["stopped"].startswith("left: ")
+    finally:
+        env.close()
+
+
+def test_arms_of_an_environment_are_named_once() -> None:
+    for wrong in (["left", "left"], [], "left"):
+        with raises_code(hal.CommandError, "bad_robots"):
+            RigEnv(TWO_ARMS, driver="mock", robots=wrong)
+    with raises_code(hal.CommandError, "bad_robots"):
+        RigEnv(TWO_ARMS, driver="mock", robot="left", robots=["left", "right"])
