@@ -110,6 +110,8 @@ class Control:
         self._id = 0
         self._stopped = False
         self._reported = False
+        self._unreported: Trip | None = None
+        """The stop that no call has reported when the session began to end; None before."""
         self._rearmed_at = -math.inf
         self._detach: Callable[[], None] | None = None
         self._grip: float | None = None
@@ -178,21 +180,23 @@ class Control:
         """
         if not self._id:
             return
-        unreported = self._unreported_trip()
-        # Needs no answer: from here on the arm brakes, whatever happens to this program.
-        self._mail.close_session(self._id)
+        self.brake()
+        unreported, self._unreported = self._unreported, None
         try:
             self._wait_for_rest()
         finally:
             self._forget()
-        if unreported is not Trip.NONE:
+        if unreported:
             text = f"{self.robot.name} was stopped in this session: {unreported.text}"
             warnings.warn(text, RuntimeWarning, stacklevel=3)
 
-    def _unreported_trip(self) -> Trip:
-        """Return a stop that no call has reported, because no command was sent after it."""
-        found = self._mail.peek()
-        return Trip.NONE if found is None or found.session != self._id or self._reported else found.trip
+    def brake(self) -> None:
+        """Begin to end the session, and do not wait as :meth:`close` does: so that several arms brake at once."""
+        if self._id and self._unreported is None:
+            found = self._mail.peek()
+            known = found is None or found.session != self._id or self._reported
+            self._unreported = Trip.NONE if found is None or known else found.trip
+            self._mail.close_session(self._id)  # needs no answer: the arm brakes, whatever happens to this program
 
     def _forget(self) -> None:
         """End the session on this side; the host ends it too if it has not yet."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from enum import Enum
@@ -361,6 +361,7 @@ class TeleopSession:
         """Follow the pads in one control session of each arm; return why they ended."""
         with ExitStack() as sessions:
             controls = self._open_controls(sessions)
+            sessions.callback(_brake, controls.values())  # all at once, before the first is waited for
             for tick in self.rig.clock.rate(RATE_HZ):
                 for arm in self.arms:
                     if arm in controls and not self._drive(arm, controls[arm], tick.dt):
@@ -544,6 +545,11 @@ class TeleopSession:
         """Reset the simulated scene. The control sessions have ended, so the arms are at rest."""
         self.rig.world.reset()
         self.announce(f"scene reset: hold {self.deadman_name} again to drive", "scene_reset")
+
+
+def _brake(controls: Iterable[Control]) -> None:
+    for control in controls:
+        control.brake()
 
 
 def _listed(given: T | Sequence[T] | None, default: Sequence[T], missing: str, code: str) -> list[T]:

@@ -417,6 +417,7 @@ class RigEnv(gymnasium.Env[ObservationDict, NDArray[np.float32]]):
             for arm in self._arms:
                 control, arm.control = arm.control, None
                 if control is not None:
+                    control.brake()
                     closing.callback(control.close)
 
     def step(self, action: NDArray[np.float32]) -> tuple[ObservationDict, float, bool, bool, dict[str, Any]]:

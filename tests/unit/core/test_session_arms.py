@@ -205,3 +205,12 @@ def test_a_dead_man_that_is_disarmed_needs_a_new_press() -> None:
     assert held == [False, False, True, False, False]
     switch.update(False, True, 1.2)
     assert switch.update(True, True, 1.3).held
+
+
+@pytest.mark.filterwarnings("error::RuntimeWarning")
+def test_both_arms_brake_at_once_when_the_sessions_end() -> None:
+    with bench(TWO_PADS) as two:
+        first, second = two.pad("first"), two.pad("second")
+        two.run(1.0, (0.2, up(first)), (0.2, up(second)))
+        assert all(speed_of(arm) == 0.0 for arm in two.rig.robots.values())
+        assert two.session.run(lambda state: "now") == "now"
