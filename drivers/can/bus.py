@@ -65,11 +65,14 @@ class CanBus:
         self._users = 0
         self._bus: can.BusABC | None = None
         self._handlers: dict[int, FrameHandler | None] = {}
-        """Id -> the device's function; None for ids that this process sends."""
+        """Id -> the device's function; None for an id that a device sends at."""
+        self._senders: dict[int, int] = {}
+        """Id -> number of devices that send at it."""
         self._messages: dict[int, can.Message] = {}
         self._timeout = 0.0 if settings.interface in _INSTANT else _SEND_TIMEOUT
         self._retry_at = 0.0
         self._opening: threading.Thread | None = None
+        self._closed = False
         self.reopened = 0
         """How often the bus was opened again."""
         self.reset_statistics()
@@ -107,6 +110,7 @@ class CanBus:
             if self._users > 0:
                 return
             self._open_buses.pop(self.settings.key, None)
+            self._closed = True
             if self._opening is not None:
                 self._opening.join(_SHUTDOWN)
             self._disconnect()
@@ -121,18 +125,25 @@ class CanBus:
         Raises:
             ConfigError: Another device of this process has one of the ids.
         """
-        taken = sorted(id for id in handlers if self._handlers.get(id) is not None)
-        if taken:
+        sent = tuple(sent)
+        taken = sorted({id for id in handlers if id in self._handlers} | {id for id in sent if self._handlers.get(id)})
+        if taken:  # also an id at which one device is commanded and another one answers: a reply would be a command
             text = ", ".join(f"{id:#x}" for id in taken)
             message = f"id {text} belongs to two devices on {self.settings.interface} {self.settings.channel}"
             raise ConfigError([Problem("<rig>", "real", message, "id_collision")])
         self._handlers.update(handlers)
-        self._handlers.update({id: None for id in sent if id not in self._handlers})
+        for id in sent:
+            self._handlers[id] = None
+            self._senders[id] = self._senders.get(id, 0) + 1
 
-    def unsubscribe(self, ids: Iterable[int]) -> None:
-        """Stop to hand frames with these ids to their device."""
+    def unsubscribe(self, ids: Iterable[int], sent: Iterable[int] = ()) -> None:
+        """Stop to hand frames with these ids to a device that sends no more at those of ``sent``."""
         for id in ids:
             self._handlers.pop(id, None)
+        for id in sent:
+            self._senders[id] -= 1
+            if not self._senders[id]:
+                del self._senders[id], self._handlers[id]
 
     # Opening.
 
@@ -176,6 +187,8 @@ class CanBus:
             self.fault = getattr(error, "fault", None) or self.fault
         else:
             self.reopened += 1
+            if self._closed:  # it took longer than the end waited
+                self._disconnect()
 
     def _lose(self, error: Exception) -> None:
         if self.fault is None:
@@ -216,8 +229,8 @@ class CanBus:
 
     # Frames.
 
-    def send(self, id: int, data: bytes) -> None:
-        """Queue a frame; a queue that is full drops it, which is counted.
+    def send(self, id: int, data: bytes) -> bool:
+        """Queue a frame. A queue that is full drops it: that is counted, and False is returned.
 
         Raises:
             ConnectionLost: The bus does not work.
@@ -237,10 +250,11 @@ class CanBus:
         except (can.CanError, OSError, ValueError) as error:
             if isinstance(error, can.CanTimeoutError) or _errno_of(error) in _NO_QUEUE or "buffer full" in str(error):
                 self.unsent += 1
-                return
+                return False
             self._lose(error)
             raise self.error(f"{self.settings.interface} {self.settings.channel}") from error
         self.sent += 1
+        return True
 
     def poll(self) -> bool:
         """Hand every frame that has come to its device; return whether the bus works. Never waits."""
@@ -258,13 +272,12 @@ class CanBus:
                     continue
                 id = message.arbitration_id
                 self.received += 1
-                try:
-                    handler = handlers[id]
-                except KeyError:
+                if id not in handlers or message.is_extended_id or message.is_remote_frame:
                     self.unexpected += 1
                     if len(self.unexpected_ids) < _KEPT_IDS:
                         self.unexpected_ids.add(id)
                     continue
+                handler = handlers[id]
                 if handler is not None:
                     handler(message.data)
         except (can.CanError, OSError, ValueError) as error:

@@ -30,6 +30,8 @@ __all__ = ["DamiaoArm"]
 
 _STICKING = 0.02
 """Speed below which the friction that a command adds falls to zero, rad/s: it would make a joint at rest tremble."""
+_BRAKE = 0.3
+"""Share of a motor's damping in torque mode: it bounds the speed where the torques are no longer renewed."""
 _ATTEMPTS = 3
 """How often a motor is switched on until it counts as broken."""
 
@@ -155,7 +157,8 @@ class DamiaoArm(RobotDriver):
                 self._fault = Fault(
                     "switched_off",
                     f"{off.label} is off, though nothing here switched it off",
-                    "support the arm; check its power supply, and whether another program drives it",
+                    "support the arm; check its power supply, and whether another program drives it; compare the "
+                    "joint with its picture, because a restart may shift a motor's zero",
                 )
         if in_use and (chain.lost is not None or (self.engaged and not on)):
             self.engaged = False
@@ -211,12 +214,15 @@ class DamiaoArm(RobotDriver):
                 tau = [
                     t + f * min(max(v / _STICKING, -1.0), 1.0) for t, f, v in zip(tau, self._friction, dq, strict=True)
                 ]
-            if not isfinite(sum(q) + sum(dq) + sum(tau)):
-                raise ValueError(f"{self.spec.name}: a set-point is not finite: {setpoint}")
-            frames = [motor.command(q[k], dq[k], motor.kp, motor.kd, tau[k]) for k, motor in enumerate(motors)]
         else:
             weight = self.dynamics.gravity([motor.q for motor in motors])
-            frames = [motor.command(q[k], 0.0, 0.0, 0.0, setpoint.tau[k] + weight[k]) for k, motor in enumerate(motors)]
+            tau = [a + b for a, b in zip(setpoint.tau, weight, strict=True)]
+        if not isfinite(sum(q) + sum(dq) + sum(tau)):
+            raise ValueError(f"{self.spec.name}: a set-point is not finite: {setpoint}")
+        if setpoint.tau is None:
+            frames = [motor.command(q[k], dq[k], motor.kp, motor.kd, tau[k]) for k, motor in enumerate(motors)]
+        else:  # damped around the present speed: nothing while it is streamed, a brake where the stream ends
+            frames = [motor.command(q[k], motor.dq, 0.0, _BRAKE * motor.kd, tau[k]) for k, motor in enumerate(motors)]
         for motor, frame in zip(motors, frames, strict=True):  # all are encoded: none has NaN
             chain.send(motor, frame)
         self._written = True
@@ -240,6 +246,11 @@ class DamiaoArm(RobotDriver):
         chain.usable  # noqa: B018  # raises while there is no connection
         if self._fault is not None:
             raise RobotFault(self._fault.cause, self._fault.remedy, code=self._fault.code)
+        if chain.ask_registers():
+            return  # of a motor that was switched off and on again
+        fault = chain.register_fault()
+        if fault is not None:
+            raise RobotFault(fault.cause, fault.remedy, code=fault.code)
         motor = self._switching
         if motor is not None:
             if motor.on and motor.status == 1 and motor.t >= self._t_switched:

@@ -44,8 +44,8 @@ _ROUND = 0.01
 """Longest time to wait for the answers of one round of requests, s."""
 _LOCK_PATIENCE = 2.0
 """Longest time to wait for another program to release the motors, s."""
-_CLEARING = 0.2
-"""Longest time until an error is cleared, s."""
+_CLEARING = 0.03
+"""Longest time until an error is cleared, s. Meanwhile the other motors hear nothing: it is below every TIMEOUT."""
 _LOWERING = 6.0
 """Longest time that an arm is lowered before it is left to the damping of its motors, s."""
 _SINKING = 0.4
@@ -90,6 +90,7 @@ class DamiaoChain:
         self.lost: ConnectionLost | None = None
         """Why the device counts as lost; None while it answers."""
         self.bus: CanBus | None = None
+        self._sent_ids = (REGISTER_ID, *(motor.id for motor in self.motors))
         self._subscribed = False
         self._locks: list[DeviceLock] = []
         self._asked = False
@@ -120,7 +121,7 @@ class DamiaoChain:
             bus.drain()  # frames from before
             bus.subscribe(
                 {motor.settings.reply_id: motor.receive for motor in self.motors},
-                (REGISTER_ID, *(motor.id for motor in self.motors)),
+                self._sent_ids,
             )
             self._subscribed = True
             for motor in self.motors:
@@ -199,7 +200,7 @@ class DamiaoChain:
         bus, self.bus = self.bus, None
         if bus is not None:
             if self._subscribed:
-                bus.unsubscribe(motor.settings.reply_id for motor in self.motors)
+                bus.unsubscribe((motor.settings.reply_id for motor in self.motors), self._sent_ids)
             bus.release()
         self._subscribed = False
         for motor in self.motors:
@@ -248,6 +249,8 @@ class DamiaoChain:
                 motor.t = self._t_asked
                 if motor.on and motor.status != 1 and now - motor.switched_at > SWITCHING:
                     motor.on = False
+                    if motor.status == 0:
+                        motor.registers.clear()  # it was switched off and on again
             if count > asked:
                 late = min(count - asked, motor.gap)
                 motor.late += late
@@ -273,7 +276,7 @@ class DamiaoChain:
             self._count_loss()
             self.lost = self._silence_error(silent)
         elif self.lost is not None:
-            self._check_return(bus)
+            self._check_return()
 
     def _count_loss(self) -> None:
         self.losses += self.lost is None
@@ -289,16 +292,31 @@ class DamiaoChain:
         error.fault = fault
         return error
 
-    def _check_return(self, bus: CanBus) -> None:
+    def ask_registers(self) -> bool:
+        """Ask motors that were off for their registers, one at a time; return whether some are still missing.
+
+        Raises:
+            ConnectionLost: The bus does not work.
+        """
+        bus = self.bus
+        assert bus is not None
+        missing = [self._ask_register(bus, motor) for motor in self.motors]
+        return any(missing)
+
+    def register_fault(self) -> Fault | None:
+        """Return the first register that does not fit the rig; None if those that were read do."""
+        problem = next((problem for motor in self.motors for problem in self._problems(motor)), None)
+        return None if problem is None else Fault(problem.code, problem.message, "open the rig again")
+
+    def _check_return(self) -> None:
         """Ask motors that answer again for their registers, and end the loss when all fit."""
         try:
-            waiting = [motor for motor in self.motors if self._ask_register(bus, motor) or motor.silent]
+            waiting = self.ask_registers() or any(motor.silent for motor in self.motors)
         except ConnectionLost as error:
             self.lost = error
             return
-        problems = [problem for motor in self.motors for problem in self._problems(motor) if motor.registers]
-        if problems:
-            fault = Fault(problems[0].code, problems[0].message, "open the rig again")
+        fault = self.register_fault()
+        if fault is not None:
             self.lost = ConnectionLost(f"{self.name}: {fault.cause}; {fault.remedy}", code=fault.code)
             self.lost.fault = fault
         elif not waiting:
@@ -340,7 +358,7 @@ class DamiaoChain:
         return None
 
     def clear_errors(self) -> None:
-        """Clear the errors of all motors that have one; those are then off. Takes up to 0.2 s.
+        """Clear the errors of all motors that have one; those are then off. Takes up to 30 ms.
 
         Raises:
             RobotFault: An error stays; names the motor.
@@ -392,14 +410,17 @@ class DamiaoChain:
             deadline = time.monotonic() + _LOWERING
             at, since = self._positions(), time.monotonic()
             carried = True
+            heard: set[int] = set()  # since then: a motor that does not answer is not known to rest
             while (now := time.monotonic()) < deadline:
                 q = self._positions()
                 if any(abs(q[k] - at[k]) > _AT_REST for k in on):
                     at, since, carried = q, now, True
-                if now - since > _REST:
+                    heard.clear()
+                if now - since > _REST and heard.issuperset(on):
                     if not carried or weight is None:
                         break
                     since, carried = now, False
+                    heard.clear()
                 tau = weight(q) if weight is not None and carried else (0.0,) * len(q)
                 for k in on:
                     motor = self.motors[k]
@@ -409,10 +430,11 @@ class DamiaoChain:
                 time.sleep(_LOWERING_PERIOD)
                 if not bus.poll():
                     return
-                for motor in self.motors:
+                for k, motor in enumerate(self.motors):
                     if motor.replies:
                         motor.decode()
                         motor.replies = 0
+                        heard.add(k)
             else:
                 return
             for _ in range(2):  # one may be lost

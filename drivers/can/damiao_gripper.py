@@ -125,11 +125,15 @@ class DamiaoGripper(GripperDriver):
         chain, motor = self.chain, self._motor
         dt = min(max(now - self._now, 0.0), _LONGEST_STEP) if self._now is not None else 0.0
         self._now = now
+        was_on = motor.on and motor.status == 1
         chain.update(now)
         if chain.lost is not None:
             self._active = False
         elif self._fault is None:
-            self._fault = chain.fault(engaged=motor.on)
+            self._fault = chain.fault(engaged=motor.on or was_on)
+            if self._fault is None and was_on and not motor.on:  # it continues with a new command only
+                cause = f"{motor.label} went off: what it held may be loose"
+                self._fault = Fault("switched_off", cause, "check its power supply, and send the command again")
         if chain.bus is not None and chain.bus.fault is None:
             self._drive(now, dt)
         if chain.lost is not None:
@@ -140,7 +144,7 @@ class DamiaoGripper(GripperDriver):
     def _drive(self, now: float, dt: float) -> None:
         """Send the motor's command of this cycle, or a request for its state."""
         chain, motor = self.chain, self._motor
-        if self._active and not motor.on and self._fault is None:
+        if self._active and not motor.on and self._fault is None and not chain.ask_registers():
             self._switch_on()
         elif not motor.on:
             chain.ask_state(motor)
@@ -173,6 +177,9 @@ class DamiaoGripper(GripperDriver):
     def _switch_on(self) -> None:
         """Switch the motor on where it is."""
         motor = self._motor
+        self._fault = self.chain.register_fault()
+        if self._fault is not None:
+            return
         self._attempts += 1
         if self._attempts > _ATTEMPTS:
             self._active, self._attempts = False, 0

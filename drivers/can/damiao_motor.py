@@ -32,6 +32,8 @@ CHECKED_REGISTERS = (
 """Registers that are read before a motor may be switched on."""
 SHORTEST_TIMEOUT = 0.05
 """Shortest TIMEOUT with which a busy computer can drive a motor, s."""
+LONGEST_TIMEOUT = 1.0
+"""Longest TIMEOUT, s: for so long a motor repeats the last command of a killed program, a torque for example."""
 HEAT_MARGIN = 5.0
 """Distance from the temperature at which a motor switches itself off that is a fault, K."""
 
@@ -189,9 +191,12 @@ def register_problems(settings: DamiaoMotorSettings, registers: dict[int, float]
                 "wrong_range",
             )
     timeout = registers.get(MotorRegister.TIMEOUT)
-    if timeout is not None and not timeout * TIMEOUT_UNIT >= SHORTEST_TIMEOUT:
-        what = "is 0: the motor would run on without this program" if timeout == 0 else f"is {timeout * TIMEOUT_UNIT} s"
-        yield "TIMEOUT", f"{what}; set it to 8000 (0.4 s), the factory's value", "no_timeout"
+    if timeout is not None and not SHORTEST_TIMEOUT <= timeout * TIMEOUT_UNIT <= LONGEST_TIMEOUT:
+        what = f"is {timeout * TIMEOUT_UNIT:g} s, must be {SHORTEST_TIMEOUT:g} to {LONGEST_TIMEOUT:g} s"
+        code = "short_timeout"
+        if timeout == 0 or timeout * TIMEOUT_UNIT > LONGEST_TIMEOUT:
+            what, code = f"{what}: the motor would run on without this program", "no_timeout"
+        yield "TIMEOUT", f"{what}; set it to 8000 (0.4 s), the factory's value", code
     mode = registers.get(MotorRegister.CTRL_MODE)
     if mode is not None and mode != MIT_MODE:
         yield "CTRL_MODE", f"is {mode:g}, must be {MIT_MODE} (MIT)", "wrong_mode"

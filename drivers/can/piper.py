@@ -49,6 +49,9 @@ _SWITCHED_ON = 0.8
 _CLEARING = 0.15
 """Time for which an error may still be reported after it was cleared, s: slow frames come every 25 ms."""
 _OWN_IDS = (*(id for id in FEEDBACK_IDS if id not in GRIPPER_IDS), ACKNOWLEDGEMENT)
+_OTHERS_CONTROL = frozenset({2, 5, 6, 7})
+"""Control modes in which the arm is moved by a hand, a leader arm or a recorded trajectory (see PiperStatus)."""
+_NO_COMMANDS = Fault("no_commands", "the bus takes no commands", "check the adapter and its cable")
 _ALL_PAIRS = 0b111
 _NO_JOINTS = (0.0,) * JOINTS
 
@@ -94,6 +97,8 @@ class PiperArm(RobotDriver):
         """Error that ended the engagement; kept until recover(), even if the arm no longer reports it."""
         self._clearing_until = -inf
         self._t_asked = self._t_engaging = self._t_last_try = -inf
+        self._blocked_since: float | None = None
+        """Time since which the bus has taken no set-point, s; None while it does."""
         self._confirmed = False
 
     # Connection
@@ -207,7 +212,14 @@ class PiperArm(RobotDriver):
             self._link.send(())
             return False
         q = tuple(setpoint.q)
-        self._link.send(encode_joint_targets(q))
+        if not self._link.send(encode_joint_targets(q)):
+            if self._blocked_since is None:
+                self._blocked_since = self._now
+            if self._now - self._blocked_since > SILENCE:
+                self._disengage()
+                raise self._link.lose(f"the bus has taken no command for {1e3 * SILENCE:.0f} ms")
+            return False
+        self._blocked_since = None
         self._commanded, self._commanded_dq = q, tuple(setpoint.dq)
         return True
 
@@ -235,12 +247,14 @@ class PiperArm(RobotDriver):
         if now - self._t_last_try > SILENCE:  # a new attempt
             self._t_engaging, self._t_asked, self._confirmed = now, -inf, False
         self._t_last_try = now
+        if status.control in _OTHERS_CONTROL:  # it is moved by a hand or by another program: never take it from them
+            raise refusal(self.spec.name, control_fault(status, [ENABLED] * JOINTS) or _NO_COMMANDS)
         fault = fault or control_fault(status, self._flags)
         if fault is None and self._confirmed and self._t_status > self._t_asked:
-            self.engaged = True
+            self.engaged, self._blocked_since = True, None
             return
-        if fault is not None and now - self._t_engaging > _SWITCHED_ON:
-            raise refusal(self.spec.name, fault)
+        if now - self._t_engaging > _SWITCHED_ON:
+            raise refusal(self.spec.name, fault or _NO_COMMANDS)
         if now - self._t_asked < _ASK_AGAIN:
             return
         self._t_asked = now
@@ -248,8 +262,10 @@ class PiperArm(RobotDriver):
             self._link.send([EnableRequest().frame()])
             return
         mode = ModeRequest(speed_percent=self.settings.speed_percent, mounting=self.settings.mounting_code)
-        self._link.send([mode.frame(), *encode_joint_targets(q)])
-        self._commanded, self._commanded_dq, self._confirmed = q, _NO_JOINTS, True
+        targets = encode_joint_targets(q)
+        # Also before the mode, so that the arm does not begin with the target of an earlier program.
+        self._confirmed = self._link.send([*targets, mode.frame(), *targets])
+        self._commanded, self._commanded_dq = q, _NO_JOINTS
 
     def _disengage(self) -> None:
         self.engaged, self._commanded, self._t_last_try = False, None, -inf

@@ -41,8 +41,8 @@ class PiperGripper(GripperDriver):
         self._seq = 0
         self._target: float | None = None
         """Width of the newest command, m; None before the first one."""
-        self._ramp = 0.0
-        """Width that the gripper was sent last, m."""
+        self._ramp: float | None = None
+        """Width that the gripper was sent last, m; None before the first command."""
         self._goal = 0.0
         """Width at which the ramp ends, m."""
         self._speed = 0.0
@@ -94,15 +94,15 @@ class PiperGripper(GripperDriver):
 
     def _advance(self, dt: float) -> None:
         """Move the target along at the speed of the command, and send it."""
-        if self._stopped or self._ramp == self._goal:
+        if self._stopped or self._ramp is None or self._ramp == self._goal:
             return
         step, rest = self._speed * min(dt, _AT_REST), self._goal - self._ramp
         self._ramp = self._goal if abs(rest) <= step else self._ramp + (step if rest > 0.0 else -step)
         self._t_moved = self._now
-        self._send(clear=False)
+        self._send(self._ramp, clear=False)
 
-    def _send(self, clear: bool) -> None:
-        self._link.send([GripperRequest(self._ramp, self._torque, clear_error=clear).frame()])
+    def _send(self, width: float, clear: bool) -> None:
+        self._link.send([GripperRequest(width, self._torque, clear_error=clear).frame()])
 
     def _take(self, record: PiperFeedback) -> None:
         if type(record) is GripperStatus:
@@ -124,7 +124,7 @@ class PiperGripper(GripperDriver):
         widest = self.spec.width_max
         self._target, self._goal = min(max(target, 0.0), widest), min(max(goal, 0.0), widest)
         width = min(max(status.width, 0.0), widest)
-        if not status.flags & ENABLED:
+        if self._ramp is None or not status.flags & ENABLED:
             self._ramp = width
         elif self._goal > self._ramp:  # fingers that an object stopped start to open where they are
             self._ramp = min(max(self._ramp, width), self._goal)
@@ -132,7 +132,7 @@ class PiperGripper(GripperDriver):
         self._torque = min(max(force / self.settings.force_per_torque, 0.0), _LARGEST_TORQUE)
         self._stopped = False
         self._t_moved = self._now
-        self._send(clear=gripper_fault(status) is not None)
+        self._send(self._ramp, clear=gripper_fault(status) is not None)
 
     def stop(self) -> None:
         """Keep the fingers where they are; an object that they hold stays held with the same torque."""

@@ -185,7 +185,7 @@ class PiperLink:
         """Give up the bus. Idempotent."""
         bus, self.bus = self.bus, None
         if bus is not None:
-            bus.unsubscribe(self._ids)
+            bus.unsubscribe(self._ids, COMMAND_IDS)
             bus.release()
 
     def poll(self) -> None:
@@ -196,13 +196,13 @@ class PiperLink:
             bus.try_reopen()
             raise self.lost
 
-    def send(self, frames: Iterable[tuple[int, bytes]]) -> None:
-        """Send frames. Raises ConnectionLost while the device counts as lost."""
+    def send(self, frames: Iterable[tuple[int, bytes]]) -> bool:
+        """Send frames; return whether the bus took all. Raises ConnectionLost while the device counts as lost."""
         bus = self._open_bus()
         if self.lost is not None:
             raise self.lost
-        for frame in frames:
-            bus.send(*frame)
+        taken = [bus.send(*frame) for frame in frames]
+        return all(taken)
 
     def lose(self, what: str) -> ConnectionLost:
         """Return the exception for a device that does not report any more, and note that it is lost."""

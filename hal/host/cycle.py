@@ -73,6 +73,8 @@ TCP_APART, TCP_TURNED = 0.002, 0.02
 """Largest distance of a device's own tcp from the model's, m and rad."""
 ENGAGE_LIMIT = 1.0
 """Longest time for switching an arm's drives on, s."""
+FRESH = 0.02
+"""Greatest age of the state at which a drive is switched on, s."""
 
 
 class ArmUnit:
@@ -100,6 +102,8 @@ class ArmUnit:
         self._prepared: Inbox | None = None
         """The inbox from which the next set-point was computed ahead; None if it was not."""
         self._t_written = 0.0
+        self._t_read = 0.0
+        """Time of the last attempt to read the device, s."""
         self._session = 0
 
     def reset_statistics(self) -> None:
@@ -148,6 +152,7 @@ class ArmUnit:
     def read(self, now: float) -> None:
         """Read the device. One whose write failed counts as lost for a whole cycle, although it answers again."""
         before = self.reading
+        self._t_read = now
         try:
             self.reading = reading = self.driver.read(now)
             if self.error is not None and not self._write_failed:
@@ -316,14 +321,22 @@ class ArmUnit:
         self._session = session.id
 
     def _engage(self, turn: Callable[[], None]) -> None:
-        """Switch the drives on, and read the arm again; nothing if they are on."""
-        for _ in range(max(1, round(ENGAGE_LIMIT / self.dt))):
+        """Switch the drives on, and read the arm again; nothing if they are on.
+
+        An arm without power can be moved by hand, and would be pulled back to an old position: each step needs a state
+        that was measured after the request, and just before the step. This process may have been paused in between.
+        """
+        began = math.inf
+        for _ in range(1 + max(1, round(ENGAGE_LIMIT / self.dt))):
             if self.error is not None:
                 raise self.error
             if self.driver.engaged:
                 return
-            self.driver.engage()
+            t = self.reading.t if self.reading is not None else -math.inf
+            if t >= began and self._t_read - t <= max(FRESH, 2.0 * self.dt):
+                self.driver.engage()
             turn()
+            began = min(began, self._t_read)
         if not self.driver.engaged:
             raise RobotFault(
                 f"{self.spec.name}: its drives did not switch on within {ENGAGE_LIMIT:g} s",

@@ -155,7 +155,7 @@ def test_another_arm_of_the_group_moves_on_while_drives_are_switched_on(monkeypa
     ticks, written = arms.cycle.ticks, len(arms.left.driver.log)
     arms.begin("right")
     taken = arms.cycle.ticks - ticks
-    assert taken == 7  # one for each drive
+    assert taken == 8  # one to read the arm, and one for each drive
     assert len(arms.left.driver.log) == written + taken
     arms.drive(arms.right)
     assert arms.left.servo.report.trip is Trip.NONE

@@ -181,6 +181,11 @@ def test_an_arm_that_no_longer_follows_is_not_engaged(bench: Bench, act: Callabl
     assert reading.fault.code == code
     assert not bench.driver.engaged
     bench.driver.recover()
+    if act is start_teaching:  # a hand may hold it
+        with pytest.raises(RobotFault):
+            bench.engage()
+        bench.far.arm.control = protocol.STANDBY
+        bench.run(0.05)
     bench.engage()
     assert bench.run(0.05).fault is None
 
