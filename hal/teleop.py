@@ -171,7 +171,8 @@ class Teleop:
         """Return what the controls do, for a page that displays them.
 
         Args:
-            actions: Actions of the mapping that the program handles, and ``home`` if it uses :meth:`home_pressed`.
+            actions: Actions of the mapping that the program handles, ``home`` if it uses :meth:`home_pressed`, and
+                ``other_arm`` if it uses :meth:`other_arm_pressed`.
 
         Returns:
             A dict for JSON. Its ``controls`` map an axis to its meanings at both ends (-1 and 1, or released and
@@ -192,6 +193,8 @@ class Teleop:
         elif grip is not None:
             controls |= {str(grip.open): ["open the gripper"], str(grip.close): ["close the gripper"]}
         controls |= {button: [action] for action, button in mapping.actions.items() if action in actions}
+        if mapping.other_arm is not None and "other_arm" in actions:
+            controls[mapping.other_arm] = ["next arm"]
         home = mapping.go_home if "home" in actions else None
         if home is not None:
             controls[home] = ["home"]

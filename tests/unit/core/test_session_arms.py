@@ -144,6 +144,7 @@ def test_one_pad_is_handed_on_while_its_dead_man_is_released() -> None:
         assert max(one.speed("left", 0.0, 2.0)) == 0.0
         assert min(one.speed("right", 1.2, 1.9)) > 0.05
         assert "next arm of left, right" in one.session.help()
+        assert one.session.teleop.labels(actions=("other_arm",))["controls"]["select"] == ["next arm"]
 
 
 def test_home_is_for_the_arm_whose_pad_it_is() -> None:
