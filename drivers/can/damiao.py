@@ -151,7 +151,7 @@ class DamiaoArm(RobotDriver):
         for motor in self._motors:
             on = on and motor.on
         if self._fault is None and chain.lost is None:
-            self._fault = chain.fault(engaged=self.engaged)
+            self._fault = chain.fault(engaged=self.engaged) or self._check_following()
             if self._fault is None and self.engaged and not on:
                 off = next(motor for motor in self._motors if not motor.on)
                 self._fault = Fault(
@@ -163,6 +163,22 @@ class DamiaoArm(RobotDriver):
         if in_use and (chain.lost is not None or (self.engaged and not on)):
             self.engaged = False
             self._switching = None
+
+    def _check_following(self) -> Fault | None:
+        """Return a fault, and hold the measured position, if a joint is too far from its set-point."""
+        if not self.engaged or self._tau_sent is not None:
+            return None
+        limit = self.settings.following_limit
+        for motor, target in zip(self._motors, self._target, strict=True):
+            if abs(motor.q - target) > limit:
+                self._target = [motor.q for motor in self._motors]
+                self._holds = None
+                return Fault(
+                    "not_following",
+                    f"{motor.label} is {abs(motor.q - target):.2f} rad away from its set-point",
+                    "check what the arm touches, and its load (`payload` in the rig)",
+                )
+        return None
 
     def _send_idle(self) -> None:
         """Send what keeps the arm as it is: the hold to motors that are on, a request for its state to each other."""

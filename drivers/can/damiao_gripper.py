@@ -18,7 +18,7 @@ from hal.errors import Fault, RobotFault
 from hal.specs import GripperSpec
 from hal.types import GripperOutcome
 
-from .damiao_chain import DamiaoChain
+from .damiao_chain import SWITCHING, DamiaoChain
 from .settings import DamiaoGripperSettings
 
 __all__ = ["DamiaoGripper", "FingerTable"]
@@ -130,10 +130,7 @@ class DamiaoGripper(GripperDriver):
         if chain.lost is not None:
             self._active = False
         elif self._fault is None:
-            self._fault = chain.fault(engaged=motor.on or was_on)
-            if self._fault is None and was_on and not motor.on:  # it continues with a new command only
-                cause = f"{motor.label} went off: what it held may be loose"
-                self._fault = Fault("switched_off", cause, "check its power supply, and send the command again")
+            self._note_fault(was_on, now)
         if chain.bus is not None and chain.bus.fault is None:
             self._drive(now, dt)
         if chain.lost is not None:
@@ -141,10 +138,22 @@ class DamiaoGripper(GripperDriver):
         chain.usable  # noqa: B018  # raises if it is not open
         return self._report(now)
 
+    def _note_fault(self, was_on: bool, now: float) -> None:
+        """Note a fault of the motor, which ends the motion; only a new command moves the fingers again."""
+        motor = self._motor
+        if self._active and (not was_on or now - motor.switched_at <= SWITCHING):
+            return  # it is about to be switched on, which clears its errors
+        fault = self.chain.fault(engaged=was_on)
+        if fault is None and was_on and not motor.on:
+            cause = f"{motor.label} went off: what it held may be loose"
+            fault = Fault("switched_off", cause, "check its power supply, and send the command again")
+        if fault is not None:
+            self._fault, self._active, self._goal = fault, False, self._ramp
+
     def _drive(self, now: float, dt: float) -> None:
         """Send the motor's command of this cycle, or a request for its state."""
         chain, motor = self.chain, self._motor
-        if self._active and not motor.on and self._fault is None and not chain.ask_registers():
+        if self._active and not motor.on and not chain.ask_registers():
             self._switch_on()
         elif not motor.on:
             chain.ask_state(motor)
@@ -177,12 +186,13 @@ class DamiaoGripper(GripperDriver):
     def _switch_on(self) -> None:
         """Switch the motor on where it is."""
         motor = self._motor
-        self._fault = self.chain.register_fault()
-        if self._fault is not None:
+        fault = self.chain.register_fault()
+        if fault is not None:
+            self._fault, self._active = fault, False
             return
         self._attempts += 1
         if self._attempts > _ATTEMPTS:
-            self._active, self._attempts = False, 0
+            self._active = False
             cause = f"{motor.label} does not switch on (status {motor.status:x})"
             self._fault = Fault("not_switched_on", cause, "check its power supply, and send the command again")
             return
@@ -208,10 +218,10 @@ class DamiaoGripper(GripperDriver):
             seq=self._seq,
             width=width,
             width_target=self._target,
-            moving=self._active and self._fault is None and not resting,
+            moving=self._active and not resting,
             grasped=grasped if motor.on else None,
             force=force,
-            outcome=GripperOutcome.FAILED if self._fault is not None and self._active else None,
+            outcome=None if self._fault is None else GripperOutcome.FAILED,
             fault=self._fault,
         )
 

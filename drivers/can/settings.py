@@ -135,6 +135,7 @@ Stiffness = Annotated[float, Quantity("Nm/rad", 0.0, KP_MAX, above=True)]
 Damping = Annotated[float, Quantity("Nm s/rad", 0.0, KD_MAX, above=True)]
 Friction = Annotated[float, Quantity("Nm", 0.0, 10.0)]
 Temperature = Annotated[float, Quantity("deg C", 30.0, 200.0)]
+FollowingLimit = Annotated[float, Quantity("rad", 0.05, 3.0)]
 WidthTable = Annotated[tuple[tuple[float, float], ...], BeforeValidator(_width_table)]
 
 
@@ -239,6 +240,8 @@ class DamiaoArmSettings(BusSettings):
     """The motors, one for each joint, from base to tip."""
     mosfet_limit: Temperature = 120.0
     """Temperature at which the motors' electronics switch off, deg C (Damiao's manuals). The rotor's is a register."""
+    following_limit: FollowingLimit = 0.5
+    """Largest distance of a joint from its set-point, rad. Beyond it the arm is blocked, and holds where it is."""
 
     @classmethod
     def of(cls, spec: RobotSpec) -> DamiaoArmSettings:

@@ -10,7 +10,7 @@ import contextlib
 import errno
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 from unittest.mock import patch
 
@@ -20,10 +20,13 @@ import pytest
 from stepped_can import SteppedArm, SteppedEmulator, stepped_arm
 
 import hal
+from hal.driver import GripperReading, Reading
 from hal.drivers.can.bus import CanBus
 from hal.drivers.can.damiao import DamiaoArm
+from hal.drivers.can.damiao_gripper import DamiaoGripper
 from hal.drivers.can.damiao_protocol import MOTOR_RANGES, MotorCodec
 from hal.errors import ConfigError, DeviceNotFound, HalError, MotionStopped, RobotFault
+from hal.types import GripperOutcome
 
 DT = 0.004
 """Period of a YAM's cycle, s."""
@@ -199,6 +202,33 @@ def test_a_fault_in_motion(fault: CanFault) -> None:
         )
 
 
+def test_an_arm_that_is_pushed_away_from_its_set_point_yields_and_does_not_snap_back() -> None:
+    with SteppedEmulator("yam") as far:
+        driver = DamiaoArm(replace(far.spec, options={**far.spec.options, "following_limit": 0.2}))
+        driver.open()
+
+        def run(seconds: float) -> Reading:
+            for _ in range(round(seconds / DT)):
+                far.advance(DT)
+                reading = driver.read(far.passed)
+                if not driver.engaged and reading.fault is None:
+                    driver.engage()
+            return reading
+
+        assert run(0.5).fault is None
+        far.execute("push 1 12")
+        assert run(0.5).fault is None, "12 Nm move a joint of 80 Nm/rad by 0.15 rad"
+        far.execute("push 1 24")
+        reading = run(0.5)
+        assert reading.fault is not None
+        assert reading.fault.code == "not_following"
+        assert driver.engaged, "it holds"
+        far.execute("push 1 0")
+        assert run(1.0).q[0] > 0.15, "where it was when the fault came"
+        far.cut("on")
+        driver.close()
+
+
 # Faults that are there before the arm is opened.
 
 
@@ -241,6 +271,60 @@ def test_frames_from_before_the_connect_are_discarded() -> None:
         driver.close()
         bus.release()
         TABLE.append("| 50 frames from before the connect | nothing | | discarded | |")
+
+
+# The gripper.
+
+
+@pytest.fixture
+def gripper() -> Iterator[tuple[SteppedEmulator, DamiaoGripper, Callable[[float], GripperReading]]]:
+    """The emulator, the gripper's driver, and a function that lets seconds pass and returns the last reading."""
+    with SteppedEmulator("yam") as far:
+        assert far.spec.gripper is not None
+        driver = DamiaoGripper(far.spec.gripper)
+        driver.open()
+
+        def run(seconds: float) -> GripperReading:
+            for _ in range(round(seconds / DT)):
+                far.advance(DT)
+                reading = driver.read(far.passed)
+            return reading
+
+        yield far, driver, run
+        driver.close()
+
+
+@pytest.mark.parametrize(
+    ("status", "code"), [("a", "over_current"), ("d", "lost_communication"), ("0", "switched_off")]
+)
+def test_a_gripper_with_a_fault_waits_for_the_next_command(gripper: Any, status: str, code: str) -> None:
+    far, driver, run = gripper
+    driver.move(0.0, 0.05, 30.0)
+    run(0.3)
+    far.execute(f"status 7 {status}")
+    reading = run(0.1)
+    assert reading.fault is not None
+    assert reading.fault.code == code
+    assert reading.outcome is GripperOutcome.FAILED
+    width = reading.width
+    assert not reading.moving
+    assert run(0.5).width == pytest.approx(width, abs=2e-3), "nothing moves before a new command"
+    assert width > 0.01
+    driver.move(0.0, 0.05, 30.0)
+    reading = run(1.5)
+    assert reading.fault is None
+    assert reading.width == pytest.approx(0.0, abs=1e-3)
+
+
+def test_a_grip_is_no_stronger_than_commanded(gripper: Any) -> None:
+    far, driver, run = gripper
+    far.execute("object 0.03")
+    for force in (10.0, 30.0):
+        driver.move(0.0, 0.1, force)
+        reading = run(1.0)
+        assert reading.grasped
+        assert reading.force == pytest.approx(force, rel=0.15)
+        assert abs(far.arm.gripper.tau) == pytest.approx(force * 0.095 / 6.5, rel=0.1)
 
 
 # Closing.

@@ -1,9 +1,10 @@
 """An arm on a CAN bus against the emulator, in real time: missed cycles, incomplete cycles, time per cycle.
 
-    python benchmarks/can.py [--seconds 60] [--rig openarm|yam] [--disturb]
+    python benchmarks/can_cycle.py [--seconds 60] [--rig openarm|yam]
 
 The bus is python-can's ``udp_multicast``; the emulator, with its mechanics, is another process on this computer, and
-takes a share of the processors that motors would not. An OpenArm has 7 motors and that of its hand, at 500 Hz.
+takes a share of the processors that motors would not. A cycle is incomplete if a motor's reply is not there by the next
+one, 2 ms later, so a busy computer shows in it. An OpenArm has 7 motors and that of its hand, at 500 Hz.
 """
 
 from __future__ import annotations
