@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import hashlib
 import socket
 import struct
 import time
@@ -36,7 +37,9 @@ class DeviceLock:
 
     def __init__(self, name: str, what: str, patience: float = 0.0) -> None:
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
-        address = f"\0hal-{name}"[:_LONGEST]
+        address = f"\0hal-{name}"
+        if len(address.encode()) > _LONGEST:  # the end of a serial adapter's path tells it from others
+            address = f"\0hal-{hashlib.sha256(name.encode()).hexdigest()}"
         deadline = time.monotonic() + patience
         while not self._bind(address):
             if time.monotonic() > deadline:

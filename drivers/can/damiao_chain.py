@@ -115,7 +115,8 @@ class DamiaoChain:
             where = "-".join(self.settings.key)
             for motor in self.motors:
                 what = f"{self.name}: {motor.label} on {self.settings.channel}"
-                self._locks.append(DeviceLock(f"can-{where}-{motor.id:#x}", what, _LOCK_PATIENCE))
+                for id in (motor.id, motor.settings.reply_id):  # a reply at another motor's id would command that one
+                    self._locks.append(DeviceLock(f"can-{where}-{id:#x}", what, _LOCK_PATIENCE))
             bus = CanBus.acquire(self.settings)
             self.bus = bus
             bus.drain()  # frames from before

@@ -30,6 +30,14 @@ def test_a_program_that_holds_a_lock_itself_is_named() -> None:
     DeviceLock(name, "the arm").release()
 
 
+def test_long_names_that_differ_at_their_ends_are_two_devices() -> None:
+    path = f"test-{os.getpid()}-/dev/serial/by-id/usb-Openlight_Labs_CANable2_b158aa7_github.com_canable2.git_205A"
+    locks = [DeviceLock(f"{path}-{k}", "a motor") for k in (1, 2)]
+    refusal(f"{path}-2")
+    for lock in locks:
+        lock.release()
+
+
 def test_the_program_behind_a_device_process_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend(str(KITS))
     name = f"test-child-{os.getpid()}"

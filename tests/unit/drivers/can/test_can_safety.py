@@ -8,6 +8,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Iterator
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -20,14 +21,14 @@ from hal.drivers.can import damiao_chain, piper_link
 from hal.drivers.can.bus import CanBus
 from hal.drivers.can.damiao import DamiaoArm
 from hal.drivers.can.damiao_gripper import DamiaoGripper
-from hal.drivers.can.damiao_motor import register_problems
+from hal.drivers.can.damiao_motor import ChainMotor, register_problems
 from hal.drivers.can.damiao_protocol import MotorRegister, MotorStatus
 from hal.drivers.can.emulator.server import CanEmulator
 from hal.drivers.can.piper import PiperArm
 from hal.drivers.can.piper_gripper import PiperGripper
 from hal.drivers.can.piper_protocol import GripperRequest, JointTargets, decode_command
-from hal.drivers.can.settings import BusSettings
-from hal.errors import ConfigError, ConnectionLost, RobotFault
+from hal.drivers.can.settings import BusSettings, DamiaoMotorSettings
+from hal.errors import ConfigError, ConnectionLost, ControlTaken, RobotFault
 from hal.host.cycle import ArmUnit
 
 from ....kits.can_kit import can_overrides
@@ -176,6 +177,30 @@ def test_motors_do_not_race_when_a_program_is_killed_in_torque_mode(yam: Bench, 
     assert yam.fastest(0.6) < 3.0  # TIMEOUT is 0.4 s; undamped it is 10 to 15 rad/s
 
 
+@pytest.mark.parametrize("direction", [1.0, -1.0])
+def test_direction_and_offset_turn_position_velocity_and_torque_alike(direction: float) -> None:
+    settings = DamiaoMotorSettings(id=1, type="DM4310", kp=10.0, kd=1.0, direction=direction, offset=0.3)
+    motor = ChainMotor(settings, "joint1")
+    q, dq, kp, kd, tau = motor.codec.decode_command(motor.command(0.8, 2.0, 10.0, 1.0, -4.0))
+    assert (q, dq, tau) == pytest.approx((direction * 0.5, direction * 2.0, direction * -4.0), abs=0.015)
+    assert (kp, kd) == pytest.approx((10.0, 1.0), abs=0.13)
+    motor.receive(bytearray(motor.codec.encode_feedback(1, 1, direction * 0.5, direction * 2.0, direction * -4.0)))
+    motor.decode()
+    assert (motor.q, motor.dq, motor.tau) == pytest.approx((0.8, 2.0, -4.0), abs=0.015)
+
+
+def test_a_bus_that_takes_no_frames_is_noticed(yam: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    driver = engaged_yam(yam)
+    monkeypatch.setattr(driver.chain.bus, "send", lambda id, data: False)
+    began, q = yam.now, yam.reading.q
+    with pytest.raises(ConnectionLost):
+        while True:
+            driver.write(Setpoint(q, NO_MOTION, NO_MOTION))
+            yam.cycle()
+    assert yam.now - began <= 0.15
+    assert not driver.engaged
+
+
 # Damiao motors: restarts and registers.
 
 
@@ -227,6 +252,16 @@ def test_a_gripper_whose_motor_restarts_does_not_go_on_by_itself(yam: Bench) -> 
     driver.move(0.0, 0.05, 10.0)
     assert yam.cycle(50).fault is None
     assert yam.arm.motors[7].status == MotorStatus.ENABLED
+
+
+def test_an_arm_whose_replies_would_command_another_one_is_refused(yam: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also one in another process: ids 17 to 22 are those at which the first arm answers."""
+    engaged_yam(yam)
+    monkeypatch.setattr(damiao_chain, "_LOCK_PATIENCE", 0.0)
+    motors = [{**motor, "id": motor["id"] + 0x10} for motor in yam.spec.options["motors"]]
+    other = DamiaoArm(replace(yam.spec, options={**yam.spec.options, "motors": motors}))
+    with pytest.raises(ControlTaken):
+        other.open()
 
 
 # Switching on.
