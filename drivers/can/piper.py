@@ -46,8 +46,10 @@ _ASK_AGAIN = 0.02
 """s between two commands to switch the motors on, or to take over control."""
 _SWITCHED_ON = 0.8
 """Time in which all motors must be on, s."""
-_CLEARING = 0.15
-"""Time for which an error may still be reported after it was cleared, s: slow frames come every 25 ms."""
+_SLOW_SILENCE = 0.5
+"""Silence after which a motor counts as lost whose slow report is missing, s: it comes every 25 ms."""
+_CLEARING = 0.12
+"""Longest time until an error is cleared, s."""
 _OWN_IDS = (*(id for id in FEEDBACK_IDS if id not in GRIPPER_IDS), ACKNOWLEDGEMENT)
 _OTHERS_CONTROL = frozenset({2, 5, 6, 7})
 """Control modes in which the arm is moved by a hand, a leader arm or a recorded trajectory (see PiperStatus)."""
@@ -81,6 +83,7 @@ class PiperArm(RobotDriver):
         self._status: PiperStatus | None = None
         self._t_status = -inf
         self._joints: list[JointStatus | None] = [None] * JOINTS
+        self._t_joints = [-inf] * JOINTS
         self._flags = [0] * JOINTS
         self._q: tuple[float, ...] | None = None
         self._t_q = -inf
@@ -88,6 +91,9 @@ class PiperArm(RobotDriver):
         self._seq = 0
         self._dq = list(_NO_JOINTS)
         self._tau = list(_NO_JOINTS)
+        self._t_dq = [-inf] * JOINTS
+        self._moving: set[int] = set()
+        """Joints whose speed has been reported."""
         self._pairs: list[tuple[float, float]] = [(0.0, 0.0)] * 3
         self._pairs_come = 0
         self._t_pairs = -inf
@@ -95,7 +101,6 @@ class PiperArm(RobotDriver):
         self._commanded_dq: tuple[float, ...] = _NO_JOINTS
         self._fault: Fault | None = None
         """Error that ended the engagement; kept until recover(), even if the arm no longer reports it."""
-        self._clearing_until = -inf
         self._t_asked = self._t_engaging = self._t_last_try = -inf
         self._blocked_since: float | None = None
         """Time since which the bus has taken no set-point, s; None while it does."""
@@ -135,30 +140,34 @@ class PiperArm(RobotDriver):
 
     def _missing(self) -> str:
         """Return which reports have not come yet, in words; empty if the state is complete."""
-        silent = join_joints(k for k, joint in enumerate(self._joints) if joint is None)
+        silent = join_joints(k for k in range(JOINTS) if self._joints[k] is None or k not in self._moving)
         parts = {"no arm status (0x2A1)": self._status is None, "no positions (0x2A5 to 0x2A7)": self._q is None}
         if all(parts.values()) and self._joints == [None] * JOINTS:
             return "no PiPER reports"
         texts = [text for text, absent in parts.items() if absent]
-        return ", ".join([*texts, *([f"no motor status of {silent}"] if silent else [])])
+        return ", ".join([*texts, *([f"no report of the motor of {silent}"] if silent else [])])
 
     # Every cycle
 
     def read(self, now: float) -> Reading:
         first = self._now == -inf
         self._now = now
-        if first and self._q is not None:  # what came while it was opened
+        if first:  # what came while it was opened
             self._t_q = self._t_status = now
+            self._t_dq, self._t_joints = [now] * JOINTS, [now] * JOINTS
         try:
             self._link.poll()
         except ConnectionLost:
             self._disengage()
             raise
         q = self._q
-        if q is None or now - self._t_q > SILENCE or now - self._t_status > SILENCE:
+        if (
+            q is None
+            or min(self._t_q, self._t_status, *self._t_dq) < now - SILENCE
+            or (min(self._t_joints) < now - _SLOW_SILENCE)
+        ):
             self._disengage()
-            what = "positions" if q is None or now - self._t_q > SILENCE else "status"
-            raise self._link.lose(f"the arm has sent no {what} for {1e3 * SILENCE:.0f} ms")
+            raise self._link.lose(f"the arm has sent no {self._silent_part(now)}")
         self._link.lost = None
         fault = self._present_fault()
         commanded, commanded_dq = (self._commanded, self._commanded_dq) if self.engaged else (None, None)
@@ -166,12 +175,26 @@ class PiperArm(RobotDriver):
             self._t_q, self._t_q, self._seq, q, tuple(self._dq), tuple(self._tau), commanded, commanded_dq, fault=fault
         )
 
+    def _silent_part(self, now: float) -> str:
+        """Return what has not been reported, and for how long, in words."""
+        usual, slow = f"for {1e3 * SILENCE:.0f} ms", f"for {1e3 * _SLOW_SILENCE:.0f} ms"
+        if self._q is None or self._t_q < now - SILENCE:
+            return f"positions {usual}"
+        if self._t_status < now - SILENCE:
+            return f"status {usual}"
+        joints = join_joints(k for k, t in enumerate(self._t_dq) if t < now - SILENCE)
+        if joints:
+            return f"speed of {joints} {usual}"
+        return f"state of the motor of {join_joints(k for k, t in enumerate(self._t_joints) if t < now - _SLOW_SILENCE)} {slow}"
+
     def _take(self, record: PiperFeedback) -> None:
         """Keep what a frame reports. It is stamped with the time of the last read: it may be younger, never older."""
         if type(record) is JointMotion:
             k = record.joint
             self._dq[k] = record.dq
             self._tau[k] = record.current * TORQUE_PER_AMPERE[k]
+            self._t_dq[k] = self._now
+            self._moving.add(k)
         elif type(record) is JointAngles:
             k = record.first // 2
             if k == 0:  # the arm sends them in order: a set that lacks one is dropped
@@ -191,6 +214,7 @@ class PiperArm(RobotDriver):
         elif type(record) is JointStatus:
             self._joints[record.joint] = record
             self._flags[record.joint] = record.flags
+            self._t_joints[record.joint] = self._now
 
     def _present_fault(self) -> Fault | None:
         """Return what keeps the arm from following; an engaged arm is then no longer engaged."""
@@ -203,8 +227,6 @@ class PiperArm(RobotDriver):
                 self._fault = fault
                 self._disengage()
                 self.faults += 1
-        elif self._now < self._clearing_until:
-            fault = None
         return self._fault or fault
 
     def write(self, setpoint: Setpoint) -> bool:
@@ -242,14 +264,14 @@ class PiperArm(RobotDriver):
         assert status is not None
         assert q is not None
         fault = self._fault or arm_fault(status, self._flags)
-        if fault is not None and (self._fault is not None or now >= self._clearing_until):
+        if fault is not None:
             raise refusal(self.spec.name, fault)
         if now - self._t_last_try > SILENCE:  # a new attempt
             self._t_engaging, self._t_asked, self._confirmed = now, -inf, False
         self._t_last_try = now
         if status.control in _OTHERS_CONTROL:  # it is moved by a hand or by another program: never take it from them
             raise refusal(self.spec.name, control_fault(status, [ENABLED] * JOINTS) or _NO_COMMANDS)
-        fault = fault or control_fault(status, self._flags)
+        fault = control_fault(status, self._flags)
         if fault is None and self._confirmed and self._t_status > self._t_asked:
             self.engaged, self._blocked_since = True, None
             return
@@ -274,11 +296,19 @@ class PiperArm(RobotDriver):
         """Clear the errors of the joints. It never sends the vendor's reset, which cuts the power of the motors.
 
         Raises:
+            RobotFault: An error stays; the remedy says how to end it.
             ConnectionLost: The arm does not answer.
         """
         self._link.send([JointRequest().frame()])
+
+        def present() -> Fault | None:
+            return None if self._status is None else arm_fault(self._status, self._flags)
+
+        self._link.wait(lambda: present() is None, _CLEARING)
+        fault = present()
+        if fault is not None:
+            raise refusal(self.spec.name, fault)
         self._fault = None
-        self._clearing_until = self._now + _CLEARING
 
     # Statistics
 

@@ -46,23 +46,23 @@ _STATUS_FAULTS: dict[int, tuple[str, str]] = {
     0x3: ("the arm is in a singularity", "end the other program that drives this arm; then recover"),
     0x4: (
         "a target is beyond the arm's own limit",
-        "compare them with the model's (hal-check --real); then recover",
+        "compare the arm's limits with the model's (hal-check --real); then recover",
     ),
     0x5: ("the arm's controller does not reach a motor", f"check the cables along the arm; {_SUPPORT}"),
     0x6: ("a brake is not released", f"restart the arm; {_SUPPORT}"),
     0x7: ("the arm has met an obstacle: collision", _LOOK),
     0x8: ("the arm was moved too fast by hand while teaching", "end teaching (the button on the arm); then recover"),
     0x9: ("a motor reports an error", _LOOK),
-    0xA: ("the arm reports an error without a name", f"read the vendor's tool; {_SUPPORT}"),
+    0xA: ("the arm reports an error without a name", f"look it up with the vendor's tool; {_SUPPORT}"),
     0xE: ("the arm's controller is too hot", _COOL),
     0xF: ("the brake resistor is too hot", _COOL),
 }
 """Status of the arm -> cause and remedy. 0xB to 0xD (teaching) are no errors."""
 _FLAG_FAULTS: dict[int, tuple[str, str, str]] = {
     protocol.OVER_CURRENT: ("over_current", "draws too much current", _LOOK),
-    protocol.DRIVER_HOT: ("driver_hot", "has too hot an electronics", _COOL),
+    protocol.DRIVER_HOT: ("driver_hot", "has electronics that are too hot", _COOL),
     protocol.MOTOR_HOT: ("motor_hot", "is too hot", _COOL),
-    protocol.LOW_VOLTAGE: ("low_voltage", "has too low a voltage", "check the power supply: 24 V, 10 A or more"),
+    protocol.LOW_VOLTAGE: ("low_voltage", "has too low a voltage", "check the power supply, its plugs and its cables"),
     protocol.COLLISION: ("collision", "has met an obstacle: collision protection", _LOOK),
     protocol.STALLED: ("stalled", "is blocked: stall protection", _LOOK),
     protocol.ERROR: ("joint_error", "reports an error", f"recover; where that does not help, {_SUPPORT}"),
@@ -106,6 +106,7 @@ def control_fault(status: PiperStatus, flags: Iterable[int]) -> Fault | None:
 
 
 def refusal(name: str, fault: Fault) -> RobotFault:
+    """Return the exception of an arm that refuses because of a fault."""
     return RobotFault(f"{name}: {fault.cause}", fault.remedy, code=fault.code)
 
 
@@ -195,6 +196,13 @@ class PiperLink:
             self.lost = bus.error(self.name)
             bus.try_reopen()
             raise self.lost
+
+    def wait(self, done: Callable[[], bool], seconds: float) -> None:
+        """Handle what comes until ``done`` returns True, at most for a time in s. Raises ConnectionLost."""
+        deadline = time.monotonic() + seconds
+        while not done() and time.monotonic() < deadline:
+            time.sleep(0.001)
+            self.poll()
 
     def send(self, frames: Iterable[tuple[int, bytes]]) -> bool:
         """Send frames; return whether the bus took all. Raises ConnectionLost while the device counts as lost."""

@@ -7,7 +7,7 @@ on a failed one is left out.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Generator, Iterator, Sequence
+from collections.abc import Generator, Iterator, Sequence
 from typing import NamedTuple
 
 from hal.errors import ConfigError, ControlTaken, DeviceNotFound
@@ -436,7 +436,7 @@ def _check_piper(
 ) -> Iterator[CheckResult]:
     link.send(LimitQuery(motor).frame() for motor in range(1, JOINTS + 1))
     link.send([FirmwareQuery().frame(), ParameterQuery().frame()])
-    _wait(link, lambda: len(reports.limits) == JOINTS and find_firmware(reports.firmware) is not None)
+    link.wait(lambda: len(reports.limits) == JOINTS and find_firmware(reports.firmware) is not None, _ANSWER)
     firmware = find_firmware(reports.firmware)
     if firmware is None:
         yield CheckResult("firmware", "unknown", "the arm does not report its version")
@@ -456,19 +456,12 @@ def _check_piper(
     assert bus is not None
     bus.reset_statistics()
     before, began = reports.frames, time.monotonic()
-    _wait(link, lambda: False, duration)
+    link.wait(lambda: False, duration)
     seconds, figures = time.monotonic() - began, bus.statistics()
     frames = reports.frames - before + figures["unexpected"]
     traffic = _Traffic(seconds, frames, figures["error_frames"], tuple(figures["unexpected_ids"]))
     driven = _PIPER_REPORTS + 3 * spec.rate_hz + (spec.rate_hz if spec.gripper is not None else 0.0)
     yield _judge_load(driven, traffic, _PIPER_REPORTS, settings)
-
-
-def _wait(link: PiperLink, done: Callable[[], bool], seconds: float = _ANSWER) -> None:
-    deadline = time.monotonic() + seconds
-    while not done() and time.monotonic() < deadline:
-        link.poll()
-        time.sleep(1e-3)
 
 
 def _judge_limits(spec: RobotSpec, limits: dict[int, JointLimits]) -> CheckResult:

@@ -244,6 +244,29 @@ def test_a_reading_is_never_made_of_frames_of_different_times(bench: Bench, lost
     assert (after.t, after.seq) == (bench.now, first.seq + 1)
 
 
+def test_an_error_that_stays_is_reported_by_recover(bench: Bench) -> None:
+    """An emergency stop ends only with the vendor's reset, which is never sent."""
+    bench.engage()
+    bench.far.execute("status 0 1")
+    bench.run(0.02)
+    with patch.object(bench.far.arm, "take", lambda *_: None), pytest.raises(RobotFault) as caught:
+        bench.driver.recover()
+    assert caught.value.code == "emergency_stop"
+    assert "support the arm" in caught.value.remedy
+
+
+@pytest.mark.parametrize(("first", "seconds"), [(0x251, 0.12), (0x261, 0.55)])
+def test_a_motor_that_falls_silent_is_named(bench: Bench, first: int, seconds: float) -> None:
+    bench.run(0.05)
+    send = bench.far.bus.send
+    with patch.object(bench.far.bus, "send", lambda id, data: None if id == first + 3 else send(id, data)):
+        with pytest.raises(ConnectionLost) as caught:
+            bench.run(seconds)
+        assert "joint 4" in str(caught.value)
+    bench.far.advance(0.05)
+    assert bench.cycle().fault is None
+
+
 def test_a_target_that_is_no_number_is_not_sent(bench: Bench) -> None:
     bench.engage()
     bench.sent()
