@@ -185,7 +185,8 @@ class PiperArm(RobotDriver):
         joints = join_joints(k for k, t in enumerate(self._t_dq) if t < now - SILENCE)
         if joints:
             return f"speed of {joints} {usual}"
-        return f"state of the motor of {join_joints(k for k, t in enumerate(self._t_joints) if t < now - _SLOW_SILENCE)} {slow}"
+        joints = join_joints(k for k, t in enumerate(self._t_joints) if t < now - _SLOW_SILENCE)
+        return f"state of the motor of {joints} {slow}"
 
     def _take(self, record: PiperFeedback) -> None:
         """Keep what a frame reports. It is stamped with the time of the last read: it may be younger, never older."""
