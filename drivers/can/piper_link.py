@@ -159,13 +159,14 @@ class PiperLink:
         """Why the device counts as lost; None while it answers."""
         self._handle = handle
         self._ids = ids
+        self._sent = tuple(id for id in COMMAND_IDS if id not in ids)  # the firmware's question and answer share one
 
     def open(self, missing: Callable[[], str]) -> None:
         """Open the bus, and wait until the device has reported; ``missing`` names what it has not, in words."""
         bus = CanBus.acquire(self.settings)
         try:
             bus.drain()  # what came before is old
-            bus.subscribe({id: partial(self._receive, id) for id in self._ids}, COMMAND_IDS)
+            bus.subscribe({id: partial(self._receive, id) for id in self._ids}, self._sent)
         except BaseException:
             bus.release()
             raise
@@ -186,7 +187,7 @@ class PiperLink:
         """Give up the bus. Idempotent."""
         bus, self.bus = self.bus, None
         if bus is not None:
-            bus.unsubscribe(self._ids, COMMAND_IDS)
+            bus.unsubscribe(self._ids, self._sent)
             bus.release()
 
     def poll(self) -> None:

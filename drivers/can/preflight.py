@@ -237,8 +237,11 @@ def _check_motors(chains: Sequence[DamiaoChain], bus: CanBus) -> _Steps:
     if not fits:
         return False
     motors = [motor for chain in chains for motor in chain.motors]
-    types = sorted({motor.settings.type for motor in motors})
-    yield CheckResult("motors", "ok", f"{len(motors)} answer: {', '.join(types)}")
+    types: dict[str, list[str]] = {}
+    for motor in motors:
+        types.setdefault(motor.settings.type, []).append(str(motor.id))
+    who = "; ".join(f"{', '.join(ids)} ({kind})" for kind, ids in types.items())
+    yield CheckResult("motors", "ok", f"{len(motors)} answer: {who}")
     timeouts = [TIMEOUT_UNIT * motor.registers[MotorRegister.TIMEOUT] for motor in motors]
     found = f"ranges as in the rig, MIT mode; TIMEOUT {min(timeouts):.2f} to {max(timeouts):.2f} s"
     if max(timeouts) > _LONG_TIMEOUT:
