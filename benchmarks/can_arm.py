@@ -1,8 +1,8 @@
 """Arms on a CAN bus against the emulator with gravity: at rest, on the recorded tour, after the end of a program.
 
-    python benchmarks/can_arm.py [rest] [tour] [ends] [--rig yam|piper] [--runs 20]
+    python benchmarks/can_arm.py [rest] [tour] [ends] [--rig yam|piper] [--runs 20] [--reach 0.4]
 
-* rest: places the arm at random poses within 0.6 rad of home, and compares where the plant stands with where it was
+* rest: places the arm at random poses around home, and compares where the plant stands with where it was
   sent; with the plant as the driver's model has it, and with friction and 20 % more mass.
 * tour: the recorded drive through ``hal-teleop``, simulated and emulated; how far apart the ends are, and the largest
   distance between set-point and plant on the way.
@@ -29,6 +29,7 @@ def main() -> None:
     parser.add_argument("what", nargs="*", choices=["rest", "tour", "ends", []], default=["rest", "tour", "ends"])
     parser.add_argument("--rig", choices=["yam", "piper"], default="yam")
     parser.add_argument("--runs", type=int, default=20, help="poses, and ends of each kind (%(default)s)")
+    parser.add_argument("--reach", type=float, default=0.4, help="rest: largest distance from home, rad (%(default)s)")
     options = parser.parse_args()
     if "rest" in options.what:
         plants = {
@@ -37,7 +38,8 @@ def main() -> None:
             "20 % heavier, no friction": (1.2, 0.0),
             "20 % heavier, with friction": (1.2, 1.0),
         }
-        for name, found in zip(plants, rest(options.rig, options.runs, list(plants.values())), strict=True):
+        every = rest(options.rig, options.runs, list(plants.values()), reach=options.reach)
+        for name, found in zip(plants, every, strict=True):
             distances = sorted(1e3 * one.distance for one in found)
             print(
                 f"  {name:28s} at rest, {len(found)} poses: off by mm median {distances[len(found) // 2]:.2f} "

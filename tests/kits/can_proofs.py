@@ -28,8 +28,6 @@ __all__ = ["WAYS", "End", "Rest", "Tour", "end", "rest", "tour", "tracking"]
 _TELEOP = Path(__file__).resolve().parents[2] / "apps" / "teleop.py"
 SPEED = 0.4
 """Of the joint that moves when a program ends, rad/s."""
-REACH = 0.6
-"""Largest distance of a joint from home at rest, rad."""
 WAYS = ("app killed", "host killed", "bus cut")
 
 APP = """
@@ -60,7 +58,9 @@ class Rest(NamedTuple):
     """Greatest joint speed over half a second, rad/s."""
 
 
-def rest(rig_name: str, poses: int, plants: Sequence[tuple[float, float]], *more: str) -> list[list[Rest]]:
+def rest(
+    rig_name: str, poses: int, plants: Sequence[tuple[float, float]], *more: str, reach: float = 0.4
+) -> list[list[Rest]]:
     """Return how an arm rests at random poses, for each plant.
 
     Args:
@@ -68,6 +68,7 @@ def rest(rig_name: str, poses: int, plants: Sequence[tuple[float, float]], *more
         poses: How many poses, the same for each plant.
         plants: Factors on the masses and on the friction of the plant.
         more: Further overrides of the rig, for the driver and the plant.
+        reach: Largest distance of a joint from home, rad.
     """
     found = []
     with (
@@ -83,7 +84,7 @@ def rest(rig_name: str, poses: int, plants: Sequence[tuple[float, float]], *more
             random = np.random.default_rng(1)
             found.append([])
             for _ in range(poses):
-                goal = np.clip(arm.home + random.uniform(-REACH, REACH, len(lower)), lower, upper)
+                goal = np.clip(arm.home + random.uniform(-reach, reach, len(lower)), lower, upper)
                 arm.move_to(goal, speed=0.8, unattended=True)
                 time.sleep(0.7)
                 emulator.execute("stats reset")
@@ -177,7 +178,9 @@ def end(rig_name: str, way: str, seconds: float = 5.0, joint: int = 1, speed: fl
     """End a program while its arm moves, and watch the arm for some seconds."""
     with EmulatorProcess(rig_name) as emulator:
         arguments = json.dumps([rig_name, joint, speed, *emulator.overrides, "robots.arm.speed=0.5"])
-        app = subprocess.Popen([sys.executable, "-c", APP, arguments], stdout=subprocess.PIPE, text=True)
+        app = subprocess.Popen(
+            [sys.executable, "-c", APP, arguments], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
+        )
         try:
             assert app.stdout is not None
             line = app.stdout.readline()
