@@ -10,10 +10,16 @@ from collections.abc import Sequence
 
 import can
 
-from hal.errors import HalError
+from hal.errors import ControlTaken, HalError
+from hal.lock import DeviceLock
 
 from .console import CommandPort, help_text, serve_prompt
 from .server import CanEmulator
+
+_PATIENCE = 1.0
+"""s for which an emulator waits for one that is ending."""
+_locks: list[DeviceLock] = []
+"""On the buses of this program, until it ends."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -35,7 +41,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: end.set())
     try:
-        with CanEmulator(options.config, options.set, options.seed, realtime=True) as emulator:
+        built = CanEmulator(options.config, options.set, options.seed, realtime=True)
+        _lock_buses(built)
+        with built as emulator:
             port = CommandPort(emulator, options.port)
             names = ", ".join(f"{arm.name} at {' '.join(arm.bus.key)}" for arm in emulator.arms.values())
             print(f"ready: {names}; control port {port.number}; help lists the commands", flush=True)
@@ -49,6 +57,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"error: {error}", file=sys.stderr)
         return 1
     return 0
+
+
+def _lock_buses(emulator: CanEmulator) -> None:
+    """Refuse a bus that another emulator serves: the answers of both would be mixed, without an error anywhere."""
+    for bus in emulator.buses:
+        where = " ".join(map(str, bus.settings.key))
+        try:
+            lock = DeviceLock(f"can-emulator-{where}", f"the emulated bus {where}", _PATIENCE)
+        except ControlTaken as error:
+            raise ControlTaken(f"{error}; end that emulator, or give this rig another channel") from None
+        _locks.append(lock)
 
 
 if __name__ == "__main__":

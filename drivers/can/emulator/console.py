@@ -48,7 +48,7 @@ class EmulatorCommand(NamedTuple):
 def _lose(target: _Target, words: list[str]) -> None:
     faults = target.bus.faults[target.arm.name]
     if words[0] == "next":
-        faults.lose_next[int(words[2], 0) if len(words) > 2 else 0] = int(words[1])
+        faults.lose_next[_number(target, words[2]) if len(words) > 2 else 0] = int(words[1])
     else:
         share = float(words[0])
         if not 0.0 <= share <= 1.0:
@@ -65,7 +65,7 @@ def _double(target: _Target, words: list[str]) -> None:
 
 
 def _silent(target: _Target, words: list[str]) -> None:
-    number = 0 if words[0] == "all" else int(words[0], 0)
+    number = 0 if words[0] == "all" else _number(target, words[0])
     target.bus.faults[target.arm.name].silent_until[number] = _until(words[1])
 
 
@@ -127,7 +127,10 @@ def _place(target: _Target, words: list[str]) -> None:
 
 
 def _push(target: _Target, words: list[str]) -> None:
-    target.arm.plant.push[int(words[0]) - 1] = float(words[1])
+    joint, joints = int(words[0]), len(target.arm.plant.push)
+    if not 1 <= joint <= joints:
+        raise ValueError(f"no joint {joint}; joints: 1 to {joints}")
+    target.arm.plant.push[joint - 1] = float(words[1])
 
 
 def _object(target: _Target, words: list[str]) -> None:
@@ -215,6 +218,14 @@ def execute(emulator: CanEmulator, words: list[str]) -> dict[str, Any]:
     except (ValueError, IndexError) as error:
         reason = f"usage: {command.usage}" if isinstance(error, IndexError) else error
         raise ValueError(f"{verb}: {reason}") from None
+
+
+def _number(target: _Target, word: str) -> int:
+    numbers = target.arm.numbers
+    number = int(word, 0)
+    if number not in numbers:
+        raise ValueError(f"no motor {word}; motors: {', '.join(map(str, numbers))}")
+    return number
 
 
 def _until(word: str) -> float:

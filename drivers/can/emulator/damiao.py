@@ -7,7 +7,7 @@ another fault applies no torque; only frames at a motor's own id feed its watchd
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from hal.specs import RobotSpec
@@ -274,6 +274,10 @@ class EmulatedDamiaoArm:
                 self.gripper.lower = angle
             else:
                 self.gripper.upper = angle
+
+    @property
+    def numbers(self) -> Sequence[int]:
+        return tuple(self.motors)
 
     def _motor(self, number: int) -> DamiaoMotor:
         if number not in self.motors:

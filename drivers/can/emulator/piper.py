@@ -7,7 +7,7 @@ ever. It knows its own weight. How a real one tracks is not published; the figur
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from hal.specs import RobotSpec
@@ -266,6 +266,10 @@ class EmulatedPiperArm:
     def set_register(self, number: int, name: str, value: float) -> None:
         """Raise ValueError: a PiPER has no registers."""
         raise ValueError("a PiPER has no registers")
+
+    @property
+    def numbers(self) -> Sequence[int]:
+        return range(1, JOINTS + 1)
 
     def _joint(self, number: int) -> int:
         if not 1 <= number <= JOINTS:

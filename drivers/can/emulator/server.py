@@ -46,6 +46,10 @@ class EmulatedArm(Protocol):
     plant: ArmPlant
     peak: list[float]
 
+    @property
+    def numbers(self) -> Sequence[int]:
+        """Numbers of its motors, as the console's commands name them."""
+
     def take(self, id: int, data: bytes, send: Callable[[int, bytes, int], None]) -> None:
         """Take a frame from the bus, and answer it."""
 

@@ -282,7 +282,22 @@ def test_a_command_reaches_the_arm_that_it_names(emulator: CanEmulator) -> None:
 
 
 @pytest.mark.parametrize(
-    "line", ["", "frobnicate", "lose", "lose 2", "status 99 A", "register 1 NONE 3", "silent", "place 1 2", "double x"]
+    "line",
+    [
+        "",
+        "frobnicate",
+        "lose",
+        "lose 2",
+        "lose next 1 99",
+        "status 99 A",
+        "register 1 NONE 3",
+        "silent",
+        "silent 99 on",
+        "silent three on",
+        "push 0 2",
+        "place 1 2",
+        "double x",
+    ],
 )
 def test_a_wrong_command_is_refused(emulator: CanEmulator, line: str) -> None:
     with pytest.raises(ValueError):  # noqa: PT011  # of the wording the user sees
