@@ -67,7 +67,7 @@ def show_can() -> bool:
     from hal import registry
     from hal.errors import HalError
 
-    found = False
+    found = failed = False
     places = {registry.driver(name).buses: name for name in registry.BUILT_IN}
     for place, name in places.items():
         try:
@@ -76,8 +76,9 @@ def show_can() -> bool:
                 print(line)
                 found = True
         except (HalError, OSError) as error:
-            print(f"{name:12s} {type(error).__name__}: {error}")
-    if not found:
+            print(f"{type(error).__name__}: {error}")
+            failed = True
+    if not found and not failed:
         print("no CAN interface and no adapter; plug one in, and load its driver: sudo modprobe gs_usb")
     return found
 

@@ -324,6 +324,7 @@ class ArmTeleop:
         """Newest state of the arm; None while it does not answer."""
         self.stopped = ""
         """Why the arm does not follow the pad; empty while it does."""
+        self._stop_reason = ""
         self.held_for = ""
         """Name of the arm whose stop holds this one; empty while none does."""
         self.gripper_trouble = ""
@@ -445,8 +446,11 @@ class ArmTeleop:
 
     def _note_stop(self, error: Exception, kind: SessionEventKind, text: str, reason: str) -> None:
         if self.stopped != str(error):
+            known = bool(self.stopped) and self._stop_reason.startswith(reason)  # the same stop, without its detail
             self.stopped = str(error)
-            self.announce(text, kind, reason)
+            if not known:
+                self._stop_reason = reason
+                self.announce(text, kind, reason)
 
     def note_resumed(self) -> None:
         """Note that the arm follows the pad."""

@@ -342,7 +342,7 @@ def check_damiao_arm(spec: RobotSpec) -> Iterator[tuple[str, str, str]]:
             message = f"is {spec.limits.velocity[k]:g} rad/s for {joint}, beyond VMAX, {motor.limits.velocity:g} rad/s"
             yield "limits.velocity", message, "out_of_range"
     for link, problem in find_wrong_inertials(spec.urdf, spec.joints).items():
-        message = f"the URDF's link {link} {problem}: the arm's weight cannot be carried without its maker's numbers"
+        message = f"the URDF's link {link} {problem}: without its mass and centre the arm's weight cannot be carried"
         yield "model", message, "wrong_inertials"
 
 

@@ -79,7 +79,11 @@ class RecordedTrajectory:
         lead = f"{robot.name}." if several else ""
         if f"{lead}x" not in places:
             arms = dict.fromkeys(name.partition(".")[0] for name in places)
-            raise CommandError(f"the episode has no arm {robot.name!r}; it has: {', '.join(arms)}", code="no_such_arm")
+            raise CommandError(
+                f"the episode has no arm {robot.name!r}; it has: {', '.join(arms)}; open the rig that it was "
+                "recorded with (--config)",
+                code="no_such_arm",
+            )
         own = [k for k, name in enumerate(names) if name.startswith(lead)]
         labels = [names[k].removeprefix(lead) for k in own]
         has_gripper = "gripper" in labels

@@ -130,6 +130,18 @@ def test_a_fault_is_one_event_and_the_session_continues_after_recovery(bench: Be
     assert bench.events[0].reason == "reflex"
 
 
+def test_an_arm_that_is_lost_and_answers_again_is_one_event(bench: Bench) -> None:
+    steps = [
+        (0.2, bench.press("l2", "l1")),
+        (0.6, lambda: bench.arm.inject(disconnect=True)),
+        (1.0, lambda: bench.arm.inject(disconnect=False)),
+        (1.4, bench.release("l2")),
+        (1.6, bench.press("l2")),
+    ]
+    bench.run(2.0, *steps)
+    assert bench.kinds == ["stopped", "resumed"]
+
+
 def test_a_silent_pad_stops_the_arm_and_rumbles_once(bench: Bench) -> None:
     bench.run(2.0, (0.2, bench.press("l2")), (0.6, lambda: bench.hand.inject(freeze=True)))
     assert bench.kinds == ["stopped"]
