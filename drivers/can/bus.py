@@ -133,7 +133,7 @@ class CanBus:
             raise ConfigError([Problem("<rig>", "real", message, "id_collision")])
         self._handlers.update(handlers)
         for id in sent:
-            self._handlers[id] = None
+            self._handlers.setdefault(id, None)  # a PiPER is asked for its firmware at the id that answers
             self._senders[id] = self._senders.get(id, 0) + 1
 
     def unsubscribe(self, ids: Iterable[int], sent: Iterable[int] = ()) -> None:
@@ -143,7 +143,8 @@ class CanBus:
         for id in sent:
             self._senders[id] -= 1
             if not self._senders[id]:
-                del self._senders[id], self._handlers[id]
+                del self._senders[id]
+                self._handlers.pop(id, None)
 
     # Opening.
 

@@ -91,6 +91,17 @@ def test_two_devices_may_not_have_one_id(bus: CanBus) -> None:
     bus.subscribe({0x11: lambda data: None}, sent=[3])
 
 
+def test_a_device_may_be_asked_at_the_id_at_which_it_answers(bus: CanBus, far: can.BusABC) -> None:
+    got: list[bytes] = []
+    handlers = {0x4AF: lambda data: got.append(bytes(data)), 0x11: lambda data: None}
+    bus.subscribe(handlers, sent=[0x4AF, 1])
+    far.send(frame(0x4AF, bytes(8)))
+    bus.poll()
+    assert got == [bytes(8)]
+    bus.unsubscribe(handlers, [0x4AF, 1])
+    bus.subscribe(handlers, sent=[0x4AF, 1])
+
+
 def test_frames_are_discarded_by_drain(bus: CanBus, far: can.BusABC) -> None:
     for _ in range(700):
         far.send(frame(0x11))
