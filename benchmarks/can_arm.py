@@ -26,11 +26,12 @@ from can_proofs import WAYS, end, rest, tour, tracking  # noqa: E402
 def main() -> None:
     """Print the tables."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("what", nargs="*", choices=["rest", "tour", "ends", []], default=["rest", "tour", "ends"])
+    parser.add_argument("what", nargs="*", metavar="PART", help="rest, tour or ends (all)")
     parser.add_argument("--rig", choices=["yam", "piper"], default="yam")
     parser.add_argument("--runs", type=int, default=20, help="poses, and ends of each kind (%(default)s)")
     parser.add_argument("--reach", type=float, default=0.4, help="rest: largest distance from home, rad (%(default)s)")
     options = parser.parse_args()
+    options.what = options.what or ["rest", "tour", "ends"]
     if "rest" in options.what:
         plants = {
             "plant as the model": (1.0, 0.0),
