@@ -411,7 +411,7 @@ def _collisions(motors: list[DamiaoMotorSettings]) -> Iterator[tuple[str, str, s
             yield f"{key}.id", f"{motor.id} is also the id of motor {commands[motor.id] + 1}", "id_collision"
         if motor.reply_id in replies:
             other = replies[motor.reply_id] + 1
-            message = f"{motor.reply_id:#x} is also the master id of motor {other}: their replies cannot be told apart"
+            message = f"{motor.reply_id:#x} is also the master id of motor {other}: their replies look the same"
             yield f"{key}.master", message, "id_collision"
         commands.setdefault(motor.id, k)
         replies.setdefault(motor.reply_id, k)

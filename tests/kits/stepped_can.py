@@ -1,4 +1,4 @@
-"""An emulator of a CAN arm that advances only when it is told to, so that nothing waits and nothing is late.
+"""An emulator of a CAN arm that advances only when a test lets it, so that nothing waits and nothing is late.
 
 Driver and emulator run in one thread, on python-can's ``virtual`` bus. Where a driver waits for the emulator, which it
 does only while it opens, closes or clears errors, a clock of the kit takes the place of the module ``time``.

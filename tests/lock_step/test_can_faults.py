@@ -1,4 +1,4 @@
-"""Faults of an arm with Damiao motors, in motion: what the program is told, the arm's state, and how it recovers.
+"""Faults of an arm with Damiao motors, in motion: what the program gets, the arm's state, and how it recovers.
 
 The arm is driven in lock-step: driver and emulator advance together, so the times in the table are exact. Print the
 table with ``pytest -s tests/lock_step/test_can_faults.py``.
@@ -55,7 +55,7 @@ class CanFault:
     name: str
     begin: Callable[[SteppedArm], object]
     end: Callable[[SteppedArm], object]
-    told: tuple[type[HalError], str] | None
+    raised: tuple[type[HalError], str] | None
     """Error that the program gets, and its code; None where the arm has to go on."""
     cause: str = ""
     """Code of the fault in the arm's state."""
@@ -140,7 +140,7 @@ def _table() -> Iterator[None]:
     yield
     print(
         "\n\n"
-        + "\n".join(["| fault | the program is told | after | the arm | recovery |", "|---|---|---|---|---|", *TABLE])
+        + "\n".join(["| fault | the program gets | after | the arm | recovery |", "|---|---|---|---|---|", *TABLE])
     )
 
 
@@ -156,14 +156,14 @@ def test_a_fault_in_motion(fault: CanFault) -> None:
         fault.begin(arm)
         error = arm.run(0.6, TURN)
         took = arm.clock.now() - began
-        if fault.told is None:
+        if fault.raised is None:
             assert error is None, "the arm has to continue"
             assert arm.driver.engaged
             TABLE.append(f"| {fault.name} | nothing | | continues | |")
             return
         state = arm.robot._mail.get_state()
-        assert isinstance(error, fault.told[0])
-        assert error.code == fault.told[1]
+        assert isinstance(error, fault.raised[0])
+        assert error.code == fault.raised[1]
         assert state is not None
         assert state.fault is not None
         assert state.fault.code == fault.cause
@@ -173,7 +173,7 @@ def test_a_fault_in_motion(fault: CanFault) -> None:
         drift = np.abs(arm.q - at)
         assert drift[0] < 0.1, "the joint that moved has stopped"
         power = "holds" if arm.driver.engaged else f"{on(arm)} of 6 motors hold"
-        lost = fault.told == LOST
+        lost = fault.raised == LOST
         arm_text = f"{power}, moves by {drift.max():.2f} rad in 0.3 s"
 
         fault.end(arm)
