@@ -51,6 +51,8 @@ _SLOW_SILENCE = 0.5
 _CLEARING = 0.12
 """Longest time until an error is cleared, s."""
 _OWN_IDS = (*(id for id in FEEDBACK_IDS if id not in GRIPPER_IDS), ACKNOWLEDGEMENT)
+_FOLLOWING = 0.3
+"""Largest distance of a joint from its target, rad. Beyond it the arm does not get its targets, or is too slow."""
 _OTHERS_CONTROL = frozenset({2, 5, 6, 7})
 """Control modes in which the arm is moved by a hand, a leader arm or a recorded trajectory (see PiperStatus)."""
 _NO_COMMANDS = Fault("no_commands", "the bus takes no commands", "check the adapter and its cable")
@@ -223,12 +225,22 @@ class PiperArm(RobotDriver):
         assert status is not None
         fault = arm_fault(status, self._flags)
         if self.engaged:
-            fault = fault or control_fault(status, self._flags)
+            fault = fault or control_fault(status, self._flags) or self._check_following()
             if fault is not None:
                 self._fault = fault
                 self._disengage()
                 self.faults += 1
         return self._fault or fault
+
+    def _check_following(self) -> Fault | None:
+        """Return a fault if a joint is too far from its target: the arm would race there as soon as it can."""
+        if self._commanded is None or self._q is None:
+            return None
+        for k, (target, q) in enumerate(zip(self._commanded, self._q, strict=True)):
+            if abs(target - q) > _FOLLOWING:
+                cause = f"{join_joints([k])} is {abs(target - q):.2f} rad away from its target"
+                return Fault("not_following", cause, "check what the arm touches, and `speed_percent` in the rig")
+        return None
 
     def write(self, setpoint: Setpoint) -> bool:
         if not self.engaged:

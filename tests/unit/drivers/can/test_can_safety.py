@@ -317,6 +317,24 @@ def test_a_piper_notices_a_bus_that_takes_no_frames(piper: Bench, monkeypatch: p
     assert not driver.engaged
 
 
+def test_a_piper_that_gets_no_targets_does_not_race_to_a_far_one_later(piper: Bench) -> None:
+    driver = piper.open(PiperArm(piper.spec))
+    piper.engage()
+    q = list(piper.cycle(10).q)
+    take, piper.arm.take = piper.arm.take, lambda *_: None  # its reports still come
+    fault = None
+    for _ in range(200):
+        q[0] += 0.005  # 1 rad/s
+        if driver.write(Setpoint(q, NO_MOTION, NO_MOTION)) is False:
+            break
+        fault = piper.cycle().fault
+    assert fault is not None
+    assert fault.code == "not_following"
+    assert not driver.engaged
+    piper.arm.take = take
+    assert piper.fastest(0.5) < 0.01
+
+
 def test_a_piper_is_not_taken_over_while_a_hand_or_another_program_moves_it(piper: Bench) -> None:
     driver = piper.open(PiperArm(piper.spec))
     piper.arm.control = 2  # teaching
