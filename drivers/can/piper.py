@@ -18,7 +18,7 @@ from hal.errors import ConnectionLost, Fault
 from hal.lock import DeviceLock
 from hal.specs import RobotSpec
 
-from .piper_link import SILENCE, PiperLink, arm_fault, control_fault, join_joints, refusal
+from .piper_link import FRESH_READS, SILENCE, PiperLink, arm_fault, control_fault, join_joints, refusal
 from .piper_protocol import (
     ACKNOWLEDGEMENT,
     ENABLED,
@@ -82,6 +82,7 @@ class PiperArm(RobotDriver):
         """Forget everything that the arm has reported, and that it was asked for."""
         self.engaged = False
         self._now = -inf
+        self._reads = 0
         self._status: PiperStatus | None = None
         self._t_status = -inf
         self._joints: list[JointStatus | None] = [None] * JOINTS
@@ -152,9 +153,9 @@ class PiperArm(RobotDriver):
     # Every cycle
 
     def read(self, now: float) -> Reading:
-        first = self._now == -inf
         self._now = now
-        if first:  # what came while it was opened
+        if self._reads < FRESH_READS:  # what came while it was opened
+            self._reads += 1
             self._t_q = self._t_status = now
             self._t_dq, self._t_joints = [now] * JOINTS, [now] * JOINTS
         try:

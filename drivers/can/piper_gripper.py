@@ -7,7 +7,7 @@ from math import inf
 from hal.driver import GripperDriver, GripperReading
 from hal.specs import GripperSpec
 
-from .piper_link import SILENCE, PiperLink, gripper_fault
+from .piper_link import FRESH_READS, SILENCE, PiperLink, gripper_fault
 from .piper_protocol import ENABLED, GRIPPER_IDS, GripperRequest, GripperStatus, PiperFeedback
 from .settings import PiperGripperSettings
 
@@ -36,6 +36,7 @@ class PiperGripper(GripperDriver):
 
     def _forget(self) -> None:
         self._now = -inf
+        self._reads = 0
         self._status: GripperStatus | None = None
         self._t_status = -inf
         self._seq = 0
@@ -63,7 +64,8 @@ class PiperGripper(GripperDriver):
         self._link.close()
 
     def read(self, now: float) -> GripperReading:
-        if self._now == -inf:
+        if self._reads < FRESH_READS:  # what came while it was opened
+            self._reads += 1
             self._t_status = now
         dt, self._now = max(0.0, now - self._now), now
         self._link.poll()

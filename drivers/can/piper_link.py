@@ -15,6 +15,7 @@ from .piper_protocol import COMMAND_IDS, ENABLED, JOINTS, GripperStatus, PiperFe
 from .settings import EMULATED_INTERFACES, BusSettings
 
 __all__ = [
+    "FRESH_READS",
     "SILENCE",
     "PiperLink",
     "arm_fault",
@@ -27,6 +28,9 @@ __all__ = [
 
 SILENCE = 0.1
 """Silence after which the arm or the gripper counts as lost, s."""
+FRESH_READS = 2
+"""Number of readings after the opening for which what came until then counts as new: the first one has the time at
+which the host began to open its devices."""
 _OPENING = 1.0
 """Longest time to wait for a device's state when it is opened, s."""
 _LEADER_IDS = range(0x3A1, 0x3A9)

@@ -305,6 +305,19 @@ def test_frames_from_before_the_connect_are_not_believed(bench: Bench) -> None:
     gripper.close()
 
 
+def test_a_slow_opening_of_other_devices_is_no_silence(bench: Bench) -> None:
+    """The first reading has the time before the opening, the second one the first cycle's."""
+    assert bench.far.spec.gripper is not None
+    gripper = PiperGripper(bench.far.spec.gripper)
+    gripper.open()
+    for device in (bench.driver, gripper):
+        device.read(200.0)
+        assert device.read(200.5).t == 200.5
+        with pytest.raises(ConnectionLost):
+            device.read(200.7)
+    gripper.close()
+
+
 def test_a_grippers_error_fails_its_command_and_the_next_one_clears_it(bench: Bench) -> None:
     assert bench.far.spec.gripper is not None
     gripper = PiperGripper(bench.far.spec.gripper)
