@@ -86,7 +86,7 @@ class DeviceDriver(ABC):
 
     @abstractmethod
     def close(self) -> None:
-        """Stop safely and release the device, in bounded time. Idempotent; a lost link is no error.
+        """Stop safely and release the device, within 8 s. Idempotent; a lost link is no error.
 
         A gripper keeps the object that it holds.
         """

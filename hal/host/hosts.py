@@ -86,6 +86,8 @@ SNAPSHOT_CAPACITY = 8192
 SILENT = 1.5
 """A host that has published nothing for so long does not answer any more, s. (A Franka's library waits 1 s for a
 state.)"""
+CLOSE_LIMIT = 8.0
+"""Longest time that one arm's driver may take to close, s: an arm without brakes is lowered slowly first."""
 PAD_PERIOD = 0.01
 """Period at which pads are polled in lock-step, simulated s."""
 
@@ -274,7 +276,8 @@ class RemoteHost(Host):
     def close(self) -> None:
         if self._closed.is_set():
             return
-        self.child.close(timeout=1.0 if self._silence() > SILENT else STOP_LIMIT + 3.0)
+        lasts = STOP_LIMIT + CLOSE_LIMIT * max(1, len(self.spec.robots))
+        self.child.close(timeout=1.0 if self._silence() > SILENT else lasts)
         self._closed.set()
         self._thread.join(timeout=1.0)
         self.shared.close()
