@@ -261,7 +261,8 @@ class DamiaoArm(RobotDriver):
         chain = self.chain
         chain.usable  # noqa: B018  # raises while there is no connection
         if self._fault is not None:
-            raise RobotFault(self._fault.cause, self._fault.remedy, code=self._fault.code)
+            remedy = f"{self._fault.remedy}; then robot.recover()"
+            raise RobotFault(self._fault.cause, remedy, code=self._fault.code)
         if chain.ask_registers():
             return  # of a motor that was switched off and on again
         fault = chain.register_fault()

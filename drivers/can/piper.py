@@ -279,7 +279,7 @@ class PiperArm(RobotDriver):
         assert q is not None
         fault = self._fault or arm_fault(status, self._flags)
         if fault is not None:
-            raise refusal(self.spec.name, fault)
+            raise refusal(self.spec.name, Fault(fault.code, fault.cause, f"{fault.remedy}; then robot.recover()"))
         if now - self._t_last_try > SILENCE:  # a new attempt
             self._t_engaging, self._t_asked, self._confirmed = now, -inf, False
         self._t_last_try = now

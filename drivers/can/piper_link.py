@@ -42,20 +42,20 @@ _LEADER_IDS = range(0x3A1, 0x3A9)
 _SUPPORT = (
     "support the arm by hand: clearing this with the vendor's reset, or by a restart, cuts its power and it falls"
 )
-_LOOK = "check what the arm touches, and its load; then recover"
-_COOL = "let it cool down, lower load and speed; then recover"
+_LOOK = "check what the arm touches, and its load"
+_COOL = "let it cool down; lower its load or its speed"
 _STATUS_FAULTS: dict[int, tuple[str, str]] = {
     0x1: ("the emergency stop was triggered: the arm sinks slowly", _SUPPORT),
-    0x2: ("there is no solution for a Cartesian target", "end the other program that drives this arm; then recover"),
-    0x3: ("the arm is in a singularity", "end the other program that drives this arm; then recover"),
+    0x2: ("there is no solution for a Cartesian target", "end the other program that drives this arm"),
+    0x3: ("the arm is in a singularity", "end the other program that drives this arm"),
     0x4: (
         "a target is beyond the arm's own limit",
-        "compare the arm's limits with the model's (hal-check --real); then recover",
+        "compare the arm's limits with the model's (hal-check --real)",
     ),
     0x5: ("the arm's controller does not reach a motor", f"check the cables along the arm; {_SUPPORT}"),
-    0x6: ("a brake is not released", f"restart the arm; {_SUPPORT}"),
+    0x6: ("a brake is not released", f"{_SUPPORT}; then restart it"),
     0x7: ("the arm has met an obstacle: collision", _LOOK),
-    0x8: ("the arm was moved too fast by hand while teaching", "end teaching (the button on the arm); then recover"),
+    0x8: ("the arm was moved too fast by hand while teaching", "end teaching (the button on the arm)"),
     0x9: ("a motor reports an error", _LOOK),
     0xA: ("the arm reports an error without a name", f"look it up with the vendor's tool; {_SUPPORT}"),
     0xE: ("the arm's controller is too hot", _COOL),
@@ -65,11 +65,11 @@ _STATUS_FAULTS: dict[int, tuple[str, str]] = {
 _FLAG_FAULTS: dict[int, tuple[str, str, str]] = {
     protocol.OVER_CURRENT: ("over_current", "draws too much current", _LOOK),
     protocol.DRIVER_HOT: ("driver_hot", "has electronics that are too hot", _COOL),
-    protocol.MOTOR_HOT: ("motor_hot", "is too hot", _COOL),
+    protocol.MOTOR_HOT: ("motor_hot", "has a motor that is too hot", _COOL),
     protocol.LOW_VOLTAGE: ("low_voltage", "has too low a voltage", "check the power supply, its plugs and its cables"),
     protocol.COLLISION: ("collision", "has met an obstacle: collision protection", _LOOK),
     protocol.STALLED: ("stalled", "is blocked: stall protection", _LOOK),
-    protocol.ERROR: ("joint_error", "reports an error", f"recover; where that does not help, {_SUPPORT}"),
+    protocol.ERROR: ("joint_error", "reports an error", f"if robot.recover() does not help, {_SUPPORT}"),
 }
 """Flag of a motor -> code, what the joint does, remedy; the most telling first."""
 _CONTROL = {0: "standby", 2: "teaching", 3: "Ethernet", 4: "Wi-Fi", 5: "remote control", 6: "leader", 7: "trajectory"}
@@ -103,9 +103,9 @@ def control_fault(status: PiperStatus, flags: Iterable[int]) -> Fault | None:
         return Fault("switched_off", f"{off} of the arm is off", remedy)
     if status.control != protocol.CAN_CONTROL:
         mode = _CONTROL.get(status.control, f"mode {status.control}")
-        return Fault("not_in_control", f"the arm went to {mode} control", "end it (the button on the arm); recover")
+        return Fault("not_in_control", f"the arm went to {mode} control", "end it (the button on the arm)")
     if status.move != protocol.MOVE_J:
-        return Fault("not_in_control", "another program changed the arm's mode", "end that program; recover")
+        return Fault("not_in_control", "another program changed the arm's mode", "end that program")
     return None
 
 
