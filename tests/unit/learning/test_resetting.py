@@ -87,7 +87,7 @@ def test_without_a_hand_to_open(rig: hal.Rig) -> None:
 
 def collect(rig: hal.Rig, folder: Path, *options: str) -> int:
     with Recorder(rig, folder) as recorder:
-        run = CollectRun(rig, rig.robots["panda"], rig.gamepads["pad"], recorder, parser().parse_args([*options]))
+        run = CollectRun(rig, [rig.robots["panda"]], recorder, parser().parse_args([*options]))
         return run.run()
 
 
