@@ -58,7 +58,7 @@ class Bench:
         assert self.rig.console is not None
         self.console = self.rig.console
         self.link = self.console.link
-        self.app = TeleopRun(self.rig, self.arm, self.rig.gamepads["pad"], self.args)
+        self.app = TeleopRun(self.rig, [self.arm], self.args)
         self.session = self.app.session
         self._silences: list[float] = []
         self._alive = math.inf

@@ -49,6 +49,13 @@ def main(channel: str) -> None:
         status = piper.GetArmStatus().arm_status
         return int(status.motion_status) == 0 and int(status.ctrl_mode) == 1
 
+    def firmware_known() -> bool:
+        if isinstance(piper.GetPiperFirmwareVersion(), str):  # a number while the answer is not complete
+            return True
+        piper.SearchPiperFirmwareVersion()
+        time.sleep(0.1)  # a new question discards what came of the last answer
+        return False
+
     wait(lambda: any(joints()))
     report: dict[str, Any] = {"enabled_s": wait(piper.EnablePiper)}
     report["moved_s"] = wait(at_targets)
@@ -57,6 +64,7 @@ def main(channel: str) -> None:
     time.sleep(0.2)
     report["joints"] = joints()
     report["arm_status"] = int(piper.GetArmStatus().arm_status.arm_status)
+    wait(firmware_known)
     report["firmware"] = piper.GetPiperFirmwareVersion()
     report["ok"] = piper.isOk()
     print("ready " + json.dumps(report), flush=True)
