@@ -1,19 +1,23 @@
-"""The simulated world of a rig: bodies, poses, dynamics and contacts. Simulation only."""
+"""The simulated world of a rig: bodies, poses, dynamics and contacts. Simulation only.
+
+:class:`World` is what research code holds as ``rig.world``; :class:`WorldDriver` is what a physics engine implements.
+"""
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from .errors import NotSupported
 from .geometry import Pose, frozen
-from .specs import BodySpec, to_json
+from .specs import BodySpec, WorldSpec, to_json
 
-__all__ = ["Contact", "NoWorld", "Poses", "World"]
+__all__ = ["Contact", "NoWorld", "Poses", "World", "WorldDriver"]
 
 Array = NDArray[np.float64]
 
@@ -184,6 +188,138 @@ class NoWorld:
 
     def __getattr__(self, name: str) -> Any:
         raise NotSupported("rig.world exists in simulation only: this rig has no simulated world")
+
+
+class WorldDriver(ABC):
+    """Driver of a simulated world, in the process that steps it; the devices of the same driver are views of it.
+
+    All methods are called from one thread, between two steps. The requests of ``rig.world`` take and return plain
+    numbers, lists and dicts, so that they can be sent as JSON:
+
+    =================  ======================================  ========================================================
+    request            parameters                              result
+    =================  ======================================  ========================================================
+    ``names``          none                                    names of the bodies, objects first, as they were added
+    ``describe``       ``name``                                ``index`` in segmentation images, ``robot`` (a bool),
+                                                               names of ``links`` and ``joints``
+    ``pose``           ``name``, ``link``                      ``position`` (3,) m and ``orientation`` (4,) xyzw of a
+                                                               link's own frame in the world; of the base for None
+    ``poses``          ``names``                               ``poses`` of bases by name and ``t``, s
+    ``velocity``       ``name``                                linear (3,) m/s, angular (3,) rad/s
+    ``dynamics``       ``name``, ``link``                      properties by name
+    ``contacts``       ``a``, ``b``                            the fields of each :class:`Contact`
+    ``aabb``           ``name``                                ``lower`` and ``upper`` (3,) m
+    ``add``            ``spec``, of a :class:`.BodySpec`       the new revision
+    ``remove``         ``name``                                the new revision
+    ``set_color``      ``name``, ``rgba``                      the new revision
+    ``set_pose``       ``name``, ``pose``                      none
+    ``set_velocity``   ``name``, ``linear``, ``angular``       none
+    ``set_dynamics``   ``name``, ``link``, properties          these properties as they were before
+    ``reset``          ``name``, ``pose``, ``q``               none
+    =================  ======================================  ========================================================
+
+    Args:
+        spec: Record of the world.
+
+    Raises:
+        ConfigError: Something in the record cannot be loaded; lists every problem.
+        DriverMissing: The physics engine is not installed.
+    """
+
+    REQUESTS: ClassVar[frozenset[str]] = frozenset(
+        {
+            *("names", "describe", "pose", "poses", "velocity", "dynamics", "contacts", "aabb"),
+            *("add", "remove", "set_color", "set_pose", "set_velocity", "set_dynamics", "reset"),
+        }
+    )
+    """Names of the requests."""
+    MIRRORED: ClassVar[frozenset[str]] = frozenset({"add", "remove", "set_color"})
+    """Requests that change what is drawn beyond poses. Each one that succeeds adds one to :attr:`revision`; what draws
+    the world repeats them, in their order, before it displays a snapshot of that revision."""
+
+    def __init__(self, spec: WorldSpec) -> None:
+        self.spec = spec
+        self.dt = 1.0 / spec.physics_hz
+        """One step, s."""
+        self.steps = 0
+        """Number of steps so far."""
+        self.revision = 0
+        """Number of edits of :attr:`MIRRORED` so far."""
+        self.warnings: list[str] = []
+        """Messages for the user about the files that were loaded."""
+
+    @property
+    def t(self) -> float:
+        """Simulated time, s."""
+        return self.steps * self.dt
+
+    @property
+    @abstractmethod
+    def version(self) -> tuple[int, int]:
+        """Changes whenever anything may look different: after a step, an edit or a reset."""
+
+    @abstractmethod
+    def step(self) -> None:
+        """Advance the world by :attr:`dt`."""
+
+    @abstractmethod
+    def request(self, method: str, params: Mapping[str, Any]) -> Any:
+        """Serve one of :attr:`REQUESTS`.
+
+        Args:
+            method: Name of the request.
+            params: Its parameters, as JSON.
+
+        Returns:
+            Its result, as JSON.
+
+        Raises:
+            DeviceNotFound: No body or link of that name; lists the existing ones.
+            CommandError: No such request, parameters that it does not take, or impossible numbers; nothing changes.
+            ConfigError: A body cannot be loaded; nothing changes.
+            NotSupported: The engine has no such quantity; the message has what to use instead.
+        """
+
+    @abstractmethod
+    def follow(self, name: str, q: Sequence[float], dq: Sequence[float], width: float | None = None) -> None:
+        """Place the mirror of a real arm where that arm is; to be called for every step, else the mirror stays.
+
+        Args:
+            name: An arm of the world that another driver moves.
+            q: Joint positions (n,), rad.
+            dq: Joint speeds (n,) during the next step, rad/s.
+            width: Width of its gripper, m; None if it is unknown.
+
+        Raises:
+            DeviceNotFound: No such body.
+            CommandError: The arm is simulated, or the numbers are not n finite ones. The mirror stays.
+        """
+
+    @abstractmethod
+    def snapshot(self) -> list[float]:
+        """Return the poses of all bodies, in a layout that does not depend on the engine.
+
+        First the base poses of all bodies with a fixed base, then, for each other body or body with joints, in the
+        order of ``names``: the pose of its base unless that is fixed, and the positions of its movable joints (rad or
+        m) in the order of its URDF. A pose has 7 numbers, position (3,) m and orientation (4,) xyzw of the base link's
+        own frame in the world.
+        """
+
+    @abstractmethod
+    def on_reset(self, name: str, callback: Callable[[], None]) -> None:
+        """Call ``callback`` after each reset of the robot of that name."""
+
+    @abstractmethod
+    def off_reset(self, name: str, callback: Callable[[], None]) -> None:
+        """Remove a callback of :meth:`on_reset`."""
+
+    @abstractmethod
+    def on_edit(self, callback: Callable[[str, dict[str, Any], int], None]) -> None:
+        """Call ``callback`` with the method, the parameters and the new revision after each edit that is mirrored."""
+
+    @abstractmethod
+    def close(self) -> None:
+        """Delete the world and free its memory. Idempotent."""
 
 
 def _pose(data: Mapping[str, Any] | Sequence[Any]) -> Pose:

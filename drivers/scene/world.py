@@ -1,0 +1,512 @@
+"""The base of every simulated world: the requests of ``rig.world``, their checks, errors, edits and resets.
+
+An engine subclasses :class:`SimulatedWorld` and fills in the protected methods; it only gets bodies and numbers that
+exist and make sense.
+"""
+
+from __future__ import annotations
+
+import inspect
+from abc import abstractmethod
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from itertools import combinations
+from typing import Any, ClassVar, Generic, TypeVar
+
+from hal.errors import CommandError, ConfigError, DeviceNotFound, NotSupported, Problem
+from hal.geometry import Transform
+from hal.specs import BodySpec, RobotSpec, WorldSpec, to_json
+from hal.world import WorldDriver
+
+from .values import (
+    body_spec,
+    completed_dynamics,
+    dynamics_values,
+    nearest,
+    numbers,
+    pose_json,
+    same_value,
+    transform,
+)
+
+__all__ = ["IDENTITY", "SimulatedBody", "SimulatedWorld"]
+
+IDENTITY: Transform = ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
+OVERLAP = 0.005
+"""Depth, m, from which on two arms that overlap at the start are refused."""
+
+
+@dataclass(kw_only=True)
+class SimulatedBody:
+    """A robot or an object of a simulated world. Links and joints have numbers, by which the engine finds them."""
+
+    name: str
+    spec: BodySpec | RobotSpec
+    links: dict[str, int]
+    """Numbers of the links by name; the first one is the base link."""
+    joints: dict[str, int]
+    """Numbers of all joints by name, including fixed ones."""
+    movable: tuple[int, ...]
+    """Numbers of the joints that move, in the order of the URDF."""
+    floating: bool
+    """Whether physics can move its base."""
+    home: dict[int, float] = field(default_factory=dict)
+    """Initial position of each movable joint: rad, or m."""
+    base: Transform = IDENTITY
+    """Initial pose of the base link in the world; in the frame of the arm's link for an object that is attached."""
+    index: int = -1
+    """Its place among the world's bodies: its value in segmentation images."""
+
+    def __post_init__(self) -> None:
+        self.link_names = {number: name for name, number in self.links.items()}
+
+    @property
+    def is_robot(self) -> bool:
+        """Whether this is an arm."""
+        return isinstance(self.spec, RobotSpec)
+
+    @property
+    def carried(self) -> bool:
+        """Whether it is attached to a link of an arm."""
+        return isinstance(self.spec, BodySpec) and self.spec.robot is not None
+
+    @property
+    def roams(self) -> bool:
+        """Whether its base may be elsewhere after the next step."""
+        return self.floating or self.carried
+
+    @property
+    def moves(self) -> bool:
+        """Whether its base or any joint may move."""
+        return self.roams or bool(self.movable)
+
+
+B = TypeVar("B", bound=SimulatedBody)
+
+
+class SimulatedWorld(WorldDriver, Generic[B]):
+    """A world of a physics engine, without the engine.
+
+    An engine's ``__init__`` prepares the engine and calls :meth:`_load` with all bodies and robots of the record, and
+    :meth:`_check_overlaps`.
+    """
+
+    ENGINE: ClassVar[str]
+    """Name of the engine for messages."""
+    UNSUPPORTED: ClassVar[Mapping[str, str]] = {}
+    """Dynamics that the engine does not have -> what to set instead."""
+
+    def __init__(self, spec: WorldSpec) -> None:
+        super().__init__(spec)
+        self.bodies: dict[str, B] = {}
+        self._changes = 0
+        """Changes of poses other than by steps, and of looks."""
+        self._on_reset: dict[str, list[Callable[[], None]]] = {}
+        self._on_edit: list[Callable[[str, dict[str, Any], int], None]] = []
+
+    # --- what an engine implements -----------------------------------------------------------------------------------
+
+    @abstractmethod
+    def _place(self, spec: BodySpec | RobotSpec) -> B:
+        """Load a body, whose name is new, into the engine. It need not stand at its initial pose yet.
+
+        Raises:
+            ConfigError: It cannot be loaded; nothing of it stays. Lists all problems.
+        """
+
+    @abstractmethod
+    def _arrange(self, added: Sequence[B]) -> None:
+        """Complete the world after bodies were added, before they are put home, or removed; ``bodies`` are up to date.
+
+        Objects that are attached (:meth:`_attachments`) leave physics here: they have no weight and touch nothing.
+        """
+
+    @abstractmethod
+    def _take_out(self, body: B) -> None:
+        """Remove a body from the engine; :meth:`_arrange` follows."""
+
+    @abstractmethod
+    def _follow_attached(self) -> None:
+        """Place every object that is attached at its link of an arm, after a step or a reset."""
+
+    @abstractmethod
+    def _deepest_overlap(self, a: B, b: B) -> tuple[float, str, str]:
+        """Return how deep two bodies overlap, m, 0 if they are apart, and by which link of each."""
+
+    @abstractmethod
+    def _read_pose(self, body: B, link: int) -> Transform:
+        """Return the pose in the world of a link's own frame."""
+
+    @abstractmethod
+    def _read_velocity(self, body: B) -> tuple[Sequence[float], Sequence[float]]:
+        """Return the velocity in the world: linear (3,) m/s of the base link's centre of mass, angular (3,) rad/s."""
+
+    @abstractmethod
+    def _move_base(self, body: B, pose: Transform) -> None:
+        """Place the base link there, at rest; its joints keep their positions."""
+
+    @abstractmethod
+    def _move_joints(self, body: B, positions: Mapping[int, float]) -> None:
+        """Place these joints (rad or m) at rest; those of a robot then hold there."""
+
+    @abstractmethod
+    def _set_velocity(self, body: B, linear: Sequence[float], angular: Sequence[float]) -> None:
+        """Set the velocity of a free base, as of :meth:`_read_velocity`."""
+
+    @abstractmethod
+    def _read_dynamics(self, body: B, link: int) -> dict[str, Any]:
+        """Return :data:`.values.DYNAMICS` of a link, without those of :attr:`UNSUPPORTED`."""
+
+    @abstractmethod
+    def _write_dynamics(self, body: B, link: int, values: Mapping[str, Any], before: Mapping[str, Any]) -> None:
+        """Set properties of a link; ``before`` is what :meth:`_read_dynamics` returned just before."""
+
+    @abstractmethod
+    def _forget(self, bodies: Sequence[B]) -> None:
+        """Clear what the solver keeps from one step to the next about these bodies.
+
+        Called before they are reset, so that the steps after it repeat those after the start, and after their dynamics
+        have changed, so that these act at once.
+        """
+
+    @abstractmethod
+    def _find_contacts(self, a: B | None, b: B | None) -> list[dict[str, Any]]:
+        """Return the contacts of the last step, as :meth:`contacts` does; None stands for any body."""
+
+    @abstractmethod
+    def _bounding_box(self, body: B) -> tuple[list[float], list[float]]:
+        """Return the lower and upper corner (3,) m of the box along the world's axes around a body."""
+
+    @abstractmethod
+    def _is_mirrored(self, body: B) -> bool:
+        """Return whether another driver moves this arm."""
+
+    @abstractmethod
+    def _follow(self, body: B, q: list[float], dq: list[float], width: float | None) -> None:
+        """Place the mirror of a real arm; the numbers are checked."""
+
+    def _paint(self, body: B, rgba: list[float]) -> None:  # noqa: B027  # most engines draw nothing
+        """Change the colour of a body, where the engine itself draws."""
+
+    # --- loading -----------------------------------------------------------------------------------------------------
+
+    def _load(self, specs: Sequence[BodySpec | RobotSpec]) -> None:
+        """Load bodies and put them home; raises ConfigError with the problems of all of them."""
+        problems: list[Problem] = []
+        added: list[B] = []
+        for spec in specs:
+            if spec.name in self.bodies:
+                message = "names two bodies; names must be unique in the world"
+                problems.append(Problem("world", spec.name, message, "duplicate_name"))
+                continue
+            try:
+                added.append(self._place(spec))
+                self.bodies[spec.name] = added[-1]
+            except ConfigError as error:
+                problems.extend(error.problems)
+        problems = problems or self._attachment_problems(specs)
+        if problems:
+            raise ConfigError(problems)
+        self._renumber()
+        self._arrange(added)
+        for body in added:
+            self._put_home(body)
+        self._follow_attached()
+
+    def _renumber(self) -> None:
+        for index, body in enumerate(self.bodies.values()):
+            body.index = index
+
+    def _attachment_problems(self, specs: Iterable[BodySpec | RobotSpec]) -> list[Problem]:
+        """Return what is wrong with objects that are attached: a missing arm or link, or something else than an arm."""
+        arms = [name for name, body in self.bodies.items() if body.is_robot]
+        problems = []
+        for spec in specs:
+            if not isinstance(spec, BodySpec) or spec.robot is None:
+                continue
+            key = f"objects.{spec.name}.attached"
+            if spec.robot not in arms:
+                text = f"no arm {spec.robot!r}{nearest(spec.robot, arms)}"
+                problems.append(Problem("objects", f"{key}.robot", text, "unknown_device"))
+            elif spec.link is not None and spec.link not in (links := self.bodies[spec.robot].links):
+                text = f"robot {spec.robot!r} has no link {spec.link!r}{nearest(spec.link, links)}"
+                problems.append(Problem("objects", f"{key}.link", text, "unknown_link"))
+        return problems
+
+    def _attachments(self) -> list[tuple[B, B, int]]:
+        """Return each attached object, its arm, and the number of the arm's link."""
+        found = []
+        for body in self.bodies.values():
+            spec = body.spec
+            if isinstance(spec, BodySpec) and spec.robot is not None:
+                arm = self.bodies[spec.robot]
+                found.append((body, arm, self.link(arm, spec.link)))
+        return found
+
+    def _check_overlaps(self) -> None:
+        """Refuse arms that overlap at the start: the solver would throw them apart."""
+        robots = [body for body in self.bodies.values() if body.is_robot and not self._is_mirrored(body)]
+        problems = []
+        for a, b in combinations(robots, 2):
+            depth, link_a, link_b = self._deepest_overlap(a, b)
+            if depth > OVERLAP:
+                message = f"starts {depth:.3f} m inside robot {a.name!r} (its {link_b} in {link_a})"
+                remedy = "change its base or initial; a URDF with two arms is loaded whole for every entry: split it"
+                problems.append(Problem("simulation", f"robots.{b.name}", f"{message}; {remedy}", "robots_overlap"))
+        if problems:
+            raise ConfigError(problems)
+
+    # --- requests of rig.world ---------------------------------------------------------------------------------------
+
+    def request(self, method: str, params: Mapping[str, Any]) -> Any:
+        if method not in self.REQUESTS:
+            raise CommandError(f"the world has no request {method!r}; requests: {', '.join(sorted(self.REQUESTS))}")
+        function = getattr(self, method)
+        try:
+            return function(**params)
+        except TypeError:
+            try:
+                inspect.signature(function).bind(**params)
+            except TypeError as error:
+                raise CommandError(f"world.{method}: {error}") from None
+            raise
+
+    def names(self) -> list[str]:
+        """Return the names of all bodies, objects first, in the order in which they were added."""
+        return list(self.bodies)
+
+    def describe(self, name: str) -> dict[str, Any]:
+        """Return ``index`` (in segmentation images), ``robot`` (a bool), and the names of ``links`` and ``joints``."""
+        body = self.body(name)
+        return {"index": body.index, "robot": body.is_robot, "links": list(body.links), "joints": list(body.joints)}
+
+    def pose(self, name: str, link: str | None = None) -> dict[str, list[float]]:
+        """Return the pose of a link's frame in the world; of the base link when none is named."""
+        body = self.body(name)
+        return pose_json(self._read_pose(body, self.link(body, link)))
+
+    def poses(self, names: Sequence[str] | None = None) -> dict[str, Any]:
+        """Return ``poses`` of base links by name, of all bodies for None, and ``t``, the simulated time, s."""
+        found = self.bodies.values() if names is None else [self.body(name) for name in names]
+        poses = {body.name: pose_json(self._read_pose(body, self.link(body, None))) for body in found}
+        return {"t": self.t, "poses": poses}
+
+    def set_pose(self, name: str, pose: Mapping[str, Sequence[float]]) -> None:
+        """Place an object's base link there, at rest, without a check for overlaps; its joints keep their positions."""
+        body = self.body(name)
+        if body.is_robot:
+            raise CommandError(f"{name!r} is a robot: its servo moves it, and reset() puts it back", code="is_robot")
+        self._expect_free(body)
+        there = transform(pose)
+        self._changes += 1
+        self._move_base(body, there)
+
+    def velocity(self, name: str) -> list[list[float]]:
+        """Return the velocity in the world: linear (3,) m/s of the base link's centre of mass, angular (3,) rad/s."""
+        return [list(part) for part in self._read_velocity(self.body(name))]
+
+    def set_velocity(
+        self, name: str, linear: Sequence[float] = (0.0, 0.0, 0.0), angular: Sequence[float] = (0.0, 0.0, 0.0)
+    ) -> None:
+        """Set the velocity, as :meth:`velocity` returns it, of a body with a free base."""
+        body = self.body(name)
+        if not body.floating:
+            raise CommandError(f"the base of {name!r} is fixed: it has no velocity to set", code="base_fixed")
+        self._set_velocity(body, numbers("linear", linear, 3), numbers("angular", angular, 3))
+
+    def dynamics(self, name: str, link: str | None = None) -> dict[str, Any]:
+        """Return those of :data:`.values.DYNAMICS` that the engine has."""
+        body = self.body(name)
+        return self._read_dynamics(body, self.link(body, link))
+
+    def set_dynamics(self, name: str, link: str | None = None, **values: Any) -> dict[str, Any]:
+        """Set some values of :meth:`dynamics`, check that the engine took them, and return the previous ones.
+
+        A new mass scales the inertia with it unless an inertia is given.
+        """
+        body = self.body(name)
+        number = self.link(body, link)
+        wanted = dynamics_values(name, values)
+        for key in wanted:
+            if key in self.UNSUPPORTED:
+                raise NotSupported(f"{self.ENGINE} has no {key}: {self.UNSUPPORTED[key]}", code="no_such_quantity")
+        before = self._read_dynamics(body, number)
+        wanted = completed_dynamics(name, wanted, before)
+        self._write_dynamics(body, number, wanted, before)
+        after = self._read_dynamics(body, number)
+        for key, value in wanted.items():
+            if not same_value(after[key], value):
+                raise NotSupported(f"{self.ENGINE} did not take {key} = {value} for {name!r}: it holds {after[key]}")
+        self._forget([body])
+        return {key: before[key] for key in wanted}
+
+    def contacts(self, a: str | None = None, b: str | None = None) -> list[dict[str, Any]]:
+        """Return the contacts of the last step: all, those of ``a``, or those between ``a`` and ``b``.
+
+        Each is a dict of ``a``, ``b``, ``link_a``, ``link_b``, ``position`` (3,) m on ``b``, ``normal`` (3,) from ``b``
+        towards ``a``, ``distance`` m, negative where they overlap, and ``force`` N along the normal.
+        """
+        if a is None:
+            a, b = b, None
+        first, second = (None if name is None else self.body(name) for name in (a, b))
+        return self._find_contacts(first, second)
+
+    def aabb(self, name: str) -> dict[str, list[float]]:
+        """Return ``lower`` and ``upper`` (3,) m, the corners of the box along the world's axes around the body.
+
+        It may be larger by the engine's collision margin (mm).
+        """
+        lower, upper = self._bounding_box(self.body(name))
+        return {"lower": lower, "upper": upper}
+
+    def add(self, spec: Mapping[str, Any] | BodySpec) -> int:
+        """Add an object and return the new revision."""
+        record = spec if isinstance(spec, BodySpec) else body_spec(spec)
+        problems = self._attachment_problems([record])
+        if problems:
+            raise ConfigError(problems)
+        self._load([record])
+        return self._edited("add", spec=to_json(record))
+
+    def remove(self, name: str) -> int:
+        """Remove an object, not a robot, and return the new revision."""
+        body = self.body(name)
+        if body.is_robot:
+            raise CommandError(f"{name!r} is a robot: robots stay in the world", code="is_robot")
+        self._take_out(body)
+        del self.bodies[name]
+        self._renumber()
+        self._arrange(())
+        return self._edited("remove", name=name)
+
+    def set_color(self, name: str, rgba: Sequence[float]) -> int:
+        """Set the colour of all links of a body (red, green, blue, alpha in 0..1) and return the new revision."""
+        body = self.body(name)
+        color = numbers("rgba", rgba, 4)
+        if not all(0.0 <= value <= 1.0 for value in color):
+            raise CommandError(f"rgba of {name!r} must be numbers in 0..1, not {color}")
+        self._paint(body, color)
+        return self._edited("set_color", name=name, rgba=color)
+
+    def _edited(self, method: str, **params: Any) -> int:
+        self._changes += 1
+        self.revision += 1
+        for callback in self._on_edit:
+            callback(method, params, self.revision)
+        return self.revision
+
+    def reset(
+        self,
+        name: str | None = None,
+        pose: Mapping[str, Sequence[float]] | None = None,
+        q: Sequence[float] | None = None,
+    ) -> None:
+        """Reset one body, or all, at rest, to their initial state in the rig or to these arguments.
+
+        An arm holds its position and its gripper is open. The mirror of a real arm stays where that arm is. Added and
+        removed bodies, colours and dynamics are kept, and simulated time continues.
+
+        Args:
+            name: The body; None for all.
+            pose: Pose of an object's base link in the world; only with a name.
+            q: Joint positions, rad or m; only with a name. For an arm, those of its joints, or of its joints and
+                fingers; for an object, those of all its movable joints.
+        """
+        if name is None:
+            if pose is not None or q is not None:
+                raise CommandError("reset with a pose or with q needs the name of a body", code="name_missing")
+            everything = list(self.bodies.values())
+            self._forget(everything)
+            for body in everything:
+                if not self._is_mirrored(body):
+                    self._put_home(body)
+            self._follow_attached()
+            return
+        body = self.body(name)
+        if self._is_mirrored(body):
+            raise CommandError(f"{name!r} mirrors a real arm; move that", code="is_mirrored")
+        base = body.base
+        if pose is not None:
+            if body.is_robot:
+                raise CommandError(f"{name!r} is a robot: its base is fixed by the rig", code="is_robot")
+            self._expect_free(body)
+            base = transform(pose)
+        joints = body.home if q is None else {**body.home, **_joint_positions(body, q)}
+        self._forget([body])
+        self._put(body, base, joints)
+        self._follow_attached()
+
+    def _expect_free(self, body: B) -> None:
+        if body.carried:
+            raise CommandError(f"{body.name!r} is attached to an arm: it follows that arm", code="is_attached")
+
+    def _put_home(self, body: B) -> None:
+        self._put(body, body.base, body.home)
+
+    def _put(self, body: B, base: Transform, joints: Mapping[int, float]) -> None:
+        self._changes += 1
+        if not body.carried:
+            self._move_base(body, base)
+        self._move_joints(body, joints)
+        for callback in self._on_reset.get(body.name, ()):
+            callback()
+
+    # --- for drivers and views ---------------------------------------------------------------------------------------
+
+    @property
+    def version(self) -> tuple[int, int]:
+        return self.steps, self._changes
+
+    def follow(self, name: str, q: Sequence[float], dq: Sequence[float], width: float | None = None) -> None:
+        body = self.body(name)
+        if not self._is_mirrored(body):
+            raise CommandError(f"{name!r} is not the mirror of a real arm", code="not_mirrored")
+        assert isinstance(body.spec, RobotSpec)
+        count = len(body.spec.joints)
+        positions, speeds = numbers(f"q of {name!r}", q, count), numbers(f"dq of {name!r}", dq, count)
+        if width is not None:
+            (width,) = numbers(f"the width of {name!r}", [width])
+        self._follow(body, positions, speeds, width)
+        self._changes += 1
+
+    def body(self, name: str) -> B:
+        """Return the body of that name; raises DeviceNotFound, which lists all."""
+        body = self.bodies.get(name)
+        if body is None:
+            raise DeviceNotFound(f"the world has no body {name!r}{nearest(name, self.bodies)}", code="unknown_body")
+        return body
+
+    def link(self, body: B, name: str | None) -> int:
+        """Return the number of a link by name, that of the base link for None; raises DeviceNotFound."""
+        if name is None:
+            return next(iter(body.links.values()))
+        if name not in body.links:
+            raise DeviceNotFound(f"{body.name!r} has no link {name!r}{nearest(name, body.links)}", code="unknown_link")
+        return body.links[name]
+
+    def on_reset(self, name: str, callback: Callable[[], None]) -> None:
+        self._on_reset.setdefault(name, []).append(callback)
+
+    def off_reset(self, name: str, callback: Callable[[], None]) -> None:
+        self._on_reset[name].remove(callback)
+
+    def on_edit(self, callback: Callable[[str, dict[str, Any], int], None]) -> None:
+        self._on_edit.append(callback)
+
+
+def _joint_positions(body: SimulatedBody, q: Sequence[float]) -> dict[int, float]:
+    """Return joint number -> position for the ``q`` of a reset.
+
+    ``q`` has an arm's joints, optionally its fingers after them; for an object, all its movable joints. Raises
+    CommandError.
+    """
+    values = numbers("q", q)
+    joints, fingers = list(body.movable), []
+    if isinstance(body.spec, RobotSpec):
+        joints = [body.joints[name] for name in body.spec.joints]
+        fingers = [body.joints[name] for name in body.spec.gripper.joints] if body.spec.gripper else []
+    if len(values) == len(joints) + len(fingers):
+        joints += fingers
+    if len(values) != len(joints):
+        raise CommandError(f"q of {body.name!r} must be {len(joints)} numbers, not {len(values)}", code="wrong_size")
+    return dict(zip(joints, values, strict=True))
