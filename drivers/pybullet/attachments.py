@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 
-from hal.errors import ConfigError, Problem
 from hal.geometry import compose
-from hal.specs import BodySpec, RobotSpec
+from hal.specs import RobotSpec
 
-from .engine import Body, PyBulletClient, nearest, numbers
+from .engine import Body, PyBulletClient
 from .motors import position_gain
 
 __all__ = [
@@ -22,32 +21,14 @@ class AttachedObjects:
 
     They take no part in the physics: they have no weight and touch nothing.
 
-    Raises:
-        ConfigError: An object is attached to a missing arm or link, or to something else than an arm; lists all.
+    Args:
+        client: The world.
+        places: Each object, its arm, and the index of the arm's link.
     """
 
-    def __init__(self, client: PyBulletClient, bodies: Mapping[str, Body]) -> None:
+    def __init__(self, client: PyBulletClient, places: Sequence[tuple[Body, Body, int]]) -> None:
         self._client = client
-        self._places: list[tuple[Body, Body, int]] = []
-        problems: list[Problem] = []
-        for body in bodies.values():
-            spec = body.spec
-            if not isinstance(spec, BodySpec) or spec.robot is None:
-                continue
-            arms = [name for name, other in bodies.items() if other.is_robot]
-            key = f"objects.{body.name}.attached"
-            if spec.robot not in arms:
-                text = f"no arm {spec.robot!r}{nearest(spec.robot, arms)}"
-                problems.append(Problem("objects", f"{key}.robot", text, "unknown_device"))
-                continue
-            arm = bodies[spec.robot]
-            if spec.link is not None and spec.link not in arm.links:
-                text = f"robot {spec.robot!r} has no link {spec.link!r}{nearest(spec.link, arm.links)}"
-                problems.append(Problem("objects", f"{key}.link", text, "unknown_link"))
-                continue
-            self._places.append((body, arm, -1 if spec.link is None else arm.links[spec.link]))
-        if problems:
-            raise ConfigError(problems)
+        self._places = places
 
     def leave_physics(self, bodies: Iterable[Body]) -> None:
         """Disable the contacts of those of these bodies that are attached."""
@@ -98,12 +79,10 @@ class MirroredArm:
         """Whether its fingers have been placed at the arm's width once."""
         self._hold()
 
-    def follow(self, q: Sequence[float], dq: Sequence[float], width: float | None) -> None:
-        """Take the state of the arm: see :meth:`.world.PyBulletWorld.follow`."""
-        name, count = self._body.name, len(self._joints)
-        positions, speeds = numbers(f"q of {name!r}", q, count), numbers(f"dq of {name!r}", dq, count)
+    def follow(self, positions: list[float], speeds: list[float], width: float | None) -> None:
+        """Take the state of the arm: see :meth:`hal.world.WorldDriver.follow`."""
         if width is not None and self._fingers:
-            self._follow_width(numbers(f"the width of {name!r}", [width])[0] / 2.0)
+            self._follow_width(width / 2.0)
         client = self._client
         client.resetJointStatesMultiDof(self._body.id, self._joints, _singly(positions), _singly(speeds))
         client.setJointMotorControlArray(

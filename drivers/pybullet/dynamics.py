@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable, Mapping
 from typing import Any
-
-from hal.errors import CommandError, NotSupported
 
 from .engine import Body, PyBulletClient
 
@@ -31,7 +28,6 @@ _SCALARS = {
 }
 _CONTACT = ("contact_stiffness", "contact_damping")
 _DAMPING = ("linear_damping", "angular_damping")
-_NAMES = (*_SCALARS, "inertia", *_DAMPING)
 _HARD = 1e9
 """Stiffness of a rigid contact, N/m."""
 _DEFAULT_ERP = 0.2
@@ -41,12 +37,9 @@ FAR = 1000.0
 
 
 def read_dynamics(client: PyBulletClient, body: Body, link: int) -> dict[str, Any]:
-    """Return the dynamics of a link.
+    """Return the dynamics of a link, :data:`~hal.drivers.scene.values.DYNAMICS`.
 
-    ``mass`` kg; ``inertia`` (3,) kg m2 about the principal axes; ``lateral_friction``, ``rolling_friction``,
-    ``spinning_friction`` and ``restitution``, without units; ``contact_stiffness`` N/m and ``contact_damping`` Ns/m,
-    None where contacts are as hard as the solver can make them; ``linear_damping`` and ``angular_damping`` 1/s, of the
-    whole body (PyBullet does not report these two: they are the values that were set last).
+    PyBullet does not report ``linear_damping`` and ``angular_damping``: they are the values that were set last.
     """
     info = client.getDynamicsInfo(body.id, link)
     values: dict[str, Any] = {name: float(info[place]) for name, (_, place) in _SCALARS.items()}
@@ -58,70 +51,21 @@ def read_dynamics(client: PyBulletClient, body: Body, link: int) -> dict[str, An
 
 
 def write_dynamics(
-    client: PyBulletClient, body: Body, link: int, values: Mapping[str, Any], dt: float
-) -> dict[str, Any]:
-    """Set some of the values of :func:`read_dynamics` and check that PyBullet took them.
+    client: PyBulletClient, body: Body, link: int, wanted: Mapping[str, Any], before: Mapping[str, Any], dt: float
+) -> None:
+    """Set some of the values of :func:`read_dynamics`.
 
-    A new mass scales the inertia with it unless an inertia is given (PyBullet alone would replace the URDF's inertia
-    by that of the collision shape).
+    A new mass needs an inertia beside it: PyBullet alone would replace the URDF's by that of the collision shape. It
+    takes contact_stiffness and contact_damping only together.
 
     Args:
         client: The world.
         body: The body.
         link: Index of the link.
-        values: New values by name.
+        wanted: New values by name.
+        before: The present values.
         dt: The physics step, s.
-
-    Returns:
-        The previous values, to be passed here to restore them.
-
-    Raises:
-        CommandError: An unknown name, an impossible number, or a mass that would make a fixed body movable or the
-            reverse. Nothing was set.
-        NotSupported: PyBullet did not take a value.
     """
-    wanted = _checked(body, link, values)
-    before = read_dynamics(client, body, link)
-    if "mass" in wanted:
-        if (wanted["mass"] > 0.0) != (before["mass"] > 0.0):
-            raise CommandError(f"the mass of {body.name!r} cannot change between 0 (fixed) and more")
-        scale = wanted["mass"] / before["mass"] if before["mass"] > 0.0 else 0.0
-        wanted.setdefault("inertia", [value * scale for value in before["inertia"]])
-    if any(name in wanted for name in _CONTACT):  # PyBullet takes the two only together
-        for name in _CONTACT:
-            wanted.setdefault(name, before[name])
-        if (wanted["contact_stiffness"] is None) != (wanted["contact_damping"] is None):
-            raise CommandError("contact_stiffness and contact_damping are set together, or both None")
-    _apply(client, body, link, wanted, before, dt)
-
-    after = read_dynamics(client, body, link)
-    for name, value in wanted.items():
-        if not _same(after[name], value):
-            raise NotSupported(f"PyBullet did not take {name} = {value} for {body.name!r}: it holds {after[name]}")
-    return {name: before[name] for name in wanted}
-
-
-def _checked(body: Body, link: int, values: Mapping[str, Any]) -> dict[str, Any]:
-    wanted: dict[str, Any] = {}
-    for name, value in values.items():
-        if name not in _NAMES:
-            raise CommandError(f"unknown property {name!r} of a link; properties: {', '.join(_NAMES)}")
-        if value is None and name in _CONTACT:
-            wanted[name] = None
-            continue
-        try:
-            numbers = [float(item) for item in value] if name == "inertia" else [float(value)]
-        except (TypeError, ValueError):
-            raise CommandError(f"{name} of {body.name!r} must be a number, not {value!r}") from None
-        if (name == "inertia" and len(numbers) != 3) or not all(math.isfinite(x) and x >= 0.0 for x in numbers):
-            raise CommandError(f"{name} of {body.name!r} must be finite and at least 0, not {value!r}")
-        wanted[name] = numbers if name == "inertia" else numbers[0]
-    return wanted
-
-
-def _apply(
-    client: PyBulletClient, body: Body, link: int, wanted: dict[str, Any], before: dict[str, Any], dt: float
-) -> None:
     arguments = {_SCALARS[n][0]: v for n, v in wanted.items() if n in _SCALARS and n not in _CONTACT}
     if "inertia" in wanted:
         arguments["localInertiaDiagonal"] = wanted["inertia"]
@@ -146,21 +90,13 @@ def _apply(
         body.hardened.add(link)
 
 
-def _same(a: Any, b: Any) -> bool:
-    if isinstance(a, list):
-        return all(_same(x, y) for x, y in zip(a, b, strict=True))
-    if a is None or b is None:
-        return a is b
-    return math.isclose(a, b, rel_tol=1e-9, abs_tol=1e-12)
-
-
 # --- contacts -------------------------------------------------------------------------------------------------------
 
 
 def find_contacts(
     client: PyBulletClient, bodies: Iterable[Body], a: Body | None, b: Body | None
 ) -> list[dict[str, Any]]:
-    """Return the contacts of the last step, as :meth:`.world.PyBulletWorld.contacts` does; None stands for any body."""
+    """Return the contacts of the last step, as :meth:`.SimulatedWorld.contacts` does; None stands for any body."""
     chosen = {key: body.id for key, body in (("bodyA", a), ("bodyB", b)) if body is not None}
     by_id = {body.id: body for body in bodies}
     found = []
@@ -170,8 +106,8 @@ def find_contacts(
             {
                 "a": one.name,
                 "b": other.name,
-                "link_a": one.link_names[contact[3]],
-                "link_b": other.link_names[contact[4]],
+                "link_a": one.link_name(contact[3]),
+                "link_b": other.link_name(contact[4]),
                 "position": list(contact[6]),
                 "normal": list(contact[7]),
                 "distance": contact[8],
@@ -187,7 +123,7 @@ def deepest_overlap(client: PyBulletClient, a: Body, b: Body) -> tuple[float, st
     if not points:
         return 0.0, "", ""
     deepest = min(points, key=lambda point: point[8])
-    return max(0.0, -deepest[8]), a.link_names[deepest[3]], b.link_names[deepest[4]]
+    return max(0.0, -deepest[8]), a.link_name(deepest[3]), b.link_name(deepest[4])
 
 
 def bounding_box(client: PyBulletClient, body: Body) -> tuple[list[float], list[float]]:

@@ -1,4 +1,4 @@
-"""PyBullet for one world: the library, the bodies that it holds, and how values from outside are checked.
+"""PyBullet for one world: the library, and the bodies that it holds.
 
 PyBullet is imported when it is first used, and what its C code prints is kept off the terminal.
 """
@@ -6,12 +6,10 @@ PyBullet is imported when it is first used, and what its C code prints is kept o
 from __future__ import annotations
 
 import ctypes
-import difflib
-import math
 import os
 import sys
 import tempfile
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from functools import partial
@@ -20,9 +18,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hal.errors import CommandError, DriverMissing
+from hal.drivers.scene.world import SimulatedBody
+from hal.errors import DriverMissing
 from hal.geometry import Transform, compose, inverse
-from hal.specs import BodySpec, RobotSpec, from_json
 
 from .scene import Visual
 
@@ -31,16 +29,9 @@ __all__ = [
     "CapturedOutput",
     "Gear",
     "PyBulletClient",
-    "body_spec",
-    "joint_positions",
     "link_frames",
-    "listed",
     "load_pybullet",
-    "nearest",
-    "numbers",
-    "pose_json",
     "silenced",
-    "transform",
     "visuals_of",
 ]
 
@@ -193,67 +184,29 @@ class Gear:
             self._number = None
 
 
-@dataclass
-class Body:
-    """A robot or an object: its PyBullet number, its names, and the frame in which its pose is given.
+@dataclass(kw_only=True)
+class Body(SimulatedBody):
+    """A robot or an object, with its PyBullet number, and the frame in which its pose is given.
 
-    PyBullet keeps a body's pose in the frame of its base link's *centre of mass* (its "inertial frame"); everything
-    else uses the base link's own frame. ``inertial`` is the constant transform between the two.
+    Links and joints have PyBullet's indices; that of the base link is -1. PyBullet keeps a body's pose in the frame of
+    its base link's *centre of mass* (its "inertial frame"); everything else uses the base link's own frame.
+    ``inertial`` is the constant transform between the two.
     """
 
-    name: str
     id: int
     """PyBullet's number."""
-    spec: BodySpec | RobotSpec
-    links: dict[str, int]
-    """Link indices by name; the base link is -1."""
-    joints: dict[str, int]
-    """Indices of all joints by name, including fixed ones."""
-    movable: tuple[int, ...]
-    """Indices of the joints that move."""
-    floating: bool
-    """Whether physics can move its base."""
     inertial: Transform
     """The centre of mass's frame in the frame of the base link."""
-    index: int = -1
-    """Its place among the world's bodies: its value in segmentation images."""
-    home: dict[int, float] = field(default_factory=dict)
-    """Initial position of each movable joint: rad, or m."""
     efforts: dict[int, float] = field(default_factory=dict)
     """Greatest torque or force of each driven joint: Nm, or N."""
     speeds: dict[int, float] = field(default_factory=dict)
     """Greatest speed of each driven joint: rad/s, or m/s."""
-    base: Transform = ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
-    """Initial pose of the base link in the world."""
     damping: tuple[float, float] = (0.04, 0.04)
     """Linear and angular damping. PyBullet does not report them; 0.04 is its default."""
     gears: list[Gear] = field(default_factory=list)
     """Couplings between joints that move together (fingers)."""
     hardened: set[int] = field(default_factory=set)
     """Links whose contacts were made soft and then hard again (see :mod:`.dynamics`)."""
-
-    def __post_init__(self) -> None:
-        self.link_names = {index: name for name, index in self.links.items()}
-
-    @property
-    def is_robot(self) -> bool:
-        """Whether this is an arm."""
-        return isinstance(self.spec, RobotSpec)
-
-    @property
-    def carried(self) -> bool:
-        """Whether it is attached to a link of an arm."""
-        return isinstance(self.spec, BodySpec) and self.spec.robot is not None
-
-    @property
-    def roams(self) -> bool:
-        """Whether its base may be elsewhere after the next step."""
-        return self.floating or self.carried
-
-    @property
-    def moves(self) -> bool:
-        """Whether its base or any joint may move."""
-        return self.roams or bool(self.movable)
 
     def base_pose(self, client: PyBulletClient) -> Transform:
         """Return the pose of the base link in the world."""
@@ -329,80 +282,3 @@ def _matrices(poses: NDArray[np.float64]) -> NDArray[np.float64]:
     matrices[:, :3, 3] = poses[:, :3]
     matrices[:, 3, 3] = 1
     return matrices
-
-
-# --- values from outside ---------------------------------------------------------------------------------------------
-
-
-def numbers(name: str, values: Any, size: int | None = None) -> list[float]:
-    """Return ``values`` as ``size`` finite floats; raises CommandError for anything else."""
-    try:
-        floats = [float(value) for value in values]
-    except (TypeError, ValueError):
-        raise CommandError(f"{name} must be {size or 'some'} numbers, not {values!r}") from None
-    if size is not None and len(floats) != size:
-        raise CommandError(f"{name} must be {size} numbers, not {len(floats)}", code="wrong_size")
-    if not all(map(math.isfinite, floats)):
-        raise CommandError(f"{name} holds a number that is not finite: {floats}", code="not_finite")
-    return floats
-
-
-def transform(pose: object) -> Transform:
-    """Return the transform of a pose ``{"position": (3,), "orientation": (4,) xyzw}``; the orientation is optional.
-
-    Raises:
-        CommandError: It is no such pose, or its orientation is zero.
-    """
-    if not isinstance(pose, Mapping) or not set(pose) <= {"position", "orientation"} or "position" not in pose:
-        raise CommandError(f"a pose is {{'position': [x, y, z], 'orientation': [x, y, z, w]}}, not {pose!r}")
-    position = numbers("position", pose["position"], 3)
-    orientation = numbers("orientation", pose.get("orientation", (0.0, 0.0, 0.0, 1.0)), 4)
-    norm = math.hypot(*orientation)
-    if norm < 1e-9:
-        raise CommandError("orientation must not be zero")
-    return tuple(position), tuple(value / norm for value in orientation)
-
-
-def pose_json(pose: Transform) -> dict[str, list[float]]:
-    """Return a pose as JSON."""
-    return {"position": list(pose[0]), "orientation": list(pose[1])}
-
-
-def body_spec(data: Mapping[str, Any]) -> BodySpec:
-    """Return the record of an object from its JSON; raises CommandError."""
-    try:
-        return from_json(BodySpec, dict(data))
-    except (TypeError, ValueError, KeyError, IndexError) as error:
-        raise CommandError(f"not the record of a body: {error}") from None
-
-
-def joint_positions(body: Body, q: Sequence[float]) -> dict[int, float]:
-    """Return joint index -> position for the ``q`` of a reset.
-
-    ``q`` has an arm's joints, optionally its fingers after them; for an object, all its movable joints. Raises
-    CommandError.
-    """
-    values = numbers("q", q)
-    joints, fingers = list(body.movable), []
-    if isinstance(body.spec, RobotSpec):
-        joints = [body.joints[name] for name in body.spec.joints]
-        fingers = [body.joints[name] for name in body.spec.gripper.joints] if body.spec.gripper else []
-    if len(values) == len(joints) + len(fingers):
-        joints += fingers
-    if len(values) != len(joints):
-        raise CommandError(f"q of {body.name!r} must be {len(joints)} numbers, not {len(values)}", code="wrong_size")
-    return dict(zip(joints, values, strict=True))
-
-
-def nearest(name: str, names: Iterable[str]) -> str:
-    """Return the end of an error message: the closest known name, and all known names."""
-    known = list(names)
-    close = difflib.get_close_matches(name, known, n=1)
-    hint = f"; did you mean {close[0]!r}?" if close else "."
-    return f"{hint} There are: {', '.join(known)}" if known else "; there is none"
-
-
-def listed(names: Sequence[str], most: int = 3) -> str:
-    """Return names for a message: the first ones, and how many more there are."""
-    more = len(names) - most
-    return ", ".join(names) if more <= 0 else f"{', '.join(names[:most])} and {more} more"

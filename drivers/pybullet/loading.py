@@ -4,17 +4,18 @@ from __future__ import annotations
 
 import tempfile
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Container, Iterator, Sequence
+from collections.abc import Container, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
+from hal.drivers.scene.values import listed
 from hal.errors import ConfigError, Problem
 from hal.geometry import Transform, compose, inverse
 from hal.kinematics.mesh_files import mesh_file, mesh_near
 from hal.kinematics.urdf import UrdfMimic, UrdfModel, parse_xml, read_urdf
 from hal.specs import BodySpec, RobotSpec
 
-from .engine import Body, Gear, PyBulletClient, listed, silenced
+from .engine import Body, Gear, PyBulletClient, silenced
 
 __all__ = [
     "fix_inertias",
@@ -51,14 +52,14 @@ def load_object(client: PyBulletClient, spec: BodySpec, drawn: bool = True) -> t
     key = f"objects.{spec.name}"
     if spec.shape != "urdf":
         number = _make_shape(client, spec, key)
-        body = _describe(client, spec, number, key)
+        body = _describe(client, spec, number, key, ())
         return body, []
     if spec.urdf is None:
         raise ConfigError([Problem("objects", f"{key}.urdf", "is missing, and the shape is urdf", "missing_key")])
     urdf = _read_urdf(spec.urdf, f"{key}.urdf")
     massless = _massless(urdf)
     number = _load_urdf(client, spec.urdf, f"{key}.urdf", fixed=_is_fixed(spec), scale=spec.scale, drawn=drawn)
-    body = _describe(client, spec, number, f"{key}.urdf")
+    body = _describe(client, spec, number, f"{key}.urdf", urdf.joints)
     _couple(client, body, urdf.mimics)
     warnings = fix_inertias(client, body, massless)
     if massless:
@@ -75,7 +76,7 @@ def load_robot(client: PyBulletClient, spec: RobotSpec, drawn: bool = True) -> t
     urdf = _read_urdf(spec.urdf, f"{key}.urdf")
     massless = _massless(urdf)
     number = _load_urdf(client, spec.urdf, f"{key}.urdf", fixed=True, scale=1.0, drawn=drawn)
-    body = _describe(client, spec, number, f"{key}.urdf")
+    body = _describe(client, spec, number, f"{key}.urdf", urdf.joints)
     fingers = spec.gripper.joints if spec.gripper else ()
     _check_names(body, spec, fingers, key)
 
@@ -204,17 +205,17 @@ def _is_fixed(spec: BodySpec) -> bool:
     return spec.fixed or spec.shape == "plane" or spec.robot is not None
 
 
-def _describe(client: PyBulletClient, spec: BodySpec | RobotSpec, number: int, key: str) -> Body:
-    """Return a body with its names, indices and frames as PyBullet loaded them."""
+def _describe(client: PyBulletClient, spec: BodySpec | RobotSpec, number: int, key: str, order: Iterable[str]) -> Body:
+    """Return a body with its names, indices and frames as PyBullet loaded them; ``order`` is the URDF's, of joints."""
     links = {client.getBodyInfo(number)[0].decode(): -1}
     joints: dict[str, int] = {}
-    movable: list[int] = []
+    movable: set[int] = set()
     for joint in range(client.getNumJoints(number)):
         info = client.getJointInfo(number, joint)
         joints[info[1].decode()] = joint
         links[info[12].decode()] = joint
         if info[2] in (client.JOINT_REVOLUTE, client.JOINT_PRISMATIC):
-            movable.append(joint)
+            movable.add(joint)
         elif info[2] != client.JOINT_FIXED:
             message = f"joint {info[1].decode()!r} is neither fixed, revolute, continuous nor prismatic"
             raise ConfigError([Problem(str(spec.urdf), key, message, "wrong_joint")])
@@ -229,7 +230,7 @@ def _describe(client: PyBulletClient, spec: BodySpec | RobotSpec, number: int, k
         spec=spec,
         links=links,
         joints=joints,
-        movable=tuple(movable),
+        movable=tuple(joints[name] for name in order if joints[name] in movable),
         floating=not fixed and dynamics[0] > 0.0,
         inertial=(tuple(dynamics[3]), tuple(dynamics[4])),
         home=dict.fromkeys(movable, 0.0),

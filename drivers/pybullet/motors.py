@@ -63,7 +63,7 @@ class JointTorques:
         self._body = body
         self._joints = list(joints)
         self._efforts = [body.efforts[joint] for joint in joints]
-        self._movable = list(body.movable)
+        self._movable = sorted(body.movable)  # PyBullet's order of degrees of freedom
         self._places = [self._movable.index(joint) for joint in joints]
         self._still = [0.0] * len(self._movable)
         self._compensation: Floats = ()

@@ -41,7 +41,8 @@ DYNAMICS = (
 
 ``mass`` kg; ``inertia`` (3,) kg m2 about the principal axes; ``lateral_friction``, ``rolling_friction``,
 ``spinning_friction`` and ``restitution``, without units; ``contact_stiffness`` N/m and ``contact_damping`` Ns/m, None
-where contacts are as hard as the solver can make them; ``linear_damping`` and ``angular_damping`` 1/s, of the whole body.
+where contacts are as hard as the solver can make them; ``linear_damping`` and ``angular_damping`` 1/s, of the whole
+body.
 """
 
 

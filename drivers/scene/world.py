@@ -57,8 +57,9 @@ class SimulatedBody:
     index: int = -1
     """Its place among the world's bodies: its value in segmentation images."""
 
-    def __post_init__(self) -> None:
-        self.link_names = {number: name for name, number in self.links.items()}
+    def link_name(self, number: int) -> str:
+        """Return the name of the link with this number."""
+        return next(name for name, other in self.links.items() if other == number)
 
     @property
     def is_robot(self) -> bool:
@@ -178,14 +179,13 @@ class SimulatedWorld(WorldDriver, Generic[B]):
         """Return the lower and upper corner (3,) m of the box along the world's axes around a body."""
 
     @abstractmethod
-    def _is_mirrored(self, body: B) -> bool:
-        """Return whether another driver moves this arm."""
-
-    @abstractmethod
     def _follow(self, body: B, q: list[float], dq: list[float], width: float | None) -> None:
         """Place the mirror of a real arm; the numbers are checked."""
 
-    def _paint(self, body: B, rgba: list[float]) -> None:  # noqa: B027  # most engines draw nothing
+    def _start(self, added: Sequence[B]) -> None:  # optional
+        """Complete new bodies, which are now at their initial poses."""
+
+    def _paint(self, body: B, rgba: list[float]) -> None:  # most engines draw nothing
         """Change the colour of a body, where the engine itself draws."""
 
     # --- loading -----------------------------------------------------------------------------------------------------
@@ -211,7 +211,12 @@ class SimulatedWorld(WorldDriver, Generic[B]):
         self._arrange(added)
         for body in added:
             self._put_home(body)
+        self._start(added)
         self._follow_attached()
+
+    def _is_mirrored(self, body: B) -> bool:
+        """Return whether another driver moves this arm, so that it mirrors a real one."""
+        return isinstance(body.spec, RobotSpec) and body.spec.driver != self.spec.driver
 
     def _renumber(self) -> None:
         for index, body in enumerate(self.bodies.values()):
