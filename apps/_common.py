@@ -10,7 +10,9 @@ import sys
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, get_args
+
+from hal.registry import EngineChoice
 
 if TYPE_CHECKING:
     from hal.config.mapping import TeleopMapping
@@ -28,6 +30,7 @@ __all__ = [
     "check_driving_options",
     "check_everything",
     "check_report",
+    "config_options",
     "find_deadman",
     "interruptible",
     "needs_deadman",
@@ -53,6 +56,11 @@ def add_config_options(parser: argparse.ArgumentParser) -> argparse._ArgumentGro
     flag = rig.add_mutually_exclusive_group()
     flag.add_argument("--sim", dest="sim", action="store_true", default=None, help="simulate every device")
     flag.add_argument("--real", dest="sim", action="store_false", help="use the real devices")
+    rig.add_argument(
+        "--engine",
+        choices=get_args(EngineChoice),
+        help="engine of the simulation (default: the rig's; auto: the first of these that is installed)",
+    )
     rig.add_argument(
         "--set",
         dest="overrides",
@@ -117,12 +125,15 @@ def add_deadman_options(group: argparse._ArgumentGroup) -> None:
     who.add_argument("--unattended", action="store_true", help="move a real arm without a dead-man: keep clear of it")
 
 
+def config_options(args: argparse.Namespace) -> dict[str, Any]:
+    """Return the arguments of :func:`hal.config.load` for the options of :func:`add_config_options`."""
+    return {"config": args.config, "sim": args.sim, "engine": args.engine, "overrides": args.overrides}
+
+
 def rig_options(args: argparse.Namespace) -> dict[str, Any]:
     """Return the arguments of :func:`hal.open` for the options of :func:`add_rig_options`."""
     return {
-        "config": args.config,
-        "sim": args.sim,
-        "overrides": args.overrides,
+        **config_options(args),
         "pad": args.pad,
         "viewer": args.viewer,
         "console": args.console or args.listen is not None,
@@ -154,7 +165,7 @@ def resolve_plan(args: argparse.Namespace, *details: str, cameras: Iterable[str]
     from hal.config.files import nearest
     from hal.errors import DeviceNotFound
 
-    plan = load(args.config, sim=args.sim, overrides=args.overrides).resolve()
+    plan = load(**config_options(args)).resolve()
     robots = [robot.name for robot in plan.robots]
     for name in robot_names(args):
         if name not in robots:
@@ -180,14 +191,14 @@ def check_everything(plan: Plan, args: argparse.Namespace) -> None:
 
     if args.listen is not None:
         Listen.parse(args.listen).check()
-    console = args.console or args.listen is not None
+    pads = check_opening(plan, args.pad, args.viewer, args.console or args.listen is not None)
     for robot in plan.robots:
         registry.load(robot.driver, "robot")
         if robot.gripper is not None:
             registry.load(robot.gripper.driver, "gripper")
     for camera in plan.cameras:
         registry.load(camera.driver, "camera")
-    for chosen in check_opening(plan, args.pad, args.viewer, console):
+    for chosen in pads:
         registry.load(chosen.spec.driver, "gamepad")(chosen.spec)  # checks its options; opens nothing
 
 

@@ -103,7 +103,7 @@ def _print_board(args: argparse.Namespace) -> int:
 def _main(args: argparse.Namespace) -> int:
     import hal
     from hal import calibration
-    from hal.apps._common import check_everything
+    from hal.apps._common import check_everything, config_options
     from hal.apps._display import banner, list_devices, list_links
     from hal.apps.check import may_open
     from hal.config import load
@@ -115,7 +115,7 @@ def _main(args: argparse.Namespace) -> int:
         raise CommandError(f"--views must be at least {calibration.LEAST_VIEWS}, not {args.views}")
     load_mapping(args.mapping or "default")
     check_wanted(args.pad)
-    config = load(args.config, sim=args.sim, overrides=args.overrides)
+    config = load(**config_options(args))
     plan = config.resolve()
     setup = calibration.find_setup(config, plan, args.camera, args.robot, args.eye, args.link)
     guess = calibration.initial_guess(setup, args.guess) if args.auto else None

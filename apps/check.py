@@ -15,7 +15,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, replace
 from typing import TYPE_CHECKING, TextIO
 
-from hal.apps._common import ACTION_NEEDED, add_config_options, run_app
+from hal.apps._common import ACTION_NEEDED, add_config_options, config_options, run_app
 
 if TYPE_CHECKING:
     from hal.gamepad import Gamepad
@@ -40,7 +40,8 @@ def show_cameras() -> bool:
     found = False
     for name in registry.names():
         try:
-            if registry.driver(name).camera is None:
+            spec = registry.driver(name)
+            if spec.camera is None or spec.world is not None:
                 continue
             missing = registry.missing(name)
             if missing:
@@ -383,7 +384,7 @@ def _main(args: argparse.Namespace) -> int:
     duration = _DURATION if args.duration is None else args.duration
     if not 0.0 < duration <= 60.0:
         raise CommandError(f"--duration must be above 0 and at most 60, not {duration:g}")
-    plan = load(args.config, sim=args.sim, overrides=args.overrides).resolve()
+    plan = load(**config_options(args)).resolve()
     verdicts = preflight(plan, duration)
     if args.json:
         found = list(verdicts)
@@ -404,7 +405,7 @@ def _pads(args: argparse.Namespace) -> int:
     if args.duration is not None and not args.duration > 0.0:
         raise CommandError(f"--duration must be positive, not {args.duration:g}")
     of_a_rig = args.overrides or args.config != parser().get_default("config")
-    pads = load(args.config, sim=args.sim, overrides=args.overrides).resolve().pads if of_a_rig else ()
+    pads = load(**config_options(args)).resolve().pads if of_a_rig else ()
     return 0 if show_pads(pads, args.duration) else ACTION_NEEDED
 
 

@@ -131,7 +131,7 @@ def scaling(measure: Callable[[int, float], float], seconds: float, rounds: int)
 def freshness(driver: str | None, seconds: float) -> tuple[int, int, int]:
     """Return steps in real time, and those with an old or repeated picture, and with an old or repeated state."""
 
-    def real_time(*_: object) -> hal.Rig:
+    def real_time(*_: object, **options: object) -> hal.Rig:
         return hal.open(CONFIG, sim=True if driver is None else None, driver=driver, clock="real_time", pad="none")
 
     RigEnv._open = staticmethod(real_time)  # type: ignore[assignment]  # simulated rigs run in lock-step otherwise

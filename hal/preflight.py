@@ -62,7 +62,7 @@ CameraCheck = Callable[[CameraSpec, float], Iterator[CheckResult]]
 def preflight(
     plan: Plan, duration: float = 2.0, *, machine: bool = True, cameras: bool = True
 ) -> Iterator[CheckResult]:
-    """Check this computer, then every real arm and camera; yield each result as soon as it is known.
+    """Check this computer, the simulation's engine, every real arm and camera; yield each result at once.
 
     Errors of a driver's check become results.
 
@@ -74,6 +74,8 @@ def preflight(
     """
     if machine:
         yield from check_machine()
+    if plan.engine is not None:
+        yield _check_engine(plan.engine)
     devices: list[RobotSpec | CameraSpec] = [*real_arms(plan), *(checked_cameras(plan) if cameras else ())]
     for device in devices:
         for result in _check(device, duration):
@@ -88,6 +90,15 @@ def real_arms(plan: Plan) -> tuple[RobotSpec, ...]:
 def checked_cameras(plan: Plan) -> tuple[CameraSpec, ...]:
     """Return the cameras of a rig whose driver can check them before they are opened."""
     return tuple(camera for camera in plan.cameras if registry.driver(camera.driver).camera_preflight is not None)
+
+
+def _check_engine(engine: str) -> CheckResult:
+    try:
+        registry.check_engine(engine)
+    except HalError as error:
+        return CheckResult("simulation", "fail", engine, str(error))
+    version = ", ".join(f"{library} {number}" for library, number in registry.versions(engine).items())
+    return CheckResult("simulation", "ok", version or engine)
 
 
 def _check(device: RobotSpec | CameraSpec, duration: float) -> Iterator[CheckResult]:

@@ -20,23 +20,30 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from difflib import get_close_matches
 from types import MappingProxyType
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 from .errors import DeviceNotFound, DriverMissing, NotSupported
 
 __all__ = [
     "BUILT_IN",
+    "ENGINES",
     "GROUP",
+    "SIMULATION",
     "DriverSpec",
+    "EngineChoice",
     "PadInput",
+    "check_engine",
     "checked",
+    "choose_engine",
     "driver",
     "function",
+    "is_engine",
     "load",
     "missing",
     "names",
     "pad_driver",
     "provider",
+    "versions",
 ]
 
 PadInput = Literal["plugged", "console", "keys", "recording"]
@@ -52,6 +59,7 @@ BUILT_IN: Mapping[str, str] = MappingProxyType(
         "evdev": "hal.drivers.evdev:DRIVER",
         "franka": "hal.drivers.franka:DRIVER",
         "mock": "hal.drivers.mock:DRIVER",
+        "mujoco": "hal.drivers.mujoco:DRIVER",
         "piper": "hal.drivers.can:PIPER",
         "playback": "hal.drivers.playback:DRIVER",
         "pybullet": "hal.drivers.pybullet:DRIVER",
@@ -62,6 +70,15 @@ BUILT_IN: Mapping[str, str] = MappingProxyType(
     }
 )
 """Name of a built-in driver -> place of its :class:`DriverSpec`, as "module:ATTRIBUTE"."""
+
+EngineChoice = Literal["auto", "pybullet", "mujoco"]
+"""Choice of the engine that simulates a rig; ``auto`` is the first of :data:`ENGINES` that is installed."""
+
+ENGINES: tuple[str, ...] = get_args(EngineChoice)[1:]
+"""Drivers that simulate arms, grippers and cameras in a world; a rig uses one of them."""
+
+SIMULATION = "simulation"
+"""Stands in ``drivers: {sim: simulation}`` for the engine of the rig."""
 
 
 @dataclass(frozen=True)
@@ -186,6 +203,57 @@ def pad_driver(pad_input: PadInput) -> str:
         if driver(name).pad_input == pad_input:
             return name
     raise NotSupported(f"no gamepad driver for {pad_input} input")
+
+
+def is_engine(name: str | None) -> bool:
+    """Return whether a name under ``drivers`` stands for the rig's engine: ``simulation``, or the name of an engine."""
+    return name == SIMULATION or name in ENGINES
+
+
+def choose_engine(choice: str) -> str:
+    """Return the name of the engine for an :data:`EngineChoice`; for ``auto`` the first one if none is installed.
+
+    Imports no engine, and does not check that a named one is installed (see :func:`check_engine`).
+    """
+    if choice != "auto":
+        return choice
+    return next((name for name in ENGINES if not missing(name)), ENGINES[0])
+
+
+def check_engine(name: str) -> None:
+    """Check, without an import, that the driver ``name`` of a simulated world can be used.
+
+    Raises:
+        DriverMissing: A library that it needs is not installed; the message has the command that installs it, and
+            those of all engines if none is installed (``code`` is ``missing_engine``).
+    """
+    lacking = missing(name)
+    if not lacking:
+        return
+    there = [other for other in ENGINES if other != name and not missing(other)]
+    install = " and ".join(lacking.values())
+    if there:
+        advice = f"install it with: {install}; or use the engine {there[0]!r}"
+    else:
+        others = [command for other in ENGINES if other != name for command in missing(other).values()]
+        advice = f"install it with: {install}; or install another engine: {', '.join(others)}"
+    message = f"the simulation engine {name!r} is not installed; {advice}"
+    raise DriverMissing(message, name=next(iter(lacking)), code="missing_engine")
+
+
+def versions(name: str) -> dict[str, str]:
+    """Return the versions of the libraries that a driver needs, as far as they are installed."""
+    from importlib.metadata import PackageNotFoundError, version  # slow to import, so only when it is needed
+
+    found = {}
+    for library in driver(name).requires:
+        for package in (library, f"{library}-core"):  # a package may install its library by another one
+            try:
+                found[library] = version(package)
+                break
+            except PackageNotFoundError:
+                continue
+    return found
 
 
 def load(name: str, kind: str) -> Any:

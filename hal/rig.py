@@ -50,6 +50,7 @@ def open_rig(
     sim: bool | None = None,
     driver: str | None = None,
     clock: str | None = None,
+    engine: str | None = None,
     overrides: Sequence[str] | Mapping[str, Any] = (),
     pad: str | None = None,
     viewer: str = "none",
@@ -64,6 +65,8 @@ def open_rig(
         sim: True simulates every device, False makes every device real; None keeps the flags of the rig file.
         driver: Driver that replaces those of all devices; ``"mock"`` needs no devices and no simulation.
         clock: ``"real_time"`` or ``"lock_step"``; None keeps that of the rig file.
+        engine: Engine of the simulated world: ``"pybullet"``, ``"mujoco"``, or ``"auto"`` for the first of them that is
+            installed; None keeps that of the rig file. :attr:`~hal.specs.Plan.engine` of :attr:`Rig.plan` names it.
         overrides: Values for keys of the rig file, as ``KEY=VALUE`` strings or a mapping.
         pad: Device behind a pad of ``model: auto``: ``auto``, ``evdev``, ``web`` (the console), ``terminal``, ``demo``
             (a recorded tour), the path of a recording, or ``none`` for no pad.
@@ -87,7 +90,7 @@ def open_rig(
     from .config import load
 
     where = Listen.parse(listen)
-    plan = load(config, sim=sim, driver=driver, clock=clock, overrides=overrides).resolve()
+    plan = load(config, sim=sim, driver=driver, clock=clock, engine=engine, overrides=overrides).resolve()
     rig = Rig(plan)
     try:
         rig._open(pad=pad, viewer=viewer, console=console, listen=where, realtime=realtime)
@@ -462,11 +465,13 @@ def check_opening(plan: Plan, pad: str | None, viewer: str, console: bool) -> li
         The pads to open.
 
     Raises:
-        DriverMissing: The libraries of a page are not installed.
+        DriverMissing: The engine of the simulated world, or the libraries of a page, are not installed.
         DeviceNotFound: No such pad.
         NotSupported: A viewer or a console that this rig cannot have, or a recording for a real arm.
         ConfigError: A recording that cannot be played.
     """
+    if plan.engine is not None:
+        registry.check_engine(plan.engine)
     lock_step = plan.clock == "lock_step"
     known = {"attended": plan.attended, "emulated": plan.emulated, "lock_step": lock_step}
     pads = [] if pad == "none" else [choose_pad(spec, pad, **known) for spec in plan.pads]
@@ -479,6 +484,10 @@ def check_opening(plan: Plan, pad: str | None, viewer: str, console: bool) -> li
         raise ConfigError(wrong)
     if viewer == "gui" and plan.world is None:
         raise NotSupported("there is no simulated world to view; leave the viewer out", code="no_world")
+    if viewer == "gui" and plan.engine is not None and registry.driver(plan.engine).viewer is None:
+        raise NotSupported(
+            f"the engine {plan.engine!r} has no window of its own; use the 3D view: viewer='3d'", code="no_viewer"
+        )
     if viewer == "3d":
         registry.load(registry.provider("viewer3d"), "viewer3d")
     if console or any(chosen.input == "console" for chosen in pads):

@@ -331,6 +331,11 @@ class Plan:
     """The rig's file, or ``<dict>``."""
 
     @property
+    def engine(self) -> str | None:
+        """Name of the engine that simulates the rig's world; None without a world."""
+        return self.world.driver if self.world is not None else None
+
+    @property
     def attended(self) -> bool:
         """Whether a real device moves, so that a user must be present."""
         return any(robot.attended for robot in self.robots)

@@ -9,6 +9,7 @@ from typing import Any
 
 from ..geometry import Pose
 from ..kinematics.urdf import UrdfJoint, read_urdf
+from ..registry import SIMULATION
 from .output import Commented, Inline, KeyReport, Remark
 from .reading import ArkNode, ArkReader
 
@@ -118,7 +119,7 @@ def arm_model(
         ),
         "description": f"{given}, imported from Ark",
         "urdf": urdf.model.path,
-        "drivers": Inline(sim="pybullet"),
+        "drivers": Inline(sim=SIMULATION),
         "joints": [joint.name for joint in joints],
         "tcp": Commented(
             Inline(link=link, position=[0, 0, 0]),

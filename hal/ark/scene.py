@@ -8,6 +8,7 @@ from typing import Any
 
 from ..config.schema import describe
 from ..geometry import Pose, matrix_to_quaternion, quaternion_to_matrix, rpy_to_matrix
+from ..registry import ENGINES
 from .entries import ArkItem, ImportState, position_of, rotation_of, tidy
 from .output import Commented, Inline, KeyReport, Remark
 from .reading import ArkNode, ArkReader, InvalidValue
@@ -232,7 +233,7 @@ def import_simulator(root: ArkNode, reading: ArkReader, ledger: KeyReport) -> di
         if name is not None:
             entries["description"] = f"{reading.text(name)} (from Ark, {root.file.name})"
             ledger.changed(name, "description", "for readers only")
-        _backend(node, ledger)
+        engine = _engine(node, ledger)
         ledger.ignored(node.children.get("node_frequency"), "one clock drives everything; see simulation.physics_hz")
         ledger.ignored(
             node.children.get("save_render"),
@@ -241,17 +242,24 @@ def import_simulator(root: ArkNode, reading: ArkReader, ledger: KeyReport) -> di
         config = node.get("config")
         if config is not None:
             simulation = _config(reading.keys(config), reading, ledger)
+        if engine is not None:
+            simulation = {"engine": engine, **simulation}
     if simulation:
         entries["simulation"] = simulation
     return entries
 
 
-def _backend(node: ArkNode, ledger: KeyReport) -> None:
+def _engine(node: ArkNode, ledger: KeyReport) -> str | None:
+    """Return the engine of the simulation; None where the rig need not name one."""
     backend = node.get("backend_type")
-    if backend is not None and backend.data == "pybullet":
-        ledger.kept(backend, "", "PyBullet, from the drivers.sim of every model")
+    if backend is not None and backend.data == ENGINES[0]:
+        ledger.kept(backend, "", "simulation.engine: auto, which is PyBullet where it is installed, else MuJoCo")
+    elif backend is not None and backend.data in ENGINES:
+        ledger.kept(backend, "simulation.engine")
+        return str(backend.data)
     else:
-        ledger.changed(backend, "", "the simulator is always PyBullet")
+        ledger.changed(backend, "", f"the engines are {' and '.join(ENGINES)}; see simulation.engine")
+    return None
 
 
 def _config(node: ArkNode, reading: ArkReader, ledger: KeyReport) -> dict[str, Any]:

@@ -45,6 +45,8 @@ class Context:
     driver: str | None
     clock: str | None
     problems: Problems
+    engine: str | None = None
+    """The caller's choice of the engine; None for the rig's."""
     warnings: list[str] = field(default_factory=list)
     urdfs: dict[str, UrdfModel] = field(default_factory=dict)
     """URDFs of the robots, by the robot's name; those that could be read."""
@@ -67,6 +69,11 @@ class Context:
         """The clock: ``real_time`` or ``lock_step``."""
         default = "lock_step" if self.driver is not None else self.rig.simulation.clock or "real_time"
         return self.clock or default
+
+    @property
+    def engine_driver(self) -> str:
+        """Name of the engine that simulates this rig."""
+        return registry.choose_engine(self.engine or self.rig.simulation.engine)
 
     def problem(self, key: str, message: str, code: str) -> None:
         """Add a problem in the rig's file; the arguments are those of :meth:`.files.Problems.add`."""
@@ -123,7 +130,7 @@ class Context:
         if chosen is None:
             message = f"its model has no driver for a {state} {kind}; name one in {key}.drivers.{flag}"
             self.problem(key, message, "no_driver")
-        return chosen
+        return self.engine_driver if flag == "sim" and registry.is_engine(chosen) else chosen
 
     def check_driver(self, name: str, kind: str, key: str) -> bool:
         """Return whether there is such a driver with this kind of device; if not, the problem is added."""
@@ -212,7 +219,8 @@ def options_of(
     Options that are paths become absolute: ``base`` is the folder of the rig's file, ``file`` the model's file.
     """
     own = model.drivers.sim if simulated else model.drivers.real
-    of_model = (model.simulated if simulated else model.real) if driver == own else {}
+    same = driver == own or (simulated and registry.is_engine(driver) and registry.is_engine(own))
+    of_model = (model.simulated if simulated else model.real) if same else {}
     of_rig = config.simulated if simulated else config.real
     if base is not None and file is not None and driver:
         paths = registry.driver(driver).path_options

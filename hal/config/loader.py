@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 from pydantic import PrivateAttr
 
@@ -23,6 +23,7 @@ from .rigfile import RigFile
 __all__ = ["RigConfig", "load"]
 
 CLOCKS = ("real_time", "lock_step")
+ENGINE_CHOICES: tuple[str, ...] = get_args(registry.EngineChoice)
 
 
 class RigConfig(RigFile):
@@ -41,6 +42,7 @@ def load(
     sim: bool | None = None,
     driver: str | None = None,
     clock: str | None = None,
+    engine: str | None = None,
     overrides: Sequence[str] | Mapping[str, Any] = (),
 ) -> RigConfig:
     """Read and check a rig.
@@ -52,13 +54,16 @@ def load(
             leaves each device its own; None changes nothing.
         driver: Replaces every driver (``"mock"``); then lock-step is the default clock.
         clock: ``"real_time"`` or ``"lock_step"``; None for the rig's.
+        engine: Engine of the simulated world: ``"auto"``, ``"pybullet"`` or ``"mujoco"``; None for the rig's. It need
+            not be installed.
         overrides: ``"KEY=VALUE"`` with the value in YAML, or a mapping from dotted keys to values.
 
     Raises:
         ConfigError: The rig has problems; all are listed.
     """
     problems = Problems()
-    _check_arguments(sim, clock, problems)
+    _check_arguments(sim, clock, engine, problems)
+    engine = engine if engine in ENGINE_CHOICES else None  # after a problem the rest is checked, too
     stand_in = _stand_in(driver, problems)
     data, source, base = _read(config, problems)
     if data is None:
@@ -66,15 +71,18 @@ def load(
         raise AssertionError("no data and no problem")
     data = apply_overrides(data, overrides, problems)
     rig = validate(RigConfig, data, source, problems)
-    rig._plan = resolve(Context(source, base, rig, sim, stand_in, clock, problems))
+    rig._plan = resolve(Context(source, base, rig, sim, stand_in, clock, problems, engine))
     return rig
 
 
-def _check_arguments(sim: object, clock: str | None, problems: Problems) -> None:
+def _check_arguments(sim: object, clock: str | None, engine: str | None, problems: Problems) -> None:
     if sim is not None and not isinstance(sim, bool):
         problems.add("<arguments>", "sim", f"must be true, false or None, not {sim!r}", "wrong_type")
     if clock is not None and clock not in CLOCKS:
         problems.add("<arguments>", "clock", f"{clock!r} is not possible{nearest(clock, CLOCKS)}", "invalid_choice")
+    if engine is not None and engine not in ENGINE_CHOICES:
+        message = f"{engine!r} is not possible{nearest(str(engine), ENGINE_CHOICES)}"
+        problems.add("<arguments>", "engine", message, "invalid_choice")
 
 
 def _stand_in(driver: str | None, problems: Problems) -> str | None:

@@ -65,6 +65,7 @@ class Drivers(Strict):
     """Names of the drivers, in simulation and for a real device; None if there is none."""
 
     sim: str | None = None
+    """``simulation`` is the rig's engine; the name of an engine means the same."""
     real: str | None = None
 
 

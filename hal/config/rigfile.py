@@ -23,6 +23,7 @@ from numpy.typing import ArrayLike, NDArray
 from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
 from ..geometry import Pose, matrix_to_quaternion, quaternion_to_matrix, rpy_to_matrix
+from ..registry import EngineChoice
 from ..specs import ViewSpec
 from .models import Capture, Depth, Drivers, FieldOfView, LimitsModel, SensorStream, by_name
 from .schema import (
@@ -337,6 +338,8 @@ class PadConfig(Strict):
 class SimulationConfig(Strict):
     """The simulated world."""
 
+    engine: EngineChoice = "auto"
+    """The physics engine; ``auto`` is PyBullet where it is installed, else MuJoCo."""
     physics_hz: Annotated[float, Quantity("Hz", 50.0, 10000.0)] = 240.0
     """Steps of the simulation, and of the servos in it, per second."""
     gravity: Gravity = (0.0, 0.0, -9.81)

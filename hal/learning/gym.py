@@ -250,6 +250,7 @@ class RigEnv(gymnasium.Env[ObservationDict, NDArray[np.float32]]):
         *,
         sim: bool | None = None,
         driver: str | None = None,
+        engine: str | None = None,
         robot: str | None = None,
         robots: Sequence[str] | None = None,
         action: ActionKind = "joint",
@@ -273,6 +274,7 @@ class RigEnv(gymnasium.Env[ObservationDict, NDArray[np.float32]]):
             config: The rig's configuration, as for :func:`hal.open`.
             sim: True for simulated drivers, as for :func:`hal.open`.
             driver: Driver of all devices, as for :func:`hal.open`.
+            engine: Engine of the simulated world, as for :func:`hal.open`.
             robot: Name of the arm; None for the rig's first.
             robots: Names of several arms, instead of ``robot``.
             action: Kind of action, see :data:`ActionKind`.
@@ -307,7 +309,7 @@ class RigEnv(gymnasium.Env[ObservationDict, NDArray[np.float32]]):
         self._reward, self._terminated, self._on_reset = reward, terminated, on_reset
         self._kind, self._rate, self._max_steps, self._speeds = action, rate_hz, max_steps, speeds
         self._unattended = unattended
-        self.rig = self._open(config, sim, driver, overrides, deadman is not None)
+        self.rig = self._open(config, deadman is not None, sim=sim, driver=driver, engine=engine, overrides=overrides)
         try:
             chosen_robots = _chosen(self.rig, robot, robots)
             self.robot: Robot = chosen_robots[0]
@@ -335,19 +337,14 @@ class RigEnv(gymnasium.Env[ObservationDict, NDArray[np.float32]]):
         """The complete record behind the newest observation."""
 
     @staticmethod
-    def _open(
-        config: str | Path | Mapping[str, Any],
-        sim: bool | None,
-        driver: str | None,
-        overrides: tuple[str, ...],
-        pads: bool,
-    ) -> Rig:
+    def _open(config: str | Path | Mapping[str, Any], pads: bool, **options: Any) -> Rig:
+        """Open the rig, in lock-step if nothing real is in it; ``options`` are those of :func:`hal.open`."""
         from ..config import load
 
-        plan = load(config, sim=sim, driver=driver, overrides=overrides).resolve()
+        plan = load(config, **options).resolve()
         attended = any(arm.attended for arm in plan.robots)
         clock = None if attended or pads else "lock_step"
-        return open_rig(config, sim=sim, driver=driver, overrides=overrides, clock=clock, pad=None if pads else "none")
+        return open_rig(config, clock=clock, pad=None if pads else "none", **options)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Result:
         """Reset the scene; a real arm drives to its start, and opens its gripper.

@@ -14,6 +14,7 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from .. import registry
 from ..errors import CommandError
 from .layout import TIMES
 
@@ -104,6 +105,7 @@ _PACKAGES = (
     "ruckig",
     "pin",
     "pybullet",
+    "mujoco",
     "pylibfranka",
     "pyrealsense2",
     "pyarrow",
@@ -113,7 +115,7 @@ _PACKAGES = (
 
 
 def rig_metadata(rig: Rig) -> dict[str, Any]:
-    """Return the rig's configuration, as written and as resolved, and the versions of the software."""
+    """Return the rig's configuration, as written and as resolved, its engine, and the versions of the software."""
     plan = rig.plan
     resolved = asdict(plan)
     for pad in resolved["pads"]:
@@ -123,6 +125,7 @@ def rig_metadata(rig: Rig) -> dict[str, Any]:
         written = Path(plan.source).read_text(encoding="utf-8")
     return {
         "rig": {"source": plan.source, "written": written, "resolved": resolved, "renderer": rig.renderer},
+        "engine": None if plan.engine is None else {"name": plan.engine, "versions": registry.versions(plan.engine)},
         "versions": {"python": platform.python_version(), "system": platform.platform(), **_versions()},
         "program": sys.argv[0],
     }

@@ -180,7 +180,8 @@ def test_simulator(tmp_path: Path) -> None:
     assert rig.description == "lab (from Ark, global_config.yaml)"
     assert rig.simulation.physics_hz == 500
     assert rig.simulation.gravity == (0, 0, -1.6)
-    assert row(result, "simulator.backend_type") == ("changed", "the simulator is always PyBullet")
+    assert rig.simulation.engine == "mujoco"
+    assert row(result, "simulator.backend_type") == ("kept", "simulation.engine")
     assert row(result, "simulator.config.connection_mode")[0] == "changed"
     assert row(result, "simulator.node_frequency")[0] == "ignored"
 

@@ -130,7 +130,7 @@ def test_a_model_is_made_of_another_urdf_and_the_arm_runs(tmp_path: Path) -> Non
     model = parse_yaml(text)
     assert model["joints"] == [f"joint{k}" for k in range(1, 7)]
     assert (model["home"], model["tcp"]["link"]) == ([0, -0.3, -1.2, 0, 1.5, 0], "link6")
-    assert model["drivers"] == {"sim": "pybullet"}, "no arm moves by guessed limits"
+    assert model["drivers"] == {"sim": "simulation"}, "no arm moves by guessed limits"
     speed, acceleration, jerk = (np.array(model["limits"][key]) for key in ("velocity", "acceleration", "jerk"))
     assert acceleration == pytest.approx(speed / 0.3, rel=1e-3)
     assert jerk == pytest.approx(acceleration / 0.02, rel=1e-3)

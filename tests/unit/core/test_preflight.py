@@ -41,10 +41,10 @@ def of_arms(plan: Plan) -> list[CheckResult]:
     return [v for v in preflight(plan, 0.25) if ":" in v.name]
 
 
-def test_a_simulated_rig_has_only_the_machine_to_check() -> None:
+def test_a_simulated_rig_has_only_the_machine_and_its_engine_to_check() -> None:
     plan = load("panda_table", sim=True).resolve()
     assert real_arms(plan) == ()
-    assert [v.name for v in preflight(plan)] == ["kernel", "processor", "scheduling", "memory"]
+    assert [v.name for v in preflight(plan)] == ["kernel", "processor", "scheduling", "memory", "simulation"]
 
 
 def test_an_arm_is_checked_by_its_driver_under_its_own_name(plan: Plan) -> None:

@@ -277,7 +277,7 @@ def test_in_real_time_every_observation_is_a_fresh_one() -> None:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(
             "hal.learning.gym.RigEnv._open",
-            staticmethod(lambda *a: hal.open("panda_table", driver="mock", clock="real_time", pad="none")),
+            staticmethod(lambda *a, **k: hal.open("panda_table", driver="mock", clock="real_time", pad="none")),
         )
         env = RigEnv(action="twist", rate_hz=20.0)
     try:

@@ -50,6 +50,7 @@ def test_an_episode_has_the_metadata_of_its_source(made: Path) -> None:
     assert info["rig"]["resolved"]["robots"][0]["name"] == "panda"
     assert "cameras:" in info["rig"]["written"], "the file itself"
     assert {"python", "numpy", "av", "pyarrow"} <= set(info["versions"])
+    assert info["engine"] is None, "a mock has no world"
     assert info["gaps"] == []
 
 

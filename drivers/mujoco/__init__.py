@@ -1,0 +1,13 @@
+"""The simulation with MuJoCo: one world per rig; arms and grippers are views of it."""
+
+from hal.registry import DriverSpec
+
+DRIVER = DriverSpec(
+    name="mujoco",
+    world="hal.drivers.mujoco.world:MujocoWorld",
+    robot="hal.drivers.mujoco.robot:MujocoRobot",
+    gripper="hal.drivers.mujoco.gripper:MujocoGripper",
+    camera="hal.drivers.scene.camera:SimulatedCamera",
+    pictures="hal.drivers.scene.camera:SimulatedPictures",
+    requires={"mujoco": "pip install 'robot-hal[mujoco]'"},
+)
