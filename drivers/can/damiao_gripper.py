@@ -1,8 +1,10 @@
 """Driver of a gripper with one Damiao motor: fingers that the motor opens and closes through a linkage.
 
 A table gives the distance between the fingers at each angle of the motor; its slope turns forces into torques. The
-motor follows a ramp at the commanded speed. It applies no more than the commanded force, because its target never is
-farther ahead of the fingers than the force divided by its stiffness.
+motor follows a ramp at the commanded speed. It presses with no more than the commanded force, also in the moment of
+contact: its target never is farther ahead of the fingers than the force divided by the stiffness, and it has no target
+of the speed, since the damping would press with that. So with a small force the fingers are soft in motion, and slower
+than commanded where friction takes much of it. How hard their inertia hits an object depends on the speed alone.
 
 The motor is switched on by the first command. When the program ends, it holds for its TIMEOUT (0.4 s), and then damps:
 a held object that pushes the fingers open comes loose.
@@ -10,6 +12,7 @@ a held object that pushes the fingers open comes loose.
 
 from __future__ import annotations
 
+import math
 from bisect import bisect_right
 from typing import Any
 
@@ -19,6 +22,7 @@ from hal.specs import GripperSpec
 from hal.types import GripperOutcome
 
 from .damiao_chain import SWITCHING, DamiaoChain
+from .damiao_protocol import KP_MAX
 from .settings import DamiaoGripperSettings
 
 __all__ = ["DamiaoGripper", "FingerTable"]
@@ -29,10 +33,17 @@ _REST = 0.06
 """Time at rest after which a motion has ended, s."""
 _PRESSING = 0.5
 """Share of the commanded force from which fingers at rest hold an object."""
-_FRICTION = 0.3
-"""Torque in motion beyond that of the commanded force, as a share of the motor's damping: for friction."""
+_LEAD = 0.05
+"""Time by which the motor's target is ahead of fingers that press, at the commanded speed, s. It is long against the
+age of a state, two cycles, and short, because fingers whose program was killed move for so long."""
+_PLAY = 3e-4
+"""Way of the fingers that counts as a motion, m."""
+_STIFFNESS_STEP = KP_MAX / 4095.0
+"""Resolution of the stiffness in a command, Nm/rad."""
 _LONGEST_STEP = 0.05
 """Longest time that the ramp advances in one cycle, s."""
+_FRESH = 0.02
+"""Greatest age of the state at which the motor is switched on, s: it may have been turned by hand since."""
 _ATTEMPTS = 3
 """How often the motor is switched on until it counts as broken."""
 
@@ -104,6 +115,12 @@ class DamiaoGripper(GripperDriver):
         """Greatest force, N."""
         self._resting = 0.0
         """Time for which the fingers have been at rest, s."""
+        self._closed = False
+        """Whether the last motion of the fingers closed them."""
+        self._turn = 0.0
+        """The narrowest width since then, or else the widest, m."""
+        self._held = False
+        """Whether they held an object at the last reading."""
         self._now: float | None = None
         self._seq = 0
         self._t = -1.0
@@ -153,7 +170,8 @@ class DamiaoGripper(GripperDriver):
     def _drive(self, now: float, dt: float) -> None:
         """Send the motor's command of this cycle, or a request for its state."""
         chain, motor = self.chain, self._motor
-        if self._active and not motor.on and not chain.ask_registers():
+        fresh = motor.t >= 0.0 and now - motor.t <= _FRESH
+        if self._active and not motor.on and fresh and not chain.ask_registers():
             self._switch_on()
         elif not motor.on:
             chain.ask_state(motor)
@@ -161,27 +179,44 @@ class DamiaoGripper(GripperDriver):
             chain.send(motor, motor.command(self._ramp, 0.0, motor.kp, motor.kd, 0.0))
         else:
             self._attempts = 0
-            before = self._ramp
-            free = self._advance(now, dt)
-            speed = (self._ramp - before) / dt if dt > 0.0 else 0.0
-            if not free:  # damping is no force that presses
-                speed = min(max(speed, -abs(motor.dq)), abs(motor.dq))
-            chain.send(motor, motor.command(self._ramp, speed, motor.kp, motor.kd, 0.0))
-            still = abs(motor.dq) * self.table.slope(motor.q) < _STILL
-            done = self._ramp == self._goal or not free
-            self._resting = self._resting + dt if still and done else 0.0
+            stiffness, damping = self._advance(dt)
+            chain.send(motor, motor.command(self._ramp, 0.0, stiffness, damping, 0.0))
+            self._note_motion(dt)
 
-    def _advance(self, now: float, dt: float) -> bool:
-        """Advance the ramp; return whether the fingers follow it, without the greatest force."""
+    def _advance(self, dt: float) -> tuple[float, float]:
+        """Advance the ramp, and return the motor's stiffness, Nm/rad, and damping, Nm s/rad.
+
+        In motion, and while the fingers press, both are so small that the greatest torque needs a lead of
+        :data:`_LEAD`. Near the goal they grow to the rig's.
+        """
         motor, table = self._motor, self.table
-        step = self._speed * dt / table.slope(self._ramp)
-        way = self._goal - self._ramp
+        speed = self._speed / table.slope(self._ramp)
+        step, way = speed * dt, self._goal - self._ramp
         ramp = self._goal if abs(way) <= step else self._ramp + (step if way > 0.0 else -step)
-        torque = self._force * table.slope(motor.q) + _FRICTION * motor.kd * abs(motor.dq)
-        ahead = min(torque, motor.settings.limits.torque) / motor.kp
-        at = motor.q + motor.dq * (now - motor.t)  # the state is a cycle old
-        self._ramp = min(max(ramp, at - ahead), at + ahead)
-        return self._ramp == ramp
+        torque = self._greatest_torque()
+        lead = max(min(abs(self._goal - motor.q), speed * _LEAD), 1e-6)
+        steps = math.ceil(torque / lead / _STIFFNESS_STEP)
+        stiffness = max(min(steps * _STIFFNESS_STEP, motor.kp), _STIFFNESS_STEP)
+        ahead = torque / stiffness
+        self._ramp = min(max(ramp, motor.q - ahead), motor.q + ahead)
+        damping = min(motor.kd, 0.5 * torque * _LEAD / lead)
+        return stiffness + 0.1 * _STIFFNESS_STEP, damping  # the encoding truncates
+
+    def _greatest_torque(self) -> float:
+        """Return the torque that presses with the commanded force, Nm."""
+        motor = self._motor
+        torque = self._force * self.table.slope(motor.q) + motor.settings.friction
+        return min(torque, motor.settings.limits.torque)
+
+    def _note_motion(self, dt: float) -> None:
+        """Note for how long the fingers have been at rest, and whether they came by closing."""
+        width, slope = self.table.width(self._motor.q), self.table.slope(self._motor.q)
+        self._resting = self._resting + dt if abs(self._motor.dq) * slope < _STILL else 0.0
+        opened = width - self._turn
+        if (opened > _PLAY) if self._closed else (opened < -_PLAY):
+            self._closed, self._turn = not self._closed, width
+        else:
+            self._turn = min(self._turn, width) if self._closed else max(self._turn, width)
 
     def _switch_on(self) -> None:
         """Switch the motor on where it is."""
@@ -197,6 +232,7 @@ class DamiaoGripper(GripperDriver):
             self._fault = Fault("not_switched_on", cause, "check its power supply, and send the command again")
             return
         self._ramp = motor.q
+        self._closed, self._turn = False, self.table.width(motor.q)
         self.chain.switch_on(motor, motor.command(self._ramp, 0.0, motor.kp, motor.kd, 0.0))
 
     def _report(self, now: float) -> GripperReading:
@@ -208,10 +244,12 @@ class DamiaoGripper(GripperDriver):
         width = table.width(motor.q)
         if self._target is None:
             self._target = width
-        slope = table.slope(motor.q)
-        force = max(0.0, -table.opening * motor.tau / slope) if motor.on else 0.0
+        force = 0.0
+        if motor.on:
+            force = max(0.0, -table.opening * motor.tau - motor.settings.friction) / table.slope(motor.q)
         resting = self._resting >= _REST
-        grasped = resting and width > self.settings.tolerance and force >= _PRESSING * self._force > 0.0
+        grasped = self._grasps(width, force) if resting else False
+        self._held = grasped is True
         return GripperReading(
             t=t,
             t_device=t,
@@ -225,6 +263,17 @@ class DamiaoGripper(GripperDriver):
             fault=self._fault,
         )
 
+    def _grasps(self, width: float, force: float) -> bool | None:
+        """Return whether fingers at rest hold an object; None if they press, but did not close before.
+
+        Such fingers may be held by an object, or by their own friction: the force cannot tell.
+        """
+        assert self._target is not None
+        short = width > max(self.settings.tolerance, self._target + _PLAY)
+        if not short or not force >= _PRESSING * self._force > 0.0:
+            return False
+        return True if self._closed else None
+
     # Commands.
 
     def move(self, width: float, speed: float, force: float) -> None:
@@ -235,6 +284,8 @@ class DamiaoGripper(GripperDriver):
             raise RobotFault(fault.cause, fault.remedy, code=fault.code)
         self._fault = None  # an error of the motor is cleared when it is switched on
         self._attempts = 0
+        if self._resting >= _REST and not self._held:
+            self._closed, self._turn = False, self.table.width(motor.q)
         self._target = width
         self._goal = self.table.angle(width)
         self._speed = min(speed, self.spec.speed)
@@ -247,7 +298,10 @@ class DamiaoGripper(GripperDriver):
     def stop(self) -> None:
         """Keep the fingers where they are; those that press on an object keep their force."""
         self.chain.usable  # noqa: B018  # raises if it is not open, or lost
-        self._goal = self._ramp
+        motor = self._motor
+        at = motor.q + (motor.dq * (self._now - motor.t) if self._now is not None and motor.t >= 0.0 else 0.0)
+        ahead = self._greatest_torque() / motor.kp
+        self._goal = min(max(self._ramp, at - ahead), at + ahead)
 
     def statistics(self) -> dict[str, Any]:
         """Return figures about the connection, as those of the arm."""

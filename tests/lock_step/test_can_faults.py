@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import itertools
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
@@ -316,15 +317,79 @@ def test_a_gripper_with_a_fault_waits_for_the_next_command(gripper: Any, status:
     assert reading.width == pytest.approx(0.0, abs=1e-3)
 
 
-def test_a_grip_is_no_stronger_than_commanded(gripper: Any) -> None:
+@pytest.mark.parametrize("force", [10.0, 30.0])
+def test_a_grip_is_no_stronger_than_commanded(gripper: Any, force: float) -> None:
+    far, driver, run = gripper
+    plant = far.arm.gripper
+    plant.q = plant.upper  # wide open
+    far.execute("object 0.03")
+    driver.move(0.0, 0.1, force)
+    slope = 0.095 / 6.5
+    strongest = 0.0
+    for ms in range(1600):
+        far.advance(1e-3)
+        if plant.q <= plant.lower:  # in contact: also before the driver notices
+            strongest = max(strongest, abs(plant.tau))
+        if ms % 4 == 3:
+            driver.read(far.passed)
+    assert strongest <= 1.2 * force * slope
+    reading = run(1.0)
+    assert reading.grasped
+    assert not reading.moving
+    assert reading.force == pytest.approx(force, rel=0.15)
+    assert abs(plant.tau) == pytest.approx(force * slope, rel=0.1)
+    driver.stop()
+    assert run(0.5).force == pytest.approx(force, rel=0.15)
+
+
+def test_fingers_that_were_opened_by_hand_are_not_pulled_back(gripper: Any) -> None:
+    far, driver, run = gripper
+    run(0.1)
+    far.advance(10.0)  # this program stands still
+    far.arm.gripper.q = far.arm.gripper.upper
+    driver.move(0.095, 0.05, 30.0)
+    narrowest = min((run(DT), far.arm.gripper.q)[1] for _ in range(100))
+    assert narrowest > far.arm.gripper.upper - 1e-3
+
+
+@pytest.mark.parametrize("before", [None, 0.05])
+def test_fingers_that_their_friction_holds_have_not_grasped(gripper: Any, before: float | None) -> None:
+    far, driver, run = gripper
+    far.arm.gripper.q = far.arm.gripper.upper
+    if before is not None:  # they closed before, on nothing
+        driver.move(before, 0.1, 30.0)
+        assert run(2.0).width == pytest.approx(before, abs=1e-3)
+    driver.move(0.0, 0.05, 2.0)
+    reading = run(1.0)
+    assert reading.width > 0.04
+    assert not reading.moving
+    assert not reading.grasped
+
+
+def test_an_object_is_still_grasped_while_the_force_changes(gripper: Any) -> None:
     far, driver, run = gripper
     far.execute("object 0.03")
-    for force in (10.0, 30.0):
+    for force in (10.0, 30.0, 15.0):
         driver.move(0.0, 0.1, force)
-        reading = run(1.0)
-        assert reading.grasped
-        assert reading.force == pytest.approx(force, rel=0.15)
-        assert abs(far.arm.gripper.tau) == pytest.approx(force * 0.095 / 6.5, rel=0.1)
+        assert run(1.0).grasped, "the fingers do not move any more"
+    driver.move(0.06, 0.1, 15.0)
+    assert run(1.5).grasped is False
+    far.execute("object none")
+    driver.move(0.02, 0.1, 15.0)
+    reading = run(2.0)
+    assert reading.width == pytest.approx(0.02, abs=1e-3)
+    assert reading.grasped is False
+
+
+def test_fingers_move_at_the_commanded_speed(gripper: Any) -> None:
+    far, driver, run = gripper
+    far.arm.gripper.q = far.arm.gripper.upper
+    driver.move(0.01, 0.05, 30.0)
+    run(0.2)
+    widths = [run(0.02).width for _ in range(100)]
+    assert max(a - b for a, b in itertools.pairwise(widths)) / 0.02 == pytest.approx(0.05, rel=0.2)
+    assert widths[-1] == pytest.approx(0.01, abs=1e-3)
+    assert min(widths) > 0.0095, "they do not run beyond"
 
 
 # Closing.
