@@ -224,7 +224,7 @@ class ArmUnit:
         driver = self.driver
         try:
             if not driver.engaged:  # they went off during the session
-                if self.servo.report.status is RobotStatus.FOLLOWING:
+                if self.servo.report.status is RobotStatus.FOLLOWING and self._is_fresh():
                     driver.engage()
                 self.servo.note_withheld()
                 return
@@ -332,8 +332,7 @@ class ArmUnit:
                 raise self.error
             if self.driver.engaged:
                 return
-            t = self.reading.t if self.reading is not None else -math.inf
-            if t >= began and self._t_read - t <= max(FRESH, 2.0 * self.dt):
+            if self.reading is not None and self.reading.t >= began and self._is_fresh():
                 self.driver.engage()
             turn()
             began = min(began, self._t_read)
@@ -343,6 +342,10 @@ class ArmUnit:
                 "check its power supply and its emergency stop",
                 code="not_engaged",
             )
+
+    def _is_fresh(self) -> bool:
+        """Return whether the newest state is new enough to switch a drive on where it shows the arm."""
+        return self.reading is not None and self._t_read - self.reading.t <= max(FRESH, 2.0 * self.dt)
 
     def recover(self) -> None:
         """Clear a fault of the device, or of how it follows its set-points."""

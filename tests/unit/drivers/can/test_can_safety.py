@@ -30,6 +30,7 @@ from hal.drivers.can.piper_protocol import GripperRequest, JointTargets, decode_
 from hal.drivers.can.settings import BusSettings, DamiaoMotorSettings
 from hal.errors import ConfigError, ConnectionLost, ControlTaken, RobotFault
 from hal.host.cycle import ArmUnit
+from hal.types import RobotStatus
 
 from ....kits.can_kit import can_overrides
 
@@ -271,7 +272,8 @@ class NoMail:
     """A mailbox without content."""
 
 
-def test_an_arm_that_was_moved_while_this_process_was_paused_is_held_where_it_is_now(yam: Bench) -> None:
+@pytest.mark.parametrize("session", [False, True], ids=["when_a_session_opens", "in_a_session"])
+def test_an_arm_that_was_moved_while_this_process_was_paused_is_held_where_it_is_now(yam: Bench, session: bool) -> None:
     unit = ArmUnit(yam.spec, 1.0 / yam.spec.rate_hz, NoMail(), None)  # type: ignore[arg-type]
     yam.driver = unit.driver
 
@@ -285,7 +287,16 @@ def test_an_arm_that_was_moved_while_this_process_was_paused_is_held_where_it_is
     yam.arm.plant.place((0.5, *OUTSTRETCHED[1:]))  # by hand, for as long as this process is paused
     yam.passed += 10.0
     yam.arm.peak = list(NO_MOTION)
-    unit._engage(turn)
+    if session:
+        unit.servo.report.status = RobotStatus.FOLLOWING
+        unit._setpoint = Setpoint(OUTSTRETCHED, NO_MOTION, NO_MOTION)
+        for _ in range(100):
+            unit.read(yam.now)
+            if not unit.driver.engaged:
+                unit.write(yam.now)
+            yam.advance(unit.dt)
+    else:
+        unit._engage(turn)
     assert unit.driver.engaged
     for _ in range(50):
         turn()
