@@ -1,4 +1,4 @@
-"""Test tiers, the meaning of a skip, and plain specs to make drivers from.
+"""Test tiers, the meaning of a skip, the simulation's engines, and plain specs to make drivers from.
 
 Every test carries the marker of its folder: ``unit``, ``contract``, ``lock_step``, ``wire``, ``system``, ``browser``,
 ``apps``, ``docs`` or ``packaging``. The first three are the fast tier, which carries ``fast`` as well, and is what
@@ -15,8 +15,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from engines_kit import Engine, need_engine
 
-from hal import testing
+from hal import registry, testing
 from hal.specs import CameraSpec, GripperSpec, PadSpec, RobotSpec
 
 STRICT = os.environ.get("HAL_TEST_STRICT", "") not in ("", "0")
@@ -137,6 +138,15 @@ def _strict(report: Any) -> Any:
         report.outcome = "failed"
         report.longrepr = f"HAL_TEST_STRICT=1 does not allow to skip: {reason}"
     return report
+
+
+# Engines.
+
+
+@pytest.fixture(scope="session", params=registry.ENGINES)
+def engine(request: pytest.FixtureRequest) -> Engine:
+    """Each engine of the simulated world in turn."""
+    return need_engine(request.param)
 
 
 # Specs.

@@ -28,7 +28,7 @@ except ImportError as error:
     ) from error
 
 pytest.register_assert_rewrite(
-    *(f"{__name__}.{part}" for part in ("benches", "camera", "gamepad", "gripper", "hosting", "robot"))
+    *(f"{__name__}.{part}" for part in ("benches", "camera", "gamepad", "gripper", "hosting", "robot", "world"))
 )
 
 from .benches import (  # noqa: E402
@@ -49,6 +49,7 @@ from .camera import CameraContract  # noqa: E402
 from .gamepad import GamepadContract  # noqa: E402
 from .gripper import GripperContract  # noqa: E402
 from .robot import RobotContract  # noqa: E402
+from .world import WorldBench, WorldContract  # noqa: E402
 
 __all__ = [
     "Bench",
@@ -61,6 +62,8 @@ __all__ = [
     "PadBench",
     "RobotBench",
     "RobotContract",
+    "WorldBench",
+    "WorldContract",
     "bench_of",
     "camera_spec",
     "gripper_spec",

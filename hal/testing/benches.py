@@ -220,7 +220,7 @@ def bench_of(make: Callable[[], AbstractContextManager[Bench]]) -> Any:
 
 
 class Contract:
-    """A class of checks. Inherit from one of the four contracts, give it a fixture ``bench``, and run pytest.
+    """A class of checks. Inherit from one of the five contracts, give it a fixture ``bench``, and run pytest.
 
     What the device cannot do is left out by name and with a reason; it is never skipped::
 

@@ -10,13 +10,15 @@ from typing import Any
 
 import pytest
 
+from hal import registry
 from hal.clock import LockStepClock, RealClock
 from hal.drivers.mock.camera import MockCamera
 from hal.drivers.mock.robot import MockGripper, MockRobot
 from hal.specs import BodySpec, CameraSpec, GroupSpec, ViewSpec, WorldSpec
-from hal.testing import CameraBench, GripperBench, RobotBench, camera_spec, gripper_spec, robot_spec
+from hal.testing import CameraBench, GripperBench, RobotBench, WorldBench, camera_spec, gripper_spec, robot_spec
 
 from ..kits.drives import ArmWithDrives
+from ..kits.engines_kit import Engine, need_engine
 from ..kits.specs import data, panda
 
 __all__ = [
@@ -28,9 +30,10 @@ __all__ = [
     "mock_robot_with_drives",
     "played_realsense",
     "pybullet_camera_in_lock_step",
-    "pybullet_gripper",
-    "pybullet_robot",
     "recording",
+    "simulated_gripper",
+    "simulated_robot",
+    "simulated_world",
     "software_realsense",
     "three_joints",
 ]
@@ -80,13 +83,9 @@ def three_joints() -> Iterator[RobotBench]:
 
 
 @contextmanager
-def pybullet_robot() -> Iterator[RobotBench]:
-    from hal.drivers.pybullet.robot import PyBulletRobot
-    from hal.drivers.pybullet.world import PyBulletWorld
-
-    spec = panda(driver="pybullet")
-    world = PyBulletWorld(WorldSpec("pybullet", 240.0, (0.0, 0.0, -9.81), (), (spec,)))
-    driver = PyBulletRobot(spec, world)
+def simulated_robot(engine: Engine) -> Iterator[RobotBench]:
+    world = engine.world(panda())
+    driver = engine.robot(world)
     yield _robot_bench(driver, advance=world.step)
     driver.close()
     world.close()
@@ -103,17 +102,10 @@ def mock_gripper() -> Iterator[GripperBench]:
 
 
 @contextmanager
-def pybullet_gripper() -> Iterator[GripperBench]:
-    from hal.drivers.pybullet.gripper import PyBulletGripper
-    from hal.drivers.pybullet.robot import PyBulletRobot
-    from hal.drivers.pybullet.world import PyBulletWorld
-
-    spec = panda(driver="pybullet")
-    assert spec.gripper is not None
-    world = PyBulletWorld(WorldSpec("pybullet", 240.0, (0.0, 0.0, -9.81), (), (spec,)))
-    arm = PyBulletRobot(spec, world)
+def simulated_gripper(engine: Engine) -> Iterator[GripperBench]:
+    world = engine.world(panda())
+    arm, driver = engine.robot(world), engine.gripper(world)
     arm.open()
-    driver = PyBulletGripper(spec.gripper, world)
     x, y, z = world.pose("panda", "panda_hand")["position"]
 
     def put_object(width: float) -> None:
@@ -124,6 +116,15 @@ def pybullet_gripper() -> Iterator[GripperBench]:
     driver.close()
     arm.close()
     world.close()
+
+
+# Worlds.
+
+
+@contextmanager
+def simulated_world(name: str) -> Iterator[WorldBench]:
+    need_engine(name)
+    yield WorldBench(name=name, make=registry.load(name, "world"))
 
 
 # Cameras.

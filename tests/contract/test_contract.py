@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from hal.testing import CameraContract, Contract, GamepadContract, GripperContract, RobotContract
+from hal.testing import CameraContract, Contract, GamepadContract, GripperContract, RobotContract, WorldContract
 
 HERE = Path(__file__).parent
 
@@ -36,6 +36,8 @@ NOTICED = {
     "TestStuckButtons": "test_an_unplugged_pad_is_released",
     "TestCounts": "test_names_and_ranges",
     "TestWaits": "test_a_poll_without_time_out_does_not_wait",
+    "TestStalePoses": "test_bodies_stand_where_their_records_place_them",
+    "TestMoreThanPoses": "test_edits_are_counted_and_announced",
     "TestNoBench": "test_info_describes_the_camera",
     "TestForgotten": "test_info_describes_the_camera",
     "TestBoth": "test_describe_names_the_device",
@@ -82,7 +84,7 @@ def test_what_is_left_out_must_be_known_and_have_a_reason(left_out: dict[str, st
         type("Wrong", (CameraContract,), {}, left_out=left_out)
 
 
-@pytest.mark.parametrize("contract", [RobotContract, GripperContract, CameraContract, GamepadContract])
+@pytest.mark.parametrize("contract", [RobotContract, GripperContract, CameraContract, GamepadContract, WorldContract])
 def test_every_ability_is_needed_by_a_check(contract: type[Contract]) -> None:
     needed = {ability for name in dir(contract) for ability in getattr(getattr(contract, name), "needs", ())}
     assert needed == set(contract.abilities)

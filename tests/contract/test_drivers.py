@@ -14,12 +14,15 @@ from hal.testing import (
     CameraBench,
     CameraContract,
     GamepadContract,
+    GripperBench,
     GripperContract,
     RobotBench,
     RobotContract,
+    WorldContract,
     bench_of,
 )
 
+from ..kits.engines_kit import Engine
 from .benches import (
     RenderedWorld,
     mock_camera,
@@ -29,9 +32,10 @@ from .benches import (
     mock_robot_with_drives,
     played_realsense,
     pybullet_camera_in_lock_step,
-    pybullet_gripper,
-    pybullet_robot,
     recording,
+    simulated_gripper,
+    simulated_robot,
+    simulated_world,
     software_realsense,
     three_joints,
 )
@@ -60,8 +64,11 @@ class TestArmWithoutUrdf(RobotContract):
     bench = bench_of(three_joints)
 
 
-class TestPyBulletRobot(RobotContract):
-    bench = bench_of(pybullet_robot)
+class TestSimulatedRobot(RobotContract):
+    @pytest.fixture
+    def bench(self, engine: Engine) -> Iterator[RobotBench]:
+        with simulated_robot(engine) as bench:
+            yield bench
 
 
 class TestEmulatedPiper(RobotContract, left_out=PIPER_REPORTS | {"torque": "its controller takes positions only"}):
@@ -115,8 +122,11 @@ class TestMockGripper(GripperContract):
     bench = bench_of(mock_gripper)
 
 
-class TestPyBulletGripper(GripperContract, left_out=NO_LINK):
-    bench = bench_of(pybullet_gripper)
+class TestSimulatedGripper(GripperContract, left_out=NO_LINK):
+    @pytest.fixture
+    def bench(self, engine: Engine) -> Iterator[GripperBench]:
+        with simulated_gripper(engine) as bench:
+            yield bench
 
 
 class TestEmulatedPiperGripper(GripperContract, left_out=PIPER_REPORTS):
@@ -130,6 +140,17 @@ class TestEmulatedDamiaoGripper(GripperContract, left_out={"freeze": "a silent m
 @pytest.mark.slow
 class TestEmulatedFrankaHand(GripperContract):
     bench = bench_of(franka_hand)
+
+
+# Simulated worlds.
+
+
+class TestPyBulletWorld(WorldContract):
+    bench = bench_of(partial(simulated_world, "pybullet"))
+
+
+class TestMujocoWorld(WorldContract):
+    bench = bench_of(partial(simulated_world, "mujoco"))
 
 
 # Cameras.

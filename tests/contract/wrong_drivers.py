@@ -8,6 +8,7 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
+from hal import registry
 from hal.clock import RealClock
 from hal.drivers.mock.camera import MockCamera
 from hal.drivers.mock.gamepad import MockPad
@@ -21,6 +22,8 @@ from hal.testing import (
     PadBench,
     RobotBench,
     RobotContract,
+    WorldBench,
+    WorldContract,
     camera_spec,
     gripper_spec,
     pad_spec,
@@ -272,6 +275,31 @@ class TestWaits(WrongPad):
         def poll(self, now, timeout):
             time.sleep(0.01)
             return super().poll(now, timeout)
+
+
+# Worlds.
+
+
+class WrongWorld(WorldContract):
+    engine = registry.choose_engine("auto")
+
+    @pytest.fixture
+    def bench(self) -> WorldBench:
+        return WorldBench(name=self.engine, make=self.driver)
+
+
+class TestStalePoses(WrongWorld):
+    class driver(registry.load(WrongWorld.engine, "world")):  # noqa: N801
+        def pose(self, name, link=None):
+            self.kept = getattr(self, "kept", None) or super().pose(name, link)
+            return self.kept
+
+
+class TestMoreThanPoses(WrongWorld):
+    class driver(registry.load(WrongWorld.engine, "world")):  # noqa: N801
+        def set_pose(self, name, pose):
+            super().set_pose(name, pose)
+            self.revision += 1
 
 
 # Benches.
