@@ -18,7 +18,7 @@ from hal.errors import ConfigError, ConnectionLost, DeviceNotFound, Fault, HalEr
 from hal.lock import DeviceLock
 
 from .bus import CanBus
-from .damiao_motor import CHECKED_REGISTERS, HEAT_MARGIN, ChainMotor, motor_fault, register_problems
+from .damiao_motor import CHECKED_REGISTERS, HEAT_MARGIN, MILD_FAULTS, ChainMotor, motor_fault, register_problems
 from .damiao_protocol import (
     CLEAR_ERROR,
     DISABLE,
@@ -346,17 +346,19 @@ class DamiaoChain:
     # Faults.
 
     def fault(self, *, engaged: bool) -> Fault | None:
-        """Return the fault of a motor, naming it; None without one.
+        """Return the gravest fault of a motor, naming it; None without one.
 
         Args:
             engaged: Whether the motors are in use. One that is not may have lost communication: that is its rest.
         """
+        mild: Fault | None = None
         for motor in self.motors:
             if motor.status > 1 or motor.rotor >= motor.rotor_warning or motor.mosfet >= self._mosfet_warning:
                 fault = motor_fault(motor, self.mosfet_limit, engaged=engaged)
-                if fault is not None:
+                if fault is not None and fault.code not in MILD_FAULTS:
                     return fault
-        return None
+                mild = mild or fault
+        return mild
 
     def clear_errors(self) -> None:
         """Clear the errors of all motors that have one; those are then off. Takes up to 30 ms.
