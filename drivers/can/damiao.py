@@ -54,6 +54,7 @@ class DamiaoArm(RobotDriver):
             settings.motors,
             spec.joints,
             settings.mosfet_limit,
+            spec.source,
         )
         self._motors = self.chain.motors
         self.engaged = False

@@ -26,7 +26,7 @@ from .damiao_protocol import (
     REGISTER_ID,
     encode_register_read,
 )
-from .settings import BusSettings, DamiaoMotorSettings, is_emulated
+from .settings import BusSettings, DamiaoMotorSettings, emulator_remedy, is_emulated
 
 __all__ = ["SILENCE", "SWITCHING", "DamiaoChain"]
 
@@ -68,6 +68,7 @@ class DamiaoChain:
         motors: The motors' settings.
         labels: The motors in words, for example "joint1".
         mosfet_limit: Temperature at which their electronics switch off, deg C.
+        source: The rig's file, for messages.
     """
 
     def __init__(
@@ -78,9 +79,11 @@ class DamiaoChain:
         motors: Sequence[DamiaoMotorSettings],
         labels: Sequence[str],
         mosfet_limit: float,
+        source: str = "",
     ) -> None:
         self.name = name
         self.where = where
+        self.source = source
         self.settings = settings.shared
         self.motors = tuple(
             ChainMotor(motor, f"{label} (motor {motor.id})") for motor, label in zip(motors, labels, strict=True)
@@ -182,7 +185,7 @@ class DamiaoChain:
             found = ", ".join(f"{id:#x}" for id in sorted(bus.unexpected_ids)[:8])
             who += f"; unexpected ids: {found} (`master` is the id that a motor answers with)"
         if is_emulated({"interface": s.interface}):
-            remedy = "start the emulator in another terminal: python -m hal.drivers.can.emulator --config YOUR_RIG.yaml"
+            remedy = emulator_remedy(self.source)
         elif answer:
             remedy = "check its power, its plugs and its id"
         else:

@@ -199,7 +199,9 @@ def check_damiao(spec: RobotSpec, duration: float) -> Iterator[CheckResult]:
         return
     bus = CanBus.acquire(settings.shared)
     chains = [
-        DamiaoChain(spec.name, "real.motors", settings, settings.motors, spec.joints, settings.mosfet_limit),
+        DamiaoChain(
+            spec.name, "real.motors", settings, settings.motors, spec.joints, settings.mosfet_limit, spec.source
+        ),
     ]
     gripper = spec.gripper
     if gripper is not None and gripper.driver == spec.driver:
@@ -416,7 +418,7 @@ def check_piper(spec: RobotSpec, duration: float) -> Iterator[CheckResult]:
         return
     where = " ".join(settings.key)
     reports = _PiperReports()
-    link = PiperLink(spec.name, settings, reports.take, (*FEEDBACK_IDS, *PARAMETER_IDS))
+    link = PiperLink(spec.name, settings, reports.take, (*FEEDBACK_IDS, *PARAMETER_IDS), spec.source)
     lock: DeviceLock | None = None
     try:
         if settings.interface != "virtual":

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import ipaddress
 import itertools
+import shlex
 from collections.abc import Iterator, Mapping
 from functools import cached_property
 from typing import Annotated, Any, Literal, TypeVar
@@ -33,6 +34,7 @@ __all__ = [
     "check_damiao_gripper",
     "check_piper_arm",
     "check_piper_gripper",
+    "emulator_remedy",
     "group_key",
     "is_emulated",
 ]
@@ -64,6 +66,17 @@ def group_key(options: Mapping[str, Any]) -> str | None:
     """
     interface, channel = (str(options.get(key, "")).strip() for key in ("interface", "channel"))
     return None if interface.lower() in _SHAREABLE else f"{interface} {channel}"
+
+
+def emulator_remedy(source: str) -> str:
+    """Return the command that starts the emulator of a rig, as the remedy of a message.
+
+    Args:
+        source: The rig's file; a rig without one (``<dict>``, or an empty text) needs one for its emulator.
+    """
+    known = bool(source) and not source.startswith("<")
+    file = shlex.quote(source) if known else "FILE, with the rig in a file"
+    return f"start the emulator in another terminal: python -m hal.drivers.can.emulator --config {file}"
 
 
 # Values.
