@@ -47,6 +47,8 @@ _USUAL_GROUP, _USUAL_PORT = "239.74.163.2", 43113
 """Channel and port of python-can's own default for ``udp_multicast``."""
 _FIRST_PORT, _PORTS = 20_000, 12_000
 """Range of the ports of other channels, below those that Linux gives to outgoing connections."""
+_LONGEST_NAME = 15
+"""Longest name of a network interface of Linux."""
 _LARGEST_ID = 0x7FE
 _LARGEST_MOTOR_ID = 0xFF
 """Ids of commands in other modes begin above it."""
@@ -178,6 +180,11 @@ class BusSettings(Strict):
                 group = False
             if not group:
                 raise ValueError(f"channel: must be a multicast address such as {_USUAL_GROUP}, not {self.channel}")
+        if self.interface == "socketcan" and (len(self.channel) > _LONGEST_NAME or "/" in self.channel):
+            raise ValueError(
+                f"channel: must be the name of an interface such as can0, not {self.channel}; a serial adapter has "
+                "`interface: slcan`"
+            )
         return self
 
     @property
