@@ -69,18 +69,10 @@ def show_can() -> bool:
     from hal.errors import HalError
 
     found = failed = False
-    drivers: dict[str, list[str]] = {}
-    for name in registry.BUILT_IN:
-        if (place := registry.driver(name).buses) is not None:
-            drivers.setdefault(place, []).append(name)
-    for place, names in drivers.items():
-        missing = registry.missing(names[0])
-        if missing:
-            print(f"the library of {' and '.join(names)} is not installed: {', '.join(missing.values())}")
-            failed = True
-            continue
+    places = {registry.driver(name).buses: name for name in registry.BUILT_IN}
+    for place, name in places.items():
         try:
-            lines = registry.function(names[0], place)
+            lines = registry.function(name, place)
             for line in lines() if lines is not None else ():
                 print(line)
                 found = True

@@ -15,7 +15,6 @@ from __future__ import annotations
 import argparse
 import gc
 import math
-import os
 import statistics
 import time
 from collections.abc import Callable
@@ -26,6 +25,7 @@ from ruckig import ControlInterface, InputParameter, OutputParameter, Ruckig, Sy
 from servo_streams import PANDA, robot_spec
 
 from hal.commands import NO_INBOX, CommandRecord, Inbox, Kind, Session
+from hal.config.data_files import find_data
 from hal.driver import Reading
 from hal.kinematics.arm import Kinematics
 from hal.servo.audit import SetpointAudit
@@ -38,13 +38,11 @@ Values = Callable[[float, list[float]], list[float]]
 
 
 def panda() -> RobotSpec:
-    """Return the Panda of PyBullet's data."""
-    import pybullet_data
-
+    """Return a Panda."""
     spec = robot_spec(PANDA, RATE_HZ)
     kinematics = replace(
         spec.kinematics,
-        urdf=os.path.join(pybullet_data.getDataPath(), "franka_panda", "panda.urdf"),
+        urdf=str(find_data("robots", "panda.urdf")),
         joints=tuple(f"panda_joint{i}" for i in range(1, 8)),
         tcp_link="panda_hand",
         tcp_position=(0.0, 0.0, 0.1034),

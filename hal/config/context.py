@@ -150,8 +150,10 @@ class Context:
 
 _HAS_WHEEL = sys.version_info < (3, 12) and (sys.platform, platform.machine()) == ("linux", "x86_64")
 _NO_WHEEL = (
-    f"PyBullet has no wheel for Python {platform.python_version()} on {platform.machine()}: use Python 3.11 on x86-64 "
-    "Linux (uv venv --seed --python 3.11 .venv, then install again), or build it (C++ compiler): pip install pybullet"
+    "it is a part of PyBullet, which has no wheel for "
+    f"Python {platform.python_version()} on {sys.platform} {platform.machine()}. Use Python 3.11 on x86-64 Linux "
+    "(uv venv --seed --python 3.11 .venv, then install again), or build it (C++ compiler): pip install pybullet. "
+    "The Panda, the FR3 and the built-in objects do not need it"
 )
 INSTALL = {
     "pybullet_data": "pip install pybullet" if _HAS_WHEEL else _NO_WHEEL,

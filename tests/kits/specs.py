@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 
+from hal.config.data_files import find_data
 from hal.drivers.pybullet.engine import load_pybullet
 from hal.errors import DriverMissing
 from hal.specs import BodySpec, GripperSpec, KinematicsSpec, LimitsSpec, RobotSpec, WorldSpec
@@ -59,7 +60,7 @@ def panda(name: str = "panda", **changes: Any) -> RobotSpec:
     gripper = GripperSpec(name, "pybullet", width_max=0.08, speed=0.1, force=40.0, joints=fingers)
     joints = tuple(f"panda_joint{k}" for k in range(1, 8))
     values: dict[str, Any] = {"model": "panda", "joints": joints, "home": PANDA_HOME, "gripper": gripper}
-    arm = _arm(name, data("franka_panda/panda.urdf"), limits, "panda_hand", 0.1034, values)
+    arm = _arm(name, str(find_data("robots", "panda.urdf")), limits, "panda_hand", 0.1034, values)
     return replace(arm, **changes)
 
 

@@ -215,7 +215,7 @@ def place_of(number: int) -> np.random.Generator:
 def lines() -> list[str]:
     """The file, line by line."""
     quiet = ["cameras={}"]
-    with hal.open("panda_table", sim=True, clock="lock_step", pad="none", overrides=quiet) as rig:
+    with hal.open("panda_table", sim=True, clock="lock_step", engine="pybullet", pad="none", overrides=quiet) as rig:
         held = HeldPad(rig.plan.pads[0])
         pad, arm, person = Gamepad(held), rig.robots["panda"], Person(rig, held)
         pad.open(rig.clock.now())

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import pytest
+from specs import data
 
 import hal
 from hal.apps._display import banner, list_devices
@@ -36,11 +37,12 @@ def test_a_real_hand_on_a_simulated_arm_is_called_real() -> None:
 
 
 def test_what_the_simulation_changed_in_a_file_is_a_note() -> None:
-    with hal.open("panda_table", sim=True, clock="lock_step", pad="none", overrides=("cameras={}",)) as rig:
-        duck, arm = rig.notes
-        assert duck.startswith("duck: inertia computed from the collision shapes")
-        assert arm.startswith("panda: inertia computed from the collision shapes")
-        assert f"note     {duck}" in banner(rig)
+    duck = {"name": "duck", "urdf": data("duck_vhacd.urdf"), "position": [0, 0.5, 0]}
+    config = {"sim": True, "robots": {"arm": {"model": "panda"}}, "objects": [duck]}
+    with hal.open(config, clock="lock_step", pad="none", engine="pybullet") as rig:
+        (note,) = rig.notes
+        assert note.startswith("duck: inertia computed from the collision shapes")
+        assert f"note     {note}" in banner(rig)
 
 
 def test_pads_of_fixed_models_are_named_with_the_arms_that_they_drive() -> None:

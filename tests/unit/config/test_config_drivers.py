@@ -91,6 +91,7 @@ def found(config: dict[str, Any], **arguments: Any) -> set[tuple[str, str]]:
 def own_model(folder: Path, **keys: Any) -> str:
     """A model of one's own, a Panda otherwise."""
     model = yaml.safe_load(find_data("robots", "panda.yaml").read_text())
+    model["urdf"] = str(find_data("robots", "panda.urdf"))
     model["gripper"]["drivers"] = model["drivers"] = {"sim": "pybullet", **ME}
     (folder / "mine.yaml").write_text(yaml.safe_dump({**model, "real": {}, **keys}))
     return str(folder / "mine.yaml")

@@ -386,7 +386,7 @@ class Bench:
         self.wrist["model"] = "camera.yaml"
         self.rig["gamepads"]["pad"] = {"model": "dualshock4", "driver": "evdev"}
         self.pad: dict[str, Any] = self.rig["gamepads"]["pad"]
-        self.rig["robots"]["other"] = {"model": "iiwa", "base": [2, 0, 0, 0, 0, 0, 1]}
+        self.rig["robots"]["other"] = {"model": "fr3", "base": [2, 0, 0, 0, 0, 0, 1]}
         self.objects: list[Any] = self.rig["objects"]
         self.objects += ["cup.yaml", {"file": "cube", "name": "brick"}]
 
@@ -479,7 +479,7 @@ def test_a_finger_that_turns_is_refused(bench: Bench) -> None:
 def test_a_model_and_a_urdf_without_speed_limits(bench: Bench) -> None:
     del bench.arm["limits"]["velocity"]
     assert bench.found() == set(), "the URDF has them"
-    bench.urdf = bench.urdf.replace('velocity="2.1750"', 'velocity="0"')
+    bench.urdf = bench.urdf.replace('velocity="2.175"', 'velocity="0"')
     assert bench.only() == ("arm.yaml", "limits.velocity", "missing_key")
 
 
@@ -503,7 +503,7 @@ def test_a_driver_whose_package_does_not_import() -> None:
 
 def _hide_speed_limit(bench: Bench) -> None:
     del bench.arm["limits"]["velocity"]
-    bench.urdf = bench.urdf.replace('velocity="2.1750"', 'velocity="0"')
+    bench.urdf = bench.urdf.replace('velocity="2.175"', 'velocity="0"')
 
 
 MISTAKES: dict[tuple[str, str], Callable[[Bench], object]] = {

@@ -77,6 +77,7 @@ def test_an_engine_named_by_a_model_means_the_engine_of_the_rig(installed: Insta
     """As in models from before there was a choice, whose options of the simulation still apply."""
     installed("mujoco")
     model = yaml.safe_load(find_data("robots", "panda.yaml").read_text())
+    model["urdf"] = str(find_data("robots", "panda.urdf"))
     model["drivers"] = model["gripper"]["drivers"] = {"sim": "pybullet"}
     (tmp_path / "mine.yaml").write_text(yaml.safe_dump({**model, "simulated": {"speed": 1}}))
     rig = {"robots": {"arm": {"model": str(tmp_path / "mine.yaml")}}}

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from specs import panda
+from specs import data, panda
 
 from hal.config.data_files import data_folder
 from hal.dynamics import STANDARD_GRAVITY, Dynamics
@@ -143,7 +143,7 @@ def test_links_that_the_arm_does_not_move_need_no_mass(tmp_path: Path) -> None:
 
 
 def test_invented_inertias_are_found() -> None:
-    spec = panda()
+    spec = panda(urdf=data("franka_panda/panda.urdf"))
     assert {"panda_link6", "panda_link7", "panda_hand"} <= set(find_wrong_inertials(spec.urdf, spec.joints))
 
 

@@ -1,4 +1,4 @@
-"""The FR3's files: the URDF has Franka's published values and loads everywhere; its limits hold in its whole range."""
+"""The FR3's and the Panda's URDFs have the published values and load everywhere; the FR3's limits hold in its range."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from specs import cube, data, world_spec
+from specs import cube, data, panda, world_spec
 
 from hal.config import load
 from hal.config.data_files import find_data
@@ -19,6 +19,7 @@ from hal.kinematics.arm import Kinematics
 from hal.specs import RobotSpec
 
 URDF = find_data("robots", "fr3.urdf")
+PANDA = find_data("robots", "panda.urdf")
 JOINTS = [f"fr3_joint{k}" for k in range(1, 8)]
 # a, d, alpha of the modified Denavit-Hartenberg parameters in Franka's documents; the last row is the flange.
 DH = [
@@ -56,44 +57,52 @@ def random_positions(count: int) -> np.ndarray:
     return np.random.default_rng(1).uniform(FR3.lower, FR3.upper, (count, 7))
 
 
-def test_the_kinematics_are_those_of_the_table() -> None:
-    spec = fr3()
-    kinematics = Kinematics(spec.kinematics)
-    to_hand = turn_z(-math.pi / 4)
-    to_hand[2, 3] = 0.1034
+@pytest.mark.parametrize(("model", "end"), [("fr3", "fr3_hand_tcp"), ("panda", "panda_hand")])
+def test_the_kinematics_are_those_of_the_table(model: str, end: str) -> None:
+    kinematics = Kinematics(load("franka", overrides=[f"robots.arm.model={model}"]).resolve().robots[0].kinematics)
+    to_tcp = turn_z(-math.pi / 4)
+    to_tcp[2, 3] = 0.1034
+    to_end = to_tcp if end.endswith("tcp") else turn_z(-math.pi / 4)
     for q in random_positions(50):
-        assert kinematics.pose(q).matrix() == pytest.approx(flange(q) @ to_hand, abs=1e-9)
-        assert kinematics.link_pose("fr3_hand_tcp", q).matrix() == pytest.approx(flange(q) @ to_hand, abs=1e-9)
+        assert kinematics.pose(q).matrix() == pytest.approx(flange(q) @ to_tcp, abs=1e-9)
+        assert kinematics.link_pose(end, q).matrix() == pytest.approx(flange(q) @ to_end, abs=1e-9)
 
 
 def test_every_link_stands_where_that_of_pybullets_panda_does() -> None:
     from hal.drivers.pybullet.world import PyBulletWorld
 
-    panda = load("franka", overrides=["robots.arm.model=panda"]).resolve().robots[0]
     apart = np.array([0.0, 2.0, 0.0])
-    base = tuple(np.add(panda.base_position, apart).tolist())
-    world = PyBulletWorld(world_spec(replace(fr3(), name="fr3"), replace(panda, name="panda", base_position=base)))
-    assert not [warning for warning in world.warnings if "fr3" in warning]
+    theirs = data("franka_panda/panda.urdf")
+    arms = [
+        replace(fr3(), name="fr3", base_position=(0.0, 0.0, 0.0)),
+        panda("panda", base_position=(0.0, 2.0, 0.0)),
+        panda("reference", base_position=(0.0, 4.0, 0.0), urdf=theirs),
+    ]
+    world = PyBulletWorld(world_spec(*arms))
+    assert all(warning.startswith("reference") for warning in world.warnings)
     links = [*(f"link{k}" for k in range(9)), "hand", "leftfinger", "rightfinger"]
     for q in random_positions(20):
-        world.reset("fr3", q=[*q, 0.01, 0.01])
-        world.reset("panda", q=[*q, 0.01, 0.01])
+        for arm in arms:
+            world.reset(arm.name, q=[*q, 0.01, 0.01])
         for link in links:
-            ours, theirs = world.pose("fr3", f"fr3_{link}"), world.pose("panda", f"panda_{link}")
-            assert ours["position"] == pytest.approx(np.subtract(theirs["position"], apart), abs=1e-6), link
-            if link != "rightfinger":  # ours is turned about z, so that both fingers are alike
-                same = abs(np.dot(ours["orientation"], theirs["orientation"]))
-                assert same == pytest.approx(1.0, abs=1e-6), link
+            right = world.pose("reference", f"panda_{link}")
+            for name, prefix, steps in (("panda", "panda", 1), ("fr3", "fr3", 2)):
+                ours = world.pose(name, f"{prefix}_{link}")
+                assert ours["position"] == pytest.approx(right["position"] - steps * apart, abs=1e-6), (name, link)
+                if (name, link) != ("fr3", "rightfinger"):  # turned about z, so that both fingers are alike
+                    same = abs(np.dot(ours["orientation"], right["orientation"]))
+                    assert same == pytest.approx(1.0, abs=1e-6), (name, link)
     world.close()
 
 
-def test_pybullet_loads_it_without_messages() -> None:
+@pytest.mark.parametrize("urdf", [URDF, PANDA])
+def test_pybullet_loads_it_without_messages(urdf: Path) -> None:
     from hal.drivers.pybullet.engine import PyBulletClient, silenced
     from hal.drivers.pybullet.loading import loadable_urdf
 
     data("")
     client = PyBulletClient()
-    with loadable_urdf(str(URDF)) as file, silenced() as chatter:
+    with loadable_urdf(str(urdf)) as file, silenced() as chatter:
         body = client.loadURDF(file, useFixedBase=True, flags=client.URDF_USE_INERTIA_FROM_FILE)
     assert chatter.text == ""
     drawn = [Path(shape[4].decode()) for shape in client.getVisualShapeData(body)]
@@ -102,11 +111,12 @@ def test_pybullet_loads_it_without_messages() -> None:
     client.close()
 
 
-def test_the_other_views_find_its_meshes() -> None:
+@pytest.mark.parametrize("urdf", [URDF, PANDA])
+def test_the_other_views_find_its_meshes(urdf: Path) -> None:
     from hal.kinematics.urdf import read_urdf
 
     data("")
-    visuals = [visual for link in read_urdf(URDF).links.values() for visual in link.visuals]
+    visuals = [visual for link in read_urdf(urdf).links.values() for visual in link.visuals]
     assert len(visuals) == 11
     assert all(Path(visual.file).is_file() for visual in visuals)
 
@@ -133,9 +143,56 @@ def test_no_other_joint_can_be_taken_for_one_of_the_arms() -> None:
         assert [name for name in names if f"joint{k}" in name] == [f"fr3_joint{k}"]
 
 
-def test_it_weighs_what_an_fr3_with_a_hand_does() -> None:
-    masses = [float(mass.get("value", "nan")) for mass in ElementTree.parse(URDF).getroot().iter("mass")]
+@pytest.mark.parametrize("urdf", [URDF, PANDA])
+def test_it_weighs_what_an_arm_with_a_hand_does(urdf: Path) -> None:
+    masses = [float(mass.get("value", "nan")) for mass in ElementTree.parse(urdf).getroot().iter("mass")]
     assert 17.0 < sum(masses) < 20.0
+
+
+# Gaz et al. 2019, links 1 to 7: mass, kg; centre of mass, m; xx, xy, xz, yy, yz, zz of the inertia about it, kg m2.
+GAZ = """
+4.970684  0.003875  0.002081 -0.04762   0.70337  -0.000139  0.006772 0.70661   0.019169 0.009117
+0.646926 -0.003141 -0.02872   0.003495  0.007962 -0.003925  0.010254 0.02811   0.000704 0.025995
+3.228604  0.027518  0.039252 -0.066502  0.037242 -0.004761 -0.011396 0.036155 -0.012805 0.01083
+3.587895 -0.05317   0.104419  0.027454  0.025853  0.007796 -0.001332 0.019552  0.008641 0.028323
+1.225946 -0.011953  0.041065 -0.038437  0.035549 -0.002117 -0.004037 0.029474  0.000229 0.008627
+1.666555  0.060149 -0.014117 -0.010517  0.001964  0.000109 -0.001158 0.004354  0.000341 0.005433
+0.735522  0.010517 -0.004252  0.061597  0.012516 -0.000428 -0.001196 0.010027 -0.000741 0.004815
+"""
+
+
+def inertials(urdf: Path, link: str) -> list[float]:
+    """The numbers of a link in the order of GAZ."""
+    found = ElementTree.parse(urdf).getroot().find(f"link[@name='{link}']/inertial")
+    assert found is not None
+    mass, origin, inertia = found.find("mass"), found.find("origin"), found.find("inertia")
+    assert mass is not None
+    assert origin is not None
+    assert inertia is not None
+    numbers = [mass.get("value", ""), *origin.get("xyz", "").split()]
+    return [float(n) for n in (*numbers, *(inertia.get(f"i{k}", "") for k in ("xx", "xy", "xz", "yy", "yz", "zz")))]
+
+
+def test_the_pandas_torques_are_those_of_the_published_identification() -> None:
+    """The arm's own: without the hand."""
+    import pinocchio as pin
+
+    whole = pin.buildModelFromUrdf(str(PANDA))
+    models = []
+    for table in (
+        [inertials(PANDA, f"panda_link{k}") for k in range(1, 8)],
+        np.array(GAZ.split(), float).reshape(7, 10),
+    ):
+        arm = pin.buildReducedModel(whole, [8, 9], pin.neutral(whole))
+        for k, (mass, x, y, z, xx, xy, xz, yy, yz, zz) in enumerate(table, start=1):
+            about_com = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+            arm.inertias[k] = pin.Inertia(mass, np.array([x, y, z]), about_com)
+        models.append((arm, arm.createData()))
+    random = np.random.default_rng(2)
+    for q in random_positions(50):
+        dq, ddq = random.normal(0.0, 1.0, 7), random.normal(0.0, 5.0, 7)
+        ours, published = (pin.rnea(arm, data, q, dq, ddq) for arm, data in models)
+        assert ours == pytest.approx(published, abs=1e-3)
 
 
 def test_every_speed_holds_everywhere_in_the_range() -> None:
