@@ -1,0 +1,193 @@
+"""The engines of the simulated world as each other's referee: the same runs on each of them.
+
+    python benchmarks/engines.py [--only lock-step|real-time|collect|pictures|speed] [--seconds 5]
+
+lock-step   the recorded tour of a gamepad: where the arms end, whether the servo's set-points are equal to the bit, and
+            how far the joints are from their set-points.
+real-time   the same tour in real time.
+collect     two recorded demonstrations: how high each cube is lifted, and the columns of the datasets.
+pictures    two cameras draw the same state after each engine: the share of pixels that differ.
+speed       steps/s of ``RigEnv`` at 20 Hz over 240 Hz without cameras, in turns of one second.
+"""
+
+from __future__ import annotations
+
+import argparse
+import io
+import itertools
+import statistics
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from contextlib import redirect_stdout
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import hal
+from hal import registry
+from hal.config.data_files import find_data
+from hal.geometry import Pose
+from hal.learning.gym import RigEnv
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "kits"))
+from referee_kit import RATE_HZ, TOUR, drive_tour
+
+ENGINES = [name for name in registry.ENGINES if not registry.missing(name)]
+APART, TURNED = 0.002, 0.01
+"""Goal for the ends of the tour, m and rad."""
+
+
+def pairs(found: dict[str, Any]) -> Iterator[tuple[str, Any, Any]]:
+    """Yield "one / other" and the two results for each pair of engines."""
+    for (one, a), (other, b) in itertools.combinations(found.items(), 2):
+        yield f"{one} / {other}", a, b
+
+
+def show_ends(ends: dict[str, Pose]) -> None:
+    """Print how far the ends are apart."""
+    for title, a, b in pairs(ends):
+        distance, angle = a.distance(b)
+        good = distance <= APART and angle <= TURNED
+        print(f"  {title}: ends {1e3 * distance:.3f} mm and {1e3 * angle:.3f} mrad apart {'ok' if good else 'FAILS'}")
+
+
+def lock_step(_: float) -> None:
+    """Drive the tour in lock-step."""
+    runs = {}
+    for name in ENGINES:
+        began = time.perf_counter()
+        runs[name] = drive_tour(name)
+        took, run = time.perf_counter() - began, runs[name]
+        print(f"  {name:9s} {took:5.1f} s, joints at most {1e3 * run.lag:.2f} mrad from their set-points")
+    for title, a, b in pairs(runs):
+        same = a.q_set.shape == b.q_set.shape and np.array_equal(a.q_set, b.q_set)
+        print(f"  {title}: {len(a.q_set)} set-points {'equal to the bit' if same else 'DIFFER'}")
+    show_ends({name: run.end for name, run in runs.items()})
+
+
+def real_time(_: float) -> None:
+    """Drive the tour in real time, with cameras."""
+    ends = {}
+    for name in ENGINES:
+        with hal.open("panda_table", sim=True, engine=name, pad=TOUR) as rig:
+            arm, pad = rig.robots["panda"], rig.gamepads["pad"]
+            teleop = hal.Teleop(arm)
+            with arm.control(deadman=pad.hold(teleop.mapping.deadman), rate_hz=RATE_HZ) as control:
+                for tick in rig.clock.rate(RATE_HZ):
+                    motion, grip = teleop.step(pad.state(), tick.dt)
+                    control.send(motion, grip=grip)
+                    if pad.finished:
+                        break
+            ends[name] = arm.state().tcp
+            (group,) = rig.statistics().values()
+            print(f"  {name:9s} {group['ticks']} ticks, {group['missed']} missed")
+    show_ends(ends)
+
+
+def collect(_: float) -> None:
+    """Record two demonstrations."""
+    from hal.apps.collect import main
+    from hal.recording import Dataset
+
+    columns = {}
+    pad = find_data("config", "teleop/demonstrations.jsonl")
+    for name in ENGINES:
+        with tempfile.TemporaryDirectory() as folder:
+            words = ["--sim", "--engine", name, "--out", f"{folder}/data", "--pad", str(pad), "--episodes", "2"]
+            words += ["--set", "cameras={}", "--set", "simulation.clock=lock_step"]
+            printed = io.StringIO()
+            with redirect_stdout(printed):
+                status = main(words)
+            if status != 0:
+                print(printed.getvalue())
+            episodes = list(Dataset(f"{folder}/data").episodes)
+            heights = [float(np.ptp(episode.columns["observation.object.cube"][:, 2])) for episode in episodes]
+            marks = [episode.success for episode in episodes]
+            columns[name] = [sorted(episode.columns) for episode in episodes]
+            lifted = ", ".join(f"{100 * height:.1f} cm" for height in heights)
+            print(f"  {name:9s} cubes lifted by {lifted}; judged {marks}")
+    for title, a, b in pairs(columns):
+        print(f"  {title}: columns {'equal' if a == b else 'DIFFER'}")
+
+
+def pictures(_: float) -> None:
+    """Draw one state, as PyBullet's or the first engine's arm left it, on every engine."""
+    seen: dict[str, dict[str, Any]] = {}
+    state: dict[str, Any] = {}
+    for name in ENGINES:
+        with hal.open("panda_table", sim=True, engine=name, clock="lock_step", pad="none") as rig:
+            arm, world = rig.robots["panda"], rig.world
+            if not state:
+                rig.clock.sleep(0.5)
+                arm.move_to(arm.home + 0.2, speed=0.5)
+                state = {"q": arm.state().q, "cube": world.pose("cube"), "duck": world.pose("duck")}
+            for body in ("cube", "duck"):
+                world.set_pose(body, state[body])
+            world.reset("panda", q=state["q"])
+            seen[name] = {camera.name: camera.read() for camera in rig.cameras.values()}
+            print(f"  {name:9s} drawn by {rig.renderer}")
+    for title, a, b in pairs(seen):
+        for camera in a:
+            color = (a[camera].color != b[camera].color).any(axis=2)
+            depth = np.abs(a[camera].depth - b[camera].depth)
+            print(
+                f"  {title}, {camera}: {color.sum()} of {color.size} pixels differ in colour, "
+                f"{(depth > 0).sum()} in depth, by at most {1e3 * depth.max():.3f} mm"
+            )
+
+
+def speed(seconds: float) -> None:
+    """Step an environment on each engine, in turns."""
+    environments = {name: RigEnv("panda_table", engine=name, overrides=("cameras={}",)) for name in ENGINES}
+    rates: dict[str, list[float]] = {name: [] for name in ENGINES}
+    try:
+        actions = {}
+        for name, env in environments.items():
+            env.reset(seed=0)
+            actions[name] = env.action_space.sample() * 0 + np.append(env.robot.home, 0.0).astype(np.float32)
+        for _ in range(max(1, round(seconds))):
+            for name, env in environments.items():
+                began, steps = time.perf_counter(), 0
+                while time.perf_counter() - began < 1.0:
+                    action = actions[name].copy()
+                    action[:7] += 0.05 * np.sin(0.05 * steps + np.arange(7))
+                    env.step(action)
+                    steps += 1
+                rates[name].append(steps / (time.perf_counter() - began))
+    finally:
+        for env in environments.values():
+            env.close()
+    for name, values in rates.items():
+        print(f"  {name:9s} {statistics.median(values):7.0f} steps/s")
+    for title, a, b in pairs(rates):
+        ratio = statistics.median(y / x for x, y in zip(a, b, strict=True))
+        print(f"  {title}: the second takes {ratio:.2f} times as many steps")
+
+
+PARTS: dict[str, Callable[[float], None]] = {
+    "lock-step": lock_step,
+    "real-time": real_time,
+    "collect": collect,
+    "pictures": pictures,
+    "speed": speed,
+}
+
+
+def main() -> None:
+    """Run what the command line names."""
+    parser = argparse.ArgumentParser(description="the engines of the simulated world beside each other")
+    parser.add_argument("--only", choices=[*PARTS], help="one part")
+    parser.add_argument("--seconds", type=float, default=5.0, help="seconds for each engine's speed (%(default)g)")
+    args = parser.parse_args()
+    print(", ".join(f"{name} {' '.join(registry.versions(name).values())}" for name in ENGINES))
+    for name, part in PARTS.items():
+        if args.only in (None, name):
+            print(name)
+            part(args.seconds)
+
+
+if __name__ == "__main__":
+    main()
