@@ -324,7 +324,7 @@ def _resolve(place: str, name: str, requires: Mapping[str, str]) -> Any:
         module = importlib.import_module(module_name)
     except ImportError as error:
         library = (error.name or "").partition(".")[0]
-        if library == "hal" and not isinstance(error, ModuleNotFoundError):
+        if library == "hal" and error.name != module_name:
             raise  # a mistake in this package: the traceback is more useful
         remedy = requires.get(library)
         hints = [remedy] if remedy else [f"{command} (for {wanted})" for wanted, command in requires.items()]
