@@ -29,6 +29,7 @@ __all__ = [
     "add_rig_options",
     "check_driving_options",
     "check_everything",
+    "check_one_robot",
     "check_report",
     "config_options",
     "find_deadman",
@@ -264,6 +265,19 @@ def robot_names(args: argparse.Namespace) -> list[str]:
     if len(set(names)) < len(names):
         raise CommandError(f"--robot {args.robot}: an arm is named twice", code="duplicate_name")
     return names
+
+
+def check_one_robot(args: argparse.Namespace) -> None:
+    """Check the ``--robot`` of a program that moves one arm.
+
+    Raises:
+        CommandError: It names several.
+    """
+    from hal.errors import CommandError
+
+    if len(robot_names(args)) > 1:
+        message = f"--robot {args.robot}: this program moves one arm, and the others stand still; name one of them"
+        raise CommandError(message, code="one_robot")
 
 
 def select_robots(rig: Rig, args: argparse.Namespace) -> list[Robot]:

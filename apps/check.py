@@ -69,10 +69,18 @@ def show_can() -> bool:
     from hal.errors import HalError
 
     found = failed = False
-    places = {registry.driver(name).buses: name for name in registry.BUILT_IN}
-    for place, name in places.items():
+    drivers: dict[str, list[str]] = {}
+    for name in registry.BUILT_IN:
+        if (place := registry.driver(name).buses) is not None:
+            drivers.setdefault(place, []).append(name)
+    for place, names in drivers.items():
+        missing = registry.missing(names[0])
+        if missing:
+            print(f"the library of {' and '.join(names)} is not installed: {', '.join(missing.values())}")
+            failed = True
+            continue
         try:
-            lines = registry.function(name, place)
+            lines = registry.function(names[0], place)
             for line in lines() if lines is not None else ():
                 print(line)
                 found = True

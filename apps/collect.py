@@ -20,6 +20,12 @@ DEMO_MISPLACED = (
     "the cube is elsewhere, so the gripper closes on air, and the episode is saved as a failure"
 )
 
+DEMO_DRIVES_HOME = (
+    "--pad demo plays at fixed times, and this arm has to be driven home first: its first demonstration passes "
+    "meanwhile, so one episode is recorded here, or none; to record more, drive from the page in the browser "
+    "(--pad web)"
+)
+
 
 def parser() -> argparse.ArgumentParser:
     """Return the parser of ``collect``."""
@@ -117,6 +123,8 @@ def _main(args: argparse.Namespace) -> int:
                 judge = judge or lifts_cube(rig, robots[0])
                 if judge is None:
                     notes.append(f"--pad demo: whether {robots[0].name} lifts a cube is not checked; see --success")
+                if any(robot.spec.attended for robot in robots):
+                    notes.append(DEMO_DRIVES_HOME)
                 if args.seed or recorder.episodes:
                     notes.append(DEMO_MISPLACED)
             for note in notes:

@@ -58,7 +58,7 @@ def main(argv: list[str] | None = None) -> int:
 
 def _main(args: argparse.Namespace) -> int:
     import hal
-    from hal.apps._common import check_report, find_deadman, needs_deadman, resolve_plan
+    from hal.apps._common import check_one_robot, check_report, find_deadman, needs_deadman, resolve_plan
     from hal.apps._display import banner, list_links
     from hal.apps.check import may_open
     from hal.errors import CommandError
@@ -67,6 +67,7 @@ def _main(args: argparse.Namespace) -> int:
 
     if not 0.0 < args.speed <= 1.0:
         raise CommandError(f"--speed must be above 0 and at most 1, not {args.speed:g}")
+    check_one_robot(args)
     check_report(args.report)
     episodes = Dataset(args.dataset).episodes
     if not -len(episodes) <= args.episode < len(episodes):

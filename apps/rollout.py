@@ -84,7 +84,7 @@ def main(argv: list[str] | None = None) -> int:
 
 def _main(args: argparse.Namespace) -> int:
     import hal
-    from hal.apps._common import check_report, find_deadman, needs_deadman, resolve_plan
+    from hal.apps._common import check_one_robot, check_report, find_deadman, needs_deadman, resolve_plan
     from hal.apps._display import banner, list_links
     from hal.apps.check import may_open
     from hal.errors import CommandError
@@ -95,6 +95,7 @@ def _main(args: argparse.Namespace) -> int:
             raise CommandError(f"--{name} must be positive, not {getattr(args, name):g}")
     if args.seed < 0:
         raise CommandError(f"--seed must be 0 or more, not {args.seed}")
+    check_one_robot(args)
     check_report(args.report)
     if os.getcwd() not in sys.path:
         sys.path.insert(0, os.getcwd())

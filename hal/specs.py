@@ -143,6 +143,8 @@ class RobotSpec:
     """Longest deadline that a command may have, s (0.3 where something real moves)."""
     options: dict[str, Any] = field(default_factory=dict)
     """Options of the driver (``real:`` or ``simulated:`` of the rig's file)."""
+    source: str = ""
+    """The rig's file, or ``<dict>``."""
 
 
 @dataclass(frozen=True)

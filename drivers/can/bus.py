@@ -43,6 +43,8 @@ _BUS_OFF = 0x40
 """Bit in the id of an error frame: the controller has taken itself off the bus (CAN_ERR_BUSOFF)."""
 _KEPT_IDS = 64
 """Largest number of unexpected ids that are remembered."""
+_LIBRARIES = {"slcan": "pip install pyserial", "gs_usb": "pip install 'python-can[gs-usb]'"}
+"""Interface -> command that installs its library."""
 _NO_QUEUE = frozenset({errno.ENOBUFS, errno.EAGAIN})
 """Errors of a full transmit queue: nothing on the bus acknowledges frames, or there are too many."""
 
@@ -214,19 +216,33 @@ class CanBus:
             message = f"there is no interface {s.interface!r} in python-can{hint}"
             return ConfigError([Problem("<rig>", "real.interface", message, "unknown_interface")])
         if isinstance(error, (ImportError, can.CanInterfaceNotImplementedError)):
-            return DriverMissing(f"{where}: {error}; `pip install 'robot-hal[can]'`, or the interface's own library")
+            remedy = _LIBRARIES.get(s.interface, "install the library of this interface (see python-can's manual)")
+            return DriverMissing(f"{where}: {error}; {remedy}")
         code = _errno_of(error)
         if code == errno.EAFNOSUPPORT:
-            return _not_found(where, "this kernel has no SocketCAN", "sudo modprobe can can_raw", "no_socketcan")
+            remedy = "sudo modprobe can_raw; a container or WSL needs a kernel with it"
+            return _not_found(where, "this kernel has no SocketCAN", remedy, "no_socketcan")
         if code == errno.ENODEV:
             there = ", ".join(can_interfaces()) or "none"
-            remedy = f"plug in the adapter; interfaces: {there}"
+            remedy = f"plug in the adapter, or correct `channel`; interfaces: {there}"
+            if s.channel.startswith("vcan"):
+                remedy = f"sudo ip link add {s.channel} type vcan; {bring_up(s)}"
             return _not_found(where, f"there is no interface {s.channel}", remedy, "no_interface")
         if code == errno.ENETDOWN:
             return _lost(where, f"the interface {s.channel} is down", bring_up(s), "interface_down")
+        if code == errno.EINVAL and s.fd and s.interface == "socketcan":
+            remedy = f"sudo ip link set {s.channel} down; {bring_up(s)}; or `fd: false` for an arm with classic CAN"
+            return _lost(where, f"the interface {s.channel} takes no CAN-FD frames", remedy, "no_can_fd")
+        if code == errno.EACCES:
+            remedy = "sudo usermod -aG dialout $USER, then log in again"
+            return _not_found(where, f"no permission to open {s.channel}", remedy, "no_permission")
         if isinstance(error, (ValueError, TypeError)):
             return ConfigError([Problem("<rig>", "real.bus", f"{where}: {error}", "bad_bus")])
-        return _lost(where, f"the bus does not work: {error}", "check the adapter and its cable", "bus_lost")
+        remedy = "check the adapter and its cable"
+        if s.interface != "socketcan":
+            remedy += ", and that the library of its vendor is installed; on Linux, most adapters are SocketCAN "
+            remedy += "interfaces (hal-check --can lists them)"
+        return _lost(where, f"the bus does not work: {error}", remedy, "bus_lost")
 
     # Frames.
 
@@ -288,10 +304,12 @@ class CanBus:
     def drain(self) -> None:
         """Discard every frame that has come, for example those from before the devices were opened."""
         bus = self._bus
-        with contextlib.suppress(can.CanError, OSError, ValueError):
+        try:
             for _ in range(100 * _LONGEST_POLL):
                 if bus is None or bus.recv(0.0) is None:
                     return
+        except (can.CanError, OSError, ValueError) as error:  # reported once: an interface that is down, for example
+            self._lose(error)
 
     def _note_error_frame(self, id: int) -> None:
         self.error_frames += 1
@@ -336,7 +354,7 @@ def can_interfaces() -> tuple[str, ...]:
 def bring_up(settings: BusSettings) -> str:
     """Return the command that brings a SocketCAN interface up at the bit rate of these settings."""
     if settings.channel.startswith("vcan"):
-        return f"sudo ip link set {settings.channel} up"
+        return f"sudo ip link set {settings.channel} up{' mtu 72' if settings.fd else ''}"
     line = f"sudo ip link set {settings.channel} up type can bitrate {settings.bit_rate}"
     return f"{line} dbitrate {settings.data_bit_rate} fd on" if settings.fd else line
 

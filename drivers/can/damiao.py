@@ -5,7 +5,8 @@
   torque only. Nothing waits: the replies are taken by the next ``read``.
 * ``read`` keeps the arm: a motor that is on gets the last set-point again in a cycle without a new one, and a motor
   that is off is asked for its state.
-* A fault of one motor stops the arm; the others hold. The arm has no brakes: where nothing is sent any more, it sinks,
+* A fault of one motor stops the arm; the others hold. A motor that is about to be too hot still follows, so that the
+  servo brakes the arm. The arm has no brakes: where nothing is sent any more, it sinks,
   damped by its motors.
 """
 
@@ -23,7 +24,7 @@ from hal.histogram import Histogram
 from hal.specs import RobotSpec
 
 from .damiao_chain import SWITCHING, DamiaoChain
-from .damiao_motor import ChainMotor
+from .damiao_motor import MILD_FAULTS, ChainMotor
 from .settings import DamiaoArmSettings
 
 __all__ = ["DamiaoArm"]
@@ -53,6 +54,7 @@ class DamiaoArm(RobotDriver):
             settings.motors,
             spec.joints,
             settings.mosfet_limit,
+            spec.source,
         )
         self._motors = self.chain.motors
         self.engaged = False
@@ -150,19 +152,27 @@ class DamiaoArm(RobotDriver):
         on = True
         for motor in self._motors:
             on = on and motor.on
-        if self._fault is None and chain.lost is None:
-            self._fault = chain.fault(engaged=self.engaged) or self._check_following()
-            if self._fault is None and self.engaged and not on:
-                off = next(motor for motor in self._motors if not motor.on)
-                self._fault = Fault(
-                    "switched_off",
-                    f"{off.label} is off, though nothing here switched it off",
-                    "support the arm; check its power supply, and whether another program drives it; compare the "
-                    "joint with its picture, because a restart may shift a motor's zero",
-                )
+        if chain.lost is None and (self._fault is None or self._fault.code in MILD_FAULTS):
+            self._fault = self._find_fault(on) or self._fault
         if in_use and (chain.lost is not None or (self.engaged and not on)):
             self.engaged = False
             self._switching = None
+
+    def _find_fault(self, on: bool) -> Fault | None:
+        """Return the gravest fault; ``on`` is whether all motors are on."""
+        fault = self.chain.fault(engaged=self.engaged)
+        if fault is not None and fault.code not in MILD_FAULTS:
+            return fault
+        grave = self._check_following()
+        if grave is None and self.engaged and not on:
+            off = next(motor for motor in self._motors if not motor.on)
+            grave = Fault(
+                "switched_off",
+                f"{off.label} is off, though nothing here switched it off",
+                "support the arm; check its power supply, and whether another program drives it; compare the "
+                "joint with its picture, because a restart may shift a motor's zero",
+            )
+        return grave or fault
 
     def _check_following(self) -> Fault | None:
         """Return a fault, and hold the measured position, if a joint is too far from its set-point."""
@@ -221,7 +231,7 @@ class DamiaoArm(RobotDriver):
         chain, motors = self.chain, self._motors
         if chain.lost is not None or chain.bus is None:
             raise chain.lost or ConnectionLost(f"{self.spec.name} is not open", code="closed")
-        if self._fault is not None or not self.engaged:
+        if not self.engaged or (self._fault is not None and self._fault.code not in MILD_FAULTS):
             return False
         q, dq = setpoint.q, setpoint.dq
         if setpoint.tau is None:

@@ -18,7 +18,7 @@ from hal.errors import ConfigError, ConnectionLost, DeviceNotFound, Fault, HalEr
 from hal.lock import DeviceLock
 
 from .bus import CanBus
-from .damiao_motor import CHECKED_REGISTERS, HEAT_MARGIN, ChainMotor, motor_fault, register_problems
+from .damiao_motor import CHECKED_REGISTERS, HEAT_MARGIN, MILD_FAULTS, ChainMotor, motor_fault, register_problems
 from .damiao_protocol import (
     CLEAR_ERROR,
     DISABLE,
@@ -26,7 +26,7 @@ from .damiao_protocol import (
     REGISTER_ID,
     encode_register_read,
 )
-from .settings import BusSettings, DamiaoMotorSettings, is_emulated
+from .settings import BusSettings, DamiaoMotorSettings, emulator_remedy, is_emulated
 
 __all__ = ["SILENCE", "SWITCHING", "DamiaoChain"]
 
@@ -68,6 +68,7 @@ class DamiaoChain:
         motors: The motors' settings.
         labels: The motors in words, for example "joint1".
         mosfet_limit: Temperature at which their electronics switch off, deg C.
+        source: The rig's file, for messages.
     """
 
     def __init__(
@@ -78,9 +79,11 @@ class DamiaoChain:
         motors: Sequence[DamiaoMotorSettings],
         labels: Sequence[str],
         mosfet_limit: float,
+        source: str = "",
     ) -> None:
         self.name = name
         self.where = where
+        self.source = source
         self.settings = settings.shared
         self.motors = tuple(
             ChainMotor(motor, f"{label} (motor {motor.id})") for motor, label in zip(motors, labels, strict=True)
@@ -182,7 +185,7 @@ class DamiaoChain:
             found = ", ".join(f"{id:#x}" for id in sorted(bus.unexpected_ids)[:8])
             who += f"; unexpected ids: {found} (`master` is the id that a motor answers with)"
         if is_emulated({"interface": s.interface}):
-            remedy = "start the emulator in another terminal: python -m hal.drivers.can.emulator --config YOUR_RIG.yaml"
+            remedy = emulator_remedy(self.source)
         elif answer:
             remedy = "check its power, its plugs and its id"
         else:
@@ -346,17 +349,19 @@ class DamiaoChain:
     # Faults.
 
     def fault(self, *, engaged: bool) -> Fault | None:
-        """Return the fault of a motor, naming it; None without one.
+        """Return the gravest fault of a motor, naming it; None without one.
 
         Args:
             engaged: Whether the motors are in use. One that is not may have lost communication: that is its rest.
         """
+        mild: Fault | None = None
         for motor in self.motors:
             if motor.status > 1 or motor.rotor >= motor.rotor_warning or motor.mosfet >= self._mosfet_warning:
                 fault = motor_fault(motor, self.mosfet_limit, engaged=engaged)
-                if fault is not None:
+                if fault is not None and fault.code not in MILD_FAULTS:
                     return fault
-        return None
+                mild = mild or fault
+        return mild
 
     def clear_errors(self) -> None:
         """Clear the errors of all motors that have one; those are then off. Takes up to 30 ms.

@@ -19,7 +19,7 @@ from .damiao_protocol import (
 )
 from .settings import DamiaoMotorSettings
 
-__all__ = ["CHECKED_REGISTERS", "HEAT_MARGIN", "ChainMotor", "motor_fault", "register_problems"]
+__all__ = ["CHECKED_REGISTERS", "HEAT_MARGIN", "MILD_FAULTS", "ChainMotor", "motor_fault", "register_problems"]
 
 CHECKED_REGISTERS = (
     MotorRegister.PMAX,
@@ -36,6 +36,8 @@ LONGEST_TIMEOUT = 1.0
 """Longest TIMEOUT, s: for so long a motor repeats the last command of a killed program, a torque for example."""
 HEAT_MARGIN = 5.0
 """Distance from the temperature at which a motor switches itself off that is a fault, K."""
+MILD_FAULTS = frozenset({"motor_hot"})
+"""Codes of the faults with which every motor still follows its commands, so that the arm can be braked."""
 
 _HOT = "let it cool down, with the arm supported; lower its load or its speed"
 _STATUS_FAULTS = {

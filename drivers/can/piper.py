@@ -70,7 +70,7 @@ class PiperArm(RobotDriver):
         super().__init__(spec, world)
         self.settings = PiperArmSettings.of(spec)
         self.engaged = False
-        self._link = PiperLink(spec.name, self.settings, self._take, _OWN_IDS)
+        self._link = PiperLink(spec.name, self.settings, self._take, _OWN_IDS, spec.source)
         self._lock: DeviceLock | None = None
         self.longest_gap = 0.0
         """Longest time between two samples, s."""

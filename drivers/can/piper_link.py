@@ -12,7 +12,7 @@ from hal.errors import ConnectionLost, DeviceNotFound, Fault, HalError, RobotFau
 from . import piper_protocol as protocol
 from .bus import CanBus
 from .piper_protocol import COMMAND_IDS, ENABLED, JOINTS, GripperStatus, PiperFeedback, PiperStatus, decode_feedback
-from .settings import EMULATED_INTERFACES, BusSettings
+from .settings import EMULATED_INTERFACES, BusSettings, emulator_remedy
 
 __all__ = [
     "FRESH_READS",
@@ -131,15 +131,15 @@ def join_joints(numbers: Iterable[int]) -> str:
 # Connection
 
 
-def silence_remedy(bus: CanBus) -> str:
-    """Return why an arm may be silent, with what to do about it."""
+def silence_remedy(bus: CanBus, source: str) -> str:
+    """Return why an arm may be silent, with what to do about it; ``source`` is the rig's file."""
     if any(id in _LEADER_IDS for id in bus.unexpected_ids):
         return (
             "an arm reports at 0x3A1 and above, as the leader of a pair does: make it a follower with the vendor's "
             "tool (0x470, FC), then restart it"
         )
     if bus.settings.key[0] in EMULATED_INTERFACES:
-        return "start the emulator in another terminal: python -m hal.drivers.can.emulator --config YOUR_RIG.yaml"
+        return emulator_remedy(source)
     return "check the arm's power, the cable (CAN_H, CAN_L), the termination, and the bit rate: hal-check --real"
 
 
@@ -151,12 +151,19 @@ class PiperLink:
         settings: The bus.
         handle: Takes each frame that is decoded.
         ids: Ids of these frames.
+        source: The rig's file, for messages.
     """
 
     def __init__(
-        self, name: str, settings: BusSettings, handle: Callable[[PiperFeedback], None], ids: tuple[int, ...]
+        self,
+        name: str,
+        settings: BusSettings,
+        handle: Callable[[PiperFeedback], None],
+        ids: tuple[int, ...],
+        source: str = "",
     ) -> None:
         self.name = name
+        self.source = source
         self.settings = settings.shared
         self.bus: CanBus | None = None
         self.lost: ConnectionLost | None = None
@@ -181,7 +188,7 @@ class PiperLink:
                 error: HalError = bus.error(self.name)
                 if bus.fault is None:
                     where = f"{self.settings.interface} {self.settings.channel}"
-                    text = f"{self.name}: {missing()} on {where}; {silence_remedy(bus)}"
+                    text = f"{self.name}: {missing()} on {where}; {silence_remedy(bus, self.source)}"
                     error = DeviceNotFound(text, code="no_answer")
                 self.close()
                 raise error
@@ -219,7 +226,7 @@ class PiperLink:
 
     def lose(self, what: str) -> ConnectionLost:
         """Return the exception for a device that does not report any more, and note that it is lost."""
-        remedy = silence_remedy(self._open_bus())
+        remedy = silence_remedy(self._open_bus(), self.source)
         self.lost = ConnectionLost(f"{self.name}: {what}; {remedy}", code="silent")
         self.lost.fault = Fault("silent", what, remedy)
         return self.lost

@@ -199,12 +199,17 @@ def check_damiao(spec: RobotSpec, duration: float) -> Iterator[CheckResult]:
         return
     bus = CanBus.acquire(settings.shared)
     chains = [
-        DamiaoChain(spec.name, "real.motors", settings, settings.motors, spec.joints, settings.mosfet_limit),
+        DamiaoChain(
+            spec.name, "real.motors", settings, settings.motors, spec.joints, settings.mosfet_limit, spec.source
+        ),
     ]
     gripper = spec.gripper
     if gripper is not None and gripper.driver == spec.driver:
         own = DamiaoGripperSettings.of(gripper)
-        chains.append(DamiaoChain(gripper.name, "real.motor", own, (own.motor,), ("gripper",), own.mosfet_limit))
+        fingers = DamiaoChain(
+            gripper.name, "real.motor", own, (own.motor,), ("gripper",), own.mosfet_limit, spec.source
+        )
+        chains.append(fingers)
     try:
         if (yield from _check_motors(chains, bus)):
             yield from _check_states(chains)
@@ -334,7 +339,7 @@ def _measure_answers(chains: Sequence[DamiaoChain], rate_hz: float, duration: fl
             motor.replies = 0
         time.sleep(max(0.0, start + 1.0 / rate_hz - time.monotonic()))
     seconds = time.monotonic() - began
-    yield _judge_answers(rounds, incomplete, sorted(times), rate_hz)
+    yield _judge_answers(rounds, incomplete, sorted(times), rate_hz, chains[0].settings)
     figures = bus.statistics()
     sent = len(motors) * rounds
     traffic = _Traffic(
@@ -343,16 +348,19 @@ def _measure_answers(chains: Sequence[DamiaoChain], rate_hz: float, duration: fl
     yield _judge_load(2 * len(motors) * rate_hz, traffic, 2 * sent / seconds, chains[0].settings)
 
 
-def _judge_answers(rounds: int, incomplete: int, times: Sequence[float], rate_hz: float) -> CheckResult:
+def _judge_answers(
+    rounds: int, incomplete: int, times: Sequence[float], rate_hz: float, settings: BusSettings
+) -> CheckResult:
     share = incomplete / rounds
+    cause = "check whether the emulator still runs" if settings.interface in EMULATED_INTERFACES else _WIRING
     found = f"{rounds} rounds at {rate_hz:g} Hz, {incomplete} not answered in time"
     if times:
         median, late = times[len(times) // 2], times[min(len(times) - 1, int(0.99 * len(times)))]
         found += f"; all answers after {1e3 * median:.2f} ms (median), {1e3 * late:.2f} ms (99 %)"
     if share > _MANY_LOST:
-        return CheckResult("answers", "fail", found, f"{_WIRING}; end busy programs; use a lower `rate_hz`")
+        return CheckResult("answers", "fail", found, f"{cause}; end busy programs; use a lower `rate_hz`")
     if share > _FEW_LOST:
-        return CheckResult("answers", "warn", found, f"end busy programs; {_WIRING}")
+        return CheckResult("answers", "warn", found, f"end busy programs; {cause}")
     return CheckResult("answers", "ok", found)
 
 
@@ -416,7 +424,7 @@ def check_piper(spec: RobotSpec, duration: float) -> Iterator[CheckResult]:
         return
     where = " ".join(settings.key)
     reports = _PiperReports()
-    link = PiperLink(spec.name, settings, reports.take, (*FEEDBACK_IDS, *PARAMETER_IDS))
+    link = PiperLink(spec.name, settings, reports.take, (*FEEDBACK_IDS, *PARAMETER_IDS), spec.source)
     lock: DeviceLock | None = None
     try:
         if settings.interface != "virtual":

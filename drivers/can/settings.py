@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import ipaddress
 import itertools
+import shlex
 from collections.abc import Iterator, Mapping
 from functools import cached_property
 from typing import Annotated, Any, Literal, TypeVar
@@ -33,6 +34,7 @@ __all__ = [
     "check_damiao_gripper",
     "check_piper_arm",
     "check_piper_gripper",
+    "emulator_remedy",
     "group_key",
     "is_emulated",
 ]
@@ -45,6 +47,8 @@ _USUAL_GROUP, _USUAL_PORT = "239.74.163.2", 43113
 """Channel and port of python-can's own default for ``udp_multicast``."""
 _FIRST_PORT, _PORTS = 20_000, 12_000
 """Range of the ports of other channels, below those that Linux gives to outgoing connections."""
+_LONGEST_NAME = 15
+"""Longest name of a network interface of Linux."""
 _LARGEST_ID = 0x7FE
 _LARGEST_MOTOR_ID = 0xFF
 """Ids of commands in other modes begin above it."""
@@ -64,6 +68,17 @@ def group_key(options: Mapping[str, Any]) -> str | None:
     """
     interface, channel = (str(options.get(key, "")).strip() for key in ("interface", "channel"))
     return None if interface.lower() in _SHAREABLE else f"{interface} {channel}"
+
+
+def emulator_remedy(source: str) -> str:
+    """Return the command that starts the emulator of a rig, as the remedy of a message.
+
+    Args:
+        source: The rig's file; a rig without one (``<dict>``, or an empty text) needs one for its emulator.
+    """
+    known = bool(source) and not source.startswith("<")
+    file = shlex.quote(source) if known else "FILE, with the rig in a file"
+    return f"start the emulator in another terminal: python -m hal.drivers.can.emulator --config {file}"
 
 
 # Values.
@@ -165,6 +180,11 @@ class BusSettings(Strict):
                 group = False
             if not group:
                 raise ValueError(f"channel: must be a multicast address such as {_USUAL_GROUP}, not {self.channel}")
+        if self.interface == "socketcan" and (len(self.channel) > _LONGEST_NAME or "/" in self.channel):
+            raise ValueError(
+                f"channel: must be the name of an interface such as can0, not {self.channel}; a serial adapter has "
+                "`interface: slcan`"
+            )
         return self
 
     @property

@@ -113,6 +113,7 @@ def resolve_robot(context: Context, name: str, config: RobotConfig) -> RobotSpec
                 emulated=bool(real) and all(is_emulated(*device) for device in real),
                 deadline_max=DEADLINE_SIMULATED if simulated else DEADLINE_REAL,
                 options=options,
+                source=context.source,
             )
             if spec.emulated:
                 context.emulated.add(key)

@@ -203,6 +203,29 @@ def test_a_fault_in_motion(fault: CanFault) -> None:
         )
 
 
+def test_an_arm_with_a_motor_that_gets_hot_is_braked_within_its_limits() -> None:
+    with stepped_arm() as arm:
+        fast = hal.JointVelocity([1.5, 0.0, 0.0, 0.0, 0.0, 0.0])
+        assert arm.run(0.8, fast) is None
+        arm.far.execute("temperature 1 40 96")
+        motor = arm.far.arm.motors[1]
+        speeds = [motor.drive.dq]
+        assert speeds[0] > 0.5
+        for _ in range(150):
+            arm.clock.sleep(DT)
+            speeds.append(motor.drive.dq)
+        steps = [abs(after - before) for before, after in itertools.pairwise(speeds)]
+        rounding = 2.0 * MOTOR_RANGES["DM4340"].velocity / 4095
+        assert max(steps) <= arm.robot.spec.limits.acceleration[0] * DT + 2.0 * rounding
+        assert abs(speeds[-1]) <= rounding
+        assert arm.robot.state(max_age=1.0).fault is not None
+        arm.far.execute("status 2 a")
+        arm.clock.sleep(3 * DT)
+        fault = arm.robot.state(max_age=1.0).fault
+        assert fault is not None
+        assert fault.code == "over_current", "the graver fault is reported"
+
+
 def test_an_arm_that_is_pushed_away_from_its_set_point_yields_and_does_not_snap_back() -> None:
     with SteppedEmulator("yam") as far:
         driver = DamiaoArm(replace(far.spec, options={**far.spec.options, "following_limit": 0.2}))

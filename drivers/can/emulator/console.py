@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import math
 import os
 import signal
 import socket
@@ -42,22 +43,78 @@ class EmulatorCommand(NamedTuple):
     run: _Run
 
 
+# Values of a command. A wrong one is a ValueError, in words.
+
+
+def _float(word: str, what: str, least: float | None = None) -> float:
+    """Return a number; ``what`` names it and its unit."""
+    try:
+        value = float(word)
+    except ValueError:
+        value = math.nan
+    if not math.isfinite(value) or (least is not None and value < least):
+        bound = "" if least is None else f" of at least {least:g}"
+        raise ValueError(f"{what} must be a number{bound}, not {word!r}")
+    return value
+
+
+def _int(word: str, what: str, least: int, most: int, base: int = 0) -> int:
+    """Return a whole number; with base 0, one that begins with 0x is hexadecimal."""
+    try:
+        value = int(word, base)
+    except ValueError:
+        value = least - 1
+    if not least <= value <= most:
+        bounds = f"{least:X} to {most:X} (hexadecimal)" if base == 16 else f"{least} to {most}"
+        raise ValueError(f"{what} must be {bounds}, not {word!r}")
+    return value
+
+
+def _motor(target: _Target, word: str, other: str = "") -> int:
+    """Return the number of a motor; ``other`` is a further word that the command takes."""
+    numbers = target.arm.numbers
+    try:
+        number = int(word, 0)
+    except ValueError:
+        number = -1
+    if number not in numbers:
+        raise ValueError(f"there is no motor {word!r}; motors: {', '.join(map(str, numbers))}{other and f', {other}'}")
+    return number
+
+
+def _until(word: str) -> float:
+    """Return the time at which a fault ends, s on the monotonic clock."""
+    if word in ("on", "off"):
+        return time.monotonic() + _FOREVER if word == "on" else 0.0
+    try:
+        return time.monotonic() + _float(word, "S", 0.0)
+    except ValueError:
+        raise ValueError(f"takes a time in s, on or off, not {word!r}") from None
+
+
+def _switch(word: str) -> bool:
+    if word not in ("on", "off"):
+        raise ValueError(f"takes on or off, not {word!r}")
+    return word == "on"
+
+
 # Faults of the bus.
 
 
 def _lose(target: _Target, words: list[str]) -> None:
     faults = target.bus.faults[target.arm.name]
     if words[0] == "next":
-        faults.lose_next[_number(target, words[2]) if len(words) > 2 else 0] = int(words[1])
+        motor = _motor(target, words[2]) if len(words) > 2 else 0
+        faults.lose_next[motor] = _int(words[1], "the number of replies", 0, 1_000_000)
     else:
-        share = float(words[0])
-        if not 0.0 <= share <= 1.0:
-            raise ValueError("the share is 0 to 1")
+        share = _float(words[0], "the share of the replies", 0.0)
+        if share > 1.0:
+            raise ValueError(f"the share of the replies must be 0 to 1, not {words[0]}")
         faults.lost_share = share
 
 
 def _late(target: _Target, words: list[str]) -> None:
-    target.bus.faults[target.arm.name].delay = float(words[0])
+    target.bus.faults[target.arm.name].delay = _float(words[0], "the delay in s", 0.0)
 
 
 def _double(target: _Target, words: list[str]) -> None:
@@ -65,7 +122,7 @@ def _double(target: _Target, words: list[str]) -> None:
 
 
 def _silent(target: _Target, words: list[str]) -> None:
-    number = 0 if words[0] == "all" else _number(target, words[0])
+    number = 0 if words[0] == "all" else _motor(target, words[0], "or all")
     target.bus.faults[target.arm.name].silent_until[number] = _until(words[1])
 
 
@@ -74,67 +131,75 @@ def _cut(target: _Target, words: list[str]) -> None:
 
 
 def _frame(target: _Target, words: list[str]) -> None:
-    id, data = int(words[0], 0), bytes.fromhex(words[1])
-    for _ in range(int(words[2]) if len(words) > 2 else 1):
+    id = _int(words[0], "the id", 0, 0x7FF)
+    longest = 64 if target.bus.settings.fd else 8
+    try:
+        data = bytes.fromhex(words[1])
+    except ValueError:
+        data = bytes(longest + 1)
+    if len(data) > longest:
+        raise ValueError(f"the data must be up to {longest} bytes in hexadecimal, such as 01ff, not {words[1]!r}")
+    for _ in range(_int(words[2], "the number of frames", 0, 100_000) if len(words) > 2 else 1):
         target.bus.send(id, data)
 
 
 def _stall(target: _Target, words: list[str]) -> None:
-    target.bus.stall = float(words[0])
+    target.bus.stall = _float(words[0], "the time in s", 0.0)
 
 
 # Faults of motors.
 
 
 def _status(target: _Target, words: list[str]) -> None:
-    target.arm.set_status(int(words[0], 0), int(words[1], 16))
+    arm = target.arm
+    number = 0 if words[0] == "0" and 0 not in arm.numbers else _motor(target, words[0])
+    arm.set_status(number, _int(words[1], "the status", 0, 0xFF, 16))
 
 
 def _register(target: _Target, words: list[str]) -> None:
-    try:
-        target.arm.set_register(int(words[0], 0), words[1], float(words[2]))
-    except KeyError:
-        raise ValueError(f"no register {words[1]!r}") from None
+    target.arm.set_register(_motor(target, words[0]), words[1], _float(words[2], "the value", 0.0))
 
 
 def _temperature(target: _Target, words: list[str]) -> None:
-    target.arm.set_temperature(int(words[0], 0), int(words[1]), int(words[2]))
+    degrees = [_int(word, "a temperature in deg C", 0, 127) for word in words[1:3]]
+    target.arm.set_temperature(_motor(target, words[0]), degrees[0], degrees[1])
 
 
 # Mechanics.
 
 
 def _masses(target: _Target, words: list[str]) -> None:
-    target.arm.plant.load(mass_factor=float(words[0]))
+    target.arm.plant.load(mass_factor=_float(words[0], "the factor", 0.0))
 
 
 def _friction(target: _Target, words: list[str]) -> None:
-    target.arm.plant.friction = float(words[0])
+    target.arm.plant.friction = _float(words[0], "the factor", 0.0)
 
 
 def _payload(target: _Target, words: list[str]) -> None:
-    mass, *place = map(float, words)
-    target.arm.plant.load(payload=(mass, place if len(place) == 3 else (0.0, 0.0, 0.0)))
+    mass = _float(words[0], "the mass in kg", 0.0)
+    place = [_float(word, "X, Y and Z in m") for word in words[1:]]
+    if len(place) not in (0, 3):
+        raise IndexError
+    target.arm.plant.load(payload=(mass, place or (0.0, 0.0, 0.0)))
 
 
 def _place(target: _Target, words: list[str]) -> None:
-    q = [float(word) for word in words] or target.arm.plant.q.tolist()
+    q = [_float(word, "a position in rad") for word in words] or target.arm.plant.q.tolist()
     if len(q) != len(target.arm.plant.q):
-        raise ValueError(f"takes {len(target.arm.plant.q)} positions")
+        raise ValueError(f"takes {len(target.arm.plant.q)} positions in rad, or none for the present ones")
     target.arm.restart()
     target.arm.plant.place(q)
     target.arm.restart()
 
 
 def _push(target: _Target, words: list[str]) -> None:
-    joint, joints = int(words[0]), len(target.arm.plant.push)
-    if not 1 <= joint <= joints:
-        raise ValueError(f"no joint {joint}; joints: 1 to {joints}")
-    target.arm.plant.push[joint - 1] = float(words[1])
+    joint = _int(words[0], "the joint", 1, len(target.arm.plant.push))
+    target.arm.plant.push[joint - 1] = _float(words[1], "the torque in Nm")
 
 
 def _object(target: _Target, words: list[str]) -> None:
-    target.arm.set_object(None if words[0] == "none" else float(words[0]))
+    target.arm.set_object(None if words[0] == "none" else _float(words[0], "the width in m", 0.0))
 
 
 # Reports.
@@ -178,7 +243,9 @@ COMMANDS = {
     "frame": EmulatorCommand("frame ID HEX [N]", "send a frame of your own, N times", _frame),
     "stall": EmulatorCommand("stall S", "stop the emulator itself", _stall),
     "status": EmulatorCommand(
-        "status MOTOR CODE", "give a motor a status, hex: 8 to E; a PiPER: its joint's flags, or MOTOR 0", _status
+        "status MOTOR CODE",
+        "give a motor a status, hex: 8 to E; a PiPER: its joint's flags, with MOTOR 0 the arm's status",
+        _status,
     ),
     "register": EmulatorCommand("register MOTOR NAME VALUE", "change a register, as VMAX or TIMEOUT", _register),
     "temperature": EmulatorCommand("temperature MOTOR C C", "report these: electronics, motor", _temperature),
@@ -210,7 +277,7 @@ def execute(emulator: CanEmulator, words: list[str]) -> dict[str, Any]:
     verb, *rest = words[1:] if words and words[0] in arms else words or [""]
     command = COMMANDS.get(verb)
     if command is None:
-        raise ValueError(f"no command {verb!r}; help lists them")
+        raise ValueError(f"there is no command {verb!r}; help lists them")
     bus = emulator.bus_of(arm)
     try:
         with bus.lock:
@@ -220,38 +287,22 @@ def execute(emulator: CanEmulator, words: list[str]) -> dict[str, Any]:
         raise ValueError(f"{verb}: {reason}") from None
 
 
-def _number(target: _Target, word: str) -> int:
-    numbers = target.arm.numbers
-    number = int(word, 0)
-    if number not in numbers:
-        raise ValueError(f"no motor {word}; motors: {', '.join(map(str, numbers))}")
-    return number
-
-
-def _until(word: str) -> float:
-    if word in ("on", "off"):
-        return time.monotonic() + _FOREVER if word == "on" else 0.0
-    return time.monotonic() + float(word)
-
-
-def _switch(word: str) -> bool:
-    if word not in ("on", "off"):
-        raise ValueError("takes on or off")
-    return word == "on"
-
-
 # Prompt and control port.
 
 
 def serve_prompt(emulator: CanEmulator) -> None:
-    """Execute the lines of standard input, in a thread, until it ends."""
+    """Execute the lines of standard input, in a thread, until it ends. Answers are for a reader: text, or JSON."""
 
     def serve() -> None:
         with contextlib.suppress(OSError, ValueError):
             for line in sys.stdin:
                 if line.strip():
                     answer = _answer(emulator, line)
-                    print(answer.get("text") or json.dumps(answer), flush=True)
+                    report = {key: value for key, value in answer.items() if key != "ok"}
+                    print(
+                        answer.get("text") or answer.get("error") or (json.dumps(report) if report else "ok"),
+                        flush=True,
+                    )
 
     threading.Thread(target=serve, name="prompt", daemon=True).start()
 

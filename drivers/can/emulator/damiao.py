@@ -244,12 +244,18 @@ class EmulatedDamiaoArm:
 
     def set_status(self, number: int, status: int) -> None:
         """Give a motor a status, a fault for example; it lasts until the motor's error is cleared."""
+        if status not in tuple(MotorStatus):
+            known = ", ".join(f"{code:X} {code.name.lower()}" for code in MotorStatus)
+            raise ValueError(f"there is no status {status:X}; statuses: {known}")
         self._motor(number).status = MotorStatus(status)
 
     def set_register(self, number: int, name: str, value: float) -> None:
         """Change a register of a motor."""
         motor = self._motor(number)
-        motor.registers[MotorRegister[name.upper()]] = value
+        register = MotorRegister.__members__.get(name.upper())
+        if register is None:
+            raise ValueError(f"there is no register {name!r}; registers: {', '.join(MotorRegister.__members__)}")
+        motor.registers[register] = value
         motor.set_ranges()
 
     def set_temperature(self, number: int, mosfet: int, rotor: int) -> None:
@@ -281,5 +287,5 @@ class EmulatedDamiaoArm:
 
     def _motor(self, number: int) -> DamiaoMotor:
         if number not in self.motors:
-            raise ValueError(f"no motor {number}; motors: {', '.join(map(str, self.motors))}")
+            raise ValueError(f"there is no motor {number}; motors: {', '.join(map(str, self.motors))}")
         return self.motors[number]

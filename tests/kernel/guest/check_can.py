@@ -141,6 +141,27 @@ def check_an_interface_that_is_down_or_missing_is_named() -> None:
     assert "vcan0" in str(missing.value)
 
 
+def check_an_interface_that_is_down_is_noticed_by_a_device_that_sends_nothing(bus: CanBus) -> None:
+    """The kernel reports it once, to the first reader, which discards old frames."""
+    _set("down")
+    bus.drain()
+    assert not bus.poll()
+    assert bus.fault is not None
+    assert bus.fault.code == "interface_down"
+
+
+def check_an_interface_without_can_fd_is_named() -> None:
+    """It opens, and refuses the first CAN-FD frame."""
+    subprocess.run("ip link set vcan0 down; ip link set vcan0 mtu 16; ip link set vcan0 up", shell=True, check=True)
+    try:
+        with pytest.raises(ConnectionLost) as refused:
+            CanBus.acquire(BusSettings(interface="socketcan", channel="vcan0", fd=True)).send(0x01, b"........")
+    finally:
+        CanBus._open_buses.clear()
+        subprocess.run("ip link set vcan0 down; ip link set vcan0 mtu 72; ip link set vcan0 up", shell=True, check=True)
+    assert refused.value.code == "no_can_fd"
+
+
 def check_error_frames_are_counted_and_bus_off_is_a_loss(bus: CanBus) -> None:
     """A controller with errors is counted; one that took itself off the bus is lost."""
     with _open() as other:

@@ -53,6 +53,7 @@ def test_a_simulated_episode_replayed_in_simulation(dataset: Path, tmp_path: Pat
         (["--speed", "1.5"], ["--speed", "at most 1"]),
         (["--report", "/nowhere/at/all.json"], ["/nowhere/at"]),
         (["--robot", "pandas"], ["no robot 'pandas'", "did you mean 'panda'"]),
+        (["--robot", "left,right"], ["--robot left,right", "one arm"]),
         (["--set", "robots.panda.speed=0.02"], ["CommandError", "rad/s", "at speed"]),
         (["--set", "robots.panda.limits.upper=[2,1.7,2,-2.3,2,3.7,2]"], ["panda_joint4 goes through"]),
         (["--set", "objects=[floor, table]"], ["cube, duck"]),

@@ -13,7 +13,7 @@ import pytest
 
 from hal.drivers.can.bus import CanBus, bring_up
 from hal.drivers.can.settings import BusSettings
-from hal.errors import ConfigError, ConnectionLost, DeviceNotFound, HalError
+from hal.errors import ConfigError, ConnectionLost, DeviceNotFound, DriverMissing, HalError
 
 _numbers = itertools.count()
 
@@ -123,6 +123,7 @@ def failing(error: Exception) -> Callable[..., Any]:
         (OSError(errno.ENETDOWN, "down"), ConnectionLost, "interface_down"),
         (OSError(errno.ENODEV, "no device"), DeviceNotFound, "no_interface"),
         (OSError(errno.EAFNOSUPPORT, "no family"), DeviceNotFound, "no_socketcan"),
+        (OSError(errno.EACCES, "not allowed"), DeviceNotFound, "no_permission"),
         (ValueError("bit rate"), ConfigError, "config"),
         (can.CanInitializationError("broken"), ConnectionLost, "bus_lost"),
     ],
@@ -138,12 +139,47 @@ def test_a_bus_that_does_not_open_says_why(
         assert bring_up(settings(interface="socketcan", channel="can0")) in str(raised.value)
 
 
+def test_an_interface_without_can_fd_is_a_loss_with_the_command_that_sets_it_up(
+    bus: CanBus, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The kernel refuses the first CAN-FD frame, not the opening."""
+    monkeypatch.setattr(bus, "settings", settings(interface="socketcan", channel="can0", fd=True))
+    monkeypatch.setattr(bus._bus, "send", failing(can.CanOperationError("invalid argument", errno.EINVAL)))
+    with pytest.raises(ConnectionLost) as raised:
+        bus.send(1, bytes(8))
+    assert raised.value.code == "no_can_fd"
+    assert bring_up(bus.settings) in str(raised.value)
+
+
+@pytest.mark.parametrize("interface", ["slcan", "gs_usb"])
+def test_a_missing_library_of_an_interface_is_named_with_its_command(
+    monkeypatch: pytest.MonkeyPatch, interface: str
+) -> None:
+    monkeypatch.setattr(can, "Bus", failing(can.CanInterfaceNotImplementedError("no module")))
+    with pytest.raises(DriverMissing, match="pip install"):
+        CanBus.acquire(settings(interface=interface, channel="0"))
+
+
+def test_an_interface_that_is_down_is_noticed_when_old_frames_are_discarded(
+    bus: CanBus, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The kernel reports it once, to the first reader."""
+    monkeypatch.setattr(bus, "settings", settings(interface="socketcan", channel="can0"))
+    monkeypatch.setattr(bus._bus, "recv", failing(can.CanOperationError("down", errno.ENETDOWN)))
+    bus.drain()
+    monkeypatch.undo()
+    assert not bus.poll()
+    assert bus.fault is not None
+    assert bus.fault.code == "interface_down"
+
+
 def test_the_command_that_brings_an_interface_up_fits_its_settings() -> None:
     classic = settings(interface="socketcan", channel="can0", bit_rate=500_000)
     assert bring_up(classic) == "sudo ip link set can0 up type can bitrate 500000"
     fast = settings(interface="socketcan", channel="can1", fd=True)
     assert bring_up(fast) == "sudo ip link set can1 up type can bitrate 1000000 dbitrate 5000000 fd on"
     assert bring_up(settings(interface="socketcan", channel="vcan0")) == "sudo ip link set vcan0 up"
+    assert bring_up(settings(interface="socketcan", channel="vcan0", fd=True)) == "sudo ip link set vcan0 up mtu 72"
 
 
 def test_a_full_queue_drops_frames_and_counts_them(bus: CanBus, monkeypatch: pytest.MonkeyPatch) -> None:

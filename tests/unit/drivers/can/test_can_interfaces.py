@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import json
 from typing import Any
 
@@ -188,3 +189,13 @@ def test_the_program_lists_the_buses(
     answer()
     assert check_program(["--can"]) == 2
     assert "no CAN interface" in capsys.readouterr().out
+
+
+def test_the_program_names_every_driver_whose_library_is_missing(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    find_spec = importlib.util.find_spec
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == "can" else find_spec(name))
+    assert check_program(["--can"]) == 2
+    printed = capsys.readouterr().out
+    assert all(word in printed for word in ("damiao", "piper", "pip install 'robot-hal[can]'"))

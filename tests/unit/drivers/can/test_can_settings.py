@@ -139,6 +139,12 @@ def test_missing_options_are_named(option: str) -> None:
         DamiaoArmSettings.of(replace(arm(), options=options))
 
 
+@pytest.mark.parametrize("channel", ["/dev/ttyACM0", "239.74.163.2/24", "an_interface_with_a_long_name"])
+def test_a_channel_that_is_no_network_interface_is_refused(channel: str) -> None:
+    spec = arm(interface="socketcan", channel=channel)
+    assert [(key, code) for key, _, code in check_damiao_arm(spec)] == [("real", "invalid")]
+
+
 @pytest.mark.parametrize(
     ("interface", "emulated"), [("virtual", True), ("udp_multicast", True), ("socketcan", False), ("slcan", False)]
 )

@@ -295,10 +295,49 @@ def test_a_command_reaches_the_arm_that_it_names(emulator: CanEmulator) -> None:
         "silent 99 on",
         "silent three on",
         "push 0 2",
+        "push one 2",
         "place 1 2",
+        "place a b c d e f g",
         "double x",
+        "late -1",
+        "masses nan",
+        "cut now",
+        "frame 0x900 00",
+        "frame 0x11 0g",
+        "status 3 Z",
+        "status 3 7",
+        "register 3 VMAX fast",
+        "register 3 NONE 1",
+        "temperature 3 hot hot",
+        "payload",
+        "payload 1 2",
+        "object wide",
     ],
 )
-def test_a_wrong_command_is_refused(emulator: CanEmulator, line: str) -> None:
-    with pytest.raises(ValueError):  # noqa: PT011  # of the wording the user sees
+def test_a_wrong_command_is_refused_and_changes_nothing(emulator: CanEmulator, line: str) -> None:
+    before = {name: arm.report() for name, arm in emulator.arms.items()}
+    with pytest.raises(ValueError) as refused:  # noqa: PT011  # the wording is what the user gets
+        execute(emulator, line.split())
+    assert not any(raw in str(refused.value) for raw in ("literal", "convert", "unpack", "non-hex"))
+    assert {name: arm.report() for name, arm in emulator.arms.items()} == before
+
+
+@pytest.mark.parametrize(
+    ("line", "offered"),
+    [
+        ("status 3 Z", "0 to FF"),
+        ("status 3 7", "A over_current"),
+        ("silent foo on", "or all"),
+        ("register 3 NONE 1", "VMAX"),
+    ],
+)
+def test_a_wrong_value_is_answered_with_those_that_there_are(emulator: CanEmulator, line: str, offered: str) -> None:
+    with pytest.raises(ValueError, match=offered):
+        execute(emulator, line.split())
+
+
+@pytest.mark.parametrize("line", ["status 5 100", "status seven 1", "register 1 VMAX 8"])
+def test_a_piper_refuses_what_it_cannot_report(line: str) -> None:
+    emulator = CanEmulator("piper", can_overrides("virtual"))
+    with pytest.raises(ValueError):  # noqa: PT011
         execute(emulator, line.split())

@@ -16,6 +16,8 @@ from errors_kit import raises_code
 from numpy.typing import NDArray
 from specs import IIWA_HOME, PANDA_HOME, box, cube, data, floor, iiwa, panda, world_spec
 
+from hal.config.data_files import data_folder
+from hal.config.loader import load
 from hal.drivers.pybullet.world import PyBulletWorld
 from hal.errors import CommandError, ConfigError, DeviceNotFound, NotSupported
 from hal.geometry import Pose
@@ -495,6 +497,12 @@ class TestBadInput:
         assert len(world.warnings) == 1
         assert "shell" in world.warnings[0]
         assert "1 kg" in world.warnings[0]
+
+    @pytest.mark.parametrize("model", sorted(path.stem for path in data_folder("robots").glob("*.urdf")))
+    def test_the_urdfs_of_this_project_load_without_a_warning(self, model: str) -> None:
+        plan = load({"robots": {"arm": {"model": model}}}, sim=True).resolve()
+        assert plan.world is not None
+        assert (*plan.warnings, *PyBulletWorld(plan.world).warnings) == ()
 
     @pytest.mark.parametrize(("given", "kept"), [(0.001, True), (0.1, False)])
     def test_an_impossible_inertia_is_a_warning_and_replaced(self, tmp_path: Path, given: float, kept: bool) -> None:
