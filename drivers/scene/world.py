@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from itertools import combinations
 from typing import Any, ClassVar, Generic, TypeVar
 
-from hal.errors import CommandError, ConfigError, DeviceNotFound, NotSupported, Problem
+from hal.errors import CommandError, ConfigError, DeviceNotFound, Fault, NotSupported, Problem
 from hal.geometry import Transform
 from hal.specs import BodySpec, RobotSpec, WorldSpec, to_json
 from hal.world import WorldDriver
@@ -100,6 +100,8 @@ class SimulatedWorld(WorldDriver, Generic[B]):
     def __init__(self, spec: WorldSpec) -> None:
         super().__init__(spec)
         self.bodies: dict[str, B] = {}
+        self.fault: Fault | None = None
+        """Why the simulation stands still, which its arms report; None while it runs."""
         self._changes = 0
         """Changes of poses other than by steps, and of looks."""
         self._on_reset: dict[str, list[Callable[[], None]]] = {}

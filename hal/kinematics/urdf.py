@@ -29,7 +29,7 @@ MOVABLE = (*TURNING, "prismatic")
 
 @dataclass(frozen=True)
 class UrdfVisual:
-    """One shape to draw, with its pose in the frame of its link."""
+    """One shape of a link, drawn or touched, with its pose in the frame of the link."""
 
     pose: Pose
     shape: str
@@ -52,6 +52,10 @@ class UrdfLink:
     has_shapes: bool
     """Whether it has a visual or a collision shape."""
     visuals: tuple[UrdfVisual, ...]
+    collisions: tuple[UrdfVisual, ...] = ()
+    """Its collision shapes; they have no colour."""
+    mass: float | None = None
+    """kg; None where the link has no ``<inertial>``."""
 
 
 @dataclass(frozen=True)
@@ -383,16 +387,21 @@ def _named_colors(robot: ElementTree.Element) -> _Colors:
 
 def _link(element: ElementTree.Element, colors: _Colors, folder: Path) -> UrdfLink:
     inertial = element.find("inertial")
-    visuals = [_visual(visual, colors, folder) for visual in element.findall("visual")]
+    visuals, collisions = (
+        tuple(shape for shape in (_shape(one, colors, folder) for one in element.findall(kind)) if shape is not None)
+        for kind in ("visual", "collision")
+    )
     return UrdfLink(
         name=element.get("name", ""),
         inertial=_origin(inertial) if inertial is not None else None,
         has_shapes=element.find("visual") is not None or element.find("collision") is not None,
-        visuals=tuple(visual for visual in visuals if visual is not None),
+        visuals=visuals,
+        collisions=collisions,
+        mass=None if inertial is None else next(iter(_floats(inertial.find("mass"), "value", (0.0,)))),
     )
 
 
-def _visual(element: ElementTree.Element, colors: _Colors, folder: Path) -> UrdfVisual | None:
+def _shape(element: ElementTree.Element, colors: _Colors, folder: Path) -> UrdfVisual | None:
     material, geometry = element.find("material"), element.find("geometry")
     rgba = colors.get(material.get("name", "")) if material is not None else None
     if material is not None and (own := material.find("color")) is not None:

@@ -1,0 +1,500 @@
+"""Build arms and objects of a rig into a MuJoCo model, and correct what their URDF files leave out or get wrong.
+
+Only what physics needs is built: links, joints, masses and collision shapes.
+"""
+
+from __future__ import annotations
+
+import itertools
+import re
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hal.drivers.scene.records import check_names, is_fixed, joint_drives, mimics_of, required
+from hal.drivers.scene.urdf_files import checked_urdf, massless
+from hal.drivers.scene.values import listed
+from hal.errors import ConfigError, Problem
+from hal.geometry import Pose, quaternion_to_matrix
+from hal.kinematics.urdf import TURNING, UrdfJoint, UrdfLink, UrdfModel, UrdfVisual, parse_xml
+from hal.specs import BodySpec, RobotSpec
+
+from .engine import Body, LinkContact, load_mujoco, wxyz
+
+__all__ = ["BodyPlan", "build", "contact_dimensions", "plan_object", "plan_robot", "take_out"]
+
+Array = NDArray[np.float64]
+
+FINGER_INERTIA = 3.0
+"""Inertia of the drive of each finger, kg: it is in no URDF, and a finger of 30 g alone could not press steadily."""
+LEAST_MASS, LEAST_INERTIA = 1e-3, 1e-7
+"""Least mass, kg, and moment of inertia, kg m2, of a link that moves: MuJoCo takes none without."""
+STIFF_CONTACT = (0.01, 1.0)
+"""Time constant, s, and damping ratio of contacts that are as hard as they can be at 240 Hz."""
+CONTACT_IMPEDANCE = (0.95, 0.99, 0.001, 0.5, 2.0)
+"""How much of a contact's ideal force acts: little of it is lost, so that fingers do not sink into what they hold."""
+COUPLING = (0.01, 1.0)
+"""Time constant, s, and damping ratio of the constraint between joints that move together."""
+UNBOUNDED = 1e-6
+"""What is added to the range of a joint, rad or m: a joint that rests at its limit needs no force to stay there."""
+
+
+@dataclass
+class Shape:
+    """One collision shape, in the frame of its link."""
+
+    kind: str
+    size: tuple[float, ...]
+    """Half extents of a box; radius; radius and half the length, m."""
+    pose: Pose
+    points: Array | None = None
+    """Vertices (n, 3) of a mesh, m: its convex hull collides."""
+
+    def corners(self) -> Array:
+        """Return points (n, 3) in the frame of the link that the shape is within."""
+        if self.points is not None:
+            points = self.points
+        else:
+            half = {
+                "box": self.size,
+                "sphere": self.size * 3,
+                "cylinder": (self.size[0], self.size[0], self.size[-1]),
+                "capsule": (self.size[0], self.size[0], self.size[0] + self.size[-1]),
+            }[self.kind]
+            points = np.array(list(itertools.product(*((-one, one) for one in half))))
+        corners: Array = points @ quaternion_to_matrix(self.pose.orientation).T + self.pose.position
+        return corners
+
+
+@dataclass
+class Inertial:
+    """Mass of a link."""
+
+    mass: float
+    """kg"""
+    moments: Array
+    """(3,) kg m2, about the principal axes."""
+    pose: Pose
+    """Centre of mass and principal axes, in the frame of the link."""
+
+
+@dataclass
+class LinkPlan:
+    """One link of a body, before it is built."""
+
+    name: str
+    joint: UrdfJoint | None
+    """The joint that carries it; None for the base."""
+    parent: int
+    shapes: list[Shape]
+    inertial: Inertial | None
+
+
+@dataclass
+class BodyPlan:
+    """All that is needed to build one body."""
+
+    body: Body
+    links: list[LinkPlan]
+    """From the base outwards."""
+    limits: dict[str, tuple[float, float] | None] = field(default_factory=dict)
+    """Range of each joint that moves, rad or m."""
+    mimics: list[tuple[str, str, float, float]] = field(default_factory=list)
+    """Follower, leader, multiplier and offset."""
+    fingers: tuple[str, ...] = ()
+    warnings: list[str] = field(default_factory=list)
+
+
+# --- records ---------------------------------------------------------------------------------------------------------
+
+
+def plan_object(spec: BodySpec) -> BodyPlan:
+    """Return the plan of an object.
+
+    Raises:
+        ConfigError: Its file is missing or broken, MuJoCo cannot take it, or a size that its shape needs is missing.
+    """
+    fixed = is_fixed(spec)
+    if spec.shape != "urdf":
+        shape = _primitive(spec)
+        inertial = None if fixed or spec.mass <= 0.0 else _uniform(spec.mass, shape)
+        body = Body(
+            name=spec.name,
+            spec=spec,
+            links={"base": 0},
+            joints={},
+            movable=(),
+            floating=inertial is not None,
+            base=(tuple(spec.position), tuple(spec.orientation)),
+            contacts=[LinkContact()],
+        )
+        shapes = [shape] if spec.collision else []
+        return BodyPlan(body, [LinkPlan("base", None, -1, shapes, inertial)])
+    key = f"objects.{spec.name}.urdf"
+    if spec.urdf is None:
+        raise ConfigError([Problem("objects", key, "is missing, and the shape is urdf", "missing_key")])
+    urdf = checked_urdf(spec.urdf, key)
+    plan = _plan_urdf(spec, urdf, key, spec.scale)
+    body = plan.body
+    body.floating = not fixed and plan.links[0].inertial is not None
+    body.home = dict.fromkeys(body.movable, 0.0)
+    body.base = (tuple(spec.position), tuple(spec.orientation))
+    if made_up := massless(urdf):
+        plan.warnings.append(f"{spec.name}: no <inertial> in {listed(made_up)}; 1 kg is used for each")
+    return plan
+
+
+def plan_robot(spec: RobotSpec) -> BodyPlan:
+    """Return the plan of an arm, with its base fixed in the world.
+
+    Raises:
+        ConfigError: As of :func:`plan_object`, or a joint or link that the record names is not in the URDF.
+    """
+    key = f"robots.{spec.name}.urdf"
+    urdf = checked_urdf(spec.urdf, key)
+    plan = _plan_urdf(spec, urdf, key, 1.0)
+    body = plan.body
+    moving = {name: joint for name, joint in urdf.joints.items() if joint.movable}
+    check_names(spec, moving, body.links)
+    drives = joint_drives(spec, {name: (joint.effort or 0.0, joint.velocity or 0.0) for name, joint in moving.items()})
+    plan.warnings += drives.warnings
+    for name in moving:
+        number = body.joints[name]
+        body.home[number], body.efforts[number] = drives.home[name], drives.efforts[name]
+        body.speeds[number] = drives.speeds[name]
+    plan.fingers = spec.gripper.joints if spec.gripper else ()
+    root = Pose(spec.base_position, spec.base_orientation)
+    if spec.kinematics.base_link:
+        root = root @ urdf.poses({})[spec.kinematics.base_link].inverse()
+    body.base = (tuple(root.position.tolist()), tuple(root.orientation.tolist()))
+    return plan
+
+
+def _plan_urdf(spec: BodySpec | RobotSpec, urdf: UrdfModel, key: str, scale: float) -> BodyPlan:
+    for joint in urdf.joints.values():
+        if not joint.movable and joint.kind != "fixed":
+            message = f"joint {joint.name!r} is neither fixed, revolute, continuous nor prismatic"
+            raise ConfigError([Problem(str(urdf.path), key, message, "wrong_joint")])
+    elements = {element.get("name", ""): element for element in parse_xml(urdf.path).findall("link")}
+    order = (urdf.root, *(joint.child for joint in urdf.outwards))
+    number = {name: k for k, name in enumerate(order)}
+    carried_by = {joint.child: joint for joint in urdf.joints.values()}
+    links: list[LinkPlan] = []
+    fixed: list[str] = []
+    problems: list[Problem] = []
+    for name in order:
+        link, found = urdf.links[name], carried_by.get(name)
+        try:
+            shapes = list(_shapes(link, scale))
+        except ValueError as error:
+            text = f"MuJoCo cannot load link {name!r}: {error}"
+            problems.append(Problem(str(urdf.path), key, text, "bad_mesh"))
+            continue
+        inertial, wrong = _inertial(elements[name], link, shapes, scale)
+        if wrong:
+            fixed.append(name)
+        links.append(LinkPlan(name, found, number[found.parent] if found else -1, shapes, inertial))
+    if problems:
+        raise ConfigError(problems)
+    joints = {name: k for k, name in enumerate(urdf.joints)}
+    moving = [joint for joint in urdf.joints.values() if joint.movable]
+    plan = BodyPlan(
+        Body(
+            name=spec.name,
+            spec=spec,
+            links=number,
+            joints=joints,
+            movable=tuple(joints[joint.name] for joint in moving),
+            floating=False,
+            contacts=[_contact(elements[name]) for name in order],
+        ),
+        links,
+        limits={joint.name: _range(joint) for joint in moving},
+        mimics=[(one.joint, one.of, one.multiplier, one.offset) for one in mimics_of(spec, urdf)],
+    )
+    if fixed:
+        text = "inertia computed from the collision shapes, the URDF's is impossible"
+        plan.warnings.append(f"{spec.name}: {text}: {listed(fixed)}")
+    if scale != 1.0:
+        for made in links:
+            if made.joint is not None:
+                made.joint = _scaled(made.joint, scale)
+    return plan
+
+
+def _scaled(joint: UrdfJoint, scale: float) -> UrdfJoint:
+    return replace(joint, origin=Pose(joint.origin.position * scale, joint.origin.orientation))
+
+
+def _range(joint: UrdfJoint) -> tuple[float, float] | None:
+    if joint.lower is None or joint.upper is None or joint.lower >= joint.upper:
+        return None
+    return joint.lower - UNBOUNDED, joint.upper + UNBOUNDED
+
+
+def _contact(link: ElementTree.Element) -> LinkContact:
+    """Return the frictions in a link's ``<contact>``, a custom element of PyBullet's."""
+    given = {}
+    for name in ("lateral_friction", "rolling_friction", "spinning_friction"):
+        element = link.find(f"contact/{name}")
+        if element is not None and element.get("value"):
+            given[name] = float(element.get("value", "0"))
+    return LinkContact(**given)
+
+
+# --- shapes ----------------------------------------------------------------------------------------------------------
+
+
+def _primitive(spec: BodySpec) -> Shape:
+    if spec.shape == "box":
+        if spec.half_extents is None:
+            message = "is missing, and a box needs it"
+            raise ConfigError([Problem("objects", f"objects.{spec.name}.half_extents", message, "missing_key")])
+        return Shape("box", tuple(spec.half_extents), Pose())
+    if spec.shape == "sphere":
+        return Shape("sphere", (required(spec, "radius"),), Pose())
+    if spec.shape in ("cylinder", "capsule"):
+        return Shape(spec.shape, (required(spec, "radius"), required(spec, "length") / 2.0), Pose())
+    if spec.shape == "plane":  # infinite in contacts
+        return Shape("plane", (0.0, 0.0, 1.0), Pose())
+    message = f"is {spec.shape!r}; shapes: box, sphere, cylinder, capsule, plane, urdf"
+    raise ConfigError([Problem("objects", f"objects.{spec.name}.shape", message, "unknown_shape")])
+
+
+def _shapes(link: UrdfLink, scale: float) -> Iterator[Shape]:
+    """Yield the collision shapes of a link; raises ValueError if a mesh has no hull."""
+    for shape in link.collisions:
+        pose = Pose(shape.pose.position * scale, shape.pose.orientation)
+        if shape.shape == "mesh":
+            for points in _hulls(shape):
+                yield Shape("mesh", (), pose, points * scale)
+        elif shape.shape == "box":
+            yield Shape("box", tuple(side / 2.0 * scale for side in shape.size), pose)
+        elif shape.shape == "sphere":
+            yield Shape("sphere", (shape.size[0] * scale,), pose)
+        else:
+            radius, length = shape.size
+            yield Shape(shape.shape, (radius * scale, length / 2.0 * scale), pose)
+
+
+_GROUP = re.compile(rb"^[ \t]*[og][ \t][^\n]*$", re.MULTILINE)
+_VERTEX = re.compile(rb"^[ \t]*v[ \t]+(\S+)[ \t]+(\S+)[ \t]+(\S+)", re.MULTILINE)
+_FACE = re.compile(rb"^[ \t]*f[ \t]+([^\r\n]*)", re.MULTILINE)
+
+
+def _hulls(shape: UrdfVisual) -> Iterator[Array]:
+    """Yield the vertices of each part of a mesh: parts of an OBJ have hulls of their own, as in PyBullet."""
+    name = Path(shape.file).name
+    for points in _parts(Path(shape.file)):
+        points = np.unique(points * np.array(shape.size), axis=0)
+        spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False) if len(points) > 3 else np.zeros(3)
+        if spread[2] <= 1e-6 * max(spread[0], 1e-9):
+            raise ValueError(f"mesh {name} is flat, and has no hull; use a thin box as its collision shape")
+        yield points
+
+
+def _parts(file: Path) -> list[Array]:
+    if file.suffix.lower() == ".obj":
+        data = file.read_bytes()
+        vertices = np.array(_VERTEX.findall(data)).astype(float)
+        parts = []
+        for part in _GROUP.split(data):
+            corners = [word.split(b"/")[0] for face in _FACE.findall(part) for word in face.split()]
+            if corners:
+                indices = np.array(corners).astype(int)
+                parts.append(vertices[np.unique(np.where(indices > 0, indices - 1, indices))])
+        return parts or [vertices]
+    import trimesh  # 0.3 s
+
+    try:
+        mesh: Any = trimesh.load(str(file), force="mesh")
+        return [np.array(mesh.vertices, dtype=np.float64)]
+    except Exception as error:  # whatever the reader of that format raises
+        raise ValueError(f"mesh {file.name} cannot be read: {error}") from None
+
+
+# --- masses ----------------------------------------------------------------------------------------------------------
+
+
+def _uniform(mass: float, shape: Shape) -> Inertial:
+    """Return the mass of a solid of uniform density."""
+    return Inertial(mass, mass * _box_inertia(shape.corners()), shape.pose)
+
+
+def _box_inertia(corners: Array) -> Array:
+    """Return the moments (3,) of the box of 1 kg around points, m2."""
+    squares = np.square(corners.max(axis=0) - corners.min(axis=0))
+    moments: Array = (squares.sum() - squares) / 12.0
+    return moments
+
+
+def _inertial(
+    element: ElementTree.Element, link: UrdfLink, shapes: list[Shape], scale: float
+) -> tuple[Inertial | None, bool]:
+    """Return the mass of a link, and whether its inertia is not the file's, which is impossible.
+
+    The mass of a link lies inside the box around its collision shapes. If all of it were in the corners, the inertia
+    would be three times that of a uniform box; no body has more. Placeholders such as 0.1 kg m2 for a finger of 0.1 kg
+    break this bound by orders of magnitude. Links without a shape, or with a possible inertia, keep the file's.
+    """
+    corners = np.vstack([shape.corners() for shape in shapes]) if shapes else None
+    given = element.find("inertial")
+    if given is None:
+        if not link.has_shapes:
+            return None, False
+        of_shapes = _box_inertia(corners) if corners is not None else np.full(3, 1e-3)
+        middle = (corners.max(axis=0) + corners.min(axis=0)) / 2.0 if corners is not None else np.zeros(3)
+        return Inertial(1.0, of_shapes, Pose(middle)), False
+    mass_of, inertia = given.find("mass"), given.find("inertia")
+    mass = float(mass_of.get("value", "0")) if mass_of is not None else 0.0
+    values = {name: float(inertia.get(name, "0")) if inertia is not None else 0.0 for name in _MOMENTS}
+    if mass <= 0.0:
+        return None, any(values.values())
+    place = link.inertial or Pose()
+    xx, yy, zz, xy, xz, yz = values.values()
+    moments, axes = np.linalg.eigh(np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]) * scale**2)
+    pose = Pose(place.position * scale, place.orientation) @ Pose.from_matrix(_frame(axes))
+    wrong = False
+    if corners is not None:
+        most = 3.0 * mass * _box_inertia(corners)
+        wrong = bool((np.sort(moments) > np.sort(most)).any()) or bool((moments <= 0.0).all())
+        if wrong:
+            moments, pose = most / 3.0, Pose(pose.position)
+    moments = np.maximum(moments, LEAST_INERTIA)
+    excess = moments.max() - (moments.sum() - moments.max())  # MuJoCo refuses a moment above the sum of the others
+    if excess > 0.0:
+        moments = moments + np.where(moments == moments.max(), 0.0, 0.5 * excess * (1.0 + 1e-6))
+    return Inertial(mass, moments, pose), wrong
+
+
+_MOMENTS = ("ixx", "iyy", "izz", "ixy", "ixz", "iyz")
+
+
+def _frame(axes: Array) -> Array:
+    """Return the transform (4, 4) with these columns as its axes, right-handed."""
+    matrix = np.eye(4)
+    matrix[:3, :3] = axes if np.linalg.det(axes) > 0.0 else axes * np.array([1.0, 1.0, -1.0])
+    return matrix
+
+
+# --- building --------------------------------------------------------------------------------------------------------
+
+
+def build(model: Any, plan: BodyPlan) -> None:
+    """Add a body to a model. Links, joints and shapes of one body do not collide with each other.
+
+    Args:
+        model: A ``mujoco.MjSpec``.
+        plan: The body.
+    """
+    mujoco = load_mujoco()
+    body = plan.body
+    made: list[Any] = []
+    for number, link in enumerate(plan.links):
+        if link.joint is None:
+            position, orientation = body.base
+            node = model.worldbody.add_body(name=body.mujoco_name(link.name), pos=position, quat=wxyz(orientation))
+            if body.floating:
+                node.add_freejoint(name=body.mujoco_name())
+        else:
+            origin = link.joint.origin
+            node = made[link.parent].add_body(
+                name=body.mujoco_name(link.name), pos=origin.position, quat=wxyz(origin.orientation)
+            )
+            if link.joint.movable:
+                _add_joint(mujoco, node, plan, link.joint)
+        made.append(node)
+        inertial = link.inertial
+        if inertial is None and link.joint is not None and link.joint.movable:
+            inertial = Inertial(LEAST_MASS, np.full(3, LEAST_INERTIA), Pose())
+        node.explicitinertial = True
+        if inertial is not None:
+            node.mass, node.inertia = inertial.mass, inertial.moments
+            node.ipos, node.iquat = inertial.pose.position, wxyz(inertial.pose.orientation)
+        for k, shape in enumerate(link.shapes):
+            _add_shape(mujoco, model, node, body, number, f"{body.mujoco_name(link.name)}/{k}", shape)
+    names = [body.mujoco_name(link.name) for link in plan.links]
+    for first, second in itertools.combinations((names[k] for k, link in enumerate(plan.links) if link.shapes), 2):
+        model.add_exclude(bodyname1=first, bodyname2=second, name=f"{first}|{second}")  # as in PyBullet
+    for follower, leader, multiplier, offset in plan.mimics:
+        coupling = model.add_equality(
+            name=f"{body.mujoco_name(follower)}|mimic",
+            type=mujoco.mjtEq.mjEQ_JOINT,
+            objtype=mujoco.mjtObj.mjOBJ_JOINT,
+            name1=body.mujoco_name(follower),
+            name2=body.mujoco_name(leader),
+            solref=COUPLING,
+        )
+        coupling.data[:2] = offset, multiplier
+
+
+def take_out(model: Any, plan: BodyPlan) -> None:
+    """Remove a body that :func:`build` added."""
+    body = plan.body
+    root = model.body(body.mujoco_name(plan.links[0].name))
+    prefix = body.mujoco_name()
+    for one in (*model.excludes, *model.equalities):
+        if one.name.startswith(prefix):
+            model.delete(one)
+    model.delete(root)
+    for mesh in model.meshes:
+        if mesh.name.startswith(prefix):
+            model.delete(mesh)
+
+
+def _add_joint(mujoco: Any, node: Any, plan: BodyPlan, joint: UrdfJoint) -> None:
+    turn = joint.origin.inverse().orientation
+    axis = Pose((0.0, 0.0, 0.0), turn).matrix()[:3, :3] @ np.array(joint.axis)  # in the child's frame
+    kind = mujoco.mjtJoint.mjJNT_HINGE if joint.kind in TURNING else mujoco.mjtJoint.mjJNT_SLIDE
+    made = node.add_joint(name=plan.body.mujoco_name(joint.name), type=kind, axis=axis)
+    limits = plan.limits[joint.name]
+    made.limited = limits is not None
+    if limits is not None:
+        made.range = limits
+    if joint.name in plan.fingers:
+        made.armature = FINGER_INERTIA
+
+
+_KINDS: Mapping[str, str] = {
+    "box": "mjGEOM_BOX",
+    "sphere": "mjGEOM_SPHERE",
+    "cylinder": "mjGEOM_CYLINDER",
+    "capsule": "mjGEOM_CAPSULE",
+    "plane": "mjGEOM_PLANE",
+    "mesh": "mjGEOM_MESH",
+}
+
+
+def _add_shape(mujoco: Any, model: Any, node: Any, body: Body, link: int, name: str, shape: Shape) -> None:
+    contact = body.contacts[link]
+    values: dict[str, Any] = {
+        "name": name,
+        "type": getattr(mujoco.mjtGeom, _KINDS[shape.kind]),
+        "pos": shape.pose.position,
+        "quat": wxyz(shape.pose.orientation),
+        "mass": 0.0,
+        "friction": (contact.lateral_friction, contact.spinning_friction, contact.rolling_friction),
+        "condim": contact_dimensions(contact),
+        "solref": STIFF_CONTACT,
+        "solimp": CONTACT_IMPEDANCE,
+        "priority": int(body.floating),
+    }
+    if body.carried:
+        values |= {"contype": 0, "conaffinity": 0}
+    if shape.points is not None:
+        mesh = model.add_mesh(name=name)
+        mesh.uservert = shape.points.ravel().tolist()
+        values["meshname"] = name
+    else:
+        values["size"] = (*shape.size, 0.0, 0.0)[:3]
+    node.add_geom(**values)
+
+
+def contact_dimensions(contact: LinkContact) -> int:
+    """Return MuJoCo's number of directions in which a contact of this link has forces."""
+    return 6 if contact.rolling_friction > 0.0 else 4 if contact.spinning_friction > 0.0 else 3

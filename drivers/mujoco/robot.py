@@ -1,0 +1,55 @@
+"""A simulated arm."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from hal.drivers.scene.robot import SimulatedRobot
+
+from .world import MujocoWorld
+
+__all__ = ["MujocoRobot"]
+
+Floats = Sequence[float]
+
+
+class MujocoRobot(SimulatedRobot[MujocoWorld]):
+    """The driver of one robot in a :class:`~hal.drivers.mujoco.world.MujocoWorld`, driven by :class:`.motors.Motors`.
+
+    With the aim ``q_set - dq_set dt`` and the speed ``dq_set``, a joint is at its set-point at the end of the step.
+    """
+
+    WORLD = MujocoWorld
+
+    def _find(self) -> None:
+        self._body = self._world.body(self.spec.name)
+        self._at = self._world.dofs(self._body, self.spec.joints)
+        self._inertia: Any = None
+
+    def _state(self) -> tuple[Floats, Floats, Floats]:
+        world, at = self._world, self._at
+        return world.q[at].tolist(), world.dq[at].tolist(), world.motors.applied[at].tolist()
+
+    def _follow(self, q: Floats, dq: Floats) -> None:
+        motors, at, dt = self._world.motors, self._at, self._world.dt
+        motors.aim[at] = [a - b * dt for a, b in zip(q, dq, strict=True)]
+        motors.feed[at] = dq
+
+    def _hold_at(self, q: Floats) -> None:
+        motors, at = self._world.motors, self._at
+        if motors.torques.pop(self.spec.name, None) is not None:
+            motors.rest(at, q)
+        motors.aim[at], motors.feed[at] = q, 0.0
+
+    def _take_over(self) -> None:
+        """Do nothing: the first torques switch the motors off."""
+
+    def _apply(self, tau: Floats) -> None:
+        self._world.motors.torques[self.spec.name] = (self._at, np.array(tau, float))
+
+    def mass_matrix(self, q: Sequence[float]) -> Any:
+        """Return the joint-space inertia of the simulated arm (n, n) at ``q``, kg m2."""
+        return self._world.mass_matrix(self._at, q)

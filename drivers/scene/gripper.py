@@ -1,0 +1,181 @@
+"""A simulated parallel gripper, without its physics engine: two coupled fingers of limited speed and force."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from typing import ClassVar, Generic, TypeVar
+
+from hal.driver import GripperDriver, GripperReading
+from hal.errors import CommandError, ConfigError, ConnectionLost, Problem
+from hal.specs import GripperSpec, RobotSpec
+
+from .world import SimulatedBody, SimulatedWorld
+
+__all__ = ["SimulatedGripper"]
+
+AT_TARGET = 0.001
+"""Tolerance of the target width, m."""
+SLOW = 0.002
+"""Speed below which fingers at their target have arrived, m/s."""
+STILL = 0.0005
+"""A width that changes by less than this, m, counts as standing still. Pressed on a hard, uneven object, the joints of
+the fingers oscillate fast while the width hardly moves, so their speed is no criterion."""
+SETTLE = 0.1
+"""Time of standing still after which a motion has ended at any width, s. Slow motions take longer."""
+BLOCKED = 0.25
+"""Share of the commanded speed below which fingers, long after the command, count as blocked."""
+PRESSING = 0.5
+"""Share of the commanded force from which on the fingers count as pressing on something."""
+
+W = TypeVar("W", bound=SimulatedWorld)  # type: ignore[type-arg]  # of any kind of body
+B = TypeVar("B", bound=SimulatedBody)
+
+
+class SimulatedGripper(GripperDriver, Generic[W, B]):
+    """Base class of the driver of the fingers of one robot in a simulated world.
+
+    Each finger is driven by a position motor whose force is the grip force, so a grasp needs no code per step: on an
+    object the motors press with that force, from both sides, until the next command. Positive joint positions open.
+    """
+
+    simulated: ClassVar[bool] = True
+    WORLD: ClassVar[type[SimulatedWorld]]  # type: ignore[type-arg]
+    """The class of world that the gripper must be in."""
+
+    def __init__(self, spec: GripperSpec, world: object | None = None) -> None:
+        super().__init__(spec, world)
+        if not isinstance(world, self.WORLD):
+            text = f"{spec.name}: a simulated gripper needs its simulated world, not {world!r}"
+            raise CommandError(text, code="world_missing")
+        self._world: W = world  # type: ignore[assignment]  # of that class
+        self._open = False
+        self._target = self._aim = spec.width_max
+        self._force = spec.force
+        self._stood = self._stood_since = 0.0
+        """Width, m, near which the fingers have stayed, and since when, s."""
+        self._settle = SETTLE
+        self._resting = True
+        self._seen = 0.0
+        """When the width was read last, s."""
+        self._speed = spec.speed
+
+    # --- what an engine implements -----------------------------------------------------------------------------------
+
+    @abstractmethod
+    def _find(self) -> None:
+        """Find the fingers of :attr:`_body`."""
+
+    @abstractmethod
+    def _width(self) -> tuple[float, float, float, float]:
+        """Return the width, m, its speed, m/s (positive opens), the force of the weaker motor, N (positive closes), and
+        the greatest force of a motor in either direction, N.
+        """
+
+    @abstractmethod
+    def _drive(self, speed: float) -> None:
+        """Drive the fingers to the width :attr:`_aim` with :attr:`_force`; ``speed`` is that of the width, m/s."""
+
+    @abstractmethod
+    def _handle(self, active: bool) -> None:
+        """Take notice whether the fingers move or hold something; else they need no coupling."""
+
+    # --- the driver --------------------------------------------------------------------------------------------------
+
+    def open(self) -> None:
+        """Find the fingers in the world; raises ConfigError when they belong to no robot."""
+        self._body: B = self._owner()
+        self._find()
+        self._was_reset()
+        if not self._open:
+            self._world.on_reset(self._body.name, self._was_reset)
+        self._open = True
+
+    def read(self, now: float) -> GripperReading:
+        """Return the fingers after the last physics step; ``force`` is that of the weaker motor, N."""
+        self._expect_open()
+        width, speed, force, load = self._width()
+        moving = not self._at_rest(width, speed)
+        pressing = force >= PRESSING * self._force
+        idle = not moving and abs(width - self._aim) <= AT_TARGET and load < PRESSING * self._force
+        self._handle(not idle)
+        return GripperReading(
+            t=now,
+            t_device=self._world.t,
+            seq=self._world.steps,
+            width=width,
+            width_target=self._target,
+            moving=moving,
+            grasped=not moving and pressing and width > self._aim + AT_TARGET,
+            force=force,
+        )
+
+    def move(self, width: float, speed: float, force: float) -> None:
+        """Start a motion to ``width``, clipped to the gripper's range; the newest command wins."""
+        self._target = self._aim = min(max(width, 0.0), self.spec.width_max)
+        self._start(speed, force)
+
+    def grasp(self, width: float, speed: float, force: float, inner: float, outer: float) -> None:
+        """Start to close until something, or the other finger, stops the fingers; they go on pressing."""
+        self._target, self._aim = min(max(width, 0.0), self.spec.width_max), 0.0
+        self._start(speed, force)
+
+    def _expect_open(self) -> None:
+        if not self._open:
+            raise ConnectionLost(f"{self.spec.name} is not open")
+
+    def _start(self, speed: float, force: float) -> None:
+        self._expect_open()
+        self._force = force
+        self._speed = min(speed, self.spec.speed)
+        self._resting, self._stood_since = False, self._world.t
+        self._settle = max(SETTLE, 2.0 * STILL / self._speed)
+        self._handle(True)
+        self._drive(self._speed)
+
+    def _at_rest(self, width: float, speed: float) -> bool:
+        """Return whether the fingers have arrived, or stand still elsewhere. To be called for every new width."""
+        t = self._world.t
+        unseen, self._seen = t - self._seen, t
+        stood_long = t - self._stood_since >= self._settle
+        if abs(width - self._stood) > STILL:
+            if unseen < self._settle:
+                self._resting = self._resting and stood_long  # a creeping finger has stood long at every place
+            else:  # in lock-step nothing is read while a program sleeps
+                self._resting = abs(speed) <= BLOCKED * self._speed
+            self._stood, self._stood_since = width, t
+        elif stood_long:
+            self._resting = True
+        return self._resting or (abs(width - self._aim) <= AT_TARGET and abs(speed) <= SLOW)
+
+    def stop(self) -> None:
+        """Stop the fingers where they are; on an object, they continue to press."""
+        self._expect_open()
+        width, speed, force, _ = self._width()
+        if force >= PRESSING * self._force and (abs(speed) <= SLOW or self._at_rest(width, speed)):
+            return
+        self._target = self._aim = width
+        self._handle(True)
+        self._drive(self.spec.speed)
+
+    def close(self) -> None:
+        """Disconnect; the motors hold, or press, for as long as the world exists."""
+        if self._open:
+            self._world.off_reset(self._body.name, self._was_reset)
+        self._open = False
+
+    def _was_reset(self) -> None:
+        self._target = self._aim = self._stood = self._width()[0]
+        self._resting, self._stood_since = True, self._world.t
+        self._force = self.spec.force
+
+    def _owner(self) -> B:
+        """Return the only robot in the world that has this gripper."""
+        spec, bodies = self.spec, self._world.bodies.values()
+        owners: list[B] = [body for body in bodies if isinstance(body.spec, RobotSpec) and body.spec.gripper == spec]
+        if len(owners) != 1 or not spec.joints:
+            message = f"{len(owners)} robots have it" if spec.joints else "names no finger joints"
+            message += "; it needs one robot and its finger joints"
+            raise ConfigError(
+                [Problem("grippers", spec.name, message, "wrong_count" if spec.joints else "missing_key")]
+            )
+        return owners[0]

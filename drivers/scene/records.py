@@ -1,0 +1,112 @@
+"""What every engine needs of the records of arms and objects before it loads them, and what is wrong with them."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, field
+
+from hal.errors import ConfigError, Problem
+from hal.kinematics.urdf import UrdfMimic, UrdfModel
+from hal.specs import BodySpec, RobotSpec
+
+from .values import listed
+
+__all__ = [
+    "JointDrives",
+    "check_names",
+    "is_fixed",
+    "joint_drives",
+    "mimics_of",
+    "required",
+]
+
+UNKNOWN_EFFORT = 200.0
+"""Effort, Nm or N, of a joint without a limit (a URDF's effort of 0 means unknown, not powerless)."""
+UNKNOWN_SPEED = 2.0
+"""Speed, rad/s or m/s, of a joint without a limit."""
+
+
+def is_fixed(spec: BodySpec) -> bool:
+    """Return whether physics leaves the base of this object alone; an object attached to an arm is placed instead."""
+    return spec.fixed or spec.shape == "plane" or spec.robot is not None
+
+
+def required(spec: BodySpec, name: str) -> float:
+    """Return a size that an object's shape needs; raises ConfigError if the record lacks it."""
+    value = getattr(spec, name)
+    if value is None:
+        message = f"is missing, and a {spec.shape} needs it"
+        raise ConfigError([Problem("objects", f"objects.{spec.name}.{name}", message, "missing_key")])
+    return float(value)
+
+
+def check_names(spec: RobotSpec, movable: Collection[str], links: Collection[str]) -> None:
+    """Raise ConfigError unless every joint that the record names is movable, and its base link exists."""
+    key = f"robots.{spec.name}"
+    fingers = spec.gripper.joints if spec.gripper else ()
+    problems = [
+        Problem(
+            spec.urdf,
+            f"{key}.{where}",
+            f"has no movable joint {name!r}; movable: {', '.join(sorted(movable))}",
+            "unknown_joint",
+        )
+        for where, names in (("joints", spec.joints), ("gripper.joints", fingers))
+        for name in names
+        if name not in movable
+    ]
+    base_link = spec.kinematics.base_link
+    if base_link is not None and base_link not in links:
+        message = f"has no link {base_link!r}; links: {', '.join(links)}"
+        problems.append(Problem(spec.urdf, f"{key}.base_link", message, "unknown_link"))
+    if problems:
+        raise ConfigError(problems)
+
+
+@dataclass
+class JointDrives:
+    """Start and limits of the joints of an arm and its gripper, by joint."""
+
+    home: dict[str, float] = field(default_factory=dict)
+    """Initial position, rad or m."""
+    efforts: dict[str, float] = field(default_factory=dict)
+    """Greatest torque or force, Nm or N."""
+    speeds: dict[str, float] = field(default_factory=dict)
+    """Greatest speed, rad/s or m/s."""
+    warnings: list[str] = field(default_factory=list)
+
+
+def joint_drives(spec: RobotSpec, limits: Mapping[str, tuple[float, float]]) -> JointDrives:
+    """Return the drives of an arm's movable joints.
+
+    Args:
+        spec: The arm's record, whose own limits of effort and speed win.
+        limits: Effort and speed of every movable joint in the URDF, 0 if unknown.
+    """
+    drives = JointDrives()
+    fingers = spec.gripper.joints if spec.gripper else ()
+    without: list[str] = []
+    for name, (effort, speed) in limits.items():
+        drives.home[name] = 0.0
+        if name in spec.joints:
+            place = spec.joints.index(name)
+            drives.home[name] = spec.initial[place]
+            speed = spec.limits.velocity[place]
+            effort = spec.limits.torque[place] if spec.limits.torque else effort
+        elif name in fingers and spec.gripper:
+            drives.home[name] = spec.gripper.width_max / 2.0
+        if effort <= 0.0:
+            without.append(name)
+        drives.efforts[name] = effort if effort > 0.0 else UNKNOWN_EFFORT
+        drives.speeds[name] = speed if speed > 0.0 else UNKNOWN_SPEED
+    if without:
+        text = f"{spec.name}: no effort limit of {listed(without)}; {UNKNOWN_EFFORT:g} Nm (N) is used"
+        drives.warnings.append(text)
+    return drives
+
+
+def mimics_of(spec: BodySpec | RobotSpec, urdf: UrdfModel) -> tuple[UrdfMimic, ...]:
+    """Return which joints follow others; an arm's fingers move together even if the URDF does not say so."""
+    fingers = spec.gripper.joints if isinstance(spec, RobotSpec) and spec.gripper else ()
+    mimics = urdf.mimics or tuple(UrdfMimic(finger, fingers[0], 1.0, 0.0) for finger in fingers[1:])
+    return tuple(mimic for mimic in mimics if mimic.of in urdf.joints and mimic.multiplier != 0.0)

@@ -1,0 +1,191 @@
+"""A simulated arm, without its physics engine: how it takes set-points, holds, and fails on demand."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Sequence
+from typing import ClassVar, Generic, TypeVar
+
+from hal.driver import Reading, RobotDriver, Setpoint
+from hal.errors import CommandError, ConnectionLost, Fault
+from hal.specs import RobotSpec
+
+from .world import SimulatedWorld
+
+__all__ = ["SimulatedRobot"]
+
+HOLD_TIME = 0.020
+"""Time for which torques are held without new ones, s: the same as a Franka's."""
+
+Floats = Sequence[float]
+W = TypeVar("W", bound=SimulatedWorld)  # type: ignore[type-arg]  # of any kind of body
+
+
+class SimulatedRobot(RobotDriver, Generic[W]):
+    """Base class of the driver of one robot in a simulated world.
+
+    Its joints follow positions by motors that an engine implements: at the end of the step before which a set-point was
+    written the arm is there, so the next reading has no lag, and the arm does not sag. The motors' torques are limited
+    to those of the rig, or of the URDF where the rig has none, and their speeds too, so that a set-point that jumps
+    cannot move a joint faster.
+
+    A set-point with torques switches the motors off, and adds its torques to the compensation of gravity; one without
+    switches them on again. The last torques are held for 20 ms without new ones, then the motors hold the arm.
+    """
+
+    modes: ClassVar[frozenset[str]] = frozenset({"position", "velocity", "torque"})
+    simulated: ClassVar[bool] = True
+    WORLD: ClassVar[type[SimulatedWorld]]  # type: ignore[type-arg]
+    """The class of world that the arm must stand in."""
+
+    def __init__(self, spec: RobotSpec, world: object | None = None) -> None:
+        super().__init__(spec, world)
+        if not isinstance(world, self.WORLD):
+            text = f"{spec.name}: a simulated device needs its simulated world, not {world!r}"
+            raise CommandError(text, code="world_missing")
+        self._world: W = world  # type: ignore[assignment]  # of that class
+        self._open = False
+        self._connected = True
+        self._frozen: Reading | None = None
+        self._freeze = False
+        self._fault: Fault | None = None
+        self._q: Floats | None = None
+        self._dq: Floats | None = None
+        self._tau: Floats | None = None
+        """Torques that drive the arm, Nm; None while the motors follow positions."""
+        self._t_received = 0.0
+        """When the last torques arrived, in simulated s."""
+
+    # --- what an engine implements -----------------------------------------------------------------------------------
+
+    @abstractmethod
+    def _find(self) -> None:
+        """Find the robot in the world; raises DeviceNotFound."""
+
+    @abstractmethod
+    def _state(self) -> tuple[Floats, Floats, Floats]:
+        """Return positions (n,), velocities (n,), and the torques (n,) that the motors applied in the last step."""
+
+    @abstractmethod
+    def _follow(self, q: Floats, dq: Floats) -> None:
+        """Let the motors bring the joints to ``q`` with the velocities ``dq`` by the end of the next step."""
+
+    @abstractmethod
+    def _hold_at(self, q: Floats) -> None:
+        """Switch the motors on, if they are off, and let them hold the joints at ``q``."""
+
+    @abstractmethod
+    def _take_over(self) -> None:
+        """Switch the motors off, because torques follow."""
+
+    @abstractmethod
+    def _apply(self, tau: Floats) -> None:
+        """Apply torques (n,) on top of the compensation to the next step, in place of those applied to it before."""
+
+    # --- the driver --------------------------------------------------------------------------------------------------
+
+    def open(self) -> None:
+        """Find the robot in the world; raises DeviceNotFound."""
+        self._find()
+        if not self._open:
+            self._world.on_reset(self.spec.name, self._was_reset)
+        self._open = True
+
+    def read(self, now: float) -> Reading:
+        """Return the joints after the last physics step; ``tau`` is what the motors applied in it, Nm."""
+        if not self._open or not self._connected:
+            raise self._lost()
+        world = self._world
+        if self._tau is not None:
+            self._keep_torques(self._tau)
+        if self._freeze and self._frozen is not None:
+            return self._frozen
+        q, dq, tau = self._state()
+        fault = self._fault or world.fault
+        reading = Reading(now, world.t, world.steps, q, dq, tau, self._q, self._dq, None, None, fault)
+        self._frozen = reading
+        return reading
+
+    def write(self, setpoint: Setpoint) -> None:
+        """Apply a set-point; a robot with a fault ignores it, which its ``q_commanded`` shows."""
+        if not self._open or not self._connected:
+            raise self._lost()
+        if self._fault is not None:
+            return
+        q, dq, tau = setpoint.q, setpoint.dq, setpoint.tau
+        if tau is not None:
+            if self._tau is None:
+                self._take_over()
+            self._tau, self._t_received = tau, self._world.t
+            self._keep_torques(tau)
+        else:
+            if self._tau is not None:
+                self._hold(q)  # puts the motors' speed limits back
+            self._follow(q, dq)
+        self._q, self._dq = q, dq
+
+    def _keep_torques(self, tau: Floats) -> None:
+        """Apply torques to each step and compensate gravity, as an arm's own controller does between commands."""
+        if self._world.t - self._t_received > HOLD_TIME:
+            self._hold(self._positions())
+        else:
+            self._apply(tau)
+
+    def halt(self) -> None:
+        """Hold the last set-point; an arm that is driven by torques holds its present position."""
+        if self._open and self._q is not None:
+            self._hold(self._q if self._tau is None else self._positions())
+
+    def recover(self) -> None:
+        """Clear every injected fault."""
+        self._connected, self._freeze, self._fault = True, False, None
+
+    def inject(self, **faults: object) -> None:
+        """Switch injected faults on or off.
+
+        Args:
+            **faults: ``freeze=True``: every reading repeats the last one, including its stamps. ``disconnect=True``:
+                the robot does not answer. ``fault="text"``: the robot reports that fault, holds its position and
+                ignores set-points; ``fault=None`` ends it.
+
+        Raises:
+            CommandError: No such fault.
+        """
+        known = {"freeze", "disconnect", "fault"}
+        if not set(faults) <= known:
+            raise CommandError(
+                f"{', '.join(sorted(set(faults) - known))}: unknown fault; faults: freeze, disconnect, fault",
+                code="unknown_fault",
+            )
+        self._freeze = bool(faults.get("freeze", self._freeze))
+        self._connected = not faults.get("disconnect", not self._connected)
+        if not self._connected and self._open and self._tau is not None:
+            self._hold(self._positions())  # the arm's own controller notices, and it is not read any more
+        if "fault" not in faults:
+            return
+        cause = faults["fault"]
+        self._fault = Fault("injected", str(cause), "call recover() on the arm") if cause else None
+        if self._fault is not None and self._open:
+            self._hold(self._positions())
+
+    def close(self) -> None:
+        """Disconnect; the motors hold the last set-point for as long as the world exists."""
+        self.halt()
+        if self._open:
+            self._world.off_reset(self.spec.name, self._was_reset)
+        self._open = False
+
+    def _lost(self) -> ConnectionLost:
+        return ConnectionLost(f"{self.spec.name} {'does not answer (injected)' if self._open else 'is not open'}")
+
+    def _hold(self, q: Floats) -> None:
+        self._hold_at(q)
+        self._q, self._dq = list(q), [0.0] * len(q)
+        self._tau = None
+
+    def _positions(self) -> Floats:
+        return self._state()[0]
+
+    def _was_reset(self) -> None:
+        self._q, self._dq = self._positions(), [0.0] * len(self.spec.joints)
+        self._tau = None

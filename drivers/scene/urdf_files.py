@@ -1,0 +1,97 @@
+"""The URDF files of a simulated world: how they are checked, and what is drawn where meshes are not installed."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+from hal.errors import ConfigError, Problem
+from hal.kinematics.mesh_files import mesh_file, package_folder
+from hal.kinematics.urdf import UrdfLink, UrdfModel, UrdfVisual, parse_xml, read_urdf
+from hal.specs import BodySpec
+
+__all__ = ["absent_packages", "checked_urdf", "drawn_visuals", "has_free_base", "massless"]
+
+
+def checked_urdf(path: str, key: str) -> UrdfModel:
+    """Read and check a URDF and its meshes.
+
+    A visual mesh in a package that is not installed is no problem: see :func:`drawn_visuals`.
+
+    Args:
+        path: The file.
+        key: The configuration key that names it.
+
+    Raises:
+        ConfigError: The file or a mesh is missing or broken; lists all problems.
+    """
+    try:
+        model = read_urdf(Path(path))
+    except OSError as error:
+        raise ConfigError([Problem(path, key, f"cannot be read: {error.strerror}", "missing_file")]) from None
+    except ValueError as error:
+        raise ConfigError([Problem(path, key, str(error), "bad_urdf")]) from None
+    missing = [name for name, drawn in _missing_meshes(path) if not (drawn and _absent(name))]
+    if missing:
+        text = "names a mesh that does not exist"
+        raise ConfigError([Problem(path, key, f"{text}: {name}", "missing_file") for name in dict.fromkeys(missing)])
+    return model
+
+
+def absent_packages(path: str) -> tuple[str, ...]:
+    """Return the packages that a URDF's visual meshes are in and that are not installed."""
+    names = [_absent(name) for name, drawn in _missing_meshes(path) if drawn]
+    return tuple(dict.fromkeys(name for name in names if name))
+
+
+def drawn_visuals(link: UrdfLink) -> tuple[UrdfVisual, ...]:
+    """Return what is drawn of a link: its visual shapes; its collision shapes if it has none, or if meshes are missing.
+
+    Collision shapes have the colour of the visual shape that they replace.
+    """
+    if not link.visuals:
+        return link.collisions
+    missing = [visual for visual in link.visuals if visual.shape == "mesh" and not Path(visual.file).is_file()]
+    if not missing:
+        return link.visuals
+    rgba = missing[0].rgba
+    if link.collisions:
+        return tuple(UrdfVisual(shape.pose, shape.shape, shape.size, rgba, shape.file) for shape in link.collisions)
+    return tuple(visual for visual in link.visuals if visual not in missing)
+
+
+def has_free_base(spec: BodySpec, urdf: UrdfModel | None) -> bool:
+    """Return whether physics moves the base of an object: it has a mass, and is neither fixed nor attached to an arm.
+
+    The mass of a URDF is that of its root; a root without ``<inertial>`` has one unless its name is ``world``.
+    """
+    if spec.fixed or spec.shape == "plane" or spec.robot is not None:
+        return False
+    if urdf is None:
+        return spec.mass > 0.0
+    mass = urdf.links[urdf.root].mass
+    return urdf.root != "world" if mass is None else mass > 0.0
+
+
+def massless(urdf: UrdfModel) -> tuple[str, ...]:
+    """Return the links that have shapes but no ``<inertial>``: engines make up a mass for them."""
+    return tuple(link.name for link in urdf.links.values() if link.inertial is None and link.has_shapes)
+
+
+def _missing_meshes(path: str) -> Iterator[tuple[str, bool]]:
+    """Yield the name of each mesh that does not exist, and whether it is only drawn."""
+    folder = Path(path).resolve().parent
+    for link in parse_xml(path).iter("link"):
+        for shape in link:
+            for mesh in shape.iter("mesh"):
+                name = mesh.get("filename", "")
+                if not mesh_file(name, folder).is_file():
+                    yield name, shape.tag == "visual"
+
+
+def _absent(name: str) -> str:
+    """Return the package of a mesh if that package is not installed, else an empty text."""
+    if not name.startswith("package://"):
+        return ""
+    package = name.removeprefix("package://").partition("/")[0]
+    return package if package_folder(package) is None else ""
