@@ -224,6 +224,15 @@ class RobotDriver(DeviceDriver):
     def halt(self) -> None:
         """End streaming: the device stops, and holds where it is. Idempotent."""
 
+    def lower(self) -> bool:
+        """Lower an arm without brakes a little further, before :meth:`close`; return whether it is down.
+
+        It is called once per cycle in place of :meth:`read` and :meth:`write`, after the last session, until it returns
+        True, for 7 s at most. Meanwhile the group's other arms are lowered as well, and its grippers hold. A lost link
+        is no error. ``close`` may come without it, and then lowers the arm by itself.
+        """
+        return True
+
     def recover(self) -> None:
         """Clear a fault of the device, only on the user's request. Devices without faults need nothing."""
 

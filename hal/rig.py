@@ -421,9 +421,12 @@ class Rig:
         errors: list[BaseException] = []
         sessions = [robot._open for robot in self.robots.values() if robot._open is not None]
         shown = [item for item in (self.viewer3d, self.console, self._viewer, self._pictures) if item is not None]
-        for device in (*sessions, *self.gamepads.values(), *self.cameras.values(), *shown, *self._hosts):
+        ends = [device.close for device in (*sessions, *self.gamepads.values(), *self.cameras.values(), *shown)]
+        ends += [host.request_close for host in self._hosts]  # all at the same time: lowering an arm takes seconds
+        ends += [host.close for host in self._hosts]
+        for end in ends:
             try:
-                device.close()
+                end()
             except BaseException as error:  # a second Ctrl-C must not leave the rest open
                 errors.append(error)
         self._closed = True

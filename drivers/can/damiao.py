@@ -104,6 +104,11 @@ class DamiaoArm(RobotDriver):
         self.chain.lower(self.dynamics.gravity)
         self.chain.close()
 
+    def lower(self) -> bool:
+        self.engaged = False
+        self._switching = None
+        return self.chain.lower_further(self.dynamics.gravity)
+
     # Every cycle.
 
     def read(self, now: float) -> Reading:

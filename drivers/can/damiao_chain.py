@@ -30,6 +30,9 @@ from .settings import BusSettings, DamiaoMotorSettings, emulator_remedy, is_emul
 
 __all__ = ["SILENCE", "SWITCHING", "DamiaoChain"]
 
+Weight = Callable[[Sequence[float]], Sequence[float]]
+"""Function that returns the torques (n,), Nm, that carry a device at joint positions (n,), rad."""
+
 SILENCE = 0.1
 """Silence after which a motor counts as lost, s,"""
 _UNANSWERED = 5
@@ -96,6 +99,8 @@ class DamiaoChain:
         self._sent_ids = (REGISTER_ID, *(motor.id for motor in self.motors))
         self._subscribed = False
         self._locks: list[DeviceLock] = []
+        self._lowering: Iterator[bool] | None = None
+        """Its remaining steps; None before the first."""
         self._asked = False
         """Whether frames were sent since the last update."""
         self._t_asked = 0.0
@@ -202,6 +207,7 @@ class DamiaoChain:
     def close(self) -> None:
         """Give up the bus and the motors, without any frame. Idempotent."""
         bus, self.bus = self.bus, None
+        self._lowering = None
         if bus is not None:
             if self._subscribed:
                 bus.unsubscribe((motor.settings.reply_id for motor in self.motors), self._sent_ids)
@@ -397,17 +403,30 @@ class DamiaoChain:
         self.send(motor, hold)
         motor.on, motor.switched_at = True, self._now
 
-    def lower(self, weight: Callable[[Sequence[float]], Sequence[float]] | None = None) -> None:
-        """Let the motors that are on sink to rest, slowly and damped, and switch them off. Never raises.
+    def lower(self, weight: Weight | None = None) -> None:
+        """Do all steps of :meth:`lower_further`, and wait in between."""
+        while not self.lower_further(weight):
+            time.sleep(_LOWERING_PERIOD)
+
+    def lower_further(self, weight: Weight | None = None) -> bool:
+        """Let the motors that are on sink to rest, slowly and damped, and switch them off: one step. Never raises.
 
         A motor's damping alone is too small for an arm's weight. So the part of the weight that would sink faster
         than :data:`_SINKING` is carried, and let go of once everything rests. An arm that does not rest within 6 s is
         left to its motors, which damp after TIMEOUT until they are switched off by hand: it is never dropped.
 
         Args:
-            weight: Function that returns the torques (n,), Nm, that carry the device at joint positions (n,), rad; None
-                if it weighs nothing.
+            weight: What the device weighs; None if it weighs nothing.
+
+        Returns:
+            Whether this was the last step.
         """
+        if self._lowering is None:
+            self._lowering = self._lower(weight)
+        return next(self._lowering, True)
+
+    def _lower(self, weight: Weight | None) -> Iterator[bool]:
+        """Yield False after each step."""
         bus = self.bus
         on = [k for k, motor in enumerate(self.motors) if motor.on]
         if bus is None or not on:
@@ -433,7 +452,7 @@ class DamiaoChain:
                     free = _SINKING * motor.kd
                     held = tau[k] - min(max(tau[k], -free), free)
                     self.send(motor, motor.command(motor.q, 0.0, 0.0, motor.kd, held))
-                time.sleep(_LOWERING_PERIOD)
+                yield False
                 if not bus.poll():
                     return
                 for k, motor in enumerate(self.motors):
@@ -446,7 +465,7 @@ class DamiaoChain:
             for _ in range(2):  # one may be lost
                 for k in on:
                     self.send(self.motors[k], DISABLE)
-                time.sleep(_LOWERING_PERIOD)
+                yield False
         except HalError:
             return  # the motors damp by themselves after TIMEOUT
 

@@ -7,6 +7,7 @@ lock-step (:mod:`hal.host.hosts`).
 from __future__ import annotations
 
 import math
+import time
 import traceback
 from collections.abc import Callable, Iterable
 from typing import Any
@@ -357,6 +358,14 @@ class ArmUnit:
         self.reading = self.driver.read(self.reading.t if self.reading else 0.0)
         self._anchor()
 
+    def lower(self) -> bool:
+        """Lower the arm a little further; return whether it is down."""
+        try:
+            return self.driver.lower()
+        except Exception as error:
+            traceback.print_exception(error)  # a bug in the driver, whose close is still called
+            return True
+
     def close(self) -> None:
         """Close the device."""
         self.driver.close()
@@ -364,6 +373,8 @@ class ArmUnit:
 
 STOP_LIMIT = 5.0
 """Longest time for bringing the arms to rest before the devices are closed anyway, s."""
+LOWER_LIMIT = 7.0
+"""Longest time for lowering arms without brakes before they are closed anyway, s."""
 
 
 class Cycle:
@@ -539,7 +550,8 @@ class Cycle:
         return result
 
     def close(self) -> None:
-        """Close every device. Idempotent."""
+        """Lower the arms that have no brakes, all at the same time, and close every device. Idempotent."""
+        self._lower_arms()
         errors = []
         for close in (*(unit.close for unit in self._arm_units), *(gripper.close for gripper in self._gripper_units)):
             try:
@@ -550,3 +562,15 @@ class Cycle:
             self.world.close()
         if errors:
             raise errors[0]
+
+    def _lower_arms(self) -> None:
+        """Lower all arms; the grippers keep what they hold meanwhile."""
+        began = time.monotonic()
+        left = self._arm_units
+        while time.monotonic() - began < LOWER_LIMIT:
+            left = tuple(unit for unit in left if not unit.lower())
+            if not left:
+                return
+            for gripper in self._gripper_units:
+                gripper.publish(self.t + time.monotonic() - began)
+            time.sleep(self.dt)

@@ -115,6 +115,9 @@ class Host(ABC):
     def stop(self) -> None:
         """Latch a stop of every arm. Any thread may call it, at any time."""
 
+    def request_close(self) -> None:  # noqa: B027  # most have nothing to do before
+        """Begin to close, without waiting, where that is possible: the hosts of a rig close at the same time."""
+
     @abstractmethod
     def close(self) -> None:
         """Bring the arms to rest and close the devices. Idempotent."""
@@ -226,6 +229,8 @@ class RemoteHost(Host):
         memories = [self.shared, *(other.shared for other in others)]
         self.child = Child(spec.name, "hal.host.main:main", config, memories)
         self._stops = 0
+        self._close_by: float | None = None
+        """Time at which the process is killed, s; None before it was asked to close."""
         self._asking = threading.Lock()
         self._writing = threading.RLock()  # a signal handler may call stop() in the middle of stop()
         self._closed = threading.Event()
@@ -273,11 +278,18 @@ class RemoteHost(Host):
             self._stops += 1
             self.memory.app.write(time.monotonic(), self._stops)
 
+    def request_close(self) -> None:
+        if self._close_by is None and not self._closed.is_set():
+            lasts = STOP_LIMIT + CLOSE_LIMIT * max(1, len(self.spec.robots))
+            self._close_by = time.monotonic() + (1.0 if self._silence() > SILENT else lasts)
+            self.child.request_close()
+
     def close(self) -> None:
         if self._closed.is_set():
             return
-        lasts = STOP_LIMIT + CLOSE_LIMIT * max(1, len(self.spec.robots))
-        self.child.close(timeout=1.0 if self._silence() > SILENT else lasts)
+        RemoteHost.request_close(self)
+        assert self._close_by is not None
+        self.child.close(timeout=max(0.0, self._close_by - time.monotonic()))
         self._closed.set()
         self._thread.join(timeout=1.0)
         self.shared.close()
@@ -291,6 +303,9 @@ class SteppedHost(RemoteHost):
         cycles = round(t * self.spec.rate_hz) - self.memory.get_host().ticks  # a request may have run some, too
         if cycles > 0:
             self.request("advance", {"cycles": cycles})
+
+    def request_close(self) -> None:
+        """Do nothing: it is stepped until the arms of the group that steps it are at rest."""
 
     def _silence(self) -> float:
         return 0.0  # silent while it is not stepped; a request without an answer shows that it is gone

@@ -245,6 +245,7 @@ class Child:
         )
         theirs.close()
         self.ready: Any = None
+        self._closing = False
         try:
             self.channel.send(config)
         except ConnectionLost:
@@ -385,13 +386,16 @@ class Child:
         lines = self._log.read().decode(errors="replace").strip().splitlines()[-8:]
         return "; its last output:\n    " + "\n    ".join(lines) if lines else ""
 
+    def request_close(self) -> None:
+        """Make the child end, without waiting for it."""
+        if not self._closing and self.is_alive:
+            self._closing = True
+            with contextlib.suppress(ConnectionLost):
+                self.channel.send({"id": 0, "method": "close", "params": {}}, _GOODBYE)
+
     def close(self, timeout: float = 5.0) -> None:
         """Make the child end, and wait for it; kill it if it has not ended within ``timeout`` s. Idempotent."""
-        try:
-            if self.is_alive:
-                self.channel.send({"id": 0, "method": "close", "params": {}}, _GOODBYE)
-        except ConnectionLost:
-            pass
+        self.request_close()
         if not self._wait_end(timeout):
             self.process.kill()
             self._wait_end(timeout)

@@ -29,6 +29,7 @@ from hal.deadman import StopLatch
 from hal.drivers.can import damiao_chain, piper_link
 from hal.drivers.can.emulator import console, server
 from hal.errors import ConnectionLost, HalError, MotionStopped, RobotFault
+from hal.host import cycle as host_cycle
 from hal.host.hosts import LocalHost
 from hal.robot import Robot
 from hal.specs import GroupSpec, RobotSpec
@@ -73,7 +74,8 @@ class SteppedEmulator:
 
     def __enter__(self) -> SteppedEmulator:
         clock = SimpleNamespace(monotonic=lambda: 1000.0 + self.passed, sleep=self.advance)
-        for module in (damiao_chain, piper_link, server, console):
+        self.clock = clock
+        for module in (damiao_chain, piper_link, server, console, host_cycle):
             self._patches.enter_context(patch.object(module, "time", clock))
         self.bus.open()
         return self

@@ -25,8 +25,11 @@ from hal.driver import GripperReading, Reading
 from hal.drivers.can.bus import CanBus
 from hal.drivers.can.damiao import DamiaoArm
 from hal.drivers.can.damiao_gripper import DamiaoGripper
-from hal.drivers.can.damiao_protocol import MOTOR_RANGES, MotorCodec
+from hal.drivers.can.damiao_protocol import MOTOR_RANGES, MotorCodec, MotorStatus
 from hal.errors import ConfigError, DeviceNotFound, HalError, MotionStopped, RobotFault
+from hal.host.cycle import Cycle
+from hal.host.records import AppRecord, GroupMemory
+from hal.specs import GroupSpec
 from hal.types import GripperOutcome
 
 DT = 0.004
@@ -449,3 +452,40 @@ def test_an_arm_that_was_never_engaged_is_not_switched_off() -> None:
         assert not driver.engaged
         driver.close()
         assert far.execute("state")["motors"][2]["status"] == "1"
+
+
+def test_a_gripper_holds_while_its_arm_sinks() -> None:
+    with SteppedEmulator("yam") as far:
+        spec = replace(far.spec, workspace=None)
+        assert spec.gripper is not None
+        group = GroupSpec("arm", "lock_step", spec.rate_hz, (spec,), grippers=(spec.gripper,))
+        cycle = Cycle(group, GroupMemory.of(memoryview(bytearray(GroupMemory.size_of(group))), group))
+        arm, hand = cycle.arms[spec.name].driver, cycle.grippers[spec.gripper.name].driver
+
+        def run(seconds: float) -> None:
+            for _ in range(round(seconds / DT)):
+                far.advance(DT)
+                cycle.step(far.passed, AppRecord(far.passed, 0))
+                cycle.publish(far.passed)
+                if not arm.engaged:
+                    arm.engage()
+
+        cycle.open(0.0)
+        far.execute("object 0.03")
+        hand.move(0.0, 0.1, 20.0)
+        run(1.5)
+        held = abs(far.arm.gripper.tau)
+        weakest, down = [], far.arm.motors[2]
+        advance = far.advance
+
+        def watch(seconds: float) -> None:
+            advance(seconds)
+            if down.status == MotorStatus.ENABLED:
+                weakest.append(abs(far.arm.gripper.tau))
+
+        with patch.object(far, "advance", watch):
+            far.clock.sleep = watch
+            cycle.close()
+        assert len(weakest) * DT > 1.0, "it sinks for longer than TIMEOUT"
+        assert held > 0.2
+        assert min(weakest) == pytest.approx(held, rel=0.1)

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+from typing import Any
+
 import pytest
 from drives import ArmWithDrives
 from specs import panda
@@ -10,7 +13,7 @@ from hal import registry
 from hal.commands import CommandRecord, Kind, Session
 from hal.errors import ConnectionLost, RobotFault
 from hal.geometry import Pose
-from hal.host.cycle import TCP_APART, TCP_TURNED, ArmUnit, Cycle
+from hal.host.cycle import LOWER_LIMIT, TCP_APART, TCP_TURNED, ArmUnit, Cycle
 from hal.host.records import AppRecord, GroupMemory, RobotMail
 from hal.specs import GroupSpec
 from hal.types import RobotStatus, Trip
@@ -230,3 +233,39 @@ def test_drives_that_do_not_switch_on_during_a_session_stop_the_arm(monkeypatch:
         arms.turn()
     report = arms.right.servo.report
     assert (report.status, report.trip) == (RobotStatus.TRIPPED, Trip.DEVICE_LOST)
+
+
+# The end.
+
+
+def test_arms_are_lowered_at_the_same_time_before_one_is_closed(monkeypatch: pytest.MonkeyPatch) -> None:
+    arms = TwoArms(monkeypatch)
+    calls: list[tuple[str, str]] = []
+    monkeypatch.setattr("hal.host.cycle.time", SimpleNamespace(monotonic=lambda: 1.0 + DT * len(calls), sleep=abs))
+    for name, steps in (("left", 2), ("right", 4)):
+        driver = arms.cycle.arms[name].driver
+
+        def lower(name: str = name, steps: int = steps) -> bool:
+            calls.append((name, "lower"))
+            return calls.count((name, "lower")) == steps
+
+        monkeypatch.setattr(driver, "lower", lower)
+        monkeypatch.setattr(driver, "close", lambda name=name: calls.append((name, "close")))
+    arms.cycle.close()
+    left, right = ("left", "lower"), ("right", "lower")
+    assert calls == [left, right, left, right, right, right, ("left", "close"), ("right", "close")]
+
+
+@pytest.mark.parametrize("wrong", [lambda: False, lambda: 1 / 0], ids=["never_down", "an_error"])
+def test_an_arm_that_cannot_be_lowered_is_closed_anyway(wrong: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    arms = TwoArms(monkeypatch)
+    now = [1.0]
+    clock = SimpleNamespace(monotonic=lambda: now[0], sleep=lambda seconds: now.append(now.pop() + seconds))
+    monkeypatch.setattr("hal.host.cycle.time", clock)
+    closed: list[str] = []
+    for name in ("left", "right"):
+        monkeypatch.setattr(arms.cycle.arms[name].driver, "close", lambda name=name: closed.append(name))
+    monkeypatch.setattr(arms.left.driver, "lower", wrong)
+    arms.cycle.close()
+    assert closed == ["left", "right"]
+    assert now[0] < 1.0 + LOWER_LIMIT + 2.0 * DT
