@@ -31,6 +31,9 @@ TURNS = 100
 SECONDS = "1.5"
 """A program that a document starts ends after so many, unless it ends by itself."""
 
+HANG = 600
+"""s after which a program counts as hanging. It ends by itself: a busy computer only makes it slower."""
+
 NOT_RUN = {
     "pip": "would change the environment; tests/packaging installs the wheel",
     "pytest": "this is it",
@@ -133,7 +136,7 @@ class Reader:
                 env=environment,
                 capture_output=True,
                 text=True,
-                timeout=60,
+                timeout=HANG,
             )
             output = (done.stdout + done.stderr).strip()
             wrong = any("Error" in line for line in shown)

@@ -11,7 +11,7 @@ import hal
 from hal.errors import ConfigError
 
 from .blocks import RUN, SHOWN, Block, anchors_of, blocks_of, links_of
-from .running import ROOT, Reader
+from .running import HANG, ROOT, Reader
 
 DOCUMENTS = [ROOT / "README.md", *sorted(ROOT.glob("C*.md")), *sorted((ROOT / "docs").rglob("*.md"))]
 
@@ -34,6 +34,7 @@ def reader(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Reader]:
             del sys.modules[name]  # the next document may have a file of the same name
 
 
+@pytest.mark.timeout(2 * HANG)
 @pytest.mark.parametrize("document", DOCUMENTS, ids=names(DOCUMENTS))
 def test_what_a_document_shows_runs(document: Path, reader: Reader) -> None:
     blocks = [block for block in blocks_of(document) if block.language in RUN]
