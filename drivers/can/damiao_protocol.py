@@ -133,7 +133,7 @@ class MotorRegister(IntEnum):
     """Registers that the driver reads, by their number (RID)."""
 
     OT_VALUE = 2
-    """Temperature of the rotor at which the motor switches itself off, deg C."""
+    """Over-temperature protection, 80 to 200 deg C. Taken as the rotor's: by the manual only the rotor's can be set."""
     MST_ID = 7
     ESC_ID = 8
     """The motor's own id."""

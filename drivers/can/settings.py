@@ -259,7 +259,8 @@ class DamiaoArmSettings(BusSettings):
     motors: tuple[DamiaoMotorSettings, ...] = Field(min_length=1)
     """The motors, one for each joint, from base to tip."""
     mosfet_limit: Temperature = 120.0
-    """Temperature at which the motors' electronics switch off, deg C (Damiao's manuals). The rotor's is a register."""
+    """Temperature at which the motors' electronics switch off, deg C: fixed, by Damiao's manual of the DM9008; assumed
+    for the other types. The rotor's is the register OT_VALUE, for which that manual advises 100 at most."""
     following_limit: FollowingLimit = 0.5
     """Largest distance of a joint from its set-point, rad. Beyond it the arm is blocked, and holds where it is."""
 
@@ -311,8 +312,9 @@ class PiperGripperSettings(BusSettings):
     """Settings under ``real:`` of a PiPER's gripper; those of the bus default to the arm's."""
 
     force_per_torque: Annotated[float, Quantity("N/Nm", 1.0, 200.0)] = 40.0
-    """Grip force for each Nm of the motor, N/Nm. Not published: the vendor rates the gripper at 40 N, and its examples
-    set 1 Nm."""
+    """Grip force for each Nm of the motor, N/Nm. An assumption: no public source has it. The vendor's two libraries
+    disagree about the number in the frame (piper_sdk: 0.001 Nm, up to 5000; pyAgxArm: 0.001 N), and both set 1000 by
+    default. Measure it before a force matters."""
     tolerance: Size = 0.001
     """Largest distance from the target width at which the fingers count as arrived, m."""
 

@@ -8,7 +8,10 @@ import sys
 import threading
 from collections.abc import Sequence
 
-import can
+try:
+    import can
+except ModuleNotFoundError:
+    sys.exit("error: python-can is not installed: pip install 'robot-hal[can]'")
 
 from hal.errors import ControlTaken, HalError
 from hal.lock import DeviceLock
