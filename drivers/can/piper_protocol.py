@@ -109,8 +109,7 @@ HOMED = 0x80
 """Bit of :attr:`GripperStatus.flags`: the gripper's zero is set."""
 
 TORQUE_PER_AMPERE = (1.18125, 1.18125, 1.18125, 0.95844, 0.95844, 0.95844)
-"""Joint torque over motor current, Nm/A, as the vendor's piper_sdk computes it. The manual of its newer pyAgxArm has
-another factor of 4 for joints 1 to 3, so these torques are no measure of a force."""
+"""Joint torque over motor current, Nm/A, by piper_sdk; the manual of pyAgxArm has 4 times that for joints 1 to 3."""
 
 _STOP, _MODE, _TARGETS, _GRIPPER = 0x150, 0x151, 0x155, 0x159
 _ENABLE, _LIMIT_QUERY, _LIMITS, _JOINT = 0x471, 0x472, 0x473, 0x475
