@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -15,6 +15,16 @@ from hal.errors import DriverMissing
 from hal.specs import BodySpec, RobotSpec, WorldSpec
 from hal.world import WorldDriver
 
+KNOWN: Mapping[str, tuple[str, ...]] = {
+    "mujoco": (
+        "test_a_joint_whose_set_point_jumps_moves_no_faster_than_its_limit",
+        "test_after_torques_the_motors_hold_the_arm_with_their_speed_limit",
+        "test_widths_and_speeds_are_clipped",
+        "test_oscillating_fingers_count_as_at_rest",
+        "test_pushes_objects_and_is_not_stopped_by_them",
+    ),
+}
+"""Tests that may fail on an engine, by its name."""
 REPLACED = (registry.SIMULATION, *registry.ENGINES)
 """Drivers of records that become the engine's; others (``franka``) stay."""
 
@@ -83,3 +93,28 @@ def need_engine(name: str) -> Engine:
     if not has_engine(name):
         pytest.skip(f"the engine {name} is not installed")
     return Engine(name)
+
+
+def joint_positions(world: Any, name: str) -> dict[str, float]:
+    """Return the positions of all movable joints of a body, rad or m, from the world's snapshot."""
+    bodies = world.bodies.values()
+    place = 7 * sum(not body.roams for body in bodies)
+    for body in bodies:
+        place += 7 * body.roams
+        if body.name == name:
+            names = {number: joint for joint, number in body.joints.items()}
+            values = world.snapshot()[place : place + len(body.movable)]
+            return {names[number]: value for number, value in zip(body.movable, values, strict=True)}
+        place += len(body.movable) if body.moves else 0
+    raise KeyError(name)
+
+
+def push(world: Any, name: str, link: str, force: Sequence[float]) -> None:
+    """Push a link at its centre of mass with a force (3,) N in the world; before every step, with zeros in the end."""
+    body = world.body(name)
+    if hasattr(world, "client"):
+        client, number = world.client, body.links[link]
+        place = client.getLinkState(body.id, number)[0]
+        client.applyExternalForce(body.id, number, force, place, client.WORLD_FRAME)
+    else:
+        world.data.body(body.mujoco_name(link)).xfrc_applied[:3] = force

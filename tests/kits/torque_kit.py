@@ -7,15 +7,14 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from engines_kit import Engine
 from numpy.typing import NDArray
 from servo_kit import HandTicked
-from specs import panda, world_spec
+from specs import panda
 
 from hal.commands import Kind, Session
 from hal.driver import Reading, Setpoint
 from hal.drivers.mock.robot import MockRobot
-from hal.drivers.pybullet.robot import PyBulletRobot
-from hal.drivers.pybullet.world import PyBulletWorld
 from hal.servo.servo import Servo
 from hal.specs import WorkspaceSpec
 from hal.types import RobotStatus, Trip
@@ -30,7 +29,7 @@ class Driven(HandTicked):
     def __init__(
         self,
         driver: Any,
-        world: PyBulletWorld | None = None,
+        world: Any = None,
         *,
         rate_hz: float = 240.0,
         speed: float = 0.3,
@@ -133,13 +132,15 @@ def wheels(box: WorkspaceSpec | None = None, **how: Any) -> Driven:
     return Driven(MockRobot(replace(panda(driver="mock"), rate_hz=rate_hz, workspace=box)), **how)
 
 
-def simulated(initial: Sequence[float] | None = None, box: WorkspaceSpec | None = None, **how: Any) -> Driven:
-    """PyBullet's Panda, which has had the time to settle."""
+def simulated(
+    engine: Engine, initial: Sequence[float] | None = None, box: WorkspaceSpec | None = None, **how: Any
+) -> Driven:
+    """A simulated Panda, which has had the time to settle."""
     rate_hz = how.get("rate_hz", 240.0)
     spec = replace(panda(), rate_hz=rate_hz, workspace=box)
     if initial is not None:
         spec = replace(spec, initial=tuple(initial))
-    world = PyBulletWorld(world_spec(spec, physics_hz=rate_hz))
+    world = engine.world(spec, physics_hz=rate_hz)
     for _ in range(60):
         world.step()
-    return Driven(PyBulletRobot(spec, world), world, **how)
+    return Driven(engine.robot(world), world, **how)

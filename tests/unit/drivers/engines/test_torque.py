@@ -1,18 +1,18 @@
-"""Torques in real physics: PyBullet's Panda floats, turns, is stopped, and keeps every bound."""
+"""Torques in the physics of each engine: a simulated Panda floats, turns, is stopped, and keeps every bound."""
 
 from __future__ import annotations
 
 import random
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
-from specs import PANDA_HOME, box, iiwa, panda, world_spec
+from engines_kit import Engine, push
+from specs import PANDA_HOME, box, iiwa, panda
 from torque_kit import NOTHING, N, one, simulated
 
-from hal.driver import Setpoint
-from hal.drivers.pybullet.robot import PyBulletRobot
-from hal.drivers.pybullet.world import PyBulletWorld
+from hal.driver import RobotDriver, Setpoint
 from hal.kinematics import Kinematics
 from hal.specs import BodySpec
 from hal.types import Limited, RobotStatus, Trip
@@ -21,20 +21,20 @@ STIFFNESS = np.array([0.0, 200.0, 200.0, 200.0, 20.0, 20.0, 2.0])  # Nm per rad,
 RATES = pytest.mark.parametrize("rate_hz", [240.0, 1000.0])
 
 
-def opened(*others: BodySpec, torque: tuple[float, ...] | None = None) -> tuple[PyBulletWorld, PyBulletRobot]:
+def opened(engine: Engine, *others: BodySpec, torque: tuple[float, ...] | None = None) -> tuple[Any, Any]:
     """An arm that follows set-points by itself, without a servo."""
     spec = panda()
     if torque is not None:
         spec = replace(spec, limits=replace(spec.limits, torque=torque))
-    world = PyBulletWorld(world_spec(spec, *others))
-    driver = PyBulletRobot(spec, world)
+    world = engine.world(spec, *others)
+    driver = engine.robot(world)
     driver.open()
     for _ in range(60):
         world.step()
     return world, driver
 
 
-def torques(driver: PyBulletRobot, tau: tuple[float, ...] | list[float] = NOTHING) -> Setpoint:
+def torques(driver: RobotDriver, tau: tuple[float, ...] | list[float] = NOTHING) -> Setpoint:
     reading = driver.read(0.0)
     return Setpoint(reading.q, reading.dq, NOTHING, tau)
 
@@ -43,8 +43,8 @@ class TestServed:
     """With the servo above it."""
 
     @RATES
-    def test_a_small_torque_turns_the_wrist_and_a_release_stops_and_holds_it(self, rate_hz: float) -> None:
-        arm = simulated(rate_hz=rate_hz)
+    def test_a_small_torque_turns_the_wrist_and_a_release_holds_it(self, engine: Engine, rate_hz: float) -> None:
+        arm = simulated(engine, rate_hz=rate_hz)
         start = arm.q
         arm.drive(0.5, one(6, 0.3))
         assert arm.q[6] - start[6] > 0.1
@@ -60,8 +60,8 @@ class TestServed:
         arm.assert_within_limits()
 
     @RATES
-    def test_at_full_speed_it_brakes_along_its_way(self, rate_hz: float) -> None:
-        arm = simulated(rate_hz=rate_hz, speed=1.0, tcp_speed=99.0)
+    def test_at_full_speed_it_brakes_along_its_way(self, engine: Engine, rate_hz: float) -> None:
+        arm = simulated(engine, rate_hz=rate_hz, speed=1.0, tcp_speed=99.0)
         arm.drive(0.3, [20.0, 5.0, -5.0, 5.0, 1.0, -1.0, 0.3])
         assert np.abs(arm.dq / arm.spec.limits.velocity).max() > 0.7
         arm.stops += 1
@@ -73,30 +73,29 @@ class TestServed:
         assert arm.servo.report.trip is Trip.STOP
         arm.assert_within_limits()
 
-    def test_the_torque_limit_holds_at_the_motors_too(self) -> None:
-        arm = simulated(speed=1.0, tcp_speed=99.0)
+    def test_the_torque_limit_holds_at_the_motors_too(self, engine: Engine) -> None:
+        arm = simulated(engine, speed=1.0, tcp_speed=99.0)
         arm.drive(0.3, [500.0, -500.0, 500.0, -500.0, 50.0, 50.0, -50.0])
         applied = np.abs([reading.tau for reading in arm.readings if reading.tau is not None]).max(axis=0)
         assert (applied <= np.array(arm.spec.limits.torque) + 1e-9).all()
         arm.assert_within_limits()
 
-    def test_a_hand_that_pushes_too_fast_trips_it(self) -> None:
-        arm = simulated()
-        client, body = arm.world.client, arm.world.body("panda")
+    def test_a_hand_that_pushes_too_fast_trips_it(self, engine: Engine) -> None:
+        arm = simulated(engine)
         for _ in range(240):
             arm.send(NOTHING)
-            place = client.getLinkState(body.id, body.links["panda_hand"])[0]
-            client.applyExternalForce(body.id, body.links["panda_hand"], (0.0, 30.0, 0.0), place, client.WORLD_FRAME)
+            push(arm.world, "panda", "panda_hand", (0.0, 30.0, 0.0))
             arm.tick()
             if arm.servo.report.trip:
                 break
+        push(arm.world, "panda", "panda_hand", (0.0, 0.0, 0.0))
         assert arm.servo.report.trip is Trip.LIMIT
         assert arm.limited & (Limited.SPEED | Limited.TCP_SPEED)
         assert arm.tcp_speed < 0.35
         assert arm.until_held() < 0.3
 
-    def test_against_a_wall_it_pushes_and_relaxes_before_positions_take_over(self) -> None:
-        arm = simulated()
+    def test_against_a_wall_it_pushes_and_relaxes_before_positions_take_over(self, engine: Engine) -> None:
+        arm = simulated(engine)
         arm.world.add(box("wall", (0.3, 0.22, 0.5), (0.3, 0.02, 0.5)))
         for _ in range(720):
             hold = -STIFFNESS * (arm.q - PANDA_HOME) - 0.1 * STIFFNESS * arm.dq
@@ -111,18 +110,15 @@ class TestServed:
         assert sum(contact["force"] for contact in arm.world.contacts("panda", "wall")) < 20.0
         arm.assert_within_limits()
 
-    def test_an_undeclared_load_sinks_slowly_and_is_held_in_the_end(self) -> None:
-        arm = simulated()
-        client, body = arm.world.client, arm.world.body("panda")
-        hand = body.links["panda_hand"]
+    def test_an_undeclared_load_sinks_slowly_and_is_held_in_the_end(self, engine: Engine) -> None:
+        arm = simulated(engine)
         start = arm.q
         for turn in range(480):
             if turn < 24:
                 arm.send(NOTHING)
             elif turn == 24:
                 arm.release()
-            place = client.getLinkState(body.id, hand)[0]
-            client.applyExternalForce(body.id, hand, (0.0, 0.0, -20.0), place, client.WORLD_FRAME)
+            push(arm.world, "panda", "panda_hand", (0.0, 0.0, -20.0))
             arm.tick()
             if turn > 24 and not arm.by_torques:
                 break
@@ -131,14 +127,14 @@ class TestServed:
 
     @pytest.mark.slow
     @pytest.mark.parametrize("seed", range(12))
-    def test_random_torques_keep_every_bound(self, seed: int) -> None:
+    def test_random_torques_keep_every_bound(self, engine: Engine, seed: int) -> None:
         rng = random.Random(seed)
         limits = panda().limits
         start = [
             low + (high - low) * rng.uniform(0.2, 0.8) for low, high in zip(limits.lower, limits.upper, strict=True)
         ]
         speed = rng.choice((0.3, 1.0))
-        arm = simulated(start, speed=speed, deadman=False)
+        arm = simulated(engine, start, speed=speed, deadman=False)
         size = [rng.choice((2.0, 10.0, 50.0)) * (1.0 if joint < 4 else 0.15) for joint in range(N)]
         for turn in range(480):
             if turn % 24 == 0:
@@ -160,10 +156,9 @@ class TestServed:
 class TestDriver:
     """The simulated device alone."""
 
-    def test_inertia_of_a_correct_urdf_is_that_of_the_kinematics(self) -> None:
+    def test_inertia_of_a_correct_urdf_is_that_of_the_kinematics(self, engine: Engine) -> None:
         spec = iiwa()
-        world = PyBulletWorld(world_spec(spec))
-        driver = PyBulletRobot(spec, world)
+        driver = engine.robot(engine.world(spec))
         driver.open()
         rng = np.random.default_rng(0)
         kinematics = Kinematics(spec.kinematics)
@@ -171,8 +166,8 @@ class TestDriver:
             q = rng.uniform(spec.limits.lower, spec.limits.upper).tolist()
             assert np.array(driver.mass_matrix(q)) == pytest.approx(kinematics.mass_matrix(q), rel=1e-3, abs=1e-4)
 
-    def test_reading_twice_does_not_carry_it_twice(self) -> None:
-        world, driver = opened()
+    def test_reading_twice_does_not_carry_it_twice(self, engine: Engine) -> None:
+        world, driver = opened(engine)
         for _ in range(240):
             driver.write(torques(driver))
             driver.read(0.0)
@@ -180,8 +175,8 @@ class TestDriver:
             world.step()
         assert driver.read(0.0).q == pytest.approx(PANDA_HOME, abs=2e-3)
 
-    def test_torques_that_stop_coming_are_kept_up_for_20_ms_and_then_it_holds(self) -> None:
-        world, driver = opened()
+    def test_torques_that_stop_coming_are_kept_up_for_20_ms_and_then_it_holds(self, engine: Engine) -> None:
+        world, driver = opened(engine)
         driver.write(torques(driver, one(0, 5.0)))
         speeds = []
         for _ in range(100):
@@ -194,8 +189,8 @@ class TestDriver:
         assert driver.read(0.0).q[1:] == pytest.approx(PANDA_HOME[1:], abs=0.02)
 
     @pytest.mark.parametrize("how", ["halt", "close", "fault", "disconnect", "position"])
-    def test_after_torques_the_motors_hold_the_arm_with_their_speed_limit(self, how: str) -> None:
-        world, driver = opened()
+    def test_after_torques_the_motors_hold_the_arm_with_their_speed_limit(self, engine: Engine, how: str) -> None:
+        world, driver = opened(engine)
         for _ in range(12):
             driver.write(torques(driver, one(0, 5.0)))
             world.step()
@@ -220,8 +215,8 @@ class TestDriver:
         assert driver.read(0.0).q[0] > q[0] + 0.5
         assert max(speeds) <= driver.spec.limits.velocity[0] * 1.001
 
-    def test_a_reset_ends_them(self) -> None:
-        world, driver = opened()
+    def test_a_reset_ends_them(self, engine: Engine) -> None:
+        world, driver = opened(engine)
         driver.write(torques(driver, one(0, 5.0)))
         world.reset("panda")
         for _ in range(120):
@@ -229,8 +224,8 @@ class TestDriver:
             driver.read(0.0)
         assert driver.read(0.0).q == pytest.approx(PANDA_HOME, abs=2e-3)
 
-    def test_the_effort_bounds_torque_and_carrying_together(self) -> None:
-        world, driver = opened(torque=(87.0, 5.0, 87.0, 87.0, 12.0, 12.0, 12.0))
+    def test_the_effort_bounds_torque_and_carrying_together(self, engine: Engine) -> None:
+        world, driver = opened(engine, torque=(87.0, 5.0, 87.0, 87.0, 12.0, 12.0, 12.0))
         applied = []
         for _ in range(60):
             driver.write(torques(driver, one(1, -4.5)))

@@ -1,22 +1,23 @@
-"""Things in an arm's hand: they go where the link goes, in the world and in its mirrors, and touch nothing."""
+"""Objects attached to a link of an arm, on each engine: they follow the link, and touch nothing."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import closing
-from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
+from engines_kit import Engine
 from errors_kit import raises_code, raises_problems
-from specs import panda
+from specs import PANDA_HOME, panda
 
 import hal
 from hal.config import load
-from hal.drivers.pybullet.world import PyBulletWorld
+from hal.driver import Setpoint
 from hal.errors import CommandError, ConfigError
 from hal.geometry import Pose
-from hal.specs import BodySpec, WorldSpec, from_json, to_json
+from hal.specs import BodySpec
 
 IN_HAND = Pose([0.03, 0.0, 0.19], [0.5, 0.5, 0.5, 0.5])
 
@@ -29,69 +30,59 @@ def held(name: str = "board", robot: str | None = "panda", link: str | None = "p
     )
 
 
-def pose_of(scene: PyBulletWorld, name: str, link: str | None = None) -> Pose:
+def pose_of(scene: Any, name: str, link: str | None = None) -> Pose:
     found = scene.pose(name, link)
     return Pose(found["position"], found["orientation"])
 
 
-def off(scene: PyBulletWorld) -> tuple[float, float]:
+def off(scene: Any) -> tuple[float, float]:
     return pose_of(scene, "board").distance(pose_of(scene, "panda", "panda_hand") @ IN_HAND)
 
 
 @pytest.fixture
-def spec() -> WorldSpec:
-    return WorldSpec("pybullet", 240.0, (0.0, 0.0, -9.81), (held(),), (panda(),))
-
-
-@pytest.fixture
-def scene(spec: WorldSpec) -> Iterator[PyBulletWorld]:
-    made = PyBulletWorld(spec)
+def scene(engine: Engine) -> Iterator[Any]:
+    made = engine.world(held(), panda())
     yield made
     made.close()
 
 
-def bend(scene: PyBulletWorld, steps: int = 60) -> None:
-    """Let the arm fall: its motors hold nothing any more."""
-    body = scene.body("panda")
-    for joint in body.movable:
-        scene.client.setJointMotorControl2(body.id, joint, scene.client.VELOCITY_CONTROL, force=0.0)
-    for _ in range(steps):
+def bend(engine: Engine, scene: Any, steps: int = 60) -> None:
+    """Lower the arm at its shoulder, by 0.3 rad in 60 steps."""
+    arm = engine.robot(scene)
+    arm.open()
+    q = list(PANDA_HOME)
+    for step in range(steps):
+        q[1] = PANDA_HOME[1] + 0.005 * (step + 1)
+        arm.write(Setpoint(q, [0.0] * 7, [0.0] * 7))
         scene.step()
+    arm.close()
 
 
-def test_follows_its_link_through_steps_and_resets(scene: PyBulletWorld, spec: WorldSpec) -> None:
+def test_follows_its_link_through_steps_and_resets(engine: Engine, scene: Any) -> None:
     assert max(off(scene)) < 1e-6
     start = pose_of(scene, "board")
-    bend(scene)
+    bend(engine, scene)
     assert pose_of(scene, "board").distance(start)[0] > 0.05, "it moved"
     assert max(off(scene)) < 1e-6
     scene.reset("panda")
     assert max(off(scene)) < 1e-6
-    bend(scene)
+    bend(engine, scene)
     scene.reset()
     assert pose_of(scene, "board").distance(start)[0] < 1e-6
 
 
-def test_has_no_weight_and_no_contacts(spec: WorldSpec) -> None:
-    def fall(bodies: tuple[BodySpec, ...]) -> np.ndarray:
-        with closing(PyBulletWorld(replace(spec, bodies=bodies))) as scene:
-            bend(scene)
+def test_has_no_weight_and_no_contacts(engine: Engine) -> None:
+    def lowered(*bodies: BodySpec) -> np.ndarray:
+        with closing(engine.world(*bodies, panda())) as scene:
+            bend(engine, scene)
             assert all("board" not in (c["a"], c["b"]) for c in scene.contacts())
             return np.array(scene.pose("panda", "panda_hand")["position"])
 
     obstacle = BodySpec("box", (0.35, 0.0, 0.1), (0, 0, 0, 1), "box", half_extents=(0.01, 0.01, 0.1), fixed=True)
-    assert np.array_equal(fall((obstacle,)), fall((held(), obstacle)))
+    assert np.array_equal(lowered(obstacle), lowered(held(), obstacle))
 
 
-def test_mirror_world_shows_it(scene: PyBulletWorld, spec: WorldSpec) -> None:
-    with closing(PyBulletWorld(from_json(WorldSpec, to_json(spec)), mirror=True)) as mirror:
-        bend(scene)
-        mirror.show(scene.snapshot())
-        assert max(off(mirror)) < 1e-6
-        assert pose_of(mirror, "board").distance(pose_of(scene, "board"))[0] < 1e-6
-
-
-def test_is_added_and_removed_but_not_placed(scene: PyBulletWorld) -> None:
+def test_is_added_and_removed_but_not_placed(engine: Engine, scene: Any) -> None:
     scene.add(held("second", link="panda_link7"))
     scene.step()
     expected = pose_of(scene, "panda", "panda_link7") @ IN_HAND
@@ -100,7 +91,7 @@ def test_is_added_and_removed_but_not_placed(scene: PyBulletWorld) -> None:
         with raises_code(CommandError, "is_attached"):
             act("second", pose={"position": [0, 0, 0]})
     scene.remove("second")
-    bend(scene, 10)
+    bend(engine, scene, 10)
     assert max(off(scene)) < 1e-6
 
 
@@ -112,20 +103,22 @@ def test_is_added_and_removed_but_not_placed(scene: PyBulletWorld) -> None:
         ({"robot": "board"}, "unknown_device"),
     ],
 )
-def test_missing_arm_or_link_is_refused_and_changes_nothing(scene, wrong, code):
+def test_missing_arm_or_link_is_refused_and_changes_nothing(engine, scene, wrong, code):
     with raises_problems(code):
         scene.add(held("second", **wrong))
     assert scene.names() == ["board", "panda"]
-    bend(scene, 10)
+    bend(engine, scene, 10)
     assert max(off(scene)) < 1e-6
 
 
 HELD = "{file: charuco_board, attached: {robot: panda, link: panda_hand, pose: [0.03, 0, 0.19, 0.5, 0.5, 0.5, 0.5]}}"
 
 
-def test_rig_file_attaches_an_object() -> None:
+def test_rig_file_attaches_an_object(engine: Engine) -> None:
     overrides = ["cameras={}", f"objects=[{HELD}]"]
-    with hal.open("panda_table", sim=True, clock="lock_step", pad="none", overrides=overrides) as opened:
+    with hal.open(
+        "panda_table", sim=True, engine=engine.name, clock="lock_step", pad="none", overrides=overrides
+    ) as opened:
         arm = opened.robots["panda"]
         opened.clock.sleep(0.1)
         arm.move_to(arm.home + 0.2)

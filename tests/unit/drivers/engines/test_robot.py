@@ -1,20 +1,21 @@
-"""The simulated arm: it follows set-points closely, keeps its speed and torque, holds, and fails when told to."""
+"""A simulated arm on each engine: it follows set-points closely, keeps its speed and torque, holds, reports faults."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+from engines_kit import Engine
 from errors_kit import raises_code
 from numpy.typing import NDArray
-from specs import IIWA_HOME, PANDA_HOME, box, cube, floor, iiwa, panda, world_spec
+from specs import IIWA_HOME, PANDA_HOME, box, floor, iiwa, panda
 
-from hal.driver import Reading, Setpoint
-from hal.drivers.pybullet.robot import PyBulletRobot
-from hal.drivers.pybullet.world import PyBulletWorld
+from hal import registry
+from hal.driver import Reading, RobotDriver, Setpoint
 from hal.errors import CommandError
 from hal.specs import BodySpec, RobotSpec
 
@@ -22,10 +23,10 @@ ZERO = (0.0,) * 7
 DIRECTION = np.array([1.0, 0.5, -1.0, 0.5, 1.0, 0.5, 1.0])
 
 
-def opened(spec: RobotSpec | None = None, *others: BodySpec, hz: float = 240.0) -> tuple[PyBulletWorld, PyBulletRobot]:
-    arm = spec or panda()
-    world = PyBulletWorld(world_spec(*others, arm, physics_hz=hz))
-    driver = PyBulletRobot(arm, world)
+def opened(engine: Engine, spec: RobotSpec | None = None, *others: BodySpec, hz: float = 240.0) -> tuple[Any, Any]:
+    """Return a world with an arm, and the arm's driver, open."""
+    world = engine.world(*others, spec or panda(), physics_hz=hz)
+    driver = engine.robot(world)
     driver.open()
     return world, driver
 
@@ -38,9 +39,7 @@ def swing(t: float, home: NDArray[np.float64]) -> Setpoint:
     return Setpoint(q.tolist(), dq.tolist(), ZERO)
 
 
-def follow(
-    world: PyBulletWorld, driver: PyBulletRobot, seconds: float
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def follow(world: Any, driver: RobotDriver, seconds: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Swing; the errors (ticks, 7) of the readings against the set-points before them, and the speeds."""
     home = np.array(driver.spec.initial)
     errors, speeds = [], []
@@ -57,15 +56,15 @@ def follow(
 class TestFollowing:
     @pytest.mark.parametrize("hz", [240.0, 1000.0])
     @pytest.mark.parametrize(("spec", "home"), [(panda, PANDA_HOME), (iiwa, IIWA_HOME)])
-    def test_smooth_motion_is_followed_within_a_tenth_of_a_millirad(self, spec, home, hz: float) -> None:
-        world, driver = opened(spec(), hz=hz)
+    def test_smooth_motion_is_followed_within_0_1_mrad(self, engine: Engine, spec, home, hz: float) -> None:
+        world, driver = opened(engine, spec(), hz=hz)
         errors, speeds = follow(world, driver, 1.5)
         assert np.abs(speeds).max() == pytest.approx(1.0, abs=0.02)  # it did move
         assert np.abs(errors).max() < 1e-4
 
-    def test_with_two_kilograms_in_the_hand(self) -> None:
-        world, driver = opened()
-        weld_weight(world)
+    def test_with_two_kilograms_in_the_hand(self, engine: Engine) -> None:
+        world, driver = opened(engine)
+        load_hand(world)
         for _ in range(120):
             world.step()
         errors, speeds = follow(world, driver, 1.5)
@@ -73,8 +72,8 @@ class TestFollowing:
         assert np.abs(errors).max() < 2e-3
 
     @pytest.mark.parametrize("joint", range(7))
-    def test_a_joint_whose_set_point_jumps_moves_no_faster_than_its_limit(self, joint: int) -> None:
-        world, driver = opened()
+    def test_a_joint_whose_set_point_jumps_moves_no_faster_than_its_limit(self, engine: Engine, joint: int) -> None:
+        world, driver = opened(engine)
         target = list(PANDA_HOME)
         target[joint] += 1.5
         speeds = []
@@ -85,8 +84,8 @@ class TestFollowing:
         assert driver.read(0.0).q == pytest.approx(target, abs=1e-3)
         assert 1.5 < max(speeds) <= driver.spec.limits.velocity[joint] * 1.001
 
-    def test_set_points_at_the_speed_limit_are_followed_and_not_overtaken(self) -> None:
-        world, driver = opened()
+    def test_set_points_at_the_speed_limit_are_followed_and_not_overtaken(self, engine: Engine) -> None:
+        world, driver = opened(engine)
         limit, home, rate = np.array(driver.spec.limits.velocity), np.array(PANDA_HOME), 3.0
         speeds, errors = [], []
         for tick in range(480):
@@ -102,10 +101,10 @@ class TestFollowing:
         assert peak.max() < 1.001
         assert np.abs(errors).max() < 1e-3
 
-    def test_the_torque_limit_holds(self) -> None:
+    def test_the_torque_limit_holds(self, engine: Engine) -> None:
         weak = panda()
         weak = replace(weak, limits=replace(weak.limits, torque=(87.0, 5.0, 87.0, 87.0, 12.0, 12.0, 12.0)))
-        world, driver = opened(replace(weak, initial=(0.0, 0.9, 0.0, -0.8, 0.0, 1.6, 0.785)))
+        world, driver = opened(engine, replace(weak, initial=(0.0, 0.9, 0.0, -0.8, 0.0, 1.6, 0.785)))
         torques = []
         for _ in range(60):
             world.step()
@@ -113,7 +112,7 @@ class TestFollowing:
         assert np.abs(torques).max(axis=0)[1] == pytest.approx(5.0)
         assert driver.read(0.0).q[1] > 1.0  # 5 Nm do not carry the arm
 
-    def test_a_joint_without_an_effort_limit_gives_a_warning_and_is_driven(self, tmp_path: Path) -> None:
+    def test_a_joint_without_effort_limit_is_driven_with_a_warning(self, engine: Engine, tmp_path: Path) -> None:
         urdf = tmp_path / "arm.urdf"
         urdf.write_text(ONE_JOINT)
         limits = replace(panda().limits, torque=None)
@@ -121,7 +120,7 @@ class TestFollowing:
         spec = panda(
             urdf=str(urdf), joints=("j",), initial=(0.5,), home=(0.0,), gripper=None, limits=replace(limits, **one)
         )
-        world, driver = opened(spec)
+        world, driver = opened(engine, spec)
         for _ in range(240):
             world.step()
         assert "panda: no effort limit of j; 200 Nm (N) is used" in world.warnings
@@ -137,32 +136,24 @@ ONE_JOINT = """<robot name="arm">
 <limit lower="-2" upper="2" effort="0" velocity="0"/></joint></robot>"""
 
 
-def weld_weight(world: PyBulletWorld) -> None:
-    """2 kg, as the cube has, fixed below the hand."""
-    hand = world.pose("panda", "panda_hand")
-    x, y, z = hand["position"]
-    world.add(cube((x, y, z - 0.15)))
-    world.set_pose("cube", {"position": [x, y, z - 0.15], "orientation": hand["orientation"]})
-    body, weight = world.body("panda"), world.body("cube")
-    joint = world.client.JOINT_FIXED
-    world.client.createConstraint(
-        body.id, body.links["panda_hand"], weight.id, -1, joint, (0, 0, 0), (0, 0, 0.15), (0, 0, 0)
-    )
+def load_hand(world: Any) -> None:
+    """Make the hand 2 kg heavier, as with the cube in it."""
+    world.set_dynamics("panda", "panda_hand", mass=world.dynamics("panda", "panda_hand")["mass"] + 2.0)
 
 
 class TestHolding:
-    def test_it_does_not_sag(self) -> None:
+    def test_it_does_not_sag(self, engine: Engine) -> None:
         for weight in (False, True):
-            world, driver = opened()
+            world, driver = opened(engine)
             if weight:
-                weld_weight(world)
+                load_hand(world)
             for _ in range(960):
                 world.step()
             assert np.abs(np.subtract(driver.read(0.0).q, PANDA_HOME)).max() < 2e-3
             assert np.abs(driver.read(0.0).tau or ZERO).max() > 10.0  # it carries its own weight
 
-    def test_halt_holds_the_last_set_point(self) -> None:
-        world, driver = opened()
+    def test_halt_holds_the_last_set_point(self, engine: Engine) -> None:
+        world, driver = opened(engine)
         follow(world, driver, 0.5)
         last = driver.read(0.0).q_commanded
         driver.halt()
@@ -173,8 +164,8 @@ class TestHolding:
         assert (reading.q, reading.q_commanded) == (pytest.approx(last, abs=1e-4), last)
         assert np.abs(reading.dq).max() < 1e-4
 
-    def test_it_gives_way_to_a_wall_within_its_torques(self) -> None:
-        world, driver = opened(None, box("wall", (0.5, 0.2, 0.5), (0.3, 0.02, 0.5)))
+    def test_it_gives_way_to_a_wall_within_its_torques(self, engine: Engine) -> None:
+        world, driver = opened(engine, None, box("wall", (0.5, 0.2, 0.5), (0.3, 0.02, 0.5)))
         home, torques, deepest = np.array(PANDA_HOME), [], 0.0
         for tick in range(480):
             angle = min(0.5 * tick * world.dt, 1.0)
@@ -191,8 +182,8 @@ class TestHolding:
 
 
 class TestReadings:
-    def test_stamps_and_units(self) -> None:
-        world, driver = opened()
+    def test_stamps_and_units(self, engine: Engine) -> None:
+        world, driver = opened(engine)
         first = driver.read(5.0)
         world.step()
         second = driver.read(6.0)
@@ -201,8 +192,8 @@ class TestReadings:
         assert second.q == pytest.approx(PANDA_HOME, abs=1e-4)
         assert second.tau_ext is None
 
-    def test_what_was_commanded_is_known_once_something_was(self) -> None:
-        world, driver = opened()
+    def test_what_was_commanded_is_known_once_something_was(self, engine: Engine) -> None:
+        world, driver = opened(engine)
         assert driver.read(0.0).q_commanded is None
         setpoint = swing(0.3, np.array(PANDA_HOME))
         driver.write(setpoint)
@@ -213,10 +204,10 @@ class TestReadings:
         assert reading.q_commanded == pytest.approx([0.1, *PANDA_HOME[1:]])
         assert reading.dq_commanded == [0.0] * 7
 
-    def test_two_arms_do_not_disturb_each_other(self) -> None:
+    def test_two_arms_do_not_disturb_each_other(self, engine: Engine) -> None:
         left, right = panda("left"), iiwa("right", base_position=(0.0, 1.5, 0.0))
-        world = PyBulletWorld(world_spec(floor(), left, right))
-        one, other = PyBulletRobot(left, world), PyBulletRobot(right, world)
+        world = engine.world(floor(), left, right)
+        one, other = engine.robot(world, "left"), engine.robot(world, "right")
         one.open()
         other.open()
         errors, _ = follow(world, one, 1.0)
@@ -225,8 +216,8 @@ class TestReadings:
 
 
 class TestFaults:
-    def test_freeze_repeats_the_reading_while_the_arm_moves_on(self) -> None:
-        world, driver = opened()
+    def test_freeze_repeats_the_reading_while_the_arm_moves_on(self, engine: Engine) -> None:
+        world, driver = opened(engine)
         frozen = driver.read(1.0)
         driver.inject(freeze=True)
         follow(world, driver, 0.5)
@@ -234,8 +225,8 @@ class TestFaults:
         driver.recover()
         assert moved(driver.read(3.0), frozen)
 
-    def test_a_fault_is_reported_and_holds_the_arm(self) -> None:
-        world, driver = opened()
+    def test_a_fault_is_reported_and_holds_the_arm(self, engine: Engine) -> None:
+        world, driver = opened(engine)
         follow(world, driver, 0.5)
         driver.inject(fault="collision")
         at_fault = driver.read(0.0)
@@ -256,6 +247,6 @@ def moved(one: Reading, other: Reading) -> bool:
     return float(np.abs(np.subtract(one.q, other.q)).max()) > 0.1
 
 
-def test_a_world_is_needed() -> None:
+def test_a_world_is_needed(engine: Engine) -> None:
     with raises_code(CommandError, "world_missing"):
-        PyBulletRobot(panda(), None)
+        registry.load(engine.name, "robot")(panda(), None)

@@ -1,55 +1,56 @@
-"""The copy of a real arm in the simulated world: where the arm is, whatever is in its way."""
+"""The mirror of a real arm in the simulated world of each engine: where the arm is, whatever is in its way."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterator
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
+from engines_kit import Engine, joint_positions
 from errors_kit import raises_code
-from specs import PANDA_HOME, box, cube, floor, panda, world_spec
+from specs import PANDA_HOME, box, cube, floor, panda
 
-from hal.drivers.pybullet.world import PyBulletWorld
 from hal.errors import CommandError, DeviceNotFound
 from hal.kinematics.arm import Kinematics
+from hal.specs import BodySpec
 
 REST = [0.0] * 7
 JOINTS = tuple(f"panda_joint{k}" for k in range(1, 8))
 FINGERS = ("panda_finger_joint1", "panda_finger_joint2")
 
 
-def copied(*things: object) -> PyBulletWorld:
-    """A world with the copy of a real arm."""
-    arm = panda("arm", driver="franka")
-    return PyBulletWorld(world_spec(*things, arm))
+def mirrored(engine: Engine, *things: BodySpec) -> Any:
+    """Return a world with the mirror of a real arm."""
+    return engine.world(*things, panda("arm", driver="franka"))
 
 
 @pytest.fixture
-def world() -> Iterator[PyBulletWorld]:
-    world = copied(floor())
+def world(engine: Engine) -> Iterator[Any]:
+    world = mirrored(engine, floor())
     yield world
     world.close()
 
 
-def joints(world: PyBulletWorld, names: tuple[str, ...] = JOINTS) -> np.ndarray:
-    body = world.body("arm")
-    return np.array([state[0] for state in world.client.getJointStates(body.id, [body.joints[n] for n in names])])
+def joints(world: Any, names: tuple[str, ...] = JOINTS) -> np.ndarray:
+    found = joint_positions(world, "arm")
+    return np.array([found[name] for name in names])
 
 
-def run(world: PyBulletWorld, seconds: float) -> None:
+def run(world: Any, seconds: float) -> None:
     for _ in range(round(seconds / world.dt)):
         world.step()
 
 
-def test_stays_at_its_start_until_the_first_state(world: PyBulletWorld) -> None:
+def test_stays_at_its_start_until_the_first_state(world: Any) -> None:
     assert world.describe("arm")["robot"]
     run(world, 1.0)
     assert joints(world) == pytest.approx(PANDA_HOME, abs=1e-4)
 
 
-def test_takes_the_state_of_the_arm_at_once(world: PyBulletWorld) -> None:
+def test_takes_the_state_of_the_arm_at_once(world: Any) -> None:
     q = [0.3, -0.2, 0.4, -1.5, 0.2, 1.2, -0.6]
     world.follow("arm", q, REST, 0.03)
     assert (joints(world), joints(world, FINGERS)) == (pytest.approx(q), pytest.approx(0.015))
@@ -57,7 +58,7 @@ def test_takes_the_state_of_the_arm_at_once(world: PyBulletWorld) -> None:
     assert world.pose("arm", "panda_hand")["position"] == pytest.approx(hand.position, abs=1e-5)
 
 
-def test_neither_sags_nor_lags(world: PyBulletWorld) -> None:
+def test_neither_sags_nor_lags(world: Any) -> None:
     """After a step it is where the arm will be then."""
     q, dq = list(PANDA_HOME), [0.0] * 7
     for k in range(480):
@@ -70,7 +71,7 @@ def test_neither_sags_nor_lags(world: PyBulletWorld) -> None:
 
 
 @pytest.mark.parametrize("dq", [0.0, 1.0])
-def test_without_new_states_it_stays(world: PyBulletWorld, dq: float) -> None:
+def test_without_new_states_it_stays(world: Any, dq: float) -> None:
     world.follow("arm", PANDA_HOME, [dq] * 7, 0.04)
     world.step()
     stopped = joints(world)
@@ -79,9 +80,9 @@ def test_without_new_states_it_stays(world: PyBulletWorld, dq: float) -> None:
     assert joints(world) == pytest.approx(stopped, abs=1e-4)
 
 
-def test_pushes_objects_and_is_not_stopped_by_them() -> None:
+def test_pushes_objects_and_is_not_stopped_by_them(engine: Engine) -> None:
     """A cube of 50 kg in the way of the forearm, which swings about the first joint."""
-    world = copied(floor(), box("block", (0.33, 0.35, 0.3), (0.1, 0.1, 0.3), mass=50.0))
+    world = mirrored(engine, floor(), box("block", (0.33, 0.35, 0.3), (0.1, 0.1, 0.3), mass=50.0))
     q = [0.0, 0.6, 0.0, -2.2, 0.0, 2.0, 0.785]
     run_into = 0.9
     for k in range(round(run_into / 0.5 / world.dt)):
@@ -94,11 +95,11 @@ def test_pushes_objects_and_is_not_stopped_by_them() -> None:
     world.close()
 
 
-def test_fingers_hold_a_simulated_object() -> None:
+def test_fingers_hold_a_simulated_object(engine: Engine) -> None:
     """The real fingers close on nothing; the copy's close as far as the cube, and carry it."""
     kinematics = Kinematics(panda().kinematics)
     here = tuple(kinematics.fk(PANDA_HOME)[:3])
-    world = copied(floor(), cube(here))
+    world = mirrored(engine, floor(), cube(here))
     world.set_dynamics("cube", mass=0.2)
     q = list(PANDA_HOME)
     for k in range(60):
@@ -116,7 +117,7 @@ def test_fingers_hold_a_simulated_object() -> None:
     world.close()
 
 
-def test_unknown_width_leaves_the_fingers_alone(world: PyBulletWorld) -> None:
+def test_unknown_width_leaves_the_fingers_alone(world: Any) -> None:
     world.follow("arm", PANDA_HOME, REST, 0.02)
     run(world, 0.1)
     world.follow("arm", PANDA_HOME, REST, None)
@@ -124,7 +125,7 @@ def test_unknown_width_leaves_the_fingers_alone(world: PyBulletWorld) -> None:
     assert joints(world, FINGERS) == pytest.approx(0.01, abs=1e-4)
 
 
-def test_reset_leaves_it_at_the_real_arm(world: PyBulletWorld) -> None:
+def test_reset_leaves_it_at_the_real_arm(world: Any) -> None:
     q = [0.5, *PANDA_HOME[1:]]
     world.follow("arm", q, REST, 0.04)
     world.reset()
@@ -133,19 +134,6 @@ def test_reset_leaves_it_at_the_real_arm(world: PyBulletWorld) -> None:
         world.reset("arm")
     with raises_code(CommandError, "is_robot"):
         world.set_pose("arm", {"position": [0, 0, 1]})
-
-
-def test_mirror_world_shows_it() -> None:
-    world = copied(floor())
-    mirror = PyBulletWorld(world.spec, mirror=True)
-    world.follow("arm", [0.5, *PANDA_HOME[1:]], REST, 0.01)
-    world.step()
-    mirror.show(world.snapshot())
-    for link in ("panda_hand", "panda_leftfinger"):
-        shown, there = mirror.pose("arm", link), world.pose("arm", link)
-        assert shown["position"] == pytest.approx(there["position"], abs=1e-6)
-    world.close()
-    mirror.close()
 
 
 @pytest.mark.parametrize(
@@ -159,7 +147,7 @@ def test_mirror_world_shows_it() -> None:
         (None, REST, 0.04),
     ],
 )
-def test_impossible_states_are_refused(world: PyBulletWorld, q: list[float], dq: list[float], width: float) -> None:
+def test_impossible_states_are_refused(world: Any, q: list[float], dq: list[float], width: float) -> None:
     with pytest.raises(CommandError):
         world.follow("arm", q, dq, width)
     world.step()
@@ -167,12 +155,12 @@ def test_impossible_states_are_refused(world: PyBulletWorld, q: list[float], dq:
     assert joints(world, FINGERS) == pytest.approx(0.04, abs=1e-4)
 
 
-def test_only_a_mirrored_arm_takes_states(world: PyBulletWorld) -> None:
+def test_only_a_mirrored_arm_takes_states(engine: Engine, world: Any) -> None:
     with raises_code(DeviceNotFound, "unknown_body"):
         world.follow("arn", PANDA_HOME, REST, None)
     with raises_code(CommandError, "not_mirrored"):
         world.follow("floor", PANDA_HOME, REST, None)
-    simulated = PyBulletWorld(world_spec(panda("arm")))
+    simulated = engine.world(panda("arm"))
     with raises_code(CommandError, "not_mirrored"):
         simulated.follow("arm", PANDA_HOME, REST, None)
     simulated.close()

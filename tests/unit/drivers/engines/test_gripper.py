@@ -1,18 +1,18 @@
-"""The simulated hand: width, speed and force, both fingers together, and a grasp that holds."""
+"""A simulated gripper on each engine: width, speed and force, both fingers together, and a grasp that holds."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from typing import Any
 
 import numpy as np
 import pytest
+from engines_kit import Engine, joint_positions, push
 from errors_kit import raises_code, raises_problems
-from specs import PANDA_HOME, box, cube, data, floor, iiwa, panda, world_spec
+from specs import PANDA_HOME, box, cube, data, floor, iiwa, panda
 
+from hal import registry
 from hal.driver import GripperReading, Setpoint
-from hal.drivers.pybullet.gripper import PyBulletGripper
-from hal.drivers.pybullet.robot import PyBulletRobot
-from hal.drivers.pybullet.world import PyBulletWorld
 from hal.errors import CommandError
 from hal.geometry import Pose
 from hal.specs import GripperSpec
@@ -23,12 +23,9 @@ FINGERS = ("panda_finger_joint1", "panda_finger_joint2")
 class Bench:
     """A Panda over a floor, with its hand open."""
 
-    def __init__(self, hz: float = 240.0) -> None:
-        spec = panda()
-        assert spec.gripper is not None
-        self.world = PyBulletWorld(world_spec(floor(), spec, physics_hz=hz))
-        self.arm = PyBulletRobot(spec, self.world)
-        self.hand = PyBulletGripper(spec.gripper, self.world)
+    def __init__(self, engine: Engine, hz: float = 240.0) -> None:
+        self.world = engine.world(floor(), panda(), physics_hz=hz)
+        self.arm, self.hand = engine.robot(self.world), engine.gripper(self.world)
         self.arm.open()
         self.hand.open()
         hand = self.world.pose("panda", "panda_hand")["position"]
@@ -45,9 +42,9 @@ class Bench:
         return readings
 
     def fingers(self) -> tuple[float, float]:
-        body = self.world.body("panda")
-        left, right = self.world.client.getJointStates(body.id, [body.joints[name] for name in FINGERS])
-        return left[0], right[0]
+        """Return the positions of both fingers, m."""
+        found = joint_positions(self.world, "panda")
+        return found[FINGERS[0]], found[FINGERS[1]]
 
     def put_cube(self) -> None:
         """The 2 kg cube between the fingers, on a stand."""
@@ -81,8 +78,8 @@ class Bench:
 
 
 @pytest.fixture
-def bench() -> Iterator[Bench]:
-    made = Bench()
+def bench(engine: Engine) -> Iterator[Bench]:
+    made = Bench(engine)
     yield made
     made.world.close()
 
@@ -126,13 +123,11 @@ class TestCoupling:
         """A hand that idles is uncoupled, and coupled again before its motors give way, read 20 times a second."""
         bench.hand.move(0.04, 0.1, 20.0)
         bench.run(1.0)
-        world, body = bench.world, bench.world.body("panda")
-        push, apart = 0.0, []
+        world = bench.world
+        force, apart = 0.0, []
         for tick in range(240):
-            push = 0.25 * tick  # N, up to 60
-            world.client.applyExternalForce(
-                body.id, body.links["panda_leftfinger"], (0.0, -push, 0.0), (0.0, 0.0, 0.0), world.client.LINK_FRAME
-            )
+            force = 0.25 * tick  # N, up to 60
+            push(world, "panda", "panda_leftfinger", (0.0, force, 0.0))
             world.step()
             if tick % 12 == 0:
                 bench.hand.read(world.t)
@@ -150,8 +145,8 @@ class TestCoupling:
 
 class TestGrasping:
     @pytest.mark.parametrize(("force", "hz"), [(30.0, 240.0), (70.0, 240.0), (70.0, 1000.0)])
-    def test_the_cube_is_lifted_and_held(self, force: float, hz: float) -> None:
-        bench = Bench(hz)
+    def test_the_cube_is_lifted_and_held(self, engine: Engine, force: float, hz: float) -> None:
+        bench = Bench(engine, hz)
         bench.put_cube()
         bench.hand.move(0.0, 0.1, force)
         gripped = bench.run(1.0)[-1]
@@ -232,24 +227,24 @@ class TestGrasping:
         assert held - bench.world.pose("cube")["position"][2] > 0.05
 
 
-def distance(world: PyBulletWorld) -> float:
+def distance(world: Any) -> float:
     """From the hand to the cube, m."""
     hand, thing = world.pose("panda", "panda_hand")["position"], world.pose("cube")["position"]
     return float(np.linalg.norm(np.subtract(hand, thing)))
 
 
 class TestBadInput:
-    def test_a_world_is_needed(self) -> None:
+    def test_a_world_is_needed(self, engine: Engine) -> None:
         with raises_code(CommandError, "world_missing"):
-            PyBulletGripper(GripperSpec("hand", "pybullet", 0.08, 0.1, 20.0), None)
+            registry.load(engine.name, "gripper")(GripperSpec("hand", engine.name, 0.08, 0.1, 20.0), None)
 
-    def test_a_gripper_of_no_robot(self) -> None:
-        world = PyBulletWorld(world_spec(iiwa()))
-        gripper = PyBulletGripper(GripperSpec("hand", "pybullet", 0.08, 0.1, 20.0, FINGERS), world)
+    def test_a_gripper_of_no_robot(self, engine: Engine) -> None:
+        spec = GripperSpec("hand", engine.name, 0.08, 0.1, 20.0, FINGERS)
+        gripper = registry.load(engine.name, "gripper")(spec, engine.world(iiwa()))
         with raises_problems("wrong_count"):
             gripper.open()
 
-    def test_a_finger_that_the_urdf_lacks(self) -> None:
-        wrong = GripperSpec("hand", "pybullet", 0.08, 0.1, 20.0, ("panda_finger_joint1", "panda_finger_joint9"))
+    def test_a_finger_that_the_urdf_lacks(self, engine: Engine) -> None:
+        wrong = GripperSpec("hand", engine.name, 0.08, 0.1, 20.0, ("panda_finger_joint1", "panda_finger_joint9"))
         with raises_problems("unknown_joint"):
-            PyBulletWorld(world_spec(panda(gripper=wrong)))
+            engine.world(panda(gripper=wrong))
