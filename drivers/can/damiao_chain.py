@@ -61,6 +61,15 @@ _REST = 0.2
 """s."""
 
 
+_FOREIGN_RATE = 12.0
+"""Answers of a motor that nothing here asked for, 1/s: so many are none of another program's commands, but a bus that
+repeats a frame now and then."""
+_FOREIGN_LIMIT = 5.0
+"""Number of answers beyond those of that rate that count as another program."""
+_CALM = 0.05
+"""Time without such an answer after which the other program counts as gone, s."""
+
+
 class DamiaoChain:
     """The motors of one device on a bus.
 
@@ -101,6 +110,8 @@ class DamiaoChain:
         self._locks: list[DeviceLock] = []
         self._lowering: Iterator[bool] | None = None
         """Its remaining steps; None before the first."""
+        self._contested: ChainMotor | None = None
+        """A motor that another program seems to command, or did."""
         self._asked = False
         """Whether frames were sent since the last update."""
         self._t_asked = 0.0
@@ -136,6 +147,7 @@ class DamiaoChain:
             for motor in self.motors:
                 motor.registers.clear()
                 motor.on, motor.replies, motor.asked, motor.silent, motor.gap, motor.t = False, 0, 0, 0, 0, -1.0
+                motor.unasked = 0.0
             self._read_registers(bus)
             problems = [problem for motor in self.motors for problem in self._problems(motor)]
             if problems:
@@ -264,8 +276,9 @@ class DamiaoChain:
             if count > asked:
                 late = min(count - asked, motor.gap)
                 motor.late += late
-                motor.doubled += count - asked - late
                 motor.gap = 0
+                if count - asked > late:
+                    self._note_unasked(motor, count - asked - late)
             elif count < asked:
                 motor.missing += asked - count
                 motor.gap += asked - count
@@ -287,6 +300,14 @@ class DamiaoChain:
             self.lost = self._silence_error(silent)
         elif self.lost is not None:
             self._check_return()
+
+    def _note_unasked(self, motor: ChainMotor, count: int) -> None:
+        """Count answers that nothing here asked for. Own frames that come back are none: they have other ids."""
+        motor.doubled += count
+        motor.unasked = max(0.0, motor.unasked - _FOREIGN_RATE * (self._now - motor.t_unasked)) + count
+        motor.t_unasked = self._now
+        if motor.unasked > _FOREIGN_LIMIT:
+            self._contested = motor
 
     def _count_loss(self) -> None:
         self.losses += self.lost is None
@@ -367,6 +388,14 @@ class DamiaoChain:
                 if fault is not None and fault.code not in MILD_FAULTS:
                     return fault
                 mild = mild or fault
+        contested = self._contested
+        if contested is not None and self._now - contested.t_unasked > _CALM:
+            for motor in self.motors:
+                motor.unasked = 0.0
+            self._contested = contested = None
+        if mild is None and contested is not None:
+            cause = f"{contested.label} answers more often than it is asked: another program commands it"
+            mild = Fault("other_program", cause, "end the other program, on any computer on this bus")
         return mild
 
     def clear_errors(self) -> None:

@@ -22,6 +22,7 @@ from hal.specs import GripperSpec
 from hal.types import GripperOutcome
 
 from .damiao_chain import SWITCHING, DamiaoChain
+from .damiao_motor import MILD_FAULTS
 from .damiao_protocol import KP_MAX
 from .settings import DamiaoGripperSettings
 
@@ -280,7 +281,7 @@ class DamiaoGripper(GripperDriver):
         chain, motor = self.chain, self._motor
         chain.usable  # noqa: B018  # raises if it is not open, or lost
         fault = chain.fault(engaged=False)
-        if fault is not None and fault.code == "motor_hot":
+        if fault is not None and fault.code in MILD_FAULTS:
             raise RobotFault(fault.cause, fault.remedy, code=fault.code)
         self._fault = None  # an error of the motor is cleared when it is switched on
         self._attempts = 0

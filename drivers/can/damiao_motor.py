@@ -36,7 +36,7 @@ LONGEST_TIMEOUT = 1.0
 """Longest TIMEOUT, s: for so long a motor repeats the last command of a killed program, a torque for example."""
 HEAT_MARGIN = 5.0
 """Distance from the temperature at which a motor switches itself off that is a fault, K."""
-MILD_FAULTS = frozenset({"motor_hot"})
+MILD_FAULTS = frozenset({"motor_hot", "other_program"})
 """Codes of the faults with which every motor still follows its commands, so that the arm can be braked."""
 
 _HOT = "let it cool down, with the arm supported; lower its load or its speed"
@@ -102,6 +102,8 @@ class ChainMotor:
         """Number of frames that were sent to it since then."""
         self.gap = 0
         """Number of replies that were missing, and may still come."""
+        self.unasked = self.t_unasked = 0.0
+        """Recent answers that nothing here asked for, and the time of the last one, s."""
         self.silent = 0
         """Number of updates in a row without a reply."""
         self.silent_since = 0.0

@@ -101,6 +101,44 @@ def bring_interface_up(arm: SteppedArm) -> None:
         time.sleep(0.01)  # a thread opens the bus, at most every 0.2 s
 
 
+def _meanwhile(arm: SteppedArm, period: float, act: Callable[[], object]) -> None:
+    """Call a function once per ``period`` of the emulator's time, s, until :func:`stop_repeating`."""
+    advance, passed = arm.far.advance, [0.0]
+
+    def advance_both(seconds: float) -> None:
+        advance(seconds)
+        passed[0] += seconds
+        while passed[0] >= period:
+            passed[0] -= period
+            act()
+
+    arm.far.advance = advance_both  # type: ignore[method-assign]
+
+
+def stop_repeating(arm: SteppedArm) -> None:
+    arm.far.execute("reset")
+    del arm.far.advance
+
+
+def repeat_some(arm: SteppedArm) -> None:
+    """Repeat one answer of each motor in 0.16 s."""
+    motors = list(arm.driver.chain.motors)
+
+    def act() -> None:
+        for motor in motors:
+            motor.receive(bytearray(motor.bits.to_bytes(8, "big")))
+
+    _meanwhile(arm, 0.16, act)
+
+
+def command_as_another_program(arm: SteppedArm) -> None:
+    """Send motor 3 the commands that hold it, from another node of the bus."""
+    motor, channel = arm.driver.chain.motors[2], arm.driver.settings.channel
+    bus = can.Bus(interface="virtual", channel=channel)
+    data = motor.command(motor.q, 0.0, motor.kp, motor.kd, 0.0)
+    _meanwhile(arm, 0.01, lambda: bus.send(can.Message(arbitration_id=motor.id, data=data, is_extended_id=False)))
+
+
 RESET = line("reset")
 STATUS = {
     0x8: "over_voltage",
@@ -116,7 +154,16 @@ FAULT = (RobotFault, "robot_fault")
 FAULTS = [
     CanFault("1 reply in 20 lost", line("lose 0.05"), RESET, None),
     CanFault("replies 6 ms late", line("late 0.006"), RESET, None),
-    CanFault("replies doubled", line("double on"), RESET, None),
+    CanFault("1 reply in 40 doubled", repeat_some, stop_repeating, None),
+    CanFault("replies doubled", line("double on"), RESET, FAULT, "other_program", recovers=True),
+    CanFault(
+        "another program commands motor 3, 100 times a second",
+        command_as_another_program,
+        stop_repeating,
+        FAULT,
+        "other_program",
+        recovers=True,
+    ),
     CanFault("200 frames of another device", line("frame 0x2ff 0011223344556677 200"), nothing, None),
     CanFault("20 frames with another motor's number", line("frame 0x11 1500007ff7ff1e1e 20"), nothing, None),
     CanFault("bus cut for 60 ms", line("cut 0.06"), RESET, None),
