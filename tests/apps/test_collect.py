@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 
 pytest.importorskip("zstandard", reason="pip install 'robot-hal[record]'")
-pytest.importorskip("pybullet", reason="pip install 'robot-hal[sim]'")
 
 from app_kit import CROSS, seed_of, write_pad
 from recording_kit import ROUNDED, Stage, at_row, small

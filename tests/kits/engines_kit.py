@@ -25,6 +25,10 @@ KNOWN: Mapping[str, tuple[str, ...]] = {
     ),
 }
 """Tests that may fail on an engine, by its name."""
+
+AUTO = registry.choose_engine("auto")
+"""The engine of a rig that names none, on this computer."""
+
 REPLACED = (registry.SIMULATION, *registry.ENGINES)
 """Drivers of records that become the engine's; others (``franka``) stay."""
 

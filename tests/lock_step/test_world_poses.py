@@ -7,8 +7,6 @@ import pytest
 import hal
 from hal import DeviceNotFound, Pose
 
-pytest.importorskip("pybullet", reason="pip install 'robot-hal[sim]'")
-
 PLAIN = ["cameras={}"]
 SECONDS = 1.5
 

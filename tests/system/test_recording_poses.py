@@ -17,7 +17,6 @@ from hal.geometry import Pose
 from hal.recording import Dataset, Episode, Recorder
 
 pytestmark = pytest.mark.slow
-pytest.importorskip("pybullet", reason="pip install 'robot-hal[sim]'")
 
 OVERRIDES = small(160, 120)
 

@@ -13,7 +13,6 @@ from hal.recording import Dataset, Recorder
 from hal.types import RobotState
 
 pytestmark = pytest.mark.slow
-pytest.importorskip("pybullet", reason="pip install 'robot-hal[sim]'")
 
 SECONDS = 5.0
 

@@ -84,7 +84,7 @@ def test_two_rigs_at_once_and_one_after_the_other(tmp_path: Path) -> None:
     program = """
 import hal
 for _ in range(2):
-    with hal.open("panda_table", driver="mock") as a, hal.open("iiwa_table", driver="mock") as b:
+    with hal.open("panda_table", driver="mock") as a, hal.open("franka", driver="mock", pad="none") as b:
         a.clock.sleep(0.1); b.clock.sleep(0.2)
         print(a.clock.now() < b.clock.now(), a.robots["panda"].n)
 """

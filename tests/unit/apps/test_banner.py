@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import pytest
+from engines_kit import AUTO
 from specs import data
 
 import hal
@@ -20,10 +21,10 @@ def robot_line(config: Any, **arguments: Any) -> str:
 @pytest.mark.parametrize(
     ("config", "sim", "words"),
     [
-        ("franka", True, "fr3, simulated (pybullet), 240 Hz, gripper 0..0.08 m"),
+        ("franka", True, f"fr3, simulated ({AUTO}), 240 Hz, gripper 0..0.08 m"),
         ("franka", False, "fr3, REAL (franka at 172.16.0.2), 1000 Hz, gripper 0..0.08 m"),
         ("franka_emulator", None, "fr3, EMULATED (franka at 127.0.0.2), 1000 Hz, gripper 0..0.08 m"),
-        ("franka_emulator", True, "fr3, simulated (pybullet), 240 Hz"),
+        ("franka_emulator", True, f"fr3, simulated ({AUTO}), 240 Hz"),
     ],
 )
 def test_an_arm_is_called_what_it_is(config: str, sim: bool | None, words: str) -> None:
@@ -33,7 +34,7 @@ def test_an_arm_is_called_what_it_is(config: str, sim: bool | None, words: str) 
 def test_a_real_hand_on_a_simulated_arm_is_called_real() -> None:
     hand = {"sim": False, "real": {"host": "172.16.0.2"}}
     line = robot_line({"robots": {"arm": {"model": "fr3", "gripper": hand}}})
-    assert "simulated (pybullet), 240 Hz, gripper 0..0.08 m, REAL (franka at 172.16.0.2)" in line
+    assert f"simulated ({AUTO}), 240 Hz, gripper 0..0.08 m, REAL (franka at 172.16.0.2)" in line
 
 
 def test_what_the_simulation_changed_in_a_file_is_a_note() -> None:

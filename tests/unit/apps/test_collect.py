@@ -13,9 +13,9 @@ import pytest
 
 pytest.importorskip("zstandard", reason="pip install 'robot-hal[record]'")
 pytest.importorskip("gymnasium", reason="pip install 'robot-hal[gym]'")
-pytest.importorskip("pybullet", reason="pip install 'robot-hal[sim]'")
 
 from app_kit import CIRCLE, CROSS, PS, SQUARE, seed_of, write_pad
+from engines_kit import need_engine
 
 import hal
 from hal.apps import collect
@@ -94,6 +94,7 @@ def test_a_demonstration_that_misses_the_cube_is_a_failure(
 
 def test_the_recorded_pad_is_the_output_of_its_program() -> None:
     """Presses only, and to 0.1 s: other builds of the physics differ in the last bits."""
+    need_engine("pybullet")
     made: list[str] = runpy.run_path(str(MADE_BY))["lines"]()
     shipped = PAD.read_text(encoding="utf-8").splitlines()
     assert made[0] == shipped[0]

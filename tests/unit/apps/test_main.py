@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 from app_kit import run_here
+from engines_kit import AUTO
 
 from hal.apps import teleop
 from hal.apps.main import PROGRAMS, main
@@ -62,7 +63,7 @@ def test_usage_of_a_single_program(command: str, monkeypatch: pytest.MonkeyPatch
 def test_it_runs_a_program() -> None:
     done = run_here(main, "teleop", "--sim", "--dry-run")
     assert done.returncode == 0
-    assert "simulated (pybullet)" in done.stdout
+    assert f"simulated ({AUTO})" in done.stdout
 
 
 @pytest.mark.parametrize(

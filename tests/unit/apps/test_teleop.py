@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 from app_kit import run_here
+from engines_kit import AUTO
 
 from hal.apps.teleop import main
 
@@ -22,7 +23,7 @@ def test_the_recorded_tour_drives_the_arm(tmp_path: Path) -> None:
     assert (done.returncode, done.stderr) == (0, "")
     assert "the recorded pad has ended after 12.5 s" in done.stdout
     found = json.loads(out.read_text())
-    assert (found["backend"], found["clean_exit"], found["trips"], found["faults"]) == ("pybullet", True, [], [])
+    assert (found["backend"], found["clean_exit"], found["trips"], found["faults"]) == (AUTO, True, [], [])
     assert found["tcp_travel_m"] >= 0.3
     assert found["servo"]["rate_hz"] == 240
     assert found["servo"]["ticks"] > 133 * 15
@@ -35,7 +36,7 @@ def test_the_recorded_tour_drives_the_arm(tmp_path: Path) -> None:
 def test_dry_run_lists_and_opens_nothing() -> None:
     done = run_here(main, "--sim", "--dry-run")
     assert done.returncode == 0, done.stderr
-    assert re.search(r"robot +panda .*simulated \(pybullet\)", done.stdout)
+    assert re.search(rf"robot +panda .*simulated \({AUTO}\)", done.stdout)
     assert "256x256" in done.stdout
 
 

@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 
 pytest.importorskip("zstandard", reason="pip install 'robot-hal[record]'")
-pytest.importorskip("pybullet", reason="pip install 'robot-hal[sim]'")
 
 import yaml
 from app_kit import CROSS, PS, run_here, write_pad

@@ -5,11 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-import pybullet as p
 import pytest
 import yaml
 from ark_kit import BALL, CAMERA, DATA, PANDA, PANDA_URDF, TUTORIAL, changed, imported, leaves, row, write
-from pybullet_utils.bullet_client import BulletClient
 
 import hal
 from hal.ark import ArkOptions, Imported, import_ark
@@ -18,6 +16,9 @@ from hal.ark.reading import ArkReader
 from hal.config import load
 from hal.config.data_files import list_data
 from hal.geometry import Pose
+
+p = pytest.importorskip("pybullet")
+BulletClient = pytest.importorskip("pybullet_utils.bullet_client").BulletClient
 
 
 def saved(result: Imported, path: Path) -> Path:

@@ -6,12 +6,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pybullet as p
-import pybullet_data
 import pytest
 from ark_kit import CAMERA, PANDA, PANDA_URDF, changed, imported, row
 from errors_kit import raises_problems
-from pybullet_utils.bullet_client import BulletClient
 
 import hal
 from hal.ark import ArkOptions
@@ -19,6 +16,10 @@ from hal.ark.arm_model import ArkUrdf
 from hal.config import load
 from hal.config.files import parse_yaml
 from hal.geometry import Pose
+
+p = pytest.importorskip("pybullet")
+pybullet_data = pytest.importorskip("pybullet_data")
+BulletClient = pytest.importorskip("pybullet_utils.bullet_client").BulletClient
 
 HOME = [0, -0.785, 0, -2.356, 0, 1.571, 0.785]
 OTHER = [0.1, -0.5, 0, -2.0, 0, 1.5, 0.7]

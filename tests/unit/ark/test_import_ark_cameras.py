@@ -7,16 +7,17 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pybullet as p
-import pybullet_data
 import pytest
 from ark_kit import CAMERA, PANDA, PANDA_URDF, changed, imported, row
-from pybullet_utils.bullet_client import BulletClient
 
 from hal.ark import ArkOptions
 from hal.config import load
 from hal.geometry import Pose
 from hal.kinematics.arm import Kinematics
+
+p = pytest.importorskip("pybullet")
+pybullet_data = pytest.importorskip("pybullet_data")
+BulletClient = pytest.importorskip("pybullet_utils.bullet_client").BulletClient
 
 XARM = Path(pybullet_data.getDataPath(), "xarm", "xarm6_robot.urdf")
 

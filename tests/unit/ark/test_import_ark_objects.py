@@ -127,6 +127,7 @@ def test_urdfs_are_found_from_where_ark_is_started(tmp_path: Path, monkeypatch: 
 
 
 def test_urdfs_of_pybullet_are_named_by_their_package(tmp_path: Path) -> None:
+    pytest.importorskip("pybullet_data")
     data, _ = imported(tmp_path, robots={"arm": PANDA}, objects={"duck": mug("duck_vhacd.urdf", global_scaling=0.5)})
     assert data["objects"][0]["urdf"] == {"package": "pybullet_data", "path": "duck_vhacd.urdf"}
     assert data["objects"][0]["scale"] == 0.5

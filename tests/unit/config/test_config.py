@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
+from engines_kit import AUTO
 from jsonschema import Draft202012Validator, ValidationError
 
 from hal.config import load
@@ -45,6 +46,8 @@ def with_real_drivers(config: dict[str, Any]) -> dict[str, Any]:
 
 @pytest.mark.parametrize("name", list_data("config"))
 def test_every_built_in_rig_is_valid(name: str) -> None:
+    if name == "iiwa_table":
+        pytest.importorskip("pybullet_data")
     rig = plan(name)
     assert rig.robots
     assert rig.world is not None
@@ -93,7 +96,7 @@ def test_a_rig_in_one_line_has_good_defaults() -> None:
     assert rig.sim
     assert (rig.clock, rig.source) == ("real_time", "<dict>")
     arm = rig.robots[0]
-    assert (arm.driver, arm.speed, arm.move_speed, arm.tcp_speed) == ("pybullet", 0.3, 0.1, 0.25)
+    assert (arm.driver, arm.speed, arm.move_speed, arm.tcp_speed) == (AUTO, 0.3, 0.1, 0.25)
     assert (arm.rate_hz, arm.attended, arm.deadline_max) == (240.0, False, 1.0)
     assert rig.world is not None
     assert rig.world.robots == rig.robots
@@ -108,7 +111,7 @@ def test_missing_flag_means_simulation_and_sim_true_overrules_all() -> None:
     everything = plan(config, sim=True)
     assert everything.sim
     assert [r.attended for r in everything.robots] == [False, False]
-    assert {r.driver for r in everything.robots} | {c.driver for c in everything.cameras} == {"pybullet"}
+    assert {r.driver for r in everything.robots} | {c.driver for c in everything.cameras} == {AUTO}
     config["robots"]["one"]["sim"] = False
     assert not plan(config, sim=True).robots[0].attended
 
@@ -118,10 +121,10 @@ def test_sim_false_sets_the_rigs_flag_and_leaves_each_device_its_own() -> None:
     assert not rig.sim
     one, two = rig.robots
     assert (one.driver, one.attended, one.rate_hz, one.deadline_max) == ("mock", True, 1000.0, 0.3)
-    assert (two.driver, two.attended, two.rate_hz, two.deadline_max) == ("pybullet", False, 240.0, 1.0)
+    assert (two.driver, two.attended, two.rate_hz, two.deadline_max) == (AUTO, False, 240.0, 1.0)
     assert one.gripper is not None
     assert two.gripper is not None
-    assert (one.gripper.driver, two.gripper.driver) == ("mock", "pybullet")
+    assert (one.gripper.driver, two.gripper.driver) == ("mock", AUTO)
     assert rig.cameras[0].driver == "mock"
     # The real arm stands in the world too, as a copy that simulated cameras see.
     assert rig.world is not None
@@ -271,6 +274,7 @@ def test_limits_may_be_tightened_by_the_rig() -> None:
 
 
 def test_position_and_speed_limits_may_come_from_the_urdf() -> None:
+    pytest.importorskip("pybullet_data")
     limits = plan("iiwa_table").robots[0].limits
     assert limits.lower[0] == pytest.approx(-math.radians(170))
     assert limits.upper[6] == pytest.approx(math.radians(175))

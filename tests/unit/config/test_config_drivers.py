@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 import yaml
+from engines_kit import AUTO
 from errors_kit import raises_problems
 
 from hal.config import load
@@ -182,7 +183,7 @@ def test_an_arm_is_emulated_when_all_that_is_real_of_it_is() -> None:
 
 def test_a_real_hand_on_a_simulated_arm_is_attended() -> None:
     config = rig({"sim": False, "real": {"host": "there"}}, sim=True)
-    assert (arm(config).driver, arm(config).attended, arm(config).emulated) == ("pybullet", True, False)
+    assert (arm(config).driver, arm(config).attended, arm(config).emulated) == (AUTO, True, False)
     config = rig({"sim": False, "real": {"host": "here"}}, sim=True)
     assert (arm(config).attended, arm(config).emulated) == (True, True)
 

@@ -6,6 +6,7 @@ import copy
 import random
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Callable, Iterator, Sequence
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -167,7 +168,12 @@ def thing(**keys: Any) -> dict[str, Any]:
         (robot(limits={"lower": -3.0}), "robots.arm.limits.lower", "looser_limit"),
         (robot(limits={"velocity": -1.0}), "robots.arm.limits.velocity", "out_of_range"),
         (robot(gripper={"speed": 0.9}), "robots.arm.gripper.speed", "looser_limit"),
-        ({"robots": {"a": {"model": "iiwa", "gripper": {"speed": 0.1}}}}, "robots.a.gripper", "no_gripper"),
+        pytest.param(
+            {"robots": {"a": {"model": "iiwa", "gripper": {"speed": 0.1}}}},
+            "robots.a.gripper",
+            "no_gripper",
+            marks=pytest.mark.skipif(find_spec("pybullet_data") is None, reason="needs pybullet_data"),
+        ),
         (robot(workspace={"upper": [1, 1, 0.1], "table_height": 0.2}), "robots.arm.workspace", "empty_range"),
         # Objects.
         (thing(half_extents=None), "objects.0", "missing_key"),
@@ -289,7 +295,7 @@ def test_files_that_are_no_rig(tmp_path: Path, text: str, code: str) -> None:
 
 
 def test_keys_that_are_given_twice(tmp_path: Path) -> None:
-    (tmp_path / "rig.yaml").write_text("robots:\n  arm: {model: panda}\n  arm: {model: iiwa, speed: 0.1, speed: 0.2}\n")
+    (tmp_path / "rig.yaml").write_text("robots:\n  arm: {model: panda}\n  arm: {model: fr3, speed: 0.1, speed: 0.2}\n")
     found = problems(tmp_path / "rig.yaml")
     assert {(problem.key, problem.code) for problem in found} == {
         ("robots.arm", "duplicate_key"),
@@ -361,6 +367,7 @@ def test_arguments() -> None:
 
 
 def test_a_real_arm_without_a_driver_for_it() -> None:
+    pytest.importorskip("pybullet_data")
     problem = only({"robots": {"arm": {"model": "iiwa"}}}, sim=False)
     assert (problem.key, problem.code) == ("robots.arm", "no_driver")
     assert "robots.arm.drivers.real" in problem.message

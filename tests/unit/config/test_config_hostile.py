@@ -166,7 +166,7 @@ def test_mutated_rigs_are_in_order_or_a_config_error(tmp_path: Path) -> None:
 
 def fuzz(folder: Path, count: int) -> None:
     """Load ``count`` mutated rigs, and print how many were in order and how many were refused."""
-    names = ["panda_table", "iiwa_table", "franka_emulator", "panda_calibration", "openarm"]
+    names = ["panda_table", "yam", "franka_emulator", "panda_calibration", "openarm"]
     texts = [find_data("config", f"{name}.yaml").read_text() for name in names]
     loaded = refused = 0
     for seed in range(count):

@@ -35,7 +35,7 @@ def test_skipped_tests_and_modules(tmp_path: Path, strict: str, expected: str) -
     (tmp_path / "test_module.py").write_text("import pytest\npytest.importorskip('no_such_library')\n")
     options = ["-q", "-ra", "-p", "no:cacheprovider", "-p", "no:xdist", "--continue-on-collection-errors"]
     command = [sys.executable, "-m", "pytest", *options, "--rootdir", str(tmp_path), str(tmp_path)]
-    environment = os.environ | {"HAL_TEST_STRICT": strict}
+    environment = os.environ | {"HAL_TEST_STRICT": strict, "PYTHONPATH": str(CONFTEST.parent / "kits")}
     result = subprocess.run(command, capture_output=True, text=True, timeout=60, env=environment, cwd=tmp_path)
     assert expected in result.stdout
     assert all(reason in result.stdout for reason in ("needs umockdev", "needs xvfb", "no_such_library"))

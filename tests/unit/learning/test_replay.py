@@ -81,7 +81,7 @@ def episode() -> Recorded:
 # How it goes.
 
 
-@pytest.mark.parametrize("driver", ["mock", "pybullet"])
+@pytest.mark.parametrize("driver", ["mock", "simulation"])
 @pytest.mark.parametrize("speed", [1.0, 0.5])
 def test_a_replay_is_where_the_recording_was(driver: str, speed: float) -> None:
     episode = record(driver)
@@ -105,8 +105,8 @@ def test_a_replay_is_where_the_recording_was(driver: str, speed: float) -> None:
 
 
 def test_objects_are_put_back_to_their_recorded_poses() -> None:
-    episode = record("pybullet", seconds=1.0, cube=hal.Pose([0.15, 0.2, 0.63]))
-    with opened("pybullet") as rig:
+    episode = record("simulation", seconds=1.0, cube=hal.Pose([0.15, 0.2, 0.63]))
+    with opened("simulation") as rig:
         arm = rig.robots["panda"]
         away = rig.world.pose("cube").position[:2] - [0.15, 0.2]
         assert np.linalg.norm(away) > 0.05

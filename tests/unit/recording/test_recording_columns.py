@@ -6,7 +6,6 @@ import re
 from pathlib import Path
 
 import numpy as np
-import pytest
 from recording_kit import check_layout, mock_rig
 
 import hal
@@ -49,7 +48,6 @@ def test_every_column_is_in_the_documentation() -> None:
 
 
 def test_an_object_that_is_taken_away_is_not_known_any_more(tmp_path: Path) -> None:
-    pytest.importorskip("pybullet", reason="pip install 'robot-hal[sim]'")
     with (
         hal.open("panda_table", sim=True, clock="lock_step", pad="none", overrides=["cameras={}"]) as rig,
         Recorder(rig, tmp_path / "out") as recorder,

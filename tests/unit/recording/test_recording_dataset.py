@@ -259,7 +259,6 @@ def test_the_package_imports_without_its_libraries() -> None:
 
 
 def test_infrared_and_segmentation_are_recorded_on_request(tmp_path: Path) -> None:
-    pytest.importorskip("pybullet", reason="pip install 'robot-hal[sim]'")
     out, streams = tmp_path / "out", "[color, depth, infrared, segmentation]"
     overrides = [*small(), f"cameras.scene.streams={streams}"]
     drawn = []

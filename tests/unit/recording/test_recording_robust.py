@@ -294,7 +294,6 @@ def test_a_camera_that_is_named_twice_is_kept_once(rig: Rig, out: Path) -> None:
 
 
 def test_an_object_whose_name_can_be_no_column(out: Path) -> None:
-    pytest.importorskip("pybullet", reason="pip install 'robot-hal[sim]'")
     with hal.open("panda_table", sim=True, clock="lock_step", pad="none", overrides=["cameras={}"]) as rig:
         rig.world.add(hal.BodySpec("ball/1", (0, 0, 1), (0, 0, 0, 1), "sphere", radius=0.03, mass=0.1))
         with raises_code(CommandError, "bad_name"):

@@ -44,6 +44,7 @@ def test_primitives_have_their_size_and_colour(shape: str, size: tuple[float, ..
 
 
 def test_meshes_of_an_arm_keep_their_pose_and_colours() -> None:
+    pytest.importorskip("pybullet_data")
     links = read_urdf(Path(panda().urdf)).links
     (link,) = links["panda_link1"].visuals
     scene = loaded(link)
