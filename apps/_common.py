@@ -26,8 +26,10 @@ __all__ = [
     "add_config_options",
     "add_deadman_options",
     "add_driving_options",
+    "add_episode_options",
     "add_rig_options",
     "check_driving_options",
+    "check_episode_options",
     "check_everything",
     "check_one_robot",
     "check_report",
@@ -131,6 +133,66 @@ def config_options(args: argparse.Namespace) -> dict[str, Any]:
     return {"config": args.config, "sim": args.sim, "engine": args.engine, "overrides": args.overrides}
 
 
+def add_episode_options(group: argparse._ArgumentGroup) -> None:
+    """Add the options of a program in which a policy drives episodes."""
+    group.add_argument("--robot", metavar="NAME", help="arm to drive (default: the first)")
+    group.add_argument(
+        "--rate", type=float, default=20.0, metavar="HZ", help="calls of the policy per second (%(default)g)"
+    )
+    group.add_argument(
+        "--history", type=int, default=1, metavar="N", help="observations passed to each call (%(default)s)"
+    )
+    group.add_argument("--episodes", type=int, default=1, metavar="N", help="number of episodes (%(default)s)")
+    group.add_argument("--seconds", type=float, default=30.0, metavar="S", help="length of an episode (%(default)g)")
+    group.add_argument(
+        "--seed",
+        type=int,
+        default=0,
+        metavar="N",
+        help="object placement seed of the first episode; each next one adds 1 (0)",
+    )
+    group.add_argument(
+        "--reset", metavar="MODULE:NAME", help="function of the rig and a random generator, called after each reset"
+    )
+    group.add_argument(
+        "--success",
+        metavar="MODULE:NAME",
+        help="function of the rig and an observation; True ends an episode as a success",
+    )
+    group.add_argument("--fps", type=int, default=30, metavar="N", help="frame rate of the recording (%(default)s)")
+    group.add_argument("--task", default="", metavar="TEXT", help="task, saved with each episode")
+    group.add_argument("--report", metavar="FILE", help="write the results to a JSON file")
+
+
+def check_episode_options(args: argparse.Namespace, *places: str) -> None:
+    """Check the options of :func:`add_episode_options`, and import the functions that options name.
+
+    Modules are also looked for in the working directory.
+
+    Args:
+        args: The parsed options.
+        places: Options that name a ``MODULE:NAME``.
+
+    Raises:
+        CommandError: A number is out of range, or a function cannot be imported.
+    """
+    from hal.errors import CommandError
+    from hal.learning.policy import load_object
+
+    for name in ("rate", "episodes", "seconds", "history"):
+        if not getattr(args, name) > 0:
+            raise CommandError(f"--{name} must be positive, not {getattr(args, name):g}")
+    if args.seed < 0:
+        raise CommandError(f"--seed must be 0 or more, not {args.seed}")
+    check_one_robot(args)
+    check_report(args.report)
+    if os.getcwd() not in sys.path:
+        sys.path.insert(0, os.getcwd())
+    for what in places:
+        if getattr(args, what):
+            load_object(getattr(args, what), f"--{what}")
+
+
 def rig_options(args: argparse.Namespace) -> dict[str, Any]:
     """Return the arguments of :func:`hal.open` for the options of :func:`add_rig_options`."""
     return {
@@ -146,13 +208,16 @@ def rig_options(args: argparse.Namespace) -> dict[str, Any]:
 # Before a rig is opened.
 
 
-def resolve_plan(args: argparse.Namespace, *details: str, cameras: Iterable[str] = ()) -> Plan | None:
+def resolve_plan(
+    args: argparse.Namespace, *details: str, cameras: Iterable[str] = (), clock: str | None = None
+) -> Plan | None:
     """Resolve the rig that the options name.
 
     Args:
         args: Options of :func:`add_rig_options`, and ``robot``.
         details: Further lines to print with ``--dry-run``.
         cameras: Names of cameras that must exist.
+        clock: ``real_time`` or ``lock_step``, whatever the rig file has; None for the rig's.
 
     Returns:
         The plan; None after ``--dry-run``, for which everything was checked and listed.
@@ -166,7 +231,7 @@ def resolve_plan(args: argparse.Namespace, *details: str, cameras: Iterable[str]
     from hal.config.files import nearest
     from hal.errors import DeviceNotFound
 
-    plan = load(**config_options(args)).resolve()
+    plan = load(**config_options(args), clock=clock).resolve()
     robots = [robot.name for robot in plan.robots]
     for name in robot_names(args):
         if name not in robots:

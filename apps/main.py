@@ -24,6 +24,7 @@ PROGRAMS = {
     "review": "view, check and repair a dataset",
     "replay": "replay a recorded episode",
     "rollout": "run a policy and count its successes",
+    "generate": "generate a dataset in simulation, on several workers",
     "export": "convert a dataset for training",
     "calibrate": "measure where a camera is",
     "import-ark": "convert a configuration of Ark",

@@ -8,13 +8,19 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
 import sys
 import traceback
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from hal.apps._common import ACTION_NEEDED, add_deadman_options, add_rig_options, rig_options, run_app
+from hal.apps._common import (
+    ACTION_NEEDED,
+    add_deadman_options,
+    add_episode_options,
+    add_rig_options,
+    rig_options,
+    run_app,
+)
 
 if TYPE_CHECKING:
     from hal.config.mapping import TeleopMapping
@@ -45,35 +51,9 @@ def parser() -> argparse.ArgumentParser:
         metavar="MODULE:NAME",
         help="policy: a function, or a class whose instances are called",
     )
-    run.add_argument("--robot", metavar="NAME", help="arm to drive (default: the first)")
-    run.add_argument(
-        "--rate", type=float, default=20.0, metavar="HZ", help="calls of the policy per second (%(default)g)"
-    )
-    run.add_argument(
-        "--history", type=int, default=1, metavar="N", help="observations passed to each call (%(default)s)"
-    )
-    run.add_argument("--episodes", type=int, default=1, metavar="N", help="number of episodes (%(default)s)")
-    run.add_argument("--seconds", type=float, default=30.0, metavar="S", help="length of an episode (%(default)g)")
-    run.add_argument(
-        "--seed",
-        type=int,
-        default=0,
-        metavar="N",
-        help="object placement seed of the first episode; each next one adds 1 (0)",
-    )
-    run.add_argument(
-        "--reset", metavar="MODULE:NAME", help="function of the rig and a random generator, called after each reset"
-    )
-    run.add_argument(
-        "--success",
-        metavar="MODULE:NAME",
-        help="function of the rig and an observation; True ends an episode as a success",
-    )
+    add_episode_options(run)
     add_deadman_options(run)
     run.add_argument("--out", metavar="DIR", help="dataset to record into")
-    run.add_argument("--fps", type=int, default=30, metavar="N", help="frame rate of the recording (%(default)s)")
-    run.add_argument("--task", default="", metavar="TEXT", help="task, saved with each episode")
-    run.add_argument("--report", metavar="FILE", help="write the results to a JSON file")
     return made
 
 
@@ -84,24 +64,12 @@ def main(argv: list[str] | None = None) -> int:
 
 def _main(args: argparse.Namespace) -> int:
     import hal
-    from hal.apps._common import check_one_robot, check_report, find_deadman, needs_deadman, resolve_plan
+    from hal.apps._common import check_episode_options, find_deadman, needs_deadman, resolve_plan
     from hal.apps._display import banner, list_links
     from hal.apps.check import may_open
     from hal.errors import CommandError
-    from hal.learning.policy import load_object
 
-    for name in ("rate", "episodes", "seconds", "history"):
-        if not getattr(args, name) > 0:
-            raise CommandError(f"--{name} must be positive, not {getattr(args, name):g}")
-    if args.seed < 0:
-        raise CommandError(f"--seed must be 0 or more, not {args.seed}")
-    check_one_robot(args)
-    check_report(args.report)
-    if os.getcwd() not in sys.path:
-        sys.path.insert(0, os.getcwd())
-    for what in ("policy", "reset", "success"):
-        if getattr(args, what):
-            load_object(getattr(args, what), f"--{what}")
+    check_episode_options(args, "policy", "reset", "success")
     plan = resolve_plan(args, f"policy   {args.policy}")
     if plan is None:
         return 0

@@ -31,6 +31,7 @@ __all__ = [
     "PolicyOutcome",
     "Policy",
     "PolicyRunner",
+    "is_made_with_rig",
     "load_object",
     "load_policy",
 ]
@@ -79,6 +80,14 @@ def load_object(place: str, what: str) -> Any:
     return target
 
 
+def is_made_with_rig(target: Any) -> bool:
+    """Return whether a policy is a class whose constructor takes an argument, the rig."""
+    if not isinstance(target, type):
+        return False
+    parameters = inspect.signature(target).parameters.values()
+    return any(p.kind in (p.POSITIONAL_ONLY, p.POSITIONAL_OR_KEYWORD) for p in parameters)
+
+
 def load_policy(place: str, rig: Rig) -> Policy:
     """Return the policy at ``module:name``.
 
@@ -89,9 +98,7 @@ def load_policy(place: str, rig: Rig) -> Policy:
     """
     target: Any = load_object(place, "policy")
     if isinstance(target, type):
-        parameters = inspect.signature(target).parameters.values()
-        takes = [p for p in parameters if p.kind in (p.POSITIONAL_ONLY, p.POSITIONAL_OR_KEYWORD)]
-        target = cast(Any, target)(*([rig] if takes else []))
+        target = cast(Any, target)(*([rig] if is_made_with_rig(target) else []))
         if not callable(target):
             raise CommandError(
                 f"policy {place!r}: an object of this class cannot be called; give it a __call__", code="not_callable"

@@ -1,4 +1,4 @@
-"""Recordings of demonstrations: a crash-safe recorder, recovery after a crash, and a reader.
+"""Recordings of demonstrations: a crash-safe recorder, recovery after a crash, a reader, and merging of datasets.
 
     from hal.recording import Dataset, Recorder, recover
 
@@ -22,15 +22,17 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from .dataset import Dataset, Episode
     from .finish import recover, repair
+    from .merging import merge
     from .recorder import Recorder, RecorderStatus
 
-__all__ = ["Dataset", "Episode", "Recorder", "RecorderStatus", "recover", "repair"]
+__all__ = ["Dataset", "Episode", "Recorder", "RecorderStatus", "merge", "recover", "repair"]
 
 _HOME = {
     "Dataset": "dataset",
     "Episode": "dataset",
     "Recorder": "recorder",
     "RecorderStatus": "recorder",
+    "merge": "merging",
     "recover": "finish",
     "repair": "finish",
 }

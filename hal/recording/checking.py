@@ -30,6 +30,7 @@ __all__ = [
     "check_dataset",
     "check_index",
     "check_rows",
+    "format_differences",
 ]
 
 
@@ -229,6 +230,14 @@ def check_compatible(
         raise CommandError(
             f"the dataset in {root} has another format: {'; '.join(found)}; choose a new folder", code="other_dataset"
         )
+
+
+def format_differences(there: Mapping[str, Any], here: Mapping[str, Any]) -> list[str]:
+    """Return the differences in columns, videos, rate and arms of two datasets, from their ``meta/info.json``."""
+    return [
+        *_settings(there, here["fps"], here.get("robot_type") or ""),
+        *_features(there["features"], here["features"]),
+    ]
 
 
 def _settings(info: Mapping[str, Any], fps: int, robot_type: str) -> Iterator[str]:

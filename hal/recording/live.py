@@ -102,6 +102,11 @@ class RowQueue:
         """Whether there is no free slot."""
         return self._ring.is_full
 
+    @property
+    def is_half_full(self) -> bool:
+        """Whether more than half of the slots are waiting."""
+        return 2 * self._ring.waiting > len(self._ring.slots)
+
     def open_slot(self) -> RowSlot:
         """Return the free slot to be filled; call it only if the queue is not full."""
         return self._slots[id(self._ring.open_slot())]

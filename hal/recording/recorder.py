@@ -129,9 +129,8 @@ class Recorder:
         self.task = task
         """Task of the next episodes."""
         self.root = DatasetLayout(out).root
-        self._sampler, self._buffers, self.notes = select_devices(
-            rig, cameras, [stream for stream in streams if depth or stream != "depth"]
-        )
+        self._selected = cameras, [stream for stream in streams if depth or stream != "depth"]
+        self._sampler, self._buffers, self.notes = select_devices(rig, *self._selected)
         """Messages for the operator: streams that are not recorded, episodes that were recovered."""
         self._warn_free = warn_free
         setups = [buffer.setup for buffer in self._buffers]
@@ -191,6 +190,28 @@ class Recorder:
         """Number of finished episodes in the dataset."""
         info = read_index(DatasetLayout(self.root))
         return int(info["total_episodes"]) if info is not None else 0
+
+    def switch_rig(self, rig: Rig) -> None:
+        """Record another rig of the same configuration from the next episode on, with the same writer's process.
+
+        Args:
+            rig: An open rig. The one before may be closed.
+
+        Raises:
+            CommandError: An episode is open (code ``episode_open``), or the rig has other columns or cameras
+                (``other_rig``).
+            StaleStateError: An arm or an object has no current state.
+            ConnectionLost: A device is lost.
+        """
+        with self._lock:
+            if self._is_open:
+                raise CommandError("save or discard the episode before switching rigs", code="episode_open")
+            self.wait_saved()
+            sampler, buffers, _ = select_devices(rig, *self._selected)
+            setups = [[buffer.setup for buffer in each] for each in (buffers, self._buffers)]
+            if sampler.columns != self._sampler.columns or setups[0] != setups[1]:
+                raise CommandError("this rig has other columns or cameras than the recorder's", code="other_rig")
+            self.rig, self._sampler, self._buffers = rig, sampler, buffers
 
     def start(self, seed: int | None = None, info: Mapping[str, Any] | None = None) -> None:
         """Start an episode. Blocks while the previous one is still being saved.
@@ -429,7 +450,8 @@ class EpisodeRecorder:
         for buffer, images in zip(self._buffers, slot.images, strict=True):
             buffer.copy_into(frames[buffer.camera.name], images)
         self._queue.publish()
-        self._child.notify("row", timeout=_NOTIFY_TIMEOUT)
+        if not self._lock_step or self._queue.is_half_full:  # in lock-step rows come fast: wake the writer for several
+            self._child.notify("row", timeout=_NOTIFY_TIMEOUT)
         self.frames += 1
         self.seconds = t - self.clock.start_time
         self.dropped.row_made()

@@ -32,7 +32,7 @@ def test_a_point_cloud_shows_the_table_where_it_is(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("seed", ["0", "1", "2"])
 def test_the_cube_is_picked_up_wherever_it_lies(tmp_path: Path, seed: str) -> None:
-    assert "held: True" in run("pick.py", tmp_path, seed)
+    assert "lifted: True" in run("pick.py", tmp_path, seed)
 
 
 def test_random_scenes_have_pictures_and_true_poses(tmp_path: Path) -> None:

@@ -1,0 +1,237 @@
+"""Generate a dataset in simulation: seeded episodes of a policy or a scripted skill, on several workers at once.
+
+python apps/generate.py --skill examples.pick:pick --episodes 200 --workers 4 --out data/picks
+python apps/generate.py --policy my_policy:Act --success my_task:done --episodes 1000 --workers 8 --out data/eval
+python apps/generate.py --skill my_skill:stack --episodes 10000 --workers 64 --ray auto --out /shared/stack
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import json
+import sys
+import time
+from collections import Counter
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from hal.apps._common import add_config_options, add_episode_options, config_options, run_app
+
+if TYPE_CHECKING:
+    from hal.apps._display import StatusLine
+    from hal.learning.episode_worker import EpisodeRecipe, EpisodeResult
+    from hal.learning.generate import GenerateProgress
+    from hal.specs import Plan
+
+__all__ = ["main", "parser"]
+
+_PERIOD = 10.0
+"""Time between two lines of progress if the output is not a terminal, s."""
+EXAMPLES = """\
+examples:
+  hal-generate --skill examples.pick:pick --episodes 200 --workers 2 --out data/picks
+  hal-generate --policy my_policy:Act --success my_task:done --episodes 1000 --workers 8 --out data/eval
+  hal-generate --skill my_skill:stack --episodes 10000 --workers 64 --ray auto --out /shared/stack
+
+The same command continues an interrupted run, and with a larger --episodes extends a dataset. Episode k has the seed
+--seed + k, and the same rows whatever the number of workers. Until it is complete, the workers' datasets are in
+OUT.parts. The exit status is 0 if the dataset is complete.
+"""
+
+
+def parser() -> argparse.ArgumentParser:
+    """Return the parser of the command line."""
+    made = argparse.ArgumentParser(
+        prog="generate",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        description="Generate a dataset in simulation, in lock-step, on several workers at once.",
+        epilog=EXAMPLES,
+    )
+    rig = add_config_options(made)
+    rig.add_argument("--dry-run", action="store_true", help="check everything and list the devices; open nothing")
+    run = made.add_argument_group("running")
+    what = run.add_mutually_exclusive_group(required=True)
+    what.add_argument(
+        "--policy", default="", metavar="MODULE:NAME", help="policy: a function, or a class; see docs/evaluate.md"
+    )
+    what.add_argument(
+        "--skill",
+        default="",
+        metavar="MODULE:NAME",
+        help="function of the rig and a random generator that drives by itself and returns whether it succeeded",
+    )
+    add_episode_options(run)
+    run.add_argument("--out", required=True, metavar="DIR", help="dataset to generate")
+    run.add_argument("--cameras", metavar="NAMES", help="cameras to record, or none (default: all)")
+    run.add_argument(
+        "--streams", default="color,depth", metavar="NAMES", help="streams to record of the cameras (%(default)s)"
+    )
+    run.add_argument("--codec", choices=["auto", "h264", "av1"], default="auto", help="video codec (%(default)s)")
+    where = made.add_argument_group("workers")
+    where.add_argument("--workers", type=int, default=1, metavar="N", help="number of workers (%(default)s)")
+    where.add_argument(
+        "--ray",
+        metavar="ADDRESS",
+        help="run the workers on the Ray cluster at this address (auto: the one this computer belongs to; local: start "
+        "one on this computer); its nodes need this package, your modules and the folder --out",
+    )
+    return made
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run the program; return the exit status."""
+    return run_app(_main, parser(), argv)
+
+
+def _main(args: argparse.Namespace) -> int:
+    from contextlib import ExitStack
+
+    from hal.apps._common import check_episode_options, resolve_plan
+    from hal.apps._display import StatusLine, list_devices
+    from hal.errors import CommandError
+    from hal.learning.generate import LocalWorker, StartWorker, generate, parts_folder
+    from hal.recording.layout import require_libraries
+
+    check_episode_options(args, "policy", "skill", "reset", "success")
+    if args.workers < 1:
+        raise CommandError(f"--workers must be 1 or more, not {args.workers}")
+    args.pad, args.viewer, args.console, args.listen = "none", "none", False, None
+    cameras = _names(args.cameras)
+    where = f"the Ray cluster {args.ray}" if args.ray else "this computer"
+    details = (
+        f"{'skill ' if args.skill else 'policy'}   {args.skill or args.policy}",
+        f"dataset  {args.out}: {args.episodes} episode(s), {args.workers} worker(s) on {where}",
+    )
+    plan = resolve_plan(args, *details, cameras=cameras or (), clock="lock_step")
+    require_libraries()
+    if plan is None:
+        return 0
+    _check_plan(plan)
+    print("\n".join(f"  {line}" for line in [f"rig      {plan.source}", *list_devices(plan), *details]), flush=True)
+    line = StatusLine()
+    with ExitStack() as cluster:
+        start_worker: StartWorker = LocalWorker
+        if args.ray:
+            from hal.learning.ray_workers import RayCluster
+
+            start_worker = cluster.enter_context(RayCluster(args.ray, args.workers)).start_worker
+        try:
+            made = generate(
+                _recipe(args, plan, cameras),
+                args.out,
+                args.episodes,
+                workers=args.workers,
+                start_worker=start_worker,
+                on_progress=_show_progress(line),
+                on_event=lambda text: line.event(f"  {text}"),
+            )
+        except BaseException:
+            line.clear()
+            if parts_folder(args.out).is_dir():
+                print(f"  finished episodes are in {parts_folder(args.out)}; the same command continues", flush=True)
+            raise
+    line.clear()
+    _print_results(args, made)
+    return 0
+
+
+def _names(text: str | None) -> list[str] | None:
+    if text is None:
+        return None
+    return [] if text == "none" else [name.strip() for name in text.split(",") if name.strip()]
+
+
+def _check_plan(plan: Plan) -> None:
+    """Raise CommandError for a rig that cannot run in lock-step, without anyone present."""
+    from hal.errors import CommandError
+
+    if plan.attended:
+        raise CommandError(
+            f"{plan.source} has a real arm; episodes are generated in simulation only: add --sim", code="attended"
+        )
+    if not plan.robots:
+        raise CommandError(f"{plan.source} has no robot", code="no_robot")
+
+
+def _recipe(args: argparse.Namespace, plan: Plan, cameras: list[str] | None) -> EpisodeRecipe:
+    from hal.learning.episode_worker import EpisodeRecipe
+    from hal.specs import to_json
+
+    config = str(Path(args.config).resolve()) if Path(args.config).is_file() else args.config
+    resolved = {key: value for key, value in to_json(plan).items() if key not in ("pads", "clock")}
+    return EpisodeRecipe(
+        rig=config_options(args) | {"config": config, "engine": plan.engine},
+        policy=args.policy,
+        skill=args.skill,
+        reset=args.reset or "",
+        success=args.success or "",
+        robot=args.robot or "",
+        rate_hz=args.rate,
+        history=args.history,
+        seconds=args.seconds,
+        seed=args.seed,
+        fps=args.fps,
+        task=args.task,
+        cameras=cameras,
+        streams=_names(args.streams) or [],
+        codec=args.codec,
+        plan=hashlib.sha256(json.dumps(resolved, sort_keys=True, default=str).encode()).hexdigest()[:16],
+    )
+
+
+def _show_progress(line: StatusLine) -> Callable[[GenerateProgress], None]:
+    """Return a function that shows the progress: in the terminal's last line, or else in a line every 10 s."""
+    next_line = time.monotonic() + _PERIOD
+
+    def show(progress: GenerateProgress) -> None:
+        nonlocal next_line
+        if sys.stdout.isatty():
+            line.update(lambda: f"  {describe(progress)}")
+        elif time.monotonic() >= next_line:
+            next_line = time.monotonic() + _PERIOD
+            line.event(f"  {describe(progress)}")
+
+    return show
+
+
+def describe(progress: GenerateProgress) -> str:
+    """Return the progress in one line."""
+    parts = [f"{progress.done} of {progress.total} episodes"]
+    if progress.left is not None:
+        minutes, seconds = divmod(round(progress.left), 60)
+        parts += [f"{progress.rate:.2f}/s", f"{minutes // 60}:{minutes % 60:02d}:{seconds:02d} left"]
+    if progress.judged:
+        share = 100 * progress.succeeded / progress.judged
+        parts.append(f"{progress.succeeded} succeeded ({share:.0f} % of {progress.judged})")
+    if progress.restarts:
+        parts.append(f"{progress.restarts} worker(s) replaced")
+    return ", ".join(parts)
+
+
+def _print_results(args: argparse.Namespace, made: list[EpisodeResult]) -> None:
+    """Print the results, and write the report."""
+    from hal.recording import Dataset
+
+    dataset = Dataset(args.out)
+    marks = [episode.success for episode in dataset.episodes]
+    judged = [mark for mark in marks if mark is not None]
+    rate = f", {sum(judged)} of {len(judged)} succeeded" if judged else ""
+    new = f" ({len(made)} new)" if len(made) < len(marks) else ""
+    print(f"  {dataset.root}: {len(marks)} episodes{new}, {dataset.info['total_frames']} rows{rate}")
+    for reason, count in Counter(result.reason for result in made if result.reason).most_common(5):
+        print(f"    {count} stopped: {reason}")
+    if args.report:
+        report: dict[str, Any] = {
+            "out": str(dataset.root),
+            "workers": args.workers,
+            "episodes": len(marks),
+            "succeeded": sum(judged),
+            "made": [vars(result) for result in made],
+        }
+        Path(args.report).write_text(json.dumps(report, indent=2) + "\n")
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,135 @@
+"""``hal-generate`` as a program: workers and the program itself are killed, and the rows are those of one worker.
+
+Three kills here; HAL_GENERATE_KILLS=20 does more.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from recording_layout import check_layout
+
+from hal.recording import Dataset
+
+ROOT = Path(__file__).resolve().parents[2]
+KILLS = int(os.environ.get("HAL_GENERATE_KILLS", "3"))
+EPISODES = 8
+
+
+def command(out: Path, *more: str) -> list[str]:
+    """Return the command line of a run; its seconds are simulated."""
+    program = [sys.executable, str(ROOT / "apps" / "generate.py"), "--skill", "pick:pick", "--sim", "--fps", "15"]
+    return [*program, "--set", "cameras={}", "--episodes", str(EPISODES), "--out", str(out), *more]
+
+
+def start(out: Path, *more: str) -> subprocess.Popen[str]:
+    return subprocess.Popen(command(out, *more), cwd=ROOT / "examples", stdout=subprocess.PIPE, text=True)
+
+
+@pytest.fixture(scope="module")
+def expected(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The dataset that one worker generates."""
+    out = tmp_path_factory.mktemp("one") / "out"
+    app = start(out)
+    assert app.wait(100.0) == 0
+    return out
+
+
+def check_same(out: Path, expected: Path) -> None:
+    """Check that a dataset has every episode once, with the expected rows, and that nothing else is left."""
+    check_layout(out)
+    found, wanted = Dataset(out).episodes, Dataset(expected).episodes
+    assert [episode.info["seed"] for episode in found] == list(range(EPISODES))
+    for one, other in zip(found, wanted, strict=True):
+        assert one.success, "the cube was lifted"
+        for key, values in other.columns.items():
+            assert one.columns[key].tobytes() == values.tobytes(), (one.number, key)
+    assert (out / "meta/stats.json").read_bytes() == (expected / "meta/stats.json").read_bytes()
+    assert [path.name for path in out.parent.iterdir()] == [out.name]
+
+
+def workers(pid: int) -> list[int]:
+    """Return the child processes of a program."""
+    found = []
+    for stat in Path("/proc").glob("[0-9]*/stat"):
+        try:
+            fields = stat.read_text().rpartition(")")[2].split()
+        except OSError:
+            continue
+        if int(fields[1]) == pid and fields[0] != "Z":
+            found.append(int(stat.parent.name))
+    return found
+
+
+def saved(out: Path) -> int:
+    return len(list(out.with_name("out.parts").glob("worker-*/episodes/*.json")))
+
+
+def wait_for_episodes(app: subprocess.Popen[str], out: Path, count: int) -> None:
+    deadline = time.monotonic() + 60.0
+    while saved(out) < count and app.poll() is None:
+        assert time.monotonic() < deadline, "no episode was saved"
+        time.sleep(0.01)
+
+
+@pytest.mark.slow
+def test_killed_workers_lose_and_double_nothing(tmp_path: Path, expected: Path) -> None:
+    out = tmp_path / "out"
+    app = start(out, "--workers", "2")
+    kills = 0
+    while kills < KILLS and app.poll() is None:
+        wait_for_episodes(app, out, 1 + 2 * kills)
+        for pid in workers(app.pid)[:1]:
+            os.kill(pid, signal.SIGKILL)
+            kills += 1
+        time.sleep(0.3)
+    printed, _ = app.communicate(timeout=100.0)
+    assert app.returncode == 0, printed
+    assert kills == KILLS
+    assert "which is made again" in printed
+    check_same(out, expected)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM])
+def test_an_interrupted_run_continues_and_its_workers_end(tmp_path: Path, expected: Path, number: int) -> None:
+    out = tmp_path / "out"
+    app = start(out, "--workers", "2")
+    wait_for_episodes(app, out, 2)
+    children = workers(app.pid)
+    assert len(children) == 2
+    app.send_signal(number)
+    app.wait(20.0)
+    deadline = time.monotonic() + 10.0
+    while any(Path(f"/proc/{pid}").exists() for pid in children):
+        assert time.monotonic() < deadline, "a worker outlives the program"
+        time.sleep(0.05)
+    assert not out.exists()
+    before = saved(out)
+    assert before >= 2
+    done = subprocess.run(command(out), cwd=ROOT / "examples", capture_output=True, text=True, timeout=100.0)
+    assert done.returncode == 0, done.stderr
+    assert "new)" in done.stdout, "the finished episodes were kept"
+    check_same(out, expected)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(importlib.util.find_spec("ray") is None, reason="pip install 'robot-hal[ray]'")
+def test_a_ray_cluster_makes_the_same_rows(tmp_path: Path, expected: Path) -> None:
+    out = tmp_path / "out"
+    done = subprocess.run(
+        command(out, "--workers", "2", "--ray", "local"),
+        cwd=ROOT / "examples",
+        capture_output=True,
+        text=True,
+        timeout=110.0,
+    )
+    assert done.returncode == 0, done.stderr
+    check_same(out, expected)
