@@ -10,7 +10,7 @@ import signal
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -50,7 +50,14 @@ PATIENCE = 20.0
 class Bench:
     """A simulated rig that its console drives, with the teleoperation app's own loop in a thread."""
 
-    def __init__(self, cameras: bool = False, rig: Any = "panda_table", listen: str = ":0", **options: Any) -> None:
+    def __init__(
+        self,
+        cameras: bool = False,
+        rig: Any = "panda_table",
+        listen: str = ":0",
+        robots: Sequence[str] = (),
+        **options: Any,
+    ) -> None:
         self.args = parser().parse_args(["--sim"])
         overrides = [] if cameras else ["cameras={}"]
         self.rig = hal.open(rig, sim=True, pad="web", listen=listen, overrides=overrides, **options)
@@ -58,7 +65,7 @@ class Bench:
         assert self.rig.console is not None
         self.console = self.rig.console
         self.link = self.console.link
-        self.app = TeleopRun(self.rig, [self.arm], self.args)
+        self.app = TeleopRun(self.rig, [self.rig.robots[name] for name in robots] or [self.arm], self.args)
         self.session = self.app.session
         self._silences: list[float] = []
         self._alive = math.inf

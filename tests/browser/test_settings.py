@@ -22,11 +22,28 @@ TWO_ARMS = {
 }
 
 
+TWO_PADS = TWO_ARMS | {
+    "gamepads": {
+        "left_pad": {"model": "auto", "drives": "left"},
+        "right_pad": {"model": "auto", "drives": "right"},
+    },
+}
+
+
 @pytest.fixture(scope="module")
 def bench() -> Iterator[Bench]:
     """Two arms; which one is driven shows in the page."""
     need_browser()
     bench = Bench(rig=TWO_ARMS)
+    yield bench
+    bench.close()
+
+
+@pytest.fixture
+def two_pads() -> Iterator[Bench]:
+    """Two arms and two pads, both of which are the page."""
+    need_browser()
+    bench = Bench(rig=TWO_PADS, robots=("left", "right"))
     yield bench
     bench.close()
 
@@ -70,6 +87,19 @@ def held_key(page: Browser, code: str, key: str) -> Iterator[None]:
         yield
     finally:
         page.key(code, key, False)
+
+
+def test_with_two_pads_the_page_drives_the_chosen_arm_alone(two_pads: Bench, browser: Browser) -> None:
+    assert sum("one pad" in note for note in two_pads.rig.notes) == 1
+    browser.open(two_pads.link)
+    browser.wait_driving()
+    wait_for(lambda: not two_pads.session.pad.waiting_for, "the pad to be at rest")
+    wait_for(lambda: names_the_driven(browser, "left"), "the page to name the driven arm")
+    drive_up(two_pads, browser, "left")
+    choose(browser, "right")
+    wait_for(lambda: names_the_driven(browser, "right"), "the page to name the other arm")
+    wait_until_released(two_pads)
+    drive_up(two_pads, browser, "right")
 
 
 def test_the_arm_that_is_chosen_is_the_arm_that_moves(bench: Bench, page: Browser) -> None:

@@ -1,7 +1,8 @@
 """Emulated Damiao motors: registers, MIT mode, watchdog, faults and temperatures, on the mechanics of an arm.
 
-What the manuals leave open is assumed: a motor without communication damps as if its windings were shorted; one with
-another fault applies no torque; only frames at a motor's own id feed its watchdog.
+What public sources leave open is assumed: a motor without communication damps as if its windings were shorted (I2RT
+calls it damping, Damiao's manual says that the motor leaves its enabled mode); one with another fault applies no
+torque; only frames at a motor's own id feed its watchdog.
 """
 
 from __future__ import annotations
