@@ -19,10 +19,10 @@ from dataclasses import replace
 from pathlib import Path
 
 from hal.config import load
-from hal.drivers.pybullet.camera import TinyRenderer
-from hal.drivers.pybullet.exposure import camera_pose
-from hal.drivers.pybullet.renderer import GLRenderer, Renderer
-from hal.drivers.pybullet.world import PyBulletWorld
+from hal.drivers.scene.camera import choose_renderer
+from hal.drivers.scene.drawn import DrawnWorld
+from hal.drivers.scene.exposure import camera_pose
+from hal.drivers.scene.renderer import Renderer
 from hal.specs import CameraSpec
 
 SIZES = ((256, 256), (640, 480), (1280, 720))
@@ -43,7 +43,7 @@ def sized(camera: CameraSpec, width: int, height: int) -> CameraSpec:
     return replace(camera, width=width, height=height, K=K, streams=("color", "depth"))
 
 
-def timed(renderer: Renderer, world: PyBulletWorld, camera: CameraSpec) -> float:
+def timed(renderer: Renderer, world: DrawnWorld, camera: CameraSpec) -> float:
     """Return the time of one frame, ms."""
     start = time.perf_counter()
     renderer.render(camera, camera_pose(world, camera))
@@ -68,8 +68,12 @@ def main() -> None:
 
     plan = load(arguments.config, sim=True).resolve()
     assert plan.world is not None
-    world = PyBulletWorld(plan.world)
-    renderers: dict[str, Renderer] = {"OpenGL": GLRenderer(world), "PyBullet's own": TinyRenderer(world)}
+    world = DrawnWorld(plan.world)
+    renderers: dict[str, Renderer] = {
+        "OpenGL": choose_renderer(world, "gl"),
+        "PyBullet's own": choose_renderer(world, "tiny"),
+    }
+    start = world.snapshot()  # the frames of the links are computed for each picture
     print(f"{renderers['OpenGL'].description}; RGB-D, median ms per frame, and their ratio")
     print(f"{'camera':10} {'size':>10} {'OpenGL':>10} {'own':>10} {'ratio':>7}")
     for camera in plan.cameras:
@@ -78,12 +82,12 @@ def main() -> None:
             times: dict[str, list[float]] = {name: [] for name in renderers}
             for turn in range(arguments.frames + 1):
                 for name, renderer in renderers.items():
+                    world.show(start)
                     spent = timed(renderer, world, view)
                     if turn:  # the first one makes buffers and shaders
                         times[name].append(spent)
             ours, own = (statistics.median(values) for values in times.values())
             print(f"{camera.name:10} {width:>5}x{height:<4} {ours:>10.1f} {own:>10.1f} {own / ours:>7.1f}")
-    world.close()
 
     print("\nfirst frame of every camera, s after hal.open was called (goal: 5 without the cache, 2 with it)")
     for clock in ("lock_step", "real_time"):

@@ -1,7 +1,7 @@
 """Time of `import hal` and of `apps/teleop.py --help`, beside an interpreter that does nothing and `import numpy`.
 
 And, in real time and without cameras, that of `hal.open`, and the memory of the process that steps the world; and what
-loading a world with and without its visual meshes takes.
+loading a world takes, and what is drawn of it.
 
 python benchmarks/start_up.py [--runs 7]
 """
@@ -49,18 +49,20 @@ WORLD = """
 import resource, sys, time
 from pathlib import Path
 from hal.config import load
-from hal.drivers.pybullet.world import PyBulletWorld
+from hal.registry import load as load_driver
+from hal.drivers.scene.drawn import DrawnWorld
 spec = load("panda_table", sim=True).resolve().world
+make = DrawnWorld if sys.argv[1] == "drawn" else load_driver(spec.driver, "world")
 start = time.perf_counter()
-world = PyBulletWorld(spec, drawn=sys.argv[1] == "drawn")
+world = make(spec)
 pages = int(Path("/proc/self/statm").read_text().split()[1])
 print(time.perf_counter() - start, pages * resource.getpagesize() / 1e6)
 """
 
 
-def load_world(how: str) -> tuple[float, float]:
-    """Return how long loading the world takes in a fresh process, s, and the memory of that process then, MB."""
-    done = subprocess.run([sys.executable, "-c", WORLD, how], check=True, capture_output=True, text=True)
+def load_world(what: str) -> tuple[float, float]:
+    """Return how long loading it takes in a fresh process, s, and the memory of that process then, MB."""
+    done = subprocess.run([sys.executable, "-c", WORLD, what], check=True, capture_output=True, text=True)
     spent, memory = map(float, done.stdout.split()[-2:])
     return spent, memory
 
@@ -76,9 +78,9 @@ def main() -> None:
         print(f"{name:28s}{statistics.median(values):10.3f}{min(values):10.3f}{max(values):10.3f}")
     opened, memory = zip(*(host_memory() for _ in range(runs)), strict=True)
     print(f"hal.open, no cameras: {statistics.median(opened):.2f} s; the world's process: {memory[-1]:.0f} MB")
-    for how in ("drawn", "not drawn"):
-        spent, memory = zip(*(load_world(how) for _ in range(runs)), strict=True)
-        print(f"loading the world, {how}: {statistics.median(spent):.2f} s; the process: {memory[-1]:.0f} MB")
+    for what in ("stepped", "drawn"):
+        spent, memory = zip(*(load_world(what) for _ in range(runs)), strict=True)
+        print(f"loading the world that is {what}: {statistics.median(spent):.2f} s; the process: {memory[-1]:.0f} MB")
 
 
 if __name__ == "__main__":

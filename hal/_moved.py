@@ -31,6 +31,17 @@ MODULES: Mapping[str, str] = MappingProxyType(
         "hal.console": "hal.views",
         "hal.course": "hal.learning.replay",
         "hal.cropping": "hal.images",
+        **{
+            f"hal.drivers.pybullet.{old}": f"hal.drivers.scene.{new}"
+            for old, new in {
+                "camera": "camera",
+                "exposure": "exposure",
+                "meshes": "meshes",
+                "mirror": "mirror",
+                "renderer": "renderer",
+                "scene": "shapes",
+            }.items()
+        },
         "hal.gripper_motion": "hal.gripper",
         "hal.gym": "hal.learning.gym",
         "hal.ik": "hal.kinematics.ik",
@@ -63,6 +74,11 @@ NAMES: Mapping[str, Mapping[str, str]] = MappingProxyType(
             "Course": "hal.learning.replay.RecordedTrajectory",
             "arms_of": "hal.learning.replay.recorded_arms",
             "moved_besides": "hal.learning.replay.other_moving_arms",
+        },
+        "hal.drivers.pybullet.camera": {
+            "PyBulletCamera": "hal.drivers.scene.camera.SimulatedCamera",
+            "PyBulletPictures": "hal.drivers.scene.camera.SimulatedPictures",
+            "TinyRenderer": "hal.drivers.pybullet.tiny.TinyRenderer",
         },
         "hal.gamepad": {name: f"hal.driver.{name}" for name in ("GamepadDriver", "Plugged")},
         "hal.gripper": {name: f"hal.driver.{name}" for name in ("GripperDriver", "GripperReading")},

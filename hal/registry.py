@@ -102,6 +102,8 @@ class DriverSpec:
     """A page with the arms in 3D: :class:`~hal.views.Viewer3D`."""
     pictures: str | None = None
     """Renderer of all simulated cameras of a rig: :class:`~hal.views.CameraRenderer`."""
+    software_renderer: str | None = None
+    """A renderer of simulated cameras that needs no OpenGL."""
     console: str | None = None
     """A page in a browser that displays a rig and drives it: :class:`~hal.views.Console`."""
     pad_input: PadInput | None = None
@@ -145,7 +147,8 @@ class DriverSpec:
         return tuple(kind for kind in _KINDS if getattr(self, kind) is not None)
 
 
-_KINDS = ("robot", "gripper", "camera", "gamepad", "world", "viewer", "viewer3d", "pictures", "console")
+_VIEWS = ("viewer", "viewer3d", "pictures", "software_renderer", "console")
+_KINDS = ("robot", "gripper", "camera", "gamepad", "world", *_VIEWS)
 
 
 def names() -> tuple[str, ...]:

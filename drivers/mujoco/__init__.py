@@ -9,5 +9,6 @@ DRIVER = DriverSpec(
     gripper="hal.drivers.mujoco.gripper:MujocoGripper",
     camera="hal.drivers.scene.camera:SimulatedCamera",
     pictures="hal.drivers.scene.camera:SimulatedPictures",
+    checks={"camera": "hal.drivers.scene.exposure:check"},
     requires={"mujoco": "pip install 'robot-hal[mujoco]'"},
 )

@@ -1,7 +1,6 @@
-"""The simulation: one PyBullet world per rig; arms, grippers and cameras are views of it.
+"""The simulation with PyBullet: one world per rig; arms and grippers are views of it.
 
-What is independent of the physics engine stands in files that do not use PyBullet: :mod:`.scene`, :mod:`.meshes`,
-:mod:`.renderer` and :mod:`.exposure`.
+What is drawn, and the cameras, are those of :mod:`hal.drivers.scene`.
 """
 
 from hal.registry import DriverSpec
@@ -11,9 +10,10 @@ DRIVER = DriverSpec(
     world="hal.drivers.pybullet.world:PyBulletWorld",
     robot="hal.drivers.pybullet.robot:PyBulletRobot",
     gripper="hal.drivers.pybullet.gripper:PyBulletGripper",
-    camera="hal.drivers.pybullet.camera:PyBulletCamera",
-    pictures="hal.drivers.pybullet.camera:PyBulletPictures",
+    camera="hal.drivers.scene.camera:SimulatedCamera",
+    pictures="hal.drivers.scene.camera:SimulatedPictures",
+    software_renderer="hal.drivers.pybullet.tiny:TinyRenderer",
     viewer="hal.drivers.pybullet.viewer:PyBulletViewer",
-    checks={"camera": "hal.drivers.pybullet.exposure:check"},
+    checks={"camera": "hal.drivers.scene.exposure:check"},
     requires={"pybullet": "pip install 'robot-hal[sim]'"},
 )

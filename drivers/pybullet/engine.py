@@ -9,30 +9,23 @@ import ctypes
 import os
 import sys
 import tempfile
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
 from hal.drivers.scene.world import SimulatedBody
 from hal.errors import DriverMissing
 from hal.geometry import Transform, compose, inverse
-
-from .scene import Visual
 
 __all__ = [
     "Body",
     "CapturedOutput",
     "Gear",
     "PyBulletClient",
-    "link_frames",
     "load_pybullet",
     "silenced",
-    "visuals_of",
 ]
 
 GEAR_SHARE = 0.8
@@ -215,70 +208,3 @@ class Body(SimulatedBody):
     def set_base_pose(self, client: PyBulletClient, pose: Transform) -> None:
         """Place the base link at ``pose`` in the world. Velocities stay."""
         client.resetBasePositionAndOrientation(self.id, *compose(pose, self.inertial))
-
-
-# --- what there is to draw -------------------------------------------------------------------------------------------
-
-
-def visuals_of(client: PyBulletClient, body: int) -> tuple[Visual, ...]:
-    """Return the visual shapes of the body with PyBullet's number ``body``."""
-    kinds = {
-        client.GEOM_MESH: "mesh",
-        client.GEOM_BOX: "box",
-        client.GEOM_SPHERE: "sphere",
-        client.GEOM_CYLINDER: "cylinder",
-        client.GEOM_CAPSULE: "capsule",
-        client.GEOM_PLANE: "plane",
-    }
-    found = []
-    for _, link, number, size, file, position, orientation, rgba, *_ in client.getVisualShapeData(body):
-        kind = kinds.get(number)
-        if kind == "sphere":
-            size = size[:1]
-        elif kind in ("cylinder", "capsule"):
-            size = (size[1], size[0])  # PyBullet gives the length first
-        if kind is not None:
-            found.append(Visual(link, kind, tuple(size), file.decode(), position, orientation, rgba))
-    return tuple(found)
-
-
-def link_frames(client: PyBulletClient, links: Sequence[tuple[int, int]]) -> NDArray[np.float64]:
-    """Return the poses (N, 4, 4) in the world of the frames of links.
-
-    Args:
-        links: (body, link) by PyBullet's numbers, -1 for a base; those of one body together.
-    """
-    wanted: dict[int, list[int]] = {}
-    for body, link in links:
-        wanted.setdefault(body, []).append(link)
-    frames: list[tuple[float, ...]] = []
-    for body, indices in wanted.items():
-        moving = [link for link in indices if link >= 0]
-        states = iter(client.getLinkStates(body, moving, computeForwardKinematics=1) if moving else ())
-        for link in indices:
-            if link >= 0:
-                state = next(states)
-                frames.append((*state[4], *state[5]))
-            else:  # PyBullet gives the base by its centre of mass
-                inertial = client.getDynamicsInfo(body, -1)[3:5]
-                centre = client.getBasePositionAndOrientation(body)
-                position, orientation = client.multiplyTransforms(*centre, *client.invertTransform(*inertial))
-                frames.append((*position, *orientation))
-    return _matrices(np.array(frames).reshape(-1, 7))
-
-
-def _matrices(poses: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return poses (N, 7), position and quaternion, as matrices (N, 4, 4)."""
-    x, y, z, w = poses[:, 3:].T
-    matrices = np.zeros((len(poses), 4, 4))
-    rows = (
-        (1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)),
-        (2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)),
-        (2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)),
-    )
-    for k, row in enumerate(rows):
-        for column, values in enumerate(row):
-            matrices[:, k, column] = values
-    matrices[:, :3, 3] = poses[:, :3]
-    matrices[:, 3, 3] = 1
-    return matrices

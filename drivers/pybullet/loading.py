@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import tempfile
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Container, Iterable, Iterator, Sequence
+from collections.abc import Container, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
+from hal.drivers.scene.drawn import PLANE
+from hal.drivers.scene.urdf_files import checked_urdf, has_free_base, massless
 from hal.drivers.scene.values import listed
 from hal.errors import ConfigError, Problem
 from hal.geometry import Transform, compose, inverse
 from hal.kinematics.mesh_files import mesh_file, mesh_near
-from hal.kinematics.urdf import UrdfMimic, UrdfModel, parse_xml, read_urdf
+from hal.kinematics.urdf import UrdfMimic, UrdfModel, parse_xml
 from hal.specs import BodySpec, RobotSpec
 
 from .engine import Body, Gear, PyBulletClient, silenced
@@ -24,8 +26,6 @@ __all__ = [
     "loadable_urdf",
 ]
 
-PLANE = (5.0, 5.0)
-"""Half extents of the part of an infinite plane that is drawn, m."""
 UNKNOWN_EFFORT = 200.0
 """Effort, Nm or N, of a joint without a limit (a URDF's effort of 0 means unknown, not powerless)."""
 UNKNOWN_SPEED = 2.0
@@ -35,13 +35,13 @@ FINGER_MASS = 0.1
 in no URDF."""
 
 
-def load_object(client: PyBulletClient, spec: BodySpec, drawn: bool = True) -> tuple[Body, list[str]]:
+def load_object(client: PyBulletClient, spec: BodySpec, drawn: bool = False) -> tuple[Body, list[str]]:
     """Load an object.
 
     Args:
         client: The world.
         spec: The object's record.
-        drawn: Load its visual meshes too.
+        drawn: Load its visual shapes too.
 
     Returns:
         The body, and warnings for the user.
@@ -51,36 +51,38 @@ def load_object(client: PyBulletClient, spec: BodySpec, drawn: bool = True) -> t
     """
     key = f"objects.{spec.name}"
     if spec.shape != "urdf":
-        number = _make_shape(client, spec, key)
-        body = _describe(client, spec, number, key, ())
+        number = _make_shape(client, spec, key, drawn)
+        body = _describe(client, spec, number, key)
         return body, []
     if spec.urdf is None:
         raise ConfigError([Problem("objects", f"{key}.urdf", "is missing, and the shape is urdf", "missing_key")])
-    urdf = _read_urdf(spec.urdf, f"{key}.urdf")
-    massless = _massless(urdf)
-    number = _load_urdf(client, spec.urdf, f"{key}.urdf", fixed=_is_fixed(spec), scale=spec.scale, drawn=drawn)
-    body = _describe(client, spec, number, f"{key}.urdf", urdf.joints)
+    urdf = checked_urdf(spec.urdf, f"{key}.urdf")
+    lacking = massless(urdf)
+    number = _load_urdf(
+        client, spec.urdf, f"{key}.urdf", fixed=spec.fixed or spec.robot is not None, scale=spec.scale, drawn=drawn
+    )
+    body = _describe(client, spec, number, f"{key}.urdf", urdf)
     _couple(client, body, urdf.mimics)
-    warnings = fix_inertias(client, body, massless)
-    if massless:
-        warnings.append(f"{spec.name}: no <inertial> in {listed(massless)}; PyBullet takes 1 kg for each")
+    warnings = fix_inertias(client, body, lacking)
+    if lacking:
+        warnings.append(f"{spec.name}: no <inertial> in {listed(lacking)}; PyBullet takes 1 kg for each")
     return body, warnings
 
 
-def load_robot(client: PyBulletClient, spec: RobotSpec, drawn: bool = True) -> tuple[Body, list[str]]:
+def load_robot(client: PyBulletClient, spec: RobotSpec, drawn: bool = False) -> tuple[Body, list[str]]:
     """Load an arm, with its base fixed in the world.
 
     Takes, returns and raises the same as :func:`load_object`; a joint or link that the URDF lacks is a ConfigError too.
     """
     key = f"robots.{spec.name}"
-    urdf = _read_urdf(spec.urdf, f"{key}.urdf")
-    massless = _massless(urdf)
+    urdf = checked_urdf(spec.urdf, f"{key}.urdf")
+    lacking = massless(urdf)
     number = _load_urdf(client, spec.urdf, f"{key}.urdf", fixed=True, scale=1.0, drawn=drawn)
-    body = _describe(client, spec, number, f"{key}.urdf", urdf.joints)
+    body = _describe(client, spec, number, f"{key}.urdf", urdf)
     fingers = spec.gripper.joints if spec.gripper else ()
     _check_names(body, spec, fingers, key)
 
-    warnings = fix_inertias(client, body, massless)
+    warnings = fix_inertias(client, body, lacking)
     without_effort: list[str] = []
     limits = spec.limits
     for joint in body.movable:
@@ -108,31 +110,12 @@ def load_robot(client: PyBulletClient, spec: RobotSpec, drawn: bool = True) -> t
     return body, warnings
 
 
-def _read_urdf(path: str, key: str) -> UrdfModel:
-    """Read and check a URDF and its meshes. Raises ConfigError, in the configuration key ``key``, with all problems."""
-    try:
-        model = read_urdf(Path(path))
-    except OSError as error:
-        raise ConfigError([Problem(path, key, f"cannot be read: {error.strerror}", "missing_file")]) from None
-    except ValueError as error:
-        raise ConfigError([Problem(path, key, str(error), "bad_urdf")]) from None
-    folder = Path(path).resolve().parent
-    names = dict.fromkeys(mesh.get("filename", "") for mesh in parse_xml(path).iter("mesh"))
-    missing = [name for name in names if not mesh_file(name, folder).is_file()]
-    if missing:
-        text = "names a mesh that does not exist"
-        raise ConfigError([Problem(path, key, f"{text}: {name}", "missing_file") for name in missing])
-    return model
-
-
-def _massless(urdf: UrdfModel) -> tuple[str, ...]:
-    """Return the links that have shapes but no ``<inertial>``: PyBullet gives them a mass of 1 kg."""
-    return tuple(link.name for link in urdf.links.values() if link.inertial is None and link.has_shapes)
-
-
 @contextmanager
 def loadable_urdf(path: str) -> Iterator[str]:
-    """Yield the path of a URDF that PyBullet can load: a temporary copy where meshes are in installed packages."""
+    """Yield the path of a URDF that PyBullet can load: a temporary copy where meshes are in packages.
+
+    Visual shapes whose meshes are in a package that is not installed are left out.
+    """
     folder = Path(path).resolve().parent
     root = parse_xml(path)
     files = [element for tag in ("mesh", "texture") for element in root.iter(tag) if element.get("filename")]
@@ -141,6 +124,10 @@ def loadable_urdf(path: str) -> Iterator[str]:
         return
     for element in files:
         element.set("filename", str(mesh_file(element.get("filename", ""), folder)))
+    for link in root.iter("link"):
+        for visual in link.findall("visual"):
+            if not all(Path(mesh.get("filename", "")).is_file() for mesh in visual.iter("mesh")):
+                link.remove(visual)
     with tempfile.TemporaryDirectory() as place:
         copy = Path(place) / Path(path).name
         copy.write_bytes(ElementTree.tostring(root, encoding="utf-8"))
@@ -163,7 +150,7 @@ def _load_urdf(client: PyBulletClient, path: str, key: str, *, fixed: bool, scal
     return number
 
 
-def _make_shape(client: PyBulletClient, spec: BodySpec, key: str) -> int:
+def _make_shape(client: PyBulletClient, spec: BodySpec, key: str, drawn: bool) -> int:
     def need(name: str) -> float:
         value = getattr(spec, name)
         if value is None:
@@ -171,42 +158,39 @@ def _make_shape(client: PyBulletClient, spec: BodySpec, key: str) -> int:
             raise ConfigError([Problem("objects", f"{key}.{name}", message, "missing_key")])
         return float(value)
 
-    drawn_at: Sequence[float] = (0.0, 0.0, 0.0)
+    at: Sequence[float] = (0.0, 0.0, 0.0)
     if spec.shape == "box":
         if spec.half_extents is None:
             message = "is missing, and a box needs it"
             raise ConfigError([Problem("objects", f"{key}.half_extents", message, "missing_key")])
-        solid = drawn = {"shapeType": client.GEOM_BOX, "halfExtents": spec.half_extents}
+        solid = seen = {"shapeType": client.GEOM_BOX, "halfExtents": spec.half_extents}
     elif spec.shape == "sphere":
-        solid = drawn = {"shapeType": client.GEOM_SPHERE, "radius": need("radius")}
+        solid = seen = {"shapeType": client.GEOM_SPHERE, "radius": need("radius")}
     elif spec.shape in ("cylinder", "capsule"):
         kind = client.GEOM_CYLINDER if spec.shape == "cylinder" else client.GEOM_CAPSULE
         solid = {"shapeType": kind, "radius": need("radius"), "height": need("length")}
-        drawn = {"shapeType": kind, "radius": need("radius"), "length": need("length")}
+        seen = {"shapeType": kind, "radius": need("radius"), "length": need("length")}
     elif spec.shape == "plane":  # infinite in contacts; drawn as a thin box whose upper face is the plane
         x, y = (spec.half_extents or (*PLANE, 0.0))[:2]
         solid = {"shapeType": client.GEOM_PLANE, "planeNormal": (0.0, 0.0, 1.0)}
-        drawn = {"shapeType": client.GEOM_BOX, "halfExtents": (x, y, 0.005)}
-        drawn_at = (0.0, 0.0, -0.005)
+        seen = {"shapeType": client.GEOM_BOX, "halfExtents": (x, y, 0.005)}
+        at = (0.0, 0.0, -0.005)
     else:
         message = f"is {spec.shape!r}; shapes: box, sphere, cylinder, capsule, plane, urdf"
         raise ConfigError([Problem("objects", f"{key}.shape", message, "unknown_shape")])
     shape = client.createCollisionShape(**solid) if spec.collision else -1
-    visual = (
-        client.createVisualShape(**drawn, rgbaColor=spec.rgba, visualFramePosition=drawn_at) if spec.visible else -1
-    )
-    mass = 0.0 if _is_fixed(spec) else spec.mass
+    visual = -1
+    if drawn and spec.visible:
+        visual = client.createVisualShape(**seen, rgbaColor=spec.rgba, visualFramePosition=at)
+    mass = spec.mass if has_free_base(spec, None) else 0.0
     number: int = client.createMultiBody(mass, shape, visual)
     return number
 
 
-def _is_fixed(spec: BodySpec) -> bool:
-    """Return whether physics leaves the base of this object alone; an object attached to an arm is placed instead."""
-    return spec.fixed or spec.shape == "plane" or spec.robot is not None
-
-
-def _describe(client: PyBulletClient, spec: BodySpec | RobotSpec, number: int, key: str, order: Iterable[str]) -> Body:
-    """Return a body with its names, indices and frames as PyBullet loaded them; ``order`` is the URDF's, of joints."""
+def _describe(
+    client: PyBulletClient, spec: BodySpec | RobotSpec, number: int, key: str, urdf: UrdfModel | None = None
+) -> Body:
+    """Return a body with its names, indices and frames as PyBullet loaded them."""
     links = {client.getBodyInfo(number)[0].decode(): -1}
     joints: dict[str, int] = {}
     movable: set[int] = set()
@@ -220,7 +204,6 @@ def _describe(client: PyBulletClient, spec: BodySpec | RobotSpec, number: int, k
             message = f"joint {info[1].decode()!r} is neither fixed, revolute, continuous nor prismatic"
             raise ConfigError([Problem(str(spec.urdf), key, message, "wrong_joint")])
     dynamics = client.getDynamicsInfo(number, -1)
-    fixed = isinstance(spec, RobotSpec) or _is_fixed(spec)
     base: Transform = ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
     if isinstance(spec, BodySpec):
         base = (tuple(spec.position), tuple(spec.orientation))
@@ -230,8 +213,8 @@ def _describe(client: PyBulletClient, spec: BodySpec | RobotSpec, number: int, k
         spec=spec,
         links=links,
         joints=joints,
-        movable=tuple(joints[name] for name in order if joints[name] in movable),
-        floating=not fixed and dynamics[0] > 0.0,
+        movable=tuple(joints[name] for name in (urdf.joints if urdf is not None else ()) if joints[name] in movable),
+        floating=isinstance(spec, BodySpec) and has_free_base(spec, urdf),
         inertial=(tuple(dynamics[3]), tuple(dynamics[4])),
         home=dict.fromkeys(movable, 0.0),
         base=base,

@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from contextlib import suppress
 from typing import Any
 
+from hal.drivers.scene.mirror import WorldMirror
 from hal.errors import ConnectionLost, NotSupported
 from hal.host.hosts import SNAPSHOT_CAPACITY, Host, LocalHost, RemoteHost
 from hal.host.memory import SeriesBox
@@ -16,7 +17,6 @@ from hal.host.process import Channel, Child, SharedMemory, serve
 from hal.specs import WorldSpec, from_json, to_json
 from hal.views import Viewer
 
-from .mirror import WorldMirror
 from .world import PyBulletWorld
 
 __all__ = ["PyBulletViewer", "main"]

@@ -10,9 +10,6 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
 from hal.drivers.scene.world import IDENTITY, SimulatedWorld
 from hal.errors import NotSupported
 from hal.geometry import Transform, compose, inverse
@@ -20,10 +17,9 @@ from hal.specs import BodySpec, RobotSpec, WorldSpec
 
 from .attachments import AttachedObjects, MirroredArm
 from .dynamics import bounding_box, deepest_overlap, find_contacts, forget_contacts, read_dynamics, write_dynamics
-from .engine import Body, PyBulletClient, link_frames, visuals_of
+from .engine import Body, PyBulletClient
 from .loading import load_object, load_robot
 from .motors import hold
-from .scene import Visual
 
 __all__ = [
     "PyBulletWorld",
@@ -53,8 +49,7 @@ class PyBulletWorld(SimulatedWorld[Body]):
     Args:
         spec: The record of the world.
         mirror: The world is posed by snapshots and never stepped.
-        gui: Open PyBullet's window.
-        drawn: Load visual meshes, because this very world is drawn. Without them loading takes less time and memory.
+        gui: Open PyBullet's window, and load what it displays.
 
     Raises:
         ConfigError: Something in the record cannot be loaded; lists every problem.
@@ -63,10 +58,10 @@ class PyBulletWorld(SimulatedWorld[Body]):
 
     ENGINE = "PyBullet"
 
-    def __init__(self, spec: WorldSpec, *, mirror: bool = False, gui: bool = False, drawn: bool = True) -> None:
+    def __init__(self, spec: WorldSpec, *, mirror: bool = False, gui: bool = False) -> None:
         super().__init__(spec)
         self.mirror = mirror
-        self.drawn = drawn
+        self._drawn = gui
         self.client = PyBulletClient(gui=gui)
         self._mirrored: dict[str, MirroredArm] = {}
         """Mirrors of arms that other drivers move."""
@@ -133,14 +128,6 @@ class PyBulletWorld(SimulatedWorld[Body]):
                 (gear.engage if active else gear.release)()
         self._set_residual()
 
-    def visuals(self, body: int) -> tuple[Visual, ...]:
-        """Return the visual shapes of the body with PyBullet's number ``body``."""
-        return visuals_of(self.client, body)
-
-    def link_frames(self, links: Sequence[tuple[int, int]]) -> NDArray[np.float64]:
-        """Return the poses (N, 4, 4) of links, each given as (PyBullet's number of the body, link)."""
-        return link_frames(self.client, links)
-
     # --- the engine of SimulatedWorld --------------------------------------------------------------------------------
 
     def _set_residual(self) -> None:
@@ -148,7 +135,7 @@ class PyBulletWorld(SimulatedWorld[Body]):
 
     def _place(self, spec: BodySpec | RobotSpec) -> Body:
         load = load_robot if isinstance(spec, RobotSpec) else load_object
-        body, warnings = load(self.client, spec, self.drawn)  # type: ignore[arg-type]  # of that kind
+        body, warnings = load(self.client, spec, self._drawn)  # type: ignore[arg-type]  # of that kind
         self.warnings += warnings
         return body
 
@@ -220,6 +207,8 @@ class PyBulletWorld(SimulatedWorld[Body]):
         return bounding_box(self.client, body)
 
     def _paint(self, body: Body, rgba: list[float]) -> None:
+        if not self._drawn:
+            return
         for link in {shape[1] for shape in self.client.getVisualShapeData(body.id)}:
             self.client.changeVisualShape(body.id, link, rgbaColor=rgba)
 

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from viser import SceneApi, SceneNodeHandle, TransformControlsEvent, TransformControlsHandle
 
-from hal import registry
+from hal.drivers.scene.drawn import DrawnWorld
 from hal.errors import HalError
 from hal.geometry import Pose
 from hal.host.memory import SeriesBox
@@ -190,7 +190,7 @@ def workspace_lines(workspace: WorkspaceSpec) -> NDArray[np.float32]:
 class BodiesView:
     """All bodies of a simulated world, drawn from their specs and moved by a mirror of the world.
 
-    Bodies that can move are left out where the world's driver has no mirrors.
+    Bodies that can move are left out if a file of the world's record is broken.
     """
 
     def __init__(self, scene: SceneApi, spec: WorldSpec, snapshots: SeriesBox, notes: list[str]) -> None:
@@ -235,7 +235,7 @@ class BodiesView:
         self._number = number
         for name, links in self._links.items():
             for link, node in links.items():
-                pose = self._mirror.request("pose", {"name": name, "link": link})
+                pose = self._mirror.pose(name, link)
                 _move_node(node, pose["position"], pose["orientation"])
 
     def _repeat_edit(self, method: str, params: Mapping[str, Any]) -> None:
@@ -299,18 +299,14 @@ def _read_urdf(path: str) -> UrdfModel:
         raise ValueError(f"{path}: {error}") from None
 
 
-def _mirror(spec: WorldSpec, notes: list[str]) -> Any | None:
-    """Return a copy of the world that snapshots pose; None where its driver offers none."""
+def _mirror(spec: WorldSpec, notes: list[str]) -> DrawnWorld | None:
+    """Return a copy of the world that snapshots pose; None where a file of its record is broken."""
     try:
-        made = registry.load(spec.driver, "world")
-        if hasattr(made, "MIRRORED"):
-            return made(spec, mirror=True, drawn=False)
-        reason = "its driver has no mirrors"
+        return DrawnWorld(spec)
     except HalError as error:
-        reason = str(error)
-    if any(not body.fixed for body in spec.bodies):
-        notes.append(f"bodies that can move are not drawn: {reason}")
-    return None
+        if any(not body.fixed for body in spec.bodies):
+            notes.append(f"bodies that can move are not drawn: {error}")
+        return None
 
 
 def _primitive(body: BodySpec) -> UrdfVisual:

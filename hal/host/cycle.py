@@ -400,8 +400,7 @@ class Cycle:
         """Runs one whole cycle, in the middle of a request; the host sets its own, which waits for the cycle's time."""
         self.world: Any = None
         if spec.world is not None:
-            # In real time, a process of its own draws a copy of the world.
-            self.world = registry.load(spec.world.driver, "world")(spec.world, drawn=spec.clock == "lock_step")
+            self.world = registry.load(spec.world.driver, "world")(spec.world)
         self.arms = {r.name: ArmUnit(r, self.dt, memory.robots[r.name], self.world) for r in spec.robots}
         self._arm_units = tuple(self.arms.values())
         self.grippers: dict[str, GripperUnit] = {}

@@ -151,12 +151,15 @@ def mock_camera_in_lock_step() -> Iterator[CameraBench]:
 def pybullet_camera_in_lock_step() -> Iterator[CameraBench]:
     """A camera that renders the present state of the world in the caller's thread."""
     data("plane.urdf")
-    from hal.drivers.pybullet.camera import DirectSource, PyBulletCamera, TinyRenderer
     from hal.drivers.pybullet.world import PyBulletWorld
+    from hal.drivers.scene.camera import DirectSource, SimulatedCamera, choose_renderer
+    from hal.drivers.scene.mirror import LocalMirror
 
     spec = camera_spec(driver="pybullet", view=FROM_ABOVE)
     world = PyBulletWorld(WORLD)
-    driver = PyBulletCamera(spec, DirectSource(world, TinyRenderer(world), spec, lambda: bench.now))
+    mirror = LocalMirror(world)
+    renderer = choose_renderer(mirror.drawn, "tiny")
+    driver = SimulatedCamera(spec, DirectSource(mirror, renderer, spec, lambda: bench.now))
     clock = LockStepClock(lambda: bench.now, lambda t: None)
     bench = CameraBench(driver=driver, clock=clock, dt=world.dt, advance=world.step)
     yield bench
@@ -169,12 +172,12 @@ class RenderedWorld:
 
     def __init__(self) -> None:
         data("plane.urdf")
-        from hal.drivers.pybullet.camera import PyBulletPictures
+        from hal.drivers.scene.camera import SimulatedPictures
         from hal.host.hosts import RemoteHost
 
         self.spec = camera_spec(driver="pybullet", view=FROM_ABOVE)
         self.host = RemoteHost(GroupSpec("simulation", "real_time", 240.0, (), WORLD))
-        self.pictures = PyBulletPictures(self.host, [self.spec], "tiny")
+        self.pictures = SimulatedPictures(self.host, [self.spec], "tiny")
         self.pictures.wait_ready()
         self.host.wait_ready()
         self.broken = False
@@ -182,9 +185,9 @@ class RenderedWorld:
     @contextmanager
     def camera(self) -> Iterator[CameraBench]:
         """One camera of the world."""
-        from hal.drivers.pybullet.camera import PyBulletCamera
+        from hal.drivers.scene.camera import SimulatedCamera
 
-        driver = PyBulletCamera(self.spec, self.pictures.source(self.spec.name))
+        driver = SimulatedCamera(self.spec, self.pictures.source(self.spec.name))
         yield CameraBench(driver=driver, lose=self._break, patience=5.0)
         driver.close()
 

@@ -164,7 +164,7 @@ class TestMockCameraInLockStep(CameraContract):
     bench = bench_of(mock_camera_in_lock_step)
 
 
-class TestPyBulletCameraInLockStep(CameraContract, left_out=NO_LINK):
+class TestSimulatedCameraInLockStep(CameraContract, left_out=NO_LINK):
     bench = bench_of(pybullet_camera_in_lock_step)
 
 
@@ -177,7 +177,7 @@ def worlds() -> Iterator[list[RenderedWorld]]:
         world.close()
 
 
-class TestPyBulletCameraInRealTime(
+class TestSimulatedCameraInRealTime(
     CameraContract,
     left_out={
         "restore": "the render process belongs to the rig: without it the rig must be opened again",

@@ -2,18 +2,24 @@
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
-from specs import data
 
-from hal.drivers.pybullet.renderer import Renderer
-from hal.drivers.pybullet.world import PyBulletWorld
+from hal.drivers.scene.camera import choose_renderer
+from hal.drivers.scene.drawn import DrawnWorld
+from hal.drivers.scene.renderer import Renderer
+from hal.drivers.scene.shapes import RenderScene
 from hal.errors import DriverMissing
 from hal.geometry import Pose
 from hal.specs import BodySpec, CameraSpec, RobotSpec, ViewSpec, WorldSpec
 from hal.testing import camera_spec
+
+if TYPE_CHECKING:
+    from hal.drivers.pybullet.world import PyBulletWorld
 
 STREAMS = ("color", "depth", "segmentation")
 COLLADA = """<?xml version="1.0" encoding="utf-8"?>
@@ -38,10 +44,24 @@ COLLADA = """<?xml version="1.0" encoding="utf-8"?>
 """The corner of a cube with sides of 2 cm, three times as high."""
 
 
-def world(*bodies: BodySpec, robots: tuple[RobotSpec, ...] = (), **changes: Any) -> PyBulletWorld:
-    """A world that the caller closes."""
-    data("plane.urdf")  # skips where PyBullet is not installed
-    return PyBulletWorld(WorldSpec("pybullet", 240.0, (0.0, 0.0, -9.81), bodies, robots), **changes)
+def world(*bodies: BodySpec, robots: tuple[RobotSpec, ...] = ()) -> WorldSpec:
+    """The record of a world."""
+    return WorldSpec("pybullet", 240.0, (0.0, 0.0, -9.81), bodies, robots)
+
+
+def drawn(*bodies: BodySpec, robots: tuple[RobotSpec, ...] = ()) -> DrawnWorld:
+    """What is drawn of a world, without physics."""
+    return DrawnWorld(world(*bodies, robots=robots))
+
+
+@contextmanager
+def stepped(*bodies: BodySpec, robots: tuple[RobotSpec, ...] = ()) -> Iterator[PyBulletWorld]:
+    """A world with physics; skips the test where PyBullet is not installed."""
+    pytest.importorskip("pybullet")
+    from hal.drivers.pybullet.world import PyBulletWorld
+
+    with closing(PyBulletWorld(world(*bodies, robots=robots))) as made:
+        yield made
 
 
 def box(
@@ -74,18 +94,12 @@ def look_at(eye: tuple[float, ...], target: tuple[float, ...], up: tuple[float, 
     return Pose.from_matrix(matrix)
 
 
-def renderer(name: str, scene: PyBulletWorld) -> Renderer:
-    """A renderer by name; skips the test where there is no OpenGL."""
-    if name == "tiny":
-        from hal.drivers.pybullet.camera import TinyRenderer
-
-        return TinyRenderer(scene)
-    from hal.drivers.pybullet.renderer import GLRenderer
-
+def renderer(name: str, scene: RenderScene) -> Renderer:
+    """A renderer by name; skips the test where there is no OpenGL, or no PyBullet."""
     try:
-        return GLRenderer(scene)
+        return choose_renderer(scene, name)
     except DriverMissing as error:
-        pytest.skip(f"no OpenGL here: libegl1 libgl1-mesa-dri ({error})")
+        pytest.skip(f"no renderer {name}: {error}")
 
 
 def rays(spec: CameraSpec) -> np.ndarray:

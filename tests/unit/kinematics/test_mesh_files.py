@@ -6,9 +6,9 @@ import sys
 from pathlib import Path
 
 import pytest
-from specs import data, world_spec
+from specs import world_spec
 
-from hal.drivers.pybullet.world import PyBulletWorld
+from hal.drivers.scene.drawn import DrawnWorld
 from hal.errors import ConfigError
 from hal.kinematics.mesh_files import mesh_file, package_folder
 from hal.specs import BodySpec
@@ -79,17 +79,14 @@ def test_an_absolute_path_stays_one(tmp_path: Path) -> None:
 
 
 def test_the_simulation_draws_a_mesh_out_of_a_package(package: Path, tmp_path: Path) -> None:
-    data("")
-    world = PyBulletWorld(world_spec(thing(tmp_path, "package://lab_meshes/parts/cube.obj")))
-    (shape,) = world.client.getVisualShapeData(world.body("thing").id)
-    assert Path(shape[4].decode()) == package / "parts" / "cube.obj"
-    world.close()
+    world = DrawnWorld(world_spec(thing(tmp_path, "package://lab_meshes/parts/cube.obj")))
+    (shape,) = world.visuals(world.bodies["thing"].id)
+    assert Path(shape.file) == package / "parts" / "cube.obj"
 
 
-def test_a_mesh_that_no_package_has_is_a_problem(package: Path, tmp_path: Path) -> None:
-    data("")
+def test_a_mesh_that_an_installed_package_lacks_is_a_problem(package: Path, tmp_path: Path) -> None:
     with pytest.raises(ConfigError) as caught:
-        PyBulletWorld(world_spec(thing(tmp_path, "package://lab_meshes/ball.obj")))
+        DrawnWorld(world_spec(thing(tmp_path, "package://lab_meshes/ball.obj")))
     (problem,) = caught.value.problems
     assert (problem.file, problem.code) == (str(tmp_path / "thing.urdf"), "missing_file")
     assert "package://lab_meshes/ball.obj" in problem.message

@@ -72,22 +72,6 @@ class TestStepping:
         assert np.abs(one[-1] - one[0]).max() > 0.01  # something fell
         assert np.array_equal(one, other)
 
-    def test_world_without_visual_meshes_moves_identically(self) -> None:
-        things = world_spec(floor(), cube((0.0, 0.0, 0.5)), mug(), panda())
-        drawn, plain = PyBulletWorld(things), PyBulletWorld(things, drawn=False)
-        names = {
-            kind: {shape[4] for shape in world.client.getVisualShapeData(world.bodies["panda"].id)}
-            for kind, world in (("drawn", drawn), ("plain", plain))
-        }
-        assert any(b"visual" in name for name in names["drawn"])
-        assert not any(b"visual" in name for name in names["plain"])
-        for world in (drawn, plain):
-            world.set_color("cube", [1.0, 0.0, 0.0, 1.0])
-            for _ in range(240):
-                world.step()
-        assert (plain.snapshot(), plain.revision) == (drawn.snapshot(), drawn.revision)
-        assert plain.aabb("mug") == drawn.aabb("mug")
-
     def test_free_fall(self) -> None:
         world = PyBulletWorld(world_spec(cube((0.0, 0.0, 10.0))))
         world.set_dynamics("cube", linear_damping=0.0)
@@ -255,13 +239,6 @@ class TestRequests:
         assert {(contact["a"], contact["b"]) for contact in turned} == {("floor", "cube")}
         assert turned[0]["normal"] == pytest.approx([0.0, 0.0, -1.0], abs=1e-3)
         assert world.contacts("cube", "far") == []
-
-    def test_painting_changes_what_is_drawn(self) -> None:
-        world = scene()
-        world.set_color("panda", (0.1, 0.2, 0.3, 1.0))
-        shapes = world.client.getVisualShapeData(world.body("panda").id)
-        assert len(shapes) > 5
-        assert all(shape[7] == pytest.approx((0.1, 0.2, 0.3, 1.0)) for shape in shapes)
 
 
 class TestReset:
@@ -442,7 +419,7 @@ class TestBadInput:
     def test_every_missing_mesh_is_named(self, tmp_path: Path) -> None:
         urdf = tmp_path / "broken.urdf"
         links = "".join(
-            f'<link name="l{k}"><visual><geometry><mesh filename="package://gone/m{k}.obj"/></geometry></visual></link>'
+            f'<link name="l{k}"><collision><geometry><mesh filename="package://gone/m{k}.obj"/></geometry></collision></link>'
             for k in (1, 2)
         )
         joint = '<joint name="j" type="fixed"><parent link="l1"/><child link="l2"/></joint>'

@@ -8,12 +8,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from pictures_kit import box, camera, look_at, rays, renderer, world
+from pictures_kit import box, camera, drawn, look_at, rays, renderer
 from specs import data, panda
 
-from hal.drivers.pybullet.meshes import MeshLibrary
-from hal.drivers.pybullet.renderer import RenderedImages
-from hal.drivers.pybullet.scene import parts_of
+from hal.drivers.scene.meshes import MeshLibrary
+from hal.drivers.scene.renderer import RenderedImages
+from hal.drivers.scene.shapes import parts_of
 from hal.geometry import Pose
 from hal.specs import BodySpec, CameraSpec
 
@@ -24,7 +24,7 @@ TILTED = Pose.from_rpy((0.0, 0.0, 0.0), (0.15, 0.2, 0.1))
 
 @contextmanager
 def picture(name: str, *bodies: BodySpec, spec: CameraSpec, pose: Pose) -> Iterator[RenderedImages]:
-    with closing(world(*bodies)) as scene, closing(renderer(name, scene)) as draws:
+    with closing(renderer(name, drawn(*bodies))) as draws:
         yield draws.render(spec, pose)
 
 
@@ -121,9 +121,10 @@ def test_segmentation_counts_bodies_as_the_world_does(name: str) -> None:
     wall = box("wall", (0.2, 4.0, 0.05), (0.3, 0.0, 1.0))
     hidden = box("hidden", (0.1, 0.1, 0.05), (0.3, 0.0, 2.0))
     ball = BodySpec("ball", (-0.4, 0.0, 1.0), (0, 0, 0, 1), "sphere", radius=0.1, fixed=True)
-    with closing(world(wall, hidden, ball)) as scene, closing(renderer(name, scene)) as draws:
+    scene = drawn(wall, hidden, ball)
+    with closing(renderer(name, scene)) as draws:
         before = draws.render(spec, Pose()).segmentation
-        scene.remove("hidden")
+        scene.request("remove", {"name": "hidden"})
         after = draws.render(spec, Pose()).segmentation
     assert before is not None
     assert after is not None
@@ -148,7 +149,7 @@ def test_depth_is_zero_outside_the_cameras_range(name: str) -> None:
 @pytest.mark.parametrize("streams", [("depth",), ("color",), ("infrared",), ("segmentation",)])
 def test_only_what_is_streamed_is_computed(name: str, streams: tuple[str, ...]) -> None:
     wall = box("wall", (0.2, 0.2, 0.05), (0.0, 0.0, 1.0), rgba=(0.9, 0.2, 0.2, 1.0))
-    with closing(world(wall)) as scene, closing(renderer(name, scene)) as draws:
+    with closing(renderer(name, drawn(wall))) as draws:
         images = draws.render(camera(80, 60, streams=streams), Pose())
         everything = draws.render(camera(80, 60, streams=("color", "depth", "infrared", "segmentation")), Pose())
     for stream in RenderedImages._fields:
@@ -170,9 +171,11 @@ def test_both_renderers_show_the_same_world() -> None:
     ]
     spec = camera(320, 240)
     pose = look_at((1.5, -0.8, 0.9), (0.2, 0.0, 0.35))
-    with closing(world(*bodies, robots=(panda(),))) as scene, closing(renderer("gl", scene)) as draws:
+    scene = drawn(*bodies, robots=(panda(),))
+    with closing(renderer("gl", scene)) as draws:
         gl = draws.render(spec, pose)
-        tiny = renderer("tiny", scene).render(spec, pose)
+    with closing(renderer("tiny", scene)) as draws:
+        tiny = draws.render(spec, pose)
     assert gl.segmentation is not None
     assert tiny.segmentation is not None
     for index in range(len(bodies) + 1):
@@ -186,9 +189,10 @@ def test_both_renderers_show_the_same_world() -> None:
 def test_a_small_picture_is_drawn_with_a_third_of_the_triangles_and_hardly_differs(monkeypatch):
     pose = look_at((1.5, -0.8, 0.9), (0.2, 0.0, 0.35))
     small, large = camera(256, 256), camera(1280, 960)
-    with closing(world(robots=(panda(),))) as scene, closing(renderer("gl", scene)) as draws:
+    scene = drawn(robots=(panda(),))
+    with closing(renderer("gl", scene)) as draws:
         fast, same = draws.render(small, pose), draws.render(large, pose)
-        monkeypatch.setattr("hal.drivers.pybullet.renderer._COARSE_PIXELS", 0.0)
+        monkeypatch.setattr("hal.drivers.scene.renderer._COARSE_PIXELS", 0.0)
         full, whole = draws.render(small, pose), draws.render(large, pose)
         parts = parts_of(0, scene.visuals(scene.bodies["panda"].id), MeshLibrary().load)
     heavy = {part.link for part in parts if part.coarse}

@@ -1,6 +1,6 @@
-"""What there is to draw in a world: triangle meshes, primitive shapes, and the visual shapes of its bodies.
+"""Shapes to draw: triangle meshes, primitive shapes, and the visual shapes of the bodies of a scene.
 
-Nothing here depends on a physics engine: a world that is drawn implements :class:`RenderScene`.
+What is drawn implements :class:`RenderScene`.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ class SceneBody(Protocol):
 
     @property
     def id(self) -> int:
-        """Number by which the physics engine names it."""
+        """Its number, which no other body of this world gets."""
 
     @property
     def index(self) -> int:
@@ -54,7 +54,7 @@ class Visual(NamedTuple):
     """A visual shape of a link."""
 
     link: int
-    """-1 is the base."""
+    """Number of the link in its body; 0 is the base."""
     kind: str
     """``mesh``, ``box``, ``sphere``, ``cylinder``, ``capsule`` or ``plane``."""
     size: tuple[float, ...]
@@ -256,7 +256,7 @@ class DrawnPart:
     body: int
     """The body's id."""
     link: int
-    """-1 is the base."""
+    """Number of the link in its body."""
     mesh: Mesh
     coarse: bool
     """Whether it is for pictures in which ``mesh.cell`` is small."""

@@ -1,7 +1,5 @@
 """From drawn pictures to the frames of a simulated camera: the views of its sensors, and the noise of its depth.
 
-Nothing here depends on a physics engine.
-
 The errors of a real camera's depth, added to exact depth:
 
 **Stereo** (D400 series). Depth is z = f b / d, with the disparity d in pixels, so an error of d becomes one of z that

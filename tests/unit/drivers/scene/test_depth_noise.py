@@ -10,8 +10,8 @@ import pytest
 from errors_kit import raises_problems
 
 from hal.config import load
-from hal.drivers.pybullet.camera import PyBulletCamera
-from hal.drivers.pybullet.exposure import DepthNoise, depth_noise
+from hal.drivers.scene.camera import SimulatedCamera
+from hal.drivers.scene.exposure import DepthNoise, depth_noise
 from hal.specs import CameraSpec
 
 FB = 384.0 * 0.05
@@ -94,8 +94,8 @@ def test_depth_comes_in_steps_of_disparity_and_in_whole_units() -> None:
     disparity = FB / np.unique(depth[depth > 0])
     steps = disparity * 32
     assert np.abs(steps - np.rint(steps)).max() < 0.2  # a millimetre at 3 m is 0.07 of a step
-    assert PyBulletCamera(spec).info.depth_scale == 0.001
-    assert PyBulletCamera(camera(noise=False)).info.depth_scale is None
+    assert SimulatedCamera(spec).info.depth_scale == 0.001
+    assert SimulatedCamera(camera(noise=False)).info.depth_scale is None
 
 
 class TestShadow:

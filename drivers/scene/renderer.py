@@ -21,7 +21,7 @@ from hal.geometry import Pose
 from hal.specs import CameraSpec
 
 from .meshes import MeshLibrary
-from .scene import DrawnPart, RenderScene, Visual, parts_of
+from .shapes import DrawnPart, RenderScene, Visual, parts_of
 
 __all__ = ["BACKGROUND", "LUMINANCE", "GLRenderer", "RenderedImages", "Renderer", "create_context"]
 

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from pictures_kit import COLLADA
 
-from hal.drivers.pybullet.meshes import MeshLibrary, cache_folder, parse, simplified
-from hal.drivers.pybullet.scene import Mesh, box, capsule, cylinder, sphere
+from hal.drivers.scene.meshes import MeshLibrary, cache_folder, parse, simplified
+from hal.drivers.scene.shapes import Mesh, box, capsule, cylinder, sphere
 
 CUBE = """\
 mtllib cube.mtl

@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .scene import Mesh, joined, unit
+from .shapes import Mesh, joined, unit
 
 __all__ = ["MeshLibrary", "cache_folder", "coarsened", "parse", "simplified"]
 

@@ -10,24 +10,25 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 from errors_kit import raises_code
-from pictures_kit import box, camera, look_at, renderer, world
+from pictures_kit import box, camera, drawn, look_at, renderer, stepped
 from specs import data, panda, world_spec
 
 from hal.driver import RawFrame
-from hal.drivers.pybullet.camera import (
+from hal.drivers.pybullet.world import PyBulletWorld
+from hal.drivers.scene.camera import (
     DirectSource,
-    PyBulletCamera,
-    PyBulletPictures,
     RenderWorker,
     SharedSource,
-    TinyRenderer,
+    SimulatedCamera,
+    SimulatedPictures,
     choose_renderer,
 )
-from hal.drivers.pybullet.exposure import camera_pose
-from hal.drivers.pybullet.mirror import WorldMirror
-from hal.drivers.pybullet.renderer import create_context
-from hal.drivers.pybullet.world import PyBulletWorld
+from hal.drivers.scene.drawn import DrawnWorld
+from hal.drivers.scene.exposure import camera_pose
+from hal.drivers.scene.mirror import LocalMirror, WorldMirror
+from hal.drivers.scene.renderer import create_context
 from hal.errors import ConfigError, ConnectionLost, DriverMissing, NotSupported
+from hal.geometry import Pose
 from hal.host.hosts import RemoteHost
 from hal.host.memory import SeriesBox
 from hal.host.ring import frame_rings, frame_rings_size
@@ -42,60 +43,55 @@ def ball(name: str, x: float, **more: object) -> BodySpec:
     return BodySpec(name, (x, 0.0, 0.1), STILL, "sphere", radius=0.1, **{"mass": 1.0, **more})
 
 
-def direct(scene: PyBulletWorld, spec: object) -> PyBulletCamera:
-    source = DirectSource(scene, TinyRenderer(scene), spec, lambda: 10.0 + scene.t)
-    driver = PyBulletCamera(spec, source)
-    driver.open()
-    return driver
-
-
 class TestDirect:
     """Lock-step."""
 
     def test_an_attached_camera_follows_its_link(self) -> None:
         view = ViewSpec((0.02, -0.05, 0.1), (0.0, 0.38268343, 0.0, 0.92387953), "panda", "panda_hand")
-        scene = world(robots=(panda(),))
         spec = camera(40, 30, view=view)
-        driver = direct(scene, spec)
-        before = driver.grab(0.0)
-        scene.reset("panda", q=[0.5, -0.3, 0.2, -1.8, 0.1, 1.4, 0.2])
-        after = driver.grab(0.0)
-        distance, angle = before.T_world_camera.distance(after.T_world_camera)
-        assert distance > 0.1
-        assert angle > 0.1
-        state = scene.client.getLinkState(scene.bodies["panda"].id, 8, computeForwardKinematics=1)
-        expected = scene.client.multiplyTransforms(state[4], state[5], view.position, view.orientation)
-        assert np.allclose(after.T_world_camera.position, expected[0], atol=1e-9)
-        assert abs(np.dot(after.T_world_camera.orientation, expected[1])) == pytest.approx(1.0)
-        scene.close()
+        with stepped(robots=(panda(),)) as world:
+            mirror = LocalMirror(world)
+            driver = SimulatedCamera(
+                spec, DirectSource(mirror, renderer("tiny", mirror.drawn), spec, lambda: 10.0 + world.t)
+            )
+            driver.open()
+            before = driver.grab(0.0)
+            world.reset("panda", q=[0.5, -0.3, 0.2, -1.8, 0.1, 1.4, 0.2])
+            after = driver.grab(0.0)
+            distance, angle = before.T_world_camera.distance(after.T_world_camera)
+            assert distance > 0.1
+            assert angle > 0.1
+            link = world.pose("panda", "panda_hand")
+            expected = Pose(link["position"], link["orientation"]) @ Pose(view.position, view.orientation)
+            assert after.T_world_camera.distance(expected) == pytest.approx((0.0, 0.0), abs=1e-6)
 
     def test_camera_without_a_place_is_refused(self) -> None:
-        scene = world(robots=(panda(),))
-        draws = TinyRenderer(scene)
-        with pytest.raises(ConfigError):
-            DirectSource(scene, draws, camera(view=None), lambda: 0.0)
-        nowhere = ViewSpec((0.0, 0.0, 0.0), STILL, "panda", "panda_hnad")
-        with pytest.raises(ConfigError, match="panda_hand"):
-            DirectSource(scene, draws, camera(view=nowhere), lambda: 0.0)
-        scene.close()
+        with stepped(robots=(panda(),)) as world:
+            mirror = LocalMirror(world)
+            draws = renderer("tiny", mirror.drawn)
+            with pytest.raises(ConfigError):
+                DirectSource(mirror, draws, camera(view=None), lambda: 0.0)
+            nowhere = ViewSpec((0.0, 0.0, 0.0), STILL, "panda", "panda_hnad")
+            with pytest.raises(ConfigError, match="panda_hand"):
+                DirectSource(mirror, draws, camera(view=nowhere), lambda: 0.0)
 
     def test_camera_without_a_world_is_refused(self) -> None:
         with raises_code(NotSupported, "world_missing"):
-            PyBulletCamera(camera()).open()
+            SimulatedCamera(camera()).open()
 
 
 class Bench:
     """A stepped world that publishes, and a worker that draws, in one process."""
 
-    def __init__(self, *bodies: BodySpec) -> None:
-        self.world = world(*bodies)
+    def __init__(self, world: PyBulletWorld) -> None:
+        self.world = world
         self.box = SeriesBox(memoryview(bytearray(SeriesBox.size(256))), 256)
         self.spec = camera(80, 60, view=FROM_ABOVE, rate_hz=10000.0)
         specs = [self.spec]
         buffer = memoryview(bytearray(frame_rings_size(specs)))
-        mirror_world = PyBulletWorld(self.world.spec, mirror=True)
-        self.mirror = WorldMirror(mirror_world, self.box)
-        self.worker = RenderWorker(self.mirror, TinyRenderer(mirror_world), specs, frame_rings(buffer, specs))
+        shown = DrawnWorld(self.world.spec)
+        self.mirror = WorldMirror(shown, self.box)
+        self.worker = RenderWorker(shown, self.mirror, renderer("tiny", shown), specs, frame_rings(buffer, specs))
         self.source = SharedSource(frame_rings(buffer, specs)[self.spec.name], lambda: None)
         self.t = 0.0
 
@@ -115,16 +111,11 @@ class Bench:
     def edit(self, method: str, **params: object) -> tuple[str, dict[str, object], int]:
         return method, params, self.world.request(method, params)
 
-    def close(self) -> None:
-        self.world.close()
-        self.mirror.world.close()
-
 
 @pytest.fixture
 def bench() -> Iterator[Bench]:
-    made = Bench(box("floor", (2.0, 2.0, 0.05), (0.0, 0.0, -0.05)), ball("ball", 0.0))
-    yield made
-    made.close()
+    with stepped(box("floor", (2.0, 2.0, 0.05), (0.0, 0.0, -0.05)), ball("ball", 0.0)) as world:
+        yield Bench(world)
 
 
 class TestWorker:
@@ -175,10 +166,10 @@ class TestChoice:
         raise DriverMissing("no EGL; apt install libegl1 libgl1-mesa-dri")
 
     def test_without_gl_the_tiny_renderer_draws_and_gives_the_reason(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        scene = world(box("wall", (1.0, 1.0, 0.1), (0.0, 0.0, 1.0)))
-        monkeypatch.setattr("hal.drivers.pybullet.renderer.create_context", self.no_gl)
+        scene = drawn(box("wall", (1.0, 1.0, 0.1), (0.0, 0.0, 1.0)))
+        monkeypatch.setattr("hal.drivers.scene.renderer.create_context", self.no_gl)
         chosen = choose_renderer(scene)
-        assert isinstance(chosen, TinyRenderer)
+        assert "TinyRenderer" in chosen.description
         assert "apt install libegl1" in chosen.description
         images = chosen.render(camera(16, 12), camera_pose(scene, camera(16, 12)))
         assert (images.depth > 0).all()
@@ -187,7 +178,6 @@ class TestChoice:
         assert "apt install" not in choose_renderer(scene, "tiny").description
         with pytest.raises(ConfigError):
             choose_renderer(scene, "opengl")
-        scene.close()
 
     def test_missing_moderngl_is_a_missing_driver(self, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setitem(__import__("sys").modules, "moderngl", None)
@@ -195,19 +185,18 @@ class TestChoice:
             create_context()
 
     def test_gl_is_the_first_choice(self) -> None:
-        scene = world(box("wall", (1.0, 1.0, 0.1), (0.0, 0.0, 1.0)))
+        scene = drawn(box("wall", (1.0, 1.0, 0.1), (0.0, 0.0, 1.0)))
         renderer("gl", scene).close()  # or skip
         chosen = choose_renderer(scene)
         assert "OpenGL on " in chosen.description
         chosen.close()
         chosen.close()
-        scene.close()
 
 
 def test_gl_draws_from_any_thread() -> None:
     import threading
 
-    scene = world(box("wall", (0.2, 0.2, 0.1), (0.0, 0.0, 1.0)))
+    scene = drawn(box("wall", (0.2, 0.2, 0.1), (0.0, 0.0, 1.0)))
     draws = renderer("gl", scene)
     spec = camera(40, 30)
     found = []
@@ -224,10 +213,9 @@ def test_gl_draws_from_any_thread() -> None:
     assert np.ptp(found[0].depth) > 0.5
     assert all(np.array_equal(found[0].depth, images.depth) for images in found)
     draws.close()
-    scene.close()
 
 
-def newest(driver: PyBulletCamera, after: float) -> RawFrame:
+def newest(driver: SimulatedCamera, after: float) -> RawFrame:
     """A frame that shows the world later than ``after``."""
     deadline = time.monotonic() + 20.0
     while time.monotonic() < deadline:
@@ -242,13 +230,13 @@ def test_renderer_process_draws_follows_edits_and_reports_its_end() -> None:
     spec = world_spec(box("floor", (2.0, 2.0, 0.05), (0.0, 0.0, -0.05)), box("block", (0.1, 0.1, 0.1), (0.0, 0.0, 0.1)))
     cameras = [camera(64, 48, name=name, view=FROM_ABOVE) for name in ("one", "two")]
     host = RemoteHost(GroupSpec("world", "real_time", 240.0, (), spec))
-    pictures = PyBulletPictures(host, cameras, "tiny")
+    pictures = SimulatedPictures(host, cameras, "tiny")
     try:
         pictures.wait_ready()
         host.wait_ready()
         assert "TinyRenderer" in pictures.describe()
         assert "one" in pictures
-        drivers = [PyBulletCamera(camera, pictures.source(camera.name)) for camera in cameras]
+        drivers = [SimulatedCamera(camera, pictures.source(camera.name)) for camera in cameras]
         start = time.monotonic()
         for driver in drivers:
             driver.open()

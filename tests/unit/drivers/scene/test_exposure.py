@@ -8,16 +8,17 @@ from typing import Any
 
 import numpy as np
 import pytest
-from pictures_kit import box, look_at, renderer, world
+from pictures_kit import box, drawn, look_at, renderer, stepped
 
 from hal.camera import Camera
 from hal.clock import LockStepClock
 from hal.config import load
-from hal.drivers.pybullet.camera import DirectSource, PyBulletCamera, RenderWorker, SharedSource, TinyRenderer
-from hal.drivers.pybullet.exposure import Exposure
-from hal.drivers.pybullet.mirror import WorldMirror
-from hal.drivers.pybullet.renderer import RenderedImages, Renderer
 from hal.drivers.pybullet.world import PyBulletWorld
+from hal.drivers.scene.camera import DirectSource, RenderWorker, SharedSource, SimulatedCamera
+from hal.drivers.scene.drawn import DrawnWorld
+from hal.drivers.scene.exposure import Exposure
+from hal.drivers.scene.mirror import LocalMirror, WorldMirror
+from hal.drivers.scene.renderer import RenderedImages, Renderer
 from hal.geometry import Pose
 from hal.host.memory import SeriesBox
 from hal.host.ring import FrameRing, frame_rings
@@ -36,13 +37,19 @@ def camera(model: str = "realsense_d435", **keys: Any) -> CameraSpec:
     return spec
 
 
+FLOOR = box("floor", (3.0, 3.0, 0.05), (0.0, 0.0, -0.05), rgba=(0.3, 0.3, 0.3, 1.0))
+BRICK = box("brick", (0.05, 0.05, 0.05), (0.0, 0.0, 0.05), rgba=(1.0, 1.0, 1.0, 1.0))
+
+
 @pytest.fixture
-def scene() -> Iterator[PyBulletWorld]:
-    floor = box("floor", (3.0, 3.0, 0.05), (0.0, 0.0, -0.05), rgba=(0.3, 0.3, 0.3, 1.0))
-    brick = box("brick", (0.05, 0.05, 0.05), (0.0, 0.0, 0.05), rgba=(1.0, 1.0, 1.0, 1.0))
-    made = world(floor, brick)
-    yield made
-    made.close()
+def scene() -> DrawnWorld:
+    return drawn(FLOOR, BRICK)
+
+
+@pytest.fixture
+def moving() -> Iterator[PyBulletWorld]:
+    with stepped(FLOOR, BRICK) as world:
+        yield world
 
 
 def middle_of(bright: np.ndarray) -> tuple[float, float]:
@@ -127,8 +134,8 @@ def test_only_the_streams_of_the_spec_are_drawn(scene, model, keys, asked):
     assert (frame.skew is None) == (not {"color", "depth"} <= set(spec.streams))
 
 
-def test_without_noise_depth_is_as_it_is_drawn(scene: PyBulletWorld) -> None:
-    drawing = TinyRenderer(scene)
+def test_without_noise_depth_is_as_it_is_drawn(scene: DrawnWorld) -> None:
+    drawing = renderer("tiny", scene)
     spec = camera(streams=["color", "depth"])
     plain = drawing.render(spec, EYE).depth
     frame = Exposure(spec).capture(scene, drawing, 0.0, 0.0, 1)
@@ -144,22 +151,23 @@ def test_without_noise_depth_is_as_it_is_drawn(scene: PyBulletWorld) -> None:
     assert np.array_equal(drawing.render(spec, EYE).depth, plain), "the picture that was drawn is not written to"
 
 
-def test_in_lock_step_a_picture_of_one_state_of_the_world_is_drawn_once(scene: PyBulletWorld) -> None:
+def test_in_lock_step_a_picture_of_one_state_of_the_world_is_drawn_once(moving: PyBulletWorld) -> None:
     drawing, spec = Counting(), camera(streams=["color", "depth"])
-    clock = LockStepClock(lambda: scene.t, lambda t: None)
-    public = Camera(PyBulletCamera(spec, DirectSource(scene, drawing, spec, clock.now)), clock, threaded=False)
+    clock = LockStepClock(lambda: moving.t, lambda t: None)
+    source = DirectSource(LocalMirror(moving), drawing, spec, clock.now)
+    public = Camera(SimulatedCamera(spec, source), clock, threaded=False)
     public.open()
     heard: list[Frame] = []
     public.on_frame(heard.append)
     elsewhere = {"position": (1.0, 0.0, 0.5), "orientation": (0.0, 0.0, 0.0, 1.0)}
     changes: list[Callable[[], object]] = [
         lambda: None,
-        scene.step,
-        lambda: scene.set_pose("brick", elsewhere),
-        lambda: scene.set_color("brick", (1.0, 0.0, 0.0, 1.0)),
-        lambda: scene.reset("brick"),
-        scene.reset,
-        lambda: scene.remove("brick"),
+        moving.step,
+        lambda: moving.set_pose("brick", elsewhere),
+        lambda: moving.set_color("brick", (1.0, 0.0, 0.0, 1.0)),
+        lambda: moving.reset("brick"),
+        moving.reset,
+        lambda: moving.remove("brick"),
     ]
     for number, change in enumerate(changes, start=1):
         change()
@@ -179,9 +187,9 @@ class FakeTime:
 
 
 @pytest.mark.parametrize("rate", [6.0, 15.0, 60.0, 90.0])
-def test_frames_come_at_the_configured_rate(scene, rate, monkeypatch):
+def test_frames_come_at_the_configured_rate(moving, rate, monkeypatch):
     clock = FakeTime()
-    monkeypatch.setattr("hal.drivers.pybullet.camera.time", clock)
+    monkeypatch.setattr("hal.drivers.scene.camera.time", clock)
     streams = ["color", "depth", "infrared_right"] if rate <= 60 else ["depth", "infrared_right"]
     spec = replace(
         camera(
@@ -193,14 +201,14 @@ def test_frames_come_at_the_configured_rate(scene, rate, monkeypatch):
     assert spec.rate_hz == rate
     snapshots = SeriesBox(memoryview(bytearray(SeriesBox.size(256))), 256)
     buffer = memoryview(bytearray(FrameRing.size(spec)))
-    mirrored = PyBulletWorld(scene.spec, mirror=True)
-    worker = RenderWorker(WorldMirror(mirrored, snapshots), Counting(), [spec], frame_rings(buffer, [spec]))
-    driver = PyBulletCamera(spec, SharedSource(FrameRing(buffer, spec), lambda: None))
+    shown = DrawnWorld(moving.spec)
+    worker = RenderWorker(shown, WorldMirror(shown, snapshots), Counting(), [spec], frame_rings(buffer, [spec]))
+    driver = SimulatedCamera(spec, SharedSource(FrameRing(buffer, spec), lambda: None))
     driver.open()
     frames = []
     for k in range(960):  # 4 s of a world at 240 Hz
         clock.now = 1000.0 + k / 240
-        snapshots.write(k / 240 + 0.001, scene.revision, scene.snapshot())
+        snapshots.write(k / 240 + 0.001, moving.revision, moving.snapshot())
         worker.run_once()
         frame = driver.grab(0.0)
         if frame is not None:
@@ -212,4 +220,3 @@ def test_frames_come_at_the_configured_rate(scene, rate, monkeypatch):
     assert frames[0].infrared_right is not None
     assert frames[0].skew == (0.0 if "color" in streams else None)
     assert not np.array_equal(frames[0].depth, frames[1].depth), "each frame has noise of its own"
-    mirrored.close()

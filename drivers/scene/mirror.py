@@ -1,0 +1,95 @@
+"""A copy of the world that follows the world that is stepped: in the process that draws, or beside it in lock-step."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, Protocol
+
+from hal.host.memory import SeriesBox
+from hal.world import WorldDriver
+
+from .drawn import DrawnWorld
+
+__all__ = ["LocalMirror", "MirrorWorld", "WorldMirror"]
+
+
+class MirrorWorld(Protocol):
+    """A world that repeats edits and is posed by snapshots."""
+
+    @property
+    def revision(self) -> int:
+        """Number of edits so far."""
+
+    def request(self, method: str, params: dict[str, Any]) -> Any:
+        """Repeat an edit."""
+
+    def show(self, snapshot: Sequence[float]) -> None:
+        """Place every body as in a snapshot of the same revision."""
+
+
+class WorldMirror:
+    """Poses a copy of the world by the snapshots and the edits of the world that is stepped in another process.
+
+    Args:
+        world: The copy.
+        snapshots: Where the stepped world's process publishes its snapshots.
+    """
+
+    def __init__(self, world: MirrorWorld, snapshots: SeriesBox) -> None:
+        self._world = world
+        self._snapshots = snapshots
+        self._edits: dict[int, tuple[str, dict[str, Any]]] = {}
+        self._number = 0
+        self._t: float | None = None
+
+    def edited(self, method: str, params: dict[str, Any], revision: int) -> None:
+        """Note an edit; it is made before the first snapshot of its revision is shown. They may come in any order."""
+        self._edits[revision] = (method, params)
+
+    def update(self) -> float | None:
+        """Show the newest snapshot.
+
+        Returns:
+            Its time, s. None before the first one, and while an edit that it includes has not arrived: snapshots come
+            through memory and may overtake edits, which come through a socket.
+        """
+        record = self._snapshots.read()
+        if record is None:
+            return None
+        number, t, revision, values = record
+        if number == self._number:
+            return self._t
+        world = self._world
+        while world.revision < revision:
+            edit = self._edits.pop(world.revision + 1, None)
+            if edit is None:
+                return None
+            world.request(*edit)
+        world.show(values)
+        self._number, self._t = number, t
+        return t
+
+
+class LocalMirror:
+    """What is drawn of a world that is stepped in this process.
+
+    Args:
+        world: The world, before its first edit.
+    """
+
+    def __init__(self, world: WorldDriver) -> None:
+        self.world = world
+        self.drawn = DrawnWorld(world.spec)
+        self._version: tuple[int, int] | None = None
+        world.on_edit(self._repeat)
+
+    def _repeat(self, method: str, params: dict[str, Any], revision: int) -> None:
+        self.drawn.request(method, params)
+
+    def update(self) -> tuple[int, int]:
+        """Show the present state of the world; return its version."""
+        version = self.world.version
+        if version != self._version:
+            self.drawn.show(self.world.snapshot())
+            self._version = version
+        return version
