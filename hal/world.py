@@ -182,6 +182,32 @@ class World:
             params["q"] = np.asarray(q, float).tolist()
         self._request("world.reset", params)
 
+    def save(self) -> dict[str, Any]:
+        """Return the state of the world: positions, velocities, what the solver keeps, and the arms' set-points.
+
+        Colours, dynamics and added or removed bodies are no part of it, nor is the time.
+
+        Returns:
+            A record for :meth:`restore`, which can be written as JSON. What is inside depends on the engine.
+        """
+        state: dict[str, Any] = self._call("save")
+        return state
+
+    def restore(self, state: Mapping[str, Any]) -> None:
+        """Put the world into a state of :meth:`save`, also one of another world with the same bodies.
+
+        Simulated time continues. Arms hold, with the set-point that they had; a control session continues from there,
+        as after :meth:`reset`. Mirrors of real arms stay where these arms are.
+
+        Args:
+            state: The record.
+
+        Raises:
+            CommandError: It is no such record, or one of another engine or of other bodies (``code`` is
+                ``wrong_state``); nothing changes.
+        """
+        self._call("restore", state=state)
+
 
 class NoWorld:
     """Stands for ``rig.world`` if nothing is simulated: every use of it raises NotSupported."""
@@ -216,6 +242,8 @@ class WorldDriver(ABC):
     ``set_velocity``   ``name``, ``linear``, ``angular``       none
     ``set_dynamics``   ``name``, ``link``, properties          these properties as they were before
     ``reset``          ``name``, ``pose``, ``q``               none
+    ``save``           none                                    the state, for ``restore``
+    ``restore``        ``state``                               none
     =================  ======================================  ========================================================
 
     Args:
@@ -229,7 +257,7 @@ class WorldDriver(ABC):
     REQUESTS: ClassVar[frozenset[str]] = frozenset(
         {
             *("names", "describe", "pose", "poses", "velocity", "dynamics", "contacts", "aabb"),
-            *("add", "remove", "set_color", "set_pose", "set_velocity", "set_dynamics", "reset"),
+            *("add", "remove", "set_color", "set_pose", "set_velocity", "set_dynamics", "reset", "save", "restore"),
         }
     )
     """Names of the requests."""
@@ -312,6 +340,16 @@ class WorldDriver(ABC):
     @abstractmethod
     def off_reset(self, name: str, callback: Callable[[], None]) -> None:
         """Remove a callback of :meth:`on_reset`."""
+
+    @abstractmethod
+    def keep(self, name: str, save: Callable[[], Any], restore: Callable[[Any], None]) -> None:
+        """Save and restore the state of a driver with the world's.
+
+        Args:
+            name: Name of the driver's device, unique in the world; a later call replaces the functions.
+            save: Returns the state, as JSON.
+            restore: Takes that state, after the world has been restored.
+        """
 
     @abstractmethod
     def on_edit(self, callback: Callable[[str, dict[str, Any], int], None]) -> None:

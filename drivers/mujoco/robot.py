@@ -50,6 +50,11 @@ class MujocoRobot(SimulatedRobot[MujocoWorld]):
     def _apply(self, tau: Floats) -> None:
         self._world.motors.torques[self.spec.name] = (self._at, np.array(tau, float))
 
+    def _restore(self, state: dict[str, Any]) -> None:
+        super()._restore(state)
+        if self._tau is not None:
+            self._apply(self._tau)
+
     def mass_matrix(self, q: Sequence[float]) -> Any:
         """Return the joint-space inertia of the simulated arm (n, n) at ``q``, kg m2."""
         return self._world.mass_matrix(self._at, q)

@@ -52,7 +52,7 @@ class MujocoWorld(SimulatedWorld[Body]):
         "angular_damping": "leave it out: bodies turn without air resistance",
     }
 
-    def __init__(self, spec: WorldSpec, *, drawn: bool = False) -> None:
+    def __init__(self, spec: WorldSpec) -> None:
         super().__init__(spec)
         self.mujoco = mujoco = load_mujoco()
         self.substeps = max(1, math.ceil(self.dt / LONGEST_STEP - 1e-6))
@@ -321,6 +321,34 @@ class MujocoWorld(SimulatedWorld[Body]):
             self.fault, self._touched = None, False
         for body in bodies:
             self.data.qacc_warmstart[_places(body)[1]] = 0.0
+
+    def _save(self) -> dict[str, Any]:
+        mujoco, motors = self.mujoco, self.motors
+        kind = mujoco.mjtState.mjSTATE_INTEGRATION
+        values = np.empty(mujoco.mj_stateSize(self.model, kind))
+        mujoco.mj_getState(self.model, self.data, values, kind)
+        return {
+            "integration": values.tolist(),
+            "motors": [motors.state.tolist(), motors.efforts.tolist(), motors.speeds.tolist()],
+            "places": {body.name: body.place for body in self.bodies.values() if body.free is None},
+        }
+
+    def _restore(self, state: Any) -> None:
+        mujoco, motors = self.mujoco, self.motors
+        kind = mujoco.mjtState.mjSTATE_INTEGRATION
+        values, parts = np.array(state["integration"], float), [np.array(part, float) for part in state["motors"]]
+        if values.shape != (mujoco.mj_stateSize(self.model, kind),) or parts[0].shape != motors.state.shape:
+            raise ValueError("it has another size")
+        mujoco.mj_setState(self.model, self.data, values, kind)
+        for name, (position, orientation) in state["places"].items():
+            body = self.bodies[name]
+            body.place = tuple(position), tuple(orientation)
+            self._place_base(body)
+        motors.state[:], motors.efforts[:], motors.speeds[:] = parts
+        motors.limit()
+        motors.torques.clear()  # an arm that torques drive applies its own
+        self.fault, self._placed, self._touched = None, False, False
+        self._lay_out()
 
     def _find_contacts(self, a: Body | None, b: Body | None) -> list[dict[str, Any]]:
         return find_contacts(self.mujoco, self.model, self.data, self.bodies.values(), a, b) if self._touched else []

@@ -5,7 +5,7 @@ from __future__ import annotations
 from hal.drivers.scene.gripper import SimulatedGripper
 
 from .engine import Body
-from .motors import position_gain
+from .motors import hold, position_gain
 from .world import PyBulletWorld
 
 __all__ = ["PyBulletGripper"]
@@ -40,6 +40,13 @@ class PyBulletGripper(SimulatedGripper[PyBulletWorld, Body]):
                 velocityGain=1.0,
                 maxVelocity=speed / 2.0,
             )
+
+    def _resume(self) -> None:
+        if self._driven is not None:
+            self._drive(self._driven)
+        else:
+            targets = dict.fromkeys(self._joints, self._aim / 2.0)
+            hold(self._world.client, self._body, targets, self._world.dt)
 
     def _width(self) -> tuple[float, float, float, float]:
         widths, speeds, _, forces = zip(*self._read(self._body.id, self._joints), strict=True)

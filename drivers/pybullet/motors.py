@@ -68,16 +68,22 @@ class JointTorques:
         self._still = [0.0] * len(self._movable)
         self._compensation: Floats = ()
         self._applied: Floats = [0.0] * len(self._joints)
-        """Applied to this step already, Nm: PyBullet adds torques up."""
+        """Torques of the coming step, Nm."""
+        self._sum: Floats = self._applied
+        """What PyBullet has added up for that step, Nm: the same but for rounding."""
         self.last_applied: Floats = self._applied
         """Torques that acted in the last step, Nm; PyBullet reports those of motors only."""
 
     def take_over(self) -> None:
+        """Switch the joints' own motors off, and start to apply torques."""
+        self.switch_off()
+        self._applied = self._sum = [0.0] * len(self._joints)
+        self.next_step()
+
+    def switch_off(self) -> None:
         """Switch the joints' own motors off."""
         client, nothing = self._client, [0.0] * len(self._joints)
         client.setJointMotorControlArray(self._body.id, self._joints, client.VELOCITY_CONTROL, forces=nothing)
-        self._applied = nothing
-        self.next_step()
 
     def next_step(self) -> None:
         """Start the next physics step, to which no torques are applied yet."""
@@ -86,6 +92,7 @@ class JointTorques:
         compensation = client.calculateInverseDynamics(body.id, q, dq, self._still)
         self._compensation = [compensation[place] for place in self._places]
         self.last_applied, self._applied = self._applied, [0.0] * len(self._joints)
+        self._sum = self._applied
 
     def apply(self, tau: Floats) -> None:
         """Apply torques (Nm) plus the compensation, within the efforts, to the next step."""
@@ -94,9 +101,29 @@ class JointTorques:
             for own, held, effort in zip(tau, self._compensation, self._efforts, strict=True)
         ]
         more = [new - old for new, old in zip(wanted, self._applied, strict=True)]
+        self._add(more)
+        self._applied = wanted
+
+    def _add(self, more: Floats) -> None:
         client = self._client
         client.setJointMotorControlArray(self._body.id, self._joints, client.TORQUE_CONTROL, forces=more)
-        self._applied = wanted
+        self._sum = [a + b for a, b in zip(self._sum, more, strict=True)]
+
+    def save(self) -> dict[str, Floats]:
+        """Return the torques of the coming step, which are no part of PyBullet's states."""
+        parts = {"sum": self._sum, "applied": self._applied, "compensation": self._compensation}
+        return {name: list(part) for name, part in parts.items()}
+
+    def withdraw(self) -> None:
+        """Withdraw what was applied to the coming step."""
+        self._add([-part for part in self._sum])
+        self._applied = self._sum
+
+    def restore(self, state: Mapping[str, Floats]) -> None:
+        """Apply the torques of :meth:`save` to the coming step, to which nothing is applied yet."""
+        self._sum = [0.0] * len(self._joints)
+        self._add(state["sum"])
+        self._applied, self._compensation = state["applied"], state["compensation"]
 
     def mass_matrix(self, q: Floats) -> list[list[float]]:
         """Return the inertia matrix (n, n) at ``q`` (n,) rad, kg m2; the body's other joints keep their positions."""

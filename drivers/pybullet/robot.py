@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from math import isfinite
 from typing import Any
 
 from hal.drivers.scene.robot import SimulatedRobot
@@ -42,7 +43,16 @@ class PyBulletRobot(SimulatedRobot[PyBulletWorld]):
 
     def _state(self) -> tuple[Floats, Floats, Floats]:
         q, dq, _, tau = zip(*self._read(self._body.id, self._joints), strict=True)
+        if not isfinite(sum(dq)):
+            return self._unstable()
         return q, dq, tau if self._tau is None else tuple(self._torques.last_applied)
+
+    def _unstable(self) -> tuple[Floats, Floats, Floats]:
+        """Report that the simulation has become unstable; return the arm's last sound position, at rest."""
+        self._world.note_unstable()
+        home = [self._body.home[joint] for joint in self._joints]
+        nothing = [0.0] * len(home)
+        return home if self._frozen is None else self._frozen.q, nothing, nothing
 
     def _follow(self, q: Floats, dq: Floats) -> None:
         dt = self._world.dt
@@ -70,6 +80,22 @@ class PyBulletRobot(SimulatedRobot[PyBulletWorld]):
             self._torques.next_step()
             self._t_applied = t
         self._torques.apply(tau)
+
+    def _save(self) -> dict[str, Any]:
+        return super()._save() | {"torques": self._torques.save()}
+
+    def _restore(self, state: dict[str, Any]) -> None:
+        if self._t_applied == self._world.t:
+            self._torques.withdraw()
+        super()._restore(state)
+        q, dq = self._q, self._dq
+        self._hold_at(q if q is not None else [self._body.home[joint] for joint in self._joints])
+        if self._tau is not None:
+            self._torques.switch_off()
+            self._torques.restore(state["torques"])
+            self._t_applied = self._world.t
+        elif q is not None and dq is not None:
+            self._follow(q, dq)
 
     def mass_matrix(self, q: Sequence[float]) -> Any:
         """Return the joint-space inertia of the simulated arm (n, n) at ``q``, kg m2."""

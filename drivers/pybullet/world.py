@@ -7,11 +7,16 @@ same record and never stepped, repeats the edits of :attr:`PyBulletWorld.MIRRORE
 
 from __future__ import annotations
 
+import base64
+import tempfile
+import zlib
 from collections.abc import Iterable, Mapping, Sequence
+from math import isfinite
+from pathlib import Path
 from typing import Any
 
 from hal.drivers.scene.world import IDENTITY, SimulatedWorld
-from hal.errors import NotSupported
+from hal.errors import Fault, NotSupported
 from hal.geometry import Transform, compose, inverse
 from hal.specs import BodySpec, RobotSpec, WorldSpec
 
@@ -90,6 +95,9 @@ class PyBulletWorld(SimulatedWorld[Body]):
         """Make one physics step."""
         if self.mirror:
             raise NotSupported("a mirror is posed by show(), never stepped")
+        if self.fault is not None:
+            self.steps += 1
+            return
         for arm in self._mirrored.values():
             arm.prepare_step()
         self._step()
@@ -103,7 +111,16 @@ class PyBulletWorld(SimulatedWorld[Body]):
         self.client.close()
 
     def snapshot(self) -> list[float]:
-        return self._layout.read()
+        return self._layout.read() if self.fault is None else self._layout.read_sound()
+
+    def note_unstable(self) -> None:
+        """Let the world stand still, with a fault, until it is reset: its numbers mean nothing any more."""
+        if self.fault is None:
+            self.fault = Fault(
+                "simulation_unstable",
+                f"the simulation became unstable at {self.t:.3f} s: a number is not finite",
+                "reset the world; use a smaller contact_stiffness, masses that differ less, or a higher physics_hz",
+            )
 
     def show(self, snapshot: Sequence[float]) -> None:
         """Place every body as in a snapshot of the same revision.
@@ -198,7 +215,35 @@ class PyBulletWorld(SimulatedWorld[Body]):
         write_dynamics(self.client, body, link, values, before, self.dt)
 
     def _forget(self, bodies: Sequence[Body]) -> None:
+        if len(bodies) == len(self.bodies):
+            self.fault = None
         forget_contacts(self.client, bodies)
+
+    def _save(self) -> dict[str, Any]:
+        """Return what PyBullet writes into a file, with the contacts that its solver starts from."""
+        with tempfile.TemporaryDirectory() as folder:
+            file = Path(folder) / "state.bullet"
+            self.client.saveBullet(str(file))
+            data = file.read_bytes()
+        return {"handling": sorted(self._handling), "bullet": base64.b64encode(zlib.compress(data, 1)).decode()}
+
+    def _restore(self, state: Any) -> None:
+        handling = set(state["handling"]) & set(self.bodies)
+        try:
+            data = zlib.decompress(base64.b64decode(state["bullet"], validate=True))
+        except zlib.error as error:
+            raise ValueError(str(error)) from None
+        for name in self._handling | handling:
+            self.handle(name, name in handling)
+        with tempfile.TemporaryDirectory() as folder:
+            file = Path(folder) / "state.bullet"
+            file.write_bytes(data)
+            try:
+                self.client.restoreState(fileName=str(file))
+            except self.client.error as error:
+                raise ValueError(str(error)) from None
+        self.fault = None
+        self._read_layout()
 
     def _find_contacts(self, a: Body | None, b: Body | None) -> list[dict[str, Any]]:
         return find_contacts(self.client, self.bodies.values(), a, b)
@@ -227,27 +272,32 @@ class SnapshotLayout:
         for body in self._still:
             position, orientation = body.base_pose(client)
             self._still_values += [*position, *orientation]
-        self._moving = [
-            (body, body.id, body.roams, None if body.inertial == IDENTITY else inverse(body.inertial), body.movable)
-            for body in everything
-            if body.moves
+        self._moving = [body for body in everything if body.moves]
+        self._parts = [
+            (body.id, body.roams, None if body.inertial == IDENTITY else inverse(body.inertial), body.movable)
+            for body in self._moving
         ]
-        self.size = len(self._still_values) + sum(7 * body.roams + len(body.movable) for body, *_ in self._moving)
+        self.size = len(self._still_values) + sum(7 * body.roams + len(body.movable) for body in self._moving)
+        self._start = self.read()
 
     def read(self) -> list[float]:
         """Return the present snapshot."""
         values = self._still_values.copy()
         pose_of, joints_of = self._client.getBasePositionAndOrientation, self._client.getJointStates
-        for _, number, roams, to_base, movable in self._moving:
+        for number, roams, to_base, movable in self._parts:
             if roams:
-                pose = pose_of(number)
+                position, orientation = pose_of(number)
                 if to_base is not None:  # PyBullet's pose is that of the centre of mass
-                    pose = compose(pose, to_base)
-                values += pose[0]
-                values += pose[1]
+                    position, orientation = compose((position, orientation), to_base)
+                values += position
+                values += orientation
             if movable:
                 values += [state[0] for state in joints_of(number, movable)]
         return values
+
+    def read_sound(self) -> list[float]:
+        """Return the present snapshot, with numbers from before where they are not finite."""
+        return [new if isfinite(new) else old for new, old in zip(self.read(), self._start, strict=True)]
 
     def apply(self, snapshot: Sequence[float]) -> None:
         """Place all bodies as in a snapshot; raises ValueError when it is one of other bodies."""
@@ -260,13 +310,14 @@ class SnapshotLayout:
             for k, body in enumerate(self._still):
                 body.set_base_pose(client, _pose(values, 7 * k))
             self._still_values = values[:place]
-        for body, number, roams, _, movable in self._moving:
-            if roams:
+        for body in self._moving:
+            if body.roams:
                 body.set_base_pose(client, _pose(values, place))
                 place += 7
-            if movable:
-                put_joints(number, movable, [[value] for value in values[place : place + len(movable)]])
-                place += len(movable)
+            if body.movable:
+                count = len(body.movable)
+                put_joints(body.id, body.movable, [[value] for value in values[place : place + count]])
+                place += count
 
 
 def _pose(values: Sequence[float], place: int) -> Transform:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from typing import ClassVar, Generic, TypeVar
+from typing import Any, ClassVar, Generic, TypeVar
 
 from hal.driver import GripperDriver, GripperReading
 from hal.errors import CommandError, ConfigError, ConnectionLost, Problem
@@ -26,6 +26,9 @@ BLOCKED = 0.25
 """Share of the commanded speed below which fingers, long after the command, count as blocked."""
 PRESSING = 0.5
 """Share of the commanded force from which on the fingers count as pressing on something."""
+
+_KEPT = ("target", "aim", "force", "stood", "settle", "resting", "speed", "driven")
+"""Attributes that a saved state has."""
 
 W = TypeVar("W", bound=SimulatedWorld)  # type: ignore[type-arg]  # of any kind of body
 B = TypeVar("B", bound=SimulatedBody)
@@ -58,6 +61,8 @@ class SimulatedGripper(GripperDriver, Generic[W, B]):
         self._seen = 0.0
         """When the width was read last, s."""
         self._speed = spec.speed
+        self._driven: float | None = None
+        """Speed of the motion that the motors make, m/s; None while they hold since a reset."""
 
     # --- what an engine implements -----------------------------------------------------------------------------------
 
@@ -79,6 +84,12 @@ class SimulatedGripper(GripperDriver, Generic[W, B]):
     def _handle(self, active: bool) -> None:
         """Take notice whether the fingers move or hold something; else they need no coupling."""
 
+    def _resume(self) -> None:  # optional
+        """Let the motors do what they did when a state was saved, if the engine's states are without those of motors.
+
+        They moved at :attr:`_driven` to :attr:`_aim`, or held there since a reset.
+        """
+
     # --- the driver --------------------------------------------------------------------------------------------------
 
     def open(self) -> None:
@@ -88,6 +99,7 @@ class SimulatedGripper(GripperDriver, Generic[W, B]):
         self._was_reset()
         if not self._open:
             self._world.on_reset(self._body.name, self._was_reset)
+            self._world.keep(f"{self._body.name}.gripper", self._save, self._restore)
         self._open = True
 
     def read(self, now: float) -> GripperReading:
@@ -130,7 +142,8 @@ class SimulatedGripper(GripperDriver, Generic[W, B]):
         self._resting, self._stood_since = False, self._world.t
         self._settle = max(SETTLE, 2.0 * STILL / self._speed)
         self._handle(True)
-        self._drive(self._speed)
+        self._driven = self._speed
+        self._drive(self._driven)
 
     def _at_rest(self, width: float, speed: float) -> bool:
         """Return whether the fingers have arrived, or stand still elsewhere. To be called for every new width."""
@@ -155,7 +168,8 @@ class SimulatedGripper(GripperDriver, Generic[W, B]):
             return
         self._target = self._aim = width
         self._handle(True)
-        self._drive(self.spec.speed)
+        self._driven = self.spec.speed
+        self._drive(self._driven)
 
     def close(self) -> None:
         """Disconnect; the motors hold, or press, for as long as the world exists."""
@@ -163,7 +177,18 @@ class SimulatedGripper(GripperDriver, Generic[W, B]):
             self._world.off_reset(self._body.name, self._was_reset)
         self._open = False
 
+    def _save(self) -> dict[str, Any]:
+        return {name: getattr(self, f"_{name}") for name in _KEPT} | {"stood_for": self._world.t - self._stood_since}
+
+    def _restore(self, state: dict[str, Any]) -> None:
+        for name in _KEPT:
+            setattr(self, f"_{name}", state[name])
+        self._seen = self._world.t
+        self._stood_since = self._world.t - state["stood_for"]
+        self._resume()
+
     def _was_reset(self) -> None:
+        self._driven = None
         self._target = self._aim = self._stood = self._width()[0]
         self._resting, self._stood_since = True, self._world.t
         self._force = self.spec.force

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Sequence
-from typing import ClassVar, Generic, TypeVar
+from typing import Any, ClassVar, Generic, TypeVar
 
 from hal.driver import Reading, RobotDriver, Setpoint
 from hal.errors import CommandError, ConnectionLost, Fault
@@ -89,6 +89,7 @@ class SimulatedRobot(RobotDriver, Generic[W]):
         self._find()
         if not self._open:
             self._world.on_reset(self.spec.name, self._was_reset)
+            self._world.keep(self.spec.name, self._save, self._restore)
         self._open = True
 
     def read(self, now: float) -> Reading:
@@ -185,6 +186,15 @@ class SimulatedRobot(RobotDriver, Generic[W]):
 
     def _positions(self) -> Floats:
         return self._state()[0]
+
+    def _save(self) -> dict[str, Any]:
+        parts = {"q": self._q, "dq": self._dq, "tau": self._tau}
+        state: dict[str, Any] = {name: None if part is None else list(part) for name, part in parts.items()}
+        return state | {"age": self._world.t - self._t_received}
+
+    def _restore(self, state: dict[str, Any]) -> None:
+        self._q, self._dq, self._tau = state["q"], state["dq"], state["tau"]
+        self._t_received = self._world.t - state["age"]
 
     def _was_reset(self) -> None:
         self._q, self._dq = self._positions(), [0.0] * len(self.spec.joints)

@@ -106,6 +106,8 @@ class SimulatedWorld(WorldDriver, Generic[B]):
         """Changes of poses other than by steps, and of looks."""
         self._on_reset: dict[str, list[Callable[[], None]]] = {}
         self._on_edit: list[Callable[[str, dict[str, Any], int], None]] = []
+        self._kept: dict[str, tuple[Callable[[], Any], Callable[[Any], None]]] = {}
+        """How the states of drivers are saved and restored."""
 
     # --- what an engine implements -----------------------------------------------------------------------------------
 
@@ -183,6 +185,18 @@ class SimulatedWorld(WorldDriver, Generic[B]):
     @abstractmethod
     def _follow(self, body: B, q: list[float], dq: list[float], width: float | None) -> None:
         """Place the mirror of a real arm; the numbers are checked."""
+
+    def _save(self) -> Any:
+        """Return the state of the engine, as JSON; an engine has it with the motors', or without."""
+        raise NotSupported(f"{self.ENGINE} does not save states", code="no_states")
+
+    def _restore(self, state: Any) -> None:
+        """Put the engine into a state of :meth:`_save`, of a world with the same bodies.
+
+        Raises:
+            ValueError: It is no such state; nothing changes.
+        """
+        raise NotSupported(f"{self.ENGINE} does not restore states", code="no_states")
 
     def _start(self, added: Sequence[B]) -> None:  # optional
         """Complete new bodies, which are now at their initial poses."""
@@ -443,6 +457,38 @@ class SimulatedWorld(WorldDriver, Generic[B]):
         self._put(body, base, joints)
         self._follow_attached()
 
+    def save(self) -> dict[str, Any]:
+        """Return the state of the world and of its drivers: see :meth:`hal.world.World.save`."""
+        return {
+            "engine": self.ENGINE,
+            "bodies": {name: len(body.movable) for name, body in self.bodies.items()},
+            "drivers": {name: save() for name, (save, _) in self._kept.items()},
+            "state": self._save(),
+        }
+
+    def restore(self, state: Any) -> None:
+        """Restore a state of :meth:`save`: see :meth:`hal.world.World.restore`."""
+        if not {"engine", "bodies", "drivers", "state"} <= set(state if isinstance(state, Mapping) else ()):
+            raise CommandError("not a state of a world; rig.world.save() returns one", code="wrong_state")
+        if state["engine"] != self.ENGINE:
+            raise CommandError(f"the state is one of {state['engine']}, not of {self.ENGINE}", code="wrong_state")
+        theirs, ours = list(state["bodies"].items()), [(name, len(b.movable)) for name, b in self.bodies.items()]
+        if theirs != ours:
+            others = ", ".join(name for name, _ in theirs)
+            raise CommandError(
+                f"the state is one of other bodies: {others}; this world has: {', '.join(self.bodies)}",
+                code="wrong_state",
+            )
+        try:
+            self._restore(state["state"])
+        except (KeyError, ValueError, TypeError) as error:
+            raise CommandError(f"the state cannot be restored: {error}", code="wrong_state") from error
+        self._changes += 1
+        self._follow_attached()
+        for name, (_, restore) in self._kept.items():
+            if name in state["drivers"]:
+                restore(state["drivers"][name])
+
     def _expect_free(self, body: B) -> None:
         if body.carried:
             raise CommandError(f"{body.name!r} is attached to an arm: it follows that arm", code="is_attached")
@@ -496,6 +542,9 @@ class SimulatedWorld(WorldDriver, Generic[B]):
 
     def off_reset(self, name: str, callback: Callable[[], None]) -> None:
         self._on_reset[name].remove(callback)
+
+    def keep(self, name: str, save: Callable[[], Any], restore: Callable[[Any], None]) -> None:
+        self._kept[name] = save, restore
 
     def on_edit(self, callback: Callable[[str, dict[str, Any], int], None]) -> None:
         self._on_edit.append(callback)

@@ -541,7 +541,7 @@ class Cycle:
         result = self.world.request(method, params)
         if method == "poses":
             result["t"] = self.t  # a world only counts its steps
-        if method == "reset":
+        if method in ("reset", "restore"):
             name = params.get("name")
             for unit in self._arm_units:
                 if name is None or name == unit.spec.name:

@@ -182,8 +182,8 @@ class LocalHost(Host):
         with self._busy:
             self.check()
             result = self.cycle.request(method, params or {})
-            # Of the world's requests, only a reset changes what arms and grippers report.
-            if not method.startswith("world.") or method == "world.reset":
+            # Of the world's requests, only these change what arms and grippers report.
+            if not method.startswith("world.") or method in ("world.reset", "world.restore"):
                 self.publish()
             return result
 

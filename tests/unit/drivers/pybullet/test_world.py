@@ -194,6 +194,8 @@ class TestRequests:
             ("set_color", {"name": "new", "rgba": [1, 0, 0, 1]}),
             ("reset", {}),
             ("remove", {"name": "new"}),
+            ("save", {}),
+            ("restore", {"state": world.save()}),
         ]
         assert {method for method, _ in requests} == PyBulletWorld.REQUESTS
         for method, params in requests:

@@ -1,0 +1,104 @@
+"""Saved and restored states of the simulated world, and simulations that become unstable."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+from engines_kit import Engine, need_engine
+from errors_kit import raises_code
+from specs import PANDA_HOME, box, cube, floor, panda
+
+from hal.driver import Setpoint
+from hal.errors import CommandError
+
+
+class SimulatedBench:
+    """A stack of two boxes, a falling one, and an arm that moves while its gripper closes."""
+
+    def __init__(self, engine: Engine) -> None:
+        lid = box("lid", (0.5, -0.2, 0.09), (0.03, 0.03, 0.03), mass=0.5)
+        falling = box("falling", (0.2, 0.5, 0.6), (0.03, 0.02, 0.01), mass=0.2, orientation=(0.1, 0.2, 0.3, 0.927))
+        self.world = engine.world(floor(), cube((0.5, -0.2, 0.03)), lid, falling, panda())
+        self.robot, self.gripper = engine.robot(self.world), engine.gripper(self.world)
+        self.robot.open()
+        self.gripper.open()
+
+    def run(self, steps: int, torque: bool | None = None) -> list[Any]:
+        """Step, and return every state; the arm moves, or is driven by torques, unless ``torque`` is None."""
+        seen = []
+        for k in range(steps):
+            q = [home + 0.1 * math.sin(0.02 * k) for home in PANDA_HOME]
+            dq = [0.1 * 0.02 * 240 * math.cos(0.02 * k)] * 7
+            if torque is not None:
+                tau = [0.3 * math.sin(0.1 * k)] * 7 if torque else None
+                self.robot.write(Setpoint(q, dq, [0.0] * 7, tau))
+            self.world.step()
+            reading, grip = self.robot.read(0.0), self.gripper.read(0.0)
+            commanded = [*(reading.q_commanded or ()), *(reading.dq_commanded or ())]
+            seen.append([self.world.snapshot(), reading.q, reading.dq, commanded, grip[3:], self.world.contacts()])
+        return seen
+
+
+@pytest.fixture
+def bench(engine: Engine) -> Iterator[SimulatedBench]:
+    made = SimulatedBench(engine)
+    yield made
+    made.world.close()
+
+
+@pytest.mark.parametrize("torque", [False, True])
+def test_the_steps_after_a_restore_repeat_those_after_the_save(engine, bench, torque):
+    bench.run(20, torque)
+    bench.gripper.grasp(0.03, 0.05, 20.0, 0.01, 0.01)
+    bench.run(30, torque)
+    state = json.loads(json.dumps(bench.world.save()))
+    first = bench.run(120, torque), bench.run(60)  # then its motors, or the last torques, hold it
+    assert np.abs(np.subtract(first[0][-1][0], first[0][0][0])).max() > 0.01
+    bench.gripper.move(0.08, 0.1, 20.0)
+    bench.run(40, not torque)
+    for world in (bench, other := SimulatedBench(engine)):
+        steps = world.world.steps
+        world.world.restore(state)
+        assert world.world.steps == steps, "time goes on"
+        assert (world.run(120, torque), world.run(60)) == first
+    other.world.close()
+
+
+def test_a_restore_changes_what_cameras_see_and_a_state_of_other_bodies_is_refused(bench: SimulatedBench) -> None:
+    world = bench.world
+    state, version = world.save(), world.version
+    world.restore(state)
+    assert world.version != version
+    for wrong in (None, {}, {**state, "engine": "other"}, {**state, "bodies": {}}, {**state, "state": {}}):
+        with raises_code(CommandError, "wrong_state"):
+            world.restore(wrong)
+    before = world.snapshot()
+    world.remove("falling")
+    with raises_code(CommandError, "wrong_state"):
+        world.restore(state)
+    world.add(box("falling", (0.2, 0.5, 0.6), (0.03, 0.02, 0.01), mass=0.2))
+    with raises_code(CommandError, "wrong_state"):
+        world.restore(state)  # in another order
+    assert len(world.snapshot()) == len(before)
+
+
+def test_an_arm_whose_numbers_mean_nothing_reports_a_fault_until_the_world_is_reset() -> None:
+    bench = SimulatedBench(need_engine("pybullet"))
+    sound = bench.run(1, False)[-1][1]
+    body = bench.world.body("panda")
+    bench.world.client.resetJointState(body.id, 3, 0.0, 1e200)
+    bench.world.step()
+    reading = bench.robot.read(7.0)
+    assert reading.fault is not None
+    assert (reading.fault.code, reading.t, reading.q, reading.dq) == ("simulation_unstable", 7.0, sound, [0.0] * 7)
+    bench.world.reset()
+    bench.world.step()
+    reading = bench.robot.read(8.0)
+    assert reading.fault is None
+    assert reading.q == pytest.approx(PANDA_HOME, abs=1e-3)
+    bench.world.close()
