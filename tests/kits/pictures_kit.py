@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import pytest
+from engines_kit import need_engine
 
 from hal.drivers.scene.camera import choose_renderer
 from hal.drivers.scene.drawn import DrawnWorld
@@ -15,11 +16,9 @@ from hal.drivers.scene.renderer import Renderer
 from hal.drivers.scene.shapes import RenderScene
 from hal.errors import DriverMissing
 from hal.geometry import Pose
+from hal.registry import choose_engine
 from hal.specs import BodySpec, CameraSpec, RobotSpec, ViewSpec, WorldSpec
 from hal.testing import camera_spec
-
-if TYPE_CHECKING:
-    from hal.drivers.pybullet.world import PyBulletWorld
 
 STREAMS = ("color", "depth", "segmentation")
 COLLADA = """<?xml version="1.0" encoding="utf-8"?>
@@ -55,12 +54,9 @@ def drawn(*bodies: BodySpec, robots: tuple[RobotSpec, ...] = ()) -> DrawnWorld:
 
 
 @contextmanager
-def stepped(*bodies: BodySpec, robots: tuple[RobotSpec, ...] = ()) -> Iterator[PyBulletWorld]:
-    """A world with physics; skips the test where PyBullet is not installed."""
-    pytest.importorskip("pybullet")
-    from hal.drivers.pybullet.world import PyBulletWorld
-
-    with closing(PyBulletWorld(world(*bodies, robots=robots))) as made:
+def stepped(*bodies: BodySpec, robots: tuple[RobotSpec, ...] = ()) -> Iterator[Any]:
+    """A world with physics, of an engine that is installed."""
+    with closing(need_engine(choose_engine("auto")).world(*bodies, *robots)) as made:
         yield made
 
 

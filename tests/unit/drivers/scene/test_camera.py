@@ -6,6 +6,7 @@ import os
 import signal
 import time
 from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,7 +15,6 @@ from pictures_kit import box, camera, drawn, look_at, renderer, stepped
 from specs import data, panda, world_spec
 
 from hal.driver import RawFrame
-from hal.drivers.pybullet.world import PyBulletWorld
 from hal.drivers.scene.camera import (
     DirectSource,
     RenderWorker,
@@ -27,6 +27,7 @@ from hal.drivers.scene.drawn import DrawnWorld
 from hal.drivers.scene.exposure import camera_pose
 from hal.drivers.scene.mirror import LocalMirror, WorldMirror
 from hal.drivers.scene.renderer import create_context
+from hal.drivers.scene.world import SimulatedWorld
 from hal.errors import ConfigError, ConnectionLost, DriverMissing, NotSupported
 from hal.geometry import Pose
 from hal.host.hosts import RemoteHost
@@ -83,7 +84,7 @@ class TestDirect:
 class Bench:
     """A stepped world that publishes, and a worker that draws, in one process."""
 
-    def __init__(self, world: PyBulletWorld) -> None:
+    def __init__(self, world: SimulatedWorld[Any]) -> None:
         self.world = world
         self.box = SeriesBox(memoryview(bytearray(SeriesBox.size(256))), 256)
         self.spec = camera(80, 60, view=FROM_ABOVE, rate_hz=10000.0)

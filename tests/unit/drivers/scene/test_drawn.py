@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import pytest
 from errors_kit import raises_code, raises_problems
 from pictures_kit import box, drawn, stepped
 from specs import cube, data, floor, iiwa, panda
 
-from hal.drivers.pybullet.world import PyBulletWorld
 from hal.drivers.scene.drawn import DrawnWorld
 from hal.drivers.scene.mirror import LocalMirror
+from hal.drivers.scene.world import SimulatedWorld
 from hal.errors import DeviceNotFound
 from hal.geometry import Pose
 from hal.specs import BodySpec, to_json
@@ -20,12 +21,12 @@ UPRIGHT = (0.0, 0.0, 0.0, 1.0)
 TURNED = (0.1, 0.2, 0.3, 0.9273618495495703)
 
 
-def pose(world: DrawnWorld | PyBulletWorld, name: str, link: str | None = None) -> Pose:
+def pose(world: DrawnWorld | SimulatedWorld[Any], name: str, link: str | None = None) -> Pose:
     found = world.pose(name, link)
     return Pose(found["position"], found["orientation"])
 
 
-def assert_same(world: PyBulletWorld, shown: DrawnWorld) -> None:
+def assert_same(world: SimulatedWorld[Any], shown: DrawnWorld) -> None:
     assert list(shown.bodies) == world.names()
     for name, body in shown.bodies.items():
         assert body.index == world.describe(name)["index"]

@@ -13,12 +13,12 @@ from pictures_kit import box, drawn, look_at, renderer, stepped
 from hal.camera import Camera
 from hal.clock import LockStepClock
 from hal.config import load
-from hal.drivers.pybullet.world import PyBulletWorld
 from hal.drivers.scene.camera import DirectSource, RenderWorker, SharedSource, SimulatedCamera
 from hal.drivers.scene.drawn import DrawnWorld
 from hal.drivers.scene.exposure import Exposure
 from hal.drivers.scene.mirror import LocalMirror, WorldMirror
 from hal.drivers.scene.renderer import RenderedImages, Renderer
+from hal.drivers.scene.world import SimulatedWorld
 from hal.geometry import Pose
 from hal.host.memory import SeriesBox
 from hal.host.ring import FrameRing, frame_rings
@@ -47,7 +47,7 @@ def scene() -> DrawnWorld:
 
 
 @pytest.fixture
-def moving() -> Iterator[PyBulletWorld]:
+def moving() -> Iterator[SimulatedWorld[Any]]:
     with stepped(FLOOR, BRICK) as world:
         yield world
 
@@ -151,7 +151,7 @@ def test_without_noise_depth_is_as_it_is_drawn(scene: DrawnWorld) -> None:
     assert np.array_equal(drawing.render(spec, EYE).depth, plain), "the picture that was drawn is not written to"
 
 
-def test_in_lock_step_a_picture_of_one_state_of_the_world_is_drawn_once(moving: PyBulletWorld) -> None:
+def test_in_lock_step_a_picture_of_one_state_of_the_world_is_drawn_once(moving: SimulatedWorld[Any]) -> None:
     drawing, spec = Counting(), camera(streams=["color", "depth"])
     clock = LockStepClock(lambda: moving.t, lambda t: None)
     source = DirectSource(LocalMirror(moving), drawing, spec, clock.now)
