@@ -1,4 +1,4 @@
-"""A window onto the simulated world: PyBullet's own, in a process of its own that mirrors the world."""
+"""A window onto the simulated world: PyBullet's own, in a process of its own that mirrors the world of any engine."""
 
 from __future__ import annotations
 
@@ -7,10 +7,11 @@ import signal
 import time
 from collections.abc import Sequence
 from contextlib import suppress
+from importlib.util import find_spec
 from typing import Any
 
 from hal.drivers.scene.mirror import WorldMirror
-from hal.errors import ConnectionLost, NotSupported
+from hal.errors import ConnectionLost, DriverMissing, NotSupported
 from hal.host.hosts import SNAPSHOT_CAPACITY, Host, LocalHost, RemoteHost
 from hal.host.memory import SeriesBox
 from hal.host.process import Channel, Child, SharedMemory, serve
@@ -33,11 +34,18 @@ class PyBulletViewer(Viewer):
     """PyBullet's window. Closing it ends only the window.
 
     Raises:
+        DriverMissing: PyBullet is not installed; the world may be another engine's.
         NotSupported: There is no display to open the window on.
     """
 
     def __init__(self, host: Host) -> None:
         super().__init__(host)
+        if find_spec("pybullet") is None:
+            raise DriverMissing(
+                "the window is PyBullet's, which is not installed: pip install 'robot-hal[sim]' (Python 3.11 or older, or a "
+                "C++ compiler); or use --viewer 3d",
+                name="pybullet",
+            )
         if not os.environ.get("DISPLAY"):
             raise NotSupported(
                 "the window needs a display, and DISPLAY is not set: run it on a desktop, through `ssh -X`, or under "

@@ -15,7 +15,7 @@ from errors_kit import raises_code
 from specs import box, data, world_spec
 
 from hal.drivers.pybullet.viewer import PyBulletViewer
-from hal.errors import NotSupported
+from hal.errors import DriverMissing, NotSupported
 from hal.host.hosts import LocalHost
 from hal.specs import BodySpec, GroupSpec, to_json
 
@@ -66,6 +66,14 @@ def test_without_a_display_the_viewer_is_not_supported(monkeypatch: pytest.Monke
         monkeypatch.setenv("DISPLAY", name)
     with raises_code(NotSupported, "no_display"):
         PyBulletViewer(lock_step()).wait_ready()
+
+
+def test_without_pybullet_the_viewer_is_a_missing_driver(monkeypatch: pytest.MonkeyPatch) -> None:
+    host = lock_step()
+    monkeypatch.setattr("hal.drivers.pybullet.viewer.find_spec", lambda name: None)
+    with pytest.raises(DriverMissing):
+        PyBulletViewer(host)
+    host.close()
 
 
 def test_the_window_shows_the_world_and_its_edits_until_it_is_closed(display: Display) -> None:
