@@ -42,8 +42,8 @@ class PyBulletViewer(Viewer):
         super().__init__(host)
         if find_spec("pybullet") is None:
             raise DriverMissing(
-                "the window is PyBullet's, which is not installed: pip install 'robot-hal[sim]' (Python 3.11 or older, or a "
-                "C++ compiler); or use --viewer 3d",
+                "the window is PyBullet's, which is not installed: pip install 'robot-hal[sim]' (Python 3.11 or older, "
+                "or a C++ compiler); or use --viewer 3d",
                 name="pybullet",
             )
         if not os.environ.get("DISPLAY"):

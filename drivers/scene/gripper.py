@@ -54,12 +54,14 @@ class SimulatedGripper(GripperDriver, Generic[W, B]):
         self._open = False
         self._target = self._aim = spec.width_max
         self._force = spec.force
-        self._stood = self._stood_since = 0.0
-        """Width, m, near which the fingers have stayed, and since when, s."""
+        self._stood = 0.0
+        """Width near which the fingers have stayed, m."""
+        self._stood_since = 0
+        """The step since which they have stayed there."""
         self._settle = SETTLE
         self._resting = True
-        self._seen = 0.0
-        """When the width was read last, s."""
+        self._seen = 0
+        """The step after which the width was read last."""
         self._speed = spec.speed
         self._driven: float | None = None
         """Speed of the motion that the motors make, m/s; None while they hold since a reset."""
@@ -139,7 +141,7 @@ class SimulatedGripper(GripperDriver, Generic[W, B]):
         self._expect_open()
         self._force = force
         self._speed = min(speed, self.spec.speed)
-        self._resting, self._stood_since = False, self._world.t
+        self._resting, self._stood_since = False, self._world.steps
         self._settle = max(SETTLE, 2.0 * STILL / self._speed)
         self._handle(True)
         self._driven = self._speed
@@ -147,15 +149,15 @@ class SimulatedGripper(GripperDriver, Generic[W, B]):
 
     def _at_rest(self, width: float, speed: float) -> bool:
         """Return whether the fingers have arrived, or stand still elsewhere. To be called for every new width."""
-        t = self._world.t
-        unseen, self._seen = t - self._seen, t
-        stood_long = t - self._stood_since >= self._settle
+        step, dt = self._world.steps, self._world.dt
+        unseen, self._seen = (step - self._seen) * dt, step
+        stood_long = (step - self._stood_since) * dt >= self._settle
         if abs(width - self._stood) > STILL:
             if unseen < self._settle:
                 self._resting = self._resting and stood_long  # a creeping finger has stood long at every place
             else:  # in lock-step nothing is read while a program sleeps
                 self._resting = abs(speed) <= BLOCKED * self._speed
-            self._stood, self._stood_since = width, t
+            self._stood, self._stood_since = width, step
         elif stood_long:
             self._resting = True
         return self._resting or (abs(width - self._aim) <= AT_TARGET and abs(speed) <= SLOW)
@@ -178,19 +180,21 @@ class SimulatedGripper(GripperDriver, Generic[W, B]):
         self._open = False
 
     def _save(self) -> dict[str, Any]:
-        return {name: getattr(self, f"_{name}") for name in _KEPT} | {"stood_for": self._world.t - self._stood_since}
+        now = self._world.steps
+        steps = {"stood_for": now - self._stood_since, "unseen_for": now - self._seen}
+        return {name: getattr(self, f"_{name}") for name in _KEPT} | steps
 
     def _restore(self, state: dict[str, Any]) -> None:
         for name in _KEPT:
             setattr(self, f"_{name}", state[name])
-        self._seen = self._world.t
-        self._stood_since = self._world.t - state["stood_for"]
+        now = self._world.steps
+        self._stood_since, self._seen = now - state["stood_for"], now - state["unseen_for"]
         self._resume()
 
     def _was_reset(self) -> None:
         self._driven = None
         self._target = self._aim = self._stood = self._width()[0]
-        self._resting, self._stood_since = True, self._world.t
+        self._resting, self._stood_since = True, self._world.steps
         self._force = self.spec.force
 
     def _owner(self) -> B:

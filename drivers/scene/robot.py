@@ -53,8 +53,8 @@ class SimulatedRobot(RobotDriver, Generic[W]):
         self._dq: Floats | None = None
         self._tau: Floats | None = None
         """Torques that drive the arm, Nm; None while the motors follow positions."""
-        self._t_received = 0.0
-        """When the last torques arrived, in simulated s."""
+        self._received = 0
+        """The step before which the last torques arrived."""
 
     # --- what an engine implements -----------------------------------------------------------------------------------
 
@@ -117,7 +117,7 @@ class SimulatedRobot(RobotDriver, Generic[W]):
         if tau is not None:
             if self._tau is None:
                 self._take_over()
-            self._tau, self._t_received = tau, self._world.t
+            self._tau, self._received = tau, self._world.steps
             self._keep_torques(tau)
         else:
             if self._tau is not None:
@@ -127,7 +127,7 @@ class SimulatedRobot(RobotDriver, Generic[W]):
 
     def _keep_torques(self, tau: Floats) -> None:
         """Apply torques to each step and compensate gravity, as an arm's own controller does between commands."""
-        if self._world.t - self._t_received > HOLD_TIME:
+        if (self._world.steps - self._received) * self._world.dt > HOLD_TIME:
             self._hold(self._positions())
         else:
             self._apply(tau)
@@ -190,11 +190,11 @@ class SimulatedRobot(RobotDriver, Generic[W]):
     def _save(self) -> dict[str, Any]:
         parts = {"q": self._q, "dq": self._dq, "tau": self._tau}
         state: dict[str, Any] = {name: None if part is None else list(part) for name, part in parts.items()}
-        return state | {"age": self._world.t - self._t_received}
+        return state | {"age": self._world.steps - self._received}
 
     def _restore(self, state: dict[str, Any]) -> None:
         self._q, self._dq, self._tau = state["q"], state["dq"], state["tau"]
-        self._t_received = self._world.t - state["age"]
+        self._received = self._world.steps - state["age"]
 
     def _was_reset(self) -> None:
         self._q, self._dq = self._positions(), [0.0] * len(self.spec.joints)
