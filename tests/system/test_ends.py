@@ -66,4 +66,4 @@ def test_user_code_that_goes_wrong(watch, ending: str, trip: Trip) -> None:
         app.wait_for(app.nobody_left)
         assert app.process.wait(5) == 1, "the user's own exception ends the program"
     else:
-        assert app.servo().trip is trip
+        app.wait_for(lambda: app.servo().trip is trip)  # a busy computer may show the arm at rest before its deadline
