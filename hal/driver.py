@@ -172,8 +172,7 @@ class RobotDriver(DeviceDriver):
     :meth:`engage`) sets it to False until then, and again when a fault or a lost link switched them off."""
 
     def __init__(self, spec: RobotSpec, world: object | None = None) -> None:
-        self.spec = spec
-        self.world = world
+        self.spec, self.world = spec, world
 
     def wait(self) -> None:
         """Block until the device's next cycle, for a bounded time. Needed if :attr:`paces_itself` is True.
@@ -225,11 +224,10 @@ class RobotDriver(DeviceDriver):
         """End streaming: the device stops, and holds where it is. Idempotent."""
 
     def lower(self) -> bool:
-        """Lower an arm without brakes a little further, before :meth:`close`; return whether it is down.
+        """Lower an arm without brakes by one cycle, before :meth:`close`; return whether it is down.
 
-        It is called once per cycle in place of :meth:`read` and :meth:`write`, after the last session, until it returns
-        True, for 7 s at most. Meanwhile the group's other arms are lowered as well, and its grippers hold. A lost link
-        is no error. ``close`` may come without it, and then lowers the arm by itself.
+        Called in place of :meth:`read` and :meth:`write` until it returns True, for 7 s at most, as are the other
+        arms of the group; its grippers hold. A lost link is no error. ``close`` may come without it.
         """
         return True
 
@@ -324,8 +322,7 @@ class GripperDriver(DeviceDriver):
     """
 
     def __init__(self, spec: GripperSpec, world: object | None = None) -> None:
-        self.spec = spec
-        self.world = world
+        self.spec, self.world = spec, world
 
     @abstractmethod
     def read(self, now: float) -> GripperReading:
@@ -465,8 +462,7 @@ class CameraDriver(DeviceDriver):
     """Sets of images dropped so far."""
 
     def __init__(self, spec: CameraSpec, source: object | None = None) -> None:
-        self.spec = spec
-        self.source = source
+        self.spec, self.source = spec, source
 
     @classmethod
     def plugged(cls) -> tuple[str, ...]:
@@ -486,14 +482,10 @@ class CameraDriver(DeviceDriver):
             pose = Pose(s.position, s.orientation)
             streams[name] = StreamInfo(s.format, s.width, s.height, s.rate_hz, frozen(s.K), distortion, pose)
         infrared = spec.K_infrared or (spec.K if {"infrared", "infrared_right"} & set(spec.streams) else None)
-        return CameraInfo(
-            title or spec.model,
-            frozen(spec.K),
-            distortion,
-            frozen(infrared) if infrared is not None else None,
-            clock="simulated" if self.simulated else "hardware",
-            streams=MappingProxyType(streams),
-        )
+        K_infrared = None if infrared is None else frozen(infrared)
+        clock = "simulated" if self.simulated else "hardware"
+        made = MappingProxyType(streams)
+        return CameraInfo(title or spec.model, frozen(spec.K), distortion, K_infrared, clock, streams=made)
 
     @abstractmethod
     def grab(self, timeout: float) -> RawFrame | None:
@@ -560,8 +552,7 @@ class GamepadDriver(DeviceDriver):
     buttons serve as the dead-man of a real arm. It may change when another pad is plugged in."""
 
     def __init__(self, spec: PadSpec, source: object | None = None) -> None:
-        self.spec = spec
-        self.source = source
+        self.spec, self.source = spec, source
         self.notes: tuple[str, ...] = ()
         """Messages for the user about this pad, each with the remedy."""
         self.flat: Mapping[str, float] = MappingProxyType({})
