@@ -27,7 +27,7 @@ class MujocoGripper(SimulatedGripper[MujocoWorld, Body]):
 
     def _drive(self, speed: float) -> None:
         motors, at = self._world.motors, self._at
-        motors.aim[at], motors.feed[at] = self._aim / 2.0, 0.0
+        motors.target[at], motors.feed[at] = self._aim / 2.0, 0.0
         motors.efforts[at], motors.speeds[at] = self._force, speed / 2.0
         motors.limit()
 

@@ -17,39 +17,41 @@ STIFFNESS = 72.0
 """Rate at which a position error decays, 1/s: the same as with PyBullet."""
 BOOST = 0.25
 """Share of the speed that a joint lacks after a step that is added to what is wanted from then on."""
-_AIM, _FEED, _Q, _DQ, _WANTED, _BOOST = range(6)
+_TARGET, _FEED, _Q, _DQ, _WANTED, _BOOST = range(6)
 
 
 class Motors:
     """Computes the torques of all driven joints before each step.
 
-    A motor wants its joint to have the speed ``feed + STIFFNESS (aim - q)`` at the end of the step, within its speed
-    limit. The torques that do it follow from the inertia of the arms and the forces that act on them: gravity, Coriolis
-    and centrifugal forces. A load or a contact that is not in this model makes a joint lag. What it lacks is added up
-    and compensated (:data:`BOOST`), so that an arm carries an object without sagging, and fingers press with their full
-    force. Torques stay within the motors' limits.
+    A motor wants its joint to have the speed ``feed + STIFFNESS (target - feed dt - q)`` in the step, within its speed
+    limit, so that a joint which keeps up is at the target at the end. The torques that do it follow from the inertia of
+    the arms and the forces that act on them: gravity, Coriolis and centrifugal forces. A load or a contact that is not
+    in this model makes a joint lag. What it lacks is added up and compensated (:data:`BOOST`), so that an arm carries
+    an object without sagging, and fingers press with their full force. Torques stay within the motors' limits.
 
     The driven joints are the first ``n`` degrees of freedom of the model, with one position each.
 
     Args:
         n: Number of driven joints.
+        dt: Length of the world's step, s.
         h: Length of MuJoCo's step, s.
     """
 
-    def __init__(self, n: int, h: float) -> None:
+    def __init__(self, n: int, dt: float, h: float) -> None:
         self.n = n
         self.h = h
-        self.state = np.zeros((6, n))
-        """Aim (rad or m), feed (per s), position, speed, wanted speed, and boost (per s) of each joint."""
-        self.aim, self.feed, self.wanted, self.boost = (self.state[k] for k in (_AIM, _FEED, _WANTED, _BOOST))
+        self._state = state = np.zeros((6, n))
+        """Target (rad or m), feed (per s), position, speed, wanted speed, and boost (per s) of each joint."""
+        self.target, self.feed, self.wanted, self.boost = (state[k] for k in (_TARGET, _FEED, _WANTED, _BOOST))
+        self._results, self._speeds = state[_WANTED:], state[_DQ:]
         self.efforts = np.zeros(n)
         """Greatest torque or force of each motor, Nm or N."""
         self.speeds = np.zeros(n)
         """Greatest speed of each joint, rad/s or m/s."""
         self.torques: dict[str, tuple[Any, Array]] = {}
         """Arms that are driven by torques instead: places of their joints, torques on top of the compensation, Nm."""
-        gain = min(STIFFNESS, 1.0 / h)
-        self._law = np.array([[gain, 1.0, -gain, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, -BOOST, BOOST, 1.0]])
+        gain = min(STIFFNESS, 1.0 / dt)
+        self._law = np.array([[gain, 1.0 - gain * dt, -gain, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, -BOOST, BOOST, 1.0]])
         self._next = np.zeros((2, n))
         self._most = np.zeros((2, n))
         self._least = np.zeros((2, n))
@@ -75,20 +77,22 @@ class Motors:
 
     def rest(self, at: Any, q: Floats | float) -> None:
         """Hold some joints at positions, and forget what their motors compensated."""
-        self.aim[at] = q
+        self.target[at] = q
         self.feed[at] = self.wanted[at] = self.boost[at] = 0.0
 
     def drive(self) -> None:
         """Set the torques of the next step; to be called when inertia and forces are those of the present state."""
-        state, new, force = self.state, self._next, self._driven_force
-        state[_Q], state[_DQ] = self._q, self._dq
-        np.dot(self._law, state, out=new)
+        state, new, force = self._state, self._next, self._driven_force
+        state[_Q] = self._q
+        state[_DQ] = self._dq
+        self._law.dot(state, new)
         np.maximum(new, self._least, out=new)
-        np.minimum(new, self._most, out=state[_WANTED:])
-        np.dot(self._to_acceleration, state[_DQ:], out=self._driven_acceleration)
+        np.minimum(new, self._most, out=self._results)
+        self._to_acceleration.dot(self._speeds, self._driven_acceleration)
         self._mulm(self._model, self._data, self._force, self._acceleration)
-        for at, torques in self.torques.values():
-            force[at] = torques
+        if self.torques:
+            for at, torques in self.torques.values():
+                force[at] = torques
         np.add(force, self._bias, out=force)
         np.maximum(force, self._negative_efforts, out=force)
         np.minimum(force, self.efforts, out=self.applied)

@@ -17,10 +17,7 @@ Floats = Sequence[float]
 
 
 class MujocoRobot(SimulatedRobot[MujocoWorld]):
-    """The driver of one robot in a :class:`~hal.drivers.mujoco.world.MujocoWorld`, driven by :class:`.motors.Motors`.
-
-    With the aim ``q_set - dq_set dt`` and the speed ``dq_set``, a joint is at its set-point at the end of the step.
-    """
+    """The driver of one robot in a :class:`~hal.drivers.mujoco.world.MujocoWorld`, moved by :class:`.motors.Motors`."""
 
     WORLD = MujocoWorld
 
@@ -34,15 +31,15 @@ class MujocoRobot(SimulatedRobot[MujocoWorld]):
         return world.q[at].tolist(), world.dq[at].tolist(), world.motors.applied[at].tolist()
 
     def _follow(self, q: Floats, dq: Floats) -> None:
-        motors, at, dt = self._world.motors, self._at, self._world.dt
-        motors.aim[at] = [a - b * dt for a, b in zip(q, dq, strict=True)]
+        motors, at = self._world.motors, self._at
+        motors.target[at] = q
         motors.feed[at] = dq
 
     def _hold_at(self, q: Floats) -> None:
         motors, at = self._world.motors, self._at
         if motors.torques.pop(self.spec.name, None) is not None:
             motors.rest(at, q)
-        motors.aim[at], motors.feed[at] = q, 0.0
+        motors.target[at], motors.feed[at] = q, 0.0
 
     def _take_over(self) -> None:
         """Do nothing: the first torques switch the motors off."""

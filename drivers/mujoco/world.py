@@ -27,6 +27,8 @@ LONGEST_STEP = 1.0 / 240.0
 """Longest step of MuJoCo's, s: a world of a lower rate makes several of them in one of its own."""
 FASTEST = 1e4
 """Speed of a joint or a body, rad/s or m/s, from which on a simulation counts as unstable."""
+SOUND_EVERY = 16
+"""Steps after which the positions are kept to which an unstable simulation is set back."""
 MIRROR_STRENGTH = 10.0
 """Torques of a mirror's motors, as a multiple of the arm's: nothing in the world stops it or makes it sag."""
 
@@ -77,7 +79,7 @@ class MujocoWorld(SimulatedWorld[Body]):
         option.disableflags = mujoco.mjtDisableBit.mjDSBL_AUTORESET
         # Several contacts between two convex shapes: on by default since MuJoCo 4.
         option.enableflags = int(getattr(mujoco.mjtEnableBit, "mjENBL_MULTICCD", 0))
-        self.motors = Motors(0, option.timestep)
+        self.motors = Motors(0, self.dt, option.timestep)
         try:
             self._load((*spec.bodies, *spec.robots))
             self._check_overlaps()
@@ -92,15 +94,16 @@ class MujocoWorld(SimulatedWorld[Body]):
         if self._following:
             self._hold_mirrors()
         motors, model, data = self.motors, self.model, self.data
-        np.copyto(self._sound, self._qpos)
+        if not self.steps % SOUND_EVERY:
+            self._sound[:] = self._qpos
         for _ in range(self.substeps):
             self._step1(model, data)
             motors.drive()
             self._step2(model, data)
             if self.substeps > 1:
-                motors.aim += motors.feed * motors.h
+                motors.target += motors.feed * motors.h  # as far as it moves in this part of the step
         if self.substeps > 1:
-            motors.aim -= motors.feed * self.dt
+            motors.target -= motors.feed * self.dt
         self.steps += 1
         self._placed = False
         self._touched = True
@@ -195,7 +198,7 @@ class MujocoWorld(SimulatedWorld[Body]):
         robots = [body for body in self.bodies.values() if body.is_robot]
         n = sum(len(body.movable) for body in robots)
         if n != self.motors.n:  # the first time: arms stay
-            self.motors = Motors(n, model.opt.timestep)
+            self.motors = Motors(n, self.dt, model.opt.timestep)
             for body in robots:
                 self._set_limits(body)
         self.motors.bind(mujoco, model, data)
@@ -367,14 +370,14 @@ class MujocoWorld(SimulatedWorld[Body]):
         assert isinstance(body.spec, RobotSpec)
         motors, data, at = self.motors, self.data, self.dofs(body, body.spec.joints)
         data.qpos[at], data.qvel[at] = q, dq
-        motors.rest(at, q)
+        motors.rest(at, [a + b * self.dt for a, b in zip(q, dq, strict=True)])
         motors.feed[at] = motors.wanted[at] = dq
         self._placed = False
         self._following.add(body.name)
         self._fresh.add(body.name)
         if width is not None and body.spec.gripper is not None:
             fingers = self.dofs(body, body.spec.gripper.joints)
-            motors.aim[fingers] = width / 2.0
+            motors.target[fingers] = width / 2.0
             if body.name not in self._width_known:
                 self._width_known.add(body.name)
                 data.qpos[fingers], data.qvel[fingers] = width / 2.0, 0.0
