@@ -32,6 +32,8 @@ Array = NDArray[np.float64]
 
 FINGER_INERTIA = 3.0
 """Inertia of the drive of each finger, kg: it is in no URDF, and a finger of 30 g alone could not press steadily."""
+ROUGH = 1.15
+"""A link may have so many times the greatest inertia that fits its collision shapes, which are rough."""
 LEAST_MASS, LEAST_INERTIA = 1e-3, 1e-7
 """Least mass, kg, and moment of inertia, kg m2, of a link that moves: MuJoCo takes none without."""
 STIFF_CONTACT = (0.01, 1.0)
@@ -362,7 +364,7 @@ def _inertial(
     wrong = False
     if corners is not None:
         most = 3.0 * mass * _box_inertia(corners)
-        wrong = bool((np.sort(moments) > np.sort(most)).any()) or bool((moments <= 0.0).all())
+        wrong = bool((np.sort(moments) > ROUGH * np.sort(most)).any()) or bool((moments <= 0.0).all())
         if wrong:
             moments, pose = most / 3.0, Pose(pose.position)
     moments = np.maximum(moments, LEAST_INERTIA)

@@ -17,7 +17,7 @@ STIFFNESS = 72.0
 """Rate at which a position error decays, 1/s: the same as with PyBullet."""
 BOOST = 0.25
 """Share of the speed that a joint lacks after a step that is added to what is wanted from then on."""
-_TARGET, _FEED, _Q, _DQ, _WANTED, _BOOST = range(6)
+_TARGET, _FEED, _CUT, _Q, _DQ, _WANTED, _BOOST = range(7)
 
 
 class Motors:
@@ -40,10 +40,11 @@ class Motors:
     def __init__(self, n: int, dt: float, h: float) -> None:
         self.n = n
         self.h = h
-        self._state = state = np.zeros((6, n))
-        """Target (rad or m), feed (per s), position, speed, wanted speed, and boost (per s) of each joint."""
+        self._state = state = np.zeros((7, n))
+        """Of each joint: target (rad or m), feed (per s), what the torque limit took from the wanted speed (per s),
+        position, speed, wanted speed, and boost (per s)."""
         self.target, self.feed, self.wanted, self.boost = (state[k] for k in (_TARGET, _FEED, _WANTED, _BOOST))
-        self._results, self._speeds = state[_WANTED:], state[_DQ:]
+        self._cut, self._results, self._speeds = state[_CUT], state[_WANTED:], state[_DQ:]
         self.efforts = np.zeros(n)
         """Greatest torque or force of each motor, Nm or N."""
         self.speeds = np.zeros(n)
@@ -51,7 +52,9 @@ class Motors:
         self.torques: dict[str, tuple[Any, Array]] = {}
         """Arms that are driven by torques instead: places of their joints, torques on top of the compensation, Nm."""
         gain = min(STIFFNESS, 1.0 / dt)
-        self._law = np.array([[gain, 1.0 - gain * dt, -gain, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, -BOOST, BOOST, 1.0]])
+        self._law = np.array(
+            [[gain, 1.0 - gain * dt, 0.0, -gain, 0.0, 0.0, 0.0], [0.0, 0.0, BOOST, 0.0, -BOOST, BOOST, 1.0]]
+        )
         self._next = np.zeros((2, n))
         self._most = np.zeros((2, n))
         self._least = np.zeros((2, n))
@@ -78,7 +81,7 @@ class Motors:
     def rest(self, at: Any, q: Floats | float) -> None:
         """Hold some joints at positions, and forget what their motors compensated."""
         self.target[at] = q
-        self.feed[at] = self.wanted[at] = self.boost[at] = 0.0
+        self.feed[at] = self.wanted[at] = self.boost[at] = self._cut[at] = 0.0
 
     def drive(self) -> None:
         """Set the torques of the next step; to be called when inertia and forces are those of the present state."""
@@ -96,3 +99,5 @@ class Motors:
         np.add(force, self._bias, out=force)
         np.maximum(force, self._negative_efforts, out=force)
         np.minimum(force, self.efforts, out=self.applied)
+        np.subtract(self.applied, force, out=force)
+        np.multiply(force, self._ease, out=self._cut)
