@@ -97,7 +97,8 @@ class Motors:
             for at, torques in self.torques.values():
                 force[at] = torques
         np.add(force, self._bias, out=force)
-        np.maximum(force, self._negative_efforts, out=force)
-        np.minimum(force, self.efforts, out=self.applied)
-        np.subtract(self.applied, force, out=force)
+        applied = self.applied
+        np.maximum(force, self._negative_efforts, out=applied)
+        np.minimum(applied, self.efforts, out=applied)
+        np.subtract(applied, force, out=force)
         np.multiply(force, self._ease, out=self._cut)
