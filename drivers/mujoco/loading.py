@@ -34,6 +34,8 @@ FINGER_INERTIA = 3.0
 """Inertia of the drive of each finger, kg: it is in no URDF, and a finger of 30 g alone could not press steadily."""
 ROUGH = 1.15
 """A link may have so many times the greatest inertia that fits its collision shapes, which are rough."""
+UNSTOPPABLE, STRONGEST = 1e5, 1e9
+"""Inertia, kg m2, and greatest torque, Nm, of the joints of an arm that mirrors a real one."""
 LEAST_MASS, LEAST_INERTIA = 1e-3, 1e-7
 """Least mass, kg, and moment of inertia, kg m2, of a link that moves: MuJoCo takes none without."""
 STIFF_CONTACT = (0.01, 1.0)
@@ -109,6 +111,8 @@ class BodyPlan:
     mimics: list[tuple[str, str, float, float]] = field(default_factory=list)
     """Follower, leader, multiplier and offset."""
     fingers: tuple[str, ...] = ()
+    unstoppable: tuple[str, ...] = ()
+    """Joints that nothing holds back."""
     warnings: list[str] = field(default_factory=list)
 
 
@@ -151,8 +155,12 @@ def plan_object(spec: BodySpec) -> BodyPlan:
     return plan
 
 
-def plan_robot(spec: RobotSpec) -> BodyPlan:
+def plan_robot(spec: RobotSpec, *, mirrored: bool = False) -> BodyPlan:
     """Return the plan of an arm, with its base fixed in the world.
+
+    Args:
+        spec: The arm's record.
+        mirrored: It mirrors a real arm: nothing in the world stops its joints, and its fingers have their grip force.
 
     Raises:
         ConfigError: As of :func:`plan_object`, or a joint or link that the record names is not in the URDF.
@@ -170,6 +178,11 @@ def plan_robot(spec: RobotSpec) -> BodyPlan:
         body.home[number], body.efforts[number] = drives.home[name], drives.efforts[name]
         body.speeds[number] = drives.speeds[name]
     plan.fingers = spec.gripper.joints if spec.gripper else ()
+    if mirrored:
+        plan.unstoppable = spec.joints
+        for name in moving:
+            finger = spec.gripper is not None and name in spec.gripper.joints
+            body.efforts[body.joints[name]] = spec.gripper.force if spec.gripper and finger else STRONGEST
     root = Pose(spec.base_position, spec.base_orientation)
     if spec.kinematics.base_link:
         root = root @ urdf.poses({})[spec.kinematics.base_link].inverse()
@@ -460,6 +473,8 @@ def _add_joint(mujoco: Any, node: Any, plan: BodyPlan, joint: UrdfJoint) -> None
         made.range = limits
     if joint.name in plan.fingers:
         made.armature = FINGER_INERTIA
+    elif joint.name in plan.unstoppable:
+        made.armature = UNSTOPPABLE
 
 
 _KINDS: Mapping[str, str] = {

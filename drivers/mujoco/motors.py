@@ -49,6 +49,8 @@ class Motors:
         """Greatest torque or force of each motor, Nm or N."""
         self.speeds = np.zeros(n)
         """Greatest speed of each joint, rad/s or m/s."""
+        self.arms: dict[str, NDArray[np.intp]] = {}
+        """Places of the joints of each arm, without its fingers."""
         self.torques: dict[str, tuple[Any, Array]] = {}
         """Arms that are driven by torques instead: places of their joints, torques on top of the compensation, Nm."""
         gain = min(STIFFNESS, 1.0 / dt)
@@ -70,6 +72,10 @@ class Motors:
         self._acceleration, self._force = np.zeros(model.nv), np.zeros(model.nv)
         self._driven_acceleration, self._driven_force = self._acceleration[:n], self._force[:n]
         self._ease = self.h * model.dof_invweight0[:n]
+        self._of_arms = np.zeros(n)
+        for arm in self.arms.values():
+            self._of_arms[arm] = 1.0
+        self._alone = self._ease * (1.0 - self._of_arms)
         self.limit()
 
     def limit(self) -> None:
@@ -94,11 +100,61 @@ class Motors:
         self._to_acceleration.dot(self._speeds, self._driven_acceleration)
         self._mulm(self._model, self._data, self._force, self._acceleration)
         if self.torques:
-            for at, torques in self.torques.values():
-                force[at] = torques
+            self._drive_by_torques()
         np.add(force, self._bias, out=force)
         applied = self.applied
         np.maximum(force, self._negative_efforts, out=applied)
         np.minimum(applied, self.efforts, out=applied)
         np.subtract(applied, force, out=force)
-        np.multiply(force, self._ease, out=self._cut)
+        np.multiply(force, self._alone, out=self._cut)
+        np.multiply(force, self._of_arms, out=force)
+        if force.dot(force) > 0.0:
+            self._share(force)
+
+    def _drive_by_torques(self) -> None:
+        """Put the torques of :attr:`torques` in place of those of the motors."""
+        for at, torques in self.torques.values():
+            self._driven_force[at] = torques
+
+    def _share(self, excess: Array) -> None:
+        """Choose the torques of arms with a joint at its limit: all joints that can move as wanted do.
+
+        A joint at its limit moves less than wanted, and that changes what the others need.
+        """
+        for name, arm in self.arms.items():
+            if name in self.torques or not excess[arm].any():
+                continue
+            inertia, most = self.inertia(self._model, self._data, arm), self.efforts[arm]
+            wanted = self._acceleration[arm]
+            rest = self.applied[arm] - excess[arm] - inertia @ wanted
+            acceleration, limited, signs = wanted.copy(), np.zeros(len(arm), bool), np.zeros(len(arm))
+            for _ in range(4 * len(arm)):  # it ends after as many turns as joints are at their limit, mostly
+                acceleration[~limited] = wanted[~limited]
+                if limited.any():
+                    own = inertia[np.ix_(limited, limited)]
+                    given = signs[limited] * most[limited] - rest[limited]
+                    given -= inertia[np.ix_(limited, ~limited)] @ wanted[~limited]
+                    acceleration[limited] = np.linalg.solve(own, given)
+                torques = rest + inertia @ acceleration
+                too_much = signs * (acceleration - wanted)  # it needs less than its limit
+                if too_much.max() > 1e-9:
+                    joint = int(too_much.argmax())
+                    limited[joint], signs[joint] = False, 0.0
+                    continue
+                over = np.where(limited, 0.0, np.abs(torques) - most)
+                joint = int(over.argmax())
+                if over[joint] <= 1e-9:
+                    break
+                limited[joint], signs[joint] = True, np.sign(torques[joint])
+            self.applied[arm] = np.clip(torques, -most, most)
+            self.wanted[arm[limited]] = self._dq[arm[limited]] + self.h * acceleration[limited]
+
+    def inertia(self, model: Any, data: Any, at: NDArray[np.intp]) -> Array:
+        """Return the joint-space inertia (k, k), kg m2, of the joints at these places, of the state in ``data``."""
+        rows, row, unit = np.zeros((len(at), len(at))), np.zeros(model.nv), np.zeros(model.nv)
+        for k, place in enumerate(at):
+            unit[place] = 1.0
+            self._mulm(model, data, row, unit)
+            unit[place] = 0.0
+            rows[k] = row[at]
+        return rows

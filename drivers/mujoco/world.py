@@ -29,8 +29,6 @@ FASTEST = 1e4
 """Speed of a joint or a body, rad/s or m/s, from which on a simulation counts as unstable."""
 SOUND_EVERY = 16
 """Steps after which the positions are kept to which an unstable simulation is set back."""
-MIRROR_STRENGTH = 10.0
-"""Torques of a mirror's motors, as a multiple of the arm's: nothing in the world stops it or makes it sag."""
 
 
 class MujocoWorld(SimulatedWorld[Body]):
@@ -142,12 +140,7 @@ class MujocoWorld(SimulatedWorld[Body]):
         mujoco.mj_kinematics(model, data)
         mujoco.mj_comPos(model, data)
         mujoco.mj_makeM(model, data)
-        rows, row, unit = [], np.zeros(model.nv), np.zeros(model.nv)
-        for place in np.arange(model.nv)[at].tolist():
-            unit[place] = 1.0
-            mujoco.mj_mulM(model, data, row, unit)
-            unit[place] = 0.0
-            rows.append(row[at].tolist())
+        rows: list[list[float]] = self.motors.inertia(model, data, np.arange(model.nv)[at]).tolist()
         return rows
 
     def dofs(self, body: Body, names: Sequence[str]) -> Any:
@@ -160,7 +153,10 @@ class MujocoWorld(SimulatedWorld[Body]):
     # --- loading -----------------------------------------------------------------------------------------------------
 
     def _place(self, spec: BodySpec | RobotSpec) -> Body:
-        plan = plan_robot(spec) if isinstance(spec, RobotSpec) else plan_object(spec)
+        if isinstance(spec, RobotSpec):
+            plan = plan_robot(spec, mirrored=spec.driver != self.spec.driver)
+        else:
+            plan = plan_object(spec)
         self._plans[spec.name] = plan
         self.warnings += plan.warnings
         return plan.body
@@ -201,6 +197,9 @@ class MujocoWorld(SimulatedWorld[Body]):
             self.motors = Motors(n, self.dt, model.opt.timestep)
             for body in robots:
                 self._set_limits(body)
+                assert isinstance(body.spec, RobotSpec)
+                places = [body.qvel[body.joints[name]] for name in body.spec.joints]
+                self.motors.arms[body.name] = np.array(places)
         self.motors.bind(mujoco, model, data)
         self._fingers = {
             body.name: frozenset(body.joints[joint] for joint in body.spec.gripper.joints)
@@ -219,14 +218,8 @@ class MujocoWorld(SimulatedWorld[Body]):
         self._lay_out()
 
     def _set_limits(self, body: Body) -> None:
-        strength = MIRROR_STRENGTH if self._is_mirrored(body) else 1.0
-        fingers = body.spec.gripper if isinstance(body.spec, RobotSpec) else None
         for joint, place in body.qvel.items():
-            self.motors.efforts[place] = strength * body.efforts[joint]
-            self.motors.speeds[place] = body.speeds[joint]
-        if fingers is not None and strength != 1.0:
-            for name in fingers.joints:
-                self.motors.efforts[body.qvel[body.joints[name]]] = fingers.force
+            self.motors.efforts[place], self.motors.speeds[place] = body.efforts[joint], body.speeds[joint]
 
     def _state_of(self, body: Body) -> tuple[list[Array], list[Array], list[bool]]:
         data, (at, along) = self.data, _places(body)
