@@ -30,7 +30,7 @@ __all__ = ["BodyPlan", "build", "contact_dimensions", "plan_object", "plan_robot
 
 Array = NDArray[np.float64]
 
-FINGER_INERTIA = 3.0
+FINGER_INERTIA = 1.0
 """Inertia of the drive of each finger, kg: it is in no URDF, and a finger of 30 g alone could not press steadily."""
 ROUGH = 1.15
 """A link may have so many times the greatest inertia that fits its collision shapes, which are rough."""

@@ -16,13 +16,7 @@ from hal.specs import BodySpec, RobotSpec, WorldSpec
 from hal.world import WorldDriver
 
 KNOWN: Mapping[str, tuple[str, ...]] = {
-    "mujoco": (
-        "test_a_joint_whose_set_point_jumps_moves_no_faster_than_its_limit",
-        "test_after_torques_the_motors_hold_the_arm_with_their_speed_limit",
-        "test_widths_and_speeds_are_clipped",
-        "test_oscillating_fingers_count_as_at_rest",
-        "test_pushes_objects_and_is_not_stopped_by_them",
-    ),
+    "mujoco": ("test_oscillating_fingers_count_as_at_rest",),
 }
 """Tests that may fail on an engine, by its name."""
 
