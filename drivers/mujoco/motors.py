@@ -40,7 +40,7 @@ class Motors:
     def __init__(self, n: int, dt: float, h: float) -> None:
         self.n = n
         self.h = h
-        self._state = state = np.zeros((7, n))
+        self.state = state = np.zeros((7, n))
         """Of each joint: target (rad or m), feed (per s), what the torque limit took from the wanted speed (per s),
         position, speed, wanted speed, and boost (per s)."""
         self.target, self.feed, self.wanted, self.boost = (state[k] for k in (_TARGET, _FEED, _WANTED, _BOOST))
@@ -91,7 +91,7 @@ class Motors:
 
     def drive(self) -> None:
         """Set the torques of the next step; to be called when inertia and forces are those of the present state."""
-        state, new, force = self._state, self._next, self._driven_force
+        state, new, force = self.state, self._next, self._driven_force
         state[_Q] = self._q
         state[_DQ] = self._dq
         self._law.dot(state, new)
