@@ -58,6 +58,8 @@ class Body(SimulatedBody):
     """Greatest speed of each driven joint: rad/s, or m/s."""
     contacts: list[LinkContact] = field(default_factory=list)
     """By link."""
+    solids: list[int] = field(default_factory=list)
+    """Number of collision shapes of each link."""
     place: Transform = ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
     """Present pose of a base that physics does not move."""
     ids: list[int] = field(default_factory=list)
@@ -72,6 +74,10 @@ class Body(SimulatedBody):
     """The same in ``qvel`` and all that is sorted like it."""
     couplings: list[tuple[frozenset[int], int]] = field(default_factory=list)
     """Joints that move together, with MuJoCo's number of the constraint."""
+
+    def link_path(self, link: int) -> str:
+        """Return the name in MuJoCo of the link of this number."""
+        return self.mujoco_name(self.link_name(link))
 
     def mujoco_name(self, part: str = "") -> str:
         """Return the name in MuJoCo of a link or joint of this body."""

@@ -13,8 +13,8 @@ __all__ = ["MujocoGripper"]
 class MujocoGripper(SimulatedGripper[MujocoWorld, Body]):
     """The driver of the fingers of one robot in a :class:`~hal.drivers.mujoco.world.MujocoWorld`.
 
-    To hold an object of mass m, friction needs ``2 mu force >= m (g + a)``, with ``mu`` the friction of the object
-    (see :data:`.loading.STIFF_CONTACT` and ``priority`` there): 20 N for the 2 kg cube with 0.5 at rest.
+    To hold an object of mass m, friction needs ``2 mu force >= m (g + a)``, with ``mu`` the product of the frictions of
+    finger and object: 20 N for the 2 kg cube on the Panda's fingers (1.0 and 0.5) at rest.
     """
 
     WORLD = MujocoWorld

@@ -24,9 +24,10 @@ from hal.geometry import Pose, quaternion_to_matrix
 from hal.kinematics.urdf import TURNING, UrdfJoint, UrdfLink, UrdfModel, UrdfVisual, parse_xml
 from hal.specs import BodySpec, RobotSpec
 
+from .contacts import contact_parameters
 from .engine import Body, LinkContact, load_mujoco, wxyz
 
-__all__ = ["BodyPlan", "build", "contact_dimensions", "plan_object", "plan_robot", "take_out"]
+__all__ = ["BodyPlan", "build", "plan_object", "plan_robot", "take_out"]
 
 Array = NDArray[np.float64]
 
@@ -38,10 +39,6 @@ UNSTOPPABLE, STRONGEST = 1e5, 1e9
 """Inertia, kg m2, and greatest torque, Nm, of the joints of an arm that mirrors a real one."""
 LEAST_MASS, LEAST_INERTIA = 1e-3, 1e-7
 """Least mass, kg, and moment of inertia, kg m2, of a link that moves: MuJoCo takes none without."""
-STIFF_CONTACT = (0.01, 1.0)
-"""Time constant, s, and damping ratio of contacts that are as hard as they can be at 240 Hz."""
-CONTACT_IMPEDANCE = (0.95, 0.99, 0.001, 0.5, 2.0)
-"""How much of a contact's ideal force acts: little of it is lost, so that fingers do not sink into what they hold."""
 COUPLING = (0.01, 1.0)
 """Time constant, s, and damping ratio of the constraint between joints that move together."""
 UNBOUNDED = 1e-6
@@ -138,6 +135,7 @@ def plan_object(spec: BodySpec) -> BodyPlan:
             floating=inertial is not None,
             base=(tuple(spec.position), tuple(spec.orientation)),
             contacts=[LinkContact()],
+            solids=[int(spec.collision)],
         )
         shapes = [shape] if spec.collision else []
         return BodyPlan(body, [LinkPlan("base", None, -1, shapes, inertial)])
@@ -227,6 +225,7 @@ def _plan_urdf(spec: BodySpec | RobotSpec, urdf: UrdfModel, key: str, scale: flo
             movable=tuple(joints[joint.name] for joint in moving),
             floating=False,
             contacts=[_contact(elements[name]) for name in order],
+            solids=[len(link.shapes) for link in links],
         ),
         links,
         limits={joint.name: _range(joint) for joint in moving},
@@ -488,18 +487,13 @@ _KINDS: Mapping[str, str] = {
 
 
 def _add_shape(mujoco: Any, model: Any, node: Any, body: Body, link: int, name: str, shape: Shape) -> None:
-    contact = body.contacts[link]
     values: dict[str, Any] = {
         "name": name,
         "type": getattr(mujoco.mjtGeom, _KINDS[shape.kind]),
         "pos": shape.pose.position,
         "quat": wxyz(shape.pose.orientation),
         "mass": 0.0,
-        "friction": (contact.lateral_friction, contact.spinning_friction, contact.rolling_friction),
-        "condim": contact_dimensions(contact),
-        "solref": STIFF_CONTACT,
-        "solimp": CONTACT_IMPEDANCE,
-        "priority": int(body.floating),
+        **contact_parameters(body.contacts[link], node.mass, model.option.timestep)._asdict(),
     }
     if body.carried:
         values |= {"contype": 0, "conaffinity": 0}
@@ -510,8 +504,3 @@ def _add_shape(mujoco: Any, model: Any, node: Any, body: Body, link: int, name: 
     else:
         values["size"] = (*shape.size, 0.0, 0.0)[:3]
     node.add_geom(**values)
-
-
-def contact_dimensions(contact: LinkContact) -> int:
-    """Return MuJoCo's number of directions in which a contact of this link has forces."""
-    return 6 if contact.rolling_friction > 0.0 else 4 if contact.spinning_friction > 0.0 else 3

@@ -14,7 +14,8 @@ from hal.errors import ConfigError, Fault, Problem
 from hal.geometry import Transform, compose, rotate
 from hal.specs import BodySpec, RobotSpec, WorldSpec
 
-from .dynamics import bounding_box, deepest_overlap, find_contacts, read_dynamics, write_dynamics
+from .contacts import add_pairs, bounding_box, deepest_overlap, find_contacts
+from .dynamics import read_dynamics, write_dynamics
 from .engine import Body, load_mujoco, wxyz
 from .loading import BodyPlan, build, plan_object, plan_robot, take_out
 from .motors import Motors
@@ -167,6 +168,7 @@ class MujocoWorld(SimulatedWorld[Body]):
     def _arrange(self, added: Sequence[Body]) -> None:
         for body in sorted(added, key=lambda body: not body.is_robot):
             build(self._spec, self._plans[body.name])
+        add_pairs(self._spec, self.bodies.values())
         try:
             model = self._spec.compile()
         except ValueError as error:
@@ -309,8 +311,8 @@ class MujocoWorld(SimulatedWorld[Body]):
         return read_dynamics(self.model, body, link)
 
     def _write_dynamics(self, body: Body, link: int, values: Mapping[str, Any], before: Mapping[str, Any]) -> None:
-        write_dynamics(self.mujoco, self._spec, self.model, body, link, values)
-        self.motors.bind(self.mujoco, self.model, self.data)
+        write_dynamics(self._spec, body, link, values)
+        self._arrange(())
 
     def _forget(self, bodies: Sequence[Body]) -> None:
         if len(bodies) == len(self.bodies):

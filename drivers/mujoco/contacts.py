@@ -1,0 +1,189 @@
+"""Contacts of links: their friction and stiffness, what touches what, and the space that bodies take."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Collection, Iterable, Iterator
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .engine import Body, LinkContact
+
+__all__ = [
+    "ContactParameters",
+    "add_pairs",
+    "bounding_box",
+    "contact_parameters",
+    "deepest_overlap",
+    "find_contacts",
+    "friction_pairs",
+]
+
+Array = NDArray[np.float64]
+
+USUAL_FRICTION = 0.5
+"""Friction of a link whose file or record does not give another one."""
+HARD_CONTACT = (0.02, 1.0)
+"""Time constant, s, and damping ratio of contacts without a stiffness: MuJoCo's own."""
+HARD_IMPEDANCE = (0.95, 0.99, 0.001, 0.5, 2.0)
+"""How much of a contact's ideal force acts: little of it is lost, so that fingers do not sink into what they hold."""
+SOFTEST = 0.1
+"""Least ratio of the force that acts to that which is lost, for contacts with a stiffness."""
+
+
+class ContactParameters(NamedTuple):
+    """MuJoCo's parameters of a shape's contacts."""
+
+    friction: tuple[float, float, float]
+    condim: int
+    solref: tuple[float, float]
+    solimp: tuple[float, float, float, float, float]
+    priority: int
+
+
+def contact_parameters(contact: LinkContact, mass: float, h: float) -> ContactParameters:
+    """Return the parameters of the shapes of a link.
+
+    In a contact MuJoCo uses the greater friction of the two, not their product as this project means it: half of each
+    (:data:`USUAL_FRICTION`) makes both the same where at least one of the two has the usual friction, and neither less.
+    :func:`friction_pairs` gives all others.
+
+    A contact in MuJoCo has a stiffness per mass, and loses a share of its force that acts like more mass. The share
+    is chosen so that a spring of this stiffness is stable at this step.
+
+    Args:
+        contact: Properties of the link's contacts.
+        mass: Mass of the link, kg.
+        h: Step of MuJoCo, s.
+    """
+    friction = (USUAL_FRICTION * contact.lateral_friction, contact.spinning_friction, contact.rolling_friction)
+    condim = 6 if contact.rolling_friction > 0.0 else 4 if contact.spinning_friction > 0.0 else 3
+    stiffness, damping = contact.contact_stiffness, contact.contact_damping
+    if stiffness is None or damping is None:
+        return ContactParameters(friction, condim, HARD_CONTACT, HARD_IMPEDANCE, 0)
+    mass = mass or 1.0
+    ratio = max(SOFTEST, 2.0 * (stiffness * h + damping) * h / mass)
+    share = ratio / (1.0 + ratio)
+    solref = (-stiffness * (1.0 - share) / mass, -damping * (1.0 - share) / mass)
+    return ContactParameters(friction, condim, solref, (share, share, 0.001, 0.5, 2.0), 1)
+
+
+def add_pairs(spec: Any, bodies: Collection[Body]) -> None:
+    """Add to a ``mujoco.MjSpec`` the pairs of shapes of :func:`friction_pairs`, in place of those from before."""
+    for pair in spec.pairs:
+        spec.delete(pair)
+    for a, k, b, m, friction in friction_pairs(bodies):
+        one, other = spec.geom(f"{a.link_path(k)}/0"), spec.geom(f"{b.link_path(m)}/0")
+        first = max((one, other), key=lambda shape: shape.priority)
+        spin, roll = (max(one.friction[place], other.friction[place]) for place in (1, 2))
+        for first_shape, second_shape in itertools.product(range(a.solids[k]), range(b.solids[m])):
+            spec.add_pair(
+                geomname1=f"{a.link_path(k)}/{first_shape}",
+                geomname2=f"{b.link_path(m)}/{second_shape}",
+                friction=(friction, friction, spin, roll, roll),
+                condim=max(one.condim, other.condim),
+                solref=first.solref,
+                solimp=first.solimp,
+            )
+
+
+def friction_pairs(bodies: Collection[Body]) -> Iterator[tuple[Body, int, Body, int, float]]:
+    """Yield the links (body and number of each) between which MuJoCo's own friction is wrong, with the right one."""
+    for a, b in itertools.combinations(bodies, 2):
+        if a.carried or b.carried or not (a.floating or a.movable or b.floating or b.movable):
+            continue
+        for (k, one), (m, other) in itertools.product(enumerate(a.contacts), enumerate(b.contacts)):
+            if not (a.solids[k] and b.solids[m]):
+                continue
+            soft_one, soft_other = one.contact_stiffness is not None, other.contact_stiffness is not None
+            if soft_one == soft_other:
+                used = max(one.lateral_friction, other.lateral_friction)
+            else:
+                used = (one if soft_one else other).lateral_friction
+            right = one.lateral_friction * other.lateral_friction
+            if abs(USUAL_FRICTION * used - right) > 1e-9:
+                yield a, k, b, m, right
+
+
+def find_contacts(
+    mujoco: Any, model: Any, data: Any, bodies: Iterable[Body], a: Body | None, b: Body | None
+) -> list[dict[str, Any]]:
+    """Return the contacts of the last step, as :meth:`.SimulatedWorld.contacts` does; None stands for any body."""
+    owners = {number: (body, link) for body in bodies for number, link in zip(body.ids, body.links, strict=True)}
+    found, force = [], np.zeros(6)
+    for number in range(data.ncon):
+        contact = data.contact[number]
+        if contact.efc_address < 0:
+            continue
+        one, other = (owners[int(model.geom_bodyid[geom])] for geom in contact.geom)
+        normal = -contact.frame[:3]  # MuJoCo's points from the first shape to the second one
+        if (a is not None and other[0] is a) or (a is None and b is not None and one[0] is b):
+            one, other, normal = other, one, -normal
+        if (a is not None and one[0] is not a) or (b is not None and other[0] is not b):
+            continue
+        mujoco.mj_contactForce(model, data, number, force)
+        found.append(
+            {
+                "a": one[0].name,
+                "b": other[0].name,
+                "link_a": one[1],
+                "link_b": other[1],
+                "position": (contact.pos - 0.5 * contact.dist * normal).tolist(),
+                "normal": normal.tolist(),
+                "distance": float(contact.dist),
+                "force": float(force[0]),
+            }
+        )
+    return found
+
+
+def deepest_overlap(mujoco: Any, model: Any, data: Any, a: Body, b: Body) -> tuple[float, str, str]:
+    """Return how deep two bodies overlap, m, 0 where they are apart, and by which link of each."""
+    deepest: tuple[float, str, str] = (0.0, "", "")
+    for link_a, shapes_a in zip(a.links, a.shapes, strict=True):
+        for link_b, shapes_b in zip(b.links, b.shapes, strict=True):
+            for one in shapes_a:
+                for other in shapes_b:
+                    apart = np.linalg.norm(data.geom_xpos[one] - data.geom_xpos[other])
+                    if apart < model.geom_rbound[one] + model.geom_rbound[other]:
+                        depth = -mujoco.mj_geomDistance(model, data, one, other, 0.001, None)
+                        deepest = max(deepest, (depth, link_a, link_b))
+    return deepest
+
+
+FAR = 1e3
+"""Half extents of a plane, m."""
+
+
+def bounding_box(mujoco: Any, model: Any, data: Any, body: Body) -> tuple[list[float], list[float]]:
+    """Return the lower and upper corner (3,) m of the box along the world's axes around all links of a body."""
+    boxes = [_box_of(mujoco, model, data, shape) for shapes in body.shapes for shape in shapes]
+    if not boxes:
+        place = data.xpos[body.ids[0]].tolist()
+        return place, list(place)
+    lower, upper = (np.array(corners) for corners in zip(*boxes, strict=True))
+    return lower.min(axis=0).tolist(), upper.max(axis=0).tolist()
+
+
+def _box_of(mujoco: Any, model: Any, data: Any, shape: int) -> tuple[Array, Array]:
+    kinds = mujoco.mjtGeom
+    kind, size, centre = model.geom_type[shape], model.geom_size[shape], data.geom_xpos[shape]
+    turn = data.geom_xmat[shape].reshape(3, 3)
+    if kind == kinds.mjGEOM_PLANE:
+        return centre - FAR, centre + FAR * (1.0 - turn[:, 2])
+    if kind == kinds.mjGEOM_MESH:
+        mesh = model.geom_dataid[shape]
+        first, count = model.mesh_vertadr[mesh], model.mesh_vertnum[mesh]
+        points = model.mesh_vert[first : first + count] @ turn.T + centre
+        return points.min(axis=0), points.max(axis=0)
+    if kind == kinds.mjGEOM_SPHERE:
+        half = np.full(3, size[0])
+    elif kind == kinds.mjGEOM_CAPSULE:
+        half = np.abs(turn[:, 2]) * size[1] + size[0]
+    elif kind == kinds.mjGEOM_CYLINDER:
+        half = np.abs(turn[:, 2]) * size[1] + size[0] * np.sqrt(np.maximum(0.0, 1.0 - turn[:, 2] ** 2))
+    else:
+        half = np.abs(turn) @ size
+    return centre - half, centre + half
