@@ -191,10 +191,11 @@ def check_yaml(text: str, folder: Path, name: str) -> None:
         rig = {"robots": {"panda": {"model": "panda"}}} if "robots" not in data else {}
         load({**rig, **data} if rig else file)
     elif keys <= set(RobotModel.model_fields):
-        model = parse_yaml(find_data("robots", "panda.yaml").read_text()) if "urdf" not in data else {}
-        if model:
+        if "urdf" not in data:
             import yaml
 
+            panda = find_data("robots", "panda.yaml")
+            model = {**parse_yaml(panda.read_text()), "urdf": str(panda.with_suffix(".urdf"))}
             file.write_text(yaml.safe_dump({**model, **data}), encoding="utf-8")
         load({"robots": {"arm": {"model": str(file)}}}, sim=True)
     elif keys <= {*ObjectConfig.model_fields, "pose"}:
