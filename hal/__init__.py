@@ -18,6 +18,7 @@ from ._moved import install as _install_aliases
 from ._moved import names_of as _names_of
 
 if TYPE_CHECKING:
+    from . import gym as gym
     from .camera import Camera
     from .commands import (
         CartesianTarget,
@@ -177,6 +178,8 @@ def __getattr__(name: str) -> Any:
         return version("robot-hal")
     if name == "open":
         value = import_module(".rig", __name__).open_rig
+    elif name == "gym":
+        value = import_module(".gym", __name__)
     elif name in _HOME:
         value = getattr(import_module(f".{_HOME[name]}", __name__), name)
     else:

@@ -43,7 +43,6 @@ MODULES: Mapping[str, str] = MappingProxyType(
             }.items()
         },
         "hal.gripper_motion": "hal.gripper",
-        "hal.gym": "hal.learning.gym",
         "hal.ik": "hal.kinematics.ik",
         "hal.placement": "hal.learning.episode",
         "hal.policy": "hal.learning.policy",

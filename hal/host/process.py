@@ -281,16 +281,26 @@ class Child:
                 within ``timeout`` s.
             HalError: Whatever the child's method raised.
         """
+        return self.wait_result(self.send_request(method, params, timeout), method, timeout)
+
+    def send_request(self, method: str, params: dict[str, Any] | None = None, timeout: float = REQUEST_TIMEOUT) -> int:
+        """Send a request, and return its number for :meth:`wait_result`. Raises as :meth:`request`."""
         with self._numbering:
             self._number = number = self._number + 1
             self._waiting.add(number)
         try:
-            try:
-                self.check()
-                self.channel.send({"id": number, "method": method, "params": params or {}}, timeout)
-            except ConnectionLost:
+            self.check()
+            self.channel.send({"id": number, "method": method, "params": params or {}}, timeout)
+        except BaseException as error:
+            self._waiting.discard(number)
+            if isinstance(error, ConnectionLost):
                 self._raise_last_error()
-                raise
+            raise
+        return number
+
+    def wait_result(self, number: int, method: str, timeout: float = REQUEST_TIMEOUT) -> Any:
+        """Return the answer to a request that was sent. Raises as :meth:`request`."""
+        try:
             return self._wait_answer(number, timeout, f"answer {method!r}")["result"]
         finally:
             self._waiting.discard(number)

@@ -1,6 +1,6 @@
 """A rig as a Gymnasium environment, the same for the simulated and for the real arm.
 
-    from hal.learning.gym import RigEnv
+    from hal.gym import RigEnv
 
     env = RigEnv("panda_table", action="twist", rate_hz=20)
     observation, info = env.reset(seed=1)

@@ -1,0 +1,382 @@
+"""Many copies of one simulated rig as a Gymnasium ``VectorEnv``, spread over a few processes.
+
+    from hal.gym import make_vec
+
+    envs = make_vec("panda_table", 16, sim=True, action="twist", overrides=("cameras={}",))
+    observations, infos = envs.reset(seed=1)
+    observations, rewards, terminated, truncated, infos = envs.step(envs.action_space.sample())
+
+Each process (:class:`~hal.host.process.Child`) holds several :class:`.RigEnv` and steps them one after the other: a
+servo in Python keeps one core busy, and a process costs more memory than a world. Observations are in memory that all
+share; actions, rewards and infos are messages. The processes end with the program, however it ends.
+"""
+
+from __future__ import annotations
+
+import base64
+import os
+import pickle
+import traceback
+import weakref
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack, suppress
+from functools import partial
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import cloudpickle  # type: ignore[import-untyped]
+import numpy as np
+from gymnasium.spaces import Dict
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space
+from numpy.typing import NDArray
+
+from ..config import load
+from ..errors import CommandError, ConnectionLost, HalError, NotSupported
+from ..host.process import START_TIMEOUT, Channel, Child, SharedMemory, pack_error, serve, unpack_error
+from .gym import ObservationDict, RigEnv, entry_key
+
+__all__ = ["RigVectorEnv", "make_vec"]
+
+_LONGEST = 3600.0
+"""Longest time of a call, s: functions of the user run in it."""
+_CLOSE_TIMEOUT = 10.0
+_PLAN = ("sim", "driver", "engine", "overrides")
+"""Arguments of RigEnv that choose the rig."""
+
+VectorResult = tuple[ObservationDict, dict[str, Any]]
+VectorStep = tuple[ObservationDict, NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]]
+
+
+def make_vec(
+    config: str | Path | Mapping[str, Any] = "panda_table",
+    num_envs: int = 1,
+    *,
+    processes: int | None = None,
+    autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
+    **options: Any,
+) -> RigVectorEnv:
+    """Return copies of a simulated rig that step together, as a Gymnasium ``VectorEnv``.
+
+    World ``k`` of ``reset(seed=s)`` is, to the bit, a :class:`.RigEnv` with the seed ``s + k``.
+
+    Args:
+        config: The rig's configuration, as for :func:`hal.open`.
+        num_envs: Number of worlds.
+        processes: Number of processes that share them; None for one per core.
+        autoreset_mode: What follows the end of an episode, as in Gymnasium: ``NextStep`` resets that world in the next
+            step, whose action it ignores; ``SameStep`` resets it at once, and the end is in ``infos["final_obs"]`` and
+            ``infos["final_info"]``; ``Disabled`` leaves it to ``reset(options={"reset_mask": ...})``.
+        options: Arguments of :class:`.RigEnv`. Functions (``reward``, ``terminated``, ``on_reset``) are copied into the
+            processes by cloudpickle, so they share no variables with this program.
+
+    Raises:
+        CommandError: An argument is wrong.
+        ConfigError: The rig file is wrong.
+        NotSupported: The rig has real arms (code ``not_simulated``).
+        DriverMissing: gymnasium is not installed.
+    """
+    if num_envs < 1 or (processes is not None and processes < 1):
+        raise CommandError("make_vec needs at least one world and one process", code="bad_count")
+    modes = [mode.value for mode in AutoresetMode]
+    if not isinstance(autoreset_mode, AutoresetMode) and autoreset_mode not in modes:
+        raise CommandError(f"autoreset_mode is one of {', '.join(modes)}, not {autoreset_mode!r}", code="bad_autoreset")
+    if wrong := sorted({"deadman", "unattended"} & options.keys()):
+        raise CommandError(f"make_vec: {', '.join(wrong)}= is for real arms; use RigEnv", code="not_simulated")
+    plan = load(config, **{name: options[name] for name in _PLAN if name in options}).resolve()
+    if real := [arm.name for arm in plan.robots if arm.attended]:
+        raise NotSupported(f"make_vec: {', '.join(real)} really moves; pass sim=True", code="not_simulated")
+    make = partial(RigEnv, config, **options)
+    return RigVectorEnv(make, num_envs, min(num_envs, processes or _cores()), AutoresetMode(autoreset_mode))
+
+
+def _cores() -> int:
+    """Return the number of cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+class RigVectorEnv(VectorEnv[ObservationDict, NDArray[np.float32], NDArray[Any]]):
+    """Worlds that step together; made by :func:`make_vec`.
+
+    If a world raises an error, the others have finished that step, the error names the world, and the next ``reset``
+    starts again. If a process is killed, all end.
+
+    Args:
+        make: Makes one world; called in the processes.
+        num_envs: Number of worlds.
+        processes: Number of processes.
+        autoreset_mode: What follows the end of an episode.
+    """
+
+    def __init__(
+        self, make: Callable[[], RigEnv], num_envs: int, processes: int, autoreset_mode: AutoresetMode
+    ) -> None:
+        self.num_envs = num_envs
+        self._parts = [slice(*ends) for ends in pairwise(num_envs * k // processes for k in range(processes + 1))]
+        """Worlds of each process."""
+        self._children: list[Child] = []
+        self._memory = SharedMemory()  # grows when the spaces are known
+        self._finalizer = weakref.finalize(self, _close, self._children, self._memory)
+        common = {"make": base64.b64encode(cloudpickle.dumps(make)).decode(), "mode": autoreset_mode.value}
+        try:
+            for part in self._parts:
+                own = common | {"first": part.start, "end": part.stop, "count": num_envs}
+                name = f"make_vec (worlds {part.start} to {part.stop - 1})"
+                self._children.append(Child(name, "hal.learning.vector:main", own, [self._memory]))
+            for child, part in zip(self._children, self._parts, strict=True):
+                child.wait_ready(START_TIMEOUT * (part.stop - part.start))
+            spaces = _unpack(self._children[0].ready)
+            self.single_observation_space, self.single_action_space, self.metadata, self.render_mode, rendered = spaces
+            self.metadata = {**self.metadata, "autoreset_mode": autoreset_mode}
+            self.observation_space = batch_space(self.single_observation_space, num_envs)
+            self.action_space = batch_space(self.single_action_space, num_envs)
+            self._rendered = rendered
+            record = _record_of(spaces[0])
+            os.ftruncate(self._memory.fd, 2 * num_envs * record.itemsize)
+            self._observations, self._final = _map_records(self._memory, record, num_envs)
+            self._run("attach", [()] * processes)
+        except BaseException:
+            self.close()
+            raise
+
+    @property  # type: ignore[misc]
+    def np_random(self) -> tuple[np.random.Generator, ...]:  # type: ignore[override]  # as in AsyncVectorEnv
+        """Copies of the worlds' random generators."""
+        return self.get_attr("np_random")
+
+    @property
+    def np_random_seed(self) -> tuple[int, ...]:  # type: ignore[override]
+        """Seeds of the worlds."""
+        return self.get_attr("np_random_seed")
+
+    def reset(
+        self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
+    ) -> VectorResult:
+        """Reset all worlds, or those of ``options["reset_mask"]``.
+
+        Args:
+            seed: Seed of the first world, the others count on from it; or the seed of each. None continues the random
+                sequence of each world.
+            options: As for :meth:`.RigEnv.reset`, for all worlds alike; ``reset_mask`` (num_envs,) bool selects worlds.
+        """
+        options = dict(options or {})
+        mask = np.asarray(options.pop("reset_mask", np.ones(self.num_envs, bool)))
+        if mask.shape != (self.num_envs,) or mask.dtype != bool or not mask.any():
+            raise CommandError(f"reset_mask has shape ({self.num_envs},), bool, some True", code="bad_reset_mask")
+        if seed is None or isinstance(seed, (int, np.integer)):
+            seeds = [None if seed is None else int(seed) + k for k in range(self.num_envs)]
+        elif len(seeds := list(seed)) != self.num_envs:
+            raise CommandError(f"seed: {self.num_envs} seeds, not {len(seeds)}", code="bad_seed")
+        answers = self._run("reset", [(mask[part], seeds[part], options) for part in self._parts])
+        return self._batch(), self._infos([info for infos in answers for info in infos])
+
+    def step(self, actions: NDArray[np.float32]) -> VectorStep:
+        """Send an action to every world, (num_envs, numbers of an action); returns Gymnasium's five values.
+
+        Raises:
+            CommandError: ``reset`` was not called (code ``not_reset``), or the shape is wrong (``bad_action``).
+            ConnectionLost: A process ended (code ``process_ended``); then all are closed.
+        """
+        actions = np.asarray(actions)
+        if actions.shape != self.action_space.shape:
+            raise CommandError(f"actions have shape {self.action_space.shape}, not {actions.shape}", code="bad_action")
+        answers = self._run("step", [(actions[part],) for part in self._parts])
+        rewards, terminated, truncated, infos = zip(*(world for answer in answers for world in answer), strict=True)
+        return self._batch(), np.array(rewards, float), np.array(terminated), np.array(truncated), self._infos(infos)
+
+    def render(self) -> tuple[NDArray[np.uint8] | None, ...]:  # type: ignore[override]  # None without a camera
+        """Return the newest colour picture (H, W, 3) of each world's first camera."""
+        if self._rendered and not self.closed:
+            return tuple(self._observations[self._rendered].copy())  # without a message
+        return self.call("render")
+
+    def call(self, name: str, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
+        """Call a method of every world, or read an attribute of it; return the copied results, one for each world."""
+        answers = self._run("call", [(name, args, kwargs)] * len(self._parts))
+        return tuple(result for answer in answers for result in answer)
+
+    def get_attr(self, name: str) -> tuple[Any, ...]:
+        """Return copies of an attribute, one for each world."""
+        return self.call(name)
+
+    def set_attr(self, name: str, values: Any) -> None:
+        """Set an attribute of every world: to one value each of a list or tuple, or all to the same value."""
+        values = list(values) if isinstance(values, (list, tuple)) else [values] * self.num_envs
+        if len(values) != self.num_envs:
+            raise CommandError(f"{name}: {self.num_envs} values, not {len(values)}", code="bad_count")
+        self._run("set_attr", [(name, values[part]) for part in self._parts])
+
+    def close_extras(self, **kwargs: Any) -> None:
+        """Close every world and end the processes."""
+        self._finalizer()
+
+    def _batch(self) -> ObservationDict:
+        return _copy_of(self._observations)
+
+    def _infos(self, infos: Sequence[dict[str, Any]]) -> dict[str, Any]:
+        """Return the worlds' infos in Gymnasium's form: name -> an array, ``_name`` -> which worlds have it."""
+        found: dict[str, Any] = {}
+        for k, info in enumerate(infos):
+            if "final_obs" in info:
+                info["final_obs"] = _copy_of(self._final[k])
+            found = self._add_info(found, info, k)
+        return found
+
+    def _run(self, method: str, arguments: Sequence[tuple[Any, ...]]) -> list[Any]:
+        """Run a method in all processes at the same time, each with its own arguments; return their answers."""
+        if self.closed:
+            raise HalError("the environments are closed", code="closed")
+        answers: list[Any] = []
+        errors: list[HalError] = []
+        numbers: list[int] = []
+        try:
+            for child, own in zip(self._children, arguments, strict=True):
+                numbers.append(child.send_request(method, {"data": _pack(own)}, _LONGEST))
+            for child, number in zip(self._children, numbers, strict=True):
+                try:
+                    answers.append(_unpack(child.wait_result(number, method, _LONGEST)))
+                except HalError as error:
+                    child.check()
+                    errors.append(error)
+        except ConnectionLost:
+            self.close()
+            raise
+        if errors:
+            raise errors[0]
+        return answers
+
+
+def _close(children: Sequence[Child], memory: SharedMemory) -> None:
+    for child in children:  # all at the same time
+        with suppress(ConnectionLost):
+            child.notify("close", timeout=0.5)
+    for child in children:
+        child.close(_CLOSE_TIMEOUT)
+    memory.close()
+
+
+def _pack(value: Any) -> str:
+    return base64.b64encode(pickle.dumps(value)).decode()
+
+
+def _unpack(text: str) -> Any:
+    return pickle.loads(base64.b64decode(text))
+
+
+def _record_of(space: Dict) -> np.dtype[Any]:
+    """Return the type of one world's observation in shared memory."""
+    return np.dtype([(key, box.dtype, box.shape) for key, box in space.items()], align=True)
+
+
+def _map_records(memory: SharedMemory, record: np.dtype[Any], count: int) -> NDArray[Any]:
+    """Return the worlds' newest observations, and the last ones of episodes that ended: (2, count) records."""
+    records: NDArray[Any] = np.ndarray((2, count), record, SharedMemory(fd=memory.fd).buffer)
+    return records
+
+
+def _copy_of(records: NDArray[Any]) -> ObservationDict:
+    return {key: records[key].copy() for key in records.dtype.names or ()}
+
+
+# --- in the processes ------------------------------------------------------------------------------------------------
+
+
+class _Worlds:
+    """The worlds of one process."""
+
+    def __init__(
+        self, envs: Sequence[RigEnv], first: int, count: int, mode: AutoresetMode, memory: SharedMemory
+    ) -> None:
+        self._envs, self._first, self._mode = envs, first, mode
+        self._ended = [False] * len(envs)
+        self._memory, self._count = memory, count
+
+    def attach(self) -> None:
+        """Map the memory of the observations, which has its size now."""
+        record = _record_of(self._envs[0].observation_space)
+        self._observations, self._final = _map_records(self._memory, record, self._count)
+
+    def reset(self, mask: Sequence[bool], seeds: Sequence[int | None], options: dict[str, Any]) -> list[dict[str, Any]]:
+        """Reset the worlds of ``mask``; return the infos of all."""
+
+        def reset(k: int) -> dict[str, Any]:
+            if not mask[k]:
+                return {}
+            seen, info = self._envs[k].reset(seed=seeds[k], options=options)
+            self._ended[k] = False
+            self._write(self._observations, k, seen)
+            return info
+
+        return self._each(reset)
+
+    def step(self, actions: NDArray[np.float32]) -> list[tuple[float, bool, bool, dict[str, Any]]]:
+        """Step every world; return reward, terminated, truncated and info of each."""
+
+        def step(k: int) -> tuple[float, bool, bool, dict[str, Any]]:
+            env = self._envs[k]
+            if self._mode is AutoresetMode.NEXT_STEP and self._ended[k]:
+                seen, info = env.reset()
+                reward, terminated, truncated = 0.0, False, False
+            else:
+                seen, reward, terminated, truncated, info = env.step(actions[k])
+            self._ended[k] = terminated or truncated
+            if self._mode is AutoresetMode.SAME_STEP and self._ended[k]:
+                self._write(self._final, k, seen)
+                final = {"final_info": info, "final_obs": None}  # read from memory
+                seen, info = env.reset()
+                info = final | info
+            self._write(self._observations, k, seen)
+            return reward, terminated, truncated, info
+
+        return self._each(step)
+
+    def call(self, name: str, args: Sequence[Any], kwargs: Mapping[str, Any]) -> list[Any]:
+        """Call a method of every world, or read an attribute."""
+        found = [env.get_wrapper_attr(name) for env in self._envs]
+        return self._each(lambda k: found[k](*args, **kwargs) if callable(found[k]) else found[k])
+
+    def set_attr(self, name: str, values: Sequence[Any]) -> None:
+        """Set an attribute of every world."""
+        for env, value in zip(self._envs, values, strict=True):
+            env.set_wrapper_attr(name, value)
+
+    def _write(self, records: NDArray[Any], k: int, seen: ObservationDict) -> None:
+        for key, values in seen.items():
+            records[key][self._first + k] = values
+
+    def _each(self, run: Callable[[int], Any]) -> list[Any]:
+        """Run a function for every world, and raise the first error after the last one."""
+        results, failed = [], None
+        for k in range(len(self._envs)):
+            try:
+                results.append(run(k))
+            except Exception as error:
+                packed = pack_error(error)
+                trace = "" if isinstance(error, HalError) else "\n" + traceback.format_exc()
+                packed["text"] = f"world {self._first + k}: {packed['text']}{trace}"
+                failed = failed or unpack_error(packed)
+        if failed is not None:
+            raise failed
+        return results
+
+
+def main(channel: Channel, memories: Sequence[SharedMemory], config: dict[str, Any]) -> None:
+    """Run the worlds of one process, until the program closes them or is gone."""
+    make: Callable[[], RigEnv] = _unpack(config["make"])
+    with ExitStack() as closing:
+        envs = []
+        for _ in range(config["first"], config["end"]):
+            envs.append(env := make())
+            closing.callback(env.close)
+        worlds = _Worlds(envs, config["first"], config["count"], AutoresetMode(config["mode"]), memories[0])
+        rendered = entry_key(env._cameras[0], "color") if env._cameras else ""
+        rendered = rendered if rendered in env.observation_space.spaces else ""
+        spaces = (env.observation_space, env.action_space, env.metadata, env.render_mode, rendered)
+        channel.send({"ready": _pack(spaces)})
+
+        def answer(method: Callable[..., Any]) -> Callable[[str], str]:
+            return lambda data: _pack(method(*_unpack(data)))
+
+        methods = (worlds.attach, worlds.reset, worlds.step, worlds.call, worlds.set_attr)
+        serve(channel, {method.__name__: answer(method) for method in methods}, timeout=_LONGEST)
