@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hal.drivers.scene.records import check_names, is_fixed, joint_drives, mimics_of, required
-from hal.drivers.scene.urdf_files import checked_urdf, massless
+from hal.drivers.scene.records import check_names, joint_drives, mimics_of, required
+from hal.drivers.scene.urdf_files import checked_urdf, has_free_base, massless
 from hal.drivers.scene.values import listed
 from hal.errors import ConfigError, Problem
 from hal.geometry import Pose, quaternion_to_matrix
@@ -122,17 +122,17 @@ def plan_object(spec: BodySpec) -> BodyPlan:
     Raises:
         ConfigError: Its file is missing or broken, MuJoCo cannot take it, or a size that its shape needs is missing.
     """
-    fixed = is_fixed(spec)
     if spec.shape != "urdf":
         shape = _primitive(spec)
-        inertial = None if fixed or spec.mass <= 0.0 else _uniform(spec.mass, shape)
+        free = has_free_base(spec, None)
+        inertial = _uniform(spec.mass, shape) if free else None
         body = Body(
             name=spec.name,
             spec=spec,
             links={"base": 0},
             joints={},
             movable=(),
-            floating=inertial is not None,
+            floating=free,
             base=(tuple(spec.position), tuple(spec.orientation)),
             contacts=[LinkContact()],
             solids=[int(spec.collision)],
@@ -145,7 +145,10 @@ def plan_object(spec: BodySpec) -> BodyPlan:
     urdf = checked_urdf(spec.urdf, key)
     plan = _plan_urdf(spec, urdf, key, spec.scale)
     body = plan.body
-    body.floating = not fixed and plan.links[0].inertial is not None
+    body.floating = has_free_base(spec, urdf)
+    if body.floating and plan.links[0].inertial is None:  # a frame that other links are fixed to
+        alone = len(plan.links) == 1
+        plan.links[0].inertial = Inertial(1.0 if alone else LEAST_MASS, np.full(3, LEAST_INERTIA), Pose())
     body.home = dict.fromkeys(body.movable, 0.0)
     body.base = (tuple(spec.position), tuple(spec.orientation))
     if made_up := massless(urdf):

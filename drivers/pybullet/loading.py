@@ -9,6 +9,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from hal.drivers.scene.drawn import PLANE
+from hal.drivers.scene.records import check_names, joint_drives, mimics_of, required
 from hal.drivers.scene.urdf_files import checked_urdf, has_free_base, massless
 from hal.drivers.scene.values import listed
 from hal.errors import ConfigError, Problem
@@ -26,10 +27,6 @@ __all__ = [
     "loadable_urdf",
 ]
 
-UNKNOWN_EFFORT = 200.0
-"""Effort, Nm or N, of a joint without a limit (a URDF's effort of 0 means unknown, not powerless)."""
-UNKNOWN_SPEED = 2.0
-"""Speed, rad/s or m/s, of a joint without a limit."""
 FINGER_MASS = 0.1
 """Least mass of a finger, kg: the solver lets one of 29 g press with no more than 26 N. The drive that moves with it is
 in no URDF."""
@@ -62,7 +59,7 @@ def load_object(client: PyBulletClient, spec: BodySpec, drawn: bool = False) -> 
         client, spec.urdf, f"{key}.urdf", fixed=spec.fixed or spec.robot is not None, scale=spec.scale, drawn=drawn
     )
     body = _describe(client, spec, number, f"{key}.urdf", urdf)
-    _couple(client, body, urdf.mimics)
+    _couple(client, body, mimics_of(spec, urdf))
     warnings = fix_inertias(client, body, lacking)
     if lacking:
         warnings.append(f"{spec.name}: no <inertial> in {listed(lacking)}; PyBullet takes 1 kg for each")
@@ -79,35 +76,21 @@ def load_robot(client: PyBulletClient, spec: RobotSpec, drawn: bool = False) -> 
     lacking = massless(urdf)
     number = _load_urdf(client, spec.urdf, f"{key}.urdf", fixed=True, scale=1.0, drawn=drawn)
     body = _describe(client, spec, number, f"{key}.urdf", urdf)
-    fingers = spec.gripper.joints if spec.gripper else ()
-    _check_names(body, spec, fingers, key)
+    moving = {name: joint for name, joint in body.joints.items() if joint in body.movable}
+    check_names(spec, moving, body.links)
 
     warnings = fix_inertias(client, body, lacking)
-    without_effort: list[str] = []
-    limits = spec.limits
-    for joint in body.movable:
-        info = client.getJointInfo(number, joint)
-        name, effort, speed = info[1].decode(), float(info[10]), float(info[11])
-        body.home[joint] = 0.0
-        if name in spec.joints:
-            place = spec.joints.index(name)
-            body.home[joint] = spec.initial[place]
-            speed = limits.velocity[place]
-            effort = limits.torque[place] if limits.torque else effort
-        elif name in fingers and spec.gripper:
-            body.home[joint] = spec.gripper.width_max / 2.0
-            if client.getDynamicsInfo(number, joint)[0] < FINGER_MASS:
-                client.changeDynamics(number, joint, mass=FINGER_MASS)
-        if effort <= 0.0:
-            without_effort.append(name)
-        body.efforts[joint] = effort if effort > 0.0 else UNKNOWN_EFFORT
-        body.speeds[joint] = speed if speed > 0.0 else UNKNOWN_SPEED
-    if without_effort:
-        warnings.append(f"{spec.name}: no effort limit of {listed(without_effort)}; {UNKNOWN_EFFORT:g} Nm (N) is used")
+    infos = {name: client.getJointInfo(number, joint) for name, joint in moving.items()}
+    drives = joint_drives(spec, {name: (float(info[10]), float(info[11])) for name, info in infos.items()})
+    for name, joint in moving.items():
+        body.home[joint], body.efforts[joint] = drives.home[name], drives.efforts[name]
+        body.speeds[joint] = drives.speeds[name]
+    for name in spec.gripper.joints if spec.gripper else ():
+        if client.getDynamicsInfo(number, moving[name])[0] < FINGER_MASS:
+            client.changeDynamics(number, moving[name], mass=FINGER_MASS)
     body.base = _root_pose(client, body, spec)
-    mimics = urdf.mimics or tuple(UrdfMimic(finger, fingers[0], 1.0, 0.0) for finger in fingers[1:])
-    _couple(client, body, mimics)
-    return body, warnings
+    _couple(client, body, mimics_of(spec, urdf))
+    return body, warnings + drives.warnings
 
 
 @contextmanager
@@ -151,13 +134,6 @@ def _load_urdf(client: PyBulletClient, path: str, key: str, *, fixed: bool, scal
 
 
 def _make_shape(client: PyBulletClient, spec: BodySpec, key: str, drawn: bool) -> int:
-    def need(name: str) -> float:
-        value = getattr(spec, name)
-        if value is None:
-            message = f"is missing, and a {spec.shape} needs it"
-            raise ConfigError([Problem("objects", f"{key}.{name}", message, "missing_key")])
-        return float(value)
-
     at: Sequence[float] = (0.0, 0.0, 0.0)
     if spec.shape == "box":
         if spec.half_extents is None:
@@ -165,11 +141,11 @@ def _make_shape(client: PyBulletClient, spec: BodySpec, key: str, drawn: bool) -
             raise ConfigError([Problem("objects", f"{key}.half_extents", message, "missing_key")])
         solid = seen = {"shapeType": client.GEOM_BOX, "halfExtents": spec.half_extents}
     elif spec.shape == "sphere":
-        solid = seen = {"shapeType": client.GEOM_SPHERE, "radius": need("radius")}
+        solid = seen = {"shapeType": client.GEOM_SPHERE, "radius": required(spec, "radius")}
     elif spec.shape in ("cylinder", "capsule"):
         kind = client.GEOM_CYLINDER if spec.shape == "cylinder" else client.GEOM_CAPSULE
-        solid = {"shapeType": kind, "radius": need("radius"), "height": need("length")}
-        seen = {"shapeType": kind, "radius": need("radius"), "length": need("length")}
+        solid = {"shapeType": kind, "radius": required(spec, "radius"), "height": required(spec, "length")}
+        seen = {"shapeType": kind, "radius": required(spec, "radius"), "length": required(spec, "length")}
     elif spec.shape == "plane":  # infinite in contacts; drawn as a thin box whose upper face is the plane
         x, y = (spec.half_extents or (*PLANE, 0.0))[:2]
         solid = {"shapeType": client.GEOM_PLANE, "planeNormal": (0.0, 0.0, 1.0)}
@@ -221,28 +197,6 @@ def _describe(
     )
 
 
-def _check_names(body: Body, spec: RobotSpec, fingers: Sequence[str], key: str) -> None:
-    """Raise ConfigError unless every joint that the record names exists and is movable, and its base link exists."""
-    moving = {name for name, joint in body.joints.items() if joint in body.movable}
-    problems = [
-        Problem(
-            spec.urdf,
-            f"{key}.{where}",
-            f"has no movable joint {name!r}; movable: {', '.join(sorted(moving))}",
-            "unknown_joint",
-        )
-        for where, names in (("joints", spec.joints), ("gripper.joints", fingers))
-        for name in names
-        if name not in moving
-    ]
-    base_link = spec.kinematics.base_link
-    if base_link is not None and base_link not in body.links:
-        message = f"has no link {base_link!r}; links: {', '.join(body.links)}"
-        problems.append(Problem(spec.urdf, f"{key}.base_link", message, "unknown_link"))
-    if problems:
-        raise ConfigError(problems)
-
-
 def _root_pose(client: PyBulletClient, body: Body, spec: RobotSpec) -> Transform:
     """Return the pose of the URDF's root that puts the arm's base link where the rig has it."""
     link = body.links[spec.kinematics.base_link] if spec.kinematics.base_link else -1
@@ -256,8 +210,6 @@ def _root_pose(client: PyBulletClient, body: Body, spec: RobotSpec) -> Transform
 def _couple(client: PyBulletClient, body: Body, mimics: Sequence[UrdfMimic]) -> None:
     """Couple joints that have a ``<mimic>``, which PyBullet ignores."""
     for mimic in mimics:
-        if mimic.joint not in body.joints or mimic.of not in body.joints or mimic.multiplier == 0.0:
-            continue
         follower, leader = body.joints[mimic.joint], body.joints[mimic.of]
         effort = max(body.efforts.get(leader, 0.0), body.efforts.get(follower, 0.0), 100.0)
         body.gears.append(Gear(client, body.id, leader, follower, mimic.multiplier, effort))

@@ -14,7 +14,6 @@ from .values import listed
 __all__ = [
     "JointDrives",
     "check_names",
-    "is_fixed",
     "joint_drives",
     "mimics_of",
     "required",
@@ -24,11 +23,6 @@ UNKNOWN_EFFORT = 200.0
 """Effort, Nm or N, of a joint without a limit (a URDF's effort of 0 means unknown, not powerless)."""
 UNKNOWN_SPEED = 2.0
 """Speed, rad/s or m/s, of a joint without a limit."""
-
-
-def is_fixed(spec: BodySpec) -> bool:
-    """Return whether physics leaves the base of this object alone; an object attached to an arm is placed instead."""
-    return spec.fixed or spec.shape == "plane" or spec.robot is not None
 
 
 def required(spec: BodySpec, name: str) -> float:
