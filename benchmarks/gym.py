@@ -1,6 +1,6 @@
 """``RigEnv`` in lock-step beside PyBullet by hand, in several processes, and the freshness of its observations.
 
-    python benchmarks/gym.py [--seconds 4] [--rounds 5]
+    python benchmarks/gym.py [--seconds 4] [--rounds 5] [--engine mujoco]
 
 Each part has its reference in the same run; rounds alternate and the medians are printed. The references of lock-step
 are those of ``benchmarks/lock_step.py``: PyBullet's own functions for the same scene, one motor command and one reading
@@ -25,6 +25,7 @@ import gymnasium
 import numpy as np
 
 import hal
+from hal import registry
 from hal.learning.gym import RigEnv
 
 sys.path.insert(0, str(Path(__file__).resolve().parent))
@@ -33,9 +34,9 @@ from lock_step import CONFIG, POLICY_HZ, by_hand, rate
 BARE = ("cameras={}",)
 
 
-def make(cameras: bool = False) -> RigEnv:
+def make(engine: str, cameras: bool = False) -> RigEnv:
     """Return one environment in lock-step."""
-    return RigEnv(CONFIG, sim=True, rate_hz=POLICY_HZ, overrides=() if cameras else BARE)
+    return RigEnv(CONFIG, sim=True, engine=engine, rate_hz=POLICY_HZ, overrides=() if cameras else BARE)
 
 
 def actions(start: np.ndarray) -> Callable[[int], np.ndarray]:
@@ -62,9 +63,9 @@ def stepping(env: RigEnv) -> Callable[[], None]:
     return step
 
 
-def lock_step(cameras: bool, seconds: float, rounds: int) -> tuple[float, float, float]:
+def lock_step(engine: str, cameras: bool, seconds: float, rounds: int) -> tuple[float, float, float]:
     """Return steps/s of RigEnv and of PyBullet by hand, and the median of their ratios."""
-    env = make(cameras)
+    env = make(engine, cameras)
     assert env.rig.plan.world is not None
     reference, disconnect = by_hand(env.rig.plan.world, cameras, every_tick=False)
     step = stepping(env)
@@ -75,9 +76,9 @@ def lock_step(cameras: bool, seconds: float, rounds: int) -> tuple[float, float,
     return mine, theirs, statistics.median(a / b for a, b in pairs)
 
 
-def together(count: int, seconds: float, cameras: bool = False) -> float:
+def together(engine: str, count: int, seconds: float, cameras: bool = False) -> float:
     """Return the total steps/s of ``count`` in one ``AsyncVectorEnv``; each step waits for the slowest."""
-    envs = gymnasium.vector.AsyncVectorEnv([partial(make, cameras)] * count, context="spawn")
+    envs = gymnasium.vector.AsyncVectorEnv([partial(make, engine, cameras)] * count, context="spawn")
     try:
         seen, _ = envs.reset(seed=1)
         action, turn = actions(seen["q"][0]), 0
@@ -102,9 +103,9 @@ print(count / seconds)
 """
 
 
-def alone(seconds: float) -> float:
+def alone(engine: str, seconds: float) -> float:
     """Return steps/s of one independent environment."""
-    env = make()
+    env = make(engine)
     found = rate(stepping(env), seconds)
     env.close()
     return found
@@ -164,20 +165,21 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=4.0, help="length of one round (%(default)s)")
     parser.add_argument("--rounds", type=int, default=5, help="rounds of each (%(default)s)")
     parser.add_argument("--alone", type=float, metavar="S", help="only print the steps/s of one environment")
+    parser.add_argument("--engine", choices=registry.ENGINES, default="auto", help="of the simulated world")
     args = parser.parse_args()
     if args.alone is not None:
-        print(alone(args.alone))
+        print(alone(args.engine, args.alone))
         return
     load = os.getloadavg()[0]
     print(f"{os.cpu_count()} cores, load {load:.1f}; steps/s at {POLICY_HZ:g} Hz, medians of {args.rounds} rounds")
     print(f"{'':30s}{'RigEnv':>12s}{'reference':>14s}{'ratio':>8s}{'goal':>8s}")
     for cameras, name, goal in ((False, "no camera", 0.55), (True, "two 256x256 RGB-D cameras", 4.0)):
-        mine, theirs, ratio = lock_step(cameras, args.seconds, args.rounds)
+        mine, theirs, ratio = lock_step(args.engine, cameras, args.seconds, args.rounds)
         print(f"{name:30s}{mine:12.1f}{theirs:14.1f}{ratio:8.2f}{goal:8.2f}", flush=True)
     for name, measure in (
-        ("two in an AsyncVectorEnv, one", together),
-        ("... with two cameras each", partial(together, cameras=True)),
-        ("two programs, one", programs(__file__, "--alone")),
+        ("two in an AsyncVectorEnv, one", partial(together, args.engine)),
+        ("... with two cameras each", partial(together, args.engine, cameras=True)),
+        ("two programs, one", programs(__file__, "--engine", args.engine, "--alone")),
         ("... that only count", programs("-c", SPINS)),
     ):
         two, one, ratio = scaling(measure, args.seconds, args.rounds)

@@ -1,6 +1,6 @@
 """Real time: missed servo ticks, frame rates, ages of states and frames, with both cameras of the built-in rig.
 
-    python benchmarks/real_time.py [--seconds 20] [--rates 240 1000] [--loaded]
+    python benchmarks/real_time.py [--seconds 20] [--rates 240 1000] [--loaded] [--engine mujoco]
 
 The reference in the same run is the same rig without cameras, and a bare pacer at the same rate that does nothing. With
 ``--loaded``: both cameras, with and without as many busy programs as there are processors, with real-time priority,
@@ -25,6 +25,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "kits"))
 from child_targets import give_up_right
 
 import hal
+from hal import registry
 from hal.histogram import Histogram
 from hal.host.main import PeriodicPace
 
@@ -51,11 +52,17 @@ def busy_programs(number: int) -> Iterator[None]:
             program.wait()
 
 
-def run(rate_hz: float, seconds: float, cameras: bool, realtime: bool = True) -> dict[str, Any]:
+def run(engine: str, rate_hz: float, seconds: float, cameras: bool, realtime: bool = True) -> dict[str, Any]:
     """Drive the arm at 50 Hz, and read its state and every frame."""
     overrides = [f"simulation.physics_hz={rate_hz:g}"] + ([] if cameras else ["cameras={}"])
     with hal.open(
-        "panda_table", sim=True, clock="real_time", overrides=overrides, pad="none", realtime=realtime
+        "panda_table",
+        sim=True,
+        engine=engine,
+        clock="real_time",
+        overrides=overrides,
+        pad="none",
+        realtime=realtime,
     ) as rig:
         arm = rig.robots["panda"]
         before = next(iter(rig.statistics().values()))
@@ -84,7 +91,7 @@ def run(rate_hz: float, seconds: float, cameras: bool, realtime: bool = True) ->
         }
 
 
-def loaded(rates: list[float], seconds: float) -> None:
+def loaded(engine: str, rates: list[float], seconds: float) -> None:
     """Print the missed ticks with and without load, by scheduling; gives up the right to real-time priority."""
     for asked in ("asked for", "refused", "not asked for"):
         if asked == "refused":
@@ -92,7 +99,7 @@ def loaded(rates: list[float], seconds: float) -> None:
         for rate_hz in rates:
             for number in (0, os.cpu_count() or 1):
                 with busy_programs(number):
-                    found = run(rate_hz, seconds, True, realtime=asked != "not asked for")
+                    found = run(engine, rate_hz, seconds, True, realtime=asked != "not asked for")
                 period, frames = found["period"], [f"{counts.fps:.1f}" for counts in found["cameras"].values()]
                 print(
                     f"  priority {asked:13s}  {rate_hz:4g} Hz, {number} busy programs: "
@@ -108,15 +115,16 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=20.0, help="length of each run (%(default)s)")
     parser.add_argument("--rates", type=float, nargs="+", default=[240.0, 1000.0], help="servo rates, Hz")
     parser.add_argument("--loaded", action="store_true", help="the loaded computer instead")
+    parser.add_argument("--engine", choices=registry.ENGINES, default="auto", help="of the simulated world")
     args = parser.parse_args()
     if args.loaded:
-        loaded(args.rates, args.seconds)
+        loaded(args.engine, args.rates, args.seconds)
         return
     for rate_hz in args.rates:
         print(f"\nservo {rate_hz:g} Hz, {args.seconds:g} s each")
         print(f"  bare pacer            missed {100 * bare(rate_hz, args.seconds / 2):.2f} %")
         for cameras in (False, True):
-            found = run(rate_hz, args.seconds, cameras)
+            found = run(args.engine, rate_hz, args.seconds, cameras)
             name = "with both cameras" if cameras else "without cameras"
             period, age = found["period"], found["age"]
             print(
