@@ -17,7 +17,7 @@ STIFFNESS = 72.0
 """Rate at which a position error decays, 1/s: the same as with PyBullet."""
 BOOST = 0.25
 """Share of the speed that a joint lacks after a step that is added to what is wanted from then on."""
-_TARGET, _FEED, _CUT, _Q, _DQ, _WANTED, _BOOST = range(7)
+_TARGET, _FEED, _Q, _DQ, _WANTED, _BOOST = range(6)
 
 
 class Motors:
@@ -40,11 +40,10 @@ class Motors:
     def __init__(self, n: int, dt: float, h: float) -> None:
         self.n = n
         self.h = h
-        self.state = state = np.zeros((7, n))
-        """Of each joint: target (rad or m), feed (per s), what the torque limit took from the wanted speed (per s),
-        position, speed, wanted speed, and boost (per s)."""
+        self.state = state = np.zeros((6, n))
+        """Of each joint: target (rad or m), feed (per s), position, speed, wanted speed, and boost (per s)."""
         self.target, self.feed, self.wanted, self.boost = (state[k] for k in (_TARGET, _FEED, _WANTED, _BOOST))
-        self._cut, self._results, self._speeds = state[_CUT], state[_WANTED:], state[_DQ:]
+        self._results, self._speeds = state[_WANTED:], state[_DQ:]
         self.efforts = np.zeros(n)
         """Greatest torque or force of each motor, Nm or N."""
         self.speeds = np.zeros(n)
@@ -54,9 +53,7 @@ class Motors:
         self.torques: dict[str, tuple[Any, Array]] = {}
         """Arms that are driven by torques instead: places of their joints, torques on top of the compensation, Nm."""
         gain = min(STIFFNESS, 1.0 / dt)
-        self._law = np.array(
-            [[gain, 1.0 - gain * dt, 0.0, -gain, 0.0, 0.0, 0.0], [0.0, 0.0, BOOST, 0.0, -BOOST, BOOST, 1.0]]
-        )
+        self._law = np.array([[gain, 1.0 - gain * dt, -gain, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, -BOOST, BOOST, 1.0]])
         self._next = np.zeros((2, n))
         self._most = np.zeros((2, n))
         self._least = np.zeros((2, n))
@@ -72,10 +69,10 @@ class Motors:
         self._acceleration, self._force = np.zeros(model.nv), np.zeros(model.nv)
         self._driven_acceleration, self._driven_force = self._acceleration[:n], self._force[:n]
         self._ease = self.h * model.dof_invweight0[:n]
-        self._of_arms = np.zeros(n)
+        self._alone = self._ease.copy()
+        """Change of a finger's speed in a step by each N; 0 for the joints of arms."""
         for arm in self.arms.values():
-            self._of_arms[arm] = 1.0
-        self._alone = self._ease * (1.0 - self._of_arms)
+            self._alone[arm] = 0.0
         self.limit()
 
     def limit(self) -> None:
@@ -87,7 +84,7 @@ class Motors:
     def rest(self, at: Any, q: Floats | float) -> None:
         """Hold some joints at positions, and forget what their motors compensated."""
         self.target[at] = q
-        self.feed[at] = self.wanted[at] = self.boost[at] = self._cut[at] = 0.0
+        self.feed[at] = self.wanted[at] = self.boost[at] = 0.0
 
     def drive(self) -> None:
         """Set the torques of the next step; to be called when inertia and forces are those of the present state."""
@@ -106,8 +103,6 @@ class Motors:
         np.maximum(force, self._negative_efforts, out=applied)
         np.minimum(applied, self.efforts, out=applied)
         np.subtract(applied, force, out=force)
-        np.multiply(force, self._alone, out=self._cut)
-        np.multiply(force, self._of_arms, out=force)
         if force.dot(force) > 0.0:
             self._share(force)
 
@@ -117,10 +112,14 @@ class Motors:
             self._driven_force[at] = torques
 
     def _share(self, excess: Array) -> None:
-        """Choose the torques of arms with a joint at its limit: all joints that can move as wanted do.
+        """Expect less of motors at their limit, and choose the torques of their arms' other joints.
 
-        A joint at its limit moves less than wanted, and that changes what the others need.
+        A joint at its limit moves less than wanted, which changes what the others need to move as wanted.
+
+        Args:
+            excess: What each torque lacks, Nm or N.
         """
+        self.wanted += excess * self._alone
         for name, arm in self.arms.items():
             if name in self.torques or not excess[arm].any():
                 continue
