@@ -21,7 +21,7 @@ from ..errors import CommandError, ConnectionLost, HalError
 from ..host.process import Child
 from ..recording.dataset import Episode
 from ..recording.layout import DatasetLayout, require_libraries
-from ..recording.merging import merge
+from ..recording.merging import finish_replacement, merge
 from .episode_worker import EpisodeRecipe, EpisodeResult, clean_part
 
 __all__ = ["EpisodeFailed", "GenerateProgress", "LocalWorker", "WorkerHandle", "generate", "parts_folder"]
@@ -32,6 +32,8 @@ _LONGEST = 3600.0
 """A worker that needs longer for an episode counts as dead, s of wall-clock time."""
 _START = 120.0
 """Longest time in which a worker must be ready, s: importing a policy may take a while."""
+_WRITING = 60.0
+"""Time that the recorder of a dead worker may take to finish, s."""
 _UPDATE = 0.2
 """Period of the calls of ``on_progress``, s."""
 
@@ -201,6 +203,7 @@ class _GenerateRun:
 
     def _find_done(self) -> dict[int, bool | None]:
         """Return the episodes that earlier runs finished. Raises CommandError for a folder with other content."""
+        finish_replacement(self._out)
         known = DatasetLayout(self._out).info.exists() or not self._out.exists()
         if not known and not (self._out.is_dir() and not any(self._out.iterdir())):
             raise CommandError(f"{self._out} holds no generated dataset; choose a new folder", code="output_exists")
@@ -285,7 +288,7 @@ class _GenerateRun:
                 self._drop(index)
                 if self._stop.is_set():
                     return
-                marks = clean_part(folder, self._recipe)
+                marks = self._clean(folder)
                 if number in marks:  # it was being saved when the worker died
                     result = EpisodeResult(number, self._seed + number, marks[number], "saved")
                 elif death == _DEATHS:
@@ -304,6 +307,16 @@ class _GenerateRun:
                 self._marks[number] = result.success
                 self._results.append(result)
             return
+
+    def _clean(self, folder: Path) -> dict[int, bool | None]:
+        """Call :func:`.clean_part` as soon as the dead worker's recorder has finished what it had received."""
+        end = time.monotonic() + _WRITING
+        while True:
+            try:
+                return clean_part(folder, self._recipe)
+            except CommandError as error:
+                if error.code != "dataset_locked" or time.monotonic() > end:
+                    raise
 
     def _handle(self, index: int, folder: Path) -> WorkerHandle:
         """Return the worker of this number; start it if there is none."""

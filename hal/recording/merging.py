@@ -26,7 +26,7 @@ from .finish import entry_table, new_info, tasks_table, write_table
 from .index import dataset_errors, read_entry
 from .layout import CHUNK, DatasetLayout, lock_dataset, require_libraries, video_key, write_json
 
-__all__ = ["merge"]
+__all__ = ["finish_replacement", "merge"]
 
 _THREADS = 4
 _Source = tuple[DatasetLayout, Episode]
@@ -57,10 +57,9 @@ def merge(
         OSError: The disk refuses.
     """
     require_libraries()
+    finish_replacement(out)
     target = DatasetLayout(out)
-    building, replaced = (target.root.with_name(f".{target.root.name}.{what}") for what in ("merging", "replaced"))
-    if replaced.is_dir() and not target.root.exists():  # an earlier call was interrupted in the middle of a replacement
-        replaced.rename(target.root)
+    building, replaced = _beside(target, "merging"), _beside(target, "replaced")
     layouts = [DatasetLayout(part) for part in parts]
     replaces = target.root in [layout.root for layout in layouts]
     if not replaces and target.root.exists() and (not target.root.is_dir() or any(target.root.iterdir())):
@@ -87,6 +86,19 @@ def merge(
         building.rename(target.root)
         shutil.rmtree(replaced, ignore_errors=True)
     return len(sources)
+
+
+def _beside(layout: DatasetLayout, what: str) -> Path:
+    """Return a hidden folder on the same file system."""
+    return layout.root.with_name(f".{layout.root.name}.{what}")
+
+
+def finish_replacement(out: str | Path) -> None:
+    """Put a dataset back that :func:`merge` was about to replace when it was interrupted; do nothing otherwise."""
+    target = DatasetLayout(out)
+    replaced = _beside(target, "replaced")
+    if replaced.is_dir() and not target.root.exists():
+        replaced.rename(target.root)
 
 
 def _sources(layouts: Sequence[DatasetLayout], key: Callable[[Episode], Any] | None) -> list[_Source]:

@@ -75,6 +75,8 @@ def test_a_key_sorts_and_takes_each_once(part: Path, tmp_path: Path) -> None:
     assert [episode.task for episode in Dataset(merged).episodes] == ["lower", "lift", "lift", "lower"]
     assert sorted(path.name for path in tmp_path.iterdir()) == ["merged"]
     check_layout(merged)
+    merged.rename(tmp_path / ".merged.replaced")  # as if the program had been killed between two renames
+    assert merge([merged, part], merged) == 6
 
 
 def test_what_cannot_be_merged_is_refused(part: Path, tmp_path: Path) -> None:
