@@ -14,6 +14,7 @@ from __future__ import annotations
 import argparse
 import os
 import random
+import resource
 import signal
 import subprocess
 import sys
@@ -88,19 +89,25 @@ class Killer:
         self._thread.join()
 
 
+def processor_time() -> float:
+    """Return the processor time that this program's processes have used, s, without those that run or were killed."""
+    return sum(sum(resource.getrusage(who)[:2]) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
+
+
 def timed(name: str, out: Path, args: argparse.Namespace, workers: int, start: StartWorker = LocalWorker) -> float:
     """Generate a dataset; print and return its episodes per second."""
-    begun = time.perf_counter()
+    begun, used = time.perf_counter(), processor_time()
     made = generate(recipe(args.camera), out, args.episodes, workers=workers, start_worker=start)
     spent = time.perf_counter() - begun
     dataset = Dataset(out)
     numbers = [episode.info["info"]["episode"] for episode in dataset.episodes]
     assert numbers == list(range(args.episodes)), "every episode once, in order"
     lifted = sum(episode.success or False for episode in dataset.episodes)
+    used = (processor_time() - used) / len(made)
     making = sum(result.wall_s for result in made) / len(made)
     print(
-        f"{name:34s}{spent:8.1f} s {args.episodes / spent:7.2f} episodes/s; {making:.2f} s of a worker each; "
-        f"{lifted} lifted, {dataset.info['total_frames']} rows",
+        f"{name:34s}{spent:8.1f} s {args.episodes / spent:7.2f} episodes/s; {making:.2f} s each, "
+        f"{used:.2f} s of a processor; {lifted} lifted, {dataset.info['total_frames']} rows",
         flush=True,
     )
     return args.episodes / spent
