@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from viser import SceneApi, SceneNodeHandle, TransformControlsEvent, TransformControlsHandle
 
 from hal.drivers.scene.drawn import DrawnWorld
+from hal.drivers.scene.urdf_files import absent_packages, drawn_visuals
 from hal.errors import HalError
 from hal.geometry import Pose
 from hal.host.memory import SeriesBox
@@ -160,8 +161,8 @@ def _draw_links(
         node = scene.add_frame(path, show_axes=False, position=np.array(position), wxyz=_wxyz(orientation))
         if joint.movable:
             moving.append((joint, node))
-    for name, link in urdf.links.items():
-        _draw_visuals(scene, paths[name], link.visuals, notes)
+    for name, visuals in shown_visuals(urdf, notes).items():
+        _draw_visuals(scene, paths[name], visuals, notes)
     return moving
 
 
@@ -281,11 +282,12 @@ class BodiesView:
             self._notes.append(f"not drawn: {error}")
             return []
         rgba = body.rgba if painted else None
+        visuals = shown_visuals(urdf, self._notes)
         return [
             (
                 None if link == urdf.root else link,
                 _scaled(pose, body.scale),
-                [_scaled_visual(visual, body.scale, rgba) for visual in urdf.links[link].visuals],
+                [_scaled_visual(visual, body.scale, rgba) for visual in visuals[link]],
             )
             for link, pose in urdf.poses({}).items()
         ]
@@ -297,6 +299,15 @@ def _read_urdf(path: str) -> UrdfModel:
         return read_urdf(Path(path), meshes=False)  # a mesh that cannot be drawn becomes a note
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from None
+
+
+def shown_visuals(urdf: UrdfModel, notes: list[str]) -> dict[str, tuple[UrdfVisual, ...]]:
+    """Return what is drawn of each link: its visuals, or collision shapes where their package is not installed."""
+    absent = absent_packages(str(urdf.path))
+    if not absent:
+        return {name: link.visuals for name, link in urdf.links.items()}
+    notes.append(f"{urdf.path.name}: drawn by its collision shapes; not installed: {', '.join(absent)}")
+    return {name: drawn_visuals(link) for name, link in urdf.links.items()}
 
 
 def _mirror(spec: WorldSpec, notes: list[str]) -> DrawnWorld | None:

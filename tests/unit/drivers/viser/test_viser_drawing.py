@@ -12,6 +12,7 @@ import trimesh
 from pictures_kit import COLLADA
 from specs import data, panda
 
+from hal.config.data_files import find_data
 from hal.drivers.viser.meshes import visual_glb
 from hal.geometry import Pose
 from hal.kinematics.urdf import UrdfVisual, read_urdf
@@ -54,6 +55,19 @@ def test_meshes_of_an_arm_keep_their_pose_and_colours() -> None:
     assert (np.ptp(shades, axis=1) < 20).all()  # greys
     assert shades.min() < 70  # the dark pad, in linear numbers
     assert shades.max() > 180  # the white rest
+
+
+def test_meshes_that_are_not_installed_are_drawn_by_the_collision_shapes(tmp_path: Path) -> None:
+    pytest.importorskip("viser", reason="needs viser (pip install 'robot-hal[viewer]')")
+    from hal.drivers.viser.scene import shown_visuals
+
+    file = tmp_path / "arm.urdf"
+    file.write_text(find_data("robots", "panda.urdf").read_text().replace("://pybullet_data/", "://no_such_package/"))
+    notes: list[str] = []
+    drawn = shown_visuals(read_urdf(file, meshes=False), notes)
+    assert [visual.shape for visual in drawn["panda_link1"]] == ["cylinder", "cylinder"]
+    (note,) = notes
+    assert "no_such_package" in note
 
 
 def test_collada_file_keeps_its_units_and_colours(tmp_path: Path) -> None:
