@@ -4,20 +4,22 @@ from collections.abc import Iterator
 
 import numpy as np
 import pytest
+from engines_kit import Engine
 
 import hal
 from hal import JointTarget, Pose, Twist
 
 
 @pytest.fixture
-def rig() -> Iterator[hal.Rig]:
-    with hal.open("panda_table", sim=True, clock="lock_step", pad="none") as opened:
+def rig(engine: Engine) -> Iterator[hal.Rig]:
+    with hal.open("panda_table", sim=True, engine=engine.name, clock="lock_step", pad="none") as opened:
         yield opened
 
 
-def drive(steps: int) -> tuple[bytes, bytes]:
+def drive(engine: str, steps: int) -> tuple[bytes, bytes]:
     """Arm and cube after some steps that touch both, as bytes."""
-    with hal.open("panda_table", sim=True, clock="lock_step", pad="none", overrides=["cameras={}"]) as rig:
+    options = {"clock": "lock_step", "pad": "none", "overrides": ["cameras={}"]}
+    with hal.open("panda_table", sim=True, engine=engine, **options) as rig:
         arm = rig.robots["panda"]
         start = arm.state().q
         trace, cube = [], []
@@ -33,8 +35,8 @@ def drive(steps: int) -> tuple[bytes, bytes]:
         return np.array(trace).tobytes(), np.array(cube).tobytes()
 
 
-def test_two_runs_are_equal_to_the_bit() -> None:
-    assert drive(1000) == drive(1000)
+def test_two_runs_are_equal_to_the_bit(engine: Engine) -> None:
+    assert drive(engine.name, 600) == drive(engine.name, 600)
 
 
 def test_time_stands_still_between_waits(rig: hal.Rig) -> None:
@@ -110,10 +112,11 @@ def test_dynamics_are_read_back_and_restored(rig: hal.Rig) -> None:
 
 
 @pytest.mark.parametrize("name", ["iiwa_table", "yam", "yam_emulator", "piper", "piper_emulator", "openarm"])
-def test_another_arm_is_only_data(name: str) -> None:
+def test_another_arm_is_only_data(engine: Engine, name: str) -> None:
     if name == "iiwa_table":
         pytest.importorskip("pybullet_data")
-    with hal.open(name, sim=True, clock="lock_step", pad="none", overrides=["cameras={}"]) as rig:
+    options = {"clock": "lock_step", "pad": "none", "overrides": ["cameras={}"]}
+    with hal.open(name, sim=True, engine=engine.name, **options) as rig:
         for arm in rig.robots.values():
             goal = arm.home.copy()
             goal[0] += 0.2

@@ -4,6 +4,7 @@ from collections.abc import Iterator
 
 import numpy as np
 import pytest
+from engines_kit import Engine
 
 import hal
 from hal import JointTarget, JointTorque, MotionStopped, RobotStatus, Trip
@@ -13,8 +14,9 @@ WRIST = [0.0] * 6 + [0.3]
 
 
 @pytest.fixture
-def rig() -> Iterator[hal.Rig]:
-    with hal.open("panda_table", sim=True, clock="lock_step", overrides=["cameras={}"], pad="none") as opened:
+def rig(engine: Engine) -> Iterator[hal.Rig]:
+    options = {"clock": "lock_step", "pad": "none", "overrides": ["cameras={}"]}
+    with hal.open("panda_table", sim=True, engine=engine.name, **options) as opened:
         yield opened
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pytest
+from engines_kit import Engine
 
 import hal
 from hal import DeviceNotFound, Pose
@@ -11,8 +12,8 @@ PLAIN = ["cameras={}"]
 SECONDS = 1.5
 
 
-def test_they_are_those_of_one_moment_and_of_the_bodies_that_were_asked_for() -> None:
-    with hal.open("panda_table", sim=True, clock="lock_step", pad="none", overrides=PLAIN) as rig:
+def test_they_are_those_of_one_moment_and_of_the_bodies_that_were_asked_for(engine: Engine) -> None:
+    with hal.open("panda_table", sim=True, engine=engine.name, clock="lock_step", pad="none", overrides=PLAIN) as rig:
         assert rig.world.poses().t == rig.clock.now() == 0.0
         rig.clock.sleep(0.2)
         seen = rig.world.poses()
@@ -26,9 +27,10 @@ def test_they_are_those_of_one_moment_and_of_the_bodies_that_were_asked_for() ->
 
 
 @pytest.mark.parametrize("clock", ["lock_step", pytest.param("real_time", marks=pytest.mark.slow)])
-def test_their_time_is_that_of_the_world_that_they_show(clock: str) -> None:
+def test_their_time_is_that_of_the_world_that_they_show(engine: Engine, clock: str) -> None:
     """What the arm carries is where the arm's state of that very time says: within 0.1 mm, at 0.2 m/s."""
-    with hal.open("panda_calibration_held", sim=True, clock=clock, pad="none", overrides=PLAIN) as rig:
+    options = {"clock": clock, "pad": "none", "overrides": PLAIN}
+    with hal.open("panda_calibration_held", sim=True, engine=engine.name, **options) as rig:
         arm = rig.robots["panda"]
         (board,) = set(rig.world.bodies) - {"floor", "table", "panda"}
         base = rig.world.pose("panda")

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from engines_kit import Engine
 
 import hal
 from hal import BodySpec, ConnectionLost, JointVelocity, MotionStopped, Pose, RobotStatus, Trip
@@ -19,8 +20,8 @@ pytestmark = pytest.mark.slow
 
 
 @pytest.fixture(scope="module")
-def rig() -> Iterator[hal.Rig]:
-    with hal.open("panda_table", sim=True, clock="real_time", pad="none") as opened:
+def rig(engine: Engine) -> Iterator[hal.Rig]:
+    with hal.open("panda_table", sim=True, engine=engine.name, clock="real_time", pad="none") as opened:
         yield opened
 
 
