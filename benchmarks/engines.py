@@ -33,7 +33,7 @@ from hal.geometry import Pose
 from hal.learning.gym import RigEnv
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "kits"))
-from referee_kit import RATE_HZ, TOUR, drive_tour
+from referee_kit import RATE_HZ, TOUR, draw_state, drive_tour
 
 ENGINES = [name for name in registry.ENGINES if not registry.missing(name)]
 APART, TURNED = 0.002, 0.01
@@ -114,21 +114,11 @@ def collect(_: float) -> None:
 
 
 def pictures(_: float) -> None:
-    """Draw one state, as PyBullet's or the first engine's arm left it, on every engine."""
-    seen: dict[str, dict[str, Any]] = {}
-    state: dict[str, Any] = {}
+    """Draw the state after a motion on the first engine, after each of them."""
+    seen: dict[str, Any] = {}
+    state = None
     for name in ENGINES:
-        with hal.open("panda_table", sim=True, engine=name, clock="lock_step", pad="none") as rig:
-            arm, world = rig.robots["panda"], rig.world
-            if not state:
-                rig.clock.sleep(0.5)
-                arm.move_to(arm.home + 0.2, speed=0.5)
-                state = {"q": arm.state().q, "cube": world.pose("cube"), "duck": world.pose("duck")}
-            for body in ("cube", "duck"):
-                world.set_pose(body, state[body])
-            world.reset("panda", q=state["q"])
-            seen[name] = {camera.name: camera.read() for camera in rig.cameras.values()}
-            print(f"  {name:9s} drawn by {rig.renderer}")
+        seen[name], state = draw_state(name, state)
     for title, a, b in pairs(seen):
         for camera in a:
             color = (a[camera].color != b[camera].color).any(axis=2)

@@ -78,3 +78,25 @@ def drive_tour(engine: str, *overrides: str, config: Any = "panda_table") -> Tou
                     break
         end = arm.state().tcp
     return TourRun(np.array(setpoints), np.array(q), np.array(width), np.array(ticks), tuple(releases), touched, end)
+
+
+def draw_state(engine: str, state: dict[str, Any] | None = None) -> tuple[dict[str, hal.Frame], dict[str, Any]]:
+    """Draw a rig in lock-step with all its cameras.
+
+    Args:
+        engine: Name of the engine.
+        state: Where the arm and the objects are; None for where a motion takes them on this engine.
+
+    Returns:
+        The frames by camera, and the state that they show.
+    """
+    with hal.open("panda_table", sim=True, engine=engine, clock="lock_step", pad="none") as rig:
+        arm, world = rig.robots["panda"], rig.world
+        if state is None:
+            rig.clock.sleep(0.5)
+            arm.move_to(arm.home + 0.2, speed=0.5)
+            state = {"q": arm.state().q, **{name: world.pose(name) for name in ("cube", "duck")}}
+        world.reset("panda", q=state["q"])
+        for name in ("cube", "duck"):
+            world.set_pose(name, state[name])
+        return {name: camera.read() for name, camera in rig.cameras.items()}, state

@@ -7,7 +7,7 @@ import itertools
 import numpy as np
 import pytest
 from engines_kit import has_engine
-from referee_kit import TourRun, drive_tour
+from referee_kit import TourRun, draw_state, drive_tour
 
 from hal import registry
 
@@ -43,3 +43,16 @@ def test_the_arm_ends_where_it_does_on_every_engine(tours: dict[str, TourRun]) -
         distance, angle = a.end.distance(b.end)
         assert distance < APART, (one, other)
         assert angle < TURNED, (one, other)
+
+
+def test_one_state_gives_one_picture_on_every_engine() -> None:
+    """To the pixel, in colour and depth: what draws has no physics engine."""
+    first, *others = [name for name in registry.ENGINES if has_engine(name)]
+    frames, state = draw_state(first)
+    for other in others:
+        again, _ = draw_state(other, state)
+        for camera, frame in frames.items():
+            assert frame.color is not None
+            assert frame.color.std() > 10.0, f"{camera} shows something"
+            assert np.array_equal(frame.color, again[camera].color), (camera, other)
+            assert np.array_equal(frame.depth, again[camera].depth), (camera, other)
