@@ -449,6 +449,20 @@ class WorldContract(Contract):
         assert np.allclose(cube, (1, 0, 1, *_UPRIGHT), atol=1e-9)
         assert np.allclose(joints, (0.1, 0.2, 0.01, 0.02), atol=1e-9)
 
+    def test_a_restored_state_continues_as_it_did(self, bench: WorldBench, tmp_path: Path) -> None:
+        world = bench.world(_floor(), _cube((0.6, 0.0, 0.3)), bench.arm(tmp_path))
+        _steps(world, 0.25)
+        state, here = json.loads(json.dumps(world.request("save", {}))), world.snapshot()
+        there = _steps(world, 0.5).snapshot()
+        world.request("set_pose", {"name": "cube", "pose": {"position": [2, 2, 2]}})
+        world.request("restore", {"state": state})
+        assert np.allclose(world.snapshot(), here, atol=1e-9)
+        assert world.t == pytest.approx(0.75), "time continues"
+        assert _steps(world, 0.5).snapshot() == there, "to the bit"
+        with pytest.raises(CommandError) as refused:
+            bench.world(_floor()).request("restore", {"state": state})
+        assert refused.value.code == "wrong_state", "it is a state of other bodies"
+
     # The mirror of a real arm.
 
     def test_a_mirror_follows_its_arm(self, bench: WorldBench, tmp_path: Path) -> None:

@@ -175,7 +175,7 @@ class TestDynamics:
         assert pose(world, "cube").position[2] == pytest.approx(hard, abs=2e-5)
 
     def test_friction_acts_at_once(self, engine: Engine) -> None:
-        """A cube that slides stops after v^2 / (2 mu g), with mu the product of both in PyBullet, MuJoCo's the cube's."""
+        """A cube that slides stops after v^2 / (2 mu g): mu is the product of both, in MuJoCo the cube's own."""
         for friction in (0.4, 0.8):
             world = engine.world(floor(), cube((0.0, 0.0, 0.03)))
             run(world, 60)
