@@ -168,14 +168,14 @@ class TestDynamics:
         before = world.set_dynamics("cube", contact_stiffness=1000.0, contact_damping=50.0)
         assert before == {"contact_stiffness": None, "contact_damping": None}
         run(world, 480)  # it was at rest when they were set: they act in a contact that lasts, too
-        assert hard - pose(world, "cube").position[2] == pytest.approx(2.0 * 9.81 / 4000.0, rel=0.01)
+        assert hard - pose(world, "cube").position[2] == pytest.approx(2.0 * 9.81 / 4000.0, rel=0.02)
         world.set_dynamics("cube", **before)
         assert world.dynamics("cube")["contact_stiffness"] is None
         run(world, 480)
         assert pose(world, "cube").position[2] == pytest.approx(hard, abs=2e-5)
 
     def test_friction_acts_at_once(self, engine: Engine) -> None:
-        """A cube that slides stops after v^2 / (2 mu g): mu is the product of both, in MuJoCo the cube's own."""
+        """A cube that slides stops after v^2 / (2 mu g), with mu the product of both frictions."""
         for friction in (0.4, 0.8):
             world = engine.world(floor(), cube((0.0, 0.0, 0.03)))
             run(world, 60)
@@ -185,8 +185,7 @@ class TestDynamics:
             assert before["lateral_friction"] == 0.5
             run(world, 480)
             slid = pose(world, "cube").position[0]
-            of_both = {"pybullet": 0.5 * friction, "mujoco": friction}[engine.name]
-            assert slid == pytest.approx(1.0 / (2.0 * of_both * 9.81), rel=0.07)
+            assert slid == pytest.approx(1.0 / (2.0 * 0.5 * friction * 9.81), rel=0.07)
 
     def test_an_object_at_rest_sinks_in_by_less_than_0_1_mm(self, engine: Engine) -> None:
         world = engine.world(floor(), cube((0.0, 0.0, 0.03)))
