@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from engines_kit import KNOWN, Engine, need_engine
+from engines_kit import Engine, need_engine
 
 from hal import registry, testing
 from hal.specs import CameraSpec, GripperSpec, PadSpec, RobotSpec
@@ -113,8 +113,6 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         slow = item.get_closest_marker("slow") is not None
         for name in ["all", *([tier] if tier else []), *(["fast"] if tier in FAST and not slow else [])]:
             item.add_marker(name)
-        if _known_on_an_engine(item):
-            item.add_marker(pytest.mark.xfail(strict=False, reason="differs on this engine"))
         (left if slow and not config.option.markexpr and not _touches(item.path, named) else kept).append(item)
     if left:
         items[:] = kept
@@ -157,12 +155,6 @@ def _strict(report: Any) -> Any:
 def engine(request: pytest.FixtureRequest) -> Engine:
     """Each engine of the simulated world in turn."""
     return need_engine(request.param)
-
-
-def _known_on_an_engine(item: pytest.Item) -> bool:
-    """Whether a test may fail on the engine that it is for."""
-    engine = getattr(item, "callspec", None) and item.callspec.params.get("engine")  # type: ignore[attr-defined]
-    return getattr(item, "originalname", "") in KNOWN.get(engine, ())
 
 
 # Specs.

@@ -74,7 +74,7 @@ class MujocoWorld(SimulatedWorld[Body]):
         option.gravity = spec.gravity
         option.integrator = mujoco.mjtIntegrator.mjINT_EULER
         option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
-        option.impratio = 10.0
+        option.impratio = 100.0  # what is held slides less
         option.disableflags = mujoco.mjtDisableBit.mjDSBL_AUTORESET
         # Several contacts between two convex shapes: on by default since MuJoCo 4.
         option.enableflags = int(getattr(mujoco.mjtEnableBit, "mjENBL_MULTICCD", 0))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -14,11 +14,6 @@ from hal.driver import GripperDriver, RobotDriver
 from hal.errors import DriverMissing
 from hal.specs import BodySpec, RobotSpec, WorldSpec
 from hal.world import WorldDriver
-
-KNOWN: Mapping[str, tuple[str, ...]] = {
-    "mujoco": ("test_oscillating_fingers_count_as_at_rest",),
-}
-"""Tests that may fail on an engine, by its name."""
 
 AUTO = registry.choose_engine("auto")
 """The engine of a rig that names none, on this computer."""
