@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import os
 import sys
+import tempfile
 from types import TracebackType
 from typing import Any
 
@@ -40,8 +41,11 @@ class RayCluster:
             raise DriverMissing("ray is not installed: pip install 'robot-hal[ray]'", name="ray") from error
         self._ray: Any = ray
         own: dict[str, Any] = {}
+        self._folder: tempfile.TemporaryDirectory[str] | None = None
         if address == "local":
+            self._folder = tempfile.TemporaryDirectory(prefix="hal-ray-", ignore_cleanup_errors=True)
             own = {
+                "_temp_dir": self._folder.name,
                 "num_cpus": workers,
                 "include_dashboard": False,
                 "object_store_memory": _STORE,
@@ -59,6 +63,8 @@ class RayCluster:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self._ray.shutdown()
+        if self._folder is not None:
+            self._folder.cleanup()
 
     def start_worker(self, recipe: dict[str, Any], folder: str, index: int) -> RayWorker:
         """Start a worker; see :data:`~hal.learning.generate.StartWorker`."""
