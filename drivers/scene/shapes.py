@@ -32,8 +32,9 @@ __all__ = [
 Array = NDArray[np.float64]
 Points = NDArray[np.float32]
 
-_SEGMENTS = 48
-"""Segments of a circle. A chord then leaves the circle by 0.2 % of its radius."""
+_SEGMENTS, _COARSE_SEGMENTS = 48, 16
+"""Segments of a circle, and of that of a sphere or capsule that is small in the picture. A chord leaves the circle by
+0.2 % of its radius, or by 1.9 %."""
 _PLANE_HALF = 50.0
 """Half the side of the square that is drawn for an infinite plane, m."""
 
@@ -189,9 +190,7 @@ def box(half_extents: tuple[float, float, float]) -> Mesh:
 
 def sphere(radius: float) -> Mesh:
     """Return a sphere around the origin; radius in m."""
-    angle = np.linspace(-np.pi / 2, np.pi / 2, _SEGMENTS // 2 + 1)
-    ring = np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    return _revolved(radius * ring, ring)
+    return _in_two_levels(radius, lambda segments: _capsule(radius, 0.0, segments))
 
 
 def cylinder(radius: float, length: float) -> Mesh:
@@ -204,11 +203,23 @@ def cylinder(radius: float, length: float) -> Mesh:
 
 def capsule(radius: float, length: float) -> Mesh:
     """Return a cylinder of ``length`` along z with a half sphere on either end; m."""
-    angle = np.linspace(0, np.pi / 2, _SEGMENTS // 4 + 1)
+    return _in_two_levels(radius, lambda segments: _capsule(radius, length, segments))
+
+
+def _capsule(radius: float, length: float, segments: int) -> Mesh:
+    angle = np.linspace(0, np.pi / 2, segments // 4 + 1)
     cap = np.stack([np.cos(angle), np.sin(angle)], axis=1)
     upper = radius * cap + (0, length / 2)
     mirror = np.array([1, -1])
-    return _revolved(np.concatenate([(upper * mirror)[::-1], upper]), np.concatenate([(cap * mirror)[::-1], cap]))
+    lower, below = (upper * mirror)[::-1], (cap * mirror)[::-1]
+    if not length:  # one circle at the equator
+        lower, below = lower[:-1], below[:-1]
+    return _revolved(np.concatenate([lower, upper]), np.concatenate([below, cap]), segments)
+
+
+def _in_two_levels(radius: float, make: Callable[[int], Mesh]) -> Mesh:
+    coarse = replace(make(_COARSE_SEGMENTS), cell=2.0 * np.pi * radius / _COARSE_SEGMENTS)
+    return replace(make(_SEGMENTS), coarse=coarse)
 
 
 def plane() -> Mesh:
@@ -218,9 +229,9 @@ def plane() -> Mesh:
     return _white(positions, np.tile([0.0, 0, 1], (4, 1)), np.array([[0, 1, 2], [0, 2, 3]]), closed=False)
 
 
-def _revolved(profile: Array, normals: Array) -> Mesh:
+def _revolved(profile: Array, normals: Array, segments: int = _SEGMENTS) -> Mesh:
     """Return the surface of revolution around z of a profile (P, 2) of radius and height, from bottom to top."""
-    angle = np.linspace(0, 2 * np.pi, _SEGMENTS + 1)
+    angle = np.linspace(0, 2 * np.pi, segments + 1)
     circle = np.stack([np.cos(angle), np.sin(angle)], axis=1)
 
     def around(points: Array) -> Array:
@@ -229,8 +240,8 @@ def _revolved(profile: Array, normals: Array) -> Mesh:
         rows: Array = np.concatenate([ring, height], axis=2).reshape(-1, 3)
         return rows
 
-    row = _SEGMENTS + 1
-    lower = (np.arange(len(profile) - 1)[:, None] * row + np.arange(_SEGMENTS)).reshape(-1)
+    row = segments + 1
+    lower = (np.arange(len(profile) - 1)[:, None] * row + np.arange(segments)).reshape(-1)
     quads = np.stack([lower, lower + 1, lower + row + 1, lower, lower + row + 1, lower + row], axis=1)
     positions, faces = around(profile), quads.reshape(-1, 3)
     corners = positions[faces]
