@@ -24,8 +24,8 @@ def opened(engine: str) -> Any:
     return hal.open("panda_table", sim=True, clock="lock_step", engine=engine, pad="none", overrides=["cameras={}"])
 
 
-def states_of(rig: Any, random: np.random.Generator, count: int) -> list[dict[str, Any]]:
-    """Return states of a scene in which everything moves."""
+def states_of(rig: Any, random: np.random.Generator, count: int, seconds: float) -> list[dict[str, Any]]:
+    """Return states of a scene in which everything moves, and what followed each."""
     arm, found = rig.robots["panda"], []
     for _ in range(count):
         rig.world.set_velocity("cube", random.normal(0.0, 0.3, 3), random.normal(0.0, 3.0, 3))
@@ -35,7 +35,8 @@ def states_of(rig: Any, random: np.random.Generator, count: int) -> list[dict[st
         rig.clock.sleep(random.uniform(0.01, 0.2))
         start = time.perf_counter()
         state = rig.world.save()
-        found.append({"save": time.perf_counter() - start, "state": json.loads(json.dumps(state))})
+        spent = time.perf_counter() - start
+        found.append({"save": spent, "state": json.loads(json.dumps(state)), "after": after(rig, seconds)})
     return found
 
 
@@ -54,10 +55,7 @@ def measure(engine: str, count: int, seconds: float) -> None:
     """Print the results of one engine."""
     random = np.random.default_rng(1)
     with opened(engine) as rig, opened(engine) as other:
-        states = states_of(rig, random, count)
-        for one in states:
-            rig.world.restore(one["state"])
-            one["after"] = after(rig, seconds)
+        states = states_of(rig, random, count, seconds)
         agree, elsewhere, times = 0, 0, []
         for k in random.permutation(count):
             start = time.perf_counter()

@@ -220,11 +220,16 @@ class PyBulletWorld(SimulatedWorld[Body]):
         forget_contacts(self.client, bodies)
 
     def _save(self) -> dict[str, Any]:
-        """Return what PyBullet writes into a file, with the contacts that its solver starts from."""
+        """Return what PyBullet writes into a file, and restore it at once.
+
+        The contacts that the solver remembers are in no state that PyBullet restores. They are forgotten now, and at
+        each restore, so that the steps after both are the same.
+        """
         with tempfile.TemporaryDirectory() as folder:
             file = Path(folder) / "state.bullet"
             self.client.saveBullet(str(file))
             data = file.read_bytes()
+            self._load_state(file)
         return {"handling": sorted(self._handling), "bullet": base64.b64encode(zlib.compress(data, 1)).decode()}
 
     def _restore(self, state: Any) -> None:
@@ -238,12 +243,16 @@ class PyBulletWorld(SimulatedWorld[Body]):
         with tempfile.TemporaryDirectory() as folder:
             file = Path(folder) / "state.bullet"
             file.write_bytes(data)
-            try:
-                self.client.restoreState(fileName=str(file))
-            except self.client.error as error:
-                raise ValueError(str(error)) from None
+            self._load_state(file)
         self.fault = None
         self._read_layout()
+
+    def _load_state(self, file: Path) -> None:
+        forget_contacts(self.client, self.bodies.values())
+        try:
+            self.client.restoreState(fileName=str(file))
+        except self.client.error as error:
+            raise ValueError(str(error)) from None
 
     def _find_contacts(self, a: Body | None, b: Body | None) -> list[dict[str, Any]]:
         return find_contacts(self.client, self.bodies.values(), a, b)

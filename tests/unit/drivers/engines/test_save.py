@@ -40,7 +40,16 @@ class SimulatedBench:
             self.world.step()
             reading, grip = self.robot.read(0.0), self.gripper.read(0.0)
             commanded = [*(reading.q_commanded or ()), *(reading.dq_commanded or ())]
-            seen.append([self.world.snapshot(), reading.q, reading.dq, commanded, grip[3:], self.world.contacts()])
+            seen.append(
+                [
+                    self.world.snapshot(),
+                    reading.q,
+                    reading.dq,
+                    commanded,
+                    grip[3:],
+                    sorted(map(str, self.world.contacts())),
+                ]
+            )
         return seen
 
 
