@@ -76,8 +76,8 @@ class DrawnWorld:
         self.bodies: dict[str, DrawnBody] = {}
         self.revision = 0
         """Number of edits so far, as of the world."""
-        self.notes: list[str] = []
-        """Messages for the user: what is not drawn as its file describes it."""
+        self._absent: dict[str, list[str]] = {}
+        """Packages of meshes that are not installed -> the bodies that need them."""
         self._numbers = count()
         self._by_id: dict[int, DrawnBody] = {}
         self._frames: Array | None = None
@@ -117,16 +117,18 @@ class DrawnWorld:
             urdf = checked_urdf(spec.urdf, f"robots.{spec.name}.urdf")
         elif spec.urdf is not None:
             urdf = checked_urdf(spec.urdf, f"objects.{spec.name}.urdf")
-        if urdf is not None:
-            self._note_absent(spec.name, str(urdf.path))
+        for package in absent_packages(str(urdf.path)) if urdf is not None else ():
+            self._absent.setdefault(package, []).append(spec.name)
         body = _body(next(self._numbers), spec, urdf)
         self.bodies[spec.name] = self._by_id[body.id] = body
 
-    def _note_absent(self, name: str, path: str) -> None:
-        absent = absent_packages(path)
-        if absent:
-            what = f"{name}: drawn by its collision shapes, because its meshes are in a package that is not installed"
-            self.notes.append(f"{what} ({', '.join(absent)})")
+    @property
+    def notes(self) -> list[str]:
+        """Messages for the user: what is not drawn as its file describes it."""
+        return [
+            f"{', '.join(names)}: drawn by collision shapes, as the meshes are in {package}, which is not installed"
+            for package, names in self._absent.items()
+        ]
 
     # --- snapshots ---------------------------------------------------------------------------------------------------
 
