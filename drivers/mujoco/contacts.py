@@ -153,8 +153,8 @@ def deepest_overlap(mujoco: Any, model: Any, data: Any, a: Body, b: Body) -> tup
     return deepest
 
 
-FAR = 1e3
-"""Half extents of a plane, m."""
+FAR = 1e30
+"""Half extents of a plane, m: those of PyBullet, by which a reset of the scene knows a plane."""
 
 
 def bounding_box(mujoco: Any, model: Any, data: Any, body: Body) -> tuple[list[float], list[float]]:

@@ -27,7 +27,7 @@ from hal.types import RobotState, Trip
 from .goals import HandleDrag
 from .meshes import visual_glb
 
-__all__ = ["ArmView", "BodiesView", "workspace_lines"]
+__all__ = ["ArmView", "BodiesView", "shown_visuals", "workspace_lines"]
 
 _OPEN_SIDE = 0.8
 """Distance from the base at which an open side of a workspace is drawn, m."""

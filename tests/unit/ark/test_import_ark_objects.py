@@ -148,6 +148,7 @@ def test_a_file_with_a_list_of_items_is_read(tmp_path: Path) -> None:
 
 
 def test_a_duplicate_name_is_reported(tmp_path: Path) -> None:
+    pytest.importorskip("pybullet_data")
     for name in ("one", "two"):
         (tmp_path / f"{name}.yaml").write_text("name: ball\nconfig: {source: urdf, urdf_path: duck_vhacd.urdf}\n")
     source = tmp_path / "global.yaml"

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from engines_kit import need_engine
 from errors_kit import raises_code
 from pictures_kit import box, camera, drawn, look_at, renderer, stepped
 from specs import data, panda, world_spec
@@ -167,6 +168,7 @@ class TestChoice:
         raise DriverMissing("no EGL; apt install libegl1 libgl1-mesa-dri")
 
     def test_without_gl_the_tiny_renderer_draws_and_gives_the_reason(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        need_engine("pybullet")
         scene = drawn(box("wall", (1.0, 1.0, 0.1), (0.0, 0.0, 1.0)))
         monkeypatch.setattr("hal.drivers.scene.renderer.create_context", self.no_gl)
         chosen = choose_renderer(scene)

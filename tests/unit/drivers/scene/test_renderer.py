@@ -187,6 +187,7 @@ def test_both_renderers_show_the_same_world() -> None:
 
 
 def test_a_small_picture_is_drawn_with_a_third_of_the_triangles_and_hardly_differs(monkeypatch):
+    pytest.importorskip("pybullet_data")  # the meshes
     pose = look_at((1.5, -0.8, 0.9), (0.2, 0.0, 0.35))
     small, large = camera(256, 256), camera(1280, 960)
     scene = drawn(robots=(panda(),))
