@@ -16,6 +16,7 @@ from __future__ import annotations
 import base64
 import os
 import pickle
+import time
 import traceback
 import weakref
 from collections.abc import Callable, Mapping, Sequence
@@ -42,6 +43,10 @@ __all__ = ["RigVectorEnv", "make_vec"]
 _LONGEST = 3600.0
 """Longest time of a call, s: functions of the user run in it."""
 _CLOSE_TIMEOUT = 10.0
+_AWAKE = 5e-4
+"""A process that made a step awaits the next one so long without sleeping, s: waking up takes a tenth of a ms."""
+_IDLE = 0.5
+"""Longest sleep of a process, s, before it checks that the program is there."""
 _PLAN = ("sim", "driver", "engine", "overrides")
 """Arguments of RigEnv that choose the rig."""
 
@@ -290,6 +295,7 @@ class _Worlds:
     ) -> None:
         self._envs, self._first, self._mode = envs, first, mode
         self._ended = [False] * len(envs)
+        self._stepped = 0.0
         self._memory, self._count = memory, count
 
     def attach(self) -> None:
@@ -329,7 +335,17 @@ class _Worlds:
             self._write(self._observations, k, seen)
             return reward, terminated, truncated, info
 
-        return self._each(step)
+        try:
+            return self._each(step)
+        finally:
+            self._stepped = time.monotonic()
+
+    def pause(self) -> float:
+        """Return how long to sleep until the next message, s; right after a step not at all."""
+        if time.monotonic() - self._stepped > _AWAKE:
+            return _IDLE
+        os.sched_yield()  # the program may need this core
+        return 0.0
 
     def call(self, name: str, args: Sequence[Any], kwargs: Mapping[str, Any]) -> list[Any]:
         """Call a method of every world, or read an attribute."""
@@ -379,4 +395,4 @@ def main(channel: Channel, memories: Sequence[SharedMemory], config: dict[str, A
             return lambda data: _pack(method(*_unpack(data)))
 
         methods = (worlds.attach, worlds.reset, worlds.step, worlds.call, worlds.set_attr)
-        serve(channel, {method.__name__: answer(method) for method in methods}, timeout=_LONGEST)
+        serve(channel, {method.__name__: answer(method) for method in methods}, worlds.pause, _LONGEST)
