@@ -88,6 +88,7 @@ def main(argv: list[str] | None = None) -> int:
 def _main(args: argparse.Namespace) -> int:
     from contextlib import ExitStack
 
+    from hal import registry
     from hal.apps._common import check_episode_options, resolve_plan
     from hal.apps._display import StatusLine, list_devices
     from hal.errors import CommandError
@@ -109,6 +110,8 @@ def _main(args: argparse.Namespace) -> int:
     if plan is None:
         return 0
     _check_plan(plan)
+    if plan.engine is not None:
+        registry.check_engine(plan.engine)
     print("\n".join(f"  {line}" for line in [f"rig      {plan.source}", *list_devices(plan), *details]), flush=True)
     line = StatusLine()
     with ExitStack() as cluster:
@@ -129,7 +132,7 @@ def _main(args: argparse.Namespace) -> int:
             )
         except BaseException:
             line.clear()
-            if parts_folder(args.out).is_dir():
+            if any(parts_folder(args.out).glob("*/meta/info.json")):
                 print(f"  finished episodes are in {parts_folder(args.out)}; the same command continues", flush=True)
             raise
     line.clear()

@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 from app_kit import run_here
 
+from hal import registry
 from hal.apps.generate import describe, main
 from hal.learning.generate import GenerateProgress
 
@@ -52,6 +53,14 @@ def test_a_dry_run_opens_nothing(folder: Path) -> None:
     for text in ("skills:wait", "7 episode(s)", "lock step"):
         assert text in done.stdout
     assert not (folder / "out").exists()
+
+
+def test_an_engine_that_is_not_installed_leaves_no_folder(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(registry, "missing", lambda name: {name: "pip install it"})
+    done = run_here(main, *SKILL, "--sim", "--set", "cameras={}", "--engine", "pybullet")
+    assert (done.returncode, done.stdout) == (2, ""), done.stdout + done.stderr
+    assert "'pybullet' is not installed" in done.stderr
+    assert not list(folder.glob("out*"))
 
 
 def test_the_progress_has_the_rate_and_the_time_left() -> None:
