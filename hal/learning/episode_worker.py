@@ -278,8 +278,18 @@ def _difference(made: Any, recipe: dict[str, Any]) -> str:
     """Describe how the recipe of an episode on the disk differs."""
     if not isinstance(made, dict):
         return "has episodes that were not generated"
-    other = [key for key in {**made, **recipe} if made.get(key) != recipe.get(key)]
-    return "was generated with " + ", ".join(f"{key} {made.get(key)!r} instead of {recipe.get(key)!r}" for key in other)
+    old, new = _flat_options(made), _flat_options(recipe)
+    other = [key for key in {**old, **new} if old.get(key) != new.get(key)]
+    if other == ["plan"]:
+        return "was generated with a rig that has changed since, or with another version of it"
+    return "was generated with " + ", ".join(
+        f"{key} {old.get(key)!r} instead of {new.get(key)!r}" for key in other if key != "plan"
+    )
+
+
+def _flat_options(recipe: dict[str, Any]) -> dict[str, Any]:
+    """Return the fields of a recipe, with the options of its rig among them."""
+    return {**{key: value for key, value in recipe.items() if key != "rig"}, **recipe.get("rig", {})}
 
 
 def main(channel: Channel, memories: Sequence[SharedMemory], config: dict[str, Any]) -> None:

@@ -109,7 +109,13 @@ def test_every_episode_is_made_once_although_workers_die(tmp_path: Path, skills:
     assert sorted(path.name for path in tmp_path.iterdir() if path.name.startswith(("out", "."))) == ["out"]
 
     assert generate(recipe, out, 3) == [], "nothing is left to do"
-    for changed, count, code in ((replace(recipe, seed=4), 3, "other_recipe"), (recipe, 2, "fewer_episodes")):
+    rig = {**RIG, "engine": "mujoco"}
+    for changed, count, code in (
+        (replace(recipe, seed=4), 3, "other_recipe"),
+        (replace(recipe, rig=rig, plan="0"), 3, "other_recipe"),
+        (replace(recipe, plan="0"), 3, "other_recipe"),
+        (recipe, 2, "fewer_episodes"),
+    ):
         with raises_code(CommandError, code):
             generate(changed, out, count)
     (tmp_path / "other").mkdir()
