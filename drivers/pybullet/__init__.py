@@ -15,5 +15,5 @@ DRIVER = DriverSpec(
     software_renderer="hal.drivers.pybullet.tiny:TinyRenderer",
     viewer="hal.drivers.pybullet.viewer:PyBulletViewer",
     checks={"camera": "hal.drivers.scene.exposure:check"},
-    requires={"pybullet": "pip install 'robot-hal[sim]'"},
+    requires={"pybullet": "pip install 'robot-hal[sim]' (Python 3.10, 3.11, or a C++ compiler)"},
 )

@@ -42,7 +42,7 @@ class PyBulletViewer(Viewer):
         super().__init__(host)
         if find_spec("pybullet") is None:
             raise DriverMissing(
-                "the window is PyBullet's, which is not installed: pip install 'robot-hal[sim]' (Python 3.11 or older, "
+                "the window is PyBullet's, which is not installed: pip install 'robot-hal[sim]' (Python 3.10, 3.11, "
                 "or a C++ compiler); or use --viewer 3d",
                 name="pybullet",
             )
