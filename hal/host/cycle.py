@@ -354,8 +354,12 @@ class ArmUnit:
         self.servo.recover()
 
     def anchor_again(self) -> None:
-        """Read and anchor again: the arm was moved by a reset of the simulated world."""
-        self.reading = self.driver.read(self.reading.t if self.reading else 0.0)
+        """Read and anchor again: the arm was moved by a reset of the simulated world. A lost one is left as it is."""
+        try:
+            self.reading = self.driver.read(self.reading.t if self.reading else 0.0)
+        except Exception as error:
+            self._lose(error)
+            return
         self._anchor()
 
     def lower(self) -> bool:

@@ -1,6 +1,8 @@
 """A simulation in lock-step, through the public interface: deterministic, and time stands still between waits."""
 
+import json
 from collections.abc import Iterator
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -126,3 +128,24 @@ def test_another_arm_is_only_data(engine: Engine, name: str) -> None:
                 width = 0.4 * arm.gripper.width_max
                 arm.gripper.move(width)
                 assert arm.gripper.state().width == pytest.approx(width, abs=2e-3)
+
+
+def test_a_reset_leaves_an_arm_at_rest_although_another_one_is_lost(engine: Engine, tmp_path: Path) -> None:
+    arms = {name: {"model": "panda", "base": [0, y, 0, 0, 0, 0, 1]} for name, y in (("one", 0.5), ("two", -0.5))}
+    file = tmp_path / "rig.yaml"
+    file.write_text(json.dumps({"robots": arms}))
+    with hal.open(file, sim=True, engine=engine.name, clock="lock_step", pad="none") as rig:
+        arm = rig.robots["two"]
+        q = arm.home.copy()
+        q[0] = 0.7
+        rig.world.reset("two", q=q)
+        with arm.control() as control:
+            control.send(JointTarget(q))
+            rig.clock.sleep(0.02)
+            rig.robots["one"].inject(disconnect=True)
+            rig.clock.sleep(0.02)
+            rig.world.reset()
+            assert arm.state().q_set == pytest.approx(arm.home, abs=1e-6)
+            for _ in range(10):
+                rig.clock.sleep(0.01)
+                assert np.abs(arm.state().dq).max() < 0.1
