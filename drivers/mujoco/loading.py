@@ -318,7 +318,7 @@ def _hulls(shape: UrdfVisual) -> Iterator[Array]:
 def _parts(file: Path) -> list[Array]:
     if file.suffix.lower() == ".obj":
         data = file.read_bytes()
-        vertices = np.array(_VERTEX.findall(data)).astype(float)
+        vertices = np.array(_VERTEX.findall(data)).astype(float).reshape(-1, 3)
         parts = []
         for part in _GROUP.split(data):
             corners = [word.split(b"/")[0] for face in _FACE.findall(part) for word in face.split()]

@@ -9,8 +9,9 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from hal.drivers.scene.values import transform
 from hal.drivers.scene.world import SimulatedWorld
-from hal.errors import ConfigError, Fault, Problem
+from hal.errors import CommandError, ConfigError, Fault, Problem
 from hal.geometry import Transform, compose, rotate
 from hal.specs import BodySpec, RobotSpec, WorldSpec
 
@@ -30,6 +31,7 @@ FASTEST = 1e4
 """Speed of a joint or a body, rad/s or m/s, from which on a simulation counts as unstable."""
 SOUND_EVERY = 16
 """Steps after which the positions are kept to which an unstable simulation is set back."""
+_POSE = ("position", "orientation")
 
 
 class MujocoWorld(SimulatedWorld[Body]):
@@ -115,7 +117,8 @@ class MujocoWorld(SimulatedWorld[Body]):
         what = f"a body is faster than {FASTEST:g} m/s or rad/s" if speed < math.inf else "a number is not finite"
         remedy = "reset the world; use a smaller contact_stiffness, masses that differ less, or a higher physics_hz"
         self.fault = Fault("simulation_unstable", f"the simulation became unstable at {self.t:.3f} s: {what}", remedy)
-        self.data.qpos[:], self.data.qvel[:] = self._sound, 0.0
+        self.data.qpos[:], self.data.qvel[:], self.motors.applied[:] = self._sound, 0.0, 0.0
+        self.motors.state[np.isnan(self.motors.state)] = 0.0
 
     def close(self) -> None:
         self.bodies = {}
@@ -177,7 +180,7 @@ class MujocoWorld(SimulatedWorld[Body]):
             for body in added:
                 del self.bodies[body.name]
                 take_out(self._spec, self._plans.pop(body.name))
-            raise ConfigError(named or problems) from None
+            raise ConfigError(named or problems or [_refused(str(error))]) from None
         new = {body.name for body in added}
         self._adopt(model, [body for body in self.bodies.values() if body.name not in new])
 
@@ -312,7 +315,13 @@ class MujocoWorld(SimulatedWorld[Body]):
 
     def _write_dynamics(self, body: Body, link: int, values: Mapping[str, Any], before: Mapping[str, Any]) -> None:
         write_dynamics(self._spec, body, link, values)
-        self._arrange(())
+        try:
+            self._arrange(())
+        except ConfigError as error:
+            write_dynamics(self._spec, body, link, {name: before[name] for name in values})
+            self._arrange(())
+            message = f"{body.name!r} cannot have these dynamics: {error.problems[0].message}"
+            raise CommandError(message, code="bad_dynamics") from None
 
     def _forget(self, bodies: Sequence[Body]) -> None:
         if len(bodies) == len(self.bodies):
@@ -335,14 +344,24 @@ class MujocoWorld(SimulatedWorld[Body]):
         mujoco, motors = self.mujoco, self.motors
         kind = mujoco.mjtState.mjSTATE_INTEGRATION
         values, parts = np.array(state["integration"], float), [np.array(part, float) for part in state["motors"]]
-        if values.shape != (mujoco.mj_stateSize(self.model, kind),) or parts[0].shape != motors.state.shape:
+        shapes = (mujoco.mj_stateSize(self.model, kind),), motors.state.shape, motors.efforts.shape, motors.speeds.shape
+        if tuple(part.shape for part in (values, *parts)) != shapes:
             raise ValueError("it has another size")
+        if not all(np.isfinite(part).all() for part in (values, *parts)):
+            raise ValueError("a number in it is not finite")
+        places = {name: transform(dict(zip(_POSE, place, strict=True))) for name, place in state["places"].items()}
+        if set(places) != {body.name for body in self.bodies.values() if body.free is None}:
+            raise ValueError("it has other fixed bodies")
         mujoco.mj_setState(self.model, self.data, values, kind)
-        for name, (position, orientation) in state["places"].items():
-            body = self.bodies[name]
-            body.place = tuple(position), tuple(orientation)
-            self._place_base(body)
-        motors.state[:], motors.efforts[:], motors.speeds[:] = parts
+        for name, place in places.items():
+            self.bodies[name].place = place
+            self._place_base(self.bodies[name])
+        fingers = np.ones(motors.n, bool)
+        for arm in motors.arms.values():
+            fingers[arm] = False  # the limits of an arm are the rig's
+        motors.state[:], motors.efforts[fingers], motors.speeds[fingers] = (
+            parts[0], parts[1][fingers], parts[2][fingers],
+        )  # fmt: skip
         motors.limit()
         motors.torques.clear()  # an arm that torques drive applies its own
         self.fault, self._placed, self._touched = None, False, False
@@ -436,6 +455,10 @@ def _find(body: Body, model: Any) -> None:
             ends = [end.removeprefix(body.mujoco_name()) for end in ends]
             couplings.append((frozenset(body.joints[end] for end in ends), number))
     body.couplings = couplings
+
+
+def _refused(reason: str) -> Problem:
+    return Problem("world", "world", f"MuJoCo: {' '.join(reason.removeprefix('Error: ').split())}", "bad_urdf")
 
 
 def _not_compiled(body: Body, reason: str) -> Problem:

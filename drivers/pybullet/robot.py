@@ -43,7 +43,7 @@ class PyBulletRobot(SimulatedRobot[PyBulletWorld]):
 
     def _state(self) -> tuple[Floats, Floats, Floats]:
         q, dq, _, tau = zip(*self._read(self._body.id, self._joints), strict=True)
-        if not isfinite(sum(dq)):
+        if not isfinite(sum(dq) + sum(tau)):
             return self._unstable()
         return q, dq, tau if self._tau is None else tuple(self._torques.last_applied)
 

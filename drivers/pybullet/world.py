@@ -15,6 +15,7 @@ from math import isfinite
 from pathlib import Path
 from typing import Any
 
+from hal.drivers.scene.values import completed_dynamics, numbers
 from hal.drivers.scene.world import IDENTITY, SimulatedWorld
 from hal.errors import Fault, NotSupported
 from hal.geometry import Transform, compose, inverse
@@ -111,7 +112,11 @@ class PyBulletWorld(SimulatedWorld[Body]):
         self.client.close()
 
     def snapshot(self) -> list[float]:
-        return self._layout.read() if self.fault is None else self._layout.read_sound()
+        values = self._layout.read()
+        if self.fault is None and isfinite(sum(values)):
+            return values
+        self.note_unstable()
+        return self._layout.read_sound()
 
     def note_unstable(self) -> None:
         """Let the world stand still, with a fault, until it is reset: its numbers mean nothing any more."""
@@ -215,44 +220,85 @@ class PyBulletWorld(SimulatedWorld[Body]):
         write_dynamics(self.client, body, link, values, before, self.dt)
 
     def _forget(self, bodies: Sequence[Body]) -> None:
-        if len(bodies) == len(self.bodies):
+        if len(bodies) == len(self.bodies) and self.fault is not None:
+            self._reload()
             self.fault = None
         forget_contacts(self.client, bodies)
 
-    def _save(self) -> dict[str, Any]:
-        """Return what PyBullet writes into a file, and restore it at once.
+    def _reload(self) -> None:
+        """Load all bodies again: a motor of PyBullet's whose numbers were not finite moves nothing any more."""
+        client, bodies, said = self.client, list(self.bodies.values()), list(self.warnings)
+        dynamics = {
+            body.name: {link: read_dynamics(client, body, link) for link in body.links.values()} for body in bodies
+        }
+        for body in reversed(bodies):
+            client.removeBody(body.id)
+        for body in bodies:
+            new = self._place(body.spec)
+            body.id, body.gears, body.hardened = new.id, new.gears, new.hardened
+            for link, values in dynamics[body.name].items():
+                before = read_dynamics(client, body, link)
+                if changed := {name: value for name, value in values.items() if value != before[name]}:
+                    write_dynamics(client, body, link, completed_dynamics(body.name, changed, before), before, self.dt)
+        self.warnings = said
+        self._handling = {robot.name for robot in self.spec.robots if robot.gripper is not None}
+        self._set_residual()
+        self._arrange(bodies)
+        for body in bodies:
+            self._move_base(body, body.base)
+            self._move_joints(body, body.home)
+        self._start(bodies)
+        self._follow_attached()
 
-        The contacts that the solver remembers are in no state that PyBullet restores. They are forgotten now, and at
-        each restore, so that the steps after both are the same.
-        """
-        with tempfile.TemporaryDirectory() as folder:
-            file = Path(folder) / "state.bullet"
-            self.client.saveBullet(str(file))
-            data = file.read_bytes()
-            self._load_state(file)
-        return {"handling": sorted(self._handling), "bullet": base64.b64encode(zlib.compress(data, 1)).decode()}
+    def _save(self) -> dict[str, Any]:
+        """Return what PyBullet writes into a file, with the contacts that its solver starts from."""
+        return {
+            "handling": sorted(self._handling),
+            "snapshot": self._layout.read(),
+            "bullet": base64.b64encode(zlib.compress(self._write_file(), 1)).decode(),
+        }
 
     def _restore(self, state: Any) -> None:
         handling = set(state["handling"]) & set(self.bodies)
+        poses = numbers("the snapshot", state["snapshot"], self._layout.size)
         try:
             data = zlib.decompress(base64.b64decode(state["bullet"], validate=True))
         except zlib.error as error:
             raise ValueError(str(error)) from None
-        for name in self._handling | handling:
-            self.handle(name, name in handling)
+        if self.fault is not None:
+            self._reload()
+        handled, before = set(self._handling), self._write_file()
+        self._handle_only(handling)
+        try:
+            self._read_file(data)
+        except ValueError:
+            self._handle_only(handled)
+            raise
+        if any(abs(new - old) > 1e-6 for new, old in zip(self._layout.read(), poses, strict=True)):
+            self._handle_only(handled)
+            self._read_file(before)  # PyBullet finds bodies by their order in its own lists
+            raise ValueError("its bodies were added or removed in another order")
+        self.fault = None
+
+    def _handle_only(self, names: set[str]) -> None:
+        for name in self._handling | names:
+            self.handle(name, name in names)
+
+    def _write_file(self) -> bytes:
+        with tempfile.TemporaryDirectory() as folder:
+            file = Path(folder) / "state.bullet"
+            self.client.saveBullet(str(file))
+            return file.read_bytes()
+
+    def _read_file(self, data: bytes) -> None:
         with tempfile.TemporaryDirectory() as folder:
             file = Path(folder) / "state.bullet"
             file.write_bytes(data)
-            self._load_state(file)
-        self.fault = None
+            try:
+                self.client.restoreState(fileName=str(file))
+            except self.client.error as error:
+                raise ValueError(str(error)) from None
         self._read_layout()
-
-    def _load_state(self, file: Path) -> None:
-        forget_contacts(self.client, self.bodies.values())
-        try:
-            self.client.restoreState(fileName=str(file))
-        except self.client.error as error:
-            raise ValueError(str(error)) from None
 
     def _find_contacts(self, a: Body | None, b: Body | None) -> list[dict[str, Any]]:
         return find_contacts(self.client, self.bodies.values(), a, b)

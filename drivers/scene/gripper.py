@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from abc import abstractmethod
 from typing import Any, ClassVar, Generic, TypeVar
 
@@ -108,6 +109,8 @@ class SimulatedGripper(GripperDriver, Generic[W, B]):
         """Return the fingers after the last physics step; ``force`` is that of the weaker motor, N."""
         self._expect_open()
         width, speed, force, load = self._width()
+        if not math.isfinite(width + speed + force + load):  # the simulation is unstable, which its arms report
+            width, speed, force, load = self._stood, 0.0, 0.0, 0.0
         moving = not self._at_rest(width, speed)
         pressing = force >= PRESSING * self._force
         idle = not moving and abs(width - self._aim) <= AT_TARGET and load < PRESSING * self._force

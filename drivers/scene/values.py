@@ -14,8 +14,10 @@ from hal.specs import BodySpec, from_json
 __all__ = [
     "DYNAMICS",
     "body_spec",
+    "check_body",
     "completed_dynamics",
     "dynamics_values",
+    "like",
     "listed",
     "nearest",
     "numbers",
@@ -86,6 +88,36 @@ def body_spec(data: Mapping[str, Any]) -> BodySpec:
         return from_json(BodySpec, dict(data))
     except (TypeError, ValueError, KeyError, IndexError) as error:
         raise CommandError(f"not the record of a body: {error}") from None
+
+
+def check_body(spec: BodySpec) -> None:
+    """Raise CommandError for an object with an impossible number, or with a name that engines cannot take."""
+    if not spec.name or "/" in spec.name:
+        raise CommandError(f"the name of a body has at least one character, and no '/': {spec.name!r}")
+    transform({"position": spec.position, "orientation": spec.orientation})
+    sizes = {"half_extents": spec.half_extents, "radius": spec.radius, "length": spec.length, "scale": spec.scale}
+    for name, size in sizes.items():
+        if size is not None and min(numbers(name, size if name == "half_extents" else [size])) <= 0.0:
+            raise CommandError(f"{name} of {spec.name!r} must be more than 0, not {size}")
+    if numbers("mass", [spec.mass])[0] < 0.0:
+        raise CommandError(f"mass of {spec.name!r} must be at least 0, not {spec.mass}")
+
+
+def like(state: Any, own: Any) -> bool:
+    """Return whether ``state``, from outside, is built as ``own``, of finite numbers.
+
+    None stands for any part, and lists may be empty.
+    """
+    if isinstance(state, Mapping):
+        if own is None:
+            return all(like(part, None) for part in state.values())
+        return isinstance(own, Mapping) and set(state) == set(own) and all(like(state[key], own[key]) for key in own)
+    if isinstance(state, (list, tuple)):
+        fits = own is None or (isinstance(own, (list, tuple)) and (not own or not state or len(own) == len(state)))
+        return fits and all(like(part, None) for part in state)
+    if isinstance(own, Mapping):
+        return False
+    return state is None or (isinstance(state, (int, float)) and math.isfinite(state))
 
 
 def nearest(name: str, names: Iterable[str]) -> str:

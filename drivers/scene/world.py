@@ -20,8 +20,10 @@ from hal.world import WorldDriver
 
 from .values import (
     body_spec,
+    check_body,
     completed_dynamics,
     dynamics_values,
+    like,
     nearest,
     numbers,
     pose_json,
@@ -383,6 +385,7 @@ class SimulatedWorld(WorldDriver, Generic[B]):
     def add(self, spec: Mapping[str, Any] | BodySpec) -> int:
         """Add an object and return the new revision."""
         record = spec if isinstance(spec, BodySpec) else body_spec(spec)
+        check_body(record)
         problems = self._attachment_problems([record])
         if problems:
             raise ConfigError(problems)
@@ -461,7 +464,7 @@ class SimulatedWorld(WorldDriver, Generic[B]):
         """Return the state of the world and of its drivers: see :meth:`hal.world.World.save`."""
         return {
             "engine": self.ENGINE,
-            "bodies": {name: len(body.movable) for name, body in self.bodies.items()},
+            "bodies": self._structure(),
             "drivers": {name: save() for name, (save, _) in self._kept.items()},
             "state": self._save(),
         }
@@ -472,22 +475,33 @@ class SimulatedWorld(WorldDriver, Generic[B]):
             raise CommandError("not a state of a world; rig.world.save() returns one", code="wrong_state")
         if state["engine"] != self.ENGINE:
             raise CommandError(f"the state is one of {state['engine']}, not of {self.ENGINE}", code="wrong_state")
-        theirs, ours = list(state["bodies"].items()), [(name, len(b.movable)) for name, b in self.bodies.items()]
-        if theirs != ours:
-            others = ", ".join(name for name, _ in theirs)
+        theirs, ours = state["bodies"], self._structure()
+        if not isinstance(theirs, Mapping) or list(theirs.items()) != list(ours.items()):
+            others = ", ".join(map(str, theirs)) if isinstance(theirs, Mapping) else theirs
             raise CommandError(
-                f"the state is one of other bodies: {others}; this world has: {', '.join(self.bodies)}",
+                f"the state is one of other bodies: {others}; this world has: {', '.join(ours)}, as the rig has them",
                 code="wrong_state",
             )
+        drivers = state["drivers"]
+        own = {name: save() for name, (save, _) in self._kept.items() if name in (drivers or ())}
+        if not isinstance(drivers, Mapping) or not all(like(drivers[name], part) for name, part in own.items()):
+            raise CommandError("the state of an arm or a gripper in it is none of this world's", code="wrong_state")
         try:
             self._restore(state["state"])
-        except (KeyError, ValueError, TypeError) as error:
+        except (AttributeError, KeyError, ValueError, TypeError) as error:
             raise CommandError(f"the state cannot be restored: {error}", code="wrong_state") from error
         self._changes += 1
         self._follow_attached()
         for name, (_, restore) in self._kept.items():
-            if name in state["drivers"]:
-                restore(state["drivers"][name])
+            if name in drivers:
+                restore(drivers[name])
+
+    def _structure(self) -> dict[str, list[float]]:
+        """Return what a saved state needs to fit: joints of each body, whether it is free, and the bases of arms."""
+        return {
+            name: [len(body.movable), body.floating, *((*body.base[0], *body.base[1]) if body.is_robot else ())]
+            for name, body in self.bodies.items()
+        }
 
     def _expect_free(self, body: B) -> None:
         if body.carried:

@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Iterator
+from contextlib import suppress
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -96,18 +98,72 @@ def test_a_restore_changes_what_cameras_see_and_a_state_of_other_bodies_is_refus
     assert len(world.snapshot()) == len(before)
 
 
+def test_a_state_with_wrong_parts_is_refused_and_changes_nothing(bench: SimulatedBench) -> None:
+    bench.run(5, False)
+    world = bench.world
+    state, before = world.save(), world.snapshot()
+    arm = state["drivers"]["panda"]
+    for wrong in ({}, {**arm, "q": [0.0]}, {**arm, "q": [math.nan] * 7}, None):
+        drivers = {**state["drivers"], "panda": wrong} if wrong is not None else None
+        with raises_code(CommandError, "wrong_state"):
+            world.restore({**state, "drivers": drivers})
+    for bodies in (None, list(state["bodies"]), {**state["bodies"], "lid": [0, False]}):
+        with raises_code(CommandError, "wrong_state"):
+            world.restore({**state, "bodies": bodies})
+    assert world.snapshot() == before
+
+
+def test_a_state_reaches_the_bodies_of_its_names_or_is_refused(engine: Engine) -> None:
+    places = {"one": (0.5, 0.0, 0.5), "two": (0.5, 0.3, 0.5), "three": (0.5, -0.3, 0.5)}
+    boxes = {name: box(name, place, (0.02, 0.02, 0.02), mass=0.1) for name, place in places.items()}
+    first, second = engine.world(*boxes.values()), engine.world(boxes["two"], boxes["three"])
+    first.remove("one")
+    for world in (first, second):
+        world.add(boxes["one"])
+        world.step()
+    before = second.snapshot()
+    with suppress(CommandError):
+        second.restore(first.save())
+    assert second.snapshot() == pytest.approx(before, abs=1e-6)
+
+
+def test_a_state_of_an_arm_that_stands_elsewhere_is_refused(engine: Engine) -> None:
+    here, there = engine.world(panda()), engine.world(panda(base_position=(0.1, 0.0, 0.0)))
+    with raises_code(CommandError, "wrong_state"):
+        there.restore(here.save())
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [{"half_extents": (0.0, 1.0, 1.0)}, {"mass": -1.0}, {"mass": math.nan}, {"position": (math.inf, 0.0, 0.0)},
+     {"orientation": (0.0, 0.0, 0.0, 0.0)}, {"name": "a/b"}, {"shape": "sphere", "radius": 0.0}],
+)  # fmt: skip
+def test_an_impossible_object_is_refused_and_changes_nothing(engine: Engine, wrong: dict[str, Any]) -> None:
+    world = engine.world()
+    with pytest.raises(CommandError):
+        world.add(replace(box("box", (0.0, 0.0, 0.5), (0.1, 0.1, 0.1), mass=1.0), **wrong))
+    assert world.names() == []
+
+
 def test_an_arm_whose_numbers_mean_nothing_reports_a_fault_until_the_world_is_reset() -> None:
     bench = SimulatedBench(need_engine("pybullet"))
     sound = bench.run(1, False)[-1][1]
+    state, before = bench.world.save(), bench.world.snapshot()
     body = bench.world.body("panda")
     bench.world.client.resetJointState(body.id, 3, 0.0, 1e200)
     bench.world.step()
     reading = bench.robot.read(7.0)
     assert reading.fault is not None
     assert (reading.fault.code, reading.t, reading.q, reading.dq) == ("simulation_unstable", 7.0, sound, [0.0] * 7)
+    assert math.isfinite(bench.gripper.read(7.0).width)
+    bench.world.set_dynamics("lid", mass=0.7)
     bench.world.reset()
-    bench.world.step()
+    bench.run(60)
     reading = bench.robot.read(8.0)
     assert reading.fault is None
-    assert reading.q == pytest.approx(PANDA_HOME, abs=1e-3)
+    assert reading.q == pytest.approx(PANDA_HOME, abs=1e-3), "its motors hold it"
+    assert math.isfinite(bench.gripper.read(8.0).force)
+    assert bench.world.dynamics("lid")["mass"] == pytest.approx(0.7)
+    bench.world.restore(state)
+    assert bench.world.snapshot() == pytest.approx(before, abs=1e-9)
     bench.world.close()

@@ -10,10 +10,11 @@ from typing import Any
 import numpy as np
 import pytest
 from engines_kit import Engine, need_engine
+from errors_kit import raises_code
 from specs import PANDA_HOME, box, cube, floor, panda
 
 from hal.driver import Setpoint
-from hal.errors import ConfigError, NotSupported
+from hal.errors import CommandError, ConfigError, NotSupported
 from hal.specs import BodySpec
 
 UPRIGHT = (0.0, 0.0, 0.0, 1.0)
@@ -125,8 +126,33 @@ class TestContacts:
         with pytest.raises(NotSupported, match=name):
             scene.set_dynamics("cube", **{name: 0.1})
 
+    @pytest.mark.parametrize("inertia", [(1.0, 0.1, 0.1), (0.0, 0.0, 0.0)])
+    def test_an_impossible_inertia_is_refused_and_changes_nothing(self, scene: Any, inertia: Any) -> None:
+        before = scene.dynamics("cube")
+        with raises_code(CommandError, "bad_dynamics"):
+            scene.set_dynamics("cube", inertia=inertia)
+        assert scene.dynamics("cube") == before
+        scene.add(box("more", (1.0, 1.0, 1.0), (0.1, 0.1, 0.1), mass=1.0))  # which compiles the model again
+        scene.remove("more")
+
 
 class TestSteps:
+    def test_an_arm_whose_numbers_are_not_finite_reports_the_last_sound_ones(self, engine: Engine, scene: Any) -> None:
+        scene.reset()
+        robot, gripper = engine.robot(scene), engine.gripper(scene)
+        robot.open()
+        gripper.open()
+        steps(scene, 2).motors.target[3] = math.nan
+        reading, grip = (steps(scene, 2), robot.read(1.0))[1], gripper.read(1.0)
+        assert reading.fault is not None
+        assert np.isfinite([*reading.q, *reading.dq, *reading.tau, grip.width, grip.force]).all()
+        scene.reset()
+        steps(scene, 20)
+        assert robot.read(2.0).fault is None
+        assert robot.read(2.0).q == pytest.approx(PANDA_HOME, abs=1e-3)
+        robot.close()
+        gripper.close()
+
     def test_an_unstable_simulation_is_a_fault_until_a_reset(self, engine: Engine, scene: Any) -> None:
         scene.reset()
         robot = engine.robot(scene)
