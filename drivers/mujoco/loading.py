@@ -374,7 +374,7 @@ def _inertial(
         return None, any(values.values())
     place = link.inertial or Pose()
     xx, yy, zz, xy, xz, yz = values.values()
-    moments, axes = np.linalg.eigh(np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]) * scale**2)
+    moments, axes = _principal(np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]) * scale**2)
     pose = Pose(place.position * scale, place.orientation) @ Pose.from_matrix(_frame(axes))
     wrong = False
     if corners is not None:
@@ -390,6 +390,16 @@ def _inertial(
 
 
 _MOMENTS = ("ixx", "iyy", "izz", "ixy", "ixz", "iyz")
+
+
+def _principal(inertia: Array) -> tuple[Array, Array]:
+    """Return the principal moments (3,), and their axes as columns (3, 3), in the order of the axes nearest to them.
+
+    So the moments of a diagonal matrix are its diagonal, as with PyBullet.
+    """
+    moments, axes = np.linalg.eigh(inertia)
+    order = max(itertools.permutations(range(3)), key=lambda order: float(np.abs(np.diag(axes[:, order])).sum()))
+    return moments[list(order)], axes[:, order]
 
 
 def _frame(axes: Array) -> Array:

@@ -106,7 +106,7 @@ class TestBodies:
         urdf = tmp_path / "lopsided.urdf"
         urdf.write_text(
             '<robot name="lopsided"><link name="body"><inertial><origin xyz="0.1 0 0" rpy="0 0 0.5"/><mass value="1"/>'
-            '<inertia ixx="0.01" iyy="0.02" izz="0.03" ixy="0" ixz="0" iyz="0"/></inertial><collision><geometry>'
+            '<inertia ixx="0.005" iyy="0.008" izz="0.006" ixy="0" ixz="0" iyz="0"/></inertial><collision><geometry>'
             '<box size="0.2 0.2 0.2"/></geometry></collision></link></robot>'
         )
         there = Pose((1.0, 2.0, 3.0), (0.0, math.sin(0.4), 0.0, math.cos(0.4)))
@@ -116,6 +116,7 @@ class TestBodies:
         elsewhere = Pose((0.0, 0.0, 1.0), (0.0, 0.0, 1.0, 0.0))
         world.set_pose("it", {"position": [0.0, 0.0, 1.0], "orientation": [0.0, 0.0, 1.0, 0.0]})
         assert pose(world, "it").distance(elsewhere) == pytest.approx((0.0, 0.0), abs=1e-7)
+        assert world.dynamics("it")["inertia"] == pytest.approx([0.005, 0.008, 0.006]), "in the file's order"
 
 
 class TestReset:
