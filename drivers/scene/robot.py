@@ -193,9 +193,11 @@ class SimulatedRobot(RobotDriver, Generic[W]):
         return state | {"age": self._world.steps - self._received}
 
     def _restore(self, state: dict[str, Any]) -> None:
+        self._frozen = None
         self._q, self._dq, self._tau = state["q"], state["dq"], state["tau"]
         self._received = self._world.steps - state["age"]
 
     def _was_reset(self) -> None:
+        self._frozen = None
         self._q, self._dq = self._positions(), [0.0] * len(self.spec.joints)
         self._tau = None

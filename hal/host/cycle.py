@@ -354,11 +354,12 @@ class ArmUnit:
         self.servo.recover()
 
     def anchor_again(self) -> None:
-        """Read and anchor again: the arm was moved by a reset of the simulated world. A lost one is left as it is."""
+        """Read and anchor again, because a reset of the simulated world moved the arm; a lost one, when it is back."""
         try:
             self.reading = self.driver.read(self.reading.t if self.reading else 0.0)
         except Exception as error:
             self._lose(error)
+            self.servo.note_withheld()  # it is where it reports to be when it answers again
             return
         self._anchor()
 

@@ -130,22 +130,25 @@ def test_another_arm_is_only_data(engine: Engine, name: str) -> None:
                 assert arm.gripper.state().width == pytest.approx(width, abs=2e-3)
 
 
-def test_a_reset_leaves_an_arm_at_rest_although_another_one_is_lost(engine: Engine, tmp_path: Path) -> None:
+def test_a_reset_leaves_arms_at_rest_although_one_is_lost(engine: Engine, tmp_path: Path) -> None:
     arms = {name: {"model": "panda", "base": [0, y, 0, 0, 0, 0, 1]} for name, y in (("one", 0.5), ("two", -0.5))}
     file = tmp_path / "rig.yaml"
     file.write_text(json.dumps({"robots": arms}))
     with hal.open(file, sim=True, engine=engine.name, clock="lock_step", pad="none") as rig:
-        arm = rig.robots["two"]
-        q = arm.home.copy()
+        q = rig.robots["two"].home.copy()
         q[0] = 0.7
-        rig.world.reset("two", q=q)
-        with arm.control() as control:
+        for name in arms:
+            rig.world.reset(name, q=q)
+        with rig.robots["one"].control() as lost, rig.robots["two"].control() as control:
+            lost.send(JointTarget(q))
             control.send(JointTarget(q))
             rig.clock.sleep(0.02)
             rig.robots["one"].inject(disconnect=True)
             rig.clock.sleep(0.02)
             rig.world.reset()
-            assert arm.state().q_set == pytest.approx(arm.home, abs=1e-6)
+            assert rig.robots["two"].state().q_set == pytest.approx(q - [0.7, 0, 0, 0, 0, 0, 0], abs=1e-6)
+            rig.clock.sleep(0.02)
+            rig.robots["one"].inject(disconnect=False)
             for _ in range(10):
                 rig.clock.sleep(0.01)
-                assert np.abs(arm.state().dq).max() < 0.1
+                assert max(np.abs(arm.state().dq).max() for arm in rig.robots.values()) < 0.1
