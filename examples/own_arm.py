@@ -1,6 +1,6 @@
 """Simulate an arm of your own: its URDF, one YAML file of numbers (xarm6.yaml beside this), and a rig.
 
-python examples/own_arm.py
+python examples/own_arm.py         # needs PyBullet, which the URDF comes with: Python 3.10 or 3.11
 """
 
 from __future__ import annotations

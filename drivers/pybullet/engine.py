@@ -90,7 +90,7 @@ def load_pybullet() -> Any:
             import pybullet
     except ImportError as error:
         raise DriverMissing(
-            f"the simulation needs PyBullet ({error}); install it with: pip install 'robot-hal[sim]' "
+            f"PyBullet is not installed ({error}); install it with: pip install 'robot-hal[sim]' "
             "(Python 3.10, 3.11, or a C++ compiler)"
         ) from error
     return pybullet
