@@ -231,7 +231,7 @@ def _plan_urdf(spec: BodySpec | RobotSpec, urdf: UrdfModel, key: str, scale: flo
             solids=[len(link.shapes) for link in links],
         ),
         links,
-        limits={joint.name: _range(joint) for joint in moving},
+        limits={joint.name: _range(joint, scale) for joint in moving},
         mimics=[(one.joint, one.of, one.multiplier, one.offset) for one in mimics_of(spec, urdf)],
     )
     if fixed:
@@ -248,10 +248,11 @@ def _scaled(joint: UrdfJoint, scale: float) -> UrdfJoint:
     return replace(joint, origin=Pose(joint.origin.position * scale, joint.origin.orientation))
 
 
-def _range(joint: UrdfJoint) -> tuple[float, float] | None:
+def _range(joint: UrdfJoint, scale: float) -> tuple[float, float] | None:
     if joint.lower is None or joint.upper is None or joint.lower >= joint.upper:
         return None
-    return joint.lower - UNBOUNDED, joint.upper + UNBOUNDED
+    size = 1.0 if joint.kind in TURNING else scale
+    return size * joint.lower - UNBOUNDED, size * joint.upper + UNBOUNDED
 
 
 def _contact(link: ElementTree.Element) -> LinkContact:

@@ -135,6 +135,19 @@ class TestContacts:
         scene.add(box("more", (1.0, 1.0, 1.0), (0.1, 0.1, 0.1), mass=1.0))  # which compiles the model again
         scene.remove("more")
 
+    def test_a_drawer_of_twice_the_size_opens_twice_as_far(self, engine: Engine, tmp_path: Path) -> None:
+        part = '<link name="{}"><collision><geometry><box size="0.1 0.1 0.1"/></geometry></collision></link>'
+        joint = (
+            '<joint name="slide" type="prismatic"><parent link="frame"/><child link="drawer"/><axis xyz="0 0 -1"/>'
+            '<limit lower="0" upper="0.2" effort="0" velocity="0"/></joint>'
+        )
+        urdf = tmp_path / "drawer.urdf"
+        urdf.write_text(f'<robot name="it">{part.format("frame")}{part.format("drawer")}{joint}</robot>')
+        it = BodySpec("it", (0.0, 0.0, 1.0), UPRIGHT, "urdf", urdf=str(urdf), fixed=True, scale=2.0)
+        world = steps(engine.world(it), 240)
+        assert world.pose("it", "drawer")["position"][2] == pytest.approx(0.6, abs=1e-3)
+        world.close()
+
 
 class TestSteps:
     def test_an_arm_whose_numbers_are_not_finite_reports_the_last_sound_ones(self, engine: Engine, scene: Any) -> None:
