@@ -488,7 +488,7 @@ class SimulatedWorld(WorldDriver, Generic[B]):
             raise CommandError("the state of an arm or a gripper in it is none of this world's", code="wrong_state")
         try:
             self._restore(state["state"])
-        except (AttributeError, KeyError, ValueError, TypeError) as error:
+        except (AttributeError, CommandError, KeyError, ValueError, TypeError) as error:
             raise CommandError(f"the state cannot be restored: {error}", code="wrong_state") from error
         self._changes += 1
         self._follow_attached()
