@@ -478,10 +478,10 @@ class SimulatedWorld(WorldDriver, Generic[B]):
         theirs, ours = state["bodies"], self._structure()
         if not isinstance(theirs, Mapping) or list(theirs.items()) != list(ours.items()):
             others = ", ".join(map(str, theirs)) if isinstance(theirs, Mapping) else theirs
-            raise CommandError(
-                f"the state is one of other bodies: {others}; this world has: {', '.join(ours)}, as the rig has them",
-                code="wrong_state",
-            )
+            text = f"the state is one of other bodies: {others}; this world has: {', '.join(ours)}"
+            if isinstance(theirs, Mapping) and list(theirs) == list(ours):
+                text = "the state is one of bodies of the same names with other joints or bases"
+            raise CommandError(text, code="wrong_state")
         drivers = state["drivers"]
         own = {name: save() for name, (save, _) in self._kept.items() if name in (drivers or ())}
         if not isinstance(drivers, Mapping) or not all(like(drivers[name], part) for name, part in own.items()):
