@@ -251,11 +251,17 @@ class PyBulletWorld(SimulatedWorld[Body]):
         self._follow_attached()
 
     def _save(self) -> dict[str, Any]:
-        """Return what PyBullet writes into a file, with the contacts that its solver starts from."""
+        """Return what PyBullet writes into a file, and restore it at once.
+
+        The contacts that the solver remembers are in no state that PyBullet restores. They are forgotten now, and at
+        each restore, so that the steps after both are the same.
+        """
+        data, snapshot = self._write_file(), self._layout.read()
+        self._read_file(data)
         return {
             "handling": sorted(self._handling),
-            "snapshot": self._layout.read(),
-            "bullet": base64.b64encode(zlib.compress(self._write_file(), 1)).decode(),
+            "snapshot": snapshot,
+            "bullet": base64.b64encode(zlib.compress(data, 1)).decode(),
         }
 
     def _restore(self, state: Any) -> None:
@@ -291,6 +297,7 @@ class PyBulletWorld(SimulatedWorld[Body]):
             return file.read_bytes()
 
     def _read_file(self, data: bytes) -> None:
+        forget_contacts(self.client, self.bodies.values())
         with tempfile.TemporaryDirectory() as folder:
             file = Path(folder) / "state.bullet"
             file.write_bytes(data)

@@ -15,8 +15,10 @@ from engines_kit import Engine, need_engine
 from errors_kit import raises_code
 from specs import PANDA_HOME, box, cube, floor, panda
 
+import hal
 from hal.driver import Setpoint
 from hal.errors import CommandError
+from hal.learning.episode import reset_scene
 
 
 class SimulatedBench:
@@ -60,6 +62,18 @@ def bench(engine: Engine) -> Iterator[SimulatedBench]:
     made = SimulatedBench(engine)
     yield made
     made.world.close()
+
+
+def test_contacts_that_the_solver_remembers_change_nothing_after_a_restore(engine: Engine) -> None:
+    where: Any = {"engine": engine.name, "clock": "lock_step", "pad": "none", "overrides": ["cameras={}"]}
+    with hal.open("panda_table", sim=True, **where) as rig:
+        reset_scene(rig, rig.robots["panda"], random=np.random.default_rng(1))  # the duck comes to rest on its mesh
+        state = rig.world.save()
+        rig.clock.sleep(0.5)
+        there = rig.world.poses().poses
+        rig.world.restore(state)
+        rig.clock.sleep(0.5)
+        assert rig.world.poses().poses == there
 
 
 @pytest.mark.parametrize("torque", [False, True])
