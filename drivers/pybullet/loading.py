@@ -167,7 +167,7 @@ def _describe(
     client: PyBulletClient, spec: BodySpec | RobotSpec, number: int, key: str, urdf: UrdfModel | None = None
 ) -> Body:
     """Return a body with its names, indices and frames as PyBullet loaded them."""
-    links = {client.getBodyInfo(number)[0].decode(): -1}
+    links = {client.getBodyInfo(number)[0].decode() if urdf is not None else "base": -1}  # as in hal.drivers.scene
     joints: dict[str, int] = {}
     movable: set[int] = set()
     for joint in range(client.getNumJoints(number)):

@@ -102,6 +102,9 @@ class TestBodies:
             q = list(joint_positions(world, name).values())[:7]
             assert np.allclose(q, home, atol=1e-3), name
 
+    def test_the_link_of_an_object_without_a_file_is_its_base(self, world: Any) -> None:
+        assert world.dynamics("cube", "base") == world.dynamics("cube")
+
     def test_a_urdf_object_is_posed_by_its_base_link(self, engine: Engine, tmp_path: Path) -> None:
         urdf = tmp_path / "lopsided.urdf"
         urdf.write_text(
