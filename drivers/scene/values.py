@@ -93,7 +93,7 @@ def body_spec(data: Mapping[str, Any]) -> BodySpec:
 def check_body(spec: BodySpec) -> None:
     """Raise CommandError for an object with an impossible number, or with a name that engines cannot take."""
     if not spec.name or "/" in spec.name:
-        raise CommandError(f"the name of a body has at least one character, and no '/': {spec.name!r}")
+        raise CommandError(f"the name of a body has at least one character, and no '/': {spec.name!r}", code="bad_name")
     transform({"position": spec.position, "orientation": spec.orientation})
     sizes = {"half_extents": spec.half_extents, "radius": spec.radius, "length": spec.length, "scale": spec.scale}
     for name, size in sizes.items():

@@ -24,7 +24,7 @@ from .index import read_index
 from .layout import MORE_STREAMS, TIMES, DatasetLayout, features_of, lock_dataset, require_libraries
 from .live import RowQueue
 from .metadata import ClockPace, caller_metadata, rig_metadata, start_metadata
-from .sampling import CameraBuffer, LockStepSampleClock, RealTimeSampleClock, RowSampler, SampleClock, movable_objects
+from .sampling import CameraBuffer, LockStepSampleClock, RealTimeSampleClock, RowSampler, SampleClock
 
 if TYPE_CHECKING:
     from ..rig import Rig
@@ -565,8 +565,6 @@ def select_devices(
         raise CommandError(f"there is no stream {unknown[0]!r}; streams: {known}", code="unknown_stream")
     if not rig.robots:
         raise CommandError("this rig has no arm to record", code="no_arm")
-    if odd := [name for name in movable_objects(rig) if "/" in name]:
-        raise CommandError(f"the name of an object must not contain a slash: {odd[0]!r}", code="bad_name")
     names = tuple(rig.cameras) if cameras is None else tuple(dict.fromkeys(cameras))
     buffers, notes = [], []
     for name in names:

@@ -293,13 +293,6 @@ def test_a_camera_that_is_named_twice_is_kept_once(rig: Rig, out: Path) -> None:
     assert Dataset(out).episodes[0].cameras == ("wrist",)
 
 
-def test_an_object_whose_name_can_be_no_column(out: Path) -> None:
-    with hal.open("panda_table", sim=True, clock="lock_step", pad="none", overrides=["cameras={}"]) as rig:
-        rig.world.add(hal.BodySpec("ball/1", (0, 0, 1), (0, 0, 0, 1), "sphere", radius=0.03, mass=0.1))
-        with raises_code(CommandError, "bad_name"):
-            Recorder(rig, out)
-
-
 # What others left behind.
 
 
