@@ -116,7 +116,7 @@ def _extent(link: ElementTree.Element, folder: Path) -> Array | None:
     """Return the sides (3,) of the box around a link's collision shapes, along its axes, m; None if unknown."""
     corners: list[Array] = []
     for shape in link.findall("collision"):
-        box = _bounds(next(iter(shape.find("geometry") or ()), None), folder)
+        box = _bounds(shape.find("geometry/*"), folder)
         if box is None:
             return None
         turn, position = _origin(shape)

@@ -57,6 +57,7 @@ def test_an_unknown_host_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_a_robot_that_accepts_and_never_answers_is_a_failure(monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("pylibfranka", reason="needs pylibfranka: pip install 'robot-hal[franka]'")
     monkeypatch.setattr(preflight, "PATIENCE", 1.0)
     with socket.create_server((MUTE, 1337)):
         found = checked(rig(MUTE))
