@@ -28,7 +28,7 @@ __all__ = ["EpisodeFailed", "GenerateProgress", "LocalWorker", "WorkerHandle", "
 
 _DEATHS = 3
 """Number of workers that may die while they make the same episode."""
-_LONGEST = 3600.0
+LONGEST = 3600.0
 """A worker that needs longer for an episode counts as dead, s of wall-clock time."""
 _START = 120.0
 """Longest time in which a worker must be ready, s: importing a policy may take a while."""
@@ -110,7 +110,7 @@ class LocalWorker(WorkerHandle):
 
     def make(self, number: int) -> EpisodeResult:
         """Make an episode; see :meth:`WorkerHandle.make`."""
-        return EpisodeResult(**self._child.request("make", {"number": number}, _LONGEST))
+        return EpisodeResult(**self._child.request("make", {"number": number}, LONGEST))
 
     def kill(self) -> None:
         """End the process at once."""
@@ -317,6 +317,7 @@ class _GenerateRun:
             except CommandError as error:
                 if error.code != "dataset_locked" or time.monotonic() > end:
                     raise
+            time.sleep(_UPDATE)
 
     def _handle(self, index: int, folder: Path) -> WorkerHandle:
         """Return the worker of this number; start it if there is none."""

@@ -6,18 +6,23 @@ import logging
 import os
 import sys
 import tempfile
+from contextlib import suppress
 from types import TracebackType
 from typing import Any
 
 from ..errors import ConnectionLost, DriverMissing
 from ..host.process import unpack_error
 from .episode_worker import EpisodeResult, EpisodeWorker
-from .generate import WorkerHandle
+from .generate import LONGEST, WorkerHandle
 
 __all__ = ["RayCluster", "RayWorker"]
 
 _STORE = 80_000_000
 """Memory for Ray's objects on a cluster that is started here, bytes: close to Ray's least. Results are small."""
+
+
+_CLOSING = 60.0
+"""Time in which a worker must have closed its dataset, s."""
 
 
 class RayCluster:
@@ -82,9 +87,11 @@ class RayWorker(WorkerHandle):
     def make(self, number: int) -> EpisodeResult:
         """Make an episode; see :meth:`.WorkerHandle.make`."""
         try:
-            answer = self._ray.get(self._actor.make_packed.remote(number))
+            answer = self._ray.get(self._actor.make_packed.remote(number), timeout=LONGEST)
         except self._ray.exceptions.RayActorError as error:
             raise ConnectionLost(f"the worker's process ended: {error}", code="process_ended") from error
+        except self._ray.exceptions.GetTimeoutError as error:
+            raise ConnectionLost(f"the worker made no episode within {LONGEST:g} s", code="process_silent") from error
         if "error" in answer:
             raise unpack_error(answer["error"])
         return EpisodeResult(**answer["result"])
@@ -95,8 +102,6 @@ class RayWorker(WorkerHandle):
 
     def close(self) -> None:
         """End the recorder of the worker, then its process."""
-        try:
-            self._ray.get(self._actor.close.remote())
-        except self._ray.exceptions.RayActorError:
-            return
+        with suppress(self._ray.exceptions.RayActorError, self._ray.exceptions.GetTimeoutError):
+            self._ray.get(self._actor.close.remote(), timeout=_CLOSING)
         self.kill()
