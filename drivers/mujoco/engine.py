@@ -6,7 +6,7 @@ import sys
 from dataclasses import dataclass, field
 from typing import Any
 
-from hal.drivers.scene.world import SimulatedBody
+from hal.drivers.scene.engine import SimulatedBody
 from hal.errors import DriverMissing
 from hal.geometry import Transform
 

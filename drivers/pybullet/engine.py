@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
 
-from hal.drivers.scene.world import SimulatedBody
+from hal.drivers.scene.engine import SimulatedBody
 from hal.errors import DriverMissing
 from hal.geometry import Transform, compose, inverse
 

@@ -15,8 +15,9 @@ from math import isfinite
 from pathlib import Path
 from typing import Any
 
+from hal.drivers.scene.engine import IDENTITY
 from hal.drivers.scene.values import completed_dynamics, numbers
-from hal.drivers.scene.world import IDENTITY, SimulatedWorld
+from hal.drivers.scene.world import SimulatedWorld
 from hal.errors import Fault, NotSupported
 from hal.geometry import Transform, compose, inverse
 from hal.specs import BodySpec, RobotSpec, WorldSpec

@@ -10,7 +10,8 @@ from hal.driver import GripperDriver, GripperReading
 from hal.errors import CommandError, ConfigError, ConnectionLost, Problem
 from hal.specs import GripperSpec, RobotSpec
 
-from .world import SimulatedBody, SimulatedWorld
+from .engine import SimulatedBody
+from .world import SimulatedWorld
 
 __all__ = ["SimulatedGripper"]
 

@@ -1,0 +1,172 @@
+"""What a physics engine implements of a simulated world: :class:`SceneEngine`, and the bodies in it.
+
+:class:`.world.SimulatedWorld` adds the requests of ``rig.world``, and only passes on bodies and numbers that exist and
+make sense.
+"""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, ClassVar, Generic, TypeVar
+
+from hal.errors import NotSupported
+from hal.geometry import Transform
+from hal.specs import BodySpec, RobotSpec
+from hal.world import WorldDriver
+
+__all__ = ["IDENTITY", "SceneEngine", "SimulatedBody"]
+
+IDENTITY: Transform = ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
+
+
+@dataclass(kw_only=True)
+class SimulatedBody:
+    """A robot or an object of a simulated world. Links and joints have numbers, by which the engine finds them."""
+
+    name: str
+    spec: BodySpec | RobotSpec
+    links: dict[str, int]
+    """Numbers of the links by name; the first one is the base link."""
+    joints: dict[str, int]
+    """Numbers of all joints by name, including fixed ones."""
+    movable: tuple[int, ...]
+    """Numbers of the joints that move, in the order of the URDF."""
+    floating: bool
+    """Whether physics can move its base."""
+    home: dict[int, float] = field(default_factory=dict)
+    """Initial position of each movable joint: rad, or m."""
+    base: Transform = IDENTITY
+    """Initial pose of the base link in the world; in the frame of the arm's link for an object that is attached."""
+    index: int = -1
+    """Its place among the world's bodies: its value in segmentation images."""
+
+    def link_name(self, number: int) -> str:
+        """Return the name of the link with this number."""
+        return next(name for name, other in self.links.items() if other == number)
+
+    @property
+    def is_robot(self) -> bool:
+        """Whether this is an arm."""
+        return isinstance(self.spec, RobotSpec)
+
+    @property
+    def carried(self) -> bool:
+        """Whether it is attached to a link of an arm."""
+        return isinstance(self.spec, BodySpec) and self.spec.robot is not None
+
+    @property
+    def roams(self) -> bool:
+        """Whether its base may be elsewhere after the next step."""
+        return self.floating or self.carried
+
+    @property
+    def moves(self) -> bool:
+        """Whether its base or any joint may move."""
+        return self.roams or bool(self.movable)
+
+
+B = TypeVar("B", bound=SimulatedBody)
+
+
+class SceneEngine(WorldDriver, Generic[B]):
+    """The part of a simulated world that each physics engine implements."""
+
+    ENGINE: ClassVar[str]
+    """Name of the engine for messages."""
+    UNSUPPORTED: ClassVar[Mapping[str, str]] = {}
+    """Dynamics that the engine does not have -> what to set instead."""
+
+    @abstractmethod
+    def _place(self, spec: BodySpec | RobotSpec) -> B:
+        """Load a body, whose name is new, into the engine. It need not stand at its initial pose yet.
+
+        Raises:
+            ConfigError: It cannot be loaded; nothing of it stays. Lists all problems.
+        """
+
+    @abstractmethod
+    def _arrange(self, added: Sequence[B]) -> None:
+        """Complete the world after bodies were added, before they are put home, or removed; ``bodies`` are up to date.
+
+        Objects that are attached (:meth:`_attachments`) leave physics here: they have no weight and touch nothing.
+        """
+
+    @abstractmethod
+    def _take_out(self, body: B) -> None:
+        """Remove a body from the engine; :meth:`_arrange` follows."""
+
+    @abstractmethod
+    def _follow_attached(self) -> None:
+        """Place every object that is attached at its link of an arm, after a step or a reset."""
+
+    @abstractmethod
+    def _deepest_overlap(self, a: B, b: B) -> tuple[float, str, str]:
+        """Return how deep two bodies overlap, m, 0 if they are apart, and by which link of each."""
+
+    @abstractmethod
+    def _read_pose(self, body: B, link: int) -> Transform:
+        """Return the pose in the world of a link's own frame."""
+
+    @abstractmethod
+    def _read_velocity(self, body: B) -> tuple[Sequence[float], Sequence[float]]:
+        """Return the velocity in the world: linear (3,) m/s of the base link's centre of mass, angular (3,) rad/s."""
+
+    @abstractmethod
+    def _move_base(self, body: B, pose: Transform) -> None:
+        """Place the base link there, at rest; its joints keep their positions."""
+
+    @abstractmethod
+    def _move_joints(self, body: B, positions: Mapping[int, float]) -> None:
+        """Place these joints (rad or m) at rest; those of a robot then hold there."""
+
+    @abstractmethod
+    def _set_velocity(self, body: B, linear: Sequence[float], angular: Sequence[float]) -> None:
+        """Set the velocity of a free base, as of :meth:`_read_velocity`."""
+
+    @abstractmethod
+    def _read_dynamics(self, body: B, link: int) -> dict[str, Any]:
+        """Return :data:`.values.DYNAMICS` of a link, without those of :attr:`UNSUPPORTED`."""
+
+    @abstractmethod
+    def _write_dynamics(self, body: B, link: int, values: Mapping[str, Any], before: Mapping[str, Any]) -> None:
+        """Set properties of a link; ``before`` is what :meth:`_read_dynamics` returned just before."""
+
+    @abstractmethod
+    def _forget(self, bodies: Sequence[B]) -> None:
+        """Clear what the solver keeps from one step to the next about these bodies.
+
+        Called before they are reset, so that the steps after it repeat those after the start, and after their dynamics
+        have changed, so that these act at once.
+        """
+
+    @abstractmethod
+    def _find_contacts(self, a: B | None, b: B | None) -> list[dict[str, Any]]:
+        """Return the contacts of the last step, as :meth:`contacts` does; None stands for any body."""
+
+    @abstractmethod
+    def _bounding_box(self, body: B) -> tuple[list[float], list[float]]:
+        """Return the lower and upper corner (3,) m of the box along the world's axes around a body."""
+
+    @abstractmethod
+    def _follow(self, body: B, q: list[float], dq: list[float], width: float | None) -> None:
+        """Place the mirror of a real arm; the numbers are checked."""
+
+    def _save(self) -> Any:
+        """Return the state of the engine, as JSON; an engine has it with the motors', or without."""
+        raise NotSupported(f"{self.ENGINE} does not save states", code="no_states")
+
+    def _restore(self, state: Any) -> None:
+        """Put the engine into a state of :meth:`_save`, of a world with the same bodies.
+
+        Raises:
+            ValueError: It is no such state; nothing changes.
+        """
+        raise NotSupported(f"{self.ENGINE} does not restore states", code="no_states")
+
+    def _start(self, added: Sequence[B]) -> None:  # optional
+        """Complete new bodies, which are now at their initial poses."""
+
+    def _paint(self, body: B, rgba: list[float]) -> None:  # most engines draw nothing
+        """Change the colour of a body, where the engine itself draws."""
