@@ -1,26 +1,32 @@
 """Commands to an arm: frozen records in SI units, checked when they are created.
 
 A program sends one of the six commands with :meth:`hal.control.Control.send`. Poses and twists are in the arm's base
-frame unless stated otherwise. The second half of this file holds the records in which commands, sessions and dead-man
-switches reach the servo.
+frame unless stated otherwise. After them come the records in which commands, sessions and dead-man switches reach the
+servo, and the checks that every command passes before it is sent (:class:`CommandChecks`).
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from . import registry
 from .arguments import frozen, vector
-from .errors import CommandError
+from .errors import CommandError, NotSupported, Unreachable
 from .geometry import Pose, tcp_pose
+
+if TYPE_CHECKING:
+    from .specs import LimitsSpec, RobotSpec
 
 __all__ = [
     "CartesianTarget",
     "Command",
+    "CommandChecks",
     "CommandRecord",
     "DeadmanRecord",
     "Inbox",
@@ -275,3 +281,194 @@ class Inbox(NamedTuple):
 
 
 NO_INBOX = Inbox(None, None, 0, 0, 0.0)
+
+
+class CheckedArm(Protocol):
+    """What :class:`CommandChecks` needs of an arm: a part of :class:`hal.robot.Robot`."""
+
+    name: str
+    spec: RobotSpec
+
+    @property
+    def n(self) -> int: ...
+    @property
+    def joints(self) -> tuple[str, ...]: ...
+    @property
+    def limits(self) -> LimitsSpec: ...
+    @property
+    def kinematics(self) -> Any: ...
+
+
+class CommandChecks:
+    """Checks of the commands for one arm: size, limits, reach, and distance of the first target.
+
+    Args:
+        robot: The arm.
+    """
+
+    def __init__(self, robot: CheckedArm) -> None:
+        self._robot = robot
+        self._n = robot.n
+        self._lower, self._upper = np.array(robot.limits.lower), np.array(robot.limits.upper)
+        self._takes_torques = False
+        """Whether the driver is known to take torques."""
+
+    def checked(self, command: Command, now: float, reasons: list[str]) -> Command:
+        """Return the command to send: the same one, or one cut to the limits.
+
+        Args:
+            command: The command.
+            now: Time on the rig's clock, s.
+            reasons: List to which the reasons for every change are appended.
+
+        Raises:
+            CommandError: Not a command, or one of the wrong size (``code`` is ``not_a_command``, ``wrong_joint_count``,
+                ``chunk_in_the_past`` or ``chunk_too_long``).
+            NotSupported: Torques, for an arm that takes none.
+            Unreachable: A pose beyond the arm's reach.
+        """
+        if isinstance(command, JointTorque):
+            self.check_torques()
+        self._check_kind(command)
+        if isinstance(command, CartesianTarget):
+            self._check_reach(command)
+        elif isinstance(command, JointTarget):
+            q = self._in_limits(command.q, reasons)
+            return command if q is command.q else JointTarget(q, command.dq)
+        elif isinstance(command, JointChunk):
+            self._check_times(command, now)
+            q = self._in_limits(command.q, reasons)
+            return command if q is command.q else JointChunk(command.t, q)
+        elif isinstance(command, JointTorque):
+            return self._within_torques(command, reasons)
+        return command
+
+    def check_first(self, command: Command, now: float, q_set: Sequence[float]) -> None:
+        """Refuse a first target that is far from the set-point, so that the arm does not leap to it.
+
+        Args:
+            command: The command.
+            now: Time on the rig's clock, s.
+            q_set: Joint set-point (n,), rad.
+
+        Raises:
+            CommandError: The target is too far away (``code`` is ``first_step_too_far``).
+        """
+        if isinstance(command, (JointTarget, JointChunk)):
+            first = command.q if isinstance(command, JointTarget) else _target_at(command, now)
+            step = np.abs(first - np.asarray(q_set))
+            worst = int(np.argmax(step))
+            if step[worst] > FIRST_STEP_ANGLE:
+                raise CommandError(
+                    f"the first target is {step[worst]:.3f} rad from the set-point at {self._robot.joints[worst]}, "
+                    f"more than {FIRST_STEP_ANGLE} rad: use move_to first",
+                    code="first_step_too_far",
+                )
+        elif isinstance(command, CartesianTarget):
+            distance, turn = self._robot.kinematics.pose(q_set).distance(command.pose)
+            if distance > FIRST_STEP_DISTANCE or turn > FIRST_STEP_TURN:
+                raise CommandError(
+                    f"the first pose is {distance:.3f} m and {turn:.3f} rad from the set-point, more than "
+                    f"{FIRST_STEP_DISTANCE} m or {FIRST_STEP_TURN} rad: use move_to first",
+                    code="first_step_too_far",
+                )
+
+    def _check_kind(self, command: Command) -> None:
+        if isinstance(command, JointChunk):
+            count = command.q.shape[1]
+        elif (size := _JOINTS.get(type(command))) is not None:
+            count = getattr(command, size).size
+        elif isinstance(command, (CartesianTarget, Twist)):
+            return
+        else:
+            meant = _MEANT.get(type(command))
+            hint = f"; did you mean {meant}?" if meant else ""
+            raise CommandError(f"{type(command).__name__} is not a command{hint}", code="not_a_command")
+        if count != self._n:
+            raise CommandError(
+                f"{self._robot.name} has {self._n} joints; {type(command).__name__} has {count}",
+                code="wrong_joint_count",
+            )
+
+    def _check_reach(self, command: CartesianTarget) -> None:
+        farthest = self._robot.kinematics.farthest()
+        away = float(np.linalg.norm(command.pose.position)) - farthest
+        if away > 0.0:
+            raise Unreachable(
+                f"{self._robot.name} reaches {farthest:.2f} m from its base", position_error=away, rotation_error=0.0
+            )
+
+    @staticmethod
+    def _check_times(command: JointChunk, now: float) -> None:
+        end = float(command.t[-1]) - now
+        if end <= 0.0:
+            raise CommandError(
+                f"the chunk's last target was due {-end:.3f} s ago: its times are on rig.clock",
+                code="chunk_in_the_past",
+            )
+        if end > CHUNK_AHEAD:
+            raise CommandError(
+                f"the chunk reaches {end:.3f} s into the future; at most {CHUNK_AHEAD:g} s are allowed",
+                code="chunk_too_long",
+            )
+
+    def _in_limits(self, q: NDArray[np.float64], reasons: list[str]) -> NDArray[np.float64]:
+        """Return ``q`` (n,) or (k, n) cut to the position limits; the same array if that changes nothing."""
+        inside: NDArray[np.float64] = np.minimum(np.maximum(q, self._lower), self._upper)
+        over = (inside != q).any(axis=0) if q.ndim > 1 else inside != q
+        if not over.any():
+            return q
+        names = [name for name, is_over in zip(self._robot.joints, over, strict=True) if is_over]
+        reasons.append(f"position limit of {', '.join(names)}")
+        return inside
+
+    def check_torques(self) -> None:
+        """Raise NotSupported for an arm that takes no torques. The driver's class is checked once."""
+        spec = self._robot.spec
+        if self._takes_torques:
+            return
+        modes: frozenset[str] = registry.load(spec.driver, "robot").modes
+        if "torque" not in modes:
+            raise NotSupported(
+                f"{spec.name}: driver {spec.driver} takes no torques, only: {', '.join(sorted(modes))}",
+                code="no_torque_mode",
+            )
+        if spec.limits.torque is None:
+            raise NotSupported(
+                f"{spec.name}: model {spec.model} takes no torques without limits.torque, Nm per joint",
+                code="no_torque_limits",
+            )
+        self._takes_torques = True
+
+    def _within_torques(self, command: JointTorque, reasons: list[str]) -> JointTorque:
+        most = self._robot.limits.torque
+        if most is None:
+            return command
+        wanted = zip(command.tau.tolist(), most, self._robot.joints, strict=True)
+        over = [name for x, limit, name in wanted if abs(x) > limit]
+        if not over:
+            return command
+        reasons.append(f"torque limit of {', '.join(over)}")
+        return JointTorque(np.clip(command.tau, np.negative(most), most))
+
+
+def _target_at(chunk: JointChunk, t: float) -> NDArray[np.float64]:
+    """Return the joint positions (n,) of a chunk at time ``t``, rad; its first target before its first time."""
+    k = int(np.searchsorted(chunk.t, t, side="right"))
+    due: NDArray[np.float64] = chunk.q[min(k, len(chunk.t) - 1)]
+    if 0 < k < len(chunk.t):
+        share = (t - chunk.t[k - 1]) / (chunk.t[k] - chunk.t[k - 1])
+        due = chunk.q[k - 1] + share * (due - chunk.q[k - 1])
+    return due
+
+
+_JOINTS = {JointTarget: "q", JointVelocity: "dq", JointTorque: "tau"}
+
+
+_MEANT: dict[type, str] = {
+    Pose: "hal.CartesianTarget(pose)",
+    np.ndarray: "hal.JointTarget(q)",
+    list: "hal.JointTarget(q)",
+    tuple: "hal.JointTarget(q)",
+}
+"""Type that is not a command -> the command that was probably intended."""

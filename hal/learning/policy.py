@@ -12,8 +12,7 @@ from typing import TYPE_CHECKING, Any, Protocol, TypeAlias, cast
 
 import numpy as np
 
-from ..commands import Command
-from ..control import CommandChecks
+from ..commands import Command, CommandChecks
 from ..errors import CommandError, ConnectionLost, MotionStopped, RobotFault, StaleStateError
 from ..histogram import Histogram
 from ..observation import Observation
