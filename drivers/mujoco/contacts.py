@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator, Set
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -108,16 +108,38 @@ def friction_pairs(bodies: Collection[Body]) -> Iterator[tuple[Body, int, Body, 
 
 
 def find_contacts(
-    mujoco: Any, model: Any, data: Any, bodies: Iterable[Body], a: Body | None, b: Body | None
+    mujoco: Any,
+    model: Any,
+    data: Any,
+    bodies: Iterable[Body],
+    a: Body | None,
+    b: Body | None,
+    *,
+    only: Set[int] | None = None,
+    without: Set[int] = frozenset(),
 ) -> list[dict[str, Any]]:
-    """Return the contacts of the last step, as :meth:`.SimulatedWorld.contacts` does; None stands for any body."""
+    """Return the contacts of the last step, as :meth:`.SimulatedWorld.contacts` does; None stands for any body.
+
+    Args:
+        mujoco: The module.
+        model: The model.
+        data: Its data after the step.
+        bodies: All bodies.
+        a: See :meth:`.SimulatedWorld.contacts`.
+        b: The same.
+        only: MuJoCo's numbers of the links that have the contacts; None for all.
+        without: MuJoCo's numbers of links without contacts.
+    """
     owners = {number: (body, link) for body in bodies for number, link in zip(body.ids, body.links, strict=True)}
     found, force = [], np.zeros(6)
     for number in range(data.ncon):
         contact = data.contact[number]
         if contact.efc_address < 0:
             continue
-        one, other = (owners[int(model.geom_bodyid[geom])] for geom in contact.geom)
+        ends = [int(model.geom_bodyid[geom]) for geom in contact.geom]
+        if not without.isdisjoint(ends) or (only is not None and only.isdisjoint(ends)):
+            continue
+        one, other = (owners[end] for end in ends)
         normal = -contact.frame[:3]  # MuJoCo's points from the first shape to the second one
         if (a is not None and other[0] is a) or (a is None and b is not None and one[0] is b):
             one, other, normal = other, one, -normal

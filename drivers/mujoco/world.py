@@ -20,6 +20,7 @@ from .dynamics import read_dynamics, write_dynamics
 from .engine import Body, load_mujoco, wxyz
 from .loading import BodyPlan, build, plan_object, plan_robot, take_out
 from .motors import Motors
+from .sleep import Sleep
 
 __all__ = ["MujocoWorld"]
 
@@ -187,6 +188,7 @@ class MujocoWorld(SimulatedWorld[Body]):
     def _adopt(self, model: Any, old: Sequence[Body]) -> None:
         """Use a new model; the bodies ``old`` keep the state that they have in the present one."""
         mujoco, data = self.mujoco, self.mujoco.MjData(model)
+        self.sleep = Sleep(mujoco, model, data)
         kept = {body.name: self._state_of(body) for body in old}
         for body in self.bodies.values():
             _find(body, model)
@@ -219,6 +221,7 @@ class MujocoWorld(SimulatedWorld[Body]):
         self.q, self.dq = data.qpos[:n], data.qvel[:n]
         self._scratch = mujoco.MjData(model)
         """For quantities of other states than the present one."""
+        self.sleep.wake()
         self._placed = self._touched = False
         self._lay_out()
 
@@ -250,6 +253,7 @@ class MujocoWorld(SimulatedWorld[Body]):
             for body, arm, link in self._attached:
                 body.place = compose(self._pose_of(arm.ids[link]), body.base)
                 self._place_base(body)
+                self.data.body_awake[body.ids] = True  # a fixed base is computed only then
             self.mujoco.mj_kinematics(self.model, self.data)
 
     def _pose_of(self, number: int) -> Transform:
@@ -291,8 +295,10 @@ class MujocoWorld(SimulatedWorld[Body]):
         if body.free is None:
             body.place = pose
             self._place_base(body)
+            self.sleep.wake()
             self._lay_out()
             return
+        self.sleep.wake()
         at, along = body.free
         self.data.qpos[at : at + 7] = [*pose[0], *wxyz(pose[1])]
         self.data.qvel[along : along + 6] = 0.0
@@ -324,6 +330,7 @@ class MujocoWorld(SimulatedWorld[Body]):
             raise CommandError(message, code="bad_dynamics") from None
 
     def _forget(self, bodies: Sequence[Body]) -> None:
+        self.sleep.wake()
         if len(bodies) == len(self.bodies):
             self.fault, self._touched = None, False
         for body in bodies:
@@ -337,6 +344,7 @@ class MujocoWorld(SimulatedWorld[Body]):
         return {
             "integration": values.tolist(),
             "motors": [motors.state.tolist(), motors.efforts.tolist(), motors.speeds.tolist()],
+            "sleep": self.sleep.save(),
             "places": {body.name: body.place for body in self.bodies.values() if body.free is None},
         }
 
@@ -349,13 +357,16 @@ class MujocoWorld(SimulatedWorld[Body]):
             raise ValueError("it has another size")
         if not all(np.isfinite(part).all() for part in (values, *parts)):
             raise ValueError("a number in it is not finite")
+        sleep = self.sleep.check(state["sleep"])
         places = {name: transform(dict(zip(_POSE, place, strict=True))) for name, place in state["places"].items()}
         if set(places) != {body.name for body in self.bodies.values() if body.free is None}:
             raise ValueError("it has other fixed bodies")
-        mujoco.mj_setState(self.model, self.data, values, kind)
         for name, place in places.items():
             self.bodies[name].place = place
             self._place_base(self.bodies[name])
+        self.sleep.wake()
+        mujoco.mj_setState(self.model, self.data, values, kind)
+        self.sleep.restore(sleep)
         fingers = np.ones(motors.n, bool)
         for arm in motors.arms.values():
             fingers[arm] = False  # the limits of an arm are the rig's
@@ -368,7 +379,18 @@ class MujocoWorld(SimulatedWorld[Body]):
         self._lay_out()
 
     def _find_contacts(self, a: Body | None, b: Body | None) -> list[dict[str, Any]]:
-        return find_contacts(self.mujoco, self.model, self.data, self.bodies.values(), a, b) if self._touched else []
+        if not self._touched:
+            return []
+        mujoco, model, data, bodies = self.mujoco, self.model, self.data, self.bodies.values()
+        sleepers = set(self.sleep.sleepers().tolist())
+        found = find_contacts(mujoco, model, data, bodies, a, b, without=sleepers)
+        if sleepers:
+            still, kind = self._scratch, mujoco.mjtState.mjSTATE_INTEGRATION
+            mujoco.mj_copyState(model, data, still, kind)
+            with self.sleep.off():
+                mujoco.mj_forward(model, still)
+            found += find_contacts(mujoco, model, still, bodies, a, b, only=sleepers)
+        return found
 
     def _deepest_overlap(self, a: Body, b: Body) -> tuple[float, str, str]:
         self._kinematics()
