@@ -59,7 +59,7 @@ class Sleep:
 
     @contextmanager
     def off(self) -> Iterator[None]:
-        """Compute in this block as if there were no sleep, also for the fixed bases, which otherwise stay as they are."""
+        """Compute in this block without sleep, and the poses of fixed bases, too."""
         self._model.opt.enableflags &= ~self._flag
         try:
             yield

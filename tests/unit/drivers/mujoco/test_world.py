@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Iterator
 from pathlib import Path
@@ -97,6 +98,62 @@ class TestFiles:
         ball = BodySpec("ball", (0.0, 0.0, 0.4), UPRIGHT, "sphere", radius=0.02, mass=0.1)
         world = steps(engine.world(floor(), it, ball), 240)
         assert world.pose("ball")["position"][2] == pytest.approx(0.02, abs=2e-3)
+
+
+class TestSleep:
+    """Objects at rest sleep; nothing that a user can see depends on it, but the time of a step."""
+
+    @pytest.fixture
+    def stack(self, engine: Engine) -> Iterator[Any]:
+        """A stack of two cubes on a fixed shelf, asleep."""
+        shelf = box("shelf", (0.5, -0.2, 0.1), (0.1, 0.1, 0.1), fixed=True)
+        lid = box("lid", (0.5, -0.2, 0.29), (0.03, 0.03, 0.03), mass=0.5)
+        world = steps(engine.world(floor(), shelf, cube((0.5, -0.2, 0.23)), lid, panda()), 240)
+        assert (world.data.tree_asleep >= 0).sum() == 2
+        yield world
+        world.close()
+
+    def test_contacts_are_reported(self, stack: Any) -> None:
+        weight = {
+            pair: sum(one["force"] for one in stack.contacts(*pair)) for pair in (("lid", "cube"), ("cube", "shelf"))
+        }
+        mass = stack.dynamics("cube")["mass"]
+        assert weight["lid", "cube"] == pytest.approx(0.5 * 9.81, rel=0.01)
+        assert weight["cube", "shelf"] == pytest.approx((0.5 + mass) * 9.81, rel=0.01)
+        assert len(stack.contacts()) == len(stack.contacts("cube"))
+
+    @pytest.mark.parametrize("edit", ["shelf", "cube", "velocity", "force", "arm"])
+    def test_what_changes_wakes_them(self, stack: Any, edit: str) -> None:
+        before = stack.pose("lid")["position"]
+        if edit == "shelf":
+            stack.set_pose("shelf", {"position": (0.8, 0.5, 0.1), "orientation": UPRIGHT})
+        elif edit == "cube":
+            stack.set_pose("cube", {"position": (0.5, 0.5, 0.03), "orientation": UPRIGHT})
+        elif edit == "velocity":
+            stack.set_velocity("lid", (0.3, 0.0, 0.5))
+        elif edit == "force":
+            stack.data.body("lid/base").xfrc_applied[2] = 10.0
+        else:
+            stack.reset("panda", q=[-0.4, 0.62, 0.0, -2.3, 0.0, 2.9, 0.8])  # its hand is in the lid
+        assert math.dist(steps(stack, 20).pose("lid")["position"], before) > 0.01
+
+    def test_a_restored_world_sleeps_and_wakes_as_the_saved_one(self, stack: Any) -> None:
+        state = json.loads(json.dumps(stack.save()))
+
+        def run() -> list[Any]:
+            seen = [steps(stack, 5).snapshot(), stack.data.tree_asleep.tolist(), stack.contacts()]
+            stack.set_velocity("lid", (0.0, 0.3, 0.3))
+            return [*seen, *(steps(stack, 20).snapshot() for _ in range(8)), stack.contacts()]
+
+        first = run()
+        stack.set_pose("shelf", {"position": (0.8, 0.5, 0.1), "orientation": UPRIGHT})
+        steps(stack, 30)
+        stack.restore(state)
+        assert run() == first
+        for part in ("tree_asleep", "body_awake_ind"):
+            wrong = [99] * len(state["state"]["sleep"][part])
+            with raises_code(CommandError, "wrong_state"):
+                stack.restore({**state, "state": {**state["state"], "sleep": {**state["state"]["sleep"], part: wrong}}})
 
 
 class TestContacts:
