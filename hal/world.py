@@ -17,7 +17,7 @@ from .errors import NotSupported
 from .geometry import Pose, frozen
 from .specs import BodySpec, WorldSpec, to_json
 
-__all__ = ["Contact", "NoWorld", "Poses", "World", "WorldDriver"]
+__all__ = ["Contact", "NoWorld", "Poses", "RayHit", "World", "WorldDriver"]
 
 Array = NDArray[np.float64]
 
@@ -46,6 +46,20 @@ class Poses(NamedTuple):
     """Time of the world, s on ``rig.clock``."""
     poses: Mapping[str, Pose]
     """Pose of each body's base in the world, by the body's name."""
+
+
+class RayHit(NamedTuple):
+    """What a ray meets first."""
+
+    name: str
+    """The body."""
+    link: str
+    position: Array
+    """Point on the body, (3,) m in the world."""
+    normal: Array
+    """Unit vector (3,) out of the body."""
+    distance: float
+    """Distance from the start of the ray, m."""
 
 
 class World:
@@ -122,6 +136,72 @@ class World:
             linear=np.asarray(linear, float).tolist(),
             angular=np.asarray(angular, float).tolist(),
         )
+
+    def apply_force(
+        self,
+        name: str,
+        force: ArrayLike,
+        point: ArrayLike | None = None,
+        *,
+        link: str | None = None,
+        duration: float | None = None,
+    ) -> None:
+        """Push a body with a constant force; forces on one body add up, and a reset of the body ends them.
+
+        Args:
+            name: An object or an arm.
+            force: Force (3,) in the world, N.
+            point: Point (3,) in the world where it acts now, m; the point moves with the link. None for the link's
+                centre of mass.
+            link: Name of the link; None for the base, which must be free.
+            duration: Time for which it acts, s of simulated time; None for the next physics step only.
+
+        Raises:
+            CommandError: The link's base is fixed, or attached to an arm, or a number is impossible.
+        """
+        self._call(
+            "apply_force",
+            name=name,
+            force=np.asarray(force, float).tolist(),
+            point=None if point is None else np.asarray(point, float).tolist(),
+            link=link,
+            duration=duration,
+        )
+
+    def set_gravity(self, gravity: ArrayLike) -> Array:
+        """Set the acceleration (3,) that gravity causes, m/s2 in the world; a reset keeps it.
+
+        Returns:
+            The gravity before, for a later call.
+        """
+        return frozen(self._call("set_gravity", gravity=np.asarray(gravity, float).tolist()))
+
+    def ray(self, start: ArrayLike, end: ArrayLike) -> RayHit | None:
+        """Return what a straight ray meets first; None if nothing with a collision shape is in its way.
+
+        Args:
+            start: Point (3,) in the world, m, outside of all bodies: whether a body around it counts depends on the
+                engine.
+            end: Point (3,) in the world where the ray ends, m.
+        """
+        found = self._call("ray", start=np.asarray(start, float).tolist(), end=np.asarray(end, float).tolist())
+        if found is None:
+            return None
+        return RayHit(**(found | {"position": frozen(found["position"]), "normal": frozen(found["normal"])}))
+
+    def distance(self, a: str, b: str, link_a: str | None = None, link_b: str | None = None) -> float:
+        """Return the smallest distance between the collision shapes of two bodies, m; negative if they overlap.
+
+        Args:
+            a: Name of a body.
+            b: Name of another body.
+            link_a: Only this link of ``a``; None for all of it.
+            link_b: Only this link of ``b``.
+
+        Raises:
+            CommandError: One of them has no collision shape (``code`` is ``no_shape``).
+        """
+        return float(self._call("distance", a=a, b=b, link_a=link_a, link_b=link_b))
 
     def dynamics(self, name: str, link: str | None = None) -> dict[str, Any]:
         """Return mass (kg), frictions, restitution, dampings, and contact stiffness and damping of a body or link."""
@@ -235,12 +315,16 @@ class WorldDriver(ABC):
     ``dynamics``       ``name``, ``link``                      properties by name
     ``contacts``       ``a``, ``b``                            the fields of each :class:`Contact`
     ``aabb``           ``name``                                ``lower`` and ``upper`` (3,) m
+    ``ray``            ``start``, ``end``                      the fields of a :class:`RayHit`, or None
+    ``distance``       ``a``, ``b``, ``link_a``, ``link_b``    m
     ``add``            ``spec``, of a :class:`.BodySpec`       the new revision
     ``remove``         ``name``                                the new revision
     ``set_color``      ``name``, ``rgba``                      the new revision
     ``set_pose``       ``name``, ``pose``                      none
     ``set_velocity``   ``name``, ``linear``, ``angular``       none
     ``set_dynamics``   ``name``, ``link``, properties          these properties as they were before
+    ``apply_force``    those of :meth:`World.apply_force`      none
+    ``set_gravity``    ``gravity``                             the gravity before, (3,) m/s2
     ``reset``          ``name``, ``pose``, ``q``               none
     ``save``           none                                    the state, for ``restore``
     ``restore``        ``state``                               none
@@ -256,8 +340,9 @@ class WorldDriver(ABC):
 
     REQUESTS: ClassVar[frozenset[str]] = frozenset(
         {
-            *("names", "describe", "pose", "poses", "velocity", "dynamics", "contacts", "aabb"),
-            *("add", "remove", "set_color", "set_pose", "set_velocity", "set_dynamics", "reset", "save", "restore"),
+            *("names", "describe", "pose", "poses", "velocity", "dynamics", "contacts", "aabb", "ray", "distance"),
+            *("add", "remove", "set_color", "set_pose", "set_velocity", "set_dynamics", "apply_force", "set_gravity"),
+            *("reset", "save", "restore"),
         }
     )
     """Names of the requests."""

@@ -3,20 +3,25 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Collection, Iterable, Iterator, Set
+from collections.abc import Collection, Iterable, Iterator, Sequence, Set
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from hal.drivers.scene.engine import RayFound
+
 from .engine import Body, LinkContact
 
 __all__ = [
+    "CARRIED",
     "ContactParameters",
     "add_pairs",
     "bounding_box",
+    "cast_ray",
     "contact_parameters",
     "deepest_overlap",
+    "distance",
     "find_contacts",
     "friction_pairs",
 ]
@@ -29,6 +34,10 @@ HARD_CONTACT = (0.02, 1.0)
 """Time constant, s, and damping ratio of contacts without a stiffness: MuJoCo's own."""
 HARD_IMPEDANCE = (0.95, 0.99, 0.001, 0.5, 2.0)
 """How much of a contact's ideal force acts: little of it is lost, so that fingers do not sink into what they hold."""
+CARRIED = 5
+"""Group of the shapes of objects that are attached to an arm, which rays pass through."""
+REACH = 1e4
+"""Largest distance between two bodies that is computed, m."""
 SOFTEST = 0.1
 """Least ratio of the force that acts to that which is lost, for contacts with a stiffness."""
 
@@ -173,6 +182,36 @@ def deepest_overlap(mujoco: Any, model: Any, data: Any, a: Body, b: Body) -> tup
                         depth = -mujoco.mj_geomDistance(model, data, one, other, 0.001, None)
                         deepest = max(deepest, (depth, link_a, link_b))
     return deepest
+
+
+def distance(mujoco: Any, model: Any, data: Any, a: Sequence[int], b: Sequence[int]) -> float | None:
+    """Return the smallest distance between two groups of shapes, m, negative if they overlap; None without shapes."""
+    pairs = []
+    for one, other in itertools.product(a, b):
+        rounds = model.geom_rbound[one], model.geom_rbound[other]  # 0 for a plane
+        apart = np.linalg.norm(data.geom_xpos[one] - data.geom_xpos[other]) - sum(rounds)
+        pairs.append((float(apart) if min(rounds) > 0.0 else -np.inf, one, other))
+    least = np.inf
+    for bound, one, other in sorted(pairs):
+        if bound > least:
+            break
+        least = min(least, mujoco.mj_geomDistance(model, data, one, other, REACH, None))
+    return float(least) if pairs else None
+
+
+def cast_ray(
+    mujoco: Any, model: Any, data: Any, bodies: Iterable[Body], start: Sequence[float], end: Sequence[float]
+) -> RayFound | None:
+    """Return what a ray meets first."""
+    here, along = np.array(start, float), np.subtract(end, start)
+    geom, normal = np.full((1, 1), -1, np.int32), np.zeros((3, 1))
+    groups = np.array([[one] for one in (1, 1, 1, 1, 1, 0)], np.uint8)  # without CARRIED
+    share = mujoco.mj_ray(model, data, here, along, groups, True, -1, geom, normal)
+    if not 0.0 <= share <= 1.0:
+        return None
+    number = int(model.geom_bodyid[geom[0, 0]])
+    body = next(body for body in bodies if number in body.ids)
+    return RayFound(body, body.ids.index(number), (here + share * along).tolist(), normal[:, 0].tolist())
 
 
 FAR = 1e30

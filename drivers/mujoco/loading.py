@@ -24,7 +24,7 @@ from hal.geometry import Pose, quaternion_to_matrix
 from hal.kinematics.urdf import TURNING, UrdfJoint, UrdfLink, UrdfModel, UrdfVisual, parse_xml
 from hal.specs import BodySpec, RobotSpec
 
-from .contacts import contact_parameters
+from .contacts import CARRIED, contact_parameters
 from .engine import Body, LinkContact, load_mujoco, wxyz
 
 __all__ = ["BodyPlan", "build", "plan_object", "plan_robot", "take_out"]
@@ -510,7 +510,7 @@ def _add_shape(mujoco: Any, model: Any, node: Any, body: Body, link: int, name: 
         **contact_parameters(body.contacts[link], node.mass, model.option.timestep)._asdict(),
     }
     if body.carried:
-        values |= {"contype": 0, "conaffinity": 0}
+        values |= {"contype": 0, "conaffinity": 0, "group": CARRIED}
     if shape.points is not None:
         mesh = model.add_mesh(name=name)
         mesh.uservert = shape.points.ravel().tolist()

@@ -9,13 +9,14 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from hal.drivers.scene.engine import AppliedForce, RayFound
 from hal.drivers.scene.values import transform
 from hal.drivers.scene.world import SimulatedWorld
 from hal.errors import CommandError, ConfigError, Fault, Problem
 from hal.geometry import Transform, compose, rotate
 from hal.specs import BodySpec, RobotSpec, WorldSpec
 
-from .contacts import add_pairs, bounding_box, deepest_overlap, find_contacts
+from .contacts import add_pairs, bounding_box, cast_ray, deepest_overlap, distance, find_contacts
 from .dynamics import read_dynamics, write_dynamics
 from .engine import Body, load_mujoco, wxyz
 from .loading import BodyPlan, build, plan_object, plan_robot, take_out
@@ -100,12 +101,19 @@ class MujocoWorld(SimulatedWorld[Body]):
             self._sound[:] = self._qpos
         for _ in range(self.substeps):
             self._step1(model, data)
+            if self._forces:
+                data.xfrc_applied[:] = 0.0
+                for force in self._forces:
+                    self._push(force)
             motors.drive()
             self._step2(model, data)
             if self.substeps > 1:
                 motors.target += motors.feed * motors.h  # as far as it moves in this part of the step
         if self.substeps > 1:
             motors.target -= motors.feed * self.dt
+        if self._forces:
+            data.xfrc_applied[:] = 0.0
+            self._spend_forces()
         self.steps += 1
         self._placed = False
         self._touched = True
@@ -377,6 +385,29 @@ class MujocoWorld(SimulatedWorld[Body]):
         motors.torques.clear()  # an arm that torques drive applies its own
         self.fault, self._placed, self._touched = None, False, False
         self._lay_out()
+
+    def _push(self, force: AppliedForce[Body]) -> None:
+        number, data = force.body.ids[force.link], self.data
+        acting = data.xfrc_applied[number]  # at the centre of mass
+        acting[:3] += force.force
+        if force.point is not None:
+            w, *xyz = data.xquat[number].tolist()
+            lever = data.xpos[number] + rotate((*xyz, w), force.point) - data.xipos[number]
+            acting[3:] += np.cross(lever, force.force)
+
+    def _set_gravity(self, gravity: Sequence[float]) -> None:
+        self._spec.option.gravity = gravity
+        self.model.opt.gravity[:] = gravity
+
+    def _cast_ray(self, start: Sequence[float], end: Sequence[float]) -> RayFound | None:
+        self._kinematics()
+        return cast_ray(self.mujoco, self.model, self.data, self.bodies.values(), start, end)
+
+    def _distance(self, a: Body, links_a: Sequence[int], b: Body, links_b: Sequence[int]) -> float | None:
+        self._kinematics()
+        own = [shape for link in links_a for shape in a.shapes[link]]
+        others = [shape for link in links_b for shape in b.shapes[link]]
+        return distance(self.mujoco, self.model, self.data, own, others)
 
     def _find_contacts(self, a: Body | None, b: Body | None) -> list[dict[str, Any]]:
         if not self._touched:

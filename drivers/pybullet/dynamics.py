@@ -2,14 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+import itertools
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
+
+from hal.drivers.scene.engine import AppliedForce, RayFound
+from hal.geometry import compose
 
 from .engine import Body, PyBulletClient
 
 __all__ = [
+    "apply_force",
     "bounding_box",
+    "cast_ray",
     "deepest_overlap",
+    "distance",
     "find_contacts",
     "forget_contacts",
     "read_dynamics",
@@ -124,6 +131,39 @@ def deepest_overlap(client: PyBulletClient, a: Body, b: Body) -> tuple[float, st
         return 0.0, "", ""
     deepest = min(points, key=lambda point: point[8])
     return max(0.0, -deepest[8]), a.link_name(deepest[3]), b.link_name(deepest[4])
+
+
+def distance(client: PyBulletClient, a: Body, links_a: Sequence[int], b: Body, links_b: Sequence[int]) -> float | None:
+    """Return the smallest distance between links of two bodies, m; None if one side has no collision shape."""
+    found = [
+        point[8]
+        for one, other in itertools.product(links_a, links_b)
+        for point in client.getClosestPoints(a.id, b.id, distance=FAR, linkIndexA=one, linkIndexB=other)
+    ]
+    return min(found, default=None)
+
+
+def cast_ray(
+    client: PyBulletClient, bodies: Iterable[Body], start: Sequence[float], end: Sequence[float]
+) -> RayFound | None:
+    """Return what a ray meets first."""
+    number, link, _, position, normal = client.rayTest(start, end)[0]
+    body = next((body for body in bodies if body.id == number), None)
+    return None if body is None else RayFound(body, link, position, normal)
+
+
+def apply_force(client: PyBulletClient, force: AppliedForce[Body]) -> None:
+    """Let a force act in the next step."""
+    number, link = force.body.id, force.link
+    if force.point is not None:
+        state = None if link == -1 else client.getLinkState(number, link)
+        frame = force.body.base_pose(client) if state is None else (state[4], state[5])
+        place = compose(frame, (tuple(force.point), (0.0, 0.0, 0.0, 1.0)))[0]
+    elif link == -1:
+        place = client.getBasePositionAndOrientation(number)[0]
+    else:
+        place = client.getLinkState(number, link)[0]
+    client.applyExternalForce(number, link, force.force, place, client.WORLD_FRAME)
 
 
 def bounding_box(client: PyBulletClient, body: Body) -> tuple[list[float], list[float]]:

@@ -15,7 +15,7 @@ from math import isfinite
 from pathlib import Path
 from typing import Any
 
-from hal.drivers.scene.engine import IDENTITY
+from hal.drivers.scene.engine import IDENTITY, AppliedForce, RayFound
 from hal.drivers.scene.values import completed_dynamics, numbers
 from hal.drivers.scene.world import SimulatedWorld
 from hal.errors import Fault, NotSupported
@@ -23,7 +23,17 @@ from hal.geometry import Transform, compose, inverse
 from hal.specs import BodySpec, RobotSpec, WorldSpec
 
 from .attachments import AttachedObjects, MirroredArm
-from .dynamics import bounding_box, deepest_overlap, find_contacts, forget_contacts, read_dynamics, write_dynamics
+from .dynamics import (
+    apply_force,
+    bounding_box,
+    cast_ray,
+    deepest_overlap,
+    distance,
+    find_contacts,
+    forget_contacts,
+    read_dynamics,
+    write_dynamics,
+)
 from .engine import Body, PyBulletClient
 from .loading import load_object, load_robot
 from .motors import hold
@@ -102,6 +112,10 @@ class PyBulletWorld(SimulatedWorld[Body]):
             return
         for arm in self._mirrored.values():
             arm.prepare_step()
+        if self._forces:
+            for force in self._forces:
+                self._push(force)
+            self._spend_forces()
         self._step()
         self._attached.follow()
         self.steps += 1
@@ -307,6 +321,18 @@ class PyBulletWorld(SimulatedWorld[Body]):
             except self.client.error as error:
                 raise ValueError(str(error)) from None
         self._read_layout()
+
+    def _push(self, force: AppliedForce[Body]) -> None:
+        apply_force(self.client, force)
+
+    def _set_gravity(self, gravity: Sequence[float]) -> None:
+        self.client.setGravity(*gravity)
+
+    def _cast_ray(self, start: Sequence[float], end: Sequence[float]) -> RayFound | None:
+        return cast_ray(self.client, self.bodies.values(), start, end)
+
+    def _distance(self, a: Body, links_a: Sequence[int], b: Body, links_b: Sequence[int]) -> float | None:
+        return distance(self.client, a, links_a, b, links_b)
 
     def _find_contacts(self, a: Body | None, b: Body | None) -> list[dict[str, Any]]:
         return find_contacts(self.client, self.bodies.values(), a, b)

@@ -9,14 +9,14 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, ClassVar, Generic, TypeVar
+from typing import Any, ClassVar, Generic, NamedTuple, TypeVar
 
 from hal.errors import NotSupported
 from hal.geometry import Transform
 from hal.specs import BodySpec, RobotSpec
 from hal.world import WorldDriver
 
-__all__ = ["IDENTITY", "SceneEngine", "SimulatedBody"]
+__all__ = ["IDENTITY", "AppliedForce", "RayFound", "SceneEngine", "SimulatedBody"]
 
 IDENTITY: Transform = ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
 
@@ -68,6 +68,31 @@ class SimulatedBody:
 
 
 B = TypeVar("B", bound=SimulatedBody)
+
+
+@dataclass
+class AppliedForce(Generic[B]):
+    """A constant force on a link."""
+
+    body: B
+    link: int
+    force: Sequence[float]
+    """(3,) N in the world."""
+    point: Sequence[float] | None
+    """Where it acts, (3,) m in the frame of the link; None for the centre of mass."""
+    steps: int
+    """Number of steps for which it still acts."""
+
+
+class RayFound(NamedTuple):
+    """What a ray meets first."""
+
+    body: SimulatedBody
+    link: int
+    position: Sequence[float]
+    """(3,) m in the world."""
+    normal: Sequence[float]
+    """(3,) unit vector out of the body."""
 
 
 class SceneEngine(WorldDriver, Generic[B]):
@@ -139,6 +164,25 @@ class SceneEngine(WorldDriver, Generic[B]):
 
         Called before they are reset, so that the steps after it repeat those after the start, and after their dynamics
         have changed, so that these act at once.
+        """
+
+    @abstractmethod
+    def _push(self, force: AppliedForce[B]) -> None:
+        """Let a force act in the coming step, in addition to others on the same link."""
+
+    @abstractmethod
+    def _set_gravity(self, gravity: Sequence[float]) -> None:
+        """Set the gravity, (3,) m/s2 in the world."""
+
+    @abstractmethod
+    def _cast_ray(self, start: Sequence[float], end: Sequence[float]) -> RayFound | None:
+        """Return what a ray between two points (3,) in the world meets first; objects that are attached never."""
+
+    @abstractmethod
+    def _distance(self, a: B, links_a: Sequence[int], b: B, links_b: Sequence[int]) -> float | None:
+        """Return the smallest distance between links of two bodies, m, negative if they overlap.
+
+        None if one side has no collision shape.
         """
 
     @abstractmethod

@@ -7,15 +7,16 @@ that exist and make sense.
 from __future__ import annotations
 
 import inspect
+import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from itertools import combinations
 from typing import Any
 
 from hal.errors import CommandError, ConfigError, DeviceNotFound, Fault, NotSupported, Problem
-from hal.geometry import Transform
+from hal.geometry import Transform, compose, inverse
 from hal.specs import BodySpec, RobotSpec, WorldSpec, to_json
 
-from .engine import B, SceneEngine, SimulatedBody
+from .engine import AppliedForce, B, SceneEngine, SimulatedBody
 from .values import (
     body_spec,
     check_body,
@@ -49,6 +50,9 @@ class SimulatedWorld(SceneEngine[B]):
         """Why the simulation stands still, which its arms report; None while it runs."""
         self._changes = 0
         """Changes of poses other than by steps, and of looks."""
+        self._forces: list[AppliedForce[B]] = []
+        """Forces on links that act in the coming step."""
+        self._gravity = list(spec.gravity)
         self._on_reset: dict[str, list[Callable[[], None]]] = {}
         self._on_edit: list[Callable[[str, dict[str, Any], int], None]] = []
         self._kept: dict[str, tuple[Callable[[], Any], Callable[[Any], None]]] = {}
@@ -185,6 +189,77 @@ class SimulatedWorld(SceneEngine[B]):
             raise CommandError(f"the base of {name!r} is fixed: it has no velocity to set", code="base_fixed")
         self._set_velocity(body, numbers("linear", linear, 3), numbers("angular", angular, 3))
 
+    def apply_force(
+        self,
+        name: str,
+        force: Sequence[float],
+        point: Sequence[float] | None = None,
+        link: str | None = None,
+        duration: float | None = None,
+    ) -> None:
+        """Push a link with a constant force: see :meth:`hal.world.World.apply_force`."""
+        body = self.body(name)
+        number = self.link(body, link)
+        self._expect_free(body)
+        if self._is_mirrored(body):
+            raise CommandError(f"{name!r} mirrors a real arm: nothing in the simulation moves it", code="is_mirrored")
+        if not (body.floating or (number != self.link(body, None) and body.movable)):
+            raise CommandError(f"the base of {name!r} is fixed: a force does not move it", code="base_fixed")
+        pushed, at = numbers("force", force, 3), None
+        if point is not None:
+            there = numbers("point", point, 3)
+            at = compose(inverse(self._read_pose(body, number)), (tuple(there), (0.0, 0.0, 0.0, 1.0)))[0]
+        steps = 1
+        if duration is not None:
+            (seconds,) = numbers("duration", [duration])
+            if seconds <= 0.0:
+                raise CommandError(f"duration must be more than 0 s, not {duration}")
+            steps = max(1, round(seconds / self.dt))
+        self._forces.append(AppliedForce(body, number, pushed, at, steps))
+
+    def _spend_forces(self) -> None:
+        """Note that a step was made with the present forces."""
+        for force in self._forces:
+            force.steps -= 1
+        self._forces = [force for force in self._forces if force.steps > 0]
+
+    def set_gravity(self, gravity: Sequence[float]) -> list[float]:
+        """Set the gravity, (3,) m/s2 in the world, and return the previous one."""
+        before, self._gravity = self._gravity, numbers("gravity", gravity, 3)
+        self._set_gravity(self._gravity)
+        return before
+
+    def ray(self, start: Sequence[float], end: Sequence[float]) -> dict[str, Any] | None:
+        """Return what a ray meets first: see :meth:`hal.world.World.ray`."""
+        here, there = numbers("start", start, 3), numbers("end", end, 3)
+        if math.dist(here, there) < 1e-9:
+            raise CommandError("a ray needs two different points, start and end")
+        found = self._cast_ray(here, there)
+        if found is None:
+            return None
+        body, link, position, normal = found
+        return {
+            "name": body.name,
+            "link": body.link_name(link),
+            "position": list(position),
+            "normal": list(normal),
+            "distance": math.dist(here, position),
+        }
+
+    def distance(self, a: str, b: str, link_a: str | None = None, link_b: str | None = None) -> float:
+        """Return the smallest distance of two bodies: see :meth:`hal.world.World.distance`."""
+        first, second = self.body(a), self.body(b)
+        if first is second:
+            raise CommandError(f"the distance needs two bodies, not {a!r} twice")
+        links_a, links_b = (
+            list(body.links.values()) if link is None else [self.link(body, link)]
+            for body, link in ((first, link_a), (second, link_b))
+        )
+        found = self._distance(first, links_a, second, links_b)
+        if found is None:
+            raise CommandError(f"{a!r} or {b!r} has no collision shape there", code="no_shape")
+        return found
+
     def dynamics(self, name: str, link: str | None = None) -> dict[str, Any]:
         """Return those of :data:`.values.DYNAMICS` that the engine has."""
         body = self.body(name)
@@ -247,6 +322,7 @@ class SimulatedWorld(SceneEngine[B]):
             raise CommandError(f"{name!r} is a robot: robots stay in the world", code="is_robot")
         self._take_out(body)
         del self.bodies[name]
+        self._forces = [force for force in self._forces if force.body is not body]
         self._renumber()
         self._arrange(())
         return self._edited("remove", name=name)
@@ -360,6 +436,7 @@ class SimulatedWorld(SceneEngine[B]):
 
     def _put(self, body: B, base: Transform, joints: Mapping[int, float]) -> None:
         self._changes += 1
+        self._forces = [force for force in self._forces if force.body is not body]
         if not body.carried:
             self._move_base(body, base)
         self._move_joints(body, joints)

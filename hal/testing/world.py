@@ -243,6 +243,59 @@ class WorldContract(Contract):
         assert np.allclose((x, y), 0.0, atol=1e-6)
         assert 2 * math.atan2(z, w) == pytest.approx(0.2, abs=0.01)
 
+    def test_a_force_accelerates_a_body_for_as_long_as_it_acts(self, bench: WorldBench, tmp_path: Path) -> None:
+        arm = bench.arm(tmp_path, base_position=(3.0, 0.0, 0.0))
+        world = bench.world(_cube((0.0, 0.0, 1.0)), _cube((1.0, 0.0, 1.0), name="fixed", fixed=True), arm)
+        assert world.request("set_gravity", {"gravity": [0, 0, 0]}) == [0.0, 0.0, -_G], "the gravity before"
+        world.request("apply_force", {"name": "cube", "force": [1.5, 0, 0], "duration": 0.5})
+        world.request("apply_force", {"name": "cube", "force": [0.5, 0, 0], "duration": 0.5})
+        for _ in range(2):
+            linear, angular = _steps(world, 0.5).request("velocity", {"name": "cube"})
+            assert np.allclose((*linear, *angular), (1.0, 0, 0, 0, 0, 0), atol=0.1), "N s / kg, and no longer"
+        world.request("reset", {})
+        beside = (_position(world, "cube") + (0.0, 0.02, 0.0)).tolist()
+        world.request("apply_force", {"name": "cube", "force": [1, 0, 0], "point": beside})
+        world.step()
+        linear, angular = world.request("velocity", {"name": "cube"})
+        assert linear[0] == pytest.approx(world.dt, rel=0.01), "one step by default"
+        inertia = world.request("dynamics", {"name": "cube"})["inertia"][2]
+        assert angular[2] == pytest.approx(-0.02 * world.dt / inertia, rel=0.01), "a force beside the centre turns it"
+        finger = _position(world, "arm", "left")
+        world.request("apply_force", {"name": "arm", "link": "left", "force": [0, 5000, 0]})
+        world.step()
+        assert _position(world, "arm", "left")[1] > finger[1] + 1e-4, "more than its motor can hold"
+        for params, code in (
+            ({"name": "fixed"}, "base_fixed"),
+            ({"name": "arm"}, "base_fixed"),
+            ({"name": "cube", "force": [0, 0, math.nan]}, "not_finite"),
+            ({"name": "cube", "duration": -1.0}, "bad_command"),
+        ):
+            with pytest.raises(CommandError) as refused:
+                world.request("apply_force", {"force": [1, 0, 0], **params})
+            assert refused.value.code == code, params
+
+    def test_a_ray_meets_the_nearest_body(self, bench: WorldBench) -> None:
+        world = bench.world(_floor(), _cube((0.0, 0.0, 1.0)), _cube((0.0, 0.0, 2.0), name="seen", collision=False))
+        hit = world.request("ray", {"start": [0, 0, 3], "end": [0, 0, -1]})
+        assert (hit["name"], hit["link"]) == ("cube", "base")
+        assert np.allclose((*hit["position"], *hit["normal"]), (0, 0, 1.05, 0, 0, 1), atol=1e-3)
+        assert hit["distance"] == pytest.approx(1.95, abs=1e-3)
+        assert world.request("ray", {"start": [1, 0, 3], "end": [1, 0, -1]})["name"] == "floor"
+        assert world.request("ray", {"start": [1, 0, 3], "end": [1, 0, 1]}) is None
+
+    def test_the_distance_of_two_bodies(self, bench: WorldBench, tmp_path: Path) -> None:
+        world = bench.world(_floor(), _cube((0.0, 0.0, 1.0)), bench.arm(tmp_path, base_position=(0.0, 1.0, 0.5)))
+        base = world.request("distance", {"a": "arm", "b": "cube", "link_a": "base"})
+        assert base == pytest.approx(math.hypot(0.9, 0.4), abs=3e-3)
+        assert world.request("distance", {"a": "arm", "b": "cube"}) < base - 0.01
+        for z, apart in ((1.0, 0.95), (0.03, -0.02)):
+            world.request("set_pose", {"name": "cube", "pose": {"position": [0, 0, z]}})
+            assert world.request("distance", {"a": "cube", "b": "floor"}) == pytest.approx(apart, abs=2e-3)
+        with pytest.raises(CommandError) as refused:
+            world.request("add", {"spec": to_json(_cube((0.0, 0.0, 5.0), name="seen", collision=False))})
+            world.request("distance", {"a": "cube", "b": "seen"})
+        assert refused.value.code == "no_shape"
+
     def test_a_body_without_mass_and_a_fixed_one_stay(self, bench: WorldBench) -> None:
         world = bench.world(_cube((0.0, 0.0, 1.0), mass=0.0), _cube((1.0, 0.0, 1.0), name="fixed", fixed=True))
         before = world.snapshot()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -100,14 +100,3 @@ def joint_positions(world: Any, name: str) -> dict[str, float]:
             return {names[number]: value for number, value in zip(body.movable, values, strict=True)}
         place += len(body.movable) if body.moves else 0
     raise KeyError(name)
-
-
-def push(world: Any, name: str, link: str, force: Sequence[float]) -> None:
-    """Push a link at its centre of mass with a force (3,) N in the world; before every step, with zeros in the end."""
-    body = world.body(name)
-    if hasattr(world, "client"):
-        client, number = world.client, body.links[link]
-        place = client.getLinkState(body.id, number)[0]
-        client.applyExternalForce(body.id, number, force, place, client.WORLD_FRAME)
-    else:
-        world.data.body(body.mujoco_name(link)).xfrc_applied[:3] = force

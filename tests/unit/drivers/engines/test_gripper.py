@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from engines_kit import Engine, joint_positions, push
+from engines_kit import Engine, joint_positions
 from errors_kit import raises_code, raises_problems
 from specs import PANDA_HOME, box, cube, data, floor, iiwa, panda
 
@@ -127,7 +127,7 @@ class TestCoupling:
         force, apart = 0.0, []
         for tick in range(240):
             force = 0.25 * tick  # N, up to 60
-            push(world, "panda", "panda_leftfinger", (0.0, force, 0.0))
+            world.apply_force("panda", (0.0, force, 0.0), link="panda_leftfinger")
             world.step()
             if tick % 12 == 0:
                 bench.hand.read(world.t)

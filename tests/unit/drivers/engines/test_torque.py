@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from engines_kit import Engine, push
+from engines_kit import Engine
 from specs import PANDA_HOME, box, iiwa, panda
 from torque_kit import NOTHING, N, one, simulated
 
@@ -84,11 +84,10 @@ class TestServed:
         arm = simulated(engine)
         for _ in range(240):
             arm.send(NOTHING)
-            push(arm.world, "panda", "panda_hand", (0.0, 30.0, 0.0))
+            arm.world.apply_force("panda", (0.0, 30.0, 0.0), link="panda_hand")
             arm.tick()
             if arm.servo.report.trip:
                 break
-        push(arm.world, "panda", "panda_hand", (0.0, 0.0, 0.0))
         assert arm.servo.report.trip is Trip.LIMIT
         assert arm.limited & (Limited.SPEED | Limited.TCP_SPEED)
         assert arm.tcp_speed < 0.35
@@ -118,7 +117,7 @@ class TestServed:
                 arm.send(NOTHING)
             elif turn == 24:
                 arm.release()
-            push(arm.world, "panda", "panda_hand", (0.0, 0.0, -20.0))
+            arm.world.apply_force("panda", (0.0, 0.0, -20.0), link="panda_hand")
             arm.tick()
             if turn > 24 and not arm.by_torques:
                 break
