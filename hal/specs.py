@@ -9,6 +9,7 @@ from __future__ import annotations
 import types as _types
 import typing
 from dataclasses import asdict, dataclass, field, fields, is_dataclass
+from functools import cached_property
 from typing import Any, TypeVar
 
 __all__ = [
@@ -90,8 +91,47 @@ class GripperSpec:
     force: float
     """Default grip force, N."""
     joints: tuple[str, ...] = ()
-    """Finger joints in the arm's URDF; each moves half the width."""
+    """Finger joints in the arm's URDF, which move together."""
+    opened: Floats = ()
+    """Position of each finger joint at the greatest width, rad or m; empty where each slides by half the width."""
+    closed: Floats = ()
+    """Position of each finger joint at width 0, rad or m; empty like ``opened``."""
+    widths: tuple[tuple[float, float], ...] = ()
+    """Pairs of a position of the first joint (rad or m) and the width there, m, from closed to open; empty where the
+    width is proportional to the way of the joints."""
     options: dict[str, Any] = field(default_factory=dict)
+
+    def finger_positions(self, width: float) -> list[float]:
+        """Return the position of each finger joint, rad or m, at a width, m."""
+        if not self.opened:
+            return [width / 2.0] * len(self.joints)
+        share = self.travel_at(width)
+        return [shut + share * (far - shut) for far, shut in zip(self.opened, self.closed, strict=True)]
+
+    def travel_at(self, width: float) -> float:
+        """Return the share of their way, from closed to open, that the joints have gone at a width, m."""
+        return _interpolated(width, [(b, a) for a, b in self.travel])
+
+    def width_at(self, share: float) -> float:
+        """Return the width, m, at a share of the way of the joints from closed to open."""
+        return _interpolated(share, self.travel)
+
+    @cached_property
+    def travel(self) -> list[tuple[float, float]]:
+        """Pairs of the share of the way of the joints and the width there, m, both ascending."""
+        if not self.widths:
+            return [(0.0, 0.0), (1.0, self.width_max)]
+        shut, way = self.closed[0], self.opened[0] - self.closed[0]
+        return sorted(((angle - shut) / way, width) for angle, width in self.widths)
+
+
+def _interpolated(x: float, table: list[tuple[float, float]]) -> float:
+    """Return the value at ``x`` of pairs with ascending ``x``; beyond their ends the outermost lines continue."""
+    k = 1
+    while k < len(table) - 1 and x > table[k][0]:
+        k += 1
+    (x0, y0), (x1, y1) = table[k - 1], table[k]
+    return y0 + (x - x0) * (y1 - y0) / (x1 - x0)
 
 
 @dataclass(frozen=True)

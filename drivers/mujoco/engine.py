@@ -9,6 +9,7 @@ from typing import Any
 from hal.drivers.scene.engine import SimulatedBody
 from hal.errors import DriverMissing
 from hal.geometry import Transform
+from hal.kinematics.urdf import UrdfMimic
 
 __all__ = ["Body", "LinkContact", "load_mujoco", "wxyz"]
 
@@ -72,6 +73,8 @@ class Body(SimulatedBody):
     """Place of each movable joint in MuJoCo's ``qpos``."""
     qvel: dict[int, int] = field(default_factory=dict)
     """The same in ``qvel`` and all that is sorted like it."""
+    followers: tuple[UrdfMimic, ...] = ()
+    """Joints without a motor that follow the driven fingers of a gripper."""
     couplings: list[tuple[frozenset[int], int]] = field(default_factory=list)
     """Joints that move together, with MuJoCo's number of the constraint."""
 

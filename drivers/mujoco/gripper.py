@@ -21,19 +21,23 @@ class MujocoGripper(SimulatedGripper[MujocoWorld, Body]):
 
     def _find(self) -> None:
         self._at = self._world.dofs(self._body, self.spec.joints)
+        joints, followers = self.spec.joints, self._body.followers
+        self._followers = self._world.dofs(self._body, [one.joint for one in followers]) if followers else None
+        self._follow = [(joints.index(one.of), one.multiplier, one.offset) for one in followers]
 
     def _handle(self, active: bool) -> None:
         self._world.handle(self._body.name, active)
 
     def _drive(self, speed: float) -> None:
-        motors, at = self._world.motors, self._at
-        motors.target[at], motors.feed[at] = self._aim / 2.0, 0.0
-        motors.efforts[at], motors.speeds[at] = self._force, speed / 2.0
+        motors, at, travel = self._world.motors, self._at, self._travel
+        targets, speeds = travel.positions(self._aim), travel.speeds(speed)
+        motors.target[at], motors.feed[at] = targets, 0.0
+        motors.efforts[at], motors.speeds[at] = travel.efforts(self._force), speeds
+        if self._followers is not None:  # their couplings move them; the law of the motors has to expect it
+            motors.target[self._followers] = [ratio * targets[of] + offset for of, ratio, offset in self._follow]
+            motors.speeds[self._followers] = [abs(ratio) * speeds[of] for of, ratio, _ in self._follow]
         motors.limit()
 
     def _width(self) -> tuple[float, float, float, float]:
         world, at = self._world, self._at
-        widths, speeds = world.q[at].tolist(), world.dq[at].tolist()
-        forces = world.motors.applied[at].tolist()
-        share = 2.0 / len(widths)
-        return share * sum(widths), share * sum(speeds), -max(forces), max(map(abs, forces))
+        return self._travel.reading(world.q[at].tolist(), world.dq[at].tolist(), world.motors.applied[at].tolist())

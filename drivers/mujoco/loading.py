@@ -16,7 +16,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hal.drivers.scene.records import check_names, joint_drives, mimics_of, required
+from hal.drivers.scene.gripper import FingerTravel
+from hal.drivers.scene.records import check_names, followers_of, joint_drives, mimics_of, required
 from hal.drivers.scene.urdf_files import checked_urdf, has_free_base, massless
 from hal.drivers.scene.values import listed
 from hal.errors import ConfigError, Problem
@@ -32,7 +33,8 @@ __all__ = ["BodyPlan", "build", "plan_object", "plan_robot", "take_out"]
 Array = NDArray[np.float64]
 
 FINGER_INERTIA = 1.0
-"""Inertia of the drive of each finger, kg: it is in no URDF, and a finger of 30 g alone could not press steadily."""
+"""Inertia of the drive of each finger, kg, at the fingertip: it is in no URDF, and a finger of 30 g alone could not
+press steadily."""
 ROUGH = 1.15
 """A link may have so many times the greatest inertia that fits its collision shapes, which are rough."""
 UNSTOPPABLE, STRONGEST = 1e5, 1e9
@@ -41,6 +43,8 @@ LEAST_MASS, LEAST_INERTIA = 1e-3, 1e-7
 """Least mass, kg, and moment of inertia, kg m2, of a link that moves: MuJoCo takes none without."""
 COUPLING = (0.01, 1.0)
 """Time constant, s, and damping ratio of the constraint between joints that move together."""
+STIFF = (0.99, 0.999)
+"""Impedance of the couplings that carry the whole force of a finger, at no distance and far from it."""
 UNBOUNDED = 1e-6
 """What is added to the range of a joint, rad or m: a joint that rests at its limit needs no force to stay there."""
 
@@ -107,7 +111,8 @@ class BodyPlan:
     """Range of each joint that moves, rad or m."""
     mimics: list[tuple[str, str, float, float]] = field(default_factory=list)
     """Follower, leader, multiplier and offset."""
-    fingers: tuple[str, ...] = ()
+    fingers: dict[str, float] = field(default_factory=dict)
+    """Inertia of the drive of each finger, kg or kg m2, by its joint."""
     unstoppable: tuple[str, ...] = ()
     """Joints that nothing holds back."""
     warnings: list[str] = field(default_factory=list)
@@ -172,18 +177,28 @@ def plan_robot(spec: RobotSpec, *, mirrored: bool = False) -> BodyPlan:
     body = plan.body
     moving = {name: joint for name, joint in urdf.joints.items() if joint.movable}
     check_names(spec, moving, body.links)
-    drives = joint_drives(spec, {name: (joint.effort or 0.0, joint.velocity or 0.0) for name, joint in moving.items()})
+    limits = {name: (joint.effort or 0.0, joint.velocity or 0.0) for name, joint in moving.items()}
+    drives = joint_drives(spec, limits, urdf)
     plan.warnings += drives.warnings
     for name in moving:
         number = body.joints[name]
         body.home[number], body.efforts[number] = drives.home[name], drives.efforts[name]
         body.speeds[number] = drives.speeds[name]
-    plan.fingers = spec.gripper.joints if spec.gripper else ()
+    body.followers = followers_of(spec, urdf)
+    if spec.gripper:
+        levers = FingerTravel(spec.gripper).speeds(1.0)
+        plan.fingers = {
+            name: FINGER_INERTIA * (0.5 / lever) ** 2 for name, lever in zip(spec.gripper.joints, levers, strict=True)
+        }
+        plan.fingers |= {one.joint: plan.fingers[one.of] * one.multiplier**2 for one in body.followers}
     if mirrored:
         plan.unstoppable = spec.joints
         for name in moving:
-            finger = spec.gripper is not None and name in spec.gripper.joints
-            body.efforts[body.joints[name]] = spec.gripper.force if spec.gripper and finger else STRONGEST
+            if name not in (one.joint for one in body.followers):
+                body.efforts[body.joints[name]] = STRONGEST
+        if spec.gripper:
+            efforts = FingerTravel(spec.gripper).efforts(spec.gripper.force)
+            body.efforts |= {body.joints[name]: e for name, e in zip(spec.gripper.joints, efforts, strict=True)}
     root = Pose(spec.base_position, spec.base_orientation)
     if spec.kinematics.base_link:
         root = root @ urdf.poses({})[spec.kinematics.base_link].inverse()
@@ -449,6 +464,7 @@ def build(model: Any, plan: BodyPlan) -> None:
     names = [body.mujoco_name(link.name) for link in plan.links]
     for first, second in itertools.combinations((names[k] for k, link in enumerate(plan.links) if link.shapes), 2):
         model.add_exclude(bodyname1=first, bodyname2=second, name=f"{first}|{second}")  # as in PyBullet
+    followers = {one.joint for one in body.followers}
     for follower, leader, multiplier, offset in plan.mimics:
         coupling = model.add_equality(
             name=f"{body.mujoco_name(follower)}|mimic",
@@ -459,6 +475,8 @@ def build(model: Any, plan: BodyPlan) -> None:
             solref=COUPLING,
         )
         coupling.data[:2] = offset, multiplier
+        if follower in followers:
+            coupling.solimp[:2] = STIFF
 
 
 def take_out(model: Any, plan: BodyPlan) -> None:
@@ -485,7 +503,7 @@ def _add_joint(mujoco: Any, node: Any, plan: BodyPlan, joint: UrdfJoint) -> None
     if limits is not None:
         made.range = limits
     if joint.name in plan.fingers:
-        made.armature = FINGER_INERTIA
+        made.armature = plan.fingers[joint.name]
     elif joint.name in plan.unstoppable:
         made.armature = UNSTOPPABLE
 

@@ -444,11 +444,12 @@ class MujocoWorld(SimulatedWorld[Body]):
         self._fresh.add(body.name)
         if width is not None and body.spec.gripper is not None:
             fingers = self.dofs(body, body.spec.gripper.joints)
-            motors.target[fingers] = width / 2.0
+            positions = body.spec.gripper.finger_positions(width)
+            motors.target[fingers] = positions
             if body.name not in self._width_known:
                 self._width_known.add(body.name)
-                data.qpos[fingers], data.qvel[fingers] = width / 2.0, 0.0
-                motors.rest(fingers, [width / 2.0] * len(body.spec.gripper.joints))
+                data.qpos[fingers], data.qvel[fingers] = positions, 0.0
+                motors.rest(fingers, positions)
 
     def _hold_mirrors(self) -> None:
         """Let mirrors without a new state since the last step stay where they are."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 
+from hal.drivers.scene.gripper import FingerTravel
 from hal.geometry import compose
 from hal.specs import RobotSpec
 
@@ -70,7 +71,8 @@ class MirroredArm:
         self._joints = [body.joints[name] for name in spec.joints]
         self._torques = [STRENGTH * body.efforts[joint] for joint in self._joints]
         self._fingers = [body.joints[name] for name in gripper.joints] if gripper else []
-        self._grip = [gripper.force if gripper else 0.0] * len(self._fingers)
+        self._gripper = gripper
+        self._grip = FingerTravel(gripper).efforts(gripper.force) if gripper else []
         self._gains = [position_gain(dt)] * len(self._joints)
         self._fresh = False
         """Whether a state of the arm has arrived since the last step."""
@@ -82,7 +84,7 @@ class MirroredArm:
     def follow(self, positions: list[float], speeds: list[float], width: float | None) -> None:
         """Take the state of the arm: see :meth:`hal.world.WorldDriver.follow`."""
         if width is not None and self._fingers:
-            self._follow_width(width / 2.0)
+            self._follow_width(width)
         client = self._client
         client.resetJointStatesMultiDof(self._body.id, self._joints, _singly(positions), _singly(speeds))
         client.setJointMotorControlArray(
@@ -90,16 +92,18 @@ class MirroredArm:
         )
         self._fresh = self._following = True
 
-    def _follow_width(self, half: float) -> None:
+    def _follow_width(self, width: float) -> None:
+        assert self._gripper is not None
         client, count = self._client, len(self._fingers)
+        positions = self._gripper.finger_positions(width)
         if not self._placed:
-            client.resetJointStatesMultiDof(self._body.id, self._fingers, [[half]] * count, [[0.0]] * count)
+            client.resetJointStatesMultiDof(self._body.id, self._fingers, _singly(positions), [[0.0]] * count)
             self._placed = True
         client.setJointMotorControlArray(
             self._body.id,
             self._fingers,
             client.POSITION_CONTROL,
-            targetPositions=[half] * count,
+            targetPositions=positions,
             forces=self._grip,
             positionGains=[1.0] * count,
             velocityGains=[1.0] * count,

@@ -28,27 +28,33 @@ class PyBulletGripper(SimulatedGripper[PyBulletWorld, Body]):
         self._world.handle(self._body.name, active)
 
     def _drive(self, speed: float) -> None:
-        client = self._world.client
-        for joint in self._joints:
+        client, travel = self._world.client, self._travel
+        drives = zip(
+            self._joints,
+            travel.positions(self._aim),
+            travel.efforts(self._force),
+            travel.speeds(speed),
+            strict=True,
+        )
+        for joint, position, effort, fastest in drives:
             client.setJointMotorControl2(
                 self._body.id,
                 joint,
                 client.POSITION_CONTROL,
-                targetPosition=self._aim / 2.0,
-                force=self._force,
+                targetPosition=position,
+                force=effort,
                 positionGain=position_gain(self._world.dt),
                 velocityGain=1.0,
-                maxVelocity=speed / 2.0,
+                maxVelocity=fastest,
             )
 
     def _resume(self) -> None:
         if self._driven is not None:
             self._drive(self._driven)
         else:
-            targets = dict.fromkeys(self._joints, self._aim / 2.0)
+            targets = dict(zip(self._joints, self._travel.positions(self._aim), strict=True))
             hold(self._world.client, self._body, targets, self._world.dt)
 
     def _width(self) -> tuple[float, float, float, float]:
-        widths, speeds, _, forces = zip(*self._read(self._body.id, self._joints), strict=True)
-        share = 2.0 / len(widths)
-        return share * sum(widths), share * sum(speeds), -max(forces), max(map(abs, forces))
+        positions, speeds, _, efforts = zip(*self._read(self._body.id, self._joints), strict=True)
+        return self._travel.reading(positions, speeds, efforts)

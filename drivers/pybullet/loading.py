@@ -81,7 +81,7 @@ def load_robot(client: PyBulletClient, spec: RobotSpec, drawn: bool = False) -> 
 
     warnings = fix_inertias(client, body, lacking)
     infos = {name: client.getJointInfo(number, joint) for name, joint in moving.items()}
-    drives = joint_drives(spec, {name: (float(info[10]), float(info[11])) for name, info in infos.items()})
+    drives = joint_drives(spec, {name: (float(info[10]), float(info[11])) for name, info in infos.items()}, urdf)
     for name, joint in moving.items():
         body.home[joint], body.efforts[joint] = drives.home[name], drives.efforts[name]
         body.speeds[joint] = drives.speeds[name]

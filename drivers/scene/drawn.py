@@ -360,5 +360,5 @@ def _initial_joints(spec: RobotSpec, movable: Sequence[str]) -> dict[str, float]
     fingers = spec.gripper.joints if spec.gripper is not None else ()
     values = dict.fromkeys(movable, 0.0) | dict(zip(spec.joints, spec.initial, strict=True))
     if spec.gripper is not None:
-        values |= dict.fromkeys(fingers, spec.gripper.width_max / 2.0)
+        values |= dict(zip(fingers, spec.gripper.finger_positions(spec.gripper.width_max), strict=True))
     return {name: value for name, value in values.items() if name in movable}

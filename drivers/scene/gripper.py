@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from abc import abstractmethod
+from collections.abc import Sequence
 from typing import Any, ClassVar, Generic, TypeVar
 
 from hal.driver import GripperDriver, GripperReading
@@ -13,7 +14,7 @@ from hal.specs import GripperSpec, RobotSpec
 from .engine import SimulatedBody
 from .world import SimulatedWorld
 
-__all__ = ["SimulatedGripper"]
+__all__ = ["FingerTravel", "SimulatedGripper"]
 
 AT_TARGET = 0.001
 """Tolerance of the target width, m."""
@@ -36,11 +37,60 @@ W = TypeVar("W", bound=SimulatedWorld)  # type: ignore[type-arg]  # of any kind 
 B = TypeVar("B", bound=SimulatedBody)
 
 
+class FingerTravel:
+    """How the joints of a gripper's fingers make its width, and its force their torques.
+
+    Each joint goes its way from closed to open in proportion to the others. Without a table the width is proportional
+    to that way. A torque follows from the force by virtual work along the mean slope of the table, so the force at a
+    width differs from it as much as the slope there does.
+    """
+
+    def __init__(self, spec: GripperSpec) -> None:
+        self._spec = spec
+        n = len(spec.joints)
+        if not spec.opened:  # each joint slides by half the width, and its motor has the whole force
+            self._closed, self._ratios, self._gears = [0.0] * n, [2.0] * n, [1.0] * n
+        else:
+            ways = [far - shut for far, shut in zip(spec.opened, spec.closed, strict=True)]
+            self._closed = list(spec.closed)
+            self._ratios = [spec.width_max / way for way in ways]
+            self._gears = [ratio / n for ratio in self._ratios]
+        self._table = bool(spec.widths)
+
+    def positions(self, width: float) -> list[float]:
+        """Return the position of each joint at a width, rad or m."""
+        way = self._spec.width_max * self._spec.travel_at(width) if self._table else width
+        return [shut + way / ratio for shut, ratio in zip(self._closed, self._ratios, strict=True)]
+
+    def speeds(self, speed: float) -> list[float]:
+        """Return the greatest speed of each joint, rad/s or m/s, for one of the width, m/s."""
+        return [speed / abs(ratio) for ratio in self._ratios]
+
+    def efforts(self, force: float) -> list[float]:
+        """Return the greatest torque or force of each joint, Nm or N, for a force of the fingers, N."""
+        return [force * abs(gear) for gear in self._gears]
+
+    def reading(
+        self, positions: Sequence[float], speeds: Sequence[float], efforts: Sequence[float]
+    ) -> tuple[float, float, float, float]:
+        """Return width, its speed and the two forces of :meth:`SimulatedGripper._width` for what the joints have."""
+        n = len(positions)
+        way = sum([r * (p - c) for r, p, c in zip(self._ratios, positions, self._closed, strict=True)]) / n
+        speed = sum([r * v for r, v in zip(self._ratios, speeds, strict=True)]) / n
+        forces = [effort / gear for effort, gear in zip(efforts, self._gears, strict=True)]
+        if self._table:
+            share = way / self._spec.width_max
+            way = self._spec.width_at(share)
+            speed *= (self._spec.width_at(share + 1e-3) - way) / (1e-3 * self._spec.width_max)
+        return way, speed, -max(forces), max(map(abs, forces))
+
+
 class SimulatedGripper(GripperDriver, Generic[W, B]):
     """Base class of the driver of the fingers of one robot in a simulated world.
 
     Each finger is driven by a position motor whose force is the grip force, so a grasp needs no code per step: on an
-    object the motors press with that force, from both sides, until the next command. Positive joint positions open.
+    object the motors press with that force, from both sides, until the next command. All fingers are one drive: none
+    can be moved, or stopped, alone.
     """
 
     simulated: ClassVar[bool] = True
@@ -53,6 +103,7 @@ class SimulatedGripper(GripperDriver, Generic[W, B]):
             text = f"{spec.name}: a simulated gripper needs its simulated world, not {world!r}"
             raise CommandError(text, code="world_missing")
         self._world: W = world  # type: ignore[assignment]  # of that class
+        self._travel = FingerTravel(spec)
         self._open = False
         self._target = self._aim = spec.width_max
         self._force = spec.force

@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, field
 
 from hal.errors import ConfigError, Problem
 from hal.kinematics.urdf import UrdfMimic, UrdfModel
-from hal.specs import BodySpec, RobotSpec
+from hal.specs import BodySpec, GripperSpec, RobotSpec
 
 from .values import listed
 
 __all__ = [
     "JointDrives",
     "check_names",
+    "followers_of",
     "joint_drives",
     "mimics_of",
     "required",
@@ -70,15 +71,17 @@ class JointDrives:
     warnings: list[str] = field(default_factory=list)
 
 
-def joint_drives(spec: RobotSpec, limits: Mapping[str, tuple[float, float]]) -> JointDrives:
+def joint_drives(spec: RobotSpec, limits: Mapping[str, tuple[float, float]], urdf: UrdfModel) -> JointDrives:
     """Return the drives of an arm's movable joints.
 
     Args:
         spec: The arm's record, whose own limits of effort and speed win.
         limits: Effort and speed of every movable joint in the URDF, 0 if unknown.
+        urdf: The arm's URDF. Joints that follow others by a ``<mimic>`` have no motor and start where they follow to.
     """
     drives = JointDrives()
     fingers = spec.gripper.joints if spec.gripper else ()
+    opened = spec.gripper.finger_positions(spec.gripper.width_max) if spec.gripper else []
     without: list[str] = []
     for name, (effort, speed) in limits.items():
         drives.home[name] = 0.0
@@ -87,20 +90,42 @@ def joint_drives(spec: RobotSpec, limits: Mapping[str, tuple[float, float]]) -> 
             drives.home[name] = spec.initial[place]
             speed = spec.limits.velocity[place]
             effort = spec.limits.torque[place] if spec.limits.torque else effort
-        elif name in fingers and spec.gripper:
-            drives.home[name] = spec.gripper.width_max / 2.0
+        elif name in fingers:
+            drives.home[name] = opened[fingers.index(name)]
         if effort <= 0.0:
             without.append(name)
         drives.efforts[name] = effort if effort > 0.0 else UNKNOWN_EFFORT
         drives.speeds[name] = speed if speed > 0.0 else UNKNOWN_SPEED
+    for mimic in followers_of(spec, urdf):
+        drives.home[mimic.joint] = mimic.multiplier * drives.home[mimic.of] + mimic.offset
+        drives.efforts[mimic.joint] = 0.0
     if without:
         text = f"{spec.name}: no effort limit of {listed(without)}; {UNKNOWN_EFFORT:g} Nm (N) is used"
         drives.warnings.append(text)
     return drives
 
 
+def followers_of(spec: RobotSpec, urdf: UrdfModel) -> tuple[UrdfMimic, ...]:
+    """Return the joints that follow fingers and are no driven fingers themselves."""
+    fingers = spec.gripper.joints if spec.gripper else ()
+    driven = {*fingers, *spec.joints}
+    return tuple(one for one in mimics_of(spec, urdf) if one.of in fingers and one.joint not in driven)
+
+
 def mimics_of(spec: BodySpec | RobotSpec, urdf: UrdfModel) -> tuple[UrdfMimic, ...]:
     """Return which joints follow others; an arm's fingers move together even if the URDF does not say so."""
     fingers = spec.gripper.joints if isinstance(spec, RobotSpec) and spec.gripper else ()
-    mimics = urdf.mimics or tuple(UrdfMimic(finger, fingers[0], 1.0, 0.0) for finger in fingers[1:])
+    if isinstance(spec, RobotSpec) and spec.gripper and spec.gripper.opened:
+        mimics = (*urdf.mimics, *_couplings(spec.gripper, {mimic.joint for mimic in urdf.mimics}))
+    else:
+        mimics = urdf.mimics or tuple(UrdfMimic(finger, fingers[0], 1.0, 0.0) for finger in fingers[1:])
     return tuple(mimic for mimic in mimics if mimic.of in urdf.joints and mimic.multiplier != 0.0)
+
+
+def _couplings(gripper: GripperSpec, known: Collection[str]) -> Iterator[UrdfMimic]:
+    """Yield how the driven fingers follow the first one, without those that the URDF couples."""
+    far, shut = gripper.opened[0], gripper.closed[0]
+    for name, opened, closed in zip(gripper.joints[1:], gripper.opened[1:], gripper.closed[1:], strict=True):
+        if name not in known:
+            ratio = (opened - closed) / (far - shut)
+            yield UrdfMimic(name, gripper.joints[0], ratio, closed - ratio * shut)

@@ -123,7 +123,8 @@ class ArmView:
         values = dict(zip(self.spec.joints, state.q.tolist(), strict=True))
         gripper = self.gripper.get() if self.gripper is not None else None
         if gripper is not None and self.spec.gripper is not None:
-            values |= dict.fromkeys(self.spec.gripper.joints, gripper.state.width / 2.0)
+            positions = self.spec.gripper.finger_positions(gripper.state.width)
+            values |= dict(zip(self.spec.gripper.joints, positions, strict=True))
         for joint, node in self._links:
             _move_node(node, *joint.placement(values))
         _move_node(self._set, state.tcp_set.position.tolist(), state.tcp_set.orientation.tolist())

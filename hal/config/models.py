@@ -5,10 +5,11 @@ A model of your own is a file with the same keys, which a rig names by its path.
 
 from __future__ import annotations
 
+from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple
 
-from pydantic import BeforeValidator, Field, model_validator
+from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
 from .data_files import data_folder, is_path, list_data, user_path
 from .files import Problems, nearest, read_yaml
@@ -16,6 +17,7 @@ from .schema import (
     Accelerations,
     CameraRate,
     Distance,
+    FingerPosition,
     Flag,
     Force,
     Jerks,
@@ -103,10 +105,41 @@ class TcpModel(Strict):
     orientation: QuaternionConfig = (0.0, 0.0, 0.0, 1.0)
 
 
-class GripperModel(Strict):
-    """A parallel gripper: its fingers move together, each by half the width."""
+class FingerModel(Strict):
+    """One finger joint: a name alone slides (``prismatic``) by half the width; others have both of their ends."""
 
-    joints: tuple[str, ...] = ()
+    name: str
+    open: FingerPosition | None = None
+    """Position at the greatest width, rad or m."""
+    closed: FingerPosition | None = None
+    """Position at width 0, rad or m."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _plain_name(cls, data: Any) -> Any:
+        return {"name": data} if isinstance(data, str) else data
+
+
+def _check_widths(rows: Any) -> Any:
+    if rows and len(rows) < 2:
+        raise ValueProblem("needs two pairs of a position and a width at least", "wrong_count")
+    steps = [(b[0] - a[0], b[1] - a[1]) for a, b in pairwise(rows)]
+    if any(0.0 in step for step in steps) or len({(turn > 0.0, more > 0.0) for turn, more in steps}) > 1:
+        raise ValueProblem("positions and widths must ascend, or descend, from each pair to the next", "wrong_order")
+    return rows
+
+
+_WidthRow = Annotated[tuple[float, ...], Several(Quantity("rad or m", -10.0, 10.0), 2, "position, width")]
+
+
+class GripperModel(Strict):
+    """A gripper: its fingers move together between open and closed."""
+
+    joints: tuple[FingerModel, ...] = ()
+    """Joints that its drive moves; those that a ``<mimic>`` of the URDF couples to them follow by themselves."""
+    widths: Annotated[tuple[_WidthRow, ...], AfterValidator(_check_widths)] = ()
+    """Pairs of a position of the first joint (rad or m) and the width there (m), from closed to open or the reverse;
+    needed where the width is not proportional to the way of the joint, as on fingers that turn."""
     drivers: Drivers = Drivers()
     width_max: Size
     """Greatest width, m."""
@@ -116,6 +149,24 @@ class GripperModel(Strict):
     """Grip force, N."""
     real: dict[str, Any] = Field(default_factory=dict)
     simulated: dict[str, Any] = Field(default_factory=dict)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the finger joints."""
+        return tuple(joint.name for joint in self.joints)
+
+    @model_validator(mode="after")
+    def _both_ends(self) -> GripperModel:
+        given = [end is not None for joint in self.joints for end in (joint.open, joint.closed)]
+        if any(given) and not all(given):
+            raise ValueProblem("every joint, or none, needs open and closed", "missing_key")
+        if any(joint.open == joint.closed for joint in self.joints if joint.open is not None):
+            raise ValueProblem("open and closed of a joint must differ", "empty_range")
+        if self.widths and not any(given):
+            raise ValueProblem("joints need open and closed where widths are given", "missing_key")
+        if self.widths and max(width for _, width in self.widths) < self.width_max:
+            raise ValueProblem(f"widths end below width_max, {self.width_max:g} m", "out_of_range")
+        return self
 
 
 class RobotModel(Strict):

@@ -171,13 +171,12 @@ def _check_names(model: RobotModel, urdf: UrdfModel, file: Path, problems: Probl
     with suppress(Unknown):
         _check_joints(model.joints, "joints", urdf, file, problems)
     with suppress(Unknown):
-        fingers = model.gripper.joints if model.gripper else ()
-        _check_joints(fingers, "gripper.joints", urdf, file, problems)
-        for k, name in enumerate(fingers):
-            kind = urdf.joints[name].kind if name in urdf.joints else ""
-            if kind in TURNING and name not in model.joints:
-                message = f"joint {name!r} turns ({kind}); only fingers that slide (prismatic) are supported"
-                remedy = "remove the model's gripper, and its joints stay where they start"
+        _check_joints(model.gripper.names if model.gripper else (), "gripper.joints", urdf, file, problems)
+        for k, finger in enumerate(model.gripper.joints if model.gripper else ()):
+            kind = urdf.joints[finger.name].kind if finger.name in urdf.joints else ""
+            if kind in TURNING and finger.name not in model.joints and finger.open is None:
+                message = f"joint {finger.name!r} turns ({kind}), so it needs both of its ends"
+                remedy = f"{{name: {finger.name}, open: ..., closed: ...}}, and widths if they are not proportional"
                 problems.add(file, f"gripper.joints.{k}", f"{message}: {remedy}", "wrong_joint")
     with suppress(Unknown):
         if model.base_link is not None:
@@ -217,7 +216,7 @@ def _check_chain(model: RobotModel, urdf: UrdfModel, file: Path, problems: Probl
         if name in urdf.joints and name not in chain:
             message = f"joint {name!r} does not move the tcp's link {model.tcp.link!r}"
             problems.add(file, f"joints.{k}", message, "wrong_joint")
-    for name in sorted(chain.intersection(model.joints, model.gripper.joints if model.gripper else ())):
+    for name in sorted(chain.intersection(model.joints, model.gripper.names if model.gripper else ())):
         problems.add(file, "gripper.joints", f"{name!r} is also one of the arm's joints", "wrong_joint")
 
 
@@ -398,7 +397,7 @@ def _initial(context: Context, key: str, model: RobotModel, config: RobotConfig)
     given, n = config.initial, len(model.joints)
     if given is None or len(given) == n:
         return given
-    fingers = model.gripper.joints if model.gripper else ()
+    fingers = model.gripper.names if model.gripper else ()
     if fingers and len(given) == n + len(fingers):
         message = f"{context.source}: {key} has {len(given)} numbers; those of the {len(fingers)} fingers are not used"
         context.warnings.append(message)
@@ -481,7 +480,10 @@ def _gripper(
         width_max=kind.width_max,
         speed=own.speed or kind.speed,
         force=own.force or kind.force,
-        joints=kind.joints,
+        joints=kind.names,
+        opened=tuple(joint.open for joint in kind.joints if joint.open is not None),
+        closed=tuple(joint.closed for joint in kind.joints if joint.closed is not None),
+        widths=tuple((row[0], row[1]) for row in kind.widths),
         options=options,
     )
 

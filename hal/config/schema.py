@@ -27,6 +27,7 @@ __all__ = [
     "Direction",
     "Distance",
     "Factor",
+    "FingerPosition",
     "Flag",
     "Force",
     "Gravity",
@@ -269,6 +270,8 @@ _OR_ALL = "one for each joint, or one for all of them"
 # Joints that slide have m instead of rad.
 JointPositions = Annotated[_Any, Several(Quantity("rad", -1e4, 1e4), None, _EACH)]
 """Compared with the limits of the joints later."""
+FingerPosition = Annotated[float, Quantity("rad", -10.0, 10.0)]
+"""rad, or m for a finger that slides."""
 JointLimits = Annotated[_Any, Several(Quantity("rad", -30.0, 30.0), None, _OR_ALL, single=True)]
 Velocities = Annotated[_Any, Several(Quantity("rad/s", 0.0, 50.0, above=True), None, _OR_ALL, single=True)]
 Accelerations = Annotated[_Any, Several(Quantity("rad/s2", 0.0, 2000.0, above=True), None, _OR_ALL, single=True)]

@@ -149,7 +149,7 @@ def _mesh_bounds(file: Path, scale: str) -> Any:
 
     try:
         bounds: Any = trimesh.load(str(file), force="mesh").bounds
-        return tuple(np.sort(bounds * np.array(scale.split(), float), axis=0))
+        return tuple(np.sort(bounds * np.array(scale.split()[:3], float), axis=0))
     except Exception:  # a mesh that is empty, or that nothing can read; the simulation reports it
         return None
 

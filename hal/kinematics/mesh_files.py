@@ -5,6 +5,7 @@ Some libraries crash on a mesh whose indices point past the end of its lists.
 
 from __future__ import annotations
 
+import importlib.metadata
 import importlib.util
 import re
 import struct
@@ -22,16 +23,27 @@ _SCHEMES = (_PACKAGE, "model://", "file://")
 
 
 def package_folder(package: str) -> Path | None:
-    """Return the folder of an installed Python package, without importing it; None if there is no such package."""
+    """Return the folder of an installed Python package, without importing it; None if there is no such package.
+
+    Wheels of cmeel, such as ``example_robot_data``, hold no module, only files: the folder is then that of their data.
+    """
     try:
         spec = importlib.util.find_spec(package)
     except (ImportError, ValueError):
         return None
     if spec is None:
-        return None
+        return _cmeel_folder(package.replace("_", "-"))
     if spec.submodule_search_locations:
         return Path(next(iter(spec.submodule_search_locations)))
     return Path(spec.origin).parent if spec.origin else None
+
+
+def _cmeel_folder(name: str) -> Path | None:
+    try:
+        folder = Path(str(importlib.metadata.distribution(name).locate_file(f"cmeel.prefix/share/{name}")))
+    except (importlib.metadata.PackageNotFoundError, ValueError):
+        return None
+    return folder if folder.is_dir() else None
 
 
 def mesh_file(name: str, folder: Path) -> Path:

@@ -25,6 +25,8 @@ TURNING = ("revolute", "continuous")
 """Joints that turn about an axis, rad."""
 MOVABLE = (*TURNING, "prismatic")
 """Joints about or along one axis."""
+ROUNDING = 1e-12
+"""How far below 0 a moment of inertia may be, kg m2: programs that write URDF files round."""
 
 
 @dataclass(frozen=True)
@@ -212,7 +214,7 @@ def parse_xml(path: Path | str) -> ElementTree.Element:
         ValueError: It is not valid XML.
         OSError: It cannot be read.
     """
-    data = Path(path).read_bytes()
+    data = Path(path).read_bytes().lstrip()  # a blank line before the declaration is common, though no XML
     builder = ElementTree.TreeBuilder()
     parser = expat.ParserCreate()
     parser.buffer_text = True
@@ -274,7 +276,8 @@ _NUMBERS = {
     "dynamics": {"damping": (1, 0.0), "friction": (1, 0.0)},
     "mimic": {"multiplier": (1, -math.inf), "offset": (1, -math.inf)},
     "mass": {"value": (1, 0.0)},
-    "inertia": dict.fromkeys(("ixx", "iyy", "izz"), (1, 0.0)) | dict.fromkeys(("ixy", "ixz", "iyz"), (1, -math.inf)),
+    "inertia": dict.fromkeys(("ixx", "iyy", "izz"), (1, -ROUNDING))
+    | dict.fromkeys(("ixy", "ixz", "iyz"), (1, -math.inf)),
     "mesh": {"scale": (3, -math.inf)},
     "box": {"size": (3, 0.0)},
     "cylinder": {"radius": (1, 0.0), "length": (1, 0.0)},
@@ -296,10 +299,10 @@ def _check_numbers(owner: ElementTree.Element) -> None:
                 values = [float(word) for word in text.split()]
             except ValueError:
                 raise ValueError(f"{place}{element.tag} {attribute}={text!r}> is not a number") from None
-            if len(values) != count:
+            if len(values) != count and not (attribute == "scale" and len(values) > count):  # the rest is not used
                 raise ValueError(f"{place}{element.tag} {attribute}={text!r}> must be {count} number(s)")
             if not all(math.isfinite(value) and value >= least for value in values):
-                must = "finite" if least < 0.0 else "finite and not negative"
+                must = "finite" if least == -math.inf else "finite and not negative"
                 raise ValueError(f"{place}{element.tag} {attribute}={text!r}> must be {must}")
             if element.tag == "axis" and owner.get("type") in MOVABLE and math.hypot(*values) < 1e-6:
                 raise ValueError(f"{place}axis xyz={text!r}> is not a direction")
@@ -412,7 +415,7 @@ def _shape(element: ElementTree.Element, colors: _Colors, folder: Path) -> UrdfV
     pose = _origin(element)
     if shape.tag == "mesh":
         file = mesh_file(shape.get("filename", ""), folder)
-        return UrdfVisual(pose, "mesh", _floats(shape, "scale", (1.0, 1.0, 1.0)), rgba, str(file))
+        return UrdfVisual(pose, "mesh", _floats(shape, "scale", (1.0, 1.0, 1.0))[:3], rgba, str(file))
     if shape.tag == "box":
         return UrdfVisual(pose, "box", _floats(shape, "size", (0.0, 0.0, 0.0)), rgba)
     if shape.tag in ("sphere", "cylinder", "capsule"):

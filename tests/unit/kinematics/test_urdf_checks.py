@@ -50,6 +50,20 @@ def test_an_arm_in_order(tmp_path: Path) -> None:
     assert set(read_urdf(arm(tmp_path)).joints) == {"turn"}
 
 
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ("<robot", '\n\n<?xml version="1.0"?>\n<robot'),
+        ('ixx="0.01"', 'ixx="-5.4e-20"'),
+        ('scale="1 1 1"', 'scale="1 1 1 1"'),
+        ("</joint>", "<drake:acceleration xyz='1'/></joint>"),
+    ],
+)
+def test_what_other_readers_accept(tmp_path: Path, old: str, new: str) -> None:
+    model = read_urdf(arm(tmp_path, ARM.replace(old, new, 1)))
+    assert model.links["upper"].visuals[0].size == (1.0, 1.0, 1.0)
+
+
 JOINT = '<joint name="{}" type="fixed"><parent link="{}"/><child link="{}"/></joint></robot>'
 
 
