@@ -7,13 +7,14 @@
     observations, rewards, terminated, truncated, infos = envs.step(envs.action_space.sample())
 
 Each process (:class:`~hal.host.process.Child`) holds several :class:`.RigEnv` and steps them one after the other: a
-servo in Python keeps one core busy, and a process costs more memory than a world. Observations are in memory that all
-share; actions, rewards and infos are messages. The processes end with the program, however it ends.
+servo in Python keeps one core busy, and a process costs more memory than a world. What every step takes and returns is
+in memory that all share, the rest in messages. The processes end with the program, however it ends.
 """
 
 from __future__ import annotations
 
 import base64
+import gc
 import os
 import pickle
 import time
@@ -28,7 +29,7 @@ from typing import Any
 
 import cloudpickle  # type: ignore[import-untyped]
 import numpy as np
-from gymnasium.spaces import Dict
+from gymnasium.spaces import Dict, Space
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
@@ -82,8 +83,10 @@ def make_vec(
         NotSupported: The rig has real arms (code ``not_simulated``).
         DriverMissing: gymnasium is not installed.
     """
-    if num_envs < 1 or (processes is not None and processes < 1):
-        raise CommandError("make_vec needs at least one world and one process", code="bad_count")
+    processes = _cores() if processes is None else processes
+    for name, count in (("num_envs", num_envs), ("processes", processes)):
+        if isinstance(count, bool) or not isinstance(count, (int, np.integer)) or count < 1:
+            raise CommandError(f"{name} is a whole number of at least 1, not {count!r}", code="bad_count")
     modes = [mode.value for mode in AutoresetMode]
     if not isinstance(autoreset_mode, AutoresetMode) and autoreset_mode not in modes:
         raise CommandError(f"autoreset_mode is one of {', '.join(modes)}, not {autoreset_mode!r}", code="bad_autoreset")
@@ -93,7 +96,7 @@ def make_vec(
     if real := [arm.name for arm in plan.robots if arm.attended]:
         raise NotSupported(f"make_vec: {', '.join(real)} really moves; pass sim=True", code="not_simulated")
     make = partial(RigEnv, config, **options)
-    return RigVectorEnv(make, num_envs, min(num_envs, processes or _cores()), AutoresetMode(autoreset_mode))
+    return RigVectorEnv(make, int(num_envs), int(min(num_envs, processes)), AutoresetMode(autoreset_mode))
 
 
 def _cores() -> int:
@@ -137,9 +140,9 @@ class RigVectorEnv(VectorEnv[ObservationDict, NDArray[np.float32], NDArray[Any]]
             self.observation_space = batch_space(self.single_observation_space, num_envs)
             self.action_space = batch_space(self.single_action_space, num_envs)
             self._rendered = rendered
-            record = _record_of(spaces[0])
-            os.ftruncate(self._memory.fd, 2 * num_envs * record.itemsize)
-            self._observations, self._final = _map_records(self._memory, record, num_envs)
+            sizes = _WorldRecords.dtypes(self.single_observation_space, self.single_action_space)
+            os.ftruncate(self._memory.fd, num_envs * sum(size.itemsize for size in sizes))
+            self._records = _WorldRecords(self._memory, sizes, num_envs)
             self._run("attach", [()] * processes)
         except BaseException:
             self.close()
@@ -174,7 +177,7 @@ class RigVectorEnv(VectorEnv[ObservationDict, NDArray[np.float32], NDArray[Any]]
         elif len(seeds := list(seed)) != self.num_envs:
             raise CommandError(f"seed: {self.num_envs} seeds, not {len(seeds)}", code="bad_seed")
         answers = self._run("reset", [(mask[part], seeds[part], options) for part in self._parts])
-        return self._batch(), self._infos([info for infos in answers for info in infos])
+        return self._batch(), self._infos([info for infos in answers for info in infos], {})
 
     def step(self, actions: NDArray[np.float32]) -> VectorStep:
         """Send an action to every world, (num_envs, numbers of an action); returns Gymnasium's five values.
@@ -186,14 +189,23 @@ class RigVectorEnv(VectorEnv[ObservationDict, NDArray[np.float32], NDArray[Any]]
         actions = np.asarray(actions)
         if actions.shape != self.action_space.shape:
             raise CommandError(f"actions have shape {self.action_space.shape}, not {actions.shape}", code="bad_action")
-        answers = self._run("step", [(actions[part],) for part in self._parts])
-        rewards, terminated, truncated, infos = zip(*(world for answer in answers for world in answer), strict=True)
-        return self._batch(), np.array(rewards, float), np.array(terminated), np.array(truncated), self._infos(infos)
+        steps = self._records.steps
+        try:
+            steps["action"] = actions
+        except (TypeError, ValueError) as error:
+            raise CommandError(f"actions are numbers: {error}", code="bad_action") from None
+        answers = self._request("step", [{}] * len(self._parts))
+        infos: dict[str, Any] = {"elapsed": steps["elapsed"].copy(), "_elapsed": np.ones(self.num_envs, bool)}
+        for part, answer in zip(self._parts, answers, strict=True):
+            if answer is not None:
+                infos = self._infos(_unpack(answer), infos, part.start)
+        results = (steps[name].copy() for name in ("reward", "terminated", "truncated"))
+        return (self._batch(), *results, infos)  # type: ignore[return-value]  # three arrays
 
     def render(self) -> tuple[NDArray[np.uint8] | None, ...]:  # type: ignore[override]  # None without a camera
         """Return the newest colour picture (H, W, 3) of each world's first camera."""
         if self._rendered and not self.closed:
-            return tuple(self._observations[self._rendered].copy())  # without a message
+            return tuple(self._records.observations[self._rendered].copy())  # without a message
         return self.call("render")
 
     def call(self, name: str, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
@@ -217,30 +229,36 @@ class RigVectorEnv(VectorEnv[ObservationDict, NDArray[np.float32], NDArray[Any]]
         self._finalizer()
 
     def _batch(self) -> ObservationDict:
-        return _copy_of(self._observations)
+        return _copy_of(self._records.observations)
 
-    def _infos(self, infos: Sequence[dict[str, Any]]) -> dict[str, Any]:
-        """Return the worlds' infos in Gymnasium's form: name -> an array, ``_name`` -> which worlds have it."""
-        found: dict[str, Any] = {}
-        for k, info in enumerate(infos):
+    def _infos(self, infos: Sequence[dict[str, Any]], found: dict[str, Any], first: int = 0) -> dict[str, Any]:
+        """Return ``found`` with the infos of the worlds from the ``first`` one on, in Gymnasium's form.
+
+        That is name -> an array, ``_name`` -> which worlds have it.
+        """
+        for k, info in enumerate(infos, first):
             if "final_obs" in info:
-                info["final_obs"] = _copy_of(self._final[k])
+                info["final_obs"] = _copy_of(self._records.final[k])
             found = self._add_info(found, info, k)
         return found
 
     def _run(self, method: str, arguments: Sequence[tuple[Any, ...]]) -> list[Any]:
         """Run a method in all processes at the same time, each with its own arguments; return their answers."""
+        return [_unpack(answer) for answer in self._request(method, [{"data": _pack(own)} for own in arguments])]
+
+    def _request(self, method: str, params: Sequence[dict[str, Any]]) -> list[Any]:
+        """Send a request to all processes, each with its own parameters; return their answers."""
         if self.closed:
             raise HalError("the environments are closed", code="closed")
         answers: list[Any] = []
         errors: list[HalError] = []
         numbers: list[int] = []
         try:
-            for child, own in zip(self._children, arguments, strict=True):
-                numbers.append(child.send_request(method, {"data": _pack(own)}, _LONGEST))
+            for child, own in zip(self._children, params, strict=True):
+                numbers.append(child.send_request(method, own, _LONGEST))
             for child, number in zip(self._children, numbers, strict=True):
                 try:
-                    answers.append(_unpack(child.wait_result(number, method, _LONGEST)))
+                    answers.append(child.wait_result(number, method, _LONGEST))
                 except HalError as error:
                     child.check()
                     errors.append(error)
@@ -269,15 +287,27 @@ def _unpack(text: str) -> Any:
     return pickle.loads(base64.b64decode(text))
 
 
-def _record_of(space: Dict) -> np.dtype[Any]:
-    """Return the type of one world's observation in shared memory."""
-    return np.dtype([(key, box.dtype, box.shape) for key, box in space.items()], align=True)
+class _WorldRecords:
+    """Arrays (worlds,) in memory that all processes share: observations, and what else a step takes and returns."""
 
+    def __init__(self, memory: SharedMemory, dtypes: Sequence[np.dtype[Any]], count: int) -> None:
+        buffer, start, arrays = SharedMemory(fd=memory.fd).buffer, 0, []
+        for dtype in dtypes:
+            arrays.append(np.ndarray(count, dtype, buffer, start))
+            start += count * dtype.itemsize
+        self.observations: NDArray[Any] = arrays[0]
+        """The newest one of each world."""
+        self.final: NDArray[Any] = arrays[1]
+        """The last one of the episode that ended."""
+        self.steps: NDArray[Any] = arrays[2]
+        """``action``, ``reward``, ``elapsed`` (of the infos), ``terminated`` and ``truncated`` of the newest step."""
 
-def _map_records(memory: SharedMemory, record: np.dtype[Any], count: int) -> NDArray[Any]:
-    """Return the worlds' newest observations, and the last ones of episodes that ended: (2, count) records."""
-    records: NDArray[Any] = np.ndarray((2, count), record, SharedMemory(fd=memory.fd).buffer)
-    return records
+    @staticmethod
+    def dtypes(observation: Dict, action: Space[Any]) -> tuple[np.dtype[Any], ...]:
+        """Return the types of the elements of :attr:`observations`, :attr:`final` and :attr:`steps`."""
+        seen = np.dtype([(key, box.dtype, box.shape) for key, box in observation.items()], align=True)
+        numbers = [("action", float, action.shape), ("reward", float), ("elapsed", float)]
+        return seen, seen, np.dtype([*numbers, ("terminated", bool), ("truncated", bool)], align=True)
 
 
 def _copy_of(records: NDArray[Any]) -> ObservationDict:
@@ -300,8 +330,9 @@ class _Worlds:
 
     def attach(self) -> None:
         """Map the memory of the observations, which has its size now."""
-        record = _record_of(self._envs[0].observation_space)
-        self._observations, self._final = _map_records(self._memory, record, self._count)
+        env = self._envs[0]
+        dtypes = _WorldRecords.dtypes(env.observation_space, env.action_space)
+        self._records = _WorldRecords(self._memory, dtypes, self._count)
 
     def reset(self, mask: Sequence[bool], seeds: Sequence[int | None], options: dict[str, Any]) -> list[dict[str, Any]]:
         """Reset the worlds of ``mask``; return the infos of all."""
@@ -311,32 +342,36 @@ class _Worlds:
                 return {}
             seen, info = self._envs[k].reset(seed=seeds[k], options=options)
             self._ended[k] = False
-            self._write(self._observations, k, seen)
+            self._write(self._records.observations, k, seen)
             return info
 
         return self._each(reset)
 
-    def step(self, actions: NDArray[np.float32]) -> list[tuple[float, bool, bool, dict[str, Any]]]:
-        """Step every world; return reward, terminated, truncated and info of each."""
+    def step(self) -> str | None:
+        """Step every world; return their packed infos, without those in shared memory; None if nothing is left."""
+        steps = self._records.steps[self._first : self._first + len(self._envs)]
+        results = steps[["reward", "elapsed", "terminated", "truncated"]]
 
-        def step(k: int) -> tuple[float, bool, bool, dict[str, Any]]:
+        def step(k: int) -> dict[str, Any]:
             env = self._envs[k]
             if self._mode is AutoresetMode.NEXT_STEP and self._ended[k]:
                 seen, info = env.reset()
                 reward, terminated, truncated = 0.0, False, False
             else:
-                seen, reward, terminated, truncated, info = env.step(actions[k])
+                seen, reward, terminated, truncated, info = env.step(steps["action"][k].copy())
             self._ended[k] = terminated or truncated
             if self._mode is AutoresetMode.SAME_STEP and self._ended[k]:
-                self._write(self._final, k, seen)
+                self._write(self._records.final, k, seen)
                 final = {"final_info": info, "final_obs": None}  # read from memory
                 seen, info = env.reset()
                 info = final | info
-            self._write(self._observations, k, seen)
-            return reward, terminated, truncated, info
+            self._write(self._records.observations, k, seen)
+            results[k] = reward, info.pop("elapsed"), terminated, truncated
+            return info
 
         try:
-            return self._each(step)
+            infos = self._each(step)
+            return _pack(infos) if any(infos) else None
         finally:
             self._stepped = time.monotonic()
 
@@ -394,5 +429,7 @@ def main(channel: Channel, memories: Sequence[SharedMemory], config: dict[str, A
         def answer(method: Callable[..., Any]) -> Callable[[str], str]:
             return lambda data: _pack(method(*_unpack(data)))
 
-        methods = (worlds.attach, worlds.reset, worlds.step, worlds.call, worlds.set_attr)
-        serve(channel, {method.__name__: answer(method) for method in methods}, worlds.pause, _LONGEST)
+        methods = (worlds.attach, worlds.reset, worlds.call, worlds.set_attr)
+        gc.freeze()  # worlds have many objects, which no collection needs to look at
+        handlers = {method.__name__: answer(method) for method in methods} | {"step": worlds.step}
+        serve(channel, handlers, worlds.pause, _LONGEST)

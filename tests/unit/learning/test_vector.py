@@ -165,6 +165,7 @@ def test_a_killed_process_is_an_error_and_leaves_nothing_behind() -> None:
 def test_what_cannot_be_is_refused() -> None:
     for options, error, code in (
         ({"num_envs": 0}, hal.CommandError, "bad_count"),
+        ({"num_envs": 1.5}, hal.CommandError, "bad_count"),
         ({"processes": 0}, hal.CommandError, "bad_count"),
         ({"autoreset_mode": "never"}, hal.CommandError, "bad_autoreset"),
         ({"unattended": True}, hal.CommandError, "not_simulated"),
