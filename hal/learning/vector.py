@@ -84,7 +84,8 @@ def make_vec(
         DriverMissing: gymnasium is not installed.
     """
     processes = _cores() if processes is None else processes
-    for name, count in (("num_envs", num_envs), ("processes", processes)):
+    counts: tuple[tuple[str, Any], ...] = (("num_envs", num_envs), ("processes", processes))
+    for name, count in counts:
         if isinstance(count, bool) or not isinstance(count, (int, np.integer)) or count < 1:
             raise CommandError(f"{name} is a whole number of at least 1, not {count!r}", code="bad_count")
     modes = [mode.value for mode in AutoresetMode]
@@ -140,7 +141,7 @@ class RigVectorEnv(VectorEnv[ObservationDict, NDArray[np.float32], NDArray[Any]]
             self.observation_space = batch_space(self.single_observation_space, num_envs)
             self.action_space = batch_space(self.single_action_space, num_envs)
             self._rendered = rendered
-            sizes = _WorldRecords.dtypes(self.single_observation_space, self.single_action_space)
+            sizes = _WorldRecords.dtypes(*spaces[:2])
             os.ftruncate(self._memory.fd, num_envs * sum(size.itemsize for size in sizes))
             self._records = _WorldRecords(self._memory, sizes, num_envs)
             self._run("attach", [()] * processes)
@@ -200,7 +201,7 @@ class RigVectorEnv(VectorEnv[ObservationDict, NDArray[np.float32], NDArray[Any]]
             if answer is not None:
                 infos = self._infos(_unpack(answer), infos, part.start)
         results = (steps[name].copy() for name in ("reward", "terminated", "truncated"))
-        return (self._batch(), *results, infos)  # type: ignore[return-value]  # three arrays
+        return self._batch(), *results, infos
 
     def render(self) -> tuple[NDArray[np.uint8] | None, ...]:  # type: ignore[override]  # None without a camera
         """Return the newest colour picture (H, W, 3) of each world's first camera."""
