@@ -17,7 +17,7 @@ from .errors import NotSupported
 from .geometry import Pose, frozen
 from .specs import BodySpec, WorldSpec, to_json
 
-__all__ = ["Contact", "NoWorld", "Poses", "RayHit", "World", "WorldDriver"]
+__all__ = ["BodyJoint", "Contact", "NoWorld", "Poses", "RayHit", "World", "WorldDriver"]
 
 Array = NDArray[np.float64]
 
@@ -46,6 +46,22 @@ class Poses(NamedTuple):
     """Time of the world, s on ``rig.clock``."""
     poses: Mapping[str, Pose]
     """Pose of each body's base in the world, by the body's name."""
+
+
+class BodyJoint(NamedTuple):
+    """A joint of a body that moves."""
+
+    kind: str
+    """``revolute``, ``continuous`` or ``prismatic``."""
+    lower: float | None
+    """Least position, rad or m; None without a limit."""
+    upper: float | None
+    damping: float
+    """Force or torque against a speed, Nm s/rad or Ns/m: the URDF's. An arm's motors compensate it."""
+    friction: float
+    """Force or torque of dry friction, Nm or N: the URDF's."""
+    follows: str | None = None
+    """The joint that it follows (a URDF's ``<mimic>``)."""
 
 
 class RayHit(NamedTuple):
@@ -122,6 +138,33 @@ class World:
     def set_pose(self, name: str, pose: Pose) -> None:
         """Place a body, at rest. Robots are moved by their servo, or by :meth:`reset`."""
         self._call("set_pose", name=name, pose=_plain(pose))
+
+    def links(self, name: str) -> tuple[str, ...]:
+        """Return the names of a body's links; the first one is the base."""
+        return tuple(self._call("describe", name=name)["links"])
+
+    def joints(self, name: str) -> dict[str, BodyJoint]:
+        """Return the joints of a body that move, by name, in the order of the URDF."""
+        movable = self._call("describe", name=name)["movable"]
+        return {joint: BodyJoint(**facts) for joint, facts in movable.items()}
+
+    def joint_positions(self, name: str) -> dict[str, float]:
+        """Return the position of each joint of :meth:`joints`, rad or m."""
+        return dict(self._call("joint_positions", name=name))
+
+    def set_joint_positions(self, name: str, positions: Mapping[str, float]) -> None:
+        """Place joints of an object, such as a drawer or a door, at rest; joints that follow one of them, too.
+
+        Args:
+            name: Name of the object. Robots are moved by their servo, or by :meth:`reset`.
+            positions: Position by the name of the joint, rad or m; other joints stay.
+
+        Raises:
+            DeviceNotFound: No such joint; lists the existing ones.
+            CommandError: A position is outside of the joint's range (``code`` is ``out_of_range``), or the joint
+                follows another one (``joint_follows``).
+        """
+        self._call("set_joint_positions", name=name, positions={key: float(value) for key, value in positions.items()})
 
     def velocity(self, name: str) -> tuple[Array, Array]:
         """Return the linear (3,) m/s and the angular (3,) rad/s velocity of a body's base, in the world."""
@@ -307,7 +350,9 @@ class WorldDriver(ABC):
     =================  ======================================  ========================================================
     ``names``          none                                    names of the bodies, objects first, as they were added
     ``describe``       ``name``                                ``index`` in segmentation images, ``robot`` (a bool),
-                                                               names of ``links`` and ``joints``
+                                                               names of ``links`` and ``joints``, and ``movable``: the
+                                                               fields of each :class:`BodyJoint` by name
+    ``joint_positions``  ``name``                              position by joint that moves, rad or m
     ``pose``           ``name``, ``link``                      ``position`` (3,) m and ``orientation`` (4,) xyzw of a
                                                                link's own frame in the world; of the base for None
     ``poses``          ``names``                               ``poses`` of bases by name and ``t``, s
@@ -322,6 +367,7 @@ class WorldDriver(ABC):
     ``set_color``      ``name``, ``rgba``                      the new revision
     ``set_pose``       ``name``, ``pose``                      none
     ``set_velocity``   ``name``, ``linear``, ``angular``       none
+    ``set_joint_positions``  ``name``, ``positions``           none
     ``set_dynamics``   ``name``, ``link``, properties          these properties as they were before
     ``apply_force``    those of :meth:`World.apply_force`      none
     ``set_gravity``    ``gravity``                             the gravity before, (3,) m/s2
@@ -341,6 +387,7 @@ class WorldDriver(ABC):
     REQUESTS: ClassVar[frozenset[str]] = frozenset(
         {
             *("names", "describe", "pose", "poses", "velocity", "dynamics", "contacts", "aabb", "ray", "distance"),
+            *("joint_positions", "set_joint_positions"),
             *("add", "remove", "set_color", "set_pose", "set_velocity", "set_dynamics", "apply_force", "set_gravity"),
             *("reset", "save", "restore"),
         }

@@ -45,6 +45,8 @@ COUPLING = (0.01, 1.0)
 """Time constant, s, and damping ratio of the constraint between joints that move together."""
 STIFF = (0.99, 0.999)
 """Impedance of the couplings that carry the whole force of a finger, at no distance and far from it."""
+STIFF_FRICTION = (0.9999, 0.9999, 0.001, 0.5, 2.0)
+"""How much of a joint's friction acts: what it holds creeps by less than 10 um/s."""
 UNBOUNDED = 1e-6
 """What is added to the range of a joint, rad or m: a joint that rests at its limit needs no force to stay there."""
 
@@ -243,6 +245,7 @@ def _plan_urdf(spec: BodySpec | RobotSpec, urdf: UrdfModel, key: str, scale: flo
             movable=tuple(joints[joint.name] for joint in moving),
             floating=False,
             contacts=[_contact(elements[name]) for name in order],
+            urdf=urdf,
             solids=[len(link.shapes) for link in links],
         ),
         links,
@@ -506,6 +509,10 @@ def _add_joint(mujoco: Any, node: Any, plan: BodyPlan, joint: UrdfJoint) -> None
         made.armature = plan.fingers[joint.name]
     elif joint.name in plan.unstoppable:
         made.armature = UNSTOPPABLE
+    if not plan.body.is_robot:
+        linear_only = (joint.damping, 0.0, 0.0)  # since MuJoCo 4, with terms of higher order
+        made.damping = linear_only if np.ndim(made.damping) else joint.damping
+        made.frictionloss, made.solimp_friction = joint.friction, STIFF_FRICTION
 
 
 _KINDS: Mapping[str, str] = {

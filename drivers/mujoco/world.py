@@ -99,12 +99,12 @@ class MujocoWorld(SimulatedWorld[Body]):
         motors, model, data = self.motors, self.model, self.data
         if not self.steps % SOUND_EVERY:
             self._sound[:] = self._qpos
+        if self._forces:  # before the step, so that they wake what sleeps
+            self._kinematics()
+            for force in self._forces:
+                self._push(force)
         for _ in range(self.substeps):
             self._step1(model, data)
-            if self._forces:
-                data.xfrc_applied[:] = 0.0
-                for force in self._forces:
-                    self._push(force)
             motors.drive()
             self._step2(model, data)
             if self.substeps > 1:
@@ -324,6 +324,9 @@ class MujocoWorld(SimulatedWorld[Body]):
                 self._set_limits(body)
                 self.motors.limit()
 
+    def _read_joints(self, body: Body) -> Sequence[float]:
+        return [float(self.data.qpos[body.qpos[joint]]) for joint in body.movable]
+
     def _read_dynamics(self, body: Body, link: int) -> dict[str, Any]:
         return read_dynamics(self.model, body, link)
 
@@ -398,6 +401,7 @@ class MujocoWorld(SimulatedWorld[Body]):
     def _set_gravity(self, gravity: Sequence[float]) -> None:
         self._spec.option.gravity = gravity
         self.model.opt.gravity[:] = gravity
+        self.sleep.wake()
 
     def _cast_ray(self, start: Sequence[float], end: Sequence[float]) -> RayFound | None:
         self._kinematics()

@@ -202,6 +202,12 @@ class Body(SimulatedBody):
     hardened: set[int] = field(default_factory=set)
     """Links whose contacts were made soft and then hard again (see :mod:`.dynamics`)."""
 
+    @property
+    def damped(self) -> bool:
+        """Whether it is an object with damping in its joints."""
+        joints = () if self.urdf is None or self.is_robot else self.urdf.joints.values()
+        return any(joint.damping > 0.0 for joint in joints if joint.movable)
+
     def base_pose(self, client: PyBulletClient) -> Transform:
         """Return the pose of the base link in the world."""
         return compose(client.getBasePositionAndOrientation(self.id), inverse(self.inertial))

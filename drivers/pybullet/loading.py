@@ -19,6 +19,7 @@ from hal.kinematics.urdf import UrdfMimic, UrdfModel, parse_xml
 from hal.specs import BodySpec, RobotSpec
 
 from .engine import Body, Gear, PyBulletClient, silenced
+from .motors import PassiveJoints
 
 __all__ = [
     "fix_inertias",
@@ -60,6 +61,8 @@ def load_object(client: PyBulletClient, spec: BodySpec, drawn: bool = False) -> 
     )
     body = _describe(client, spec, number, f"{key}.urdf", urdf)
     _couple(client, body, mimics_of(spec, urdf))
+    if body.movable:
+        PassiveJoints(client, body).release()
     warnings = fix_inertias(client, body, lacking)
     if lacking:
         warnings.append(f"{spec.name}: no <inertial> in {listed(lacking)}; PyBullet takes 1 kg for each")
@@ -194,6 +197,7 @@ def _describe(
         inertial=(tuple(dynamics[3]), tuple(dynamics[4])),
         home=dict.fromkeys(movable, 0.0),
         base=base,
+        urdf=urdf,
     )
 
 

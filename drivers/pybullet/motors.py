@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 
 from .engine import Body, PyBulletClient
 
-__all__ = ["JointTorques", "hold", "position_gain"]
+__all__ = ["JointTorques", "PassiveJoints", "hold", "position_gain"]
 
 Floats = Sequence[float]
 
@@ -48,6 +48,41 @@ def hold(client: PyBulletClient, body: Body, targets: Mapping[int, float], dt: f
             positionGain=position_gain(dt),
             velocityGain=1.0,
             maxVelocity=body.speeds[joint],
+        )
+
+
+class PassiveJoints:
+    """The friction and damping of an object's joints, which its URDF gives.
+
+    PyBullet's own motor of a joint becomes its friction: it stops the joint with a force that is limited to friction
+    and damping. So a great damping stops the joint at most, while PyBullet's own, an explicit force, makes it unstable.
+    """
+
+    def __init__(self, client: PyBulletClient, body: Body) -> None:
+        assert body.urdf is not None
+        joints = [joint for joint in body.urdf.joints.values() if joint.movable]
+        self._client, self._id = client, body.id
+        self._joints = [body.joints[joint.name] for joint in joints]
+        self._friction = [joint.friction for joint in joints]
+        self._damping = [joint.damping for joint in joints]
+        self._still = [0.0] * len(joints)
+
+    def release(self) -> None:
+        """Put friction in the place of PyBullet's motors and damping."""
+        for joint in self._joints:
+            self._client.changeDynamics(self._id, joint, jointDamping=0.0)
+        self._limit(self._friction)
+
+    def prepare_step(self) -> None:
+        """Limit the motors to friction and damping at the present speeds."""
+        states = self._client.getJointStates(self._id, self._joints)
+        rows = zip(self._friction, self._damping, states, strict=True)
+        self._limit([friction + damping * abs(state[1]) for friction, damping, state in rows])
+
+    def _limit(self, forces: Floats) -> None:
+        client = self._client
+        client.setJointMotorControlArray(
+            self._id, self._joints, client.VELOCITY_CONTROL, targetVelocities=self._still, forces=forces
         )
 
 

@@ -36,7 +36,7 @@ from .dynamics import (
 )
 from .engine import Body, PyBulletClient
 from .loading import load_object, load_robot
-from .motors import hold
+from .motors import PassiveJoints, hold
 
 __all__ = [
     "PyBulletWorld",
@@ -83,6 +83,8 @@ class PyBulletWorld(SimulatedWorld[Body]):
         self._mirrored: dict[str, MirroredArm] = {}
         """Mirrors of arms that other drivers move."""
         self._attached = AttachedObjects(self.client, ())
+        self._damped: list[PassiveJoints] = []
+        """Joints of objects with damping."""
         self._handling = {robot.name for robot in spec.robots if robot.gripper is not None}
         """Robots whose fingers may move or hold something."""
         try:
@@ -112,6 +114,8 @@ class PyBulletWorld(SimulatedWorld[Body]):
             return
         for arm in self._mirrored.values():
             arm.prepare_step()
+        for joints in self._damped:
+            joints.prepare_step()
         if self._forces:
             for force in self._forces:
                 self._push(force)
@@ -179,6 +183,7 @@ class PyBulletWorld(SimulatedWorld[Body]):
     def _arrange(self, added: Sequence[Body]) -> None:
         self._attached = AttachedObjects(self.client, self._attachments())
         self._attached.leave_physics(added)
+        self._damped = [PassiveJoints(self.client, body) for body in self.bodies.values() if body.damped]
         self._read_layout()
 
     def _read_layout(self) -> None:
@@ -227,6 +232,9 @@ class PyBulletWorld(SimulatedWorld[Body]):
             self.client.resetJointState(body.id, joint, position, 0.0)
         if body.is_robot:
             hold(self.client, body, positions, self.dt)
+
+    def _read_joints(self, body: Body) -> Sequence[float]:
+        return [state[0] for state in self.client.getJointStates(body.id, body.movable)] if body.movable else []
 
     def _read_dynamics(self, body: Body, link: int) -> dict[str, Any]:
         return read_dynamics(self.client, body, link)

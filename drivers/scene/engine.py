@@ -13,6 +13,7 @@ from typing import Any, ClassVar, Generic, NamedTuple, TypeVar
 
 from hal.errors import NotSupported
 from hal.geometry import Transform
+from hal.kinematics.urdf import UrdfModel
 from hal.specs import BodySpec, RobotSpec
 from hal.world import WorldDriver
 
@@ -39,6 +40,8 @@ class SimulatedBody:
     """Initial position of each movable joint: rad, or m."""
     base: Transform = IDENTITY
     """Initial pose of the base link in the world; in the frame of the arm's link for an object that is attached."""
+    urdf: UrdfModel | None = None
+    """Its file; None for an object without one."""
     index: int = -1
     """Its place among the world's bodies: its value in segmentation images."""
 
@@ -145,6 +148,10 @@ class SceneEngine(WorldDriver, Generic[B]):
     @abstractmethod
     def _move_joints(self, body: B, positions: Mapping[int, float]) -> None:
         """Place these joints (rad or m) at rest; those of a robot then hold there."""
+
+    @abstractmethod
+    def _read_joints(self, body: B) -> Sequence[float]:
+        """Return the positions of the joints that move, rad or m, in the order of the URDF."""
 
     @abstractmethod
     def _set_velocity(self, body: B, linear: Sequence[float], angular: Sequence[float]) -> None:

@@ -16,7 +16,8 @@ from hal.errors import CommandError, ConfigError, DeviceNotFound, Fault, NotSupp
 from hal.geometry import Transform, compose, inverse
 from hal.specs import BodySpec, RobotSpec, WorldSpec, to_json
 
-from .engine import AppliedForce, B, SceneEngine, SimulatedBody
+from .engine import AppliedForce, B, SceneEngine
+from .joints import joints_to_place, movable_joints, reset_positions
 from .values import (
     body_spec,
     check_body,
@@ -151,9 +152,11 @@ class SimulatedWorld(SceneEngine[B]):
         return list(self.bodies)
 
     def describe(self, name: str) -> dict[str, Any]:
-        """Return ``index`` (in segmentation images), ``robot`` (a bool), and the names of ``links`` and ``joints``."""
+        """Return what a body consists of: see :class:`hal.world.WorldDriver`."""
         body = self.body(name)
-        return {"index": body.index, "robot": body.is_robot, "links": list(body.links), "joints": list(body.joints)}
+        links, joints = list(body.links), list(body.joints)
+        movable = {joint: facts._asdict() for joint, facts in movable_joints(body).items()}
+        return {"index": body.index, "robot": body.is_robot, "links": links, "joints": joints, "movable": movable}
 
     def pose(self, name: str, link: str | None = None) -> dict[str, list[float]]:
         """Return the pose of a link's frame in the world; of the base link when none is named."""
@@ -175,6 +178,20 @@ class SimulatedWorld(SceneEngine[B]):
         there = transform(pose)
         self._changes += 1
         self._move_base(body, there)
+
+    def joint_positions(self, name: str) -> dict[str, float]:
+        """Return the position of each joint that moves, rad or m, in the order of the URDF."""
+        body = self.body(name)
+        return dict(zip(movable_joints(body), self._read_joints(body), strict=True))
+
+    def set_joint_positions(self, name: str, positions: Mapping[str, float]) -> None:
+        """Place joints of an object: see :meth:`hal.world.World.set_joint_positions`."""
+        body = self.body(name)
+        if body.is_robot:
+            raise CommandError(f"{name!r} is a robot: its servo moves it; reset(q=...) places it", code="is_robot")
+        wanted = joints_to_place(body, positions)
+        self._changes += 1
+        self._move_joints(body, wanted)
 
     def velocity(self, name: str) -> list[list[float]]:
         """Return the velocity in the world: linear (3,) m/s of the base link's centre of mass, angular (3,) rad/s."""
@@ -379,7 +396,7 @@ class SimulatedWorld(SceneEngine[B]):
                 raise CommandError(f"{name!r} is a robot: its base is fixed by the rig", code="is_robot")
             self._expect_free(body)
             base = transform(pose)
-        joints = body.home if q is None else {**body.home, **_joint_positions(body, q)}
+        joints = body.home if q is None else {**body.home, **reset_positions(body, q)}
         self._forget([body])
         self._put(body, base, joints)
         self._follow_attached()
@@ -487,21 +504,3 @@ class SimulatedWorld(SceneEngine[B]):
 
     def on_edit(self, callback: Callable[[str, dict[str, Any], int], None]) -> None:
         self._on_edit.append(callback)
-
-
-def _joint_positions(body: SimulatedBody, q: Sequence[float]) -> dict[int, float]:
-    """Return joint number -> position for the ``q`` of a reset.
-
-    ``q`` has an arm's joints, optionally its fingers after them; for an object, all its movable joints. Raises
-    CommandError.
-    """
-    values = numbers("q", q)
-    joints, fingers = list(body.movable), []
-    if isinstance(body.spec, RobotSpec):
-        joints = [body.joints[name] for name in body.spec.joints]
-        fingers = [body.joints[name] for name in body.spec.gripper.joints] if body.spec.gripper else []
-    if len(values) == len(joints) + len(fingers):
-        joints += fingers
-    if len(values) != len(joints):
-        raise CommandError(f"q of {body.name!r} must be {len(joints)} numbers, not {len(values)}", code="wrong_size")
-    return dict(zip(joints, values, strict=True))

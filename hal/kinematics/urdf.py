@@ -87,6 +87,10 @@ class UrdfJoint:
     velocity: float | None = None
     effort: float | None = None
     mimic: UrdfMimic | None = None
+    damping: float = 0.0
+    """Force or torque against a speed, Ns/m or Nm s/rad."""
+    friction: float = 0.0
+    """Force or torque of dry friction, N or Nm."""
 
     @property
     def movable(self) -> bool:
@@ -340,6 +344,7 @@ def _joint(element: ElementTree.Element) -> UrdfJoint:
     name, kind = element.get("name", ""), element.get("type", "")
     parent, child = _ends(element)
     origin, limit, mimic = _origin(element), element.find("limit"), element.find("mimic")
+    dynamics = element.find("dynamics")
     axis = _floats(element.find("axis"), "xyz", (1.0, 0.0, 0.0))
     length = math.hypot(*axis) or 1.0
 
@@ -369,6 +374,8 @@ def _joint(element: ElementTree.Element) -> UrdfJoint:
             float(mimic.get("multiplier", 1.0)),
             float(mimic.get("offset", 0.0)),
         ),
+        damping=_floats(dynamics, "damping", (0.0,))[0],
+        friction=_floats(dynamics, "friction", (0.0,))[0],
     )
 
 

@@ -49,7 +49,8 @@ from .camera import CameraContract  # noqa: E402
 from .gamepad import GamepadContract  # noqa: E402
 from .gripper import GripperContract  # noqa: E402
 from .robot import RobotContract  # noqa: E402
-from .world import WorldBench, WorldContract  # noqa: E402
+from .world import WorldContract  # noqa: E402
+from .world_bench import WorldBench  # noqa: E402
 
 __all__ = [
     "Bench",

@@ -8,8 +8,7 @@ from __future__ import annotations
 import itertools
 import json
 import math
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -17,104 +16,18 @@ import numpy as np
 import pytest
 
 from ..errors import CommandError, ConfigError, DeviceNotFound, HalError, NotSupported
-from ..specs import BodySpec, GripperSpec, LimitsSpec, RobotSpec, WorldSpec, to_json
+from ..specs import to_json
 from ..world import WorldDriver
-from .benches import Bench, Contract, robot_spec
+from .benches import Contract
+from .world_bench import FINGERS, GRAVITY, JOINTS, UPRIGHT, WorldBench, body, cabinet, cube, floor
 
-__all__ = ["WorldBench", "WorldContract"]
+__all__ = ["WorldContract"]
 
-_UPRIGHT = (0.0, 0.0, 0.0, 1.0)
-_G = 9.81
-_ARM = """<robot name="arm">
-  <link name="base"><inertial><mass value="3"/><inertia ixx="0.02" iyy="0.02" izz="0.02" ixy="0" ixz="0" iyz="0"/>
-    </inertial><collision><geometry><box size="0.1 0.1 0.1"/></geometry></collision></link>
-  <link name="upper"><inertial><origin xyz="0 0 0.15"/><mass value="1"/><inertia ixx="0.008" iyy="0.008" izz="0.001"
-    ixy="0" ixz="0" iyz="0"/></inertial><collision><origin xyz="0 0 0.17"/><geometry><box size="0.04 0.04 0.2"/>
-    </geometry></collision></link>
-  <link name="hand"><inertial><mass value="0.3"/><inertia ixx="0.001" iyy="0.001" izz="0.001" ixy="0" ixz="0" iyz="0"/>
-    </inertial><collision><origin xyz="0 0 0.06"/><geometry><box size="0.03 0.1 0.02"/></geometry></collision></link>
-  <link name="left"><inertial><mass value="0.05"/><inertia ixx="1e-5" iyy="1e-5" izz="1e-5" ixy="0" ixz="0" iyz="0"/>
-    </inertial><collision><geometry><box size="0.02 0.01 0.04"/></geometry></collision></link>
-  <link name="right"><inertial><mass value="0.05"/><inertia ixx="1e-5" iyy="1e-5" izz="1e-5" ixy="0" ixz="0" iyz="0"/>
-    </inertial><collision><geometry><box size="0.02 0.01 0.04"/></geometry></collision></link>
-  <joint name="turn" type="revolute"><origin xyz="0 0 0.05"/><parent link="base"/><child link="upper"/>
-    <axis xyz="0 0 1"/><limit lower="-2" upper="2" velocity="2" effort="50"/></joint>
-  <joint name="bend" type="revolute"><origin xyz="0 0 0.3"/><parent link="upper"/><child link="hand"/>
-    <axis xyz="0 1 0"/><limit lower="-2" upper="2" velocity="2" effort="50"/></joint>
-  <joint name="slide_left" type="prismatic"><origin xyz="0 0 0.1"/><parent link="hand"/><child link="left"/>
-    <axis xyz="0 1 0"/><limit lower="0" upper="0.04" velocity="0.2" effort="20"/></joint>
-  <joint name="slide_right" type="prismatic"><origin xyz="0 0 0.1"/><parent link="hand"/><child link="right"/>
-    <axis xyz="0 -1 0"/><limit lower="0" upper="0.04" velocity="0.2" effort="20"/></joint>
-</robot>
-"""
 _PROPERTIES = (
     *("lateral_friction", "rolling_friction", "spinning_friction", "restitution"),
     *("linear_damping", "angular_damping", "contact_stiffness", "contact_damping"),
 )
 """Properties of ``dynamics`` besides mass and inertia."""
-_START = (0.3, -0.4)
-_JOINTS = ("turn", "bend")
-_FINGERS = ("slide_left", "slide_right")
-
-
-@dataclass(kw_only=True)
-class WorldBench(Bench):
-    """A simulation engine: makes the worlds of the checks, and closes them."""
-
-    driver: Any = None
-    """Unused: each check makes a world of its own."""
-    name: str
-    """Name of the driver, as in ``WorldSpec.driver``."""
-    make: Callable[[WorldSpec], WorldDriver]
-    """The driver's class."""
-    made: list[WorldDriver] = field(default_factory=list)
-    """The worlds so far."""
-
-    def has(self, ability: str) -> bool:
-        return ability in WorldContract.abilities or super().has(ability)
-
-    def world(self, *things: BodySpec | RobotSpec, **changes: Any) -> WorldDriver:
-        """Return a world of these objects and arms at 240 Hz; ``changes`` are fields of its record."""
-        bodies = tuple(thing for thing in things if isinstance(thing, BodySpec))
-        robots = tuple(thing for thing in things if isinstance(thing, RobotSpec))
-        spec = WorldSpec(self.name, 240.0, (0.0, 0.0, -_G), bodies, robots)
-        self.made.append(self.make(replace(spec, **changes)))
-        return self.made[-1]
-
-    def arm(self, folder: Path, name: str = "arm", **changes: Any) -> RobotSpec:
-        """Return a small simulated arm with a gripper, whose URDF is written into ``folder``."""
-        path = folder / "arm.urdf"
-        path.write_text(_ARM)
-        base = robot_spec(2)
-        limits = LimitsSpec((-2.0, -2.0), (2.0, 2.0), (2.0, 2.0), (10.0, 10.0), (100.0, 100.0), (50.0, 50.0))
-        changes = {"driver": self.name, **changes}
-        return replace(
-            base,
-            **{
-                "name": name,
-                "rate_hz": 240.0,
-                "urdf": str(path),
-                "joints": _JOINTS,
-                "initial": _START,
-                "limits": limits,
-                "kinematics": replace(base.kinematics, urdf=str(path), joints=_JOINTS, tcp_link="hand"),
-                "gripper": GripperSpec(name, changes["driver"], 0.08, 0.1, 20.0, _FINGERS),
-                **changes,
-            },
-        )
-
-
-def _body(name: str, shape: str, at: tuple[float, float, float], **changes: Any) -> BodySpec:
-    """Return an object of 1 kg; ``changes`` are fields of its record."""
-    return BodySpec(**{"name": name, "position": at, "orientation": _UPRIGHT, "shape": shape, "mass": 1.0, **changes})
-
-
-def _floor() -> BodySpec:
-    return _body("floor", "plane", (0.0, 0.0, 0.0), mass=0.0)
-
-
-def _cube(at: tuple[float, float, float], **changes: Any) -> BodySpec:
-    return _body(changes.pop("name", "cube"), "box", at, half_extents=(0.05, 0.05, 0.05), **changes)
 
 
 def _steps(world: WorldDriver, seconds: float) -> WorldDriver:
@@ -149,20 +62,20 @@ class WorldContract(Contract):
     # Time.
 
     def test_a_step_is_one_period_of_the_physics(self, bench: WorldBench) -> None:
-        world = bench.world(_cube((0.0, 0.0, 1.0)), physics_hz=500.0)
+        world = bench.world(cube((0.0, 0.0, 1.0)), physics_hz=500.0)
         assert (world.dt, world.t, world.steps) == (0.002, 0.0, 0)
         _steps(world, 0.5)
         assert world.steps == 250
         assert world.t == pytest.approx(0.5), "t is the number of steps times dt"
-        assert 1.0 - _position(world, "cube")[2] == pytest.approx(0.5 * _G * 0.25, rel=0.02), "it falls freely"
+        assert 1.0 - _position(world, "cube")[2] == pytest.approx(0.5 * GRAVITY * 0.25, rel=0.02), "it falls freely"
 
     def test_two_worlds_that_are_made_alike_agree_to_the_bit(self, bench: WorldBench, tmp_path: Path) -> None:
-        things = _floor(), _cube((0.3, 0.0, 0.2)), bench.arm(tmp_path)
+        things = floor(), cube((0.3, 0.0, 0.2)), bench.arm(tmp_path)
         one, other = (_steps(bench.world(*things), 0.5) for _ in range(2))
         assert one.snapshot() == other.snapshot()
 
     def test_the_version_changes_with_whatever_may_look_different(self, bench: WorldBench) -> None:
-        world = bench.world(_cube((0.0, 0.0, 1.0)))
+        world = bench.world(cube((0.0, 0.0, 1.0)))
         seen = [world.version]
         for act in (
             world.step,
@@ -178,18 +91,18 @@ class WorldContract(Contract):
     # Bodies and poses.
 
     def test_objects_come_before_robots_and_have_their_place_as_index(self, bench: WorldBench, tmp_path: Path) -> None:
-        world = bench.world(_floor(), _cube((1.0, 0.0, 0.5)), bench.arm(tmp_path))
+        world = bench.world(floor(), cube((1.0, 0.0, 0.5)), bench.arm(tmp_path))
         assert world.request("names", {}) == ["floor", "cube", "arm"]
         assert [world.request("describe", {"name": name})["index"] for name in ("floor", "cube", "arm")] == [0, 1, 2]
         arm = world.request("describe", {"name": "arm"})
         assert arm["robot"]
         assert {"base", "upper", "hand", "left", "right"} <= set(arm["links"])
-        assert {*_JOINTS, *_FINGERS} <= set(arm["joints"])
+        assert {*JOINTS, *FINGERS} <= set(arm["joints"])
 
     def test_bodies_stand_where_their_records_place_them(self, bench: WorldBench, tmp_path: Path) -> None:
         turned = (0.0, 0.0, math.sin(0.2), math.cos(0.2))
         arm = bench.arm(tmp_path, base_position=(0.5, 0.6, 0.7), base_orientation=turned)
-        world = bench.world(_cube((1.0, 2.0, 3.0), orientation=turned), arm)
+        world = bench.world(cube((1.0, 2.0, 3.0), orientation=turned), arm)
         for name, position in (("cube", (1.0, 2.0, 3.0)), ("arm", (0.5, 0.6, 0.7))):
             pose = world.request("pose", {"name": name})
             assert np.allclose(pose["position"], position, atol=1e-9)
@@ -198,7 +111,7 @@ class WorldContract(Contract):
         assert np.allclose(_position(world, "arm", "hand"), (0.5, 0.6, 1.05), atol=1e-9)
 
     def test_poses_are_of_one_moment(self, bench: WorldBench) -> None:
-        world = _steps(bench.world(_floor(), _cube((0.0, 0.0, 1.0))), 0.1)
+        world = _steps(bench.world(floor(), cube((0.0, 0.0, 1.0))), 0.1)
         found = world.request("poses", {"names": None})
         assert found["t"] == world.t
         assert found["poses"] == {name: world.request("pose", {"name": name}) for name in ("floor", "cube")}
@@ -216,7 +129,7 @@ class WorldContract(Contract):
     def test_shapes_have_their_size_and_rest_on_a_plane(
         self, bench: WorldBench, shape: str, size: dict[str, Any], half: tuple[float, ...]
     ) -> None:
-        world = bench.world(_floor(), _body("it", shape, (0.0, 0.0, 0.2), **size))
+        world = bench.world(floor(), body("it", shape, (0.0, 0.0, 0.2), **size))
         box = world.request("aabb", {"name": "it"})
         assert np.allclose(box["lower"], np.array([0.0, 0.0, 0.2]) - half, atol=0.003)
         assert np.allclose(box["upper"], np.array([0.0, 0.0, 0.2]) + half, atol=0.003)
@@ -224,7 +137,7 @@ class WorldContract(Contract):
         assert _position(world, "it")[2] == pytest.approx(half[2], abs=0.003)
 
     def test_a_placed_body_is_at_rest(self, bench: WorldBench) -> None:
-        world = _steps(bench.world(_cube((0.0, 0.0, 1.0))), 0.3)
+        world = _steps(bench.world(cube((0.0, 0.0, 1.0))), 0.3)
         assert _speed(world, "cube") > 2.0
         world.request("set_pose", {"name": "cube", "pose": {"position": [1, 2, 3], "orientation": [0, 0, 1, 0]}})
         pose = world.request("pose", {"name": "cube"})
@@ -233,7 +146,7 @@ class WorldContract(Contract):
         assert _speed(world, "cube") == 0.0
 
     def test_a_velocity_moves_a_body(self, bench: WorldBench) -> None:
-        world = bench.world(_cube((0.0, 0.0, 1.0)), gravity=(0.0, 0.0, 0.0))
+        world = bench.world(cube((0.0, 0.0, 1.0)), gravity=(0.0, 0.0, 0.0))
         world.request("set_velocity", {"name": "cube", "linear": [0.5, 0.0, -0.2], "angular": [0.0, 0.0, 1.0]})
         linear, angular = world.request("velocity", {"name": "cube"})
         assert np.allclose((*linear, *angular), (0.5, 0.0, -0.2, 0.0, 0.0, 1.0))
@@ -245,8 +158,8 @@ class WorldContract(Contract):
 
     def test_a_force_accelerates_a_body_for_as_long_as_it_acts(self, bench: WorldBench, tmp_path: Path) -> None:
         arm = bench.arm(tmp_path, base_position=(3.0, 0.0, 0.0))
-        world = bench.world(_cube((0.0, 0.0, 1.0)), _cube((1.0, 0.0, 1.0), name="fixed", fixed=True), arm)
-        assert world.request("set_gravity", {"gravity": [0, 0, 0]}) == [0.0, 0.0, -_G], "the gravity before"
+        world = bench.world(cube((0.0, 0.0, 1.0)), cube((1.0, 0.0, 1.0), name="fixed", fixed=True), arm)
+        assert world.request("set_gravity", {"gravity": [0, 0, 0]}) == [0.0, 0.0, -GRAVITY], "the gravity before"
         world.request("apply_force", {"name": "cube", "force": [1.5, 0, 0], "duration": 0.5})
         world.request("apply_force", {"name": "cube", "force": [0.5, 0, 0], "duration": 0.5})
         for _ in range(2):
@@ -275,7 +188,7 @@ class WorldContract(Contract):
             assert refused.value.code == code, params
 
     def test_a_ray_meets_the_nearest_body(self, bench: WorldBench) -> None:
-        world = bench.world(_floor(), _cube((0.0, 0.0, 1.0)), _cube((0.0, 0.0, 2.0), name="seen", collision=False))
+        world = bench.world(floor(), cube((0.0, 0.0, 1.0)), cube((0.0, 0.0, 2.0), name="seen", collision=False))
         hit = world.request("ray", {"start": [0, 0, 3], "end": [0, 0, -1]})
         assert (hit["name"], hit["link"]) == ("cube", "base")
         assert np.allclose((*hit["position"], *hit["normal"]), (0, 0, 1.05, 0, 0, 1), atol=1e-3)
@@ -284,7 +197,7 @@ class WorldContract(Contract):
         assert world.request("ray", {"start": [1, 0, 3], "end": [1, 0, 1]}) is None
 
     def test_the_distance_of_two_bodies(self, bench: WorldBench, tmp_path: Path) -> None:
-        world = bench.world(_floor(), _cube((0.0, 0.0, 1.0)), bench.arm(tmp_path, base_position=(0.0, 1.0, 0.5)))
+        world = bench.world(floor(), cube((0.0, 0.0, 1.0)), bench.arm(tmp_path, base_position=(0.0, 1.0, 0.5)))
         base = world.request("distance", {"a": "arm", "b": "cube", "link_a": "base"})
         assert base == pytest.approx(math.hypot(0.9, 0.4), abs=3e-3)
         assert world.request("distance", {"a": "arm", "b": "cube"}) < base - 0.01
@@ -292,12 +205,12 @@ class WorldContract(Contract):
             world.request("set_pose", {"name": "cube", "pose": {"position": [0, 0, z]}})
             assert world.request("distance", {"a": "cube", "b": "floor"}) == pytest.approx(apart, abs=2e-3)
         with pytest.raises(CommandError) as refused:
-            world.request("add", {"spec": to_json(_cube((0.0, 0.0, 5.0), name="seen", collision=False))})
+            world.request("add", {"spec": to_json(cube((0.0, 0.0, 5.0), name="seen", collision=False))})
             world.request("distance", {"a": "cube", "b": "seen"})
         assert refused.value.code == "no_shape"
 
     def test_a_body_without_mass_and_a_fixed_one_stay(self, bench: WorldBench) -> None:
-        world = bench.world(_cube((0.0, 0.0, 1.0), mass=0.0), _cube((1.0, 0.0, 1.0), name="fixed", fixed=True))
+        world = bench.world(cube((0.0, 0.0, 1.0), mass=0.0), cube((1.0, 0.0, 1.0), name="fixed", fixed=True))
         before = world.snapshot()
         assert _steps(world, 0.2).snapshot() == before
         with pytest.raises(CommandError) as refused:
@@ -305,15 +218,52 @@ class WorldContract(Contract):
         assert refused.value.code == "base_fixed"
 
     def test_a_body_without_collision_touches_nothing(self, bench: WorldBench) -> None:
-        world = _steps(bench.world(_floor(), _cube((0.0, 0.0, 0.1), collision=False)), 0.5)
+        world = _steps(bench.world(floor(), cube((0.0, 0.0, 0.1), collision=False)), 0.5)
         assert _position(world, "cube")[2] < -0.5
+
+    # Joints of objects.
+
+    def test_the_joints_of_an_object_can_be_placed(self, bench: WorldBench, tmp_path: Path) -> None:
+        world = bench.world(cabinet(tmp_path), bench.arm(tmp_path, base_position=(3.0, 0.0, 0.0)))
+        found = world.request("describe", {"name": "cabinet"})
+        assert found["links"] == ["frame", "drawer", "left", "right"]
+        assert list(found["movable"]) == ["slide", "hinge", "other"]
+        slide = {"kind": "prismatic", "lower": 0.0, "upper": 1.0, "damping": 5.0, "friction": 2.0, "follows": None}
+        assert found["movable"]["slide"] == slide
+        world.request("set_joint_positions", {"name": "cabinet", "positions": {"slide": 0.3, "hinge": 0.5}})
+        there = {"slide": 0.3, "hinge": 0.5, "other": -0.5}
+        assert world.request("joint_positions", {"name": "cabinet"}) == pytest.approx(there), "a mimic follows"
+        assert _position(world, "cabinet", "drawer") == pytest.approx((0.3, 0.0, 1.0), abs=1e-6)
+        for name, positions, code in (
+            ("cabinet", {"slide": 1.5}, "out_of_range"),
+            ("cabinet", {"other": 0.1}, "joint_follows"),
+            ("cabinet", {"slide": math.nan}, "not_finite"),
+            ("cabinet", {"slid": 0.1}, "unknown_joint"),
+            ("arm", {"turn": 0.1}, "is_robot"),
+        ):
+            with pytest.raises(HalError) as refused:
+                world.request("set_joint_positions", {"name": name, "positions": positions})
+            assert refused.value.code == code, positions
+        assert world.request("joint_positions", {"name": "cabinet"}) == pytest.approx(there), "nothing changed"
+
+    def test_the_joints_of_an_object_have_the_friction_and_damping_of_its_file(
+        self, bench: WorldBench, tmp_path: Path
+    ) -> None:
+        world = bench.world(cabinet(tmp_path))
+        world.request("apply_force", {"name": "cabinet", "link": "drawer", "force": [1.5, 0, 0], "duration": 0.5})
+        assert _steps(world, 0.5).request("joint_positions", {"name": "cabinet"})["slide"] < 1e-4, "friction holds it"
+        world.request("apply_force", {"name": "cabinet", "link": "drawer", "force": [10, 0, 0], "duration": 0.5})
+        beyond = 10.0 - 2.0  # N; the speed approaches that / 5 Ns/m
+        way = beyond / 5.0 * (0.5 - (1.0 - math.exp(-5.0 * 0.5)) / 5.0)
+        moved = _steps(world, 0.5).request("joint_positions", {"name": "cabinet"})["slide"]
+        assert moved == pytest.approx(way, rel=0.02)
 
     # Contacts and dynamics.
 
     def test_contacts_hold_the_weight(self, bench: WorldBench) -> None:
-        world = _steps(bench.world(_floor(), _cube((0.0, 0.0, 0.051), mass=2.0)), 1.0)
+        world = _steps(bench.world(floor(), cube((0.0, 0.0, 0.051), mass=2.0)), 1.0)
         contacts = world.request("contacts", {"a": "cube", "b": "floor"})
-        assert sum(contact["force"] for contact in contacts) == pytest.approx(2.0 * _G, rel=0.05), "N"
+        assert sum(contact["force"] for contact in contacts) == pytest.approx(2.0 * GRAVITY, rel=0.05), "N"
         for contact in contacts:
             assert (contact["a"], contact["b"]) == ("cube", "floor")
             assert np.allclose(contact["normal"], (0.0, 0.0, 1.0), atol=0.01), "from b to a"
@@ -325,7 +275,7 @@ class WorldContract(Contract):
         assert world.request("contacts", {"a": "cube"}) == contacts
 
     def test_set_dynamics_returns_what_was_set_before(self, bench: WorldBench) -> None:
-        world = bench.world(_floor(), _cube((0.0, 0.0, 0.05)))
+        world = bench.world(floor(), cube((0.0, 0.0, 0.05)))
         before = world.request("dynamics", {"name": "cube"})
         assert before["mass"] == pytest.approx(1.0)
         inertia = before["inertia"]
@@ -342,7 +292,7 @@ class WorldContract(Contract):
     def test_less_friction_lets_a_body_slide_farther(self, bench: WorldBench) -> None:
         ways = []
         for friction in (0.4, 0.8):
-            world = bench.world(_floor(), _cube((0.0, 0.0, 0.05)))
+            world = bench.world(floor(), cube((0.0, 0.0, 0.05)))
             for name in ("floor", "cube"):
                 world.request("set_dynamics", {"name": name, "lateral_friction": friction})
             _steps(world, 0.1)
@@ -355,7 +305,7 @@ class WorldContract(Contract):
         "values", [{"mass": -1.0}, {"lateral_friction": math.nan}, {"colour": 1.0}, {"mass": "heavy"}]
     )
     def test_impossible_dynamics_are_refused(self, bench: WorldBench, values: dict[str, Any]) -> None:
-        world = bench.world(_cube((0.0, 0.0, 1.0)))
+        world = bench.world(cube((0.0, 0.0, 1.0)))
         before = world.request("dynamics", {"name": "cube"})
         with pytest.raises(CommandError):
             world.request("set_dynamics", {"name": "cube", **values})
@@ -363,7 +313,7 @@ class WorldContract(Contract):
 
     @pytest.mark.parametrize("name", _PROPERTIES)
     def test_a_property_exists_or_is_refused_by_name(self, bench: WorldBench, name: str) -> None:
-        world = bench.world(_cube((0.0, 0.0, 1.0)))
+        world = bench.world(cube((0.0, 0.0, 1.0)))
         before = world.request("dynamics", {"name": "cube"})
         value = 2e4 if name == "contact_stiffness" else 0.25
         both = {"contact_stiffness": 2e4, "contact_damping": 0.25}
@@ -382,10 +332,10 @@ class WorldContract(Contract):
     # Edits.
 
     def test_edits_are_counted_and_announced(self, bench: WorldBench) -> None:
-        world = bench.world(_floor())
+        world = bench.world(floor())
         announced: list[tuple[str, int]] = []
         world.on_edit(lambda method, params, revision: announced.append((method, revision)))
-        assert world.request("add", {"spec": to_json(_cube((0.0, 0.0, 1.0)))}) == 1
+        assert world.request("add", {"spec": to_json(cube((0.0, 0.0, 1.0)))}) == 1
         assert world.request("set_color", {"name": "cube", "rgba": [1, 0, 0, 1]}) == 2
         world.request("set_pose", {"name": "cube", "pose": {"position": [0, 0, 2]}})
         _steps(world, 0.1)
@@ -396,9 +346,9 @@ class WorldContract(Contract):
         assert world.request("names", {}) == ["floor"]
 
     def test_an_added_body_comes_last_and_takes_part(self, bench: WorldBench, tmp_path: Path) -> None:
-        world = _steps(bench.world(_floor(), bench.arm(tmp_path)), 0.2)
+        world = _steps(bench.world(floor(), bench.arm(tmp_path)), 0.2)
         before = world.snapshot()
-        world.request("add", {"spec": to_json(_cube((0.6, 0.0, 0.2)))})
+        world.request("add", {"spec": to_json(cube((0.6, 0.0, 0.2)))})
         assert world.request("names", {}) == ["floor", "arm", "cube"]
         assert world.snapshot()[: len(before)] == before, "what was there keeps its state"
         _steps(world, 1.0)
@@ -408,7 +358,7 @@ class WorldContract(Contract):
         assert len(world.snapshot()) == len(before)
 
     def test_what_cannot_be_edited_is_refused(self, bench: WorldBench, tmp_path: Path) -> None:
-        world = bench.world(_floor(), _cube((1.0, 0.0, 1.0)), bench.arm(tmp_path))
+        world = bench.world(floor(), cube((1.0, 0.0, 1.0)), bench.arm(tmp_path))
         there = {"position": [0, 0, 1]}
         for method, params, code in (
             ("remove", {"name": "arm"}, "is_robot"),
@@ -421,14 +371,14 @@ class WorldContract(Contract):
                 world.request(method, params)
             assert refused.value.code == code, method
         with pytest.raises(ConfigError) as wrong:
-            world.request("add", {"spec": to_json(_cube((0.0, 0.0, 1.0)))})
+            world.request("add", {"spec": to_json(cube((0.0, 0.0, 1.0)))})
         assert wrong.value.problems[0].code == "duplicate_name"
         assert world.revision == 0, "a refused edit is none"
 
     # Requests.
 
     def test_unknown_names_are_device_not_found(self, bench: WorldBench, tmp_path: Path) -> None:
-        world = bench.world(_cube((1.0, 0.0, 1.0)), bench.arm(tmp_path))
+        world = bench.world(cube((1.0, 0.0, 1.0)), bench.arm(tmp_path))
         for method, params, code in (
             ("pose", {"name": "cub"}, "unknown_body"),
             ("pose", {"name": "arm", "link": "elbow"}, "unknown_link"),
@@ -440,7 +390,7 @@ class WorldContract(Contract):
             assert refused.value.code == code, method
 
     def test_wrong_requests_are_command_errors(self, bench: WorldBench) -> None:
-        world = bench.world(_cube((0.0, 0.0, 1.0)))
+        world = bench.world(cube((0.0, 0.0, 1.0)))
         for method, params in (
             ("explode", {}),
             ("close", {}),
@@ -455,7 +405,7 @@ class WorldContract(Contract):
                 world.request(method, params)
 
     def test_results_travel_as_json(self, bench: WorldBench, tmp_path: Path) -> None:
-        world = _steps(bench.world(_floor(), _cube((1.0, 0.0, 0.05)), bench.arm(tmp_path)), 0.1)
+        world = _steps(bench.world(floor(), cube((1.0, 0.0, 0.05)), bench.arm(tmp_path)), 0.1)
         for method, params in (
             ("describe", {"name": "arm"}),
             ("pose", {"name": "arm", "link": "hand"}),
@@ -471,7 +421,7 @@ class WorldContract(Contract):
     # Resets and states.
 
     def test_reset_returns_everything_to_its_start(self, bench: WorldBench, tmp_path: Path) -> None:
-        world = bench.world(_floor(), _cube((0.6, 0.0, 0.3)), bench.arm(tmp_path))
+        world = bench.world(floor(), cube((0.6, 0.0, 0.3)), bench.arm(tmp_path))
         resets: list[int] = []
         world.on_reset("arm", lambda: resets.append(world.steps))
         start = world.snapshot()
@@ -482,7 +432,7 @@ class WorldContract(Contract):
         assert np.allclose(_steps(world, 0.4).snapshot(), first, atol=1e-9), "and takes the same course again"
 
     def test_reset_of_one_body_to_another_state(self, bench: WorldBench, tmp_path: Path) -> None:
-        world = bench.world(_cube((1.0, 0.0, 1.0)), bench.arm(tmp_path))
+        world = bench.world(cube((1.0, 0.0, 1.0)), bench.arm(tmp_path))
         _steps(world, 0.1)
         world.request("reset", {"name": "arm", "q": [0.0, math.pi / 2]})
         left = _position(world, "arm", "left")
@@ -494,16 +444,16 @@ class WorldContract(Contract):
 
     def test_a_snapshot_has_the_layout_of_every_engine(self, bench: WorldBench, tmp_path: Path) -> None:
         """Fixed bases first, then each body that moves: the pose of a free base, and its joints in the URDF's order."""
-        world = bench.world(_cube((1.0, 0.0, 1.0)), _floor(), bench.arm(tmp_path))
+        world = bench.world(cube((1.0, 0.0, 1.0)), floor(), bench.arm(tmp_path))
         world.request("reset", {"name": "arm", "q": [0.1, 0.2, 0.01, 0.02]})
-        floor, arm, cube, joints = np.split(np.array(world.snapshot()), [7, 14, 21])
-        assert np.allclose(floor, (0, 0, 0, *_UPRIGHT), atol=1e-9)
-        assert np.allclose(arm, (0, 0, 0, *_UPRIGHT), atol=1e-9)
-        assert np.allclose(cube, (1, 0, 1, *_UPRIGHT), atol=1e-9)
+        ground, arm, box, joints = np.split(np.array(world.snapshot()), [7, 14, 21])
+        assert np.allclose(ground, (0, 0, 0, *UPRIGHT), atol=1e-9)
+        assert np.allclose(arm, (0, 0, 0, *UPRIGHT), atol=1e-9)
+        assert np.allclose(box, (1, 0, 1, *UPRIGHT), atol=1e-9)
         assert np.allclose(joints, (0.1, 0.2, 0.01, 0.02), atol=1e-9)
 
     def test_a_restored_state_continues_as_it_did(self, bench: WorldBench, tmp_path: Path) -> None:
-        world = bench.world(_floor(), _cube((0.6, 0.0, 0.3)), bench.arm(tmp_path))
+        world = bench.world(floor(), cube((0.6, 0.0, 0.3)), bench.arm(tmp_path))
         _steps(world, 0.25)
         state, here = json.loads(json.dumps(world.request("save", {}))), world.snapshot()
         there = _steps(world, 0.5).snapshot()
@@ -513,13 +463,13 @@ class WorldContract(Contract):
         assert world.t == pytest.approx(0.75), "time continues"
         assert _steps(world, 0.5).snapshot() == there, "to the bit"
         with pytest.raises(CommandError) as refused:
-            bench.world(_floor()).request("restore", {"state": state})
+            bench.world(floor()).request("restore", {"state": state})
         assert refused.value.code == "wrong_state", "it is a state of other bodies"
 
     # The mirror of a real arm.
 
     def test_a_mirror_follows_its_arm(self, bench: WorldBench, tmp_path: Path) -> None:
-        world = bench.world(_floor(), bench.arm(tmp_path, driver="elsewhere"))
+        world = bench.world(floor(), bench.arm(tmp_path, driver="elsewhere"))
         for bend in np.linspace(0.0, 1.0, 49):
             world.follow("arm", [0.0, float(bend)], [0.0, 5.0], 0.04)
             world.step()

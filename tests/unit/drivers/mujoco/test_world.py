@@ -122,7 +122,7 @@ class TestSleep:
         assert weight["cube", "shelf"] == pytest.approx((0.5 + mass) * 9.81, rel=0.01)
         assert len(stack.contacts()) == len(stack.contacts("cube"))
 
-    @pytest.mark.parametrize("edit", ["shelf", "cube", "velocity", "force", "arm"])
+    @pytest.mark.parametrize("edit", ["shelf", "cube", "velocity", "force", "gravity", "arm"])
     def test_what_changes_wakes_them(self, stack: Any, edit: str) -> None:
         before = stack.pose("lid")["position"]
         if edit == "shelf":
@@ -132,7 +132,9 @@ class TestSleep:
         elif edit == "velocity":
             stack.set_velocity("lid", (0.3, 0.0, 0.5))
         elif edit == "force":
-            stack.data.body("lid/base").xfrc_applied[2] = 10.0
+            stack.apply_force("lid", (0.0, 0.0, 10.0), duration=0.5)
+        elif edit == "gravity":
+            stack.set_gravity((0.0, 0.0, 9.81))
         else:
             stack.reset("panda", q=[-0.4, 0.62, 0.0, -2.3, 0.0, 2.9, 0.8])  # its hand is in the lid
         assert math.dist(steps(stack, 20).pose("lid")["position"], before) > 0.01
