@@ -1,0 +1,23 @@
+"""Skills: plain functions over Robot, Gripper and Camera that grasp and push, in simulation and on a real arm alike.
+
+A skill returns a :class:`SkillResult`, which is false, with a named reason, for what may go wrong in the world. Stops,
+faults and lost devices are the exceptions that they are everywhere else.
+"""
+
+from __future__ import annotations
+
+from .grasping import grasp
+from .objects import LocatedObject, grasp_pose, locate_by_truth, object_from_points
+from .running import Reason, SkillPhase, SkillProgress, SkillResult
+
+__all__ = [
+    "LocatedObject",
+    "Reason",
+    "SkillPhase",
+    "SkillProgress",
+    "SkillResult",
+    "grasp",
+    "grasp_pose",
+    "locate_by_truth",
+    "object_from_points",
+]

@@ -1,0 +1,356 @@
+"""What all skills share: phases, moves of the arm and the fingers behind one dead-man, and the result."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from types import TracebackType
+from typing import TYPE_CHECKING, Literal, NoReturn
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..control import check_deadman
+from ..errors import CommandError, MotionStopped, NotSupported, RobotFault, Unreachable
+from ..geometry import Pose, tcp_pose
+from ..types import GripperOutcome
+
+if TYPE_CHECKING:
+    from ..deadman import Deadman
+    from ..gripper import Gripper, GripperMotion, GripperResult
+    from ..robot import Robot
+
+__all__ = ["Reason", "SkillPhase", "SkillProgress", "SkillResult", "SkillRun", "above", "flipped"]
+
+Array = NDArray[np.float64]
+
+Reason = Literal[
+    "",
+    "unreachable",
+    "outside_limits",
+    "too_wide",
+    "blocked",
+    "fingers_blocked",
+    "missed",
+    "wrong_width",
+    "not_centred",
+    "dropped",
+]
+"""Why a skill failed: a stable identifier, empty for a success.
+
+====================  ================================================================================================
+``unreachable``       The arm does not reach a pose of the plan. Nothing has moved.
+``outside_limits``    A pose of the plan is outside the workspace or the joint limits of the rig.
+``too_wide``          The object is wider than the gripper opens. Nothing has moved.
+``blocked``           The arm did not get to a pose of the plan: something was in its way.
+``fingers_blocked``   The fingers did not open as far as they should, or never came to rest.
+``missed``            The fingers closed on nothing.
+``wrong_width``       The fingers closed on something that is wider or narrower than the object should be.
+``not_centred``       The object was not found between the fingers where the first touch was.
+``dropped``           The object was held, and is not any more.
+====================  ================================================================================================
+"""
+
+_POLL = 0.02
+"""Time between two looks at the dead-man or the fingers, s."""
+_OFF_TARGET = 0.01
+"""Distance from the goal above which an arm at rest counts as blocked, m."""
+_LONGEST_MOVE = 120.0
+"""Time after which an arm that has not arrived counts as blocked, s; without a dead-man, which may pause it."""
+_LONGEST_GRIP = 15.0
+"""Time after which moving fingers count as blocked, s."""
+
+
+@dataclass(frozen=True, slots=True)
+class SkillProgress:
+    """Passed to a skill's ``progress`` function when a phase begins."""
+
+    skill: str
+    """Name of the skill: ``grasp``, ``gentle_grasp`` or ``push``."""
+    phase: str
+    """Name of the phase that begins."""
+    number: int
+    """Number of the phase, counted from 1."""
+    count: int
+    """Number of all phases of the skill."""
+
+
+@dataclass(frozen=True, slots=True)
+class SkillPhase:
+    """A phase that was begun."""
+
+    name: str
+    start: float
+    """Time on ``rig.clock``, s."""
+
+
+@dataclass(frozen=True, slots=True)
+class SkillResult:
+    """How a skill ended. It is true for a success."""
+
+    skill: str
+    reason: Reason
+    """Why it failed; empty for a success."""
+    phase: str
+    """The phase in which it ended."""
+    message: str
+    """The same in words, with numbers."""
+    phases: tuple[SkillPhase, ...]
+    """All phases that were begun, in order."""
+    duration: float
+    """Time that it took, s."""
+    tcp: Pose
+    """Pose of the tcp at the end, in the arm's base frame."""
+    width: float | None
+    """Distance between the fingers at the end, m; None without a gripper."""
+
+    def __bool__(self) -> bool:
+        return not self.reason
+
+
+class _Failed(Exception):
+    """Ends the ``with`` block of a :class:`SkillRun`."""
+
+
+class SkillRun:
+    """One run of a skill, used in a ``with`` statement, whose block ends at the first :meth:`fail`.
+
+    Stops and faults leave the block as the exceptions that they are.
+
+    Args:
+        skill: Name of the skill.
+        arm: The arm.
+        phases: Names of the phases, in order.
+        deadman: Switch that must be held for the arm and the fingers to move.
+        unattended: Move an arm that really moves without a dead-man.
+        patience: Longest time for which the dead-man may be released, s.
+        speed: Share of the joint speed limits for motions in free space; the rig's ``move_speed`` by default.
+        progress: Called when a phase begins; what it raises ends the skill.
+    """
+
+    def __init__(
+        self,
+        skill: str,
+        arm: Robot,
+        phases: Sequence[str],
+        *,
+        deadman: Deadman | None = None,
+        unattended: bool = False,
+        patience: float = 60.0,
+        speed: float | None = None,
+        progress: Callable[[SkillProgress], None] | None = None,
+    ) -> None:
+        check_deadman(deadman)
+        self.arm = arm
+        self._skill, self._names, self._progress = skill, tuple(phases), progress
+        self._deadman, self._unattended, self._patience, self._speed = deadman, unattended, patience, speed
+        self._start = arm.clock.now()
+        self._phases: list[SkillPhase] = []
+        self._reason: Reason = ""
+        self._message = ""
+
+    @property
+    def gripper(self) -> Gripper:
+        """The arm's gripper. Raises NotSupported if it has none."""
+        if self.arm.gripper is None:
+            raise NotSupported(f"{self.arm.name} has no gripper, which {self._skill} needs", code="no_gripper")
+        return self.arm.gripper
+
+    def __enter__(self) -> SkillRun:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> bool:
+        return isinstance(error, _Failed)
+
+    def begin(self, phase: str) -> None:
+        """Begin a phase, and report it."""
+        self._phases.append(SkillPhase(phase, self.arm.clock.now()))
+        if self._progress is not None:
+            number = self._names.index(phase) + 1
+            self._progress(SkillProgress(self._skill, phase, number, len(self._names)))
+
+    def fail(self, reason: Reason, message: str) -> NoReturn:
+        """End the block as a failure; the first failure of a run is the one that is reported."""
+        if not self._reason:
+            self._reason, self._message = reason, message
+        raise _Failed
+
+    @property
+    def reason(self) -> Reason:
+        """Why the skill has failed; empty if it has not."""
+        return self._reason
+
+    def result(self) -> SkillResult:
+        """Return how the skill ended."""
+        arm = self.arm
+        return SkillResult(
+            skill=self._skill,
+            reason=self._reason,
+            phase=self._phases[-1].name if self._phases else "plan",
+            message=self._message or f"{self._skill} succeeded",
+            phases=tuple(self._phases),
+            duration=arm.clock.now() - self._start,
+            tcp=arm.state().tcp,
+            width=arm.gripper.state().width if arm.gripper is not None else None,
+        )
+
+    # The arm.
+
+    def choose_way(self, ways: Sequence[Sequence[Pose]]) -> Sequence[Pose]:
+        """Return the way whose start is nearest, in joint positions, of those that the arm reaches all along.
+
+        Fails as ``unreachable`` or ``outside_limits`` if there is none.
+
+        Args:
+            ways: For each way the poses of the tcp, in the arm's base frame, in the order in which they are visited.
+        """
+        now, found = self.arm.state().q, []
+        problems: list[tuple[Reason, str]] = []
+        for way in ways:
+            try:
+                found.append((float(np.abs(self._solve(way) - now).max()), way))
+            except Unreachable as error:
+                problems.append(("unreachable", str(error)))
+            except CommandError as error:
+                problems.append(("outside_limits", str(error)))
+        if not found:
+            self.fail(*problems[0])
+        return min(found, key=lambda pair: pair[0])[1]
+
+    def _solve(self, way: Sequence[Pose]) -> Array:
+        """Return the joint positions (n,) in rad at the start of a way; raise if the arm does not reach all of it."""
+        arm, box = self.arm, self.arm.spec.workspace
+        seed, first = arm.state().q, None
+        for pose in way:
+            if box is not None and not np.all((pose.position >= box.lower) & (pose.position <= box.upper)):
+                raise CommandError(f"{_text(pose)} is outside the workspace of {arm.name}", code="outside_workspace")
+            seed = arm.ik(pose, seed)
+            first = seed if first is None else first
+        assert first is not None
+        return first
+
+    def move(self, pose: Pose, *, tcp_speed: float | None = None, straight: bool = False) -> None:
+        """Move the tcp to a pose; fail as ``blocked`` or ``outside_limits`` if it does not get there.
+
+        Args:
+            pose: Pose of the tcp in the arm's base frame.
+            tcp_speed: Greatest speed of the tcp, m/s.
+            straight: Go there along a straight line, and at ``tcp_speed`` alone.
+        """
+        timeout = _LONGEST_MOVE if self._deadman is None else None
+        most = self.arm.spec.tcp_speed
+        try:
+            state = self.arm.move_to(
+                pose,
+                deadman=self._deadman,
+                unattended=self._unattended,
+                patience=self._patience,
+                timeout=timeout,
+                tcp_speed=None if tcp_speed is None else min(tcp_speed, most),
+                speed=self.arm.spec.speed if straight else self._speed,
+            )
+        except Unreachable as error:
+            self.fail("unreachable", str(error))
+        except CommandError as error:
+            if error.code not in ("outside_limits", "outside_workspace"):
+                raise
+            self.fail("outside_limits", str(error))
+        except TimeoutError as error:
+            self.fail("blocked", str(error))
+        self.check_arrived(pose, state.tcp)
+
+    def check_arrived(self, pose: Pose, tcp: Pose) -> None:
+        """Fail as ``blocked`` if the tcp is not at a pose."""
+        distance, _ = pose.distance(tcp)
+        if distance > _OFF_TARGET:
+            self.fail("blocked", f"the tcp of {self.arm.name} rests {1e3 * distance:.0f} mm from {_text(pose)}")
+
+    # The fingers.
+
+    def wait_held(self) -> None:
+        """Wait until the dead-man is held. Raises MotionStopped (``deadman_released``) after the patience."""
+        deadman, clock = self._deadman, self.arm.clock
+        since = clock.now()
+        while deadman is not None and not deadman.held:
+            if clock.now() - since > self._patience:
+                raise MotionStopped(f"the dead-man was not held for {self._patience:g} s", code="deadman_released")
+            clock.sleep(_POLL)
+
+    def close_fingers(
+        self, start: Callable[[], GripperMotion], until: Callable[[], bool] = lambda: False
+    ) -> GripperResult | None:
+        """Start a motion of the fingers, and wait until they rest.
+
+        They stop while the dead-man is released, and the motion is started again when it is held again.
+
+        Args:
+            start: Starts the motion.
+            until: Checked underway; True stops the fingers.
+
+        Returns:
+            The result; None if ``until`` stopped the fingers.
+
+        Raises:
+            RobotFault: The gripper failed.
+            MotionStopped: A stop, or another command, ended the motion, or the dead-man was released too long.
+        """
+        clock, gripper = self.arm.clock, self.gripper
+        while True:
+            self.wait_held()
+            motion = start()
+            begun = clock.now()
+            while not motion.done:
+                if self._deadman is not None and not self._deadman.held:
+                    gripper.stop()
+                    break
+                if until():
+                    gripper.stop()
+                    motion.wait()
+                    return None
+                if clock.now() - begun > _LONGEST_GRIP:
+                    gripper.stop()
+                    self.fail("fingers_blocked", f"{gripper.name} does not come to rest: {gripper.state().width:.4f} m")
+                clock.sleep(max(_POLL, gripper.period))
+            else:
+                return self._checked(motion.wait())
+
+    def open_fingers(self, width: float | None = None) -> None:
+        """Open the fingers to a width in m, by default completely; fail as ``fingers_blocked`` if they do not."""
+        gripper = self.gripper
+        goal = gripper.width_max if width is None else min(width, gripper.width_max)
+        result = self.close_fingers(lambda: gripper.start(goal))
+        if result is not None and abs(result.state.width - goal) > 0.005:
+            self.fail("fingers_blocked", f"{gripper.name} rests at {result.state.width:.4f} m instead of {goal:.4f} m")
+
+    def _checked(self, result: GripperResult) -> GripperResult:
+        """Return the result of a motion of the fingers; raise if it failed, or was ended by another command."""
+        if result.outcome is GripperOutcome.FAILED:
+            fault = result.fault
+            raise RobotFault(*((fault.cause, fault.remedy) if fault else (f"{self.gripper.name} failed", "")))
+        if result.outcome is GripperOutcome.STOPPED:
+            raise MotionStopped(f"{self.gripper.name} was stopped, or got a newer command", code="gripper_stopped")
+        return result
+
+
+def above(pose: Pose, height: float) -> Pose:
+    """Return the pose ``height`` m farther up, along the z axis of the base frame."""
+    return Pose(pose.position + [0.0, 0.0, height], pose.orientation)
+
+
+def flipped(pose: Pose) -> Pose:
+    """Return the pose turned by half a turn about the tcp's own z axis: the same grasp for two equal fingers."""
+    return pose @ Pose.from_rpy((0.0, 0.0, 0.0), (0.0, 0.0, math.pi))
+
+
+def checked_path(name: str, poses: Sequence[Pose], least: int) -> list[Pose]:
+    """Return poses that all have an orientation. Raises CommandError if they do not, or are too few."""
+    if isinstance(poses, Pose) or len(poses) < least:
+        raise CommandError(f"{name} must be at least {least} poses of the tcp", code="path_too_short")
+    return [tcp_pose(name, pose) for pose in poses]
+
+
+def _text(pose: Pose) -> str:
+    return "({:.3f}, {:.3f}, {:.3f}) m".format(*pose.position)

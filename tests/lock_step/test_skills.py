@@ -1,0 +1,27 @@
+"""The skills in the simulated worlds of both engines; ``benchmarks/skills.py`` counts hundreds of tries of the same."""
+
+from __future__ import annotations
+
+import importlib.util
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+from engines_kit import Engine
+
+
+@pytest.fixture(scope="module")
+def tries() -> ModuleType:
+    """Return the benchmark, whose functions make the tries."""
+    path = Path(__file__).parents[2] / "benchmarks" / "skills.py"
+    spec = importlib.util.spec_from_file_location("benchmark_of_skills", path)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.mark.parametrize("thing", ["cube", "mug"])
+def test_grasps_by_ground_truth(tries: ModuleType, engine: Engine, thing: str) -> None:
+    assert tries.grasps(engine.name, thing, 1) == [""]

@@ -1,0 +1,181 @@
+"""``hal.skills.grasp`` and what its failures are called: in lock-step, with the mock's arm and gripper."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import pytest
+from errors_kit import raises_code
+
+import hal
+from hal.skills import SkillProgress, grasp
+
+DOWN = [1.0, 0.0, 0.0, 0.0]
+POSE = hal.Pose([0.45, 0.1, 0.1], DOWN)
+WIDTH = 0.03
+PHASES = ["open", "approach", "descend", "close", "lift", "hold"]
+
+
+@pytest.fixture(scope="module")
+def opened() -> Iterator[hal.Rig]:
+    with hal.open("panda_table", driver="mock", overrides=["cameras={}"]) as opened:
+        yield opened
+
+
+@pytest.fixture
+def rig(opened: hal.Rig) -> hal.Rig:
+    arm = opened.robots["panda"]
+    opened.driver("panda").inject(following_error=0.0)
+    opened.driver("panda.gripper").clear()
+    opened.driver("panda.gripper").inject(object_width=WIDTH)
+    opened.driver("pad").release("l2")
+    opened.clock.sleep(0.1)
+    arm.move_to(arm.home, speed=1.0)
+    return opened
+
+
+def at(phase: str, call: Callable[[], Any]) -> Callable[[SkillProgress], None]:
+    """Return a ``progress`` function that makes a call when a phase begins."""
+
+    def progress(now: SkillProgress) -> None:
+        if now.phase == phase:
+            call()
+
+    return progress
+
+
+def test_a_grasp_runs_through_its_phases_and_holds(rig: hal.Rig) -> None:
+    arm, seen = rig.robots["panda"], list[SkillProgress]()
+    result = grasp(arm, POSE, width=WIDTH, lift=0.08, hold=0.5, speed=1.0, progress=seen.append)
+    assert result
+    assert (result.reason, result.phase, result.skill) == ("", "hold", "grasp")
+    assert [phase.name for phase in result.phases] == [now.phase for now in seen] == PHASES
+    assert [now.number for now in seen] == list(range(1, 7))
+    assert {now.count for now in seen} == {6}
+    assert result.width == pytest.approx(WIDTH, abs=1e-4)
+    assert result.tcp.position == pytest.approx(POSE.position + [0.0, 0.0, 0.08], abs=2e-3)
+    starts = [phase.start for phase in result.phases]
+    assert starts == sorted(starts)
+    assert result.duration == pytest.approx(0.5 + starts[-1] - starts[0])
+
+
+@pytest.mark.parametrize(
+    ("reason", "phase", "when", "faults", "options"),
+    [
+        ("missed", "close", "close", {"object_width": None}, {}),
+        ("wrong_width", "close", "close", {"object_width": 0.06}, {}),
+        ("wrong_width", "close", "close", {"object_width": 0.01}, {}),
+        ("fingers_blocked", "open", "open", {"stuck": True}, {}),
+        ("dropped", "lift", "lift", {"object_width": None}, {}),
+        ("dropped", "hold", "hold", {"object_width": None}, {"hold": 1.0}),
+        ("too_wide", "plan", "open", {}, {"width": 0.09}),
+    ],
+)
+def test_what_goes_wrong_at_the_fingers(
+    rig: hal.Rig, reason: str, phase: str, when: str, faults: dict[str, Any], options: dict[str, Any]
+) -> None:
+    arm, gripper = rig.robots["panda"], rig.driver("panda.gripper")
+    if reason == "fingers_blocked":
+        assert arm.gripper is not None
+        arm.gripper.grip(1.0)
+    result = grasp(
+        arm,
+        POSE,
+        **{"width": WIDTH, "speed": 1.0, **options},
+        progress=at(when, lambda: gripper.inject(**faults)),
+    )
+    assert not result
+    assert (result.reason, result.phase) == (reason, phase)
+    if reason in ("missed", "wrong_width"):
+        assert result.width == pytest.approx(0.08, abs=1e-3), "the fingers are open again"
+        assert result.tcp.position[2] > 0.19, "and the hand is out of the way"
+
+
+@pytest.mark.parametrize(
+    ("reason", "pose"),
+    [
+        ("unreachable", hal.Pose([0.9, 0.3, 0.3], DOWN)),
+        ("outside_limits", hal.Pose([0.45, 0.0, -0.05], DOWN)),
+    ],
+)
+def test_a_plan_that_the_arm_cannot_follow_moves_nothing(rig: hal.Rig, reason: str, pose: hal.Pose) -> None:
+    arm = rig.robots["panda"]
+    before, t = arm.state().q_set, rig.clock.now()
+    result = grasp(arm, pose, lift=0.0)
+    assert (result.reason, result.phase, result.phases) == (reason, "plan", ())
+    assert (arm.state().q_set == before).all()
+    assert rig.clock.now() == t
+
+
+def test_an_arm_that_is_held_back_is_blocked(rig: hal.Rig) -> None:
+    result = grasp(
+        rig.robots["panda"],
+        POSE,
+        speed=1.0,
+        progress=at("descend", lambda: rig.driver("panda").inject(following_error=0.03)),
+    )
+    assert (result.reason, result.phase) == ("blocked", "descend")
+
+
+def test_the_nearer_of_two_equal_grasps_is_taken(rig: hal.Rig) -> None:
+    arm = rig.robots["panda"]
+    turned = hal.Pose.from_rpy(POSE.position, (3.14159, 0.0, 3.0))
+    result = grasp(arm, turned, speed=1.0)
+    assert result
+    assert result.tcp.distance(turned)[1] == pytest.approx(3.14, abs=0.02), "the hand is turned by half a turn"
+    arm.move_to(arm.home, speed=1.0)
+    assert grasp(arm, turned, speed=1.0, flip=False).tcp.distance(turned)[1] == pytest.approx(0.0, abs=0.02)
+
+
+def test_stops_and_faults_are_exceptions(rig: hal.Rig) -> None:
+    arm, gripper = rig.robots["panda"], rig.driver("panda.gripper")
+    with pytest.raises(hal.RobotFault):
+        grasp(arm, POSE, speed=1.0, progress=at("close", lambda: gripper.inject(fail="worn out")))
+    gripper.inject(fail=None)
+    with raises_code(hal.MotionStopped, "rig_stop"):
+        grasp(arm, POSE, speed=1.0, progress=at("approach", rig.stop))
+    rig.rearm()
+    with raises_code(hal.CommandError, "no_orientation"):
+        grasp(arm, hal.Pose([0.45, 0.0, 0.1]))
+    with raises_code(hal.CommandError, "not_a_deadman"):
+        grasp(arm, POSE, deadman=rig.gamepads["pad"])  # type: ignore[arg-type]
+
+
+def test_a_released_dead_man_pauses_the_arm_and_the_fingers(rig: hal.Rig) -> None:
+    pad, deadman = rig.driver("pad"), rig.gamepads["pad"].hold("l2")
+    log = rig.driver("panda.gripper").log
+    pauses = dict.fromkeys(PHASES, 0)
+    pad.press("l2")
+
+    def pause(now: SkillProgress) -> None:
+        """Release the dead-man soon after the beginning of a phase, and press it again a second later."""
+        t = rig.clock.now()
+
+        def tick() -> None:
+            elapsed = rig.clock.now() - t
+            if 0.1 <= elapsed < 0.15:
+                pad.release("l2")
+                pauses[now.phase] = len(log)
+            elif elapsed >= 1.1:
+                pad.press("l2")
+                ends.pop()()
+
+        ends = [rig.clock.every(0.05, tick)]
+
+    before = len(log)
+    result = grasp(rig.robots["panda"], POSE, width=WIDTH, speed=1.0, hold=1.2, deadman=deadman, progress=pause)
+    assert result
+    assert all(pauses.values())
+    assert len(log) - before >= 3, "opened, closed, and closed again after the pause"
+    assert result.duration > 5.0
+
+    with raises_code(hal.MotionStopped, "deadman_released"):
+        grasp(
+            rig.robots["panda"],
+            POSE,
+            speed=1.0,
+            deadman=deadman,
+            patience=0.5,
+            progress=at("close", lambda: (pad.release("l2"), rig.clock.sleep(0.1))),
+        )
