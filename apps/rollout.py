@@ -2,12 +2,14 @@
 
 python apps/rollout.py --policy my_policy:act --sim
 python apps/rollout.py --policy my_policy:Act --episodes 10 --out data/eval --real --config my_rig.yaml
+python apps/rollout.py --policy ws://gpu:8000 --policy-config droid --task "put the cube on the plate" --sim
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import os
 import sys
 import traceback
 from pathlib import Path
@@ -26,7 +28,8 @@ if TYPE_CHECKING:
     from hal.config.mapping import TeleopMapping
     from hal.deadman import Deadman
     from hal.geometry import Pose
-    from hal.learning.policy import PolicyOutcome
+    from hal.learning.policy import Policy, PolicyOutcome
+    from hal.learning.policy_config import PolicyConfig
     from hal.recording import Recorder
     from hal.rig import Rig
     from hal.robot import Robot
@@ -48,8 +51,20 @@ def parser() -> argparse.ArgumentParser:
     run.add_argument(
         "--policy",
         required=True,
-        metavar="MODULE:NAME",
-        help="policy: a function, or a class whose instances are called",
+        metavar="MODULE:NAME|URL",
+        help="policy: a function, or a class whose instances are called; or ws://HOST:PORT of a policy's server",
+    )
+    run.add_argument(
+        "--policy-config",
+        metavar="NAME|FILE",
+        help="what a policy on a server sees, and what its actions mean: droid, roboarena, or a YAML file",
+    )
+    run.add_argument(
+        "--latency",
+        type=float,
+        default=0.0,
+        metavar="S",
+        help="simulated time that a policy on a server takes to answer, in lock-step (0)",
     )
     add_episode_options(run)
     add_deadman_options(run)
@@ -68,8 +83,14 @@ def _main(args: argparse.Namespace) -> int:
     from hal.apps._display import banner, list_links
     from hal.apps.check import may_open
     from hal.errors import CommandError
+    from hal.learning.asynchronous import RemotePolicy
+    from hal.learning.policy_config import load_policy_config
 
-    check_episode_options(args, "policy", "reset", "success")
+    remote = is_url(args.policy)
+    check_episode_options(args, *([] if remote else ["policy"]), "reset", "success")
+    if remote != bool(args.policy_config):
+        raise CommandError("a policy on a server (--policy ws://HOST:PORT) needs --policy-config, and no other does")
+    config = load_policy_config(args.policy_config) if remote else None
     plan = resolve_plan(args, f"policy   {args.policy}")
     if plan is None:
         return 0
@@ -83,11 +104,31 @@ def _main(args: argparse.Namespace) -> int:
         print(f"{banner(rig)}\n  policy   {args.policy}\n{list_links(rig)}", flush=True)
         deadman, mapping = find_deadman(rig) if holds else (None, None)
         recorder = _recorder(rig, args)
+        policy = _policy(rig, robot, args, config)
         try:
-            return RolloutRun(rig, robot, args, recorder, deadman, mapping).run()
+            return RolloutRun(rig, robot, args, policy, recorder, deadman, mapping).run()
         finally:
+            if isinstance(policy, RemotePolicy):
+                policy.close()
             if recorder is not None:
                 recorder.close()
+
+
+def is_url(policy: str) -> bool:
+    """Return whether a policy is the address of a server."""
+    return policy.startswith(("ws://", "wss://"))
+
+
+def _policy(rig: Rig, robot: Robot, args: argparse.Namespace, config: PolicyConfig | None) -> Policy:
+    """Return the policy of ``--policy``; one on a server is not connected yet."""
+    from hal.learning.asynchronous import RemotePolicy
+    from hal.learning.policy import load_policy
+    from hal.learning.remote import PolicyClient
+
+    if config is None:
+        return load_policy(args.policy, rig)
+    client = PolicyClient(args.policy, api_key=os.environ.get("HAL_POLICY_KEY", ""))
+    return RemotePolicy(rig, client, config, robot=robot, task=args.task, latency=args.latency)
 
 
 def _recorder(rig: Rig, args: argparse.Namespace) -> Recorder | None:
@@ -106,13 +147,15 @@ class RolloutRun:
         rig: Rig,
         robot: Robot,
         args: argparse.Namespace,
+        policy: Policy,
         recorder: Recorder | None,
         deadman: Deadman | None,
         mapping: TeleopMapping | None,
     ) -> None:
-        """Load the policy. ``deadman`` and ``mapping`` are those of the pad; None without a dead-man."""
+        """Prepare to run a policy. ``deadman`` and ``mapping`` are those of the pad; None without a dead-man."""
         from hal.apps._display import StatusLine
-        from hal.learning.policy import PolicyRunner, load_object, load_policy
+        from hal.learning.asynchronous import RemotePolicy
+        from hal.learning.policy import PolicyRunner, load_object
 
         self.rig, self.robot, self.args, self.recorder = rig, robot, args, recorder
         self.deadman = deadman
@@ -126,12 +169,13 @@ class RolloutRun:
         self.reset_function: Any = load_object(args.reset, "--reset") if args.reset else None
         self.runner = PolicyRunner(
             rig,
-            load_policy(args.policy, rig),
+            policy,
             robot=robot,
             rate_hz=args.rate,
             seconds=args.seconds,
             deadman=deadman,
             unattended=args.unattended or mapping is None,
+            cameras=policy.config.cameras() if isinstance(policy, RemotePolicy) else None,
             history=args.history,
             success=load_object(args.success, "--success") if args.success else None,
             mark=self._mark,
@@ -254,6 +298,7 @@ class RolloutRun:
                     "repeated": outcome.repeated,
                     "pauses": outcome.pauses,
                     "inference_ms": {name: _ms(value) for name, value in outcome.inference.items()},
+                    "policy": dict(outcome.statistics),
                 }
                 for number, outcome in enumerate(self.outcomes)
             ],
@@ -276,6 +321,13 @@ def _describe(outcome: PolicyOutcome) -> str:
     mark = {True: ", success", False: ", failure", None: ""}[outcome.success if outcome.ended == "time" else None]
     text = f"{how.get(outcome.ended, outcome.ended)}{mark} after {outcome.seconds:.1f} s, {outcome.turns} step(s)"
     missed = f", {outcome.missed} MISSED" if outcome.missed else ""
+    if "latency" in (figures := outcome.statistics):
+        latency = {name: _ms(value) or 0.0 for name, value in figures["latency"].items()}
+        late = f", {figures['late']} LATE" if figures["late"] else ""
+        return (
+            f"{text}{missed}; {figures['chunks']} chunk(s){late}, latency p50 {latency['p50']:.0f}, "
+            f"p99 {latency['p99']:.0f} ms"
+        )
     return f"{text}{missed}; inference p50 {p50:.1f}, p99 {p99:.1f} ms"
 
 

@@ -11,6 +11,7 @@
     ├── StaleStateError (TimeoutError)      the newest state or frame is too old to act on
     ├── MotionStopped (RuntimeError)        a stop is latched; states its reason and how to acknowledge it
     ├── RobotFault (RuntimeError)           the robot reports a fault; carries cause and remedy
+    ├── PolicyError (RuntimeError)          a policy, or its server, does not answer, or answers with nonsense
     ├── ControlTaken (RuntimeError)         another session or program controls this arm
     └── NotSupported (NotImplementedError)  this driver or this rig cannot do that
 
@@ -34,6 +35,7 @@ __all__ = [
     "HalError",
     "MotionStopped",
     "NotSupported",
+    "PolicyError",
     "Problem",
     "RobotFault",
     "StaleStateError",
@@ -201,6 +203,12 @@ class RobotFault(HalError, RuntimeError):
         super().__init__(f"{cause}; {remedy}" if remedy else cause, code=code)
         self.cause = cause
         self.remedy = remedy
+
+
+class PolicyError(HalError, RuntimeError):
+    """A policy, or the server on which it runs, does not answer in time, or answers with something unusable."""
+
+    code = "policy_error"
 
 
 class ControlTaken(HalError, RuntimeError):

@@ -6,14 +6,14 @@ import contextlib
 import importlib
 import inspect
 import time
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, Protocol, TypeAlias, cast
 
 import numpy as np
 
 from ..commands import Command, CommandChecks
-from ..errors import CommandError, ConnectionLost, MotionStopped, RobotFault, StaleStateError
+from ..errors import CommandError, ConnectionLost, MotionStopped, PolicyError, RobotFault, StaleStateError
 from ..histogram import Histogram
 from ..observation import Observation
 
@@ -47,8 +47,9 @@ FIRST_ANSWER = 2.5
 class Policy(Protocol):
     """Anything that can be called with an observation.
 
-    It may have a method ``reset(seed)``, which is called before each episode. The times of a chunk are on
-    ``rig.clock``, as ``observation.t`` is.
+    The times of a chunk are on ``rig.clock``, as ``observation.t`` is. It may have more methods: ``reset(seed)`` is
+    called before each episode, ``restart()`` before the first call after a pause, ``rehearse(observation)`` instead of
+    the call that :meth:`PolicyRunner.rehearse` makes, and ``statistics()`` after each episode.
     """
 
     def __call__(self, observation: Observation, /) -> PolicyAnswer:
@@ -128,6 +129,8 @@ class PolicyOutcome:
     """p50, p99 and max of the policy's time per call, s."""
     error: BaseException | None = None
     """Error of the policy."""
+    statistics: Mapping[str, Any] = field(default_factory=dict)
+    """Figures of the policy's own, if it has any (see :meth:`.RemotePolicy.statistics`)."""
 
 
 class PolicyRunner:
@@ -187,7 +190,7 @@ class PolicyRunner:
         that is not a command (code ``bad_answer``).
         """
         self._reset(None)
-        command, _ = _parts(self.policy(self._observe()))
+        command, _ = _parts(getattr(self.policy, "rehearse", self.policy)(self._observe()))
         if command is not None and not isinstance(command, Command):
             raise CommandError(
                 f"the policy answers with a {type(command).__name__}, which is not a command", code="bad_answer"
@@ -203,11 +206,12 @@ class PolicyRunner:
             seed: Passed to the policy's ``reset``.
             on_turn: Called with the policy's driving time, s, in each turn, also in pauses.
         """
-        self._reset(seed)
         self.rig.forget_observations()
         tally = _Tally(judged=self._success is not None)
         control = self.robot.control(deadman=self._deadman, rate_hz=self._rate, unattended=self._unattended)
         try:
+            with _policy_errors(PolicyError):
+                self._reset(seed)
             with control:
                 self._drive(control, tally, on_turn)
         except (MotionStopped, RobotFault, ConnectionLost, StaleStateError) as stop:
@@ -215,7 +219,8 @@ class PolicyRunner:
         except _PolicyError as wrong:
             error = wrong.__cause__
             tally.end_as("error", f"{type(error).__name__}: {error}", error)
-        return tally.outcome()
+        statistics = getattr(self.policy, "statistics", dict)
+        return replace(tally.outcome(), statistics=statistics())
 
     def _reset(self, seed: int | None) -> None:
         reset = getattr(self.policy, "reset", None)
@@ -226,7 +231,8 @@ class PolicyRunner:
         return self.rig.observe(history=self._history, cameras=self._cameras)
 
     def _drive(self, control: Control, tally: _Tally, on_turn: Callable[[float], None]) -> None:
-        seen, begun = -np.inf, False
+        seen, begun, paused = -np.inf, False, False
+        restart = getattr(self.policy, "restart", lambda: None)
         for tick in self.rig.clock.rate(self._rate):
             on_turn(tally.seconds)
             mark = self._mark() if self._mark is not None else None
@@ -234,8 +240,11 @@ class PolicyRunner:
                 return tally.end_as("success" if mark else "failure")
             if not control.hold_until_following():
                 tally.count_pause()
-                begun = False
+                begun, paused = False, True
                 continue
+            if paused:
+                restart()
+                paused = False
             tally.count_turn(tick.dt, tick.missed)
             if tally.seconds > self._seconds - 1e-9:
                 return tally.end_as("time")

@@ -1,0 +1,366 @@
+"""A policy on a server: messages, chunks that overlap in time, and everything that a server can do wrong."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+from errors_kit import raises_code
+
+import hal
+from hal.learning.asynchronous import RemotePolicy
+from hal.learning.policy import PolicyOutcome, PolicyRunner
+from hal.learning.policy_config import PolicyConfig, load_policy_config
+from hal.learning.remote import PolicyClient, PolicyServer, pack, unpack
+
+pytest.importorskip("msgpack")
+
+Rig = hal.Rig
+STEPS = 16
+CONFIG: dict[str, Any] = {
+    "rate_hz": 15,
+    "execute": 8,
+    "observation": {"state": {"state": ["q", "closed"]}, "prompt": {"text": "task"}},
+    "action": {"kind": "joint_position", "gripper": {"index": 7, "threshold": 0.5}},
+}
+
+
+@pytest.fixture
+def rig() -> Iterator[Rig]:
+    with hal.open("panda_table", driver="mock", overrides=["cameras={}"]) as rig:
+        yield rig
+
+
+def stay(request: dict[str, Any]) -> dict[str, Any]:
+    """Answer with the positions of the request, and an open gripper."""
+    return {"actions": np.tile([*request["state"][:7], 0.0], (STEPS, 1))}
+
+
+def run(
+    rig: Rig,
+    infer: Callable[[dict[str, Any]], Any],
+    *,
+    config: dict[str, Any] = CONFIG,
+    latency: float = 0.0,
+    seconds: float = 3.0,
+    timeout: float = 5.0,
+    metadata: dict[str, Any] | None = None,
+    rehearse: bool = False,
+    on_turn: Callable[[float], None] = lambda seconds: None,
+) -> PolicyOutcome:
+    """Run an episode of a policy on a server of its own."""
+    with PolicyServer(infer, metadata=metadata) as server:
+        policy = RemotePolicy(
+            rig, PolicyClient(server.url, timeout=timeout), load_policy_config(config), task="wave", latency=latency
+        )
+        runner = PolicyRunner(rig, policy, rate_hz=50, seconds=seconds, cameras=())
+        try:
+            if rehearse:
+                runner.rehearse()
+            return runner.run(seed=1, on_turn=on_turn)
+        finally:
+            policy.close()
+
+
+# Messages.
+
+
+def test_a_message_returns_as_it_was_sent() -> None:
+    sent = {
+        "picture": np.arange(24, dtype=np.uint8).reshape(2, 4, 3),
+        "state": np.linspace(0.0, 1.0, 7, dtype=np.float32),
+        "one": np.float64(0.5),
+        "prompt": "wave",
+        "nested": {"flag": True, "list": [1, 2.5, None]},
+    }
+    got = unpack(pack(sent))
+    assert got["picture"].dtype == np.uint8
+    np.testing.assert_array_equal(got["picture"], sent["picture"])
+    np.testing.assert_array_equal(got["state"], sent["state"])
+    assert (got["one"], got["prompt"], got["nested"]) == (0.5, "wave", sent["nested"])
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        b"\xc1",
+        b"",
+        pack({"a": 1})[:-1],
+        pack({b"__ndarray__": True, b"data": b"\0" * 8, b"dtype": "|O", b"shape": [1]}),
+        pack({b"__ndarray__": True, b"data": b"\0" * 8, b"dtype": "<f8", b"shape": [2]}),
+        pack({b"__ndarray__": True, b"data": b"\0" * 8, b"dtype": "nonsense", b"shape": [1]}),
+        pack({b"__ndarray__": True}),
+    ],
+    ids=["no message", "empty", "cut", "objects", "too short", "no type", "no array"],
+)
+def test_a_message_that_is_no_data_is_refused(data: bytes) -> None:
+    with raises_code(hal.PolicyError, "policy_protocol"):
+        unpack(data)
+
+
+# Driving.
+
+
+def sine(rig: Rig) -> Callable[[float], np.ndarray]:
+    start = np.array(rig.robots["panda"].state().q_set)
+    begun = rig.clock.now()
+    return lambda t: start + 0.1 * np.sin(2 * np.pi * 0.3 * max(0.0, t - begun)) * np.eye(7)[0]
+
+
+@pytest.mark.parametrize("latency", [0.0, 0.05, 0.2, 0.4])
+def test_chunks_of_a_late_policy_join_without_a_step(rig: Rig, latency: float) -> None:
+    arm = rig.robots["panda"]
+    wave = sine(rig)
+
+    def infer(request: dict[str, Any]) -> dict[str, Any]:
+        t = rig.clock.now() + np.arange(STEPS) / 15
+        return {"actions": np.array([[*wave(x), 0.0] for x in t])}
+
+    seen: list[tuple[float, float, float]] = []
+
+    def watch(_: float) -> None:
+        state = arm.state()
+        seen.append((state.stamp.t, state.q_set[0], state.dq_set[0]))
+
+    outcome = run(rig, infer, latency=latency, seconds=6.0, on_turn=watch)
+    assert (outcome.ended, outcome.reason, outcome.missed) == ("time", "", 0)
+    t, q, dq = np.array(seen).T
+    settled = t > t[0] + 2.5
+    due = np.array([wave(x)[0] for x in t])
+    away = 0.6 * (q - due)[settled]  # of the hand, 0.6 m from the axis
+    assert np.sqrt((away**2).mean()) < 0.005
+    assert np.ptp(q[settled]) > 0.15
+    assert np.abs(np.diff(dq)).max() < 0.02 * max(arm.limits.acceleration) + 1e-9
+    figures = outcome.statistics
+    # The first chunk begins when it arrives, later by the latency than the policy meant.
+    assert figures["splice"] < 0.1 * 2 * np.pi * 0.3 * (latency + 0.02) + 2e-4
+    assert figures["chunks"] > 6.0 / (max(8 / 15, latency) + 0.1) - 1
+    assert abs(figures["latency"]["p50"] - latency) < 0.03
+
+
+def test_the_gripper_closes_by_the_policys_own_convention(rig: Rig) -> None:
+    gripper = rig.robots["panda"].gripper
+    assert gripper is not None
+    asked: list[float] = []
+
+    def infer(request: dict[str, Any]) -> dict[str, Any]:
+        asked.append(float(request["state"][7]))
+        return {"actions": np.tile([*request["state"][:7], -0.9], (STEPS, 1))}
+
+    action = {"kind": "joint_position", "gripper": {"index": 7, "open": 1.0, "closed": -1.0, "threshold": 0.5}}
+    assert run(rig, infer, config={**CONFIG, "action": action}).ended == "time"
+    assert gripper.state().width < 0.002
+    assert asked[0] < 0.05
+    assert asked[-1] > 0.95
+
+
+@pytest.mark.parametrize(
+    ("action", "row", "expected"),
+    [
+        ({"kind": "joint_delta"}, [0.1] + 6 * [0.0], [0.1, 0.1]),
+        ({"kind": "joint_velocity", "scale": 0.2, "clip": True}, [2.0, 1.0] + 5 * [0.0], [0.2, 0.4]),
+    ],
+)
+def test_relative_actions_start_from_the_observed_positions(
+    rig: Rig, action: dict[str, Any], row: list[float], expected: list[float]
+) -> None:
+    config = load_policy_config({**CONFIG, "action": action})
+    arm, observation = rig.robots["panda"], rig.observe(cameras=())
+    decoded = config.decode(np.tile(row, (2, 1)), observation, arm)
+    np.testing.assert_allclose(decoded.q[:, 0] - observation.robots["panda"].q[0], expected, atol=1e-12)
+    assert decoded.first == (action["kind"] == "joint_velocity")
+
+
+def test_steps_of_the_tcp_become_joint_positions(rig: Rig) -> None:
+    config = load_policy_config({**CONFIG, "action": {"kind": "tcp_delta", "scale": 0.01, "turn": 0.1}})
+    arm, observation = rig.robots["panda"], rig.observe(cameras=())
+    decoded = config.decode(np.tile([1.0, 0, 0, 0, 0, 1.0], (3, 1)), observation, arm)
+    before, after = observation.robots["panda"].tcp, arm.fk(decoded.q[-1])
+    np.testing.assert_allclose(after.position - before.position, [0.03, 0.0, 0.0], atol=1e-4)
+    assert abs(before.distance(after)[1] - 0.3) < 1e-3
+
+
+# What a server can do wrong.
+
+
+def far_away(request: dict[str, Any]) -> dict[str, Any]:
+    return {"actions": np.tile([*(request["state"][:7] + 0.5), 0.0], (STEPS, 1))}
+
+
+def fails(request: dict[str, Any]) -> dict[str, Any]:
+    raise ValueError("out of memory")
+
+
+ANSWERS: list[tuple[Any, str]] = [
+    (lambda request: {"actions": np.zeros((STEPS, 9))}, "policy_bad_actions"),
+    (lambda request: {"actions": np.zeros((0, 8))}, "policy_bad_actions"),
+    (lambda request: {"actions": np.full((STEPS, 8), np.nan)}, "policy_bad_actions"),
+    (lambda request: {"actions": "none"}, "policy_bad_actions"),
+    (lambda request: {"action": np.zeros((STEPS, 8))}, "policy_bad_actions"),
+    (fails, "policy_error"),
+]
+
+
+@pytest.mark.parametrize(("infer", "code"), ANSWERS)
+def test_a_bad_answer_shows_before_anything_moves(rig: Rig, infer: Any, code: str) -> None:
+    before = rig.robots["panda"].state().q_set
+    with raises_code(hal.PolicyError, code):
+        run(rig, infer, rehearse=True)
+    np.testing.assert_array_equal(rig.robots["panda"].state().q_set, before)
+
+
+@pytest.mark.parametrize(
+    ("infer", "code"),
+    [
+        *ANSWERS,
+        (far_away, "policy_jump"),
+        (lambda request: {"actions": stay(request)["actions"][:2]}, "policy_too_late"),
+    ],
+)
+def test_a_bad_answer_later_ends_the_episode_at_rest(rig: Rig, infer: Any, code: str) -> None:
+    arm, calls = rig.robots["panda"], []
+
+    def turns_bad(request: dict[str, Any]) -> Any:
+        calls.append(1)
+        return stay(request) if len(calls) < 3 else infer(request)
+
+    # A short answer is too late for a policy that takes longer to answer than its actions last.
+    outcome = run(rig, turns_bad, latency=0.3 if code == "policy_too_late" else 0.0)
+    assert outcome.ended == "error"
+    assert isinstance(outcome.error, hal.PolicyError)
+    assert outcome.error.code == code
+    assert np.abs(arm.state().dq_set).max() < 1e-9
+    assert outcome.seconds < 2.0
+
+
+def test_a_first_target_far_away_is_refused(rig: Rig) -> None:
+    outcome = run(rig, far_away)
+    assert outcome.ended == "error"
+    assert isinstance(outcome.error, hal.CommandError)
+
+
+def test_a_server_that_freezes_stops_the_arm_within_its_last_chunk(rig: Rig) -> None:
+    wave, calls, ended = sine(rig), [], threading.Event()
+
+    def infer(request: dict[str, Any]) -> dict[str, Any]:
+        calls.append(rig.clock.now())
+        if len(calls) == 3:
+            ended.wait(10.0)  # as if the server were frozen
+        t = rig.clock.now() + np.arange(STEPS) / 15
+        return {"actions": np.array([[*wave(x), 0.0] for x in t])}
+
+    with PolicyServer(infer) as server:
+        policy = RemotePolicy(rig, PolicyClient(server.url, timeout=0.3), load_policy_config(CONFIG))
+        try:
+            outcome = PolicyRunner(rig, policy, rate_hz=50, seconds=5.0, cameras=()).run()
+        finally:
+            ended.set()
+            policy.close()
+    assert isinstance(outcome.error, hal.PolicyError)
+    assert outcome.error.code == "policy_timeout"
+    assert rig.clock.now() < calls[-1] + STEPS / 15 + 1.0
+    assert np.abs(rig.robots["panda"].state().dq_set).max() < 1e-9
+
+
+def test_no_server_is_an_error_before_anything_moves(rig: Rig) -> None:
+    with PolicyServer(stay) as server:
+        gone = server.url
+    policy = RemotePolicy(rig, PolicyClient(gone), load_policy_config(CONFIG))
+    with raises_code(hal.PolicyError, "policy_unreachable"):
+        PolicyRunner(rig, policy, cameras=()).rehearse()
+    policy.close()
+
+
+def test_a_new_connection_is_made_for_the_next_episode(rig: Rig) -> None:
+    calls: list[int] = []
+
+    def infer(request: dict[str, Any]) -> dict[str, Any]:
+        calls.append(1)
+        if len(calls) == 2:
+            raise ValueError("once")
+        return stay(request)
+
+    with PolicyServer(infer) as server:
+        policy = RemotePolicy(rig, PolicyClient(server.url), load_policy_config(CONFIG))
+        runner = PolicyRunner(rig, policy, rate_hz=50, seconds=1.0, cameras=())
+        outcomes = [runner.run(), runner.run()]
+        assert [outcome.ended for outcome in outcomes] == ["error", "time"]
+        policy.close()
+
+
+# RoboArena's servers say what they need.
+
+ARENA: dict[str, Any] = {
+    "image_resolution": None,
+    "needs_wrist_camera": False,
+    "n_external_cameras": 0,
+    "action_space": "joint_position",
+}
+
+
+def test_a_roboarena_server_is_reset_and_told_its_session(rig: Rig) -> None:
+    seen: list[dict[str, Any]] = []
+    with PolicyServer(stay, reset=seen.append, metadata=ARENA) as server:
+        policy = RemotePolicy(rig, PolicyClient(server.url), load_policy_config(CONFIG))
+        assert PolicyRunner(rig, policy, rate_hz=50, seconds=0.5, cameras=()).run(seed=7).ended == "time"
+        policy.close()
+    assert [sorted(request) for request in seen] == [["session_id"]]
+
+
+@pytest.mark.parametrize("change", [{"action_space": "joint_velocity"}, {"needs_wrist_camera": True}])
+def test_what_a_server_needs_and_the_file_lacks_is_named(rig: Rig, change: dict[str, Any]) -> None:
+    with raises_code(hal.PolicyError, "policy_mismatch"):
+        run(rig, stay, metadata={**ARENA, **change}, rehearse=True)
+
+
+# The file.
+
+
+@pytest.mark.parametrize("name", ["droid", "roboarena"])
+def test_built_in_files_fit_the_built_in_rig(name: str) -> None:
+    config = load_policy_config(name)
+    with hal.open("panda_table", driver="mock") as rig:
+        config.check(rig, rig.robots["panda"])
+        request = config.request(rig.observe(), rig.robots["panda"], "wave")
+    pictures = [value for value in request.values() if getattr(value, "dtype", None) == np.uint8]
+    assert [picture.shape for picture in pictures] == 2 * [(224, 224, 3)]
+    assert request["prompt"] == "wave"
+    assert config.numbers(7) == 8
+
+
+def test_a_rig_without_the_camera_is_refused_with_both_lists(rig: Rig) -> None:
+    with pytest.raises(hal.DeviceNotFound, match=r"scene, wrist.*none"):
+        load_policy_config("droid").check(rig, rig.robots["panda"])
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"rate_hz": 0},
+        {"execute": 0},
+        {"observation": {"state": {"state": "speed"}}},
+        {"observation": {"picture": {"camera": "scene", "size": [0, 10]}}},
+        {"action": {"kind": "jump"}},
+        {"action": {"kind": "joint_position", "gripper": {"open": 1.0, "closed": 1.0}}},
+        {"observation": {"state": {"state": "q", "camera": "scene"}}},
+        {"extra": 1},
+    ],
+)
+def test_a_wrong_file_is_a_config_error(change: dict[str, Any]) -> None:
+    with pytest.raises(hal.ConfigError):
+        load_policy_config({**CONFIG, **change})
+
+
+def test_pictures_are_scaled_to_fit_and_padded() -> None:
+    config = PolicyConfig.model_validate(
+        {**CONFIG, "observation": {"image": {"camera": "scene", "size": [32, 32], "layout": "chw"}}}
+    )
+    with hal.open("panda_table", driver="mock", overrides=["cameras.scene.output={width: 64, height: 32}"]) as rig:
+        picture = config.request(rig.observe(), rig.robots["panda"], "")["image"]
+    assert picture.shape == (3, 32, 32)
+    assert not picture[:, :8].any()
+    assert not picture[:, 24:].any()
+    assert picture[:, 10:22].any()
