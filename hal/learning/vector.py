@@ -325,6 +325,7 @@ class _Worlds:
         self, envs: Sequence[RigEnv], first: int, count: int, mode: AutoresetMode, memory: SharedMemory
     ) -> None:
         self._envs, self._first, self._mode = envs, first, mode
+        self._order = list(range(len(envs)))
         self._ended = [False] * len(envs)
         self._stepped = 0.0
         self._memory, self._count = memory, count
@@ -398,18 +399,23 @@ class _Worlds:
             records[key][self._first + k] = values
 
     def _each(self, run: Callable[[int], Any]) -> list[Any]:
-        """Run a function for every world, and raise the first error after the last one."""
-        results, failed = [], None
-        for k in range(len(self._envs)):
+        """Run a function for every world, and raise the first world's error after all.
+
+        Each time in the other direction: the worlds that were last are still in the processor's cache.
+        """
+        self._order.reverse()
+        results: list[Any] = [None] * len(self._envs)
+        errors: dict[int, HalError] = {}
+        for k in self._order:
             try:
-                results.append(run(k))
+                results[k] = run(k)
             except Exception as error:
                 packed = pack_error(error)
                 trace = "" if isinstance(error, HalError) else "\n" + traceback.format_exc()
                 packed["text"] = f"world {self._first + k}: {packed['text']}{trace}"
-                failed = failed or unpack_error(packed)
-        if failed is not None:
-            raise failed
+                errors[k] = unpack_error(packed)
+        if errors:
+            raise errors[min(errors)]
         return results
 
 
