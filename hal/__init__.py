@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from .deadman import Deadman
     from .driver import CameraInfo
     from .errors import (
+        CollisionError,
         CommandError,
         ConfigError,
         ConnectionLost,
@@ -68,6 +69,7 @@ __all__ = [
     "Camera",
     "CameraInfo",
     "CartesianTarget",
+    "CollisionError",
     "Command",
     "CommandError",
     "ConfigError",
@@ -132,6 +134,7 @@ _MODULES = {
     "control": ("Control",),
     "deadman": ("Deadman",),
     "errors": (
+        "CollisionError",
         "CommandError",
         "ConfigError",
         "ConnectionLost",

@@ -3,6 +3,7 @@
     HalError
     ├── ConfigError (ValueError)            a rig, a model or a mapping is wrong; lists every problem
     ├── CommandError (ValueError)           a command or an argument is invalid; nothing was sent
+    │   └── CollisionError                  a motion would collide; nothing moved
     ├── DatasetError (ValueError)           a file of a recording is missing or damaged; names the file and the episode
     ├── Unreachable (ValueError)            no joint position reaches the pose; carries the residual
     ├── DriverMissing (ImportError)         a library is not installed; names the command that installs it
@@ -24,6 +25,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 __all__ = [
+    "CollisionError",
     "CommandError",
     "ConfigError",
     "ConnectionLost",
@@ -109,6 +111,26 @@ class CommandError(HalError, ValueError):
     """A command has the wrong shape, a non-finite number or an impossible value. Nothing was sent."""
 
     code = "bad_command"
+
+
+class CollisionError(CommandError):
+    """A motion would bring two shapes nearer than the margin. Nothing moved."""
+
+    code = "collision"
+
+    def __init__(self, robot: str, first: str, second: str, distance: float, along: float) -> None:
+        nearest = f"{1e3 * distance:.0f} mm apart" if distance > 0.0 else "in each other"
+        super().__init__(
+            f"the motion of {robot} would collide: {first} and {second} are {nearest} {100.0 * along:.0f} % of the way"
+        )
+        self.first = first
+        """Name of the link."""
+        self.second = second
+        """Name of the other link, or of the box."""
+        self.distance = distance
+        """Their distance there, m; negative if they overlap."""
+        self.along = along
+        """Where on the way that is, from 0 (its start) to 1 (its end)."""
 
 
 class DatasetError(HalError, ValueError):

@@ -162,7 +162,9 @@ class Rig:
             self.notes.extend(world_host.request("warnings"))
         for host in self._hosts:
             for spec in host.spec.robots:
-                self.robots[spec.name] = Robot(spec, host, self.clock, self._latch, self._gripper_of(spec))
+                gripper, collisions = self._gripper_of(spec), plan.collisions
+                robot = Robot(spec, host, self.clock, self._latch, gripper, collisions, self.robots)
+                self.robots[spec.name] = robot
         for opened in (self.console, self.viewer3d):
             if opened is not None:
                 opened.wait_ready()

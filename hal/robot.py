@@ -7,6 +7,8 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping, Sequence
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -15,8 +17,9 @@ from numpy.typing import ArrayLike, NDArray
 from ._moved import names_of
 from .arguments import number, vector
 from .control import Control, check_deadman
-from .errors import CommandError, ConnectionLost, MotionStopped, StaleStateError
+from .errors import CommandError, ConnectionLost, MotionStopped, NotSupported, StaleStateError
 from .geometry import Pose, frozen, tcp_pose
+from .specs import CollisionSpec
 from .types import RobotState, RobotStatus
 
 if TYPE_CHECKING:
@@ -25,12 +28,14 @@ if TYPE_CHECKING:
     from .gripper import Gripper
     from .host.hosts import Host
     from .kinematics.arm import Kinematics
+    from .kinematics.collisions import Collisions
     from .specs import LimitsSpec, RobotSpec
 
 __all__ = ["Robot"]
 
 _MOVE_RATE = 50.0
 """Rate at which :meth:`Robot.move_to` checks its motion, Hz."""
+_NOTHING = CollisionSpec(own=False, arms=False)
 _FRESH_STATE = 0.2
 """Longest wait for a state after a recovery, s."""
 
@@ -44,10 +49,19 @@ class Robot:
         clock: The rig's clock.
         latch: The rig's latched stop.
         gripper: Gripper of this arm; None if it has none.
+        collisions: What it must not touch.
+        others: All arms of the rig, by name.
     """
 
     def __init__(
-        self, spec: RobotSpec, host: Host, clock: Clock, latch: StopLatch, gripper: Gripper | None = None
+        self,
+        spec: RobotSpec,
+        host: Host,
+        clock: Clock,
+        latch: StopLatch,
+        gripper: Gripper | None = None,
+        collisions: CollisionSpec = _NOTHING,
+        others: Mapping[str, Robot] | None = None,
     ) -> None:
         self.spec = spec
         self.name = spec.name
@@ -59,6 +73,9 @@ class Robot:
         self._commands = 0
         self._open: Control | None = None
         self._kinematics: Kinematics | None = None
+        self._collision_spec = collisions
+        self._collisions: Collisions | None = None
+        self._others = others or {}
         self.gripper = gripper
         """Gripper on this arm; None if the model has none."""
 
@@ -98,7 +115,36 @@ class Robot:
             self._kinematics = Kinematics(self.spec.kinematics)
         return self._kinematics
 
+    @property
+    def collisions(self) -> Collisions:
+        """Collisions of this arm with itself, with the rig's boxes and with the other arms.
+
+        Raises:
+            NotSupported: The arm has no collision shapes, or a mesh that cannot be read.
+        """
+        if self._collisions is None:
+            from .kinematics.collisions import Collisions
+
+            seen = self._others.values() if self._collision_spec.arms else ()
+            others = [(robot.spec, partial(robot._position, math.inf)) for robot in seen if robot is not self]
+            self._collisions = Collisions(self.spec, self._collision_spec, others)
+        return self._collisions
+
     # State and kinematics.
+
+    def _position(self, max_age: float) -> NDArray[np.float64]:
+        """Return the measured joint positions (n,), rad."""
+        return self.state(max_age).q
+
+    def _check_collisions(self, goal: Sequence[float]) -> None:
+        """Raise CollisionError if the way to ``goal`` (n,), rad, straight in joint space, would collide."""
+        if not self._collision_spec.any:
+            return
+        try:
+            collisions = self.collisions
+        except NotSupported:
+            return  # the rig's notes have it
+        collisions.check_motion(np.array([self.state().q, goal]))
 
     def state(self, max_age: float = 0.1) -> RobotState:
         """Return the newest state; never waits.
@@ -231,6 +277,7 @@ class Robot:
         Raises:
             CommandError: An invalid target (``code`` is ``outside_limits`` or ``outside_workspace`` for one that the
                 arm must not reach).
+            CollisionError: The arm would touch itself, a box of the rig or another arm on the way.
             Unreachable: No joint positions for the pose.
             MotionStopped: After a trip, or if the dead-man was released for longer than ``patience`` (``code`` is
                 ``deadman_released``).
@@ -241,6 +288,8 @@ class Robot:
         if timeout is not None:
             number("timeout", timeout, "s", least=0.0, above=True)
         check_deadman(deadman)
+        goal = self._goal(target, position)
+        self._check_collisions(goal)
         session = Control(
             self,
             deadman=deadman,
@@ -248,7 +297,7 @@ class Robot:
             speed=speed,
             tcp_speed=tcp_speed,
             unattended=unattended,
-            goal=self._goal(target, position),
+            goal=goal,
         )
         clock = self.clock
         start = held = clock.now()

@@ -14,7 +14,9 @@ from typing import Any, TypeVar
 
 __all__ = [
     "BodySpec",
+    "BoxSpec",
     "CameraSpec",
+    "CollisionSpec",
     "DepthSensorSpec",
     "GripperSpec",
     "GroupSpec",
@@ -227,6 +229,36 @@ class BodySpec:
 
 
 @dataclass(frozen=True)
+class BoxSpec:
+    """A box that no arm may touch."""
+
+    name: str
+    position: Vector3
+    """Of its middle, in the world, m."""
+    orientation: Quaternion
+    size: Vector3
+    """Its whole sides, m."""
+
+
+@dataclass(frozen=True)
+class CollisionSpec:
+    """What the arms of a rig must not touch."""
+
+    own: bool = True
+    """Whether an arm must not touch itself."""
+    arms: bool = True
+    """Whether arms must not touch each other."""
+    boxes: tuple[BoxSpec, ...] = ()
+    margin: float = 0.01
+    """Distance that is kept, m."""
+
+    @property
+    def any(self) -> bool:
+        """Whether there is anything to check."""
+        return self.own or self.arms or bool(self.boxes)
+
+
+@dataclass(frozen=True)
 class ViewSpec:
     """Pose of a camera: fixed in the world, or attached to a link of a robot.
 
@@ -338,6 +370,8 @@ class GroupSpec:
     world: WorldSpec | None = None
     grippers: tuple[GripperSpec, ...] = ()
     """Grippers that run in this group: those of its arms, or one that has a process of its own."""
+    collisions: CollisionSpec | None = None
+    """What its arms must not touch; None if nothing is checked."""
 
 
 @dataclass(frozen=True)
@@ -371,6 +405,8 @@ class Plan:
     """Messages for the user that are not errors."""
     source: str
     """The rig's file, or ``<dict>``."""
+    collisions: CollisionSpec = CollisionSpec()
+    """What the arms must not touch."""
 
     @property
     def engine(self) -> str | None:

@@ -7,14 +7,17 @@ what needs the value in a hole is skipped, everything else is still checked, and
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
+from pathlib import Path
 from typing import Any, TypeVar
 
 from .. import registry
 from ..errors import ConfigError
+from ..geometry import Pose
+from ..kinematics.urdf import read_urdf
 from ..pads.model import pad_model
-from ..specs import BodySpec, PadSpec, Plan, RobotSpec, WorldSpec
+from ..specs import BodySpec, BoxSpec, CollisionSpec, PadSpec, Plan, RobotSpec, WorldSpec
 from .context import Context
 from .data_files import user_path
 from .files import nearest, read_yaml
@@ -48,7 +51,11 @@ def resolve(context: Context) -> Plan:
     bodies: tuple[BodySpec, ...] = ()
     with suppress(Unknown):
         bodies = load_objects(context)  # for a real rig, too, so that mistakes in objects are found there
+    boxes: tuple[BoxSpec, ...] = ()
+    with suppress(Unknown):
+        boxes = tuple(_boxes(context, bodies))
     context.problems.raise_any()
+    wanted = rig.collisions
     physics = rig.simulation
     world = WorldSpec(driver, physics.physics_hz, physics.gravity, bodies, robots) if driver is not None else None
     return Plan(
@@ -61,7 +68,49 @@ def resolve(context: Context) -> Plan:
         renderer=rig.simulation.renderer,
         warnings=tuple(context.warnings),
         source=context.source,
+        collisions=CollisionSpec(wanted.self, wanted.arms, boxes, wanted.margin),
     )
+
+
+def _boxes(context: Context, bodies: Iterable[BodySpec]) -> Iterator[BoxSpec]:
+    """Yield the boxes that no arm may touch; those of an object of the rig have its name."""
+    objects = {body.name: body for body in bodies}
+    for k, box in enumerate(context.rig.collisions.boxes):
+        key = f"collisions.boxes.{k}"
+        if box.position is not None and box.size is not None:
+            yield BoxSpec(box.name, box.position, box.orientation, box.size)
+        elif box.name in objects:
+            yield from _boxes_of(context, key, objects[box.name])
+        elif not context.problems.found:  # else it may be one whose file is wrong
+            message = f"there is no object {box.name!r}{nearest(box.name, objects)}; a box needs position and size"
+            context.problem(key, message, "unknown_object")
+
+
+def _boxes_of(context: Context, key: str, body: BodySpec) -> Iterator[BoxSpec]:
+    """Yield the boxes of an object, which must be fixed and consist of boxes."""
+    pose = Pose(body.position, body.orientation)
+    shapes: list[tuple[Pose, tuple[float, ...]]] = []
+    if body.half_extents is not None:
+        shapes.append((pose, tuple(2.0 * half for half in body.half_extents)))
+    elif body.urdf is not None:
+        urdf = read_urdf(Path(body.urdf), meshes=False)
+        for link, at in urdf.poses({}).items():
+            for shape in urdf.links[link].collisions:
+                size = tuple(body.scale * side for side in shape.size) if shape.shape == "box" else ()
+                own = at @ shape.pose
+                shapes.append((pose @ Pose(body.scale * own.position, own.orientation), size))
+    if not shapes or not all(size for _, size in shapes):
+        message = (
+            f"the collision shapes of {body.name!r} are not boxes: give name, position and size of a box around it"
+        )
+        context.problem(key, message, "wrong_shape")
+        return
+    if body.robot is not None or not (body.fixed or (body.urdf is None and body.mass == 0.0)):
+        context.problem(key, f"{body.name!r} can move: only objects that are fixed can be given here", "wrong_shape")
+        return
+    for at, size in shapes:
+        position, orientation = at.position.tolist(), at.orientation.tolist()
+        yield BoxSpec(body.name, tuple(position), tuple(orientation), tuple(size))  # type: ignore[arg-type]
 
 
 def resolve_pad(context: Context, name: str, config: PadConfig) -> PadSpec | None:

@@ -43,9 +43,11 @@ from .schema import (
     PoseConfig,
     Position,
     Quantity,
+    QuaternionConfig,
     RateHz,
     Several,
     Share,
+    Sizes,
     Speed,
     Strict,
     TcpSpeed,
@@ -55,7 +57,9 @@ from .schema import (
 
 __all__ = [
     "Attached",
+    "BoxConfig",
     "CameraConfig",
+    "CollisionsConfig",
     "GripperConfig",
     "LimitsConfig",
     "LookAt",
@@ -178,6 +182,8 @@ def view_of(pose: Pose, robot: str | None = None, link: str | None = None) -> Vi
     a, b, c, d = pose.orientation.tolist()
     return ViewSpec((x, y, z), (a, b, c, d), robot, link)
 
+
+Margin = Annotated[float, Quantity("m", 0.0, 0.5)]
 
 DEVICES, OBJECTS = 64, 1000
 """Greatest number of devices of one kind, and of objects, in a rig; more would take minutes to check."""
@@ -350,6 +356,45 @@ class SimulationConfig(Strict):
     """``gl`` is moderngl, ``tiny`` PyBullet's own; ``auto`` is the first that works."""
 
 
+class BoxConfig(Strict):
+    """A box in the world that no arm may touch: its position and size, or the name of an object of this rig."""
+
+    name: Name
+    """Its own name; or, alone, that of an object that is fixed and consists of boxes."""
+    position: Position | None = None
+    """Of its middle, m."""
+    orientation: QuaternionConfig = (0.0, 0.0, 0.0, 1.0)
+    size: Sizes | None = None
+    """Its whole sides, m."""
+
+    @model_validator(mode="after")
+    def _whole(self) -> BoxConfig:
+        given = [key for key in ("position", "orientation", "size") if key in self.model_fields_set]
+        missing = [key for key in ("position", "size") if key not in given]
+        if given and missing:
+            raise ValueProblem(f"{missing[0]} is missing; or give the name of an object alone", "missing_key")
+        return self
+
+
+def _box(value: Any) -> Any:
+    return {"name": value} if isinstance(value, str) else value
+
+
+class CollisionsConfig(Strict):
+    """What the arms must not touch."""
+
+    self: Flag = True
+    """Whether an arm must not touch itself."""
+    arms: Flag = True
+    """Whether the arms must not touch each other."""
+    boxes: list[Annotated[BoxConfig, BeforeValidator(_box, json_schema_input_type=Name | BoxConfig)]] = Field(
+        default_factory=list, max_length=DEVICES
+    )
+    """Boxes that no arm may touch: ``{name, position, size}``, or names of objects of this rig."""
+    margin: Margin = 0.01
+    """Distance that is kept, m."""
+
+
 def _objects(value: Any) -> Any:
     if value is None:  # "objects:" without a value
         return []
@@ -378,6 +423,7 @@ class RigFile(Strict):
     gamepads: Annotated[dict[Name, PadConfig], BeforeValidator(_section), _FEW] = Field(default_factory=dict)
     objects: Annotated[list[Any], BeforeValidator(_objects)] = Field(default_factory=list, max_length=OBJECTS)
     """Objects of the simulated world: names in ``config/objects/``, paths, or ``{name, shape, ...}``."""
+    collisions: Annotated[CollisionsConfig, BeforeValidator(_section)] = CollisionsConfig()
     simulation: Annotated[SimulationConfig, BeforeValidator(_section)] = SimulationConfig()
 
 
