@@ -6,7 +6,7 @@ Vectors are plain lists in the order of the arm's joints; a call takes some micr
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -18,6 +18,7 @@ from .errors import NotSupported
 from .geometry import rotate
 from .kinematics.arm import add_tcp, reduced_model
 from .kinematics.inertials import find_wrong_inertials
+from .kinematics.urdf import read_urdf
 
 if TYPE_CHECKING:
     from .specs import KinematicsSpec, PayloadSpec, RobotSpec, Vector3
@@ -33,13 +34,18 @@ STANDARD_GRAVITY = 9.81
 class Dynamics:
     """Gravity, inertia and inverse dynamics of one arm with ``n`` joints and what it carries.
 
-    All joints that are not the arm's, such as those of the fingers, are at zero. Friction and the inertia of the
-    motors' rotors are in no URDF, and are left out. An object has scratch memory, so every thread needs its own.
+    Joints are in the order of the spec. Those that are not the arm's are still, such as the fingers'. Friction, damping
+    and the inertia of the motors' rotors are left out. An object has scratch memory, so every thread needs its own.
+
+    The equation of motion is ``tau = M(q) ddq + c(q, dq) + g(q)``; :meth:`mass_matrix`, :meth:`coriolis` and
+    :meth:`gravity` return its parts, :meth:`inverse` the whole and :meth:`forward` its solution for ddq. Torques that
+    an arm is commanded (:class:`hal.JointTorque`) come on top of g: an arm carries itself, and nothing else.
 
     Args:
         spec: The arm's joints, links and tcp.
         payload: A mass that it carries in addition.
         gravity: Acceleration of gravity (3,) in the arm's base frame, m/s2. See :meth:`of`.
+        others: Positions of joints that are not the arm's, rad or m; absent ones are at 0.
 
     Raises:
         NotSupported: The URDF has links without a mass, or with an impossible inertia (``code`` is
@@ -52,6 +58,7 @@ class Dynamics:
         spec: KinematicsSpec,
         payload: PayloadSpec | None = None,
         gravity: Vector3 = (0.0, 0.0, -STANDARD_GRAVITY),
+        others: Mapping[str, float] | None = None,
     ) -> None:
         import pinocchio as pin
 
@@ -67,9 +74,10 @@ class Dynamics:
         self.payload = payload
         self.n = len(spec.joints)
         self._pin: Any = pin
-        self._model: Any = reduced_model(spec, pin)
+        self._model: Any = reduced_model(spec, pin, others)
+        self._tcp = add_tcp(self._model, spec, pin)
         if payload is not None:
-            self._attach(payload, add_tcp(self._model, spec, pin))
+            self._attach(payload)
         self._model.gravity.linear = np.array(gravity, float)
         self._data: Any = self._model.createData()
         # Place of each joint of the spec in pinocchio's vectors; None if the orders agree, as they usually do.
@@ -78,13 +86,28 @@ class Dynamics:
         self._inverse_columns: NDArray[np.intp] | None = None
         if columns != list(range(self.n)):
             self._columns, self._inverse_columns = np.array(columns), np.argsort(columns)
+        self.damping: tuple[float, ...] = tuple(self._listed(self._model.damping))
+        """Viscous damping of each joint (n,), Nm s/rad: simulated arms have it, the methods leave it out."""
 
     @classmethod
-    def of(cls, spec: RobotSpec) -> Dynamics:
-        """Return the dynamics of an arm of a rig, with its payload, and with gravity as its base is mounted."""
+    def of(cls, spec: RobotSpec, width: float | None = None) -> Dynamics:
+        """Return the dynamics of an arm of a rig, with its payload, and with gravity as its base is mounted.
+
+        Args:
+            spec: The arm.
+            width: Width of its gripper, m; None: open, as a simulated arm starts. Fingers that open wide have a large
+                share of the inertia of the last joint.
+        """
         x, y, z, w = spec.base_orientation
         down = rotate((-x, -y, -z, w), (0.0, 0.0, -STANDARD_GRAVITY))
-        return cls(spec.kinematics, spec.payload, (down[0], down[1], down[2]))
+        fingers: dict[str, float] = {}
+        if spec.gripper is not None:
+            width = spec.gripper.width_max if width is None else width
+            fingers = dict(zip(spec.gripper.joints, spec.gripper.finger_positions(width), strict=True))
+            for one in read_urdf(Path(spec.urdf), meshes=False).mimics:
+                if one.of in fingers:
+                    fingers[one.joint] = one.multiplier * fingers[one.of] + one.offset
+        return cls(spec.kinematics, spec.payload, (down[0], down[1], down[2]), fingers)
 
     def gravity(self, q: Floats) -> list[float]:
         """Return the joint torques (n,), Nm, that hold the arm still at ``q`` (n,), rad."""
@@ -101,6 +124,24 @@ class Dynamics:
         ordered = self._ordered
         return self._listed(self._pin.rnea(self._model, self._data, ordered(q), ordered(dq), ordered(ddq)))
 
+    def coriolis(self, q: Floats, dq: Floats) -> list[float]:
+        """Return the Coriolis and centrifugal torques (n,), Nm, at ``q`` (n,) rad and ``dq`` (n,) rad/s."""
+        pin, model, data = self._pin, self._model, self._data
+        position = self._ordered(q)
+        both = pin.nonLinearEffects(model, data, position, self._ordered(dq)).copy()
+        return self._listed(both - pin.computeGeneralizedGravity(model, data, position))
+
+    def forward(self, q: Floats, dq: Floats, tau: Floats) -> list[float]:
+        """Return the joint accelerations (n,), rad/s2, under torques: the inverse of :meth:`inverse`.
+
+        Args:
+            q: Joint positions (n,), rad.
+            dq: Joint velocities (n,), rad/s.
+            tau: All torques of the joints (n,), Nm, those that carry the arm's weight included.
+        """
+        ordered = self._ordered
+        return self._listed(self._pin.aba(self._model, self._data, ordered(q), ordered(dq), ordered(tau)))
+
     def mass_matrix(self, q: Floats) -> list[list[float]]:
         """Return the joint-space inertia (n, n), kg m2, at ``q`` (n,), rad. It is symmetric and positive definite."""
         mass = self._pin.crba(self._model, self._data, self._ordered(q))
@@ -109,11 +150,30 @@ class Dynamics:
         rows: list[list[float]] = mass.tolist()
         return rows
 
-    def _attach(self, payload: PayloadSpec, tcp: int) -> None:
+    def task_inertia(self, q: Floats) -> NDArray[np.float64]:
+        """Return the inertia (6, 6) of the tcp, kg, kg m and kg m2: (J M^-1 J^T)^-1.
+
+        A force and a torque on the tcp, along the base's axes, accelerate it by the inverse (Khatib, IEEE J. Robotics
+        and Automation 3(1), 1987). It is the pseudo-inverse: 0 in directions in which the tcp cannot move, at a
+        singularity or with fewer than six joints.
+
+        Args:
+            q: Joint positions (n,), rad.
+        """
+        pin, model, data = self._pin, self._model, self._data
+        position = self._ordered(q)
+        jacobian = pin.computeFrameJacobian(
+            model, data, position, self._tcp, pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
+        ).copy()
+        mobility = jacobian @ np.linalg.solve(pin.crba(model, data, position), jacobian.T)
+        inertia: NDArray[np.float64] = np.linalg.pinv(mobility, rcond=1e-9, hermitian=True)
+        return inertia
+
+    def _attach(self, payload: PayloadSpec) -> None:
         """Add a payload to the link that carries the tcp."""
         if not (isfinite(payload.mass) and payload.mass >= 0.0):
             raise ValueError(f"a payload has a mass of 0 kg or more, not {payload.mass}")
-        frame = self._model.frames[tcp]
+        frame = self._model.frames[self._tcp]
         lever = frame.placement.act(np.array(payload.position, float))
         inertia = self._pin.Inertia(payload.mass, lever, np.zeros((3, 3)))
         self._model.appendBodyToJoint(frame.parentJoint, inertia, self._pin.SE3.Identity())

@@ -25,6 +25,7 @@ from .types import RobotState, RobotStatus
 if TYPE_CHECKING:
     from .clock import Clock
     from .deadman import Deadman, StopLatch
+    from .dynamics import Dynamics
     from .gripper import Gripper
     from .host.hosts import Host
     from .kinematics.arm import Kinematics
@@ -76,6 +77,7 @@ class Robot:
         self._collision_spec = collisions
         self._collisions: Collisions | None = None
         self._others = others or {}
+        self._dynamics: Dynamics | None = None
         self.gripper = gripper
         """Gripper on this arm; None if the model has none."""
 
@@ -129,6 +131,19 @@ class Robot:
             others = [(robot.spec, partial(robot._position, math.inf)) for robot in seen if robot is not self]
             self._collisions = Collisions(self.spec, self._collision_spec, others)
         return self._collisions
+
+    @property
+    def dynamics(self) -> Dynamics:
+        """Gravity, inertia and torques of this arm, with its payload and its gripper open.
+
+        Raises:
+            NotSupported: The URDF lacks masses, or has impossible ones; the message names the links.
+        """
+        if self._dynamics is None:
+            from .dynamics import Dynamics
+
+            self._dynamics = Dynamics.of(self.spec)
+        return self._dynamics
 
     # State and kinematics.
 

@@ -17,9 +17,9 @@ from typing import Any, ClassVar
 
 from hal.config.data_files import find_data
 from hal.driver import Reading, RobotDriver, Setpoint
-from hal.errors import ConnectionLost, DriverMissing, Fault, HalError, RobotFault
+from hal.dynamics import Dynamics
+from hal.errors import ConnectionLost, DriverMissing, Fault, HalError, NotSupported, RobotFault
 from hal.histogram import Histogram
-from hal.kinematics import Kinematics
 from hal.lock import DeviceLock
 from hal.preflight import has_realtime_kernel
 from hal.specs import RobotSpec
@@ -64,7 +64,7 @@ class FrankaArm(RobotDriver):
         """Whether the fault clears itself once the robot is ready again, and whether it has been reported."""
         self._shown = _NOT_SHOWN
         """Last mode that was interpreted, and its fault."""
-        self._inertias: Kinematics | None = None
+        self._dynamics: Dynamics | None = None
         self.success_min = inf
         """Lowest success rate so far."""
         self._t_received = 0.0
@@ -175,17 +175,18 @@ class FrankaArm(RobotDriver):
     def mass_matrix(self, q: Sequence[float]) -> Any:
         """Return the joint-space inertia (n, n), kg m2, at ``q`` (n,), rad.
 
-        It uses the published inertias of an FR3 with its hand. A Panda has the same lengths and nearly the same
-        masses; the inertias in PyBullet's URDF of the Panda are invented.
+        For a URDF without the published inertials it is that of an FR3 with its hand: every Franka arm has the same
+        lengths and nearly the same masses.
         """
-        if self._inertias is None:
-            spec = self.spec.kinematics
-            if self.settings.arm != "fr3":
+        if self._dynamics is None:
+            try:
+                self._dynamics = Dynamics.of(self.spec)
+            except NotSupported:
                 joints = tuple(f"fr3_joint{k}" for k in range(1, 8))
                 urdf = str(find_data("robots", "fr3.urdf"))
-                spec = replace(spec, urdf=urdf, joints=joints, base_link=None, tcp_link="fr3_hand")
-            self._inertias = Kinematics(spec)
-        return self._inertias.mass_matrix(q)
+                spec = replace(self.spec.kinematics, urdf=urdf, joints=joints, base_link=None, tcp_link="fr3_hand")
+                self._dynamics = Dynamics(spec)
+        return self._dynamics.mass_matrix(q)
 
     def halt(self) -> None:
         """End the motion: the robot holds its position."""

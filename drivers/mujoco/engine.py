@@ -57,6 +57,8 @@ class Body(SimulatedBody):
     """Greatest torque or force of each driven joint: Nm, or N."""
     speeds: dict[int, float] = field(default_factory=dict)
     """Greatest speed of each driven joint: rad/s, or m/s."""
+    damping: dict[int, float] = field(default_factory=dict)
+    """Damping of the joints that have any, Nm s/rad."""
     contacts: list[LinkContact] = field(default_factory=list)
     """By link."""
     solids: list[int] = field(default_factory=list)

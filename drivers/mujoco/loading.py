@@ -186,6 +186,8 @@ def plan_robot(spec: RobotSpec, *, mirrored: bool = False) -> BodyPlan:
         number = body.joints[name]
         body.home[number], body.efforts[number] = drives.home[name], drives.efforts[name]
         body.speeds[number] = drives.speeds[name]
+        if moving[name].damping:
+            body.damping[number] = moving[name].damping
     body.followers = followers_of(spec, urdf)
     if spec.gripper:
         levers = FingerTravel(spec.gripper).speeds(1.0)

@@ -51,7 +51,9 @@ class Motors:
         self.arms: dict[str, NDArray[np.intp]] = {}
         """Places of the joints of each arm, without its fingers."""
         self.torques: dict[str, tuple[Any, Array]] = {}
-        """Arms that are driven by torques instead: places of their joints, torques on top of the compensation, Nm."""
+        """Arms that are driven by torques instead: places of their joints, torques on top of gravity, Nm."""
+        self.damping = np.zeros(n)
+        """Damping of each joint in the URDF, Nm s/rad. It acts only on arms that are driven by torques."""
         gain = min(STIFFNESS, 1.0 / dt)
         self._law = np.array([[gain, 1.0 - gain * dt, -gain, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, -BOOST, BOOST, 1.0]])
         self._next = np.zeros((2, n))
@@ -62,6 +64,10 @@ class Motors:
     def bind(self, mujoco: Any, model: Any, data: Any) -> None:
         """Drive the joints of a model that was compiled."""
         n = self.n
+        self._mujoco = mujoco
+        self._at_rest: Any = None
+        """Data of the same positions at rest, for gravity alone; made when torques drive an arm."""
+        self._gravity = np.zeros(model.nv)
         self._mulm, self._model, self._data = mujoco.mj_mulM, model, data
         self._q, self._dq, self._bias = data.qpos[:n], data.qvel[:n], data.qfrc_bias[:n]
         self.applied = data.qfrc_applied[:n]
@@ -74,6 +80,8 @@ class Motors:
         for arm in self.arms.values():
             self._alone[arm] = 0.0
         self.limit()
+        for at, _ in self.torques.values():
+            model.dof_damping[at] = self.damping[at]
 
     def limit(self) -> None:
         """Use new :attr:`efforts` and :attr:`speeds`."""
@@ -86,6 +94,22 @@ class Motors:
         self.target[at] = q
         self.feed[at] = self.wanted[at] = self.boost[at] = 0.0
 
+    def drive_by_torques(self, name: str, at: Any, tau: Floats) -> None:
+        """Drive an arm by torques (n,), Nm, on top of gravity; its joints are at the places ``at``.
+
+        Its joints then have the damping of the URDF, which MuJoCo integrates implicitly.
+        """
+        if name not in self.torques:
+            self._model.dof_damping[at] = self.damping[at]
+        self.torques[name] = (at, np.array(tau, float))
+
+    def drive_by_motors(self, name: str) -> bool:
+        """Let the motors of an arm follow positions again; return whether torques drove it."""
+        found = self.torques.pop(name, None)
+        if found is not None:
+            self._model.dof_damping[found[0]] = 0.0
+        return found is not None
+
     def drive(self) -> None:
         """Set the torques of the next step; to be called when inertia and forces are those of the present state."""
         state, new, force = self.state, self._next, self._driven_force
@@ -95,10 +119,12 @@ class Motors:
         np.maximum(new, self._least, out=new)
         np.minimum(new, self._most, out=self._results)
         self._to_acceleration.dot(self._speeds, self._driven_acceleration)
+        for at, _ in self.torques.values():
+            self._driven_acceleration[at] = 0.0
         self._mulm(self._model, self._data, self._force, self._acceleration)
+        np.add(force, self._bias, out=force)
         if self.torques:
             self._drive_by_torques()
-        np.add(force, self._bias, out=force)
         applied = self.applied
         np.maximum(force, self._negative_efforts, out=applied)
         np.minimum(applied, self.efforts, out=applied)
@@ -107,9 +133,17 @@ class Motors:
             self._share(force)
 
     def _drive_by_torques(self) -> None:
-        """Put the torques of :attr:`torques` in place of those of the motors."""
+        """Put the torques of :attr:`torques`, and those that carry their arms, in place of those of the motors."""
+        mujoco, model = self._mujoco, self._model
+        if self._at_rest is None:
+            self._at_rest = mujoco.MjData(model)
+        at_rest = self._at_rest
+        np.copyto(at_rest.qpos, self._data.qpos)
+        mujoco.mj_kinematics(model, at_rest)
+        mujoco.mj_comPos(model, at_rest)
+        mujoco.mj_rne(model, at_rest, 0, self._gravity)
         for at, torques in self.torques.values():
-            self._driven_force[at] = torques
+            self._driven_force[at] = torques + self._gravity[: self.n][at]
 
     def _share(self, excess: Array) -> None:
         """Expect less of motors at their limit, and choose the torques of their arms' other joints.

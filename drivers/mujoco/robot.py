@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-import numpy as np
-
 from hal.drivers.scene.robot import SimulatedRobot
 
 from .world import MujocoWorld
@@ -37,7 +35,7 @@ class MujocoRobot(SimulatedRobot[MujocoWorld]):
 
     def _hold_at(self, q: Floats) -> None:
         motors, at = self._world.motors, self._at
-        if motors.torques.pop(self.spec.name, None) is not None:
+        if motors.drive_by_motors(self.spec.name):
             motors.rest(at, q)
         motors.target[at], motors.feed[at] = q, 0.0
 
@@ -45,7 +43,7 @@ class MujocoRobot(SimulatedRobot[MujocoWorld]):
         """Do nothing: the first torques switch the motors off."""
 
     def _apply(self, tau: Floats) -> None:
-        self._world.motors.torques[self.spec.name] = (self._at, np.array(tau, float))
+        self._world.motors.drive_by_torques(self.spec.name, self._at, tau)
 
     def _restore(self, state: dict[str, Any]) -> None:
         super()._restore(state)

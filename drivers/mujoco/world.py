@@ -236,6 +236,7 @@ class MujocoWorld(SimulatedWorld[Body]):
     def _set_limits(self, body: Body) -> None:
         for joint, place in body.qvel.items():
             self.motors.efforts[place], self.motors.speeds[place] = body.efforts[joint], body.speeds[joint]
+            self.motors.damping[place] = body.damping.get(joint, 0.0)
 
     def _state_of(self, body: Body) -> tuple[list[Array], list[Array], list[bool]]:
         data, (at, along) = self.data, _places(body)
@@ -319,7 +320,7 @@ class MujocoWorld(SimulatedWorld[Body]):
             if body.is_robot:
                 self.motors.rest(place, position)
         if body.is_robot:
-            self.motors.torques.pop(body.name, None)
+            self.motors.drive_by_motors(body.name)
             if not self._is_mirrored(body):
                 self._set_limits(body)
                 self.motors.limit()
@@ -385,7 +386,8 @@ class MujocoWorld(SimulatedWorld[Body]):
             parts[0], parts[1][fingers], parts[2][fingers],
         )  # fmt: skip
         motors.limit()
-        motors.torques.clear()  # an arm that torques drive applies its own
+        for name in list(motors.torques):
+            motors.drive_by_motors(name)  # an arm that torques drive applies its own
         self.fault, self._placed, self._touched = None, False, False
         self._lay_out()
 

@@ -51,6 +51,9 @@ def read_dynamics(client: PyBulletClient, body: Body, link: int) -> dict[str, An
     info = client.getDynamicsInfo(body.id, link)
     values: dict[str, Any] = {name: float(info[place]) for name, (_, place) in _SCALARS.items()}
     values["inertia"] = [float(value) for value in info[2]]
+    if link in body.fingers:
+        mass, moments = body.fingers[link][0]
+        values |= {"mass": mass, "inertia": list(moments)}
     if values["contact_stiffness"] < 0.0 or link in body.hardened:
         values.update(dict.fromkeys(_CONTACT))
     values.update(zip(_DAMPING, body.damping, strict=True))
@@ -81,6 +84,11 @@ def write_dynamics(
             arguments[argument] = wanted[name]
     if arguments:
         client.changeDynamics(body.id, link, **arguments)
+        body.edits += 1
+        if link in body.fingers and not {"mass", "inertia"}.isdisjoint(wanted):
+            new = wanted.get("mass", before["mass"]), tuple(wanted.get("inertia", before["inertia"]))
+            body.fingers[link] = new, body.fingers[link][1]
+            body.weigh_fingers(client, body.handling)
     body.damping = (wanted.get(_DAMPING[0], body.damping[0]), wanted.get(_DAMPING[1], body.damping[1]))
 
     if _CONTACT[0] not in wanted:

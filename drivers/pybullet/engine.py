@@ -178,6 +178,10 @@ class Gear:
             self._number = None
 
 
+Weight = tuple[float, tuple[float, ...]]
+"""Mass, kg, and principal moments of inertia (3,), kg m2."""
+
+
 @dataclass(kw_only=True)
 class Body(SimulatedBody):
     """A robot or an object, with its PyBullet number, and the frame in which its pose is given.
@@ -199,6 +203,12 @@ class Body(SimulatedBody):
     """Linear and angular damping. PyBullet does not report them; 0.04 is its default."""
     gears: list[Gear] = field(default_factory=list)
     """Couplings between joints that move together (fingers)."""
+    fingers: dict[int, tuple[Weight, Weight]] = field(default_factory=dict)
+    """Links of light fingers: their mass and moments, and those that they have while they move or hold something."""
+    handling: bool = True
+    """Whether the fingers move or hold something."""
+    edits: int = 0
+    """Number of changes of masses, of the base's place, and of gravity."""
     hardened: set[int] = field(default_factory=set)
     """Links whose contacts were made soft and then hard again (see :mod:`.dynamics`)."""
 
@@ -215,3 +225,12 @@ class Body(SimulatedBody):
     def set_base_pose(self, client: PyBulletClient, pose: Transform) -> None:
         """Place the base link at ``pose`` in the world. Velocities stay."""
         client.resetBasePositionAndOrientation(self.id, *compose(pose, self.inertial))
+        self.edits += 1
+
+    def weigh_fingers(self, client: PyBulletClient, handling: bool) -> None:
+        """Give the fingers the mass that they have while they move or hold something, or their own."""
+        self.handling = handling
+        for link, (own, heavy) in self.fingers.items():
+            mass, moments = heavy if handling and heavy[0] > own[0] else own
+            client.changeDynamics(self.id, link, mass=mass, localInertiaDiagonal=moments)
+        self.edits += 1

@@ -29,8 +29,8 @@ __all__ = [
 ]
 
 FINGER_MASS = 0.1
-"""Least mass of a finger, kg: the solver lets one of 29 g press with no more than 26 N. The drive that moves with it is
-in no URDF."""
+"""Least mass of a finger that moves or holds something, kg: the solver lets one of 29 g press with no more than 26 N.
+The drive that moves with it is in no URDF. Fingers at rest have their own mass, so that the arm's inertia is right."""
 
 
 def load_object(client: PyBulletClient, spec: BodySpec, drawn: bool = False) -> tuple[Body, list[str]]:
@@ -89,8 +89,11 @@ def load_robot(client: PyBulletClient, spec: RobotSpec, drawn: bool = False) -> 
         body.home[joint], body.efforts[joint] = drives.home[name], drives.efforts[name]
         body.speeds[joint] = drives.speeds[name]
     for name in spec.gripper.joints if spec.gripper else ():
-        if client.getDynamicsInfo(number, moving[name])[0] < FINGER_MASS:
-            client.changeDynamics(number, moving[name], mass=FINGER_MASS)
+        link = moving[name]
+        mass, _, moments = client.getDynamicsInfo(number, link)[:3]
+        if mass < FINGER_MASS:
+            client.changeDynamics(number, link, mass=FINGER_MASS)
+            body.fingers[link] = (mass, moments), (FINGER_MASS, client.getDynamicsInfo(number, link)[2])
     body.base = _root_pose(client, body, spec)
     _couple(client, body, mimics_of(spec, urdf))
     return body, warnings + drives.warnings

@@ -3,11 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hal.geometry import rotate
+from hal.kinematics.arm import bounded_urdf
+from hal.specs import RobotSpec
 
 from .engine import Body, PyBulletClient
 
 __all__ = ["JointTorques", "PassiveJoints", "hold", "position_gain"]
 
+Array = NDArray[np.float64]
 Floats = Sequence[float]
 
 STIFFNESS = 72.0
@@ -19,6 +28,9 @@ GEAR_FORCE = 10.0
 """Strength of a coupling, as a multiple of the effort of the joints that it couples."""
 CONSTRAINT_ERP = 0.2
 """PyBullet's own share, which it multiplies a gear's by."""
+
+_DRAG, _DRAG_OF_BULLET = 0.04, float(np.float32(0.04))
+"""PyBullet's default of the damping of bodies, and the number that it has for it."""
 
 
 def position_gain(dt: float) -> float:
@@ -86,58 +98,179 @@ class PassiveJoints:
         )
 
 
-class JointTorques:
-    """Drives some joints of a body by torques, on top of the compensation of gravity and motion.
+class SimulatedDynamics:
+    """Gravity and inertia of a body as PyBullet simulates it, computed by pinocchio.
 
-    PyBullet takes a torque for one step, so they must be applied again for each. The compensation covers gravity on
-    everything that the joints move, and Coriolis and centrifugal torques; an object in the gripper is not compensated.
+    PyBullet's own inverse dynamics keep the masses, and the place of the base, of the first call.
+
+    Args:
+        client: The world.
+        body: An arm.
     """
 
-    def __init__(self, client: PyBulletClient, body: Body, joints: Sequence[int]) -> None:
+    def __init__(self, client: PyBulletClient, body: Body) -> None:
+        import pinocchio as pin
+
+        assert isinstance(body.spec, RobotSpec)
+        self._pin: Any = pin
+        self._client = client
+        self._body = body
+        self._model: Any = pin.buildModelFromXML(bounded_urdf(body.spec.urdf))
+        self._data: Any = self._model.createData()
+        self._links = {link: self._model.frames[self._model.getBodyId(name)] for name, link in body.links.items()}
+        names = {number: name for name, number in body.joints.items()}
+        self.movable = sorted(body.movable, key=lambda joint: int(self._joint(names[joint]).idx_v))
+        """Joints in the order of all vectors here."""
+        self._edits = -1
+
+    def _joint(self, name: str) -> Any:
+        return self._model.joints[self._model.getJointId(name)]
+
+    def update(self) -> None:
+        """Read masses, base and gravity again if they were changed."""
+        client, body, pin = self._client, self._body, self._pin
+        if self._edits == body.edits:
+            return
+        self._edits = body.edits
+        inertias = [pin.Inertia.Zero() for _ in range(self._model.njoints)]
+        for link, frame in self._links.items():
+            mass, _, moments, position, orientation = client.getDynamicsInfo(body.id, link)[:5]
+            if mass > 0.0 and frame.parentJoint > 0:
+                place = frame.placement * pin.XYZQUATToSE3(np.array([*position, *orientation]))
+                inertias[frame.parentJoint] += place.act(pin.Inertia(mass, np.zeros(3), np.diag(moments)))
+        for k, inertia in enumerate(inertias):
+            self._model.inertias[k] = inertia
+        x, y, z, w = body.base_pose(client)[1]
+        world = client.getPhysicsEngineParameters()
+        down = [world[f"gravityAcceleration{axis}"] for axis in "XYZ"]
+        self._model.gravity.linear = np.array(rotate((-x, -y, -z, w), down))
+
+    def gravity(self, q: Array) -> Array:
+        """Return the torques (n,), Nm, that hold all joints still at ``q`` (n,)."""
+        torques: Array = self._pin.computeGeneralizedGravity(self._model, self._data, q)
+        return torques
+
+    def bias(self, q: Array, dq: Array) -> Array:
+        """Return gravity, Coriolis and centrifugal torques (n,), Nm."""
+        torques: Array = self._pin.nonLinearEffects(self._model, self._data, q, dq)
+        return torques
+
+    def inertia(self, q: Array) -> Array:
+        """Return the joint-space inertia (n, n), kg m2 or kg."""
+        mass: Array = self._pin.crba(self._model, self._data, q)
+        return mass
+
+
+class JointTorques:
+    """Drives some joints of a body by torques, on top of the compensation of gravity.
+
+    PyBullet takes a torque for one step, so they must be applied again for each. The compensation covers gravity on
+    everything that the joints move; an object in the gripper is not compensated.
+
+    While torques drive the arm, PyBullet's drag on all bodies does not act on it, and damping in the URDF is integrated
+    implicitly here: PyBullet takes it from the speed at the start of the step, which is unstable for a light wrist
+    (0.5 Nm s/rad on 0.001 kg m2 at 240 Hz). It follows from the speed that is expected at the end instead,
+    ``(M + dt D) v = M v0 + dt (tau - bias + external)``; contacts and loads are estimated from what the step before
+    changed unexpectedly.
+    """
+
+    def __init__(self, client: PyBulletClient, body: Body, joints: Sequence[int], dt: float) -> None:
         self._client = client
         self._body = body
         self._joints = list(joints)
+        self._dt = dt
         self._efforts = [body.efforts[joint] for joint in joints]
-        self._movable = sorted(body.movable)  # PyBullet's order of degrees of freedom
-        self._places = [self._movable.index(joint) for joint in joints]
-        self._still = [0.0] * len(self._movable)
-        self._compensation: Floats = ()
+        self._model = SimulatedDynamics(client, body)
+        places = [self._model.movable.index(joint) for joint in joints]
+        self._places = np.array(places)
+        self._block = np.ix_(places, places)
+        damping = [float(client.getJointInfo(body.id, joint)[6]) for joint in joints]
+        self._damping: Array | None = np.array(damping) if any(damping) else None
+        """Nm s/rad; None if no joint has any."""
+        self._gravity: Floats = ()
         self._applied: Floats = [0.0] * len(self._joints)
         """Torques of the coming step, Nm."""
         self._sum: Floats = self._applied
-        """What PyBullet has added up for that step, Nm: the same but for rounding."""
+        """What PyBullet has added up for that step, Nm: those torques and the damping's."""
         self.last_applied: Floats = self._applied
         """Torques that acted in the last step, Nm; PyBullet reports those of motors only."""
+        self._external = np.zeros(len(joints))
+        """Estimated torques of contacts and loads, Nm."""
+        self._v0 = self._mass = self._bias = np.zeros(0)
+        """Of the present step: speeds at its start (n,), inertia (n, n), and gravity and Coriolis torques (n,)."""
+        self._driving = False
 
     def take_over(self) -> None:
         """Switch the joints' own motors off, and start to apply torques."""
         self.switch_off()
         self._applied = self._sum = [0.0] * len(self._joints)
+        self._external = np.zeros(len(self._joints))
+        self._v0 = np.zeros(0)
         self.next_step()
 
     def switch_off(self) -> None:
         """Switch the joints' own motors off."""
         client, nothing = self._client, [0.0] * len(self._joints)
         client.setJointMotorControlArray(self._body.id, self._joints, client.VELOCITY_CONTROL, forces=nothing)
+        if not self._driving:
+            self._driving = True
+            self._set_damping([0.0] * len(self._joints), (0.0, 0.0))
+
+    def end(self) -> None:
+        """Let PyBullet damp the joints again, because their motors follow. Idempotent."""
+        if self._driving:
+            self._driving = False
+            damping = [0.0] * len(self._joints) if self._damping is None else self._damping.tolist()
+            drag = [_DRAG_OF_BULLET if value == _DRAG else value for value in self._body.damping]
+            self._set_damping(damping, drag)
+
+    def _set_damping(self, damping: Floats, drag: Floats) -> None:
+        client, number = self._client, self._body.id
+        if self._damping is not None:
+            for joint, value in zip(self._joints, damping, strict=True):
+                client.changeDynamics(number, joint, jointDamping=value)
+        client.changeDynamics(number, -1, linearDamping=drag[0], angularDamping=drag[1])
 
     def next_step(self) -> None:
         """Start the next physics step, to which no torques are applied yet."""
-        client, body = self._client, self._body
-        q, dq, _, _ = zip(*client.getJointStates(body.id, self._movable), strict=True)
-        compensation = client.calculateInverseDynamics(body.id, q, dq, self._still)
-        self._compensation = [compensation[place] for place in self._places]
+        self._model.update()
+        q, dq = self._state()
+        self._gravity = self._model.gravity(q)[self._places].tolist()
+        if self._damping is not None:
+            speeds = dq[self._places]
+            if len(self._v0):
+                expected = np.array(self._sum) - self._bias
+                self._external = self._mass @ (speeds - self._v0) / self._dt - expected
+            self._weigh(q, dq)
         self.last_applied, self._applied = self._applied, [0.0] * len(self._joints)
         self._sum = self._applied
+
+    def _state(self) -> tuple[Array, Array]:
+        q, dq, _, _ = zip(*self._client.getJointStates(self._body.id, self._model.movable), strict=True)
+        return np.array(q), np.array(dq)
+
+    def _weigh(self, q: Array, dq: Array) -> None:
+        self._v0 = dq[self._places]
+        self._mass = self._model.inertia(q)[self._block]
+        self._bias = self._model.bias(q, dq)[self._places]
 
     def apply(self, tau: Floats) -> None:
         """Apply torques (Nm) plus the compensation, within the efforts, to the next step."""
         wanted = [
             max(-effort, min(effort, own + held))
-            for own, held, effort in zip(tau, self._compensation, self._efforts, strict=True)
+            for own, held, effort in zip(tau, self._gravity, self._efforts, strict=True)
         ]
-        more = [new - old for new, old in zip(wanted, self._applied, strict=True)]
-        self._add(more)
+        total = wanted if self._damping is None else self._damped(wanted, self._damping)
+        self._add([new - old for new, old in zip(total, self._sum, strict=True)])
         self._applied = wanted
+
+    def _damped(self, torques: Floats, damping: Array) -> list[float]:
+        """Return the torques of the motors with those of the damping (n,), Nm."""
+        dt = self._dt
+        free = self._mass @ self._v0 + dt * (np.array(torques) - self._bias + self._external)
+        speeds = np.linalg.solve(self._mass + np.diag(dt * damping), free)
+        total: list[float] = (torques - damping * speeds).tolist()
+        return total
 
     def _add(self, more: Floats) -> None:
         client = self._client
@@ -146,8 +279,8 @@ class JointTorques:
 
     def save(self) -> dict[str, Floats]:
         """Return the torques of the coming step, which are no part of PyBullet's states."""
-        parts = {"sum": self._sum, "applied": self._applied, "compensation": self._compensation}
-        return {name: list(part) for name, part in parts.items()}
+        parts = {"sum": self._sum, "applied": self._applied, "gravity": self._gravity}
+        return {name: list(part) for name, part in parts.items()} | {"external": self._external.tolist()}
 
     def withdraw(self) -> None:
         """Withdraw what was applied to the coming step."""
@@ -158,13 +291,16 @@ class JointTorques:
         """Apply the torques of :meth:`save` to the coming step, to which nothing is applied yet."""
         self._sum = [0.0] * len(self._joints)
         self._add(state["sum"])
-        self._applied, self._compensation = state["applied"], state["compensation"]
+        self._applied, self._gravity = state["applied"], state["gravity"]
+        self._external = np.array(state["external"])
+        self._model.update()
+        if self._damping is not None:
+            self._weigh(*self._state())
 
     def mass_matrix(self, q: Floats) -> list[list[float]]:
         """Return the inertia matrix (n, n) at ``q`` (n,) rad, kg m2; the body's other joints keep their positions."""
-        client, body = self._client, self._body
-        everything = [state[0] for state in client.getJointStates(body.id, self._movable)]
-        for place, x in zip(self._places, q, strict=True):
-            everything[place] = x
-        rows = client.calculateMassMatrix(body.id, everything)
-        return [[rows[i][k] for k in self._places] for i in self._places]
+        self._model.update()
+        everything, _ = self._state()
+        everything[self._places] = q
+        rows: list[list[float]] = self._model.inertia(everything)[self._block].tolist()
+        return rows

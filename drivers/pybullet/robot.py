@@ -37,7 +37,7 @@ class PyBulletRobot(SimulatedRobot[PyBulletWorld]):
         self._read = world.client.getJointStates
         self._write = world.client.setJointMotorControlArray
         self._mode = world.client.POSITION_CONTROL
-        self._torques = JointTorques(world.client, self._body, self._joints)
+        self._torques = JointTorques(world.client, self._body, self._joints, world.dt)
         self._t_applied = 0.0
         """The step to which torques were applied last, in simulated s."""
 
@@ -68,6 +68,7 @@ class PyBulletRobot(SimulatedRobot[PyBulletWorld]):
         )
 
     def _hold_at(self, q: Floats) -> None:
+        self._torques.end()
         hold(self._world.client, self._body, dict(zip(self._joints, q, strict=True)), self._world.dt)
 
     def _take_over(self) -> None:
@@ -80,6 +81,12 @@ class PyBulletRobot(SimulatedRobot[PyBulletWorld]):
             self._torques.next_step()
             self._t_applied = t
         self._torques.apply(tau)
+
+    def _was_reset(self) -> None:
+        if self._tau is not None and self._t_applied == self._world.t:
+            self._torques.withdraw()
+        super()._was_reset()
+        self._torques.end()
 
     def _save(self) -> dict[str, Any]:
         return super()._save() | {"torques": self._torques.save()}

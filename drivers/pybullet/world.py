@@ -167,6 +167,7 @@ class PyBulletWorld(SimulatedWorld[Body]):
         for gear in body.gears:
             if gear.joints <= fingers:
                 (gear.engage if active else gear.release)()
+        body.weigh_fingers(self.client, active)
         self._set_residual()
 
     # --- the engine of SimulatedWorld --------------------------------------------------------------------------------
@@ -258,7 +259,8 @@ class PyBulletWorld(SimulatedWorld[Body]):
             client.removeBody(body.id)
         for body in bodies:
             new = self._place(body.spec)
-            body.id, body.gears, body.hardened = new.id, new.gears, new.hardened
+            body.id, body.gears, body.hardened, body.fingers = new.id, new.gears, new.hardened, new.fingers
+            body.handling, body.edits = True, body.edits + 1
             for link, values in dynamics[body.name].items():
                 before = read_dynamics(client, body, link)
                 if changed := {name: value for name, value in values.items() if value != before[name]}:
@@ -335,6 +337,8 @@ class PyBulletWorld(SimulatedWorld[Body]):
 
     def _set_gravity(self, gravity: Sequence[float]) -> None:
         self.client.setGravity(*gravity)
+        for body in self.bodies.values():
+            body.edits += 1
 
     def _cast_ray(self, start: Sequence[float], end: Sequence[float]) -> RayFound | None:
         return cast_ray(self.client, self.bodies.values(), start, end)

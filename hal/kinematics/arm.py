@@ -8,10 +8,10 @@ from __future__ import annotations
 
 import difflib
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Sequence
-from math import dist, hypot, inf, sqrt
+from collections.abc import Mapping, Sequence
+from math import cos, dist, hypot, inf, sin, sqrt
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -25,9 +25,11 @@ from .urdf import parse_xml
 if TYPE_CHECKING:
     from ..specs import KinematicsSpec
 
-__all__ = ["Kinematics", "Pose7", "add_tcp", "reduced_model"]
+__all__ = ["Frame", "Kinematics", "Pose7", "add_tcp", "bounded_urdf", "reduced_model"]
 
 Array = NDArray[np.float64]
+Frame = Literal["base", "tcp", "space"]
+"""In which frame a Jacobian is: see :meth:`Kinematics.jacobian`."""
 Pose7 = tuple[float, float, float, float, float, float, float]
 """x, y, z in m, then a unit quaternion x, y, z, w."""
 
@@ -79,6 +81,8 @@ class Kinematics:
         if columns != list(range(self.n)):
             self._columns, self._inverse_columns = np.array(columns), np.argsort(columns)
         ranks = np.array([self._model.getJointId(name) for name in spec.joints])
+        self._ranks: list[int] = ranks.tolist()
+        """Places of the joints from the base outwards."""
         self._inner = (ranks[:, None] <= ranks)[:, :, None]
         """(n, n, 1): whether joint i is joint j or nearer to the base."""
         # Greatest change of the Jacobian (Frobenius norm) for a turn of the joints of length 1.
@@ -98,22 +102,73 @@ class Kinematics:
 
     def link_pose(self, link: str, q: Sequence[float] | Array) -> Pose:
         """Return the pose of a link's frame (not its centre of mass). Raises KeyError for an unknown link."""
-        frame = self._model.getFrameId(link)
-        if frame >= self._model.nframes or self._model.frames[frame].type != self._pin.FrameType.BODY:
-            links = [f.name for f in self._model.frames if f.type == self._pin.FrameType.BODY]
-            near = difflib.get_close_matches(link, links, 3) or links
-            raise KeyError(f"no link {link!r} in {Path(self.spec.urdf).name}; did you mean {', '.join(near)}?")
+        frame = self._body_frame(link)
         self._forward(q)
         self._pin.updateFramePlacement(self._model, self._data, frame)
         values = self._pin.SE3ToXYZQUATtuple(self._data.oMf[frame])
         return Pose(values[:3], values[3:])
 
-    def jacobian(self, q: Sequence[float] | Array) -> Array:
-        """Return the Jacobian (6, n) from joint speeds to the tcp's velocity, m/s then rad/s, along the base's axes."""
-        jacobian: Array = self._pin.computeFrameJacobian(
-            self._model, self._data, self._ordered(q), self._tcp, self._axes
-        )
+    def jacobian(self, q: Sequence[float] | Array, frame: Frame = "base", link: str | None = None) -> Array:
+        """Return the Jacobian (6, n) from joint speeds to a velocity: three rows linear, m/s, three angular, rad/s.
+
+        Args:
+            q: Joint positions (n,), rad.
+            frame: ``"base"``: velocity of the tcp's origin, along the base's axes (as :class:`hal.Twist` has it).
+                ``"tcp"``: the same velocity along the tcp's own axes, the body Jacobian. ``"space"``: velocity of that
+                point of the moving body, extended if need be, which passes through the base's origin, along the base's
+                axes: the spatial Jacobian, whose columns are the present screw axes.
+            link: A link whose frame replaces the tcp's; its columns of joints farther out are 0. None: the tcp.
+
+        Raises:
+            KeyError: No such link.
+            CommandError: No such frame.
+        """
+        if frame == "base":
+            axes = self._axes
+        else:
+            reference = self._pin.ReferenceFrame
+            if frame not in ("tcp", "space"):
+                raise CommandError(f"frame must be 'base', 'tcp' or 'space', not {frame!r}", code="unknown_frame")
+            axes = reference.LOCAL if frame == "tcp" else reference.WORLD
+        number = self._tcp if link is None else self._body_frame(link)
+        jacobian: Array = self._pin.computeFrameJacobian(self._model, self._data, self._ordered(q), number, axes)
         return jacobian if self._columns is None else jacobian[:, self._columns]
+
+    def screw_axes(self, link: str | None = None) -> Array:
+        """Return the screw axes (6, n) of the joints in the base frame where all joints are at 0: v, then omega.
+
+        Of a joint that turns, omega is its unit axis and v = -omega x p for a point p on it, m; of one that slides, v
+        is the unit axis and omega 0. (Lynch and Park, "Modern Robotics", 2017, section 4.1; they write omega first.)
+
+        Args:
+            link: Joints beyond this link have columns of 0. None: the tcp.
+        """
+        return self.jacobian([0.0] * self.n, "space", link)
+
+    def exponential(self, q: ArrayLike, link: str | None = None) -> Pose:
+        """Return the pose of the tcp, or of a link, by the product of exponentials of :meth:`screw_axes`.
+
+        ``exp([S1] q1) ... exp([Sn] qn) M`` with the pose M where all joints are at 0 (Brockett, 1984; Lynch and Park,
+        "Modern Robotics", 2017, section 4.1). It equals :meth:`pose`, computed in another way.
+
+        Args:
+            q: Joint positions (n,), rad.
+            link: A link; None: the tcp.
+        """
+        zero, axes = [0.0] * self.n, self.screw_axes(link)
+        angles = vector("q", q, self.n)
+        matrix: Array = (self.pose(zero) if link is None else self.link_pose(link, zero)).matrix()
+        for k in sorted(range(self.n), key=self._ranks.__getitem__, reverse=True):
+            matrix = _exponential(axes[:, k], float(angles[k])) @ matrix
+        return Pose.from_matrix(matrix)
+
+    def manipulability(self, q: Sequence[float] | Array, link: str | None = None) -> float:
+        """Return the product of the singular values of :meth:`jacobian` at ``q`` (n,), rad: 0 at a singularity.
+
+        With six joints or more that is sqrt(det(J J^T)) (Yoshikawa, Int. J. Robotics Research 4(2), 1985). It mixes m
+        and rad, so it compares postures of one arm, not different arms.
+        """
+        return float(np.prod(np.linalg.svd(self.jacobian(q, "base", link), compute_uv=False)))
 
     def fk_and_jacobian(self, q: Sequence[float] | Array) -> tuple[Pose7, Array]:
         """Return :meth:`fk` and :meth:`jacobian`; together they take little longer than one of them."""
@@ -130,14 +185,6 @@ class Kinematics:
         """
         turned = np.cross(jacobian[3:].T[:, None], jacobian[:3].T)
         return np.where(self._inner, turned, turned.transpose(1, 0, 2))
-
-    def mass_matrix(self, q: Sequence[float] | Array) -> Array:
-        """Return the joint-space inertia (n, n), kg m2, of the URDF, which in some files has made-up values.
-
-        :class:`hal.dynamics.Dynamics` refuses such files.
-        """
-        mass: Array = self._pin.crba(self._model, self._data, self._ordered(q))
-        return mass if self._columns is None else mass[np.ix_(self._columns, self._columns)]
 
     def velocity(
         self,
@@ -270,6 +317,14 @@ class Kinematics:
             joint = int(model.parents[joint])
         return tuple(reach[name] for name in self.spec.joints), distance
 
+    def _body_frame(self, link: str) -> int:
+        frame = int(self._model.getFrameId(link))
+        if frame >= self._model.nframes or self._model.frames[frame].type != self._pin.FrameType.BODY:
+            links = [f.name for f in self._model.frames if f.type == self._pin.FrameType.BODY]
+            near = difflib.get_close_matches(link, links, 3) or links
+            raise KeyError(f"no link {link!r} in {Path(self.spec.urdf).name}; did you mean {', '.join(near)}?")
+        return frame
+
     def _ordered(self, q: Sequence[float] | Array) -> Array:
         values = np.array(q, float)
         return values if self._inverse_columns is None else values[self._inverse_columns]
@@ -278,14 +333,38 @@ class Kinematics:
         self._pin.forwardKinematics(self._model, self._data, self._ordered(q))
 
 
-def reduced_model(spec: KinematicsSpec, pin: Any) -> Any:
-    """Return pinocchio's model of the arm's joints alone, with the base link as its world frame."""
-    full = pin.buildModelFromXML(_bounded_joints(spec.urdf))
+def _exponential(axis: Array, angle: float) -> Array:
+    """Return the matrix exponential (4, 4) of a screw axis (6,), v then omega, by Rodrigues' formula."""
+    matrix = np.eye(4)
+    v, (x, y, z) = axis[:3], axis[3:]
+    if not axis[3:].any():
+        matrix[:3, 3] = angle * v
+        return matrix
+    skew = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    square, one = skew @ skew, np.eye(3)
+    matrix[:3, :3] = one + sin(angle) * skew + (1.0 - cos(angle)) * square
+    matrix[:3, 3] = (angle * one + (1.0 - cos(angle)) * skew + (angle - sin(angle)) * square) @ v
+    return matrix
+
+
+def reduced_model(spec: KinematicsSpec, pin: Any, others: Mapping[str, float] | None = None) -> Any:
+    """Return pinocchio's model of the arm's joints alone, with the base link as its world frame.
+
+    Args:
+        spec: The arm.
+        pin: The module.
+        others: Positions of joints that are not the arm's, such as those of fingers, rad or m; absent ones are at 0.
+    """
+    full = pin.buildModelFromXML(bounded_urdf(spec.urdf))
     missing = [name for name in spec.joints if not full.existJointName(name)]
     if missing:
         raise ValueError(f"{spec.urdf} has no movable joint {', '.join(missing)}")
     locked = [k for k in range(1, full.njoints) if full.names[k] not in spec.joints]
-    model = pin.buildReducedModel(full, locked, pin.neutral(full))
+    reference = pin.neutral(full)
+    for name, value in (others or {}).items():
+        if full.existJointName(name):
+            reference[full.joints[full.getJointId(name)].idx_q] = value
+    model = pin.buildReducedModel(full, locked, reference)
     if model.nq != len(spec.joints) or model.nv != len(spec.joints):
         raise ValueError(f"an arm's joints must turn or slide about one axis each: {', '.join(spec.joints)}")
     if spec.base_link is not None:
@@ -302,7 +381,7 @@ def reduced_model(spec: KinematicsSpec, pin: Any) -> Any:
     return model
 
 
-def _bounded_joints(urdf: str) -> str:
+def bounded_urdf(urdf: str) -> str:
     """Return the URDF's text with continuous joints made revolute: pinocchio has two numbers for a continuous one."""
     robot = parse_xml(urdf)
     for joint in robot.iter("joint"):

@@ -167,7 +167,12 @@ class TorqueBounds:
         if tcp_share < 1.0:
             envelope.limited |= Limited.TCP_SPEED
         share = min(share, tcp_share)
-        return slowed if share == 1.0 else [share * x for x in slowed]
+        if share == 1.0:
+            return slowed
+        # What is scaled away may have braked a joint that Coriolis torques accelerate: all speeds are braked instead.
+        excess = max(abs(v) / limit for v, limit in zip(arm.dq, most, strict=True)) - 1.0
+        brake = (1.0 - share) * self._decay * max(0.0, excess)
+        return [share * x - brake * p for x, p in zip(slowed, arm.inertia.momentum(arm.dq), strict=True)]
 
     def _slowed(self, tau: float, v: float, inertia: float, most: float, limit: float) -> float:
         """Return ``tau`` cut to what leaves this joint at ``most`` rad/s: inertia (most - v) = tau T + tau^2 / (2 R).

@@ -56,7 +56,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _prepare(options: argparse.Namespace, stack: ExitStack, journal: Journal) -> tuple[ArmServer, str]:
     """Return the server, ready to run, and the line that announces it. Raises OSError and ValueError."""
     title, model, version = _ROBOTS[options.robot]
-    urdf = options.urdf or find_data("robots", "fr3.urdf")
+    urdf = options.urdf or find_data("robots", f"{options.robot}.urdf")
     library = options.model_library
     files = RobotFiles(
         arm_only(urdf.read_text(encoding="utf-8")).encode(), library.read_bytes() if library is not None else None
@@ -113,7 +113,7 @@ def _parser() -> argparse.ArgumentParser:
         help="with --lockstep: longest wait for an answer, s (%(default)s)",
     )
     add("--q", type=float, nargs=7, default=_HOME, metavar="RAD", help="joint positions at the start (home)")
-    add("--urdf", type=Path, help="the arm's URDF (the project's fr3.urdf)")
+    add("--urdf", type=Path, help="the arm's URDF (the project's own)")
     add(
         "--model-library",
         type=Path,

@@ -1,7 +1,6 @@
 """The simulated arm behind the emulated controller: rigid-body model, plants, and the URDF that a client gets.
 
-Kinematics and dynamics are computed by pinocchio from a URDF. The Panda has the same kinematics as the FR3 and nearly
-its masses, so both emulators use the same URDF.
+Kinematics and dynamics are computed by pinocchio from a URDF, in which the hand is open.
 """
 
 from __future__ import annotations
@@ -62,7 +61,11 @@ class RigidBody:
         model = pin.buildModelFromUrdf(str(urdf))
         names = [_named(model, f"joint{k}") for k in range(1, 8)]
         others = [k for k in range(1, model.njoints) if model.names[k] not in names]
-        self._model: Any = pin.buildReducedModel(model, others, pin.neutral(model))
+        reference = pin.neutral(model)
+        for k in others:
+            if "JointModelP" in model.joints[k].shortname():  # a finger, open
+                reference[model.joints[k].idx_q] = model.upperPositionLimit[model.joints[k].idx_q]
+        self._model: Any = pin.buildReducedModel(model, others, reference)
         if [str(name) for name in self._model.names][1:] != names:
             raise ValueError(f"{urdf}: the seven joints must follow each other from base to flange")
         self._data: Any = self._model.createData()

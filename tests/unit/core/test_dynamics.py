@@ -11,11 +11,15 @@ import numpy as np
 import pytest
 from specs import data, panda
 
+from hal.config import load
 from hal.config.data_files import data_folder
 from hal.dynamics import STANDARD_GRAVITY, Dynamics
 from hal.errors import NotSupported
+from hal.geometry import Pose
+from hal.kinematics import Kinematics
 from hal.kinematics.inertials import find_wrong_inertials
-from hal.specs import KinematicsSpec, PayloadSpec
+from hal.kinematics.urdf import parse_xml
+from hal.specs import KinematicsSpec, LimitsSpec, PayloadSpec
 from hal.testing import robot_spec
 
 G = STANDARD_GRAVITY
@@ -104,12 +108,83 @@ def test_coriolis_torques_are_in_inverse_dynamics(tmp_path: Path) -> None:
     assert moving[0] - dynamics.gravity(q)[0] == pytest.approx(h)
 
 
+def configurations(limits: LimitsSpec, count: int) -> list[list[float]]:
+    positions: list[list[float]] = np.random.default_rng(4).uniform(limits.lower, limits.upper, (count, 7)).tolist()
+    return positions
+
+
+def differences(function: Any, q: Any, h: float = 1e-3) -> list[Any]:
+    """Fourth-order central differences along each joint."""
+
+    def at(k: int, steps: int) -> Any:
+        return np.array(function([x + steps * h * (j == k) for j, x in enumerate(q)]))
+
+    return [(8.0 * (at(k, 1) - at(k, -1)) - (at(k, 2) - at(k, -2))) / (12.0 * h) for k in range(len(q))]
+
+
+def potential(kinematics: Kinematics, q: list[float]) -> float:
+    """Potential energy of all links, J, from the centres of mass in the URDF."""
+    energy = 0.0
+    for link in parse_xml(kinematics.spec.urdf).findall("link"):
+        mass, origin = link.find("inertial/mass"), link.find("inertial/origin")
+        if mass is not None:
+            place = [float(word) for word in ("0 0 0" if origin is None else origin.get("xyz", "0 0 0")).split()]
+            pose = kinematics.link_pose(link.get("name", ""), q)
+            energy += G * float(mass.get("value", "0")) * (pose @ Pose(place)).position[2]
+    return energy
+
+
+@pytest.mark.parametrize("model", ["fr3", "panda"])
+def test_dynamics_are_derivatives_of_the_energies_and_agree_with_the_recursive_form(model: str) -> None:
+    spec = load("franka", overrides=[f"robots.arm.model={model}"]).resolve().robots[0]
+    dynamics, kinematics = Dynamics(spec.kinematics), Kinematics(spec.kinematics)
+    random, still = np.random.default_rng(5), [0.0] * 7
+    for q in configurations(spec.limits, 5):
+        gravity = np.array(dynamics.gravity(q))
+        assert gravity == pytest.approx(differences(lambda q: potential(kinematics, q), q), abs=1e-9)
+        mass = np.array(dynamics.mass_matrix(q))
+        columns = [dynamics.inverse(q, still, unit) - gravity for unit in np.eye(7)]
+        assert mass == pytest.approx(np.array(columns).T, abs=1e-9)
+        dq, ddq = random.normal(size=7), random.normal(size=7)
+        slope = np.array(differences(dynamics.mass_matrix, q))
+        by_energy = np.einsum("kij,k,j->i", slope, dq, dq) - 0.5 * np.einsum("kij,i,j->k", slope, dq, dq)
+        coriolis = np.array(dynamics.coriolis(q, dq))
+        assert coriolis == pytest.approx(by_energy, abs=1e-9)
+        tau = dynamics.inverse(q, dq, ddq)
+        assert tau == pytest.approx(mass @ ddq + coriolis + gravity, abs=1e-9)
+        assert dynamics.forward(q, dq, tau) == pytest.approx(ddq, abs=1e-9)
+
+
+def test_the_task_inertia_is_how_hard_the_tcp_is_to_accelerate() -> None:
+    spec = load("franka").resolve().robots[0]
+    dynamics, kinematics = Dynamics.of(spec), Kinematics(spec.kinematics)
+    q, still, wrench = spec.home, [0.0] * 7, np.array([3.0, -2.0, 5.0, 0.1, 0.3, -0.2])
+    jacobian = kinematics.jacobian(q)
+    tau = np.array(dynamics.gravity(q)) + jacobian.T @ wrench
+    acceleration = jacobian @ dynamics.forward(q, still, tau)
+    assert dynamics.task_inertia(q) @ acceleration == pytest.approx(wrench)
+    stretched = dynamics.task_inertia(still)  # along z nothing can move
+    assert np.isfinite(stretched).all()
+
+
+def test_open_fingers_are_part_of_the_inertia() -> None:
+    spec = load("franka").resolve().robots[0]
+    wide, shut = Dynamics.of(spec), Dynamics.of(spec, width=0.0)
+    more = np.array(wide.mass_matrix(spec.home)) - shut.mass_matrix(spec.home)
+    finger = 0.0291  # kg, each 40 mm off the axis of joint 7, and a little farther with its own centre of mass
+    assert more[6, 6] == pytest.approx(2.0 * finger * (0.0553**2 - 0.0153**2), rel=0.01)
+    assert wide.gravity(spec.home) == pytest.approx(shut.gravity(spec.home), abs=1e-9)
+
+
 def test_joints_may_be_in_another_order_than_in_the_file(tmp_path: Path) -> None:
     spec = arm(tmp_path).kinematics
     plain, turned = Dynamics(spec), Dynamics(replace(spec, joints=("j2", "j1")))
     q, dq, ddq = (0.3, 0.5), (0.2, -1.0), (1.5, -2.0)
     assert turned.inverse(q[::-1], dq[::-1], ddq[::-1]) == pytest.approx(plain.inverse(q, dq, ddq)[::-1])
     assert turned.gravity(q[::-1]) == pytest.approx(plain.gravity(q)[::-1])
+    assert turned.coriolis(q[::-1], dq[::-1]) == pytest.approx(plain.coriolis(q, dq)[::-1])
+    assert turned.forward(q[::-1], dq[::-1], ddq[::-1]) == pytest.approx(plain.forward(q, dq, ddq)[::-1])
+    np.testing.assert_allclose(turned.task_inertia(q[::-1]), plain.task_inertia(q), atol=1e-9)
     np.testing.assert_allclose(turned.mass_matrix(q[::-1]), np.array(plain.mass_matrix(q))[::-1, ::-1], atol=1e-12)
 
 

@@ -378,14 +378,67 @@ def test_joints_keep_the_order_of_the_spec(tmp_path: Path) -> None:
     assert np.isfinite(speeds).all()
 
 
-def test_the_inertia_keeps_the_order_of_the_spec() -> None:
-    backwards = {name: getattr(IIWA, name)[::-1] for name in ("joints", "lower", "upper", "home")}
-    plain, turned = Kinematics(IIWA), Kinematics(dataclasses.replace(IIWA, **backwards))
-    for q in configurations(IIWA, 5):
-        mass = plain.mass_matrix(q)
-        assert mass == pytest.approx(mass.T)
-        assert (np.linalg.eigvalsh(mass) > 0.0).all()
-        np.testing.assert_allclose(turned.mass_matrix(q[::-1]), mass[::-1, ::-1], atol=1e-12)
+def derivative_of(matrix: Any, q: np.ndarray, joint: int, h: float = 1e-3) -> np.ndarray:
+    """Fourth-order central difference of ``matrix(q)`` along one joint."""
+    step = np.eye(len(q))[joint] * h
+    near, far = matrix(q + step) - matrix(q - step), matrix(q + 2 * step) - matrix(q - 2 * step)
+    return (8.0 * near - far) / (12.0 * h)
+
+
+@pytest.mark.parametrize("link", [None, "panda_link5"])
+def test_jacobians_in_three_frames_are_derivatives_of_the_pose(panda: Kinematics, link: str | None) -> None:
+    def pose(q: np.ndarray) -> np.ndarray:
+        return (panda.pose(q) if link is None else panda.link_pose(link, q)).matrix()
+
+    for q in configurations(PANDA, 10):
+        here = pose(q)
+        back, base = np.linalg.inv(here), np.eye(4)
+        base[:3, 3] = here[:3, 3]
+        at_tcp = np.linalg.inv(base)
+        found = {frame: panda.jacobian(q, frame, link) for frame in ("base", "tcp", "space")}
+        for k in range(7):
+            slope = derivative_of(pose, q, k)
+            twists = {"space": slope @ back, "tcp": back @ slope, "base": at_tcp @ slope @ back @ base}
+            for frame, m in twists.items():
+                column = [*m[:3, 3], m[2, 1], m[0, 2], m[1, 0]]
+                np.testing.assert_allclose(found[frame][:, k], column, atol=1e-8)
+    if link is not None:
+        assert not found["base"][:, 5:].any()
+
+
+def test_an_unknown_frame_and_an_unknown_link_are_refused(panda: Kinematics) -> None:
+    with pytest.raises(CommandError) as caught:
+        panda.jacobian(panda.home, "world")  # type: ignore[arg-type]  # the mistake
+    assert caught.value.code == "unknown_frame"
+    with pytest.raises(KeyError):
+        panda.jacobian(panda.home, link="panda_link55")
+
+
+@pytest.mark.parametrize("link", [None, "panda_link4"])
+def test_the_product_of_exponentials_is_forward_kinematics(panda: Kinematics, link: str | None) -> None:
+    axes = panda.screw_axes()
+    np.testing.assert_allclose(np.linalg.norm(axes[3:], axis=0), 1.0, atol=1e-12)
+    np.testing.assert_allclose(np.einsum("ij,ij->j", axes[:3], axes[3:]), 0.0, atol=1e-12)  # they turn only
+    for q in configurations(PANDA, 20):
+        pose = panda.pose(q) if link is None else panda.link_pose(link, q)
+        np.testing.assert_allclose(panda.exponential(q, link).matrix(), pose.matrix(), atol=1e-12)
+
+
+def test_the_product_of_exponentials_of_an_arm_with_a_slide_in_another_order(tmp_path: Path) -> None:
+    path = tmp_path / "arm.urdf"
+    path.write_text(arm_urdf())
+    arm = Kinematics(
+        small_spec(path, joints=("alpha", "zeta", "mu"), lower=(0.0, -100.0, -2.0), upper=(1.0, 100.0, 2.0))
+    )
+    q = (0.3, 0.7, -0.4)
+    np.testing.assert_allclose(arm.exponential(q).matrix(), arm.pose(q).matrix(), atol=1e-12)
+    assert sorted(np.linalg.norm(arm.screw_axes()[3:], axis=0).tolist()) == pytest.approx([0.0, 1.0, 1.0])
+
+
+def test_manipulability_is_yoshikawas(panda: Kinematics) -> None:
+    jacobian = panda.jacobian(panda.home)
+    assert panda.manipulability(panda.home) == pytest.approx(np.sqrt(np.linalg.det(jacobian @ jacobian.T)))
+    assert panda.manipulability(np.zeros(7)) == pytest.approx(0.0, abs=1e-9)  # stretched out
 
 
 @pytest.mark.parametrize(

@@ -9,11 +9,12 @@ from typing import Any
 import numpy as np
 import pytest
 from engines_kit import Engine
-from specs import PANDA_HOME, box, iiwa, panda
+from specs import PANDA_HOME, box, data, iiwa, panda
 from torque_kit import NOTHING, N, one, simulated
 
+from hal.config import load
 from hal.driver import RobotDriver, Setpoint
-from hal.kinematics import Kinematics
+from hal.dynamics import Dynamics
 from hal.specs import BodySpec
 from hal.types import Limited, RobotStatus, Trip
 
@@ -155,15 +156,71 @@ class TestServed:
 class TestDriver:
     """The simulated device alone."""
 
-    def test_inertia_of_a_correct_urdf_is_that_of_the_kinematics(self, engine: Engine) -> None:
-        spec = iiwa()
-        driver = engine.robot(engine.world(spec))
+    @pytest.mark.parametrize("model", ["fr3", "iiwa", "yam"])
+    def test_it_is_the_arm_that_dynamics_describe(self, engine: Engine, model: str) -> None:
+        """Its inertia with open fingers at rest, and its weight: without more torque it stays where it is."""
+        if model == "iiwa":
+            data("")
+        plan = load({"robots": {"arm": {"model": model}}}, sim=True, engine=engine.name).resolve()
+        assert plan.world is not None
+        spec, world = plan.robots[0], engine.world_of(plan.world)
+        driver, dynamics = engine.robot(world), Dynamics.of(spec)
         driver.open()
+        if spec.gripper is not None:
+            engine.gripper(world).open()
+            world.handle("arm", False)
         rng = np.random.default_rng(0)
-        kinematics = Kinematics(spec.kinematics)
-        for _ in range(10):
-            q = rng.uniform(spec.limits.lower, spec.limits.upper).tolist()
-            assert np.array(driver.mass_matrix(q)) == pytest.approx(kinematics.mass_matrix(q), rel=1e-3, abs=1e-4)
+        for _ in range(3):
+            q = rng.uniform(spec.limits.lower, spec.limits.upper)
+            mass = np.array(dynamics.mass_matrix(q))
+            scale = np.sqrt(np.outer(mass.diagonal(), mass.diagonal()))
+            assert np.array(driver.mass_matrix(q)) == pytest.approx(mass, rel=0, abs=1e-3 * scale.min())
+            if engine.name == "pybullet":  # its own, which has nothing of the code above
+                body = world.body("arm")
+                everything = [*q, *(body.home[joint] for joint in sorted(body.movable)[len(q) :])]
+                own = world.client.calculateInverseDynamics(body.id, everything, *[[0.0] * len(everything)] * 2)
+                assert dynamics.gravity(q) == pytest.approx(own[: len(q)], abs=1e-6)
+            world.reset("arm", q=q.tolist())
+            driver.read(0.0)
+            still = [0.0] * len(q)
+            for _ in range(120):
+                reading = driver.read(0.0)
+                driver.write(Setpoint(reading.q, reading.dq, still, still))
+                world.step()
+            assert driver.read(0.0).q == pytest.approx(q, abs=1e-3)
+        world.close()
+
+    def test_only_gravity_is_carried_and_the_rest_follows_the_equation_of_motion(self, engine: Engine) -> None:
+        """As on an arm whose own controller compensates gravity: no Coriolis torques, no drag."""
+        spec = load("franka", sim=True, overrides=["robots.arm.rate_hz=1000"]).resolve().robots[0]
+        spec = replace(spec, base_position=(0.0, 0.0, 0.0))
+        world, dynamics = engine.world(spec, physics_hz=1000.0), Dynamics.of(spec)
+        driver = engine.robot(world)
+        driver.open()
+        world.handle(spec.name, False)
+        q, dq, still = np.array(spec.home), np.zeros(N), [0.0] * N
+        mass = np.array(dynamics.mass_matrix(q))
+        for turn in range(400):
+            tau = mass @ (4.0 * np.sin(0.005 * turn + np.arange(N)))
+            driver.write(Setpoint(driver.read(0.0).q, still, still, tau.tolist()))
+            world.step()
+            dq = dq + 0.001 * np.array(dynamics.forward(q, dq, tau + dynamics.gravity(q)))
+            q = q + 0.001 * dq
+        assert np.abs(dq).max() > 0.3
+        assert driver.read(0.0).q == pytest.approx(q, abs=1e-4)
+        world.close()
+
+    def test_damping_of_a_light_wrist_is_stable_and_lets_a_torque_turn_it(self, engine: Engine) -> None:
+        """The iiwa has 0.5 Nm s/rad on 0.001 kg m2: pushed, its last joint turns at tau / D."""
+        spec = iiwa()
+        world = engine.world(spec)
+        driver = engine.robot(world)
+        driver.open()
+        still = [0.0] * N
+        for _ in range(240):
+            driver.write(Setpoint(driver.read(0.0).q, still, still, [*still[:6], 0.5]))
+            world.step()
+        assert driver.read(0.0).dq[6] == pytest.approx(1.0, rel=0.02)
 
     def test_reading_twice_does_not_carry_it_twice(self, engine: Engine) -> None:
         world, driver = opened(engine)
