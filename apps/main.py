@@ -22,6 +22,7 @@ PROGRAMS = {
     "check": "check this computer, real arms and cameras before they move; show gamepads, CAN adapters",
     "collect": "record demonstrations",
     "review": "view, check and repair a dataset",
+    "dataset": "list, delete, mark, re-task, extract and merge recorded episodes",
     "replay": "replay a recorded episode",
     "rollout": "run a policy and count its successes",
     "generate": "generate a dataset in simulation, on several workers",

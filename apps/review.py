@@ -28,7 +28,7 @@ __all__ = ["main", "parser"]
 
 LEAVE_OUT = (
     "restore the files of a damaged episode from a copy, or leave it out with hal-export --episodes; "
-    "docs/record.md says how to remove it"
+    "docs/record.md describes how to remove the last one"
 )
 
 _MARK = {True: "success", False: "failure", None: "-"}

@@ -1,4 +1,4 @@
-"""Recordings of demonstrations: a crash-safe recorder, recovery after a crash, a reader, and merging of datasets.
+"""Recordings of demonstrations: a crash-safe recorder, recovery after a crash, a reader, and curation.
 
     from hal.recording import Dataset, Recorder, recover
 
@@ -22,19 +22,35 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from .dataset import Dataset, Episode
     from .finish import recover, repair
-    from .merging import merge
+    from .merging import delete_episodes, extract, mark_episodes, merge, set_task
     from .recorder import Recorder, RecorderStatus
 
-__all__ = ["Dataset", "Episode", "Recorder", "RecorderStatus", "merge", "recover", "repair"]
+__all__ = [
+    "Dataset",
+    "Episode",
+    "Recorder",
+    "RecorderStatus",
+    "delete_episodes",
+    "extract",
+    "mark_episodes",
+    "merge",
+    "recover",
+    "repair",
+    "set_task",
+]
 
 _HOME = {
     "Dataset": "dataset",
     "Episode": "dataset",
     "Recorder": "recorder",
     "RecorderStatus": "recorder",
+    "delete_episodes": "merging",
+    "extract": "merging",
+    "mark_episodes": "merging",
     "merge": "merging",
     "recover": "finish",
     "repair": "finish",
+    "set_task": "merging",
 }
 
 
