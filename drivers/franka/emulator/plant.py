@@ -112,7 +112,7 @@ class RigidBody:
 
 
 def _named(model: Any, ending: str) -> str:
-    found = [str(name) for name in model.names if str(name).endswith(ending)]
+    found = [str(name) for name in model.names if str(name).endswith(ending) and "finger" not in str(name)]
     if len(found) != 1:
         raise ValueError(f"the URDF has {len(found)} joints whose name ends in {ending!r}, not one")
     return found[0]
