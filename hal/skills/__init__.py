@@ -6,6 +6,7 @@ faults and lost devices are the exceptions that they are everywhere else.
 
 from __future__ import annotations
 
+from .depth import find_by_depth, locate_by_depth, look_at, read_frames
 from .grasping import grasp
 from .objects import LocatedObject, grasp_pose, locate_by_truth, object_from_points
 from .running import Reason, SkillPhase, SkillProgress, SkillResult
@@ -16,8 +17,12 @@ __all__ = [
     "SkillPhase",
     "SkillProgress",
     "SkillResult",
+    "find_by_depth",
     "grasp",
     "grasp_pose",
+    "locate_by_depth",
     "locate_by_truth",
+    "look_at",
     "object_from_points",
+    "read_frames",
 ]

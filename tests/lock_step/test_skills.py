@@ -7,7 +7,7 @@ from pathlib import Path
 from types import ModuleType
 
 import pytest
-from engines_kit import Engine
+from engines_kit import AUTO, Engine
 
 
 @pytest.fixture(scope="module")
@@ -24,4 +24,8 @@ def tries() -> ModuleType:
 
 @pytest.mark.parametrize("thing", ["cube", "mug"])
 def test_grasps_by_ground_truth(tries: ModuleType, engine: Engine, thing: str) -> None:
-    assert tries.grasps(engine.name, thing, 1) == [""]
+    assert tries.grasps(engine.name, thing, tries.TRUTH, 1) == [""]
+
+
+def test_a_grasp_by_noisy_depth(tries: ModuleType) -> None:
+    assert tries.grasps(AUTO, "duck", tries.NOISY, 1) == [""]
