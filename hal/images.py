@@ -7,6 +7,7 @@ w - 1/2, and distortion is the five coefficients (k1, k2, p1, p2, k3) of Brown a
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -17,6 +18,7 @@ __all__ = [
     "Cropping",
     "Intrinsics",
     "centre_crop",
+    "depth_to_points",
     "distort_points",
     "from_field_of_view",
     "undistort_pixels",
@@ -153,6 +155,33 @@ def undistort_pixels(pixels: ArrayLike, K: Array, distortion: ArrayLike) -> Arra
             raise ValueError("the distortion has no inverse at these pixels; check the camera's coefficients")
     ideal: Array = np.column_stack([points, np.ones(len(points))]) @ K[:2].T
     return ideal
+
+
+def depth_to_points(depth: NDArray[np.float32], K: Array, distortion: ArrayLike) -> NDArray[np.float32]:
+    """Return the point that each pixel of a depth image shows.
+
+    Args:
+        depth: (H, W) distance along the optical axis, m; 0 where nothing was measured.
+        K: (3, 3)
+        distortion: (5,)
+
+    Returns:
+        (H, W, 3) in the camera's axes (x right, y down, z forward), m; 0 where nothing was measured.
+    """
+    rays = _rays(depth.shape, tuple(K.ravel().tolist()), tuple(np.asarray(distortion, float).tolist()))
+    points: NDArray[np.float32] = depth[..., None] * rays
+    return points
+
+
+@lru_cache(maxsize=8)
+def _rays(shape: tuple[int, int], matrix: tuple[float, ...], distortion: tuple[float, ...]) -> NDArray[np.float32]:
+    """Return x/z, y/z and 1 (H, W, 3) of what each pixel shows."""
+    K, (height, width) = np.array(matrix).reshape(3, 3), shape
+    pixels = np.dstack(np.meshgrid(np.arange(width), np.arange(height))).reshape(-1, 2)
+    ideal = undistort_pixels(pixels, K, distortion)
+    rays = np.column_stack([ideal, np.ones(len(ideal))]) @ np.linalg.inv(K).T
+    image: NDArray[np.float32] = rays.reshape(height, width, 3).astype(np.float32)
+    return image
 
 
 class Cropping:

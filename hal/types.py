@@ -10,11 +10,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import IntEnum, IntFlag
 from types import MappingProxyType
+from typing import Literal
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from .errors import Fault
+from .errors import CommandError, Fault, NotSupported
 from .geometry import Pose
 
 __all__ = [
@@ -282,6 +283,54 @@ class Frame:
     """(H, W), of the right imager."""
     skew: float | None = None
     """Time of the colour image minus that of the depth image, s; None without both."""
+
+    def points(
+        self, mask: NDArray[np.bool_] | None = None, frame: Literal["camera", "world"] | Pose = "camera"
+    ) -> NDArray[np.float32]:
+        """Return the points (k, 3), m, that the depth image shows, by rows; pixels without depth have none.
+
+        Args:
+            mask: (H, W), for example ``frame.segmentation == rig.world.bodies.index("cube")``; None for all pixels.
+            frame: ``"camera"`` (x right, y down, z forward), ``"world"``, or the pose in the world of the frame that
+                they are given in: ``arm.base`` for an arm's.
+
+        Raises:
+            CommandError: The mask has another shape, or there is no such frame.
+            NotSupported: There is no depth (``code`` is ``no_depth``), or the camera's pose is unknown
+                (``no_camera_pose``).
+        """
+        points = self.point_image(frame)
+        seen = np.asarray(self.depth) > 0.0
+        if mask is not None:
+            if np.shape(mask) != seen.shape:
+                raise CommandError(f"mask must have shape {seen.shape}, not {np.shape(mask)}", code="bad_mask")
+            seen &= np.asarray(mask, bool)
+        return points[seen]
+
+    def point_image(self, frame: Literal["camera", "world"] | Pose = "camera") -> NDArray[np.float32]:
+        """Return the point (H, W, 3), m, that each pixel of the depth image shows; 0 where nothing was measured.
+
+        Takes and raises the same as :meth:`points`.
+        """
+        from .images import depth_to_points
+
+        if self.depth is None:
+            raise NotSupported("this frame has no depth: give the camera a depth stream", code="no_depth")
+        points = depth_to_points(self.depth, self.K, self.distortion)
+        if isinstance(frame, str) and frame == "camera":
+            return points
+        if not isinstance(frame, Pose) and frame != "world":
+            raise CommandError(f"frame must be 'camera', 'world' or a hal.Pose, not {frame!r}", code="unknown_frame")
+        if self.T_world_camera is None:
+            raise NotSupported(
+                "the camera's pose in the world is unknown: give the camera a mount, or calibrate it",
+                code="no_camera_pose",
+            )
+        pose = self.T_world_camera if frame == "world" else frame.inverse() @ self.T_world_camera
+        matrix = pose.matrix().astype(np.float32)
+        moved: NDArray[np.float32] = points @ matrix[:3, :3].T + matrix[:3, 3]
+        moved[self.depth <= 0.0] = 0.0
+        return moved
 
 
 @dataclass(frozen=True, slots=True)

@@ -94,6 +94,8 @@ def action_names(robots: Sequence[Robot], kind: ActionKind, several: bool) -> tu
     return tuple(names)
 
 
+POINTS = "points"
+"""Name of the stream of points, which follows from the depth."""
 _TCP_NAMES = ("x", "y", "z", "roll", "pitch", "yaw")
 
 
@@ -114,7 +116,7 @@ def observation_space(
         sizes = {"q": robot.n, "dq": robot.n, "tcp": 7} | ({"gripper": 1} if robot.gripper is not None else {})
         parts += [(lead + name, free(size)) for name, size in sizes.items()]
     for camera in cameras:
-        found = [stream for stream in streams if stream in camera.spec.streams]
+        found = [stream for stream in streams if stream in _offered(camera.spec)]
         parts += [(entry_key(camera.name, stream), _picture_space(camera.spec, stream)) for stream in found]
     parts += [(entry_key("object", name), free(7)) for name in objects]
     keys = [name for name, _ in parts]
@@ -127,8 +129,10 @@ def observation_space(
 
 
 def _picture_space(camera: CameraSpec, stream: str) -> spaces.Box:
-    """Return the box of one camera's pictures: (H, W, 3) colour, (H, W, 1) anything else."""
+    """Return the box of one camera's pictures: (H, W, 3) colour and points, (H, W, 1) anything else."""
     size = (camera.height, camera.width)
+    if stream == POINTS:
+        return spaces.Box(-np.inf, np.inf, (*size, 3), np.float32)
     if stream == "color":
         return spaces.Box(0, 255, (*size, 3), np.uint8)
     if stream == "depth":
@@ -143,7 +147,7 @@ def numbers_and_pictures(
 ) -> ObservationDict:
     """Return the entries of an observation: the arms, their grippers and these streams of these cameras.
 
-    ``robots`` maps what leads the names of an arm's entries to the arm.
+    ``robots`` maps what leads the names of an arm's entries to the arm. Points are in the base frame of the first.
     """
     shown: ObservationDict = {}
     for lead, robot in robots.items():
@@ -154,10 +158,18 @@ def numbers_and_pictures(
     for name in cameras:
         frame = observation.cameras[name].frame
         for stream in streams:
-            picture = getattr(frame, stream)
+            if stream != POINTS:
+                picture = getattr(frame, stream)
+            else:
+                picture = None if frame.depth is None else frame.point_image(next(iter(robots.values())).base)
             if picture is not None:
                 shown[entry_key(name, stream)] = picture if picture.ndim == 3 else picture[..., None]
     return shown
+
+
+def _offered(camera: CameraSpec) -> tuple[str, ...]:
+    """Return the streams of a camera that can be observed: its own, and points where it has depth."""
+    return (*camera.streams, POINTS) if "depth" in camera.streams else tuple(camera.streams)
 
 
 def entry_key(*parts: str) -> str:
@@ -230,7 +242,8 @@ class RigEnv(gymnasium.Env[ObservationDict, NDArray[np.float32]]):
     Observations are a dict: ``q`` and ``dq`` (n,), rad and rad/s; ``tcp`` (7,), position in m and quaternion xyzw in
     the arm's base frame; ``gripper`` (1,), width in m; per camera, of the streams that it has, ``<name>_color`` (H, W,
     3) uint8, ``<name>_depth`` (H, W, 1) float32 in m, ``<name>_infrared`` and ``<name>_infrared_right`` (H, W, 1)
-    uint8, ``<name>_segmentation`` (H, W, 1) int32 (see :class:`~hal.types.Frame`); per observed object
+    uint8, ``<name>_segmentation`` (H, W, 1) int32 (see :class:`~hal.types.Frame`), ``<name>_points`` (H, W, 3) float32,
+    m, in the first arm's base frame, 0 where nothing was measured; per observed object
     ``object_<name>`` (7,), its pose in the world. A dash in a name becomes an underscore. :attr:`observation` is the
     complete record behind it, with every stamp; ``info["elapsed"]`` is its time since the reset, s.
 
@@ -279,8 +292,8 @@ class RigEnv(gymnasium.Env[ObservationDict, NDArray[np.float32]]):
             robots: Names of several arms, instead of ``robot``.
             action: Kind of action, see :data:`ActionKind`.
             cameras: Names of the observed cameras; None for all.
-            streams: Observed streams: some of ``color``, ``depth``, ``infrared``, ``infrared_right`` and
-                ``segmentation``; None for colour and depth.
+            streams: Observed streams: some of ``color``, ``depth``, ``infrared``, ``infrared_right``,
+                ``segmentation`` and ``points``; None for colour and depth.
             objects: Names of the objects of the simulated world whose poses are observed.
             rate_hz: Steps per second.
             max_steps: Steps after which an episode is truncated; None for no limit.
@@ -508,7 +521,7 @@ def _known(objects: Collection[str], rig: Rig) -> tuple[str, ...]:
 
 def _streamed(streams: Collection[str], cameras: Collection[Camera]) -> tuple[str, ...]:
     """Return the observed streams. Raises NotSupported for one that none of the cameras has."""
-    there = {stream for camera in cameras for stream in camera.spec.streams}
+    there = {stream for camera in cameras for stream in _offered(camera.spec)}
     if missing := [stream for stream in streams if stream not in there]:
         message = (
             f"streams=: no observed camera has {', '.join(missing)}; they have: {', '.join(sorted(there)) or 'none'}"

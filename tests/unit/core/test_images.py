@@ -1,11 +1,15 @@
-"""Crop, scaling and lens distortion of images."""
+"""Crop, scaling and lens distortion of images, and the points that depth images show."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
+from errors_kit import raises_code
 
+from hal.errors import CommandError, NotSupported
+from hal.geometry import Pose
 from hal.images import Cropping, distort_points, undistort_pixels
+from hal.types import Frame, Stamp
 
 SIZES = [((640, 480), (256, 256)), ((848, 480), (640, 480)), ((640, 480), (640, 480)), ((640, 480), (1280, 960))]
 
@@ -72,3 +76,48 @@ def test_distortion_agrees_with_opencv_and_its_inverse_undoes_it() -> None:
 def test_a_distortion_without_an_inverse_is_an_error() -> None:
     with pytest.raises(ValueError, match="distortion"):
         undistort_pixels([[5000.0, 4000.0]], K, (-2.0, 3.0, 0.0, 0.0, -1.0))
+
+
+# Points.
+
+
+def frame_of(depth: np.ndarray | None, pose: Pose | None = None, distortion: tuple[float, ...] = (0.0,) * 5) -> Frame:
+    K = np.array([[100.0, 0.0, 2.0], [0.0, 120.0, 1.0], [0.0, 0.0, 1.0]])
+    return Frame(Stamp(0.0, 0.0, 0), None, depth, None, None, K, np.array(distortion), pose)
+
+
+def test_points_are_what_each_pixel_shows_in_the_frame_that_was_chosen() -> None:
+    depth = np.zeros((3, 5), np.float32)
+    depth[1, 2], depth[2, 4] = 0.5, 2.0
+    pose = Pose.from_rpy((1.0, 2.0, 3.0), (np.pi, 0.0, 0.0))  # it looks down
+    frame = frame_of(depth, pose)
+    seen = [[0.0, 0.0, 0.5], [0.04, 2.0 / 120.0, 2.0]]
+    assert frame.points() == pytest.approx(np.array(seen))
+    assert frame.points(depth > 1.0) == pytest.approx(np.array(seen[1:]))
+    assert frame.points(frame="world") == pytest.approx(np.array([[1.0, 2.0, 2.5], [1.04, 2.0 - 2.0 / 120.0, 1.0]]))
+    base = Pose((1.0, 2.0, 0.0), (0.0, 0.0, np.sqrt(0.5), np.sqrt(0.5)))
+    assert frame.points(frame=base)[1] == pytest.approx([-2.0 / 120.0, -0.04, 1.0], abs=1e-6)
+    image = frame.point_image(base)
+    assert (image.shape, image.dtype) == ((3, 5, 3), np.float32)
+    assert not image[0].any()
+
+
+def test_the_lens_distortion_is_taken_out_of_points() -> None:
+    distortion = (0.3, -0.1, 0.01, -0.02, 0.05)
+    points = frame_of(np.full((30, 40), 2.0, np.float32), distortion=distortion).points()
+    K, ideal = frame_of(None).K, points[:, :2] / points[:, 2:]
+    pixels = distort_points(ideal, distortion) @ K[:2, :2].T + K[:2, 2]
+    there = np.dstack(np.meshgrid(np.arange(40), np.arange(30))).reshape(-1, 2)
+    assert pixels == pytest.approx(there, abs=1e-4)
+
+
+def test_points_that_cannot_be_computed_are_refused_by_name() -> None:
+    depth = np.ones((3, 5), np.float32)
+    with raises_code(NotSupported, "no_depth"):
+        frame_of(None).points()
+    with raises_code(NotSupported, "no_camera_pose"):
+        frame_of(depth).points(frame="world")
+    with raises_code(CommandError, "bad_mask"):
+        frame_of(depth).points(np.ones((5, 3), bool))
+    with raises_code(CommandError, "unknown_frame"):
+        frame_of(depth).points(frame="arm")  # type: ignore[arg-type]  # the mistake

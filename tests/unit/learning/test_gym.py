@@ -36,7 +36,7 @@ STREAMS = "cameras.scene.streams=[color, depth, infrared, segmentation]"
 
 
 def test_keys_are_identifiers_and_every_stream_can_be_chosen() -> None:
-    streams = ["color", "infrared", "segmentation"]
+    streams = ["color", "infrared", "segmentation", "points"]
     env = RigEnv("panda_table", sim=True, streams=streams, objects=["cube"], overrides=(STREAMS,))
     try:
         seen, _ = env.reset()
@@ -49,12 +49,17 @@ def test_keys_are_identifiers_and_every_stream_can_be_chosen() -> None:
             "scene_color": ((*size, 3), np.uint8),
             "scene_infrared": ((*size, 1), np.uint8),
             "scene_segmentation": ((*size, 1), np.int32),
+            "scene_points": ((*size, 3), np.float32),
             "wrist_color": ((*size, 3), np.uint8),
+            "wrist_points": ((*size, 3), np.float32),
         }
         assert env.rig.world is not None
         bodies = env.rig.world.bodies
         assert {bodies.index("cube"), bodies.index("panda")} <= set(np.unique(seen["scene_segmentation"]))
         assert seen["scene_infrared"].std() > 5.0
+        on_cube = (seen["scene_segmentation"] == bodies.index("cube"))[..., 0]
+        in_world = env.rig.robots["panda"].base @ hal.Pose(np.median(seen["scene_points"][on_cube], axis=0))
+        assert in_world.position == pytest.approx(seen["object_cube"][:3], abs=0.04)
     finally:
         env.close()
     for wrong in (["color", "thermal"], ["segmentation"]):
