@@ -25,6 +25,7 @@ PROGRAMS = {
     "dataset": "list, delete, mark, re-task, extract and merge recorded episodes",
     "replay": "replay a recorded episode",
     "rollout": "run a policy and count its successes",
+    "serve-lerobot": "serve a policy that was trained with LeRobot, for rollout",
     "generate": "generate a dataset in simulation, on several workers",
     "export": "convert a dataset for training",
     "calibrate": "measure where a camera is",

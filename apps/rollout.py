@@ -8,8 +8,10 @@ python apps/rollout.py --policy ws://gpu:8000 --policy-config droid --task "put 
 from __future__ import annotations
 
 import argparse
+import contextlib
 import json
 import os
+import subprocess
 import sys
 import traceback
 from pathlib import Path
@@ -25,6 +27,8 @@ from hal.apps._common import (
 )
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
     from hal.config.mapping import TeleopMapping
     from hal.deadman import Deadman
     from hal.geometry import Pose
@@ -35,6 +39,8 @@ if TYPE_CHECKING:
     from hal.robot import Robot
 
 ENDED_EARLY = 1
+LEROBOT = "lerobot:"
+"""Begins a policy that is the checkpoint of one that LeRobot trained."""
 MARKS = {"finish": True, "fail": False}
 """Action of the pad's mapping that ends an episode -> whether it is marked a success, as in ``apps/collect.py``."""
 
@@ -51,13 +57,15 @@ def parser() -> argparse.ArgumentParser:
     run.add_argument(
         "--policy",
         required=True,
-        metavar="MODULE:NAME|URL",
-        help="policy: a function, or a class whose instances are called; or ws://HOST:PORT of a policy's server",
+        metavar="MODULE:NAME|URL|CHECKPOINT",
+        help="policy: a function, or a class whose instances are called; ws://HOST:PORT of a policy's server; or "
+        "lerobot:CHECKPOINT, where LeRobot is installed beside this package",
     )
     run.add_argument(
         "--policy-config",
         metavar="NAME|FILE",
-        help="what a policy on a server sees, and what its actions mean: droid, roboarena, or a YAML file",
+        help="what a policy on a server sees, and what its actions mean: droid, roboarena, or a YAML file "
+        "(default: as the server describes itself)",
     )
     run.add_argument(
         "--latency",
@@ -83,14 +91,13 @@ def _main(args: argparse.Namespace) -> int:
     from hal.apps._display import banner, list_links
     from hal.apps.check import may_open
     from hal.errors import CommandError
-    from hal.learning.asynchronous import RemotePolicy
     from hal.learning.policy_config import load_policy_config
 
-    remote = is_url(args.policy)
+    remote = is_remote(args.policy)
     check_episode_options(args, *([] if remote else ["policy"]), "reset", "success")
-    if remote != bool(args.policy_config):
-        raise CommandError("a policy on a server (--policy ws://HOST:PORT) needs --policy-config, and no other does")
-    config = load_policy_config(args.policy_config) if remote else None
+    if args.policy_config and not remote:
+        raise CommandError("--policy-config is for a policy on a server: --policy ws://HOST:PORT")
+    config = load_policy_config(args.policy_config) if args.policy_config else None
     plan = resolve_plan(args, f"policy   {args.policy}")
     if plan is None:
         return 0
@@ -104,31 +111,59 @@ def _main(args: argparse.Namespace) -> int:
         print(f"{banner(rig)}\n  policy   {args.policy}\n{list_links(rig)}", flush=True)
         deadman, mapping = find_deadman(rig) if holds else (None, None)
         recorder = _recorder(rig, args)
-        policy = _policy(rig, robot, args, config)
         try:
-            return RolloutRun(rig, robot, args, policy, recorder, deadman, mapping).run()
+            with _policy(rig, robot, args, config) as policy:
+                return RolloutRun(rig, robot, args, policy, recorder, deadman, mapping).run()
         finally:
-            if isinstance(policy, RemotePolicy):
-                policy.close()
             if recorder is not None:
                 recorder.close()
 
 
-def is_url(policy: str) -> bool:
-    """Return whether a policy is the address of a server."""
-    return policy.startswith(("ws://", "wss://"))
+def is_remote(policy: str) -> bool:
+    """Return whether a policy runs in another process."""
+    return policy.startswith(("ws://", "wss://", LEROBOT))
 
 
-def _policy(rig: Rig, robot: Robot, args: argparse.Namespace, config: PolicyConfig | None) -> Policy:
-    """Return the policy of ``--policy``; one on a server is not connected yet."""
+@contextlib.contextmanager
+def _policy(rig: Rig, robot: Robot, args: argparse.Namespace, config: PolicyConfig | None) -> Iterator[Policy]:
+    """Yield the policy of ``--policy``."""
     from hal.learning.asynchronous import RemotePolicy
     from hal.learning.policy import load_policy
     from hal.learning.remote import PolicyClient
 
-    if config is None:
-        return load_policy(args.policy, rig)
-    client = PolicyClient(args.policy, api_key=os.environ.get("HAL_POLICY_KEY", ""))
-    return RemotePolicy(rig, client, config, robot=robot, task=args.task, latency=args.latency)
+    if not is_remote(args.policy):
+        yield load_policy(args.policy, rig)
+        return
+    with contextlib.ExitStack() as stack:
+        url = args.policy
+        if url.startswith(LEROBOT):
+            url = stack.enter_context(_lerobot_server(url.removeprefix(LEROBOT)))
+        client = PolicyClient(url, api_key=os.environ.get("HAL_POLICY_KEY", ""))
+        stack.callback(client.close)
+        yield RemotePolicy(rig, client, config, robot=robot, task=args.task, latency=args.latency)
+
+
+@contextlib.contextmanager
+def _lerobot_server(checkpoint: str) -> Iterator[str]:
+    """Start ``hal-serve-lerobot`` in a process of its own, which ends with this one; yield its address."""
+    from hal.errors import PolicyError
+
+    command = [sys.executable, "-m", "hal.apps.serve_lerobot", checkpoint, "--port", "0", "--until-stdin-ends"]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as server:
+        assert server.stdin is not None
+        assert server.stdout is not None
+        try:
+            lines = iter(server.stdout.readline, "")
+            address = next((line for line in lines if line.startswith("listening at ")), None)
+            if address is None:
+                raise PolicyError(f"the policy {checkpoint} was not loaded; see above", code="policy_unreachable")
+            yield address.removeprefix("listening at ").strip()
+        finally:
+            server.stdin.close()
+            try:
+                server.wait(5.0)
+            except subprocess.TimeoutExpired:
+                server.kill()
 
 
 def _recorder(rig: Rig, args: argparse.Namespace) -> Recorder | None:

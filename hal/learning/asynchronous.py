@@ -19,9 +19,9 @@ from numpy.typing import NDArray
 
 from ..arguments import number
 from ..commands import CHUNK_AHEAD, CHUNK_POINTS, FIRST_STEP_ANGLE, JointChunk
-from ..errors import NotSupported, PolicyError
+from ..errors import ConfigError, NotSupported, PolicyError
 from ..histogram import Histogram
-from .policy_config import PolicyConfig
+from .policy_config import PolicyConfig, load_policy_config
 from .remote import PolicyClient, check_actions
 
 if TYPE_CHECKING:
@@ -74,18 +74,19 @@ class RemotePolicy:
         self,
         rig: Rig,
         client: PolicyClient,
-        config: PolicyConfig,
+        config: PolicyConfig | None = None,
         *,
         robot: Robot | None = None,
         task: str = "",
         latency: float = 0.0,
     ) -> None:
-        """Prepare a policy; the connection is opened by :meth:`rehearse` or by the first :meth:`reset`.
+        """Prepare a policy. Without a ``config`` it connects now, otherwise in :meth:`rehearse` or :meth:`reset`.
 
         Args:
             rig: An open rig.
             client: Connection to the server.
-            config: What the policy sees, and what its actions mean.
+            config: What the policy sees, and what its actions mean. None: as the server describes it, which those of
+                ``hal-serve-lerobot`` do.
             robot: The arm; None for the rig's first.
             task: The task in words, for policies that follow instructions.
             latency: Simulated time until an answer arrives, s; in lock-step only.
@@ -93,17 +94,20 @@ class RemotePolicy:
         Raises:
             DeviceNotFound: The rig lacks a camera that the policy needs.
             NotSupported: The policy uses a gripper, and the arm has none; or ``latency`` in real time.
+            PolicyError: Without ``config``: the server does not answer or does not describe itself, or its policy is
+                for other joints.
             CommandError: ``latency`` is negative.
         """
-        self.rig, self.client, self.config = rig, client, config
+        self.rig, self.client = rig, client
         self.robot = next(iter(rig.robots.values())) if robot is None else robot
+        self.config = config or self._described(client.connect())
         self.task = task
         self._latency = number("latency", latency, "s", least=0.0)
         if latency and not rig.lock_step:
             raise NotSupported("latency= is for lock-step: in real time an answer takes as long as it takes")
-        config.check(rig, self.robot)
-        self._dt = 1.0 / config.rate_hz
-        self._numbers = config.numbers(self.robot.n)
+        self.config.check(rig, self.robot)
+        self._dt = 1.0 / self.config.rate_hz
+        self._numbers = self.config.numbers(self.robot.n)
         self._fastest = self.robot.limits.velocity
         self._roboarena = False
         self._session_id = ""
@@ -213,6 +217,27 @@ class RemotePolicy:
         size = metadata.get("image_resolution")
         if size is not None:
             self._resize(int(size[0]), int(size[1]))
+
+    def _described(self, metadata: dict[str, Any]) -> PolicyConfig:
+        """Return the configuration that a server describes in its metadata."""
+        if "policy_config" not in metadata:
+            raise PolicyError(
+                f"{self.client.url} does not describe its policy; pass a configuration (--policy-config)",
+                code="policy_mismatch",
+            )
+        joints = list(metadata.get("joints", self.robot.joints))
+        if joints != list(self.robot.joints):
+            raise PolicyError(
+                f"the policy at {self.client.url} moves {', '.join(map(str, joints))}; {self.robot.name} has "
+                f"{', '.join(self.robot.joints)}",
+                code="policy_mismatch",
+            )
+        try:
+            return load_policy_config(metadata["policy_config"])
+        except (ConfigError, TypeError) as error:
+            raise PolicyError(
+                f"{self.client.url} describes its policy wrongly: {error}", code="policy_protocol"
+            ) from error
 
     def _resize(self, height: int, width: int) -> None:
         """Send pictures in the size that the server asks for."""

@@ -76,12 +76,15 @@ class GripperAction(Strict):
     """Its value for an open gripper."""
     closed: float = 1.0
     """Its value for a closed gripper."""
+    metres: bool = False
+    """Whether it is the distance between the fingers in m, in place of ``open`` and ``closed``."""
     threshold: Annotated[float, Field(gt=0.0, lt=1.0)] | None = None
     """Share of the way to closed from which the gripper closes, and below which it opens; None: in proportion."""
 
-    def grip(self, values: Array) -> Array:
-        """Return the grips (k,), 0 open to 1 closed, for values of the action (k,)."""
-        share = np.clip((values - self.open) / (self.closed - self.open), 0.0, 1.0)
+    def grip(self, values: Array, width_max: float) -> Array:
+        """Return the grips (k,), 0 open to 1 closed, for values of the action (k,) and a gripper of this width, m."""
+        opened, closed = (width_max, 0.0) if self.metres else (self.open, self.closed)
+        share = np.clip((values - opened) / (closed - opened), 0.0, 1.0)
         return share if self.threshold is None else (share >= self.threshold).astype(float)
 
     @model_validator(mode="after")
@@ -102,6 +105,9 @@ class ActionConfig(Strict):
     """Step for an action of 1."""
     turn: Annotated[float, Quantity("rad per step", 0.0, 3.2, above=True)] = 1.0
     """Turn for an action of 1, for ``tcp_delta``."""
+    first: Annotated[int, Field(ge=0, le=1)] | None = None
+    """Steps after the observation at which the first action is due; None: 0 for ``joint_position`` and ``joint_delta``,
+    1 for steps that are added up."""
     clip: bool = False
     """Whether an action with a number beyond -1 to 1 is scaled down as a whole."""
     gripper: GripperAction | None = None
@@ -182,17 +188,18 @@ class PolicyConfig(Strict):
         action, state = self.action, observation.robots[robot.name]
         grip = None
         if action.gripper is not None:
-            grip = action.gripper.grip(actions[:, action.gripper.index])
+            assert robot.gripper is not None
+            grip = action.gripper.grip(actions[:, action.gripper.index], robot.gripper.width_max)
             actions = np.delete(actions, action.gripper.index, axis=1)
         if action.clip:
             actions = actions / np.maximum(1.0, np.abs(actions).max(axis=1, keepdims=True))
-        if action.kind == "joint_position":
-            return Decoded(action.scale * actions, grip, 0)
-        if action.kind == "joint_delta":
-            return Decoded(state.q + action.scale * actions, grip, 0)
-        if action.kind == "joint_velocity":
-            return Decoded(state.q + np.cumsum(action.scale * actions, axis=0), grip, 1)
-        return Decoded(self._follow_steps(actions, state.tcp, state.q, robot), grip, 1)
+        summed = action.kind in ("joint_velocity", "tcp_delta")
+        if action.kind == "tcp_delta":
+            q = self._follow_steps(actions, state.tcp, state.q, robot)
+        else:
+            q = action.scale * (np.cumsum(actions, axis=0) if summed else actions)
+            q = q if action.kind == "joint_position" else state.q + q
+        return Decoded(q, grip, int(summed) if action.first is None else action.first)
 
     def _follow_steps(self, actions: Array, tcp: Pose, q: Array, robot: Robot) -> Array:
         """Return the joint positions (k, n) of steps (k, 6) of the tcp, which begin at ``tcp`` and ``q``."""
