@@ -57,10 +57,22 @@ if TYPE_CHECKING:
     from .observation import Observation
     from .rig import Rig, open_rig
     from .robot import Robot
+    from .servo.controllers import JointImpedance, OperationalSpace, Position
     from .session import SessionEvent, TeleopSession
     from .specs import BodySpec
     from .teleop import Teleop
-    from .types import Frame, GripperOutcome, GripperState, Limited, PadState, RobotState, RobotStatus, Stamp, Trip
+    from .types import (
+        ControlMode,
+        Frame,
+        GripperOutcome,
+        GripperState,
+        Limited,
+        PadState,
+        RobotState,
+        RobotStatus,
+        Stamp,
+        Trip,
+    )
 
     open = open_rig
 
@@ -75,6 +87,7 @@ __all__ = [
     "ConfigError",
     "ConnectionLost",
     "Control",
+    "ControlMode",
     "ControlTaken",
     "DatasetError",
     "Deadman",
@@ -90,6 +103,7 @@ __all__ = [
     "GripperState",
     "HalError",
     "JointChunk",
+    "JointImpedance",
     "JointTarget",
     "JointTorque",
     "JointVelocity",
@@ -97,9 +111,11 @@ __all__ = [
     "MotionStopped",
     "NotSupported",
     "Observation",
+    "OperationalSpace",
     "PadState",
     "PolicyError",
     "Pose",
+    "Position",
     "Rig",
     "Robot",
     "RobotFault",
@@ -156,10 +172,12 @@ _MODULES = {
     "geometry": ("Pose",),
     "rig": ("Rig",),
     "robot": ("Robot",),
+    "servo.controllers": ("JointImpedance", "OperationalSpace", "Position"),
     "session": ("SessionEvent", "TeleopSession"),
     "specs": ("BodySpec",),
     "teleop": ("Teleop",),
     "types": (
+        "ControlMode",
         "Fault",
         "Frame",
         "GripperOutcome",

@@ -235,6 +235,9 @@ class Session(NamedTuple):
     """Joint positions (n,) to go to and stay, rad; None for a session that follows streamed commands."""
     stops: int = 0
     """Number of calls of ``rig.stop()`` that had been acknowledged when the session was opened."""
+    controller: dict[str, Any] | None = None
+    """Controller that follows the set-point, as :func:`hal.servo.controllers.controller_data` describes it; None for
+    the arm's own position controller."""
 
 
 class CommandRecord(NamedTuple):

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 import warnings
 from types import TracebackType
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from .arguments import number
 from .commands import (
@@ -17,6 +17,7 @@ from .commands import (
     CommandRecord,
     JointChunk,
     JointTarget,
+    JointTorque,
     Sent,
     Session,
     encode,
@@ -38,6 +39,7 @@ if TYPE_CHECKING:
 
     from .host.records import ServoRecord
     from .robot import Robot
+    from .servo.controllers import Controller
 
 __all__ = ["Control"]
 
@@ -56,6 +58,9 @@ class Control:
     Leaving the ``with`` block, for whatever reason, brings the arm to rest; an exception of the block is the one that
     is raised. The arguments are those of :meth:`hal.robot.Robot.control`, and ``goal`` (n,), rad, for a session that
     moves to one joint position.
+
+    Attributes:
+        controller: What follows the set-point, with a value for every gain.
     """
 
     def __init__(
@@ -67,6 +72,7 @@ class Control:
         speed: float | None,
         tcp_speed: float | None,
         unattended: bool,
+        controller: Controller | None = None,
         goal: tuple[float, ...] | None = None,
     ) -> None:
         check_deadman(deadman)
@@ -106,6 +112,24 @@ class Control:
         self._at_once = 0
         """Number of commands that were sent without any time passing."""
         self._checks = CommandChecks(robot)
+        self.controller = self._resolved(controller)
+        self._law: dict[str, Any] | None = self._described()
+        """The controller as plain data; None for the arm's own."""
+
+    def _resolved(self, controller: Controller | None) -> Controller:
+        """Return the controller with a value for every gain, checked against the arm."""
+        from .servo.controllers import Position, resolve  # together with the servo's libraries, so only when needed
+
+        if controller is None or isinstance(controller, Position):
+            return Position()
+        robot = self.robot
+        self._checks.check_torques()
+        return resolve(controller, robot.spec, robot.kinematics, self._host.spec.rate_hz)
+
+    def _described(self) -> dict[str, Any] | None:
+        from .servo.controllers import controller_data
+
+        return controller_data(self.controller)
 
     # Opening and closing.
 
@@ -129,7 +153,8 @@ class Control:
         self._check_latch()
         robot._sessions += 1
         self._id = robot._sessions
-        session = Session(self._id, self.speed, self.tcp_speed, self.deadman is not None, self._goal, stops)
+        terms = (self.speed, self.tcp_speed, self.deadman is not None)
+        session = Session(self._id, *terms, self._goal, stops, self._law)
         try:
             robot._open = self
             if self.deadman is not None:
@@ -203,6 +228,31 @@ class Control:
 
     # Commands.
 
+    def set_gains(self, **gains: Any) -> None:
+        """Change gains of the session's controller; they take effect within 0.2 s.
+
+        Args:
+            **gains: Arguments of the controller with their new values, for example ``stiffness=300.0``. The frame and
+                ``position_only`` stay as they are, and so does whether the gains are stiffnesses or rates.
+
+        Raises:
+            CommandError: No such gain, or a wrong value for this arm (``code`` is ``bad_controller``).
+        """
+        from .servo.controllers import with_gains
+
+        self._require_open()
+        before, self.controller = self.controller, self._resolved(with_gains(self.controller, gains))
+        law = self._described()
+        try:
+            self._host.request("gains", {"robot": self.robot.name, "session": self._id, "controller": law})
+        except HalError:
+            self.controller = before
+            raise
+
+    def _require_open(self) -> None:
+        if not self._id:
+            raise CommandError("this control session is not open: use it in a 'with' statement", code="session_closed")
+
     @property
     def status(self) -> RobotStatus:
         """Status of the arm."""
@@ -256,8 +306,7 @@ class Control:
                 DeprecationWarning,
                 stacklevel=2,
             )
-        if not self._id:
-            raise CommandError("this control session is not open: use it in a 'with' statement", code="session_closed")
+        self._require_open()
         servo = self._peek()
         now = self.robot.clock.now()
         self._check_trip(servo, now)
@@ -276,6 +325,8 @@ class Control:
             if self._goal is not None:
                 raise CommandError("this session moves to a goal; it takes no commands")
             command = self._checks.checked(command, now, reasons)
+            if isinstance(command, JointTorque) and self._law:
+                raise CommandError("this session has a controller: it takes no torques", code="torques_by_controller")
             self._check_time(now)
             if waiting:
                 reasons.append("the dead-man is not held: the arm does not move")

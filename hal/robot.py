@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from .host.hosts import Host
     from .kinematics.arm import Kinematics
     from .kinematics.collisions import Collisions
+    from .servo.controllers import Controller
     from .specs import LimitsSpec, RobotSpec
 
 __all__ = ["Robot"]
@@ -243,6 +244,7 @@ class Robot:
         speed: float | None = None,
         tcp_speed: float | None = None,
         unattended: bool = False,
+        controller: Controller | None = None,
     ) -> Control:
         """Return a control session, in which this arm follows commands; use it in a ``with`` statement.
 
@@ -253,13 +255,24 @@ class Robot:
             speed: Share of the joint speed limits, up to the rig's own share, which is the default.
             tcp_speed: Greatest speed of the tcp, m/s, up to the rig's own, which is the default.
             unattended: Move an arm that really moves without a dead-man.
+            controller: What follows the set-point: :class:`hal.Position` (the default), :class:`hal.JointImpedance` or
+                :class:`hal.OperationalSpace`.
 
         Raises:
             CommandError: An invalid argument, or neither ``deadman`` nor ``unattended`` for an arm that really moves
-                (``code`` is ``deadman_required``).
-            NotSupported: The dead-man's pad is not safe enough for a real arm.
+                (``code`` is ``deadman_required``); gains that do not suit the arm (``bad_controller``).
+            NotSupported: The dead-man's pad is not safe enough for a real arm. Or a controller, for a driver without
+                torques (``code`` is ``no_torque_mode``), or an arm whose URDF lacks inertias (``wrong_inertials``).
         """
-        return Control(self, deadman=deadman, rate_hz=rate_hz, speed=speed, tcp_speed=tcp_speed, unattended=unattended)
+        return Control(
+            self,
+            deadman=deadman,
+            rate_hz=rate_hz,
+            speed=speed,
+            tcp_speed=tcp_speed,
+            unattended=unattended,
+            controller=controller,
+        )
 
     def move_to(
         self,
@@ -272,6 +285,7 @@ class Robot:
         tcp_speed: float | None = None,
         timeout: float | None = None,
         patience: float = 60.0,
+        controller: Controller | None = None,
     ) -> RobotState:
         """Move to joint positions or to a pose of the tcp, straight in joint space; block until the arm is there.
 
@@ -285,6 +299,7 @@ class Robot:
             tcp_speed: Greatest speed of the tcp, m/s, up to the rig's own, which is the default.
             timeout: Longest duration, s; None for no limit.
             patience: Longest time for which the dead-man may be released, s.
+            controller: What follows the set-point, as for :meth:`control`.
 
         Returns:
             The state on arrival.
@@ -312,6 +327,7 @@ class Robot:
             speed=speed,
             tcp_speed=tcp_speed,
             unattended=unattended,
+            controller=controller,
             goal=goal,
         )
         clock = self.clock

@@ -22,6 +22,7 @@ __all__ = [
     "AXES",
     "BUTTONS",
     "CAP_AXES",
+    "ControlMode",
     "Fault",
     "Frame",
     "GripperOutcome",
@@ -103,6 +104,19 @@ class RobotStatus(_Named):
     """The device reports a fault."""
     LOST = 6
     """The device does not answer."""
+
+
+class ControlMode(_Named):
+    """What makes an arm follow its set-point."""
+
+    POSITION = 0
+    """The arm's own position controller."""
+    JOINT_IMPEDANCE = 1
+    """Torques of :class:`hal.JointImpedance`."""
+    OPERATIONAL_SPACE = 2
+    """Torques of :class:`hal.OperationalSpace`."""
+    TORQUE = 3
+    """Nothing: torques of :class:`hal.JointTorque`, or those that brake the arm, drive it, and it has no set-point."""
 
 
 class Trip(_Named):
@@ -193,13 +207,13 @@ class Limited(IntFlag):
     WORKSPACE = 8
     """The boundary of the workspace is near; the motion towards it was slowed or stopped."""
     LEAD = 16
-    """The goal was too far ahead of the arm and was held back."""
+    """The goal was too far ahead of the arm and was held back; with a controller, the set-point was."""
     SINGULAR = 32
     """The arm is close to a singularity and does not exactly follow the commanded direction."""
     REANCHORED = 64
     """The device did not take the last set-point; the motion continues from the position that it reports."""
     TORQUE = 128
-    """The commanded torques were cut to the torque limits."""
+    """The commanded torques, or those of the controller, were cut to the torque limits."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -236,6 +250,11 @@ class RobotState:
     """Limits by which the servo reduced the motion in this tick."""
     target_seq: int
     """Number of the command that the set-point follows; 0 before the first."""
+    controller: ControlMode = ControlMode.POSITION
+    """What makes the arm follow its set-point."""
+    tau_set: Array | None = None
+    """Joint torques (n,) that were last written to the device, Nm, on top of those that carry the arm's weight; None
+    while the arm's own position controller drives it."""
 
 
 @dataclass(frozen=True, slots=True)

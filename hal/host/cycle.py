@@ -22,6 +22,7 @@ from ..geometry import Pose
 from ..histogram import Histogram
 from ..kinematics.arm import Kinematics
 from ..servo.audit import SetpointAudit
+from ..servo.controllers import controller_of
 from ..servo.servo import Servo
 from ..specs import GroupSpec, RobotSpec
 from ..types import RobotStatus
@@ -88,7 +89,7 @@ class ArmUnit:
         self.driver: RobotDriver = registry.load(spec.driver, "robot")(spec, world)
         self.kinematics = Kinematics(spec.kinematics)
         mass_matrix = self.driver.mass_matrix if "torque" in self.driver.modes else None
-        self.servo = Servo(spec, dt, self.kinematics, mass_matrix, self.driver.repeats)
+        self.servo = Servo(spec, dt, self.kinematics, mass_matrix, self.driver.repeats, self.driver.simulated)
         self.reset_statistics()
         self.reading: Reading | None = None
         self.error: ConnectionLost | None = None
@@ -288,6 +289,8 @@ class ArmUnit:
             report.t_stop,
             report.q_set,
             report.dq_set,
+            report.controller,
+            report.tau_set,
         )
         self.mail.put_state(reading, servo, tcp, self.kinematics.fk(report.q_set), jacobian.dot(reading.dq).tolist())
 
@@ -506,6 +509,9 @@ class Cycle:
         fields = Session(*session)
         goal = tuple(fields.move_to) if fields.move_to is not None else None
         self._arm(robot).open_session(fields._replace(move_to=goal), self.memory.get_app(), self.turn)
+
+    def _do_gains(self, robot: str, session: int, controller: dict[str, Any]) -> None:
+        self._arm(robot).servo.set_gains(session, controller_of(controller))
 
     def _do_recover(self, robot: str) -> None:
         self._arm(robot).recover()

@@ -21,7 +21,7 @@ from ..commands import CHUNK_POINTS, CommandRecord, DeadmanRecord, Kind
 from ..driver import Reading
 from ..errors import Fault
 from ..geometry import Pose
-from ..types import GripperOutcome, GripperState, Limited, RobotState, RobotStatus, Stamp, Trip
+from ..types import ControlMode, GripperOutcome, GripperState, Limited, RobotState, RobotStatus, Stamp, Trip
 from .memory import History, Mailbox, Newest, SeriesBox, newest
 
 if TYPE_CHECKING:
@@ -72,7 +72,8 @@ def fault_at(record: bytes, offset: int) -> Fault | None:
 
 
 _STAMP = struct.Struct("<ddQ")
-_SERVO = struct.Struct("<iiiQQ?Qdd")
+_SERVO = struct.Struct("<iiiQQ?Qddi")
+_CONTROLLERS = {int(mode): mode for mode in ControlMode}
 _STATUSES = {int(status): status for status in RobotStatus}
 _TRIPS = {int(trip): trip for trip in Trip}
 
@@ -94,19 +95,22 @@ class ServoRecord(NamedTuple):
     """Time at which the last braking began, s."""
     q_set: Sequence[float]
     dq_set: Sequence[float]
+    controller: ControlMode = ControlMode.POSITION
+    tau_set: Sequence[float] = ()
+    """Torques of the last set-point, Nm; empty if it has none, and in a record that was read."""
 
 
 class StateLayout:
     """Layout of the state of an arm with ``n`` joints: a stamp, one run of doubles, the servo's state, the fault.
 
     The doubles, in this order: q, dq, tau, q_set, dq_set (n each); tcp, tcp_set (7 each), tcp_twist (6); tau_ext (n),
-    wrench_ext (6). A reader decodes only what it needs: the servo's part for every ``send``, or the whole state, whose
-    arrays are read-only views of the record's own bytes.
+    wrench_ext (6); tau_set (n). A reader decodes only what it needs: the servo's part for every ``send``, or the whole
+    state, whose arrays are read-only views of the record's own bytes.
     """
 
     def __init__(self, n: int) -> None:
         self.n = n
-        self._count = 6 * n + 26
+        self._count = 7 * n + 26
         self._servo_at = _STAMP.size + 8 * self._count
         self._set_at = _STAMP.size + 8 * 3 * n
         self._set_points = struct.Struct(f"<{2 * n}d")
@@ -148,25 +152,27 @@ class StateLayout:
             *twist,
             *(reading.tau_ext or nothing),
             *(reading.wrench_ext or (nan,) * 6),
+            *(servo.tau_set or nothing),
             *servo[:9],  # all but the set-points
+            servo.controller,
             *fault_values(reading.fault),
         )
 
     def servo(self, record: bytes) -> ServoRecord:
         """Return the servo's part of a record."""
-        status, trip, limited, *rest = _SERVO.unpack_from(record, self._servo_at)
+        status, trip, limited, *rest, controller = _SERVO.unpack_from(record, self._servo_at)
         sets = self._set_points.unpack_from(record, self._set_at)
-        n = self.n
-        return ServoRecord._make((_STATUSES[status], _TRIPS[trip], _limited(limited), *rest, sets[:n], sets[n:]))
+        n, first = self.n, (_STATUSES[status], _TRIPS[trip], _limited(limited))
+        return ServoRecord._make((*first, *rest, sets[:n], sets[n:], _CONTROLLERS[controller], ()))
 
     def state(self, record: bytes) -> RobotState:
         """Return the whole state in a record."""
         n, end = self.n, self._servo_at
         numbers: NDArray[np.float64] = np.frombuffer(record, "<f8", self._count, _STAMP.size)
-        status, trip, limited, target_seq, *_ = _SERVO.unpack_from(record, end)
+        status, trip, limited, target_seq, *_, controller = _SERVO.unpack_from(record, end)
         tau = numbers[2 * n : 3 * n]
         rest = numbers[5 * n :]
-        tau_ext, wrench_ext = rest[20 : 20 + n], rest[20 + n :]
+        tau_ext, wrench_ext, tau_set = rest[20 : 20 + n], rest[20 + n : 26 + n], rest[26 + n :]
         return RobotState(
             stamp=Stamp(*_STAMP.unpack_from(record, 0)),
             q=numbers[:n],
@@ -184,6 +190,8 @@ class StateLayout:
             fault=fault_at(record, end + _SERVO.size),
             limited=_limited(limited),
             target_seq=target_seq,
+            controller=_CONTROLLERS[controller],
+            tau_set=_known(tau_set),
         )
 
 

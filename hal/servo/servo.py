@@ -2,6 +2,7 @@
 
     newest command ─► watchdog ─► motion (goal in joint space) ─► envelope (speed caps) ─► smoother ─► set-point
 
+A session with a controller writes the torques that follow this set-point in its place (:mod:`.compliance`).
 The host calls :meth:`Servo.tick` once per cycle between reading the device and writing to it. Whatever happens, an arm
 that must not follow is brought to rest by the smoother's time-optimal stop and held where that ends.
 """
@@ -18,13 +19,15 @@ from ..driver import Reading, Setpoint
 from ..errors import CommandError, ControlTaken, Fault
 from ..kinematics.arm import Kinematics
 from ..specs import RobotSpec
-from ..types import Limited, RobotStatus, Trip
+from ..types import ControlMode, Limited, RobotStatus, Trip
 from .anchoring import Anchoring
 from .cartesian import PoseMotion, TwistMotion
+from .compliance import Compliance
+from .controllers import Controller
 from .envelope import Envelope
 from .joint import ChunkMotion, JointTargetMotion, JointVelocityMotion, PathMotion, ServoMotion
 from .smoothing import JointSmoother
-from .torque import MassMatrix, TorqueMotion
+from .torque import BRAKE_LIMIT, MassMatrix, TorqueMotion
 from .watchdog import SILENCE, Watchdog, is_alive, is_timely
 
 __all__ = [
@@ -58,10 +61,15 @@ class ServoReport:
     """Time at which the stop was latched, s."""
     t_stop: float = 0.0
     """Time at which the last braking began, s."""
+    controller: ControlMode = ControlMode.POSITION
+    """What makes the arm follow its set-point."""
+    tau_set: Floats = ()
+    """Torques (n,) of the last set-point, Nm; empty if it has none."""
 
 
 # Members of enumerations that every tick names: a global is found faster than a member.
 _NO_TRIP, _FAULT, _UNLIMITED, _FOLLOWING = Trip.NONE, Trip.FAULT, Limited.NONE, RobotStatus.FOLLOWING
+_POSITION = ControlMode.POSITION
 
 _ABSURD = 1e3
 """Joint speeds beyond this are an invalid reading, rad/s."""
@@ -80,6 +88,7 @@ class Servo:
         kinematics: Kinematics | None = None,
         mass_matrix: MassMatrix | None = None,
         repeats: bool = False,
+        simulated: bool = False,
     ) -> None:
         """Make the servo of one arm.
 
@@ -89,6 +98,7 @@ class Servo:
             kinematics: The arm's kinematics, if they are loaded already.
             mass_matrix: Inertia of a device that takes torques; without it, torque commands are refused.
             repeats: Whether the device repeats its last set-point when one is lost (see :attr:`.RobotDriver.repeats`).
+            simulated: Whether the arm has the joint damping of its URDF, which controllers then compensate.
         """
         self.spec = spec
         self.kinematics = Kinematics(spec.kinematics) if kinematics is None else kinematics
@@ -103,6 +113,7 @@ class Servo:
         self._middle = [0.5 * (low + high) for low, high in limits]
         self._radius = min(0.5 * (high - low) for low, high in limits) + _BEYOND
         self._torque = TorqueMotion(smoother, envelope, spec.limits, mass_matrix)
+        self._compliance = Compliance(self._torque, envelope, spec, simulated)
         self._motions: dict[Kind, ServoMotion] = {
             Kind.JOINT_TARGET: JointTargetMotion(smoother, envelope),
             Kind.JOINT_CHUNK: ChunkMotion(smoother, envelope),
@@ -123,6 +134,8 @@ class Servo:
         """Time of the last tick, s."""
         self._seq = 0
         """Number of the newest command that was handled or is no longer valid."""
+        self._braking = 0.0
+        """Time for which a controller has held a session open that is closing, s."""
         self._resting = 0
         """Number of ticks for which a session that is closing has been at rest."""
         self._corrected = False
@@ -163,7 +176,7 @@ class Servo:
             )
         self._smoother.anchor(self._anchoring.start_position(q) if dq is None else q, dq)
         self._ready = None
-        self._torque.active = False
+        self._torque.active = self._compliance.active = False
         self._anchoring.forget()
         self._anchored = True
         self._forget_goals()
@@ -186,13 +199,13 @@ class Servo:
             raise CommandError("anchor the servo before a session begins", code="not_anchored")
         if not (0.0 < session.speed <= 1.0 and session.tcp_speed > 0.0):
             raise CommandError(f"a session needs 0 < speed <= 1 and tcp_speed > 0, not {session}", code="bad_session")
-        self._envelope.open(session)
-        self._torque.open()
+        self._compliance.open_session(session)
         if session.move_to is not None:
             self._path.set_goal(session.move_to)
         self._session = session
         self._ending = self._ahead = False
         self._resting = 0
+        self._braking = 0.0
         self._ready = None
         self._seq = 0
         self.report.target_seq = self.report.refused = 0
@@ -202,6 +215,11 @@ class Servo:
         self._anchoring.relearn()
         self.report.status = RobotStatus.HOLDING
         self.report.trip = Trip.NONE
+
+    def set_gains(self, session: int, controller: Controller) -> None:
+        """Change the gains of the controller of this session, if it is still open, within 0.2 s."""
+        if self._session is not None and self._session.id == session:
+            self._compliance.set_gains(controller)
 
     def close_session(self) -> None:
         """Close the session: brake, then be idle."""
@@ -236,6 +254,8 @@ class Servo:
         if torque.active:
             torque.observe(reading if known else None)
             device = device or self._overruns()
+            if device:
+                self._compliance.active = False  # torques brake it, as in any other session
         else:
             if known:
                 torque.q, torque.dq = reading.q, reading.dq  # where torques would begin
@@ -297,6 +317,7 @@ class Servo:
         self._envelope.limited = Limited.NONE
         self._watchdog.device_lost(now)
         self._anchoring.note_silence()
+        self._compliance.active = False
         if self._torque.active:
             self._torque.observe(None)
         if self._session is None or (self._ending and self._finished()):
@@ -345,7 +366,10 @@ class Servo:
 
     def _overruns(self) -> Trip:
         """Return ``Trip.LIMIT`` if an arm that follows torques, or is braked by them, runs into a limit."""
-        limit = self._torque.overrun(driven=self._motion is self._torque)
+        if self._compliance.active:
+            limit = self._compliance.strays()
+        else:
+            limit = self._torque.overrun(driven=self._motion is self._torque)
         if limit is None:
             return _NO_TRIP
         self._envelope.limited |= limit
@@ -382,13 +406,21 @@ class Servo:
             return  # overtaken by the next chunk, whose command follows
         self._seq = command.seq
         motion = self._motions.get(command.kind)
-        if motion is None or not is_timely(now, command) or not motion.usable(command.values):
+        compliance = self._compliance
+        if (
+            motion is None
+            or (compliance.chosen and motion is self._torque)
+            or not is_timely(now, command)
+            or not motion.usable(command.values)
+        ):
             self.report.refused = command.seq
             return
         if motion is not self._motion:
-            if self._torque.active and self._torque.resting:
+            by_torques = self._torque.active and not compliance.active
+            if by_torques and self._torque.resting:
                 self._leave_torques()
-            if self._torque.active or motion.too_far(command.values):
+                by_torques = False
+            if by_torques or motion.too_far(command.values):
                 self.report.refused = command.seq
                 return
             motion.start()
@@ -402,20 +434,27 @@ class Servo:
         smoother, watchdog, report = self._smoother, self._watchdog, self.report
         motion = self._motion if watchdog.allowed else None
         q_from = smoother.q
+        compliance = self._compliance
+        if compliance.chosen:
+            self._prepare_compliance(motion)
         if motion is not None:
             if self._anchoring.waiting:
                 self._anchoring.waiting = False  # the next one may be computed ahead, before the device is heard
-            else:
+            elif motion is not self._path or not compliance.held_back:
                 motion.step(now)
             self._envelope.note(smoother)
             report.arrived = motion is self._path and self._path.arrived
+            if compliance.active:
+                report.arrived = report.arrived and self._torque.still
             usual = _FOLLOWING
         else:
             if self._followed:
                 report.t_stop = now
-            if self._torque.active and self._torque.brake():
+            by_torques = self._torque.active and not compliance.active
+            if by_torques and self._torque.brake():
                 self._leave_torques()
-            if not self._torque.active:
+                by_torques = False
+            if not by_torques:
                 smoother.stop()
             usual = RobotStatus.HOLDING if self._at_rest() else RobotStatus.STOPPING
             if watchdog.trip:
@@ -424,25 +463,45 @@ class Servo:
         report.status = usual if status is None else status
         report.trip = watchdog.trip
         report.t_trip = watchdog.t_trip
+        if compliance.active:
+            compliance.drive()
         self._publish()
         if self._torque.active:
             return self._torque.setpoint()
         return Setpoint(smoother.q, smoother.dq, smoother.ddq, None, q_from)
 
+    def _prepare_compliance(self, motion: ServoMotion | None) -> None:
+        """Let the controller of the session take over when the arm is to move, and let go when the session closes."""
+        compliance, torque = self._compliance, self._torque
+        if motion is not None and not torque.active:
+            compliance.begin()
+        if not compliance.active:
+            return
+        if compliance.hold_back() and motion is not None:
+            motion.reanchored()
+        if self._ending and self._smoother.at_rest():
+            self._braking += self._smoother.dt
+            if torque.still:
+                self._leave_torques()  # to positions where it was measured, so without a jerk
+            elif self._braking > BRAKE_LIMIT:
+                compliance.active = False  # torques brake it
+
     def _at_rest(self) -> bool:
-        """Return whether nothing moves, and positions (not torques) hold the arm."""
-        return self._smoother.at_rest() and not self._torque.active
+        """Return whether nothing moves, and positions or a controller (not bare torques) hold the arm."""
+        return self._smoother.at_rest() and (not self._torque.active or self._compliance.active)
 
     def _leave_torques(self) -> None:
         """Hand the arm over from torques to positions."""
         self._torque.leave()
+        self._compliance.active = False
         self._anchoring.forget()
 
     def _finished(self) -> bool:
         """Close the session once it has come to rest; returns whether it is closed."""
         if self._torque.active and self._torque.blind:  # the device was left alone: it holds by itself
             self._leave_torques()
-        self._resting = self._resting + 1 if self._at_rest() else 0
+        at_rest = self._smoother.at_rest() and not self._torque.active
+        self._resting = self._resting + 1 if at_rest else 0
         # What is computed ahead is given one tick later, and seen to be taken another one later.
         if self._resting < (3 if self._ahead else 1):
             return False
@@ -463,6 +522,9 @@ class Servo:
     def _publish(self) -> None:
         report, smoother = self.report, self._smoother
         report.q_set, report.dq_set, report.ddq_set = smoother.q, smoother.dq, smoother.ddq
+        report.controller, report.tau_set = _POSITION, ()
         if self._torque.active:
-            report.q_set, report.dq_set, report.ddq_set = self._torque.q, self._torque.dq, [0.0] * smoother.n
+            report.controller, report.tau_set = self._compliance.mode, self._torque.tau
+            if not self._compliance.active:
+                report.q_set, report.dq_set, report.ddq_set = self._torque.q, self._torque.dq, [0.0] * smoother.n
         report.limited = self._envelope.limited

@@ -76,6 +76,9 @@ _SLACK = 5e-3
 """An arm that begins outside a limit may not move farther out than this, rad and m."""
 
 
+_STRAY = 0.02
+"""A joint that follows a set-point by a controller's torques may be this far beyond its range, rad."""
+
 _RUNAWAY = 1.5
 """Share of its speed limit at which a braked arm counts as out of control: its inertia is very different from the
 model's."""
@@ -129,6 +132,10 @@ class TorqueBounds:
         self._envelope = envelope
         self._kinematics = envelope.kinematics
         self._reach = self._kinematics.reach()
+        self.velocity: Floats = envelope.velocity
+        """Greatest joint speeds (n,) that torques may lead to, rad/s."""
+        self.tcp_speed = envelope.tcp_speed
+        """Greatest speed of the tcp that they may lead to, m/s."""
         self._step = RATE * dt
         self._lag = _LAG * dt
         self._decay = min(_DECAY, _STABLE / dt)
@@ -139,6 +146,7 @@ class TorqueBounds:
 
     def open_session(self, q: Floats) -> None:
         """Open a session with the arm at ``q`` (n,), rad: outside a limit it may only come back in."""
+        self.velocity, self.tcp_speed = self._envelope.velocity, self._envelope.tcp_speed
         self._ranges = _around(self._limits.lower, self._limits.upper, q)
         workspace = self._envelope.workspace
         if workspace is not None:
@@ -157,7 +165,7 @@ class TorqueBounds:
         tau = [max(-limit, min(limit, x)) for x, limit in zip(commanded, self._torque, strict=True)]
         if tau != commanded:
             envelope.limited |= Limited.TORQUE
-        most, coupled = [_SHARE * v for v in envelope.velocity], [_COUPLED * v for v in envelope.velocity]
+        most, coupled = [_SHARE * v for v in self.velocity], [_COUPLED * v for v in self.velocity]
         slowed = list(map(self._slowed, tau, arm.dq, arm.inertia.alone, most, self._torque))
         added = arm.inertia.added(slowed, self._lag)
         share = min(map(_share, arm.dq, added, coupled))
@@ -192,7 +200,7 @@ class TorqueBounds:
 
         With a the tcp's velocity and b what they add to it, the greater root of |a + s b| = cap.
         """
-        cap = _SHARE * self._envelope.tcp_speed
+        cap = _SHARE * self.tcp_speed
         if self._surely_slower([abs(v) + abs(dv) for v, dv in zip(arm.dq, added, strict=True)], cap):
             return 1.0
         jacobian = self._kinematics.jacobian(arm.q)[:3]
@@ -287,6 +295,22 @@ class TorqueBounds:
                 return Limited.WORKSPACE
         return None
 
+    def strays(self, arm: ArmInMotion) -> Limited | None:
+        """Return the limit that an arm exceeds whose set-point keeps all of them; None if it keeps all.
+
+        That are its own joint speeds, half as much again as the session's tcp speed, and its ranges.
+        """
+        if any(abs(v) > most for v, most in zip(arm.dq, self._limits.velocity, strict=True)):
+            return Limited.SPEED
+        fastest = _RUNAWAY * self.tcp_speed
+        surely = self._surely_slower([abs(v) for v in arm.dq], fastest)
+        if not surely and hypot(*self._kinematics.jacobian(arm.q)[:3].dot(arm.dq).tolist()) > fastest:
+            return Limited.TCP_SPEED
+        for x, (low, high) in zip(arm.q, self._ranges, strict=True):
+            if not low - _STRAY <= x <= high + _STRAY:
+                return Limited.POSITION
+        return None
+
     def is_runaway(self, arm: ArmInMotion) -> bool:
         """Return whether a joint is so much faster than its limit that torques must not be used any longer."""
         return any(abs(v) > _RUNAWAY * most for v, most in zip(arm.dq, self._limits.velocity, strict=True))
@@ -345,9 +369,9 @@ class TorqueMotion(ServoMotion):
         """Whether the arm follows torques, or brakes by them."""
         self.patience = max(PATIENCE, 3.0 * smoother.dt)
         self._mass_matrix = mass_matrix
-        self._bounds: TorqueBounds | None = None
+        self.bounds: TorqueBounds | None = None
         if mass_matrix is not None and limits.torque is not None:
-            self._bounds = TorqueBounds(limits, smoother.dt, envelope)
+            self.bounds = TorqueBounds(limits, smoother.dt, envelope)
         self.q: Floats = smoother.q
         """Newest measured joint positions (n,), rad."""
         self.dq: Floats = smoother.dq
@@ -355,10 +379,10 @@ class TorqueMotion(ServoMotion):
         self._inertia: Inertia | None = None
         self._weighed_at: Floats | None = None
         """Joint positions of the inertia, rad."""
-        self._arm: ArmInMotion | None = None
+        self.arm: ArmInMotion | None = None
         """Newest measured state of the arm; None while it is unknown."""
         self._nothing = [0.0] * self.size
-        self._tau = self._nothing
+        self.tau = self._nothing
         """Torques that drive the arm now (n,), Nm."""
         self._commanded = self._nothing
         """Commanded torques (n,), Nm."""
@@ -377,13 +401,13 @@ class TorqueMotion(ServoMotion):
 
     def open(self) -> None:
         """Open a session, at rest."""
-        if self._bounds is not None:
-            self._bounds.open_session(self.smoother.q)
+        if self.bounds is not None:
+            self.bounds.open_session(self.smoother.q)
 
     def observe(self, reading: Reading | None) -> None:
         """Note the reading of this tick; None if there is none or it is invalid."""
         dt = self.smoother.dt
-        self._arm = None
+        self.arm = None
         self._unseen += dt
         if reading is None:
             self._still = 0.0
@@ -391,7 +415,7 @@ class TorqueMotion(ServoMotion):
         self._update_inertia()  # where the arm was a tick ago: it is the same, and may be computed ahead
         self.q, self.dq = reading.q, reading.dq
         if reading.tau_commanded is not None:
-            self._tau = list(reading.tau_commanded)  # what was lost on its way must not make the next step greater
+            self.tau = list(reading.tau_commanded)  # what was lost on its way must not make the next step greater
         self._still = self._still + dt if max(map(abs, reading.dq)) < _REST else 0.0
         self._update_arm()
 
@@ -412,7 +436,7 @@ class TorqueMotion(ServoMotion):
 
     def _update_arm(self) -> None:
         if self._inertia is not None:  # else it is as though the device were silent
-            self._arm = ArmInMotion(self.q, self.dq, self._inertia)
+            self.arm = ArmInMotion(self.q, self.dq, self._inertia)
             self._unseen = 0.0
 
     # Output to the servo.
@@ -423,9 +447,14 @@ class TorqueMotion(ServoMotion):
         return self._unseen > SILENCE
 
     @property
+    def still(self) -> bool:
+        """Whether the arm is measured to be at rest, whatever torques hold it there."""
+        return self._still >= _REST_TIME
+
+    @property
     def resting(self) -> bool:
         """Whether the arm is measured to be at rest, with no torque left but what one tick removes."""
-        return self._still >= _REST_TIME and max(map(abs, self._tau)) <= RATE * self.smoother.dt
+        return self._still >= _REST_TIME and max(map(abs, self.tau)) <= RATE * self.smoother.dt
 
     def overrun(self, driven: bool) -> Limited | None:
         """Return the limit that the arm runs into; None if it keeps all.
@@ -435,9 +464,9 @@ class TorqueMotion(ServoMotion):
         """
         if driven:
             return self._overran
-        if self._bounds is None or self._arm is None:
+        if self.bounds is None or self.arm is None:
             return None
-        return Limited.SPEED if self._cannot_brake(self._bounds, self._arm) else None
+        return Limited.SPEED if self._cannot_brake(self.bounds, self.arm) else None
 
     def _cannot_brake(self, bounds: TorqueBounds, arm: ArmInMotion) -> bool:
         return self._braking >= BRAKE_LIMIT or bounds.is_runaway(arm)
@@ -446,12 +475,12 @@ class TorqueMotion(ServoMotion):
         """Return the set-point to be written; None while the arm's state is unknown."""
         if self.blind:
             return None
-        return Setpoint(self.q, self.dq, self._nothing, self._tau)
+        return Setpoint(self.q, self.dq, self._nothing, self.tau)
 
     # The motion.
 
     def usable(self, values: Floats) -> bool:
-        return self._bounds is not None and super().usable(values)
+        return self.bounds is not None and super().usable(values)
 
     def too_far(self, values: Floats) -> bool:
         """Return whether the arm moves: torques begin at rest."""
@@ -460,11 +489,11 @@ class TorqueMotion(ServoMotion):
     def start(self) -> None:
         super().start()
         self.active = True
-        self._tau = self._commanded = self._nothing
+        self.tau = self._commanded = self._nothing
         self._begun = self._given_up = False
         self._overran = None
         self._unseen = self._still = self._braking = self._share = 0.0
-        self._arm = None
+        self.arm = None
         self._update_inertia()
         self._update_arm()
 
@@ -473,30 +502,41 @@ class TorqueMotion(ServoMotion):
 
     def step(self, now: float) -> None:
         """Move the torques by one tick towards the command. The first set-point has none: it changes the mode."""
-        assert self._bounds is not None
+        assert self.bounds is not None
         self._braking = self._share = 0.0
-        arm = self._arm
+        arm = self.arm
         if self._begun and arm is not None:
-            before = self._tau
-            tau = self._bounds.towards(before, self._bounds.allowed(self._commanded, arm))
-            self._overran = self._bounds.overrun(tau, arm)
-            self._tau = tau
+            before = self.tau
+            tau = self.bounds.towards(before, self.bounds.allowed(self._commanded, arm))
+            self._overran = self.bounds.overrun(tau, arm)
+            self.tau = tau
             if self._overran is not None:
-                self._tau, self._share = self._bounds.brake(before, arm, 0.0)
+                self.tau, self._share = self.bounds.brake(before, arm, 0.0)
+        self._begun = True
+
+    def drive(self, tau: list[float]) -> None:
+        """Move the torques by one tick towards those of a controller (n,), Nm, as far as the bounds allow.
+
+        The first set-point has none: it changes the mode.
+        """
+        self._braking = self._share = 0.0
+        if self._begun and self.arm is not None:
+            assert self.bounds is not None
+            self.tau = self.bounds.towards(self.tau, self.bounds.allowed(tau, self.arm))
         self._begun = True
 
     def brake(self) -> bool:
         """Brake by one tick. Returns True, and does nothing, if positions should take over from here."""
-        bounds, arm = self._bounds, self._arm
+        bounds, arm = self.bounds, self.arm
         assert bounds is not None
         if arm is None:
             self._given_up = self._given_up or self.blind
-            self._tau = bounds.release(self._tau)
+            self.tau = bounds.release(self.tau)
             return False
         if self._given_up or self.resting or self._cannot_brake(bounds, arm):
             return True
         self._braking += self.smoother.dt
-        self._tau, self._share = bounds.brake(self._tau, arm, self._share)
+        self.tau, self._share = bounds.brake(self.tau, arm, self._share)
         return False
 
     def leave(self) -> None:

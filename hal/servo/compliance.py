@@ -1,0 +1,147 @@
+"""An arm that follows the servo's set-point by the torques of a controller, instead of by its own position controller.
+
+The set-point is made as ever. Its tcp goes a little slower than the session allows, so that an arm that lags can catch
+up without being faster than that. It never leads an arm that is held back by more than :data:`LEAD`, so that nothing
+springs when the arm is let go; :class:`.torque.TorqueBounds` keep the arm below the session's tcp speed besides.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from contextlib import suppress
+from math import hypot
+
+from ..commands import Session
+from ..dynamics import Dynamics
+from ..errors import NotSupported
+from ..geometry import difference
+from ..specs import RobotSpec
+from ..types import ControlMode, Limited
+from .controllers import Controller, ControllerLaw, Position, controller_of
+from .envelope import Envelope
+from .torque import TorqueMotion
+
+__all__ = ["LEAD", "Compliance"]
+
+Floats = Sequence[float]
+
+LEAD = (0.05, 0.2)
+"""How far a set-point may be from the measured tcp, m and rad, or from a measured joint with joint springs, rad."""
+RESUME = 0.8
+"""Share of :data:`LEAD` below which a motion that was held back continues."""
+SPEED_SHARE, TCP_SHARE = 0.8, 0.85
+"""A set-point takes at most these shares of the joints' greatest speeds and of the session's tcp speed."""
+
+
+class Compliance:
+    """Drives one arm by a controller; ``active`` from the first command until positions hold the arm again.
+
+    Args:
+        torque: The arm's torques: its bounds, its measured state, its brake.
+        envelope: The envelope of the set-point.
+        spec: The arm.
+        simulated: Whether it has the joint damping of its URDF, which the controller of a real arm compensates.
+    """
+
+    def __init__(self, torque: TorqueMotion, envelope: Envelope, spec: RobotSpec, simulated: bool) -> None:
+        self._torque = torque
+        self._envelope = envelope
+        self._dynamics: Dynamics | None = None
+        if torque.bounds is not None:
+            with suppress(NotSupported):  # no session gets a controller then
+                self._dynamics = Dynamics.of(spec)
+        self._friction = self._dynamics.damping if self._dynamics is not None and simulated else None
+        self._law: ControllerLaw | None = None
+        """The law of this session; None if the arm's own position controller follows the set-point."""
+        self.active = False
+        """Whether the controller drives the arm."""
+        self._due: tuple[Floats, Floats] = ((), ())
+        """Set-point of the last tick: positions (n,), rad, and speeds (n,), rad/s, that are due now."""
+        self.held_back = False
+        """Whether the set-point is as far ahead of the arm as it may be."""
+
+    @property
+    def chosen(self) -> bool:
+        """Whether the session has a controller."""
+        return self._law is not None
+
+    @property
+    def mode(self) -> ControlMode:
+        """What makes the arm follow its set-point at present."""
+        if self._law is not None and self.active:
+            return self._law.mode
+        return ControlMode.TORQUE if self._torque.active else ControlMode.POSITION
+
+    def open_session(self, session: Session) -> None:
+        """Open a session: set the envelope of its set-point, and the bounds of its torques."""
+        controller = controller_of(session.controller)
+        torque, bounds = self._torque, self._torque.bounds
+        self.active = self.held_back = False
+        self._law = None
+        if isinstance(controller, Position) or bounds is None:
+            self._envelope.open(session)
+            torque.open()
+            return
+        smoother = torque.smoother
+        self._law = ControllerLaw(controller, smoother.n, smoother.dt, self._dynamics, self._friction)
+        slower = session._replace(speed=min(session.speed, SPEED_SHARE), tcp_speed=TCP_SHARE * session.tcp_speed)
+        self._envelope.open(slower)
+        torque.open()
+        bounds.velocity, bounds.tcp_speed = smoother.velocity, session.tcp_speed
+
+    def set_gains(self, controller: Controller) -> None:
+        """Change the gains of the session's controller within 0.2 s."""
+        if self._law is not None and type(controller) is type(self._law.controller):
+            self._law.set_gains(controller)
+
+    def begin(self) -> None:
+        """Begin to drive the arm, whose set-point is at rest."""
+        self._torque.start()
+        self.active, self.held_back = True, False
+
+    def hold_back(self) -> bool:
+        """Bring a set-point that is too far ahead of the arm back to :data:`LEAD`; returns whether it was.
+
+        To be called once per tick, before the set-point moves on.
+        """
+        law, smoother, torque = self._law, self._torque.smoother, self._torque
+        assert law is not None
+        q, goal = torque.q, smoother.q
+        most, turn = LEAD
+        if law.in_joints and max([abs(a - b) for a, b in zip(goal, q, strict=True)]) > turn:
+            goal = [b + max(-turn, min(turn, a - b)) for a, b in zip(goal, q, strict=True)]
+        kinematics = self._envelope.kinematics
+        here = kinematics.fk(q)
+        error = difference(here, kinematics.fk(goal))
+        share = hypot(*error[:3]) / most
+        if not law.in_joints and not law.position_only:
+            share = max(share, hypot(*error[3:]) / turn)
+        if share > 1.0:
+            goal = [b + (a - b) / share for a, b in zip(goal, q, strict=True)]
+        self.held_back = share > RESUME if self.held_back and goal is smoother.q else goal is not smoother.q
+        moved = goal is not smoother.q
+        if moved:
+            smoother.anchor(goal)
+            self._envelope.limited |= Limited.LEAD
+        self._due = smoother.q, smoother.dq
+        return moved
+
+    def drive(self) -> None:
+        """Advance the torques by one tick towards those of the controller."""
+        torque, law, smoother = self._torque, self._law, self._torque.smoother
+        assert law is not None
+        arm = torque.arm
+        if arm is None:  # the last ones are kept, for a bounded time
+            return
+        q_due, dq_due = self._due
+        kinematics = self._envelope.kinematics
+        pose, jacobian = kinematics.fk_and_jacobian(arm.q)
+        error = difference(pose, kinematics.fk(q_due)) if not law.in_joints else ()
+        dt = smoother.dt
+        acceleration = [(new - old) / dt for new, old in zip(smoother.dq, dq_due, strict=True)]
+        torque.drive(law.torques(arm.q, arm.dq, (q_due, dq_due, acceleration), arm.inertia, jacobian, pose, error))
+
+    def strays(self) -> Limited | None:
+        """Return the limit that the arm exceeds, although its set-point keeps all of them; None if it keeps all."""
+        bounds, arm = self._torque.bounds, self._torque.arm
+        return None if bounds is None or arm is None else bounds.strays(arm)

@@ -1,0 +1,471 @@
+"""Controllers: how an arm follows the servo's set-point. The records that a program passes, and their laws.
+
+A set-point is the same whichever controller follows it: limits, dead-man, deadlines and stops act before. A law makes
+torques of the set-point and of the reading, on top of those that carry the arm's own weight. With q, dq the measured
+and q_s, dq_s, ddq_s the set-point's positions, speeds and accelerations, M the joint-space inertia and c the Coriolis
+torques, :class:`JointImpedance` applies
+
+    tau = K (q_s - q) + D (dq_s - dq) + M ddq_s + c,
+
+and :class:`OperationalSpace`, with the tcp's Jacobian J and the pose error e (m, and the rotation vector in rad),
+
+    tau = J' (K e + D J (dq_s - dq)) + N' tau_0 + M ddq_s + c,   N' = 1 - J' L J M^-1,   L = (J M^-1 J')^-1,
+
+where the posture's torques tau_0 act in the null space of the task only (Khatib, "A unified approach for motion and
+force control of robot manipulators: the operational space formulation", IEEE J. Robotics and Automation 3(1), 1987).
+
+D follows from a damping ratio: in the modes in which K and the inertia are both diagonal, mode i has the damping
+``2 ratio sqrt(k_i m_i)`` ("double diagonalization": Albu-Schaeffer, Ott, Frese, Hirzinger, "Cartesian impedance control
+of redundant robots", ICRA 2003). A rate r (1/s2) in place of a stiffness is multiplied by the inertia: K = r L.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from math import sqrt
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ..arguments import number, vector
+from ..errors import CommandError
+from ..types import ControlMode
+
+if TYPE_CHECKING:
+    from ..dynamics import Dynamics
+    from ..kinematics.arm import Kinematics, Pose7
+    from ..specs import RobotSpec
+    from .torque import Inertia
+
+__all__ = [
+    "Controller",
+    "ControllerLaw",
+    "JointImpedance",
+    "OperationalSpace",
+    "Position",
+    "controller_data",
+    "controller_of",
+    "resolve",
+    "with_gains",
+]
+
+Array = NDArray[np.float64]
+Floats = Sequence[float]
+Gain: TypeAlias = float | tuple[float, ...]
+
+_STIFFEST = 1e5
+"""Greatest stiffness, N/m and Nm/rad, and greatest rate, 1/s2."""
+_SOFTEST = 1e-3
+"""Smallest stiffness and rate, in the same units."""
+
+
+@dataclass(frozen=True, slots=True)
+class Position:
+    """The arm's own position controller follows the set-point: as stiff and as exact as the arm is. The default."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class JointImpedance:
+    """Each joint follows its set-point like a spring with a damper.
+
+    Args:
+        stiffness: Nm/rad, one number or one for each joint. By default four times the joint's torque limit per rad, at
+            most 200 Nm/rad.
+        damping_ratio: 1 for critical damping: as fast as possible without overshoot.
+        rate: Instead of ``stiffness``: 1/s2, times the inertia. Every joint then answers equally fast, and a joint of
+            little inertia, such as a wrist's, with next to no force.
+    """
+
+    stiffness: Gain | None = None
+    damping_ratio: float = 1.0
+    rate: Gain | None = None
+
+    def __post_init__(self) -> None:
+        _check_gains(self, ("stiffness", "rate"), None)
+        if self.stiffness is not None and self.rate is not None:
+            raise CommandError("pass a stiffness or a rate, not both", code="bad_controller")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class OperationalSpace:
+    """The tcp follows its set-point like a body on springs and dampers; the other joints keep a posture.
+
+    Args:
+        stiffness: Of the tcp's position, N/m: one number, or three along x, y and z. 1000 N/m by default.
+        rotation_stiffness: Of its orientation, Nm/rad: one number, or three about x, y and z. 50 Nm/rad by default.
+        damping_ratio: 1 for critical damping: as fast as possible without overshoot.
+        frame: Axes of the gains: those of the arm's ``base``, or of the ``tcp`` itself.
+        position_only: Leave the orientation free; only the posture's stiffness holds it.
+        posture: Joint positions (n,), rad, that the null space moves towards; the set-point's own by default.
+        posture_stiffness: Nm/rad of each joint, in the null space only.
+        rate: Instead of ``stiffness``: 1/s2, times the inertia at the tcp, as robosuite's ``kp``.
+        rotation_rate: The same for the orientation. Pass both rates or none.
+    """
+
+    stiffness: Gain | None = None
+    rotation_stiffness: Gain | None = None
+    damping_ratio: float = 1.0
+    frame: Literal["base", "tcp"] = "base"
+    position_only: bool = False
+    posture: tuple[float, ...] | None = None
+    posture_stiffness: float = 10.0
+    rate: Gain | None = None
+    rotation_rate: Gain | None = None
+
+    def __post_init__(self) -> None:
+        _check_gains(self, ("stiffness", "rotation_stiffness", "rate", "rotation_rate"), 3)
+        if self.frame not in ("base", "tcp"):
+            raise CommandError(f"frame must be 'base' or 'tcp', not {self.frame!r}", code="bad_controller")
+        number("posture_stiffness", self.posture_stiffness, "Nm/rad", least=0.0, most=_STIFFEST)
+        if self.posture is not None:
+            object.__setattr__(self, "posture", tuple(vector("posture", self.posture).tolist()))
+        rates = (self.rate is not None, self.rotation_rate is not None)
+        if any(rates):
+            if self.stiffness is not None or self.rotation_stiffness is not None:
+                raise CommandError("pass stiffnesses or rates, not both", code="bad_controller")
+            if not all(rates) and not (rates[0] and self.position_only):
+                raise CommandError("pass both rate and rotation_rate", code="bad_controller")
+
+
+Controller: TypeAlias = Position | JointImpedance | OperationalSpace
+
+
+def _check_gains(record: Any, names: Sequence[str], size: int | None) -> None:
+    """Check the gains of a record, and store each as a float or as a tuple."""
+    for name in names:
+        value = getattr(record, name)
+        if value is None:
+            continue
+        if np.ndim(value) == 0:
+            gain: Gain = number(name, value, least=_SOFTEST, most=_STIFFEST)
+        else:
+            gain = tuple(number(name, x, least=_SOFTEST, most=_STIFFEST) for x in vector(name, value, size).tolist())
+        object.__setattr__(record, name, gain)
+    number("damping_ratio", record.damping_ratio, least=0.0, above=True, most=5.0)
+
+
+_KINDS: dict[str, type[Controller]] = {kind.__name__: kind for kind in (Position, JointImpedance, OperationalSpace)}
+
+
+def controller_data(controller: Controller) -> dict[str, Any] | None:
+    """Return a controller as plain data, for the process of the servo; None for :class:`Position`."""
+    return None if isinstance(controller, Position) else {"kind": type(controller).__name__, **asdict(controller)}
+
+
+def controller_of(data: dict[str, Any] | None) -> Controller:
+    """Return the controller that :func:`controller_data` described."""
+    if data is None:
+        return Position()
+    values: dict[str, Any] = {name: tuple(x) if isinstance(x, list) else x for name, x in data.items()}
+    kind: type[Any] = _KINDS[values.pop("kind")]
+    made: Controller = kind(**values)
+    return made
+
+
+_FASTEST = 1.0
+"""Greatest product of a mode's natural frequency and the servo's period: beyond it no damping is stable."""
+_DAMPED = 0.9
+"""Most that a damper may take of a speed in one period of the servo."""
+
+
+def resolve(controller: object, spec: RobotSpec, kinematics: Kinematics, rate_hz: float) -> Controller:
+    """Return a controller with a value for every gain, checked against an arm that takes torques.
+
+    Args:
+        controller: The controller, as the program passed it.
+        spec: The arm.
+        kinematics: Its kinematics.
+        rate_hz: Rate of the servo, Hz.
+
+    Raises:
+        CommandError: A wrong number of gains, a posture beyond the limits, or gains that are too stiff for the arm's
+            inertia at this rate (``code`` is ``bad_controller``).
+        NotSupported: The arm's URDF lacks inertias (``code`` is ``wrong_inertials``).
+    """
+    from ..dynamics import Dynamics
+
+    if isinstance(controller, Position):
+        return controller
+    n = len(spec.joints)
+    if isinstance(controller, JointImpedance):
+        resolved: Controller = _resolve_joints(controller, spec, n)
+    elif isinstance(controller, OperationalSpace):
+        resolved = _resolve_task(controller, spec, n)
+    else:
+        raise CommandError(
+            f"controller must be hal.Position(), hal.JointImpedance() or hal.OperationalSpace(), not {controller!r}",
+            code="bad_controller",
+        )
+    mass = np.array(Dynamics.of(spec).mass_matrix(spec.home))
+    law = ControllerLaw(resolved, n, 1.0 / rate_hz)
+    fastest = law.fastest(np.linalg.inv(mass), kinematics.jacobian(spec.home)) / rate_hz
+    if fastest > _FASTEST:
+        raise CommandError(
+            f"{spec.name}: these gains are too stiff for the inertia of {spec.model} at {rate_hz:g} Hz: divide them by "
+            f"{1.1 * (fastest / _FASTEST) ** 2:.1f}, or run the servo at {1.05 * rate_hz * fastest / _FASTEST:.0f} Hz",
+            code="bad_controller",
+        )
+    return resolved
+
+
+def _resolve_joints(controller: JointImpedance, spec: RobotSpec, n: int) -> JointImpedance:
+    if controller.rate is not None:
+        return replace(controller, rate=_spread("rate", controller.rate, n))
+    stiffness = controller.stiffness
+    if stiffness is None:
+        assert spec.limits.torque is not None
+        stiffness = tuple(min(200.0, 4.0 * most) for most in spec.limits.torque)
+    return replace(controller, stiffness=_spread("stiffness", stiffness, n))
+
+
+def _resolve_task(controller: OperationalSpace, spec: RobotSpec, n: int) -> OperationalSpace:
+    if controller.posture is not None:
+        posture = vector("posture", controller.posture, n)
+        if (posture < spec.limits.lower).any() or (posture > spec.limits.upper).any():
+            raise CommandError(f"{spec.name}: the posture is outside the joint limits", code="bad_controller")
+    if controller.rate is not None:
+        rotation = None if controller.rotation_rate is None else _spread("rotation_rate", controller.rotation_rate, 3)
+        return replace(controller, rate=_spread("rate", controller.rate, 3), rotation_rate=rotation)
+    return replace(
+        controller,
+        stiffness=_spread("stiffness", 1000.0 if controller.stiffness is None else controller.stiffness, 3),
+        rotation_stiffness=_spread(
+            "rotation_stiffness", 50.0 if controller.rotation_stiffness is None else controller.rotation_stiffness, 3
+        ),
+    )
+
+
+def _spread(name: str, gain: Gain, count: int) -> tuple[float, ...]:
+    """Return ``count`` gains: the same one for all if there is only one."""
+    gains = (gain,) * count if isinstance(gain, (int, float)) else gain
+    if len(gains) != count:
+        raise CommandError(f"{name} must be one number or {count}, not {len(gains)}", code="bad_controller")
+    return gains
+
+
+_FIXED = ("frame", "position_only")
+
+
+def with_gains(controller: Controller, gains: dict[str, ArrayLike]) -> Controller:
+    """Return a controller with other gains.
+
+    Raises:
+        CommandError: No such gain, one that stays as it is within a session, or a stiffness in place of a rate
+            (``code`` is ``bad_controller``).
+    """
+    known = set(asdict(controller)) - set(_FIXED)
+    for name in gains:
+        if name not in known:
+            text = f"{type(controller).__name__} has no gain {name!r} to change; gains: {', '.join(sorted(known))}"
+            raise CommandError(text, code="bad_controller")
+        if name.endswith(("stiffness", "rate")) and getattr(controller, name) is None:
+            raise CommandError(
+                f"{name}: stiffnesses and rates do not change places in a session", code="bad_controller"
+            )
+    changed: Controller = replace(controller, **gains)  # type: ignore[arg-type]  # checked by the record
+    return changed
+
+
+# The laws.
+
+RAMP = 0.2
+"""Time in which new gains take effect, s."""
+_HEAVIEST = np.array([200.0] * 3 + [20.0] * 3)
+"""Greatest inertia at the tcp that is taken into account, kg and kg m2: near a singularity it is infinite."""
+_SLOWEST = 1e-9
+"""Smallest square of a natural frequency, 1/s2, for the rounding of those that are 0."""
+_POSTURE_LEAD = 0.2
+"""A posture that is farther away pulls no harder, rad."""
+
+
+class ControllerLaw:
+    """Makes torques of set-points and readings, by one controller.
+
+    Args:
+        controller: A :class:`JointImpedance` or :class:`OperationalSpace` with all its gains (see :func:`resolve`).
+        n: Number of joints.
+        dt: Period of the servo, s.
+        dynamics: The arm's dynamics, for the Coriolis torques; without it there are none.
+        friction: Viscous friction (n,) of the joints that is to be compensated, Nm s/rad; None for none.
+    """
+
+    def __init__(
+        self,
+        controller: Controller,
+        n: int,
+        dt: float,
+        dynamics: Dynamics | None = None,
+        friction: Floats | None = None,
+    ) -> None:
+        self._dt = dt
+        self._still = [0.0] * n
+        self._dynamics = dynamics
+        self._friction = np.array(friction) if friction is not None and any(friction) else None
+        self.in_joints = isinstance(controller, JointImpedance)
+        """Whether the springs are those of the joints; else they are those of the tcp."""
+        self.mode = ControlMode.JOINT_IMPEDANCE if self.in_joints else ControlMode.OPERATIONAL_SPACE
+        self.controller = controller
+        task = controller if isinstance(controller, OperationalSpace) else None
+        self.position_only = task is not None and task.position_only
+        """Whether the orientation of the tcp is free."""
+        self._rows = n if task is None else 3 if task.position_only else 6
+        self._along_tcp = task is not None and task.frame == "tcp"
+        self._redundant = task is not None and n > self._rows
+        self._ease = 0.0 if task is None else np.diag(1.0 / _HEAVIEST[: self._rows])
+        self._by_rate = getattr(controller, "rate", None) is not None
+        self._posture: Array | None = None
+        self._goal = self._numbers(controller)
+        self._from = self._now = self._goal
+        self._ramped = 1.0
+        self._apply(self._goal)
+        self._set_posture(controller)
+
+    def _numbers(self, controller: Controller) -> Array:
+        """Return all gains as one vector: those of the task or of the joints, the damping ratio, the posture's."""
+        if isinstance(controller, JointImpedance):
+            gains = controller.rate if controller.rate is not None else controller.stiffness
+            return np.array([*_tuple(gains), controller.damping_ratio, 0.0])
+        assert isinstance(controller, OperationalSpace)
+        by_rate = controller.rate is not None
+        first = controller.rate if by_rate else controller.stiffness
+        second = controller.rotation_rate if by_rate else controller.rotation_stiffness
+        gains = (*_tuple(first), *(() if controller.position_only else _tuple(second)))
+        return np.array([*gains, controller.damping_ratio, controller.posture_stiffness])
+
+    def set_gains(self, controller: Controller) -> None:
+        """Change the gains, within :data:`RAMP` s; ``controller`` is of the same kind."""
+        self.controller = controller
+        self._from, self._goal = self._now, self._numbers(controller)
+        self._ramped = 0.0
+        self._set_posture(controller)
+
+    def _set_posture(self, controller: Controller) -> None:
+        posture = getattr(controller, "posture", None)
+        self._posture = None if posture is None else np.array(posture)
+
+    def _apply(self, numbers: Array) -> None:
+        self._now = numbers
+        self._gains, self._ratio, self._posture_stiffness = numbers[:-2], float(numbers[-2]), float(numbers[-1])
+        self._roots = np.sqrt(self._gains)
+        self._weights = np.outer(self._roots, self._roots)
+
+    def fastest(self, inverse_mass: Array, jacobian: Array) -> float:
+        """Return the fastest mode's natural frequency, rad/s, at an inverse inertia (n, n) and a Jacobian (6, n)."""
+        if self._by_rate:
+            return float(self._roots.max())
+        if self.in_joints:
+            ease = inverse_mass
+        else:
+            rows = jacobian[: self._rows]
+            ease = rows @ inverse_mass @ rows.T
+        return sqrt(float(np.linalg.eigvalsh(ease * self._weights).max()))
+
+    def torques(
+        self,
+        q: Floats,
+        dq: Floats,
+        setpoint: tuple[Floats, Floats, Floats],
+        inertia: Inertia,
+        jacobian: Array,
+        pose: Pose7,
+        error: Floats,
+    ) -> list[float]:
+        """Return the torques (n,), Nm, of one period, on top of those that carry the arm's weight.
+
+        Args:
+            q: Measured joint positions (n,), rad.
+            dq: Measured joint speeds (n,), rad/s.
+            setpoint: Positions, speeds and accelerations (n,) of the set-point.
+            inertia: Inertia of the arm where it is.
+            jacobian: Jacobian (6, n) of the tcp there, along the base's axes.
+            pose: Pose of the tcp there.
+            error: Twist (6,) from that pose to the set-point's within 1 s, m and rad (:func:`hal.geometry.difference`).
+        """
+        if self._ramped < 1.0:
+            self._ramped = min(1.0, self._ramped + self._dt / RAMP)
+            self._apply(self._from + self._ramped * (self._goal - self._from))
+        q_set, dq_set, ddq_set = setpoint
+        lag: Array = np.subtract(dq_set, dq)
+        if self.in_joints:
+            tau = self._springs(inertia.inverse, np.subtract(q_set, q), lag)
+        else:
+            tau = self._task(np.subtract(self._posture if self._posture is not None else q_set, q), lag, inertia,
+                             jacobian, pose, np.array(error))  # fmt: skip
+        tau += inertia.mass.dot(ddq_set)
+        if self._dynamics is not None:
+            tau += self._dynamics.coriolis(q, dq)
+        if self._friction is not None:
+            tau += self._friction * dq_set
+        torques: list[float] = tau.tolist()
+        return torques
+
+    def _task(self, away: Array, lag: Array, inertia: Inertia, jacobian: Array, pose: Pose7, error: Array) -> Array:
+        """Return the torques of the tcp's springs, and those of the posture in their null space."""
+        rows = self._rows
+        if rows == 3:
+            jacobian, error = jacobian[:3], error[:3]
+        if self._along_tcp:
+            turn = _rotation(pose[3:]).T
+            jacobian, error = _turned(turn, jacobian), _turned(turn, error)
+        eased = jacobian.dot(inertia.inverse)
+        ease = eased.dot(jacobian.T) + self._ease
+        force = self._springs(ease, error, jacobian.dot(lag))
+        if self._redundant:
+            diagonal = inertia.mass.diagonal()
+            stiffness = self._posture_stiffness
+            damping = 2.0 * self._ratio * np.sqrt(stiffness * diagonal) + diagonal
+            posture = stiffness * np.minimum(np.maximum(away, -_POSTURE_LEAD), _POSTURE_LEAD) + damping * lag
+            force -= np.linalg.solve(ease, eased.dot(posture))
+            tau: Array = force.dot(jacobian) + posture
+        else:
+            tau = force.dot(jacobian)
+        return tau
+
+    def _springs(self, ease: Array, error: Array, lag: Array) -> Array:
+        """Return the forces (k,) of the springs and dampers.
+
+        In the modes of the matrix sqrt(K) A sqrt(K), A being the inverse inertia ``ease`` (k, k), each spring of unit
+        stiffness moves a mass of 1 / w^2, so that a damper of 2 ratio / w damps it by the ratio.
+
+        Args:
+            ease: Inverse of the inertia that the springs move.
+            error: Distance of the set-point (k,).
+            lag: Speed of the set-point relative to what was measured (k,).
+        """
+        if self._by_rate:
+            per_second = np.minimum(2.0 * self._ratio * self._roots, _DAMPED / self._dt)
+            return np.asarray(np.linalg.solve(ease, self._gains * error + per_second * lag), np.float64)
+        values, modes = np.linalg.eigh(ease * self._weights)
+        squares: Array = np.maximum(values, _SLOWEST)
+        damping = np.minimum(2.0 * self._ratio / np.sqrt(squares), _DAMPED / (self._dt * squares))
+        spring = (self._roots * error).dot(modes)
+        most = _FASTEST * _FASTEST * 1.5 / (self._dt * self._dt)
+        if squares[-1] > most:  # where the arm is lighter than at home
+            spring *= np.minimum(1.0, most / squares)
+        spring += damping * (self._roots * lag).dot(modes)
+        return np.asarray(self._roots * modes.dot(spring), np.float64)
+
+
+def _tuple(gain: Gain | None) -> tuple[float, ...]:
+    assert isinstance(gain, tuple), "resolve a controller first"
+    return gain
+
+
+def _turned(turn: Array, values: Array) -> Array:
+    """Return values (3, ...) or (6, ...) with each three of them turned by a matrix (3, 3)."""
+    if len(values) == 3:
+        return turn @ values
+    return np.concatenate((turn @ values[:3], turn @ values[3:]))
+
+
+def _rotation(quaternion: Floats) -> Array:
+    x, y, z, w = quaternion
+    return np.array(
+        [
+            [1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - z * w), 2.0 * (x * z + y * w)],
+            [2.0 * (x * y + z * w), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - x * w)],
+            [2.0 * (x * z - y * w), 2.0 * (y * z + x * w), 1.0 - 2.0 * (x * x + y * y)],
+        ]
+    )
