@@ -83,7 +83,9 @@ class Compliance:
             torque.open()
             return
         smoother = torque.smoother
-        self._law = ControllerLaw(controller, smoother.n, smoother.dt, self._dynamics, self._friction)
+        self._law = ControllerLaw(
+            controller, smoother.n, smoother.dt, smoother.velocity, self._dynamics, self._friction
+        )
         slower = session._replace(speed=min(session.speed, SPEED_SHARE), tcp_speed=TCP_SHARE * session.tcp_speed)
         self._envelope.open(slower)
         torque.open()
@@ -139,7 +141,9 @@ class Compliance:
         error = difference(pose, kinematics.fk(q_due)) if not law.in_joints else ()
         dt = smoother.dt
         acceleration = [(new - old) / dt for new, old in zip(smoother.dq, dq_due, strict=True)]
-        torque.drive(law.torques(arm.q, arm.dq, (q_due, dq_due, acceleration), arm.inertia, jacobian, pose, error))
+        tau = law.torques(arm.q, arm.dq, (q_due, dq_due, acceleration), arm.inertia, jacobian, pose, error)
+        pull, brake = tau.tolist()
+        torque.drive(pull, brake, law.gain, jacobian)
 
     def strays(self) -> Limited | None:
         """Return the limit that the arm exceeds, although its set-point keeps all of them; None if it keeps all."""

@@ -270,12 +270,18 @@ def with_gains(controller: Controller, gains: dict[str, ArrayLike]) -> Controlle
 
 # The laws.
 
+TORQUE_RATE = 990.0
+"""Greatest rate of every torque, Nm/s: the 1000 of a Franka's interface, less a margin for rounding."""
 RAMP = 0.2
 """Time in which new gains take effect, s."""
 _HEAVIEST = np.array([200.0] * 3 + [20.0] * 3)
 """Greatest inertia at the tcp that is taken into account, kg and kg m2: near a singularity it is infinite."""
 _SLOWEST = 1e-9
 """Smallest square of a natural frequency, 1/s2, for the rounding of those that are 0."""
+_TURN = 3.0
+"""Speed that the tcp must not turn faster than when it is let go, rad/s."""
+_RELEASED = 0.7
+"""Share of this speed, and of the joints', that a spring may reach."""
 _POSTURE_LEAD = 0.2
 """A posture that is farther away pulls no harder, rad."""
 
@@ -287,6 +293,7 @@ class ControllerLaw:
         controller: A :class:`JointImpedance` or :class:`OperationalSpace` with all its gains (see :func:`resolve`).
         n: Number of joints.
         dt: Period of the servo, s.
+        velocity: Greatest joint speeds (n,), rad/s; not needed to ask for :meth:`fastest`.
         dynamics: The arm's dynamics, for the Coriolis torques; without it there are none.
         friction: Viscous friction (n,) of the joints that is to be compensated, Nm s/rad; None for none.
     """
@@ -296,11 +303,16 @@ class ControllerLaw:
         controller: Controller,
         n: int,
         dt: float,
+        velocity: Floats = (),
         dynamics: Dynamics | None = None,
         friction: Floats | None = None,
     ) -> None:
         self._dt = dt
-        self._still = [0.0] * n
+        springs: Array = np.array(velocity) if isinstance(controller, JointImpedance) else np.full(3, _TURN)
+        self._reach = np.e * _RELEASED * springs
+        """Length of a spring (n,) or (3,), times its natural frequency, that is not exceeded: rad/s."""
+        self._most = 1.5 * (_FASTEST / dt) ** 2
+        """Greatest square of a mode's natural frequency, 1/s2: a faster one is softened."""
         self._dynamics = dynamics
         self._friction = np.array(friction) if friction is not None and any(friction) else None
         self.in_joints = isinstance(controller, JointImpedance)
@@ -316,6 +328,10 @@ class ControllerLaw:
         self._ease = 0.0 if task is None else np.diag(1.0 / _HEAVIEST[: self._rows])
         self._by_rate = getattr(controller, "rate", None) is not None
         self._posture: Array | None = None
+        self._modes: tuple[Array, Array, Array | None] = (np.zeros(1), np.ones(1), None)
+        """Accelerations by the springs in their modes, frequencies of the modes, rad/s, and the modes."""
+        self.gain: Array = np.zeros(3)
+        """Velocity (3,) of the tcp, m/s, that the springs of the last call may still add."""
         self._goal = self._numbers(controller)
         self._from = self._now = self._goal
         self._ramped = 1.0
@@ -371,8 +387,8 @@ class ControllerLaw:
         jacobian: Array,
         pose: Pose7,
         error: Floats,
-    ) -> list[float]:
-        """Return the torques (n,), Nm, of one period, on top of those that carry the arm's weight.
+    ) -> Array:
+        """Return the torques of one period, on top of those that carry the arm's weight.
 
         Args:
             q: Measured joint positions (n,), rad.
@@ -382,49 +398,84 @@ class ControllerLaw:
             jacobian: Jacobian (6, n) of the tcp there, along the base's axes.
             pose: Pose of the tcp there.
             error: Twist (6,) from that pose to the set-point's within 1 s, m and rad (:func:`hal.geometry.difference`).
+
+        Returns:
+            Two rows (2, n), Nm, whose sum is the controller's: what draws the arm to its set-point, and what only
+            brakes it.
         """
         if self._ramped < 1.0:
             self._ramped = min(1.0, self._ramped + self._dt / RAMP)
             self._apply(self._from + self._ramped * (self._goal - self._from))
         q_set, dq_set, ddq_set = setpoint
-        lag: Array = np.subtract(dq_set, dq)
+        speeds: Array = np.array((dq_set, dq))
         if self.in_joints:
-            tau = self._springs(inertia.inverse, np.subtract(q_set, q), lag)
+            tau = self._springs(inertia.inverse, self._shortened(np.subtract(q_set, q), inertia.inverse), speeds)
         else:
-            tau = self._task(np.subtract(self._posture if self._posture is not None else q_set, q), lag, inertia,
-                             jacobian, pose, np.array(error))  # fmt: skip
-        tau += inertia.mass.dot(ddq_set)
-        if self._dynamics is not None:
-            tau += self._dynamics.coriolis(q, dq)
+            away = np.subtract(q_set if self._posture is None else self._posture, q)
+            tau = self._task(away, speeds, inertia, jacobian, pose, np.array(error))
+        self.gain = self._gain(float(np.abs(tau[0]).max()), jacobian, pose)
+        tau[0] += inertia.mass.dot(ddq_set)
         if self._friction is not None:
-            tau += self._friction * dq_set
-        torques: list[float] = tau.tolist()
-        return torques
+            tau[0] += self._friction * dq_set
+        if self._dynamics is not None:
+            tau[1] += self._dynamics.coriolis(q, dq)
+        return tau
 
-    def _task(self, away: Array, lag: Array, inertia: Inertia, jacobian: Array, pose: Pose7, error: Array) -> Array:
-        """Return the torques of the tcp's springs, and those of the posture in their null space."""
-        rows = self._rows
-        if rows == 3:
+    def _gain(self, most: float, jacobian: Array, pose: Pose7) -> Array:
+        """Return the velocity (3,) of the tcp that the springs may still add, m/s, if all torques are removed from now.
+
+        A mode with the natural frequency w gains no more than a critically damped one that is let go: its acceleration
+        for 1 / (e w).
+
+        Args:
+            most: Greatest torque, Nm.
+            jacobian: Jacobian (6, n) of the tcp.
+            pose: Pose of the tcp.
+        """
+        accelerations, frequencies, modes = self._modes
+        seconds = 2.0 * self._dt + most * (0.5 / TORQUE_RATE)
+        gains = accelerations * np.minimum(seconds, 1.0 / (np.e * frequencies))
+        velocity = gains if modes is None else modes.dot(gains) / self._roots
+        if self.in_joints:
+            velocity = jacobian[:3].dot(velocity)
+        elif self._along_tcp:
+            velocity = _rotation(pose[3:]).dot(velocity[:3])
+        return np.asarray(velocity[:3], np.float64)
+
+    def _task(self, away: Array, speeds: Array, inertia: Inertia, jacobian: Array, pose: Pose7, error: Array) -> Array:
+        """Return the torques (2, n) of the tcp's springs, and those of the posture in their null space."""
+        if self._rows == 3:
             jacobian, error = jacobian[:3], error[:3]
         if self._along_tcp:
             turn = _rotation(pose[3:]).T
             jacobian, error = _turned(turn, jacobian), _turned(turn, error)
         eased = jacobian.dot(inertia.inverse)
         ease = eased.dot(jacobian.T) + self._ease
-        force = self._springs(ease, error, jacobian.dot(lag))
-        if self._redundant:
-            diagonal = inertia.mass.diagonal()
-            stiffness = self._posture_stiffness
-            damping = 2.0 * self._ratio * np.sqrt(stiffness * diagonal) + diagonal
-            posture = stiffness * np.minimum(np.maximum(away, -_POSTURE_LEAD), _POSTURE_LEAD) + damping * lag
-            force -= np.linalg.solve(ease, eased.dot(posture))
-            tau: Array = force.dot(jacobian) + posture
-        else:
-            tau = force.dot(jacobian)
-        return tau
+        if self._rows == 6:
+            error[3:] = self._shortened(error[3:], ease)
+        force = self._springs(ease, error, speeds.dot(jacobian.T))
+        if not self._redundant:
+            return np.asarray(force.dot(jacobian), np.float64)
+        diagonal = inertia.mass.diagonal()
+        stiffness = self._posture_stiffness
+        posture = speeds * (2.0 * self._ratio * np.sqrt(stiffness * diagonal) + diagonal)
+        np.negative(posture[1], out=posture[1])
+        posture[0] += stiffness * np.minimum(np.maximum(away, -_POSTURE_LEAD), _POSTURE_LEAD)
+        force -= np.linalg.solve(ease, eased.dot(posture.T)).T
+        return np.asarray(force.dot(jacobian) + posture, np.float64)
 
-    def _springs(self, ease: Array, error: Array, lag: Array) -> Array:
-        """Return the forces (k,) of the springs and dampers.
+    def _shortened(self, error: Array, ease: Array) -> Array:
+        """Return the lengths (k,) of the last k springs, cut so that none moves what it holds too fast when let go.
+
+        A critically damped spring of length x that is let go reaches the speed w x / e.
+        """
+        k = len(error)
+        squares = self._gains[-k:] if self._by_rate else self._gains[-k:] * ease.diagonal()[-k:]
+        most = self._reach / np.sqrt(squares)
+        return np.asarray(np.minimum(np.maximum(error, -most), most), np.float64)
+
+    def _springs(self, ease: Array, error: Array, speeds: Array) -> Array:
+        """Return the forces (2, k) of the springs and dampers: those that draw, and those that brake.
 
         In the modes of the matrix sqrt(K) A sqrt(K), A being the inverse inertia ``ease`` (k, k), each spring of unit
         stiffness moves a mass of 1 / w^2, so that a damper of 2 ratio / w damps it by the ratio.
@@ -432,20 +483,26 @@ class ControllerLaw:
         Args:
             ease: Inverse of the inertia that the springs move.
             error: Distance of the set-point (k,).
-            lag: Speed of the set-point relative to what was measured (k,).
+            speeds: Speed of the set-point, and the measured one (2, k).
         """
         if self._by_rate:
-            per_second = np.minimum(2.0 * self._ratio * self._roots, _DAMPED / self._dt)
-            return np.asarray(np.linalg.solve(ease, self._gains * error + per_second * lag), np.float64)
+            damped = speeds * np.minimum(2.0 * self._ratio * self._roots, _DAMPED / self._dt)
+            damped[0] += self._gains * error
+            np.negative(damped[1], out=damped[1])
+            self._modes = self._gains * error, self._roots, None
+            return np.asarray(np.linalg.solve(ease, damped.T).T, np.float64)
         values, modes = np.linalg.eigh(ease * self._weights)
         squares: Array = np.maximum(values, _SLOWEST)
         damping = np.minimum(2.0 * self._ratio / np.sqrt(squares), _DAMPED / (self._dt * squares))
+        damped = (speeds * self._roots).dot(modes)
+        damped *= damping
+        np.negative(damped[1], out=damped[1])
         spring = (self._roots * error).dot(modes)
-        most = _FASTEST * _FASTEST * 1.5 / (self._dt * self._dt)
-        if squares[-1] > most:  # where the arm is lighter than at home
-            spring *= np.minimum(1.0, most / squares)
-        spring += damping * (self._roots * lag).dot(modes)
-        return np.asarray(self._roots * modes.dot(spring), np.float64)
+        if squares[-1] > self._most:  # where the arm is lighter than at home
+            spring *= np.minimum(1.0, self._most / squares)
+        damped[0] += spring
+        self._modes = spring * squares, np.sqrt(squares), modes
+        return np.asarray(damped.dot(modes.T) * self._roots, np.float64)
 
 
 def _tuple(gain: Gain | None) -> tuple[float, ...]:

@@ -27,6 +27,7 @@ from ..commands import CommandRecord
 from ..driver import Reading, Setpoint
 from ..specs import LimitsSpec
 from ..types import Limited
+from .controllers import TORQUE_RATE
 from .envelope import UNLIMITED, Envelope
 from .joint import ServoMotion
 from .smoothing import JointSmoother
@@ -44,8 +45,8 @@ __all__ = [
 Array = NDArray[np.float64]
 Floats = Sequence[float]
 
-RATE = 990.0
-"""Greatest rate of every torque, Nm/s: the 1000 of a Franka's interface, less a margin for rounding."""
+RATE = TORQUE_RATE
+"""Greatest rate of every torque, Nm/s."""
 
 _SHARE = 0.9
 """Share of the session's speeds that torques may lead to; a faster joint is braked. The rest is for what the prediction
@@ -182,6 +183,33 @@ class TorqueBounds:
         brake = (1.0 - share) * self._decay * max(0.0, excess)
         return [share * x - brake * p for x, p in zip(slowed, arm.inertia.momentum(arm.dq), strict=True)]
 
+    def shared(self, pull: Floats, brake: Floats, gain: Any, arm: ArmInMotion, jacobian: Any) -> list[float]:
+        """Return the torques (n,) to move towards, Nm: a controller's, with as much pull as keeps the speeds.
+
+        Args:
+            pull: Torques (n,), Nm, that draw the arm to its set-point.
+            brake: Torques (n,), Nm, that only slow it down; they are applied in full.
+            gain: Velocity (3,) of the tcp, m/s, that the pull may still add.
+            arm: Measured state.
+            jacobian: Jacobian (6, n) of the tcp there.
+        """
+        envelope = self._envelope
+        slowed, more = (self._lag * arm.inertia.inverse.dot(np.array((brake, pull)).T)).T.tolist()
+        before = [v + dv for v, dv in zip(arm.dq, slowed, strict=True)]
+        share = min(map(_share, before, more, [_COUPLED * v for v in self.velocity]))
+        if share < 1.0:
+            envelope.limited |= Limited.SPEED
+        if self.tcp_speed < UNLIMITED:
+            tcp_share = _greatest_share(jacobian[:3].dot(arm.dq), gain, _COUPLED * self.tcp_speed)
+            if tcp_share < 1.0:
+                envelope.limited |= Limited.TCP_SPEED
+                share = min(share, tcp_share)
+        total = [share * a + b for a, b in zip(pull, brake, strict=True)]
+        tau = [max(-limit, min(limit, x)) for x, limit in zip(total, self._torque, strict=True)]
+        if tau != total:
+            envelope.limited |= Limited.TORQUE
+        return tau
+
     def _slowed(self, tau: float, v: float, inertia: float, most: float, limit: float) -> float:
         """Return ``tau`` cut to what leaves this joint at ``most`` rad/s: inertia (most - v) = tau T + tau^2 / (2 R).
 
@@ -196,19 +224,12 @@ class TorqueBounds:
         return max(-greatest, min(greatest, tau))
 
     def _tcp_share(self, arm: ArmInMotion, added: list[float]) -> float:
-        """Return the greatest share (0..1) of what torques add that leaves the tcp below its speed, or slows it.
-
-        With a the tcp's velocity and b what they add to it, the greater root of |a + s b| = cap.
-        """
+        """Return the greatest share (0..1) of what torques add that leaves the tcp below its speed, or slows it."""
         cap = _SHARE * self.tcp_speed
         if self._surely_slower([abs(v) + abs(dv) for v, dv in zip(arm.dq, added, strict=True)], cap):
             return 1.0
         jacobian = self._kinematics.jacobian(arm.q)[:3]
-        a, b = jacobian.dot(arm.dq), jacobian.dot(added)
-        bb, ab, rest = float(b.dot(b)), float(a.dot(b)), cap * cap - float(a.dot(a))
-        if bb + 2.0 * ab <= rest or bb == 0.0:
-            return 1.0
-        return max(0.0, min(1.0, (sqrt(max(0.0, ab * ab + bb * rest)) - ab) / bb))
+        return _greatest_share(jacobian.dot(arm.dq), jacobian.dot(added), cap)
 
     def _surely_slower(self, speeds: Floats, cap: float) -> bool:
         """Return whether the tcp provably stays below ``cap`` (m/s) at joint speeds up to ``speeds`` (n,) >= 0."""
@@ -320,6 +341,17 @@ def _share(v: float, added: float, most: float) -> float:
     """Return the greatest share (0..1) of ``added`` that leaves a joint at ``most`` rad/s or does not speed it up."""
     room = most - v if added > 0.0 else most + v
     return 1.0 if abs(added) <= max(0.0, room) else max(0.0, room / abs(added))
+
+
+def _greatest_share(a: Any, b: Any, cap: float) -> float:
+    """Return the greatest share s (0..1) for which a velocity a + s b (3,) is below ``cap`` m/s, or slower than a.
+
+    It is the greater root of |a + s b| = cap.
+    """
+    bb, ab, rest = float(b.dot(b)), float(a.dot(b)), cap * cap - float(a.dot(a))
+    if bb + 2.0 * ab <= rest or bb == 0.0:
+        return 1.0
+    return max(0.0, min(1.0, (sqrt(max(0.0, ab * ab + bb * rest)) - ab) / bb))
 
 
 def _around(lower: Floats, upper: Floats, at: Floats) -> list[tuple[float, float]]:
@@ -514,15 +546,15 @@ class TorqueMotion(ServoMotion):
                 self.tau, self._share = self.bounds.brake(before, arm, 0.0)
         self._begun = True
 
-    def drive(self, tau: list[float]) -> None:
-        """Move the torques by one tick towards those of a controller (n,), Nm, as far as the bounds allow.
+    def drive(self, pull: Floats, brake: Floats, gain: Any, jacobian: Any) -> None:
+        """Move the torques by one tick towards those of a controller (see :meth:`TorqueBounds.shared`).
 
         The first set-point has none: it changes the mode.
         """
         self._braking = self._share = 0.0
         if self._begun and self.arm is not None:
             assert self.bounds is not None
-            self.tau = self.bounds.towards(self.tau, self.bounds.allowed(tau, self.arm))
+            self.tau = self.bounds.towards(self.tau, self.bounds.shared(pull, brake, gain, self.arm, jacobian))
         self._begun = True
 
     def brake(self) -> bool:
