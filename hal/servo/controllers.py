@@ -32,12 +32,12 @@ from numpy.typing import ArrayLike, NDArray
 from ..arguments import number, vector
 from ..errors import CommandError
 from ..types import ControlMode
+from .torque import RATE, Inertia
 
 if TYPE_CHECKING:
     from ..dynamics import Dynamics
     from ..kinematics.arm import Kinematics, Pose7
     from ..specs import RobotSpec
-    from .torque import Inertia
 
 __all__ = [
     "Controller",
@@ -270,8 +270,6 @@ def with_gains(controller: Controller, gains: dict[str, ArrayLike]) -> Controlle
 
 # The laws.
 
-TORQUE_RATE = 990.0
-"""Greatest rate of every torque, Nm/s: the 1000 of a Franka's interface, less a margin for rounding."""
 RAMP = 0.2
 """Time in which new gains take effect, s."""
 _HEAVIEST = np.array([200.0] * 3 + [20.0] * 3)
@@ -433,7 +431,7 @@ class ControllerLaw:
             pose: Pose of the tcp.
         """
         accelerations, frequencies, modes = self._modes
-        seconds = 2.0 * self._dt + most * (0.5 / TORQUE_RATE)
+        seconds = 2.0 * self._dt + most * (0.5 / RATE)
         gains = accelerations * np.minimum(seconds, 1.0 / (np.e * frequencies))
         velocity = gains if modes is None else modes.dot(gains) / self._roots
         if self.in_joints:

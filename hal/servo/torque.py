@@ -27,7 +27,6 @@ from ..commands import CommandRecord
 from ..driver import Reading, Setpoint
 from ..specs import LimitsSpec
 from ..types import Limited
-from .controllers import TORQUE_RATE
 from .envelope import UNLIMITED, Envelope
 from .joint import ServoMotion
 from .smoothing import JointSmoother
@@ -45,8 +44,8 @@ __all__ = [
 Array = NDArray[np.float64]
 Floats = Sequence[float]
 
-RATE = TORQUE_RATE
-"""Greatest rate of every torque, Nm/s."""
+RATE = 990.0
+"""Greatest rate of every torque, Nm/s: the 1000 of a Franka's interface, less a margin for rounding."""
 
 _SHARE = 0.9
 """Share of the session's speeds that torques may lead to; a faster joint is braked. The rest is for what the prediction
