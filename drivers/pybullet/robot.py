@@ -67,8 +67,14 @@ class PyBulletRobot(SimulatedRobot[PyBulletWorld]):
             self._velocity_gains,
         )
 
-    def _hold_at(self, q: Floats) -> None:
+    def _end_torques(self) -> None:
+        """Withdraw torques that the coming step would have; the joints are damped again."""
+        if self._tau is not None and self._t_applied == self._world.t:
+            self._torques.withdraw()
         self._torques.end()
+
+    def _hold_at(self, q: Floats) -> None:
+        self._end_torques()
         hold(self._world.client, self._body, dict(zip(self._joints, q, strict=True)), self._world.dt)
 
     def _take_over(self) -> None:
@@ -83,10 +89,8 @@ class PyBulletRobot(SimulatedRobot[PyBulletWorld]):
         self._torques.apply(tau)
 
     def _was_reset(self) -> None:
-        if self._tau is not None and self._t_applied == self._world.t:
-            self._torques.withdraw()
+        self._end_torques()
         super()._was_reset()
-        self._torques.end()
 
     def _save(self) -> dict[str, Any]:
         return super()._save() | {"torques": self._torques.save()}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import random
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,7 @@ from torque_kit import NOTHING, N, one, simulated
 
 from hal.config import load
 from hal.driver import RobotDriver, Setpoint
+from hal.drivers.franka.emulator.plant import RigidBody
 from hal.dynamics import Dynamics
 from hal.specs import BodySpec
 from hal.types import Limited, RobotStatus, Trip
@@ -190,25 +192,32 @@ class TestDriver:
             assert driver.read(0.0).q == pytest.approx(q, abs=1e-3)
         world.close()
 
-    def test_only_gravity_is_carried_and_the_rest_follows_the_equation_of_motion(self, engine: Engine) -> None:
-        """As on an arm whose own controller compensates gravity: no Coriolis torques, no drag."""
-        spec = load("franka", sim=True, overrides=["robots.arm.rate_hz=1000"]).resolve().robots[0]
-        spec = replace(spec, base_position=(0.0, 0.0, 0.0))
-        world, dynamics = engine.world(spec, physics_hz=1000.0), Dynamics.of(spec)
-        driver = engine.robot(world)
+    def test_the_same_torques_move_a_simulated_fr3_and_the_emulators_alike(self, engine: Engine) -> None:
+        """On both they come on top of gravity alone: no Coriolis torques, no drag. See benchmarks/dynamics.py."""
+        spec = load("franka", sim=True).resolve().robots[0]
+        world = engine.world(replace(spec, base_position=(0.0, 0.0, 0.0)), physics_hz=1000.0)
+        driver, body = engine.robot(world), RigidBody(Path(spec.urdf))
         driver.open()
         world.handle(spec.name, False)
-        q, dq, still = np.array(spec.home), np.zeros(N), [0.0] * N
-        mass = np.array(dynamics.mass_matrix(q))
+        q, dq, still = list(spec.home), [0.0] * N, [0.0] * N
+        mass = np.array(Dynamics.of(spec).mass_matrix(q))
         for turn in range(400):
-            tau = mass @ (4.0 * np.sin(0.005 * turn + np.arange(N)))
-            driver.write(Setpoint(driver.read(0.0).q, still, still, tau.tolist()))
+            tau = (mass @ (4.0 * np.sin(0.005 * turn + np.arange(N)))).tolist()
+            driver.write(Setpoint(driver.read(0.0).q, still, still, tau))
             world.step()
-            dq = dq + 0.001 * np.array(dynamics.forward(q, dq, tau + dynamics.gravity(q)))
-            q = q + 0.001 * dq
+            dq = body.step(q, dq, tau, still, 0.001)
+            q = [a + 0.001 * b for a, b in zip(q, dq, strict=True)]
         assert np.abs(dq).max() > 0.3
         assert driver.read(0.0).q == pytest.approx(q, abs=1e-4)
         world.close()
+
+    def test_a_reset_and_new_torques_before_the_next_step_leave_nothing_of_the_old_ones(self, engine: Engine) -> None:
+        world, driver = opened(engine)
+        driver.write(torques(driver, one(0, 50.0)))
+        driver.halt()
+        driver.write(torques(driver))
+        world.step()
+        assert np.abs(driver.read(0.0).dq).max() < 1e-3
 
     def test_damping_of_a_light_wrist_is_stable_and_lets_a_torque_turn_it(self, engine: Engine) -> None:
         """The iiwa has 0.5 Nm s/rad on 0.001 kg m2: pushed, its last joint turns at tau / D."""
