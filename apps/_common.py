@@ -9,6 +9,7 @@ import signal
 import sys
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args
 
@@ -245,7 +246,8 @@ def resolve_plan(
     check_everything(plan, args)
     notes = [*plan.warnings, *_world_warnings(plan)]
     print(f"{plan.source} is valid; it would open:")
-    print("\n".join(f"  {line}" for line in [*list_devices(plan), *(f"note     {note}" for note in notes), *details]))
+    shown = replace(plan, pads=()) if args.pad == "none" else plan
+    print("\n".join(f"  {line}" for line in [*list_devices(shown), *(f"note     {note}" for note in notes), *details]))
     return None
 
 

@@ -14,6 +14,7 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,6 +22,7 @@ from hal.apps._common import add_config_options, add_episode_options, config_opt
 
 if TYPE_CHECKING:
     from hal.apps._display import StatusLine
+    from hal.errors import ConfigError, HalError
     from hal.learning.episode_worker import EpisodeRecipe, EpisodeResult
     from hal.learning.generate import GenerateProgress
     from hal.specs import Plan
@@ -91,7 +93,7 @@ def _main(args: argparse.Namespace) -> int:
     from hal import registry
     from hal.apps._common import check_episode_options, resolve_plan
     from hal.apps._display import StatusLine, list_devices
-    from hal.errors import CommandError
+    from hal.errors import CommandError, ConfigError
     from hal.learning.generate import LocalWorker, StartWorker, generate, parts_folder
     from hal.recording.layout import require_libraries
 
@@ -105,14 +107,20 @@ def _main(args: argparse.Namespace) -> int:
         f"{'skill ' if args.skill else 'policy'}   {args.skill or args.policy}",
         f"dataset  {args.out}: {args.episodes} episode(s), {args.workers} worker(s) on {where}",
     )
-    plan = resolve_plan(args, *details, cameras=cameras or (), clock="lock_step")
+    try:
+        plan = resolve_plan(args, *details, cameras=cameras or (), clock="lock_step")
+    except ConfigError as error:
+        raise _without_real_devices(error, args) from None
     require_libraries()
     if plan is None:
         return 0
     _check_plan(plan)
     if plan.engine is not None:
         registry.check_engine(plan.engine)
-    print("\n".join(f"  {line}" for line in [f"rig      {plan.source}", *list_devices(plan), *details]), flush=True)
+    print(
+        "\n".join(f"  {line}" for line in [f"rig      {plan.source}", *list_devices(replace(plan, pads=())), *details]),
+        flush=True,
+    )
     line = StatusLine()
     with ExitStack() as cluster:
         start_worker: StartWorker = LocalWorker
@@ -144,6 +152,18 @@ def _names(text: str | None) -> list[str] | None:
     if text is None:
         return None
     return [] if text == "none" else [name.strip() for name in text.split(",") if name.strip()]
+
+
+def _without_real_devices(error: ConfigError, args: argparse.Namespace) -> HalError:
+    """Return the error for this program, in which nothing else than a simulation would help against real devices."""
+    from hal.errors import CommandError
+
+    if {problem.code for problem in error.problems} - {"real_in_lock_step", "emulated_in_lock_step"}:
+        return error
+    real = ", ".join(problem.key for problem in error.problems)
+    remedy = "leave out --real" if args.sim is False else "add --sim"
+    text = f"real devices: {real}; episodes are generated in simulation only: {remedy}"
+    return CommandError(text, code="attended")
 
 
 def _check_plan(plan: Plan) -> None:

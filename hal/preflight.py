@@ -62,7 +62,7 @@ CameraCheck = Callable[[CameraSpec, float], Iterator[CheckResult]]
 def preflight(
     plan: Plan, duration: float = 2.0, *, machine: bool = True, cameras: bool = True
 ) -> Iterator[CheckResult]:
-    """Check this computer, the simulation's engine, every real arm and camera; yield each result at once.
+    """Check this computer, the simulation and its pictures, real arms and cameras; yield each result at once.
 
     Errors of a driver's check become results.
 
@@ -76,6 +76,8 @@ def preflight(
         yield from check_machine()
     if plan.engine is not None:
         yield _check_engine(plan.engine)
+        if cameras:
+            yield from _check_pictures(plan)
     devices: list[RobotSpec | CameraSpec] = [*real_arms(plan), *(checked_cameras(plan) if cameras else ())]
     for device in devices:
         for result in _check(device, duration):
@@ -99,6 +101,19 @@ def _check_engine(engine: str) -> CheckResult:
         return CheckResult("simulation", "fail", engine, str(error))
     version = ", ".join(f"{library} {number}" for library, number in registry.versions(engine).items())
     return CheckResult("simulation", "ok", version or engine)
+
+
+def _check_pictures(plan: Plan) -> Iterator[CheckResult]:
+    """Check that the simulated cameras of a rig can be drawn."""
+    world = plan.world
+    if world is None or all(camera.driver != world.driver for camera in plan.cameras):
+        return
+    try:
+        check = registry.function(world.driver, registry.driver(world.driver).pictures_preflight)
+        if check is not None:
+            yield from check(plan)
+    except (HalError, OSError) as error:
+        yield CheckResult("renderer", "fail", f"{type(error).__name__}: {error}", "or open the rig without its cameras")
 
 
 def _check(device: RobotSpec | CameraSpec, duration: float) -> Iterator[CheckResult]:

@@ -104,6 +104,9 @@ class DriverSpec:
     """Renderer of all simulated cameras of a rig: :class:`~hal.views.CameraRenderer`."""
     software_renderer: str | None = None
     """A renderer of simulated cameras that needs no OpenGL."""
+    pictures_preflight: str | None = None
+    """"module:function" that checks whether :attr:`pictures` can draw; its argument is the rig (see
+    :mod:`hal.preflight`)."""
     console: str | None = None
     """A page in a browser that displays a rig and drives it: :class:`~hal.views.Console`."""
     pad_input: PadInput | None = None

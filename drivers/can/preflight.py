@@ -58,7 +58,7 @@ _PIPER_REPORTS = 14 * 200.0 + 6 * 40.0
 _HIGH_LOAD, _FULL_LOAD = 0.8, 0.95
 """Bus load above which frames come late, and above which they pile up."""
 _OTHERS = 1.3
-"""Measured load over the expected one above which somebody else must be on the bus."""
+"""Measured load over the expected one above which another program or device must use the bus, too."""
 _FEW_LOST, _MANY_LOST = 0.002, 0.05
 """Share of rounds with a missing answer from which a check warns, and fails."""
 _LONG_TIMEOUT = 1.0

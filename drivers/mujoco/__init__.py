@@ -9,6 +9,7 @@ DRIVER = DriverSpec(
     gripper="hal.drivers.mujoco.gripper:MujocoGripper",
     camera="hal.drivers.scene.camera:SimulatedCamera",
     pictures="hal.drivers.scene.camera:SimulatedPictures",
+    pictures_preflight="hal.drivers.scene.camera:check_pictures",
     viewer="hal.drivers.pybullet.viewer:PyBulletViewer",
     checks={"camera": "hal.drivers.scene.exposure:check"},
     requires={"mujoco": "pip install 'robot-hal[mujoco]'"},

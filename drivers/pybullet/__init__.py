@@ -13,6 +13,7 @@ DRIVER = DriverSpec(
     camera="hal.drivers.scene.camera:SimulatedCamera",
     pictures="hal.drivers.scene.camera:SimulatedPictures",
     software_renderer="hal.drivers.pybullet.tiny:TinyRenderer",
+    pictures_preflight="hal.drivers.scene.camera:check_pictures",
     viewer="hal.drivers.pybullet.viewer:PyBulletViewer",
     checks={"camera": "hal.drivers.scene.exposure:check"},
     requires={"pybullet": "pip install 'robot-hal[sim]' (Python 3.10, 3.11, or a C++ compiler)"},

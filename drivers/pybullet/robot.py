@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from math import isfinite
+from math import hypot, inf, isfinite
 from typing import Any
 
 from hal.drivers.scene.robot import SimulatedRobot
@@ -14,6 +14,10 @@ from .world import PyBulletWorld
 __all__ = ["PyBulletRobot"]
 
 Floats = Sequence[float]
+
+FASTEST = 99.0
+"""Speed of an arm's joints together, rad/s, from which on a simulation counts as unstable: PyBullet cuts each speed to
+100, so nothing becomes faster, and no arm is nearly as fast."""
 
 
 class PyBulletRobot(SimulatedRobot[PyBulletWorld]):
@@ -43,13 +47,14 @@ class PyBulletRobot(SimulatedRobot[PyBulletWorld]):
 
     def _state(self) -> tuple[Floats, Floats, Floats]:
         q, dq, _, tau = zip(*self._read(self._body.id, self._joints), strict=True)
-        if not isfinite(sum(dq) + sum(tau)):
-            return self._unstable()
+        if not (hypot(*dq) < FASTEST and isfinite(sum(tau))):
+            fast = FASTEST <= hypot(*dq) < inf
+            return self._unstable(f"joints are faster than {FASTEST:g} rad/s" if fast else "a number is not finite")
         return q, dq, tau if self._tau is None else tuple(self._torques.last_applied)
 
-    def _unstable(self) -> tuple[Floats, Floats, Floats]:
+    def _unstable(self, reason: str) -> tuple[Floats, Floats, Floats]:
         """Report that the simulation has become unstable; return the arm's last sound position, at rest."""
-        self._world.note_unstable()
+        self._world.note_unstable(reason)
         home = [self._body.home[joint] for joint in self._joints]
         nothing = [0.0] * len(home)
         return home if self._frozen is None else self._frozen.q, nothing, nothing

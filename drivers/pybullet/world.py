@@ -60,6 +60,10 @@ RESIDUAL = {"fine": 1e-7, "coarse": 3e-6}
 and an arm follows less exactly: ``benchmarks/world_tick.py`` prints both."""
 
 
+LEAST_HZ = 100.0
+"""Rate of the steps below which contacts give way visibly, Hz."""
+
+
 class PyBulletWorld(SimulatedWorld[Body]):
     """One simulation and all bodies in it.
 
@@ -95,6 +99,11 @@ class PyBulletWorld(SimulatedWorld[Body]):
             self._load((*spec.bodies, *spec.robots))
             if not mirror:
                 self._check_overlaps()
+                if spec.physics_hz < LEAST_HZ:
+                    self.warnings.append(
+                        f"physics_hz is {spec.physics_hz:g}: below {LEAST_HZ:g}, PyBullet lets objects sink into each "
+                        "other by some mm; use 240, or MuJoCo, which divides long steps"
+                    )
         except BaseException:
             self.close()
             raise
@@ -137,12 +146,12 @@ class PyBulletWorld(SimulatedWorld[Body]):
         self.note_unstable()
         return self._layout.read_sound()
 
-    def note_unstable(self) -> None:
+    def note_unstable(self, reason: str = "a number is not finite") -> None:
         """Let the world stand still, with a fault, until it is reset: its numbers mean nothing any more."""
         if self.fault is None:
             self.fault = Fault(
                 "simulation_unstable",
-                f"the simulation became unstable at {self.t:.3f} s: a number is not finite",
+                f"the simulation became unstable at {self.t:.3f} s: {reason}",
                 "reset the world; use a smaller contact_stiffness, masses that differ less, or a higher physics_hz",
             )
 

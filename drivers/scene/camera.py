@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import time
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import PurePath
 from typing import Any, ClassVar, Protocol
@@ -16,12 +16,14 @@ from typing import Any, ClassVar, Protocol
 from hal import registry
 from hal.driver import CameraDriver, CameraInfo, RawFrame
 from hal.errors import ConfigError, ConnectionLost, DriverMissing, NotSupported, Problem
+from hal.geometry import Pose
 from hal.host.hosts import SNAPSHOT_CAPACITY, Host, LocalHost, RemoteHost
 from hal.host.memory import SeriesBox
 from hal.host.process import Channel, Child, SharedMemory, serve
 from hal.host.ring import FrameRing, frame_rings, frame_rings_size
 from hal.host.scheduling import yield_to_others
-from hal.specs import CameraSpec, WorldSpec, from_json, to_json
+from hal.preflight import CheckResult
+from hal.specs import CameraSpec, Plan, WorldSpec, from_json, to_json
 from hal.views import CameraRenderer
 
 from .drawn import DrawnWorld
@@ -37,6 +39,7 @@ __all__ = [
     "SimulatedPictures",
     "RenderWorker",
     "SharedSource",
+    "check_pictures",
     "choose_renderer",
     "main",
 ]
@@ -323,3 +326,28 @@ def choose_renderer(scene: RenderScene, name: str = "auto") -> Renderer:
         raise
     renderer.description += reason
     return renderer
+
+
+def check_pictures(plan: Plan) -> Iterator[CheckResult]:
+    """Draw a picture with each simulated camera of a rig, for ``hal-check``."""
+    assert plan.world is not None
+    scene = DrawnWorld(plan.world)
+    renderer = choose_renderer(scene, plan.renderer)
+    try:
+        found = []
+        for camera in plan.cameras:
+            if camera.driver == plan.world.driver:
+                for _ in range(2):  # the first picture loads meshes
+                    start = time.perf_counter()
+                    renderer.render(camera, Pose())
+                    spent = time.perf_counter() - start
+                found.append(f"{camera.name} {camera.width}x{camera.height} in {1e3 * spent:.1f} ms")
+        slow = plan.renderer == "auto" and not isinstance(renderer, GLRenderer)
+        yield CheckResult(
+            "renderer",
+            "warn" if slow else "ok",
+            f"{renderer.description}: {', '.join(found)}",
+            "OpenGL draws several times as fast" if slow else "",
+        )
+    finally:
+        renderer.close()

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..errors import CommandError, ConnectionLost, HalError
+from ..errors import CommandError, ConfigError, ConnectionLost, DeviceNotFound, DriverMissing, HalError, NotSupported
 from ..host.process import Channel, SharedMemory, pack_error, serve
 from ..recording import Dataset, Recorder
 from ..recording.finish import finalise
@@ -32,6 +32,9 @@ if TYPE_CHECKING:
     from ..robot import Robot
 
 __all__ = ["EpisodeRecipe", "EpisodeResult", "EpisodeWorker", "clean_part", "main"]
+
+_MISTAKES = (ConfigError, DeviceNotFound, DriverMissing, NotSupported)
+"""Errors that no episode can be about: the skill, or the installation, is wrong."""
 
 
 @dataclass(frozen=True)
@@ -214,6 +217,8 @@ class EpisodeWorker:
             return success, "done", ""
         except _TimeOver:
             return False, "time", ""
+        except _MISTAKES as error:
+            return None, "error", _trace(error)
         except HalError as error:
             return False, "stopped", str(error)
         except Exception as error:

@@ -20,7 +20,7 @@ CHECKS = {"damiao": check_damiao, "piper": check_piper}
 
 
 def absent(rig: str) -> RobotSpec:
-    """Return the record of an arm whose bus nobody else uses."""
+    """Return the record of an arm whose bus has no other user."""
     return load(rig, sim=False, overrides=can_overrides("virtual")).resolve().robots[0]
 
 

@@ -37,7 +37,7 @@ SKILL = ("--skill", "skills:wait", "--out", "out")
         ([*SKILL, "--sim", "--workers", "0"], "--workers"),
         ([*SKILL, "--sim", "--cameras", "wirst"], "did you mean 'wrist'"),
         ([*SKILL, "--config", "franka_emulator"], "--sim"),
-        ([*SKILL, "--real", "--set", "cameras={}"], "cannot be stepped"),
+        ([*SKILL, "--real", "--set", "cameras={}"], "leave out --real"),
     ],
 )
 def test_a_mistake_is_a_message(folder: Path, arguments: list[str], text: str) -> None:
@@ -52,6 +52,7 @@ def test_a_dry_run_opens_nothing(folder: Path) -> None:
     assert done.returncode == 0, done.stderr
     for text in ("skills:wait", "7 episode(s)", "lock step"):
         assert text in done.stdout
+    assert "gamepad" not in done.stdout, "none is read"
     assert not (folder / "out").exists()
 
 

@@ -44,7 +44,20 @@ def of_arms(plan: Plan) -> list[CheckResult]:
 def test_a_simulated_rig_has_only_the_machine_and_its_engine_to_check() -> None:
     plan = load("panda_table", sim=True).resolve()
     assert real_arms(plan) == ()
-    assert [v.name for v in preflight(plan)] == ["kernel", "processor", "scheduling", "memory", "simulation"]
+    bare = replace(plan, cameras=())
+    assert [v.name for v in preflight(bare)] == ["kernel", "processor", "scheduling", "memory", "simulation"]
+
+
+def test_simulated_cameras_need_a_renderer(monkeypatch: pytest.MonkeyPatch) -> None:
+    plan = load("panda_table", sim=True).resolve()
+    *_, drawn = preflight(plan, machine=False)
+    assert (drawn.name, drawn.level) == ("renderer", "ok")
+    assert [camera.name in drawn.found for camera in plan.cameras] == [True, True]
+    missing = DriverMissing("no EGL; apt install it")
+    monkeypatch.setattr("hal.drivers.scene.camera.choose_renderer", lambda *_: (_ for _ in ()).throw(missing))
+    *_, failed = preflight(plan, machine=False)
+    assert (failed.name, failed.level) == ("renderer", "fail")
+    assert [v.name for v in preflight(plan, machine=False, cameras=False)] == ["simulation"]
 
 
 def test_an_arm_is_checked_by_its_driver_under_its_own_name(plan: Plan) -> None:

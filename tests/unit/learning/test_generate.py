@@ -42,6 +42,8 @@ def various(rig, random):
         return False
     if seed == 4 and broken:
         raise ValueError("a mistake")
+    if seed == 5 and broken:
+        rig.world.pose("cbue")
 
 
 def judge(rig, observation):
@@ -128,8 +130,8 @@ def test_how_a_skill_ends_decides_the_mark(tmp_path: Path, skills: Any) -> None:
     recipe = EpisodeRecipe(RIG, skill="skills:various", success="skills:judge", seconds=1.0)
     worker = EpisodeWorker(asdict(recipe), str(tmp_path / "part"))
     try:
-        ends = [(result["success"], result["ended"]) for result in map(worker.make, range(4))]
-        assert ends == [(False, "time"), (False, "stopped"), (False, "done"), (None, "error")]
+        ends = [(result["success"], result["ended"]) for result in map(worker.make, range(5))]
+        assert ends == [(False, "time"), (False, "stopped"), (False, "done"), (None, "error"), (None, "error")]
         skills.broken = False
         skills.seed = 3
         assert worker.make(3)["success"], "judged"

@@ -50,6 +50,11 @@ def test_free_fall() -> None:
     assert 10.0 - pose(world, "cube").position[2] == pytest.approx(9.81 * dt * dt * n * (n + 1) / 2, rel=1e-9)
 
 
+def test_a_rate_at_which_contacts_give_way_is_a_warning() -> None:
+    for rate, count in ((60.0, 1), (240.0, 0)):
+        assert len(PyBulletWorld(world_spec(floor(), physics_hz=rate)).warnings) == count
+
+
 class TestMirror:
     def assert_same(self, world: PyBulletWorld, mirror: PyBulletWorld) -> None:
         assert mirror.names() == world.names()
