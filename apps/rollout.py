@@ -74,6 +74,11 @@ def parser() -> argparse.ArgumentParser:
         metavar="S",
         help="simulated time that a policy on a server takes to answer, in lock-step (0)",
     )
+    run.add_argument(
+        "--takeover",
+        action="store_true",
+        help="moving a stick takes the arm from the policy, with the dead-man held; letting go gives it back",
+    )
     add_episode_options(run)
     add_deadman_options(run)
     run.add_argument("--out", metavar="DIR", help="dataset to record into")
@@ -103,7 +108,9 @@ def _main(args: argparse.Namespace) -> int:
         return 0
     if not may_open(plan):
         return ACTION_NEEDED
-    holds = needs_deadman(plan, args)
+    if args.takeover and args.unattended:
+        raise CommandError("--takeover needs a pad and its dead-man; leave --unattended out")
+    holds = args.takeover or needs_deadman(plan, args)
     with hal.open(**{**rig_options(args), "pad": args.pad if holds else "none"}) as rig:
         if not rig.robots:
             raise CommandError(f"{rig.plan.source} has no robot", code="no_robot")
@@ -191,6 +198,8 @@ class RolloutRun:
         from hal.apps._display import StatusLine
         from hal.learning.asynchronous import RemotePolicy
         from hal.learning.policy import PolicyRunner, load_object
+        from hal.learning.takeover import Takeover
+        from hal.teleop import Teleop
 
         self.rig, self.robot, self.args, self.recorder = rig, robot, args, recorder
         self.deadman = deadman
@@ -201,6 +210,9 @@ class RolloutRun:
         self.marks = {actions[action]: mark for action, mark in MARKS.items() if action in actions}
         """Button -> how it marks an episode."""
         self.line = StatusLine()
+        takeover = None
+        if args.takeover and mapping is not None and self.pad is not None:
+            takeover = Takeover(Teleop(robot, mapping), self.pad)
         self.reset_function: Any = load_object(args.reset, "--reset") if args.reset else None
         self.runner = PolicyRunner(
             rig,
@@ -214,6 +226,7 @@ class RolloutRun:
             history=args.history,
             success=load_object(args.success, "--success") if args.success else None,
             mark=self._mark,
+            takeover=takeover,
         )
         self.pressed: set[str] = set()
         """Marking buttons that are pressed. Each press marks once."""
@@ -266,7 +279,8 @@ class RolloutRun:
             outcome = self.runner.run(seed, lambda seconds: self._show(number, seconds))
         finally:
             if self.recorder is not None:
-                self.recorder.save(outcome.success if outcome is not None else None, wait=True)
+                success, taken = (None, ()) if outcome is None else (outcome.success, outcome.interventions)
+                self.recorder.save(success, wait=True, result={"interventions": taken})
         self.outcomes.append(outcome)
         self._announce(f"episode {number}: {_describe(outcome)}")
         if self.recorder is not None and (trouble := self.recorder.status().trouble):
@@ -332,6 +346,7 @@ class RolloutRun:
                     "missed": outcome.missed,
                     "repeated": outcome.repeated,
                     "pauses": outcome.pauses,
+                    "interventions": outcome.interventions,
                     "inference_ms": {name: _ms(value) for name, value in outcome.inference.items()},
                     "policy": dict(outcome.statistics),
                 }
@@ -356,6 +371,8 @@ def _describe(outcome: PolicyOutcome) -> str:
     mark = {True: ", success", False: ", failure", None: ""}[outcome.success if outcome.ended == "time" else None]
     text = f"{how.get(outcome.ended, outcome.ended)}{mark} after {outcome.seconds:.1f} s, {outcome.turns} step(s)"
     missed = f", {outcome.missed} MISSED" if outcome.missed else ""
+    if taken := outcome.interventions:
+        missed += f", {len(taken)} takeover(s) of {sum(end - begin for begin, end in taken):.1f} s"
     if "latency" in (figures := outcome.statistics):
         latency = {name: _ms(value) or 0.0 for name, value in figures["latency"].items()}
         late = f", {figures['late']} LATE" if figures["late"] else ""

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from ..deadman import Deadman
     from ..rig import Rig
     from ..robot import Robot
+    from .takeover import Takeover
 
 __all__ = [
     "PolicyAnswer",
@@ -131,6 +132,8 @@ class PolicyOutcome:
     """Error of the policy."""
     statistics: Mapping[str, Any] = field(default_factory=dict)
     """Figures of the policy's own, if it has any (see :meth:`.RemotePolicy.statistics`)."""
+    interventions: tuple[tuple[float, float], ...] = ()
+    """Begin and end of each time in which a person drove, s on ``rig.clock``."""
 
 
 class PolicyRunner:
@@ -155,6 +158,7 @@ class PolicyRunner:
         history: int = 1,
         success: Callable[[Rig, Observation], bool] | None = None,
         mark: Callable[[], bool | None] | None = None,
+        takeover: Takeover | None = None,
     ) -> None:
         """Prepare to run a policy.
 
@@ -170,6 +174,7 @@ class PolicyRunner:
             history: Number of states per observation.
             success: Called as ``success(rig, observation)`` in each turn, before the policy; True ends the episode.
             mark: Called in each turn; True or False, the operator's mark, ends the episode.
+            takeover: Lets a person drive in between; the policy is asked again when the arm is given back.
 
         Raises:
             CommandError: ``seconds`` is not positive.
@@ -181,7 +186,7 @@ class PolicyRunner:
         self._rate, self._seconds = rate_hz, seconds
         self._deadman, self._unattended = deadman, unattended
         self._cameras, self._history = cameras, history
-        self._success, self._mark = success, mark
+        self._success, self._mark, self._takeover = success, mark, takeover
 
     def rehearse(self) -> None:
         """Call the policy once before anything moves, and discard the answer: the first call is usually the slowest.
@@ -212,6 +217,8 @@ class PolicyRunner:
         try:
             with _policy_errors(PolicyError):
                 self._reset(seed)
+            if self._takeover is not None:
+                self._takeover.reset()
             with control:
                 self._drive(control, tally, on_turn)
         except (MotionStopped, RobotFault, ConnectionLost, StaleStateError) as stop:
@@ -220,7 +227,8 @@ class PolicyRunner:
             error = wrong.__cause__
             tally.end_as("error", f"{type(error).__name__}: {error}", error)
         statistics = getattr(self.policy, "statistics", dict)
-        return replace(tally.outcome(), statistics=statistics())
+        taken = tuple(self._takeover.intervals) if self._takeover is not None else ()
+        return replace(tally.outcome(), statistics=statistics(), interventions=taken)
 
     def _reset(self, seed: int | None) -> None:
         reset = getattr(self.policy, "reset", None)
@@ -231,7 +239,7 @@ class PolicyRunner:
         return self.rig.observe(history=self._history, cameras=self._cameras)
 
     def _drive(self, control: Control, tally: _Tally, on_turn: Callable[[float], None]) -> None:
-        seen, begun, paused = -np.inf, False, False
+        seen, begun, asked, paused = -np.inf, False, False, False
         restart = getattr(self.policy, "restart", lambda: None)
         for tick in self.rig.clock.rate(self._rate):
             on_turn(tally.seconds)
@@ -240,11 +248,8 @@ class PolicyRunner:
                 return tally.end_as("success" if mark else "failure")
             if not control.hold_until_following():
                 tally.count_pause()
-                begun, paused = False, True
+                begun, paused = False, asked
                 continue
-            if paused:
-                restart()
-                paused = False
             tally.count_turn(tick.dt, tick.missed)
             if tally.seconds > self._seconds - 1e-9:
                 return tally.end_as("time")
@@ -253,6 +258,14 @@ class PolicyRunner:
             seen = observation.t
             if self._success is not None and self._success(self.rig, observation):
                 return tally.end_as("success")
+            by_hand = self._takeover.command(tick.t, tick.dt) if self._takeover is not None else None
+            if by_hand is not None:
+                control.send(by_hand[0], grip=by_hand[1])
+                begun, paused = False, asked
+                continue
+            if paused:
+                restart()
+            asked, paused = True, False
             if not begun:
                 control.hold_for(FIRST_ANSWER)
             command, grip = self._answer(observation, tally)

@@ -281,7 +281,7 @@ class Recorder:
         counts = episode.frames, episode.seconds, episode.dropped.rows, episode.clock.late
         return RecorderStatus(state, self._episode, *counts, free, trouble)
 
-    def save(self, success: bool | None = None, wait: bool = False) -> None:
+    def save(self, success: bool | None = None, wait: bool = False, result: Mapping[str, Any] | None = None) -> None:
         """End the episode now and make it part of the dataset.
 
         Until it is saved ``status().state`` is ``saving``. If saving fails in the background, ``status().trouble`` has
@@ -291,6 +291,7 @@ class Recorder:
         Args:
             success: Mark of the episode; written at once, so that it survives if the writer is killed.
             wait: Block until the episode is saved.
+            result: What else is known at the end, for the episode's metadata: anything that JSON can hold.
 
         Raises:
             CommandError: No episode is open (code ``no_episode``); with ``wait``, no row was recorded (``no_rows``).
@@ -298,7 +299,7 @@ class Recorder:
         """
         with self._lock:
             episode, partial = self._end(), DatasetLayout(self.root).partial(self._episode)
-            saving = self._saving = BackgroundSave(lambda: self._save(episode, partial, success))
+            saving = self._saving = BackgroundSave(lambda: self._save(episode, partial, success, result))
         if wait:
             saving.result()
 
@@ -308,12 +309,14 @@ class Recorder:
         if saving is not None:
             saving.result()
 
-    def _save(self, episode: EpisodeRecorder, partial: Path, success: bool | None) -> None:
+    def _save(
+        self, episode: EpisodeRecorder, partial: Path, success: bool | None, result: Mapping[str, Any] | None
+    ) -> None:
         if success is not None:
             write_mark(partial, success)
         episode.stop()
         self._stop_cameras()
-        if self._child.request("save", {"closing": episode.final_metadata(success)}, _SAVING) is None:
+        if self._child.request("save", {"closing": episode.final_metadata(success, result)}, _SAVING) is None:
             why = episode.dropped.why or "it ended at once"
             raise CommandError(f"no row was recorded, so there is nothing to save: {why}", code="no_rows")
 
@@ -399,7 +402,7 @@ class EpisodeRecorder:
         """Stop reading, and block until the writer has received every row."""
         self.clock.stop()
 
-    def final_metadata(self, success: bool | None) -> dict[str, Any]:
+    def final_metadata(self, success: bool | None, result: Mapping[str, Any] | None) -> dict[str, Any]:
         """Return the metadata that is known at the end of the episode."""
         return {
             "success": success,
@@ -409,6 +412,7 @@ class EpisodeRecorder:
             "gaps": self.dropped.as_json(),
             "repeated": {buffer.camera.name: buffer.repeated for buffer in self._buffers},
             "trouble": self.trouble,
+            "result": dict(result or {}),
         }
 
     def _read(self) -> RowSnapshot | Exception:

@@ -14,6 +14,7 @@ import pytest
 from app_kit import CIRCLE, CROSS, PS, SQUARE, Done, run_here, write_pad
 
 from hal.apps.rollout import main
+from hal.recording import Dataset
 
 ROOT = Path(__file__).resolve().parents[3]
 APP = ROOT / "apps" / "rollout.py"
@@ -146,6 +147,35 @@ def test_buttons_of_the_pad_mark_an_episode(folder: Path) -> None:
     assert 1.3 < succeeded["seconds"] < 1.6, "it counts while the dead-man is held"
     assert (failed["ended"], failed["success"], failed["turns"]) == ("failure", False, 0)
     assert "PS: success; Square: failure" in done.stdout
+
+
+def test_a_person_takes_over_and_the_recording_says_when(folder: Path) -> None:
+    pad = write_pad(folder, (1.5, "BTN_TL"), until=4.0, held=(0.5, 3.5))
+    options = (
+        "--policy",
+        "policies:Reach",
+        "--seconds",
+        2.0,
+        "--takeover",
+        "--pad",
+        pad,
+        "--out",
+        "runs",
+        "--rate",
+        50,
+    )
+    done = rollout(*options, *FAST)
+    assert done.returncode == 0, done.stderr
+    assert "1 takeover(s)" in done.stdout
+    ((begin, end),) = report(folder)["episodes"][0]["interventions"]
+    assert 0.3 < end - begin < 0.6
+    about = Dataset(folder / "runs").episodes[0].info
+    assert about["result"]["interventions"] == [[begin, end]]
+    assert about["t_start"] < begin < end < about["t_start"] + about["length"] / about["fps"] + 0.1
+
+
+def test_takeover_needs_a_dead_man(folder: Path) -> None:
+    assert rollout("--policy", "policies:Reach", "--takeover", "--unattended", *FAST).returncode == 2
 
 
 def test_an_error_of_the_policy_ends_the_run(folder: Path) -> None:
