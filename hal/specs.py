@@ -206,7 +206,7 @@ class BodySpec:
     position: Vector3
     orientation: Quaternion
     shape: str
-    """``box``, ``sphere``, ``cylinder``, ``capsule``, ``plane`` or ``urdf``."""
+    """``box``, ``sphere``, ``cylinder``, ``capsule``, ``plane``, ``mesh`` or ``urdf``."""
     half_extents: Vector3 | None = None
     """Box, m."""
     radius: float | None = None
@@ -214,10 +214,12 @@ class BodySpec:
     """Of a cylinder, and of a capsule without its caps, m."""
     urdf: str | None = None
     scale: float = 1.0
+    """Factor on the lengths of a URDF or a mesh."""
     mass: float = 0.0
-    """kg; an object of mass 0 does not move. A URDF has its own masses."""
+    """kg; an object of mass 0 does not move. A URDF has its own masses; a mesh has the inertia of its hull."""
     fixed: bool = False
     rgba: tuple[float, float, float, float] = (0.7, 0.7, 0.7, 1.0)
+    """Red, green, blue and opacity, 0..1; white leaves a mesh the colours of its file."""
     collision: bool = True
     visible: bool = True
     robot: str | None = None
@@ -226,6 +228,10 @@ class BodySpec:
     link: str | None = None
     random: RangesSpec | None = None
     """Range of :func:`hal.learning.episode.sample_poses`; None for a fixed start pose."""
+    mesh: str | None = None
+    """Path of an OBJ, STL or Collada file; its convex hull collides."""
+    parts: bool = False
+    """Whether each part of the mesh collides with a hull of its own: :func:`hal.kinematics.hulls.mesh_parts`."""
 
 
 @dataclass(frozen=True)

@@ -6,9 +6,8 @@ Only what physics needs is built: links, joints, masses and collision shapes.
 from __future__ import annotations
 
 import itertools
-import re
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -17,11 +16,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hal.drivers.scene.gripper import FingerTravel
-from hal.drivers.scene.records import check_names, followers_of, joint_drives, mimics_of, required
+from hal.drivers.scene.records import SHAPES, check_names, followers_of, hulls_of, joint_drives, mimics_of, required
 from hal.drivers.scene.urdf_files import checked_urdf, has_free_base, massless
 from hal.drivers.scene.values import listed
 from hal.errors import ConfigError, Problem
 from hal.geometry import Pose, quaternion_to_matrix
+from hal.kinematics.hulls import Hull, mesh_parts, principal_axes, uniform_solid
 from hal.kinematics.urdf import TURNING, UrdfJoint, UrdfLink, UrdfModel, UrdfVisual, parse_xml
 from hal.specs import BodySpec, RobotSpec
 
@@ -47,6 +47,9 @@ STIFF = (0.99, 0.999)
 """Impedance of the couplings that carry the whole force of a finger, at no distance and far from it."""
 STIFF_FRICTION = (0.9999, 0.9999, 0.001, 0.5, 2.0)
 """How much of a joint's friction acts: what it holds creeps by less than 10 um/s."""
+MOST_CORNERS = 400
+"""Most corners of the hull of a mesh: MuJoCo finds contacts at neighbouring corners only, so that an object with very
+close ones rocks."""
 UNBOUNDED = 1e-6
 """What is added to the range of a joint, rad or m: a joint that rests at its limit needs no force to stay there."""
 
@@ -130,9 +133,12 @@ def plan_object(spec: BodySpec) -> BodyPlan:
         ConfigError: Its file is missing or broken, MuJoCo cannot take it, or a size that its shape needs is missing.
     """
     if spec.shape != "urdf":
-        shape = _primitive(spec)
+        hulls = hulls_of(spec) if spec.shape == "mesh" else ()
+        shapes = [Shape("mesh", (), Pose(), hull.points) for hull in hulls] or [_primitive(spec)]
         free = has_free_base(spec, None)
-        inertial = _uniform(spec.mass, shape) if free else None
+        inertial = None
+        if free:
+            inertial = _solid(spec.mass, hulls) if hulls else _uniform(spec.mass, shapes[0])
         body = Body(
             name=spec.name,
             spec=spec,
@@ -142,10 +148,9 @@ def plan_object(spec: BodySpec) -> BodyPlan:
             floating=free,
             base=(tuple(spec.position), tuple(spec.orientation)),
             contacts=[LinkContact()],
-            solids=[int(spec.collision)],
+            solids=[len(shapes) if spec.collision else 0],
         )
-        shapes = [shape] if spec.collision else []
-        return BodyPlan(body, [LinkPlan("base", None, -1, shapes, inertial)])
+        return BodyPlan(body, [LinkPlan("base", None, -1, shapes if spec.collision else [], inertial)])
     key = f"objects.{spec.name}.urdf"
     if spec.urdf is None:
         raise ConfigError([Problem("objects", key, "is missing, and the shape is urdf", "missing_key")])
@@ -300,7 +305,7 @@ def _primitive(spec: BodySpec) -> Shape:
         return Shape(spec.shape, (required(spec, "radius"), required(spec, "length") / 2.0), Pose())
     if spec.shape == "plane":  # infinite in contacts
         return Shape("plane", (0.0, 0.0, 1.0), Pose())
-    message = f"is {spec.shape!r}; shapes: box, sphere, cylinder, capsule, plane, urdf"
+    message = f"is {spec.shape!r}; shapes: {SHAPES}"
     raise ConfigError([Problem("objects", f"objects.{spec.name}.shape", message, "unknown_shape")])
 
 
@@ -320,11 +325,6 @@ def _shapes(link: UrdfLink, scale: float) -> Iterator[Shape]:
             yield Shape(shape.shape, (radius * scale, length / 2.0 * scale), pose)
 
 
-_GROUP = re.compile(rb"^[ \t]*[og][ \t][^\n]*$", re.MULTILINE)
-_VERTEX = re.compile(rb"^[ \t]*v[ \t]+(\S+)[ \t]+(\S+)[ \t]+(\S+)", re.MULTILINE)
-_FACE = re.compile(rb"^[ \t]*f[ \t]+([^\r\n]*)", re.MULTILINE)
-
-
 def _hulls(shape: UrdfVisual) -> Iterator[Array]:
     """Yield the vertices of each part of a mesh: parts of an OBJ have hulls of their own, as in PyBullet."""
     name = Path(shape.file).name
@@ -338,15 +338,7 @@ def _hulls(shape: UrdfVisual) -> Iterator[Array]:
 
 def _parts(file: Path) -> list[Array]:
     if file.suffix.lower() == ".obj":
-        data = file.read_bytes()
-        vertices = np.array(_VERTEX.findall(data)).astype(float).reshape(-1, 3)
-        parts = []
-        for part in _GROUP.split(data):
-            corners = [word.split(b"/")[0] for face in _FACE.findall(part) for word in face.split()]
-            if corners:
-                indices = np.array(corners).astype(int)
-                parts.append(vertices[np.unique(np.where(indices > 0, indices - 1, indices))])
-        return parts or [vertices]
+        return mesh_parts(file)
     import trimesh  # 0.3 s
 
     try:
@@ -362,6 +354,12 @@ def _parts(file: Path) -> list[Array]:
 def _uniform(mass: float, shape: Shape) -> Inertial:
     """Return the mass of a solid of uniform density."""
     return Inertial(mass, mass * _box_inertia(shape.corners()), shape.pose)
+
+
+def _solid(mass: float, hulls: Sequence[Hull]) -> Inertial:
+    """Return the mass of hulls of uniform density."""
+    solid = uniform_solid(hulls)
+    return Inertial(mass, mass * solid.moments, Pose.from_matrix(_frame(solid.axes, solid.centre)))
 
 
 def _box_inertia(corners: Array) -> Array:
@@ -395,7 +393,7 @@ def _inertial(
         return None, any(values.values())
     place = link.inertial or Pose()
     xx, yy, zz, xy, xz, yz = values.values()
-    moments, axes = _principal(np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]) * scale**2)
+    moments, axes = principal_axes(np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]) * scale**2)
     pose = Pose(place.position * scale, place.orientation) @ Pose.from_matrix(_frame(axes))
     wrong = False
     if corners is not None:
@@ -413,20 +411,10 @@ def _inertial(
 _MOMENTS = ("ixx", "iyy", "izz", "ixy", "ixz", "iyz")
 
 
-def _principal(inertia: Array) -> tuple[Array, Array]:
-    """Return the principal moments (3,), and their axes as columns (3, 3), in the order of the axes nearest to them.
-
-    So the moments of a diagonal matrix are its diagonal, as with PyBullet.
-    """
-    moments, axes = np.linalg.eigh(inertia)
-    order = max(itertools.permutations(range(3)), key=lambda order: float(np.abs(np.diag(axes[:, order])).sum()))
-    return moments[list(order)], axes[:, order]
-
-
-def _frame(axes: Array) -> Array:
-    """Return the transform (4, 4) with these columns as its axes, right-handed."""
+def _frame(axes: Array, position: Array | float = 0.0) -> Array:
+    """Return the transform (4, 4) with these columns as its axes."""
     matrix = np.eye(4)
-    matrix[:3, :3] = axes if np.linalg.det(axes) > 0.0 else axes * np.array([1.0, 1.0, -1.0])
+    matrix[:3, :3], matrix[:3, 3] = axes, position
     return matrix
 
 
@@ -541,6 +529,8 @@ def _add_shape(mujoco: Any, model: Any, node: Any, body: Body, link: int, name: 
     if shape.points is not None:
         mesh = model.add_mesh(name=name)
         mesh.uservert = shape.points.ravel().tolist()
+        if body.urdf is None:
+            mesh.maxhullvert = MOST_CORNERS
         values["meshname"] = name
     else:
         values["size"] = (*shape.size, 0.0, 0.0)[:3]

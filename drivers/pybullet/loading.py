@@ -2,18 +2,24 @@
 
 from __future__ import annotations
 
+import math
 import tempfile
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Container, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from xml.sax.saxutils import quoteattr
+
+import numpy as np
+from numpy.typing import NDArray
 
 from hal.drivers.scene.drawn import PLANE
-from hal.drivers.scene.records import check_names, joint_drives, mimics_of, required
+from hal.drivers.scene.records import SHAPES, check_names, hulls_of, joint_drives, mimics_of, required
 from hal.drivers.scene.urdf_files import checked_urdf, has_free_base, massless
 from hal.drivers.scene.values import listed
 from hal.errors import ConfigError, Problem
 from hal.geometry import Transform, compose, inverse
+from hal.kinematics.hulls import Hull, uniform_solid
 from hal.kinematics.mesh_files import mesh_file, mesh_near
 from hal.kinematics.urdf import UrdfMimic, UrdfModel, parse_xml
 from hal.specs import BodySpec, RobotSpec
@@ -28,6 +34,8 @@ __all__ = [
     "loadable_urdf",
 ]
 
+MARGIN, THIN = 0.001, 0.2
+"""Margin that PyBullet adds around hulls, m; and what is taken off a thin hull at most, as a share of its thickness."""
 FINGER_MASS = 0.1
 """Least mass of a finger that moves or holds something, kg: the solver lets one of 29 g press with no more than 26 N.
 The drive that moves with it is in no URDF. Fingers at rest have their own mass, so that the arm's inertia is right."""
@@ -48,6 +56,8 @@ def load_object(client: PyBulletClient, spec: BodySpec, drawn: bool = False) -> 
         ConfigError: Its file is missing or broken, or a size that its shape needs is missing.
     """
     key = f"objects.{spec.name}"
+    if spec.shape == "mesh":
+        return _describe(client, spec, _make_mesh(client, spec, key, drawn), key), []
     if spec.shape != "urdf":
         number = _make_shape(client, spec, key, drawn)
         body = _describe(client, spec, number, key)
@@ -158,7 +168,7 @@ def _make_shape(client: PyBulletClient, spec: BodySpec, key: str, drawn: bool) -
         seen = {"shapeType": client.GEOM_BOX, "halfExtents": (x, y, 0.005)}
         at = (0.0, 0.0, -0.005)
     else:
-        message = f"is {spec.shape!r}; shapes: box, sphere, cylinder, capsule, plane, urdf"
+        message = f"is {spec.shape!r}; shapes: {SHAPES}"
         raise ConfigError([Problem("objects", f"{key}.shape", message, "unknown_shape")])
     shape = client.createCollisionShape(**solid) if spec.collision else -1
     visual = -1
@@ -167,6 +177,61 @@ def _make_shape(client: PyBulletClient, spec: BodySpec, key: str, drawn: bool) -
     mass = spec.mass if has_free_base(spec, None) else 0.0
     number: int = client.createMultiBody(mass, shape, visual)
     return number
+
+
+def _make_mesh(client: PyBulletClient, spec: BodySpec, key: str, drawn: bool) -> int:
+    """Make an object of the shape ``mesh`` from the hulls that collide: PyBullet reads several only from a URDF."""
+    hulls = hulls_of(spec)
+    free = has_free_base(spec, None)
+    with tempfile.TemporaryDirectory() as place:
+        parts = []
+        for k, hull in enumerate(hulls if spec.collision else ()):
+            lines = [f"v {x:.9g} {y:.9g} {z:.9g}\n" for x, y, z in without_margin(hull)]
+            lines += [f"f {a} {b} {c}\n" for a, b, c in hull.faces + 1]
+            (Path(place) / f"{k}.obj").write_text("".join(lines))
+            parts.append(f'<collision><geometry><mesh filename="{k}.obj"/></geometry></collision>')
+        if drawn and spec.visible:
+            size, name, rgba = " ".join([str(spec.scale)] * 3), quoteattr(str(spec.mesh)), " ".join(map(str, spec.rgba))
+            look = f'<material name="it"><color rgba="{rgba}"/></material>'
+            parts.append(f"<visual><geometry><mesh filename={name} scale='{size}'/></geometry>{look}</visual>")
+        if free:
+            solid = uniform_solid(hulls)
+            roll, pitch, yaw = _rpy(solid.axes)
+            centre, (xx, yy, zz) = " ".join(map(repr, solid.centre.tolist())), (spec.mass * solid.moments).tolist()
+            parts.append(
+                f'<inertial><origin xyz="{centre}" rpy="{roll!r} {pitch!r} {yaw!r}"/><mass value="{spec.mass}"/>'
+                f'<inertia ixx="{xx!r}" iyy="{yy!r}" izz="{zz!r}" ixy="0" ixz="0" iyz="0"/></inertial>'
+            )
+        else:
+            nothing = '<inertia ixx="0" iyy="0" izz="0" ixy="0" ixz="0" iyz="0"/>'
+            parts.append(f'<inertial><mass value="0"/>{nothing}</inertial>')
+        file = Path(place) / "mesh.urdf"
+        file.write_text(f'<robot name="it"><link name="base">{"".join(parts)}</link></robot>')
+        return _load_urdf(client, str(file), f"{key}.mesh", fixed=not free, scale=1.0, drawn=drawn)
+
+
+def _rpy(axes: NDArray[np.float64]) -> tuple[float, float, float]:
+    """Return the angles of a URDF of a rotation matrix (3, 3), rad."""
+    roll, yaw = math.atan2(axes[2, 1], axes[2, 2]), math.atan2(axes[1, 0], axes[0, 0])
+    return roll, math.atan2(-axes[2, 0], math.hypot(axes[2, 1], axes[2, 2])), yaw
+
+
+def without_margin(hull: Hull) -> NDArray[np.float64]:
+    """Return the corners (n, 3) of a hull that is smaller by the margin that PyBullet adds around hulls.
+
+    A corner moves along its faces' normals until it is deeper than each by the margin. A hull that is thin keeps some.
+    """
+    corners = hull.points[hull.faces]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-15)
+    heights = np.einsum("fk,nk->fn", normals, hull.points)
+    depth = float((heights.max(axis=1) - heights.min(axis=1)).min())
+    margin = min(MARGIN, THIN * depth)
+    moved: NDArray[np.float64] = hull.points.copy()
+    for k in range(len(moved)):
+        own = normals[(hull.faces == k).any(axis=1)]
+        moved[k] -= margin * np.linalg.lstsq(own, np.ones(len(own)), rcond=1e-2)[0]
+    return moved
 
 
 def _describe(

@@ -347,7 +347,9 @@ def _primitive(spec: BodySpec) -> tuple[Visual, ...]:
         size = tuple(2.0 * side for side in half)
     elif shape == "sphere":
         size = size[:1]
-    return (Visual(0, shape, size, "", at, (0.0, 0.0, 0.0, 1.0), _single(spec.rgba)),)
+    elif shape == "mesh":
+        size = (spec.scale,) * 3
+    return (Visual(0, shape, size, spec.mesh or "", at, (0.0, 0.0, 0.0, 1.0), _single(spec.rgba)),)
 
 
 def _single(rgba: Sequence[float]) -> tuple[float, ...]:

@@ -6,6 +6,7 @@ from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, field
 
 from hal.errors import ConfigError, Problem
+from hal.kinematics.hulls import Hull, mesh_hulls
 from hal.kinematics.urdf import UrdfMimic, UrdfModel
 from hal.specs import BodySpec, GripperSpec, RobotSpec
 
@@ -13,13 +14,17 @@ from .values import listed
 
 __all__ = [
     "JointDrives",
+    "SHAPES",
     "check_names",
     "followers_of",
+    "hulls_of",
     "joint_drives",
     "mimics_of",
     "required",
 ]
 
+SHAPES = "box, sphere, cylinder, capsule, plane, mesh, urdf"
+"""Shapes of objects, for messages."""
 UNKNOWN_EFFORT = 200.0
 """Effort, Nm or N, of a joint without a limit (a URDF's effort of 0 means unknown, not powerless)."""
 UNKNOWN_SPEED = 2.0
@@ -33,6 +38,23 @@ def required(spec: BodySpec, name: str) -> float:
         message = f"is missing, and a {spec.shape} needs it"
         raise ConfigError([Problem("objects", f"objects.{spec.name}.{name}", message, "missing_key")])
     return float(value)
+
+
+def hulls_of(spec: BodySpec) -> tuple[Hull, ...]:
+    """Return the hulls that collide of an object of the shape ``mesh``.
+
+    Raises:
+        ConfigError: Its file is missing, or cannot be one; names the file.
+    """
+    key = f"objects.{spec.name}.mesh"
+    if spec.mesh is None:
+        raise ConfigError([Problem("objects", key, "is missing, and the shape is mesh", "missing_key")])
+    try:
+        return mesh_hulls(spec.mesh, spec.scale, parts=spec.parts)
+    except OSError as error:
+        raise ConfigError([Problem(spec.mesh, key, f"cannot be read: {error.strerror}", "missing_file")]) from None
+    except ValueError as error:
+        raise ConfigError([Problem(spec.mesh, key, str(error), "bad_mesh")]) from None
 
 
 def check_names(spec: RobotSpec, movable: Collection[str], links: Collection[str]) -> None:

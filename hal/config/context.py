@@ -16,16 +16,17 @@ from typing import Any, TypeVar
 
 from .. import registry
 from ..errors import HalError
-from ..kinematics.mesh_files import package_folder
+from ..kinematics.hulls import FORMATS
+from ..kinematics.mesh_files import check_mesh, package_folder
 from ..kinematics.urdf import UrdfModel, read_urdf
 from ..specs import CameraSpec, RobotSpec
 from .data_files import user_path
 from .files import Problems, nearest, read_yaml, validate, with_holes
-from .models import CameraModel, GripperModel, RobotModel, UrdfSource, find_model
+from .models import CameraModel, FileSource, GripperModel, RobotModel, find_model
 from .rigfile import CameraConfig, Device, GripperConfig, RigFile, RobotConfig
 from .schema import Unknown
 
-__all__ = ["Context", "check_camera_spec", "check_robot_spec", "is_emulated", "load_urdf", "options_of"]
+__all__ = ["Context", "check_camera_spec", "check_robot_spec", "find_mesh", "is_emulated", "load_urdf", "options_of"]
 
 Model = TypeVar("Model", RobotModel, CameraModel)
 Config = RobotConfig | GripperConfig | CameraConfig
@@ -164,7 +165,7 @@ INSTALL = {
 
 
 def load_urdf(
-    source: UrdfSource, base: Path, file: Path | str, key: str, problems: Problems, warnings: list[str]
+    source: FileSource, base: Path, file: Path | str, key: str, problems: Problems, warnings: list[str]
 ) -> UrdfModel | None:
     """Return a checked URDF; None, and a problem, if it is missing or wrong. Imports no package.
 
@@ -176,7 +177,7 @@ def load_urdf(
         problems: Gets the problems.
         warnings: Gets a warning about links without mass.
     """
-    path = _locate_urdf(source, base, file, key, problems)
+    path = _locate(source, base, file, key, problems, (".urdf",))
     if path is None:
         return None
     try:
@@ -190,7 +191,26 @@ def load_urdf(
     return urdf
 
 
-def _locate_urdf(source: UrdfSource, base: Path, file: Path | str, key: str, problems: Problems) -> Path | None:
+def find_mesh(source: FileSource, base: Path, file: Path | str, key: str, problems: Problems) -> Path | None:
+    """Return the path of a mesh file; None, and a problem, if it is missing or wrong. See :func:`load_urdf`."""
+    path = _locate(source, base, file, key, problems, FORMATS)
+    if path is None:
+        return None
+    if path.suffix.lower() not in FORMATS:
+        text = f"{path.name} is none of the formats of meshes: {', '.join(FORMATS)}"
+        problems.add(file, key, text, "bad_mesh")
+        return None
+    try:
+        check_mesh(path)
+    except (ValueError, OSError) as error:
+        problems.add(path, "", str(error), "bad_mesh")
+        return None
+    return path
+
+
+def _locate(
+    source: FileSource, base: Path, file: Path | str, key: str, problems: Problems, ends: tuple[str, ...]
+) -> Path | None:
     if source.package is None:
         path = user_path(source.path, base)
     else:
@@ -203,7 +223,8 @@ def _locate_urdf(source: UrdfSource, base: Path, file: Path | str, key: str, pro
             return None
         path = user_path(source.path, folder)
     if not os.path.isfile(path):
-        there = [p.name for p in path.parent.glob("*.urdf")] if path.parent.is_dir() else []
+        beside = path.parent.iterdir() if path.parent.is_dir() else ()
+        there = sorted(one.name for one in beside if one.suffix.lower() in ends)
         hint = nearest(path.name, there) if there else ""
         problems.add(file, key, f"there is no file {path}{hint}", "missing_file")
         return None

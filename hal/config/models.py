@@ -49,6 +49,7 @@ __all__ = [
     "DepthSensor",
     "Drivers",
     "FieldOfView",
+    "FileSource",
     "GripperModel",
     "LimitsModel",
     "Mode",
@@ -56,7 +57,6 @@ __all__ = [
     "RobotModel",
     "SensorStream",
     "StreamModel",
-    "UrdfSource",
     "by_name",
     "find_model",
     "load_pad_models",
@@ -71,8 +71,8 @@ class Drivers(Strict):
     real: str | None = None
 
 
-class UrdfSource(Strict):
-    """A URDF: a path relative to the file that names it, or a path inside an installed Python package."""
+class FileSource(Strict):
+    """A URDF or a mesh: a path relative to the file that names it, or a path inside an installed Python package."""
 
     path: str
     package: str | None = None
@@ -173,7 +173,7 @@ class RobotModel(Strict):
     """An arm, with its gripper if it has one."""
 
     description: str = ""
-    urdf: UrdfSource
+    urdf: FileSource
     drivers: Drivers = Drivers()
     rate_hz: RateHz = 1000.0
     """Rate of the real arm's control cycle. A simulated arm runs at the rig's ``physics_hz``."""

@@ -13,10 +13,10 @@ from pydantic import AfterValidator, model_validator
 
 from ..kinematics.urdf import UrdfModel
 from ..specs import BodySpec, RangesSpec, Vector3
-from .context import Context, load_urdf
+from .context import Context, find_mesh, load_urdf
 from .data_files import data_folder, is_path, list_data, user_path
 from .files import Problems, nearest, read_yaml, validate
-from .models import UrdfSource
+from .models import FileSource
 from .schema import (
     Factor,
     Flag,
@@ -85,6 +85,7 @@ SIZES = {
     "cylinder": ("radius", "length"),
     "capsule": ("radius", "length"),
     "plane": (),
+    "mesh": ("mesh",),
     "urdf": ("urdf",),
 }
 """The keys that each shape needs, and that no other shape may have."""
@@ -106,17 +107,21 @@ class ObjectConfig(Strict):
     """One object. Lengths in m."""
 
     name: Name
-    shape: Literal["box", "sphere", "cylinder", "capsule", "plane", "urdf"]
-    """May be left out if ``urdf`` is given."""
+    shape: Literal["box", "sphere", "cylinder", "capsule", "plane", "mesh", "urdf"]
+    """May be left out if ``urdf`` or ``mesh`` is given."""
     half_extents: Sizes | None = None
     """Of a box."""
     radius: Size | None = None
     """Of a sphere, a cylinder or a capsule."""
     length: Size | None = None
     """Of a cylinder, or of a capsule without its caps."""
-    urdf: UrdfSource | None = None
+    mesh: FileSource | None = None
+    """An OBJ, STL or Collada file. Its convex hull collides, and gives the inertia."""
+    parts: Flag = False
+    """Whether each part of a mesh has a hull of its own: objects and groups of an OBJ, connected pieces of others."""
+    urdf: FileSource | None = None
     scale: Factor | None = None
-    """Scale of a URDF."""
+    """Scale of a URDF or a mesh."""
     mass: Mass | None = None
     """kg; an object of mass 0, the default, does not move. A URDF has its own masses."""
     fixed: Flag = False
@@ -135,12 +140,13 @@ class ObjectConfig(Strict):
     @model_validator(mode="before")
     @classmethod
     def _shorthands(cls, data: Any) -> Any:
-        return {"shape": "urdf", **data} if isinstance(data, dict) and "urdf" in data else data
+        shape = next((key for key in ("urdf", "mesh") if isinstance(data, dict) and key in data), None)
+        return data if shape is None else {"shape": shape, **data}
 
     @model_validator(mode="after")
     def _sizes(self) -> ObjectConfig:
         needed = SIZES[self.shape]
-        given = [key for key in ("half_extents", "radius", "length", "urdf") if getattr(self, key) is not None]
+        given = [key for key in ("half_extents", "radius", "length", "mesh", "urdf") if getattr(self, key) is not None]
         missing, extra = [k for k in needed if k not in given], [k for k in given if k not in needed]
         if missing or extra:
             keys = ", ".join(needed) or "no size"
@@ -149,8 +155,10 @@ class ObjectConfig(Strict):
             raise ValueProblem(f"a {self.shape} has {keys}: {', '.join(wrong)}", code)
         if self.mass is not None and self.shape == "urdf":
             raise ValueProblem("mass does not apply to a urdf, which has its own", "conflict")
-        if self.scale is not None and self.shape != "urdf":
-            raise ValueProblem(f"scale applies to a urdf only; a {self.shape} has its size in m", "conflict")
+        if self.scale is not None and self.shape not in ("urdf", "mesh"):
+            raise ValueProblem(f"scale applies to a urdf or a mesh; a {self.shape} has its size in m", "conflict")
+        if self.parts and self.shape != "mesh":
+            raise ValueProblem(f"parts applies to a mesh only, not to a {self.shape}", "conflict")
         if self.shape == "plane" and (self.attached is not None or self.random is not None):
             raise ValueProblem("a plane is infinite; it cannot have attached or random", "conflict")
         if self.random is not None and self.attached is not None:
@@ -184,11 +192,15 @@ def load_objects(context: Context) -> tuple[BodySpec, ...]:
         with suppress(Unknown):
             if config.urdf is not None:
                 urdf = load_urdf(config.urdf, folder, file, f"{prefix}urdf", problems, context.warnings)
+        mesh: Path | None = None
+        with suppress(Unknown):
+            if config.mesh is not None:
+                mesh = find_mesh(config.mesh, folder, file, f"{prefix}mesh", problems)
         with suppress(Unknown):
             if config.attached is not None:
                 _check_attached(context, config.attached, robots, file, f"{prefix}attached")
         if not problems.found:
-            bodies.append(_body(config, urdf, context.links))
+            bodies.append(_body(config, urdf, mesh, context.links))
     return tuple(bodies)
 
 
@@ -248,7 +260,9 @@ def _check_attached(context: Context, carried: CarriedBy, robots: tuple[str, ...
         context.problems.add(file, f"{key}.link", text, "unknown_link")
 
 
-def _body(config: ObjectConfig, urdf: UrdfModel | None, links: Mapping[str, Mapping[str, str]]) -> BodySpec:
+def _body(
+    config: ObjectConfig, urdf: UrdfModel | None, mesh: Path | None, links: Mapping[str, Mapping[str, str]]
+) -> BodySpec:
     carried = config.attached
     if carried is not None:
         pose, given = carried.pose, set[str]()
@@ -264,10 +278,12 @@ def _body(config: ObjectConfig, urdf: UrdfModel | None, links: Mapping[str, Mapp
         radius=config.radius,
         length=config.length,
         urdf=str(urdf.path) if urdf is not None else None,
+        mesh=str(mesh) if mesh is not None else None,
+        parts=config.parts,
         scale=config.scale or 1.0,
         mass=config.mass or 0.0,
         fixed=config.fixed,
-        rgba=config.rgba,
+        rgba=config.rgba if mesh is None or "rgba" in config.model_fields_set else (1.0, 1.0, 1.0, 1.0),
         collision=config.collision,
         visible=config.visible,
         robot=carried.robot if carried is not None else None,
