@@ -54,6 +54,7 @@ if TYPE_CHECKING:
     from .gamepad import Gamepad
     from .geometry import Pose
     from .gripper import Gripper, GripperMotion, GripperResult
+    from .motion.handle import ArmMotion, ArmMotionResult
     from .observation import Observation
     from .rig import Rig, open_rig
     from .robot import Robot
@@ -67,6 +68,7 @@ if TYPE_CHECKING:
         GripperOutcome,
         GripperState,
         Limited,
+        MotionOutcome,
         PadState,
         RobotState,
         RobotStatus,
@@ -77,6 +79,8 @@ if TYPE_CHECKING:
     open = open_rig
 
 __all__ = [
+    "ArmMotion",
+    "ArmMotionResult",
     "BodySpec",
     "Camera",
     "CameraInfo",
@@ -108,6 +112,7 @@ __all__ = [
     "JointTorque",
     "JointVelocity",
     "Limited",
+    "MotionOutcome",
     "MotionStopped",
     "NotSupported",
     "Observation",
@@ -168,6 +173,7 @@ _MODULES = {
     ),
     "gamepad": ("Gamepad",),
     "gripper": ("Gripper", "GripperMotion", "GripperResult"),
+    "motion.handle": ("ArmMotion", "ArmMotionResult"),
     "observation": ("Observation",),
     "geometry": ("Pose",),
     "rig": ("Rig",),
@@ -183,6 +189,7 @@ _MODULES = {
         "GripperOutcome",
         "GripperState",
         "Limited",
+        "MotionOutcome",
         "PadState",
         "RobotState",
         "RobotStatus",

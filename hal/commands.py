@@ -36,6 +36,7 @@ __all__ = [
     "JointVelocity",
     "Kind",
     "NO_INBOX",
+    "PathSection",
     "Sent",
     "Session",
     "Twist",
@@ -48,6 +49,8 @@ CHUNK_POINTS = 256
 """Greatest number of targets in one chunk."""
 CHUNK_AHEAD = 3.0
 """Farthest that a chunk may reach into the future, s: for so long the arm may follow an old decision."""
+PATH_KNOTS = 1000
+"""Greatest number of knots in a planned path: the servo's process takes some milliseconds to check so many."""
 FIRST_STEP_ANGLE = 0.1
 """Greatest distance of a first joint target from the set-point, rad per joint."""
 FIRST_STEP_DISTANCE = 0.05
@@ -221,6 +224,15 @@ def encode(command: Command, now: float) -> tuple[Kind, tuple[float, ...]]:
     return Kind.TWIST, (*command.linear.tolist(), *command.angular.tolist(), 1.0 if command.frame == "tcp" else 0.0)
 
 
+class PathSection(NamedTuple):
+    """Knots of a smooth section of a planned path; the arm rests at its ends."""
+
+    s: tuple[float, ...]
+    """Parameter of each knot (k,), increasing from 0; m, or rad for a path in joint space."""
+    q: tuple[tuple[float, ...], ...]
+    """Joint positions at each knot (k, n), rad."""
+
+
 class Session(NamedTuple):
     """Terms of one control session, which stay the same until it ends."""
 
@@ -238,6 +250,25 @@ class Session(NamedTuple):
     controller: dict[str, Any] | None = None
     """Controller that follows the set-point, as :func:`hal.servo.controllers.controller_data` describes it; None for
     the arm's own position controller."""
+    path: tuple[PathSection, ...] | None = None
+    """Path to follow to its end instead, where the arm stays; at most :data:`PATH_KNOTS` knots."""
+
+    @property
+    def is_motion(self) -> bool:
+        """Whether the session makes one motion, known from the start, and takes no commands."""
+        return self.move_to is not None or self.path is not None
+
+    @classmethod
+    def unpack(cls, values: Sequence[Any]) -> Session:
+        """Return the session of such values, whose tuples have become lists on their way to another process."""
+        session = cls(*values)
+        goal, path = session.move_to, session.path
+        if goal is not None:
+            session = session._replace(move_to=tuple(goal))
+        if path is not None:
+            path = tuple(PathSection(tuple(s), tuple(map(tuple, q))) for s, q in path)
+            session = session._replace(path=path)
+        return session
 
 
 class CommandRecord(NamedTuple):

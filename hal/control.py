@@ -18,6 +18,7 @@ from .commands import (
     JointChunk,
     JointTarget,
     JointTorque,
+    PathSection,
     Sent,
     Session,
     encode,
@@ -56,8 +57,8 @@ class Control:
     """A control session of one arm; created by :meth:`hal.robot.Robot.control`, used in a ``with`` statement.
 
     Leaving the ``with`` block, for whatever reason, brings the arm to rest; an exception of the block is the one that
-    is raised. The arguments are those of :meth:`hal.robot.Robot.control`, and ``goal`` (n,), rad, for a session that
-    moves to one joint position.
+    is raised. The arguments are those of :meth:`hal.robot.Robot.control`, and ``goal`` (n,), rad, or ``path`` for
+    a session that makes this one motion.
 
     Attributes:
         controller: What follows the set-point, with a value for every gain.
@@ -74,6 +75,7 @@ class Control:
         unattended: bool,
         controller: Controller | None = None,
         goal: tuple[float, ...] | None = None,
+        path: tuple[PathSection, ...] | None = None,
     ) -> None:
         check_deadman(deadman)
         spec = robot.spec
@@ -87,16 +89,20 @@ class Control:
         rate_hz = number("rate_hz", rate_hz, "Hz", least=0.0, above=True)
         self._rate_hz = rate_hz
         self._deadline = max(_SHORTEST_DEADLINE, _PERIODS / rate_hz)
-        if goal is None and self._deadline > spec.deadline_max:
+        streams = goal is None and path is None
+        if streams and self._deadline > spec.deadline_max:
             slowest = _PERIODS / spec.deadline_max
             raise CommandError(
                 f"{rate_hz:g} Hz is too slow for {robot.name}: send at {slowest:.1f} Hz or more", code="rate_too_low"
             )
         self.robot = robot
         self.deadman = deadman
-        self.speed = _share("speed", speed, spec.speed if goal is None else spec.move_speed, spec.speed, goal)
-        self.tcp_speed = _share("tcp_speed", tcp_speed, spec.tcp_speed, spec.tcp_speed, None)
-        self._goal = goal
+        if streams:
+            self.speed = _share("speed", speed, spec.speed, spec.speed)
+        else:
+            self.speed = _share("speed", speed, spec.move_speed, 1.0)
+        self.tcp_speed = _share("tcp_speed", tcp_speed, spec.tcp_speed, spec.tcp_speed)
+        self._goal, self._path = goal, path
         self._mail = robot._mail
         self._host = robot._host
         self._id = 0
@@ -144,6 +150,9 @@ class Control:
         robot = self.robot
         if self._id:
             raise ControlTaken("this control session is open already")
+        motion = robot._motion
+        if motion is not None and robot._open is not None and not motion.release():
+            raise ControlTaken(f"{robot.name} still makes the motion that was started: wait for it, or cancel it")
         if robot._open is not None:
             raise ControlTaken(
                 f"{robot.name} is under the control of another session of this program: leave its 'with' block first"
@@ -154,7 +163,7 @@ class Control:
         robot._sessions += 1
         self._id = robot._sessions
         terms = (self.speed, self.tcp_speed, self.deadman is not None)
-        session = Session(self._id, *terms, self._goal, stops, self._law)
+        session = Session(self._id, *terms, self._goal, stops, self._law, self._path)
         try:
             robot._open = self
             if self.deadman is not None:
@@ -322,8 +331,8 @@ class Control:
             )
         target = self._finger_width(grip, width, gripper)
         if command is not None:
-            if self._goal is not None:
-                raise CommandError("this session moves to a goal; it takes no commands")
+            if self._goal is not None or self._path is not None:
+                raise CommandError("this session makes one motion; it takes no commands", code="move_to_session")
             command = self._checks.checked(command, now, reasons)
             if isinstance(command, JointTorque) and self._law:
                 raise CommandError("this session has a controller: it takes no torques", code="torques_by_controller")
@@ -448,9 +457,8 @@ class Control:
             self._grip = width
 
 
-def _share(name: str, value: float | None, default: float, most: float, goal: object) -> float:
+def _share(name: str, value: float | None, default: float, most: float) -> float:
     """Return ``value`` or the default, checked against the most that the rig allows."""
-    most = 1.0 if goal is not None else most
     return number(name, default if value is None else value, least=0.0, above=True, most=most)
 
 

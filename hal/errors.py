@@ -5,7 +5,7 @@
     ├── CommandError (ValueError)           a command or an argument is invalid; nothing was sent
     │   └── CollisionError                  a motion would collide; nothing moved
     ├── DatasetError (ValueError)           a file of a recording is missing or damaged; names the file and the episode
-    ├── Unreachable (ValueError)            no joint position reaches the pose; carries the residual
+    ├── Unreachable (ValueError)            no joint position reaches the pose, or the way to it ends before
     ├── DriverMissing (ImportError)         a library is not installed; names the command that installs it
     ├── DeviceNotFound (LookupError)        no such device; lists those that are there
     ├── ConnectionLost (ConnectionError)    the device, or the process that owned it, does not answer
@@ -152,20 +152,39 @@ class DatasetError(HalError, ValueError):
 
 
 class Unreachable(HalError, ValueError):
-    """No joint position within the limits reaches the pose."""
+    """No joint position within the limits reaches the pose, or the way there cannot be followed.
+
+    ``code`` is ``unreachable``; for a way also ``joint_limit``, ``singular`` or ``workspace``.
+    """
 
     code = "unreachable"
 
     def __init__(
-        self, message: str, *, position_error: float, rotation_error: float, q: tuple[float, ...] | None = None
+        self,
+        message: str,
+        *,
+        position_error: float,
+        rotation_error: float,
+        q: tuple[float, ...] | None = None,
+        along: float | None = None,
+        distance: float | None = None,
+        code: str | None = None,
     ) -> None:
-        super().__init__(f"{message} (closest found: {position_error:.4f} m, {rotation_error:.4f} rad away)")
+        if along is None or distance is None:
+            place = f"closest found: {position_error:.4f} m, {rotation_error:.4f} rad away"
+        else:
+            place = f"after {100.0 * along:.0f} % of the way, {distance:.3f} m from its start"
+        super().__init__(f"{message} ({place})", code=code)
         self.position_error = position_error
-        """Distance of the closest position found, m."""
+        """Distance of the closest position found, m; on a way, at the first pose that is not reached."""
         self.rotation_error = rotation_error
-        """Angle to the closest orientation found, rad."""
+        """Angle to the closest orientation found, rad; likewise."""
         self.q = q
-        """The closest joint positions found (n,), rad; None if there are none."""
+        """The closest joint positions found (n,), rad, or the last ones on a way; None if there are none."""
+        self.along = along
+        """Share of the way that can be followed, from 0 to 1; None if the error is not about a way."""
+        self.distance = distance
+        """The same in m along the way of the tcp (rad for a way in joint space); None likewise."""
 
 
 class DriverMissing(HalError, ImportError):

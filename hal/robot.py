@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from functools import partial
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -17,8 +17,9 @@ from numpy.typing import ArrayLike, NDArray
 from ._moved import names_of
 from .arguments import number, vector
 from .control import Control, check_deadman
-from .errors import CommandError, ConnectionLost, MotionStopped, NotSupported, StaleStateError
+from .errors import CommandError, ConnectionLost, NotSupported, StaleStateError
 from .geometry import Pose, frozen, tcp_pose
+from .motion.handle import CHECK_HZ, ArmMotion
 from .specs import CollisionSpec
 from .types import RobotState, RobotStatus
 
@@ -30,13 +31,14 @@ if TYPE_CHECKING:
     from .host.hosts import Host
     from .kinematics.arm import Kinematics
     from .kinematics.collisions import Collisions
+    from .motion.planning import MotionPlan, PathPlanner
     from .servo.controllers import Controller
     from .specs import LimitsSpec, RobotSpec
 
 __all__ = ["Robot"]
 
-_MOVE_RATE = 50.0
-"""Rate at which :meth:`Robot.move_to` checks its motion, Hz."""
+_MOVED = 0.02
+"""A set-point at rest that is farther than this from the arm is an old one, rad: the arm was moved by hand."""
 _NOTHING = CollisionSpec(own=False, arms=False)
 _FRESH_STATE = 0.2
 """Longest wait for a state after a recovery, s."""
@@ -74,6 +76,8 @@ class Robot:
         self._sessions = 0
         self._commands = 0
         self._open: Control | None = None
+        self._motion: ArmMotion | None = None
+        """The newest motion that was started in the background."""
         self._kinematics: Kinematics | None = None
         self._collision_spec = collisions
         self._collisions: Collisions | None = None
@@ -152,15 +156,15 @@ class Robot:
         """Return the measured joint positions (n,), rad."""
         return self.state(max_age).q
 
-    def _check_collisions(self, goal: Sequence[float]) -> None:
-        """Raise CollisionError if the way to ``goal`` (n,), rad, straight in joint space, would collide."""
+    def _check_collisions(self, samples: NDArray[np.float64]) -> None:
+        """Raise CollisionError if a motion along joint positions (k, n), rad, straight between two, would collide."""
         if not self._collision_spec.any:
             return
         try:
             collisions = self.collisions
         except NotSupported:
             return  # the rig's notes have it
-        collisions.check_motion(np.array([self.state().q, goal]))
+        collisions.check_motion(samples)
 
     def state(self, max_age: float = 0.1) -> RobotState:
         """Return the newest state; never waits.
@@ -279,6 +283,7 @@ class Robot:
         target: ArrayLike | Pose | None = None,
         *,
         position: ArrayLike | None = None,
+        straight: bool = False,
         deadman: Deadman | None = None,
         unattended: bool = False,
         speed: float | None = None,
@@ -287,12 +292,17 @@ class Robot:
         patience: float = 60.0,
         controller: Controller | None = None,
     ) -> RobotState:
-        """Move to joint positions or to a pose of the tcp, straight in joint space; block until the arm is there.
+        """Move to joint positions or to a pose of the tcp, and block until the arm is there.
+
+        The way is straight in joint space; with ``straight`` it is a straight line of the tcp, on which the orientation
+        turns about one axis (slerp). Lines and waypoints are checked whole before anything moves.
 
         Args:
-            target: Joint positions (n,) in rad, or a pose of the tcp in the base frame with an orientation.
+            target: Joint positions (n,) in rad, waypoints (k, n) in rad, or a pose of the tcp in the base frame with an
+                orientation. The arm rests at each waypoint where its way turns.
             position: Position (3,) of the tcp in the base frame, m, instead of ``target``; the orientation stays as it
                 is.
+            straight: Move the tcp on a straight line; only for a pose or a position.
             deadman: Switch that must be held; the arm waits for it and pauses while it is released.
             unattended: Move an arm that really moves without a dead-man.
             speed: Share of the joint speed limits, up to 1; the rig's ``move_speed`` (0.1) by default.
@@ -308,56 +318,141 @@ class Robot:
             CommandError: An invalid target (``code`` is ``outside_limits`` or ``outside_workspace`` for one that the
                 arm must not reach).
             CollisionError: The arm would touch itself, a box of the rig or another arm on the way.
-            Unreachable: No joint positions for the pose.
+            Unreachable: No joint positions for the pose, or the way to it cannot be followed; nothing has moved.
             MotionStopped: After a trip, or if the dead-man was released for longer than ``patience`` (``code`` is
                 ``deadman_released``).
             TimeoutError: After ``timeout``.
         """
-        if patience != math.inf:
-            number("patience", patience, "s", least=0.0)
-        if timeout is not None:
-            number("timeout", timeout, "s", least=0.0, above=True)
-        check_deadman(deadman)
-        goal = self._goal(target, position)
-        self._check_collisions(goal)
-        session = Control(
-            self,
-            deadman=deadman,
-            rate_hz=_MOVE_RATE,
-            speed=speed,
-            tcp_speed=tcp_speed,
-            unattended=unattended,
-            controller=controller,
-            goal=goal,
-        )
-        clock = self.clock
-        start = held = clock.now()
-        with session:
-            for _ in clock.rate(_MOVE_RATE):
-                servo = session._peek()
-                session._check_trip(servo, clock.now())
-                if servo.refused and servo.session == session._id:
-                    raise CommandError(
-                        f"the way to the target leaves the workspace of {self.name}", code="outside_workspace"
-                    )
-                if servo.arrived and servo.session == session._id:
-                    break
-                if deadman is None or deadman.held:
-                    held = clock.now()
-                elif clock.now() - held > patience:
-                    raise MotionStopped(
-                        f"the dead-man was not held for {patience:g} s", "call move_to again", code="deadman_released"
-                    )
-                if timeout is not None and clock.now() - start > timeout:
-                    raise TimeoutError(f"{self.name} did not reach the target within {timeout:g} s")
-        return self.state()
+        motion = self._prepare(target, position, straight, _terms(deadman, unattended, speed, tcp_speed, controller))
+        return motion._run(timeout, patience)
 
-    def _goal(self, target: ArrayLike | Pose | None, position: ArrayLike | None) -> tuple[float, ...]:
-        """Return the joint positions (n,) in rad that ``move_to`` goes to, checked against the limits."""
+    def move_along(
+        self,
+        poses: Sequence[Pose],
+        *,
+        blend: float = 0.01,
+        deadman: Deadman | None = None,
+        unattended: bool = False,
+        speed: float | None = None,
+        tcp_speed: float | None = None,
+        timeout: float | None = None,
+        patience: float = 60.0,
+        controller: Controller | None = None,
+    ) -> RobotState:
+        """Move the tcp along poses on straight lines with rounded corners; block until the arm is at the last one.
+
+        Args:
+            poses: Poses of the tcp in the base frame, with orientations.
+            blend: Distance before and behind a pose from which on its corner is rounded, m, at most half of a line. The
+                tcp passes the pose at no more than 0.38 of it. With 0, and where the way leads back, the arm rests
+                there.
+            deadman: As for :meth:`move_to`; the others, too.
+            unattended: Likewise.
+            speed: Likewise.
+            tcp_speed: Likewise.
+            timeout: Likewise.
+            patience: Likewise.
+            controller: Likewise.
+
+        Returns:
+            The state on arrival.
+
+        Raises:
+            HalError: As for :meth:`move_to`.
+        """
+        motion = self._prepare_along(poses, blend, _terms(deadman, unattended, speed, tcp_speed, controller))
+        return motion._run(timeout, patience)
+
+    def start_move_to(
+        self,
+        target: ArrayLike | Pose | None = None,
+        *,
+        position: ArrayLike | None = None,
+        straight: bool = False,
+        deadman: Deadman | None = None,
+        unattended: bool = False,
+        speed: float | None = None,
+        tcp_speed: float | None = None,
+        controller: Controller | None = None,
+    ) -> ArmMotion:
+        """Start the motion of :meth:`move_to` and return at once; it continues while other code runs.
+
+        In lock-step it moves while the program waits, for example with ``rig.clock.sleep``.
+
+        Returns:
+            The motion, which has control of the arm until it is over or cancelled.
+
+        Raises:
+            HalError: As for :meth:`move_to`, for what can be known before anything moves.
+        """
+        terms = _terms(deadman, unattended, speed, tcp_speed, controller)
+        return self._prepare(target, position, straight, terms)._start()
+
+    def start_move_along(
+        self,
+        poses: Sequence[Pose],
+        *,
+        blend: float = 0.01,
+        deadman: Deadman | None = None,
+        unattended: bool = False,
+        speed: float | None = None,
+        tcp_speed: float | None = None,
+        controller: Controller | None = None,
+    ) -> ArmMotion:
+        """Start the motion of :meth:`move_along` and return at once, as :meth:`start_move_to` does."""
+        terms = _terms(deadman, unattended, speed, tcp_speed, controller)
+        return self._prepare_along(poses, blend, terms)._start()
+
+    def _prepare(
+        self, target: ArrayLike | Pose | None, position: ArrayLike | None, straight: bool, terms: dict[str, Any]
+    ) -> ArmMotion:
+        """Return the motion of ``move_to``, checked and not yet started."""
         if (target is None) == (position is None):
             raise CommandError("pass move_to either a target (joint positions or a hal.Pose) or position=")
         if position is not None:
             target = Pose(vector("position", position, 3), self.state().tcp_set.orientation)
+        if straight:
+            return self._along([tcp_pose("a straight motion's target", target)], 0.0, terms)
+        if not isinstance(target, Pose) and (points := _waypoints(target)) is not None:
+            goals = [self._goal(point) for point in points]
+            return self._following(self._planner().along_joints(self._start_position(), goals), terms)
+        assert target is not None
+        goal = self._goal(target)
+        self._check_collisions(np.array([self.state().q, goal]))
+        return ArmMotion(self, Control(self, goal=goal, **terms))
+
+    def _prepare_along(self, poses: Sequence[Pose], blend: float, terms: dict[str, Any]) -> ArmMotion:
+        """Return the motion of ``move_along``, checked and not yet started."""
+        number("blend", blend, "m", least=0.0)
+        if isinstance(poses, Pose) or not len(poses):
+            raise CommandError("pass move_along a sequence of poses, at least one")
+        return self._along([tcp_pose(f"poses[{k}]", pose) for k, pose in enumerate(poses)], blend, terms)
+
+    def _along(self, poses: Sequence[Pose], blend: float, terms: dict[str, Any]) -> ArmMotion:
+        values = [(*pose.position.tolist(), *pose.orientation.tolist()) for pose in poses]
+        return self._following(self._planner().along_poses(self._start_position(), values, blend), terms)
+
+    def _following(self, plan: MotionPlan, terms: dict[str, Any]) -> ArmMotion:
+        if plan.sections:
+            return ArmMotion(self, Control(self, path=plan.sections, **terms))
+        return ArmMotion(self, Control(self, goal=tuple(self._start_position()), **terms))  # it is there already
+
+    def _planner(self) -> PathPlanner:
+        from .motion.planning import PathPlanner
+
+        return PathPlanner(
+            self.kinematics, self.limits.lower, self.limits.upper, self.spec.workspace, self._check_collisions
+        )
+
+    def _start_position(self) -> list[float]:
+        """Return the joint positions (n,) from which a motion starts, rad: the set-point, if the arm still is there."""
+        state = self.state()
+        moved = float(np.abs(state.q - state.q_set).max()) > _MOVED
+        q: list[float] = (state.q if moved else state.q_set).tolist()
+        return q
+
+    def _goal(self, target: ArrayLike | Pose) -> tuple[float, ...]:
+        """Return the joint positions (n,) in rad that ``move_to`` goes to, checked against the limits."""
         goal = self.ik(target) if isinstance(target, Pose) else vector("target", target)
         if goal.size != self.n:
             hint = "; for a position of the tcp pass position=" if goal.size == 3 else ""
@@ -387,6 +482,34 @@ class Robot:
 
     def __repr__(self) -> str:
         return f"<Robot {self.name}: {self.spec.model}, {self.n} joints, driver {self.spec.driver}>"
+
+
+def _terms(
+    deadman: Deadman | None,
+    unattended: bool,
+    speed: float | None,
+    tcp_speed: float | None,
+    controller: Controller | None,
+) -> dict[str, Any]:
+    """Return these arguments of a motion as those of its session."""
+    check_deadman(deadman)
+    return {
+        "deadman": deadman,
+        "rate_hz": CHECK_HZ,
+        "speed": speed,
+        "tcp_speed": tcp_speed,
+        "unattended": unattended,
+        "controller": controller,
+    }
+
+
+def _waypoints(target: object) -> list[Any] | None:
+    """Return the waypoints (k, n) of a target; None if it is a single position."""
+    try:
+        points = np.asarray(target, float)
+    except (TypeError, ValueError, OverflowError):
+        return None
+    return list(points) if points.ndim == 2 and len(points) else None
 
 
 __getattr__ = names_of(__name__)

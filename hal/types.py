@@ -190,6 +190,17 @@ class GripperOutcome(_Named):
     """Refused by the gripper; its fault has the reason."""
 
 
+class MotionOutcome(_Named):
+    """How a motion of an arm ended."""
+
+    ARRIVED = 1
+    """At its end."""
+    CANCELLED = 2
+    """By ``cancel()``."""
+    STOPPED = 3
+    """By a trip or a fault, or because the arm was moved away from its path."""
+
+
 class Limited(IntFlag):
     """Limits by which the servo reduced the motion in this tick."""
 

@@ -291,6 +291,9 @@ class ArmUnit:
             report.dq_set,
             report.controller,
             report.tau_set,
+            report.held_back,
+            report.progress,
+            report.off_path,
         )
         self.mail.put_state(reading, servo, tcp, self.kinematics.fk(report.q_set), jacobian.dot(reading.dq).tolist())
 
@@ -506,9 +509,7 @@ class Cycle:
         return self.arms[robot]
 
     def _do_begin(self, robot: str, session: list[Any]) -> None:
-        fields = Session(*session)
-        goal = tuple(fields.move_to) if fields.move_to is not None else None
-        self._arm(robot).open_session(fields._replace(move_to=goal), self.memory.get_app(), self.turn)
+        self._arm(robot).open_session(Session.unpack(session), self.memory.get_app(), self.turn)
 
     def _do_gains(self, robot: str, session: int, controller: dict[str, Any]) -> None:
         self._arm(robot).servo.set_gains(session, controller_of(controller))

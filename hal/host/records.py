@@ -72,7 +72,7 @@ def fault_at(record: bytes, offset: int) -> Fault | None:
 
 
 _STAMP = struct.Struct("<ddQ")
-_SERVO = struct.Struct("<iiiQQ?Qddi")
+_SERVO = struct.Struct("<iiiQQ?Qddiid?")
 _CONTROLLERS = {int(mode): mode for mode in ControlMode}
 _STATUSES = {int(status): status for status in RobotStatus}
 _TRIPS = {int(trip): trip for trip in Trip}
@@ -98,6 +98,12 @@ class ServoRecord(NamedTuple):
     controller: ControlMode = ControlMode.POSITION
     tau_set: Sequence[float] = ()
     """Torques of the last set-point, Nm; empty if it has none, and in a record that was read."""
+    held_back: Limited = Limited.NONE
+    """Limits that reduced the one motion of the session (``move_to``), since it was opened."""
+    progress: float = 0.0
+    """Share of that motion that is done, from 0 to 1."""
+    off_path: bool = False
+    """Whether the arm was moved too far off the path of that motion to continue."""
 
 
 class StateLayout:
@@ -155,21 +161,26 @@ class StateLayout:
             *(servo.tau_set or nothing),
             *servo[:9],  # all but the set-points
             servo.controller,
+            servo.held_back,
+            servo.progress,
+            servo.off_path,
             *fault_values(reading.fault),
         )
 
     def servo(self, record: bytes) -> ServoRecord:
         """Return the servo's part of a record."""
-        status, trip, limited, *rest, controller = _SERVO.unpack_from(record, self._servo_at)
+        *rest, controller, held_back, progress, off_path = _SERVO.unpack_from(record, self._servo_at)
         sets = self._set_points.unpack_from(record, self._set_at)
+        status, trip, limited, *rest = rest
         n, first = self.n, (_STATUSES[status], _TRIPS[trip], _limited(limited))
-        return ServoRecord._make((*first, *rest, sets[:n], sets[n:], _CONTROLLERS[controller], ()))
+        motion = (_limited(held_back), progress, off_path)
+        return ServoRecord._make((*first, *rest, sets[:n], sets[n:], _CONTROLLERS[controller], (), *motion))
 
     def state(self, record: bytes) -> RobotState:
         """Return the whole state in a record."""
         n, end = self.n, self._servo_at
         numbers: NDArray[np.float64] = np.frombuffer(record, "<f8", self._count, _STAMP.size)
-        status, trip, limited, target_seq, *_, controller = _SERVO.unpack_from(record, end)
+        status, trip, limited, target_seq, *_, controller, _, _, _ = _SERVO.unpack_from(record, end)
         tau = numbers[2 * n : 3 * n]
         rest = numbers[5 * n :]
         tau_ext, wrench_ext, tau_set = rest[20 : 20 + n], rest[20 + n : 26 + n], rest[26 + n :]

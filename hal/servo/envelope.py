@@ -492,8 +492,12 @@ class Envelope:
         """Return whether the tcp keeps its speed limit in the proposed step and in a stop after it."""
         if self.tcp_speed >= UNLIMITED or self._tcp.surely_stops_slower(self.tcp_speed):
             return True
-        self._refused = Limited.TCP_SPEED
+        self.note_tcp_speed()
         return False
+
+    def note_tcp_speed(self) -> None:
+        """Note that a step was refused because the tcp would be too fast."""
+        self._refused = Limited.TCP_SPEED
 
     def allows(self, smoother: JointSmoother) -> bool:
         """Return whether a step passes both :meth:`keeps_tcp_speed` and :meth:`stays_inside`."""

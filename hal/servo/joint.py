@@ -367,6 +367,12 @@ class PathMotion(ServoMotion):
     def __init__(self, smoother: JointSmoother, envelope: Envelope) -> None:
         super().__init__(smoother, envelope)
         self.arrived = False
+        self.lost = False
+        """Always False: from wherever the arm is, a straight line leads to the goal."""
+        self.progress = 0.0
+        """Share of the way from the first start that is done, from 0 to 1."""
+        self._whole_way = 0.0
+        """Distance of the goal from the first start, rad (the joint that goes farthest)."""
         self._goal: Floats = ()
         self._from: list[float] = []
         self._direction: list[float] = []
@@ -397,7 +403,9 @@ class PathMotion(ServoMotion):
         inside = [max(low, min(high, x)) for x, low, high in zip(goal, smoother.lower, smoother.upper, strict=True)]
         self._check_workspace(inside)
         self._goal = inside
+        self._whole_way = max([abs(x - y) for x, y in zip(inside, smoother.q, strict=True)])
         self._share = 1.0
+        self.progress = 0.0
         self.arrived = False
         self._planned = False
 
@@ -431,10 +439,13 @@ class PathMotion(ServoMotion):
         output.pass_to_input(inputs)
         if result == Result.Finished:
             self.arrived = True
+            self.progress = 1.0
             smoother.adopt(self._goal, [0.0] * smoother.n, [0.0] * smoother.n)
             return
         s, ds, dds = output.new_position[0], output.new_velocity[0], output.new_acceleration[0]
         along = self._direction
+        left = inputs.target_position[0] - s
+        self.progress = max(0.0, 1.0 - left / self._whole_way) if self._whole_way > 0.0 else 0.0
         q = [x + s * d for x, d in zip(self._from, along, strict=True)]
         if not smoother.adopt(q, [ds * d for d in along], [dds * d for d in along], self.envelope.keeps_tcp_speed):
             # Stop, and continue more slowly: at the same speed the same step might be refused for ever.
@@ -449,6 +460,7 @@ class PathMotion(ServoMotion):
         length = max(map(abs, delta))
         self.arrived = length < _HERE
         if self.arrived:
+            self.progress = 1.0
             return
         self._direction = along = [d / length for d in delta]
 

@@ -26,6 +26,7 @@ from .compliance import Compliance
 from .controllers import Controller
 from .envelope import Envelope
 from .joint import ChunkMotion, JointTargetMotion, JointVelocityMotion, PathMotion, ServoMotion
+from .planned import PlannedMotion
 from .smoothing import JointSmoother
 from .torque import BRAKE_LIMIT, MassMatrix, TorqueMotion
 from .watchdog import SILENCE, Watchdog, is_alive, is_timely
@@ -56,7 +57,13 @@ class ServoReport:
     reanchored: int = 0
     """Number of set-points that the device did not take, since the servo was made."""
     arrived: bool = False
-    """Whether ``move_to`` has reached its goal."""
+    """Whether the motion of the session (``move_to`` and its kin) has reached its goal."""
+    progress: float = 0.0
+    """Share of the session's motion that is done, from 0 to 1."""
+    held_back: Limited = Limited.NONE
+    """Limits by which the servo reduced the motion of the session, since it was opened."""
+    off_path: bool = False
+    """Whether the arm was moved too far off the path of its session to continue."""
     t_trip: float = 0.0
     """Time at which the stop was latched, s."""
     t_stop: float = 0.0
@@ -123,6 +130,9 @@ class Servo:
             Kind.TWIST: TwistMotion(smoother, envelope),
         }
         self._path = PathMotion(smoother, envelope)
+        self._planned = PlannedMotion(smoother, envelope)
+        self._whole: PathMotion | PlannedMotion | None = None
+        """The one motion of a session that takes no commands; None in a session that does."""
         self._session: Session | None = None
         self._motion: ServoMotion | None = None
         """The motion that moves the arm; None until the first command."""
@@ -200,8 +210,13 @@ class Servo:
         if not (0.0 < session.speed <= 1.0 and session.tcp_speed > 0.0):
             raise CommandError(f"a session needs 0 < speed <= 1 and tcp_speed > 0, not {session}", code="bad_session")
         self._compliance.open_session(session)
-        if session.move_to is not None:
+        self._whole = None
+        if session.path is not None:
+            self._planned.set_path(session.path)
+            self._whole = self._planned
+        elif session.move_to is not None:
             self._path.set_goal(session.move_to)
+            self._whole = self._path
         self._session = session
         self._ending = self._ahead = False
         self._resting = 0
@@ -209,7 +224,8 @@ class Servo:
         self._ready = None
         self._seq = 0
         self.report.target_seq = self.report.refused = 0
-        self.report.arrived = False
+        self.report.arrived = self.report.off_path = False
+        self.report.progress, self.report.held_back = 0.0, Limited.NONE
         self._forget_goals()
         self._watchdog.open_session(session, inbox)
         self._anchoring.relearn()
@@ -392,10 +408,10 @@ class Servo:
         mine = command is not None and command.session == session.id
         if not watchdog.allowed or watchdog.renewed:
             self._forget_goals()
-        if session.move_to is not None:
+        if self._whole is not None:
             if watchdog.allowed and self._motion is None:
-                self._path.start()
-                self._motion = self._path
+                self._whole.start()
+                self._motion = self._whole
             return
         stale = not watchdog.allowed or (watchdog.renewed and session.deadman)
         if stale and command is not None and mine:  # what was sent before the press is not resumed after it
@@ -440,12 +456,11 @@ class Servo:
         if motion is not None:
             if self._anchoring.waiting:
                 self._anchoring.waiting = False  # the next one may be computed ahead, before the device is heard
-            elif motion is not self._path or not compliance.held_back:
+            elif motion is not self._whole or not compliance.held_back:
                 motion.step(now)
             self._envelope.note(smoother)
-            report.arrived = motion is self._path and self._path.arrived
-            if compliance.active:
-                report.arrived = report.arrived and self._torque.still
+            if self._whole is not None:
+                self._report_whole(self._whole)
             usual = _FOLLOWING
         else:
             if self._followed:
@@ -454,7 +469,7 @@ class Servo:
             if by_torques and self._torque.brake():
                 self._leave_torques()
                 by_torques = False
-            if not by_torques:
+            if not by_torques and not (self._whole is self._planned and self._planned.brake()):
                 smoother.stop()
             usual = RobotStatus.HOLDING if self._at_rest() else RobotStatus.STOPPING
             if watchdog.trip:
@@ -485,6 +500,14 @@ class Servo:
                 self._leave_torques()  # to positions where it was measured, so without a jerk
             elif self._braking > BRAKE_LIMIT:
                 compliance.active = False  # torques brake it
+
+    def _report_whole(self, motion: PathMotion | PlannedMotion) -> None:
+        """Report how far the motion of the session is."""
+        report = self.report
+        report.arrived = motion.arrived and (not self._compliance.active or self._torque.still)
+        report.progress = motion.progress
+        report.held_back |= self._envelope.limited
+        report.off_path = motion.lost
 
     def _at_rest(self) -> bool:
         """Return whether nothing moves, and positions or a controller (not bare torques) hold the arm."""

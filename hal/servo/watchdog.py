@@ -67,7 +67,7 @@ class Watchdog:
         self._stops = session.stops
         deadman = inbox.deadman
         # For move_to, a dead-man that is held already is as good as pressed now.
-        known = session.move_to is not None and deadman is not None and deadman.held
+        known = session.is_motion and deadman is not None and deadman.held
         self._presses = (deadman.presses if deadman is not None else 0) - int(known)
 
     def close_session(self) -> None:

@@ -11,7 +11,18 @@ from hal.drivers.franka.limits import ELBOW_FLIP, ArmLimits
 
 from .faults import SetpointReports
 from .journal import Counters, Journal
-from .motion import DT, ArmMotion, Ending, Floats, LimitChecker, MotionSample, MoveOptions, at_rest, braked, read_move
+from .motion import (
+    DT,
+    EmulatedMotion,
+    Ending,
+    Floats,
+    LimitChecker,
+    MotionSample,
+    MoveOptions,
+    at_rest,
+    braked,
+    read_move,
+)
 from .plant import Plant
 from .protocol import (
     FLAG_COUNT,
@@ -81,7 +92,7 @@ class EmulatedArm:
         self.stops = StopSwitches()
         self.errors: frozenset[int] = frozenset()
         self.last_errors: frozenset[int] = frozenset()
-        self.motion: ArmMotion | None = None
+        self.motion: EmulatedMotion | None = None
         self.sample: MotionSample = at_rest(self.plant.q)
         self.shown = self.sample
         """Set-point that the state reports."""
@@ -167,7 +178,7 @@ class EmulatedArm:
         self.last_errors = frozenset()
         self.sample = at_rest(self.sample.q)
         self.answer("Move", number, RequestOutcome.STARTED, after_state=False)
-        self.motion = ArmMotion(number, options, self.sample, self.message_id, self.checker)
+        self.motion = EmulatedMotion(number, options, self.sample, self.message_id, self.checker)
         self.counters.motions += 1
         self.journal.record("motion started", f"motion started: {options.describe()}")
 

@@ -21,7 +21,7 @@ from .protocol import CommandPacket, Controller, Generator, RequestOutcome
 __all__ = [
     "DT",
     "LOST_LIMIT",
-    "ArmMotion",
+    "EmulatedMotion",
     "Ending",
     "LimitChecker",
     "MotionSample",
@@ -318,7 +318,7 @@ class Ending(NamedTuple):
     """Error flag that it raises."""
 
 
-class ArmMotion:
+class EmulatedMotion:
     """A running motion. Until its first command the robot waits, and no command counts as lost (an assumption)."""
 
     def __init__(

@@ -1,0 +1,186 @@
+"""A motion along a planned path: its limits, its stops on the path, and paths that are refused."""
+
+from __future__ import annotations
+
+import random
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from errors_kit import raises_code
+from servo_kit import Bench, tightened
+from specs import PANDA_HOME, panda
+
+from hal.commands import PATH_KNOTS, PathSection
+from hal.errors import CommandError
+from hal.geometry import after_rotation, difference
+from hal.kinematics.arm import Kinematics
+from hal.motion.planning import PathPlanner
+from hal.servo.path import JointPath
+from hal.specs import WorkspaceSpec
+from hal.types import Limited, RobotStatus, Trip
+
+SPEC = panda()
+ARM = Kinematics(SPEC.kinematics)
+PLANNER = PathPlanner(ARM, SPEC.limits.lower, SPEC.limits.upper)
+START = ARM.fk(PANDA_HOME)
+WAY = np.array([0.1, 0.25, -0.2])
+GOAL = [*np.add(START[:3], WAY), *after_rotation(START[3:], (0.2, -0.1, 0.3))]
+PLAN = PLANNER.along_poses(PANDA_HOME, [GOAL])
+
+
+def bench_of(sections: tuple[PathSection, ...] = PLAN.sections, **terms) -> Bench:
+    bench = Bench(**{"begin": False, "tcp_speed": 0.25, "kinematics": ARM} | terms)
+    bench.session = bench.session._replace(path=sections)
+    return bench
+
+
+def finish(bench: Bench, most: float = 10.0) -> float:
+    begun = bench.now
+    while not bench.servo.report.arrived:
+        bench.tick()
+        assert bench.now - begun < most
+    return bench.now - begun
+
+
+def off_line(bench: Bench) -> tuple[float, float]:
+    """Greatest distance of a set-point from the line, m, and from its orientation there, rad."""
+    away, turned = 0.0, 0.0
+    whole = np.array(difference(START, GOAL))
+    for q in bench.history:
+        pose = ARM.fk(q)
+        share = float(np.subtract(pose[:3], START[:3]) @ WAY / (WAY @ WAY))
+        there = [*np.add(START[:3], share * WAY), *after_rotation(START[3:], share * whole[3:])]
+        error = difference(pose, there)
+        away, turned = max(away, np.linalg.norm(error[:3])), max(turned, np.linalg.norm(error[3:]))
+    return float(away), float(turned)
+
+
+@pytest.mark.parametrize("rate_hz", [240.0, 1000.0])
+@pytest.mark.parametrize("share", [1.0, 0.1])
+def test_the_tcp_goes_straight_within_every_limit(rate_hz: float, share: float) -> None:
+    spec = replace(SPEC, limits=tightened(SPEC.limits, share, share))
+    bench = bench_of(spec=spec, rate_hz=rate_hz)
+    bench.begin()
+    took = finish(bench)
+    away, turned = off_line(bench)
+    assert away < 2e-4
+    assert turned < 1e-3
+    bench.assert_within_limits()
+    tcp = np.array([ARM.fk(q)[:3] for q in bench.history])
+    fastest = np.linalg.norm(np.diff(tcp, axis=0), axis=1).max() * rate_hz
+    assert 0.24 < fastest <= 0.25
+    assert took < 1.2 * np.linalg.norm(WAY) / 0.25 if share == 1.0 else took < 3.0
+    assert bench.q == pytest.approx(PLAN.sections[-1].q[-1], abs=1e-12)
+    assert bench.limited is Limited.NONE
+
+
+@pytest.mark.parametrize("cause", ["deadman", "trip", "lost"])
+def test_a_stop_is_made_on_the_line_and_the_motion_continues_on_it(cause: str) -> None:
+    """At random times, also while it speeds up or brakes; prepared ahead or not."""
+    numbers = random.Random(1)
+    for k in range(8):
+        bench = bench_of(deadman=cause == "deadman")
+        bench.prepares = bool(k % 2)
+        if cause == "deadman":
+            bench.press()
+        bench.begin()
+        for _ in range(3):
+            bench.run(numbers.uniform(0.0, 0.5))
+            progress = bench.servo.report.progress
+            if cause == "deadman":
+                bench.release()
+            elif cause == "trip":
+                bench.stops += 1
+            else:
+                bench.lose()
+            bench.until_rest(0.5)
+            assert progress <= bench.servo.report.progress < progress + 0.2
+            assert bench.status in (RobotStatus.HOLDING, RobotStatus.TRIPPED)
+            bench.run(0.05)
+            if cause == "deadman":
+                bench.press()
+            else:
+                bench.rearms += 1
+        finish(bench)
+        away, turned = off_line(bench)
+        assert away < 2e-4
+        assert turned < 1e-3
+        bench.assert_within_limits()
+
+
+def test_an_arm_beside_its_path_comes_back_to_it_and_one_far_away_does_not() -> None:
+    bench = bench_of()
+    bench.begin()
+    bench.run(0.5)
+    bench.q = [x + 0.01 for x in bench.q]
+    bench.servo.anchor(bench.q)
+    bench.audit.reset()
+    finish(bench)
+    bench.assert_within_limits()
+    bench = bench_of()
+    bench.begin()
+    bench.run(0.5)
+    bench.q = [x + 0.1 for x in bench.q]
+    bench.servo.anchor(bench.q)
+    bench.run(1.0)
+    assert bench.servo.report.off_path
+    assert not bench.moving
+
+
+def test_sections_follow_each_other_with_a_rest_in_between() -> None:
+    middle = [x + 0.2 for x in PANDA_HOME]
+    plan = PLANNER.along_joints(PANDA_HOME, [middle, PANDA_HOME])
+    assert len(plan.sections) == 2
+    bench = bench_of(plan.sections, tcp_speed=1e9)
+    bench.begin()
+    finish(bench)
+    bench.assert_within_limits()
+    assert min(np.abs(np.subtract(q, middle)).max() for q in bench.history) == 0.0
+
+
+NAN = float("nan")
+KNOT, NEXT = tuple(PANDA_HOME), tuple(x + 0.01 for x in PANDA_HOME)
+
+
+@pytest.mark.parametrize(
+    ("sections", "code"),
+    [
+        ((), "bad_path"),
+        ((PathSection((0.0,), (KNOT,)),), "bad_path"),
+        ((PathSection((0.0, 1.0), (KNOT, NEXT[:6])),), "bad_path"),
+        ((PathSection((0.0, 1.0), (KNOT, (NAN, *NEXT[1:]))),), "bad_path"),
+        ((PathSection((0.0, NAN), (KNOT, NEXT)),), "bad_path"),
+        ((PathSection((0.0, 0.0), (KNOT, NEXT)),), "bad_path"),
+        ((PathSection((0.0, 1.0), (KNOT, NEXT)), PathSection((0.0, 1.0), (KNOT, NEXT))), "bad_path"),
+        ((PathSection(tuple(map(float, range(PATH_KNOTS + 1))), (KNOT,) * (PATH_KNOTS + 1)),), "path_too_long"),
+        ((PathSection((0.0, 1.0), (tuple(x + 0.05 for x in KNOT), NEXT)),), "start_moved"),
+        ((PathSection((0.0, 1.0), (KNOT, (*NEXT[:3], 0.0, *NEXT[4:]))),), "joint_limit"),
+        ((PathSection((0.0, 1.0), (KNOT, (1.5, *NEXT[1:]))),), "workspace"),
+    ],
+)
+def test_a_path_that_no_planner_makes_is_refused(sections: tuple[PathSection, ...], code: str) -> None:
+    bench = bench_of(sections, spec=replace(SPEC, workspace=WorkspaceSpec((-1.0, -0.2, 0.0), (1.0, 0.2, 1.0))))
+    with raises_code(CommandError, code):
+        bench.begin()
+    bench.run(0.1)
+    assert not bench.servo.active
+
+
+def test_the_spline_goes_through_its_knots_with_continuous_derivatives() -> None:
+    path = JointPath(PLAN.sections[0])
+    for s, q in zip(path.s[1:-1], path.q[1:-1], strict=True):
+        before, after = path.at(s - 1e-9), path.at(s)
+        assert after[0] == pytest.approx(q, abs=1e-12)
+        for x, y in zip(before[1:], after[1:], strict=True):
+            assert x == pytest.approx(y, abs=1e-4)
+    assert path.nearest(path.at(0.123)[0], 0.1) == pytest.approx(0.123, abs=1e-9)
+
+
+def test_the_trip_of_a_motion_is_latched() -> None:
+    bench = bench_of()
+    bench.begin()
+    bench.run(0.3)
+    bench.stops += 1
+    bench.run(1.0)
+    assert (bench.trip, bench.moving, bench.servo.report.arrived) == (Trip.STOP, False, False)
