@@ -158,7 +158,7 @@ class Rig:
         if refused:
             self._note_refused_priority()
         if world_host is not None:
-            self.world = World(world_host.request, self._world_edited)
+            self.world = World(world_host.request, partial(self._world_edited, world_host))
             self.notes.extend(world_host.request("warnings"))
         for host in self._hosts:
             for spec in host.spec.robots:
@@ -410,7 +410,9 @@ class Rig:
         """Acknowledge :meth:`stop`, so that sessions without a dead-man can be opened again."""
         self._latch.stopped = False
 
-    def _world_edited(self, method: str, params: dict[str, Any], revision: int) -> None:
+    def _world_edited(self, host: Host, method: str, params: dict[str, Any], revision: int) -> None:
+        if method == "add":
+            self.notes.extend(text for text in host.request("warnings") if text not in self.notes)
         for shown in (self._pictures, self._viewer, self.viewer3d):
             if shown is not None:
                 with contextlib.suppress(ConnectionLost):  # its own next use raises the error

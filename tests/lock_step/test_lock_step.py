@@ -113,6 +113,19 @@ def test_dynamics_are_read_back_and_restored(rig: hal.Rig) -> None:
     assert rig.world.dynamics("cube") == before
 
 
+def test_what_a_simulation_changes_of_a_new_body_is_a_note(rig: hal.Rig, tmp_path: Path) -> None:
+    urdf = tmp_path / "massless.urdf"
+    urdf.write_text(
+        '<robot name="m"><link name="shell"><collision><geometry><sphere radius="0.02"/></geometry></collision></link>'
+        "</robot>"
+    )
+    before = list(rig.notes)
+    rig.world.add(hal.BodySpec("ball", (0.3, 0.4, 1.0), (0.0, 0.0, 0.0, 1.0), "urdf", urdf=str(urdf)))
+    (note,) = [text for text in rig.notes if text not in before]
+    assert "shell" in note
+    rig.world.remove("ball")
+
+
 @pytest.mark.parametrize("name", ["iiwa_table", "yam", "yam_emulator", "piper", "piper_emulator", "openarm"])
 def test_another_arm_is_only_data(engine: Engine, name: str) -> None:
     if name == "iiwa_table":
