@@ -9,6 +9,7 @@ from __future__ import annotations
 from .depth import find_by_depth, locate_by_depth, look_at, read_frames
 from .grasping import grasp
 from .objects import LocatedObject, grasp_pose, locate_by_truth, object_from_points
+from .pushing import push, push_path, push_to
 from .running import Reason, SkillPhase, SkillProgress, SkillResult
 
 __all__ = [
@@ -24,5 +25,8 @@ __all__ = [
     "locate_by_truth",
     "look_at",
     "object_from_points",
+    "push",
+    "push_path",
+    "push_to",
     "read_frames",
 ]

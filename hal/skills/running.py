@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..control import check_deadman
-from ..errors import CommandError, MotionStopped, NotSupported, RobotFault, Unreachable
-from ..geometry import Pose, tcp_pose
+from ..errors import CollisionError, CommandError, MotionStopped, NotSupported, RobotFault, Unreachable
+from ..geometry import Pose
 from ..types import GripperOutcome
 
 if TYPE_CHECKING:
@@ -29,6 +29,7 @@ Reason = Literal[
     "",
     "unreachable",
     "outside_limits",
+    "collision",
     "too_wide",
     "blocked",
     "fingers_blocked",
@@ -36,12 +37,15 @@ Reason = Literal[
     "wrong_width",
     "not_centred",
     "dropped",
+    "not_seen",
+    "off_goal",
 ]
 """Why a skill failed: a stable identifier, empty for a success.
 
 ====================  ================================================================================================
 ``unreachable``       The arm does not reach a pose of the plan. Nothing has moved.
 ``outside_limits``    A pose of the plan is outside the workspace or the joint limits of the rig.
+``collision``         The way to a pose of the plan would bring the arm into itself, another arm, or a box of the rig.
 ``too_wide``          The object is wider than the gripper opens. Nothing has moved.
 ``blocked``           The arm did not get to a pose of the plan: something was in its way.
 ``fingers_blocked``   The fingers did not open as far as they should, or never came to rest.
@@ -49,6 +53,8 @@ Reason = Literal[
 ``wrong_width``       The fingers closed on something that is wider or narrower than the object should be.
 ``not_centred``       The object was not found between the fingers where the first touch was.
 ``dropped``           The object was held, and is not any more.
+``not_seen``          No object was found.
+``off_goal``          The object is not at its goal after the last push.
 ====================  ================================================================================================
 """
 
@@ -254,8 +260,10 @@ class SkillRun:
             )
         except Unreachable as error:
             self.fail("unreachable", str(error))
+        except CollisionError as error:
+            self.fail("collision", str(error))
         except CommandError as error:
-            if error.code not in ("outside_limits", "outside_workspace"):
+            if error.code not in ("outside_limits", "outside_workspace", "workspace"):
                 raise
             self.fail("outside_limits", str(error))
         except TimeoutError as error:
@@ -343,13 +351,6 @@ def above(pose: Pose, height: float) -> Pose:
 def flipped(pose: Pose) -> Pose:
     """Return the pose turned by half a turn about the tcp's own z axis: the same grasp for two equal fingers."""
     return pose @ Pose.from_rpy((0.0, 0.0, 0.0), (0.0, 0.0, math.pi))
-
-
-def checked_path(name: str, poses: Sequence[Pose], least: int) -> list[Pose]:
-    """Return poses that all have an orientation. Raises CommandError if they do not, or are too few."""
-    if isinstance(poses, Pose) or len(poses) < least:
-        raise CommandError(f"{name} must be at least {least} poses of the tcp", code="path_too_short")
-    return [tcp_pose(name, pose) for pose in poses]
 
 
 def _text(pose: Pose) -> str:

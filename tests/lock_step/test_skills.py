@@ -29,3 +29,8 @@ def test_grasps_by_ground_truth(tries: ModuleType, engine: Engine, thing: str) -
 
 def test_a_grasp_by_noisy_depth(tries: ModuleType) -> None:
     assert tries.grasps(AUTO, "duck", tries.NOISY, 1) == [""]
+
+
+@pytest.mark.parametrize("thing", ["cube", "cylinder"])
+def test_pushes_to_a_goal(tries: ModuleType, engine: Engine, thing: str) -> None:
+    assert tries.pushes(engine.name, thing, 1) == [""]

@@ -1,0 +1,233 @@
+"""Push an object over a table with the fingertips, with any arm."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ..arguments import number, vector, whole
+from ..errors import CommandError
+from ..geometry import Pose, tcp_pose
+from .objects import LocatedObject
+from .running import SkillProgress, SkillResult, SkillRun, above, flipped
+
+if TYPE_CHECKING:
+    from ..deadman import Deadman
+    from ..robot import Robot
+
+__all__ = ["push", "push_path", "push_to"]
+
+Array = NDArray[np.float64]
+
+PHASES = ("close", "approach", "descend", "push", "back_off", "lift")
+"""Phases of :func:`push`."""
+FINGER = 0.009
+"""Distance from the tcp to the front of the fingertips along the tcp's x axis, m: that of the Franka Hand."""
+PALM = (0.032, 0.037)
+"""How far the palm reaches before the tcp, along its x axis, and its distance from the tcp along z, m."""
+_ROOM = 0.004
+"""Least distance between the palm and the object, m."""
+_BEHIND = 0.02
+"""Distance from the object at which the fingers come down, and to which they back off, m."""
+_SPEED = 0.1
+"""Greatest speed of the tcp before and after the push, m/s."""
+_LET_GO = 0.01
+"""By how much the fingers open before they back off, m."""
+_SAME_PLACE = 1e-3
+"""Distance below which an object needs no push, m."""
+
+
+def push(
+    arm: Robot,
+    path: Sequence[Pose],
+    *,
+    opening: float = 0.02,
+    tcp_speed: float = 0.05,
+    approach: float = 0.15,
+    flip: bool = True,
+    speed: float | None = None,
+    deadman: Deadman | None = None,
+    unattended: bool = False,
+    patience: float = 60.0,
+    progress: Callable[[SkillProgress], None] | None = None,
+) -> SkillResult:
+    """Close the gripper, come down at the start of a path, follow it to its end, back off and lift.
+
+    Args:
+        arm: The arm; its gripper, if it has one, closes first.
+        path: Poses of the tcp in the arm's base frame, at least two, with straight lines between them.
+        opening: Distance between the fingers while they push, m: two open fingers turn an object less than one does.
+        tcp_speed: Speed of the tcp on the path, m/s: slow enough that the object stops when the fingers do.
+        approach: Height above the path at which the arm arrives and leaves, m.
+        flip: Whether the hand may be turned by half a turn about the tcp's z axis, if that is nearer.
+        speed: Share of the joint speed limits on the way to the path; the rig's ``move_speed`` by default.
+        deadman: Switch that must be held for the arm and the fingers to move, for example ``pad.hold("l2")``.
+        unattended: Move an arm that really moves without a dead-man.
+        patience: Longest time for which the dead-man may be released, s.
+        progress: Called when a phase begins: ``close``, ``approach``, ``descend``, ``push``, ``back_off``, ``lift``.
+
+    Returns:
+        The result; false, with the reason, for what may go wrong in the world (:data:`hal.skills.Reason`).
+
+    Raises:
+        CommandError: An invalid argument, or neither ``deadman`` nor ``unattended`` for an arm that really moves.
+        MotionStopped: A stop, or the dead-man was released for longer than ``patience``.
+        RobotFault: The arm or the gripper reports a fault.
+        ConnectionLost: The arm or the gripper does not answer.
+    """
+    if isinstance(path, Pose) or len(path) < 2:
+        raise CommandError("path must be at least two poses of the tcp", code="path_too_short")
+    poses = [tcp_pose("path", pose) for pose in path]
+    number("tcp_speed", tcp_speed, "m/s", least=0.0, above=True)
+    number("approach", approach, "m", least=0.0)
+    run = SkillRun(
+        "push",
+        arm,
+        PHASES,
+        deadman=deadman,
+        unattended=unattended,
+        patience=patience,
+        speed=speed,
+        progress=progress,
+    )
+    with run:
+        ways = [poses, [flipped(pose) for pose in poses]] if flip else [poses]
+        start, *rest, away, _ = run.choose_way([_whole_way(way, approach) for way in ways])
+        run.begin("close")
+        set_fingers(run, opening)
+        run.begin("approach")
+        run.move(start)
+        run.begin("descend")
+        run.move(rest[0], tcp_speed=_SPEED, straight=True)
+        run.begin("push")
+        for pose in rest[1:]:
+            run.move(pose, tcp_speed=tcp_speed, straight=True)
+        run.begin("back_off")
+        if opening > 0.0:  # something round between two fingers would come back with them
+            set_fingers(run, opening + _LET_GO)
+        run.move(away, tcp_speed=_SPEED, straight=True)
+        run.begin("lift")
+        run.move(above(away, approach), tcp_speed=_SPEED, straight=True)
+    return run.result()
+
+
+def set_fingers(run: SkillRun, width: float) -> None:
+    """Move the fingers, if the arm has some, to a width in m."""
+    gripper = run.arm.gripper
+    if gripper is not None:
+        goal = min(width, gripper.width_max)
+        run.close_fingers(lambda: gripper.start(goal))
+
+
+def _whole_way(path: Sequence[Pose], approach: float) -> list[Pose]:
+    """Return all poses that a push visits: above its start, along its path, back from its end, and up."""
+    last, step = path[-1], path[-1].position - path[-2].position
+    length = float(np.linalg.norm(step))
+    back = step * (min(1.0, _BEHIND / length) if length > 0.0 else 0.0)
+    away = Pose(last.position - back, last.orientation)
+    return [above(path[0], approach), *path, away, above(away, approach)]
+
+
+def push_path(
+    found: LocatedObject, goal: ArrayLike, *, height: float = 0.02, clearance: float = 0.012, finger: float = FINGER
+) -> list[Pose]:
+    """Return the poses of the tcp that push an object straight to a goal: behind the object, and short of the goal.
+
+    The tcp's z axis points down and its fingers close across the way, so that both touch the object; if the palm would
+    touch it first, the hand leans back. The side of the box around the object that faces the fingers most is taken to
+    come to lie against them.
+
+    Args:
+        found: The object.
+        goal: Where the middle of the object goes (2,), x and y in the arm's base frame, m.
+        height: Height of the tcp above the table, m; less for a low object.
+        clearance: Least distance of the tcp from the table, m.
+        finger: Distance from the tcp to the front of the fingertips along the tcp's x axis, m.
+
+    Raises:
+        CommandError: The object is at the goal already (``code`` is ``at_the_goal``).
+    """
+    middle = found.pose.position[:2]
+    way = vector("goal", goal, 2) - middle
+    length = float(np.linalg.norm(way))
+    if length < _SAME_PLACE:
+        raise CommandError("the object is at the goal already", code="at_the_goal")
+    way = way / length
+    axes = found.pose.matrix()[:2, :2]
+    side = 0.5 * found.size[int(np.argmax(np.abs(way @ axes)))]
+    behind = float(np.max((middle - found.points[:, :2]) @ way))
+    z = found.table + max(clearance, min(height, 0.4 * found.height))
+    yaw = math.atan2(way[1], way[0])
+    tilt = _lean(found.table + found.height - z, finger)
+
+    def at(distance: float) -> Pose:
+        """Return the pose of the tcp at a distance along the way, m."""
+        return Pose.from_rpy([*(middle + distance * way), z], (math.pi, -tilt, yaw))
+
+    return [at(-behind - finger - _BEHIND), at(max(length - side, -behind) - finger)]
+
+
+def _lean(height: float, finger: float) -> float:
+    """Return the least angle by which the hand leans back, so that its palm does not touch the object, rad.
+
+    Args:
+        height: Height of the object above the tcp, m.
+        finger: Distance from the tcp to the front of the fingertips, m.
+    """
+    for lean in np.radians(range(0, 35, 5)):
+        ahead, up = PALM @ np.array([[math.cos(lean), math.sin(lean)], [-math.sin(lean), math.cos(lean)]])
+        if up > height + _ROOM or ahead < finger:
+            break
+    return float(lean)
+
+
+def push_to(
+    arm: Robot,
+    locate: Callable[[], LocatedObject | None],
+    goal: ArrayLike,
+    *,
+    tolerance: float = 0.005,
+    tries: int = 4,
+    opening: float = 0.02,
+    **motion: Any,
+) -> SkillResult:
+    """Push an object to a goal: find it, push it, and correct what is left, until it is there.
+
+    Args:
+        arm: The arm.
+        locate: Finds the object, as ``lambda: locate_by_truth(rig, arm, "cube")``; None if it is not seen.
+        goal: Where the middle of the object goes (2,), x and y in the arm's base frame, m.
+        tolerance: Distance from the goal at which it is there, m.
+        tries: Greatest number of pushes.
+        opening: Distance between the fingers while they push, m.
+        **motion: Further arguments of :func:`push`.
+
+    Returns:
+        The result; its reason is also ``not_seen`` or ``off_goal``, or that of the push which failed.
+
+    Raises:
+        CommandError: An invalid argument. The other errors are those of :func:`push`.
+    """
+    target = vector("goal", goal, 2)
+    options = {name: motion[name] for name in ("deadman", "unattended", "patience", "progress") if name in motion}
+    run = SkillRun("push_to", arm, ("locate", "push"), **options)
+    with run:
+        for left in range(whole("tries", tries, least=1), -1, -1):
+            run.begin("locate")
+            found = locate()
+            if found is None:
+                run.fail("not_seen", "no object was seen on the table")
+            off = float(np.linalg.norm(found.pose.position[:2] - target))
+            if off <= tolerance:
+                break
+            if not left:
+                run.fail("off_goal", f"after {tries} pushes the object is {1e3 * off:.0f} mm from the goal")
+            run.begin("push")
+            pushed = push(arm, push_path(found, target), opening=opening, **motion)
+            if not pushed:
+                run.fail(pushed.reason, f"{pushed.phase}: {pushed.message}")
+    return run.result()
