@@ -159,8 +159,8 @@ class Rig:
             self._note_refused_priority()
         if world_host is not None:
             self.world = World(world_host.request, partial(self._world_edited, world_host))
-            self.notes.extend(world_host.request("warnings"))
         for host in self._hosts:
+            self.notes.extend(host.request("warnings"))
             for spec in host.spec.robots:
                 gripper, collisions = self._gripper_of(spec), plan.collisions
                 robot = Robot(spec, host, self.clock, self._latch, gripper, collisions, self.robots)

@@ -81,7 +81,7 @@ class Robot:
         self._kinematics: Kinematics | None = None
         self._collision_spec = collisions
         self._collisions: Collisions | None = None
-        self._others = others or {}
+        self._others = {} if others is None else others
         self._dynamics: Dynamics | None = None
         self.gripper = gripper
         """Gripper on this arm; None if the model has none."""

@@ -225,6 +225,8 @@ class Limited(IntFlag):
     """The device did not take the last set-point; the motion continues from the position that it reports."""
     TORQUE = 128
     """The commanded torques, or those of the controller, were cut to the torque limits."""
+    COLLISION = 256
+    """The arm is near itself, a box or another arm; the motion towards it was slowed or stopped."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -27,6 +27,7 @@ from ..servo.servo import Servo
 from ..specs import GroupSpec, RobotSpec
 from ..types import RobotStatus
 from .gripper_unit import GripperUnit
+from .guards import guard_arms
 from .records import AppRecord, GripperMail, GroupMemory, Marks, RobotMail, ServoRecord
 
 __all__ = [
@@ -414,6 +415,7 @@ class Cycle:
             self.world = registry.load(spec.world.driver, "world")(spec.world)
         self.arms = {r.name: ArmUnit(r, self.dt, memory.robots[r.name], self.world) for r in spec.robots}
         self._arm_units = tuple(self.arms.values())
+        self.notes = guard_arms(self.arms, spec.collisions)
         self.grippers: dict[str, GripperUnit] = {}
         for gripper in spec.grippers:
             driver = registry.load(gripper.driver, "gripper")(gripper, self.world)
@@ -524,8 +526,8 @@ class Cycle:
         self.grippers[gripper].driver.inject(**faults)
 
     def _do_warnings(self) -> list[str]:
-        """Return what the simulation had to change in the files that it loaded."""
-        return list(getattr(self.world, "warnings", ()))
+        """Return what the simulation had to change in the files that it loaded, and which collisions are not seen."""
+        return [*getattr(self.world, "warnings", ()), *self.notes]
 
     def _do_statistics(self) -> dict[str, Any]:
         return {

@@ -41,7 +41,7 @@ def groups_of(plan: Plan) -> list[GroupSpec]:
     whose driver needs a process of its own. In lock-step the first group runs in the caller's process, and the others,
     if there are any, keep in step with it.
     """
-    world, clock = plan.world, plan.clock
+    world, clock, collisions = plan.world, plan.clock, plan.collisions
     inside = tuple(r for r in plan.robots if world is not None and r.driver == world.driver)
     outside = tuple(r for r in plan.robots if r not in inside)
     apart = [
@@ -54,14 +54,18 @@ def groups_of(plan: Plan) -> list[GroupSpec]:
         if _is_alone(robot, clock):
             shared.setdefault(robot.group or robot.name, []).append(robot)
     alone = [
-        GroupSpec("+".join(r.name for r in arms), clock, arms[0].rate_hz, tuple(arms), grippers=_grippers(arms))
+        GroupSpec(
+            "+".join(r.name for r in arms), clock, arms[0].rate_hz, tuple(arms), None, _grippers(arms), collisions
+        )
         for arms in shared.values()
     ]
     if clock == "lock_step":
         robots = inside + tuple(r for r in outside if not r.emulated)
         rate = world.physics_hz if world else max((r.rate_hz for r in outside), default=240.0)
-        return [GroupSpec("simulation", clock, rate, robots, world, _grippers(robots)), *alone, *apart]
-    groups = [GroupSpec("simulation", clock, world.physics_hz, inside, world, _grippers(inside))] if world else []
+        return [GroupSpec("simulation", clock, rate, robots, world, _grippers(robots), collisions), *alone, *apart]
+    groups = []
+    if world is not None:
+        groups = [GroupSpec("simulation", clock, world.physics_hz, inside, world, _grippers(inside), collisions)]
     return groups + alone + apart
 
 

@@ -10,7 +10,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import combinations, product
-from math import isfinite
+from math import isfinite, sqrt
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -35,6 +35,10 @@ _SAMPLES = 300
 """Random positions in which pairs are tried that may always touch."""
 _MOSTLY = 0.25
 """Two links that touch in this share of them are left out: their shapes are too coarse to tell more."""
+_RESERVE = 0.05
+"""After all pairs were looked at, the joints can turn so far before that is done again, rad."""
+_RING = 16
+"""Points on the outline of a circle."""
 _SHARE_AT_HOME = 0.5
 """Two links that are near each other at home keep this share of that distance, if it is less than the margin."""
 
@@ -56,13 +60,13 @@ class PairDistance:
 
 
 class CollisionModel:
-    """Distances between the links of some arms, and between these and the boxes of a rig.
+    """Distances of an arm's links from each other, from the boxes of a rig, and from the links of other arms.
 
     Joint positions are those of all arms in their order, (n,) with n the sum of their numbers of joints. An object has
     scratch memory, so every thread needs its own.
 
     Args:
-        robots: The arms.
+        robots: The arm, and the others that it must not touch. Pairs of others among themselves are not checked.
         spec: What is checked.
 
     Raises:
@@ -119,10 +123,6 @@ class CollisionModel:
         """Return the names of pair ``k``, with this distance (m)."""
         return PairDistance(*self._scene.names[k], distance)
 
-    def between_arms(self, k: int) -> bool:
-        """Return whether pair ``k`` is of two arms."""
-        return bool(self._scene.between[k])
-
     def shapes(self) -> Iterator[tuple[str, Any, Array]]:
         """Yield the owner, coal's shape and the pose (4, 4) in the world of each shape, where they were placed last."""
         for name, shape, placed in zip(
@@ -135,7 +135,8 @@ class PairBounds:
     """Distances of all pairs of a model, computed only where a bound from an earlier position does not suffice.
 
     No distance changes by more than the levers times the way of the joints. So a distance that was computed once is a
-    bound for every position around, and only pairs that may be too near are computed again.
+    bound for every position around, and only pairs that may be too near are computed again. All pairs are looked at
+    only after the joints have turned a little; in between those few that are near.
     """
 
     def __init__(self, model: CollisionModel) -> None:
@@ -143,48 +144,86 @@ class PairBounds:
         self.distances: Array = np.full(model.count, -np.inf)
         """Distances (pairs,), m, at the positions where each was computed last: of the pairs that :meth:`near` returns,
         those at its ``q``."""
-        self._at: Array = np.zeros((model.count, model.n))
-        self._lengths: Array = np.linalg.norm(model.levers, axis=1)
-        self._lengths[self._lengths == 0.0] = 1.0
         self.room = 0.0
-        """No pair can be nearer than the ``least`` of the last call of :meth:`near`, with its ways, as long as the
-        joints are within this distance (Euclidean, rad) of the positions of that call."""
+        """No pair can get under the ``least`` of the last call of :meth:`near` as long as the joints are, with the ways
+        that they still go, within this distance (Euclidean, rad) of the positions of that call."""
+        self._at: Array = np.zeros((model.count, model.n))
+        self._lengths: Array = np.maximum(np.linalg.norm(model.levers, axis=1), 1e-9)
+        self._least: Array | None = None
+        self._centre: Array = np.zeros(model.n)
+        """Where all pairs were looked at last, rad, and the room of those that are not in the list of near ones."""
+        self._rest = -1.0
+        self._few: NDArray[np.intp] = np.empty(0, np.intp)
+        """The near pairs, and their rows of the arrays above."""
+        self._few_levers = model.levers
+        self._few_lengths = self._lengths
+        self._few_least: Array = self._lengths
 
     def near(self, q: Array, way: Array, least: Array) -> list[int]:
-        """Return the pairs that may come nearer than ``least`` (pairs,), m, on a way that begins at ``q`` (n,), rad.
+        """Return the pairs that may get under ``least`` (pairs,), m, on a way that begins at ``q`` (n,), rad.
 
         Args:
             q: Joint positions (n,), rad.
             way: How far each joint may move from there at most (n,), rad.
-            least: Distance of each pair, m.
+            least: Distance of each pair, m; not to be changed between calls.
         """
+        moved = q - self._centre
+        left = self._rest - sqrt(moved.dot(moved))
+        if least is not self._least or left < sqrt(way.dot(way)):
+            return self._look_at_all(q, way, least)
+        few = self._few
+        if not len(few):
+            self.room = left
+            return []
+        bounds = self.distances[few] - (self._few_levers * np.abs(self._at[few] - q)).sum(axis=1)
+        found = self._compute(q, few, bounds, self._few_levers @ way + self._few_least)
+        self.room = max(0.0, min(left, float(((bounds - self._few_least) / self._few_lengths).min())))
+        return found
+
+    def _look_at_all(self, q: Array, way: Array, least: Array) -> list[int]:
         levers = self.model.levers
-        on_the_way = levers @ way + least
+        everything = np.arange(self.model.count)
+        needed = levers @ way + least
         bounds = self.distances - (levers * np.abs(self._at - q)).sum(axis=1)
-        found = np.flatnonzero(bounds < on_the_way)
-        if len(found):
-            model = self.model
-            model.place(q)
-            fresh = model.distances() if 3 * len(found) > model.count else None
-            if fresh is not None:
-                self.distances, bounds = fresh, fresh
-                self._at[:] = q
-            else:
-                now = [model.distance(int(k)) for k in found]
-                self.distances[found] = bounds[found] = now
-                self._at[found] = q
-            found = np.flatnonzero(bounds < on_the_way)
-        self.room = max(0.0, float(((bounds - least) / self._lengths).min())) if self.model.count else float("inf")
-        return [int(k) for k in found]
+        self._compute(q, everything, bounds, needed + _RESERVE * self._lengths)
+        rooms = (bounds - least) / self._lengths
+        near = rooms < sqrt(way.dot(way)) + _RESERVE
+        self._least, self._centre = least, q.copy()
+        self._rest = float(rooms[~near].min(initial=np.inf))
+        self._few = np.flatnonzero(near)
+        self._few_levers, self._few_lengths = levers[near], self._lengths[near]
+        self._few_least = least[near]
+        self.room = max(0.0, float(rooms.min(initial=np.inf)))
+        # All that may be under it have just been computed: what is below the greater need includes them.
+        return [int(k) for k in np.flatnonzero(bounds < needed)]
+
+    def _compute(self, q: Array, pairs: NDArray[np.intp], bounds: Array, needed: Array) -> list[int]:
+        """Compute the pairs whose bounds (m, changed in place) are below what is needed; return those still below."""
+        low = np.flatnonzero(bounds < needed)
+        if not len(low):
+            return []
+        model = self.model
+        model.place(q)
+        if 2 * len(low) > model.count:
+            self.distances = model.distances()
+            self._at[:] = q
+            bounds[:] = self.distances[pairs]
+        else:
+            for i in low:
+                k = int(pairs[i])
+                self.distances[k] = bounds[i] = model.distance(k)
+                self._at[k] = q
+        return [int(k) for k in pairs[low[bounds[low] < needed[low]]]]
 
     def nearest(self, q: Array) -> tuple[int, float]:
         """Return the nearest pair at ``q`` (n,), rad, and its distance, m."""
+        if not self.model.count:
+            raise NotSupported("no collisions are checked for this arm", code="nothing_checked")
         self.model.place(q)
-        distances = self.model.distances()
-        self.distances = distances
+        self.distances = self.model.distances()
         self._at[:] = q
-        k = int(np.argmin(distances))
-        return k, float(distances[k])
+        k = int(np.argmin(self.distances))
+        return k, float(self.distances[k])
 
 
 # The scene: built once for each set of arms and boxes.
@@ -203,7 +242,6 @@ class _Scene:
     owners: tuple[str, ...]
     names: tuple[tuple[str, str], ...]
     indices: tuple[tuple[int, int], ...]
-    between: NDArray[np.bool_]
     levers: Array
     margins: Array
     notes: tuple[str, ...]
@@ -262,12 +300,14 @@ def _scene(arms: tuple[_Arm, ...], spec: CollisionSpec) -> _Scene:
 
     reach = _reach(model, geometry, columns, pin)
     moved_by = reach > 0.0
-    names, indices, between, levers, margins = [], [], [], [], []
+    names, indices, levers, margins = [], [], [], []
     for i, j in combinations(range(len(place)), 2):
         (a, _, link_a), (b, _, link_b) = place[i], place[j]
         margin = spec.margin
+        if a != 0 and b != 0:  # not of the first arm
+            continue
         if a == b:
-            apart = loaded[a].pairs.get((link_a, link_b)) if spec.own and a >= 0 else None
+            apart = loaded[a].pairs.get((link_a, link_b)) if spec.own else None
             if apart is None:
                 continue
             margin = min(margin, _SHARE_AT_HOME * apart)
@@ -279,12 +319,9 @@ def _scene(arms: tuple[_Arm, ...], spec: CollisionSpec) -> _Scene:
         geometry.addCollisionPair(pin.CollisionPair(i, j))
         names.append((owners[i], owners[j]))
         indices.append((i, j))
-        between.append(a != b and min(a, b) >= 0)
         levers.append(np.where(alone, reach[i] + reach[j], 0.0))
         margins.append(margin)
     n = len(columns)
-    prefixes = [f"{name}: " if several else "" for name, *_ in arms]
-    notes = [before + note for before, arm in zip(prefixes, loaded, strict=True) for note in arm.notes]
     return _Scene(
         model=model,
         geometry=geometry,
@@ -293,10 +330,9 @@ def _scene(arms: tuple[_Arm, ...], spec: CollisionSpec) -> _Scene:
         owners=tuple(owners),
         names=tuple(names),
         indices=tuple(indices),
-        between=np.array(between, bool),
         levers=np.array(levers, float).reshape(-1, n),
         margins=np.array(margins, float),
-        notes=tuple(notes) if spec.own else (),
+        notes=tuple(f"{arms[0][0]}: {note}" for note in loaded[0].notes) if spec.own else (),
     )
 
 
@@ -321,26 +357,61 @@ def _add(pin: Any, geometry: Any, joint: int, placement: Any, shape: Any) -> Non
 def _reach(model: Any, geometry: Any, columns: Sequence[int], pin: Any) -> Array:
     """Return the levers (shapes, n): how far a shape moves at most, in m, for each rad of a joint.
 
-    They are 0 for joints that do not move it. A point of the shape is no farther from a joint than along the links
-    between them.
+    They are 0 for joints that do not move it. The joint that carries a shape moves it around its axis; to a joint
+    before that, no point is farther than along the links between them.
     """
     reach = np.zeros((geometry.ngeoms, len(columns)))
     of_joint = {column: k for k, column in enumerate(columns)}
+    axes = _axes(model, pin)
     for i, item in enumerate(geometry.geometryObjects):
-        shape, joint = item.geometry, int(item.parentJoint)
-        shape.computeLocalAABB()
-        centre = item.placement.act(np.array(shape.aabb_center).ravel())
-        distance = float(np.linalg.norm(centre)) + float(shape.aabb_radius)
+        joint = int(item.parentJoint)
+        points = np.array([item.placement.act(point) for point in _outline(item.geometry)])
+        distance = float(np.linalg.norm(points, axis=1).max())
+        lever = float(np.linalg.norm(np.cross(points, axes[joint]), axis=1).max()) if joint else 0.0
         while joint > 0:
             slides = "JointModelP" in model.joints[joint].shortname()
             column = int(model.joints[joint].idx_q)
             if slides:
                 span = abs(model.lowerPositionLimit[column]), abs(model.upperPositionLimit[column])
                 distance += max(x if isfinite(x) else 0.0 for x in span)
-            reach[i, of_joint[column]] = max(distance, 1.0) if slides else distance
+            reach[i, of_joint[column]] = 1.0 if slides else lever
             distance += float(np.linalg.norm(model.jointPlacements[joint].translation))
+            lever = distance
             joint = int(model.parents[joint])
     return reach
+
+
+def _axes(model: Any, pin: Any) -> Array:
+    """Return the axis (3,) of each joint in its own frame; zeros for the first, which is the world."""
+    data = model.createData()
+    jacobian = pin.computeJointJacobians(model, data, pin.neutral(model))
+    axes = np.zeros((model.njoints, 3))
+    for k in range(1, model.njoints):
+        column = jacobian[:, int(model.joints[k].idx_v)]
+        axes[k] = data.oMi[k].rotation.T @ column[3:]
+    return axes
+
+
+def _outline(shape: Any) -> Array:
+    """Return points (k, 3) whose hull contains a shape of coal."""
+    kind = type(shape).__name__
+    if kind == "Box":
+        return _corners(np.array(shape.halfSide).ravel())
+    if kind == "Sphere":
+        return _corners(np.full(3, shape.radius))
+    if kind in ("Cylinder", "Capsule"):
+        angles = np.linspace(0.0, 2.0 * np.pi, _RING, endpoint=False)
+        ring = shape.radius / np.cos(np.pi / _RING) * np.column_stack([np.cos(angles), np.sin(angles)])
+        half = shape.halfLength + (shape.radius if kind == "Capsule" else 0.0)
+        return np.vstack([np.column_stack([ring, np.full(_RING, z)]) for z in (-half, half)])
+    points: Array = np.array(shape.points())
+    return points
+
+
+def _corners(half: Array) -> Array:
+    """Return the corners (8, 3) of a box with these half sides (3,)."""
+    corners: Array = half * np.array(list(product((-1.0, 1.0), repeat=3)))
+    return corners
 
 
 # One arm.
@@ -447,8 +518,7 @@ def _points(shape: UrdfVisual, link: str) -> Array:
         radius, length = shape.size
         caps = radius if shape.shape == "capsule" else 0.0
         half = np.array([radius, radius, 0.5 * length + caps])
-    corners: Array = half * np.array(list(product((-1.0, 1.0), repeat=3)))
-    return corners
+    return _corners(half)
 
 
 def _hull(points: Array, link: str) -> Any:

@@ -1,4 +1,4 @@
-"""The room that a session leaves the arm: joint speeds, the tcp's speed, the workspace."""
+"""The room that a session leaves the arm: joint speeds, the tcp's speed, the workspace, what it must not touch."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from ..commands import Session
 from ..kinematics.arm import Kinematics, Pose7
 from ..specs import WorkspaceSpec
 from ..types import Limited
+from .collisions import CollisionGuard
 from .smoothing import Guard, JointSmoother, speed_for, stop_displacement, stop_phases
 
 if TYPE_CHECKING:
@@ -355,6 +356,8 @@ class Envelope:
         """Check that a proposed step must pass beyond joint limits; None if there is none."""
         self._refused = Limited.NONE
         """Why the guard refused the last step."""
+        self.collisions: CollisionGuard | None = None
+        """Keeps the arm off itself, off boxes and off other arms; None if nothing is checked."""
         self._tcp = TcpReference(smoother, kinematics, workspace)
 
     def open(self, session: Session) -> None:
@@ -364,7 +367,10 @@ class Envelope:
         self._tcp.open(self.velocity)
         self.tcp_speed = session.tcp_speed
         self.goal_tcp_speed = _TCP_SHARE * session.tcp_speed
-        self.guard = None if self.workspace is None and self.tcp_speed >= UNLIMITED else self.allows
+        if self.collisions is not None:
+            self.collisions.open(self.velocity)
+        free = self.workspace is None and self.tcp_speed >= UNLIMITED and self.collisions is None
+        self.guard = None if free else self.allows
 
     # Goals: smooth caps, so that the hard checks below seldom have to act.
 
@@ -376,7 +382,7 @@ class Envelope:
             return False
         if self.tcp_speed < UNLIMITED and not self._tcp.surely_slower(dq, self.goal_tcp_speed):
             return False
-        return self.far_from_faces()
+        return self.far_from_faces() and (self.collisions is None or self.collisions.is_far(dq))
 
     def cap_joints(self, dq: list[float]) -> list[float]:
         """Return goal velocities (n,), rad/s, cut to the session's speed and to braking before a limit."""
@@ -400,12 +406,18 @@ class Envelope:
         return dq if scale == 1.0 else [scale * v for v in dq]
 
     def cap_tcp(self, dq: list[float]) -> tuple[list[float], bool]:
-        """Scale a goal velocity to the limits of the tcp's speed and of the workspace, also in a stop from there.
+        """Scale a goal velocity to the limits of the tcp's speed, of the workspace and of what is near.
+
+        They are kept in a stop from there as well.
 
         Returns:
             The goal, and whether the joints must change their speeds in proportion on the way there: each by itself,
             they might move the tcp too fast in between.
         """
+        if self.collisions is not None:
+            dq = self.collisions.slow(dq)
+            if self.collisions.slowed:
+                self.limited |= Limited.COLLISION
         if self.tcp_speed >= UNLIMITED and self.workspace is None:
             return dq, False
         fast = not self._tcp.surely_slower(dq, self.goal_tcp_speed)
@@ -499,9 +511,25 @@ class Envelope:
         """Note that a step was refused because the tcp would be too fast."""
         self._refused = Limited.TCP_SPEED
 
+    def keeps_apart(self) -> bool:
+        """Return whether the arm touches nothing in the proposed step and in the stop after it."""
+        if self.collisions is None or self.collisions.allows():
+            return True
+        self._refused = Limited.COLLISION
+        return False
+
+    @property
+    def blocked(self) -> bool:
+        """Whether the last step that was refused would have touched something."""
+        return self._refused is Limited.COLLISION
+
+    def allows_on_path(self, smoother: JointSmoother) -> bool:
+        """Return whether a step along a path that was checked before keeps the tcp's speed, and touches nothing."""
+        return self.keeps_tcp_speed(smoother) and self.keeps_apart()
+
     def allows(self, smoother: JointSmoother) -> bool:
-        """Return whether a step passes both :meth:`keeps_tcp_speed` and :meth:`stays_inside`."""
-        return self.keeps_tcp_speed(smoother) and self.stays_inside(smoother)
+        """Return whether a step passes :meth:`keeps_tcp_speed`, :meth:`stays_inside` and :meth:`keeps_apart`."""
+        return self.keeps_tcp_speed(smoother) and self.stays_inside(smoother) and self.keeps_apart()
 
     def note(self, smoother: JointSmoother) -> None:
         """Collect what the last step held back."""

@@ -350,6 +350,10 @@ _SAMPLES = 64
 _SLOWER = 0.8
 """After a step that the guard refused, the rest of the path is planned at this share of the speed before."""
 
+SLOWEST = 0.1
+RETRY = 0.1
+"""Behind something in its way an arm waits so long, s, and continues at this share of the speed at least."""
+
 _HERE = 1e-9
 """A goal this near needs no motion, rad."""
 
@@ -379,6 +383,10 @@ class PathMotion(ServoMotion):
         self._planned = False
         self._share = 1.0
         """Share of the greatest speed at which the path is planned."""
+        self._begun = False
+        """Whether the arm has moved since the path was planned."""
+        self._t_retry = 0.0
+        """Time until which the arm waits for what is in its way, s."""
         self._ruckig = Ruckig(1, smoother.dt)
         self._input = InputParameter(1)
         self._output = OutputParameter(1)
@@ -421,7 +429,9 @@ class PathMotion(ServoMotion):
     def step(self, now: float) -> None:
         smoother = self.smoother
         if not self._planned:
-            if not smoother.at_rest():
+            if now < self._t_retry:
+                self.envelope.limited |= Limited.COLLISION
+            if not smoother.at_rest() or now < self._t_retry:
                 smoother.stop()
                 return
             self._plan()
@@ -447,14 +457,22 @@ class PathMotion(ServoMotion):
         left = inputs.target_position[0] - s
         self.progress = max(0.0, 1.0 - left / self._whole_way) if self._whole_way > 0.0 else 0.0
         q = [x + s * d for x, d in zip(self._from, along, strict=True)]
-        if not smoother.adopt(q, [ds * d for d in along], [dds * d for d in along], self.envelope.keeps_tcp_speed):
+        if not smoother.adopt(q, [ds * d for d in along], [dds * d for d in along], self.envelope.allows_on_path):
             # Stop, and continue more slowly: at the same speed the same step might be refused for ever.
-            self._share *= _SLOWER
             self._planned = False
+            if not self.envelope.blocked:
+                self._share *= _SLOWER
+                return
+            if self._begun:  # else it waits for what is in its way
+                self._share = max(SLOWEST, _SLOWER * self._share)
+            self._t_retry = now + RETRY
+        else:
+            self._begun = True
 
     def _plan(self) -> None:
         smoother, envelope = self.smoother, self.envelope
         self._planned = True
+        self._begun = False
         self._from = list(smoother.q)
         delta = [goal - x for goal, x in zip(self._goal, self._from, strict=True)]
         length = max(map(abs, delta))

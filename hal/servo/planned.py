@@ -13,8 +13,9 @@ from math import dist, inf, isfinite
 from ..commands import PATH_KNOTS, CommandRecord, PathSection
 from ..errors import CommandError
 from ..specs import LimitsSpec
+from ..types import Limited
 from .envelope import UNLIMITED, Envelope
-from .joint import ServoMotion
+from .joint import RETRY, SLOWEST, ServoMotion
 from .path import JointPath, Leg, Zone, ZonePlanner, zones_of
 from .smoothing import JointSmoother
 
@@ -80,6 +81,8 @@ class PlannedMotion(ServoMotion):
         self._at: Floats = ()
         """The set-point that the last step made."""
         self._share = 1.0
+        self._waits = 0
+        """Number of ticks for which the arm still waits for what is in its way."""
 
     @property
     def progress(self) -> float:
@@ -124,6 +127,7 @@ class PlannedMotion(ServoMotion):
         self._leg = None
         self._at = ()
         self._share = 1.0
+        self._waits = 0
         self.arrived = self.lost = self._stopping = False
 
     def start(self) -> None:
@@ -143,6 +147,10 @@ class PlannedMotion(ServoMotion):
             smoother.stop()
         elif self._leg is not None:
             self._follow_leg()
+        elif self._waits > 0:
+            self._waits -= 1
+            self.envelope.limited |= Limited.COLLISION
+            smoother.stop()
         elif not smoother.at_rest():
             smoother.stop()
         elif self._returns():
@@ -179,11 +187,17 @@ class PlannedMotion(ServoMotion):
         v, a = self._v, self._a
         dq = [x * v for x in first]
         ddq = [x * a + y * v * v for x, y in zip(first, second, strict=True)]
-        if smoother.adopt(q, dq, ddq, self._keeps_tcp_speed):
+        if smoother.adopt(q, dq, ddq, self._allows):
             self._at = smoother.q
-        else:  # stops joint by joint, comes back to the path, and continues more slowly
+            return
+        # It stops joint by joint, comes back to the path, and continues more slowly.
+        if not self.envelope.blocked:
             self._share *= _SLOWER
-            self._leg, self._at = None, ()
+        else:  # by another arm, which may leave: the whole path was free
+            if self._at:
+                self._share = max(SLOWEST, _SLOWER * self._share)
+            self._waits = round(RETRY / smoother.dt)
+        self._leg, self._at = None, ()
 
     def _begin_leg(self, speed: float) -> None:
         """Plan from the present place, at ``speed`` (v) and no acceleration, to the end of the zone."""
@@ -229,6 +243,10 @@ class PlannedMotion(ServoMotion):
         elif done:
             self._section += 1
             self._zone, self._s = 0, 0.0
+
+    def _allows(self, smoother: JointSmoother) -> bool:
+        """Return whether the proposed step keeps the tcp's speed limit, and touches nothing."""
+        return self._keeps_tcp_speed(smoother) and self.envelope.keeps_apart()
 
     def _keeps_tcp_speed(self, smoother: JointSmoother) -> bool:
         """Return whether the tcp keeps its speed limit in the proposed step. A stop on the path is no faster."""

@@ -22,6 +22,7 @@ from ..specs import RobotSpec
 from ..types import ControlMode, Limited, RobotStatus, Trip
 from .anchoring import Anchoring
 from .cartesian import PoseMotion, TwistMotion
+from .collisions import CollisionGuard
 from .compliance import Compliance
 from .controllers import Controller
 from .envelope import Envelope
@@ -162,6 +163,15 @@ class Servo:
     def active(self) -> bool:
         """Whether a session is open or still braking."""
         return self._session is not None
+
+    @property
+    def smoother(self) -> JointSmoother:
+        """The set-point."""
+        return self._smoother
+
+    def set_guard(self, guard: CollisionGuard | None) -> None:
+        """Keep the arm off what ``guard`` checks, from the next session on."""
+        self._envelope.collisions = guard
 
     def anchor(self, q: Floats, dq: Floats | None = None) -> None:
         """Set the set-point and discard every goal. Nothing moves.

@@ -10,7 +10,7 @@ const MOVING = 0.005; // rad/s; slower joints are at rest
 /** Status of a robot -> label. @type {Record<string, string>} */
 const WORDS = { idle: "idle", holding: "stopped", tripped: "stopped" };
 /** What limits a motion -> label. @type {Record<string, string>} */
-const LIMITS = { speed: "joint speed", "tcp speed": "tool speed" };
+const LIMITS = { speed: "joint speed", "tcp speed": "tool speed", collision: "something near" };
 
 /** Trip -> text, where a page is the pad. @type {Record<string, string>} */
 const PAGE_TRIPS = {

@@ -1,0 +1,42 @@
+"""Two simulated arms that are driven at each other stop apart, and a rig names what is not checked."""
+
+from __future__ import annotations
+
+import runpy
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import hal
+
+SCRIPT = Path(__file__).parents[2] / "benchmarks" / "collisions.py"
+POINTED = [0.0, 0.6, 0.0, -1.2, 0.0, 1.8, 0.8]
+
+
+def test_two_arms_driven_at_each_other_stop_apart() -> None:
+    found = runpy.run_path(str(SCRIPT))["arms"](1)
+    assert found["5 mm apart or more"] == found["came within 20 mm"] == 1
+
+
+def test_a_motion_into_another_arm_is_refused_before_anything_moves() -> None:
+    facing = {"position": [0.8, 0, 0], "orientation": [0, 0, 1, 0]}
+    robots = {"left": {"model": "panda"}, "right": {"model": "panda", "base": facing}}
+    with hal.open({"robots": robots}, driver="mock", clock="lock_step", pad="none") as rig:
+        left = rig.robots["left"]
+        before = left.state()
+        with pytest.raises(hal.CollisionError) as caught:
+            left.move_to(POINTED, timeout=10.0)
+        assert caught.value.first.startswith("left/")
+        assert caught.value.second.startswith("right/")
+        assert 0.0 < caught.value.along < 1.0
+        assert np.array_equal(left.state().q_set, before.q_set)
+
+
+@pytest.mark.parametrize(("apart", "overlaps"), [(0.0, False), (0.05, True), (1.2, False)])
+def test_arms_that_overlap_at_the_start_are_named(apart: float, overlaps: bool) -> None:
+    robots = {"one": {"model": "panda"}, "two": {"model": "panda", "base": {"position": [apart, 0, 0]}}}
+    with hal.open({"robots": robots}, driver="mock", clock="lock_step", pad="none") as rig:
+        notes = [note for note in rig.notes if "one" in note and "two" in note]
+        assert bool(notes) == (apart < 1.0)
+        assert any("one/panda_link" in note for note in notes) == overlaps

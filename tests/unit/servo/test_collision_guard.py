@@ -1,0 +1,148 @@
+"""The servo keeps an arm off itself, off boxes and off other arms, whatever is commanded."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from hal.commands import NO_INBOX, CommandRecord, Inbox, Kind, Session
+from hal.config import load
+from hal.driver import Reading
+from hal.kinematics.collision_model import CollisionModel
+from hal.servo.audit import SetpointAudit
+from hal.servo.collisions import CollisionGuard, Neighbour
+from hal.servo.servo import Servo
+from hal.specs import BoxSpec, CollisionSpec, RobotSpec
+from hal.types import Limited
+
+RATE_HZ = 240.0
+TABLE = BoxSpec("table", (0.55, 0.0, -0.025), (0.0, 0.0, 0.0, 1.0), (1.5, 1.0, 0.05))
+OVER_THE_TABLE = (0.0, 0.45, 0.0, -2.1, 0.0, 2.55, 0.785)
+"""The hand points down, some 15 cm above the table."""
+Values = Callable[[float], Sequence[float]]
+
+
+@pytest.fixture(scope="module")
+def panda() -> RobotSpec:
+    return load({"robots": {"arm": {"model": "panda"}}}, sim=True, driver="mock").resolve().robots[0]
+
+
+class Bench:
+    """A servo whose set-points are taken at once."""
+
+    def __init__(
+        self, spec: RobotSpec, collisions: CollisionSpec | None, others: Sequence[tuple[RobotSpec, Neighbour]] = ()
+    ) -> None:
+        self.spec = spec
+        self.servo = Servo(spec, 1.0 / RATE_HZ)
+        self.model = CollisionModel([spec, *(r for r, _ in others)], collisions or CollisionSpec(own=False))
+        if collisions is not None:
+            self.servo.set_guard(CollisionGuard(self.model, self.servo.smoother, [n for _, n in others]))
+        self.others = [neighbour for _, neighbour in others]
+        self.seen = Limited.NONE
+        self.nearest = math.inf
+        self.track: list[list[float]] = []
+
+    def distance(self) -> float:
+        self.model.place([*self.servo.smoother.q, *(x for other in self.others for x in other()[0])])
+        return float((self.model.distances() - self.model.margins).min(initial=math.inf))
+
+    def start(self, q: Sequence[float], move_to: Sequence[float] | None = None) -> None:
+        servo = self.servo
+        servo.anchor(list(q))
+        goal = None if move_to is None else tuple(move_to)
+        servo.open_session(Session(1, 0.3, 0.25, False, goal), NO_INBOX)
+        self.audit = SetpointAudit(self.spec.limits, 1.0 / RATE_HZ)
+        self.now, self.seq = 10.0, 0
+        self.seen, self.nearest, self.track = Limited.NONE, math.inf, []
+
+    def run(self, seconds: float, kind: Kind | None = None, values: Values | None = None) -> None:
+        servo, command = self.servo, None
+        for k in range(round(seconds * RATE_HZ)):
+            self.now += 1.0 / RATE_HZ
+            if kind is not None and values is not None and k % 5 == 0:
+                self.seq += 1
+                given = tuple(values(k / RATE_HZ))
+                command = CommandRecord(self.seq, 1, self.now, self.now + 0.1, kind, given)
+            reading = Reading(self.now, self.now, self.seq, servo.smoother.q, servo.smoother.dq)
+            setpoint = servo.tick(self.now, reading, Inbox(command, None, 0, 0, self.now))
+            assert setpoint is not None
+            self.audit.add_setpoint(setpoint)
+            self.seen |= servo.report.limited
+            self.nearest = min(self.nearest, self.distance())
+            self.track.append(list(setpoint.q))
+
+
+def twist(*values: float) -> Values:
+    return lambda _: (*values, *([0.0] * (6 - len(values))), 0.0)
+
+
+def test_a_stream_into_the_table_stops_before_the_margin_and_can_leave(panda: RobotSpec) -> None:
+    bench = Bench(panda, CollisionSpec(boxes=(TABLE,)))
+    bench.start(OVER_THE_TABLE)
+    bench.run(1.5, Kind.TWIST, twist(0.0, 0.0, -0.25))
+    assert -1e-4 < bench.nearest < 2e-3
+    assert Limited.COLLISION in bench.seen
+    assert bench.servo.smoother.at_rest()
+    assert max(bench.audit.peaks().values()) <= 1.0 + 1e-6
+    before = bench.distance()
+    bench.run(0.25, Kind.TWIST, twist(0.0, 0.0, 0.2))
+    assert bench.distance() > before + 0.005
+
+
+def test_random_streams_never_get_under_a_margin(panda: RobotSpec) -> None:
+    rng = np.random.default_rng(8)
+    stopped = 0
+    for _ in range(6):
+        bench = Bench(panda, CollisionSpec(boxes=(TABLE,)))
+        bench.start(OVER_THE_TABLE)
+        goals = rng.uniform(-0.6, 0.6, (8, 7)) + [0.0, 0.5, 0.0, 0.0, 0.0, 0.0, 0.0]
+        bench.run(1.2, Kind.JOINT_VELOCITY, lambda t, goals=goals: goals[int(t / 0.15)])  # type: ignore[misc]
+        assert bench.nearest > -1e-4
+        assert max(bench.audit.peaks().values()) <= 1.0 + 1e-6
+        stopped += Limited.COLLISION in bench.seen
+    assert stopped >= 3
+
+
+def test_far_from_everything_the_set_points_are_the_same_to_the_bit(panda: RobotSpec) -> None:
+    checked, free = Bench(panda, CollisionSpec(boxes=(TABLE,))), Bench(panda, None)
+    for bench in (checked, free):
+        bench.start(panda.home)
+        bench.run(0.6, Kind.TWIST, twist(0.1, 0.2, 0.1))
+        bench.run(0.6, Kind.JOINT_VELOCITY, lambda t: [0.3 * math.sin(5.0 * t + k) for k in range(7)])
+    assert checked.track == free.track
+
+
+def test_an_arm_that_starts_inside_the_margin_may_only_leave(panda: RobotSpec) -> None:
+    box = BoxSpec("box", (0.5, 0.0, -0.1), (0.0, 0.0, 0.0, 1.0), (0.3, 0.3, 0.1))
+    bench = Bench(panda, CollisionSpec(boxes=(box,)))
+    bench.start(OVER_THE_TABLE)
+    while bench.distance() > -0.004:  # raise the box until it is inside
+        box = replace(box, position=(0.5, 0.0, box.position[2] + 0.002))
+        bench = Bench(panda, CollisionSpec(boxes=(box,)))
+        bench.start(OVER_THE_TABLE)
+    before = bench.distance()
+    bench.run(0.4, Kind.TWIST, twist(0.0, 0.0, -0.1))
+    assert bench.nearest > before - 1e-4
+    bench.run(0.4, Kind.TWIST, twist(0.0, 0.0, 0.1))
+    assert bench.distance() > before + 0.005
+
+
+def test_move_to_waits_for_an_arm_in_its_way(panda: RobotSpec) -> None:
+    other = replace(panda, name="other", base_position=(1.15, 0.0, 0.0), base_orientation=(0.0, 0.0, 1.0, 0.0))
+    away, in_the_way = (0.0, -1.0, 0.0, -2.6, 0.0, 1.6, 0.8), (0.0, 0.3, 0.0, -1.9, 0.0, 2.2, 0.8)
+    at = list(in_the_way)
+    bench = Bench(panda, CollisionSpec(), [(other, lambda: (at, at))])
+    goal = (0.0, 0.5, 0.0, -1.6, 0.0, 2.1, 0.785)
+    bench.start(panda.home, goal)
+    bench.run(2.5)
+    assert not bench.servo.report.arrived
+    assert bench.nearest > -1e-4
+    assert Limited.COLLISION in bench.servo.report.limited
+    at[:] = away
+    bench.run(8.0)
+    assert bench.servo.report.arrived
