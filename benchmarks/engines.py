@@ -1,6 +1,7 @@
 """The engines of the simulated world as each other's referee: the same runs on each of them.
 
-    python benchmarks/engines.py [--only lock-step|real-time|collect|pictures|speed] [--seconds 5]
+    python benchmarks/engines.py [--only lock-step|real-time|collect|pictures|speed|cameras|hold] [--seconds 5]
+                                 [--robosuite PYTHON]
 
 lock-step   the recorded tour of a gamepad: where the arms end, whether the servo's set-points are equal to the bit, and
             how far the joints are from their set-points.
@@ -8,6 +9,9 @@ real-time   the same tour in real time, twice on each engine.
 collect     two recorded demonstrations: how high each cube is lifted, and the columns of the datasets.
 pictures    two cameras draw the same state after each engine: the share of pixels that differ.
 speed       steps/s of ``RigEnv`` at 20 Hz over 240 Hz without cameras, in turns of one second.
+cameras     the same with two 256x256 RGB-D cameras, and with PyBullet's own renderer; with ``--robosuite``, the path of
+            an interpreter in whose environment robosuite is installed, also the cameras of its task Lift.
+hold        how far the 2 kg cube slips in the fingers while it is lifted by 15 cm, and in 10 s after that.
 """
 
 from __future__ import annotations
@@ -16,6 +20,7 @@ import argparse
 import io
 import itertools
 import statistics
+import subprocess
 import sys
 import tempfile
 import time
@@ -34,6 +39,9 @@ from hal.learning.gym import RigEnv
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "kits"))
 from referee_kit import TOUR, draw_state, drive_tour
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "examples"))
+from pick import above, grasp_pose
 
 ENGINES = [name for name in registry.ENGINES if not registry.missing(name)]
 APART, TURNED = 0.002, 0.01
@@ -139,8 +147,74 @@ def pictures(_: float) -> None:
 
 def speed(seconds: float) -> None:
     """Step an environment on each engine, in turns."""
-    environments = {name: RigEnv("panda_table", engine=name, overrides=("cameras={}",)) for name in ENGINES}
-    rates: dict[str, list[float]] = {name: [] for name in ENGINES}
+    step_in_turns({name: RigEnv("panda_table", engine=name, overrides=("cameras={}",)) for name in ENGINES}, seconds)
+
+
+ROBOSUITE = """
+import os, sys, time
+os.environ.setdefault("MUJOCO_GL", "egl")
+import numpy as np
+import robosuite
+env = robosuite.make(
+    "Lift", robots="Panda", has_renderer=False, has_offscreen_renderer=True, use_camera_obs=True, control_freq=20,
+    camera_names=["frontview", "robot0_eye_in_hand"], camera_heights=256, camera_widths=256, camera_depths=True,
+)
+env.reset()
+still = np.zeros_like(env.action_spec[0])
+env.step(still)
+start, steps = time.perf_counter(), 0
+while time.perf_counter() - start < float(sys.argv[1]):
+    env.step(still)
+    steps += 1
+print(steps / (time.perf_counter() - start))
+"""
+robosuite_python = ""
+"""Interpreter with robosuite; empty for none."""
+
+
+def cameras(seconds: float) -> None:
+    """Step environments with two cameras, in turns; then robosuite."""
+    environments = {name: RigEnv("panda_table", engine=name) for name in ENGINES}
+    if "pybullet" in ENGINES:
+        own = ("simulation.renderer=tiny",)
+        environments["PyBullet's own"] = RigEnv("panda_table", engine="pybullet", overrides=own)
+    step_in_turns(environments, seconds)
+    if robosuite_python:
+        command = [robosuite_python, "-c", ROBOSUITE, str(seconds)]
+        done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=600)
+        print(f"  {'robosuite':16s} {float(done.stdout.split()[-1]):7.1f} steps/s")
+
+
+def hold(_: float) -> None:
+    """Grasp, lift and hold the heavy cube."""
+    for name in ENGINES:
+        for force in (40.0, 60.0):
+            with hal.open(
+                "panda_table", sim=True, engine=name, clock="lock_step", pad="none", overrides=["cameras={}"]
+            ) as rig:
+                arm = rig.robots["panda"]
+                grasp = grasp_pose(arm, rig.world.pose("cube"))
+                arm.move_to(above(grasp), speed=0.5)
+                arm.move_to(grasp, speed=0.2)
+                arm.gripper.grasp(0.03, force=force)
+                seen = [seen_from_hand(rig)]
+                arm.move_to(above(grasp), speed=0.5)
+                seen.append(seen_from_hand(rig))
+                rig.clock.sleep(10.0)
+                seen.append(seen_from_hand(rig))
+                lifted, held = (1e3 * float(np.linalg.norm(b - a)) for a, b in itertools.pairwise(seen))
+                print(f"  {name:9s} {force:g} N: {lifted:.2f} mm while it is lifted, {held:.2f} mm in 10 s")
+
+
+def seen_from_hand(rig: hal.Rig) -> np.ndarray:
+    """Return where the cube is from the tcp (3,), m."""
+    arm = rig.robots["panda"]
+    return ((arm.base @ arm.state().tcp).inverse() @ rig.world.pose("cube")).position
+
+
+def step_in_turns(environments: dict[str, RigEnv], seconds: float) -> None:
+    """Print the steps/s of environments that take turns of a second, and close them."""
+    rates: dict[str, list[float]] = {name: [] for name in environments}
     try:
         actions = {}
         for name, env in environments.items():
@@ -159,7 +233,7 @@ def speed(seconds: float) -> None:
         for env in environments.values():
             env.close()
     for name, values in rates.items():
-        print(f"  {name:9s} {statistics.median(values):7.0f} steps/s")
+        print(f"  {name:16s} {statistics.median(values):7.1f} steps/s")
     for title, a, b in pairs(rates):
         ratio = statistics.median(y / x for x, y in zip(a, b, strict=True))
         print(f"  {title}: the second takes {ratio:.2f} times as many steps")
@@ -171,6 +245,8 @@ PARTS: dict[str, Callable[[float], None]] = {
     "collect": collect,
     "pictures": pictures,
     "speed": speed,
+    "cameras": cameras,
+    "hold": hold,
 }
 
 
@@ -179,7 +255,10 @@ def main() -> None:
     parser = argparse.ArgumentParser(description="the engines of the simulated world beside each other")
     parser.add_argument("--only", choices=[*PARTS], help="one part")
     parser.add_argument("--seconds", type=float, default=5.0, help="seconds for each engine's speed (%(default)g)")
+    parser.add_argument("--robosuite", default="", metavar="PYTHON", help="interpreter in whose environment it is")
     args = parser.parse_args()
+    global robosuite_python
+    robosuite_python = args.robosuite
     print(", ".join(f"{name} {' '.join(registry.versions(name).values())}" for name in ENGINES))
     for name, part in PARTS.items():
         if args.only in (None, name):
