@@ -14,8 +14,11 @@ from specs import cube, data, panda, world_spec
 
 from hal.config import load
 from hal.config.data_files import find_data
+from hal.drivers.franka.arm import FrankaArm
+from hal.drivers.franka.emulator.plant import RigidBody
 from hal.drivers.franka.limits import FR3, LIMITS
 from hal.drivers.franka.settings import check_arm
+from hal.dynamics import Dynamics
 from hal.kinematics.arm import Kinematics
 from hal.specs import RobotSpec
 
@@ -194,6 +197,19 @@ def test_the_pandas_torques_are_those_of_the_published_identification() -> None:
         dq, ddq = random.normal(0.0, 1.0, 7), random.normal(0.0, 5.0, 7)
         ours, published = (pin.rnea(arm, data, q, dq, ddq) for arm, data in models)
         assert ours == pytest.approx(published, abs=1e-3)
+
+
+@pytest.mark.parametrize("model", ["fr3", "panda"])
+def test_driver_and_emulator_have_the_inertia_of_the_urdf(model: str) -> None:
+    spec = load("franka", overrides=[f"robots.arm.model={model}"], sim=False).resolve().robots[0]
+    dynamics, driver, body = Dynamics.of(spec), FrankaArm(spec), RigidBody(Path(spec.urdf))
+    assert np.array(driver.mass_matrix(spec.home)) == pytest.approx(np.array(dynamics.mass_matrix(spec.home)))
+    still = [0.0] * 7
+    assert body.torques(spec.home, still, still) == pytest.approx(dynamics.gravity(spec.home))
+    if model == "panda":  # a URDF with invented inertias
+        kinematics = replace(spec.kinematics, urdf=data("franka_panda/panda.urdf"))
+        other = FrankaArm(replace(spec, urdf=kinematics.urdf, kinematics=kinematics)).mass_matrix(spec.home)
+        assert np.array(other) == pytest.approx(np.array(dynamics.mass_matrix(spec.home)), abs=0.15)
 
 
 def test_every_speed_holds_everywhere_in_the_range() -> None:
