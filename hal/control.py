@@ -10,6 +10,7 @@ import warnings
 from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
+from . import registry
 from .arguments import number
 from .commands import (
     Command,
@@ -130,7 +131,8 @@ class Control:
             return Position()
         robot = self.robot
         self._checks.check_torques()
-        return resolve(controller, robot.spec, robot.kinematics, self._host.spec.rate_hz)
+        simulated = registry.load(robot.spec.driver, "robot").simulated
+        return resolve(controller, robot.spec, robot.kinematics, self._host.spec.rate_hz, simulated)
 
     def _described(self) -> dict[str, Any] | None:
         from .servo.controllers import controller_data

@@ -11,6 +11,8 @@ from collections.abc import Sequence
 from contextlib import suppress
 from math import hypot
 
+import numpy as np
+
 from ..commands import Session
 from ..dynamics import Dynamics
 from ..errors import NotSupported
@@ -19,7 +21,7 @@ from ..specs import RobotSpec
 from ..types import ControlMode, Limited
 from .controllers import Controller, ControllerLaw, Position, controller_of
 from .envelope import Envelope
-from .torque import TorqueMotion
+from .torque import Inertia, TorqueMotion
 
 __all__ = ["LEAD", "Compliance"]
 
@@ -50,7 +52,9 @@ class Compliance:
         if torque.bounds is not None:
             with suppress(NotSupported):  # no session gets a controller then
                 self._dynamics = Dynamics.of(spec)
-        self._friction = self._dynamics.damping if self._dynamics is not None and simulated else None
+        self._friction: Floats | None = None
+        if simulated and self._dynamics is not None and any(self._dynamics.damping):
+            self._friction = self._dynamics.damping
         self._law: ControllerLaw | None = None
         """The law of this session; None if the arm's own position controller follows the set-point."""
         self.active = False
@@ -135,6 +139,9 @@ class Compliance:
         arm = torque.arm
         if arm is None:  # the last ones are kept, for a bounded time
             return
+        if self._friction is not None:  # it acts on the speed after the step, so a torque moves M + friction dt
+            mass = arm.inertia.mass + np.diag(self._friction) * smoother.dt
+            arm = arm._replace(inertia=Inertia(mass, smoother.n))
         q_due, dq_due = self._due
         kinematics = self._envelope.kinematics
         pose, jacobian = kinematics.fk_and_jacobian(arm.q)
@@ -143,7 +150,7 @@ class Compliance:
         acceleration = [(new - old) / dt for new, old in zip(smoother.dq, dq_due, strict=True)]
         tau = law.torques(arm.q, arm.dq, (q_due, dq_due, acceleration), arm.inertia, jacobian, pose, error)
         pull, brake = tau.tolist()
-        torque.drive(pull, brake, law.gain, jacobian)
+        torque.drive(pull, brake, law.gain, arm, jacobian)
 
     def strays(self) -> Limited | None:
         """Return the limit that the arm exceeds, although its set-point keeps all of them; None if it keeps all."""

@@ -170,7 +170,9 @@ _DAMPED = 0.9
 """Most that a damper may take of a speed in one period of the servo."""
 
 
-def resolve(controller: object, spec: RobotSpec, kinematics: Kinematics, rate_hz: float) -> Controller:
+def resolve(
+    controller: object, spec: RobotSpec, kinematics: Kinematics, rate_hz: float, simulated: bool = False
+) -> Controller:
     """Return a controller with a value for every gain, checked against an arm that takes torques.
 
     Args:
@@ -178,6 +180,7 @@ def resolve(controller: object, spec: RobotSpec, kinematics: Kinematics, rate_hz
         spec: The arm.
         kinematics: Its kinematics.
         rate_hz: Rate of the servo, Hz.
+        simulated: Whether it has the joint damping of its URDF.
 
     Raises:
         CommandError: A wrong number of gains, a posture beyond the limits, or gains that are too stiff for the arm's
@@ -198,9 +201,10 @@ def resolve(controller: object, spec: RobotSpec, kinematics: Kinematics, rate_hz
             f"controller must be hal.Position(), hal.JointImpedance() or hal.OperationalSpace(), not {controller!r}",
             code="bad_controller",
         )
-    mass = np.array(Dynamics.of(spec).mass_matrix(spec.home))
+    dynamics = Dynamics.of(spec)
+    mass = np.array(dynamics.mass_matrix(spec.home)) + np.diag(dynamics.damping) * (simulated / rate_hz)
     law = ControllerLaw(resolved, n, 1.0 / rate_hz)
-    fastest = law.fastest(np.linalg.inv(mass), kinematics.jacobian(spec.home)) / rate_hz
+    fastest = law.fastest(np.asarray(np.linalg.inv(mass), np.float64), kinematics.jacobian(spec.home)) / rate_hz
     if fastest > _FASTEST:
         raise CommandError(
             f"{spec.name}: these gains are too stiff for the inertia of {spec.model} at {rate_hz:g} Hz: divide them by "
@@ -398,8 +402,8 @@ class ControllerLaw:
             error: Twist (6,) from that pose to the set-point's within 1 s, m and rad (:func:`hal.geometry.difference`).
 
         Returns:
-            Two rows (2, n), Nm, whose sum is the controller's: what draws the arm to its set-point, and what only
-            brakes it.
+            Two rows (2, n), Nm, whose sum is the controller's: what draws the arm to its set-point; and what brakes it,
+            with what compensates friction and Coriolis torques.
         """
         if self._ramped < 1.0:
             self._ramped = min(1.0, self._ramped + self._dt / RAMP)
@@ -414,7 +418,7 @@ class ControllerLaw:
         self.gain = self._gain(float(np.abs(tau[0]).max()), jacobian, pose)
         tau[0] += inertia.mass.dot(ddq_set)
         if self._friction is not None:
-            tau[0] += self._friction * dq_set
+            tau[1] += self._friction * dq
         if self._dynamics is not None:
             tau[1] += self._dynamics.coriolis(q, dq)
         return tau

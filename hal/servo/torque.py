@@ -545,15 +545,15 @@ class TorqueMotion(ServoMotion):
                 self.tau, self._share = self.bounds.brake(before, arm, 0.0)
         self._begun = True
 
-    def drive(self, pull: Floats, brake: Floats, gain: Any, jacobian: Any) -> None:
+    def drive(self, pull: Floats, brake: Floats, gain: Any, arm: ArmInMotion, jacobian: Any) -> None:
         """Move the torques by one tick towards those of a controller (see :meth:`TorqueBounds.shared`).
 
         The first set-point has none: it changes the mode.
         """
         self._braking = self._share = 0.0
-        if self._begun and self.arm is not None:
+        if self._begun:
             assert self.bounds is not None
-            self.tau = self.bounds.towards(self.tau, self.bounds.shared(pull, brake, gain, self.arm, jacobian))
+            self.tau = self.bounds.towards(self.tau, self.bounds.shared(pull, brake, gain, arm, jacobian))
         self._begun = True
 
     def brake(self) -> bool:
