@@ -23,7 +23,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
-from math import sqrt
+from math import dist, inf, sqrt
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 import numpy as np
@@ -284,6 +284,8 @@ _TURN = 3.0
 """Speed that the tcp must not turn faster than when it is let go, rad/s."""
 _RELEASED = 0.7
 """Share of this speed, and of the joints', that a spring may reach."""
+_SAME_INERTIA = 0.05
+"""The root of the inertia is computed again when the joints have moved this far, rad."""
 _POSTURE_LEAD = 0.2
 """A posture that is farther away pulls no harder, rad."""
 
@@ -332,6 +334,9 @@ class ControllerLaw:
         self._posture: Array | None = None
         self._modes: tuple[Array, Array, Array | None] = (np.zeros(1), np.ones(1), None)
         """Accelerations by the springs in their modes, frequencies of the modes, rad/s, and the modes."""
+        self._rooted_at: Floats = (inf,) * n
+        self._root: Array = np.zeros((n, n))
+        """Square root of the inertia (n, n) at these joint positions."""
         self.gain: Array = np.zeros(3)
         """Velocity (3,) of the tcp, m/s, that the springs of the last call may still add."""
         self._goal = self._numbers(controller)
@@ -402,21 +407,21 @@ class ControllerLaw:
             error: Twist (6,) from that pose to the set-point's within 1 s, m and rad (:func:`hal.geometry.difference`).
 
         Returns:
-            Two rows (2, n), Nm, whose sum is the controller's: what draws the arm to its set-point; and what brakes it,
-            with what compensates friction and Coriolis torques.
+            Two rows (2, n), Nm, whose sum is the controller's: what the springs exert; and all the rest, which alone
+            makes the arm as fast as the set-point, and no faster.
         """
         if self._ramped < 1.0:
             self._ramped = min(1.0, self._ramped + self._dt / RAMP)
             self._apply(self._from + self._ramped * (self._goal - self._from))
         q_set, dq_set, ddq_set = setpoint
-        speeds: Array = np.array((dq_set, dq))
+        lag: Array = np.subtract(dq_set, dq)
         if self.in_joints:
-            tau = self._springs(inertia.inverse, self._shortened(np.subtract(q_set, q), inertia.inverse), speeds)
+            tau = self._springs(inertia.inverse, self._shortened(np.subtract(q_set, q), inertia.inverse), lag)
         else:
             away = np.subtract(q_set if self._posture is None else self._posture, q)
-            tau = self._task(away, speeds, inertia, jacobian, pose, np.array(error))
+            tau = self._task(q, away, lag, inertia, jacobian, pose, np.array(error))
         self.gain = self._gain(float(np.abs(tau[0]).max()), jacobian, pose)
-        tau[0] += inertia.mass.dot(ddq_set)
+        tau[1] += inertia.mass.dot(ddq_set)
         if self._friction is not None:
             tau[1] += self._friction * dq
         if self._dynamics is not None:
@@ -444,7 +449,9 @@ class ControllerLaw:
             velocity = _rotation(pose[3:]).dot(velocity[:3])
         return np.asarray(velocity[:3], np.float64)
 
-    def _task(self, away: Array, speeds: Array, inertia: Inertia, jacobian: Array, pose: Pose7, error: Array) -> Array:
+    def _task(
+        self, q: Floats, away: Array, lag: Array, inertia: Inertia, jacobian: Array, pose: Pose7, error: Array
+    ) -> Array:
         """Return the torques (2, n) of the tcp's springs, and those of the posture in their null space."""
         if self._rows == 3:
             jacobian, error = jacobian[:3], error[:3]
@@ -455,16 +462,26 @@ class ControllerLaw:
         ease = eased.dot(jacobian.T) + self._ease
         if self._rows == 6:
             error[3:] = self._shortened(error[3:], ease)
-        force = self._springs(ease, error, speeds.dot(jacobian.T))
+        force = self._springs(ease, error, jacobian.dot(lag))
         if not self._redundant:
             return np.asarray(force.dot(jacobian), np.float64)
-        diagonal = inertia.mass.diagonal()
-        stiffness = self._posture_stiffness
-        posture = speeds * (2.0 * self._ratio * np.sqrt(stiffness * diagonal) + diagonal)
-        np.negative(posture[1], out=posture[1])
-        posture[0] += stiffness * np.minimum(np.maximum(away, -_POSTURE_LEAD), _POSTURE_LEAD)
+        spring = self._posture_stiffness * np.minimum(np.maximum(away, -_POSTURE_LEAD), _POSTURE_LEAD)
+        posture = np.array((spring, self._posture_damping(q, inertia).dot(lag)))
         force -= np.linalg.solve(ease, eased.dot(posture.T)).T
         return np.asarray(force.dot(jacobian) + posture, np.float64)
+
+    def _posture_damping(self, q: Floats, inertia: Inertia) -> Array:
+        """Return the damping (n, n) of the posture, Nm s/rad: 2 ratio sqrt(k) M^(1/2), with a little of M.
+
+        Along any motion z it is at most critical, as z' M^(1/2) z <= sqrt(z' M z) for |z| = 1: the elbow's own motion
+        may have a hundredth of the inertia of the joints that take part in it.
+        """
+        if dist(q, self._rooted_at) > _SAME_INERTIA:
+            self._rooted_at = q
+            squares, axes = np.linalg.eigh(inertia.mass)
+            self._root = (axes * np.sqrt(np.maximum(squares, 0.0))).dot(axes.T)
+        scale = 2.0 * self._ratio * sqrt(self._posture_stiffness)
+        return np.asarray(scale * self._root + inertia.mass, np.float64)
 
     def _shortened(self, error: Array, ease: Array) -> Array:
         """Return the lengths (k,) of the last k springs, cut so that none moves what it holds too fast when let go.
@@ -476,8 +493,8 @@ class ControllerLaw:
         most = self._reach / np.sqrt(squares)
         return np.asarray(np.minimum(np.maximum(error, -most), most), np.float64)
 
-    def _springs(self, ease: Array, error: Array, speeds: Array) -> Array:
-        """Return the forces (2, k) of the springs and dampers: those that draw, and those that brake.
+    def _springs(self, ease: Array, error: Array, lag: Array) -> Array:
+        """Return the forces (2, k) of the springs, and of the dampers.
 
         In the modes of the matrix sqrt(K) A sqrt(K), A being the inverse inertia ``ease`` (k, k), each spring of unit
         stiffness moves a mass of 1 / w^2, so that a damper of 2 ratio / w damps it by the ratio.
@@ -485,26 +502,22 @@ class ControllerLaw:
         Args:
             ease: Inverse of the inertia that the springs move.
             error: Distance of the set-point (k,).
-            speeds: Speed of the set-point, and the measured one (2, k).
+            lag: Speed of the set-point relative to what was measured (k,).
         """
         if self._by_rate:
-            damped = speeds * np.minimum(2.0 * self._ratio * self._roots, _DAMPED / self._dt)
-            damped[0] += self._gains * error
-            np.negative(damped[1], out=damped[1])
-            self._modes = self._gains * error, self._roots, None
-            return np.asarray(np.linalg.solve(ease, damped.T).T, np.float64)
+            accelerations = self._gains * error
+            self._modes = accelerations, self._roots, None
+            both = np.array((accelerations, lag * np.minimum(2.0 * self._ratio * self._roots, _DAMPED / self._dt)))
+            return np.asarray(np.linalg.solve(ease, both.T).T, np.float64)
         values, modes = np.linalg.eigh(ease * self._weights)
         squares: Array = np.maximum(values, _SLOWEST)
-        damping = np.minimum(2.0 * self._ratio / np.sqrt(squares), _DAMPED / (self._dt * squares))
-        damped = (speeds * self._roots).dot(modes)
-        damped *= damping
-        np.negative(damped[1], out=damped[1])
-        spring = (self._roots * error).dot(modes)
+        frequencies = np.sqrt(squares)
+        both = (np.array((error, lag)) * self._roots).dot(modes)
         if squares[-1] > self._most:  # where the arm is lighter than at home
-            spring *= np.minimum(1.0, self._most / squares)
-        damped[0] += spring
-        self._modes = spring * squares, np.sqrt(squares), modes
-        return np.asarray(damped.dot(modes.T) * self._roots, np.float64)
+            both[0] *= np.minimum(1.0, self._most / squares)
+        both[1] *= np.minimum(2.0 * self._ratio / frequencies, _DAMPED / (self._dt * squares))
+        self._modes = both[0] * squares, frequencies, modes
+        return np.asarray(both.dot(modes.T) * self._roots, np.float64)
 
 
 def _tuple(gain: Gain | None) -> tuple[float, ...]:

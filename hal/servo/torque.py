@@ -186,8 +186,9 @@ class TorqueBounds:
         """Return the torques (n,) to move towards, Nm: a controller's, with as much pull as keeps the speeds.
 
         Args:
-            pull: Torques (n,), Nm, that draw the arm to its set-point.
-            brake: Torques (n,), Nm, that only slow it down; they are applied in full.
+            pull: Torques (n,), Nm, of its springs.
+            brake: Torques (n,), Nm, of all the rest, which makes the arm no faster than its set-point; they are applied
+                in full.
             gain: Velocity (3,) of the tcp, m/s, that the pull may still add.
             arm: Measured state.
             jacobian: Jacobian (6, n) of the tcp there.

@@ -1,0 +1,304 @@
+"""Controllers, measured: rest errors, tracking, compliance, contact, let-go, and steps per second.
+
+    python benchmarks/controllers.py [rest tour force table held steps] [--count 100] [--models panda fr3 iiwa]
+                                     [--engine pybullet] [--emulator fr3 --host 127.0.8.3]
+
+rest    the tcp's distance from its set-point 1.5 s after the set-point came to rest, for random reachable poses
+tour    rms distance between tcp and set-point while the recorded tour is driven, at 240 Hz and at 1 kHz
+force   displacement by 10 N at the tcp along each axis, as a share of force over stiffness
+table   force on the table with the set-point 2 cm inside it at 500 N/m, and the last bounce
+held    greatest speed of a tcp that was held back by 30 N for 5 s, and is let go
+steps   steps per second of a 20 Hz policy with 500 Hz physics, in lock-step
+
+All but the last run in lock-step and repeat exactly. ``--emulator`` measures ``rest`` and ``tour`` on an emulated
+Franka, through the vendor's own library, and needs it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+import hal
+from hal import JointImpedance, JointTarget, OperationalSpace
+from hal.drivers.franka.emulator.control import EmulatorControl
+
+ROWS = ("rest", "tour", "force", "table", "held", "steps")
+SETTLE = 1.5
+"""Time from the rest of the set-point to the measurement, s."""
+TASK = OperationalSpace(stiffness=1000.0, rotation_stiffness=50.0)
+JOINTS = JointImpedance(stiffness=(200.0,) * 4 + (50.0,) * 3)
+CONTROLLERS = (("task", TASK), ("joints", JOINTS))
+
+
+def open_rig(model: str, *more: str, engine: str | None = None, pad: str = "none", hz: float = 240.0) -> hal.Rig:
+    """Open a simulated arm in lock-step, without cameras."""
+    config = "iiwa_table" if model == "iiwa" else "panda_table"
+    overrides = ["cameras={}", f"simulation.physics_hz={hz}", *more]
+    overrides += ["robots.panda.model=fr3"] if model == "fr3" else []
+    return hal.open(config, sim=True, engine=engine, clock="lock_step", pad=pad, overrides=overrides)
+
+
+@contextlib.contextmanager
+def emulated(robot: str, host: str, pad: str = "none") -> Iterator[hal.Rig]:
+    """Open an emulated Franka in lock-step, which needs no pace."""
+    command = [sys.executable, "-m", "hal.drivers.franka.emulator", "--robot", robot, "--host", host, "--no-hand"]
+    quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL, "stdin": subprocess.PIPE}
+    with subprocess.Popen([*command, "--lockstep", "--unpaced", "--quiet"], **quiet) as process:  # type: ignore[call-overload]
+        try:
+            control, deadline = EmulatorControl(host), time.monotonic() + 20.0
+            while time.monotonic() < deadline:
+                with contextlib.suppress(OSError):
+                    control.send("state")
+                    break
+                time.sleep(0.1)
+            overrides = [f"robots.arm.real.host={host}", "cameras={}", "robots.arm.gripper.enabled=false"]
+            overrides += [f"robots.arm.model={'fr3' if robot == 'fr3' else 'panda'}", "robots.arm.workspace=null"]
+            with hal.open("franka_emulator", clock="lock_step", pad=pad, overrides=overrides) as rig:
+                yield rig
+        finally:
+            process.terminate()
+            process.wait(10.0)
+
+
+def arm_of(rig: hal.Rig) -> hal.Robot:
+    """Return the arm of a rig with one."""
+    return next(iter(rig.robots.values()))
+
+
+def follow(rig: hal.Rig, control: hal.Control, goal: Any, seconds: float) -> list[hal.RobotState]:
+    """Stream joint targets towards ``goal`` (n,), rad; return the state after each."""
+    arm, states, begun = control.robot, [], rig.clock.now()
+    for tick in rig.clock.rate(50.0):
+        if tick.t - begun >= seconds:
+            break
+        q_set = arm.state().q_set
+        control.send(JointTarget(q_set + np.clip(goal - q_set, -0.09, 0.09)))
+        states.append(arm.state())
+    return states
+
+
+def random_goals(arm: hal.Robot, count: int, seed: int) -> list[Any]:
+    """Return joint positions (n,) of random poses of the tcp in front of the arm, above its base."""
+    rng = np.random.default_rng(seed)
+    goals: list[Any] = []
+    while len(goals) < count:
+        position = rng.uniform((0.3, -0.35, 0.2), (0.65, 0.35, 0.7))
+        turn = rng.normal(size=4) * 0.25
+        orientation = arm.fk(arm.home).orientation + turn
+        with contextlib.suppress(hal.Unreachable):
+            goals.append(arm.ik(hal.Pose(position, orientation / np.linalg.norm(orientation)), arm.home))
+    return goals
+
+
+@dataclass
+class Rest:
+    """Distances from the set-point: the greatest and the median, m and rad; and how many goals were reached."""
+
+    worst: tuple[float, float]
+    median: tuple[float, float]
+    reached: int
+
+
+def rest(rig: hal.Rig, controller: Any, count: int, seed: int = 1) -> Rest:
+    """Return the rest errors of random poses."""
+    arm, errors = arm_of(rig), []
+    unattended = arm.spec.attended
+    for goal in random_goals(arm, count, seed):
+        with (
+            contextlib.suppress(hal.MotionStopped),
+            arm.control(controller=controller, unattended=unattended) as control,
+        ):
+            while np.abs(arm.state().q_set - goal).max() > 1e-4:
+                follow(rig, control, goal, 0.02)
+            follow(rig, control, goal, SETTLE)
+            errors.append(arm.state().tcp.distance(arm.fk(goal)))
+    worst, median = np.max(errors, axis=0), np.median(errors, axis=0)
+    return Rest((worst[0], worst[1]), (median[0], median[1]), len(errors))
+
+
+def tour(rig: hal.Rig, controller: Any, seconds: float) -> tuple[float, float, int]:
+    """Return rms and greatest distance of the tcp from its set-point, m, and the number of states, over the tour."""
+    arm, pad = arm_of(rig), next(iter(rig.gamepads.values()))
+    teleop = hal.Teleop(arm)
+    found: list[float] = []
+    begun = last = rig.clock.now()
+    with arm.control(deadman=pad.hold("l2"), controller=controller) as control:
+        for tick in rig.clock.rate(50.0):
+            command, _ = teleop.step(pad.state(), tick.dt)
+            control.send(command)
+            states = [state for state in arm.states(last) if state.tau_set is not None]
+            found += [state.tcp.distance(state.tcp_set)[0] for state in states if np.abs(state.dq_set).max() > 1e-3]
+            last = tick.t
+            if tick.t - begun > seconds:
+                break
+    distances = np.array(found)
+    return float(np.sqrt((distances**2).mean())), float(distances.max()), len(found)
+
+
+def push(rig: hal.Rig, arm: hal.Robot, force: Any, seconds: float) -> None:
+    """Push the hand at its tcp with a force (3,), N."""
+    point = (arm.base @ arm.state().tcp).position
+    rig.world.apply_force(arm.name, force, point, link=arm.spec.kinematics.tcp_link, duration=seconds)
+
+
+def force(rig: hal.Rig, controller: Any, newtons: float = 10.0) -> list[float]:
+    """Return the displacement (3,) by a force along each axis, as a share of force over stiffness."""
+    arm, shares = arm_of(rig), []
+    for axis in range(3):
+        with arm.control(controller=controller) as control:
+            follow(rig, control, arm.home, 0.2)
+            begin = arm.state().tcp.position[axis]
+            push(rig, arm, [newtons * (k == axis) for k in range(3)], 2.5)
+            state = follow(rig, control, arm.home, 2.0)[-1]
+            shares.append((state.tcp.position[axis] - begin) / (newtons / controller.stiffness))
+    return shares
+
+
+def table(rig: hal.Rig, stiffness: float = 500.0, depth: float = 0.02) -> tuple[float, float]:
+    """Return the force after 1 s with the set-point inside the table, and how it changes from 0.5 s on, N."""
+    arm = arm_of(rig)
+    controller = OperationalSpace(stiffness=stiffness)
+    box = rig.world.aabb("table")
+    surface = box[1][2] - arm.base.position[2]
+    start = arm.state().tcp_set
+    above = hal.Pose([start.position[0] + 0.1, start.position[1] + 0.15, surface + 0.05], start.orientation)
+    arm.move_to(above)
+    begun, forces = None, []
+    with arm.control(controller=controller) as control:
+        depth_now = 0.05
+        for tick in rig.clock.rate(50.0):
+            depth_now = max(-depth, depth_now - 0.05 * 0.02)
+            goal = hal.Pose([*above.position[:2], surface + depth_now], above.orientation)
+            control.send(hal.CartesianTarget(goal))
+            contact = rig.world.contacts(arm.name, "table")
+            forces.append((tick.t, sum(each.force for each in contact)))
+            if begun is None and depth_now == -depth:
+                begun = tick.t
+            if begun is not None and tick.t - begun > 1.0:
+                break
+    after = [newtons for t, newtons in forces if begun is not None and t > begun + 0.5]
+    return forces[-1][1], max(after) - min(after)
+
+
+def held(rig: hal.Rig, controller: Any, seconds: float = 5.0) -> tuple[float, float, float]:
+    """Return the tcp's greatest speed after it is let go, that of the session, m/s, and the greatest lead, m."""
+    arm = arm_of(rig)
+    goal = arm.home.copy()
+    goal[0] += 0.6
+    fastest = lead = 0.0
+    with arm.control(controller=controller) as control:
+        follow(rig, control, arm.home, 0.2)
+        push(rig, arm, [0.0, -30.0, 0.0], seconds)
+        last = rig.clock.now()
+        for state in follow(rig, control, goal, seconds - 0.02):
+            lead = max(lead, state.tcp.distance(state.tcp_set)[0])
+        for _ in range(150):
+            last = rig.clock.now()
+            follow(rig, control, goal, 0.02)
+            fastest = max([fastest, *(float(np.linalg.norm(each.tcp_twist[:3])) for each in arm.states(last))])
+        return fastest, control.tcp_speed, lead
+
+
+def steps(controller: Any, engine: str | None, seconds: float = 10.0) -> float:
+    """Return the steps per second of a 20 Hz policy that moves the tcp, at 500 Hz physics."""
+    with open_rig("panda", engine=engine, hz=500.0) as rig:
+        arm = arm_of(rig)
+        with arm.control(controller=controller, rate_hz=20.0) as control:
+            begun, start = 0.0, rig.clock.now()
+            for done, tick in enumerate(rig.clock.rate(20.0)):
+                t = tick.t - start
+                control.send(hal.Twist([0.05 * np.sin(t), 0.05 * np.cos(t), 0.0]))
+                arm.state()
+                begun = begun or time.perf_counter()
+                if time.perf_counter() - begun > seconds:
+                    return done / (time.perf_counter() - begun)
+    raise AssertionError
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("rows", nargs="*", help="some of: rest tour force table held steps")
+    parser.add_argument("--count", type=int, default=100, help="poses for 'rest'")
+    parser.add_argument("--seconds", type=float, default=27.0, help="length of the tour that is driven, s")
+    parser.add_argument("--models", nargs="*", default=["panda", "fr3", "iiwa"])
+    parser.add_argument("--engine", default=None)
+    parser.add_argument("--emulator", choices=["fr3", "panda"], default=None)
+    parser.add_argument("--host", default="127.0.8.3")
+    args = parser.parse_args()
+    rows = args.rows or list(ROWS)
+    if unknown := set(rows) - set(ROWS):
+        raise SystemExit(f"no row {', '.join(sorted(unknown))}; rows: {', '.join(ROWS)}")
+    if args.emulator:
+        on_emulator(rows, args)
+        return
+    for row in rows:
+        if row == "steps":
+            for name, controller in (("position", None), ("task", TASK), ("joints", JOINTS)):
+                print(f"steps   {name:9s} {steps(controller, args.engine):8.0f} steps/s")
+        elif row == "tour":
+            for model in args.models[:2]:
+                for hz in (240.0, 1000.0):
+                    for name, controller in CONTROLLERS:
+                        with open_rig(model, engine=args.engine, pad="demo", hz=hz) as rig:
+                            show_tour(f"{model} {hz:.0f} Hz {name}", tour(rig, controller, args.seconds))
+        else:
+            for model in args.models:
+                with open_rig(model, engine=args.engine) as rig:
+                    rig.clock.sleep(0.2)
+                    on_simulation(row, model, rig, args.count)
+
+
+def on_simulation(row: str, model: str, rig: hal.Rig, count: int) -> None:
+    """Measure and print one row for one simulated arm."""
+    if row == "table":
+        newtons, bounce = table(rig)
+        print(f"table   {model:6s} {newtons:.2f} N after 1 s, changes by {bounce:.2f} N in the last 0.5 s")
+        return
+    for name, controller in CONTROLLERS:
+        rig.world.reset()
+        rig.clock.sleep(0.2)
+        if row == "rest":
+            show_rest(f"{model} {name}", rest(rig, controller, count))
+        elif row == "held":
+            fastest, most, lead = held(rig, controller)
+            print(f"held    {model:6s} {name:7s} at most {fastest:.3f} of {most:.3f} m/s, led by {1e3 * lead:.1f} mm")
+        elif controller is TASK:
+            shares = force(rig, OperationalSpace(stiffness=1000.0))
+            print(f"force   {model:6s} {name:7s} " + " ".join(f"{share:.3f}" for share in shares) + " of F / k")
+
+
+def on_emulator(rows: list[str], args: argparse.Namespace) -> None:
+    """Measure and print what can be measured on an emulated Franka."""
+    for name, controller in CONTROLLERS:
+        if "rest" in rows:
+            with emulated(args.emulator, args.host) as rig:
+                show_rest(f"emulated {args.emulator} {name}", rest(rig, controller, args.count))
+        if "tour" in rows:
+            with emulated(args.emulator, args.host, "demo") as rig:
+                show_tour(f"emulated {args.emulator} {name}", tour(rig, controller, args.seconds))
+
+
+def show_rest(name: str, found: Rest) -> None:
+    worst, median = found.worst, found.median
+    print(
+        f"rest    {name:22s} {found.reached} reached; at most {1e3 * worst[0]:.3f} mm and {worst[1]:.5f} rad, "
+        f"median {1e3 * median[0]:.3f} mm and {median[1]:.5f} rad"
+    )
+
+
+def show_tour(name: str, found: tuple[float, float, int]) -> None:
+    rms, most, count = found
+    print(f"tour    {name:22s} {1e3 * rms:.3f} mm rms, {1e3 * most:.3f} mm at most, {count} states")
+
+
+if __name__ == "__main__":
+    main()
