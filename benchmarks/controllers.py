@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import socket
 import subprocess
 import sys
 import time
@@ -29,7 +30,6 @@ import numpy as np
 
 import hal
 from hal import JointImpedance, JointTarget, OperationalSpace
-from hal.drivers.franka.emulator.control import EmulatorControl
 
 ROWS = ("rest", "tour", "force", "table", "held", "steps")
 SETTLE = 1.5
@@ -54,12 +54,9 @@ def emulated(robot: str, host: str, pad: str = "none") -> Iterator[hal.Rig]:
     quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL, "stdin": subprocess.PIPE}
     with subprocess.Popen([*command, "--lockstep", "--unpaced", "--quiet"], **quiet) as process:  # type: ignore[call-overload]
         try:
-            control, deadline = EmulatorControl(host), time.monotonic() + 20.0
-            while time.monotonic() < deadline:
-                with contextlib.suppress(OSError):
-                    control.send("state")
-                    break
-                time.sleep(0.1)
+            deadline = time.monotonic() + 20.0
+            while not _listens(host) and time.monotonic() < deadline:
+                time.sleep(0.05)
             overrides = [f"robots.arm.real.host={host}", "cameras={}", "robots.arm.gripper.enabled=false"]
             overrides += [f"robots.arm.model={'fr3' if robot == 'fr3' else 'panda'}", "robots.arm.workspace=null"]
             with hal.open("franka_emulator", clock="lock_step", pad=pad, overrides=overrides) as rig:
@@ -67,6 +64,11 @@ def emulated(robot: str, host: str, pad: str = "none") -> Iterator[hal.Rig]:
         finally:
             process.terminate()
             process.wait(10.0)
+
+
+def _listens(host: str) -> bool:
+    with socket.socket() as probe:
+        return probe.connect_ex((host, 1339)) == 0
 
 
 def arm_of(rig: hal.Rig) -> hal.Robot:

@@ -55,6 +55,9 @@ _COUPLED = 0.95
 """The same for the effect of the joints on each other. It is more, so that a joint that coasts at its speed does not
 take the torques of all others away."""
 
+_SPRINGS = 0.87
+"""The same for what a controller's springs add to the tcp's speed: little more than its set-point's."""
+
 _LAG = 2.0
 """Ticks until a torque can be followed by a lower one: it acts for one, and its effect is measured after that."""
 
@@ -200,7 +203,7 @@ class TorqueBounds:
         if share < 1.0:
             envelope.limited |= Limited.SPEED
         if self.tcp_speed < UNLIMITED:
-            tcp_share = _greatest_share(jacobian[:3].dot(arm.dq), gain, _COUPLED * self.tcp_speed)
+            tcp_share = _greatest_share(jacobian[:3].dot(arm.dq), gain, _SPRINGS * self.tcp_speed)
             if tcp_share < 1.0:
                 envelope.limited |= Limited.TCP_SPEED
                 share = min(share, tcp_share)
