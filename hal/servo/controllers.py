@@ -407,8 +407,8 @@ class ControllerLaw:
             error: Twist (6,) from that pose to the set-point's within 1 s, m and rad (:func:`hal.geometry.difference`).
 
         Returns:
-            Two rows (2, n), Nm, whose sum is the controller's: what the springs exert; and all the rest, which alone
-            makes the arm as fast as the set-point, and no faster.
+            Two rows (2, n), Nm, whose sum is the controller's: what the springs of the tcp's position exert, or those
+            of the joints; and all the rest, which alone makes the tcp as fast as the set-point, and no faster.
         """
         if self._ramped < 1.0:
             self._ramped = min(1.0, self._ramped + self._dt / RAMP)
@@ -416,7 +416,7 @@ class ControllerLaw:
         q_set, dq_set, ddq_set = setpoint
         lag: Array = np.subtract(dq_set, dq)
         if self.in_joints:
-            tau = self._springs(inertia.inverse, self._shortened(np.subtract(q_set, q), inertia.inverse), lag)
+            tau = self._springs(inertia.inverse, self._shortened(np.subtract(q_set, q), inertia.inverse)[None], lag)
         else:
             away = np.subtract(q_set if self._posture is None else self._posture, q)
             tau = self._task(q, away, lag, inertia, jacobian, pose, np.array(error))
@@ -460,15 +460,19 @@ class ControllerLaw:
             jacobian, error = _turned(turn, jacobian), _turned(turn, error)
         eased = jacobian.dot(inertia.inverse)
         ease = eased.dot(jacobian.T) + self._ease
+        errors = np.zeros((self._rows // 3, self._rows))
+        errors[0, :3] = error[:3]
         if self._rows == 6:
-            error[3:] = self._shortened(error[3:], ease)
-        force = self._springs(ease, error, jacobian.dot(lag))
+            errors[1, 3:] = self._shortened(error[3:], ease)
+        force = self._springs(ease, errors, jacobian.dot(lag))
         if not self._redundant:
             return np.asarray(force.dot(jacobian), np.float64)
-        spring = self._posture_stiffness * np.minimum(np.maximum(away, -_POSTURE_LEAD), _POSTURE_LEAD)
-        posture = np.array((spring, self._posture_damping(q, inertia).dot(lag)))
-        force -= np.linalg.solve(ease, eased.dot(posture.T)).T
-        return np.asarray(force.dot(jacobian) + posture, np.float64)
+        posture = self._posture_stiffness * np.minimum(np.maximum(away, -_POSTURE_LEAD), _POSTURE_LEAD)
+        posture += self._posture_damping(q, inertia).dot(lag)
+        force[1] -= np.linalg.solve(ease, eased.dot(posture))
+        tau: Array = force.dot(jacobian)
+        tau[1] += posture
+        return tau
 
     def _posture_damping(self, q: Floats, inertia: Inertia) -> Array:
         """Return the damping (n, n) of the posture, Nm s/rad: 2 ratio sqrt(k) M^(1/2), with a little of M.
@@ -493,31 +497,34 @@ class ControllerLaw:
         most = self._reach / np.sqrt(squares)
         return np.asarray(np.minimum(np.maximum(error, -most), most), np.float64)
 
-    def _springs(self, ease: Array, error: Array, lag: Array) -> Array:
-        """Return the forces (2, k) of the springs, and of the dampers.
+    def _springs(self, ease: Array, errors: Array, lag: Array) -> Array:
+        """Return the forces (2, k) of the springs of the first row of ``errors``, and of the others with the dampers.
 
         In the modes of the matrix sqrt(K) A sqrt(K), A being the inverse inertia ``ease`` (k, k), each spring of unit
         stiffness moves a mass of 1 / w^2, so that a damper of 2 ratio / w damps it by the ratio.
 
         Args:
             ease: Inverse of the inertia that the springs move.
-            error: Distance of the set-point (k,).
+            errors: Distances of the set-point, which add up (m, k).
             lag: Speed of the set-point relative to what was measured (k,).
         """
+        parts = np.concatenate((errors, lag[None]))
         if self._by_rate:
-            accelerations = self._gains * error
-            self._modes = accelerations, self._roots, None
-            both = np.array((accelerations, lag * np.minimum(2.0 * self._ratio * self._roots, _DAMPED / self._dt)))
-            return np.asarray(np.linalg.solve(ease, both.T).T, np.float64)
-        values, modes = np.linalg.eigh(ease * self._weights)
-        squares: Array = np.maximum(values, _SLOWEST)
-        frequencies = np.sqrt(squares)
-        both = (np.array((error, lag)) * self._roots).dot(modes)
-        if squares[-1] > self._most:  # where the arm is lighter than at home
-            both[0] *= np.minimum(1.0, self._most / squares)
-        both[1] *= np.minimum(2.0 * self._ratio / frequencies, _DAMPED / (self._dt * squares))
-        self._modes = both[0] * squares, frequencies, modes
-        return np.asarray(both.dot(modes.T) * self._roots, np.float64)
+            parts[:-1] *= self._gains
+            parts[-1] *= np.minimum(2.0 * self._ratio * self._roots, _DAMPED / self._dt)
+            self._modes = parts[0], self._roots, None
+            forces = np.linalg.solve(ease, parts.T).T
+        else:
+            values, modes = np.linalg.eigh(ease * self._weights)
+            squares: Array = np.maximum(values, _SLOWEST)
+            frequencies = np.sqrt(squares)
+            parts = (parts * self._roots).dot(modes)
+            if squares[-1] > self._most:  # where the arm is lighter than at home
+                parts[:-1] *= np.minimum(1.0, self._most / squares)
+            parts[-1] *= np.minimum(2.0 * self._ratio / frequencies, _DAMPED / (self._dt * squares))
+            self._modes = parts[0] * squares, frequencies, modes
+            forces = parts.dot(modes.T) * self._roots
+        return np.array((forces[0], forces[1:].sum(axis=0)))
 
 
 def _tuple(gain: Gain | None) -> tuple[float, ...]:
