@@ -15,14 +15,14 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
 from ..camera import Camera
-from ..commands import FIRST_STEP_ANGLE, CartesianTarget, Command, JointTarget, Twist
+from ..commands import FIRST_STEP_ANGLE, CartesianTarget, Command, JointTarget, JointTorque, JointVelocity, Twist
 from ..control import Control
 from ..deadman import Deadman
 from ..errors import CommandError, DriverMissing, MotionStopped, NotSupported
@@ -32,6 +32,9 @@ from ..rig import Rig, open_rig
 from ..robot import Robot
 from ..specs import CameraSpec
 from .episode import reset_scene, stands_in_world
+
+if TYPE_CHECKING:
+    from ..servo.controllers import Controller
 
 __all__ = [
     "ActionKind",
@@ -44,11 +47,12 @@ __all__ = [
     "observation_space",
 ]
 
-ActionKind = Literal["joint", "tcp_delta", "twist"]
+ActionKind = Literal["joint", "tcp_delta", "twist", "velocity", "torque"]
 """``joint``: positions (n,), rad; more than 0.1 rad from the set-point they are clipped, and ``info["clipped"]`` is
 True. ``tcp_delta``: translation (m) and rotation vector (rad) of the tcp's goal in this step, along the base's axes.
-``twist``: velocity of the tcp, m/s and rad/s, along the base's axes. With a gripper one more number follows, 0 (open)
-to 1 (closed)."""
+``twist``: velocity of the tcp, m/s and rad/s, along the base's axes. ``velocity``: joint velocities (n,), rad/s.
+``torque``: joint torques (n,), Nm, on top of those that carry the arm's weight (see :class:`hal.JointTorque`). With a
+gripper one more number follows, 0 (open) to 1 (closed)."""
 
 ObservationDict = dict[str, NDArray[Any]]
 
@@ -64,6 +68,7 @@ def action_space(robots: Sequence[Robot], kind: ActionKind, rate_hz: float, spee
 
     Raises:
         CommandError: An unknown ``kind`` (code ``unknown_action``).
+        NotSupported: Torques, for an arm that has no limits for them (``no_torque_limits``).
     """
     linear, angular = speeds
     low: list[float] = []
@@ -72,24 +77,45 @@ def action_space(robots: Sequence[Robot], kind: ActionKind, rate_hz: float, spee
         if kind == "joint":
             low += robot.limits.lower
             high += robot.limits.upper
+        elif kind in ("velocity", "torque"):
+            most = _greatest(robot, kind)
+            low += [-value for value in most]
+            high += most
         elif kind in ("tcp_delta", "twist"):
             share = 1.0 / rate_hz if kind == "tcp_delta" else 1.0
             most = [linear * share] * 3 + [angular * share] * 3
             low += [-value for value in most]
             high += most
         else:
-            raise CommandError(f"action must be joint, tcp_delta or twist, not {kind!r}", code="unknown_action")
+            known = ", ".join(get_args(ActionKind))
+            raise CommandError(f"action must be one of {known}, not {kind!r}", code="unknown_action")
         if robot.gripper is not None:
             low.append(0.0)
             high.append(1.0)
     return spaces.Box(np.array(low, np.float32), np.array(high, np.float32), dtype=np.float32)
 
 
+def _greatest(robot: Robot, kind: ActionKind) -> list[float]:
+    """Return the greatest joint velocities of a session (n,), rad/s, or the greatest torques (n,), Nm."""
+    if kind == "velocity":
+        return [robot.spec.speed * value for value in robot.limits.velocity]
+    if robot.limits.torque is None:
+        raise NotSupported(f"{robot.name}: its model has no limits.torque, Nm per joint", code="no_torque_limits")
+    return list(robot.limits.torque)
+
+
+_IN_JOINTS = ("joint", "velocity", "torque")
+"""Kinds of action with one number for each joint."""
+
+
 def action_names(robots: Sequence[Robot], kind: ActionKind, several: bool) -> tuple[str, ...]:
     """Return the name of each number of an action; with ``several`` arms the arm's name leads, as in recordings."""
     names: list[str] = []
     for robot in robots:
-        own = [*(robot.joints if kind == "joint" else _TCP_NAMES), *(["gripper"] if robot.gripper is not None else [])]
+        own = [
+            *(robot.joints if kind in _IN_JOINTS else _TCP_NAMES),
+            *(["gripper"] if robot.gripper is not None else []),
+        ]
         names += [f"{robot.name}.{name}" if several else name for name in own]
     return tuple(names)
 
@@ -205,7 +231,7 @@ class _EnvArm:
         self.control: Control | None = None
         self.goal = Pose()
         self.clipped = False
-        self.size = (robot.n if kind == "joint" else 6) + int(robot.gripper is not None)
+        self.size = (robot.n if kind in _IN_JOINTS else 6) + int(robot.gripper is not None)
         """Count of numbers in an action."""
         self._kind = kind
         self._lower, self._upper = np.array(robot.limits.lower), np.array(robot.limits.upper)
@@ -225,6 +251,10 @@ class _EnvArm:
             q = np.minimum(np.maximum(q, self._lower), self._upper)
             self.clipped = bool((q != numbers).any())
             return JointTarget(q), grip
+        if self._kind == "velocity":
+            return JointVelocity(numbers), grip
+        if self._kind == "torque":
+            return JointTorque(numbers), grip
         if self._kind == "twist":
             return Twist(numbers[:3], numbers[3:]), grip
         reached = self.robot.state().tcp_set
@@ -267,6 +297,7 @@ class RigEnv(gymnasium.Env[ObservationDict, NDArray[np.float32]]):
         robot: str | None = None,
         robots: Sequence[str] | None = None,
         action: ActionKind = "joint",
+        controller: Controller | None = None,
         cameras: Collection[str] | None = None,
         streams: Collection[str] | None = None,
         objects: Collection[str] = (),
@@ -291,6 +322,8 @@ class RigEnv(gymnasium.Env[ObservationDict, NDArray[np.float32]]):
             robot: Name of the arm; None for the rig's first.
             robots: Names of several arms, instead of ``robot``.
             action: Kind of action, see :data:`ActionKind`.
+            controller: What makes the arm follow: :class:`hal.Position` by default, :class:`hal.JointImpedance` or
+                :class:`hal.OperationalSpace`. Not for torques.
             cameras: Names of the observed cameras; None for all.
             streams: Observed streams: some of ``color``, ``depth``, ``infrared``, ``infrared_right``,
                 ``segmentation`` and ``points``; None for colour and depth.
@@ -321,7 +354,7 @@ class RigEnv(gymnasium.Env[ObservationDict, NDArray[np.float32]]):
         self.render_mode = render_mode
         self._reward, self._terminated, self._on_reset = reward, terminated, on_reset
         self._kind, self._rate, self._max_steps, self._speeds = action, rate_hz, max_steps, speeds
-        self._unattended = unattended
+        self._unattended, self._controller = unattended, controller
         self.rig = self._open(config, deadman is not None, sim=sim, driver=driver, engine=engine, overrides=overrides)
         try:
             chosen_robots = _chosen(self.rig, robot, robots)
@@ -419,7 +452,9 @@ class RigEnv(gymnasium.Env[ObservationDict, NDArray[np.float32]]):
 
     def _open_sessions(self) -> None:
         for arm in self._arms:
-            control = arm.robot.control(deadman=self._deadman, rate_hz=self._rate, unattended=self._unattended)
+            control = arm.robot.control(
+                deadman=self._deadman, rate_hz=self._rate, unattended=self._unattended, controller=self._controller
+            )
             arm.control = control.__enter__()
 
     def _close_sessions(self) -> None:

@@ -142,6 +142,25 @@ def test_a_reset_restores_poses_or_sets_the_given_ones() -> None:
         env.close()
 
 
+@pytest.mark.parametrize(("action", "mode"), [("velocity", hal.ControlMode.JOINT_IMPEDANCE), ("torque", None)])
+def test_joints_move_by_velocities_with_a_controller_or_by_bare_torques(
+    action: str, mode: hal.ControlMode | None
+) -> None:
+    controller = hal.JointImpedance() if mode is not None else None
+    env = RigEnv("panda_table", sim=True, action=action, controller=controller, overrides=BARE)
+    try:
+        first, _ = env.reset(seed=1)
+        assert env.action_names[:1] == ("panda_joint1",)
+        most = env.action_space.high[0]
+        assert most == pytest.approx(0.3 * 2.175 if action == "velocity" else 87.0)
+        for _ in range(10):
+            last, _, _, _, _ = env.step(np.array([0.1 if mode is not None else 1.0, *[0.0] * 7], np.float32))
+        assert env.robot.state().controller is (mode or hal.ControlMode.TORQUE)
+        assert last["q"][0] - first["q"][0] > 0.02
+    finally:
+        env.close()
+
+
 RANGES = "objects.3={file: duck, random: {x: [0.2, 0.3], y: [-0.3, 0.3], yaw_deg: [-180, 180]}}"
 
 
