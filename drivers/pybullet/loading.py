@@ -36,6 +36,8 @@ __all__ = [
 
 MARGIN, THIN = 0.001, 0.2
 """Margin that PyBullet adds around hulls, m; and what is taken off a thin hull at most, as a share of its thickness."""
+LEAST_MASS, LEAST_INERTIA = 1e-3, 1e-7
+"""Mass, kg, and moment of inertia, kg m2, of a mere frame that a joint moves: Bullet takes none without."""
 FINGER_MASS = 0.1
 """Least mass of a finger that moves or holds something, kg: the solver lets one of 29 g press with no more than 26 N.
 The drive that moves with it is in no URDF. Fingers at rest have their own mass, so that the arm's inertia is right."""
@@ -70,6 +72,7 @@ def load_object(client: PyBulletClient, spec: BodySpec, drawn: bool = False) -> 
         client, spec.urdf, f"{key}.urdf", fixed=spec.fixed or spec.robot is not None, scale=spec.scale, drawn=drawn
     )
     body = _describe(client, spec, number, f"{key}.urdf", urdf)
+    _lighten_frames(client, body, urdf)
     _couple(client, body, mimics_of(spec, urdf))
     if body.movable:
         PassiveJoints(client, body).release()
@@ -89,6 +92,7 @@ def load_robot(client: PyBulletClient, spec: RobotSpec, drawn: bool = False) -> 
     lacking = massless(urdf)
     number = _load_urdf(client, spec.urdf, f"{key}.urdf", fixed=True, scale=1.0, drawn=drawn)
     body = _describe(client, spec, number, f"{key}.urdf", urdf)
+    _lighten_frames(client, body, urdf)
     moving = {name: joint for name, joint in body.joints.items() if joint in body.movable}
     check_names(spec, moving, body.links)
 
@@ -143,6 +147,11 @@ def _load_urdf(client: PyBulletClient, path: str, key: str, *, fixed: bool, scal
             number = client.loadURDF(file, useFixedBase=fixed, globalScaling=scale, flags=flags)
         except client.error:
             pass  # reported below, with what PyBullet printed
+        if number >= 0:
+            try:
+                client.getBasePositionAndOrientation(number)
+            except client.error:  # PyBullet has no room for its state
+                number = -1
     if number < 0:
         printed = " ".join(captured.text.split())
         raise ConfigError([Problem(path, key, f"PyBullet cannot load it. {printed}".strip(), "bad_urdf")])
@@ -285,6 +294,18 @@ def _couple(client: PyBulletClient, body: Body, mimics: Sequence[UrdfMimic]) -> 
         follower, leader = body.joints[mimic.joint], body.joints[mimic.of]
         effort = max(body.efforts.get(leader, 0.0), body.efforts.get(follower, 0.0), 100.0)
         body.gears.append(Gear(client, body.id, leader, follower, mimic.multiplier, effort))
+
+
+def _lighten_frames(client: PyBulletClient, body: Body, urdf: UrdfModel) -> None:
+    """Take the weight of 1 kg off links without ``<inertial>`` and shapes, which PyBullet gives to mere frames.
+
+    The root is left as it is: whether an object moves depends on it.
+    """
+    for name, link in urdf.links.items():
+        if link.inertial is None and not link.has_shapes and name != urdf.root:
+            moved = body.links[name] in body.movable
+            mass, moment = (LEAST_MASS, LEAST_INERTIA) if moved else (0.0, 0.0)
+            client.changeDynamics(body.id, body.links[name], mass=mass, localInertiaDiagonal=(moment,) * 3)
 
 
 def fix_inertias(client: PyBulletClient, body: Body, massless: Container[str]) -> list[str]:

@@ -16,6 +16,8 @@ from typing import Any, TypeVar
 
 from .. import registry
 from ..errors import HalError
+from ..geometry import Pose
+from ..kinematics.composition import MountedTool, compose_urdf
 from ..kinematics.hulls import FORMATS
 from ..kinematics.mesh_files import check_mesh, package_folder
 from ..kinematics.urdf import UrdfModel, read_urdf
@@ -26,7 +28,16 @@ from .models import CameraModel, FileSource, GripperModel, RobotModel, find_mode
 from .rigfile import CameraConfig, Device, GripperConfig, RigFile, RobotConfig
 from .schema import Unknown
 
-__all__ = ["Context", "check_camera_spec", "check_robot_spec", "find_mesh", "is_emulated", "load_urdf", "options_of"]
+__all__ = [
+    "Context",
+    "check_camera_spec",
+    "check_robot_spec",
+    "find_mesh",
+    "is_emulated",
+    "load_arm",
+    "load_urdf",
+    "options_of",
+]
 
 Model = TypeVar("Model", RobotModel, CameraModel)
 Config = RobotConfig | GripperConfig | CameraConfig
@@ -97,11 +108,28 @@ class Context:
             found = find_model(config.model, folder, parts, self.base)
             if isinstance(found, Path):
                 data = read_yaml(found, self.problems)
+                if data is not None and isinstance(config, RobotConfig):
+                    data = self._chosen_arm(key, config, data)
                 if data is not None:
                     return validate(kind, data, found, self.problems), found
             else:
                 self.problem(f"{key}.model", found, "unknown_model")
         return with_holes(kind, None, ()), self.base
+
+    def _chosen_arm(self, key: str, config: RobotConfig, data: dict[str, Any]) -> dict[str, Any] | None:
+        """Return a model with the keys of one of its arms; None, and a problem, if the rig names none of them."""
+        arms = data.get("arms")
+        chosen = getattr(config, "arm", None)
+        if not isinstance(arms, dict) or not arms:
+            if chosen is not None:
+                self.problem(f"{key}.arm", f"model {config.model!r} has one arm only", "unknown_arm")
+            return data
+        own = arms.get(chosen) if chosen is not None else None
+        if not isinstance(own, dict):
+            message = f"must be one of {', '.join(map(str, arms))}: model {config.model!r} has several arms"
+            self.problem(f"{key}.arm", message, "unknown_arm")
+            return None
+        return {**{name: value for name, value in data.items() if name != "arms"}, **own}
 
     def choose_driver(
         self, kind: str, key: str, config: Device, model: DrivenModel, parent: Device | None = None
@@ -158,10 +186,43 @@ _NO_WHEEL = (
 )
 INSTALL = {
     "pybullet_data": "pip install pybullet" if _HAS_WHEEL else _NO_WHEEL,
-    "example_robot_data": "pip install example-robot-data",
-    "airo_models": "pip install airo-models",
+    "example_robot_data": "pip install 'robot-hal[robots]'",
+    "airo_models": "pip install 'robot-hal[robots]'",
+    "rtbdata": "pip install 'robot-hal[robots]'",
 }
 """The command that installs a package, where it is not ``pip install`` and the package's name."""
+
+
+def load_arm(model: RobotModel, file: Path, problems: Problems, warnings: list[str]) -> UrdfModel | None:
+    """Return the checked URDF of an arm with its tool; None, and the problems, if something in it is wrong.
+
+    Args:
+        model: The arm's model.
+        file: The model's file.
+        problems: Gets the problems.
+        warnings: Gets a warning about links without mass.
+    """
+    freed = getattr(model, "freed", ())
+    tool = model.tool
+    if tool is None and not freed:
+        return load_urdf(model.urdf, file.parent, file, "urdf", problems, warnings)
+    arm = _locate(model.urdf, file.parent, file, "urdf", problems, (".urdf",))
+    if arm is None:
+        return None
+    mounted: MountedTool | None = None
+    if tool is not None:
+        own = _locate(tool.urdf, file.parent, file, "tool.urdf", problems, (".urdf",))
+        if own is None:
+            return None
+        mounted = MountedTool(own, tool.link, Pose(tool.position, tool.orientation))
+    try:
+        for path in (arm, *([mounted.urdf] if mounted is not None else [])):
+            read_urdf(path)
+        made = compose_urdf(arm, mounted, freed)
+    except (ValueError, OSError) as error:
+        problems.add(file, "tool" if mounted is not None else "freed", f"{arm.name}: {error}", "bad_urdf")
+        return None
+    return load_urdf(FileSource(path=str(made)), file.parent, file, "urdf", problems, warnings)
 
 
 def load_urdf(

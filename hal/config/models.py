@@ -57,6 +57,7 @@ __all__ = [
     "RobotModel",
     "SensorStream",
     "StreamModel",
+    "ToolModel",
     "by_name",
     "find_model",
     "load_pad_models",
@@ -169,11 +170,31 @@ class GripperModel(Strict):
         return self
 
 
+class ToolModel(Strict):
+    """A gripper or a tool with a URDF of its own, fixed to a link of the arm.
+
+    A name that the arm has as well gets ``tool_`` in front.
+    """
+
+    urdf: FileSource
+    link: str
+    """Link of the arm."""
+    position: Offset = (0.0, 0.0, 0.0)
+    orientation: QuaternionConfig = (0.0, 0.0, 0.0, 1.0)
+    """Pose of the root of the tool in the frame of that link."""
+
+
 class RobotModel(Strict):
     """An arm, with its gripper if it has one."""
 
     description: str = ""
     urdf: FileSource
+    tool: ToolModel | None = None
+    """What is mounted on the arm and not in its URDF."""
+    freed: tuple[str, ...] = ()
+    """Joints that the URDF has fixed, with limits, and that turn."""
+    arms: dict[Name, dict[str, Any]] = Field(default_factory=dict)
+    """Arms of one URDF that has several: for each, the keys that differ; a rig chooses with ``arm``."""
     drivers: Drivers = Drivers()
     rate_hz: RateHz = 1000.0
     """Rate of the real arm's control cycle. A simulated arm runs at the rig's ``physics_hz``."""

@@ -23,7 +23,7 @@ from ..specs import (
     Vector3,
     WorkspaceSpec,
 )
-from .context import Context, check_robot_spec, is_emulated, load_urdf, options_of
+from .context import Context, check_robot_spec, is_emulated, load_arm, options_of
 from .files import Problems, nearest
 from .models import LimitsModel, RobotModel
 from .rigfile import LimitsConfig, RobotConfig, WorkspaceConfig
@@ -63,7 +63,7 @@ def resolve_robot(context: Context, name: str, config: RobotConfig) -> RobotSpec
     model, file = context.read_model(RobotModel, key, config, "robots")
     urdf: UrdfModel | None = None
     with suppress(Unknown):
-        urdf = load_urdf(model.urdf, file.parent, file, "urdf", context.problems, context.warnings)
+        urdf = load_arm(model, file, context.problems, context.warnings)
     if urdf is not None:
         context.urdfs[name] = urdf
         _check_names(model, urdf, file, context.problems)

@@ -242,6 +242,8 @@ class RobotConfig(Device):
 
     model: str
     """A name in ``robots/``, or the path of a file of your own."""
+    arm: Name | None = None
+    """Which arm, where the model has several (``left`` or ``right`` of a ``baxter``)."""
     base: PoseConfig = PoseConfig()
     """Pose of the base link in the world."""
     initial: JointPositions | None = None

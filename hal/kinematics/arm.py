@@ -318,8 +318,8 @@ class Kinematics:
         return tuple(reach[name] for name in self.spec.joints), distance
 
     def _body_frame(self, link: str) -> int:
-        frame = int(self._model.getFrameId(link))
-        if frame >= self._model.nframes or self._model.frames[frame].type != self._pin.FrameType.BODY:
+        frame = int(self._model.getFrameId(link, self._pin.FrameType.BODY))  # a joint may have the same name
+        if frame >= self._model.nframes:
             links = [f.name for f in self._model.frames if f.type == self._pin.FrameType.BODY]
             near = difflib.get_close_matches(link, links, 3) or links
             raise KeyError(f"no link {link!r} in {Path(self.spec.urdf).name}; did you mean {', '.join(near)}?")
@@ -394,7 +394,9 @@ def bounded_urdf(urdf: str) -> str:
 
 
 def _frame(model: Any, link: str, spec: KinematicsSpec) -> int:
-    frame = int(model.getFrameId(link))
+    import pinocchio as pin
+
+    frame = int(model.getFrameId(link, pin.FrameType.BODY))  # a joint may have the same name
     if frame >= model.nframes:
         raise ValueError(f"{spec.urdf} has no link {link}")
     return frame

@@ -162,11 +162,11 @@ class UrdfModel:
         return found
 
     def without_mass(self) -> list[str]:
-        """Return the links that move and have no ``<inertial>``: simulators make up a mass for them."""
+        """Return the links that move and have shapes, but no ``<inertial>``: simulators make up a mass for them."""
         return [
             name
             for name, link in self.links.items()
-            if link.inertial is None and any(joint.kind != "fixed" for joint in self.above(name))
+            if link.inertial is None and link.has_shapes and any(joint.kind != "fixed" for joint in self.above(name))
         ]
 
 

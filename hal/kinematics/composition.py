@@ -1,0 +1,131 @@
+"""Make one URDF of an arm and a tool that has a URDF of its own, and free joints that a file has fixed.
+
+What is made is kept in the user's cache, named by its contents, because every process of a rig reads the file.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Collection
+from dataclasses import dataclass
+from math import atan2, hypot
+from pathlib import Path
+
+from ..geometry import Pose
+from .mesh_files import mesh_file
+from .urdf import parse_xml
+
+__all__ = ["MountedTool", "compose_urdf"]
+
+PREFIX = "tool_"
+"""Put before each name of a tool that the arm has too."""
+
+LIGHT = '<inertial><mass value="0.01"/><inertia ixx="1e-6" ixy="0" ixz="0" iyy="1e-6" iyz="0" izz="1e-6"/></inertial>'
+"""The mass of a tool's link that has a shape and no mass, 10 g: the pads of a gripper. Simulators make 1 kg of it."""
+
+
+@dataclass(frozen=True)
+class MountedTool:
+    """A tool with a URDF of its own, fixed to a link of an arm."""
+
+    urdf: Path
+    link: str
+    """Link of the arm."""
+    pose: Pose
+    """Pose of the root of the tool in the frame of that link."""
+
+
+def compose_urdf(arm: Path, tool: MountedTool | None = None, freed: Collection[str] = ()) -> Path:
+    """Write the URDF of an arm with a tool, and return its path.
+
+    Args:
+        arm: URDF of the arm.
+        tool: What is mounted on it.
+        freed: Fixed joints that turn about their axis, within the limits that the file has for them.
+
+    Raises:
+        ValueError: A file is no URDF, the arm has no such link, or a freed joint is not fixed or has no limits.
+        OSError: A file cannot be read, or the cache cannot be written.
+    """
+    root = _with_absolute_files(arm)
+    for name in freed:
+        joint = next((one for one in root.findall("joint") if one.get("name") == name), None)
+        if joint is None or joint.get("type") != "fixed" or joint.find("limit") is None:
+            raise ValueError(f"has no fixed joint {name!r} with limits")
+        joint.set("type", "revolute")
+    if tool is not None:
+        _mount(root, tool)
+    data = ElementTree.tostring(root, encoding="utf-8")
+    place = _cache_folder() / f"{arm.stem}-{hashlib.sha256(data).hexdigest()[:16]}.urdf"
+    if not place.is_file() or place.read_bytes() != data:
+        place.parent.mkdir(parents=True, exist_ok=True)
+        unfinished = place.with_name(f"{place.name}.{os.getpid()}")
+        unfinished.write_bytes(data)
+        os.replace(unfinished, place)
+    return place
+
+
+def _cache_folder() -> Path:
+    """Return ``$XDG_CACHE_HOME/robot-hal/urdf``, by default under ``~/.cache``."""
+    root = os.environ.get("XDG_CACHE_HOME") or os.path.join(os.path.expanduser("~"), ".cache")
+    return Path(root, "robot-hal", "urdf")
+
+
+def _with_absolute_files(urdf: Path) -> ElementTree.Element:
+    root = parse_xml(urdf)
+    if root.tag != "robot":
+        raise ValueError(f"is not a URDF: its root element is <{root.tag}>, not <robot>")
+    folder = urdf.resolve().parent
+    for tag in ("mesh", "texture"):
+        for element in root.iter(tag):
+            if element.get("filename"):
+                element.set("filename", str(mesh_file(element.get("filename", ""), folder).resolve()))
+    return root
+
+
+def _mount(root: ElementTree.Element, tool: MountedTool) -> None:
+    added = _with_absolute_files(tool.urdf)
+    names = {(one.tag, one.get("name", "")) for one in root}
+    if ("link", tool.link) not in names:
+        raise ValueError(f"has no link {tool.link!r}")
+    parts = [one for one in added if one.tag in ("link", "joint", "material")]
+    taken = {(one.tag, one.get("name", "")) for one in parts} & names
+    for one in parts:
+        _rename(one, taken)
+    for one in parts:
+        if one.tag == "link" and one.find("inertial") is None and one.find("collision") is not None:
+            one.append(ElementTree.fromstring(LIGHT))
+    children = {one.get("link") for one in added.findall("joint/child")}
+    base = next(one.get("name", "") for one in parts if one.tag == "link" and one.get("name") not in children)
+    mount = ElementTree.SubElement(root, "joint", {"name": f"{PREFIX}mount", "type": "fixed"})
+    ElementTree.SubElement(mount, "parent", {"link": tool.link})
+    ElementTree.SubElement(mount, "child", {"link": base})
+    xyz = " ".join(f"{value:.9g}" for value in tool.pose.position)
+    rpy = " ".join(f"{value:.12g}" for value in _roll_pitch_yaw(tool.pose))
+    ElementTree.SubElement(mount, "origin", {"xyz": xyz, "rpy": rpy})
+    root.extend(parts)
+
+
+def _rename(part: ElementTree.Element, taken: Collection[tuple[str, str]]) -> None:
+    """Put :data:`PREFIX` before the names that the arm has, where they are given and where they are referred to."""
+    for element in part.iter():
+        if element is part or element.tag == "material":
+            kind, key = element.tag, "name"
+        else:
+            kind, key = _REFERENCES.get(element.tag, ("", ""))
+        if (kind, element.get(key, "")) in taken:
+            element.set(key, PREFIX + element.get(key, ""))
+
+
+_REFERENCES = {"parent": ("link", "link"), "child": ("link", "link"), "mimic": ("joint", "joint")}
+"""Elements that refer to others: the kind of what they refer to, and the attribute with its name."""
+
+
+def _roll_pitch_yaw(pose: Pose) -> tuple[float, float, float]:
+    m = pose.matrix()
+    level = hypot(m[0, 0], m[1, 0])
+    if level > 1e-9:
+        return atan2(m[2, 1], m[2, 2]), atan2(-m[2, 0], level), atan2(m[1, 0], m[0, 0])
+    return atan2(-m[1, 2], m[1, 1]), atan2(-m[2, 0], level), 0.0

@@ -1,0 +1,69 @@
+"""The contracts of arms and grippers, for every built-in model whose package is installed, on each engine."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from engines_kit import Engine
+
+from hal import registry
+from hal.config import load
+from hal.config.data_files import list_data
+from hal.errors import ConfigError
+from hal.testing import RobotBench, RobotContract
+
+from .benches import _robot_bench
+
+sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
+import robots  # type: ignore[import-not-found]  # benchmarks/robots.py
+
+pytestmark = pytest.mark.slow
+ENTRIES = [entry for model in list_data("robots") for entry in robots.entries(model)]
+WITHOUT_TORQUES = ("so101", "xarm7")
+SLOW = ("jaco",)
+"""Their joints are slower than the motion of a check."""
+
+
+def bench_of(*models: str, others: bool = False) -> Any:
+    """Return the fixture with the benches of these models, or of all others."""
+    entries = [entry for entry in ENTRIES if (entry["model"] in models) != others]
+
+    @pytest.fixture(params=entries, ids=["-".join(entry.values()) for entry in entries])
+    def bench(self: object, request: pytest.FixtureRequest, engine: Engine) -> Iterator[RobotBench]:
+        yield from _bench(request.param, engine)
+
+    return bench
+
+
+def _bench(entry: dict[str, Any], engine: Engine) -> Iterator[RobotBench]:
+    try:
+        plan = load({"sim": True, "robots": {"arm": entry}}, engine=engine.name).resolve()
+    except ConfigError as error:
+        if all(problem.code == "missing_package" for problem in error.problems):
+            pytest.skip(error.problems[0].message)
+        raise
+    world: Any = registry.load(engine.name, "world")(plan.world)
+    driver: Any = engine.robot(world)
+    yield _robot_bench(driver, advance=world.step, joint=0)  # 1 Nm throws the light wrist of a small arm
+    driver.close()
+    world.close()
+
+
+class TestModels(RobotContract):
+    bench = bench_of(*WITHOUT_TORQUES, *SLOW, others=True)
+
+
+class TestModelsWithoutTorques(
+    RobotContract,
+    left_out={"torque": "1 Nm throws an SO-101, and the damping in the URDF of the xArm7 takes most of it"},
+):
+    bench = bench_of(*WITHOUT_TORQUES)
+
+
+class TestSlowModels(RobotContract):
+    bench = bench_of(*SLOW)
+    test_set_points_are_followed = None  # type: ignore[assignment]  # its motion is too fast
