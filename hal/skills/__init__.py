@@ -7,7 +7,7 @@ faults and lost devices are the exceptions that they are everywhere else.
 from __future__ import annotations
 
 from .depth import find_by_depth, locate_by_depth, look_at, read_frames
-from .grasping import grasp
+from .grasping import gentle_grasp, grasp
 from .objects import LocatedObject, grasp_pose, locate_by_truth, object_from_points
 from .pushing import push, push_path, push_to
 from .running import Reason, SkillPhase, SkillProgress, SkillResult
@@ -19,6 +19,7 @@ __all__ = [
     "SkillProgress",
     "SkillResult",
     "find_by_depth",
+    "gentle_grasp",
     "grasp",
     "grasp_pose",
     "locate_by_depth",

@@ -251,9 +251,9 @@ def look_at(
         progress=progress,
     )
     with run:
-        run.choose_way([[goal]])
+        _, q = run.choose_way([[goal]])
         run.begin("look")
-        run.move(goal)
+        run.go(goal, q)
     return run.result()
 
 

@@ -96,22 +96,24 @@ def push(
     )
     with run:
         ways = [poses, [flipped(pose) for pose in poses]] if flip else [poses]
-        start, *rest, away, _ = run.choose_way([_whole_way(way, approach) for way in ways])
+        heights = (approach, 0.6 * approach)  # lower where the arm does not reach that high
+        way, q = run.choose_way(*([_whole_way(each, height) for each in ways] for height in heights))
+        start, *rest, away, end = way
         run.begin("close")
         set_fingers(run, opening)
         run.begin("approach")
-        run.move(start)
+        run.go(start, q)
         run.begin("descend")
-        run.move(rest[0], tcp_speed=_SPEED, straight=True)
+        run.move(rest[0], tcp_speed=_SPEED)
         run.begin("push")
         for pose in rest[1:]:
-            run.move(pose, tcp_speed=tcp_speed, straight=True)
+            run.move(pose, tcp_speed=tcp_speed)
         run.begin("back_off")
         if opening > 0.0:  # something round between two fingers would come back with them
             set_fingers(run, opening + _LET_GO)
-        run.move(away, tcp_speed=_SPEED, straight=True)
+        run.move(away, tcp_speed=_SPEED)
         run.begin("lift")
-        run.move(above(away, approach), tcp_speed=_SPEED, straight=True)
+        run.move(end, tcp_speed=_SPEED)
     return run.result()
 
 

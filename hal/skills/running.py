@@ -60,6 +60,14 @@ Reason = Literal[
 
 _POLL = 0.02
 """Time between two looks at the dead-man or the fingers, s."""
+_JUMP = 1.2
+"""Change of a joint between two poses near by from which on it counts as a jump, rad."""
+_SINK = 0.03
+"""By how much the tcp may sink on its way through free space, m."""
+_RAISE = 0.15
+"""Height of the point over which the arm goes if it would sink more, m."""
+_STEPS = 10
+"""Number of points of a way at which that is checked."""
 _OFF_TARGET = 0.01
 """Distance from the goal above which an arm at rest counts as blocked, m."""
 _LONGEST_MOVE = 120.0
@@ -205,61 +213,106 @@ class SkillRun:
 
     # The arm.
 
-    def choose_way(self, ways: Sequence[Sequence[Pose]]) -> Sequence[Pose]:
-        """Return the way whose start is nearest, in joint positions, of those that the arm reaches all along.
+    def choose_way(self, *groups: Sequence[Sequence[Pose]]) -> tuple[Sequence[Pose], Array]:
+        """Return a way that the arm reaches all along, and the joint positions (n,) in rad at its start.
 
-        Fails as ``unreachable`` or ``outside_limits`` if there is none.
+        It is the nearest one, in joint positions, of the first group with any. Fails as ``unreachable`` or
+        ``outside_limits`` if there is none.
 
         Args:
-            ways: For each way the poses of the tcp, in the arm's base frame, in the order in which they are visited.
+            groups: Ways: the poses of the tcp, in the arm's base frame, in the order in which they are visited.
         """
-        now, found = self.arm.state().q, []
+        now = self.arm.state().q
         problems: list[tuple[Reason, str]] = []
-        for way in ways:
-            try:
-                found.append((float(np.abs(self._solve(way) - now).max()), way))
-            except Unreachable as error:
-                problems.append(("unreachable", str(error)))
-            except CommandError as error:
-                problems.append(("outside_limits", str(error)))
-        if not found:
-            self.fail(*problems[0])
-        return min(found, key=lambda pair: pair[0])[1]
+        for ways in groups:
+            found = []
+            for way in ways:
+                try:
+                    start = self._solve(way)
+                except Unreachable as error:
+                    problems.append(("unreachable", str(error)))
+                except CommandError as error:
+                    problems.append(("outside_limits", str(error)))
+                else:
+                    found.append((float(np.abs(start - now).max()), way, start))
+            if found:
+                _, way, start = min(found, key=lambda each: each[0])
+                return way, start
+        reason, message = problems[0]
+        return self.fail(reason, message)
 
     def _solve(self, way: Sequence[Pose]) -> Array:
         """Return the joint positions (n,) in rad at the start of a way; raise if the arm does not reach all of it."""
         arm, box = self.arm, self.arm.spec.workspace
-        seed, first = arm.state().q, None
+        last, first = arm.state().q, None
         for pose in way:
             if box is not None and not np.all((pose.position >= box.lower) & (pose.position <= box.upper)):
                 raise CommandError(f"{_text(pose)} is outside the workspace of {arm.name}", code="outside_workspace")
-            seed = arm.ik(pose, seed)
-            first = seed if first is None else first
+            q = arm.ik(pose, last)
+            if first is None:
+                first = q
+            elif np.abs(q - last).max() > _JUMP:
+                text = f"the joints would jump on the way to {_text(pose)}"
+                raise Unreachable(text, position_error=0.0, rotation_error=0.0)
+            last = q
         assert first is not None
         return first
 
-    def move(self, pose: Pose, *, tcp_speed: float | None = None, straight: bool = False) -> None:
-        """Move the tcp to a pose; fail as ``blocked`` or ``outside_limits`` if it does not get there.
+    def go(self, pose: Pose, q: Array) -> None:
+        """Move in free space to a pose, with the joint positions (n,) in rad that :meth:`choose_way` found for it.
+
+        The way is straight in joint space. If the tcp would sink on it, the arm goes over a raised point between.
+        """
+        arm = self.arm
+        start = arm.state()
+        low = min(start.tcp_set.position[2], pose.position[2]) - _SINK
+        steps = np.linspace(0.0, 1.0, _STEPS)[:, None]
+        if all(arm.fk(each).position[2] > low for each in start.q_set + steps * (q - start.q_set)):
+            self._move(pose, q)
+            return
+        middle = 0.5 * (start.tcp_set.position + pose.position)
+        try:
+            over = arm.ik(above(Pose(middle, pose.orientation), _RAISE), q)
+        except Unreachable:
+            over = q
+        self._move(pose, np.array([over, q]))
+
+    def move(self, pose: Pose, *, tcp_speed: float) -> None:
+        """Move the tcp a short way to a pose near by: on a straight line, or in joint space where that cannot be.
 
         Args:
             pose: Pose of the tcp in the arm's base frame.
             tcp_speed: Greatest speed of the tcp, m/s.
-            straight: Go there along a straight line, and at ``tcp_speed`` alone.
         """
+        try:
+            self._move(pose, pose, tcp_speed=tcp_speed, straight=True)
+        except Unreachable as error:  # nothing has moved
+            state = self.arm.state()
+            try:
+                q = self.arm.ik(pose, state.q_set)
+            except Unreachable:
+                q = None
+            if q is None or np.abs(q - state.q_set).max() > _JUMP:
+                self.fail("unreachable", str(error))
+            self._move(pose, q, tcp_speed=tcp_speed)
+
+    def _move(
+        self, pose: Pose, target: Pose | Array, *, tcp_speed: float | None = None, straight: bool = False
+    ) -> None:
+        """Move to ``target``, and fail unless the tcp is then at ``pose``. Raises Unreachable before it moves."""
         timeout = _LONGEST_MOVE if self._deadman is None else None
         most = self.arm.spec.tcp_speed
         try:
             state = self.arm.move_to(
-                pose,
+                target,
                 deadman=self._deadman,
                 unattended=self._unattended,
                 patience=self._patience,
                 timeout=timeout,
                 tcp_speed=None if tcp_speed is None else min(tcp_speed, most),
-                speed=self.arm.spec.speed if straight else self._speed,
+                speed=self._speed if tcp_speed is None else self.arm.spec.speed,
+                straight=straight,
             )
-        except Unreachable as error:
-            self.fail("unreachable", str(error))
         except CollisionError as error:
             self.fail("collision", str(error))
         except CommandError as error:

@@ -31,6 +31,10 @@ def test_a_grasp_by_noisy_depth(tries: ModuleType) -> None:
     assert tries.grasps(AUTO, "duck", tries.NOISY, 1) == [""]
 
 
+def test_a_gentle_grasp_moves_the_object_by_less_than_2_mm(tries: ModuleType, engine: Engine) -> None:
+    assert tries.gentle_grasps(engine.name, "cube", 1) == [""]
+
+
 @pytest.mark.parametrize("thing", ["cube", "cylinder"])
 def test_pushes_to_a_goal(tries: ModuleType, engine: Engine, thing: str) -> None:
     assert tries.pushes(engine.name, thing, 1) == [""]

@@ -9,7 +9,7 @@ import pytest
 from errors_kit import raises_code
 
 import hal
-from hal.skills import SkillProgress, grasp
+from hal.skills import SkillProgress, gentle_grasp, grasp
 
 DOWN = [1.0, 0.0, 0.0, 0.0]
 POSE = hal.Pose([0.45, 0.1, 0.1], DOWN)
@@ -179,3 +179,26 @@ def test_a_released_dead_man_pauses_the_arm_and_the_fingers(rig: hal.Rig) -> Non
             patience=0.5,
             progress=at("close", lambda: (pad.release("l2"), rig.clock.sleep(0.1))),
         )
+
+
+@pytest.mark.parametrize(
+    ("reason", "phase", "between"),
+    [
+        ("", "hold", WIDTH),
+        ("missed", "touch", None),
+        ("wrong_width", "centre", 0.005),
+        ("not_centred", "centre", 0.05),
+        ("dropped", "hold", WIDTH),
+    ],
+)
+def test_a_gentle_grasp_tells_what_it_touched(rig: hal.Rig, reason: str, phase: str, between: float | None) -> None:
+    """The mock's object is always in the middle, so that a wider one seems to move with the arm."""
+    gripper = rig.driver("panda.gripper")
+    gripper.inject(object_width=between)
+    lose = at("hold" if reason == "dropped" else "never", lambda: gripper.inject(object_width=None))
+    result = gentle_grasp(rig.robots["panda"], POSE, WIDTH, hold=1.0, speed=1.0, progress=lose)
+    assert (result.reason, result.phase, bool(result)) == (reason, phase, not reason)
+    closing = [(speed, force) for width, speed, force in gripper.log if width == 0.0]
+    assert (0.02, 3.0) in closing, "the touch is slow, and hardly presses"
+    if reason in ("missed", "wrong_width", "not_centred"):
+        assert result.width == pytest.approx(0.08, abs=1e-3)
