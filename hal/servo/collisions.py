@@ -64,6 +64,7 @@ class CollisionGuard:
         self._floors: dict[int, float] = {}
         """Smallest distance allowed for each pair that is inside its margin, m."""
         self._fastest = [0.0] * smoother.n
+        self._slowest = 0.0
         self._per_speed = self._per_acceleration = self._per_goal = 0.0
         self.slowed = False
         """Whether the last goal was slowed down."""
@@ -83,6 +84,7 @@ class CollisionGuard:
             worst.append((stop_displacement(u, A, A, J) - at_cap) / A)
             braked.append(self._braking_way(u, A, J) / u)
             self._fastest.append(u)
+        self._slowest = min(self._fastest)
         self._per_speed, self._per_acceleration, self._per_goal = max(steady), max(worst), max(braked)
 
     def is_far(self, dq: Floats) -> bool:
@@ -133,9 +135,11 @@ class CollisionGuard:
         """Return whether the proposed step, and the stop after it, keep every margin, or come no nearer than now."""
         smoother = self._smoother
         q, dq, ddq = smoother.q_next, smoother.dq_next, smoother.ddq_next
-        if all(-u <= v <= u for v, u in zip(dq, self._fastest, strict=True)) and self._is_clear(
-            q, self._per_speed * hypot(*dq) + self._per_acceleration * hypot(*ddq)
-        ):
+        speed = hypot(*dq)
+        if (
+            speed <= self._slowest  # one comparison, mostly, instead of one for each joint
+            or all(-u <= v <= u for v, u in zip(dq, self._fastest, strict=True))
+        ) and self._is_clear(q, self._per_speed * speed + self._per_acceleration * hypot(*ddq)):
             return True
         limits = list(zip(smoother.acceleration, smoother.jerk, strict=True))
         ways = [
