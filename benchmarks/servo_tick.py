@@ -27,8 +27,10 @@ from servo_streams import PANDA, robot_spec
 from hal.commands import NO_INBOX, CommandRecord, Inbox, Kind, Session
 from hal.config.data_files import find_data
 from hal.driver import Reading
+from hal.dynamics import Dynamics
 from hal.kinematics.arm import Kinematics
 from hal.servo.audit import SetpointAudit
+from hal.servo.controllers import Controller, JointImpedance, OperationalSpace, Position, controller_data, resolve
 from hal.servo.servo import Servo
 from hal.specs import RobotSpec, WorkspaceSpec
 
@@ -82,18 +84,26 @@ class Times:
 
 
 def measure(
-    spec: RobotSpec, kind: Kind | None, values: Values, tcp_speed: float, ticks: int, prepared: bool, idle: bool
+    spec: RobotSpec,
+    kind: Kind | None,
+    values: Values,
+    tcp_speed: float,
+    ticks: int,
+    prepared: bool,
+    idle: bool,
+    controller: Controller,
 ) -> Times:
     """Return the times of a tick, with or without computing ahead. Without a kind: move_to."""
     kinematics = Kinematics(spec.kinematics)
-    servo = Servo(spec, 1 / RATE_HZ, kinematics, kinematics.mass_matrix)
+    mass_matrix = Dynamics.of(spec).mass_matrix
+    servo = Servo(spec, 1 / RATE_HZ, kinematics, mass_matrix)
     servo.anchor(spec.home)
     goal = tuple(x + 0.3 * math.cos(k) for k, x in enumerate(spec.home)) if kind is None else None
-    servo.open_session(Session(1, 0.3, tcp_speed, False, goal), NO_INBOX)
+    servo.open_session(Session(1, 0.3, tcp_speed, False, goal, controller=controller_data(controller)), NO_INBOX)
     bare = Bare()
     now, q, dq = 10.0, list(spec.home), STILL
     start = list(q)
-    inverse = np.linalg.inv(kinematics.mass_matrix(start))
+    inverse = np.linalg.inv(mass_matrix(start))
     command = None
     times, ahead, references = [], [], []
     for k in range(ticks):
@@ -174,6 +184,9 @@ def main() -> None:
         return [pose[0] + 0.04 * math.sin(t), pose[1] + 0.04 * math.sin(2 * t), *pose[2:]]
 
     walled = replace(spec, workspace=box)
+    arm = Kinematics(spec.kinematics)
+    task = resolve(OperationalSpace(), spec, arm, RATE_HZ)
+    joints = resolve(JointImpedance(), spec, arm, RATE_HZ)
     cases: list[tuple[str, RobotSpec, Kind | None, Values, float]] = [
         ("joint targets, moving", spec, Kind.JOINT_TARGET, sine, free),
         ("joint targets, held", spec, Kind.JOINT_TARGET, held, free),
@@ -187,11 +200,17 @@ def main() -> None:
         ("torques, capped, workspace", walled, Kind.JOINT_TORQUE, torque, capped),
         ("move_to", spec, None, held, capped),
     ]
+    controlled = [
+        ("poses, OperationalSpace", walled, Kind.CARTESIAN_TARGET, target, capped, task),
+        ("twists, OperationalSpace", spec, Kind.TWIST, twist, capped, task),
+        ("twists, JointImpedance", spec, Kind.TWIST, twist, capped, joints),
+    ]
     gc.disable()
     heads = ("median", "p99", "prepared", "p99", "ahead", "reference", "ratio")
     print(f"{'kind of command':34s}" + "".join(f"{head:>10s}" for head in heads) + "   (us)")
-    for name, case, kind, values, tcp_speed in cases:
-        plain, ready = (measure(case, kind, values, tcp_speed, ticks, prepared, idle) for prepared in (False, True))
+    for name, case, kind, values, tcp_speed, controller in [*((*each, Position()) for each in cases), *controlled]:
+        how = (values, tcp_speed, ticks)
+        plain, ready = (measure(case, kind, *how, prepared, idle, controller) for prepared in (False, True))
         numbers = (plain.median, plain.p99, ready.median, ready.p99, ready.prepare, ready.reference)
         print(f"{name:34s}" + "".join(f"{x:10.1f}" for x in (*numbers, ready.median / ready.reference)))
     print(f"{'audit, one sample':34s} {audit_time(ticks):8.1f}")

@@ -12,11 +12,13 @@ from contextlib import suppress
 from math import hypot
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..commands import Session
 from ..dynamics import Dynamics
 from ..errors import NotSupported
 from ..geometry import difference
+from ..kinematics.arm import Pose7
 from ..specs import RobotSpec
 from ..types import ControlMode, Limited
 from .controllers import Controller, ControllerLaw, Position, controller_of
@@ -61,6 +63,8 @@ class Compliance:
         """Whether the controller drives the arm."""
         self._due: tuple[Floats, Floats] = ((), ())
         """Set-point of the last tick: positions (n,), rad, and speeds (n,), rad/s, that are due now."""
+        self._seen: tuple[Pose7, NDArray[np.float64], list[float]] = ((0.0,) * 7, np.zeros((6, 0)), [])
+        """Measured pose of the tcp, its Jacobian there, and the twist to the set-point within 1 s."""
         self.held_back = False
         """Whether the set-point is as far ahead of the arm as it may be."""
 
@@ -117,8 +121,8 @@ class Compliance:
         if law.in_joints and max([abs(a - b) for a, b in zip(goal, q, strict=True)]) > turn:
             goal = [b + max(-turn, min(turn, a - b)) for a, b in zip(goal, q, strict=True)]
         kinematics = self._envelope.kinematics
-        here = kinematics.fk(q)
-        error = difference(here, kinematics.fk(goal))
+        pose, jacobian = kinematics.fk_and_jacobian(q)
+        error = difference(pose, kinematics.fk(goal))
         share = hypot(*error[:3]) / most
         if not law.in_joints and not law.position_only:
             share = max(share, hypot(*error[3:]) / turn)
@@ -128,8 +132,10 @@ class Compliance:
         moved = goal is not smoother.q
         if moved:
             smoother.anchor(goal)
+            error = difference(pose, kinematics.fk(goal))
             self._envelope.limited |= Limited.LEAD
         self._due = smoother.q, smoother.dq
+        self._seen = pose, jacobian, error
         return moved
 
     def drive(self) -> None:
@@ -143,14 +149,11 @@ class Compliance:
             mass = arm.inertia.mass + np.diag(self._friction) * smoother.dt
             arm = arm._replace(inertia=Inertia(mass, smoother.n))
         q_due, dq_due = self._due
-        kinematics = self._envelope.kinematics
-        pose, jacobian = kinematics.fk_and_jacobian(arm.q)
-        error = difference(pose, kinematics.fk(q_due)) if not law.in_joints else ()
+        pose, jacobian, error = self._seen
         dt = smoother.dt
         acceleration = [(new - old) / dt for new, old in zip(smoother.dq, dq_due, strict=True)]
         tau = law.torques(arm.q, arm.dq, (q_due, dq_due, acceleration), arm.inertia, jacobian, pose, error)
-        pull, brake = tau.tolist()
-        torque.drive(pull, brake, law.gain, arm, jacobian)
+        torque.drive(tau, law.gain, arm, jacobian)
 
     def strays(self) -> Limited | None:
         """Return the limit that the arm exceeds, although its set-point keeps all of them; None if it keeps all."""

@@ -331,6 +331,9 @@ class ControllerLaw:
         self._redundant = task is not None and n > self._rows
         self._ease = 0.0 if task is None else np.diag(1.0 / _HEAVIEST[: self._rows])
         self._by_rate = getattr(controller, "rate", None) is not None
+        import eigenpy
+
+        self._eigen: Any = eigenpy.SelfAdjointEigenSolver(np.eye(self._rows))
         self._posture: Array | None = None
         self._modes: tuple[Array, Array, Array | None] = (np.zeros(1), np.ones(1), None)
         """Accelerations by the springs in their modes, frequencies of the modes, rad/s, and the modes."""
@@ -407,8 +410,9 @@ class ControllerLaw:
             error: Twist (6,) from that pose to the set-point's within 1 s, m and rad (:func:`hal.geometry.difference`).
 
         Returns:
-            Two rows (2, n), Nm, whose sum is the controller's: what the springs of the tcp's position exert, or those
-            of the joints; and all the rest, which alone makes the tcp as fast as the set-point, and no faster.
+            Two rows (2, n), Nm, whose sum is the controller's. The second is what the springs of the tcp's position
+            exert, or those of the joints; the first is all the rest, which alone makes the tcp as fast as the
+            set-point, and no faster.
         """
         if self._ramped < 1.0:
             self._ramped = min(1.0, self._ramped + self._dt / RAMP)
@@ -416,16 +420,17 @@ class ControllerLaw:
         q_set, dq_set, ddq_set = setpoint
         lag: Array = np.subtract(dq_set, dq)
         if self.in_joints:
-            tau = self._springs(inertia.inverse, self._shortened(np.subtract(q_set, q), inertia.inverse)[None], lag)
+            lengths = self._shortened(np.subtract(q_set, q), inertia.inverse)
+            tau = self._springs(inertia.inverse, np.array((lag, lengths)))
         else:
             away = np.subtract(q_set if self._posture is None else self._posture, q)
             tau = self._task(q, away, lag, inertia, jacobian, pose, np.array(error))
-        self.gain = self._gain(float(np.abs(tau[0]).max()), jacobian, pose)
-        tau[1] += inertia.mass.dot(ddq_set)
+        self.gain = self._gain(float(np.abs(tau[1]).max()), jacobian, pose)
+        tau[0] += inertia.mass.dot(ddq_set)
         if self._friction is not None:
-            tau[1] += self._friction * dq
+            tau[0] += self._friction * dq
         if self._dynamics is not None:
-            tau[1] += self._dynamics.coriolis(q, dq)
+            tau[0] += self._dynamics.coriolis(q, dq)
         return tau
 
     def _gain(self, most: float, jacobian: Array, pose: Pose7) -> Array:
@@ -460,19 +465,28 @@ class ControllerLaw:
             jacobian, error = _turned(turn, jacobian), _turned(turn, error)
         eased = jacobian.dot(inertia.inverse)
         ease = eased.dot(jacobian.T) + self._ease
-        errors = np.zeros((self._rows // 3, self._rows))
-        errors[0, :3] = error[:3]
+        parts = np.zeros((self._rows // 3 + 1, self._rows))
+        parts[0] = jacobian.dot(lag)
+        parts[-1, :3] = error[:3]
         if self._rows == 6:
-            errors[1, 3:] = self._shortened(error[3:], ease)
-        force = self._springs(ease, errors, jacobian.dot(lag))
+            parts[1, 3:] = self._shortened(error[3:], ease)
+        force = self._springs(ease, parts)
         if not self._redundant:
             return np.asarray(force.dot(jacobian), np.float64)
         posture = self._posture_stiffness * np.minimum(np.maximum(away, -_POSTURE_LEAD), _POSTURE_LEAD)
         posture += self._posture_damping(q, inertia).dot(lag)
-        force[1] -= np.linalg.solve(ease, eased.dot(posture))
+        force[0] -= self._held(ease, eased.dot(posture))
         tau: Array = force.dot(jacobian)
-        tau[1] += posture
+        tau[0] += posture
         return tau
+
+    def _held(self, ease: Array, acceleration: Array) -> Array:
+        """Return the forces (k,) that accelerate what the springs move: in the modes that :meth:`_springs` found."""
+        _, frequencies, modes = self._modes
+        if modes is None:
+            return np.asarray(np.linalg.solve(ease, acceleration), np.float64)
+        forces = modes.dot((self._roots * acceleration).dot(modes) / (frequencies * frequencies))
+        return np.asarray(self._roots * forces, np.float64)
 
     def _posture_damping(self, q: Floats, inertia: Inertia) -> Array:
         """Return the damping (n, n) of the posture, Nm s/rad: 2 ratio sqrt(k) M^(1/2), with a little of M.
@@ -497,34 +511,37 @@ class ControllerLaw:
         most = self._reach / np.sqrt(squares)
         return np.asarray(np.minimum(np.maximum(error, -most), most), np.float64)
 
-    def _springs(self, ease: Array, errors: Array, lag: Array) -> Array:
-        """Return the forces (2, k) of the springs of the first row of ``errors``, and of the others with the dampers.
+    def _springs(self, ease: Array, parts: Array) -> Array:
+        """Return forces (2, k): those of the springs of the last row of ``parts``, after those of all other rows.
 
         In the modes of the matrix sqrt(K) A sqrt(K), A being the inverse inertia ``ease`` (k, k), each spring of unit
         stiffness moves a mass of 1 / w^2, so that a damper of 2 ratio / w damps it by the ratio.
 
         Args:
             ease: Inverse of the inertia that the springs move.
-            errors: Distances of the set-point, which add up (m, k).
-            lag: Speed of the set-point relative to what was measured (k,).
+            parts: Speed of the set-point relative to what was measured (k,), and then rows of its distances, which add
+                up (m, k).
         """
-        parts = np.concatenate((errors, lag[None]))
         if self._by_rate:
-            parts[:-1] *= self._gains
-            parts[-1] *= np.minimum(2.0 * self._ratio * self._roots, _DAMPED / self._dt)
-            self._modes = parts[0], self._roots, None
+            parts[0] *= np.minimum(2.0 * self._ratio * self._roots, _DAMPED / self._dt)
+            parts[1:] *= self._gains
+            self._modes = parts[-1], self._roots, None
             forces = np.linalg.solve(ease, parts.T).T
         else:
-            values, modes = np.linalg.eigh(ease * self._weights)
-            squares: Array = np.maximum(values, _SLOWEST)
+            self._eigen.compute(ease * self._weights)
+            modes: Array = self._eigen.eigenvectors()
+            squares: Array = np.maximum(self._eigen.eigenvalues(), _SLOWEST)
             frequencies = np.sqrt(squares)
             parts = (parts * self._roots).dot(modes)
+            parts[0] *= np.minimum(2.0 * self._ratio / frequencies, (_DAMPED / self._dt) / squares)
             if squares[-1] > self._most:  # where the arm is lighter than at home
-                parts[:-1] *= np.minimum(1.0, self._most / squares)
-            parts[-1] *= np.minimum(2.0 * self._ratio / frequencies, _DAMPED / (self._dt * squares))
-            self._modes = parts[0] * squares, frequencies, modes
+                parts[1:] *= np.minimum(1.0, self._most / squares)
+            self._modes = parts[-1] * squares, frequencies, modes
             forces = parts.dot(modes.T) * self._roots
-        return np.array((forces[0], forces[1:].sum(axis=0)))
+        if len(forces) > 2:
+            forces[0] += forces[1]
+            forces = forces[::2]
+        return np.asarray(forces, np.float64)
 
 
 def _tuple(gain: Gain | None) -> tuple[float, ...]:

@@ -16,7 +16,7 @@ an obstacle or a push is not predicted; it shows in the measured speeds.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from math import hypot, isfinite, sqrt
+from math import dist, hypot, isfinite, sqrt
 from operator import mul
 from typing import Any, NamedTuple
 
@@ -132,9 +132,15 @@ class TorqueBounds:
         assert limits.torque is not None
         self._limits = limits
         self._torque = limits.torque
+        self._weakest = min(limits.torque)
         self._envelope = envelope
         self._kinematics = envelope.kinematics
         self._reach = self._kinematics.reach()
+        self._reach_length = hypot(*self._reach)
+        self._slowest = min(limits.velocity)
+        # Positions this near to the middle of their ranges are in them: one distance, not two comparisons a joint.
+        self._middle = [0.5 * (low + high) for low, high in zip(limits.lower, limits.upper, strict=True)]
+        self._radius = min(0.5 * (high - low) for low, high in zip(limits.lower, limits.upper, strict=True))
         self.velocity: Floats = envelope.velocity
         """Greatest joint speeds (n,) that torques may lead to, rad/s."""
         self.tcp_speed = envelope.tcp_speed
@@ -185,33 +191,37 @@ class TorqueBounds:
         brake = (1.0 - share) * self._decay * max(0.0, excess)
         return [share * x - brake * p for x, p in zip(slowed, arm.inertia.momentum(arm.dq), strict=True)]
 
-    def shared(self, pull: Floats, brake: Floats, gain: Any, arm: ArmInMotion, jacobian: Any) -> list[float]:
-        """Return the torques (n,) to move towards, Nm: a controller's, with as much pull as keeps the speeds.
+    def shared(self, tau: Any, gain: Any, arm: ArmInMotion, jacobian: Any) -> list[float]:
+        """Return the torques (n,) to move towards, Nm: a controller's, with as much of the springs as keeps the speeds.
 
         Args:
-            pull: Torques (n,), Nm, of its springs.
-            brake: Torques (n,), Nm, of all the rest, which makes the arm no faster than its set-point; they are applied
-                in full.
-            gain: Velocity (3,) of the tcp, m/s, that the pull may still add.
+            tau: Torques (2, n), Nm: those of all but its springs, which make the arm no faster than its set-point and
+                are applied in full; and those of its springs.
+            gain: Velocity (3,) of the tcp, m/s, that the springs may still add.
             arm: Measured state.
             jacobian: Jacobian (6, n) of the tcp there.
         """
         envelope = self._envelope
-        slowed, more = (self._lag * arm.inertia.inverse.dot(np.array((brake, pull)).T)).T.tolist()
-        before = [v + dv for v, dv in zip(arm.dq, slowed, strict=True)]
-        share = min(map(_share, before, more, [_COUPLED * v for v in self.velocity]))
-        if share < 1.0:
-            envelope.limited |= Limited.SPEED
+        slowed, more = (tau.dot(arm.inertia.inverse) * self._lag).tolist()  # the inverse is symmetric
+        share = 1.0
+        if hypot(*arm.dq) + hypot(*slowed) + hypot(*more) > _COUPLED * self._slowest:
+            before = [v + dv for v, dv in zip(arm.dq, slowed, strict=True)]
+            share = min(map(_share, before, more, [_COUPLED * v for v in self.velocity]))
+            if share < 1.0:
+                envelope.limited |= Limited.SPEED
         if self.tcp_speed < UNLIMITED:
             tcp_share = _greatest_share(jacobian[:3].dot(arm.dq), gain, _SPRINGS * self.tcp_speed)
             if tcp_share < 1.0:
                 envelope.limited |= Limited.TCP_SPEED
                 share = min(share, tcp_share)
-        total = [share * a + b for a, b in zip(pull, brake, strict=True)]
-        tau = [max(-limit, min(limit, x)) for x, limit in zip(total, self._torque, strict=True)]
-        if tau != total:
+        wanted = tau[0] + share * tau[1]
+        total: list[float] = wanted.tolist()
+        if hypot(*total) <= self._weakest:
+            return total
+        cut = [max(-limit, min(limit, x)) for x, limit in zip(total, self._torque, strict=True)]
+        if cut != total:
             envelope.limited |= Limited.TORQUE
-        return tau
+        return cut
 
     def _slowed(self, tau: float, v: float, inertia: float, most: float, limit: float) -> float:
         """Return ``tau`` cut to what leaves this joint at ``most`` rad/s: inertia (most - v) = tau T + tau^2 / (2 R).
@@ -324,15 +334,17 @@ class TorqueBounds:
 
         That are its own joint speeds, half as much again as the session's tcp speed, and its ranges.
         """
-        if any(abs(v) > most for v, most in zip(arm.dq, self._limits.velocity, strict=True)):
+        speed = hypot(*arm.dq)
+        limits, fastest = self._limits.velocity, _RUNAWAY * self.tcp_speed
+        if speed > self._slowest and any(abs(v) > most for v, most in zip(arm.dq, limits, strict=True)):
             return Limited.SPEED
-        fastest = _RUNAWAY * self.tcp_speed
-        surely = self._surely_slower([abs(v) for v in arm.dq], fastest)
-        if not surely and hypot(*self._kinematics.jacobian(arm.q)[:3].dot(arm.dq).tolist()) > fastest:
+        slow = speed * self._reach_length <= fastest
+        if not slow and hypot(*self._kinematics.jacobian(arm.q)[:3].dot(arm.dq).tolist()) > fastest:
             return Limited.TCP_SPEED
-        for x, (low, high) in zip(arm.q, self._ranges, strict=True):
-            if not low - _STRAY <= x <= high + _STRAY:
-                return Limited.POSITION
+        if dist(arm.q, self._middle) > self._radius:
+            for x, (low, high) in zip(arm.q, self._ranges, strict=True):
+                if not low - _STRAY <= x <= high + _STRAY:
+                    return Limited.POSITION
         return None
 
     def is_runaway(self, arm: ArmInMotion) -> bool:
@@ -549,7 +561,7 @@ class TorqueMotion(ServoMotion):
                 self.tau, self._share = self.bounds.brake(before, arm, 0.0)
         self._begun = True
 
-    def drive(self, pull: Floats, brake: Floats, gain: Any, arm: ArmInMotion, jacobian: Any) -> None:
+    def drive(self, tau: Any, gain: Any, arm: ArmInMotion, jacobian: Any) -> None:
         """Move the torques by one tick towards those of a controller (see :meth:`TorqueBounds.shared`).
 
         The first set-point has none: it changes the mode.
@@ -557,7 +569,7 @@ class TorqueMotion(ServoMotion):
         self._braking = self._share = 0.0
         if self._begun:
             assert self.bounds is not None
-            self.tau = self.bounds.towards(self.tau, self.bounds.shared(pull, brake, gain, arm, jacobian))
+            self.tau = self.bounds.towards(self.tau, self.bounds.shared(tau, gain, arm, jacobian))
         self._begun = True
 
     def brake(self) -> bool:
