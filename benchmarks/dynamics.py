@@ -22,15 +22,24 @@ from hal.config import load
 from hal.config.data_files import data_folder
 from hal.driver import Setpoint
 from hal.dynamics import Dynamics
-from hal.errors import ConfigError, HalError, MotionStopped
+from hal.errors import MotionStopped, NotSupported
 
 MODELS = sorted(file.stem for file in data_folder("robots").glob("*.yaml"))
 STILL = [0.0] * 7
+TURN = np.pi
+"""Joints without an end are turned so far, rad."""
 
 
 def rig_of(model: str) -> dict[str, Any]:
-    """Return a rig of one arm."""
-    return {"robots": {"arm": {"model": model}}}
+    """Return a rig of one arm; of a model with several, the left one."""
+    return {"robots": {"arm": {"model": model} | ({"arm": "left"} if model == "baxter" else {})}}
+
+
+def positions(limits: Any, count: int, seed: int) -> Any:
+    """Return random joint positions (count, n), rad."""
+    lower, upper = (np.clip(ends, -TURN, TURN) for ends in (limits.lower, limits.upper))
+    room = 0.05 * (upper - lower)
+    return np.random.default_rng(seed).uniform(lower + room, upper - room, (count, len(lower)))
 
 
 def compare(model: str, engine: str, count: int) -> tuple[float, float]:
@@ -45,7 +54,7 @@ def compare(model: str, engine: str, count: int) -> tuple[float, float]:
         world.handle("arm", False)
     dynamics, worst, heaviest = Dynamics.of(spec), 0.0, 0.0
     still = [0.0] * len(spec.joints)
-    for q in np.random.default_rng(1).uniform(spec.limits.lower, spec.limits.upper, (count, len(spec.joints))):
+    for q in positions(spec.limits, count, 1):
         mass = np.array(dynamics.mass_matrix(q))
         scale = np.sqrt(np.outer(mass.diagonal(), mass.diagonal()))
         worst = max(worst, float((np.abs(np.array(driver.mass_matrix(q)) - mass) / scale).max()))
@@ -63,14 +72,12 @@ def compare(model: str, engine: str, count: int) -> tuple[float, float]:
 
 def drift(model: str, engine: str, count: int, seconds: float) -> tuple[float, int] | None:
     """Return how far a joint drifts, rad, and the number of stops; None for an arm that takes no torques."""
-    random, worst, stops = np.random.default_rng(2), 0.0, 0
+    worst, stops = 0.0, 0
     with hal.open(rig_of(model), sim=True, clock="lock_step", engine=engine) as rig:
         arm = rig.robots["arm"]
         if arm.limits.torque is None:
             return None
-        lower, upper = np.array(arm.limits.lower), np.array(arm.limits.upper)
-        for _ in range(count):
-            q = lower + (upper - lower) * random.uniform(0.05, 0.95, arm.n)
+        for q in positions(arm.limits, count, 2):
             rig.world.reset("arm", q=q)
             rig.clock.sleep(0.2)
             start = arm.state().q
@@ -133,12 +140,12 @@ def main() -> None:
         for model in options.models.split(","):
             try:
                 mass, gravity = compare(model, engine, options.count)
-                floating = drift(model, engine, options.count, options.seconds)
-            except (ConfigError, HalError) as error:
-                print(f"{engine:9}{model:15}{error}")
-                continue
+                same = f"inertia {mass:.1e}, gravity {gravity:.1e} Nm"
+            except NotSupported as error:
+                same = f"no dynamics ({error.code})"
+            floating = drift(model, engine, options.count, options.seconds)
             text = "takes no torques" if floating is None else f"drift {floating[0]:.5f} rad, {floating[1]} stops"
-            print(f"{engine:9}{model:15}inertia {mass:.1e}, gravity {gravity:.1e} Nm, {text}", flush=True)
+            print(f"{engine:9}{model:15}{same}, {text}", flush=True)
         for rate in (240.0, 1000.0):
             apart = np.array(same_torques(engine, rate, options.count)) * 1e3
             text = f"{np.median(apart):.4f} mrad apart in the median, {apart.max():.4f} at most"

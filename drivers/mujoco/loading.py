@@ -235,7 +235,8 @@ def _plan_urdf(spec: BodySpec | RobotSpec, urdf: UrdfModel, key: str, scale: flo
             text = f"MuJoCo cannot load link {name!r}: {error}"
             problems.append(Problem(str(urdf.path), key, text, "bad_mesh"))
             continue
-        inertial, wrong = _inertial(elements[name], link, shapes, scale)
+        least = LEAST_INERTIA if found is None or found.movable else 0.0
+        inertial, wrong = _inertial(elements[name], link, shapes, scale, least)
         if wrong:
             fixed.append(name)
         links.append(LinkPlan(name, found, number[found.parent] if found else -1, shapes, inertial))
@@ -370,9 +371,11 @@ def _box_inertia(corners: Array) -> Array:
 
 
 def _inertial(
-    element: ElementTree.Element, link: UrdfLink, shapes: list[Shape], scale: float
+    element: ElementTree.Element, link: UrdfLink, shapes: list[Shape], scale: float, least: float
 ) -> tuple[Inertial | None, bool]:
     """Return the mass of a link, and whether its inertia is not the file's, which is impossible.
+
+    No moment of inertia is less than ``least``, kg m2.
 
     The mass of a link lies inside the box around its collision shapes. If all of it were in the corners, the inertia
     would be three times that of a uniform box; no body has more. Placeholders such as 0.1 kg m2 for a finger of 0.1 kg
@@ -401,7 +404,7 @@ def _inertial(
         wrong = bool((np.sort(moments) > ROUGH * np.sort(most)).any()) or bool((moments <= 0.0).all())
         if wrong:
             moments, pose = most / 3.0, Pose(pose.position)
-    moments = np.maximum(moments, LEAST_INERTIA)
+    moments = np.maximum(moments, least)
     excess = moments.max() - (moments.sum() - moments.max())  # MuJoCo refuses a moment above the sum of the others
     if excess > 0.0:
         moments = moments + np.where(moments == moments.max(), 0.0, 0.5 * excess * (1.0 + 1e-6))
