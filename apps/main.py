@@ -27,6 +27,8 @@ PROGRAMS = {
     "rollout": "run a policy and count its successes",
     "serve-lerobot": "serve a policy that was trained with LeRobot, for rollout",
     "generate": "generate a dataset in simulation, on several workers",
+    "grasp": "find an object and grasp it",
+    "push": "find an object and push it to a goal",
     "export": "convert a dataset for training",
     "calibrate": "measure where a camera is",
     "import-ark": "convert a configuration of Ark",

@@ -9,6 +9,7 @@ from __future__ import annotations
 from .depth import find_by_depth, locate_by_depth, look_at, read_frames
 from .grasping import gentle_grasp, grasp
 from .objects import LocatedObject, grasp_pose, locate_by_truth, object_from_points
+from .pictures import draw_plan, save_plan
 from .pushing import push, push_path, push_to
 from .running import Reason, SkillPhase, SkillProgress, SkillResult
 
@@ -18,6 +19,7 @@ __all__ = [
     "SkillPhase",
     "SkillProgress",
     "SkillResult",
+    "draw_plan",
     "find_by_depth",
     "gentle_grasp",
     "grasp",
@@ -30,4 +32,5 @@ __all__ = [
     "push_path",
     "push_to",
     "read_frames",
+    "save_plan",
 ]
