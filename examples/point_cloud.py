@@ -16,15 +16,6 @@ OFFSETS = [(0.0, 0.0, 0.0), (0.1, 0.0, 0.0), (-0.1, 0.0, 0.0), (0.0, 0.15, 0.0),
 """Of the tcp from where it is at home, m."""
 
 
-def points_of(frame: hal.Frame) -> tuple[np.ndarray, np.ndarray]:
-    """Return the points (n, 3) that a frame shows, in the world in m, and their colours (n, 3)."""
-    v, u = np.nonzero(frame.depth)  # 0 is "not measured"
-    z = frame.depth[v, u]
-    x = (u - frame.K[0, 2]) * z / frame.K[0, 0]
-    y = (v - frame.K[1, 2]) * z / frame.K[1, 1]
-    return frame.T_world_camera.transform(np.column_stack([x, y, z])), frame.color[v, u]
-
-
 def main(file: str = "cloud.ply") -> None:
     """Drive, look, and write the file."""
     with hal.open("panda_table", sim=True, clock="lock_step", pad="none") as rig:
@@ -33,7 +24,8 @@ def main(file: str = "cloud.ply") -> None:
         seen = []
         for offset in OFFSETS:
             arm.move_to(hal.Pose(home.position + offset, home.orientation), speed=0.5)
-            seen.append(points_of(camera.read()))
+            frame = camera.read()
+            seen.append((frame.points(frame="world"), frame.color[frame.depth > 0]))
     points, colors = (np.concatenate(parts) for parts in zip(*seen, strict=True))
     trimesh.PointCloud(points, colors).export(file)
     print(f"{len(points)} points from {len(seen)} poses are in {file}")

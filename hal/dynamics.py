@@ -1,7 +1,7 @@
 """Dynamics of one arm: gravity, inertia and inverse dynamics, by pinocchio, from the masses in its URDF.
 
 Torques computed here move real motors, so a URDF without masses, or with made-up ones, is refused with its links.
-Vectors are plain lists in the order of the arm's joints; a call takes some microseconds.
+Vectors are in the order of the arm's joints; a call takes some microseconds.
 """
 
 from __future__ import annotations
@@ -25,7 +25,8 @@ if TYPE_CHECKING:
 
 __all__ = ["STANDARD_GRAVITY", "Dynamics"]
 
-Floats = Sequence[float]
+Array = NDArray[np.float64]
+Floats = Sequence[float] | Array
 
 STANDARD_GRAVITY = 9.81
 """m/s2"""
@@ -86,7 +87,7 @@ class Dynamics:
         self._inverse_columns: NDArray[np.intp] | None = None
         if columns != list(range(self.n)):
             self._columns, self._inverse_columns = np.array(columns), np.argsort(columns)
-        self.damping: tuple[float, ...] = tuple(self._listed(self._model.damping))
+        self.damping: tuple[float, ...] = tuple(self._in_order(self._model.damping).tolist())
         """Viscous damping of each joint (n,), Nm s/rad: simulated arms have it, the methods leave it out."""
 
     @classmethod
@@ -109,11 +110,11 @@ class Dynamics:
                     fingers[one.joint] = one.multiplier * fingers[one.of] + one.offset
         return cls(spec.kinematics, spec.payload, (down[0], down[1], down[2]), fingers)
 
-    def gravity(self, q: Floats) -> list[float]:
+    def gravity(self, q: Floats) -> Array:
         """Return the joint torques (n,), Nm, that hold the arm still at ``q`` (n,), rad."""
-        return self._listed(self._pin.computeGeneralizedGravity(self._model, self._data, self._ordered(q)))
+        return self._in_order(self._pin.computeGeneralizedGravity(self._model, self._data, self._ordered(q)))
 
-    def inverse(self, q: Floats, dq: Floats, ddq: Floats) -> list[float]:
+    def inverse(self, q: Floats, dq: Floats, ddq: Floats) -> Array:
         """Return the joint torques (n,), Nm, of a motion: gravity, Coriolis and inertia.
 
         Args:
@@ -122,16 +123,16 @@ class Dynamics:
             ddq: Joint accelerations (n,), rad/s2.
         """
         ordered = self._ordered
-        return self._listed(self._pin.rnea(self._model, self._data, ordered(q), ordered(dq), ordered(ddq)))
+        return self._in_order(self._pin.rnea(self._model, self._data, ordered(q), ordered(dq), ordered(ddq)))
 
-    def coriolis(self, q: Floats, dq: Floats) -> list[float]:
+    def coriolis(self, q: Floats, dq: Floats) -> Array:
         """Return the Coriolis and centrifugal torques (n,), Nm, at ``q`` (n,) rad and ``dq`` (n,) rad/s."""
         pin, model, data = self._pin, self._model, self._data
         position = self._ordered(q)
         both = pin.nonLinearEffects(model, data, position, self._ordered(dq)).copy()
-        return self._listed(both - pin.computeGeneralizedGravity(model, data, position))
+        return self._in_order(both - pin.computeGeneralizedGravity(model, data, position))
 
-    def forward(self, q: Floats, dq: Floats, tau: Floats) -> list[float]:
+    def forward(self, q: Floats, dq: Floats, tau: Floats) -> Array:
         """Return the joint accelerations (n,), rad/s2, under torques: the inverse of :meth:`inverse`.
 
         Args:
@@ -140,17 +141,15 @@ class Dynamics:
             tau: All torques of the joints (n,), Nm, those that carry the arm's weight included.
         """
         ordered = self._ordered
-        return self._listed(self._pin.aba(self._model, self._data, ordered(q), ordered(dq), ordered(tau)))
+        return self._in_order(self._pin.aba(self._model, self._data, ordered(q), ordered(dq), ordered(tau)))
 
-    def mass_matrix(self, q: Floats) -> list[list[float]]:
+    def mass_matrix(self, q: Floats) -> Array:
         """Return the joint-space inertia (n, n), kg m2, at ``q`` (n,), rad. It is symmetric and positive definite."""
         mass = self._pin.crba(self._model, self._data, self._ordered(q))
-        if self._columns is not None:
-            mass = mass[np.ix_(self._columns, self._columns)]
-        rows: list[list[float]] = mass.tolist()
-        return rows
+        inertia: Array = mass.copy() if self._columns is None else mass[np.ix_(self._columns, self._columns)]
+        return inertia
 
-    def task_inertia(self, q: Floats) -> NDArray[np.float64]:
+    def task_inertia(self, q: Floats) -> Array:
         """Return the inertia (6, 6) of the tcp, kg, kg m and kg m2: (J M^-1 J^T)^-1.
 
         A force and a torque on the tcp, along the base's axes, accelerate it by the inverse (Khatib, IEEE J. Robotics
@@ -166,7 +165,7 @@ class Dynamics:
             model, data, position, self._tcp, pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
         ).copy()
         mobility = jacobian @ np.linalg.solve(pin.crba(model, data, position), jacobian.T)
-        inertia: NDArray[np.float64] = np.linalg.pinv(mobility, rcond=1e-9, hermitian=True)
+        inertia: Array = np.linalg.pinv(mobility, rcond=1e-9, hermitian=True)
         return inertia
 
     def _attach(self, payload: PayloadSpec) -> None:
@@ -178,10 +177,11 @@ class Dynamics:
         inertia = self._pin.Inertia(payload.mass, lever, np.zeros((3, 3)))
         self._model.appendBodyToJoint(frame.parentJoint, inertia, self._pin.SE3.Identity())
 
-    def _ordered(self, values: Floats) -> NDArray[np.float64]:
+    def _ordered(self, values: Floats) -> Array:
         array = np.array(values, float)
         return array if self._inverse_columns is None else array[self._inverse_columns]
 
-    def _listed(self, array: NDArray[np.float64]) -> list[float]:
-        values: list[float] = (array if self._columns is None else array[self._columns]).tolist()
+    def _in_order(self, array: Array) -> Array:
+        """Return a copy of pinocchio's vector, in the order of the spec."""
+        values: Array = array.copy() if self._columns is None else array[self._columns]
         return values

@@ -101,13 +101,13 @@ class DamiaoArm(RobotDriver):
         """
         self.engaged = False
         self._switching = None
-        self.chain.lower(self.dynamics.gravity)
+        self.chain.lower(self._weight)
         self.chain.close()
 
     def lower(self) -> bool:
         self.engaged = False
         self._switching = None
-        return self.chain.lower_further(self.dynamics.gravity)
+        return self.chain.lower_further(self._weight)
 
     # Every cycle.
 
@@ -219,7 +219,7 @@ class DamiaoArm(RobotDriver):
             return self._holds
         motors = self._motors
         self._target = [q if motor.on else motor.q for q, motor in zip(self._target, motors, strict=True)]
-        tau = self.dynamics.gravity(self._target)
+        tau = self._weight(self._target)
         self._holds = [
             motor.command(self._target[k], 0.0, motor.kp, motor.kd, tau[k]) for k, motor in enumerate(motors)
         ]
@@ -240,13 +240,13 @@ class DamiaoArm(RobotDriver):
             return False
         q, dq = setpoint.q, setpoint.dq
         if setpoint.tau is None:
-            tau = self.dynamics.inverse(q, dq, setpoint.ddq)
+            tau = self.dynamics.inverse(q, dq, setpoint.ddq).tolist()
             if self._friction is not None:
                 tau = [
                     t + f * min(max(v / _STICKING, -1.0), 1.0) for t, f, v in zip(tau, self._friction, dq, strict=True)
                 ]
         else:
-            weight = self.dynamics.gravity([motor.q for motor in motors])
+            weight = self._weight([motor.q for motor in motors])
             tau = [a + b for a, b in zip(setpoint.tau, weight, strict=True)]
         if not isfinite(sum(q) + sum(dq) + sum(tau)):
             raise ValueError(f"{self.spec.name}: a set-point is not finite: {setpoint}")
@@ -333,6 +333,11 @@ class DamiaoArm(RobotDriver):
         self._fault = None
 
     # Model and statistics.
+
+    def _weight(self, q: Sequence[float]) -> list[float]:
+        """Return the joint torques (n,), Nm, that hold the arm still at ``q`` (n,), rad."""
+        weight: list[float] = self.dynamics.gravity(q).tolist()
+        return weight
 
     def mass_matrix(self, q: Sequence[float]) -> Any:
         """Return the joint-space inertia (n, n), kg m2, at ``q`` (n,), rad, from the URDF's masses."""
