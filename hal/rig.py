@@ -198,13 +198,14 @@ class Rig:
             self._hosts.insert(0, local)
             self.clock = LockStepClock(local.now, local.advance_to)
             return local if group.world is not None else None
-        remotes: list[RemoteHost] = []
-        for group in sorted(groups, key=lambda group: group.world is not None):
-            others_ = remotes if group.world is not None else ()
-            remotes.append(RemoteHost(group, realtime=realtime and bool(group.robots), others=others_))
-            self._hosts.append(remotes[-1])
+        memories = [(group, RemoteHost.allocate(group)) for group in groups]
+        for group, shared in sorted(memories, key=lambda pair: pair[0].world is not None):
+            seen = group.world is not None or bool(group.neighbours)
+            others_ = [pair for pair in memories if seen and pair[0] is not group]
+            host = RemoteHost(group, realtime=realtime and bool(group.robots), shared=shared, others=others_)
+            self._hosts.append(host)
             if group.world is not None:
-                world_host = remotes[-1]
+                world_host = host
         return world_host
 
     def _gripper_of(self, robot: RobotSpec) -> Gripper | None:

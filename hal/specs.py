@@ -378,6 +378,8 @@ class GroupSpec:
     """Grippers that run in this group: those of its arms, or one that has a process of its own."""
     collisions: CollisionSpec | None = None
     """What its arms must not touch; None if nothing is checked."""
+    neighbours: tuple[RobotSpec, ...] = ()
+    """Arms of other groups that its arms must not touch."""
 
 
 @dataclass(frozen=True)

@@ -398,10 +398,11 @@ class Cycle:
         Args:
             spec: The group.
             memory: Its mailboxes.
-            others: Memories of the rig's other groups, whose arms have copies in this group's world.
+            others: Memories of the rig's other groups, whose arms are copied into this group's world, or kept off.
         """
         self.spec = spec
         self.memory = memory
+        others = list(others)
         self._mirrors = mirrors_of(spec, others)
         self.dt = 1.0 / spec.rate_hz
         self.ticks = 0
@@ -415,7 +416,7 @@ class Cycle:
             self.world = registry.load(spec.world.driver, "world")(spec.world)
         self.arms = {r.name: ArmUnit(r, self.dt, memory.robots[r.name], self.world) for r in spec.robots}
         self._arm_units = tuple(self.arms.values())
-        self.notes = guard_arms(self.arms, spec.collisions)
+        self.notes = guard_arms(spec, self.arms, others)
         self.grippers: dict[str, GripperUnit] = {}
         for gripper in spec.grippers:
             driver = registry.load(gripper.driver, "gripper")(gripper, self.world)

@@ -2,22 +2,33 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from math import copysign
 from typing import TYPE_CHECKING, Protocol
 
 from ..errors import NotSupported
 from ..geometry import Pose
 from ..servo.collisions import CollisionGuard, Neighbour
+from ..servo.smoothing import stop_distance
+from ..types import RobotStatus
 
 if TYPE_CHECKING:
     from ..driver import Reading
     from ..servo.servo import Servo
-    from ..specs import CollisionSpec, RobotSpec
+    from ..specs import CollisionSpec, GroupSpec, RobotSpec
+    from .records import GroupMemory, RobotMail, ServoRecord
 
-__all__ = ["GuardedArm", "guard_arms"]
+__all__ = ["ArmElsewhere", "GuardedArm", "guard_arms"]
+
+Floats = Sequence[float]
 
 _SAME_PLACE = 1e-3
 """Two arms whose bases are this near, m, have been given no places."""
+
+_OLD = 0.004
+"""The state of an arm in another process is this old at most while that process keeps its rate, s."""
+
+_FOLLOWS_SETPOINT = (RobotStatus.FOLLOWING, RobotStatus.STOPPING, RobotStatus.HOLDING, RobotStatus.TRIPPED)
 
 
 class GuardedArm(Protocol):
@@ -28,23 +39,63 @@ class GuardedArm(Protocol):
     reading: Reading | None
 
 
-def guard_arms(units: Mapping[str, GuardedArm], spec: CollisionSpec | None) -> list[str]:
-    """Give the servos of some arms their guards.
+class ArmElsewhere:
+    """Where an arm of another process is, by its newest state, and where it ends if it stops now."""
+
+    def __init__(self, spec: RobotSpec, mail: RobotMail) -> None:
+        self._limits = spec.limits
+        self._mail = mail
+        self._seen: ServoRecord | None = None
+        self._stop: tuple[Floats, Floats] = (spec.initial, spec.initial)
+
+    def __call__(self) -> tuple[Floats, Floats]:
+        """Return its joint positions (n,), rad, and those at the end of a stop that begins once they are known."""
+        record = self._mail.peek()
+        if record is None or record is self._seen:
+            return self._stop
+        self._seen = record
+        if record.status in _FOLLOWS_SETPOINT:
+            limits = zip(record.q_set, record.dq_set, self._limits.acceleration, self._limits.jerk, strict=True)
+            end = [q + _OLD * v + copysign(stop_distance(abs(v), A, J), v) for q, v, A, J in limits]
+            self._stop = list(record.q_set), end
+        else:  # it may be moved by hand
+            state = self._mail.get_state()
+            q = self._stop[0] if state is None else state.q.tolist()
+            self._stop = q, q
+        return self._stop
+
+
+def guard_arms(group: GroupSpec, units: Mapping[str, GuardedArm], others: Iterable[GroupMemory]) -> list[str]:
+    """Give the servos of a group's arms their guards.
+
+    Args:
+        group: The group.
+        units: Its arms.
+        others: Memories of other groups, with the states of their arms.
 
     Returns:
         Notes for the user: what is not checked, and which arms overlap at the start.
     """
+    spec = group.collisions
     if spec is None or not spec.any:
         return []
+    mails = {name: mail for memory in others for name, mail in memory.robots.items()}
+    around: list[tuple[RobotSpec, Neighbour]] = []
+    if spec.arms:
+        around += [(unit.spec, _neighbour(unit)) for unit in units.values()]
+        around += [(arm, ArmElsewhere(arm, mails[arm.name])) for arm in group.neighbours if arm.name in mails]
     notes: list[str] = []
     for name, unit in units.items():
-        others = [other for other in units.values() if other is not unit] if spec.arms else []
-        seen = [other for other in others if not _same_place(unit.spec, other.spec)]
-        for other in others:
-            if other not in seen and name < other.spec.name:
+        seen = []
+        for other in around:
+            if other[0] is unit.spec:
+                continue
+            if not _same_place(unit.spec, other[0]):
+                seen.append(other)
+            elif name < other[0].name:
                 notes.append(
-                    f"{name} and {other.spec.name} have their bases in one place, so they are not checked against "
-                    f"each other: set robots.{other.spec.name}.base"
+                    f"{name} and {other[0].name} have their bases in one place, so they are not checked against each "
+                    f"other: set robots.{other[0].name}.base"
                 )
         try:
             notes += _guard(unit, seen, spec)
@@ -53,11 +104,11 @@ def guard_arms(units: Mapping[str, GuardedArm], spec: CollisionSpec | None) -> l
     return list(dict.fromkeys(notes))
 
 
-def _guard(unit: GuardedArm, others: Sequence[GuardedArm], spec: CollisionSpec) -> list[str]:
+def _guard(unit: GuardedArm, others: Sequence[tuple[RobotSpec, Neighbour]], spec: CollisionSpec) -> list[str]:
     """Give one arm its guard; return notes."""
     from ..kinematics.collision_model import CollisionModel
 
-    robots = [unit.spec, *(other.spec for other in others)]
+    robots = [unit.spec, *(robot for robot, _ in others)]
     model = CollisionModel(robots, spec)
     model.place([x for robot in robots for x in robot.initial])
     notes = list(model.notes)
@@ -65,14 +116,14 @@ def _guard(unit: GuardedArm, others: Sequence[GuardedArm], spec: CollisionSpec) 
         pair = model.pair(k, 0.0)
         if unit.spec.name < pair.second.partition("/")[0] or "/" not in pair.second:
             notes.append(f"{pair.first} and {pair.second} overlap at the start: move one of them")
-    unit.servo.set_guard(CollisionGuard(model, unit.servo.smoother, [_neighbour(other) for other in others]))
+    unit.servo.set_guard(CollisionGuard(model, unit.servo.smoother, [neighbour for _, neighbour in others]))
     return notes
 
 
 def _neighbour(unit: GuardedArm) -> Neighbour:
-    """Return the function that returns where an arm is, and where it ends if it stops now."""
+    """Return the function that returns where an arm of this process is, and where it ends if it stops now."""
 
-    def stop() -> tuple[Sequence[float], Sequence[float]]:
+    def stop() -> tuple[Floats, Floats]:
         servo = unit.servo
         if servo.active:
             q = servo.report.q_set

@@ -9,6 +9,7 @@ import threading
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from .. import registry
@@ -62,11 +63,22 @@ def groups_of(plan: Plan) -> list[GroupSpec]:
     if clock == "lock_step":
         robots = inside + tuple(r for r in outside if not r.emulated)
         rate = world.physics_hz if world else max((r.rate_hz for r in outside), default=240.0)
-        return [GroupSpec("simulation", clock, rate, robots, world, _grippers(robots), collisions), *alone, *apart]
+        first = GroupSpec("simulation", clock, rate, robots, world, _grippers(robots), collisions)
+        return _with_neighbours([first, *alone, *apart])
     groups = []
     if world is not None:
         groups = [GroupSpec("simulation", clock, world.physics_hz, inside, world, _grippers(inside), collisions)]
-    return groups + alone + apart
+    return _with_neighbours(groups + alone + apart)
+
+
+def _with_neighbours(groups: Sequence[GroupSpec]) -> list[GroupSpec]:
+    """Return the groups, each with the arms of the others that its own must not touch."""
+    return [
+        replace(group, neighbours=tuple(r for other in groups if other is not group for r in other.robots))
+        if group.robots and group.collisions is not None and group.collisions.arms
+        else group
+        for group in groups
+    ]
 
 
 def _is_alone(robot: RobotSpec, clock: str) -> bool:
@@ -219,18 +231,29 @@ class LocalHost(Host):
 class RemoteHost(Host):
     """Real time: the cycle runs in a process of its own."""
 
-    def __init__(self, spec: GroupSpec, *, realtime: bool = False, others: Sequence[RemoteHost] = ()) -> None:
-        """Start the process. ``others`` are groups whose arms have copies in this one's world."""
-        self.spec = spec
-        size = GroupMemory.size_of(spec)
-        from .memory import SeriesBox
+    def __init__(
+        self,
+        spec: GroupSpec,
+        *,
+        realtime: bool = False,
+        shared: SharedMemory | None = None,
+        others: Sequence[tuple[GroupSpec, SharedMemory]] = (),
+    ) -> None:
+        """Start the process.
 
-        self.snapshot_offset = size
-        self.shared = SharedMemory(size + SeriesBox.size(SNAPSHOT_CAPACITY))
+        Args:
+            spec: The group.
+            realtime: Whether it requests real-time priority.
+            shared: Its memory, from :meth:`allocate`; None for a new one.
+            others: Groups whose arms have copies in this one's world, or must not be touched, with their memories.
+        """
+        self.spec = spec
+        self.snapshot_offset = GroupMemory.size_of(spec)
+        self.shared = self.allocate(spec) if shared is None else shared
         self.memory = GroupMemory.of(self.shared.buffer, spec)
         config = {"group": to_json(spec), "snapshot_capacity": SNAPSHOT_CAPACITY, "realtime": realtime}
-        config["others"] = [to_json(other.spec) for other in others]
-        memories = [self.shared, *(other.shared for other in others)]
+        config["others"] = [to_json(other) for other, _ in others]
+        memories = [self.shared, *(memory for _, memory in others)]
         self.child = Child(spec.name, "hal.host.main:main", config, memories)
         self._stops = 0
         self._close_by: float | None = None
@@ -241,6 +264,13 @@ class RemoteHost(Host):
         self._beat()
         self._thread = threading.Thread(target=self._heartbeat, name=f"hal-heartbeat-{spec.name}", daemon=True)
         self._thread.start()
+
+    @staticmethod
+    def allocate(spec: GroupSpec) -> SharedMemory:
+        """Return memory for a group, which others may be given before its process starts."""
+        from .memory import SeriesBox
+
+        return SharedMemory(GroupMemory.size_of(spec) + SeriesBox.size(SNAPSHOT_CAPACITY))
 
     def wait_ready(self) -> Any:
         """Wait until every device is open. Raises the error that stopped one of them."""

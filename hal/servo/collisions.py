@@ -32,6 +32,8 @@ _SPACING = 0.01
 _SAMPLES = 4
 _TOLERANCE = 1e-5
 """Accuracy of distances that are compared, m."""
+_NOWHERE = 1e-12
+"""A step this short is none, rad."""
 _BRAKE, _BRAKE_JERK = 0.8, 0.5
 """Shares of acceleration and jerk with which an approach slows down; the rest is for the stop that is always kept."""
 _PROBE = 2e-3
@@ -51,6 +53,7 @@ class CollisionGuard:
 
     def __init__(self, model: CollisionModel, smoother: JointSmoother, others: Sequence[Neighbour] = ()) -> None:
         self._model = model
+        self._margins: list[float] = model.margins.tolist()
         self._bounds = PairBounds(model)
         self._smoother = smoother
         self._own, *rest = model.slices
@@ -116,15 +119,15 @@ class CollisionGuard:
         model.place(self._q)
         share = 1.0
         others = levers @ self._ways - levers[:, own] @ self._ways[own]
-        now = hypot(*smoother.dq) / hypot(*dq)
-        for k, d, most, taken in zip(near, before, fastest, others, strict=True):
+        ticks = 2.0 * smoother.dt * min(1.0, hypot(*smoother.dq) / hypot(*dq))
+        slowest = _BRAKE * min([A / abs(v) for v, A in zip(dq, smoother.acceleration, strict=True) if v])
+        smoothest = _BRAKE_JERK * min([J / abs(v) for v, J in zip(dq, smoother.jerk, strict=True) if v])
+        for k, d, most, taken in zip(near, before.tolist(), fastest.tolist(), others.tolist(), strict=True):
             speed = (d - model.distance(k)) / ahead
             if speed <= _SIDEWAYS * most:
                 continue
-            left = d - model.margins[k] - taken - 2.0 * smoother.dt * min(1.0, now) * speed
-            slowest = min(A / abs(v) for v, A in zip(dq, smoother.acceleration, strict=True) if v)
-            smoothest = min(J / abs(v) for v, J in zip(dq, smoother.jerk, strict=True) if v)
-            cap = speed_for(left, _BRAKE * slowest * speed, _BRAKE_JERK * smoothest * speed)
+            left = d - self._margins[k] - taken - ticks * speed
+            cap = speed_for(left, slowest * speed, smoothest * speed)
             share = min(share, cap / speed)
         if share >= 1.0:
             return dq
@@ -135,11 +138,11 @@ class CollisionGuard:
         """Return whether the proposed step, and the stop after it, keep every margin, or come no nearer than now."""
         smoother = self._smoother
         q, dq, ddq = smoother.q_next, smoother.dq_next, smoother.ddq_next
-        speed = hypot(*dq)
-        if (
-            speed <= self._slowest  # one comparison, mostly, instead of one for each joint
-            or all(-u <= v <= u for v, u in zip(dq, self._fastest, strict=True))
-        ) and self._is_clear(q, self._per_speed * speed + self._per_acceleration * hypot(*ddq)):
+        speed, acceleration = hypot(*dq), hypot(*ddq)
+        if speed == acceleration == 0.0 and dist(q, smoother.q) < _NOWHERE:
+            return True
+        known = speed <= self._slowest or all(-u <= v <= u for v, u in zip(dq, self._fastest, strict=True))
+        if known and self._is_clear(q, self._per_speed * speed + self._per_acceleration * acceleration):
             return True
         limits = list(zip(smoother.acceleration, smoother.jerk, strict=True))
         ways = [
@@ -150,7 +153,7 @@ class CollisionGuard:
             self._floors.clear()
             return True
         lowest = self._lowest(near, q, dq, ddq, ways)
-        tight = [(k, d) for k, d in zip(near, lowest, strict=True) if d < self._model.margins[k] - _TOLERANCE]
+        tight = [(k, d) for k, d in zip(near, lowest, strict=True) if d < self._margins[k] - _TOLERANCE]
         if not tight:
             return True
         pairs = [k for k, _ in tight]
@@ -168,7 +171,7 @@ class CollisionGuard:
 
         It never falls because of this arm's own motion, so that the arm cannot creep nearer.
         """
-        margin = float(self._model.margins[k])
+        margin = self._margins[k]
         floor = self._floors.get(k, margin)
         if now < floor - 10.0 * _TOLERANCE:
             floor = now

@@ -146,7 +146,7 @@ def test_verdicts_are_those_of_pybullet() -> None:
     script = Path(__file__).parents[3] / "benchmarks" / "collisions.py"
     found = runpy.run_path(str(script))["verdicts"]("panda", 40)
     assert found["colliding"] > 2
-    assert found["of those, by 1 mm or more"] == 0
+    assert found["of those, others by 1 mm or more"] == 0
 
 
 def test_an_arm_without_shapes_is_refused(panda: RobotSpec, tmp_path: Path) -> None:
