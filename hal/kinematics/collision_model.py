@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from ..errors import NotSupported
 from ..geometry import Pose
 from .arm import reduced_model
-from .mesh_files import check_mesh
+from .mesh_files import hull_points
 from .urdf import UrdfJoint, UrdfModel, UrdfVisual, read_urdf
 
 if TYPE_CHECKING:
@@ -499,17 +499,13 @@ def _geometry(shape: UrdfVisual, link: str) -> Any:
 
 def _points(shape: UrdfVisual, link: str) -> Array:
     """Return points (k, 3) whose hull is the shape (of a mesh), or contains it."""
-    import coal
-
     if shape.shape == "mesh":
         try:
-            check_mesh(Path(shape.file))
-            mesh = coal.MeshLoader().load(shape.file, np.array(shape.size))
+            points: Array = hull_points(Path(shape.file)) * np.array(shape.size)
+            return points
         except (ValueError, RuntimeError, OSError) as error:
             what = f"collision mesh {Path(shape.file).name} of link {link}"
             raise NotSupported(f"{what} cannot be read: {error}", code="bad_mesh") from None
-        vertices: Array = np.array(mesh.vertices())
-        return vertices
     if shape.shape == "box":
         half = 0.5 * np.array(shape.size)
     elif shape.shape == "sphere":

@@ -5,8 +5,11 @@ Some libraries crash on a mesh whose indices point past the end of its lists.
 
 from __future__ import annotations
 
+import contextlib
+import hashlib
 import importlib.metadata
 import importlib.util
+import os
 import re
 import struct
 import xml.etree.ElementTree as ElementTree
@@ -16,7 +19,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["check_mesh", "is_installed", "mesh_file", "mesh_near", "package_folder"]
+__all__ = ["check_mesh", "hull_points", "is_installed", "mesh_file", "mesh_near", "package_folder"]
 
 _PACKAGE = "package://"
 _SCHEMES = (_PACKAGE, "model://", "file://")
@@ -181,3 +184,35 @@ def _check_indices(found: list[bytes], count: int, kind: str, *, first: int) -> 
     wrong = indices[(indices < least) | (indices > most) | ((indices == 0) & (first == 1))]
     if len(wrong):
         raise ValueError(f"has {kind} index {wrong[0]}, but only {count} of that kind")
+
+
+def hull_points(path: Path) -> NDArray[np.float64]:
+    """Return the corners (k, 3) of the convex hull of a mesh file, from the user's cache if it has them.
+
+    Reading a large mesh takes up to a second. A cache that is missing or cannot be written only costs that time.
+
+    Raises:
+        ValueError: The file is wrong; the message does not name it.
+        RuntimeError: coal cannot read it, or it has no volume.
+        OSError: It cannot be read.
+    """
+    state = path.stat()
+    root = os.environ.get("XDG_CACHE_HOME") or os.path.join(os.path.expanduser("~"), ".cache")
+    key = hashlib.sha256(f"1 {path.resolve()} {state.st_mtime_ns} {state.st_size}".encode()).hexdigest()
+    cached = Path(root) / "robot-hal" / "hulls" / f"{key}.npy"
+    with contextlib.suppress(OSError, ValueError, EOFError):
+        known: NDArray[np.float64] = np.load(cached)
+        if known.ndim == 2 and known.shape[1] == 3 and np.isfinite(known).all():
+            return known
+    import coal
+
+    check_mesh(path)
+    mesh = coal.MeshLoader().load(str(path))
+    mesh.buildConvexHull(True, "Qt")
+    points: NDArray[np.float64] = np.array(mesh.convex.points(), float).reshape(-1, 3)
+    with contextlib.suppress(OSError):
+        cached.parent.mkdir(parents=True, exist_ok=True)
+        part = cached.with_suffix(f".{os.getpid()}.npy")
+        np.save(part, points)
+        part.replace(cached)
+    return points
