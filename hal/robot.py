@@ -445,9 +445,12 @@ class Robot:
         )
 
     def _start_position(self) -> list[float]:
-        """Return the joint positions (n,) from which a motion starts, rad: the set-point, if the arm still is there."""
+        """Return the joint positions (n,) from which a motion starts, rad: the set-point, if the arm still is there.
+
+        A simulated arm that something holds back keeps its set-point; a real one was moved by hand.
+        """
         state = self.state()
-        moved = float(np.abs(state.q - state.q_set).max()) > _MOVED
+        moved = self.spec.attended and float(np.abs(state.q - state.q_set).max()) > _MOVED
         q: list[float] = (state.q if moved else state.q_set).tolist()
         return q
 

@@ -32,13 +32,19 @@ __all__ = ["JointPath", "Leg", "Zone", "ZonePlanner", "zones_of"]
 Array = NDArray[np.float64]
 Floats = Sequence[float]
 
-_CURVE_ACCELERATION, _CURVE_JERK = 0.75, 0.3
-"""Shares of the limits that q'' v^2 and q''' v^3 may use; the rest is for q' a and q' j."""
+_CURVE_ACCELERATION = (0.3, 0.5, 0.7)
+"""Shares of the acceleration that q'' v^2 may use; the rest is for q' a. The one with the shortest time is taken."""
+
+_CURVE_JERK = 0.3
+"""Share of the jerk limit that q''' v^3 may use."""
 
 _MIXED_JERK = 0.3
 """Share of the jerk limit that 3 q'' v a may use."""
 
-_ALIKE = (1.1, 1.6, 3.0)
+_ROUNDS = 4
+"""Rounds in which the limits of v and a are adapted to each other."""
+
+_ALIKE = (1.05, 1.2, 2.0)
 """Greatest ratios of the limits of v, a and j within a zone."""
 
 _TINY = 1e-12
@@ -153,14 +159,24 @@ def zones_of(path: JointPath, limits: LimitsSpec, velocity: Floats, tcp_speed: f
     """
     first, second, third = (np.maximum(bound, _TINY) for bound in path.bounds())
     A, J = np.array(limits.acceleration), np.array(limits.jerk)
-    v = np.minimum((np.asarray(velocity) / first).min(axis=1), np.sqrt(_CURVE_ACCELERATION * A / second).min(axis=1))
-    v = np.minimum(v, np.cbrt(_CURVE_JERK * J / third).min(axis=1))
+    most = np.minimum((np.asarray(velocity) / first).min(axis=1), np.cbrt(_CURVE_JERK * J / third).min(axis=1))
     if tcp_speed < np.inf:
-        v = np.minimum(v, tcp_speed / np.maximum(_tcp_rates(path, arm), _TINY))
-    square = np.square(v)[:, None]
-    a = ((A - second * square) / first).min(axis=1)
-    a = np.minimum(a, (_MIXED_JERK * J / (3.0 * second * v[:, None])).min(axis=1))
-    j = ((J - third * square * v[:, None] - 3.0 * second * (v * a)[:, None]) / first).min(axis=1)
+        most = np.minimum(most, tcp_speed / np.maximum(_tcp_rates(path, arm), _TINY))
+    curve = np.sqrt(A / second).min(axis=1)
+    widths = np.diff(path.s)
+    shortest, v, a = np.inf, most, most
+    for share in _CURVE_ACCELERATION:
+        speed = np.minimum(most, sqrt(share) * curve)
+        for _ in range(_ROUNDS):
+            acceleration = ((A - second * np.square(speed)[:, None]) / first).min(axis=1)
+            mixed = (_MIXED_JERK * J / (3.0 * second * speed[:, None])).min(axis=1)
+            acceleration = np.minimum(acceleration, mixed)
+            # Where the arm cannot get as fast, less of its acceleration is taken by the curve of the path.
+            inside, duration = _fastest(speed, acceleration, widths)
+            speed = np.minimum(speed, inside)
+        if duration < shortest:
+            shortest, v, a = duration, speed, acceleration
+    j = ((J - third * (v**3)[:, None] - 3.0 * second * (v * a)[:, None]) / first).min(axis=1)
     rows: list[list[float]] = np.stack((v, a, j), axis=1).tolist()
     parts = _merge(path.s.tolist(), rows)
     zones: list[Zone] = []
@@ -170,6 +186,22 @@ def zones_of(path: JointPath, limits: LimitsSpec, velocity: Floats, tcp_speed: f
         zones.append(Zone(start, end, speed, acceleration, jerk, leave))
         leave = _reachable(leave, end - start, speed, acceleration, jerk)
     return zones[::-1]
+
+
+def _fastest(speed: Array, acceleration: Array, widths: Array) -> tuple[Array, float]:
+    """Return the greatest v between two knots (k - 1,) from rest to rest, without a limit of jerk, and the duration."""
+    squares, rises = np.square(speed).tolist(), (2.0 * acceleration * widths).tolist()
+    forward, backward = [0.0], [0.0]
+    for square, rise in zip(squares, rises, strict=True):
+        forward.append(min(square, forward[-1] + rise))
+    for square, rise in zip(reversed(squares), reversed(rises), strict=True):
+        backward.append(min(square, backward[-1] + rise))
+    least = np.minimum(forward, backward[::-1])
+    # Between two knots it rises from both until the two lines meet.
+    inside: Array = np.sqrt(0.5 * (least[1:] + least[:-1]) + acceleration * widths)
+    knots = np.sqrt(least)
+    slowest = np.minimum(np.minimum(inside, speed), 0.5 * (knots[1:] + knots[:-1]) + _TINY)
+    return inside, float((widths / slowest).sum())
 
 
 def _tcp_rates(path: JointPath, arm: Kinematics) -> Array:
