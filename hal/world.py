@@ -5,19 +5,21 @@
 
 from __future__ import annotations
 
+import json
+import zlib
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .errors import NotSupported
+from .errors import CommandError, NotSupported
 from .geometry import Pose, frozen
 from .specs import BodySpec, WorldSpec, to_json
 
-__all__ = ["BodyJoint", "Contact", "NoWorld", "Poses", "RayHit", "World", "WorldDriver"]
+__all__ = ["BodyJoint", "Contact", "Contacts", "NoWorld", "Poses", "RayHit", "World", "WorldDriver", "WorldState"]
 
 Array = NDArray[np.float64]
 
@@ -37,6 +39,39 @@ class Contact(NamedTuple):
     """Distance, m; negative if they overlap."""
     force: float
     """Force along the normal, N."""
+
+
+class Contacts(tuple[Contact, ...]):
+    """The contacts of one step."""
+
+    t: float | None
+    """Time of that step, s on ``rig.clock``; None if the world was edited or reset since: there are none then, as no
+    step has computed them."""
+
+    def __new__(cls, contacts: Iterable[Contact], t: float | None) -> Contacts:
+        """Return contacts (``contacts``) of the step at ``t``, s."""
+        made = super().__new__(cls, contacts)
+        made.t = t
+        return made
+
+
+class WorldState(dict[str, Any]):
+    """State of a world, from :meth:`World.save`: plain numbers, texts, lists and dicts, so that it can be JSON."""
+
+    def to_bytes(self) -> bytes:
+        """Return the state as compressed JSON, for :meth:`from_bytes`; every number is exact."""
+        return zlib.compress(json.dumps(self, separators=(",", ":"), allow_nan=False).encode(), 1)
+
+    @classmethod
+    def from_bytes(cls, data: bytes) -> WorldState:
+        """Return the state that ``data`` of :meth:`to_bytes` holds; CommandError (``wrong_state``) if it is none."""
+        try:
+            found = json.loads(zlib.decompress(data))
+        except (zlib.error, ValueError, TypeError) as error:
+            raise CommandError(f"not the bytes of a state of a world: {error}", code="wrong_state") from None
+        if not isinstance(found, dict):
+            raise CommandError("not the bytes of a state of a world", code="wrong_state")
+        return cls(found)
 
 
 class Poses(NamedTuple):
@@ -272,18 +307,19 @@ class World:
         finally:
             self.set_dynamics(name, link, **before)
 
-    def contacts(self, a: str | None = None, b: str | None = None) -> tuple[Contact, ...]:
-        """Return the present contacts.
+    def contacts(self, a: str | None = None, b: str | None = None) -> Contacts:
+        """Return the contacts of the last step; none, with ``t`` None, directly after an edit or a reset.
 
         Args:
             a: Only those of this body.
             b: Only those between ``a`` and this body.
         """
-        found = self._call("contacts", a=a, b=b)
-        return tuple(
+        found = self._call("contacts", a=a, b=b, stamped=True)
+        contacts = (
             Contact(**(contact | {"position": frozen(contact["position"]), "normal": frozen(contact["normal"])}))
-            for contact in found
+            for contact in found["contacts"]
         )
+        return Contacts(contacts, found["t"])
 
     def aabb(self, name: str) -> tuple[Array, Array]:
         """Return the lower and the upper corner (3,) of a body's axis-aligned bounding box in the world, m."""
@@ -305,29 +341,29 @@ class World:
             params["q"] = np.asarray(q, float).tolist()
         self._request("world.reset", params)
 
-    def save(self) -> dict[str, Any]:
-        """Return the state of the world: positions, velocities, what the solver keeps, and the arms' set-points.
+    def save(self) -> WorldState:
+        """Return the state of the world: positions, velocities, forces, what the solver keeps, the arms' set-points.
 
-        Colours, dynamics and added or removed bodies are no part of it, nor is the time.
+        Colours, dynamics, gravity and added or removed bodies are no part of it, nor is the time.
 
         Returns:
-            A record for :meth:`restore`, which can be written as JSON. What is inside depends on the engine.
+            A record for :meth:`restore`, which can be written as JSON, or as bytes. What is inside depends on the
+            engine.
         """
-        state: dict[str, Any] = self._call("save")
-        return state
+        return WorldState(self._call("save"))
 
     def restore(self, state: Mapping[str, Any]) -> None:
         """Put the world into a state of :meth:`save`, also one of another world with the same bodies.
 
-        Simulated time continues. Arms hold, with the set-point that they had; a control session continues from there,
-        as after :meth:`reset`. Mirrors of real arms stay where these arms are.
+        Simulated time continues. Arms hold, with the set-point that they had; an open control session waits there for
+        a new command, as after :meth:`reset`. Mirrors of real arms stay where these arms are.
 
         Args:
             state: The record.
 
         Raises:
-            CommandError: It is no such record, or one of another engine or of other bodies (``code`` is
-                ``wrong_state``); nothing changes.
+            CommandError: It is no such record, or one of another engine or of other bodies, which the message names
+                (``code`` is ``wrong_state``); nothing changes.
         """
         self._call("restore", state=state)
 
@@ -358,7 +394,8 @@ class WorldDriver(ABC):
     ``poses``          ``names``                               ``poses`` of bases by name and ``t``, s
     ``velocity``       ``name``                                linear (3,) m/s, angular (3,) rad/s
     ``dynamics``       ``name``, ``link``                      properties by name
-    ``contacts``       ``a``, ``b``                            the fields of each :class:`Contact`
+    ``contacts``       ``a``, ``b``, ``stamped``               the fields of each :class:`Contact`; with ``stamped``
+                                                               these as ``contacts``, and ``t`` of the step, s, or None
     ``aabb``           ``name``                                ``lower`` and ``upper`` (3,) m
     ``ray``            ``start``, ``end``                      the fields of a :class:`RayHit`, or None
     ``distance``       ``a``, ``b``, ``link_a``, ``link_b``    m

@@ -357,7 +357,9 @@ class MujocoWorld(SimulatedWorld[Body]):
             "integration": values.tolist(),
             "motors": [motors.state.tolist(), motors.efforts.tolist(), motors.speeds.tolist()],
             "sleep": self.sleep.save(),
-            "places": {body.name: body.place for body in self.bodies.values() if body.free is None},
+            "places": {
+                body.name: [list(part) for part in body.place] for body in self.bodies.values() if body.free is None
+            },
         }
 
     def _restore(self, state: Any) -> None:

@@ -8,6 +8,7 @@ same record and never stepped, repeats the edits of :attr:`PyBulletWorld.MIRRORE
 from __future__ import annotations
 
 import base64
+import os
 import tempfile
 import zlib
 from collections.abc import Iterable, Mapping, Sequence
@@ -53,6 +54,8 @@ SOLVER: dict[str, Any] = {
 Each group of bodies that touch is solved by itself: PyBullet solves small groups together, which gives the same numbers
 and makes every group wait for the slowest. With PyBullet's own limit of 50 iterations, fingers do not reach a great
 force, and fast arms exceed their speed limits a little."""
+MEMORY = "/dev/shm"
+"""Folder for files that stay in the computer's memory, where there is one."""
 RESIDUAL = {"fine": 1e-7, "coarse": 3e-6}
 """The solver stops once no speed changes by more than the root of this in an iteration, m/s or rad/s: 0.3 and 1.7 mm/s.
 
@@ -84,6 +87,9 @@ class PyBulletWorld(SimulatedWorld[Body]):
         self.mirror = mirror
         self._drawn = gui
         self.client = PyBulletClient(gui=gui)
+        folder = MEMORY if os.path.isdir(MEMORY) else None
+        self._file = tempfile.NamedTemporaryFile(suffix=".bullet", dir=folder)  # noqa: SIM115  # until close()
+        """PyBullet saves and restores states by files only."""
         self._mirrored: dict[str, MirroredArm] = {}
         """Mirrors of arms that other drivers move."""
         self._attached = AttachedObjects(self.client, ())
@@ -138,6 +144,7 @@ class PyBulletWorld(SimulatedWorld[Body]):
         self.bodies = {}
         self._mirrored = {}
         self.client.close()
+        self._file.close()
 
     def snapshot(self) -> list[float]:
         values = self._layout.read()
@@ -325,20 +332,19 @@ class PyBulletWorld(SimulatedWorld[Body]):
             self.handle(name, name in names)
 
     def _write_file(self) -> bytes:
-        with tempfile.TemporaryDirectory() as folder:
-            file = Path(folder) / "state.bullet"
-            self.client.saveBullet(str(file))
-            return file.read_bytes()
+        self.client.saveBullet(self._file.name)
+        return Path(self._file.name).read_bytes()
 
     def _read_file(self, data: bytes) -> None:
         forget_contacts(self.client, self.bodies.values())
-        with tempfile.TemporaryDirectory() as folder:
-            file = Path(folder) / "state.bullet"
-            file.write_bytes(data)
-            try:
-                self.client.restoreState(fileName=str(file))
-            except self.client.error as error:
-                raise ValueError(str(error)) from None
+        Path(self._file.name).write_bytes(data)
+        self.client.setPhysicsEngineParameter(enableFileCaching=0)  # else it reads a file of one name only once
+        try:
+            self.client.restoreState(fileName=self._file.name)
+        except self.client.error as error:
+            raise ValueError(str(error)) from None
+        finally:
+            self.client.setPhysicsEngineParameter(enableFileCaching=1)
         self._read_layout()
 
     def _push(self, force: AppliedForce[Body]) -> None:

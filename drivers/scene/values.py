@@ -26,6 +26,8 @@ __all__ = [
     "transform",
 ]
 
+SINKS = 1e-4
+"""How deep a body sinks in by its weight with the stiffness that a message proposes, m."""
 _CONTACT = ("contact_stiffness", "contact_damping")
 DYNAMICS = (
     "mass",
@@ -180,8 +182,23 @@ def completed_dynamics(body: str, wanted: Mapping[str, Any], before: Mapping[str
         for name in _CONTACT:
             wanted.setdefault(name, before[name])
         if (wanted["contact_stiffness"] is None) != (wanted["contact_damping"] is None):
-            raise CommandError("contact_stiffness and contact_damping are set together, or both None")
+            raise CommandError(_other_half(body, wanted, before["mass"]), code="contact_incomplete")
     return wanted
+
+
+def _other_half(body: str, wanted: Mapping[str, Any], mass: float) -> str:
+    """Return the message about a stiffness of contacts without a damping, or the reverse, with a value to add."""
+    stiffness, mass = wanted["contact_stiffness"], mass or 1.0
+    if stiffness is None:
+        added = f"contact_stiffness={_round(mass * 9.81 / SINKS):g} (N/m; it then sinks in by {1e3 * SINKS:g} mm)"
+    else:
+        added = f"contact_damping={_round(2.0 * math.sqrt(stiffness * mass)):g} (Ns/m; it then does not bounce)"
+    return f"contact_stiffness and contact_damping of {body!r} are set together, or both None: add {added}"
+
+
+def _round(value: float) -> float:
+    """Return a value with one digit that is not 0."""
+    return float(f"{value:.0e}")
 
 
 def same_value(a: Any, b: Any) -> bool:

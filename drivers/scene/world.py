@@ -18,6 +18,7 @@ from hal.specs import BodySpec, RobotSpec, WorldSpec, to_json
 
 from .engine import AppliedForce, B, SceneEngine
 from .joints import joints_to_place, movable_joints, reset_positions
+from .states import check_state, structure_of
 from .values import (
     body_spec,
     check_body,
@@ -51,6 +52,8 @@ class SimulatedWorld(SceneEngine[B]):
         """Why the simulation stands still, which its arms report; None while it runs."""
         self._changes = 0
         """Changes of poses other than by steps, and of looks."""
+        self._edited_at = 0
+        """The step after which the world was edited last."""
         self._forces: list[AppliedForce[B]] = []
         """Forces on links that act in the coming step."""
         self._gravity = list(spec.gravity)
@@ -176,7 +179,7 @@ class SimulatedWorld(SceneEngine[B]):
             raise CommandError(f"{name!r} is a robot: its servo moves it, and reset() puts it back", code="is_robot")
         self._expect_free(body)
         there = transform(pose)
-        self._changes += 1
+        self._note_edit()
         self._move_base(body, there)
 
     def joint_positions(self, name: str) -> dict[str, float]:
@@ -190,7 +193,7 @@ class SimulatedWorld(SceneEngine[B]):
         if body.is_robot:
             raise CommandError(f"{name!r} is a robot: its servo moves it; reset(q=...) places it", code="is_robot")
         wanted = joints_to_place(body, positions)
-        self._changes += 1
+        self._note_edit()
         self._move_joints(body, wanted)
 
     def velocity(self, name: str) -> list[list[float]]:
@@ -301,10 +304,14 @@ class SimulatedWorld(SceneEngine[B]):
             if not same_value(after[key], value):
                 raise NotSupported(f"{self.ENGINE} did not take {key} = {value} for {name!r}: it holds {after[key]}")
         self._forget([body])
+        self._edited_at = self.steps
         return {key: before[key] for key in wanted}
 
-    def contacts(self, a: str | None = None, b: str | None = None) -> list[dict[str, Any]]:
+    def contacts(self, a: str | None = None, b: str | None = None, stamped: bool = False) -> Any:
         """Return the contacts of the last step: all, those of ``a``, or those between ``a`` and ``b``.
+
+        There are none after an edit or a reset: no step has computed any. With ``stamped`` they are ``contacts`` of a
+        dict that has the time of the step, s, or None, as ``t``.
 
         Each is a dict of ``a``, ``b``, ``link_a``, ``link_b``, ``position`` (3,) m on ``b``, ``normal`` (3,) from ``b``
         towards ``a``, ``distance`` m, negative where they overlap, and ``force`` N along the normal.
@@ -312,7 +319,14 @@ class SimulatedWorld(SceneEngine[B]):
         if a is None:
             a, b = b, None
         first, second = (None if name is None else self.body(name) for name in (a, b))
-        return self._find_contacts(first, second)
+        stale = self._edited_at == self.steps
+        found = [] if stale else self._find_contacts(first, second)
+        return {"t": None if stale else self.t, "contacts": found} if stamped else found
+
+    def _note_edit(self) -> None:
+        """Note that poses are others than those of the last step."""
+        self._changes += 1
+        self._edited_at = self.steps
 
     def aabb(self, name: str) -> dict[str, list[float]]:
         """Return ``lower`` and ``upper`` (3,) m, the corners of the box along the world's axes around the body.
@@ -355,6 +369,8 @@ class SimulatedWorld(SceneEngine[B]):
 
     def _edited(self, method: str, **params: Any) -> int:
         self._changes += 1
+        if method != "set_color":
+            self._edited_at = self.steps
         self.revision += 1
         for callback in self._on_edit:
             callback(method, params, self.revision)
@@ -405,44 +421,38 @@ class SimulatedWorld(SceneEngine[B]):
         """Return the state of the world and of its drivers: see :meth:`hal.world.World.save`."""
         return {
             "engine": self.ENGINE,
-            "bodies": self._structure(),
+            "bodies": structure_of(self.bodies.values()),
             "drivers": {name: save() for name, (save, _) in self._kept.items()},
+            "forces": [
+                [one.body.name, one.body.link_name(one.link), list(one.force), one.point and list(one.point), one.steps]
+                for one in self._forces
+            ],
             "state": self._save(),
         }
 
     def restore(self, state: Any) -> None:
         """Restore a state of :meth:`save`: see :meth:`hal.world.World.restore`."""
-        if not {"engine", "bodies", "drivers", "state"} <= set(state if isinstance(state, Mapping) else ()):
-            raise CommandError("not a state of a world; rig.world.save() returns one", code="wrong_state")
-        if state["engine"] != self.ENGINE:
-            raise CommandError(f"the state is one of {state['engine']}, not of {self.ENGINE}", code="wrong_state")
-        theirs, ours = state["bodies"], self._structure()
-        if not isinstance(theirs, Mapping) or list(theirs.items()) != list(ours.items()):
-            others = ", ".join(map(str, theirs)) if isinstance(theirs, Mapping) else theirs
-            text = f"the state is one of other bodies: {others}; this world has: {', '.join(ours)}"
-            if isinstance(theirs, Mapping) and list(theirs) == list(ours):
-                text = "the state is one of bodies of the same names with other joints or bases"
-            raise CommandError(text, code="wrong_state")
+        check_state(state, self.ENGINE, structure_of(self.bodies.values()))
         drivers = state["drivers"]
         own = {name: save() for name, (save, _) in self._kept.items() if name in (drivers or ())}
         if not isinstance(drivers, Mapping) or not all(like(drivers[name], part) for name, part in own.items()):
             raise CommandError("the state of an arm or a gripper in it is none of this world's", code="wrong_state")
         try:
+            forces = [self._saved_force(*force) for force in state["forces"]]
             self._restore(state["state"])
-        except (AttributeError, CommandError, KeyError, ValueError, TypeError) as error:
+        except (AttributeError, DeviceNotFound, CommandError, KeyError, ValueError, TypeError) as error:
             raise CommandError(f"the state cannot be restored: {error}", code="wrong_state") from error
-        self._changes += 1
+        self._forces = forces
+        self._note_edit()
         self._follow_attached()
         for name, (_, restore) in self._kept.items():
             if name in drivers:
                 restore(drivers[name])
 
-    def _structure(self) -> dict[str, list[float]]:
-        """Return what a saved state needs to fit: joints of each body, whether it is free, and the bases of arms."""
-        return {
-            name: [len(body.movable), body.floating, *((*body.base[0], *body.base[1]) if body.is_robot else ())]
-            for name, body in self.bodies.items()
-        }
+    def _saved_force(self, name: str, link: str, force: Any, point: Any, steps: Any) -> AppliedForce[B]:
+        body = self.body(name)
+        at = None if point is None else numbers("point", point, 3)
+        return AppliedForce(body, self.link(body, link), numbers("force", force, 3), at, max(1, int(steps)))
 
     def _expect_free(self, body: B) -> None:
         if body.carried:
@@ -452,7 +462,7 @@ class SimulatedWorld(SceneEngine[B]):
         self._put(body, body.base, body.home)
 
     def _put(self, body: B, base: Transform, joints: Mapping[int, float]) -> None:
-        self._changes += 1
+        self._note_edit()
         self._forces = [force for force in self._forces if force.body is not body]
         if not body.carried:
             self._move_base(body, base)

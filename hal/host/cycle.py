@@ -554,7 +554,7 @@ class Cycle:
         if self.world is None:
             raise NotSupported("this rig has no simulated world; rig.world exists in simulation only", code="no_world")
         result = self.world.request(method, params)
-        if method == "poses":
+        if isinstance(result, dict) and result.get("t") is not None:
             result["t"] = self.t  # a world only counts its steps
         if method in ("reset", "restore"):
             name = params.get("name")

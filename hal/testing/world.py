@@ -274,6 +274,28 @@ class WorldContract(Contract):
         assert len(world.request("contacts", {})) == len(contacts)
         assert world.request("contacts", {"a": "cube"}) == contacts
 
+    def test_directly_after_an_edit_there_are_no_contacts_yet(self, bench: WorldBench) -> None:
+        world = _steps(bench.world(floor(), cube((0.0, 0.0, 0.051))), 0.5)
+        for method, params in (
+            ("set_dynamics", {"name": "cube", "lateral_friction": 0.4}),
+            ("set_pose", {"name": "cube", "pose": {"position": [0.1, 0, 0.05]}}),
+            ("reset", {}),
+        ):
+            found = _steps(world, 0.5).request("contacts", {"stamped": True})
+            assert found["t"] == world.t, "of the last step"
+            assert found["contacts"]
+            world.request(method, params)
+            assert world.request("contacts", {"stamped": True}) == {"t": None, "contacts": []}
+
+    def test_half_of_a_soft_contact_is_refused_with_the_other_half(self, bench: WorldBench) -> None:
+        world = bench.world(cube((0.0, 0.0, 1.0)))
+        with pytest.raises(CommandError) as refused:
+            world.request("set_dynamics", {"name": "cube", "contact_damping": 1.0})
+        assert refused.value.code == "contact_incomplete"
+        proposed = str(refused.value).partition("add contact_stiffness=")[2].partition(" ")[0]
+        world.request("set_dynamics", {"name": "cube", "contact_damping": 1.0, "contact_stiffness": float(proposed)})
+        assert world.request("dynamics", {"name": "cube"})["contact_damping"] == pytest.approx(1.0)
+
     def test_set_dynamics_returns_what_was_set_before(self, bench: WorldBench) -> None:
         world = bench.world(floor(), cube((0.0, 0.0, 0.05)))
         before = world.request("dynamics", {"name": "cube"})
