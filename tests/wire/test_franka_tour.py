@@ -130,3 +130,26 @@ def test_velocities_instead_of_positions_go_to_the_same_place(emulator: Emulator
     assert not emulator.events("reflex")
     assert "joint velocity" in emulator.events("motion started")[-1]["text"]
     assert "success" in emulator.events("motion ended")[-1]["text"]
+
+
+@pytest.mark.parametrize("robot", ["fr3", "panda"])
+def test_a_straight_line_is_kept(emulator: Emulator, robot: str) -> None:
+    with rig_of(emulator.host, robot, lock_step=True) as rig:
+        arm = arm_of(rig)
+        start = arm.state().tcp_set
+        goal = Pose(start.position + [0.1, 0.15, -0.1], start.orientation)
+        motion = arm.start_move_to(goal, straight=True, speed=1.0, unattended=True)
+        away = turned = 0.0
+        way = (goal.position - start.position) / np.linalg.norm(goal.position - start.position)
+        while not motion.done:
+            rig.clock.sleep(0.01)
+            tcp = arm.state().tcp
+            off = tcp.position - start.position
+            away = max(away, float(np.linalg.norm(off - (off @ way) * way)))
+            turned = max(turned, tcp.distance(start)[1])
+        assert motion.wait()
+        assert away <= 2e-3
+        assert turned <= 5e-3
+        assert arm.state().tcp.distance(goal)[0] <= 2e-3
+    assert not emulator.events("reflex")
+    assert "success" in emulator.events("motion ended")[-1]["text"]
