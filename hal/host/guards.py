@@ -7,7 +7,7 @@ from math import copysign
 from typing import TYPE_CHECKING, Protocol
 
 from ..errors import NotSupported
-from ..geometry import Pose
+from ..kinematics.collisions import in_one_place
 from ..servo.collisions import CollisionGuard, Neighbour
 from ..servo.smoothing import stop_distance
 from ..types import RobotStatus
@@ -21,9 +21,6 @@ if TYPE_CHECKING:
 __all__ = ["ArmElsewhere", "GuardedArm", "guard_arms"]
 
 Floats = Sequence[float]
-
-_SAME_PLACE = 1e-3
-"""Two arms whose bases are this near, m, have been given no places."""
 
 _OLD = 0.004
 """The state of an arm in another process is this old at most while that process keeps its rate, s."""
@@ -90,13 +87,13 @@ def guard_arms(group: GroupSpec, units: Mapping[str, GuardedArm], others: Iterab
         for other in around:
             if other[0] is unit.spec:
                 continue
-            if not _same_place(unit.spec, other[0]):
+            if not in_one_place(unit.spec, other[0]):
                 seen.append(other)
             elif name < other[0].name:
-                notes.append(
-                    f"{name} and {other[0].name} have their bases in one place, so they are not checked against each "
-                    f"other: set robots.{other[0].name}.base"
-                )
+                one_body = unit.spec.urdf == other[0].urdf and unit.spec.joints != other[0].joints
+                why = "are arms of one body" if one_body else "have their bases in one place"
+                remedy = "" if one_body else f": set robots.{other[0].name}.base"
+                notes.append(f"{name} and {other[0].name} {why}, so they are not checked against each other{remedy}")
         try:
             notes += _guard(unit, seen, spec)
         except NotSupported as error:
@@ -132,8 +129,3 @@ def _neighbour(unit: GuardedArm) -> Neighbour:
         return q, q
 
     return stop
-
-
-def _same_place(one: RobotSpec, other: RobotSpec) -> bool:
-    apart, _ = Pose(one.base_position, one.base_orientation).distance(Pose(other.base_position, other.base_orientation))
-    return apart < _SAME_PLACE

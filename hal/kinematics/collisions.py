@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
+from math import dist
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -15,12 +16,14 @@ from .collision_model import CollisionModel, PairBounds, PairDistance
 if TYPE_CHECKING:
     from ..specs import CollisionSpec, RobotSpec
 
-__all__ = ["Collisions", "PairDistance"]
+__all__ = ["Collisions", "PairDistance", "in_one_place"]
 
 Array = NDArray[np.float64]
 
 _STEP = 1e-3
 """A way along which two shapes come this much nearer at most is checked at its ends only, m."""
+_SAME_PLACE = 1e-3
+"""Bases of two arms that are this near are in one place, m."""
 _TOLERANCE = 1e-4
 """Shapes that are nearer than the margin where a motion begins may come so much nearer still, m."""
 
@@ -34,7 +37,8 @@ class Collisions:
     Args:
         robot: The arm.
         spec: What is checked.
-        others: The other arms, each with a function that returns its present joint positions (n,), rad.
+        others: The other arms, each with a function that returns its present joint positions (n,), rad. Those whose
+            bases are in the place of this one's are left out.
 
     Raises:
         NotSupported: The arm has no collision shapes (``code`` is ``no_shapes``), or a mesh cannot be read.
@@ -48,6 +52,7 @@ class Collisions:
     ) -> None:
         self._robot = robot
         self._n = len(robot.joints)
+        others = [(other, position) for other, position in others if not in_one_place(robot, other)]
         self._others = tuple(position for _, position in others)
         self.model = CollisionModel([robot, *(other for other, _ in others)], spec)
         self._own = self.model.slices[0]
@@ -157,6 +162,11 @@ class Collisions:
     def _all(self, q: Array) -> Array:
         """Return the joint positions of all arms: ``q`` of this one, and the present ones of the others."""
         return np.concatenate([q, *(np.array(position(), float) for position in self._others)])
+
+
+def in_one_place(one: RobotSpec, other: RobotSpec) -> bool:
+    """Return whether the bases of two arms are in one place, so that they have been given none or are of one body."""
+    return dist(one.base_position, other.base_position) < _SAME_PLACE
 
 
 def _nearest_each(pairs: Iterable[PairDistance]) -> list[PairDistance]:
