@@ -34,6 +34,8 @@ from hal import JointImpedance, JointTarget, OperationalSpace
 ROWS = ("rest", "tour", "force", "table", "held", "steps")
 SETTLE = 1.5
 """Time from the rest of the set-point to the measurement, s."""
+LONGEST = 15.0
+"""Longest time for a way; an arm that runs into itself or into the table takes longer, s."""
 TASK = OperationalSpace(stiffness=1000.0, rotation_stiffness=50.0)
 JOINTS = JointImpedance(stiffness=(200.0,) * 4 + (50.0,) * 3)
 CONTROLLERS = (("task", TASK), ("joints", JOINTS))
@@ -119,10 +121,12 @@ def rest(rig: hal.Rig, controller: Any, count: int, seed: int = 1) -> Rest:
             contextlib.suppress(hal.MotionStopped),
             arm.control(controller=controller, unattended=unattended) as control,
         ):
-            while np.abs(arm.state().q_set - goal).max() > 1e-4:
+            begun = rig.clock.now()
+            while np.abs(arm.state().q_set - goal).max() > 1e-4 and rig.clock.now() < begun + LONGEST:
                 follow(rig, control, goal, 0.02)
-            follow(rig, control, goal, SETTLE)
-            errors.append(arm.state().tcp.distance(arm.fk(goal)))
+            if rig.clock.now() < begun + LONGEST:
+                follow(rig, control, goal, SETTLE)
+                errors.append(arm.state().tcp.distance(arm.fk(goal)))
     worst, median = np.max(errors, axis=0), np.median(errors, axis=0)
     return Rest((worst[0], worst[1]), (median[0], median[1]), len(errors))
 
@@ -174,16 +178,17 @@ def table(rig: hal.Rig, stiffness: float = 500.0, depth: float = 0.02) -> tuple[
     start = arm.state().tcp_set
     above = hal.Pose([start.position[0] + 0.1, start.position[1] + 0.15, surface + 0.05], start.orientation)
     arm.move_to(above)
-    begun, forces = None, []
+    begun, touch, forces = None, -np.inf, []
     with arm.control(controller=controller) as control:
-        depth_now = 0.05
+        height = surface + 0.05
         for tick in rig.clock.rate(50.0):
-            depth_now = max(-depth, depth_now - 0.05 * 0.02)
-            goal = hal.Pose([*above.position[:2], surface + depth_now], above.orientation)
-            control.send(hal.CartesianTarget(goal))
-            contact = rig.world.contacts(arm.name, "table")
-            forces.append((tick.t, sum(each.force for each in contact)))
-            if begun is None and depth_now == -depth:
+            height = max(touch - depth, height - 0.05 * 0.02)
+            control.send(hal.CartesianTarget(hal.Pose([*above.position[:2], height], above.orientation)))
+            newtons = sum(each.force for each in rig.world.contacts(arm.name, "table"))
+            forces.append((tick.t, newtons))
+            if newtons > 0.2 and touch == -np.inf:
+                touch = arm.state().tcp.position[2]  # the fingertips reach a little beyond the tcp
+            if begun is None and height == touch - depth:
                 begun = tick.t
             if begun is not None and tick.t - begun > 1.0:
                 break
@@ -254,7 +259,9 @@ def main() -> None:
                             show_tour(f"{model} {hz:.0f} Hz {name}", tour(rig, controller, args.seconds))
         else:
             for model in args.models:
-                with open_rig(model, engine=args.engine) as rig:
+                name = "iiwa" if model == "iiwa" else "panda"
+                free = (f"robots.{name}.workspace=null",) if row == "table" else ()
+                with open_rig(model, *free, engine=args.engine) as rig:
                     rig.clock.sleep(0.2)
                     on_simulation(row, model, rig, args.count)
 
