@@ -144,7 +144,10 @@ def lines(count: int = 200, engine: str = "pybullet", seed: int = 1) -> dict[str
                 rows[name].append(value)
             assert max(audit.peaks().values()) <= 1.0, audit.peaks()
     worst = {name: max(values) for name, values in rows.items()}
-    return worst | {"ratio_median": float(np.median(rows["ratio"])), "refused": refused, "count": count}
+    slow = sum(ratio > 1.3 for ratio in rows["ratio"])
+    return worst | {
+        "ratio_median": float(np.median(rows["ratio"])), "ratio_over_1.3": slow, "refused": refused, "count": count,
+    }  # fmt: skip
 
 
 def follow(spec: RobotSpec, arm: Kinematics, sections: tuple[PathSection, ...], most: float = 300.0) -> dict[str, Any]:
