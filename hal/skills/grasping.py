@@ -38,6 +38,8 @@ _PROBE = 0.003
 """Step to one side that shows which side is the right one, m."""
 _CENTRED = 0.001
 """Distance from the middle up to which an object counts as centred, m."""
+_LET_GO = 0.01
+"""By how much the fingers open between the last touch and the grasp, m."""
 _SLOW = 0.03
 """Speed of the tcp with the object between the fingers, m/s."""
 _SPEED = 0.1
@@ -229,7 +231,8 @@ def centre_on(run: SkillRun, pose: Pose, width: float, force: float, speed: floa
     for turn in range(_TOUCHES):
         if missing < -TOLERANCE:
             run.fail("wrong_width", f"the object is {2e3 * -missing:.0f} mm narrower than {width:.3f} m")
-        if missing <= _CENTRED:
+        if missing <= _CENTRED:  # let go: some hands cannot press harder on what they touch already
+            run.open_fingers(width + 2.0 * missing + _LET_GO)
             return
         run.open_fingers()
         step = min(missing, _PROBE) if turn == 0 else missing  # the first one, to find out which side is right

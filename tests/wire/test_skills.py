@@ -1,0 +1,117 @@
+"""The skills' own code on the emulated FR3 and Franka Hand: every phase, and what goes wrong there."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import pytest
+
+import hal
+from hal.skills import SkillProgress, gentle_grasp, grasp, push
+
+from .franka_kit import Emulator
+from .rig_kit import arm_of, rig_of
+
+pytest.importorskip("pylibfranka", reason="needs pylibfranka: pip install 'robot-hal[franka]'")
+pytest.importorskip("panda_py", reason="needs panda-python: pip install 'robot-hal[panda]'")
+
+pytestmark = [pytest.mark.alone, pytest.mark.slow, pytest.mark.timeout(300)]
+
+DOWN = [1.0, 0.0, 0.0, 0.0]
+POSE = hal.Pose([0.40, 0.03, 0.35], DOWN)
+"""Near home, so that the arm is there soon."""
+WIDTH = 0.03
+OPTIONS: dict[str, Any] = {"approach": 0.03, "lift": 0.03, "speed": 0.3, "unattended": True}
+GRASP = ["open", "approach", "descend", "close", "lift", "hold"]
+GENTLE = ["open", "approach", "descend", "touch", "centre", "close", "lift", "hold"]
+
+
+@pytest.fixture(scope="module")
+def robot() -> Iterator[Emulator]:
+    with Emulator(hand=True) as emulator:
+        yield emulator
+
+
+@pytest.fixture(scope="module")
+def rig(robot: Emulator) -> Iterator[hal.Rig]:
+    with rig_of(robot.host, "fr3", "robots.arm.gripper.enabled=true") as rig:
+        yield rig
+
+
+def at(phase: str, call: Callable[[], Any]) -> Callable[[SkillProgress], None]:
+    """Return a ``progress`` function that makes a call when a phase begins."""
+
+    def progress(now: SkillProgress) -> None:
+        if now.phase == phase:
+            call()
+
+    return progress
+
+
+CASES: list[tuple[str, list[str], str, str, dict[str, Any]]] = [
+    # reason, phases, when the hand is told, what it is told, options
+    ("", GRASP, "open", "object 0.03", {"width": WIDTH}),
+    ("", GRASP, "open", "object 0.03", {}),
+    ("", GRASP, "open", "object 0.03", {"width": WIDTH, "hold": 0.5}),
+    ("missed", GRASP[:4], "open", "object none", {"width": WIDTH}),
+    ("missed", GRASP[:4], "open", "object none", {}),
+    ("wrong_width", GRASP[:4], "open", "object 0.06", {"width": WIDTH}),
+    ("wrong_width", GRASP[:4], "open", "object 0.01", {"width": WIDTH}),
+    ("dropped", GRASP[:5], "lift", "object none", {"width": WIDTH}),
+    ("dropped", GRASP, "hold", "object none", {"width": WIDTH, "hold": 1.5}),
+    ("too_wide", [], "", "", {"width": 0.09}),
+    ("unreachable", [], "", "", {"pose": hal.Pose([0.74, 0.45, 0.6], DOWN)}),
+    ("outside_limits", [], "", "", {"pose": hal.Pose([0.40, 0.0, -0.1], DOWN)}),
+]
+
+
+@pytest.mark.parametrize(("reason", "phases", "when", "words", "options"), CASES)
+def test_a_grasp(
+    robot: Emulator, rig: hal.Rig, reason: str, phases: list[str], when: str, words: str, options: dict[str, Any]
+) -> None:
+    arm, options = arm_of(rig), dict(options)
+    robot.control.send(f"hand object {WIDTH if reason == 'dropped' else 'none'}")
+    pose = options.pop("pose", POSE)
+    tell = at(when, lambda: robot.control.send(f"hand {words}"))
+    result = grasp(arm, pose, **OPTIONS, **options, progress=tell)
+    assert (result.reason, [phase.name for phase in result.phases]) == (reason, phases), result.message
+    if reason in ("missed", "wrong_width"):
+        assert result.width == pytest.approx(0.08, abs=2e-3), "the fingers are open again"
+
+
+@pytest.mark.parametrize(
+    ("reason", "phases", "words"),
+    [
+        ("", GENTLE, "object 0.03"),
+        ("missed", GENTLE[:4], "object none"),
+        ("wrong_width", GENTLE[:5], "object 0.008"),
+        ("not_centred", GENTLE[:5], "object 0.05"),
+    ],
+)
+def test_a_gentle_grasp(robot: Emulator, rig: hal.Rig, reason: str, phases: list[str], words: str) -> None:
+    robot.control.send("hand object none")
+    tell = at("touch", lambda: robot.control.send(f"hand {words}"))
+    result = gentle_grasp(arm_of(rig), POSE, WIDTH, **OPTIONS, progress=tell)
+    assert (result.reason, [phase.name for phase in result.phases]) == (reason, phases), result.message
+
+
+def test_a_push(robot: Emulator, rig: hal.Rig) -> None:
+    robot.control.send("hand object none")
+    end = hal.Pose(POSE.position + [0.04, 0.0, 0.0], DOWN)
+    result = push(arm_of(rig), [POSE, end], approach=0.03, speed=0.3, unattended=True)
+    assert result, result.message
+    assert [phase.name for phase in result.phases] == ["close", "approach", "descend", "push", "back_off", "lift"]
+
+
+def test_faults_and_stops_are_exceptions(robot: Emulator, rig: hal.Rig) -> None:
+    arm = arm_of(rig)
+    robot.control.send("hand object 0.03")
+    with pytest.raises(hal.RobotFault):
+        grasp(arm, POSE, **OPTIONS, progress=at("close", lambda: robot.control.send("hand fail 1")))
+    with pytest.raises(hal.MotionStopped):
+        grasp(arm, POSE, **OPTIONS, progress=at("approach", rig.stop))
+    rig.rearm()
+    with pytest.raises(hal.RobotFault):
+        grasp(arm, POSE, **OPTIONS, progress=at("lift", lambda: robot.control.send("reflex joint_reflex")))
+    arm.recover()
