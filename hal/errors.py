@@ -154,7 +154,7 @@ class DatasetError(HalError, ValueError):
 class Unreachable(HalError, ValueError):
     """No joint position within the limits reaches the pose, or the way there cannot be followed.
 
-    ``code`` is ``unreachable``; for a way also ``joint_limit``, ``singular`` or ``workspace``.
+    ``code`` is ``unreachable``; for a way also ``joint_limit``, ``singular`` or ``outside_workspace``.
     """
 
     code = "unreachable"

@@ -132,6 +132,8 @@ class Kinematics:
             axes = reference.LOCAL if frame == "tcp" else reference.WORLD
         number = self._tcp if link is None else self._body_frame(link)
         jacobian: Array = self._pin.computeFrameJacobian(self._model, self._data, self._ordered(q), number, axes)
+        if self.n == 1:
+            jacobian = jacobian.reshape(6, 1)  # pinocchio returns a vector
         return jacobian if self._columns is None else jacobian[:, self._columns]
 
     def screw_axes(self, link: str | None = None) -> Array:

@@ -274,7 +274,7 @@ class PathPlanner:
                     q=None if q is None else tuple(q),
                     along=at / whole,
                     distance=at,
-                    code="workspace",
+                    code="outside_workspace",
                 )
 
     def _checked(self, sections: Sequence[PathSection], whole: float) -> MotionPlan:

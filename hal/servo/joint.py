@@ -516,5 +516,5 @@ class PathMotion(ServoMotion):
                 if x > max(high, x0) + 1e-6 or x < min(low, x0) - 1e-6:
                     raise CommandError(
                         f"the path leaves the workspace: {axis} = {x:.3f} m, allowed {low:.3f} to {high:.3f}",
-                        code="workspace",
+                        code="outside_workspace",
                     )

@@ -100,7 +100,7 @@ class PlannedMotion(ServoMotion):
         Raises:
             CommandError: The path is malformed (``code`` is ``bad_path``), longer than :data:`.PATH_KNOTS` knots
                 (``path_too_long``), starts elsewhere (``start_moved``), or leaves limits or workspace (``joint_limit``,
-                ``workspace``); nothing changes.
+                ``outside_workspace``); nothing changes.
         """
         smoother, envelope = self.smoother, self.envelope
         self._check_form(sections)
@@ -325,5 +325,5 @@ class PlannedMotion(ServoMotion):
                     if x > max(high, x0) + 1e-6 or x < min(low, x0) - 1e-6:
                         raise CommandError(
                             f"the path leaves the workspace: {axis} = {x:.3f} m, allowed {low:.3f} to {high:.3f}",
-                            code="workspace",
+                            code="outside_workspace",
                         )

@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -88,21 +89,15 @@ def points_of(arm: Robot, frames: Sequence[Frame]) -> Array:
     The depth of a pixel is the median over the frames that measured it.
 
     Raises:
-        CommandError: The frames have no depth (``code`` is ``no_depth``), or the camera's pose is unknown
+        NotSupported: The frames have no depth (``code`` is ``no_depth``), or the camera's pose is unknown
             (``no_camera_pose``).
     """
     newest, images = frames[-1], [frame.depth for frame in frames if frame.depth is not None]
-    if not images:
-        raise CommandError("these frames have no depth: give the camera a depth stream", code="no_depth")
-    if newest.T_world_camera is None:
-        raise CommandError("the pose of this camera is unknown: calibrate it first", code="no_camera_pose")
-    stack = np.ma.masked_equal(np.stack(images), 0.0)
-    depth = np.ma.median(stack, axis=0).filled(0.0)  # type: ignore[no-untyped-call]
-    v, u = np.nonzero(depth)
-    z = depth[v, u].astype(float)
-    K = newest.K
-    seen = np.column_stack([(u - K[0, 2]) * z / K[0, 0], (v - K[1, 2]) * z / K[1, 1], z])
-    return (arm.base.inverse() @ newest.T_world_camera).transform(seen)
+    if images:
+        stack = np.ma.masked_equal(np.stack(images), 0.0)
+        depth = np.ma.median(stack, axis=0).filled(0.0)  # type: ignore[no-untyped-call]
+        newest = replace(newest, depth=depth.astype(np.float32))
+    return newest.points(frame=arm.base).astype(float)
 
 
 def find_table(points: Array) -> Plane | None:

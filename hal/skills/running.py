@@ -316,7 +316,7 @@ class SkillRun:
         except CollisionError as error:
             self.fail("collision", str(error))
         except CommandError as error:
-            if error.code not in ("outside_limits", "outside_workspace", "workspace"):
+            if error.code not in ("outside_limits", "outside_workspace"):
                 raise
             self.fail("outside_limits", str(error))
         except TimeoutError as error:

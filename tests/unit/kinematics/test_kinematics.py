@@ -456,3 +456,12 @@ def test_a_spec_that_does_not_fit_the_urdf_is_refused(tmp_path: Path, changes: d
     path.write_text(arm_urdf())
     with pytest.raises(ValueError, match=message):
         Kinematics(small_spec(path, **changes))
+
+
+def test_an_arm_of_one_joint_has_a_jacobian_with_one_column(tmp_path: Path) -> None:
+    (tmp_path / "arm.urdf").write_text(arm_urdf())
+    one = {"joints": ("zeta",), "lower": (-3.0,), "upper": (3.0,), "home": (0.0,), "tcp_link": "m"}
+    kinematics = Kinematics(small_spec(tmp_path / "arm.urdf", **one))
+    pose, jacobian = kinematics.fk_and_jacobian([0.0])
+    np.testing.assert_allclose(pose[:3], [0.5, 0.0, 0.0], atol=1e-12)
+    np.testing.assert_allclose(jacobian, np.array([[0.0, 0.5, 0.0, 0.0, 0.0, 1.0]]).T, atol=1e-12)

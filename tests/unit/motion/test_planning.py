@@ -71,7 +71,7 @@ def test_the_spline_is_on_the_way_everywhere() -> None:
     [
         (moved([0.7, 0.0, 0.0]), "singular"),
         (moved([0.0, 0.0, 0.0], (0.0, 2.9, 0.0)), "joint_limit"),
-        (moved([0.0, 0.3, 0.0]), "workspace"),
+        (moved([0.0, 0.3, 0.0]), "outside_workspace"),
     ],
 )
 def test_refusals_say_how_far_along(goal: list[float], code: str) -> None:
@@ -93,7 +93,7 @@ def test_refusals_say_how_far_along(goal: list[float], code: str) -> None:
 def test_a_start_outside_may_come_back_in() -> None:
     box = WorkspaceSpec((-1.0, -1.0, 0.6), (1.0, 1.0, 1.5))
     assert planner(workspace=box).along_poses(PANDA_HOME, [moved([0.0, 0.0, 0.2])]).sections
-    with raises_code(Unreachable, "workspace"):
+    with raises_code(Unreachable, "outside_workspace"):
         planner(workspace=box).along_poses(PANDA_HOME, [moved([0.0, 0.0, -0.1])])
 
 

@@ -156,7 +156,7 @@ KNOT, NEXT = tuple(PANDA_HOME), tuple(x + 0.01 for x in PANDA_HOME)
         ((PathSection(tuple(map(float, range(PATH_KNOTS + 1))), (KNOT,) * (PATH_KNOTS + 1)),), "path_too_long"),
         ((PathSection((0.0, 1.0), (tuple(x + 0.05 for x in KNOT), NEXT)),), "start_moved"),
         ((PathSection((0.0, 1.0), (KNOT, (*NEXT[:3], 0.0, *NEXT[4:]))),), "joint_limit"),
-        ((PathSection((0.0, 1.0), (KNOT, (1.5, *NEXT[1:]))),), "workspace"),
+        ((PathSection((0.0, 1.0), (KNOT, (1.5, *NEXT[1:]))),), "outside_workspace"),
     ],
 )
 def test_a_path_that_no_planner_makes_is_refused(sections: tuple[PathSection, ...], code: str) -> None:
