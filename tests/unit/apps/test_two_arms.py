@@ -92,6 +92,7 @@ def test_one_pad_drives_one_arm_after_the_other(tmp_path: Path) -> None:
     assert json.loads(out.read_text())["tcp_travel_m"] == pytest.approx(0.36, abs=0.06)
 
 
+@pytest.mark.slow
 def test_episodes_of_two_arms_are_collected_and_each_arm_is_replayed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -38,6 +38,7 @@ def rig(**hosts: str) -> dict[str, Any]:
     return {"sim": False, "robots": robots, "gamepads": {"pad": {}}}
 
 
+@pytest.mark.slow
 def test_the_tour_drives_it_in_lock_step() -> None:
     with hal.open(rig(arm="here"), clock="lock_step", pad="demo") as bench:
         assert bench.attended

@@ -184,6 +184,7 @@ def test_a_base_link_that_its_arm_moves(tmp_path: Path) -> None:
     assert [problem.key for problem in caught.value.problems] == ["base_link"]
 
 
+@pytest.mark.slow
 def test_what_is_not_refused_does_not_end_the_simulator(tmp_path: Path) -> None:
     """Runs in a process of its own, which a crash would end."""
     pytest.importorskip("pybullet")

@@ -214,6 +214,7 @@ def test_a_discarded_episode_is_gone_and_one_that_is_left_open_is_kept(tmp_path:
     assert recover(out) == []
 
 
+@pytest.mark.slow
 def test_two_programs_do_not_record_into_one_folder(tmp_path: Path) -> None:
     with mock_rig() as rig, Recorder(rig, tmp_path / "out") as first, Recorder(rig, tmp_path / "out") as second:
         first.start()
