@@ -8,6 +8,7 @@ named on the command line runs whatever its tier. See ``pytest --markers``.
 
 from __future__ import annotations
 
+import gc
 import os
 import signal
 import sys
@@ -44,6 +45,12 @@ MARKERS = {
     "slow": "takes more than a few seconds; never in the fast tier",
     "alone": "drives in real time what a busy computer would stop: CI runs nothing beside it, as with all of 'browser'",
 }
+
+
+def pytest_collection_finish() -> None:
+    """Take thousands of collected tests out of garbage collection: it would pause an app in this process for 0.2 s."""
+    gc.collect()
+    gc.freeze()
 
 
 def pytest_configure(config: pytest.Config) -> None:
