@@ -33,9 +33,23 @@ def checked_urdf(path: str, key: str) -> UrdfModel:
         raise ConfigError([Problem(path, key, str(error), "bad_urdf")]) from None
     missing = [name for name, drawn in _missing_meshes(path) if not (drawn and _absent(name))]
     if missing:
-        text = "names a mesh that does not exist"
-        raise ConfigError([Problem(path, key, f"{text}: {name}", "missing_file") for name in dict.fromkeys(missing)])
+        raise ConfigError(
+            [_missing(path, key, name) for name in {_absent(name) or name: name for name in missing}.values()]
+        )
     return model
+
+
+def _missing(path: str, key: str, mesh: str) -> Problem:
+    """Return the problem of a mesh that does not exist, or of its package, which is not installed."""
+    package = _absent(mesh)
+    if not package:
+        return Problem(path, key, f"names a mesh that does not exist: {mesh}", "missing_file")
+    from hal.config.context import INSTALL
+
+    command = INSTALL.get(package, f"pip install {package.replace('_', '-')}")
+    return Problem(
+        path, key, f"its meshes are in package {package!r}, which is not installed; {command}", "missing_package"
+    )
 
 
 def absent_packages(path: str) -> tuple[str, ...]:

@@ -110,12 +110,15 @@ def test_without_the_package_of_its_meshes_a_link_is_drawn_by_its_collision_shap
 
 
 @pytest.mark.parametrize(
-    ("visual", "collision"),
-    [('<box size="1 1 1"/>', ABSENT), ('<mesh filename="gone.obj"/>', '<box size="1 1 1"/>')],
+    ("visual", "collision", "code"),
+    [
+        ('<box size="1 1 1"/>', ABSENT, "missing_package"),
+        ('<mesh filename="gone.obj"/>', '<box size="1 1 1"/>', "missing_file"),
+    ],
 )
-def test_a_mesh_that_is_touched_or_should_be_beside_the_urdf_must_exist(tmp_path, visual, collision):
+def test_a_mesh_that_is_touched_or_should_be_beside_the_urdf_must_exist(tmp_path, visual, collision, code):
     spec = urdf_of(tmp_path, visual, collision)
-    with raises_problems("missing_file"):
+    with raises_problems(code):
         drawn(spec)
-    with raises_problems("missing_file"), stepped(spec):
+    with raises_problems(code), stepped(spec):
         pass
