@@ -89,6 +89,8 @@ def test_an_arm_that_begins_inside_the_margin_may_leave_it(panda: RobotSpec, col
 
 @pytest.mark.parametrize("models", [("panda",), ("iiwa", "panda")], ids="+".join)
 def test_bounds_never_exceed_distances(models: Sequence[str]) -> None:
+    if "iiwa" in models:
+        pytest.importorskip("pybullet_data", reason="needs pybullet_data (pip install pybullet)")
     robots = arms(*models, apart=0.7)
     model = CollisionModel(robots, CollisionSpec(boxes=(TABLE,)))
     lower = np.concatenate([r.limits.lower for r in robots])
