@@ -26,6 +26,7 @@ import yaml
 from pydantic import BaseModel, TypeAdapter, ValidationError
 
 from ..errors import ConfigError, Problem
+from .data_files import data_folder, is_path, list_data, user_path
 from .schema import ValueProblem, describe, keys_at, kind_inside, record_in
 
 __all__ = [
@@ -34,6 +35,7 @@ __all__ = [
     "apply_overrides",
     "check_size",
     "closest",
+    "load_record",
     "nearest",
     "parse_yaml",
     "plain_copy",
@@ -290,6 +292,40 @@ def validate(model: type[M], data: Any, file: Path | str, problems: Problems, pr
             if right is not None:
                 guessed.add(right)
                 problems.written[str(file), _dotted(prefix, right)] = str(one["loc"][-1])
+
+
+def load_record(model: type[M], given: str | Path | Mapping[str, Any] | M, folder: str, kind: str) -> M:
+    """Return the record of a built-in file, a file of the user, or data.
+
+    Args:
+        model: The class of the record.
+        given: The name of a file in ``config/<folder>/``, the path of a file, a dict with the same keys, or a record,
+            which is returned as it is.
+        folder: Folder of the built-in files.
+        kind: What the file is, for the problems, in the form of a code such as ``policy_config``.
+
+    Raises:
+        ConfigError: It has problems; all are listed.
+    """
+    if isinstance(given, model):
+        return given
+    problems = Problems()
+    if isinstance(given, Mapping):
+        result = validate(model, given, "<dict>", problems)
+    else:
+        name = str(given)
+        if isinstance(given, Path) or is_path(name):
+            path = user_path(name, Path.cwd())
+        elif name in (there := list_data("config", folder)):
+            path = data_folder("config") / folder / f"{name}.yaml"
+        else:
+            message = f"there is no {kind.replace('_', ' ')} {name!r}{nearest(name, there)}, or a path to your own"
+            raise ConfigError([Problem("<arguments>", kind.replace("_", "-"), message, f"unknown_{kind}")])
+        data = read_yaml(path, problems)
+        problems.raise_any()
+        result = validate(model, data, path, problems)
+    problems.raise_any()
+    return result
 
 
 def with_holes(model: type[M], data: Any, wrong: Collection[Place]) -> M:

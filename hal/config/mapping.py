@@ -13,8 +13,7 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, field_validator, model_validator
 
 from ..types import AXES, BUTTONS, PadState
-from .data_files import data_folder, is_path, list_data, user_path
-from .files import Problems, nearest, read_yaml, validate
+from .files import load_record, nearest
 from .schema import Flag, Quantity, Strict, ValueProblem
 
 __all__ = ["AxisMapping", "DirectionsMapping", "GripperMapping", "TeleopMapping", "TurnsMapping", "load_mapping"]
@@ -173,27 +172,7 @@ def load_mapping(mapping: str | Path | Mapping[str, Any] | TeleopMapping = "defa
     Raises:
         ConfigError: It has problems; all are listed.
     """
-    if isinstance(mapping, TeleopMapping):
-        return mapping
-    problems = Problems()
-    data: dict[str, Any] | None = None
-    if isinstance(mapping, Mapping):
-        source, data = "<dict>", dict(mapping)
-    elif isinstance(mapping, Path) or is_path(str(mapping)):
-        path = user_path(mapping, Path.cwd())
-        source, data = str(path), read_yaml(path, problems)
-    else:
-        source = str(data_folder("config") / "teleop" / f"{mapping}.yaml")
-        there = list_data("config", "teleop")
-        if mapping in there:
-            data = read_yaml(Path(source), problems)
-        else:
-            text = f"there is no mapping {mapping!r}{nearest(str(mapping), there)}, or a path to your own"
-            problems.add("<arguments>", "mapping", text, "unknown_mapping")
-    result = validate(TeleopMapping, data, source, problems) if data is not None else None
-    problems.raise_any()
-    assert result is not None
-    return result
+    return load_record(TeleopMapping, mapping, "teleop", "mapping")
 
 
 def _known(name: str, choices: tuple[str, ...], kind: str) -> None:

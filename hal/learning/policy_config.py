@@ -14,8 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
-from ..config.data_files import data_folder, is_path, list_data, user_path
-from ..config.files import Problems, nearest, read_yaml, validate
+from ..config.files import load_record
 from ..config.schema import Quantity, Strict, ValueProblem
 from ..errors import DeviceNotFound, NotSupported, PolicyError
 from ..geometry import Pose, quaternion_to_matrix
@@ -231,27 +230,7 @@ def load_policy_config(config: str | Path | Mapping[str, Any] | PolicyConfig) ->
     Raises:
         ConfigError: It has problems; all are listed.
     """
-    if isinstance(config, PolicyConfig):
-        return config
-    problems = Problems()
-    data: dict[str, Any] | None = None
-    if isinstance(config, Mapping):
-        source, data = "<dict>", dict(config)
-    elif isinstance(config, Path) or is_path(str(config)):
-        path = user_path(config, Path.cwd())
-        source, data = str(path), read_yaml(path, problems)
-    else:
-        source = str(data_folder("config") / "policies" / f"{config}.yaml")
-        there = list_data("config", "policies")
-        if config in there:
-            data = read_yaml(Path(source), problems)
-        else:
-            text = f"there is no policy configuration {config!r}{nearest(str(config), there)}, or a path to your own"
-            problems.add("<arguments>", "policy-config", text, "unknown_policy_config")
-    result = validate(PolicyConfig, data, source, problems) if data is not None else None
-    problems.raise_any()
-    assert result is not None
-    return result
+    return load_record(PolicyConfig, config, "policies", "policy_config")
 
 
 def _state(name: StateName, observation: Observation, robot: Robot) -> Array:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +11,7 @@ import pytest
 from hal.config.data_files import list_data
 from hal.config.mapping import TeleopMapping, load_mapping
 from hal.errors import ConfigError
+from hal.learning.policy_config import load_policy_config
 from hal.types import PadState, Stamp
 
 STAMP = Stamp(0.0, 0.0, 1)
@@ -91,8 +93,9 @@ def test_mistakes_in_a_mapping(changes: dict[str, Any], key: str, code: str) -> 
     assert (problem.key, problem.code) == (key, code)
 
 
-def test_missing_mappings(tmp_path: Path) -> None:
-    for mapping, code in (("defualt", "unknown_mapping"), (tmp_path / "mine.yaml", "missing_file")):
+@pytest.mark.parametrize(("load", "kind"), [(load_mapping, "mapping"), (load_policy_config, "policy_config")])
+def test_a_name_or_a_file_that_does_not_exist(load: Callable[[Any], Any], kind: str, tmp_path: Path) -> None:
+    for given, code in (("defualt", f"unknown_{kind}"), (tmp_path / "mine.yaml", "missing_file")):
         with pytest.raises(ConfigError) as caught:
-            load_mapping(mapping)
+            load(given)
         assert [problem.code for problem in caught.value.problems] == [code]
