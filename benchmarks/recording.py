@@ -13,6 +13,7 @@ import argparse
 import os
 import tempfile
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +26,8 @@ from hal.rig import Rig
 FPS = 30
 _TICKS = os.sysconf("SC_CLK_TCK")
 _NAMES = ("scene", "wrist")
+_READ = 300
+"""Rows of depth that are read in random order."""
 
 
 def cpu(pid: int) -> float:
@@ -99,6 +102,14 @@ def report(out: Path, found: dict[str, Any]) -> None:
         f"{1e3 * np.diff(grid).max():.1f} ms; finished in {found['saving']:.1f} s"
     )
     print(f"    MB per minute: {sum(sizes.values()):.0f} ({shares})")
+    rows = np.random.default_rng(0).integers(episode.length, size=_READ)
+    took = [_timed(lambda row=row: episode.depth["wrist"][row]) for row in rows.tolist()]
+    whole = _timed(lambda: list(episode.depth("wrist")))
+    p50, p99 = 1e3 * np.quantile(took[1:], [0.5, 0.99])
+    print(
+        f"    depth of a random row: p50 {p50:.1f}, p99 {p99:.1f} ms; "
+        f"the first one {1e3 * took[0]:.1f} ms; all {episode.length} rows {1e3 * whole:.0f} ms"
+    )
     print(f"    the simulation ran at {episode.info['pace'].get('panda', float('nan')):.4f} of real time")
     for name in _NAMES:
         age = (grid - episode.stamps[f"camera.{name}"]) * 1e3
@@ -106,6 +117,12 @@ def report(out: Path, found: dict[str, Any]) -> None:
             f"    {name}: picture is ms older than its row: median {np.median(age):.1f}, most {age.max():.0f}; "
             f"shown again in {episode.info['repeated'][name]} rows"
         )
+
+
+def _timed(act: Callable[[], object]) -> float:
+    start = time.perf_counter()
+    act()
+    return time.perf_counter() - start
 
 
 def main() -> None:

@@ -125,25 +125,43 @@ class DepthReader:
 
     def units(self) -> Iterator[Units]:
         """Yield every row's picture (H, W), in units of :attr:`unit` m. Raises ValueError for a damaged one."""
-        import zstandard
-
-        expand = zstandard.ZstdDecompressor()
         picture = np.zeros(self.shape, "<u2")
         with self.path.open("rb") as file:
-            for k, (start, length) in enumerate(self._places):
+            for k, (_, length) in enumerate(self._places):
                 if length:
-                    file.seek(start - _RECORD.size)
-                    _, check = _RECORD.unpack(file.read(_RECORD.size))
-                    data = file.read(length)
-                    if crc32(data) != check or zstandard.frame_content_size(data) != picture.nbytes:
-                        raise ValueError(f"picture {k} is damaged")
-                    picture = _unshuffled(expand.decompress(data), self.shape)
+                    picture = self._decoded(file, k)
                 yield picture
 
     def __iter__(self) -> Iterator[NDArray[np.float32]]:
         """Yield every row's picture (H, W), m; 0 for what was not measured."""
         unit = np.float32(self.unit)
         return (units.astype(np.float32) * unit for units in self.units())
+
+    def __getitem__(self, k: int) -> NDArray[np.float32]:
+        """Return the picture (H, W) of row ``k``, m; no other one is decoded.
+
+        Raises IndexError if there is no such row, and ValueError if its picture is damaged.
+        """
+        own = range(len(self))[k]
+        while own and not self._places[own][1]:  # the same picture as in the row before
+            own -= 1
+        if not self._places[own][1]:
+            return np.zeros(self.shape, np.float32)
+        with self.path.open("rb") as file:
+            depth: NDArray[np.float32] = self._decoded(file, own).astype(np.float32) * np.float32(self.unit)
+            return depth
+
+    def _decoded(self, file: io.BufferedReader, k: int) -> Units:
+        """Return the picture that is stored in record ``k``."""
+        import zstandard
+
+        start, length = self._places[k]
+        file.seek(start - _RECORD.size)
+        _, check = _RECORD.unpack(file.read(_RECORD.size))
+        data = file.read(length)
+        if crc32(data) != check or zstandard.frame_content_size(data) != 2 * math.prod(self.shape):
+            raise ValueError(f"picture {k} is damaged")
+        return _unshuffled(zstandard.ZstdDecompressor().decompress(data), self.shape)
 
 
 def _records(file: io.BufferedReader, size: int) -> Iterator[tuple[int, int]]:

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from functools import cached_property
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeVar, overload
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +15,7 @@ from .codecs import DepthReader, count_frames, read_video
 from .index import dataset_errors, read_about, read_index, repair_command
 from .layout import MORE_STREAMS, SEGMENTATION, TIMES, DatasetLayout, require_libraries, video_key
 
-__all__ = ["Dataset", "Episode"]
+__all__ = ["CameraDepth", "Dataset", "Episode", "EpisodeDepth"]
 
 
 P = TypeVar("P", bound=NDArray[Any])
@@ -127,12 +127,13 @@ class Episode:
         """Yield the colour picture (H, W, 3) RGB of every row. Raises DeviceNotFound if none was recorded."""
         return self.pictures(camera, "color")
 
-    def depth(self, camera: str) -> Iterator[NDArray[np.float32]]:
-        """Yield the depth picture (H, W) of every row, m; 0 for what was not measured.
+    @cached_property
+    def depth(self) -> EpisodeDepth:
+        """Depth: ``depth[row]`` of the only camera that has some, ``depth["wrist"][row]``, ``depth("wrist")`` for all.
 
-        Raises DeviceNotFound if none was recorded.
+        A row is read alone, from its place in the file.
         """
-        return self.pictures(camera, "depth")
+        return EpisodeDepth(self)
 
     def pictures(self, camera: str, stream: str) -> Iterator[NDArray[Any]]:
         """Yield a stream's picture of every row, with the type and shape that it has in :class:`~hal.types.Frame`.
@@ -146,23 +147,31 @@ class Episode:
             DeviceNotFound: That stream was not recorded.
             DatasetError: The file is missing, or its first line is damaged. Further damage is raised by the iterator.
         """
-        path = self.files(camera).get(stream)
-        if path is None:
-            there = ", ".join(self.cameras) or "none"
-            kept = ", ".join(self.files(camera)) or "nothing"
-            raise DeviceNotFound(
-                f"episode {self.number} has no {stream} of a camera {camera!r}, but {kept}; cameras: {there}"
-            )
+        path = self._file_of(camera, stream)
         if path.suffix == ".mp4":
             height, width, _ = self._meta["features"][path.parent.parent.name]["shape"]
             if stream == "color":
                 return self._each(path, read_video(path), (height, width, 3))
             return self._each(path, (picture[:, :, 0] for picture in read_video(path)), (height, width))
-        with dataset_errors(self._layout.root, path, self.number):
-            reader = DepthReader(path)
+        reader = self._depth_reader(path)
         if stream == "depth":
             return self._each(path, iter(reader), reader.shape)
         return self._each(path, (units.astype(np.int32) - 1 for units in reader.units()), reader.shape)
+
+    def _file_of(self, camera: str, stream: str) -> Path:
+        """Return the file of a stream. Raises DeviceNotFound if it was not recorded."""
+        files = self.files(camera)
+        if stream not in files:
+            there = ", ".join(self.cameras) or "none"
+            kept = ", ".join(files) or "nothing"
+            raise DeviceNotFound(
+                f"episode {self.number} has no {stream} of a camera {camera!r}, but {kept}; cameras: {there}"
+            )
+        return files[stream]
+
+    def _depth_reader(self, path: Path) -> DepthReader:
+        with dataset_errors(self._layout.root, path, self.number):
+            return DepthReader(path)
 
     def files(self, camera: str) -> dict[str, Path]:
         """Return the file of each stream of a camera; empty for a camera that was not recorded."""
@@ -219,6 +228,73 @@ class Episode:
 
     def __repr__(self) -> str:
         return f"<Episode {self.number}: {self.length} rows at {self.fps} Hz, {self.task!r}>"
+
+
+class CameraDepth(Sequence[NDArray[np.float32]]):
+    """Depth of one camera: the picture (H, W) of a row, m; 0 for what was not measured.
+
+    A row is decoded when it is read, without the others. Raises IndexError for a row that the episode lacks, and
+    DatasetError for a damaged one.
+    """
+
+    def __init__(self, episode: Episode, camera: str) -> None:
+        self._episode = episode
+        self._path = episode._file_of(camera, "depth")
+        self._reader = episode._depth_reader(self._path)
+        episode._check_count(self._path, len(self._reader))
+
+    def __len__(self) -> int:
+        return len(self._reader)
+
+    @overload
+    def __getitem__(self, row: int) -> NDArray[np.float32]: ...
+    @overload
+    def __getitem__(self, row: slice) -> list[NDArray[np.float32]]: ...
+    def __getitem__(self, row: int | slice) -> NDArray[np.float32] | list[NDArray[np.float32]]:
+        if isinstance(row, slice):
+            return [self[k] for k in range(*row.indices(len(self)))]
+        own = range(len(self))[row]  # IndexError as it is: iteration ends with it
+        with dataset_errors(self._episode._layout.root, self._path, self._episode.number):
+            return self._reader[own]
+
+
+class EpisodeDepth:
+    """Depth of an episode's cameras; see :attr:`Episode.depth`."""
+
+    def __init__(self, episode: Episode) -> None:
+        self._episode = episode
+        self._cameras: dict[str, CameraDepth] = {}
+
+    def __call__(self, camera: str) -> Iterator[NDArray[np.float32]]:
+        """Yield the depth picture (H, W) of every row of a camera, m; 0 for what was not measured.
+
+        Raises DeviceNotFound if none was recorded.
+        """
+        return self._episode.pictures(camera, "depth")
+
+    @overload
+    def __getitem__(self, key: str) -> CameraDepth: ...
+    @overload
+    def __getitem__(self, key: int) -> NDArray[np.float32]: ...
+    def __getitem__(self, key: str | int) -> CameraDepth | NDArray[np.float32]:
+        """Return the depth of a camera, by its name, or that of a row of the only camera that has depth.
+
+        Raises:
+            DeviceNotFound: No depth of this camera was recorded, or that of several was, so a row is not enough.
+            IndexError: There is no such row.
+            DatasetError: The file is missing or damaged.
+        """
+        if not isinstance(key, str):
+            having = [camera for camera in self._episode.cameras if "depth" in self._episode.files(camera)]
+            if len(having) != 1:
+                raise DeviceNotFound(
+                    f"episode {self._episode.number} has depth of {', '.join(having) or 'no camera'}; select one: "
+                    f"depth[{having[0] if having else 'name'!r}][{key}]"
+                )
+            return self[having[0]][key]
+        if key not in self._cameras:
+            self._cameras[key] = CameraDepth(self._episode, key)
+        return self._cameras[key]
 
 
 class Dataset:

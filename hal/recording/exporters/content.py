@@ -246,7 +246,7 @@ class EpisodeContent:
         try:
             first: NDArray[Any] = next(self.episode.frames(camera))
         except DeviceNotFound:  # only depth was kept
-            first = next(self.episode.depth(camera))
+            first = self.episode.depth[camera][0]
         return first.shape[1], first.shape[0]
 
     def about(self) -> dict[str, Any]:

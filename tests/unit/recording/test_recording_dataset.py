@@ -90,8 +90,13 @@ def test_pictures_and_depth_come_back(made: Path) -> None:
             assert near.any(), "the square is nearer than the background"
             assert np.unique(depth).size == 2
             assert np.isclose(np.unique(depth), [0.9, 1.0], atol=2e-4).all()
-    with pytest.raises(DeviceNotFound):
-        episode.frames("nose")
+        assert all(np.array_equal(episode.depth[camera][k], depths[k]) for k in (len(depths) - 1, -3, 0))
+        assert np.array_equal(episode.depth[camera][2:4], depths[2:4])
+        with pytest.raises(IndexError):
+            episode.depth[camera][len(depths)]
+    for absent in (lambda: episode.frames("nose"), lambda: episode.depth["nose"], lambda: episode.depth[0]):
+        with pytest.raises(DeviceNotFound):
+            absent()
 
 
 def test_statistics_are_those_of_all_rows(made: Path) -> None:
@@ -232,6 +237,7 @@ def test_only_depth_and_only_colour(tmp_path: Path) -> None:
     assert check_layout(tmp_path / "a")["video_path"] is None
     episode = Dataset(tmp_path / "a").episodes[0]
     assert sum(1 for _ in episode.depth("scene")) == episode.length
+    assert np.array_equal(episode.depth[1], episode.depth["scene"][1]), "there is only one"
     with mock_rig() as rig, Recorder(rig, tmp_path / "b", depth=False, codec="av1") as recorder:
         record(recorder, 0.3)
     info = check_layout(tmp_path / "b")

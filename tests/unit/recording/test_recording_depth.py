@@ -59,6 +59,29 @@ def test_the_same_picture_again_takes_a_few_bytes(tmp_path: Path) -> None:
     assert path.stat().st_size - written(tmp_path / "e", [first, second]).stat().st_size == 2 * 8
 
 
+def test_a_row_is_decoded_without_the_others(tmp_path: Path) -> None:
+    shown = pictures(3)
+    path = written(tmp_path / "d", [shown[0], None, shown[1], shown[2], None, None])
+    expected = [shown[k] for k in (0, 0, 1, 2, 2, 2)]
+    reader = DepthReader(path)
+    for k in (5, 0, 3, 1, -4, 4):
+        assert np.array_equal(reader[k], expected[k])
+    for k in (6, -7):
+        with pytest.raises(IndexError):
+            reader[k]
+    data = bytearray(path.read_bytes())
+    place = reader.end_of(2) + 20  # in the record of row 2
+    data[place] ^= 1
+    path.write_bytes(data)
+    damaged = DepthReader(path)
+    assert np.array_equal(damaged[4], shown[2])
+    with pytest.raises(ValueError, match="2 is damaged"):
+        damaged[2]
+    nothing = DepthReader(written(tmp_path / "n", [None, None]))
+    assert not nothing[1].any()
+    assert np.array_equal(nothing[1], list(nothing)[1])
+
+
 def test_a_file_may_end_anywhere(tmp_path: Path) -> None:
     shown = pictures(4)
     whole = written(tmp_path / "d", [*shown]).read_bytes()
