@@ -11,9 +11,12 @@ import argparse
 import contextlib
 import json
 import os
+import queue
 import subprocess
 import sys
+import threading
 import traceback
+from collections import deque
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -41,6 +44,12 @@ if TYPE_CHECKING:
 ENDED_EARLY = 1
 LEROBOT = "lerobot:"
 """Begins a policy that is the checkpoint of one that LeRobot trained."""
+LISTENING = "listening at "
+"""Begins the line in which the server of such a policy prints its address."""
+LOAD_TIMEOUT = 300.0
+"""Longest time that such a policy may take to load, s."""
+PRINTED_LINES = 20
+"""Number of lines of such a server that are part of an error."""
 MARKS = {"finish": True, "fail": False}
 """Action of the pad's mapping that ends an episode -> whether it is marked a success, as in ``apps/collect.py``."""
 
@@ -156,21 +165,42 @@ def _lerobot_server(checkpoint: str) -> Iterator[str]:
     from hal.errors import PolicyError
 
     command = [sys.executable, "-m", "hal.apps.serve_lerobot", checkpoint, "--port", "0", "--until-stdin-ends"]
-    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as server:
+    pipes: dict[str, Any] = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": subprocess.STDOUT}
+    with subprocess.Popen(command, text=True, errors="replace", **pipes) as server:
         assert server.stdin is not None
-        assert server.stdout is not None
+        printed: deque[str] = deque(maxlen=PRINTED_LINES)
+        address: queue.SimpleQueue[str] = queue.SimpleQueue()
+        reader = threading.Thread(target=_read_server, args=(server.stdout, printed, address), daemon=True)
+        reader.start()
         try:
-            lines = iter(server.stdout.readline, "")
-            address = next((line for line in lines if line.startswith("listening at ")), None)
-            if address is None:
-                raise PolicyError(f"the policy {checkpoint} was not loaded; see above", code="policy_unreachable")
-            yield address.removeprefix("listening at ").strip()
+            try:
+                url = address.get(timeout=LOAD_TIMEOUT)
+            except queue.Empty:
+                url, trouble = "", f"was not loaded within {LOAD_TIMEOUT:g} s"
+            else:
+                trouble = "was not loaded"
+            if not url:
+                text = "".join(printed).rstrip() or "nothing"
+                raise PolicyError(f"the policy {checkpoint} {trouble}; it printed:\n{text}", code="policy_unreachable")
+            yield url
         finally:
             server.stdin.close()
             try:
                 server.wait(5.0)
             except subprocess.TimeoutExpired:
                 server.kill()
+            reader.join(1.0)
+
+
+def _read_server(lines: Any, printed: deque[str], address: queue.SimpleQueue[str]) -> None:
+    """Read what a policy's server prints until it ends, pass on its address, and show the rest."""
+    for line in lines:
+        if line.startswith(LISTENING):
+            address.put(line.removeprefix(LISTENING).strip())
+        else:
+            printed.append(line)
+            sys.stderr.write(line)
+    address.put("")  # it ended
 
 
 def _recorder(rig: Rig, args: argparse.Namespace) -> Recorder | None:

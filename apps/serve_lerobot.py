@@ -10,6 +10,7 @@ pip install --no-deps robot-hal && pip install aiohttp msgpack
 from __future__ import annotations
 
 import argparse
+import contextlib
 import json
 import os
 import sys
@@ -17,15 +18,12 @@ import threading
 from collections.abc import Collection, Mapping
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from hal.apps._common import run_app
 from hal.errors import CommandError, DriverMissing
-
-if TYPE_CHECKING:
-    from hal.learning.remote import PolicyServer
 
 STATE, IMAGES, ACTION = "observation.state", "observation.images.", "action"
 GRIPPER = "gripper"
@@ -58,6 +56,8 @@ def main(argv: list[str] | None = None) -> int:
 def _main(args: argparse.Namespace) -> int:
     from hal.learning.remote import PolicyServer
 
+    if args.until_stdin_ends:
+        threading.Thread(target=_end_with_stdin, daemon=True).start()
     checkpoint = Path(args.checkpoint).expanduser()
     if not (checkpoint / "config.json").is_file():
         raise CommandError(f"{checkpoint} has no config.json: pass the folder pretrained_model of a checkpoint")
@@ -67,15 +67,15 @@ def _main(args: argparse.Namespace) -> int:
     with PolicyServer(policy.infer, reset=policy.reset, metadata=metadata, host=args.host, port=args.port) as server:
         print(f"{policy.kind} for {', '.join(metadata['joints'])} at {metadata['policy_config']['rate_hz']} Hz")
         print(f"listening at {server.url}", flush=True)
-        if args.until_stdin_ends:
-            threading.Thread(target=_close_with_stdin, args=(server,), daemon=True).start()
         server.wait()
     return 0
 
 
-def _close_with_stdin(server: PolicyServer) -> None:
-    sys.stdin.read()
-    server.close()
+def _end_with_stdin() -> None:
+    """End this process when standard input is closed, also while it loads a policy or computes."""
+    with contextlib.suppress(OSError):
+        sys.stdin.buffer.read()
+    os._exit(0)
 
 
 def _dataset_info(checkpoint: Path, dataset: str | None) -> dict[str, Any]:

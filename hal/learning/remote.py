@@ -115,6 +115,8 @@ class PolicyClient:
         self._thread.start()
         self._session: Any = None
         self._socket: Any = None
+        self._next: asyncio.Future[Any] | None = None
+        """The next message; awaited at all times, so that one that answers no request does not pass for a reply."""
 
     @property
     def connected(self) -> bool:
@@ -172,6 +174,7 @@ class PolicyClient:
             await self._disconnect()
             reason = str(error) or "no answer"
             raise PolicyError(f"no policy server at {self.url}: {reason}", code="policy_unreachable") from error
+        self._listen()
         metadata = await self._receive(CONNECT_TIMEOUT)
         if not isinstance(metadata, dict):
             await self._disconnect()
@@ -183,6 +186,10 @@ class PolicyClient:
     async def _request(self, packed: bytes) -> Any:
         if not self.connected:
             raise PolicyError(f"the connection to {self.url} is closed", code="policy_lost")
+        if self._next is not None and self._next.done():
+            await self._receive(0.0)  # raises an error if the connection is lost
+            await self._disconnect()
+            raise PolicyError(f"{self.url} sent a message that answers no request", code="policy_protocol")
         try:
             await self._socket.send_bytes(packed)
         except (OSError, RuntimeError) as error:
@@ -192,26 +199,36 @@ class PolicyClient:
 
     async def _receive(self, timeout: float) -> Any:
         aiohttp = _aiohttp()
-        try:
-            message = await asyncio.wait_for(self._socket.receive(), timeout)
-        except asyncio.TimeoutError:
+        assert self._next is not None
+        await asyncio.wait([self._next], timeout=timeout)
+        if not self._next.done():
             await self._disconnect()
-            raise PolicyError(f"{self.url} did not answer within {timeout:g} s", code="policy_timeout") from None
+            raise PolicyError(f"{self.url} did not answer within {timeout:g} s", code="policy_timeout")
+        message = self._next.result()
         if message.type is aiohttp.WSMsgType.BINARY:
+            self._listen()
             try:
                 return unpack(message.data)
             except PolicyError:
                 await self._disconnect()
                 raise
         if message.type is aiohttp.WSMsgType.TEXT:
+            self._listen()
             if "Traceback" in message.data:  # the server closes the connection after it
                 await self._disconnect()
             return message.data
         await self._disconnect()
         raise PolicyError(f"the connection to {self.url} is lost", code="policy_lost")
 
+    def _listen(self) -> None:
+        self._next = asyncio.ensure_future(self._socket.receive())
+
     async def _disconnect(self) -> None:
-        socket, session, self._socket, self._session = self._socket, self._session, None, None
+        socket, session, listening = self._socket, self._session, self._next
+        self._socket = self._session = self._next = None
+        if listening is not None and not listening.done():
+            listening.cancel()
+            await asyncio.wait([listening], timeout=1.0)
         if socket is not None:
             with contextlib.suppress(Exception):
                 await asyncio.wait_for(socket.close(), 1.0)

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
 import re
+import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -216,6 +218,29 @@ def test_a_mistake_is_a_message(folder: Path, arguments: list[str], texts: list[
     assert done.returncode == 2, done.stdout + done.stderr
     for text in texts:
         assert text in done.stderr
+
+
+@pytest.mark.parametrize("hangs", [True, False])
+def test_a_checkpoint_that_is_not_loaded_is_an_error_with_what_its_server_printed(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, hangs: bool
+) -> None:
+    server = folder / "server.sh"
+    server.write_text(f"#!/bin/sh\necho $$ > pid\necho no such weights >&2\n{'cat > nothing' if hangs else 'exit 1'}\n")
+    server.chmod(0o755)
+    monkeypatch.setattr(sys, "executable", str(server))
+    monkeypatch.setattr("hal.apps.rollout.LOAD_TIMEOUT", 0.5 if hangs else 20.0)
+    pytest.importorskip("msgpack")
+    done = rollout("--policy", "lerobot:checkpoint", *FAST)
+    assert done.returncode == 2, done.stderr
+    assert done.stderr.count("no such weights") == 2, "as it was printed, and in the error"
+    with pytest.raises(ProcessLookupError):
+        os.kill(int((folder / "pid").read_text()), 0)
+
+
+def test_a_server_of_a_checkpoint_ends_with_its_standard_input(folder: Path) -> None:
+    command = [sys.executable, "-c", "from hal.apps.serve_lerobot import _end_with_stdin as end; end(); print('here')"]
+    done = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, timeout=60.0)
+    assert (done.returncode, done.stdout) == (0, b"")
 
 
 def test_a_dry_run_opens_nothing(folder: Path) -> None:

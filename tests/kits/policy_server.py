@@ -1,0 +1,42 @@
+"""A policy's server as a program, for tests that kill or freeze it: the first joint moves at a constant speed.
+
+python policy_server.py LATENCY JITTER: s from a request to its answer, and the greatest difference from that.
+"""
+
+from __future__ import annotations
+
+import random
+import sys
+import time
+from typing import Any
+
+import numpy as np
+
+from hal.learning.remote import PolicyServer
+
+STEPS, RATE, SPEED = 40, 15, 0.15
+EXECUTE = 15
+CONFIG: dict[str, Any] = {
+    "rate_hz": RATE,
+    "execute": EXECUTE,
+    "observation": {"state": {"state": "q"}, "way": {"text": "task"}},
+    "action": {"kind": "joint_position"},
+}
+
+
+def main() -> None:
+    latency, jitter = map(float, sys.argv[1:])
+    chance = random.Random(1)
+
+    def infer(request: dict[str, Any]) -> dict[str, Any]:
+        time.sleep(latency + jitter * chance.uniform(-1.0, 1.0))
+        speed = SPEED if request["way"] == "left" else -SPEED
+        return {"actions": request["state"] + speed * np.arange(STEPS)[:, None] / RATE * np.eye(7)[0]}
+
+    with PolicyServer(infer) as server:
+        print(server.url, flush=True)
+        sys.stdin.read()
+
+
+if __name__ == "__main__":
+    main()
