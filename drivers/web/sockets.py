@@ -157,6 +157,11 @@ class PageSocket:
         self._ws = ws
         self._transport = transport
         self._sending_since: float | None = None
+        self._receiving: asyncio.Future[CloseReason | None] | None = None
+        self.app_ended = False
+        """Whether :meth:`end` was called."""
+        self.closed = asyncio.Event()
+        """Set once it is not served any more."""
         self._minimise_buffers()
 
     def _minimise_buffers(self) -> None:
@@ -186,7 +191,15 @@ class PageSocket:
         self._transport.abort()
 
     async def receive_all(self, handle: Handle) -> CloseReason | None:
-        """Handle every message until the page is gone; returns the reason for closing if it has sent too much."""
+        """Handle every message until the page is gone or the app ends; returns a reason if it has sent too much."""
+        self._receiving = asyncio.ensure_future(self._receive_all(handle))
+        try:
+            await asyncio.wait((self._receiving,))
+        finally:
+            self._receiving.cancel()
+        return None if self._receiving.cancelled() else self._receiving.result()
+
+    async def _receive_all(self, handle: Handle) -> CloseReason | None:
         limit = RateLimit()
         async for message in self._ws:
             if message.type is WSMsgType.ERROR:
@@ -212,8 +225,19 @@ class PageSocket:
                     handle(message.data if message.type is WSMsgType.TEXT else None)
 
     async def close(self, reason: CloseReason) -> None:
-        """Close with this code and text."""
+        """Close with this code and text; returns when the page has answered, after a second at the latest."""
         await _close(self._ws, reason)
+
+    async def end(self) -> None:
+        """Let the task that serves the page close it because the app ends; returns when it has.
+
+        If another task closes it, aiohttp cuts the connection without waiting for the page's answer. A page that sends
+        at that moment takes that for a broken network, and tries to connect for ever.
+        """
+        self.app_ended = True
+        if self._receiving is not None:
+            self._receiving.cancel()
+        await self.closed.wait()
 
 
 class PageSockets(ABC):
@@ -242,8 +266,11 @@ class PageSockets(ABC):
             try:
                 with request.app[CONNECTIONS].exempt(transport):
                     await self.serve(sock)
+                if sock.app_ended:
+                    await sock.close(_APP_CLOSES)
             finally:
                 self._sockets.discard(sock)
+                sock.closed.set()
         return ws
 
     async def _refuse(self, request: web.Request) -> web.WebSocketResponse:
@@ -267,7 +294,7 @@ class PageSockets(ABC):
     async def close(self) -> None:
         """Close every page's socket because the app ends."""
         if self._sockets:
-            closing = [asyncio.ensure_future(sock.close(_APP_CLOSES)) for sock in self._sockets]
+            closing = [asyncio.ensure_future(sock.end()) for sock in self._sockets]
             await asyncio.wait(closing, timeout=_CLOSE_TIME)
 
 

@@ -288,6 +288,22 @@ async def test_the_app_closes(app: App) -> None:
         assert app.child.process.wait(WAIT) == 0
 
 
+def test_a_page_that_sends_while_the_app_closes_learns_of_it(app: App) -> None:
+    """A browser takes a failed write for a cut network: it would try to connect for ever."""
+    page = handshake(app, "/live")
+    app.child.channel.send({"id": 0, "method": "close", "params": {}})
+    for _ in range(20):
+        page.sendall(b"\x81\x82\0\0\0\0{}")  # a text, which a client masks
+        time.sleep(0.01)
+    found = b""
+    while b"the app has ended" not in found:
+        received = page.recv(65536)
+        assert received, "the connection ended without a close"
+        found += received
+    page.close()
+    assert app.child.process.wait(WAIT) == 0
+
+
 def test_it_closes_at_once_though_a_page_does_not_answer(app: App) -> None:
     frozen = handshake(app, "/live")
     start = time.monotonic()

@@ -24,6 +24,8 @@ from hal.drivers.realsense.emulator import write_recording
 from hal.drivers.realsense.emulator.pictures import EmulatedImages, make_streams
 
 SIZE = (640, 480)
+PATIENCE = 15.0
+"""s until a test gives up, on a busy computer."""
 
 
 def spec(
@@ -99,27 +101,37 @@ def sent(camera: CameraSpec, stream: str, number: int, pattern: str = "test") ->
     return EmulatedImages(streams, pattern, 0).expected(stream, streams[stream].mode, number)
 
 
-def wait_until(holds: Callable[[], bool], seconds: float) -> float:
-    """Wait until a condition holds, and return how long that took, s; fail if it takes too long."""
+def wait_until(holds: Callable[[], bool], seconds: float = PATIENCE) -> None:
+    """Wait until a condition holds; fail if it takes too long."""
     began = time.monotonic()
     while not holds():
         assert time.monotonic() - began < seconds, f"not within {seconds} s"
         time.sleep(0.005)
-    return time.monotonic() - began
 
 
-def read_until_lost(camera: Camera, seconds: float) -> ConnectionLost:
+def read_until_lost(camera: Camera) -> ConnectionLost:
     """Read until the camera is lost, and return the error."""
-    deadline = time.monotonic() + seconds
+    deadline = time.monotonic() + PATIENCE
     while time.monotonic() < deadline:
         try:
-            camera.read(timeout=seconds)
+            camera.read(timeout=PATIENCE)
         except ConnectionLost as error:
             return error
-    raise AssertionError(f"the camera was not lost within {seconds} s")
+    raise AssertionError(f"the camera was not lost within {PATIENCE} s")
 
 
-def read_again(camera: Camera, seconds: float) -> Frame:
+def wait_for_code(camera: Camera, code: str) -> None:
+    """Wait until a lost camera's error has a code: the attempts to reconnect name what they find."""
+
+    def named() -> bool:
+        with pytest.raises(ConnectionLost) as caught:
+            camera.read()
+        return caught.value.code == code
+
+    wait_until(named)
+
+
+def read_again(camera: Camera) -> Frame:
     """Return the first frame of a camera that was lost."""
-    wait_until(lambda: camera.connected, seconds)
-    return camera.read(timeout=seconds)
+    wait_until(lambda: camera.connected)
+    return camera.read(timeout=PATIENCE)

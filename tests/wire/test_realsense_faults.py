@@ -16,6 +16,7 @@ import pytest
 from hal.errors import CommandError, ConnectionLost, ControlTaken, DeviceNotFound, NotSupported, StaleStateError
 
 from .realsense_bench import (
+    PATIENCE,
     RealSenseCamera,
     open_error,
     opened,
@@ -23,6 +24,7 @@ from .realsense_bench import (
     read_until_lost,
     software,
     spec,
+    wait_for_code,
     wait_until,
 )
 
@@ -36,41 +38,38 @@ def test_a_camera_works_again_after_it_was_unplugged() -> None:
     with opened(software()) as cam:
         news: list[ConnectionLost | None] = []
         cam.on_connection(news.append)
-        before = cam.read(timeout=5.0)
+        before = cam.read(timeout=PATIENCE)
         cam.inject(disconnect=True)
-        error = read_until_lost(cam, 2.0)
+        error = read_until_lost(cam)
         lost_at = time.monotonic()
         assert error.code == "unplugged"
         with pytest.raises(ConnectionLost):
             cam.latest()
-        time.sleep(0.5)
+        wait_for_code(cam, "device_not_found")
         assert not cam.connected
-        with pytest.raises(ConnectionLost) as caught:
-            cam.read()
-        assert caught.value.code == "device_not_found"
         cam.inject(disconnect=False)
-        again = read_again(cam, 5.0)
+        again = read_again(cam)
         assert again.stamp.seq > before.stamp.seq
         assert again.stamp.t > lost_at
         assert cam.counts().reconnects == 1
-        wait_until(lambda: len(news) > 1, 5.0)  # callbacks run after the frame is readable
+        wait_until(lambda: len(news) > 1)  # callbacks run after the frame is readable
         assert [type(item) for item in news] == [ConnectionLost, type(None)]
 
 
 def test_a_silent_camera_is_lost_and_comes_back() -> None:
     with opened(software(stall_s=0.5)) as cam:
-        cam.read(timeout=5.0)
+        cam.read(timeout=PATIENCE)
         cam.inject(freeze=True)
-        assert read_until_lost(cam, 3.0).code == "stalled"
+        assert read_until_lost(cam).code == "stalled"
         cam.inject(freeze=False)
-        read_again(cam, 15.0)
+        read_again(cam)
 
 
 def test_one_silent_stream_is_named() -> None:
     with opened(software(stall_s=0.5)) as cam:
-        cam.read(timeout=5.0)
+        cam.read(timeout=PATIENCE)
         cam.inject(drop=1, drop_stream="color")
-        assert "color" in str(read_until_lost(cam, 3.0))
+        assert "color" in str(read_until_lost(cam))
         assert cam.counts().mismatched > 0
 
 
@@ -81,21 +80,21 @@ def process_of(cam: object) -> int:
 
 def test_a_process_that_hangs_is_killed_and_replaced() -> None:
     with opened(software(stall_s=0.3)) as cam:
-        cam.read(timeout=5.0)
+        cam.read(timeout=PATIENCE)
         pid = process_of(cam)
         os.kill(pid, signal.SIGSTOP)
-        assert read_until_lost(cam, 8.0).code == "process_silent"
-        read_again(cam, 15.0)
+        assert read_until_lost(cam).code == "process_silent"
+        read_again(cam)
         assert process_of(cam) != pid
         assert not os.path.exists(f"/proc/{pid}")
 
 
 def test_a_process_that_dies_is_replaced() -> None:
     with opened(software()) as cam:
-        cam.read(timeout=5.0)
+        cam.read(timeout=PATIENCE)
         os.kill(process_of(cam), signal.SIGKILL)
-        read_until_lost(cam, 5.0)
-        read_again(cam, 15.0)
+        read_until_lost(cam)
+        read_again(cam)
 
 
 def test_close_is_bounded_and_idempotent_even_if_the_library_hangs() -> None:
@@ -109,7 +108,7 @@ def test_close_is_bounded_and_idempotent_even_if_the_library_hangs() -> None:
     with pytest.raises(ConnectionLost):
         driver.grab(0.0)
     driver.open()
-    assert wait_until(lambda: driver.grab(0.1) is not None, 5.0) < 5.0
+    wait_until(lambda: driver.grab(0.1) is not None)
     driver.close()
 
 
@@ -141,12 +140,12 @@ def test_a_lost_camera_that_is_closed_for_good_leaves_no_process() -> None:
 
 def test_a_camera_that_is_closed_during_a_reconnect_leaves_no_process() -> None:
     with opened(software()) as cam:
-        cam.read(timeout=5.0)
+        cam.read(timeout=PATIENCE)
         pid = process_of(cam)
         cam.inject(disconnect=True)
-        read_until_lost(cam, 3.0)
-        time.sleep(0.5)  # meanwhile it is closed and opened without success
-    wait_until(lambda: not os.path.exists(f"/proc/{pid}"), 2.0)
+        read_until_lost(cam)
+        wait_for_code(cam, "device_not_found")  # it was closed and opened without success
+    wait_until(lambda: not os.path.exists(f"/proc/{pid}"))
 
 
 def test_without_a_camera_open_fails_at_once() -> None:
@@ -158,7 +157,7 @@ def test_without_a_camera_open_fails_at_once() -> None:
             began = time.monotonic()
             with pytest.raises(DeviceNotFound):  # the process runs by now
                 driver.open()
-            assert time.monotonic() - began < 1.0, "the library would have waited for 15 s"
+            assert time.monotonic() - began < 5.0, "the library would have waited for 15 s"
         finally:
             driver.close()
 
@@ -285,29 +284,36 @@ def test_unknown_faults_are_refused_and_real_cameras_have_none() -> None:
 
 
 def test_the_app_is_not_blocked_during_a_reconnect() -> None:
-    """The library holds the interpreter's lock while it starts, so it must not run in the app's process."""
-    turns, longest, ending = 0, 0.0, threading.Event()
+    """The library holds the interpreter's lock while it starts, so it must not run in the app's process.
 
-    def count() -> None:
-        nonlocal turns, longest
+    A busy computer may pause the app, too, but not at each of several reconnects.
+    """
+    pauses: list[float] = []
+    ending = threading.Event()
+
+    def measure() -> None:
         last = time.monotonic()
         while not ending.is_set():
             time.sleep(0.001)
-            turns, longest, last = turns + 1, max(longest, time.monotonic() - last), time.monotonic()
+            pauses[-1], last = max(pauses[-1], time.monotonic() - last), time.monotonic()
 
     with opened(software()) as cam:
-        cam.read(timeout=5.0)
-        counting = threading.Thread(target=count)
-        counting.start()
-        cam.inject(disconnect=True)
-        read_until_lost(cam, 3.0)
-        time.sleep(0.6)
-        cam.inject(disconnect=False)
-        read_again(cam, 5.0)
+        cam.read(timeout=PATIENCE)
+        measuring = threading.Thread(target=measure)
+        for _ in range(5):
+            pauses.append(0.0)
+            if not measuring.is_alive():
+                measuring.start()
+            cam.inject(disconnect=True)
+            read_until_lost(cam)
+            wait_for_code(cam, "device_not_found")
+            cam.inject(disconnect=False)
+            read_again(cam)
+            if pauses[-1] < 0.15:
+                break
         ending.set()
-        counting.join()
-    assert turns > 100
-    assert longest < 0.15, "a dead-man that is silent for so long stops the arm"
+        measuring.join()
+    assert 0.0 < min(pauses) < 0.15, "a dead-man that is silent for so long stops the arm"
 
 
 def test_a_program_that_does_not_close_leaves_no_process() -> None:
@@ -318,28 +324,29 @@ def test_a_program_that_does_not_close_leaves_no_process() -> None:
         from hal.clock import RealClock
         cam = Camera(RealSenseCamera(software()), RealClock(), threaded=True)
         cam.open()
-        print(cam.read(timeout=5.0).stamp.seq, cam._driver._link._child.process.pid)
+        print(cam.read(timeout=PATIENCE).stamp.seq, cam._driver._link._child.process.pid)
         """
     )
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=30.0, check=False)
     assert (done.returncode, done.stderr) == (0, "")
     pid = int(done.stdout.split()[1])
-    wait_until(lambda: not os.path.exists(f"/proc/{pid}"), 3.0)
+    wait_until(lambda: not os.path.exists(f"/proc/{pid}"))
 
 
 def test_automatic_exposure_settles_before_the_first_frame() -> None:
-    with opened(software(warm_up_s=0.5)) as cam:
-        frame = cam.read(timeout=5.0)
-        assert frame.stamp.seq >= 10
-    with opened(software(warm_up_s=0.5, options={"color": {"exposure": 100}, "depth": {"exposure": 100}})) as cam:
-        assert cam.read(timeout=5.0).stamp.seq < 10, "no exposure is automatic"
+    with opened(software(warm_up_s=1.5)) as cam:
+        frame = cam.read(timeout=PATIENCE)
+        assert frame.stamp.seq >= 40
+    with opened(software(warm_up_s=1.5, options={"color": {"exposure": 100}, "depth": {"exposure": 100}})) as cam:
+        assert cam.read(timeout=PATIENCE).stamp.seq < 40, "no exposure is automatic"
 
 
 def test_latest_never_waits() -> None:
-    with opened(software()) as cam:
-        cam.read(timeout=5.0)
+    with opened(software(stall_s=60.0)) as cam:
+        cam.read(timeout=PATIENCE)
+        cam.inject(freeze=True)  # there is nothing to wait for
         began = time.monotonic()
-        assert cam.latest(max_age=5.0) is not None
-        assert time.monotonic() - began < 0.05
+        assert cam.latest(max_age=60.0) is not None
+        assert time.monotonic() - began < 5.0
         with pytest.raises(StaleStateError):
             cam.latest(max_age=-1.0)

@@ -11,7 +11,7 @@ import pytest
 
 from hal.errors import ConnectionLost, ControlTaken, NotSupported
 
-from .realsense_bench import open_error, opened, read_again, read_until_lost, recording, sent, software, spec
+from .realsense_bench import PATIENCE, open_error, opened, read_again, read_until_lost, recording, sent, software, spec
 
 from hal.drivers.realsense.emulator import read_number  # isort: skip  # needs the library
 
@@ -49,7 +49,7 @@ def test_unpaced_the_time_of_a_frame_is_when_it_was_read(recorded: str) -> None:
         for _ in range(12):
             time.sleep(0.1)  # slower than the recording, so that frames wait
             before = cam.clock.now()
-            frame = cam.read(timeout=5.0)
+            frame = cam.read(timeout=PATIENCE)
             assert before <= frame.stamp.t <= cam.clock.now()
 
 
@@ -65,14 +65,15 @@ def test_time_and_numbers_continue_when_it_repeats(tmp_path: Path) -> None:
 
 def test_paced_it_takes_as_long_as_the_recording(recorded: str) -> None:
     with opened(spec(play=recorded, repeat=False)) as cam:
-        first = last = cam.read(timeout=5.0)
+        first = last = cam.read(timeout=PATIENCE)
         with pytest.raises(ConnectionLost) as ended:
             while True:
-                last = cam.read(timeout=5.0)
+                last = cam.read(timeout=PATIENCE)
         assert ended.value.code == "recording_ended"
         passed = last.stamp.t - first.stamp.t
-        assert passed == pytest.approx(last.stamp.t_device - first.stamp.t_device, abs=0.1)
-        assert 0.5 < passed < 1.5
+        recorded_for = last.stamp.t_device - first.stamp.t_device
+        assert 0.5 < recorded_for < 1.5
+        assert recorded_for - 0.3 < passed < recorded_for + 2.0
         time.sleep(0.5)
         assert not cam.connected, "a recording that has ended stays ended"
 
@@ -112,18 +113,18 @@ def test_a_recording_plays_what_was_streamed(tmp_path: Path) -> None:
     file = tmp_path / "mine.db3"
     camera = software(record=str(file))
     with opened(camera) as cam:
-        seen = {read_number(cam.read(timeout=5.0).color) for _ in range(20)}
+        seen = {read_number(cam.read(timeout=PATIENCE).color) for _ in range(20)}
         cam.inject(disconnect=True)
-        read_until_lost(cam, 3.0)
+        read_until_lost(cam)
         cam.inject(disconnect=False)
-        read_again(cam, 5.0)
+        read_again(cam)
         for _ in range(10):
-            cam.read(timeout=5.0)
+            cam.read(timeout=PATIENCE)
     for part in (file, tmp_path / "mine-2.db3"):
         played = []
         with opened(spec(play=str(part), paced=False, repeat=False)) as cam, pytest.raises(ConnectionLost) as ended:
             while True:
-                frame = cam.read(timeout=5.0)
+                frame = cam.read(timeout=PATIENCE)
                 played.append(read_number(frame.color))
                 assert np.array_equal(frame.color, sent(camera, "color", played[-1]))
         assert ended.value.code == "recording_ended"
@@ -132,7 +133,7 @@ def test_a_recording_plays_what_was_streamed(tmp_path: Path) -> None:
             assert len(seen & set(played)) >= 15
     assert open_error(camera).code == "file_exists"
     with opened(replace(camera, options={**camera.options, "overwrite": True})) as cam:
-        cam.read(timeout=5.0)
+        cam.read(timeout=PATIENCE)
 
 
 @pytest.mark.parametrize("overwrite", [False, True])
@@ -140,23 +141,23 @@ def test_two_cameras_cannot_record_to_one_file(tmp_path: Path, overwrite: bool) 
     file = tmp_path / "same.db3"
     real = {"record": str(file), "overwrite": overwrite}
     with opened(software(name="left", **real)) as left:
-        left.read(timeout=5.0)
+        left.read(timeout=PATIENCE)
         written = file.stat().st_ino
         for path in (file, tmp_path / ".." / tmp_path.name / "same.db3"):
             error = open_error(software(name="right", record=str(path), overwrite=overwrite))
             assert error.code == "recording_in_use"
             assert "camera left" in str(error), "names the other camera"
         assert file.stat().st_ino == written
-        left.read(timeout=5.0)
+        left.read(timeout=PATIENCE)
     with opened(software(name="right", record=str(file), overwrite=True)) as cam:  # now it may
-        cam.read(timeout=5.0)
+        cam.read(timeout=PATIENCE)
 
 
 def test_a_recording_file_stays_locked_while_its_camera_is_unplugged(tmp_path: Path) -> None:
     file = tmp_path / "mine.db3"
     with opened(software(name="left", record=str(file))) as left:
-        left.read(timeout=5.0)
+        left.read(timeout=PATIENCE)
         left.inject(disconnect=True)
-        read_until_lost(left, 3.0)
+        read_until_lost(left)
         assert isinstance(open_error(software(name="right", record=str(file), overwrite=True)), ControlTaken)
         assert file.is_file()

@@ -11,7 +11,17 @@ import hal
 from hal import registry
 from hal.errors import ConfigError, ConnectionLost
 
-from .realsense_bench import RealSenseCamera, opened, read_again, read_until_lost, recording, software, spec, wait_until
+from .realsense_bench import (
+    PATIENCE,
+    RealSenseCamera,
+    opened,
+    read_again,
+    read_until_lost,
+    recording,
+    software,
+    spec,
+    wait_until,
+)
 
 from hal.drivers.realsense.emulator import read_number  # isort: skip  # needs the library
 from hal.drivers.realsense.options import RealSenseSettings  # isort: skip
@@ -36,7 +46,7 @@ def rig(**real: Any) -> dict[str, Any]:
 def test_a_rig_opens_an_emulated_camera() -> None:
     with hal.open(rig(emulated=True, warm_up_s=0.0)) as bench:
         cam = bench.cameras["wrist"]
-        frame = cam.read(timeout=5.0)
+        frame = cam.read(timeout=PATIENCE)
         assert frame.color.shape == (256, 256, 3)
         assert read_number(frame.color) > 0
         assert cam.info.serial is not None
@@ -71,9 +81,9 @@ def test_no_camera_is_connected() -> None:
 def test_a_camera_that_starts_and_sends_nothing_is_reset_once(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(RealSenseSettings, "is_real", True)  # an emulated one is otherwise never reset
     with opened(software(stall_s=0.4)) as cam:
-        cam.read(timeout=5.0)
+        cam.read(timeout=PATIENCE)
         cam.inject(freeze=True)
-        assert read_until_lost(cam, 3.0).code == "stalled"
+        assert read_until_lost(cam).code == "stalled"
         errors: list[ConnectionLost] = []
 
         def was_reset() -> bool:
@@ -82,11 +92,11 @@ def test_a_camera_that_starts_and_sends_nothing_is_reset_once(monkeypatch: pytes
             errors.append(caught.value)
             return "could not be reset: hardware_reset is not implemented" in str(caught.value)
 
-        wait_until(was_reset, 20.0)
+        wait_until(was_reset, 60.0)
         first = next(error for error in errors if error.code == "no_frames")
         assert "reset" not in str(first), "the first failed start is not followed by a reset"
         cam.inject(freeze=False)
-        read_again(cam, 15.0)
+        read_again(cam)
 
 
 def test_the_same_rig_runs_on_a_recording(tmp_path: Path) -> None:
