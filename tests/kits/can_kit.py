@@ -29,7 +29,7 @@ from hal.specs import RobotSpec
 
 __all__ = ["CanBench", "EmulatorProcess", "can_overrides", "emulated_arm"]
 
-_START_LIMIT, _END_LIMIT = 20.0, 5.0
+_START_LIMIT, _END_LIMIT = 60.0, 15.0
 _numbers = itertools.count(1)
 
 

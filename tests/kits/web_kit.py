@@ -26,7 +26,7 @@ TOKEN = "a-token-of-the-test_0123456789"
 JOINTS = [("arm", 3)]
 GRIPPERS = ["arm.gripper"]
 REST = [0.0] * 8
-WAIT = 10.0
+WAIT = 20.0
 """s after which something that never comes is missed."""
 HEADER = struct.Struct("<BBHIdf")
 

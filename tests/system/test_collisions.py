@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 import hal
+
+pytestmark = pytest.mark.alone
 
 
 def test_two_arms_of_two_processes_stop_apart() -> None:
@@ -14,7 +17,7 @@ def test_two_arms_of_two_processes_stop_apart() -> None:
         left, right = rig.robots["left"], rig.robots["right"]
         start, collisions = left.state().q_set, left.collisions
         least, seen = 1.0, hal.Limited.NONE
-        with left.control(rate_hz=10) as one, right.control(rate_hz=10) as two:
+        with left.control(rate_hz=5) as one, right.control(rate_hz=5) as two:
             for tick in rig.clock.rate(30):
                 one.send(hal.Twist([0.25, 0, 0]))
                 two.send(hal.Twist([0.25, 0, 0]))

@@ -7,6 +7,7 @@ import contextlib
 import os
 import queue
 import signal
+import threading
 import time
 from collections.abc import Callable, Iterator
 from types import SimpleNamespace
@@ -79,10 +80,11 @@ async def test_a_stop_is_heard_after_a_mistake_in_what_came_before(rig, monkeypa
 
 async def test_only_one_recovery_at_a_time(rig: hal.Rig, monkeypatch: pytest.MonkeyPatch) -> None:
     calls: list[float] = []
+    refused = threading.Event()
 
     def slow() -> None:
         calls.append(time.monotonic())
-        time.sleep(0.5)
+        refused.wait(WAIT)
 
     monkeypatch.setattr(rig.robots["panda"], "recover", slow)
     async with page_of(rig) as page:
@@ -90,7 +92,8 @@ async def test_only_one_recovery_at_a_time(rig: hal.Rig, monkeypatch: pytest.Mon
         for _ in range(20):
             await page.say(type="recover", robot="panda")
         assert "already" in (await page.next("refused"))["why"]
-    assert len(calls) == 1
+        assert len(calls) == 1
+        refused.set()
 
 
 async def test_a_console_that_is_killed_leaves_no_stick_pushed_and_says_so(rig, capfd):
@@ -112,7 +115,7 @@ def test_a_console_that_is_stopped_does_not_hold_up_the_end(rig: hal.Rig) -> Non
         rig.say(f"line {k} of what nobody hears" + 200 * ".")
     begin = time.monotonic()
     rig.close()
-    assert time.monotonic() - begin < 15.0, "it would be 35 s if the end waited for an answer"
+    assert time.monotonic() - begin < 20.0, "it would be 35 s if the end waited for an answer"
 
 
 @pytest.mark.slow
@@ -177,7 +180,7 @@ async def test_a_console_that_is_stopped_holds_up_no_recording_and_shows_the_new
         begin = time.monotonic()
         for frames in range(20_000):
             console(rig).show_recording(view(frames))
-        assert time.monotonic() - begin < 5.0, "it waits for nobody"
+        assert time.monotonic() - begin < 15.0, "it waits for nobody"
     finally:
         os.kill(process_of(rig), signal.SIGCONT)
     async with page_of(rig) as page:

@@ -1,6 +1,6 @@
 """``hal-generate`` as a program: workers and the program itself are killed, and the rows are those of one worker.
 
-Three kills here; HAL_GENERATE_KILLS=20 does more.
+Two kills here; HAL_GENERATE_KILLS=20 does more.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ from recording_layout import check_layout
 from hal.recording import Dataset
 
 ROOT = Path(__file__).resolve().parents[2]
-KILLS = int(os.environ.get("HAL_GENERATE_KILLS", "3"))
-EPISODES = 8
+KILLS = int(os.environ.get("HAL_GENERATE_KILLS", "2"))
+EPISODES = max(6, 2 * KILLS + 2)
 
 
 def command(out: Path, *more: str) -> list[str]:
@@ -105,8 +105,8 @@ def test_an_interrupted_run_continues_and_its_workers_end(tmp_path: Path, expect
     children = workers(app.pid)
     assert len(children) == 2
     app.send_signal(number)
-    app.wait(20.0)
-    deadline = time.monotonic() + 10.0
+    app.wait(60.0)
+    deadline = time.monotonic() + 60.0
     while any(Path(f"/proc/{pid}").exists() for pid in children):
         assert time.monotonic() < deadline, "a worker outlives the program"
         time.sleep(0.05)

@@ -84,12 +84,12 @@ def test_the_gripper_works_as_any_other(rig: hal.Rig) -> None:
     assert hand.grasp(0.03)
     assert not hand.grasp(0.01)
     assert hand.open().width == pytest.approx(hand.width_max, abs=1e-3)
-    with arm.control() as control:
+    with arm.control(rate_hz=5) as control:
         for tick in rig.clock.rate(50):
             control.send(JointTarget(arm.home), grip=0.25)
-            if tick.elapsed > 0.5:
+            if hand.state(max_age=1.0).width_target == pytest.approx(0.75 * hand.width_max):
                 break
-    assert hand.state().width_target == pytest.approx(0.75 * hand.width_max)
+            assert tick.elapsed < 10.0
     statistics = rig.statistics()["panda.gripper"]
     assert statistics["robots"] == {}
     assert statistics["ticks"] > 0
@@ -113,7 +113,7 @@ def test_an_arm_does_not_wait_for_a_gripper_that_is_slow_or_dead(rig: hal.Rig) -
     arm, hand = rig.robots["panda"], hand_of(rig)
     child = host_of(rig, "panda.gripper").child.process
     slowest, sent = 0.0, 0
-    with arm.control() as control:
+    with arm.control(rate_hz=5) as control:
         start = np.array(arm.state().q_set)
         for turn, tick in enumerate(rig.clock.rate(50)):
             if turn == 10:
@@ -128,7 +128,7 @@ def test_an_arm_does_not_wait_for_a_gripper_that_is_slow_or_dead(rig: hal.Rig) -
             if tick.elapsed > 2.0:
                 break
         assert sent > 20
-        assert slowest < 0.1
+        assert slowest < 0.5, "as long as its process blocks, and much less than for ever"
         assert arm.state().q_set[0] - start[0] > 0.1, "it went on"
     child.wait(5.0)
     with pytest.raises(ConnectionLost, match=r"the panda\.gripper process ended"):

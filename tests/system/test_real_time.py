@@ -98,12 +98,12 @@ def test_states_and_frames_go_on_and_their_stamps_increase(rig: hal.Rig) -> None
 def test_a_fault_in_motion_is_told_and_recovered(rig: hal.Rig) -> None:
     arm = rig.robots["panda"]
     velocity = JointVelocity([0.2, 0, 0, 0, 0, 0, 0])
-    with arm.control() as control:
-        for k, _ in enumerate(rig.clock.rate(50)):
+    with arm.control(rate_hz=5) as control:  # sent ten times as often: a busy computer is no reason for a stop
+        for tick in rig.clock.rate(50):
             control.send(velocity)
-            if k == 15:
+            if arm.state(max_age=1.0).dq_set[0] > 0.1:
                 break
-        assert arm.state().dq_set[0] > 0.1
+            assert tick.elapsed < 10.0
         arm.inject(fault="collision")
         wait_for(lambda: arm.state().status is RobotStatus.FAULT)
         with pytest.raises(hal.RobotFault, match="collision"):
@@ -139,7 +139,7 @@ def test_a_renderer_that_is_killed_takes_only_the_cameras() -> None:
 def test_a_host_that_is_killed_is_told_by_the_next_call() -> None:
     rig = hal.open("panda_table", sim=True, clock="real_time", pad="none", overrides=["cameras={}"])
     arm = rig.robots["panda"]
-    with pytest.raises(ConnectionLost, match="simulation process ended"), arm.control() as control:
+    with pytest.raises(ConnectionLost, match="simulation process ended"), arm.control(rate_hz=5) as control:
         for k, _ in enumerate(rig.clock.rate(50)):
             control.send(JointVelocity([0.1] * 7))
             if k == 10:

@@ -12,9 +12,9 @@ import hal
 from hal.recording import Dataset, Recorder
 from hal.types import RobotState
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.alone]
 
-SECONDS = 5.0
+SECONDS = 4.0
 
 
 def test_a_drive_is_recorded_as_it_was(tmp_path: Path) -> None:

@@ -29,8 +29,8 @@ __all__ = ["Emulator", "free_host", "run_client"]
 LIBRARIES = {"fr3": "pylibfranka", "panda": "panda_py"}
 """The vendor's library of each robot."""
 PORTS = (1337, 1338, 1339)
-START_LIMIT = 20.0
-END_LIMIT = 5.0
+START_LIMIT = 60.0
+END_LIMIT = 15.0
 
 
 _hosts = itertools.cycle(range(1, 251))
@@ -97,7 +97,7 @@ class Emulator:
         events: list[dict[str, Any]] = self.control.send("log 1000")["events"]
         return [event for event in events if kind in (None, event["kind"])]
 
-    def wait_event(self, kind: str, after: int = 0, timeout: float = 10.0) -> dict[str, Any]:
+    def wait_event(self, kind: str, after: int = 0, timeout: float = 30.0) -> dict[str, Any]:
         """Return the first event of a kind with a number above ``after``. Raises TimeoutError if there is none."""
         deadline = time.monotonic() + timeout
         while True:
@@ -143,7 +143,7 @@ class Emulator:
         self.close()
 
 
-def run_client(robot: str, scenario: str, host: str, timeout: float = 30.0, **arguments: object) -> dict[str, Any]:
+def run_client(robot: str, scenario: str, host: str, timeout: float = 60.0, **arguments: object) -> dict[str, Any]:
     """Run one scenario of ``franka_client.py`` in a process of its own, and return its report.
 
     The vendor's libraries block all Python threads, and change the scheduling of the thread that constructs a robot,

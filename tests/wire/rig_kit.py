@@ -29,7 +29,7 @@ def arm_of(rig: Rig) -> Robot:
     return rig.robots["arm"]
 
 
-def wait_until(condition: Callable[[], bool], what: str, timeout: float = 10.0) -> float:
+def wait_until(condition: Callable[[], bool], what: str, timeout: float = 30.0) -> float:
     """Poll until a condition holds, and return the time it took, s. Raises TimeoutError with ``what``."""
     began = time.monotonic()
     while not condition():
