@@ -67,7 +67,7 @@ def test_a_program_drives_the_arm_and_its_gripper_and_leaves_them_holding() -> N
 def test_a_bus_that_is_cut_stops_the_program_and_comes_back() -> None:
     with EmulatorProcess("piper") as emulator, opened(emulator) as rig:
         arm = rig.robots["arm"]
-        with arm.control(rate_hz=5, unattended=True) as control:  # the program's own lateness is no reason to stop
+        with arm.control(rate_hz=10, unattended=True) as control:  # the program's own lateness is no reason to stop
             began = None
             with pytest.raises(HalError) as caught:
                 for tick in rig.clock.rate(50):
