@@ -50,6 +50,17 @@ def parser() -> argparse.ArgumentParser:
     what.add_argument(
         "--resize", metavar="WxH", help="crop images to this aspect ratio around the center, and scale them"
     )
+    what.add_argument(
+        "--action",
+        default="joint_position",
+        choices=("joint_position", "joint_velocity", "tcp_pose", "tcp_delta"),
+        help="joint targets, joint velocities, or poses or steps of the tcp in the base frame (%(default)s)",
+    )
+    what.add_argument(
+        "--rotation",
+        choices=("quaternion", "axis_angle", "rotation_6d"),
+        help="rotation of tcp_pose and tcp_delta (quaternion)",
+    )
     names = made.add_argument_group("for --to npz")
     names.add_argument("--camera", metavar="NAME", help="camera exported as camera (default: the first fixed one)")
     names.add_argument(
@@ -82,6 +93,8 @@ def _main(args: argparse.Namespace) -> int:
         camera=args.camera,
         gripper_camera=args.gripper_camera,
         valid=args.valid,
+        action=args.action,
+        rotation=args.rotation,
         force=args.force,
         progress=_show_progress() if sys.stderr.isatty() else None,
     )

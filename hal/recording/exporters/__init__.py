@@ -18,6 +18,7 @@ from typing import NamedTuple
 from ..._moved import names_of
 from ...errors import CommandError
 from ..dataset import Dataset
+from .actions import ActionForm, ActionKind, RotationForm
 from .content import EpisodeContent, select_episodes
 from .output import ExportJob, ExportProgress, write_atomically
 
@@ -74,6 +75,8 @@ def export(
     camera: str | None = None,
     gripper_camera: str | None = None,
     valid: float = 0.1,
+    action: ActionKind = "joint_position",
+    rotation: RotationForm | None = None,
     force: bool = False,
     progress: Callable[[ExportProgress], None] | None = None,
 ) -> ExportResult:
@@ -91,6 +94,9 @@ def export(
         camera: Camera that ``npz`` calls ``camera``.
         gripper_camera: Camera that ``npz`` calls ``gripper_camera``.
         valid: Share of the episodes in robomimic's filter ``valid``, at least 0 and below 1.
+        action: What an action is: ``joint_position``, ``joint_velocity``, ``tcp_pose`` or ``tcp_delta``; see
+            :class:`~hal.recording.exporters.actions.ActionForm`.
+        rotation: Rotation of ``tcp_pose`` and ``tcp_delta``: ``quaternion`` (if None), ``axis_angle``, ``rotation_6d``.
         force: Overwrite an existing export; other files are never overwritten.
         progress: Called as the export advances.
 
@@ -107,6 +113,7 @@ def export(
         raise CommandError(f"valid must be at least 0 and below 1, not {valid:g}", code="bad_export")
     if size is not None and not all(1 <= side <= 8192 for side in size):
         raise CommandError(f"size must be from 1x1 to 8192x8192, not {size[0]}x{size[1]}", code="bad_export")
+    form = ActionForm(action, rotation).checked()
     source = dataset if isinstance(dataset, Dataset) else Dataset(dataset)
     wanted = select_episodes(source, episodes, successful_only=successful_only)
     job = ExportJob(
@@ -115,6 +122,7 @@ def export(
         camera=camera,
         gripper_camera=gripper_camera,
         valid=valid,
+        action=form,
         report=progress,
     )
     job.check()

@@ -11,8 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..layout import ACTION
-from .content import EpisodeContent, observations, picture_name, with_channel
+from .content import EpisodeContent, picture_name, with_channel
 from .output import ExportJob
 
 __all__ = [
@@ -132,7 +131,7 @@ def write(job: ExportJob, path: Path) -> None:
 def _columns(
     job: ExportJob, content: EpisodeContent
 ) -> Iterator[tuple[str, np.dtype[Any], tuple[int, ...], Iterator[NDArray[Any]]]]:
-    numbers = observations(content) | {"action": content.episode.columns[ACTION], "timestamp": content.grid}
+    numbers = job.observations(content) | {"action": job.action.values(content), "timestamp": content.grid}
     job.unknown(content, numbers)
     for name, values in numbers.items():
         yield name, values.dtype, values.shape[1:], iter(values)

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import CommandError
-from ..layout import ACTION
+from ..layout import STATE
 from .content import EpisodeContent, camera_roles
 from .output import ExportJob
 
@@ -47,14 +47,14 @@ def write(job: ExportJob, path: Path) -> None:
 
 
 def _write_episode(job: ExportJob, content: EpisodeContent, path: Path) -> None:
-    numbers = _numbers(content)
+    numbers = _numbers(job, content)
     job.unknown(content, {name: numbers[name] for name in ("joint_states", "action") if name in numbers})
     called = camera_roles(content, job.camera, job.gripper_camera)
     texts: dict[str, str | list[str]] = {
         "info": json.dumps(content.episode.info | {"cameras_written": content.lenses()})
     }
-    for key in ("observation.state", ACTION):
-        texts[f"{key}.names"] = content.episode.names(key)
+    texts["observation.state.names"] = content.episode.names(STATE)
+    texts["action.names"] = job.action.names(content)
     for camera, name in called.items():
         numbers[f"{name}_stamps"] = content.episode.stamps[f"camera.{camera}"]
     streams = {f"{called[stream.camera]}_{stream.what}": stream for stream in content.pictures}
@@ -70,7 +70,7 @@ def _write_episode(job: ExportJob, content: EpisodeContent, path: Path) -> None:
             _add(file, name, (stream.rows, *stream.shape), stream.dtype, job.pictures(content, stream))
 
 
-def _numbers(content: EpisodeContent) -> dict[str, NDArray[Any]]:
+def _numbers(job: ExportJob, content: EpisodeContent) -> dict[str, NDArray[Any]]:
     episode = content.episode
     found: dict[str, NDArray[Any]] = {}
     for arm in content.arms:
@@ -80,7 +80,7 @@ def _numbers(content: EpisodeContent) -> dict[str, NDArray[Any]]:
         found[lead + "eef_position"], found[lead + "eef_orientation"] = pose[:, :3], pose[:, 3:]
         if (width := content.width(arm)) is not None:
             found[lead + "gripper"] = width
-    found["action"] = episode.columns[ACTION]
+    found["action"] = job.action.values(content)
     found["stamps"] = episode.stamps["grid"]
     return found | {key: values for key, values in episode.columns.items() if key not in found}
 

@@ -15,8 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import CommandError
-from ..layout import ACTION, STATE
-from .content import EpisodeContent, PictureStream
+from ..layout import STATE
+from .actions import ActionForm, rotation_observations
+from .content import EpisodeContent, PictureStream, observations
 
 __all__ = [
     "ExportJob",
@@ -43,6 +44,7 @@ class ExportJob:
     camera: str | None = None
     gripper_camera: str | None = None
     valid: float = 0.1
+    action: ActionForm = field(default_factory=ActionForm)
     report: Callable[[ExportProgress], None] | None = None
     notes: list[str] = field(default_factory=list)
     """Warnings to read before training on it."""
@@ -74,6 +76,10 @@ class ExportJob:
             if np.issubdtype(values.dtype, np.floating) and not np.isfinite(values).all():
                 self.notes.append(f"{name} of episode {content.episode.number} has unknown values (NaN)")
 
+    def observations(self, content: EpisodeContent) -> dict[str, NDArray[Any]]:
+        """Return the observations of an episode, and the orientation of its tcp in the form of the actions."""
+        return observations(content) | rotation_observations(content, self.action.rotation)
+
     def pictures(self, content: EpisodeContent, stream: PictureStream) -> Iterator[NDArray[Any]]:
         """Yield the pictures of a stream, and report progress."""
         for picture in stream:
@@ -99,7 +105,8 @@ class ExportJob:
             "fps": episode.fps,
             "robot_type": episode.info.get("robot_type"),
             "arms": [{"name": arm.name, "joints": first.joints(arm)} for arm in first.arms],
-            "action_names": episode.names(ACTION),
+            "action": self.action._asdict(),
+            "action_names": self.action.names(first),
             "state_names": episode.names(STATE),
             "objects": list(first.objects),
             "cameras": first.lenses(),

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import DriverMissing
-from ..layout import ACTION
-from .content import EpisodeContent, PictureStream, observations, picture_name, with_channel
+from .actions import action_dict
+from .content import EpisodeContent, PictureStream, picture_name, with_channel
 from .output import ExportJob
 
 __all__ = ["is_export", "write"]
@@ -54,12 +54,14 @@ def _library() -> Any:
 
 
 def _write_episode(job: ExportJob, content: EpisodeContent, group: Any, h5py: Any) -> None:
-    actions = content.episode.columns[ACTION]
-    seen = observations(content)
+    actions = job.action.values(content)
+    seen = job.observations(content)
     job.unknown(content, seen | {"actions": actions})
     last = np.zeros(content.rows)
     last[-1] = 1.0
     group["actions"] = actions
+    for name, values in action_dict(content).items():
+        group[f"action_dict/{name}"] = values
     group["dones"] = last
     group["rewards"] = last * bool(content.episode.success)
     group.attrs["num_samples"] = content.rows

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from errors_kit import raises_code
 from recording_kit import make_recording, pictures
 
 import hal
@@ -211,6 +212,119 @@ def test_zarr_chunks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, rows: int,
     assert found["values"].chunks[0] == min(3, rows)
     assert found["values"].dtype == dtype
     assert np.array_equal(found["values"][:], values)
+
+
+# Forms of actions.
+
+ROTATIONS = ("quaternion", "axis_angle", "rotation_6d")
+
+
+def turns(values: np.ndarray[Any, Any], form: str) -> Any:
+    """Read rotations as scipy does, and those of six numbers as UMI does: two rows, made orthogonal."""
+    from scipy.spatial.transform import Rotation
+
+    if form == "quaternion":
+        return Rotation.from_quat(values)
+    if form == "axis_angle":
+        return Rotation.from_rotvec(values)
+    first = values[:, :3] / np.linalg.norm(values[:, :3], axis=1, keepdims=True)
+    second = values[:, 3:] - (first * values[:, 3:]).sum(axis=1, keepdims=True) * first
+    second /= np.linalg.norm(second, axis=1, keepdims=True)
+    return Rotation.from_matrix(np.stack([first, second, np.cross(first, second)], axis=1))
+
+
+def turning(dataset: Dataset) -> Dataset:
+    """The same recording with commanded poses that turn by up to 3 rad, beyond half a turn in all, and uneven times."""
+    from scipy.spatial.transform import Rotation
+
+    random = np.random.default_rng(4)
+    for episode in dataset.episodes:
+        rows = episode.length
+        steps = Rotation.from_rotvec(random.uniform(-1.0, 1.0, (rows, 3)) * np.linspace(0.0, 1.7, rows)[:, None])
+        poses = [Rotation.random(random_state=4)]
+        for step in steps[1:]:
+            poses.append(step * poses[-1])
+        quaternions = np.array([pose.as_quat() for pose in poses])
+        positions = np.cumsum(random.normal(0.0, 0.01, (rows, 3)), axis=0)
+        episode.columns["observation.tcp_set"] = np.concatenate([positions, quaternions], axis=1).astype(np.float32)
+        dropped = np.where(np.arange(rows) < rows // 2, 0.0, 0.05)
+        episode.columns["observation.time.grid"] = episode.columns["observation.time.grid"] + dropped
+    return dataset
+
+
+def actions(dataset: Dataset, out: Path, action: str, rotation: str | None = None) -> list[np.ndarray[Any, Any]]:
+    made = export(dataset, "npz", out, cameras=[], action=action, rotation=rotation)  # type: ignore[arg-type]
+    return [np.load(file)["action"] for file in sorted(made.path.glob("*.npz"))]
+
+
+@pytest.mark.parametrize("rotation", ROTATIONS)
+def test_steps_of_the_tcp_add_up_to_its_poses(dataset: Dataset, tmp_path: Path, rotation: str) -> None:
+    source = turning(Dataset(dataset.root))
+    targets = actions(source, tmp_path / "poses", "tcp_pose", rotation)
+    steps = actions(source, tmp_path / "steps", "tcp_delta", rotation)
+    for episode, target, step in zip(source.episodes, targets, steps, strict=True):
+        poses = episode.columns["observation.tcp_set"].astype(float)
+        expected = turns(poses[:, 3:], "quaternion")
+        later = [*range(1, episode.length), episode.length - 1]
+        assert np.abs(target[:, :3] - poses[later, :3]).max() < 1e-9
+        assert (turns(target[:, 3:-1], rotation) * expected[later].inv()).magnitude().max() < 1e-9
+        place, turn = poses[0, :3], expected[0]
+        for k, (by, rotated) in enumerate(zip(step[:, :3], turns(step[:, 3:-1], rotation), strict=True)):
+            place, turn = place + by, rotated * turn
+            assert np.abs(place - poses[later[k], :3]).max() < 1e-9
+            assert (turn * expected[later[k]].inv()).magnitude() < 1e-9
+        for values in (target, step):
+            assert np.array_equal(values[:, -1], episode.columns["action"][:, -1].astype(float)), "the gripper"
+
+
+def test_velocities_of_the_joints_add_up_to_their_targets(dataset: Dataset, tmp_path: Path) -> None:
+    source = turning(Dataset(dataset.root))
+    for episode, found in zip(source.episodes, actions(source, tmp_path / "out", "joint_velocity"), strict=True):
+        period = np.append(np.diff(episode.stamps["grid"]), 1.0 / episode.fps)[:, None]
+        start = episode.columns["observation.setpoint"][0, :7].astype(float)
+        reached = start + np.cumsum(found[:, :7] * period, axis=0)
+        assert np.abs(reached - episode.columns["action"][:, :7]).max() < 1e-9
+
+
+def test_names_of_actions_follow_their_form(two_arms: Dataset, tmp_path: Path) -> None:
+    made = export(two_arms, "npz", tmp_path / "out", action="tcp_delta", rotation="axis_angle")
+    one = ["x", "y", "z", "rx", "ry", "rz", "gripper"]
+    names = [f"{arm}.{name}" for arm in ("left", "right") for name in one]
+    about = json.loads((made.path / "export.json").read_text())
+    assert about["action_names"] == names
+    assert about["action"] == {"kind": "tcp_delta", "rotation": "axis_angle"}
+    with np.load(made.path / "episode_000000.npz") as file:
+        assert file["action.names"].tolist() == names
+        moved = np.abs(file["action"]).sum(axis=0)
+        assert moved[9] > 0.01 > moved[:6].max(), "the right one went up"
+    for wrong in ({"rotation": "quaternion"}, {"action": "twist"}, {"action": "tcp_pose", "rotation": "euler"}):
+        with raises_code(hal.CommandError, "bad_export"):
+            export(two_arms, "npz", tmp_path / "wrong", **wrong)  # type: ignore[arg-type]
+
+
+def test_umi_and_robomimic_find_their_names(dataset: Dataset, two_arms: Dataset, tmp_path: Path) -> None:
+    h5py = pytest.importorskip("h5py", reason="pip install 'robot-hal[export]'")
+    zarr = pytest.importorskip("zarr", reason="pip install zarr")
+    rows, first = (dataset.episodes[0].length, column(dataset, "observation.tcp")[:1])
+    made = export(dataset, "zarr", tmp_path / "umi", cameras=[], action="tcp_pose", rotation="axis_angle")
+    data = zarr.open(str(made.path), mode="r")["data"]
+    assert data["action"].shape[1] == 7
+    assert data["robot0_eef_rot_axis_angle"].shape == (made.rows, 3)
+    start = data["robot0_demo_start_pose"][:]
+    assert np.array_equal(start[0, :3], first[0, :3])
+    assert np.array_equal(start[rows - 1], start[0])
+    difference = turns(start[:1, 3:], "axis_angle") * turns(first[:, 3:], "quaternion").inv()
+    assert difference.magnitude() < 1e-6
+    for source, leads in ((dataset, [""]), (two_arms, ["robot0_", "robot1_"])):
+        made = export(source, "robomimic", tmp_path / "file.hdf5", cameras=[], force=True)
+        with h5py.File(made.path) as file:
+            parts = file["data/demo_0/action_dict"]
+            names = ["gripper", "joint_position", "joint_velocity"]
+            names += [f"{a}_{b}" for a in ("abs", "rel") for b in ("pos", "rot_6d", "rot_axis_angle")]
+            assert set(parts) == {lead + name for lead in leads for name in names}
+            assert parts[f"{leads[0]}abs_rot_6d"].shape[1] == 6
+            state = file["data/demo_0/actions"][()]
+            assert np.array_equal(parts[f"{leads[-1]}joint_position"][()], state[:, -8:-1])
 
 
 # What was never known.
