@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from .errors import CommandError, NotSupported
 from .geometry import Pose, frozen
-from .specs import BodySpec, WorldSpec, to_json
+from .specs import BodySpec, WorldSpec, from_json, to_json
 
 __all__ = ["BodyJoint", "Contact", "Contacts", "NoWorld", "Poses", "RayHit", "World", "WorldDriver", "WorldState"]
 
@@ -173,6 +173,17 @@ class World:
     def set_pose(self, name: str, pose: Pose) -> None:
         """Place a body, at rest. Robots are moved by their servo, or by :meth:`reset`."""
         self._call("set_pose", name=name, pose=_plain(pose))
+
+    def spec(self, name: str) -> BodySpec:
+        """Return the record of an object: its shape, size and mass as it was loaded or added.
+
+        Raises:
+            CommandError: It is a robot, whose record is ``rig.robots[name].spec`` (``code`` is ``is_robot``).
+        """
+        found = self._call("describe", name=name)
+        if found["robot"]:
+            raise CommandError(f"{name!r} is a robot: its record is rig.robots[{name!r}].spec", code="is_robot")
+        return from_json(BodySpec, found["spec"])
 
     def links(self, name: str) -> tuple[str, ...]:
         """Return the names of a body's links; the first one is the base."""
@@ -386,8 +397,9 @@ class WorldDriver(ABC):
     =================  ======================================  ========================================================
     ``names``          none                                    names of the bodies, objects first, as they were added
     ``describe``       ``name``                                ``index`` in segmentation images, ``robot`` (a bool),
-                                                               names of ``links`` and ``joints``, and ``movable``: the
-                                                               fields of each :class:`BodyJoint` by name
+                                                               names of ``links`` and ``joints``, ``movable``: the
+                                                               fields of each :class:`BodyJoint` by name, and ``spec``:
+                                                               those of an object's :class:`.BodySpec`, None for a robot
     ``joint_positions``  ``name``                              position by joint that moves, rad or m
     ``pose``           ``name``, ``link``                      ``position`` (3,) m and ``orientation`` (4,) xyzw of a
                                                                link's own frame in the world; of the base for None

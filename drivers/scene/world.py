@@ -159,7 +159,15 @@ class SimulatedWorld(SceneEngine[B]):
         body = self.body(name)
         links, joints = list(body.links), list(body.joints)
         movable = {joint: facts._asdict() for joint, facts in movable_joints(body).items()}
-        return {"index": body.index, "robot": body.is_robot, "links": links, "joints": joints, "movable": movable}
+        spec = None if body.is_robot else to_json(body.spec)
+        return {
+            "index": body.index,
+            "robot": body.is_robot,
+            "spec": spec,
+            "links": links,
+            "joints": joints,
+            "movable": movable,
+        }
 
     def pose(self, name: str, link: str | None = None) -> dict[str, list[float]]:
         """Return the pose of a link's frame in the world; of the base link when none is named."""

@@ -11,11 +11,12 @@ from .grasping import gentle_grasp, grasp
 from .objects import LocatedObject, grasp_pose, locate_by_truth, object_from_points
 from .pictures import draw_plan, save_plan
 from .pushing import push, push_path, push_to
-from .running import Reason, SkillPhase, SkillProgress, SkillResult
+from .running import Reason, SkillOptions, SkillPhase, SkillProgress, SkillResult
 
 __all__ = [
     "LocatedObject",
     "Reason",
+    "SkillOptions",
     "SkillPhase",
     "SkillProgress",
     "SkillResult",

@@ -7,9 +7,9 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -18,11 +18,12 @@ from ..arguments import number, vector
 from ..errors import CommandError
 from ..geometry import Pose
 from .objects import LocatedObject, object_from_points
-from .running import SkillProgress, SkillResult, SkillRun
+from .running import SkillOptions, SkillResult, SkillRun
 
 if TYPE_CHECKING:
+    from typing_extensions import Unpack
+
     from ..camera import Camera
-    from ..deadman import Deadman
     from ..robot import Robot
     from ..types import Frame
 
@@ -201,11 +202,7 @@ def look_at(
     position: ArrayLike,
     *,
     distance: float = 0.4,
-    speed: float | None = None,
-    deadman: Deadman | None = None,
-    unattended: bool = False,
-    patience: float = 60.0,
-    progress: Callable[[SkillProgress], None] | None = None,
+    **options: Unpack[SkillOptions],
 ) -> SkillResult:
     """Move the arm so that the camera on its hand looks at a position; the hand keeps its orientation.
 
@@ -214,11 +211,7 @@ def look_at(
         camera: The camera.
         position: Where to look (3,), in the arm's base frame, m.
         distance: Distance of the camera from there, m.
-        speed: Share of the joint speed limits; the rig's ``move_speed`` by default.
-        deadman: Switch that must be held for the arm to move.
-        unattended: Move an arm that really moves without a dead-man.
-        patience: Longest time for which the dead-man may be released, s.
-        progress: Called when the phase ``look`` begins.
+        **options: :class:`~hal.skills.running.SkillOptions`.
 
     Returns:
         The result; false, with the reason, if the arm does not get there.
@@ -235,16 +228,7 @@ def look_at(
     seen_from, tcp = arm.base.inverse() @ where, arm.state().tcp
     ahead = seen_from.transform([0.0, 0.0, distance]) - seen_from.position
     goal = Pose(tcp.position + target - ahead - seen_from.position, tcp.orientation)
-    run = SkillRun(
-        "look_at",
-        arm,
-        ("look",),
-        deadman=deadman,
-        unattended=unattended,
-        patience=patience,
-        speed=speed,
-        progress=progress,
-    )
+    run = SkillRun("look_at", arm, ("look",), **options)
     with run:
         _, q = run.choose_way([[goal]])
         run.begin("look")
@@ -260,7 +244,7 @@ def find_by_depth(
     upper: ArrayLike | None = None,
     count: int = 5,
     closer: bool = True,
-    **motion: Any,
+    **options: Unpack[SkillOptions],
 ) -> LocatedObject | None:
     """Return the largest object on the table that a camera sees; None if there is none.
 
@@ -273,7 +257,8 @@ def find_by_depth(
         upper: The other corner (3,), m.
         count: Number of frames for each look.
         closer: Whether a camera on the hand looks a second time.
-        **motion: ``speed``, ``deadman``, ``unattended``, ``patience`` and ``progress`` of :func:`look_at`.
+        **options: :class:`~hal.skills.running.SkillOptions` of the motion between the looks; if it fails, the first
+            look counts.
 
     Raises:
         CommandError: The camera has no depth, or its pose is unknown.
@@ -281,7 +266,7 @@ def find_by_depth(
     found = locate_by_depth(arm, read_frames(camera, count), lower=lower, upper=upper)
     if found is None or not closer or not is_on_hand(arm, camera):
         return found
-    if not look_at(arm, camera, found.pose.position, **motion):
+    if not look_at(arm, camera, found.pose.position, **options):
         return found
     again = locate_by_depth(arm, read_frames(camera, count), lower=lower, upper=upper)
     return found if again is None else again

@@ -10,10 +10,11 @@ from numpy.typing import NDArray
 
 from ..arguments import number
 from ..geometry import Pose, tcp_pose
-from .running import SkillProgress, SkillResult, SkillRun, above, flipped
+from .running import SkillOptions, SkillResult, SkillRun, above, flipped
 
 if TYPE_CHECKING:
-    from ..deadman import Deadman
+    from typing_extensions import Unpack
+
     from ..robot import Robot
 
 __all__ = ["gentle_grasp", "grasp"]
@@ -42,8 +43,6 @@ _LET_GO = 0.01
 """By how much the fingers open between the last touch and the grasp, m."""
 _SLOW = 0.03
 """Speed of the tcp with the object between the fingers, m/s."""
-_SPEED = 0.1
-"""Speed of the tcp near the object, m/s."""
 
 
 def grasp(
@@ -56,11 +55,7 @@ def grasp(
     lift: float = 0.1,
     hold: float = 0.0,
     flip: bool = True,
-    speed: float | None = None,
-    deadman: Deadman | None = None,
-    unattended: bool = False,
-    patience: float = 60.0,
-    progress: Callable[[SkillProgress], None] | None = None,
+    **options: Unpack[SkillOptions],
 ) -> SkillResult:
     """Open the gripper, approach along the tcp's z axis, close, lift, and check that the object is held.
 
@@ -75,11 +70,8 @@ def grasp(
         lift: Height to which the object is lifted, along the z axis of the base, m.
         hold: Time for which it is held up before the last check, s.
         flip: Whether the hand may be turned by half a turn about the tcp's z axis, if that is nearer.
-        speed: Share of the joint speed limits on the way to the approach; the rig's ``move_speed`` by default.
-        deadman: Switch that must be held for the arm and the fingers to move, for example ``pad.hold("l2")``.
-        unattended: Move an arm that really moves without a dead-man.
-        patience: Longest time for which the dead-man may be released, s.
-        progress: Called when a phase begins: ``open``, ``approach``, ``descend``, ``close``, ``lift``, ``hold``.
+        **options: ``speed``, ``deadman``, ``timeout`` and others, which all skills take:
+            :class:`~hal.skills.running.SkillOptions`.
 
     Returns:
         The result; false, with the reason, for what may go wrong in the world (:data:`hal.skills.Reason`).
@@ -91,25 +83,8 @@ def grasp(
         RobotFault: The arm or the gripper reports a fault.
         ConnectionLost: The arm or the gripper does not answer.
     """
-    run = SkillRun(
-        "grasp",
-        arm,
-        PHASES,
-        deadman=deadman,
-        unattended=unattended,
-        patience=patience,
-        speed=speed,
-        progress=progress,
-    )
-    hold = number("hold", hold, "s", least=0.0)
-    with run:
-        before, pose, q = plan_grasp(run, pose, width, approach, lift, flip)
-        reach_for(run, before, pose, q)
-        close_on(run, width, force)
-        lift_up(run, lift, hold)
-    if run.reason in ("missed", "wrong_width"):
-        back_off(run, before)
-    return run.result()
+    run = SkillRun("grasp", arm, PHASES, **options)
+    return run_grasp(run, pose, width, force, approach, lift, hold, flip)
 
 
 def gentle_grasp(
@@ -124,11 +99,7 @@ def gentle_grasp(
     lift: float = 0.1,
     hold: float = 0.0,
     flip: bool = True,
-    speed: float | None = None,
-    deadman: Deadman | None = None,
-    unattended: bool = False,
-    patience: float = 60.0,
-    progress: Callable[[SkillProgress], None] | None = None,
+    **options: Unpack[SkillOptions],
 ) -> SkillResult:
     """Grasp an object that is not quite between the fingers, and hardly move it.
 
@@ -143,53 +114,58 @@ def gentle_grasp(
         width: Width of the object between the fingers, m.
         touch_force: Greatest force of a finger that touches, N.
         touch_speed: Speed at which the width shrinks until the touch, m/s.
-        force: Force to hold the object with, N; the gripper's default if left out.
-        approach: Distance from ``pose``, against the tcp's z axis, at which the approach begins, m.
-        lift: Height to which the object is lifted, along the z axis of the base, m.
-        hold: Time for which it is held up before the last check, s.
-        flip: Whether the hand may be turned by half a turn about the tcp's z axis, if that is nearer.
-        speed: Share of the joint speed limits on the way to the approach; the rig's ``move_speed`` by default.
-        deadman: Switch that must be held for the arm and the fingers to move, for example ``pad.hold("l2")``.
-        unattended: Move an arm that really moves without a dead-man.
-        patience: Longest time for which the dead-man may be released, s.
-        progress: Called when a phase begins: ``open``, ``approach``, ``descend``, ``touch``, ``centre``, ``close``,
-            ``lift``, ``hold``.
+        force: As for :func:`grasp`, like all that follow.
+        approach: Distance at which the approach begins, m.
+        lift: Height to which the object is lifted, m.
+        hold: Time for which it is held up, s.
+        flip: Whether the hand may be turned by half a turn.
+        **options: :class:`~hal.skills.running.SkillOptions`.
 
     Returns:
         The result; false, with the reason, for what may go wrong in the world (:data:`hal.skills.Reason`).
 
     Raises:
-        CommandError: An invalid argument, or neither ``deadman`` nor ``unattended`` for an arm that really moves.
-        NotSupported: The arm has no gripper.
-        MotionStopped: A stop, or the dead-man was released for longer than ``patience``.
-        RobotFault: The arm or the gripper reports a fault.
-        ConnectionLost: The arm or the gripper does not answer.
+        HalError: As :func:`grasp`.
     """
-    run = SkillRun(
-        "gentle_grasp",
-        arm,
-        GENTLE_PHASES,
-        deadman=deadman,
-        unattended=unattended,
-        patience=patience,
-        speed=speed,
-        progress=progress,
-    )
-    hold = number("hold", hold, "s", least=0.0)
     number("touch_force", touch_force, "N", least=0.0, above=True)
     number("touch_speed", touch_speed, "m/s", least=0.0, above=True)
-    with run:
-        before, pose, q = plan_grasp(run, pose, width, approach, lift, flip)
-        reach_for(run, before, pose, q)
-        centre_on(run, pose, width, touch_force, touch_speed)
-        close_on(run, width, force)
-        lift_up(run, lift, hold)
-    if run.reason in ("missed", "wrong_width", "not_centred"):
-        back_off(run, before)
-    return run.result()
+    run = SkillRun("gentle_grasp", arm, GENTLE_PHASES, **options)
+
+    def centre(at: Pose) -> None:
+        centre_on(run, at, width, touch_force, touch_speed)
+
+    return run_grasp(run, pose, width, force, approach, lift, hold, flip, centre)
 
 
 # The parts of a grasp, for other skills as well.
+
+
+def run_grasp(
+    run: SkillRun,
+    pose: Pose,
+    width: float | None,
+    force: float | None,
+    approach: float,
+    lift: float,
+    hold: float,
+    flip: bool,
+    centre: Callable[[Pose], None] = lambda at: None,
+) -> SkillResult:
+    """Make a grasp with the arguments of :func:`grasp`; ``centre`` is called between the approach and the grasp."""
+    hold = number("hold", hold, "s", least=0.0)
+    with run:
+        before, at, q = plan_grasp(run, pose, width, approach, lift, flip)
+        run.begin("open")
+        run.set_fingers()
+        run.approach(before, q, at)
+        centre(at)
+        close_on(run, width, force)
+        lift_up(run, lift, hold)
+    if run.reason in ("missed", "wrong_width", "not_centred"):
+        with run:  # let go, and go back to where the approach began
+            run.set_fingers()
+            run.move(before)
+    return run.result()
 
 
 def plan_grasp(
@@ -212,16 +188,6 @@ def plan_grasp(
     return before, at, q
 
 
-def reach_for(run: SkillRun, before: Pose, pose: Pose, q: Array) -> None:
-    """Open the fingers, and bring them around the object."""
-    run.begin("open")
-    run.open_fingers()
-    run.begin("approach")
-    run.go(before, q)
-    run.begin("descend")
-    run.move(pose, tcp_speed=_SPEED)
-
-
 def centre_on(run: SkillRun, pose: Pose, width: float, force: float, speed: float) -> None:
     """Move the tcp, along its y axis, until an object of this width in m is in the middle between the fingers."""
     run.begin("touch")
@@ -232,9 +198,9 @@ def centre_on(run: SkillRun, pose: Pose, width: float, force: float, speed: floa
         if missing < -TOLERANCE:
             run.fail("wrong_width", f"the object is {2e3 * -missing:.0f} mm narrower than {width:.3f} m")
         if missing <= _CENTRED:  # let go: some hands cannot press harder on what they touch already
-            run.open_fingers(width + 2.0 * missing + _LET_GO)
+            run.set_fingers(width + 2.0 * missing + _LET_GO)
             return
-        run.open_fingers()
+        run.set_fingers()
         step = min(missing, _PROBE) if turn == 0 else missing  # the first one, to find out which side is right
         at += side * step
         run.move(pose @ Pose((0.0, at, 0.0)), tcp_speed=_SLOW)
@@ -285,10 +251,11 @@ def lift_up(run: SkillRun, lift: float, hold: float) -> None:
     arm, gripper = run.arm, run.gripper
     held = gripper.state().width
     run.begin("lift")
-    run.move(above(arm.state().tcp_set, lift), tcp_speed=_SPEED)
+    run.move(above(arm.state().tcp_set, lift))
     check_held(run, held)
     run.begin("hold")
-    arm.clock.sleep(hold)
+    arm.clock.sleep(min(hold, run.time_left()))
+    run.time_left()
     check_held(run, held)
 
 
@@ -297,10 +264,3 @@ def check_held(run: SkillRun, width: float) -> None:
     state = run.gripper.state()
     if state.grasped is False or abs(state.width - width) > _SLIPPED:
         run.fail("dropped", f"the object was held at {width:.3f} m; the fingers are now at {state.width:.3f} m")
-
-
-def back_off(run: SkillRun, before: Pose) -> None:
-    """Let go, and go back to where the approach began."""
-    with run:
-        run.open_fingers()
-        run.move(before, tcp_speed=_SPEED)

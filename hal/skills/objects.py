@@ -6,7 +6,6 @@ Everything is in the arm's base frame, whose z axis must point up.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
@@ -158,31 +157,34 @@ def locate_by_truth(rig: Rig, arm: Robot, name: str) -> LocatedObject:
     Args:
         rig: The rig.
         arm: The arm in whose base frame it is given.
-        name: Name of an object of the rig.
+        name: Name of an object of ``rig.world``, of the rig's file or added later.
 
     Raises:
-        NotSupported: Nothing is simulated (``code`` is ``no_world``), or the object's shape is not known here.
+        NotSupported: Nothing is simulated (``code`` is ``no_world``), or a plane, which has no end.
         DeviceNotFound: There is no such object.
     """
     if not rig.has_world:
         raise NotSupported("ground truth exists in simulation only: find the object by depth", code="no_world")
-    pose = arm.base.inverse() @ rig.world.pose(name)
-    plan = rig.plan.world
-    body = next((body for body in plan.bodies if body.name == name), None) if plan is not None else None
-    if body is None:
-        raise NotSupported(f"the shape of {name!r} is not in the rig's file", code="unknown_shape")
+    body, pose = rig.world.spec(name), arm.base.inverse() @ rig.world.pose(name)
     if body.shape == "urdf":
         from ..kinematics.urdf import read_urdf
 
         assert body.urdf is not None
         model = read_urdf(Path(body.urdf), meshes=False)
-        places = model.poses({})
+        places = model.poses(rig.world.joint_positions(name))
         parts = [
             places[link.name].transform(shape.pose.transform(_surface(shape.shape, shape.size, shape.file)))
             for link in model.links.values()
             for shape in link.collisions
         ]
         local = np.concatenate(parts) * body.scale if parts else np.zeros((0, 3))
+    elif body.shape == "mesh":
+        from ..kinematics.hulls import mesh_hulls
+
+        assert body.mesh is not None
+        hulls = mesh_hulls(body.mesh, body.scale, parts=body.parts)
+        edges = ((hull.points[hull.faces], hull.points[np.roll(hull.faces, 1, axis=1)]) for hull in hulls)
+        local = np.concatenate([_lines(start.reshape(-1, 3), end.reshape(-1, 3)) for start, end in edges])
     else:
         length, radius = body.length or 0.0, body.radius or 0.0
         sizes = {
@@ -200,7 +202,10 @@ def locate_by_truth(rig: Rig, arm: Robot, name: str) -> LocatedObject:
 def _surface(shape: str, size: tuple[float, ...], file: str = "") -> Array:
     """Return points (k, 3) that outline a shape in its own frame, m; none for a shape that is not known here."""
     if shape == "box":
-        return np.array(list(_edges(np.array(size) / 2.0)))
+        corners = np.array(list(product((-1.0, 1.0), repeat=3)))
+        start, end = np.argwhere(np.abs(corners[:, None] - corners).sum(axis=2) == 2.0).T
+        corners *= np.array(size) / 2.0
+        return _lines(corners[start], corners[end])
     if shape == "sphere":
         return _rings(size[0], 0.0)
     if shape == "cylinder":
@@ -217,13 +222,12 @@ def _surface(shape: str, size: tuple[float, ...], file: str = "") -> Array:
     return np.zeros((0, 3))
 
 
-def _edges(half: Array) -> Iterator[Array]:
-    """Yield points on the edges of a box with these half sides (3,), m."""
-    for axis in range(3):
-        steps = np.linspace(-1.0, 1.0, max(2, int(2.0 * half[axis] / _FINE)))
-        for ends in product((-1.0, 1.0), repeat=2):
-            for step in steps:
-                yield np.insert(ends, axis, step) * half
+def _lines(starts: Array, ends: Array) -> Array:
+    """Return points (k, 3) on lines from ``starts`` (n, 3) to ``ends`` (n, 3), m."""
+    longest = float(np.linalg.norm(ends - starts, axis=1).max())
+    steps = np.linspace(0.0, 1.0, max(2, int(longest / _FINE)))[:, None, None]
+    points: Array = starts + steps * (ends - starts)
+    return points.reshape(-1, 3)
 
 
 def _ring(radius: float) -> Array:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -13,10 +13,11 @@ from ..arguments import number, vector, whole
 from ..errors import CommandError
 from ..geometry import Pose, tcp_pose
 from .objects import LocatedObject
-from .running import SkillProgress, SkillResult, SkillRun, above, flipped
+from .running import SkillOptions, SkillResult, SkillRun, above, flipped
 
 if TYPE_CHECKING:
-    from ..deadman import Deadman
+    from typing_extensions import Unpack
+
     from ..robot import Robot
 
 __all__ = ["push", "push_path", "push_to"]
@@ -33,8 +34,6 @@ _ROOM = 0.004
 """Least distance between the palm and the object, m."""
 _BEHIND = 0.02
 """Distance from the object at which the fingers come down, and to which they back off, m."""
-_SPEED = 0.1
-"""Greatest speed of the tcp before and after the push, m/s."""
 _LET_GO = 0.01
 """By how much the fingers open before they back off, m."""
 _SAME_PLACE = 1e-3
@@ -49,11 +48,7 @@ def push(
     tcp_speed: float = 0.05,
     approach: float = 0.15,
     flip: bool = True,
-    speed: float | None = None,
-    deadman: Deadman | None = None,
-    unattended: bool = False,
-    patience: float = 60.0,
-    progress: Callable[[SkillProgress], None] | None = None,
+    **options: Unpack[SkillOptions],
 ) -> SkillResult:
     """Close the gripper, come down at the start of a path, follow it to its end, back off and lift.
 
@@ -64,11 +59,8 @@ def push(
         tcp_speed: Speed of the tcp on the path, m/s: slow enough that the object stops when the fingers do.
         approach: Height above the path at which the arm arrives and leaves, m.
         flip: Whether the hand may be turned by half a turn about the tcp's z axis, if that is nearer.
-        speed: Share of the joint speed limits on the way to the path; the rig's ``move_speed`` by default.
-        deadman: Switch that must be held for the arm and the fingers to move, for example ``pad.hold("l2")``.
-        unattended: Move an arm that really moves without a dead-man.
-        patience: Longest time for which the dead-man may be released, s.
-        progress: Called when a phase begins: ``close``, ``approach``, ``descend``, ``push``, ``back_off``, ``lift``.
+        **options: ``speed``, ``deadman``, ``timeout`` and others, which all skills take:
+            :class:`~hal.skills.running.SkillOptions`.
 
     Returns:
         The result; false, with the reason, for what may go wrong in the world (:data:`hal.skills.Reason`).
@@ -84,45 +76,26 @@ def push(
     poses = [tcp_pose("path", pose) for pose in path]
     number("tcp_speed", tcp_speed, "m/s", least=0.0, above=True)
     number("approach", approach, "m", least=0.0)
-    run = SkillRun(
-        "push",
-        arm,
-        PHASES,
-        deadman=deadman,
-        unattended=unattended,
-        patience=patience,
-        speed=speed,
-        progress=progress,
-    )
+    run = SkillRun("push", arm, PHASES, **options)
     with run:
         ways = [poses, [flipped(pose) for pose in poses]] if flip else [poses]
         heights = (approach, 0.6 * approach)  # lower where the arm does not reach that high
         way, q = run.choose_way(*([_whole_way(each, height) for each in ways] for height in heights))
         start, *rest, away, end = way
         run.begin("close")
-        set_fingers(run, opening)
-        run.begin("approach")
-        run.go(start, q)
-        run.begin("descend")
-        run.move(rest[0], tcp_speed=_SPEED)
+        if arm.gripper is not None:
+            run.set_fingers(opening)
+        run.approach(start, q, rest[0])
         run.begin("push")
         for pose in rest[1:]:
             run.move(pose, tcp_speed=tcp_speed)
         run.begin("back_off")
-        if opening > 0.0:  # something round between two fingers would come back with them
-            set_fingers(run, opening + _LET_GO)
-        run.move(away, tcp_speed=_SPEED)
+        if arm.gripper is not None and opening > 0.0:  # something round between two fingers would come back with them
+            run.set_fingers(opening + _LET_GO)
+        run.move(away)
         run.begin("lift")
-        run.move(end, tcp_speed=_SPEED)
+        run.move(end)
     return run.result()
-
-
-def set_fingers(run: SkillRun, width: float) -> None:
-    """Move the fingers, if the arm has some, to a width in m."""
-    gripper = run.arm.gripper
-    if gripper is not None:
-        goal = min(width, gripper.width_max)
-        run.close_fingers(lambda: gripper.start(goal))
 
 
 def _whole_way(path: Sequence[Pose], approach: float) -> list[Pose]:
@@ -195,7 +168,10 @@ def push_to(
     tolerance: float = 0.005,
     tries: int = 4,
     opening: float = 0.02,
-    **motion: Any,
+    tcp_speed: float = 0.05,
+    approach: float = 0.15,
+    flip: bool = True,
+    **options: Unpack[SkillOptions],
 ) -> SkillResult:
     """Push an object to a goal: find it, push it, and correct what is left, until it is there.
 
@@ -205,8 +181,11 @@ def push_to(
         goal: Where the middle of the object goes (2,), x and y in the arm's base frame, m.
         tolerance: Distance from the goal at which it is there, m.
         tries: Greatest number of pushes.
-        opening: Distance between the fingers while they push, m.
-        **motion: Further arguments of :func:`push`.
+        opening: As for :func:`push`, like all that follow.
+        tcp_speed: Speed of the tcp on the path, m/s.
+        approach: Height above the path at which the arm arrives and leaves, m.
+        flip: Whether the hand may be turned by half a turn.
+        **options: :class:`~hal.skills.running.SkillOptions`; ``timeout`` is that of all pushes together.
 
     Returns:
         The result; its reason is also ``not_seen`` or ``off_goal``, or that of the push which failed.
@@ -215,7 +194,6 @@ def push_to(
         CommandError: An invalid argument. The other errors are those of :func:`push`.
     """
     target = vector("goal", goal, 2)
-    options = {name: motion[name] for name in ("deadman", "unattended", "patience", "progress") if name in motion}
     run = SkillRun("push_to", arm, ("locate", "push"), **options)
     with run:
         for left in range(whole("tries", tries, least=1), -1, -1):
@@ -229,7 +207,9 @@ def push_to(
             if not left:
                 run.fail("off_goal", f"after {tries} pushes the object is {1e3 * off:.0f} mm from the goal")
             run.begin("push")
-            pushed = push(arm, push_path(found, target), opening=opening, **motion)
+            options["timeout"] = run.time_left()
+            path = push_path(found, target)
+            pushed = push(arm, path, opening=opening, tcp_speed=tcp_speed, approach=approach, flip=flip, **options)
             if not pushed:
                 run.fail(pushed.reason, f"{pushed.phase}: {pushed.message}")
     return run.result()

@@ -6,22 +6,25 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from types import TracebackType
-from typing import TYPE_CHECKING, Literal, NoReturn
+from typing import TYPE_CHECKING, Literal, NoReturn, TypedDict
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ..arguments import number
 from ..control import check_deadman
 from ..errors import CollisionError, CommandError, MotionStopped, NotSupported, RobotFault, Unreachable
 from ..geometry import Pose
 from ..types import GripperOutcome
 
 if TYPE_CHECKING:
+    from typing_extensions import Unpack
+
     from ..deadman import Deadman
     from ..gripper import Gripper, GripperMotion, GripperResult
     from ..robot import Robot
 
-__all__ = ["Reason", "SkillPhase", "SkillProgress", "SkillResult", "SkillRun", "above", "flipped"]
+__all__ = ["Reason", "SkillOptions", "SkillPhase", "SkillProgress", "SkillResult", "SkillRun", "above", "flipped"]
 
 Array = NDArray[np.float64]
 
@@ -39,6 +42,7 @@ Reason = Literal[
     "dropped",
     "not_seen",
     "off_goal",
+    "timed_out",
 ]
 """Why a skill failed: a stable identifier, empty for a success.
 
@@ -55,6 +59,7 @@ Reason = Literal[
 ``dropped``           The object was held, and is not any more.
 ``not_seen``          No object was found.
 ``off_goal``          The object is not at its goal after the last push.
+``timed_out``         The skill took longer than its ``timeout``. The arm stops, and the fingers keep what they hold.
 ====================  ================================================================================================
 """
 
@@ -70,10 +75,31 @@ _STEPS = 10
 """Number of points of a way at which that is checked."""
 _OFF_TARGET = 0.01
 """Distance from the goal above which an arm at rest counts as blocked, m."""
+_NEAR_SPEED = 0.1
+"""Greatest speed of the tcp near an object, m/s."""
 _LONGEST_MOVE = 120.0
 """Time after which an arm that has not arrived counts as blocked, s; without a dead-man, which may pause it."""
+_TIMEOUT = 300.0
+"""Longest time for a skill by default, s."""
 _LONGEST_GRIP = 15.0
 """Time after which moving fingers count as blocked, s."""
+
+
+class SkillOptions(TypedDict, total=False):
+    """Arguments that all skills take, each of which may be left out."""
+
+    speed: float | None
+    """Share of the joint speed limits for motions in free space; the rig's ``move_speed`` by default."""
+    deadman: Deadman | None
+    """Switch that must be held for the arm and the fingers to move, for example ``pad.hold("l2")``."""
+    unattended: bool
+    """Move an arm that really moves without a dead-man."""
+    patience: float
+    """Longest time for which the dead-man may be released, s; 60 by default."""
+    timeout: float
+    """Longest time for the whole skill, s, with the pauses in which the dead-man is released; 300 by default."""
+    progress: Callable[[SkillProgress], None] | None
+    """Called when a phase begins; what it raises ends the skill."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -136,29 +162,18 @@ class SkillRun:
         skill: Name of the skill.
         arm: The arm.
         phases: Names of the phases, in order.
-        deadman: Switch that must be held for the arm and the fingers to move.
-        unattended: Move an arm that really moves without a dead-man.
-        patience: Longest time for which the dead-man may be released, s.
-        speed: Share of the joint speed limits for motions in free space; the rig's ``move_speed`` by default.
-        progress: Called when a phase begins; what it raises ends the skill.
+        **options: See :class:`SkillOptions`.
     """
 
-    def __init__(
-        self,
-        skill: str,
-        arm: Robot,
-        phases: Sequence[str],
-        *,
-        deadman: Deadman | None = None,
-        unattended: bool = False,
-        patience: float = 60.0,
-        speed: float | None = None,
-        progress: Callable[[SkillProgress], None] | None = None,
-    ) -> None:
-        check_deadman(deadman)
+    def __init__(self, skill: str, arm: Robot, phases: Sequence[str], **options: Unpack[SkillOptions]) -> None:
         self.arm = arm
-        self._skill, self._names, self._progress = skill, tuple(phases), progress
-        self._deadman, self._unattended, self._patience, self._speed = deadman, unattended, patience, speed
+        self._skill, self._names, self._progress = skill, tuple(phases), options.get("progress")
+        self._deadman, self._unattended = options.get("deadman"), options.get("unattended", False)
+        check_deadman(self._deadman)
+        self._speed, self._patience = options.get("speed"), options.get("patience", 60.0)
+        if self._patience != math.inf:
+            number("patience", self._patience, "s", least=0.0)
+        self._timeout = number("timeout", options.get("timeout", _TIMEOUT), "s", least=0.0, above=True)
         self._start = arm.clock.now()
         self._phases: list[SkillPhase] = []
         self._reason: Reason = ""
@@ -196,6 +211,13 @@ class SkillRun:
     def reason(self) -> Reason:
         """Why the skill has failed; empty if it has not."""
         return self._reason
+
+    def time_left(self) -> float:
+        """Return how much time is left, s; fail as ``timed_out`` if there is none."""
+        left = self._timeout - (self.arm.clock.now() - self._start)
+        if left <= 0.0:
+            self.fail("timed_out", f"{self._skill} took longer than {self._timeout:g} s")
+        return left
 
     def result(self) -> SkillResult:
         """Return how the skill ended."""
@@ -258,6 +280,19 @@ class SkillRun:
         assert first is not None
         return first
 
+    def approach(self, before: Pose, q: Array, pose: Pose) -> None:
+        """Go to where an approach begins, and from there straight to its end: ``approach`` and ``descend``.
+
+        Args:
+            before: Pose of the tcp at which the approach begins.
+            q: Joint positions (n,) in rad there, which :meth:`choose_way` has found.
+            pose: Pose of the tcp at its end.
+        """
+        self.begin("approach")
+        self.go(before, q)
+        self.begin("descend")
+        self.move(pose)
+
     def go(self, pose: Pose, q: Array) -> None:
         """Move in free space to a pose, with the joint positions (n,) in rad that :meth:`choose_way` found for it.
 
@@ -277,7 +312,7 @@ class SkillRun:
             over = q
         self._move(pose, np.array([over, q]))
 
-    def move(self, pose: Pose, *, tcp_speed: float) -> None:
+    def move(self, pose: Pose, *, tcp_speed: float = _NEAR_SPEED) -> None:
         """Move the tcp a short way to a pose near by: on a straight line, or in joint space where that cannot be.
 
         Args:
@@ -300,7 +335,7 @@ class SkillRun:
         self, pose: Pose, target: Pose | Array, *, tcp_speed: float | None = None, straight: bool = False
     ) -> None:
         """Move to ``target``, and fail unless the tcp is then at ``pose``. Raises Unreachable before it moves."""
-        timeout = _LONGEST_MOVE if self._deadman is None else None
+        left = self.time_left()
         most = self.arm.spec.tcp_speed
         try:
             state = self.arm.move_to(
@@ -308,7 +343,7 @@ class SkillRun:
                 deadman=self._deadman,
                 unattended=self._unattended,
                 patience=self._patience,
-                timeout=timeout,
+                timeout=left if self._deadman is not None else min(left, _LONGEST_MOVE),
                 tcp_speed=None if tcp_speed is None else min(tcp_speed, most),
                 speed=self._speed if tcp_speed is None else self.arm.spec.speed,
                 straight=straight,
@@ -320,6 +355,7 @@ class SkillRun:
                 raise
             self.fail("outside_limits", str(error))
         except TimeoutError as error:
+            self.time_left()
             self.fail("blocked", str(error))
         self.check_arrived(pose, state.tcp)
 
@@ -338,6 +374,7 @@ class SkillRun:
         while deadman is not None and not deadman.held:
             if clock.now() - since > self._patience:
                 raise MotionStopped(f"the dead-man was not held for {self._patience:g} s", code="deadman_released")
+            self.time_left()
             clock.sleep(_POLL)
 
     def close_fingers(
@@ -363,25 +400,31 @@ class SkillRun:
             self.wait_held()
             motion = start()
             begun = clock.now()
-            while not motion.done:
-                if self._deadman is not None and not self._deadman.held:
+            try:
+                while not motion.done:
+                    if self._deadman is not None and not self._deadman.held:
+                        gripper.stop()
+                        break
+                    if until():
+                        gripper.stop()
+                        motion.wait()
+                        return None
+                    if clock.now() - begun > _LONGEST_GRIP:
+                        rests = gripper.state().width
+                        self.fail("fingers_blocked", f"{gripper.name} does not come to rest: {rests:.4f} m")
+                    self.time_left()
+                    clock.sleep(max(_POLL, gripper.period))
+                else:
+                    return self._checked(motion.wait())
+            except BaseException:
+                if not motion.done:
                     gripper.stop()
-                    break
-                if until():
-                    gripper.stop()
-                    motion.wait()
-                    return None
-                if clock.now() - begun > _LONGEST_GRIP:
-                    gripper.stop()
-                    self.fail("fingers_blocked", f"{gripper.name} does not come to rest: {gripper.state().width:.4f} m")
-                clock.sleep(max(_POLL, gripper.period))
-            else:
-                return self._checked(motion.wait())
+                raise
 
-    def open_fingers(self, width: float | None = None) -> None:
-        """Open the fingers to a width in m, by default completely; fail as ``fingers_blocked`` if they do not."""
+    def set_fingers(self, width: float = math.inf) -> None:
+        """Move the fingers to a width in m, by default open; fail as ``fingers_blocked`` if they do not get there."""
         gripper = self.gripper
-        goal = gripper.width_max if width is None else min(width, gripper.width_max)
+        goal = min(width, gripper.width_max)
         result = self.close_fingers(lambda: gripper.start(goal))
         if result is not None and abs(result.state.width - goal) > 0.005:
             self.fail("fingers_blocked", f"{gripper.name} rests at {result.state.width:.4f} m instead of {goal:.4f} m")

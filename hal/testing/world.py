@@ -95,7 +95,8 @@ class WorldContract(Contract):
         assert world.request("names", {}) == ["floor", "cube", "arm"]
         assert [world.request("describe", {"name": name})["index"] for name in ("floor", "cube", "arm")] == [0, 1, 2]
         arm = world.request("describe", {"name": "arm"})
-        assert arm["robot"]
+        assert (arm["robot"], arm["spec"]) == (True, None)
+        assert world.request("describe", {"name": "cube"})["spec"] == to_json(cube((1.0, 0.0, 0.5)))
         assert {"base", "upper", "hand", "left", "right"} <= set(arm["links"])
         assert {*JOINTS, *FINGERS} <= set(arm["joints"])
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -179,6 +180,58 @@ def test_a_released_dead_man_pauses_the_arm_and_the_fingers(rig: hal.Rig) -> Non
             patience=0.5,
             progress=at("close", lambda: (pad.release("l2"), rig.clock.sleep(0.1))),
         )
+
+
+@pytest.mark.parametrize("phase", PHASES)
+def test_a_skill_ends_after_its_timeout_in_every_phase(rig: hal.Rig, phase: str) -> None:
+    """A dead-man that is released for ever pauses the skill until then, however long it may be released."""
+    pad, arm = rig.driver("pad"), rig.robots["panda"]
+    arm.gripper.grip(1.0)
+    pad.press("l2")
+    rig.clock.sleep(0.1)
+    begun = list[float]()
+
+    def release() -> None:
+        begun.append(rig.clock.now())
+        pad.release("l2")
+
+    result = grasp(
+        arm,
+        POSE,
+        speed=1.0,
+        hold=30.0,
+        deadman=rig.gamepads["pad"].hold("l2"),
+        patience=math.inf,
+        timeout=15.0,
+        progress=at(phase, release),
+    )
+    assert (result.reason, result.phase) == ("timed_out", phase)
+    assert result.duration == pytest.approx(15.0, abs=0.2)
+    assert rig.clock.now() - begun[0] > 1.0, "it paused"
+    t = arm.state().q
+    rig.clock.sleep(0.5)
+    assert arm.state().q == pytest.approx(t, abs=1e-6), "the arm is at rest"
+
+
+@pytest.mark.parametrize(
+    ("options", "phase"),
+    [({"speed": 0.02, "timeout": 2.0}, "approach"), ({"speed": 1.0, "timeout": 8.0, "touch_speed": 0.001}, "touch")],
+)
+def test_a_timeout_stops_the_arm_and_the_fingers(rig: hal.Rig, options: dict[str, Any], phase: str) -> None:
+    arm = rig.robots["panda"]
+    assert arm.gripper is not None
+    result = gentle_grasp(arm, POSE, WIDTH, **options)
+    assert (result.reason, result.phase) == ("timed_out", phase)
+    rest = arm.state().q, arm.gripper.state().width
+    rig.clock.sleep(1.0)
+    assert arm.state().q == pytest.approx(rest[0], abs=1e-3)
+    assert arm.gripper.state().width == pytest.approx(rest[1], abs=1e-4)
+
+
+@pytest.mark.parametrize("wrong", [{"timeout": math.nan}, {"timeout": 0.0}, {"patience": math.nan}])
+def test_bounds_that_are_no_bounds_are_refused(rig: hal.Rig, wrong: dict[str, Any]) -> None:
+    with pytest.raises(hal.CommandError):
+        grasp(rig.robots["panda"], POSE, **wrong)
 
 
 @pytest.mark.parametrize(

@@ -11,8 +11,23 @@ from errors_kit import raises_code
 
 import hal
 from hal.skills import grasp_pose, locate_by_truth, object_from_points
+from hal.specs import BodySpec
 
 TABLE = 0.2
+WEDGE = """
+v -30 -15 -20
+v 30 -15 -20
+v 30 15 -20
+v -30 15 -20
+v 0 -15 20
+v 0 15 20
+f 1 4 3 2
+f 1 2 5
+f 3 4 6
+f 2 3 6 5
+f 4 1 5 6
+"""
+"""A roof of 60 x 30 x 40 mm, with only six corners."""
 
 
 def box(size: tuple[float, float, float], yaw: float, position: tuple[float, float]) -> np.ndarray:
@@ -50,7 +65,9 @@ def test_points_must_be_some() -> None:
 
 
 @pytest.fixture(scope="module")
-def rig() -> hal.Rig:
+def rig(tmp_path_factory: pytest.TempPathFactory) -> hal.Rig:
+    mesh = tmp_path_factory.mktemp("meshes") / "wedge.obj"
+    mesh.write_text(WEDGE)
     config = Path(__file__).parents[3] / "config" / "panda_table.yaml"
     objects = [
         "floor",
@@ -59,11 +76,13 @@ def rig() -> hal.Rig:
         "mug",
         {"name": "can", "shape": "cylinder", "radius": 0.025, "length": 0.08, "position": [0.1, 0.1, 0.64]},
         {"name": "ball", "shape": "sphere", "radius": 0.02, "position": [0.1, 0.3, 0.62]},
+        {"name": "wedge", "shape": "mesh", "mesh": str(mesh), "scale": 0.001, "position": [0.2, 0.1, 0.6]},
         {"name": "pill", "shape": "capsule", "radius": 0.01, "length": 0.04, "position": [0.2, 0.3, 0.63]},
     ]
     with hal.open(
         str(config), sim=True, clock="lock_step", pad="none", overrides={"cameras": {}, "objects": objects}
     ) as rig:
+        rig.world.add(BodySpec("late", (0.3, 0.3, 0.63), (0.0, 0.0, 0.0, 1.0), "box", half_extents=(0.04, 0.01, 0.03)))
         yield rig
 
 
@@ -76,6 +95,8 @@ def rig() -> hal.Rig:
         ("duck", (0.067, 0.042, 0.06)),
         ("ball", (0.04, 0.04, 0.04)),
         ("pill", (0.02, 0.02, 0.06)),
+        ("wedge", (0.06, 0.03, 0.04)),
+        ("late", (0.08, 0.02, 0.06)),
     ],
 )
 def test_ground_truth_has_the_true_sides(rig: hal.Rig, name: str, size: tuple[float, float, float]) -> None:
@@ -97,6 +118,8 @@ def test_what_cannot_be_located_or_held_is_refused(rig: hal.Rig) -> None:
         locate_by_truth(rig, arm, "cub")
     with raises_code(hal.NotSupported, "unknown_shape"):
         locate_by_truth(rig, arm, "floor")
+    with raises_code(hal.CommandError, "is_robot"):
+        locate_by_truth(rig, arm, "panda")
     with raises_code(hal.CommandError, "too_wide"):
         grasp_pose(object_from_points(box((0.1, 0.09, 0.05), 0.0, (0.4, 0.0)), TABLE), arm.gripper)
     with hal.open("panda_table", driver="mock", pad="none", overrides=["cameras={}"]) as mock:

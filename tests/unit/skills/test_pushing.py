@@ -93,3 +93,4 @@ def test_pushes_are_repeated_until_the_object_is_there(rig: hal.Rig) -> None:
     assert (stuck.reason, stuck.phase) == ("off_goal", "locate")
     assert push_to(arm, lambda: None, [0.55, 0.0]).reason == "not_seen"
     assert push_to(arm, lambda: places[0], [1.5, 0.0]).reason == "unreachable"
+    assert push_to(arm, lambda: places[0], [0.55, 0.0], tries=9, timeout=15.0, speed=1.0).reason == "timed_out"
