@@ -104,8 +104,8 @@ def pytest_report_header(config: pytest.Config) -> str | None:
 
 
 def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
-    """Without -m, do not even import what is outside the fast tier."""
-    if config.option.markexpr or _tier(collection_path) not in OTHERS:
+    """Without -m, or with -m fast, do not even import what is outside the fast tier."""
+    if config.option.markexpr not in ("", "fast") or _tier(collection_path) not in OTHERS:
         return None
     return None if _touches(collection_path, _named(config)) else True
 

@@ -18,7 +18,7 @@ arm = rig.robots["panda"]
 goal = arm.home.copy()
 goal[0] += 0.05
 arm.move_to(goal, speed=0.5)
-frame = rig.cameras["scene"].read()
+frame = rig.cameras["scene"].read(timeout=20.0)
 print("moved", round(float(arm.state().q[0]), 3), "saw", frame.color.shape)
 print("children", *[h.child.process.pid for h in rig._hosts], rig._pictures._child.process.pid)
 """

@@ -14,6 +14,7 @@ import json
 import os
 import signal
 import socket
+import struct
 import subprocess
 import sys
 import threading
@@ -24,7 +25,7 @@ from typing import Any
 
 from hal.drivers.franka.emulator.control import EmulatorControl
 
-__all__ = ["Emulator", "free_host", "run_client"]
+__all__ = ["Client", "Emulator", "free_host", "run_client"]
 
 LIBRARIES = {"fr3": "pylibfranka", "panda": "panda_py"}
 """The vendor's library of each robot."""
@@ -51,6 +52,37 @@ def free_host() -> str:
                 listener.bind((host, port))
             return host
     raise RuntimeError(f"no free address in {block}.x")
+
+
+class Client:
+    """A client of a robot that speaks the protocol by hand."""
+
+    def __init__(self, host: str, version: int = 10) -> None:
+        self.udp = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self.udp.bind(("127.0.0.1", 0))
+        self.udp.settimeout(15.0)
+        self.tcp = socket.create_connection((host, PORTS[0]), 15.0)
+        self.send(0, struct.pack("<HH", version, self.udp.getsockname()[1]))
+
+    def send(self, code: int, payload: bytes) -> None:
+        """Send a request."""
+        self.tcp.sendall(struct.pack("<III", code, 1, 12 + len(payload)) + payload)
+
+    def reply(self) -> bytes:
+        """Return the next response, without its header."""
+        head = self.tcp.recv(12, socket.MSG_WAITALL)
+        return self.tcp.recv(struct.unpack("<III", head)[2] - 12, socket.MSG_WAITALL)
+
+    def close(self) -> None:
+        """Disconnect."""
+        self.tcp.close()
+        self.udp.close()
+
+    def __enter__(self) -> Client:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
 
 
 class Emulator:

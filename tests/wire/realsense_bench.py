@@ -125,7 +125,7 @@ def wait_for_code(camera: Camera, code: str) -> None:
 
     def named() -> bool:
         with pytest.raises(ConnectionLost) as caught:
-            camera.read()
+            camera.read(timeout=PATIENCE)
         return caught.value.code == code
 
     wait_until(named)

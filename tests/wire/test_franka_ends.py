@@ -6,7 +6,6 @@ import contextlib
 import json
 import os
 import signal
-import socket
 import subprocess
 import sys
 import threading
@@ -20,7 +19,7 @@ import pytest
 import hal
 from hal.drivers.franka.arm import create_link
 
-from .franka_kit import Emulator, free_host
+from .franka_kit import Client, Emulator, free_host
 from .rig_kit import arm_of, rig_of, wait_until
 
 pytest.importorskip("pylibfranka", reason="needs pylibfranka: pip install 'robot-hal[franka]'")
@@ -174,8 +173,10 @@ def test_the_error_of_a_second_program_names_the_first_one(emulator: Emulator, a
 
 def test_a_client_of_another_program_holds_the_arm(emulator: Emulator) -> None:
     """Another computer's: there is no process here that could be named."""
-    with socket.create_connection((emulator.host, 1337)):
-        error = opening_error(emulator.host, model_of(emulator))
+    model = model_of(emulator)
+    with Client(emulator.host, 5 if model == "panda" else 10) as other:
+        assert other.reply()[0] == 0
+        error = opening_error(emulator.host, model)
     assert isinstance(error, hal.ConnectionLost)
 
 

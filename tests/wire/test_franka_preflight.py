@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import socket
 from collections.abc import Iterator
 
 import pytest
@@ -14,7 +13,7 @@ from hal.drivers.franka.preflight import check
 from hal.preflight import CheckResult
 from hal.specs import RobotSpec
 
-from .franka_kit import Emulator, free_host
+from .franka_kit import Client, Emulator, free_host
 
 pytest.importorskip("pylibfranka", reason="needs pylibfranka: pip install 'robot-hal[franka]'")
 pytest.importorskip("panda_py", reason="needs panda-python: pip install 'robot-hal[panda]'")
@@ -87,7 +86,8 @@ def test_a_missing_hand_is_a_failure(robot: Emulator) -> None:
 
 
 def test_a_client_of_another_computer_holds_the_robot(robot: Emulator) -> None:
-    with socket.create_connection((robot.host, 1337)):
+    with Client(robot.host) as other:
+        assert other.reply()[0] == 0
         found = checked(rig(robot))
     assert found["robot"].level == "fail"
 

@@ -30,13 +30,13 @@ def test_unpaced_every_frame_is_read_once_and_in_order(recorded: str) -> None:
     with opened(played) as cam:
         with pytest.raises(ConnectionLost) as ended:
             while True:
-                last = cam.read()
+                last = cam.read(timeout=PATIENCE)
                 numbers.append(read_number(last.color))
                 assert np.array_equal(last.color, sent(played, "color", numbers[-1]))
                 if len(numbers) == 3:
                     time.sleep(0.3)  # the recording waits
         with pytest.raises(ConnectionLost) as again:
-            cam.read()
+            cam.read(timeout=PATIENCE)
         assert ended.value.code == again.value.code == "recording_ended"
         assert again.value.final
         assert cam.counts().dropped == cam.counts().repeated == 0
@@ -56,7 +56,7 @@ def test_unpaced_the_time_of_a_frame_is_when_it_was_read(recorded: str) -> None:
 def test_time_and_numbers_continue_when_it_repeats(tmp_path: Path) -> None:
     file = recording(tmp_path, spec(), 20)
     with opened(spec(play=file, paced=False)) as cam:
-        frames = [cam.read() for _ in range(70)]
+        frames = [cam.read(timeout=PATIENCE) for _ in range(70)]
     numbers = [read_number(frame.color) for frame in frames]
     assert (np.diff(numbers) < 0).sum() == 3
     assert (np.diff([frame.stamp.t for frame in frames]) > 0.0).all()
@@ -85,7 +85,7 @@ def test_a_recording_without_metadata_is_matched_by_the_driver(tmp_path: Path) -
         pairs = []
         with pytest.raises(ConnectionLost) as ended:
             while True:
-                frame = cam.read()
+                frame = cam.read(timeout=PATIENCE)
                 assert frame.skew == 0.0
                 pairs.append(read_number(frame.color))
         assert ended.value.code == "recording_ended"

@@ -103,6 +103,6 @@ def test_the_same_rig_runs_on_a_recording(tmp_path: Path) -> None:
     file = recording(tmp_path, spec())
     with hal.open(rig(play=file, paced=False, repeat=False)) as bench:
         cam = bench.cameras["wrist"]
-        frame = cam.read()
+        frame = cam.read(timeout=PATIENCE)
         assert frame.color.shape == (256, 256, 3)
-        assert cam.read().stamp.seq == frame.stamp.seq + 1
+        assert cam.read(timeout=PATIENCE).stamp.seq == frame.stamp.seq + 1

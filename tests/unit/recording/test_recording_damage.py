@@ -24,7 +24,7 @@ from hal.recording.index import read_tasks
 from hal.recording.review import draw_sheet, summarize
 from hal.rig import Rig
 
-FLIPS = int(os.environ.get("HAL_TEST_FLIPS", "60"))
+FLIPS = int(os.environ.get("HAL_TEST_FLIPS", "20"))
 """Damaged bytes that are tried."""
 Arrays = dict[str, np.ndarray[Any, Any]]
 
