@@ -73,8 +73,8 @@ def parser() -> argparse.ArgumentParser:
     run.add_argument(
         "--policy-config",
         metavar="NAME|FILE",
-        help="what a policy on a server sees, and what its actions mean: droid, roboarena, or a YAML file "
-        "(default: as the server describes itself)",
+        help="what a policy on a server sees, and what its actions mean: droid, roboarena, aloha, libero, lerobot, or "
+        "a YAML file (default: as the server describes itself)",
     )
     run.add_argument(
         "--latency",
@@ -231,7 +231,11 @@ class RolloutRun:
         from hal.learning.takeover import Takeover
         from hal.teleop import Teleop
 
-        self.rig, self.robot, self.args, self.recorder = rig, robot, args, recorder
+        self.rig, self.args, self.recorder = rig, args, recorder
+        self.robots = policy.robots if isinstance(policy, RemotePolicy) else {robot.name: robot}
+        """The arms that the policy moves, by name."""
+        self.robot = robot if robot.name in self.robots else next(iter(self.robots.values()))
+        """The arm that a person drives in a takeover."""
         self.deadman = deadman
         self.pad = next(iter(rig.gamepads.values()), None) if deadman is not None else None
         self.button = self.pad.control_name(mapping.deadman) if self.pad is not None and mapping is not None else ""
@@ -242,12 +246,12 @@ class RolloutRun:
         self.line = StatusLine()
         takeover = None
         if args.takeover and mapping is not None and self.pad is not None:
-            takeover = Takeover(Teleop(robot, mapping), self.pad)
+            takeover = Takeover(Teleop(self.robot, mapping), self.pad)
         self.reset_function: Any = load_object(args.reset, "--reset") if args.reset else None
         self.runner = PolicyRunner(
             rig,
             policy,
-            robot=robot,
+            robots=self.robots.values(),
             rate_hz=args.rate,
             seconds=args.seconds,
             deadman=deadman,
@@ -321,20 +325,21 @@ class RolloutRun:
         return outcome
 
     def _info(self) -> dict[str, Any]:
-        return {"policy": self.args.policy, "robot": self.robot.name, "rate_hz": self.args.rate}
+        return {"policy": self.args.policy, "robot": ",".join(self.robots), "rate_hz": self.args.rate}
 
     def _reset(self, number: int, seed: int) -> None:
-        """Reset the scene: a real arm drives home, and the seed places objects with random ranges."""
+        """Reset the scene: real arms drive home, and the seed places objects with random ranges."""
         import numpy as np
 
         from hal.learning.episode import reset_scene, stands_in_world
 
-        rig, robot = self.rig, self.robot
-        if not stands_in_world(rig, robot):
-            held = f"; release {self.button}, then hold it until the arm is there" if self.button else ""
-            self._announce(f"episode {number}: the arm drives home, then its gripper opens{held}")
-        random = np.random.default_rng(seed)
-        put = reset_scene(rig, robot, random=random, deadman=self.deadman, unattended=self.args.unattended)
+        rig, random, put = self.rig, np.random.default_rng(seed), {}
+        for count, robot in enumerate(self.robots.values(), start=1):
+            if not stands_in_world(rig, robot):
+                held = f"; release {self.button}, then hold it until the arm is there" if self.button else ""
+                self._announce(f"episode {number}: {robot.name} drives home, then its gripper opens{held}")
+            objects = random if count == len(self.robots) else None  # every reset of an arm puts the objects back
+            put = reset_scene(rig, robot, random=objects, deadman=self.deadman, unattended=self.args.unattended)
         if self.reset_function is not None:
             self.reset_function(rig, random)
         elif put:
@@ -359,7 +364,7 @@ class RolloutRun:
     def _report(self, ended: str) -> dict[str, Any]:
         return {
             "policy": self.args.policy,
-            "robot": self.robot.name,
+            "robot": ",".join(self.robots),
             "backend": self.robot.spec.driver,
             "clock": self.rig.plan.clock,
             "rate_hz": self.args.rate,

@@ -42,6 +42,11 @@ def parser() -> argparse.ArgumentParser:
         "--dataset", metavar="DIR", help="the recording that it was trained on (default: as the checkpoint names it)"
     )
     made.add_argument("--device", default="auto", help="torch device (default: cuda if there is one)")
+    made.add_argument(
+        "--rtc",
+        action="store_true",
+        help="real-time chunking: each chunk continues the one before (pi0, pi05, SmolVLA)",
+    )
     made.add_argument("--host", default="127.0.0.1", metavar="ADDRESS", help="address to listen at (%(default)s)")
     made.add_argument("--port", type=int, default=8000, help="port; 0 for a free one (%(default)s)")
     made.add_argument("--until-stdin-ends", action="store_true", help="end when standard input is closed")
@@ -62,8 +67,10 @@ def _main(args: argparse.Namespace) -> int:
     if not (checkpoint / "config.json").is_file():
         raise CommandError(f"{checkpoint} has no config.json: pass the folder pretrained_model of a checkpoint")
     info = _dataset_info(checkpoint, args.dataset)
-    policy = LeRobotPolicy(checkpoint, args.device)
+    policy = LeRobotPolicy(checkpoint, args.device, args.rtc)
     metadata = describe(info, policy.inputs)
+    if policy.rtc_delay:
+        metadata["rtc_max_delay_steps"] = policy.rtc_delay
     with PolicyServer(policy.infer, reset=policy.reset, metadata=metadata, host=args.host, port=args.port) as server:
         print(f"{policy.kind} for {', '.join(metadata['joints'])} at {metadata['policy_config']['rate_hz']} Hz")
         print(f"listening at {server.url}", flush=True)
@@ -102,34 +109,60 @@ def describe(info: Mapping[str, Any], inputs: Collection[str]) -> dict[str, Any]
 
     Raises:
         CommandError: The policy uses other columns than the state and the pictures (code ``unknown_input``), or the
-            recording is of another program or of several arms (``foreign_dataset``).
+            recording is of another program (``foreign_dataset``).
     """
     features = info["features"]
     names = list(features[ACTION]["names"] or [])
-    joints = [name for name in names if name != GRIPPER]
-    if features.get(STATE, {}).get("names") != names or names not in (joints, [*joints, GRIPPER]):
+    arms: dict[str, list[str]] = {}
+    for name in names:
+        lead, _, own = name.rpartition(".")
+        arms.setdefault(lead, []).append(own)
+    grouped = [f"{lead}.{own}" if lead else own for lead, parts in arms.items() for own in parts]
+    foreign = any(GRIPPER in parts[:-1] for parts in arms.values()) or ("" in arms and len(arms) > 1)
+    if not names or foreign or features.get(STATE, {}).get("names") != names or grouped != names:
         raise CommandError(f"{STATE} and {ACTION} of the dataset are not joints and a gripper", code="foreign_dataset")
+    state: list[str] = []
+    actions: list[dict[str, Any]] = []
+    for lead, parts in arms.items():
+        # The action of a row is the set-point one row later.
+        action: dict[str, Any] = {"kind": "joint_position", "first": 1}
+        if lead:
+            first = sum(action["columns"][1] - action["columns"][0] for action in actions)
+            action |= {"robot": lead, "columns": [first, first + len(parts)]}
+        state.append(f"{lead}.q" if lead else "q")
+        if GRIPPER in parts:
+            state.append(f"{lead}.width" if lead else "width")
+            action["gripper"] = {"metres": True}
+        actions.append(action)
     observation: dict[str, Any] = {"task": {"text": "task"}}
     for key in inputs:
         if key == STATE:
-            observation[key] = {"state": ["q", "width"] if GRIPPER in names else ["q"]}
+            observation[key] = {"state": state}
         elif key.startswith(IMAGES):
             observation[key] = {"camera": key.removeprefix(IMAGES), "size": features[key]["shape"][:2]}
         else:
             raise CommandError(f"the policy uses {key}, which is not served", code="unknown_input")
-    # The action of a row is the set-point one row later.
-    action: dict[str, Any] = {"kind": "joint_position", "first": 1}
-    if GRIPPER in names:
-        action["gripper"] = {"index": len(joints), "metres": True}
-    config = {"rate_hz": info["fps"], "observation": observation, "action": action}
+    config: dict[str, Any] = {"rate_hz": info["fps"], "observation": observation}
+    config |= {"action": actions[0]} if "" in arms else {"arms": actions}
+    joints = [name for name in names if name.rpartition(".")[2] != GRIPPER]
     return {"joints": joints, "robot_type": info.get("robot_type"), "policy_config": config}
 
 
 class LeRobotPolicy:
     """A checkpoint of LeRobot, with its own processing before and after the network."""
 
-    def __init__(self, checkpoint: Path, device: str) -> None:
-        """Load a checkpoint; raises DriverMissing without LeRobot."""
+    def __init__(self, checkpoint: Path, device: str, rtc: bool = False) -> None:
+        """Load a checkpoint.
+
+        Args:
+            checkpoint: Folder of the checkpoint.
+            device: Device of torch, or ``auto``.
+            rtc: Whether a chunk continues the one before (real-time chunking).
+
+        Raises:
+            DriverMissing: LeRobot is not installed.
+            CommandError: ``rtc``, and LeRobot does not have it for this policy (code ``no_rtc``).
+        """
         os.environ.setdefault("HF_HUB_OFFLINE", "1")
         try:
             torch: Any = import_module("torch")
@@ -149,6 +182,8 @@ class LeRobotPolicy:
         self._torch, self._device = torch, device
         self._policy = factory.get_policy_class(config.type).from_pretrained(checkpoint, config=config)
         self._policy.eval()
+        self.rtc_delay = self._start_rtc(config) if rtc else 0
+        """Greatest number of actions that a chunk takes from the one before; 0 without real-time chunking."""
         override = {"device_processor": {"device": device}}
         self._before, self._after = factory.make_pre_post_processors(
             config, pretrained_path=str(checkpoint), preprocessor_overrides=override, postprocessor_overrides=override
@@ -160,17 +195,34 @@ class LeRobotPolicy:
 
     def infer(self, request: Mapping[str, Any]) -> dict[str, Any]:
         """Return a chunk of actions (steps, numbers) for the observation of a request."""
-        torch = self._torch
+        torch, given = self._torch, request.get("rtc") if self.rtc_delay else None
         batch: dict[str, Any] = {"task": [str(request.get("task", ""))]}
         for key in self.inputs:
             values = torch.from_numpy(np.array(request[key]))
             if key.startswith(IMAGES):
                 values = values.permute(2, 0, 1).to(torch.float32) / 255.0
             batch[key] = values[None].to(self._device)
-        with torch.inference_mode():
-            chunk = self._policy.predict_action_chunk(self._before(batch))
+        if given is not None:  # normalised with the observation, as in training
+            batch[ACTION] = torch.from_numpy(np.array(given["actions"], np.float32))[None].to(self._device)
+        with torch.no_grad():
+            batch, options = self._before(batch), {}
+            if given is not None:
+                options = {"inference_delay": int(given["delay_steps"]), "prev_chunk_left_over": batch.pop(ACTION)}
+            chunk = self._policy.predict_action_chunk(batch, **options)
             actions = torch.stack([self._after(chunk[:, k]) for k in range(chunk.shape[1])], dim=1)
         return {"actions": actions[0].to("cpu", torch.float32).numpy()}
+
+    def _start_rtc(self, config: Any) -> int:
+        """Turn real-time chunking on; return the greatest number of actions to take from the chunk before."""
+        if not hasattr(self._policy, "init_rtc_processor"):
+            raise CommandError(f"LeRobot has no real-time chunking for the policy {config.type}", code="no_rtc")
+        rtc = import_module("lerobot.policies.rtc.configuration_rtc").RTCConfig(enabled=True)
+        trained = int(getattr(config, "rtc_training_max_delay", 0))
+        if trained:
+            rtc.mode = "trained"
+        config.rtc_config = rtc
+        self._policy.init_rtc_processor()
+        return trained or int(config.chunk_size) // 2
 
 
 if __name__ == "__main__":

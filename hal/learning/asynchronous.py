@@ -21,7 +21,7 @@ from ..arguments import number
 from ..commands import CHUNK_AHEAD, CHUNK_POINTS, FIRST_STEP_ANGLE, JointChunk
 from ..errors import ConfigError, NotSupported, PolicyError
 from ..histogram import Histogram
-from .policy_config import PolicyConfig, load_policy_config
+from .policy_config import Decoded, PolicyConfig, load_policy_config
 from .remote import PolicyClient, check_actions
 
 if TYPE_CHECKING:
@@ -52,13 +52,12 @@ class _Pending(NamedTuple):
 
 
 class _Chunk(NamedTuple):
-    """Targets that the arm follows."""
+    """Targets that the arms follow."""
 
     t: Array
     """(k,) s on ``rig.clock``."""
-    q: Array
-    """(k, n) rad."""
-    grip: Array | None
+    targets: dict[str, Decoded]
+    """Of each arm (k, n), rad."""
     t_next: float
     """Time from which the next chunk should take over, s."""
 
@@ -87,13 +86,14 @@ class RemotePolicy:
             client: Connection to the server.
             config: What the policy sees, and what its actions mean. None: as the server describes it, which those of
                 ``hal-serve-lerobot`` do.
-            robot: The arm; None for the rig's first.
+            robot: The arm; None for the rig's first. A ``config`` may name others, or several.
             task: The task in words, for policies that follow instructions.
             latency: Simulated time until an answer arrives, s; in lock-step only.
 
         Raises:
-            DeviceNotFound: The rig lacks a camera that the policy needs.
-            NotSupported: The policy uses a gripper, and the arm has none; or ``latency`` in real time.
+            DeviceNotFound: The rig lacks a camera or an arm that the policy needs.
+            NotSupported: The policy uses a gripper, and the arm has none; its numbers do not fit the arm's joints; or
+                ``latency`` in real time.
             PolicyError: Without ``config``: the server does not answer or does not describe itself, or its policy is
                 for other joints.
             CommandError: ``latency`` is negative.
@@ -105,21 +105,26 @@ class RemotePolicy:
         self._latency = number("latency", latency, "s", least=0.0)
         if latency and not rig.lock_step:
             raise NotSupported("latency= is for lock-step: in real time an answer takes as long as it takes")
-        self.config.check(rig, self.robot)
+        used = self.config.robots(rig, self.robot)
+        self._used = used
+        """Every arm that the policy moves or sees; its default first."""
+        self.robots = {name: used[name] for name in (action.robot or self.robot.name for action in self.config.actions)}
+        """The arms that the policy moves, by name."""
         self._dt = 1.0 / self.config.rate_hz
-        self._numbers = self.config.numbers(self.robot.n)
-        self._fastest = self.robot.limits.velocity
+        self._numbers = self.config.numbers(used)
         self._roboarena = False
+        self._rtc_delay: int | None = None
+        """Greatest number of actions that the server takes as given; None if it takes none."""
         self._session_id = ""
         self._pending: _Pending | None = None
         self._overtaken = False
         """Whether the answer under way is for a time before a pause."""
         self._chunk: _Chunk | None = None
-        self._grip: float | None = None
+        self._grips: dict[str, float] = {}
         self._called = -np.inf
         self._latencies: deque[float] = deque(maxlen=_LATENCIES)
         self._latency_counts = Histogram(1e-3, 10_000)
-        self._chunks = self._late = 0
+        self._chunks = self._late = self._steep = 0
         self._splice = 0.0
 
     # What the runner calls.
@@ -134,7 +139,7 @@ class RemotePolicy:
         self._ask(observation, self.rig.clock.now())
         assert self._pending is not None
         reply, self._pending = self._pending.reply, None
-        self.config.decode(check_actions(self._result(reply), self._numbers), observation, self.robot)
+        self.config.decode(check_actions(self._result(reply), self._numbers), observation, self._used)
         return None
 
     def reset(self, seed: int | None = None) -> None:
@@ -149,7 +154,7 @@ class RemotePolicy:
                 self._result(self._pending.reply)
         self._pending, self._overtaken = None, False
         self._latency_counts = Histogram(1e-3, 10_000)
-        self._chunks = self._late = 0
+        self._chunks = self._late = self._steep = 0
         self._splice = 0.0
         self._connect()
         self._session_id = str(uuid.UUID(int=0 if seed is None else seed))
@@ -159,34 +164,36 @@ class RemotePolicy:
     def restart(self) -> None:
         """Forget the present chunk, after a pause; an answer under way is not used, and the policy is asked again."""
         self._overtaken = self._pending is not None
-        self._chunk, self._grip = None, None
+        self._chunk, self._grips = None, {}
         self._called = -np.inf
 
     def __call__(self, observation: Observation) -> PolicyAnswer:
-        """Return the next chunk if one has arrived, and the grip that is due.
+        """Return for each arm the next chunk if one has arrived, and the grip that is due.
 
         Raises:
             PolicyError: The answers have stopped and the present chunk is about to end, or an answer is unusable.
         """
         now = self.rig.clock.now()
-        command = self._receive(now)
+        chunks = self._receive(now)
         if self._pending is None and (self._chunk is None or now >= self._chunk.t_next - self._lead()):
             self._ask(observation, now)
-            if command is None and not self._latency and self.rig.lock_step:
-                command = self._receive(now)
+            if not chunks and not self._latency and self.rig.lock_step:
+                chunks = self._receive(now)
         self._check_end(now)
         self._called = now
-        return command, self._due_grip(now)
+        return {name: (chunks.get(name), self._due_grip(name, now)) for name in self.robots}
 
     def statistics(self) -> dict[str, Any]:
         """Return figures of this episode.
 
         ``chunks``: number of answers; ``latency``: p50, p99 and max from a question to its use, s; ``late``: number of
         chunks that came after the time at which they should have taken over; ``splice``: greatest step between two
-        chunks at the same time, rad.
+        chunks at the same time, rad; ``steep``: number of chunks whose step was more than the arm's greatest speed
+        covers in one step of the policy.
         """
         latency = self._latency_counts.summary()
-        return {"chunks": self._chunks, "latency": latency, "late": self._late, "splice": self._splice}
+        counts = {"chunks": self._chunks, "late": self._late, "steep": self._steep}
+        return {**counts, "latency": latency, "splice": self._splice}
 
     def close(self) -> None:
         """Close the connection. Idempotent."""
@@ -195,8 +202,14 @@ class RemotePolicy:
     # The connection.
 
     def _connect(self) -> None:
-        """Connect, and check what the server asks for in its metadata; only RoboArena's servers ask for anything."""
+        """Connect, and check what the server asks for in its metadata; only RoboArena's servers ask for anything.
+
+        A server of any kind may offer to continue from given actions (``rtc_max_delay_steps``).
+        """
         metadata = self.client.connect()
+        most = metadata.get("rtc_max_delay_steps")
+        joints_only = all(action.kind != "tcp_delta" for action in self.config.actions)
+        self._rtc_delay = most if type(most) is int and most > 0 and joints_only else None
         self._roboarena = "action_space" in metadata
         if not self._roboarena:
             return
@@ -207,7 +220,7 @@ class RemotePolicy:
             wanted += [key.replace("_left", "_right") for key in wanted]
         there = self.config.observation
         lacking = [key for key in wanted if key not in there]
-        space, kind = metadata["action_space"], self.config.action.kind
+        space, kind = metadata["action_space"], self.config.actions[0].kind
         if lacking or space != kind:
             raise PolicyError(
                 f"{self.client.url} needs {', '.join(wanted) or 'no pictures'} and answers with {space}; the policy's "
@@ -216,7 +229,7 @@ class RemotePolicy:
             )
         size = metadata.get("image_resolution")
         if size is not None:
-            self._resize(int(size[0]), int(size[1]))
+            self.config = self.config.with_size(int(size[0]), int(size[1]))
 
     def _described(self, metadata: dict[str, Any]) -> PolicyConfig:
         """Return the configuration that a server describes in its metadata."""
@@ -225,35 +238,53 @@ class RemotePolicy:
                 f"{self.client.url} does not describe its policy; pass a configuration (--policy-config)",
                 code="policy_mismatch",
             )
-        joints = list(metadata.get("joints", self.robot.joints))
-        if joints != list(self.robot.joints):
-            raise PolicyError(
-                f"the policy at {self.client.url} moves {', '.join(map(str, joints))}; {self.robot.name} has "
-                f"{', '.join(self.robot.joints)}",
-                code="policy_mismatch",
-            )
         try:
-            return load_policy_config(metadata["policy_config"])
+            config = load_policy_config(metadata["policy_config"])
         except (ConfigError, TypeError) as error:
             raise PolicyError(
                 f"{self.client.url} describes its policy wrongly: {error}", code="policy_protocol"
             ) from error
-
-    def _resize(self, height: int, width: int) -> None:
-        """Send pictures in the size that the server asks for."""
-        update = {
-            key: source if source.camera is None else source.model_copy(update={"size": (height, width)})
-            for key, source in self.config.observation.items()
-        }
-        self.config = self.config.model_copy(update={"observation": update})
+        robots, joints = config.robots(self.rig, self.robot), []
+        for action in config.actions:
+            lead = "" if action.robot is None else f"{action.robot}."
+            joints += [lead + joint for joint in robots[action.robot or self.robot.name].joints]
+        wanted = list(metadata.get("joints", joints))
+        if wanted != joints:
+            raise PolicyError(
+                f"the policy at {self.client.url} moves {', '.join(map(str, wanted))}; this rig has "
+                f"{', '.join(joints)}",
+                code="policy_mismatch",
+            )
+        return config
 
     def _ask(self, observation: Observation, now: float) -> None:
-        request = self.config.request(observation, self.robot, self.task)
+        request = self.config.request(observation, self._used, self.task)
+        if self._rtc_delay is not None and (prefix := self._prefix(observation, now)) is not None:
+            request["rtc"] = prefix
         if self._roboarena:
             request |= {"endpoint": "infer", "session_id": self._session_id}
         self._pending = _Pending(self.client.request(request), observation, now)
         if self.rig.lock_step:  # the server computes now, whenever its answer is used
             wait([self._pending.reply], self.client.timeout + 1.0)
+
+    def _prefix(self, observation: Observation, now: float) -> dict[str, Any] | None:
+        """Return the actions of the present chunk from the observation on, and how many of them will be executed.
+
+        These are due before the answer is expected; from the others the policy may depart.
+        """
+        chunk = self._chunk
+        if chunk is None or self._rtc_delay is None:
+            return None
+        first = observation.t + self.config.due * self._dt
+        if chunk.t[-1] < first:
+            return None
+        t: Array = first + self._dt * np.arange(int((chunk.t[-1] - first) / self._dt + 1e-6) + 1)
+        targets = {name: _sampled(chunk.t, decoded, t) for name, decoded in chunk.targets.items()}
+        delay = max(0, int((now + self._lead() + _ONSET - first) / self._dt + 1.0))
+        return {
+            "delay_steps": min(delay, self._rtc_delay, len(t)),
+            "actions": self.config.encode(targets, observation, self._used).astype(np.float32),
+        }
 
     def _result(self, reply: Future[Any]) -> Any:
         try:
@@ -267,16 +298,16 @@ class RemotePolicy:
         """Return how long before a chunk is needed the policy is asked, s."""
         return max(self._latencies, default=0.0) + _MARGIN * self._dt
 
-    def _receive(self, now: float) -> JointChunk | None:
-        """Return the chunk of the answer, if it has arrived."""
+    def _receive(self, now: float) -> dict[str, JointChunk]:
+        """Return the chunk of each arm if the answer has arrived, else nothing."""
         pending = self._pending
         if pending is None or now < pending.t + self._latency or not (self.rig.lock_step or pending.reply.done()):
-            return None
+            return {}
         self._pending = None
         reply = self._result(pending.reply)
         if self._overtaken:
             self._overtaken = False
-            return None
+            return {}
         if self._chunks == 1:
             self._latencies.clear()  # that of the first answer, which is the slowest
         self._latencies.append(now - pending.t)
@@ -284,39 +315,46 @@ class RemotePolicy:
         self._chunks += 1
         return self._follow(check_actions(reply, self._numbers), pending.observation, now)
 
-    def _follow(self, actions: Array, observation: Observation, now: float) -> JointChunk:
-        q, grip, first = self.config.decode(actions, observation, self.robot)
-        execute = self.config.execute or max(1, len(q) // 2)
+    def _follow(self, actions: Array, observation: Observation, now: float) -> dict[str, JointChunk]:
+        decoded, first, steps = self.config.decode(actions, observation, self._used), self.config.due, len(actions)
+        execute = self.config.execute or max(1, steps // 2)
         # An arm that has stood still since the observation starts at the beginning, not where it would have been.
         start = now if self._chunk is None else observation.t
-        t: Array = start + self._dt * np.arange(first, first + len(q), dtype=float)
+        t: Array = start + self._dt * np.arange(first, first + steps, dtype=float)
         ahead = (t > now + _ONSET) & (t < now + CHUNK_AHEAD - self._dt)
         ahead[min(len(t), 2 * execute + int(np.argmax(ahead))) :] = False  # not for long after the server's death
         if not ahead.any():
             raise PolicyError(
-                f"the policy's answer took {now - observation.t:.2f} s, longer than its {len(q)} actions last",
+                f"the policy's answer took {now - observation.t:.2f} s, longer than its {steps} actions last",
                 code="policy_too_late",
             )
-        t, q = t[ahead][:CHUNK_POINTS], q[ahead][:CHUNK_POINTS]
-        self._check_splice(t, q, now)
-        self._chunk = _Chunk(t, q, None if grip is None else grip[ahead][:CHUNK_POINTS], start + execute * self._dt)
-        return JointChunk(t, q)
+        used = np.flatnonzero(ahead)[:CHUNK_POINTS]
+        targets = {
+            name: Decoded(arm.q[used], None if arm.grip is None else arm.grip[used]) for name, arm in decoded.items()
+        }
+        chunk = _Chunk(t[used], targets, start + execute * self._dt)
+        if self._chunk is not None:
+            self._check_splice(self._chunk, chunk, now)
+        self._chunk = chunk
+        return {name: JointChunk(chunk.t, arm.q) for name, arm in targets.items()}
 
-    def _check_splice(self, t: Array, q: Array, now: float) -> None:
-        """Refuse a chunk that begins farther away than the arm can be when its first target is due."""
-        old = self._chunk
-        if old is None:
-            return
+    def _check_splice(self, old: _Chunk, new: _Chunk, now: float) -> None:
+        """Refuse a chunk that begins farther away than an arm can be when its first target is due."""
         self._late += now > old.t_next
-        planned = np.array([np.interp(t[0], old.t, old.q[:, j]) for j in range(q.shape[1])])
-        step = np.abs(q[0] - planned)
-        self._splice = max(self._splice, float(step.max()))
-        if (step > FIRST_STEP_ANGLE + np.asarray(self._fastest) * (t[0] - now)).any():
-            joint = self.robot.joints[int(step.argmax())]
-            raise PolicyError(
-                f"the policy's next chunk begins {step.max():.2f} rad away from the present one at {joint}",
-                code="policy_jump",
-            )
+        steep = False
+        for name, robot in self.robots.items():
+            planned = _sampled(old.t, old.targets[name], new.t[:1]).q[0]
+            step, fastest = np.abs(new.targets[name].q[0] - planned), np.asarray(robot.limits.velocity)
+            self._splice = max(self._splice, float(step.max()))
+            steep = steep or bool((step > fastest * self._dt).any())
+            if (step > FIRST_STEP_ANGLE + fastest * (new.t[0] - now)).any():
+                joint = robot.joints[int(step.argmax())]
+                raise PolicyError(
+                    f"the policy's next chunk begins {step.max():.2f} rad away from the present one at {joint} of "
+                    f"{name}",
+                    code="policy_jump",
+                )
+        self._steep += steep
 
     def _check_end(self, now: float) -> None:
         """Raise an error in the last turn before the chunk ends without a next one, so that the cause has a name."""
@@ -331,14 +369,20 @@ class RemotePolicy:
             return
         raise PolicyError("the policy did not answer before its last chunk ended", code="policy_too_late")
 
-    def _due_grip(self, now: float) -> float | None:
-        """Return the grip that is due, if it differs from the last one."""
+    def _due_grip(self, name: str, now: float) -> float | None:
+        """Return the grip of an arm that is due, if it differs from the last one."""
         chunk = self._chunk
-        if chunk is None or chunk.grip is None:
+        if chunk is None or (grips := chunk.targets[name].grip) is None:
             return None
         k = max(0, int(np.searchsorted(chunk.t, now, side="right")) - 1)
-        grip = float(chunk.grip[k])
-        if self._grip is not None and abs(grip - self._grip) < 0.01:
+        grip = float(grips[k])
+        if abs(grip - self._grips.get(name, np.inf)) < 0.01:
             return None
-        self._grip = grip
+        self._grips[name] = grip
         return grip
+
+
+def _sampled(t: Array, targets: Decoded, at: Array) -> Decoded:
+    """Return the targets at other times; before the first and after the last, these."""
+    q = np.stack([np.interp(at, t, column) for column in targets.q.T], axis=1)
+    return Decoded(q, None if targets.grip is None else np.interp(at, t, targets.grip))

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Protocol, TypeAlias, cast
 
 import numpy as np
 
-from ..commands import Command, CommandChecks
+from ..commands import Command, CommandChecks, JointVelocity
 from ..errors import CommandError, ConnectionLost, MotionStopped, PolicyError, RobotFault, StaleStateError
 from ..histogram import Histogram
 from ..observation import Observation
@@ -36,9 +36,11 @@ __all__ = [
     "load_policy",
 ]
 
-PolicyAnswer: TypeAlias = "Command | tuple[Command | None, float | None] | None"
+ArmAnswer: TypeAlias = "Command | tuple[Command | None, float | None] | None"
 """A command; or a command and a grip from 0 (open) to 1 (closed), either of which may be None. None continues the
 chunk that was sent before."""
+PolicyAnswer: TypeAlias = "ArmAnswer | Mapping[str, ArmAnswer]"
+"""What one arm does; or, for several, the name of each arm -> what it does."""
 
 
 FIRST_ANSWER = 2.5
@@ -150,6 +152,7 @@ class PolicyRunner:
         policy: Policy,
         *,
         robot: Robot | None = None,
+        robots: Collection[Robot] | None = None,
         rate_hz: float = 20.0,
         seconds: float = 30.0,
         deadman: Deadman | None = None,
@@ -166,6 +169,8 @@ class PolicyRunner:
             rig: An open rig.
             policy: The policy.
             robot: The arm; None for the rig's first.
+            robots: Arms that the policy moves, in place of ``robot``; it then answers with a map of their names. A
+                stop of one ends the episode for all.
             rate_hz: Turns per second.
             seconds: Longest time of an episode, without pauses, s.
             deadman: Dead-man; something that really moves needs it, or ``unattended``.
@@ -174,15 +179,19 @@ class PolicyRunner:
             history: Number of states per observation.
             success: Called as ``success(rig, observation)`` in each turn, before the policy; True ends the episode.
             mark: Called in each turn; True or False, the operator's mark, ends the episode.
-            takeover: Lets a person drive in between; the policy is asked again when the arm is given back.
+            takeover: Lets a person drive an arm in between, while the others rest; the policy is asked again when the
+                arm is given back.
 
         Raises:
-            CommandError: ``seconds`` is not positive.
+            CommandError: ``seconds`` is not positive, or there is no arm.
         """
         if not seconds > 0.0:
             raise CommandError(f"an episode's seconds must be positive, not {seconds:g}")
         self.rig, self.policy = rig, policy
-        self.robot = next(iter(rig.robots.values())) if robot is None else robot
+        first = next(iter(rig.robots.values())) if robot is None else robot
+        self.robots = {arm.name: arm for arm in ([first] if robots is None else robots)}
+        if not self.robots:
+            raise CommandError("a policy moves at least one arm", code="no_robot")
         self._rate, self._seconds = rate_hz, seconds
         self._deadman, self._unattended = deadman, unattended
         self._cameras, self._history = cameras, history
@@ -195,14 +204,10 @@ class PolicyRunner:
         that is not a command (code ``bad_answer``).
         """
         self._reset(None)
-        command, _ = _parts(getattr(self.policy, "rehearse", self.policy)(self._observe()))
-        if command is not None and not isinstance(command, Command):
-            raise CommandError(
-                f"the policy answers with a {type(command).__name__}, which is not a command", code="bad_answer"
-            )
+        self._parts(getattr(self.policy, "rehearse", self.policy)(self._observe()))
 
     def run(self, seed: int | None = None, on_turn: Callable[[float], None] = lambda seconds: None) -> PolicyOutcome:
-        """Run one episode from the arm's present position; the arm is at rest afterwards.
+        """Run one episode from the arms' present positions; they are at rest afterwards.
 
         Errors of the policy, and stops of the arm, end the episode and are part of the outcome. Ctrl-C and errors of
         the session itself are raised.
@@ -213,14 +218,15 @@ class PolicyRunner:
         """
         self.rig.forget_observations()
         tally = _Tally(judged=self._success is not None)
-        control = self.robot.control(deadman=self._deadman, rate_hz=self._rate, unattended=self._unattended)
+        terms: Any = {"deadman": self._deadman, "rate_hz": self._rate, "unattended": self._unattended}
+        controls = {name: robot.control(**terms) for name, robot in self.robots.items()}
         try:
             with _policy_errors(PolicyError):
                 self._reset(seed)
             if self._takeover is not None:
                 self._takeover.reset()
-            with control:
-                self._drive(control, tally, on_turn)
+            with _all_open(controls.values()):
+                self._drive(controls, tally, on_turn)
         except (MotionStopped, RobotFault, ConnectionLost, StaleStateError) as stop:
             tally.end_as("stopped", getattr(stop, "reason", str(stop)))
         except _PolicyError as wrong:
@@ -238,17 +244,20 @@ class PolicyRunner:
     def _observe(self) -> Observation:
         return self.rig.observe(history=self._history, cameras=self._cameras)
 
-    def _drive(self, control: Control, tally: _Tally, on_turn: Callable[[float], None]) -> None:
-        seen, begun, asked, paused = -np.inf, False, False, False
+    def _drive(self, controls: Mapping[str, Control], tally: _Tally, on_turn: Callable[[float], None]) -> None:
+        seen, begun, asked, paused = -np.inf, set[str](), False, False
         restart = getattr(self.policy, "restart", lambda: None)
         for tick in self.rig.clock.rate(self._rate):
             on_turn(tally.seconds)
             mark = self._mark() if self._mark is not None else None
             if mark is not None:
                 return tally.end_as("success" if mark else "failure")
-            if not control.hold_until_following():
+            following = [name for name, control in controls.items() if control.hold_until_following()]
+            if len(following) < len(controls):
+                for name in following:
+                    _rest(controls[name])
                 tally.count_pause()
-                begun, paused = False, asked
+                begun, paused = set(), asked
                 continue
             tally.count_turn(tick.dt, tick.missed)
             if tally.seconds > self._seconds - 1e-9:
@@ -259,35 +268,75 @@ class PolicyRunner:
             if self._success is not None and self._success(self.rig, observation):
                 return tally.end_as("success")
             by_hand = self._takeover.command(tick.t, tick.dt) if self._takeover is not None else None
-            if by_hand is not None:
-                control.send(by_hand[0], grip=by_hand[1])
-                begun, paused = False, asked
+            if by_hand is not None and self._takeover is not None:
+                for name, control in controls.items():
+                    if name == self._takeover.teleop.robot.name:
+                        control.send(by_hand[0], grip=by_hand[1])
+                    else:
+                        _rest(control)
+                begun, paused = set(), asked
                 continue
             if paused:
                 restart()
             asked, paused = True, False
-            if not begun:
-                control.hold_for(FIRST_ANSWER)
-            command, grip = self._answer(observation, tally)
+            for name in controls.keys() - begun:
+                controls[name].hold_for(FIRST_ANSWER)
+            answers = self._answer(observation, tally)
             with _policy_errors(CommandError):
-                self._send(control, command, grip, first=not begun)
-            begun = begun or command is not None
+                for name, (command, grip) in answers.items():
+                    self._send(controls[name], command, grip, first=name not in begun)
+            begun |= {name for name, (command, _) in answers.items() if command is not None}
         return None
 
     def _send(self, control: Control, command: Command | None, grip: float | None, first: bool) -> None:
         if command is None and grip is None:
             return
         if command is not None and first:  # a first target that is far away is refused, as in any session
-            checks, now = CommandChecks(self.robot), self.rig.clock.now()
-            checks.check_first(checks.checked(command, now, []), now, self.robot.state().q_set.tolist())
+            checks, now = CommandChecks(control.robot), self.rig.clock.now()
+            checks.check_first(checks.checked(command, now, []), now, control.robot.state().q_set.tolist())
         control.send(command, grip=grip)
 
-    def _answer(self, observation: Observation, tally: _Tally) -> tuple[Command | None, float | None]:
+    def _answer(self, observation: Observation, tally: _Tally) -> dict[str, tuple[Command | None, float | None]]:
         start = time.perf_counter()
         with _policy_errors(Exception):
-            answer = _parts(self.policy(observation))
+            answers = self._parts(self.policy(observation))
         tally.inference.add(time.perf_counter() - start)
-        return answer
+        return answers
+
+    def _parts(self, answer: Any) -> dict[str, tuple[Command | None, float | None]]:
+        """Return command and grip for each arm. Raises CommandError for anything else (code ``bad_answer``)."""
+        if not isinstance(answer, Mapping):
+            if len(self.robots) > 1 and answer is not None:
+                raise CommandError(
+                    f"a policy for {', '.join(self.robots)} answers with a map of these names, not with a "
+                    f"{type(answer).__name__}",
+                    code="bad_answer",
+                )
+            answer = dict.fromkeys(self.robots, answer)
+        if unknown := answer.keys() - self.robots.keys():
+            raise CommandError(
+                f"the policy answers for {', '.join(sorted(map(str, unknown)))}; it moves {', '.join(self.robots)}",
+                code="bad_answer",
+            )
+        return {name: _parts(part) for name, part in answer.items()}
+
+
+@contextlib.contextmanager
+def _all_open(controls: Collection[Control]) -> Iterator[None]:
+    """Open every arm's session; at the end all brake at once, and each is closed whatever happens to the others."""
+    with contextlib.ExitStack() as closing:
+        for control in controls:
+            closing.enter_context(control)
+        try:
+            yield
+        finally:
+            for control in controls:
+                control.brake()
+
+
+def _rest(control: Control) -> None:
+    """Let an arm come to rest, or stay there, until the next command."""
+    control.send(JointVelocity(np.zeros(control.robot.n)))
 
 
 class _PolicyError(Exception):
@@ -346,13 +395,17 @@ class _Tally:
 
 
 def _parts(answer: Any) -> tuple[Command | None, float | None]:
-    """Return command and grip of a policy's answer. Raises CommandError for anything else."""
-    if not isinstance(answer, tuple):
-        return answer, None
-    if len(answer) != 2:
+    """Return command and grip of a policy's answer for one arm. Raises CommandError for anything else."""
+    command, grip = answer, None
+    if isinstance(answer, tuple):
+        if len(answer) != 2:
+            raise CommandError(
+                f"a policy answers with a command, or with (command, grip), not with {len(answer)} values",
+                code="bad_answer",
+            )
+        command, grip = answer
+    if command is not None and not isinstance(command, Command):
         raise CommandError(
-            f"a policy answers with a command, or with (command, grip), not with {len(answer)} values",
-            code="bad_answer",
+            f"the policy answers with a {type(command).__name__}, which is not a command", code="bad_answer"
         )
-    command, grip = answer
     return command, None if grip is None else float(np.clip(grip, 0.0, 1.0))

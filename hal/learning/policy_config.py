@@ -1,21 +1,22 @@
 """What a policy wants to see, and what its actions mean: a YAML file in ``config/policies/`` or of your own.
 
-A file names each entry of the policy's request and where it comes from (a camera's picture, the arm's state, a text),
-and how a row of its actions becomes joint positions and a grip.
+A file names each entry of the policy's request and where it comes from (a camera's picture, numbers of an arm, a text),
+and how a row of its actions becomes joint positions and a grip, of one arm or of several.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
+from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, model_validator
+from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
 from ..config.files import load_record
-from ..config.schema import Quantity, Strict, ValueProblem
+from ..config.schema import Flag, Quantity, Strict, ValueProblem
 from ..errors import DeviceNotFound, NotSupported, PolicyError
 from ..geometry import Pose, quaternion_to_matrix
 
@@ -33,8 +34,28 @@ __all__ = [
 ]
 
 Array = NDArray[np.float64]
+T = TypeVar("T")
 
-StateName = Literal["q", "dq", "tcp_position", "tcp_quaternion", "tcp_rpy", "tcp_rotvec", "width", "open", "closed"]
+STATES = ("q", "dq", "tcp_position", "tcp_quaternion", "tcp_rpy", "tcp_rotvec", "width", "open", "closed")
+"""Names of numbers of an arm; the last three are of its gripper."""
+
+
+_OF_GRIPPER = STATES[-3:]
+_SUMMED = ("joint_velocity", "tcp_delta")
+"""Kinds of actions that are steps from one target to the next."""
+
+
+def _known_state(name: str) -> str:
+    if name.rpartition(".")[2] not in STATES:
+        raise ValueProblem(f"{name!r} is not one of {', '.join(STATES)}, nor one after an arm's name", "unknown_value")
+    return name
+
+
+def _as_list(value: Any) -> Any:
+    return [value] if isinstance(value, str) else value
+
+
+StateName = Annotated[str, AfterValidator(_known_state)]
 PixelCount = Annotated[int, Field(ge=8, le=4096)]
 
 
@@ -47,12 +68,20 @@ class Source(Strict):
     """Height and width of the picture in pixels: it is scaled to fit, and padded with black. None: as it is."""
     layout: Literal["hwc", "chw"] = "hwc"
     """Order of height, width and channels."""
-    state: StateName | list[StateName] | None = None
+    mirror: Flag = False
+    """Whether left and right of the picture are exchanged."""
+    state: Annotated[list[StateName] | None, BeforeValidator(_as_list)] = None
     """Numbers, float32, one after the other: ``q`` (n,) rad, ``dq`` (n,) rad/s; of the tcp in the base frame
     ``tcp_position`` (3,) m, ``tcp_quaternion`` (4,) as x, y, z, w, ``tcp_rpy`` (3,) and ``tcp_rotvec`` (3,) rad; of the
-    gripper ``width`` in m, ``open`` and ``closed`` from 0 to 1."""
+    gripper ``width`` in m, ``open`` and ``closed`` from 0 to 1. ``left.q`` is that of the arm with this name."""
+    scale: float | list[float] = 1.0
+    """Factor of the numbers, one for all or one for each."""
+    offset: float | list[float] = 0.0
+    """Is added after that."""
     text: str | None = None
     """A text; ``task`` stands for that of the run."""
+    within: str | None = None
+    """Key of a map in the request that has this entry; None: the request itself."""
 
     @model_validator(mode="after")
     def _one_source(self) -> Source:
@@ -61,16 +90,16 @@ class Source(Strict):
         return self
 
     @property
-    def names(self) -> list[StateName]:
-        """Names of the numbers; empty for another kind of source."""
-        return self.state if isinstance(self.state, list) else [self.state] if self.state is not None else []
+    def names(self) -> list[tuple[str, str]]:
+        """Arm (empty for the first) and name of the numbers; empty for another kind of source."""
+        return [(arm, name) for arm, _, name in (text.rpartition(".") for text in self.state or ())]
 
 
 class GripperAction(Strict):
     """The number of an action that moves the gripper."""
 
     index: int = -1
-    """Its place in the action; -1 is the last."""
+    """Its place among the arm's numbers; -1 is the last."""
     open: float = 0.0
     """Its value for an open gripper."""
     closed: float = 1.0
@@ -79,6 +108,11 @@ class GripperAction(Strict):
     """Whether it is the distance between the fingers in m, in place of ``open`` and ``closed``."""
     threshold: Annotated[float, Field(gt=0.0, lt=1.0)] | None = None
     """Share of the way to closed from which the gripper closes, and below which it opens; None: in proportion."""
+
+    def values(self, grips: Array, width_max: float) -> Array:
+        """Return the values of the action (k,) for grips (k,), 0 open to 1 closed; the reverse of :meth:`grip`."""
+        opened, closed = (width_max, 0.0) if self.metres else (self.open, self.closed)
+        return opened + grips * (closed - opened)
 
     def grip(self, values: Array, width_max: float) -> Array:
         """Return the grips (k,), 0 open to 1 closed, for values of the action (k,) and a gripper of this width, m."""
@@ -93,15 +127,28 @@ class GripperAction(Strict):
         return self
 
 
-class ActionConfig(Strict):
-    """The meaning of a row of actions."""
+class Decoded(NamedTuple):
+    """Targets of one arm in a chunk."""
 
+    q: Array
+    """Joint positions (k, n), rad."""
+    grip: Array | None
+    """Grips (k,), 0 open to 1 closed; None if the policy does not move the gripper."""
+
+
+class ActionConfig(Strict):
+    """The meaning of a row of actions, or of the part of it that moves one of several arms."""
+
+    robot: str | None = None
+    """Name of the arm; None for that of the run."""
+    columns: tuple[Annotated[int, Field(ge=0)], Annotated[int, Field(ge=1)]] | None = None
+    """Index of the arm's first number in a row, and the index after its last; None for all numbers."""
     kind: Literal["joint_position", "joint_delta", "joint_velocity", "tcp_delta"]
     """``joint_position``: targets, rad. ``joint_delta``: the same, from the measured positions at the time of the
     observation. ``joint_velocity``: steps of ``scale`` rad, added up from those positions. ``tcp_delta``: steps of the
     tcp along the base's axes, added up: translation in ``scale`` m, then a rotation vector in ``turn`` rad."""
     scale: Annotated[float, Quantity("rad or m per step", 0.0, 10.0, above=True)] = 1.0
-    """Step for an action of 1."""
+    """Step for an action of 1; for joint positions rad for each unit of the policy's (0.0174533 for degrees)."""
     turn: Annotated[float, Quantity("rad per step", 0.0, 3.2, above=True)] = 1.0
     """Turn for an action of 1, for ``tcp_delta``."""
     first: Annotated[int, Field(ge=0, le=1)] | None = None
@@ -112,16 +159,67 @@ class ActionConfig(Strict):
     gripper: GripperAction | None = None
     """None: the policy does not move the gripper."""
 
+    @property
+    def due(self) -> int:
+        """Steps after the observation at which the first action is due."""
+        return int(self.kind in _SUMMED) if self.first is None else self.first
 
-class Decoded(NamedTuple):
-    """Targets of a chunk."""
+    def numbers(self, joints: int) -> int:
+        """Return how many numbers move an arm with so many joints."""
+        return (6 if self.kind == "tcp_delta" else joints) + (self.gripper is not None)
 
-    q: Array
-    """Joint positions (k, n), rad."""
-    grip: Array | None
-    """Grips (k,), 0 open to 1 closed."""
-    first: int
-    """Steps after the observation at which the first target is due."""
+    def decode(self, actions: Array, observation: Observation, robot: Robot) -> Decoded:
+        """Return the targets of the rows (k, numbers) of one arm, which answer ``observation``.
+
+        Raises:
+            PolicyError: A pose of the tcp is out of reach (code ``policy_unreachable_pose``).
+        """
+        state, grip = observation.robots[robot.name], None
+        if self.gripper is not None:
+            assert robot.gripper is not None
+            grip = self.gripper.grip(actions[:, self.gripper.index], robot.gripper.width_max)
+            actions = np.delete(actions, self.gripper.index, axis=1)
+        if self.clip:
+            actions = actions / np.maximum(1.0, np.abs(actions).max(axis=1, keepdims=True))
+        if self.kind == "tcp_delta":
+            return Decoded(self._follow_steps(actions, state.tcp, state.q, robot), grip)
+        q = self.scale * (np.cumsum(actions, axis=0) if self.kind in _SUMMED else actions)
+        return Decoded(q if self.kind == "joint_position" else state.q + q, grip)
+
+    def encode(self, targets: Decoded, observation: Observation, robot: Robot) -> Array:
+        """Return the rows (k, numbers) that stand for targets: the reverse of :meth:`decode` for actions of joints."""
+        assert self.kind != "tcp_delta"
+        q, start = targets.q, observation.robots[robot.name].q
+        if self.kind == "joint_velocity":
+            q = np.diff(q, axis=0, prepend=np.asarray(start)[None])
+        elif self.kind == "joint_delta":
+            q = q - start
+        rows: Array = q / self.scale
+        if self.gripper is None:
+            return rows
+        assert robot.gripper is not None
+        assert targets.grip is not None
+        values = self.gripper.values(targets.grip, robot.gripper.width_max)
+        return np.insert(rows, self.gripper.index % (rows.shape[1] + 1), values, axis=1)
+
+    def _follow_steps(self, actions: Array, tcp: Pose, q: Array, robot: Robot) -> Array:
+        """Return the joint positions (k, n) of steps (k, 6) of the tcp, which begin at ``tcp`` and ``q``."""
+        from ..errors import Unreachable
+
+        found, rotation, position = [], quaternion_to_matrix(tcp.orientation), np.array(tcp.position)
+        for step in actions:
+            position = position + self.scale * step[:3]
+            rotation = _turn(self.turn * step[3:]) @ rotation
+            matrix = np.eye(4)
+            matrix[:3, :3], matrix[:3, 3] = rotation, position
+            try:
+                q = robot.ik(Pose.from_matrix(matrix), q)
+            except Unreachable as error:
+                raise PolicyError(
+                    f"the policy leads out of the arm's reach: {error}", code="policy_unreachable_pose"
+                ) from error
+            found.append(q)
+        return np.array(found)
 
 
 class PolicyConfig(Strict):
@@ -134,90 +232,138 @@ class PolicyConfig(Strict):
     """Actions of a chunk that are driven before those of the next one; None: half of the chunk."""
     observation: dict[str, Source]
     """Key of the request -> where its value comes from."""
-    action: ActionConfig
+    action: ActionConfig | None = None
+    """What a row of actions means."""
+    arms: list[ActionConfig] | None = None
+    """Instead of ``action`` for a policy that moves several arms: the part of each."""
+
+    @model_validator(mode="after")
+    def _maps_apart(self) -> PolicyConfig:
+        for source in self.observation.values():
+            if source.within in self.observation:
+                raise ValueProblem(f"{source.within} cannot be an entry and a map with entries", "conflict")
+        return self
+
+    @model_validator(mode="after")
+    def _arms_apart(self) -> PolicyConfig:
+        if (self.action is None) == (self.arms is None):
+            raise ValueProblem("needs an action, or arms with an action each", "missing_key")
+        if self.arms is None:
+            return self
+        if not self.arms or any(action.robot is None or action.columns is None for action in self.arms):
+            raise ValueProblem("each of the arms needs a robot and columns", "missing_key")
+        names = [action.robot for action in self.arms]
+        spans = sorted(action.columns for action in self.arms if action.columns is not None)
+        if len(set(names)) < len(names) or any(one[1] > two[0] for one, two in pairwise(spans)):
+            raise ValueProblem("each robot has one action, and no two have a column in common", "conflict")
+        if len({action.due for action in self.arms}) > 1:
+            raise ValueProblem("the first actions of all arms must be due at the same time", "conflict")
+        return self
+
+    @property
+    def actions(self) -> list[ActionConfig]:
+        """The action of each arm."""
+        return [self.action] if self.action is not None else list(self.arms or ())
+
+    @property
+    def due(self) -> int:
+        """Steps after the observation at which the first action of a chunk is due."""
+        return self.actions[0].due
+
+    def with_size(self, height: int, width: int) -> PolicyConfig:
+        """Return this configuration with all pictures in another size, in pixels."""
+        resized = {
+            key: source if source.camera is None else source.model_copy(update={"size": (height, width)})
+            for key, source in self.observation.items()
+        }
+        return self.model_copy(update={"observation": resized})
 
     def cameras(self) -> tuple[str, ...]:
         """Return the names of the cameras that are needed, each once."""
         return tuple(dict.fromkeys(source.camera for source in self.observation.values() if source.camera is not None))
 
-    def check(self, rig: Rig, robot: Robot) -> None:
-        """Check that a rig has what the policy needs.
+    def robots(self, rig: Rig, robot: Robot) -> dict[str, Robot]:
+        """Return the arms that the policy moves and those that it sees, by name; ``robot`` if the file names none.
 
         Raises:
-            DeviceNotFound: A camera is missing; names those that are needed and those that are there.
-            NotSupported: The policy uses a gripper, and the arm has none.
+            DeviceNotFound: A robot or a camera is missing; names those that are needed and those that are there.
+            NotSupported: The policy uses a gripper, and the arm has none; or the columns of an arm are more or fewer
+                than its joints, and a gripper's.
         """
-        missing = [name for name in self.cameras() if name not in rig.cameras]
-        if missing:
-            raise DeviceNotFound(
-                f"the policy needs the cameras {', '.join(self.cameras())}; this rig has: "
-                f"{', '.join(rig.cameras) or 'none'}; change the names in the policy's file, or in the rig's"
-            )
-        names = {name for source in self.observation.values() for name in source.names}
-        uses = self.action.gripper is not None or names & {"width", "open", "closed"}
-        if uses and robot.gripper is None:
-            raise NotSupported(f"the policy uses a gripper, and {robot.name} has none")
+        moved = [action.robot or robot.name for action in self.actions]
+        seen = [arm for source in self.observation.values() for arm, _ in source.names if arm]
+        robots = _found("robots", [*moved, *seen], rig.robots)
+        _found("cameras", self.cameras(), rig.cameras)
+        for name, action in zip(moved, self.actions, strict=True):
+            arm, numbers = robots[name], action.numbers(robots[name].n)
+            first, end = action.columns or (0, numbers)
+            if end - first != numbers:
+                raise NotSupported(
+                    f"the policy has {end - first} numbers for {name}, the columns {first} to {end}; with "
+                    f"{arm.n} joints it needs {numbers}",
+                    code="policy_mismatch",
+                )
+            if action.gripper is not None and not -numbers <= action.gripper.index < numbers:
+                raise NotSupported(
+                    f"the policy has {numbers} numbers for {name}, and none at {action.gripper.index} for its gripper",
+                    code="policy_mismatch",
+                )
+        used = {name for name, action in zip(moved, self.actions, strict=True) if action.gripper is not None}
+        names = [(arm or moved[0], name) for source in self.observation.values() for arm, name in source.names]
+        used |= {arm for arm, name in names if name in _OF_GRIPPER}
+        for name in sorted(used):
+            if robots[name].gripper is None:
+                raise NotSupported(f"the policy uses a gripper, and {name} has none", code="no_gripper")
+        return robots
 
-    def numbers(self, joints: int) -> int:
-        """Return the length of an action for an arm with so many joints."""
-        return (6 if self.action.kind == "tcp_delta" else joints) + (self.action.gripper is not None)
+    def numbers(self, robots: Mapping[str, Robot]) -> int:
+        """Return the length of a row of actions for these arms (see :meth:`robots`)."""
+        ends = [action.columns[1] for action in self.actions if action.columns is not None]
+        return max(ends) if ends else self.actions[0].numbers(next(iter(robots.values())).n)
 
-    def request(self, observation: Observation, robot: Robot, task: str) -> dict[str, Any]:
-        """Return the request for an observation. Raises NotSupported for a camera without colour."""
+    def request(self, observation: Observation, robots: Mapping[str, Robot], task: str) -> dict[str, Any]:
+        """Return the request for an observation.
+
+        Raises:
+            NotSupported: A camera has no colour, or a scale or an offset has another length than the numbers.
+        """
         request: dict[str, Any] = {}
+        first = next(iter(robots.values()))
         for key, source in self.observation.items():
+            value: Any = task if source.text == "task" else source.text
             if source.camera is not None:
                 color = observation.cameras[source.camera].frame.color
                 if color is None:
                     raise NotSupported(f"the policy needs colour of camera {source.camera}, which has none")
-                request[key] = _picture(color, source)
+                value = _picture(color, source)
             elif source.names:
-                numbers = [_state(name, observation, robot) for name in source.names]
-                request[key] = np.concatenate(numbers).astype(np.float32)
-            else:
-                request[key] = task if source.text == "task" else source.text
+                numbers = [_state(name, observation, robots[arm] if arm else first) for arm, name in source.names]
+                value = _scaled(np.concatenate(numbers), source).astype(np.float32)
+            (request if source.within is None else request.setdefault(source.within, {}))[key] = value
         return request
 
-    def decode(self, actions: Array, observation: Observation, robot: Robot) -> Decoded:
-        """Return the targets of a chunk of actions (k, numbers), which answer ``observation``.
+    def decode(self, actions: Array, observation: Observation, robots: Mapping[str, Robot]) -> dict[str, Decoded]:
+        """Return the targets of each moved arm for a chunk of actions (k, numbers), which answer ``observation``.
 
         Raises:
             PolicyError: A pose of the tcp is out of reach (code ``policy_unreachable_pose``).
         """
-        action, state = self.action, observation.robots[robot.name]
-        grip = None
-        if action.gripper is not None:
-            assert robot.gripper is not None
-            grip = action.gripper.grip(actions[:, action.gripper.index], robot.gripper.width_max)
-            actions = np.delete(actions, action.gripper.index, axis=1)
-        if action.clip:
-            actions = actions / np.maximum(1.0, np.abs(actions).max(axis=1, keepdims=True))
-        summed = action.kind in ("joint_velocity", "tcp_delta")
-        if action.kind == "tcp_delta":
-            q = self._follow_steps(actions, state.tcp, state.q, robot)
-        else:
-            q = action.scale * (np.cumsum(actions, axis=0) if summed else actions)
-            q = q if action.kind == "joint_position" else state.q + q
-        return Decoded(q, grip, int(summed) if action.first is None else action.first)
+        found = {}
+        for action in self.actions:
+            name = action.robot or next(iter(robots))
+            rows = actions if action.columns is None else actions[:, slice(*action.columns)]
+            found[name] = action.decode(rows, observation, robots[name])
+        return found
 
-    def _follow_steps(self, actions: Array, tcp: Pose, q: Array, robot: Robot) -> Array:
-        """Return the joint positions (k, n) of steps (k, 6) of the tcp, which begin at ``tcp`` and ``q``."""
-        from ..errors import Unreachable
-
-        found, rotation, position = [], quaternion_to_matrix(tcp.orientation), np.array(tcp.position)
-        for step in actions:
-            position = position + self.action.scale * step[:3]
-            rotation = _turn(self.action.turn * step[3:]) @ rotation
-            matrix = np.eye(4)
-            matrix[:3, :3], matrix[:3, 3] = rotation, position
-            try:
-                q = robot.ik(Pose.from_matrix(matrix), q)
-            except Unreachable as error:
-                raise PolicyError(
-                    f"the policy leads out of the arm's reach: {error}", code="policy_unreachable_pose"
-                ) from error
-            found.append(q)
-        return np.array(found)
+    def encode(self, targets: Mapping[str, Decoded], observation: Observation, robots: Mapping[str, Robot]) -> Array:
+        """Return the actions (k, numbers) for targets of each arm: the reverse of :meth:`decode`."""
+        steps = len(next(iter(targets.values())).q)
+        actions = np.zeros((steps, self.numbers(robots)))
+        for action in self.actions:
+            name = action.robot or next(iter(robots))
+            columns = slice(None) if action.columns is None else slice(*action.columns)
+            actions[:, columns] = action.encode(targets[name], observation, robots[name])
+        return actions
 
 
 def load_policy_config(config: str | Path | Mapping[str, Any] | PolicyConfig) -> PolicyConfig:
@@ -233,7 +379,30 @@ def load_policy_config(config: str | Path | Mapping[str, Any] | PolicyConfig) ->
     return load_record(PolicyConfig, config, "policies", "policy_config")
 
 
-def _state(name: StateName, observation: Observation, robot: Robot) -> Array:
+def _found(kind: str, needed: Iterable[str], there: Mapping[str, T]) -> dict[str, T]:
+    """Return the devices that are needed. Raises DeviceNotFound with both lists if one is missing."""
+    names = list(dict.fromkeys(needed))
+    if set(names) <= set(there):
+        return {name: there[name] for name in names}
+    raise DeviceNotFound(
+        f"the policy needs the {kind} {', '.join(names)}; this rig has: {', '.join(there) or 'none'}; change the names "
+        "in the policy's file, or in the rig's"
+    )
+
+
+def _scaled(numbers: Array, source: Source) -> Array:
+    for factor in (source.scale, source.offset):
+        if isinstance(factor, list) and len(factor) != numbers.size:
+            names = ", ".join(name for _, name in source.names)
+            raise NotSupported(
+                f"the policy's file scales {len(factor)} numbers, and {names} are {numbers.size}",
+                code="policy_mismatch",
+            )
+    scaled: Array = np.asarray(source.scale, float) * numbers + np.asarray(source.offset, float)
+    return scaled
+
+
+def _state(name: str, observation: Observation, robot: Robot) -> Array:
     state = observation.robots[robot.name]
     if name == "q":
         return np.asarray(state.q)
@@ -267,6 +436,8 @@ def _picture(color: NDArray[np.uint8], source: Source) -> NDArray[np.uint8]:
         top, left = (height - inner[1]) // 2, (width - inner[0]) // 2
         color = np.zeros((height, width, 3), np.uint8)
         color[top : top + inner[1], left : left + inner[0]] = scaled
+    if source.mirror:
+        color = color[:, ::-1]
     return np.ascontiguousarray(color.transpose(2, 0, 1) if source.layout == "chw" else color)
 
 

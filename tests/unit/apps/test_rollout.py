@@ -220,6 +220,32 @@ def test_a_mistake_is_a_message(folder: Path, arguments: list[str], texts: list[
         assert text in done.stderr
 
 
+def test_a_policy_on_a_server_drives_two_arms(folder: Path) -> None:
+    pytest.importorskip("msgpack")
+    from hal.learning.remote import PolicyServer
+
+    (folder / "two.yaml").write_text("""
+rate_hz: 20
+observation: {state: {state: [left.q, right.q]}}
+arms:
+  - {robot: left, columns: [0, 7], kind: joint_position}
+  - {robot: right, columns: [7, 14], kind: joint_position}
+""")
+
+    def infer(request: dict[str, Any]) -> dict[str, Any]:
+        return {"actions": request["state"] + 0.01 * np.arange(16)[:, None] * np.eye(14)[[0, 7]].sum(axis=0)}
+
+    options = ("--seconds", 0.6, "--out", "runs", "--config", "openarm", *FAST)
+    with PolicyServer(infer) as server:
+        done = rollout("--policy", server.url, "--policy-config", "two.yaml", *options)
+    assert done.returncode == 0, done.stderr
+    assert report(folder)["robot"] == "left,right"
+    (episode,) = Dataset(folder / "runs").episodes
+    names = episode.names("observation.state")
+    moved = np.ptp(episode.columns["observation.state"], axis=0) > 0.05
+    assert [name for name, far in zip(names, moved, strict=True) if far] == [names[0], names[8]]
+
+
 @pytest.mark.parametrize("hangs", [True, False])
 def test_a_checkpoint_that_is_not_loaded_is_an_error_with_what_its_server_printed(
     folder: Path, monkeypatch: pytest.MonkeyPatch, hangs: bool

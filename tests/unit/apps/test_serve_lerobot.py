@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -12,9 +14,10 @@ from errors_kit import raises_code
 from recording_kit import mock_rig, record
 
 import hal
-from hal.apps.serve_lerobot import IMAGES, STATE, describe, main
+from hal.apps.serve_lerobot import IMAGES, STATE, LeRobotPolicy, describe, main
 from hal.learning.asynchronous import RemotePolicy
 from hal.learning.policy import PolicyRunner
+from hal.learning.policy_config import load_policy_config
 from hal.learning.remote import PolicyClient, PolicyServer
 from hal.recording import Dataset, Recorder
 
@@ -52,6 +55,56 @@ def test_a_policy_trained_on_a_recording_drives_the_rig_that_it_was_recorded_wit
     assert requests[0][f"{IMAGES}wrist"].shape == tuple(features[f"{IMAGES}wrist"]["shape"])
     assert requests[0][STATE].shape == tuple(features[STATE]["shape"])
     assert requests[0]["task"] == "lift"
+
+
+def test_a_recording_of_two_arms_describes_the_numbers_of_each() -> None:
+    names = [f"{arm}.{part}" for arm in ("left", "right") for part in ("a", "b", "gripper")]
+    features = {key: {"names": names, "shape": [6]} for key in (STATE, "action")}
+    metadata = describe({"fps": 30, "features": features}, [STATE])
+    assert metadata["joints"] == ["left.a", "left.b", "right.a", "right.b"]
+    config = load_policy_config(metadata["policy_config"])
+    assert [(action.robot, action.columns) for action in config.actions] == [("left", (0, 3)), ("right", (3, 6))]
+    assert config.observation[STATE].state == ["left.q", "left.width", "right.q", "right.width"]
+
+
+class FakeTensor(np.ndarray[Any, np.dtype[Any]]):
+    """The few methods of a tensor that are used, on an array."""
+
+    def to(self, *_: object) -> FakeTensor:
+        return self
+
+    def numpy(self) -> np.ndarray[Any, np.dtype[Any]]:
+        return np.asarray(self)
+
+
+@pytest.mark.parametrize("asked", [True, False])
+def test_what_is_executed_anyway_reaches_the_policy_normalised_as_in_training(asked: bool) -> None:
+    calls: list[dict[str, Any]] = []
+
+    class Network:
+        def predict_action_chunk(self, batch: dict[str, Any], **options: Any) -> FakeTensor:
+            calls.append(options)
+            assert "action" not in batch or not asked
+            return np.zeros((1, 4, 2)).view(FakeTensor)
+
+    policy = object.__new__(LeRobotPolicy)
+    policy.inputs, policy.rtc_delay, policy._device = [STATE], 6, "cpu"
+    policy._torch = SimpleNamespace(
+        from_numpy=lambda array: array.view(FakeTensor),
+        no_grad=contextlib.nullcontext,
+        stack=lambda parts, dim: np.stack(parts, dim).view(FakeTensor),
+        float32=None,
+    )
+    policy._policy, policy._after = Network(), lambda actions: actions
+    policy._before = lambda batch: {**batch, "action": 0.5 * batch["action"]} if "action" in batch else batch
+    rtc = {"actions": np.ones((3, 2), np.float32), "delay_steps": 2}
+    reply = policy.infer({STATE: np.zeros(2, np.float32)} | ({"rtc": rtc} if asked else {}))
+    assert reply["actions"].shape == (4, 2)
+    if not asked:
+        assert calls == [{}]
+        return
+    assert calls[0]["inference_delay"] == 2
+    np.testing.assert_array_equal(calls[0]["prev_chunk_left_over"], np.full((1, 3, 2), 0.5))
 
 
 def test_a_policy_for_other_joints_is_refused(recorded: Path) -> None:

@@ -117,7 +117,7 @@ def sine(rig: Rig) -> Callable[[float], np.ndarray]:
     return lambda t: start + 0.1 * np.sin(2 * np.pi * 0.3 * max(0.0, t - begun)) * np.eye(7)[0]
 
 
-@pytest.mark.parametrize("latency", [0.0, 0.05, 0.2, 0.4])
+@pytest.mark.parametrize("latency", [0.0, 0.2, 0.4])
 def test_chunks_of_a_late_policy_join_without_a_step(rig: Rig, latency: float) -> None:
     arm = rig.robots["panda"]
     wave = sine(rig)
@@ -176,18 +176,151 @@ def test_relative_actions_start_from_the_observed_positions(
 ) -> None:
     config = load_policy_config({**CONFIG, "action": action})
     arm, observation = rig.robots["panda"], rig.observe(cameras=())
-    decoded = config.decode(np.tile(row, (2, 1)), observation, arm)
+    decoded = config.decode(np.tile(row, (2, 1)), observation, {"panda": arm})["panda"]
     np.testing.assert_allclose(decoded.q[:, 0] - observation.robots["panda"].q[0], expected, atol=1e-12)
-    assert decoded.first == (action["kind"] == "joint_velocity")
+    assert config.due == (action["kind"] == "joint_velocity")
 
 
 def test_steps_of_the_tcp_become_joint_positions(rig: Rig) -> None:
     config = load_policy_config({**CONFIG, "action": {"kind": "tcp_delta", "scale": 0.01, "turn": 0.1}})
     arm, observation = rig.robots["panda"], rig.observe(cameras=())
-    decoded = config.decode(np.tile([1.0, 0, 0, 0, 0, 1.0], (3, 1)), observation, arm)
+    decoded = config.decode(np.tile([1.0, 0, 0, 0, 0, 1.0], (3, 1)), observation, {"panda": arm})["panda"]
     before, after = observation.robots["panda"].tcp, arm.fk(decoded.q[-1])
     np.testing.assert_allclose(after.position - before.position, [0.03, 0.0, 0.0], atol=1e-4)
     assert abs(before.distance(after)[1] - 0.3) < 1e-3
+
+
+# Two arms in one vector.
+
+ALOHA: dict[str, Any] = {
+    "robots": {
+        name: {"model": "vx300s", "base": {"position": [0.0, y, 0.0]}} for name, y in (("left", 0.4), ("right", -0.4))
+    },
+    "cameras": {
+        name: {
+            "model": "realsense_d405",
+            "output": {"width": 64, "height": 48},
+            "look_at": {
+                "target": [0.3, 0.0, 0.1],
+                "distance": 0.8,
+                "yaw_deg": 0.0,
+                "pitch_deg": -40.0,
+                "roll_deg": 0.0,
+            },
+        }
+        for name in ("high", "low", "left_wrist", "right_wrist")
+    },
+}
+
+
+def test_a_policy_of_two_arms_sees_and_moves_each_by_its_own_numbers() -> None:
+    requests: list[dict[str, Any]] = []
+
+    def infer(request: dict[str, Any]) -> dict[str, Any]:
+        requests.append(request)
+        steps = np.arange(1, 51)[:, None] / 50.0
+        rows = request["state"] + 0.1 * steps * (np.eye(14)[0] - np.eye(14)[8])  # left waist, right shoulder
+        rows[:, 6], rows[:, 13] = 1.0, 0.0  # the left gripper opens, the right one closes
+        return {"actions": rows}
+
+    with hal.open(ALOHA, driver="mock") as rig, PolicyServer(infer) as server:
+        config = load_policy_config("aloha")
+        before = {name: np.array(arm.state().q) for name, arm in rig.robots.items()}
+        policy = RemotePolicy(rig, PolicyClient(server.url), config, task="fold", latency=0.1)
+        runner = PolicyRunner(rig, policy, robots=policy.robots.values(), rate_hz=50, seconds=1.5)
+        runner.rehearse()
+        outcome = runner.run()
+        policy.close()
+        assert (outcome.ended, outcome.reason) == ("time", "")
+        moved = {name: arm.state().q - before[name] for name, arm in rig.robots.items()}
+        widths = {
+            name: arm.gripper.state().width / arm.gripper.width_max for name, arm in rig.robots.items() if arm.gripper
+        }
+        assert_within_limits(rig)
+    assert moved["left"][0] > 0.1
+    assert moved["right"][1] < -0.1
+    assert np.abs(np.delete(moved["left"], 0)).max() < 1e-6
+    assert np.abs(np.delete(moved["right"], 1)).max() < 1e-6
+    assert widths["left"] > 0.95
+    assert widths["right"] < 0.05
+    first = requests[0]
+    assert {picture.shape for picture in first["images"].values()} == {(3, 224, 224)}
+    assert sorted(first["images"]) == ["cam_high", "cam_left_wrist", "cam_low", "cam_right_wrist"]
+    np.testing.assert_allclose(first["state"][[0, 7]], [before["left"][0], before["right"][0]], atol=1e-6)
+
+
+def test_two_arms_stop_together(rig: Rig) -> None:
+    config = {**ALOHA, "cameras": {}}
+    swing = hal.JointVelocity([0.2, 0.0, 0.0, 0.0, 0.0, 0.0])
+    with hal.open(config, driver="mock") as both:
+
+        def act(observation: hal.Observation) -> dict[str, hal.JointVelocity]:
+            if both.clock.now() > 1.0:
+                both.driver("left").inject(fault="lost")
+            return {"left": swing, "right": swing}
+
+        outcome = PolicyRunner(both, act, robots=both.robots.values(), rate_hz=50, seconds=5.0).run()
+        assert outcome.ended == "stopped"
+        assert np.abs(both.robots["right"].state().dq_set).max() < 1e-9
+        wrong = PolicyRunner(both, lambda observation: swing, robots=both.robots.values())
+        with raises_code(hal.CommandError, "bad_answer"):
+            wrong.rehearse()
+
+
+@pytest.mark.parametrize(
+    ("change", "error", "texts"),
+    [
+        ({"robot": "lefty"}, hal.DeviceNotFound, ["lefty", "left, right"]),
+        ({"columns": [0, 8]}, hal.NotSupported, ["8", "7"]),
+    ],
+)
+def test_arms_that_do_not_fit_the_file_are_refused_with_both_sides(
+    change: dict[str, Any], error: type[hal.HalError], texts: list[str]
+) -> None:
+    aloha = load_policy_config("aloha").model_dump(exclude_none=True)
+    aloha["arms"][0] |= change
+    aloha["arms"][1]["columns"] = [8, 15]
+    aloha["observation"] = {"state": {"state": "q"}}
+    with hal.open({**ALOHA, "cameras": {}}, driver="mock") as rig, pytest.raises(error) as caught:
+        load_policy_config(aloha).robots(rig, rig.robots["left"])
+    assert all(text in str(caught.value) for text in texts)
+
+
+# Real-time chunking: a policy continues from what will be executed anyway.
+
+
+@pytest.mark.parametrize("kind", ["joint_position", "joint_delta", "joint_velocity"])
+def test_actions_of_a_chunk_return_from_its_targets(rig: Rig, kind: str) -> None:
+    gripper = {"index": 2, "open": 1.0, "closed": -1.0}
+    config = load_policy_config({**CONFIG, "action": {"kind": kind, "scale": 0.5, "gripper": gripper}})
+    actions, observation = np.random.default_rng(1).uniform(-1.0, 1.0, (6, 8)), rig.observe(cameras=())
+    targets = config.decode(actions, observation, rig.robots)
+    np.testing.assert_allclose(config.encode(targets, observation, rig.robots), actions, atol=1e-12)
+
+
+@pytest.mark.parametrize("offered", [True, False])
+def test_a_policy_that_continues_from_given_actions_joins_without_a_step(rig: Rig, offered: bool) -> None:
+    wave, requests = sine(rig), []
+
+    def infer(request: dict[str, Any]) -> dict[str, Any]:
+        requests.append(request)
+        t = rig.clock.now() + np.arange(STEPS) / 15
+        away = 0.03 if len(requests) % 2 else -0.03  # every second answer prefers another way
+        rows = np.array([[*(wave(x) + away * np.eye(7)[0]), 0.0] for x in t])
+        if "rtc" in request:
+            given, delay = request["rtc"]["actions"], request["rtc"]["delay_steps"]
+            share = np.clip((np.arange(len(given)) - delay) / 8.0, 0.0, 1.0)[:, None]
+            rows[: len(given)] = given + share * (rows[: len(given)] - given)
+        return {"actions": rows}
+
+    outcome = run(rig, infer, latency=0.2, seconds=5.0, metadata={"rtc_max_delay_steps": 6} if offered else {})
+    assert outcome.ended == "time"
+    assert any("rtc" in request for request in requests) == offered
+    assert (outcome.statistics["splice"] < 1e-3) == offered
+    if offered:
+        delays = {request["rtc"]["delay_steps"] for request in requests[2:]}
+        assert delays <= {4, 5}, "of 15 targets a second: those of 0.2 s, and of a step in reserve"
+        assert "rtc" not in requests[0], "there is no chunk to continue yet"
 
 
 # What a server can do wrong.
@@ -356,21 +489,55 @@ def test_what_a_server_needs_and_the_file_lacks_is_named(rig: Rig, change: dict[
 # The file.
 
 
-@pytest.mark.parametrize("name", ["droid", "roboarena"])
+@pytest.mark.parametrize("name", ["droid", "roboarena", "libero"])
 def test_built_in_files_fit_the_built_in_rig(name: str) -> None:
     config = load_policy_config(name)
     with hal.open("panda_table", driver="mock") as rig:
-        config.check(rig, rig.robots["panda"])
-        request = config.request(rig.observe(), rig.robots["panda"], "wave")
+        robots = config.robots(rig, rig.robots["panda"])
+        request = config.request(rig.observe(), robots, "wave")
     pictures = [value for value in request.values() if getattr(value, "dtype", None) == np.uint8]
     assert [picture.shape for picture in pictures] == 2 * [(224, 224, 3)]
     assert request["prompt"] == "wave"
-    assert config.numbers(7) == 8
+    assert config.numbers(robots) == (7 if name == "libero" else 8)
+
+
+def test_numbers_are_scaled_and_moved_into_the_policys_frame() -> None:
+    config = load_policy_config("libero")
+    with hal.open("panda_table", driver="mock") as rig:
+        arm, observation = rig.robots["panda"], rig.observe()
+        picture = config.request(observation, rig.robots, "")
+    state, tcp = picture["observation/state"], observation.robots["panda"].tcp
+    finger = observation.grippers["panda"].width / 2.0
+    np.testing.assert_allclose(state[:3], tcp.position + [-0.66, 0.0, 0.912], atol=1e-6)
+    np.testing.assert_allclose(state[6:], [finger, -finger], atol=1e-6)
+    assert arm.n == 7
+    plain = config.model_copy(
+        update={
+            "observation": {
+                key: source.model_copy(update={"mirror": False}) for key, source in config.observation.items()
+            }
+        }
+    ).request(observation, {"panda": arm}, "")
+    np.testing.assert_array_equal(picture["observation/image"], plain["observation/image"][:, ::-1])
+    assert (picture["observation/image"] != plain["observation/image"]).any()
+
+
+def test_columns_of_a_recording_are_asked_for_and_answered_in_metres() -> None:
+    config = load_policy_config("lerobot")
+    with hal.open("panda_table", driver="mock") as rig:
+        arm, observation = rig.robots["panda"], rig.observe()
+        request = config.request(observation, config.robots(rig, arm), "wave")
+        decoded = config.decode(np.tile([*np.zeros(7), 0.02], (2, 1)), observation, rig.robots)["panda"]
+        assert arm.gripper is not None
+        share = 1.0 - 0.02 / arm.gripper.width_max
+    assert request["observation.state"][7] == pytest.approx(observation.grippers["panda"].width)
+    np.testing.assert_allclose(decoded.grip, share)
+    assert config.due == 1
 
 
 def test_a_rig_without_the_camera_is_refused_with_both_lists(rig: Rig) -> None:
     with pytest.raises(hal.DeviceNotFound, match=r"scene, wrist.*none"):
-        load_policy_config("droid").check(rig, rig.robots["panda"])
+        load_policy_config("droid").robots(rig, rig.robots["panda"])
 
 
 @pytest.mark.parametrize(
@@ -383,6 +550,9 @@ def test_a_rig_without_the_camera_is_refused_with_both_lists(rig: Rig) -> None:
         {"action": {"kind": "jump"}},
         {"action": {"kind": "joint_position", "gripper": {"open": 1.0, "closed": 1.0}}},
         {"observation": {"state": {"state": "q", "camera": "scene"}}},
+        {"observation": {"state": {"state": "left.speed"}}},
+        {"observation": {"state": {"state": "q"}, "high": {"camera": "scene", "within": "state"}}},
+        {"arms": [{"robot": "left", "columns": [0, 7], "kind": "joint_position"}]},
         {"extra": 1},
     ],
 )
@@ -396,7 +566,7 @@ def test_pictures_are_scaled_to_fit_and_padded() -> None:
         {**CONFIG, "observation": {"image": {"camera": "scene", "size": [32, 32], "layout": "chw"}}}
     )
     with hal.open("panda_table", driver="mock", overrides=["cameras.scene.output={width: 64, height: 32}"]) as rig:
-        picture = config.request(rig.observe(), rig.robots["panda"], "")["image"]
+        picture = config.request(rig.observe(), rig.robots, "")["image"]
     assert picture.shape == (3, 32, 32)
     assert not picture[:, :8].any()
     assert not picture[:, 24:].any()
