@@ -278,7 +278,8 @@ class RemotePolicy:
         first = observation.t + self.config.due * self._dt
         if chunk.t[-1] < first:
             return None
-        t: Array = first + self._dt * np.arange(int((chunk.t[-1] - first) / self._dt + 1e-6) + 1)
+        count = int((chunk.t[-1] - first) / self._dt + 1e-6) + 1
+        t: Array = first + self._dt * np.arange(count, dtype=float)
         targets = {name: _sampled(chunk.t, decoded, t) for name, decoded in chunk.targets.items()}
         delay = max(0, int((now + self._lead() + _ONSET - first) / self._dt + 1.0))
         return {
