@@ -184,6 +184,7 @@ def check_yaml(text: str, folder: Path, name: str) -> None:
     from hal.config.models import RobotModel
     from hal.config.objects import ObjectConfig
     from hal.config.rigfile import RigFile
+    from hal.learning.policy_config import PolicyConfig, load_policy_config
 
     data = parse_yaml(text)
     keys = set(data)
@@ -204,6 +205,8 @@ def check_yaml(text: str, folder: Path, name: str) -> None:
         load({"objects": [data]}, sim=True)
     elif keys <= set(TeleopMapping.model_fields):
         load_mapping(file)
+    elif keys <= set(PolicyConfig.model_fields):
+        load_policy_config(file)
     else:
         raise AssertionError(f"what is a file with the keys {', '.join(sorted(keys))}?")
 
