@@ -45,6 +45,10 @@ MAX_AGE = 0.1
 """s after which the console shows no state any more."""
 PATIENCE = 20.0
 """s until a test gives up on a browser that shares two processors with a simulation."""
+TRIES = 3
+"""How often a test is tried whose machine was too busy for the pad, the arm or the app to be heard in time."""
+DISTURBANCES: list[float] = []
+"""When that was so, s, monotonic."""
 
 
 class Bench:
@@ -67,7 +71,6 @@ class Bench:
         self.link = self.console.link
         self.app = TeleopRun(self.rig, [self.rig.robots[name] for name in robots] or [self.arm], self.args)
         self.session = self.app.session
-        self._silences: list[float] = []
         self._alive = math.inf
         self.deadman.attach(self._heard)
         self._thread = threading.Thread(target=self.app.run, name="the app's loop")
@@ -110,20 +113,14 @@ class Bench:
         return max(abs(value) for value in self.servo.dq_set)
 
     def _heard(self, record: DeadmanRecord) -> None:
-        """Called whenever the pad was looked at: notes when that, or the arm, was silent for too long."""
+        """Called whenever the pad was looked at: notes when that, the arm or the app was silent for too long."""
         now = time.monotonic()
         servo = self.arm._mail.peek()
         if now - self._alive > PAD_SILENCE or (servo is not None and now - servo.t_written > MAX_AGE):
-            self._silences.append(now)
+            DISTURBANCES.append(now)
+        if servo is not None and str(servo.trip) in ("app_silent", "command_late", "host_late"):
+            DISTURBANCES.append(servo.t_stop)
         self._alive = record.t_alive if record.connected else math.inf
-
-    def disturbed(self, since: float) -> bool:
-        """Was the pad, the arm or the app's loop silent for longer than they may be, since then (s, monotonic)?
-
-        On a machine with too much else to do that happens, and the arm must not move then, nor a press count.
-        """
-        app = self.trip in ("app_silent", "command_late", "host_late") and self.servo.t_stop >= since
-        return app or any(t >= since for t in self._silences)
 
     def rests(self) -> bool:
         """Does the arm stand still? A goal that is held may leave its set-point a last bit of speed."""
@@ -277,6 +274,14 @@ class Browser:
         self.thaw()
         self.chrome.quit()
         shutil.rmtree(self._profile, ignore_errors=True)
+
+
+def disturbed(since: float) -> bool:
+    """Return whether the pad, the arm or the app's loop was silent for longer than they may be, since s, monotonic.
+
+    On a machine with too much else to do that happens, and the arm must not move then, nor a press count.
+    """
+    return any(t >= since for t in DISTURBANCES)
 
 
 def wait_for(condition: Callable[[], Any], what: str, timeout: float = PATIENCE) -> float:

@@ -7,9 +7,8 @@ from collections.abc import Callable
 
 import pytest
 
-from .kit import Bench, Browser, wait_for
+from .kit import TRIES, Bench, Browser, disturbed, wait_for
 
-TRIES = 3
 BRIEF = 8.0
 """s until a try is given up; a page that is heard moves the arm within 0.2 s."""
 
@@ -26,7 +25,7 @@ def undisturbed(bench: Bench, page: Browser, attempt: Callable[[], None]) -> Non
             attempt()
             return
         except (AssertionError, pytest.fail.Exception):
-            if turn == TRIES - 1 or not bench.disturbed(began):
+            if turn == TRIES - 1 or not disturbed(began):
                 raise
         let_go_of_all(page)
         wait_until_released(bench)

@@ -32,7 +32,7 @@ arm = rig.robots["panda"]
 host = rig._hosts[0]
 children = [host.child.process.pid] + ([rig._pictures._child.process.pid] if rig._pictures else [])
 velocity = [0.4, 0.0, 0.0, 0.0, 0.4, 0.0, 0.4]
-with rig, arm.control(rate_hz=50) as control:
+with rig, arm.control(rate_hz={rate_hz}) as control:
     for turn, tick in enumerate(rig.clock.rate(50)):
         control.send(hal.JointVelocity(velocity))
         if turn == 20:
@@ -64,8 +64,16 @@ sys.exit(app.wait())
 class Watched:
     """An app in motion."""
 
-    def __init__(self, folder: Path, ending: str = "", config: str = "panda_table", overrides: list[str] | None = None):
-        program = APP.format(config=config, overrides=overrides or ["cameras={}"], ending=ending)
+    def __init__(
+        self,
+        folder: Path,
+        ending: str = "",
+        config: str = "panda_table",
+        overrides: list[str] | None = None,
+        rate_hz: float = 50.0,
+    ) -> None:
+        """Start it; it sends 50 commands a second, and has to send ``rate_hz``."""
+        program = APP.format(config=config, overrides=overrides or ["cameras={}"], ending=ending, rate_hz=rate_hz)
         script = folder / "app.py"
         script.write_text(program)
         self.terminal, slave = pty.openpty()
@@ -115,7 +123,7 @@ class Watched:
             self.terminal = -1
         return when
 
-    def wait_for(self, condition: Callable[[], bool], timeout: float = 10.0) -> float:
+    def wait_for(self, condition: Callable[[], bool], timeout: float = 30.0) -> float:
         """Return when the condition first held; TimeoutError if it did not within ``timeout`` s."""
         deadline = time.monotonic() + timeout
         while not condition():

@@ -41,7 +41,7 @@ def wait_until(condition: Callable[[], bool], what: str, timeout: float = 30.0) 
 
 @dataclass
 class Drive:
-    """An arm in motion: alternating twists at 50 Hz, and the first error that the app got."""
+    """An arm in motion: alternating twists, more often than it needs them, and the first error that the app got."""
 
     arm: Robot
     error: Exception | None = None
@@ -52,7 +52,7 @@ class Drive:
 
     def go(self, rig: Rig, seconds: float, until: Callable[[], bool] = lambda: False) -> None:
         """Send for ``seconds``, or until a condition, or until the first error."""
-        with contextlib.suppress(hal.HalError), self.arm.control(rate_hz=50, unattended=True) as control:
+        with contextlib.suppress(hal.HalError), self.arm.control(rate_hz=10, unattended=True) as control:
             start = rig.clock.now()
             for tick in rig.clock.rate(50):
                 forth = int((tick.t - start) / 1.0) % 2 == 0

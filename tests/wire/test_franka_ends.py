@@ -236,7 +236,7 @@ LONGEST = 40.0
 @contextlib.contextmanager
 def killed(robot: str) -> Iterator[int]:
     """The process of an arm whose robot hangs, and whose app was killed."""
-    with Emulator(robot=robot) as emulator:
+    with Emulator("--lockstep", robot=robot) as emulator:
         app = App(emulator, robot)
         host = app.children[0]
         try:

@@ -144,7 +144,7 @@ def is_well(arm: hal.Robot) -> bool:
 def test_an_arm_does_not_continue_by_itself(emulator: Emulator, rig: Rig) -> None:
     """A session that is open while the arm is in reflex and recovers stays stopped until it is armed again."""
     arm = arm_of(rig)
-    with arm.control(rate_hz=50, unattended=True) as control:
+    with arm.control(rate_hz=10, unattended=True) as control:
         moving = False
         for _ in rig.clock.rate(50):
             control.send(hal.Twist([0.0, 0.05, 0.0]))

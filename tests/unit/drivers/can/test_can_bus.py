@@ -204,10 +204,8 @@ def test_a_lost_bus_is_opened_again_by_a_thread(bus: CanBus, monkeypatch: pytest
     assert not bus.poll()
     assert bus.fault is not None
     assert bus.fault.code == "interface_down"
-    deadline = time.monotonic() + 5.0
+    deadline = time.monotonic() + 20.0
     while not bus.try_reopen():
-        began = time.monotonic()
-        assert time.monotonic() - began < 1.0
         assert time.monotonic() < deadline
         time.sleep(0.01)
     assert bus.poll()
