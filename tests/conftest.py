@@ -6,10 +6,15 @@ Every test carries the marker of its folder: ``unit``, ``contract``, ``lock_step
 named on the command line runs whatever its tier. See ``pytest --markers``.
 """
 
+# ruff: noqa: E402  # numpy reads these variables when it is imported
 from __future__ import annotations
 
-import gc
 import os
+
+for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
+    os.environ.setdefault(_name, "1")  # beside other tests, threads of linear algebra mostly wait for each other
+
+import gc
 import signal
 import sys
 from collections.abc import Generator

@@ -49,6 +49,8 @@ TRIES = 3
 """How often a test is tried whose machine was too busy for the pad, the arm or the app to be heard in time."""
 DISTURBANCES: list[float] = []
 """When that was so, s, monotonic."""
+_BUSY = ("app_silent", "command_late", "host_late", "deadman_silent")
+"""Trips for which a busy machine suffices."""
 
 
 class Bench:
@@ -118,7 +120,7 @@ class Bench:
         servo = self.arm._mail.peek()
         if now - self._alive > PAD_SILENCE or (servo is not None and now - servo.t_written > MAX_AGE):
             DISTURBANCES.append(now)
-        if servo is not None and str(servo.trip) in ("app_silent", "command_late", "host_late"):
+        if servo is not None and str(servo.trip) in _BUSY:
             DISTURBANCES.append(servo.t_stop)
         self._alive = record.t_alive if record.connected else math.inf
 

@@ -5,8 +5,12 @@ First recordings of mock rigs, then one to export, then a second rig in which re
 
 from __future__ import annotations
 
+import atexit
 import math
+import shutil
+import tempfile
 import time
+from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -114,7 +118,18 @@ MARKS = (True, False, None)
 
 
 def make_recording(folder: Path) -> Dataset:
-    """Record episodes of 0.6, 0.4 and 0.3 s: a success with a stop in it, a failure, and one that is not marked."""
+    """Return a dataset of 0.6, 0.4 and 0.3 s: a success with a stop in it, a failure, and one that is not marked.
+
+    It is recorded once; ``folder`` gets a copy.
+    """
+    return Dataset(Path(shutil.copytree(_recording(), folder)))
+
+
+@cache
+def _recording() -> Path:
+    made = Path(tempfile.mkdtemp(prefix="hal-recording-"))
+    atexit.register(shutil.rmtree, made, ignore_errors=True)
+    folder = made / "demo"
     with mock_rig() as rig, Recorder(rig, out=folder, fps=20, task="lift the cube") as recorder:
         recorder.start(seed=1)
         drive(rig, 0.3)
@@ -132,7 +147,7 @@ def make_recording(folder: Path) -> Dataset:
         rig.rearm()
         record(recorder, 0.4, MARKS[1])
         record(recorder, 0.3, MARKS[2])
-    return Dataset(folder)
+    return folder
 
 
 def pictures(dataset: Dataset, what: str, camera: str) -> list[np.ndarray[Any, Any]]:

@@ -101,7 +101,8 @@ def test_the_share_that_came_in_time_is_not_from_before_the_loss() -> None:
         struck: list[float] = []
 
         def strike() -> bool:
-            if not struck and abs(arm.state(5.0).tcp_twist[1]) > 0.03:
+            again = not struck or time.monotonic() > struck[-1] + 1.0  # the emulator may have slept through it
+            if again and abs(arm.state(5.0).tcp_twist[1]) > 0.03:
                 struck.append(time.monotonic())
                 emulator.control.send("silence 0.05")
             return False

@@ -16,7 +16,7 @@ from .rig_kit import arm_of, rig_of
 pytest.importorskip("pylibfranka", reason="needs pylibfranka: pip install 'robot-hal[franka]'")
 pytest.importorskip("panda_py", reason="needs panda-python: pip install 'robot-hal[panda]'")
 
-pytestmark = [pytest.mark.alone, pytest.mark.slow, pytest.mark.timeout(300)]
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(300)]
 
 DOWN = [1.0, 0.0, 0.0, 0.0]
 POSE = hal.Pose([0.40, 0.03, 0.35], DOWN)
