@@ -78,6 +78,7 @@ class CollectRun:
         self.session = self.display.session
         self.pad = self.session.pad
         self.tape = BackgroundRecorder(recorder)
+        recorder.source = lambda: "person"
         self.phase = ""
         self.kept: list[SavedEpisode] = []
         self.discarded = 0

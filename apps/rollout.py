@@ -247,6 +247,8 @@ class RolloutRun:
         takeover = None
         if args.takeover and mapping is not None and self.pad is not None:
             takeover = Takeover(Teleop(self.robot, mapping), self.pad)
+        if recorder is not None:
+            recorder.source = lambda: "person" if takeover is not None and takeover.active else "policy"
         self.reset_function: Any = load_object(args.reset, "--reset") if args.reset else None
         self.runner = PolicyRunner(
             rig,

@@ -120,7 +120,7 @@ def collect(_: float) -> None:
             if status != 0:
                 print(printed.getvalue())
             episodes = list(Dataset(f"{folder}/data").episodes)
-            heights = [float(np.ptp(episode.columns["observation.object.cube"][:, 2])) for episode in episodes]
+            heights = [float(np.ptp(episode.columns["rig.object.cube"][:, 2])) for episode in episodes]
             marks = [episode.success for episode in episodes]
             columns[name] = [sorted(episode.columns) for episode in episodes]
             lifted = ", ".join(f"{100 * height:.1f} cm" for height in heights)

@@ -177,6 +177,7 @@ class EpisodeWorker:
             self._recorder = Recorder(
                 rig, self.folder, r.fps, r.task, cameras=r.cameras, streams=r.streams, codec=r.codec
             )
+            self._recorder.source = lambda: "policy" if r.policy else "program"
         else:
             self._recorder.switch_rig(rig)
         return self._recorder

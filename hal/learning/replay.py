@@ -43,7 +43,7 @@ _JITTER = 0.010
 moved faster between two neighbours than it did."""
 _MOVED = 0.01
 """Motion below which an arm counts as standing still, rad, or m of a gripper."""
-_OBJECT = "observation.object."
+_OBJECT = "rig.object."
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -74,7 +74,7 @@ class RecordedTrajectory:
             CommandError: The episode has no such arm (code ``no_such_arm``).
             DatasetError: The episode lacks the columns of an arm.
         """
-        places, names = episode.names("observation.tcp"), episode.names("observation.setpoint")
+        places, names = episode.names("observation.tcp"), episode.names("rig.setpoint")
         several = "x" not in places  # then the arm's name leads every other name
         lead = f"{robot.name}." if several else ""
         if f"{lead}x" not in places:
@@ -98,18 +98,18 @@ class RecordedTrajectory:
         t = stamps - stamps[0]
         later = np.append(True, np.diff(np.maximum.accumulate(t)) > 0.0)
 
-        def rows(column: str, which: Any) -> Array:
-            values: Array = np.asarray(episode.columns[f"observation.{column}"], float)[later][:, which]
+        def rows(key: str, which: Any) -> Array:
+            values: Array = np.asarray(episode.columns[key], float)[later][:, which]
             return values
 
-        setpoint = rows("setpoint", own)
+        setpoint = rows("rig.setpoint", own)
         return cls(
             joints=tuple(joints),
             model=_model(episode.info, key.removeprefix("robot.")),
             t=t[later],
             q_set=setpoint[:, :n],
-            q=rows("state", own)[:, :n],
-            tcp=rows("tcp", slice(first, first + 3)),
+            q=rows("observation.state", own)[:, :n],
+            tcp=rows("observation.tcp", slice(first, first + 3)),
             width=setpoint[:, n] if has_gripper else None,
             objects=_objects(episode.columns),
         )
@@ -206,8 +206,8 @@ def recorded_arms(episode: Episode) -> list[str]:
 
 def other_moving_arms(episode: Episode, name: str) -> list[str]:
     """Return the names of the other arms that moved in the recording, which a replay of arm ``name`` leaves out."""
-    arms, names = recorded_arms(episode), episode.names("observation.setpoint")
-    setpoint = np.asarray(episode.columns["observation.setpoint"], float)
+    arms, names = recorded_arms(episode), episode.names("rig.setpoint")
+    setpoint = np.asarray(episode.columns["rig.setpoint"], float)
     found = []
     for arm in arms if len(arms) > 1 else ():
         own = setpoint[:, [k for k, label in enumerate(names) if label.startswith(f"{arm}.")]]

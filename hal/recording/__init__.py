@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from .dataset import Dataset, Episode
     from .finish import recover, repair
-    from .merging import delete_episodes, extract, mark_episodes, merge, set_task
+    from .merging import delete_episodes, extract, mark_episodes, merge, pack, set_task
     from .recorder import Recorder, RecorderStatus
 
 __all__ = [
@@ -34,6 +34,7 @@ __all__ = [
     "extract",
     "mark_episodes",
     "merge",
+    "pack",
     "recover",
     "repair",
     "set_task",
@@ -48,6 +49,7 @@ _HOME = {
     "extract": "merging",
     "mark_episodes": "merging",
     "merge": "merging",
+    "pack": "merging",
     "recover": "finish",
     "repair": "finish",
     "set_task": "merging",

@@ -15,7 +15,7 @@ import numpy as np
 
 from ..errors import CommandError, DatasetError
 from .dataset import Dataset, Episode
-from .index import check_next_episode, dataset_errors, read_about, read_entry, read_index, read_tasks
+from .index import check_next_episode, dataset_errors, read_about, read_entries, read_index, read_tasks
 from .layout import (
     BOOKKEEPING,
     SEGMENTATION,
@@ -23,6 +23,8 @@ from .layout import (
     VERSION,
     CameraSetup,
     DatasetLayout,
+    EpisodePlace,
+    video_names,
 )
 
 __all__ = [
@@ -91,17 +93,16 @@ def check_rows(episode: Episode, start: int | None) -> None:
     for key in BOOKKEEPING:
         need(columns[key].ndim == 1, f"{key} is not one number per row")
     need(columns["frame_index"] == rows, "frame_index does not count the rows")
-    need(columns["episode_index"] == episode.number, "episode_index is another episode's")
     need(np.diff(columns["index"]) == 1, "index does not count the rows")
     need(start is None or columns["index"][0] == start, f"index does not begin with {start}")
     need(np.diff(columns["task_index"]) == 0, "has rows of several tasks")
     need(np.abs(columns["timestamp"] - rows / episode.fps) < _CLOSE + 1e-6 * rows, "timestamp is not that of the grid")
     for name, times in episode.stamps.items():
         if name == "grid":
-            need(np.isfinite(times), "observation.time.grid has values that are not numbers")
-            need(np.diff(times) > 0.0, "observation.time.grid does not increase")
+            need(np.isfinite(times), "rig.time.grid has values that are not numbers")
+            need(np.diff(times) > 0.0, "rig.time.grid does not increase")
         elif name.startswith(("robot.", "camera.")):
-            need(np.diff(times[np.isfinite(times)]) >= 0.0, f"observation.time.{name} goes backwards")
+            need(np.diff(times[np.isfinite(times)]) >= 0.0, f"rig.time.{name} goes backwards")
 
 
 def check_index(layout: DatasetLayout) -> Iterator[DatasetError]:
@@ -118,12 +119,17 @@ def check_index(layout: DatasetLayout) -> Iterator[DatasetError]:
         return DatasetError(what, file=str(path.relative_to(layout.root)), episode=number)
 
     total, numbers = int(info["total_episodes"]), layout.numbers()
+    known, videos = set(), video_names(info["features"])
     for number in range(total):
+        about: dict[str, Any] = {}
         if number not in numbers:
             yield wrong(layout.about(number), "is missing", number)
+        with contextlib.suppress(DatasetError):  # reported with its row of the index
+            about = read_about(layout, number)
+        known.update(layout.files_of(number, EpisodePlace.of(number, about), videos))
     for path in layout.finished():
-        if (number := layout.number_of(path)) >= total:
-            yield wrong(path, "is not in the index", number)
+        if path not in known:
+            yield wrong(path, "is not in the index")
     tasks: list[str] = []
     try:
         with dataset_errors(layout.root, layout.tasks):
@@ -133,9 +139,10 @@ def check_index(layout: DatasetLayout) -> Iterator[DatasetError]:
     except DatasetError as error:
         yield error
     start: int | None = 0
+    entries: dict[int, dict[int, Any]] = {}
     for number in range(total):
         try:
-            start = None if start is None else _check_entry(layout, number, start, tasks)
+            start = None if start is None else _check_entry(layout, number, start, tasks, entries)
         except DatasetError as error:
             start = None
             yield error
@@ -150,9 +157,16 @@ def check_index(layout: DatasetLayout) -> Iterator[DatasetError]:
         yield error
 
 
-def _check_entry(layout: DatasetLayout, number: int, start: int, tasks: list[str]) -> int:
-    """Check an episode's row in ``meta/episodes``. Return the number of the next episode's first row."""
-    about, path = read_about(layout, number), layout.entry(number)
+def _check_entry(
+    layout: DatasetLayout, number: int, start: int, tasks: list[str], entries: dict[int, dict[int, Any]]
+) -> int:
+    """Check an episode's row in ``meta/episodes``. Return the number of the next episode's first row.
+
+    ``entries`` keeps the files that were read, by their numbers.
+    """
+    about = read_about(layout, number)
+    place = EpisodePlace.of(number, about)
+    path = layout.entry(place.entry)
     end = start + int(about["length"])
     expected = {
         "episode_index": number,
@@ -162,7 +176,9 @@ def _check_entry(layout: DatasetLayout, number: int, start: int, tasks: list[str
         "tasks": [about["task"]],
     }
     with dataset_errors(layout.root, path, number):
-        row = read_entry(path)
+        if place.entry not in entries:
+            entries[place.entry] = read_entries(path, stats=False)
+        row = entries[place.entry][number]
         for key, value in expected.items():
             if row[key] != value:
                 raise DatasetError(

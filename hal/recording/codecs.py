@@ -2,21 +2,27 @@
 
 from __future__ import annotations
 
+import contextlib
 import io
+import itertools
 import json
 import math
 import os
 import struct
-from collections.abc import Iterator, Mapping
+import sys
+from collections.abc import Iterator, Mapping, Sequence
 from fractions import Fraction
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 from zlib import crc32
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import CommandError, NotSupported
+
+if TYPE_CHECKING:
+    from av.container import InputContainer
 
 __all__ = [
     "DepthFile",
@@ -25,13 +31,16 @@ __all__ = [
     "PictureStats",
     "Stats",
     "VideoFile",
+    "VideoPart",
     "as_rgb",
+    "can_be_joined",
     "choose_encoder",
     "column_stats",
     "count_frames",
     "truncate_to_last_fragment",
     "merge_stats",
     "ids_to_units",
+    "join_videos",
     "picture_stats",
     "stats_as_lists",
     "read_video",
@@ -404,14 +413,30 @@ def truncate_to_last_fragment(path: Path) -> None:
     os.truncate(path, whole)
 
 
-def count_frames(path: Path) -> int:
-    """Return how many pictures a video holds, without decoding them."""
+def count_frames(path: Path, first: int = 0, most: int = sys.maxsize, fps: int = 1) -> int:
+    """Return how many pictures a video holds from number ``first`` on, at most ``most``, without decoding them."""
     import av
 
     if path.stat().st_size == 0:
         return 0
     with av.open(str(path)) as container:
-        return sum(1 for packet in container.demux(video=0) if packet.size)
+        return sum(1 for _ in itertools.islice(_packets(container, first, fps), most))
+
+
+def _packets(container: InputContainer, first: int, fps: int) -> Iterator[Any]:
+    """Yield the packets of a video from picture ``first`` on."""
+    stream: Any = container.streams.video[0]
+    _seek(container, first, fps)
+    for packet in container.demux(stream):
+        if packet.size and (not first or round(packet.pts * packet.time_base * fps) >= first):
+            yield packet
+
+
+def _seek(container: InputContainer, first: int, fps: int) -> None:
+    """Go to the last key frame up to picture ``first``."""
+    if first:
+        stream: Any = container.streams.video[0]
+        container.seek(round(first / (fps * stream.time_base)), stream=stream)
 
 
 def remux(source: Path, target: Path, length: int) -> None:
@@ -427,8 +452,60 @@ def remux(source: Path, target: Path, length: int) -> None:
             plain.mux(packet)
 
 
-def picture_stats(path: Path, length: int, fps: int) -> PictureStats:
-    """Return statistics of one picture per second, or of more in a short video. Only key frames are decoded."""
+def can_be_joined(one: Path, other: Path) -> bool:
+    """Return whether the pictures of two videos can follow each other in one file."""
+    import av
+
+    heads = []
+    for path in (one, other):
+        with av.open(str(path)) as container:
+            codec = container.streams.video[0].codec_context
+            heads.append((codec.name, codec.width, codec.height, bytes(codec.extradata or b"")))
+    return heads[0] == heads[1]
+
+
+class VideoPart(NamedTuple):
+    """Pictures of a video, one after the other."""
+
+    path: Path
+    first: int
+    """Number of the first one."""
+    length: int
+
+
+def join_videos(parts: Sequence[VideoPart], target: Path, fps: int) -> None:
+    """Write pictures of several videos into one, without encoding them again; each part begins with a key frame.
+
+    Raises ValueError if a part has fewer pictures.
+    """
+    import av
+
+    written = 0
+    with contextlib.ExitStack() as stack:
+        joined = stack.enter_context(av.open(str(target), "w", format="mp4", options={"movflags": "faststart"}))
+        write: Any = None
+        for path, first, length in parts:
+            with av.open(str(path)) as container:
+                if write is None:
+                    write = joined.add_stream_from_template(container.streams.video[0], opaque=True)
+                found = 0
+                for packet in itertools.islice(_packets(container, first, fps), length):
+                    packet.time_base = Fraction(1, fps)
+                    packet.pts = packet.dts = written + found
+                    packet.duration = 1
+                    packet.stream = write
+                    joined.mux(packet)
+                    found += 1
+            if found != length:
+                raise ValueError(f"{path.name} has {found} pictures from number {first} on, not {length}")
+            written += length
+
+
+def picture_stats(path: Path, length: int, fps: int, first: int = 0) -> PictureStats:
+    """Return statistics of pictures from number ``first`` on: one per second, or more of a few.
+
+    Only key frames are decoded.
+    """
     import av
 
     stats = PictureStats()
@@ -437,7 +514,7 @@ def picture_stats(path: Path, length: int, fps: int) -> PictureStats:
         stream = container.streams.video[0]
         stream.thread_count = 1
         due = 0
-        for count, packet in enumerate(packet for packet in container.demux(stream) if packet.size):
+        for count, packet in enumerate(itertools.islice(_packets(container, first, fps), length)):
             if packet.is_keyframe and count >= due:
                 due = count + every
                 for frame in stream.codec_context.decode(packet):
@@ -447,11 +524,14 @@ def picture_stats(path: Path, length: int, fps: int) -> PictureStats:
     return stats
 
 
-def read_video(path: Path) -> Iterator[Picture]:
-    """Yield every picture (H, W, 3) RGB, in order."""
+def read_video(path: Path, first: int = 0, fps: int = 1) -> Iterator[Picture]:
+    """Yield every picture (H, W, 3) RGB from number ``first`` on, in order; ``fps`` is needed only for ``first``."""
     import av
 
     with av.open(str(path)) as container:
-        container.streams.video[0].thread_type = "AUTO"
-        for frame in container.decode(video=0):
-            yield frame.to_ndarray(format="rgb24")
+        stream: Any = container.streams.video[0]
+        stream.thread_type = "AUTO"
+        _seek(container, first, fps)
+        for frame in container.decode(stream):
+            if not first or round(frame.pts * frame.time_base * fps) >= first:
+                yield frame.to_ndarray(format="rgb24")

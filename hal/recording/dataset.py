@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from functools import cached_property
+from itertools import islice
 from pathlib import Path
 from typing import Any, TypeVar, overload
 
@@ -13,7 +14,16 @@ from numpy.typing import NDArray
 from ..errors import CommandError, DatasetError, DeviceNotFound
 from .codecs import DepthReader, count_frames, read_video
 from .index import dataset_errors, read_about, read_index, repair_command
-from .layout import MORE_STREAMS, SEGMENTATION, TIMES, DatasetLayout, require_libraries, video_key
+from .layout import (
+    MORE_STREAMS,
+    SEGMENTATION,
+    TIMES,
+    DatasetLayout,
+    EpisodePlace,
+    current_key,
+    require_libraries,
+    video_key,
+)
 
 __all__ = ["CameraDepth", "Dataset", "Episode", "EpisodeDepth"]
 
@@ -70,39 +80,61 @@ class Episode:
     @property
     def data_file(self) -> str:
         """The file of the rows, relative to the dataset's folder."""
-        return self._name(self._layout.data(self.number))
+        return self._name(self._layout.data(self.place.data[0]))
+
+    @cached_property
+    def place(self) -> EpisodePlace:
+        """The files that hold the episode, and where it begins in them."""
+        return EpisodePlace.of(self.number, self.info)
 
     @cached_property
     def columns(self) -> dict[str, NDArray[Any]]:
         """Every column by its key: (rows, n), or (rows,) for a single number."""
-        import pyarrow.parquet as pq
-
-        path = self._layout.data(self.number)
         found = _Columns(self.data_file, self.number)
+        path = self._layout.root / self.data_file
         features = {key: each for key, each in self._meta["features"].items() if each["dtype"] != "video"}
-        with (
-            dataset_errors(self._layout.root, path, self.number),
-            pq.ParquetFile(path, page_checksum_verification=True) as file,
-        ):
-            if file.metadata.num_rows != self.length:
-                raise self._wrong(path, f"has {file.metadata.num_rows} rows, and the episode has {self.length}")
-            if odd := sorted(set(file.schema_arrow.names) ^ features.keys()):
-                raise self._wrong(path, f"does not have the columns of meta/info.json: {', '.join(odd[:5])}")
-            table = file.read()
+        table = self.read_table()
+        if odd := sorted(set(table.column_names) ^ features.keys()):
+            raise self._wrong(path, f"does not have the columns of meta/info.json: {', '.join(odd[:5])}")
         for key, feature in features.items():
             column = table[key].combine_chunks()
             shape = [] if feature["shape"] == [1] else feature["shape"]
             values = (column.flatten() if shape else column).to_numpy(zero_copy_only=False)
             if str(values.dtype) != feature["dtype"] or values.size != self.length * int(np.prod(shape)):
                 raise self._wrong(path, f"{key} is not {feature['dtype']} {feature['shape']} in every row")
-            found[key] = values.reshape(-1, *shape)
+            found[current_key(key)] = values.reshape(-1, *shape)
         return found
+
+    def read_table(self) -> Any:
+        """Return the rows as an Arrow table, with the columns as they are stored."""
+        import pyarrow.parquet as pq
+
+        file_number, first = self.place.data
+        path = self._layout.data(file_number)
+        with (
+            dataset_errors(self._layout.root, path, self.number),
+            pq.ParquetFile(path, page_checksum_verification=True) as file,
+        ):
+            groups: list[int] = []
+            start = end = 0
+            for k in range(file.metadata.num_row_groups):
+                begin, end = end, end + file.metadata.row_group(k).num_rows
+                if begin < first + self.length and end > first:
+                    start = start if groups else begin
+                    groups.append(k)
+            table = file.read_row_groups(groups, use_threads=False).slice(first - start, self.length)
+            if end < first + self.length:
+                raise self._wrong(path, f"has {end} rows, and the episode ends with row {first + self.length}")
+            if set(table["episode_index"].to_pylist()) != {self.number}:
+                raise self._wrong(path, "has rows of another episode")
+        return table
 
     def names(self, key: str) -> list[str]:
         """Return the names of a column's numbers. Raises DatasetError for a column that the dataset lacks."""
-        if key not in self._meta["features"]:
-            raise DatasetError(f"has no column {key}", file="meta/info.json")
-        return list(self._meta["features"][key]["names"] or [key])
+        for stored, feature in self._meta["features"].items():
+            if current_key(stored) == key:
+                return list(feature["names"] or [key])
+        raise DatasetError(f"has no column {key}", file="meta/info.json")
 
     @cached_property
     def stamps(self) -> dict[str, NDArray[np.float64]]:
@@ -150,9 +182,10 @@ class Episode:
         path = self._file_of(camera, stream)
         if path.suffix == ".mp4":
             height, width, _ = self._meta["features"][path.parent.parent.name]["shape"]
+            found = read_video(path, self.first_picture(path), self.fps)
             if stream == "color":
-                return self._each(path, read_video(path), (height, width, 3))
-            return self._each(path, (picture[:, :, 0] for picture in read_video(path)), (height, width))
+                return self._each(path, found, (height, width, 3))
+            return self._each(path, (picture[:, :, 0] for picture in found), (height, width))
         reader = self._depth_reader(path)
         if stream == "depth":
             return self._each(path, iter(reader), reader.shape)
@@ -180,7 +213,7 @@ class Episode:
             return {}
         videos = {"color": camera} | {stream: f"{camera}_{stream}" for stream in MORE_STREAMS}
         found = {
-            stream: self._layout.video(name, self.number)
+            stream: self._layout.video(name, self.place.video(name)[0])
             for stream, name in videos.items()
             if video_key(name) in features
         }
@@ -190,6 +223,10 @@ class Episode:
             found[SEGMENTATION] = self._layout.depth(f"{camera}_{SEGMENTATION}", self.number)
         return found
 
+    def first_picture(self, video: Path) -> int:
+        """Return the number of the episode's first picture in a video of :meth:`files`."""
+        return self.place.video(video.parent.parent.name.removeprefix(video_key("")))[1]
+
     def check_pictures(self) -> None:
         """Raise DatasetError if a video or depth file is missing or does not have one picture per row.
 
@@ -197,13 +234,16 @@ class Episode:
         """
         for path in (path for camera in self.cameras for path in self.files(camera).values()):
             with dataset_errors(self._layout.root, path, self.number):
-                self._check_count(path, count_frames(path) if path.suffix == ".mp4" else len(DepthReader(path)))
+                if path.suffix == ".mp4":
+                    self._check_count(path, count_frames(path, self.first_picture(path), self.length, self.fps))
+                else:
+                    self._check_count(path, len(DepthReader(path)))
 
     def _each(self, path: Path, pictures: Iterator[P], shape: tuple[int, ...]) -> Iterator[P]:
-        """Yield one picture per row, each of ``shape``."""
+        """Yield one picture per row, each of ``shape``; pictures of a next episode may follow in a video."""
         count = 0
         with dataset_errors(self._layout.root, path, self.number):
-            for picture in pictures:
+            for picture in islice(pictures, self.length + (path.suffix != ".mp4")):
                 if picture.shape != shape:
                     raise self._wrong(path, f"has a picture of {picture.shape}, not {shape}")
                 count += 1

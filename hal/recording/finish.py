@@ -11,7 +11,7 @@ from __future__ import annotations
 import contextlib
 import json
 import shutil
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -22,22 +22,36 @@ from ..errors import CommandError, DatasetError, HalError
 from .checking import check_index, check_rows
 from .codecs import Stats, column_stats, merge_stats, picture_stats, remux, stats_as_lists
 from .dataset import Episode
-from .index import _TASK, check_next_episode, dataset_errors, read_about, read_index, read_tasks, validated_info
+from .index import (
+    _TASK,
+    check_next_episode,
+    dataset_errors,
+    next_place,
+    read_about,
+    read_index,
+    read_tasks,
+    validated_info,
+)
 from .layout import (
     ACTION,
     CHUNK,
     GRID,
     MOVES,
     SETPOINT,
+    SOURCE,
+    SOURCES,
     STATE,
     TIMES,
     VERSION,
+    VIDEO_MB,
     DatasetLayout,
+    EpisodePlace,
     lock_dataset,
     read_json,
     require_libraries,
     sync_to_disk,
     video_key,
+    video_names,
     write_json,
 )
 from .live import LiveContent, read_live
@@ -45,7 +59,8 @@ from .metadata import ClockPace
 
 __all__ = [
     "CLOSING",
-    "entry_table",
+    "entries_table",
+    "entry_row",
     "finalise",
     "write_mark",
     "new_info",
@@ -70,7 +85,7 @@ def new_info(features: Mapping[str, Any], fps: int, robot_type: str) -> dict[str
         "total_tasks": 0,
         "chunks_size": CHUNK,
         "data_files_size_in_mb": 100,
-        "video_files_size_in_mb": 200,
+        "video_files_size_in_mb": VIDEO_MB,
         "fps": fps,
         "splits": {"train": "0:0"},
         "data_path": f"data/{place}.parquet",
@@ -93,40 +108,44 @@ def rows_table(columns: Mapping[str, NDArray[Any]], features: Mapping[str, Any])
     return pa.table(arrays)
 
 
-def entry_table(
-    number: int, length: int, start: int, task: str, cameras: list[str], fps: int, stats: Mapping[str, Stats]
-) -> Any:
-    """Return the one row of ``meta/episodes`` for an episode.
+def entry_row(
+    about: Mapping[str, Any], place: EpisodePlace, start: int, fps: int, stats: Mapping[str, Mapping[str, Any]]
+) -> dict[str, Any]:
+    """Return an episode's row of ``meta/episodes``.
 
     Args:
-        number: Number of the episode.
-        length: Its rows.
+        about: Metadata of the episode: its number, rows, task, mark, dropped rows and cameras are used.
+        place: Its files.
         start: Number of its first row in the whole dataset.
-        task: Description of the task.
-        cameras: Names of the videos.
         fps: Rows per second.
         stats: Statistics of each column and video.
     """
+    number, length = about["episode"], about["length"]
+    row = {"episode_index": number, "tasks": [about["task"]], "length": length, **_at("data", place.data[0])}
+    row |= {"dataset_from_index": start, "dataset_to_index": start + length}
+    for key in (key for key in stats if key.startswith(video_key(""))):
+        file, first = place.video(key.removeprefix(video_key("")))
+        times = {"from_timestamp": first / fps, "to_timestamp": (first + length) / fps}
+        row |= _at(f"videos/{key}", file) | {f"videos/{key}/{name}": time for name, time in times.items()}
+    row |= _at("meta/episodes", place.entry) | {"success": about["success"], "dropped": about.get("dropped")}
+    for name, camera in about["cameras"].items():
+        row |= {f"camera_matrix/{name}": camera["K"], f"camera_distortion/{name}": camera["distortion"]}
+    for key, found in stats.items():
+        row |= {f"stats/{key}/{name}": np.asarray(value).tolist() for name, value in found.items()}
+    return row
+
+
+def _at(lead: str, file: int) -> dict[str, int]:
+    return {f"{lead}/chunk_index": file // CHUNK, f"{lead}/file_index": file % CHUNK}
+
+
+def entries_table(rows: Sequence[Mapping[str, Any]]) -> Any:
+    """Return the Arrow table of some rows of ``meta/episodes``."""
     import pyarrow as pa
 
-    chunk, file = pa.array([number // CHUNK]), pa.array([number % CHUNK])
-    row: dict[str, Any] = {
-        "episode_index": pa.array([number]),
-        "tasks": pa.array([[task]]),
-        "length": pa.array([length]),
-        "data/chunk_index": chunk,
-        "data/file_index": file,
-        "dataset_from_index": pa.array([start]),
-        "dataset_to_index": pa.array([start + length]),
-    }
-    for camera in cameras:
-        place = f"videos/{video_key(camera)}"
-        row |= {f"{place}/chunk_index": chunk, f"{place}/file_index": file}
-        row |= {f"{place}/from_timestamp": pa.array([0.0]), f"{place}/to_timestamp": pa.array([length / fps])}
-    row |= {"meta/episodes/chunk_index": chunk, "meta/episodes/file_index": file}
-    for key, found in stats.items():
-        row.update({f"stats/{key}/{name}": pa.array([value.tolist()]) for name, value in found.items()})
-    return pa.table(row)
+    types = {"success": pa.bool_(), "dropped": pa.int64()}
+    types |= {name: pa.list_(pa.float64()) for name in rows[0] if name.startswith("camera_distortion/")}
+    return pa.table({name: pa.array([row[name] for row in rows], types.get(name)) for name in rows[0]})
 
 
 def write_table(path: Path, table: Any) -> None:
@@ -246,6 +265,7 @@ def _prepare(layout: DatasetLayout, rest: LiveContent, recovered: bool) -> list[
     check_next_episode(layout, there)
     info = there or new_info(about["features"], about["fps"], about["robot_type"])
     number, start, fps = int(info["total_episodes"]), int(info["total_frames"]), int(info["fps"])
+    place = next_place(layout, info)
     final = rest.folder / _FINAL
     shutil.rmtree(final, ignore_errors=True)
     final.mkdir()
@@ -257,6 +277,12 @@ def _prepare(layout: DatasetLayout, rest: LiveContent, recovered: bool) -> list[
     t_start = float(rest.rows[0, _place(about["columns"], GRID)])
     columns = _columns(rest, t_start)
     rows = len(rest.rows)
+    closed = _about(rest, number, t_start, recovered) | place.as_json()
+    columns |= {
+        "intervention": interventions(columns),
+        "next.success": last_row(rows, closed["success"] is True),
+        "next.done": last_row(rows, True),
+    }
     columns |= {
         "timestamp": np.arange(rows)[:, None] / fps,
         "frame_index": np.arange(rows)[:, None],
@@ -265,23 +291,21 @@ def _prepare(layout: DatasetLayout, rest: LiveContent, recovered: bool) -> list[
         "task_index": np.full((rows, 1), tasks.index(about["task"])),
     }
     pq.write_table(rows_table(columns, info["features"]), final / "data.parquet", write_page_checksum=True)
-    made.append((final / "data.parquet", layout.data(number)))
+    made.append((final / "data.parquet", layout.data(place.data[0])))
     stats: dict[str, Stats] = {key: column_stats(values) for key, values in columns.items()}
     for camera in rest.cameras:
         for name in camera.videos:
             video = final / f"{name}.mp4"
             remux(rest.folder / video.name, video, rows)
             stats[video_key(name)] = picture_stats(video, rows, fps).stats()
-            made.append((video, layout.video(name, number)))
+            made.append((video, layout.video(name, place.video(name)[0])))
         for name in camera.depths:
             made.append((rest.folder / f"{name}.depth", layout.depth(name, number)))
-    write_json(final / "about.json", _about(rest, number, t_start, recovered))
+    write_json(final / "about.json", closed)
     made.append((final / "about.json", layout.about(number)))
 
-    videos = [name for camera in rest.cameras for name in camera.videos]
-    entry = entry_table(number, rows, start, about["task"], videos, fps, stats)
-    pq.write_table(entry, final / "entry.parquet", use_dictionary=False, write_statistics=False)
-    made.append((final / "entry.parquet", layout.entry(number)))
+    write_table(final / "entry.parquet", entries_table([entry_row(closed, place, start, fps, stats)]))
+    made.append((final / "entry.parquet", layout.entry(place.entry)))
     pq.write_table(tasks_table(tasks), final / "tasks.parquet")
     made.append((final / "tasks.parquet", layout.tasks))
     before = read_json(layout.stats) if layout.stats.exists() else {}
@@ -296,6 +320,22 @@ def _prepare(layout: DatasetLayout, rest: LiveContent, recovered: bool) -> list[
         sync_to_disk(source)
     sync_to_disk(final)
     return [(str(source.relative_to(rest.folder)), str(target.relative_to(layout.root))) for source, target in made]
+
+
+def last_row(rows: int, value: bool) -> NDArray[np.bool_]:
+    """Return a column (rows, 1) that is False but, with ``value``, in the last row."""
+    found = np.zeros((rows, 1), bool)
+    found[-1] = value
+    return found
+
+
+def interventions(columns: Mapping[str, NDArray[Any]]) -> NDArray[np.bool_]:
+    """Return where (rows, 1) a person drives in an episode of a policy or a program."""
+    if SOURCE not in columns:  # an unfinished episode of an older version
+        return np.zeros((len(columns[GRID]), 1), bool)
+    person = columns[SOURCE] == SOURCES.index("person")
+    found: NDArray[np.bool_] = person & (columns[SOURCE] > SOURCES.index("person")).any()
+    return found
 
 
 def _columns(rest: LiveContent, t_start: float) -> dict[str, NDArray[Any]]:
@@ -428,22 +468,31 @@ def _layout(out: str | Path) -> DatasetLayout:
 def _rebuild(layout: DatasetLayout) -> int:
     """Write all of ``meta/`` again from the episodes, ``info.json`` last. Return the number of episodes."""
     recorded = [path for path in layout.finished() if not path.is_relative_to(layout.info.parent)]
-    count = max(map(layout.number_of, recorded), default=-1) + 1
+    count = max(layout.numbers(), default=-1) + 1
     info = _info(layout, count)
+    episodes = [Episode(layout, number, info) for number in range(count)]
+    videos = video_names(info["features"])
+    known = {path for episode in episodes for path in layout.files_of(episode.number, episode.place, videos)}
+    for path in recorded:
+        if path not in known:
+            raise DatasetError("belongs to no episode in episodes/", file=str(path.relative_to(layout.root)))
     tasks: dict[int, str] = {}
     total: dict[str, Stats] = {}
+    entries: dict[int, list[dict[str, Any]]] = {}
     start = 0
-    for episode in (Episode(layout, number, info) for number in range(count)):
+    for episode in episodes:
         check_rows(episode, start)
         task = tasks.setdefault(int(episode.columns["task_index"][0]), episode.task)
         if task != episode.task:
             raise DatasetError(f"the task is {episode.task!r}, and {task!r} in other episodes", episode=episode.number)
         stats = _stats(layout, episode)
-        videos = [key.removeprefix(video_key("")) for key in stats if key not in episode.columns]
-        entry = entry_table(episode.number, episode.length, start, task, videos, episode.fps, stats)
-        write_table(layout.entry(episode.number), entry)
+        about = episode.info | {"episode": episode.number}
+        row = entry_row(about, episode.place, start, episode.fps, stats)
+        entries.setdefault(episode.place.entry, []).append(row)
         total = {key: merge_stats(total.get(key), found) for key, found in stats.items()}
         start += episode.length
+    for file, rows in entries.items():
+        write_table(layout.entry(file), entries_table(rows))
     if sorted(tasks) != list(range(len(tasks))):
         raise DatasetError(f"the episodes have tasks of the numbers {sorted(tasks)}", file="data")
     write_table(layout.tasks, tasks_table([tasks[k] for k in sorted(tasks)]))
@@ -477,10 +526,19 @@ def _info(layout: DatasetLayout, count: int) -> dict[str, Any]:
 
 def _stats(layout: DatasetLayout, episode: Episode) -> dict[str, Stats]:
     rows = episode.length
-    stats = {key: column_stats(values.reshape(rows, -1)) for key, values in episode.columns.items()}
+    table = episode.read_table()
+    stats = {key: column_stats(_numbers(table[key], rows)) for key in table.column_names}
     episode.check_pictures()
     for path in (path for camera in episode.cameras for path in episode.files(camera).values()):
         if path.suffix == ".mp4":
             with dataset_errors(layout.root, path, episode.number):
-                stats[path.parent.parent.name] = picture_stats(path, rows, episode.fps).stats()
+                first = episode.first_picture(path)
+                stats[path.parent.parent.name] = picture_stats(path, rows, episode.fps, first).stats()
     return stats
+
+
+def _numbers(column: Any, rows: int) -> NDArray[Any]:
+    """Return a column of an Arrow table as an array (rows, n)."""
+    whole = column.combine_chunks()
+    found: NDArray[Any] = (whole.flatten() if hasattr(whole, "flatten") else whole).to_numpy(zero_copy_only=False)
+    return found.reshape(rows, -1)

@@ -11,14 +11,15 @@ from typing import Annotated, Any, Literal
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, FiniteFloat, ValidationError, model_validator
 
 from ..errors import DatasetError, HalError
-from .layout import CHUNK, DatasetLayout, read_json
+from .layout import CHUNK, DatasetLayout, EpisodePlace, read_json, video_names
 
 __all__ = [
     "CameraName",
     "check_next_episode",
     "checked_name",
+    "next_place",
     "read_about",
-    "read_entry",
+    "read_entries",
     "read_index",
     "read_tasks",
     "dataset_errors",
@@ -107,6 +108,15 @@ class _Rig(_Model):
     resolved: _Resolved
 
 
+_At = Annotated[list[Annotated[int, Field(ge=0)]], Field(min_length=2, max_length=2)]
+
+
+class _Files(_Model):
+    index: Annotated[int, Field(ge=0)]
+    data: _At
+    videos: dict[CameraName, _At]
+
+
 class _About(_Model):
     """The keys of ``episodes/N.json`` that are used here."""
 
@@ -127,6 +137,7 @@ class _About(_Model):
     fps: Annotated[int, Field(ge=1, le=1000)] | None = None
     robot_type: str | None = None
     clock: Literal["real_time", "lock_step"] | None = None
+    files: _Files | None = None
     features: dict[CameraName, _Feature] | None = None
     """Missing in episodes of older versions."""
 
@@ -195,7 +206,7 @@ def read_index(layout: DatasetLayout) -> dict[str, Any] | None:
     with dataset_errors(layout.root, layout.info):
         info = validated_info(read_json(layout.info))
     last = info["total_episodes"] - 1
-    if last >= 0 and not any(path.exists() for path in layout.files_of(last)):
+    if last >= 0 and not any(path.exists() for path in layout.files_of(last, EpisodePlace.of(last, {}), ())):
         raise DatasetError(
             f"lists {last + 1} episodes, and there is no file of episode {last}; to rebuild it: "
             f"{repair_command(layout)}",
@@ -205,6 +216,13 @@ def read_index(layout: DatasetLayout) -> dict[str, Any] | None:
     return info
 
 
+def next_place(layout: DatasetLayout, info: dict[str, Any] | None) -> EpisodePlace:
+    """Return the place of a dataset's next episode, in files of its own; ``info`` is None for the first one."""
+    number = int(info["total_episodes"]) if info is not None else 0
+    before = EpisodePlace.of(number - 1, read_about(layout, number - 1)) if number else EpisodePlace(-1, (-1, 0), {})
+    return before.after(video_names(info["features"]) if info is not None else ())
+
+
 def check_next_episode(layout: DatasetLayout, info: dict[str, Any] | None) -> None:
     """Check that the index is complete, and that the next episode overwrites no finished one.
 
@@ -212,7 +230,8 @@ def check_next_episode(layout: DatasetLayout, info: dict[str, Any] | None) -> No
         DatasetError: It is not, or does (code ``index_wrong``).
     """
     number = int(info["total_episodes"]) if info is not None else 0
-    for path in layout.files_of(number):
+    videos = video_names(info["features"]) if info is not None else []
+    for path in layout.files_of(number, next_place(layout, info), videos):
         if path.exists():
             raise DatasetError(
                 f"exists, but meta/info.json does not list this episode; nothing is recorded over it. Rebuild the "
@@ -237,15 +256,13 @@ def read_about(layout: DatasetLayout, number: int) -> dict[str, Any]:
         return _validated(_About, read_json(path))
 
 
-def read_entry(path: Path) -> dict[str, Any]:
-    """Return the one row of an episode's :func:`~hal.recording.finish.entry_table`.
-
-    Raises ValueError for another count.
-    """
+def read_entries(path: Path, *, stats: bool) -> dict[int, dict[str, Any]]:
+    """Return the rows of a file of ``meta/episodes`` by the number of the episode, with or without the statistics."""
     import pyarrow.parquet as pq
 
-    (row,) = pq.ParquetFile(path).read().to_pylist()
-    return dict(row)
+    file = pq.ParquetFile(path)
+    names = [name for name in file.schema_arrow.names if stats or not name.startswith("stats/")]
+    return {row["episode_index"]: row for row in file.read(columns=names).to_pylist()}
 
 
 def read_tasks(path: Path) -> list[str]:

@@ -8,9 +8,10 @@ import importlib.util
 import json
 import math
 import os
+import re
 import shutil
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -19,36 +20,50 @@ from ..types import STREAMS
 
 __all__ = [
     "ACTION",
+    "AFTERWARDS",
     "BOOKKEEPING",
     "CameraSetup",
     "Column",
     "GRID",
     "MOVES",
     "DatasetLayout",
+    "EpisodePlace",
+    "GROUP",
     "MORE_STREAMS",
     "PAD",
     "SEGMENTATION",
     "SETPOINT",
+    "SOURCE",
+    "SOURCES",
     "STATE",
     "TIMES",
     "VERSION",
+    "VIDEO_MB",
+    "current_key",
     "features_of",
     "lock_dataset",
     "read_json",
     "require_libraries",
     "sync_to_disk",
     "video_key",
+    "video_names",
     "write_json",
 ]
 
 VERSION = "v3.0"
 """Version of LeRobot's format."""
 STATE = "observation.state"
-SETPOINT = "observation.setpoint"
 ACTION = "action"
-PAD = "observation.pad"
-"""Not ``action.pad``: LeRobot treats every column whose name begins with ``action`` as an action."""
-TIMES = "observation.time."
+SETPOINT = "rig.setpoint"
+"""LeRobot treats columns whose names begin with ``observation`` or ``action`` as inputs and outputs of a policy. What a
+policy must not learn from, because it contains the answer or is unknown on a robot, begins with ``rig``."""
+PAD = "rig.pad"
+SOURCE = "source"
+SOURCES = ("", "person", "policy", "program")
+"""Who drives, by the number in :data:`SOURCE`; empty if it is unknown."""
+AFTERWARDS: dict[str, str] = {"intervention": "bool", "next.success": "bool", "next.done": "bool"}
+"""Columns that are known when an episode ends, with their types."""
+TIMES = "rig.time."
 """Prefix of the columns whose first number is a time, s: on the rig's clock while it is recorded, in the dataset since
 the episode's first row."""
 GRID = f"{TIMES}grid"
@@ -71,7 +86,7 @@ class Column(NamedTuple):
 
     key: str
     dtype: str
-    """``float32``, ``float64`` or ``int64`` on disk; in the queue every number is a double."""
+    """``float32``, ``float64``, ``int64`` or ``bool`` on disk; in the queue every number is a double."""
     names: tuple[str, ...]
 
     @property
@@ -109,6 +124,16 @@ class CameraSetup(NamedTuple):
         return depth | {f"{self.name}_{stream}": stream for stream in self.more if stream == SEGMENTATION}
 
 
+_RENAMED = re.compile(
+    r"observation\.(?=(setpoint|setpoint_velocity|tcp_set|status|pad|(camera_pose|object|time)\..*)$)"
+)
+
+
+def current_key(key: str) -> str:
+    """Return the present name of a column: in older datasets ``observation`` begins every name."""
+    return _RENAMED.sub("rig.", key)
+
+
 def video_key(video: str) -> str:
     """Return the dataset's key of a video: of a camera's colour, or of ``<camera>_infrared``."""
     return f"observation.images.{video}"
@@ -127,6 +152,7 @@ def features_of(
     """
     found = {column.key: column.feature for column in columns}
     features = {STATE: found.pop(STATE), ACTION: {**found[SETPOINT]}, **found}
+    features |= {key: {"dtype": dtype, "shape": [1], "names": None} for key, dtype in AFTERWARDS.items()}
     for camera in cameras:
         for name in camera.videos:
             features[video_key(name)] = {
@@ -150,6 +176,11 @@ def features_of(
 _LIBRARIES = ("pyarrow", "av", "zstandard")
 
 
+def video_names(features: Mapping[str, Mapping[str, Any]]) -> list[str]:
+    """Return the names of the videos among ``features`` of ``meta/info.json``."""
+    return [key.removeprefix(video_key("")) for key, each in features.items() if each["dtype"] == "video"]
+
+
 def require_libraries() -> None:
     """Raise DriverMissing, with the command that installs them, if a library is missing. Imports none of them."""
     missing = [name for name in _LIBRARIES if importlib.util.find_spec(name) is None]
@@ -161,6 +192,10 @@ def require_libraries() -> None:
 
 CHUNK = 1000
 """Files in a folder."""
+GROUP = 100
+"""Episodes whose rows share a file, at most."""
+VIDEO_MB = 200
+"""Size up to which videos are joined, MB."""
 MOVES = "list.json"
 """Name of the file in a partial folder that lists where its files go. Once it exists, the episode counts as saved."""
 _DIGITS = "[0-9]" * 3
@@ -170,8 +205,47 @@ _PATIENCE = 5.0
 """Time to wait for another process to release a dataset, s: the writer of a program that was killed is about to end."""
 
 
+class EpisodePlace(NamedTuple):
+    """Which files hold an episode, by their numbers, and where it begins in those that several episodes may share."""
+
+    entry: int
+    """File of its row in LeRobot's index."""
+    data: tuple[int, int]
+    """File of its rows, and the number of its first row there."""
+    videos: Mapping[str, tuple[int, int]]
+    """File of each video, and the number of the episode's first picture there."""
+
+    @classmethod
+    def of(cls, number: int, about: Mapping[str, Any]) -> EpisodePlace:
+        """Return the place of an episode from its metadata; older ones have files of the episode's number."""
+        files = about.get("files")
+        if files is None:
+            return cls(number, (number, 0), {})
+        return cls(files["index"], (*files["data"],), {name: (*at,) for name, at in files["videos"].items()})
+
+    def video(self, name: str) -> tuple[int, int]:
+        """Return the file of a video, and the number of the episode's first picture there."""
+        return self.videos.get(name, (self.entry, 0))
+
+    def after(self, videos: Iterable[str]) -> EpisodePlace:
+        """Return the place of a next episode, in files of its own."""
+        return EpisodePlace(
+            self.entry + 1, (self.data[0] + 1, 0), {name: (self.video(name)[0] + 1, 0) for name in videos}
+        )
+
+    def as_json(self) -> dict[str, Any]:
+        """Return the entry of an episode's metadata."""
+        videos = {name: list(at) for name, at in self.videos.items()}
+        return {"files": {"index": self.entry, "data": list(self.data), "videos": videos}}
+
+
 class DatasetLayout:
-    """Paths of the files of one dataset. Every episode has files of its own, so that no episode can damage another."""
+    """Paths of the files of one dataset.
+
+    An episode is recorded into files of its own, so that no episode can damage another. Later several episodes may
+    share a file of rows, of videos or of the index (:func:`~hal.recording.merging.merge`); :class:`EpisodePlace` says
+    where they are. Depth and metadata always have a file per episode.
+    """
 
     def __init__(self, root: str | Path) -> None:
         self.root = Path(root).expanduser().absolute()
@@ -185,17 +259,17 @@ class DatasetLayout:
     def _file(number: int) -> str:
         return f"chunk-{number // CHUNK:03d}/file-{number % CHUNK:03d}"
 
-    def data(self, number: int) -> Path:
-        """Return the path of an episode's rows."""
-        return self.root / "data" / f"{self._file(number)}.parquet"
+    def data(self, file: int) -> Path:
+        """Return the path of a file of rows, by its number."""
+        return self.root / "data" / f"{self._file(file)}.parquet"
 
-    def entry(self, number: int) -> Path:
-        """Return the path of an episode's row in LeRobot's index."""
-        return self.root / "meta" / "episodes" / f"{self._file(number)}.parquet"
+    def entry(self, file: int) -> Path:
+        """Return the path of a file of LeRobot's index of episodes, by its number."""
+        return self.root / "meta" / "episodes" / f"{self._file(file)}.parquet"
 
-    def video(self, camera: str, number: int) -> Path:
-        """Return the path of a video; ``camera`` is one of :attr:`CameraSetup.videos`."""
-        return self.root / "videos" / video_key(camera) / f"{self._file(number)}.mp4"
+    def video(self, name: str, file: int) -> Path:
+        """Return the path of a file of a video, by its number; ``name`` is one of :attr:`CameraSetup.videos`."""
+        return self.root / "videos" / video_key(name) / f"{self._file(file)}.mp4"
 
     def depth(self, camera: str, number: int) -> Path:
         """Return the path of a depth file; ``camera`` is one of :attr:`CameraSetup.depths`."""
@@ -218,11 +292,11 @@ class DatasetLayout:
         """Partial folders of episodes that count as saved, but whose files are not all in their places yet."""
         return [partial for partial in self.partials() if (partial / MOVES).exists()]
 
-    def files_of(self, number: int) -> list[Path]:
-        """Return the paths of an episode's files, existing or not; of videos and depth only those that exist."""
-        file = self._file(number)
-        found = [self.data(number), self.about(number), self.entry(number)]
-        return found + [path for kind in ("videos", "depth") for path in self.root.glob(f"{kind}/*/{file}.*")]
+    def files_of(self, number: int, place: EpisodePlace, videos: Iterable[str]) -> list[Path]:
+        """Return the paths of an episode's files, existing or not; of depth only those that exist."""
+        found = [self.about(number), self.data(place.data[0]), self.entry(place.entry)]
+        found += [self.video(name, place.video(name)[0]) for name in videos]
+        return [*found, *self.root.glob(f"depth/*/{self._file(number)}.depth")]
 
     def finished(self) -> Iterator[Path]:
         """Yield every file of a finished episode."""
@@ -234,13 +308,6 @@ class DatasetLayout:
             ("depth/*", "depth"),
         ):
             yield from self.root.glob(f"{kind}/{_CHUNK_FILES}.{ending}")
-
-    @staticmethod
-    def number_of(path: Path) -> int:
-        """Return the number of the episode that a file of :meth:`finished` belongs to."""
-        if path.suffix == ".json":
-            return int(path.stem)
-        return CHUNK * int(path.parent.name.removeprefix("chunk-")) + int(path.stem.removeprefix("file-"))
 
     def numbers(self) -> list[int]:
         """Return the numbers of the episodes whose metadata file exists, in order."""

@@ -8,26 +8,49 @@ from __future__ import annotations
 
 import contextlib
 import json
+import logging
 import os
 import shutil
 from collections.abc import Callable, Collection, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from functools import lru_cache, partial
 from itertools import accumulate
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
-from ..errors import CommandError, DatasetError
+from ..errors import CommandError, DatasetError, HalError
 from .checking import format_differences
-from .codecs import Stats, column_stats, merge_stats, stats_as_lists
+from .codecs import Stats, VideoPart, can_be_joined, column_stats, join_videos, merge_stats, stats_as_lists
 from .dataset import Dataset, Episode
-from .finish import entry_table, new_info, tasks_table, write_table
-from .index import dataset_errors, read_about, read_entry
-from .layout import CHUNK, DatasetLayout, lock_dataset, require_libraries, video_key, write_json
+from .finish import entries_table, entry_row, last_row, new_info, tasks_table, write_table
+from .index import dataset_errors, read_entries, read_tasks
+from .layout import (
+    CHUNK,
+    GROUP,
+    VIDEO_MB,
+    DatasetLayout,
+    EpisodePlace,
+    lock_dataset,
+    require_libraries,
+    video_names,
+    write_json,
+)
 
-__all__ = ["EpisodeLabel", "delete_episodes", "extract", "finish_replacement", "mark_episodes", "merge", "set_task"]
+__all__ = [
+    "EpisodeLabel",
+    "delete_episodes",
+    "extract",
+    "finish_replacement",
+    "mark_episodes",
+    "merge",
+    "pack",
+    "set_task",
+]
 
+_LOG = logging.getLogger("hal.recording")
 _THREADS = 4
 
 
@@ -40,7 +63,7 @@ class EpisodeLabel(NamedTuple):
 
 
 class _Source(NamedTuple):
-    part: DatasetLayout
+    dataset: Dataset
     episode: Episode
     label: EpisodeLabel
 
@@ -91,7 +114,7 @@ def merge(
                 )
         sources = _sources(layouts, key, label or _label)
         shutil.rmtree(building, ignore_errors=True)
-        _build(DatasetLayout(building), sources, on_episode)
+        _Builder(DatasetLayout(building), sources).build(on_episode)
         os.sync()  # the parts may be removed next
         if replaces:
             shutil.rmtree(replaced, ignore_errors=True)
@@ -147,10 +170,40 @@ def set_task(dataset: str | Path, task: str, episodes: Collection[int] | None = 
 def mark_episodes(dataset: str | Path, marks: Mapping[int, bool | None]) -> None:
     """Mark episodes as a success (True), a failure (False) or neither (None). Raises as :func:`extract`."""
     _existing(dataset, marks)
-    layout = DatasetLayout(dataset)
-    with lock_dataset(layout):
-        for number, success in marks.items():
-            write_json(layout.about(number), read_about(layout, number) | {"success": success})
+    merge(
+        [dataset],
+        dataset,
+        label=lambda episode: EpisodeLabel(episode.task, marks.get(episode.number, episode.success)),
+    )
+
+
+def pack(dataset: str | Path) -> int:
+    """Join the files of episodes that were recorded one by one: rows, index, and videos up to :data:`VIDEO_MB`.
+
+    Nothing is encoded again, and large files are linked, so that it takes as long as the new episodes need. The
+    recorder does it when :data:`LOOSE` of them have come together.
+
+    Returns:
+        The number of files of rows.
+
+    Raises:
+        As :func:`merge`.
+    """
+    return -(-merge([dataset], dataset) // GROUP)
+
+
+LOOSE = 100
+"""Episodes with files of their own from which a recorder joins them when it is closed."""
+
+
+def pack_if_loose(dataset: str | Path) -> None:
+    """Call :func:`pack` if many episodes have files of their own. Never raises; what cannot be joined stays."""
+    try:
+        episodes = Dataset(dataset).episodes if DatasetLayout(dataset).info.exists() else ()
+        if episodes and episodes[-1].place.data[0] + 1 - -(-len(episodes) // GROUP) >= LOOSE:
+            pack(dataset)
+    except (HalError, OSError) as error:
+        _LOG.warning("the files of %s were not joined: %s", dataset, error)
 
 
 def _label(episode: Episode) -> EpisodeLabel:
@@ -197,8 +250,8 @@ def _sources(
                 code="other_dataset",
             )
     sources = [
-        _Source(layout, episode, new)
-        for layout, dataset in zip(layouts, datasets, strict=True)
+        _Source(dataset, episode, new)
+        for dataset in datasets
         for episode in dataset.episodes
         if (new := label(episode)) is not None
     ]
@@ -223,89 +276,221 @@ def _camera_differences(one: Dataset, other: Dataset) -> list[str]:
     return [] if there == here else [f"depth and streams are {there} there, and {here} here"]
 
 
-def _build(layout: DatasetLayout, sources: Sequence[_Source], on_episode: Callable[[int, int], object]) -> None:
-    """Write a whole dataset, ``info.json`` last."""
-    info = new_info(*(sources[0].episode._meta[name] for name in ("features", "fps", "robot_type")))
-    tasks = list(dict.fromkeys(source.label.task for source in sources))
-    starts = [0, *accumulate(source.episode.length for source in sources)]
+class _Builder:
+    """Writes a dataset of episodes of other ones: file by file, each a link where it stays as it is."""
 
-    def add(number: int) -> dict[str, Stats]:
-        return _add(layout, number, starts[number], tasks.index(sources[number].label.task), sources[number])
+    def __init__(self, layout: DatasetLayout, sources: Sequence[_Source]) -> None:
+        self.layout, self.sources = layout, sources
+        self.features: dict[str, Any] = sources[0].episode._meta["features"]
+        self.fps = sources[0].episode.fps
+        self.tasks = list(dict.fromkeys(source.label.task for source in sources))
+        self.starts = [0, *accumulate(source.episode.length for source in sources)]
+        """Number of each episode's first row in the whole dataset; then of all rows."""
+        self._entries = lru_cache(maxsize=2 * _THREADS)(partial(read_entries, stats=True))
+        self._tasks = lru_cache(maxsize=None)(read_tasks)
+        self._places: dict[str, list[tuple[int, int]]] = {}
+        """File of each video of each episode, and the number of its first picture there."""
 
-    total: dict[str, Stats] = {}
-    layout.episodes.mkdir(parents=True)
-    with ThreadPoolExecutor(min(_THREADS, os.cpu_count() or 1)) as pool:  # PyArrow releases the interpreter lock
-        try:
-            for number, stats in enumerate(pool.map(add, range(len(sources)))):
-                total = {key: merge_stats(total.get(key), found) for key, found in stats.items()}
-                on_episode(number + 1, len(sources))
-        except BaseException:
-            pool.shutdown(cancel_futures=True)
-            raise
-    write_table(layout.tasks, tasks_table(tasks))
-    write_json(layout.stats, stats_as_lists(total))
-    counts = {"total_episodes": len(sources), "total_frames": starts[-1], "total_tasks": len(tasks)}
-    write_json(layout.info, info | counts | {"splits": {"train": f"0:{len(sources)}"}})
+    def build(self, on_episode: Callable[[int, int], object]) -> None:
+        """Write everything, ``info.json`` last."""
+        count = len(self.sources)
+        total: dict[str, Stats] = {}
+        self.layout.episodes.mkdir(parents=True)
+        with ThreadPoolExecutor(min(_THREADS, os.cpu_count() or 1)) as pool:  # the libraries release the lock
+            try:
+                names = video_names(self.features)
+                self._places = dict(zip(names, pool.map(self._join_videos, names), strict=True))
+                done = 0
+                for found in pool.map(self._add_group, range(0, count, GROUP)):
+                    for stats in found:
+                        total = {key: merge_stats(total.get(key), each) for key, each in stats.items()}
+                        done += 1
+                        on_episode(done, count)
+            except BaseException:
+                pool.shutdown(cancel_futures=True)
+                raise
+        write_table(self.layout.tasks, tasks_table(self.tasks))
+        write_json(self.layout.stats, stats_as_lists(total))
+        info = new_info(self.features, self.fps, self.sources[0].episode._meta["robot_type"])
+        counts = {"total_episodes": count, "total_frames": self.starts[-1], "total_tasks": len(self.tasks)}
+        write_json(self.layout.info, info | counts | {"splits": {"train": f"0:{count}"}})
 
+    # Videos.
 
-def _add(layout: DatasetLayout, number: int, start: int, task: int, source: _Source) -> dict[str, Stats]:
-    """Write the files of one episode, with its new numbers; return its statistics."""
-    import pyarrow as pa
-    import pyarrow.parquet as pq
+    def _join_videos(self, name: str) -> list[tuple[int, int]]:
+        """Write the files of one video; return the file of each episode, and its first picture there.
 
-    part, episode, label = source
-    path, rows = part.data(episode.number), episode.length
-    renumbered = {
-        "episode_index": np.full(rows, number),
-        "index": np.arange(start, start + rows),
-        "task_index": np.full(rows, task),
-    }
-    with (
-        dataset_errors(part.root, path, episode.number),
-        pq.ParquetFile(path, page_checksum_verification=True) as file,
-    ):
-        table = file.read(use_threads=False)
-        if table.num_rows != rows:
-            raise ValueError(f"it has {table.num_rows} rows, and the episode has {rows}")
-        for name, values in renumbered.items():
-            table = table.set_column(table.schema.get_field_index(name), name, pa.array(values, pa.int64()))
-    _write(layout.data(number), lambda file: pq.write_table(table, file, write_page_checksum=True))
+        A file becomes a link if all of it is used and it is large; others are joined, up to :data:`VIDEO_MB`.
+        """
+        files: list[list[_Run]] = []
+        for run in self._runs(name):
+            if files and _fits(files[-1], run):
+                files[-1].append(run)
+            else:
+                files.append([run])
+        for number, runs in enumerate(files):
+            target = self.layout.video(name, number)
+            target.parent.mkdir(parents=True, exist_ok=True)
+            if len(runs) == 1 and runs[0].whole:
+                _link(runs[0].part.path, target)
+            else:
+                with dataset_errors(self.layout.root, runs[0].part.path):
+                    join_videos([run.part for run in runs], target, self.fps)
+        places, file, first = [], 0, 0
+        sizes = [sum(run.part.length for run in runs) for runs in files]
+        for source in self.sources:
+            if first == sizes[file]:
+                file, first = file + 1, 0
+            places.append((file, first))
+            first += source.episode.length
+        return places
 
-    stats = _read_stats(part, episode) | {name: column_stats(values[:, None]) for name, values in renumbered.items()}
-    videos = []
-    for pictures in (file for camera in episode.cameras for file in episode.files(camera).values()):
-        name = pictures.parent.parent.name
-        if pictures.suffix == ".mp4":
-            videos.append(name.removeprefix(video_key("")))
-            place = layout.video(videos[-1], number)
+    def _runs(self, name: str) -> list[_Run]:
+        """Return the pictures of all episodes; those that follow each other in a file already are one part."""
+        pictures: dict[Path, int] = {}
+        for dataset in {source.dataset.root: source.dataset for source in self.sources}.values():
+            for episode in dataset.episodes:
+                path = episode._layout.video(name, episode.place.video(name)[0])
+                pictures[path] = pictures.get(path, 0) + episode.length
+        parts: list[VideoPart] = []
+        for _, episode, _ in self.sources:
+            file, first = episode.place.video(name)
+            path = episode._layout.video(name, file)
+            with dataset_errors(episode._layout.root, path, episode.number):
+                path.stat()
+            last = parts[-1] if parts else None
+            if last is not None and (last.path, last.first + last.length) == (path, first):
+                parts[-1] = last._replace(length=last.length + episode.length)
+            else:
+                parts.append(VideoPart(path, first, episode.length))
+        return [
+            _Run(part, part.path.stat().st_size * part.length / pictures[part.path], part.length == pictures[part.path])
+            for part in parts
+        ]
+
+    # Rows, index, metadata and depth.
+
+    def _add_group(self, begin: int) -> list[dict[str, Stats]]:
+        """Write the files of :data:`GROUP` episodes, but not their videos; return their statistics."""
+        group, numbers = begin // GROUP, range(begin, min(begin + GROUP, len(self.sources)))
+        data = self.layout.data(group)
+        data.parent.mkdir(parents=True, exist_ok=True)
+        kept = self._kept_rows(numbers)
+        if kept is not None:
+            _link(kept, data)
         else:
-            place = layout.depth(name, number)
-        with dataset_errors(part.root, pictures, episode.number):
-            _link(pictures, place)
-    entry = entry_table(number, rows, start, label.task, videos, episode.fps, stats)
-    _write(layout.entry(number), lambda file: pq.write_table(entry, file, use_dictionary=False, write_statistics=False))
-    about = json.dumps(episode.info | {"episode": number} | label._asdict(), indent=1)
-    layout.about(number).write_text(about + "\n", encoding="utf-8")
-    return stats
+            self._write_rows(data, numbers)
+        found, rows = [], []
+        for number in numbers:
+            _, episode, label = self.sources[number]
+            stats = self._stats(number)
+            first = self.starts[number] - self.starts[begin]
+            place = EpisodePlace(group, (group, first), {name: at[number] for name, at in self._places.items()})
+            about = episode.info | {"episode": number} | label._asdict() | place.as_json()
+            if about == episode.info:
+                _link(episode._layout.about(number), self.layout.about(number))
+            else:
+                self.layout.about(number).write_text(json.dumps(about, indent=1) + "\n", encoding="utf-8")
+            for path in (path for camera in episode.cameras for path in episode.files(camera).values()):
+                if path.suffix == ".depth":
+                    with dataset_errors(episode._layout.root, path, episode.number):
+                        _link(path, self.layout.depth(path.parent.parent.name, number))
+            rows.append(entry_row(about, place, self.starts[number], self.fps, stats))
+            found.append(stats)
+        write_table(self.layout.entry(group), entries_table(rows))
+        return found
 
+    def _entry(self, number: int) -> dict[str, Any]:
+        """Return the row of an episode of the result in the index of its part."""
+        episode = self.sources[number].episode
+        path = episode._layout.entry(episode.place.entry)
+        with dataset_errors(episode._layout.root, path, episode.number):
+            return self._entries(path)[episode.number]
 
-def _read_stats(part: DatasetLayout, episode: Episode) -> dict[str, Stats]:
-    """Return the statistics of an episode's columns and videos, from its row of the index."""
-    path = part.entry(episode.number)
-    stats: dict[str, Stats] = {}
-    with dataset_errors(part.root, path, episode.number):
-        for name, value in read_entry(path).items():
+    def _changed(self, number: int) -> dict[str, NDArray[Any]]:
+        """Return the columns (rows,) of an episode that depend on its number and its label."""
+        _, episode, label = self.sources[number]
+        rows = episode.length
+        found = {
+            "episode_index": np.full(rows, number),
+            "index": np.arange(self.starts[number], self.starts[number] + rows),
+            "task_index": np.full(rows, self.tasks.index(label.task)),
+            "next.success": last_row(rows, label.success is True)[:, 0],
+        }
+        return {key: values for key, values in found.items() if key in self.features}
+
+    def _stats(self, number: int) -> dict[str, Stats]:
+        """Return the statistics of an episode's columns and videos, from the index of its part."""
+        episode = self.sources[number].episode
+        stats: dict[str, Stats] = {}
+        for name, value in self._entry(number).items():
             if name.startswith("stats/"):
                 _, key, what = name.split("/")
                 stats.setdefault(key, {})[what] = np.array(value)
-        if missing := [key for key in episode._meta["features"] if key not in stats]:
-            raise DatasetError(f"has no statistics of {', '.join(missing)}", file=str(path.relative_to(part.root)))
-    return stats
+        if missing := [key for key in self.features if key not in stats]:
+            file = episode._layout.entry(episode.place.entry).relative_to(episode._layout.root)
+            raise DatasetError(f"has no statistics of {', '.join(missing)}", file=str(file), episode=episode.number)
+        return stats | {key: column_stats(values[:, None]) for key, values in self._changed(number).items()}
+
+    def _kept_rows(self, numbers: range) -> Path | None:
+        """Return the file that holds the rows of just these episodes as they are to be; None if there is none."""
+        first = self.sources[numbers[0]].episode
+        path, end = first._layout.data(first.place.data[0]), 0
+        for number in numbers:
+            _, episode, label = self.sources[number]
+            entry = self._entry(number)
+            known = self._tasks(episode._layout.tasks)
+            if (
+                episode._layout.data(episode.place.data[0]) != path
+                or episode.place.data[1] != end
+                or (episode.number, entry["dataset_from_index"]) != (number, self.starts[number])
+                or entry["tasks"] != [label.task]
+                or known.index(label.task) != self.tasks.index(label.task)
+                or ("next.success" in self.features and (entry.get("success") is True) != (label.success is True))
+            ):
+                return None
+            end += episode.length
+        sharing = [
+            each for each in self.sources[numbers[0]].dataset.episodes if each.place.data[0] == first.place.data[0]
+        ]
+        return path if len(sharing) == len(numbers) else None
+
+    def _write_rows(self, path: Path, numbers: range) -> None:
+        """Write the rows of some episodes with their new numbers, each as a row group of its own."""
+        import pyarrow as pa
+        import pyarrow.parquet as pq
+
+        with contextlib.ExitStack() as stack:
+            file: Any = None
+            for number in numbers:
+                episode = self.sources[number].episode
+                table = episode.read_table().replace_schema_metadata()
+                with dataset_errors(episode._layout.root, episode._layout.root / episode.data_file, episode.number):
+                    for key, values in self._changed(number).items():
+                        table = table.set_column(table.schema.get_field_index(key), key, pa.array(values))
+                    if file is None:
+                        file = stack.enter_context(pq.ParquetWriter(path, table.schema, write_page_checksum=True))
+                    file.write_table(table.cast(file.schema), row_group_size=len(table))
 
 
-def _write(path: Path, write: Callable[[Path], object]) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    write(path)
+class _Run(NamedTuple):
+    """Pictures of episodes that follow each other in one file."""
+
+    part: VideoPart
+    size: float
+    """Bytes."""
+    whole: bool
+    """Whether they are all of the file's pictures."""
+
+
+def _fits(file: Sequence[_Run], run: _Run) -> bool:
+    """Return whether a run is to be joined to a file; a large file stays as it is, because copying it takes time."""
+    limit = VIDEO_MB * 1e6
+    if sum(each.size for each in (*file, run)) > limit or any(
+        each.whole and each.size > limit / 2 for each in (file[0], run)
+    ):
+        return False
+    return can_be_joined(file[0].part.path, run.part.path)
 
 
 def _link(source: Path, target: Path) -> None:

@@ -23,6 +23,7 @@ from .finish import write_mark
 from .index import read_index
 from .layout import MORE_STREAMS, TIMES, DatasetLayout, features_of, lock_dataset, require_libraries
 from .live import RowQueue
+from .merging import pack_if_loose
 from .metadata import ClockPace, caller_metadata, rig_metadata, start_metadata
 from .sampling import CameraBuffer, LockStepSampleClock, RealTimeSampleClock, RowSampler, SampleClock
 
@@ -128,6 +129,8 @@ class Recorder:
         self.fps = fps = int(fps)
         self.task = task
         """Task of the next episodes."""
+        self.source: Callable[[], str] = str
+        """Returns who drives when a row is due: ``person``, ``policy``, ``program``; empty if that is unknown."""
         self.root = DatasetLayout(out).root
         self._selected = cameras, [stream for stream in streams if depth or stream != "depth"]
         self._sampler, self._buffers, self.notes = select_devices(rig, *self._selected)
@@ -236,9 +239,7 @@ class Recorder:
             if self._closed:
                 raise CommandError("the recorder is closed", code="recorder_closed")
             if self._is_open:
-                raise CommandError(
-                    f"episode {self._episode} is still being recorded: save or discard it first", code="episode_open"
-                )
+                raise CommandError(f"save or discard episode {self._episode} first", code="episode_open")
             if self._saving is not None:
                 self._saving.wait()
                 if self._saving.error is not None:
@@ -255,6 +256,7 @@ class Recorder:
                 begun = self._child.request("begin", {"about": about}, _SAVING)
                 self.notes.extend(begun["notes"])
                 self._episode = begun["episode"]
+                self._sampler.source = self.source
                 episode = EpisodeRecorder(self.rig, self.fps, self._sampler, self._buffers, self._queue, self._child)
                 episode.start()
             except BaseException:
@@ -357,6 +359,7 @@ class Recorder:
                 self._saving.wait()
             self._child.close()
             self._memory.close()
+            pack_if_loose(self.root)
 
     def __enter__(self) -> Recorder:
         return self

@@ -240,7 +240,7 @@ def summary_as_json(found: DatasetSummary) -> str:
 
 
 def _line(episode: Episode) -> EpisodeSummary:
-    status, names = episode.columns["observation.status"], episode.names("observation.status")
+    status, names = episode.columns["rig.status"], episode.names("rig.status")
     trips = 0
     for k, name in enumerate(names):
         if name.split(".")[-1] == "trip":
@@ -396,7 +396,7 @@ def _photos(
 def _statuses(canvas: SheetCanvas, content: EpisodeContent, y: float) -> float:
     y = _legend(canvas, content, y) + 6
     for arm in content.arms:
-        status = content.of(arm, "observation.status").astype(int)
+        status = content.of(arm, "rig.status").astype(int)
         canvas.text(_MARGIN, y, arm.name, 14)
         for run in _runs(content, status[:, 0]):
             x, width = _span(content, run)
@@ -415,7 +415,7 @@ def _statuses(canvas: SheetCanvas, content: EpisodeContent, y: float) -> float:
 
 def _legend(canvas: SheetCanvas, content: EpisodeContent, y: float) -> float:
     x: float = _MARGIN
-    there = {int(value) for arm in content.arms for value in content.of(arm, "observation.status")[:, 0]}
+    there = {int(value) for arm in content.arms for value in content.of(arm, "rig.status")[:, 0]}
     limited = Limited(0)
     for arm in content.arms:
         limited |= Limited(int(np.bitwise_or.reduce(_limits(content, arm))))
@@ -432,11 +432,11 @@ def _legend(canvas: SheetCanvas, content: EpisodeContent, y: float) -> float:
 
 
 def _limits(content: EpisodeContent, arm: ArmColumns) -> NDArray[np.int64]:
-    return content.of(arm, "observation.status")[:, 2].astype(np.int64)
+    return content.of(arm, "rig.status")[:, 2].astype(np.int64)
 
 
 def _trips(content: EpisodeContent, arm: ArmColumns) -> NDArray[np.int64]:
-    return content.of(arm, "observation.status")[:, 1].astype(np.int64)
+    return content.of(arm, "rig.status")[:, 1].astype(np.int64)
 
 
 def _runs(content: EpisodeContent, values: NDArray[np.int64]) -> Iterator[_Run]:

@@ -20,7 +20,7 @@ from ..clock import LockStepClock
 from ..errors import ConnectionLost, DeviceNotFound, StaleStateError
 from ..types import AXES, BUTTONS, Frame, GripperState, PadState, RobotState, Stamp
 from .codecs import depth_unit_for
-from .layout import GRID, MORE_STREAMS, PAD, SETPOINT, STATE, TIMES, CameraSetup, Column
+from .layout import GRID, MORE_STREAMS, PAD, SETPOINT, SOURCE, SOURCES, STATE, TIMES, CameraSetup, Column
 
 if TYPE_CHECKING:
     from ..camera import Camera
@@ -295,6 +295,8 @@ class RowSnapshot(NamedTuple):
     """Poses in the simulated world, by the object's name; objects that were removed from the world are missing."""
     t_objects: float
     """Time of these poses, s on the rig's clock."""
+    source: int
+    """Who drives: a place in :data:`~hal.recording.layout.SOURCES`."""
 
 
 def movable_objects(rig: Rig) -> tuple[str, ...]:
@@ -316,6 +318,8 @@ class RowSampler:
 
     def __init__(self, rig: Rig, cameras: Iterable[str]) -> None:
         self._rig = rig
+        self.source: Callable[[], str] = str
+        """Returns who drives: one of :data:`~hal.recording.layout.SOURCES`."""
         self._cameras = tuple(cameras)
         self._objects = movable_objects(rig)
         self._pads = tuple(spec.name for spec in rig.plan.pads)
@@ -334,11 +338,12 @@ class RowSampler:
             self._add(f"{TIMES}pad.{name}", _STAMP, "float64")
         for name in self._cameras:
             self._add(f"{TIMES}camera.{name}", _STAMP, "float64")
-            self._add(f"observation.camera_pose.{name}", _POSE)
+            self._add(f"rig.camera_pose.{name}", _POSE)
         for name in self._objects:
-            self._add(f"observation.object.{name}", _POSE)
+            self._add(f"rig.object.{name}", _POSE)
         if self._objects:
             self._add(f"{TIMES}objects", ["t"], "float64")
+        self._add(SOURCE, ["source"], "int64")
         self.columns = tuple(Column(key, dtype, tuple(names)) for key, (dtype, names) in self._parts.items())
         """Key, type and names of the numbers in a row, in order."""
         self.width = sum(len(column.names) for column in self.columns)
@@ -360,27 +365,28 @@ class RowSampler:
         if robot in self._efforts:
             self._add("observation.effort", joints)
         self._add(SETPOINT, joints + finger)
-        self._add("observation.setpoint_velocity", joints)
-        for key in ("observation.tcp", "observation.tcp_set"):
+        self._add("rig.setpoint_velocity", joints)
+        for key in ("observation.tcp", "rig.tcp_set"):
             self._add(key, [lead + name for name in _POSE])
         self._add("observation.twist", [lead + name for name in _TWIST])
-        self._add("observation.status", [lead + name for name in ("status", "trip", "limited")], "int64")
+        self._add("rig.status", [lead + name for name in ("status", "trip", "limited")], "int64")
         self._add(f"{TIMES}robot.{robot.name}", _STAMP, "float64")
         if finger:
             self._add(f"{TIMES}gripper.{robot.name}", _STAMP, "float64")
 
     def read_snapshot(self) -> RowSnapshot:
         """Read what has no history, now."""
+        driver = SOURCES.index(self.source())
         opened = self._rig.gamepads
         pads = {name: opened[name].state() if name in opened else _NO_PAD for name in self._pads}
         if not self._objects:
-            return RowSnapshot(pads, {}, math.nan)
+            return RowSnapshot(pads, {}, math.nan, driver)
         world = self._rig.world
         try:
             seen = world.poses(self._objects)
         except DeviceNotFound:  # one was taken out of the world
             seen = world.poses()
-        return RowSnapshot(pads, seen.poses, seen.t)
+        return RowSnapshot(pads, seen.poses, seen.t, driver)
 
     def row(self, t: float, snapshot: RowSnapshot, frames: dict[str, Frame]) -> list[float]:
         """Return the numbers of a row.
@@ -411,11 +417,12 @@ class RowSampler:
             put(f"{TIMES}pad.{name}", _stamp(pad.stamp))
         for name, frame in frames.items():
             put(f"{TIMES}camera.{name}", _stamp(frame.stamp))
-            put(f"observation.camera_pose.{name}", _pose(frame.T_world_camera))
+            put(f"rig.camera_pose.{name}", _pose(frame.T_world_camera))
         for name in self._objects:
-            put(f"observation.object.{name}", _pose(snapshot.objects.get(name)))
+            put(f"rig.object.{name}", _pose(snapshot.objects.get(name)))
         if self._objects:
             put(f"{TIMES}objects", [snapshot.t_objects])
+        put(SOURCE, [snapshot.source])
         return [value for values in found.values() for value in values]
 
     def _put_robot(self, put: _Put, robot: Robot, state: RobotState) -> None:
@@ -425,11 +432,11 @@ class RowSampler:
         if robot in self._efforts:
             put("observation.effort", [math.nan] * robot.n if state.tau is None else state.tau.tolist())
         put(SETPOINT, [*state.q_set.tolist(), *(grip.width_target for grip in grips)])
-        put("observation.setpoint_velocity", state.dq_set.tolist())
+        put("rig.setpoint_velocity", state.dq_set.tolist())
         put("observation.tcp", _pose(state.tcp))
-        put("observation.tcp_set", _pose(state.tcp_set))
+        put("rig.tcp_set", _pose(state.tcp_set))
         put("observation.twist", state.tcp_twist.tolist())
-        put("observation.status", [float(state.status), float(state.trip), float(state.limited)])
+        put("rig.status", [float(state.status), float(state.trip), float(state.limited)])
         put(f"{TIMES}robot.{robot.name}", _stamp(state.stamp))
         for grip in grips:
             put(f"{TIMES}gripper.{robot.name}", _stamp(grip.stamp))

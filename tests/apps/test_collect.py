@@ -59,12 +59,14 @@ def check_report_and_columns(folder: Path) -> None:
     found, info = report(folder), check_layout(folder / "data")
     assert (found["trips"], found["faults"], found["ended"], found["discarded"]) == ([], [], "", 0)
     assert [one["dropped"] for one in found["episodes"]] == [0, 0]
-    documented = {"state", "velocity", "effort", "setpoint", "setpoint_velocity", "tcp", "tcp_set", "twist", "status"}
-    documented |= {"pad", "object.cube", "object.duck", "time.grid", "time.objects", "time.robot.panda"}
-    documented |= {"time.gripper.panda", "time.pad.pad"}
+    documented = {f"observation.{name}" for name in ("state", "velocity", "effort", "tcp", "twist")}
+    extra = {"setpoint", "setpoint_velocity", "tcp_set", "status", "pad", "object.cube", "object.duck"}
+    extra |= {"time.grid", "time.objects", "time.robot.panda", "time.gripper.panda", "time.pad.pad"}
     for camera in ("scene", "wrist"):
-        documented |= {f"images.{camera}", f"camera_pose.{camera}", f"time.camera.{camera}"}
-    columns = {key.removeprefix("observation.") for key in info["features"] if key.startswith("observation.")}
+        documented |= {f"observation.images.{camera}"}
+        extra |= {f"camera_pose.{camera}", f"time.camera.{camera}"}
+    columns = {key for key in info["features"] if key.startswith(("observation.", "rig."))}
+    documented |= {f"rig.{name}" for name in extra}
     assert columns == documented
 
 
@@ -75,8 +77,8 @@ def check_demonstration(number: int, episode: Episode) -> np.ndarray:
     assert episode.info["info"] == {"program": "collect", "robot": "panda", "mapping": "default", "speed": 1.0}
     assert episode.info["gaps"] == []
     check_stamps(episode)
-    cube, tcp = episode.columns["observation.object.cube"], episode.columns["observation.tcp"]
-    pad, names = episode.columns["observation.pad"], episode.names("observation.pad")
+    cube, tcp = episode.columns["rig.object.cube"], episode.columns["observation.tcp"]
+    pad, names = episode.columns["rig.pad"], episode.names("rig.pad")
     width, target = episode.columns["observation.state"][:, -1], episode.columns["action"][:, -1]
     assert 8.0 < episode.length / 30 < 15.0
     assert cube[0, 2] == pytest.approx(0.63, abs=0.002), "it was on the table"
@@ -85,7 +87,7 @@ def check_demonstration(number: int, episode: Episode) -> np.ndarray:
     assert width[0] > 0.075, "which were open"
     assert 0.025 < width[-1] < 0.036, "and hold its thin side"
     assert target[-1] < 0.01
-    assert (episode.columns["observation.status"][:, 1] == 0).all(), "no trip"
+    assert (episode.columns["rig.status"][:, 1] == 0).all(), "no trip"
     assert pad[:, names.index("l2")].max() == 1.0
     for camera in ("scene", "wrist"):
         assert sum(1 for _ in episode.frames(camera)) == sum(1 for _ in episode.depth(camera)) == episode.length

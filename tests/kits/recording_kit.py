@@ -182,7 +182,7 @@ class Likeness(NamedTuple):
 
 def at_row(episode: Episode, k: int) -> Scene:
     state = episode.columns["observation.state"][k].astype(float)
-    return Scene(state[:7], state[7], {name: episode.columns[f"observation.object.{name}"][k] for name in THINGS})
+    return Scene(state[:7], state[7], {name: episode.columns[f"rig.object.{name}"][k] for name in THINGS})
 
 
 def at_time(episode: Episode, t: float) -> Scene:
@@ -193,7 +193,7 @@ def at_time(episode: Episode, t: float) -> Scene:
         return np.array([np.interp(t, times, column) for column in values.T])
 
     state = between("observation.state", "robot.panda")
-    return Scene(state[:7], state[7], {name: between(f"observation.object.{name}", "objects") for name in THINGS})
+    return Scene(state[:7], state[7], {name: between(f"rig.object.{name}", "objects") for name in THINGS})
 
 
 class Stage:

@@ -21,7 +21,7 @@ av = pytest.importorskip("av", reason="pip install 'robot-hal[record]'")
 
 import pyarrow.parquet as pq  # noqa: E402
 
-TYPES = {"float32": pa.float32(), "float64": pa.float64(), "int64": pa.int64()}
+TYPES = {"float32": pa.float32(), "float64": pa.float64(), "int64": pa.int64(), "bool": pa.bool_()}
 BOOKKEEPING = {
     "timestamp": "float32",
     "frame_index": "int64",
@@ -29,6 +29,7 @@ BOOKKEEPING = {
     "index": "int64",
     "task_index": "int64",
 }
+AFTERWARDS = ("intervention", "next.success", "next.done")
 INFO = {
     "codebase_version": str,
     "robot_type": str,
@@ -61,14 +62,16 @@ def check_layout(root: Path) -> dict[str, Any]:
         check_stats(found, features[key], key)
 
     entries = sorted(root.glob("meta/episodes/*/*.parquet"))
-    assert len(entries) == total
+    rows = [(entry, row) for entry in entries for row in read_entries(entry)]
+    assert len(rows) == total
+    data_files = [row["data/file_index"] + PER_FILE * row["data/chunk_index"] for _, row in rows]
+    assert data_files == sorted(data_files), "LeRobot reads the files of rows in the order of their names"
     unknown = set()
     """Columns of which a number was not known in some episode: the whole dataset may have no statistics of those."""
     at = 0
     files = {root / "meta/info.json", root / "meta/stats.json", root / "meta/tasks.parquet", *entries}
-    for number, entry in enumerate(entries):
-        place = {"chunk_index": number // PER_FILE, "file_index": number % PER_FILE}
-        row = read_entry(entry, place)
+    for number, (_, row) in enumerate(rows):
+        place = place_of(row, "data")
         length = row["length"]
         assert [row[key] for key in INDICES] == [number, length, at, at + length]
         data = root / info["data_path"].format(**place)
@@ -79,11 +82,10 @@ def check_layout(root: Path) -> dict[str, Any]:
             unknown |= set() if np.isfinite(np.array(own["mean"])).all() else {key}
         files.add(data)
         for key in videos:
-            assert [row[f"videos/{key}/{part}"] for part in place] == list(place.values())
-            assert row[f"videos/{key}/from_timestamp"] == 0.0
-            assert row[f"videos/{key}/to_timestamp"] == pytest.approx(length / info["fps"])
-            video = root / info["video_path"].format(video_key=key, **place)
-            check_video(video, features[key], info["fps"], length)
+            span = row[f"videos/{key}/from_timestamp"], row[f"videos/{key}/to_timestamp"]
+            assert span[1] - span[0] == pytest.approx(length / info["fps"])
+            video = root / info["video_path"].format(video_key=key, **place_of(row, f"videos/{key}"))
+            check_video(video, features[key], info["fps"], span[0], length)
             files.add(video)
         at += length
         strict_json(root / f"episodes/{number:06d}.json")
@@ -121,6 +123,8 @@ def check_info(info: dict[str, Any]) -> None:
         assert "/" not in key
         if feature["dtype"] == "video":
             assert feature["names"] == ["height", "width", "channels"]
+        elif key in AFTERWARDS:
+            assert feature == {"dtype": "bool", "shape": [1], "names": None}
         elif key not in BOOKKEEPING:
             assert feature["shape"] == [len(feature["names"])]
             assert len(set(feature["names"])) == len(feature["names"])
@@ -136,8 +140,13 @@ def read_tasks(root: Path, total: int) -> list[str]:
     return texts
 
 
-def read_entry(path: Path, place: dict[str, int]) -> dict[str, Any]:
-    """The one row of an episode."""
+def place_of(row: dict[str, Any], lead: str) -> dict[str, int]:
+    """The number of a file, in two parts."""
+    return {part: row[f"{lead}/{part}"] for part in ("chunk_index", "file_index")}
+
+
+def read_entries(path: Path) -> list[dict[str, Any]]:
+    """The rows of a file of the index, one per episode."""
     table = pq.read_table(path)
     for name in table.schema.names:
         kind = table.schema.field(name).type
@@ -145,13 +154,17 @@ def read_entry(path: Path, place: dict[str, int]) -> dict[str, Any]:
             assert pa.types.is_list(kind)
         elif name == "tasks":
             assert kind == pa.list_(pa.string())
+        elif name.startswith("camera_"):
+            assert pa.types.is_list(kind)
+        elif name == "success":
+            assert kind == pa.bool_()
         else:
             assert kind == (pa.float64() if name.endswith("timestamp") else pa.int64()), name
-    (row,) = table.to_pylist()
-    for lead in ("data", "meta/episodes"):
-        assert [row[f"{lead}/{part}"] for part in place] == list(place.values())
-    assert path.parts[-2:] == (f"chunk-{place['chunk_index']:03d}", f"file-{place['file_index']:03d}.parquet")
-    return dict(row)
+    rows: list[dict[str, Any]] = table.to_pylist()
+    for row in rows:
+        place = place_of(row, "meta/episodes")
+        assert path.parts[-2:] == (f"chunk-{place['chunk_index']:03d}", f"file-{place['file_index']:03d}.parquet")
+    return rows
 
 
 def check_rows(path: Path, info: dict[str, Any], entry: dict[str, Any], tasks: list[str]) -> None:
@@ -160,13 +173,19 @@ def check_rows(path: Path, info: dict[str, Any], entry: dict[str, Any], tasks: l
     length, start = entry["length"], entry["dataset_from_index"]
     table = pq.read_table(path)
     assert table.schema.names == list(features)
+    table = table.filter(pa.compute.equal(table["episode_index"], entry["episode_index"]))
     assert len(table) == length > 0
     for key, feature in features.items():
         kind, (size,) = TYPES[feature["dtype"]], feature["shape"]
         assert table.schema.field(key).type == (kind if size == 1 else pa.list_(kind, size)), key
         assert table[key].null_count == 0
         column = table[key].combine_chunks()
-        values = (column if size == 1 else column.flatten()).to_numpy().reshape(length, size).astype(float)
+        values = (
+            (column if size == 1 else column.flatten())
+            .to_numpy(zero_copy_only=False)
+            .reshape(length, size)
+            .astype(float)
+        )
         known = np.isfinite(values).any(axis=0)
         for part, of in (("min", np.nanmin), ("max", np.nanmax), ("mean", np.nanmean), ("std", np.nanstd)):
             said = np.array(entry[f"stats/{key}/{part}"])[known]
@@ -198,7 +217,7 @@ def check_stats(stats: dict[str, Any], feature: dict[str, Any], key: str) -> Non
         assert found["max"].max() <= 1.0
 
 
-def check_video(path: Path, feature: dict[str, Any], fps: int, length: int) -> None:
+def check_video(path: Path, feature: dict[str, Any], fps: int, start: float, length: int) -> None:
     """Check that a video is as its feature describes, with every picture at its time to within 0.1 ms (as LeRobot)."""
     height, width, _ = feature["shape"]
     with av.open(str(path)) as container:
@@ -218,8 +237,10 @@ def check_video(path: Path, feature: dict[str, Any], fps: int, length: int) -> N
         assert said["video.fps"] == fps
         times = []
         for frame in container.decode(stream):
-            times.append(float(frame.pts * stream.time_base))
-            assert (frame.height, frame.width) == (height, width)
+            t = float(frame.pts * stream.time_base) - start
+            if -0.5 / fps < t < (length - 0.5) / fps:
+                times.append(t)
+                assert (frame.height, frame.width) == (height, width)
     assert len(times) == length
     assert np.abs(np.array(times) - np.arange(length) / fps).max() < 1e-4
 
@@ -228,9 +249,9 @@ def check_stamps(episode: Episode) -> None:
     """Rows follow each other in time, and so do the samples in them; a picture's stamp is new as a whole or not."""
     assert (np.diff(episode.stamps["grid"]) > 0.0).all()
     for key, column in episode.columns.items():
-        if not key.startswith("observation.time.") or column.ndim == 1:
+        if not key.startswith("rig.time.") or column.ndim == 1:
             continue
-        source = key.removeprefix("observation.time.")
+        source = key.removeprefix("rig.time.")
         known: NDArray[np.float64] = column[np.isfinite(column[:, 0])]
         steps = np.diff(known, axis=0)
         assert (steps >= 0.0).all(), source

@@ -53,7 +53,7 @@ def recorded(out: Path, clock: str, seconds: float) -> Episode:
     state = episode.columns["observation.state"]
     assert np.ptp(state[:, :7], axis=0).max() > 0.1, "the arm moved"
     assert np.ptp(state[:, 7]) > 0.05, "the gripper closed"
-    assert np.ptp(episode.columns["observation.object.cube"][:, :2], axis=0).max() > 0.03, "the cube was pushed"
+    assert np.ptp(episode.columns["rig.object.cube"][:, :2], axis=0).max() > 0.03, "the cube was pushed"
     return episode
 
 
@@ -68,7 +68,7 @@ def test_every_picture_shows_its_row(tmp_path: Path) -> None:
             stage.put(scene)
             for camera in CAMERAS:
                 right.append(stage.look(camera, k))
-                where = episode.columns[f"observation.camera_pose.{camera}"][k]
+                where = episode.columns[f"rig.camera_pose.{camera}"][k]
                 distance, angle = stage.pose(camera).distance(Pose(where[:3], where[3:]))
                 assert distance < 1e-4
                 assert angle < 2e-3

@@ -53,12 +53,12 @@ def test_a_drive_is_recorded_as_it_was(tmp_path: Path) -> None:
     t = np.array([state.stamp.t for state in seen])
     inside = (grid > t[0]) & (grid < t[-1])
     assert inside.sum() > 100
-    for key, of in (("observation.state", "q"), ("observation.setpoint", "q_set")):
+    for key, of in (("observation.state", "q"), ("rig.setpoint", "q_set")):
         values = np.array([getattr(state, of) for state in seen])
         assert np.ptp(values, axis=0).max() > 0.02, "it moved"
         for joint in range(7):
             want = np.interp(grid[inside], t, values[:, joint])
             assert np.abs(episode.columns[key][inside, joint] - want).max() < 1e-6
-    pad = episode.columns["observation.pad"]
-    assert (pad[:, episode.names("observation.pad").index("connected")] == 1.0).all(), "the pad was recorded, too"
+    pad = episode.columns["rig.pad"]
+    assert (pad[:, episode.names("rig.pad").index("connected")] == 1.0).all(), "the pad was recorded, too"
     assert (np.diff(episode.stamps["objects"]) >= 0.0).all(), "two rows share one where the thread came late"

@@ -44,12 +44,12 @@ def test_the_arm_drives_home_before_each_episode_and_moves_only_while_l2_is_held
     assert (reached.success, lifted.success) == (True, False)
     home = np.array(reached.info["rig"]["resolved"]["robots"][0]["home"])
     for episode in (reached, lifted):
-        q = episode.columns["observation.setpoint"][:, :7]
+        q = episode.columns["rig.setpoint"][:, :7]
         assert np.abs(q[0] - home).max() < 1e-3, "each begins at home"
         assert np.abs(q[-1] - home).max() > 0.02, "and the arm was driven"
         assert episode.info["dropped"] == 0
-    pressed = reached.columns["observation.pad"][:, reached.names("observation.pad").index("l2")]
-    moving = np.abs(reached.columns["observation.setpoint_velocity"]).max(axis=1) > 0.02
+    pressed = reached.columns["rig.pad"][:, reached.names("rig.pad").index("l2")]
+    moving = np.abs(reached.columns["rig.setpoint_velocity"]).max(axis=1) > 0.02
     assert moving.any()
     assert not moving[: np.argmax(pressed > 0.5)].any(), "nothing moved before L2 was held"
     assert not moving[-10:].any(), "nor after it was let go of, though the d-pad was still pressed"

@@ -23,7 +23,7 @@ Array = NDArray[np.float64]
 ActionKind = Literal["joint_position", "joint_velocity", "tcp_pose", "tcp_delta"]
 RotationForm = Literal["quaternion", "axis_angle", "rotation_6d"]
 
-_TCP, _TCP_SETPOINT = "observation.tcp", "observation.tcp_set"
+_TCP, _TCP_SETPOINT = "observation.tcp", "rig.tcp_set"
 
 _NAMES: dict[RotationForm, tuple[str, ...]] = {
     "quaternion": ("qx", "qy", "qz", "qw"),

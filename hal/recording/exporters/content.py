@@ -77,8 +77,8 @@ def select_episodes(
     return tuple(found)
 
 
-_ARM_TIME = "observation.time.robot."
-_OBJECT = "observation.object."
+_ARM_TIME = "rig.time.robot."
+_OBJECT = "rig.object."
 _GRIPPER = "gripper"
 
 

@@ -101,7 +101,7 @@ def _log_arm(rr: Any, recording: Any, content: EpisodeContent, arm: ArmColumns) 
     recording.log(f"world/{arm.name}/tcp", rr.Points3D([[0.0, 0.0, 0.0]], radii=0.01, labels=arm.name), static=True)
     recording.log(f"world/{arm.name}/path", rr.LineStrips3D([tcp[:, :3]], radii=0.001), static=True)
     last = None
-    for t, (status, trip, _) in zip(grid, content.of(arm, "observation.status").tolist(), strict=True):
+    for t, (status, trip, _) in zip(grid, content.of(arm, "rig.status").tolist(), strict=True):
         if (status, trip) != last:
             recording.set_time(_TIMELINE, duration=float(t))
             why = f", stopped: {Trip(int(trip))}" if trip else ""
@@ -155,7 +155,7 @@ def _log_lens(rr: Any, recording: Any, content: EpisodeContent, stream: PictureS
         image_from_camera=K, resolution=[width, height], camera_xyz=rr.ViewCoordinates.RDF, image_plane_distance=0.15
     )
     recording.log(place, lens, static=True)
-    key = f"observation.camera_pose.{stream.camera}"
+    key = f"rig.camera_pose.{stream.camera}"
     if content.has(key):
         _log_poses(rr, recording, place, content.grid, content.episode.columns[key])
 

@@ -57,7 +57,7 @@ def episodes() -> list[Episode]:
 
 def start_of_cube(episode: Episode) -> np.ndarray:
     """Return where the cube was when the recording began, x and y in the world, m."""
-    return np.asarray(episode.columns["observation.object.cube"][0, :2])
+    return np.asarray(episode.columns["rig.object.cube"][0, :2])
 
 
 @pytest.fixture(scope="module")
@@ -85,7 +85,7 @@ def test_a_demonstration_that_misses_the_cube_is_a_failure(
         assert call("--pad", write_pad(tmp_path, (1.0, CROSS), (2.0, PS), until=3.0), "--episodes", 1) == 0
     assert call("--pad", "demo", "--episodes", 1, "--seed", 0 if again else 1) == 0
     last = episodes()[-1]
-    assert np.ptp(last.columns["observation.object.cube"][:, 2]) < 0.02, "it stayed on the table"
+    assert np.ptp(last.columns["rig.object.cube"][:, 2]) < 0.02, "it stayed on the table"
     assert last.success is False
     out = capsys.readouterr().out
     assert "closes on air" in out
@@ -149,7 +149,7 @@ def test_the_seed_of_an_episode_gives_an_environment_the_same_start(call: Collec
         _, info = env.reset(seed=episode.info["seed"])
     finally:
         env.close()
-    began, cube = episode.columns["observation.object.cube"][0], info["poses"]["cube"]
+    began, cube = episode.columns["rig.object.cube"][0], info["poses"]["cube"]
     assert np.allclose(cube[:2], began[:2], atol=1e-3)
     assert abs(cube[3:] @ began[3:]) == pytest.approx(1.0, abs=1e-4), "turned alike; it dropped onto the table"
 

@@ -66,8 +66,9 @@ def test_deleted_episodes_are_gone_and_the_others_are_whole(demo: Path, recorded
     for old, new in zip((before[1], before[3]), Dataset(demo).episodes, strict=True):
         assert (old.columns["action"] == new.columns["action"]).all()
         for camera in old.cameras:
-            for stream, file in old.files(camera).items():
-                assert file.read_bytes() == new.files(camera)[stream].read_bytes()
+            for stream in ("color", "depth"):
+                for one, other in zip(old.pictures(camera, stream), new.pictures(camera, stream), strict=True):
+                    assert (one == other).all()
     with mock_rig() as rig, Recorder(rig, demo, fps=20, task="lift") as recorder:
         record(recorder, 0.2, True)  # the dataset goes on
     assert len(lengths(demo)) == 3

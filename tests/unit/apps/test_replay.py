@@ -85,7 +85,7 @@ def test_the_recording_is_the_driven_motion(dataset: Path) -> None:
     from hal.recording import Dataset
 
     episode = Dataset(dataset).episodes[0]
-    q = episode.columns["observation.setpoint"][:, :7]
+    q = episode.columns["rig.setpoint"][:, :7]
     assert np.ptp(q, axis=0).max() > 0.1
     assert episode.success is True
 

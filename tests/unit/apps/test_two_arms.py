@@ -119,7 +119,7 @@ def test_episodes_of_two_arms_are_collected_and_each_arm_is_replayed(
     episodes = Dataset("data").episodes
     assert [episode.success for episode in episodes] == [True, True]
     for number, episode in enumerate(episodes):
-        names = episode.names("observation.setpoint")
+        names = episode.names("rig.setpoint")
         assert {name.partition(".")[0] for name in names} == {"left", "right"}
         for arm in ("left", "right"):
             which = ("--episode", number, "--robot", arm, "--report", "r.json")

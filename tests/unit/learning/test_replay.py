@@ -45,7 +45,9 @@ def twist(t: float) -> hal.Twist:
 
 def record(driver: str = "mock", seconds: float = 4.0, cube: hal.Pose | None = None) -> Recorded:
     """Drive, close the hand half-way, and keep a row at every turn."""
-    rows: dict[str, list[Any]] = {"setpoint": [], "state": [], "tcp": [], "object.cube": []}
+    rows: dict[str, list[Any]] = {
+        key: [] for key in ("rig.setpoint", "observation.state", "observation.tcp", "rig.object.cube")
+    }
     stamps = []
     with opened(driver) as rig:
         arm = rig.robots["panda"]
@@ -57,16 +59,16 @@ def record(driver: str = "mock", seconds: float = 4.0, cube: hal.Pose | None = N
                 control.send(twist(tick.elapsed), grip=0.0 if tick.elapsed < seconds / 2 else 0.8)
                 state, hand = arm.state(), arm.gripper.state()
                 stamps.append(state.stamp.t)
-                rows["setpoint"].append([*state.q_set, hand.width_target])
-                rows["state"].append([*state.q, hand.width])
-                rows["tcp"].append([*state.tcp.position, *state.tcp.orientation])
+                rows["rig.setpoint"].append([*state.q_set, hand.width_target])
+                rows["observation.state"].append([*state.q, hand.width])
+                rows["observation.tcp"].append([*state.tcp.position, *state.tcp.orientation])
                 if rig.has_world:
                     pose = rig.world.pose("cube")
-                    rows["object.cube"].append([*pose.position, *pose.orientation])
+                    rows["rig.object.cube"].append([*pose.position, *pose.orientation])
                 if tick.elapsed > seconds:
                     break
         return Recorded(
-            columns={f"observation.{key}": np.array(values, np.float32) for key, values in rows.items() if values},
+            columns={key: np.array(values, np.float32) for key, values in rows.items() if values},
             stamps={"robot.panda": np.array(stamps)},
             info={"rig": {"resolved": {"robots": [{"name": "panda", "model": "panda"}]}}},
             joints=arm.joints,
@@ -304,7 +306,7 @@ def driven(speed: float, late: float = 0.0, seconds: float = 3.0) -> Recorded:
     q[:, n - 1] += speed * (np.minimum(t, seconds / 2) - np.maximum(t - seconds / 2, 0.0))
     tcp = np.tile([0.5, 0.0, 0.5, 1.0, 0.0, 0.0, 0.0], (len(t), 1))
     stamps = t + np.random.default_rng(1).uniform(0.0, late, len(t))
-    columns = {"observation.setpoint": q, "observation.state": q, "observation.tcp": tcp}
+    columns = {"rig.setpoint": q, "observation.state": q, "observation.tcp": tcp}
     return Recorded(
         {key: rows.astype(np.float32) for key, rows in columns.items()}, {"robot.panda": stamps}, {}, joints
     )

@@ -246,9 +246,9 @@ def turning(dataset: Dataset) -> Dataset:
             poses.append(step * poses[-1])
         quaternions = np.array([pose.as_quat() for pose in poses])
         positions = np.cumsum(random.normal(0.0, 0.01, (rows, 3)), axis=0)
-        episode.columns["observation.tcp_set"] = np.concatenate([positions, quaternions], axis=1).astype(np.float32)
+        episode.columns["rig.tcp_set"] = np.concatenate([positions, quaternions], axis=1).astype(np.float32)
         dropped = np.where(np.arange(rows) < rows // 2, 0.0, 0.05)
-        episode.columns["observation.time.grid"] = episode.columns["observation.time.grid"] + dropped
+        episode.columns["rig.time.grid"] = episode.columns["rig.time.grid"] + dropped
     return dataset
 
 
@@ -263,7 +263,7 @@ def test_steps_of_the_tcp_add_up_to_its_poses(dataset: Dataset, tmp_path: Path, 
     targets = actions(source, tmp_path / "poses", "tcp_pose", rotation)
     steps = actions(source, tmp_path / "steps", "tcp_delta", rotation)
     for episode, target, step in zip(source.episodes, targets, steps, strict=True):
-        poses = episode.columns["observation.tcp_set"].astype(float)
+        poses = episode.columns["rig.tcp_set"].astype(float)
         expected = turns(poses[:, 3:], "quaternion")
         later = [*range(1, episode.length), episode.length - 1]
         assert np.abs(target[:, :3] - poses[later, :3]).max() < 1e-9
@@ -281,7 +281,7 @@ def test_velocities_of_the_joints_add_up_to_their_targets(dataset: Dataset, tmp_
     source = turning(Dataset(dataset.root))
     for episode, found in zip(source.episodes, actions(source, tmp_path / "out", "joint_velocity"), strict=True):
         period = np.append(np.diff(episode.stamps["grid"]), 1.0 / episode.fps)[:, None]
-        start = episode.columns["observation.setpoint"][0, :7].astype(float)
+        start = episode.columns["rig.setpoint"][0, :7].astype(float)
         reached = start + np.cumsum(found[:, :7] * period, axis=0)
         assert np.abs(reached - episode.columns["action"][:, :7]).max() < 1e-9
 

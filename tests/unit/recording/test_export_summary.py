@@ -42,11 +42,11 @@ def test_the_numbers_are_those_of_the_rows(dataset: Dataset) -> None:
 
 def test_uneven_times_are_reported(dataset: Dataset) -> None:
     (episode,) = Dataset(dataset.root).episodes[:1]
-    wrist, scene = (episode.columns[f"observation.time.camera.{name}"].copy() for name in ("wrist", "scene"))
+    wrist, scene = (episode.columns[f"rig.time.camera.{name}"].copy() for name in ("wrist", "scene"))
     wrist[4:, 0] -= 0.02  # one came 20 ms early, and all after it
     wrist[8] = wrist[7]  # and one not at all
     scene[:2] = np.nan
-    episode.columns.update({"observation.time.camera.wrist": wrist, "observation.time.camera.scene": scene})
+    episode.columns.update({"rig.time.camera.wrist": wrist, "rig.time.camera.scene": scene})
     found = {each.source: each for each in summarize(dataset, [episode]).timing}
     camera_times = found["camera.wrist"]
     assert camera_times.repeated == 1

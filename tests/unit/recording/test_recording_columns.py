@@ -39,8 +39,8 @@ def test_two_arms_share_the_columns(tmp_path: Path) -> None:
 
 def test_every_column_is_in_the_documentation() -> None:
     text = (Path(__file__).parents[3] / "docs" / "record.md").read_text(encoding="utf-8")
-    table = "".join(re.findall(r"^\| (`(?:observation|action).*?) \|", text, re.MULTILINE))
-    keys = {f"observation.time{key}" if key.startswith(".") else key for key in re.findall(r"`([\w.]+)`", table)}
+    table = "".join(re.findall(r"^\| (`(?:observation|action|rig|source|intervention|next).*?) \|", text, re.MULTILINE))
+    keys = {f"rig.time{key}" if key.startswith(".") else key for key in re.findall(r"`([\w.]+)`", table)}
     with mock_rig() as rig:
         columns = RowSampler(rig, rig.cameras).columns
     missing = [one.key for one in columns if not {one.key, re.sub(r"\.\w+$", ".NAME", one.key)} & keys]
@@ -59,11 +59,11 @@ def test_an_object_that_is_taken_away_is_not_known_any_more(tmp_path: Path) -> N
         recorder.save(wait=True)
     check_layout(tmp_path / "out")
     episode = Dataset(tmp_path / "out").episodes[0]
-    duck = episode.columns["observation.object.duck"]
+    duck = episode.columns["rig.object.duck"]
     assert np.isfinite(duck[:6]).all()
     assert np.isnan(duck[-5:]).all()
-    assert np.isfinite(episode.columns["observation.object.cube"]).all()
-    assert "observation.object.table" not in episode.columns, "what stands still is in the episode's own file"
+    assert np.isfinite(episode.columns["rig.object.cube"]).all()
+    assert "rig.object.table" not in episode.columns, "what stands still is in the episode's own file"
     assert set(episode.info["objects_at_start"]) == {"floor", "table", "cube", "duck"}
 
 
@@ -85,7 +85,7 @@ def test_columns_without_an_open_pad_match_those_with_one(tmp_path: Path) -> Non
             recorder.save(wait=True)
     check_layout(tmp_path / "out")
     driven, by_itself = Dataset(tmp_path / "out").episodes
-    connected = driven.names("observation.pad").index("connected")
-    assert (driven.columns["observation.pad"][:, connected] == 1.0).all()
-    assert (by_itself.columns["observation.pad"] == 0.0).all()
+    connected = driven.names("rig.pad").index("connected")
+    assert (driven.columns["rig.pad"][:, connected] == 1.0).all()
+    assert (by_itself.columns["rig.pad"] == 0.0).all()
     assert np.isnan(by_itself.stamps["pad.pad"]).all()

@@ -68,7 +68,7 @@ def test_rows_are_at_their_times_and_nothing_is_missing(made: Path) -> None:
 
 def test_the_action_is_the_setpoint_of_the_next_row(made: Path) -> None:
     columns = Dataset(made).episodes[0].columns
-    action, setpoint = columns["action"], columns["observation.setpoint"]
+    action, setpoint = columns["action"], columns["rig.setpoint"]
     assert np.array_equal(action[:-1], setpoint[1:])
     assert np.array_equal(action[-1], setpoint[-1])
     assert np.ptp(action[:, :7], axis=0).max() > 0.01, "it moved"
@@ -82,7 +82,7 @@ def test_pictures_and_depth_come_back(made: Path) -> None:
         assert len(frames) == len(depths) == episode.length
         assert frames[0].shape == (48, 64, 3)
         assert frames[0].dtype == np.uint8
-        numbers = episode.columns[f"observation.time.camera.{camera}"][:, 2].astype(int)
+        numbers = episode.columns[f"rig.time.camera.{camera}"][:, 2].astype(int)
         for number, frame, depth in zip(numbers, frames, depths, strict=True):
             left = int(number) * 4 % 64  # where the mock's bright square is
             assert frame[24, min(63, left + 4) :].max() > 200

@@ -9,12 +9,28 @@ from pathlib import Path
 import numpy as np
 import pytest
 from errors_kit import raises_code
-from recording_kit import check_layout, mock_rig, record
+from recording_kit import CAMERAS, check_layout, mock_rig, record
 
 from hal.errors import CommandError, DatasetError
-from hal.recording import Dataset, Recorder, merge, repair
+from hal.recording import (
+    Dataset,
+    Episode,
+    Recorder,
+    delete_episodes,
+    mark_episodes,
+    merge,
+    merging,
+    pack,
+    repair,
+)
+from hal.recording.checking import check_dataset
 
+pq = pytest.importorskip("pyarrow.parquet")
 RENUMBERED = {"episode_index", "index", "task_index"}
+
+
+def pictures_of(episode: Episode, stream: str) -> bytes:
+    return b"".join(picture.tobytes() for camera in CAMERAS for picture in episode.pictures(camera, stream))
 
 
 @pytest.fixture(scope="module")
@@ -52,9 +68,10 @@ def test_episodes_are_renumbered_and_nothing_else_changes(part: Path, tmp_path: 
         assert (episode.task, episode.success) == (source.task, source.success)
         same = [key for key in source.columns if source.columns[key].tobytes() == episode.columns[key].tobytes()]
         assert set(source.columns) - set(same) <= RENUMBERED
-        for camera in source.cameras:
-            for stream, file in source.files(camera).items():
-                assert file.samefile(episode.files(camera)[stream]), "neither copied nor encoded again"
+        for stream in ("color", "depth"):
+            assert pictures_of(episode, stream) == pictures_of(source, stream), "nothing is encoded again"
+        for camera in CAMERAS:
+            assert source.files(camera)["depth"].samefile(episode.files(camera)["depth"]), "nor copied"
     assert sorted(path.name for path in tmp_path.iterdir()) == ["merged"]
 
     combined = json.loads((merged / "meta/stats.json").read_text())
@@ -100,3 +117,108 @@ def test_what_cannot_be_merged_is_refused(part: Path, tmp_path: Path) -> None:
         merge([part, copy], out)
     assert damaged.value.episode == 1
     assert not out.exists()
+
+
+def test_joined_files_read_as_before_and_are_rebuilt_repaired_and_continued(
+    part: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(merging, "GROUP", 3)
+    demo = tmp_path / "demo"
+    merge([part, part], demo)
+    names = [[str(path.relative_to(demo)) for path in demo.glob(f"{kind}/*.*")] for kind in ("data/*", "videos/*/*")]
+    assert [len(each) for each in names] == [2, len(CAMERAS)], "four episodes"
+    assert not list(check_dataset(Dataset(demo)))
+    places = [episode.place for episode in Dataset(demo).episodes]
+    rows = demo / "data/chunk-000/file-000.parquet"
+    before = rows.stat().st_ino, check_layout(demo)
+    shutil.rmtree(demo / "meta")
+    repair(demo)
+    assert (rows.stat().st_ino, check_layout(demo)) == before
+
+    with mock_rig() as rig, Recorder(rig, demo, fps=20, task="lift") as recorder:
+        record(recorder, 0.3, False)
+    check_layout(demo)
+    assert [episode.place for episode in Dataset(demo).episodes[:4]] == places
+    assert pack(demo) == 2
+    assert rows.stat().st_ino == before[0], "a full file is linked"
+    mark_episodes(demo, {4: True})
+    delete_episodes(demo, [1, 2])
+    check_layout(demo)
+    assert not list(check_dataset(Dataset(demo)))
+    first, _ = Dataset(part).episodes
+    kept = Dataset(demo).episodes
+    assert [episode.success for episode in kept] == [True, None, True]
+    assert kept[2].columns["next.success"].tolist() == [False] * (kept[2].length - 1) + [True]
+    assert pictures_of(kept[0], "color") == pictures_of(first, "color")
+    assert len(list(demo.glob("videos/*/*/*.mp4"))) == len(CAMERAS)
+
+
+def test_large_videos_are_linked_and_small_ones_joined_up_to_a_size(
+    part: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    size = (part / "videos/observation.images.wrist/chunk-000/file-000.mp4").stat().st_size
+    monkeypatch.setattr(merging, "VIDEO_MB", 2.9e-6 * size)
+    merge([part, part, part], tmp_path / "joined")
+    videos = [episode.place.video("wrist") for episode in Dataset(tmp_path / "joined").episodes]
+    assert [file for file, _ in videos] == [0, 0, 1, 1, 2, 2]
+    assert [first for _, first in videos[::2]] == [0, 0, 0]
+    check_layout(tmp_path / "joined")
+    monkeypatch.setattr(merging, "VIDEO_MB", 1.5e-6 * size)
+    merge([part], tmp_path / "linked")
+    for one, other in zip(Dataset(part).episodes, Dataset(tmp_path / "linked").episodes, strict=True):
+        assert one.files("wrist")["color"].samefile(other.files("wrist")["color"])
+
+
+def test_many_files_are_joined_when_a_recorder_is_closed(
+    part: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    demo = Path(shutil.copytree(part, tmp_path / "demo"))
+    monkeypatch.setattr(merging, "LOOSE", 2)
+    with mock_rig() as rig, Recorder(rig, demo, fps=20) as recorder:
+        record(recorder, 0.2)
+    assert len(list(demo.glob("data/*/*"))) == 1
+    assert check_layout(demo)["total_episodes"] == 3
+
+
+def test_a_set_of_the_older_columns_is_read_and_not_merged_with_a_new_one(part: Path, tmp_path: Path) -> None:
+    old = Path(shutil.copytree(part, tmp_path / "old"))
+    make_old(old)
+    for episode, source in zip(Dataset(old).episodes, Dataset(part).episodes, strict=True):
+        assert np.array_equal(episode.columns["rig.setpoint"], source.columns["rig.setpoint"])
+        assert episode.names("rig.setpoint") == source.names("rig.setpoint")
+        assert episode.stamps.keys() == source.stamps.keys()
+    assert not list(check_dataset(Dataset(old)))
+    with pytest.raises(CommandError) as refused:
+        merge([old, part], tmp_path / "both")
+    assert refused.value.code == "other_dataset"
+    for key in ("observation.setpoint", "rig.setpoint", "next.done"):
+        assert key in str(refused.value)
+    assert merge([old, old], tmp_path / "both") == 4, "but with its own kind"
+    shutil.rmtree(old / "meta")
+    repair(old)
+    assert not list(check_dataset(Dataset(old)))
+
+
+def make_old(root: Path) -> None:
+    """Give a dataset the columns and the metadata of earlier versions."""
+
+    def older(key: str) -> str:
+        return key.replace("rig.", "observation.")
+
+    new = ("source", "intervention", "next.done", "next.success")
+    for path in [root / "meta/info.json", *root.glob("episodes/*.json")]:
+        about = json.loads(path.read_text())
+        about.pop("files", None)
+        about["features"] = {older(key): each for key, each in about["features"].items() if key not in new}
+        path.write_text(json.dumps(about))
+    stats = json.loads((root / "meta/stats.json").read_text())
+    (root / "meta/stats.json").write_text(json.dumps({older(k): v for k, v in stats.items() if k not in new}))
+    for path in root.glob("data/*/*"):
+        table = pq.read_table(path).drop(list(new))
+        pq.write_table(table.rename_columns([older(name) for name in table.column_names]), path)
+    for path in root.glob("meta/episodes/*/*"):
+        table = pq.read_table(path)
+        gone = [name for name in table.column_names if name.split("/")[1:2] and name.split("/")[1] in new]
+        gone += ["success", "dropped", *(name for name in table.column_names if name.startswith("camera_"))]
+        table = table.drop(gone)
+        pq.write_table(table.rename_columns([older(name) for name in table.column_names]), path)

@@ -14,9 +14,9 @@ from hal.recording import Dataset, Recorder
 from hal.recording.metadata import ClockPace, simulated_pace
 
 COLUMNS = [
-    ("observation.time.grid", "float64", ("t",)),
-    ("observation.time.robot.left", "float64", ("t", "t_device", "seq")),
-    ("observation.time.robot.right", "float64", ("t", "t_device", "seq")),
+    ("rig.time.grid", "float64", ("t",)),
+    ("rig.time.robot.left", "float64", ("t", "t_device", "seq")),
+    ("rig.time.robot.right", "float64", ("t", "t_device", "seq")),
 ]
 
 
