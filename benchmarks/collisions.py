@@ -1,6 +1,6 @@
 """Check the verdicts of collisions against PyBullet's, and that motions that would collide are refused or stopped.
 
-    python benchmarks/collisions.py [verdicts|targets|tour|arms|tick|open] [--count N]
+    python benchmarks/collisions.py [targets|tour|verdicts|arms|torques|pushes|tick] [--count N]
 
 Each row is a function that returns its numbers, so that the tests run the same with small counts.
 """
@@ -300,11 +300,90 @@ def tour(seconds: float) -> dict[str, float]:
     return found
 
 
+OVER_THE_TABLE = [0.0, 0.45, 0.0, -2.1, 0.0, 2.55, 0.785]
+"""The hand points down, some 15 cm above the table."""
+
+
+@contextlib.contextmanager
+def over_the_table(engine: str) -> Iterator[tuple[hal.Rig, Callable[[], tuple[float, bool]]]]:
+    """Open a rig whose arm must not touch the table; also yield a function that makes a step.
+
+    It returns the distance of the nearest pair, m, and whether something held the arm back to avoid a collision.
+    """
+    initial = {"robots.panda.initial": OVER_THE_TABLE, "robots.panda.workspace": {}, "cameras": {}}
+    overrides = initial | {"collisions.boxes": ["table"]}
+    with hal.open("panda_table", sim=True, clock="lock_step", pad="none", engine=engine, overrides=overrides) as rig:
+        panda = rig.robots["panda"]
+        model = panda.collisions.model
+
+        def step() -> tuple[float, bool]:
+            rig.clock.sleep(1 / 240)
+            state = panda.state()
+            model.place(state.q)
+            return float(model.distances().min()), hal.Limited.COLLISION in state.limited
+
+        rig.clock.sleep(0.2)
+        yield rig, step
+
+
+def torques(count: int, engine: str = "pybullet") -> dict[str, float]:
+    """Drive the arm by constant torques, at random or as forces down on the table; return how near it came."""
+    rng = np.random.default_rng(3)
+    nearest, limited = [], 0
+    for k in range(count):
+        with over_the_table(engine) as (rig, step):
+            panda = rig.robots["panda"]
+            force = ([0.0, 0.0, -1.0] + 0.5 * rng.normal(size=3)) * rng.uniform(2.0, 12.0)
+            tau = panda.kinematics.jacobian(OVER_THE_TABLE)[:3].T @ force
+            if k % 2:
+                tau = rng.normal(size=7) * [8.0, 8.0, 8.0, 8.0, 1.5, 1.5, 1.5]
+            seen = []
+            with panda.control(rate_hz=100) as control, contextlib.suppress(hal.MotionStopped):
+                for _ in range(120):
+                    control.send(hal.JointTorque(tau))
+                    seen += [step(), step()]
+            seen += [step() for _ in range(60)]
+        nearest.append(min(distance for distance, _ in seen))
+        limited += any(slowed for _, slowed in seen)
+    return {
+        "drives": count,
+        "nearest of all, mm": round(1e3 * min(nearest), 2),
+        "stopped because of a collision": limited,
+    }
+
+
+def pushes(
+    engine: str = "pybullet", forces: Sequence[float] = (0.0, 5.0, 20.0, 60.0), names: Sequence[str] = ()
+) -> dict[str, str]:
+    """Drive a compliant arm down to the margin of the table, then push it on; return how near it came."""
+    soft = hal.OperationalSpace(stiffness=200.0, rotation_stiffness=20.0)
+    controllers = {"tcp 1000 N/m": hal.OperationalSpace(), "tcp 200 N/m": soft, "joints": hal.JointImpedance()}
+    found = {}
+    for name in names or controllers:
+        controller = controllers[name]
+        for force in forces:
+            with over_the_table(engine) as (rig, step):
+                seen, end = [], "no trip"
+                with rig.robots["panda"].control(rate_hz=50, controller=controller) as control:
+                    for k in range(120):
+                        if k == 80 and force:
+                            rig.world.apply_force("panda", [0.0, 0.0, -force], link="panda_hand", duration=0.5)
+                        try:
+                            control.send(hal.Twist([0.0, 0.0, -0.25 if k < 80 else 0.0]))
+                        except hal.MotionStopped as stop:
+                            end = stop.code
+                        seen += [step()[0] for _ in range(4)]
+            found[f"{name}, pushed with {force:.0f} N"] = f"{1e3 * min(seen):.1f} mm, {end}"
+    return found
+
+
 ROWS = {
     "targets": lambda count: targets(count or 1000),
     "tour": lambda count: tour(count or 60),
     "verdicts": lambda count: {m: verdicts(m, count or 10_000) for m in ("panda", "fr3", "iiwa")},
     "arms": lambda count: arms(count or 100),
+    "torques": lambda count: torques(count or 50),
+    "pushes": lambda count: pushes(),
     "tick": lambda count: tick(count or 8000),
 }
 

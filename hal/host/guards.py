@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from math import copysign
+from math import copysign, isfinite
 from typing import TYPE_CHECKING, Protocol
 
 from ..errors import NotSupported
 from ..kinematics.collisions import in_one_place
 from ..servo.collisions import CollisionGuard, Neighbour
 from ..servo.smoothing import stop_distance
-from ..types import RobotStatus
+from ..types import ControlMode, RobotStatus
 
 if TYPE_CHECKING:
     from ..driver import Reading
@@ -24,6 +24,9 @@ Floats = Sequence[float]
 
 _OLD = 0.004
 """The state of an arm in another process is this old at most while that process keeps its rate, s."""
+
+_TORQUE_STOP = 0.1
+"""An arm that is driven by torques stops in at most the way that it has in this time, s."""
 
 _FOLLOWS_SETPOINT = (RobotStatus.FOLLOWING, RobotStatus.STOPPING, RobotStatus.HOLDING, RobotStatus.TRIPPED)
 
@@ -51,15 +54,41 @@ class ArmElsewhere:
         if record is None or record is self._seen:
             return self._stop
         self._seen = record
-        if record.status in _FOLLOWS_SETPOINT:
-            limits = zip(record.q_set, record.dq_set, self._limits.acceleration, self._limits.jerk, strict=True)
-            end = [q + _OLD * v + copysign(stop_distance(abs(v), A, J), v) for q, v, A, J in limits]
-            self._stop = list(record.q_set), end
-        else:  # it may be moved by hand
+        follows = record.status in _FOLLOWS_SETPOINT
+        if follows and record.controller is ControlMode.TORQUE:  # its set-point is where it was measured
+            self._stop = record.q_set, [q + _TORQUE_STOP * v for q, v in zip(record.q_set, record.dq_set, strict=True)]
+            return self._stop
+        q: Floats = record.q_set
+        if not follows or record.controller is not ControlMode.POSITION:  # it may be elsewhere than its set-point
             state = self._mail.get_state()
             q = self._stop[0] if state is None else state.q.tolist()
+        if follows:
+            limits = zip(record.q_set, record.dq_set, self._limits.acceleration, self._limits.jerk, strict=True)
+            self._stop = q, [x + _OLD * v + copysign(stop_distance(abs(v), A, J), v) for x, v, A, J in limits]
+        else:
             self._stop = q, q
         return self._stop
+
+
+class _ArmHere:
+    """Where an arm of this process is, and where it ends if it stops now."""
+
+    def __init__(self, unit: GuardedArm) -> None:
+        self._unit = unit
+        self._measured: Floats = unit.spec.initial
+
+    def __call__(self) -> tuple[Floats, Floats]:
+        """Return its joint positions (n,), rad, and those at the end of a stop that begins now."""
+        unit, servo = self._unit, self._unit.servo
+        report, smoother = servo.report, servo.smoother
+        if servo.active and report.controller is ControlMode.POSITION:
+            return report.q_set, smoother.stop_end() if report.q_set is smoother.q else report.q_set
+        if servo.active and report.controller is ControlMode.TORQUE:  # its set-point is where it was measured
+            return report.q_set, [q + _TORQUE_STOP * v for q, v in zip(report.q_set, report.dq_set, strict=True)]
+        q = self._measured if unit.reading is None else unit.reading.q
+        if len(q) == smoother.n and isfinite(sum(q)):  # else where it was measured last
+            self._measured = q
+        return self._measured, smoother.stop_end() if servo.active else self._measured
 
 
 def guard_arms(group: GroupSpec, units: Mapping[str, GuardedArm], others: Iterable[GroupMemory]) -> list[str]:
@@ -79,7 +108,7 @@ def guard_arms(group: GroupSpec, units: Mapping[str, GuardedArm], others: Iterab
     mails = {name: mail for memory in others for name, mail in memory.robots.items()}
     around: list[tuple[RobotSpec, Neighbour]] = []
     if spec.arms:
-        around += [(unit.spec, _neighbour(unit)) for unit in units.values()]
+        around += [(unit.spec, _ArmHere(unit)) for unit in units.values()]
         around += [(arm, ArmElsewhere(arm, mails[arm.name])) for arm in group.neighbours if arm.name in mails]
     notes: list[str] = []
     for name, unit in units.items():
@@ -115,17 +144,3 @@ def _guard(unit: GuardedArm, others: Sequence[tuple[RobotSpec, Neighbour]], spec
             notes.append(f"{pair.first} and {pair.second} overlap at the start: move one of them")
     unit.servo.set_guard(CollisionGuard(model, unit.servo.smoother, [neighbour for _, neighbour in others]))
     return notes
-
-
-def _neighbour(unit: GuardedArm) -> Neighbour:
-    """Return the function that returns where an arm of this process is, and where it ends if it stops now."""
-
-    def stop() -> tuple[Floats, Floats]:
-        servo = unit.servo
-        if servo.active:
-            q = servo.report.q_set
-            return q, servo.smoother.stop_end() if q is servo.smoother.q else q
-        q = unit.reading.q if unit.reading is not None else unit.spec.initial
-        return q, q
-
-    return stop

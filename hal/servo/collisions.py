@@ -5,6 +5,9 @@ the other arms are on their own stops. Every step that replaces one that is not 
 the margin is kept whatever is commanded. A pair that is inside its margin (an arm that starts there, or one that
 another arm has approached) may not come nearer: moving apart is always possible.
 
+An arm that follows torques may be elsewhere than its set-point. It is checked where it is measured
+(:class:`MeasuredGuard`).
+
 Most ticks cost one comparison: no pair can be too near within some distance of where the last one was computed.
 """
 
@@ -12,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from math import ceil, dist, hypot, inf, sqrt
+from operator import sub
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +23,7 @@ from numpy.typing import NDArray
 from ..kinematics.collision_model import CollisionModel, PairBounds
 from .smoothing import JointSmoother, speed_for, stop_displacement, stop_distance, stop_peak, stop_phases, stop_step
 
-__all__ = ["CollisionGuard", "Neighbour"]
+__all__ = ["CollisionGuard", "MeasuredGuard", "Neighbour"]
 
 Array = NDArray[np.float64]
 Floats = Sequence[float]
@@ -40,6 +44,8 @@ _PROBE = 2e-3
 """Speeds of approach are measured over about this way, m."""
 _SIDEWAYS = 0.005
 """A motion is sideways if shapes approach by less than this share of the greatest speed that its joints allow."""
+_NOISE = 1e-3
+"""A measured arm that is inside a margin may come so much nearer, m: its position is not exact."""
 
 
 class CollisionGuard:
@@ -52,18 +58,9 @@ class CollisionGuard:
     """
 
     def __init__(self, model: CollisionModel, smoother: JointSmoother, others: Sequence[Neighbour] = ()) -> None:
-        self._model = model
         self._margins: list[float] = model.margins.tolist()
-        self._bounds = PairBounds(model)
+        self._around = _Surroundings(model, others, model.margins)
         self._smoother = smoother
-        self._own, *rest = model.slices
-        self._others = list(zip(rest, others, strict=True))
-        self._q: Array = np.zeros(model.n)
-        self._ways: Array = np.zeros(model.n)
-        self._at: list[Floats] = [[inf] * (part.stop - part.start) for part in model.slices]
-        """Joint positions of this arm and of the others at which the room was computed, rad."""
-        self._room = 0.0
-        """Distance of the joints from there, all arms together, within which no pair gets under its margin, rad."""
         self._floors: dict[int, float] = {}
         """Smallest distance allowed for each pair that is inside its margin, m."""
         self._fastest = [0.0] * smoother.n
@@ -71,6 +68,8 @@ class CollisionGuard:
         self._per_speed = self._per_acceleration = self._per_goal = 0.0
         self.slowed = False
         """Whether the last goal was slowed down."""
+        self.measured = MeasuredGuard(model, others)
+        """Checks the arm itself while it follows torques."""
 
     def open(self, velocity: Floats) -> None:
         """Open a session whose joints stay below ``velocity`` (n,), rad/s."""
@@ -92,7 +91,7 @@ class CollisionGuard:
 
     def is_far(self, dq: Floats) -> bool:
         """Return whether the arm can surely follow the goal speeds ``dq`` (n,), rad/s, now, and brake gently later."""
-        return self._is_clear(self._smoother.q, self._per_goal * hypot(*dq))
+        return self._around.is_clear(self._smoother.q, self._per_goal * hypot(*dq))
 
     def slow(self, dq: list[float]) -> list[float]:
         """Return the goal speeds ``dq`` (n,), rad/s, slowed down so far that the arm can brake before a margin.
@@ -102,28 +101,27 @@ class CollisionGuard:
         self.slowed = False
         if self.is_far(dq):
             return dq
-        smoother = self._smoother
+        smoother, around = self._smoother, self._around
         limits = zip(dq, smoother.acceleration, smoother.jerk, strict=True)
-        near = self._near(smoother.q, [self._braking_way(abs(v), A, J) for v, A, J in limits])
+        near = around.near(smoother.q, [self._braking_way(abs(v), A, J) for v, A, J in limits])
         if not near:
             return dq
-        model, own = self._model, self._own
-        before = self._bounds.distances[near]
-        levers = model.levers[near]
-        fastest = levers[:, own] @ np.abs(dq)
+        before = around.bounds.distances[near]
+        fastest = around.model.levers[near, around.own] @ np.abs(dq)
         greatest = float(fastest.max())
         if greatest <= 0.0:
             return dq
         ahead = min(0.1, _PROBE / greatest)
-        self._q[own] = [q + ahead * v for q, v in zip(smoother.q, dq, strict=True)]
-        model.place(self._q)
+        after = around.distances(near, [q + ahead * v for q, v in zip(smoother.q, dq, strict=True)])
+        others = around.approach_of_others(near)
         share = 1.0
-        others = levers @ self._ways - levers[:, own] @ self._ways[own]
         ticks = 2.0 * smoother.dt * min(1.0, hypot(*smoother.dq) / hypot(*dq))
         slowest = _BRAKE * min([A / abs(v) for v, A in zip(dq, smoother.acceleration, strict=True) if v])
         smoothest = _BRAKE_JERK * min([J / abs(v) for v, J in zip(dq, smoother.jerk, strict=True) if v])
-        for k, d, most, taken in zip(near, before.tolist(), fastest.tolist(), others.tolist(), strict=True):
-            speed = (d - model.distance(k)) / ahead
+        for k, d, d_ahead, most, taken in zip(
+            near, before.tolist(), after, fastest.tolist(), others.tolist(), strict=True
+        ):
+            speed = (d - d_ahead) / ahead
             if speed <= _SIDEWAYS * most:
                 continue
             left = d - self._margins[k] - taken - ticks * speed
@@ -136,19 +134,19 @@ class CollisionGuard:
 
     def allows(self) -> bool:
         """Return whether the proposed step, and the stop after it, keep every margin, or come no nearer than now."""
-        smoother = self._smoother
+        smoother, around = self._smoother, self._around
         q, dq, ddq = smoother.q_next, smoother.dq_next, smoother.ddq_next
         speed, acceleration = hypot(*dq), hypot(*ddq)
         if speed == acceleration == 0.0 and dist(q, smoother.q) < _NOWHERE:
             return True
         known = speed <= self._slowest or all(-u <= v <= u for v, u in zip(dq, self._fastest, strict=True))
-        if known and self._is_clear(q, self._per_speed * speed + self._per_acceleration * acceleration):
+        if known and around.is_clear(q, self._per_speed * speed + self._per_acceleration * acceleration):
             return True
         limits = list(zip(smoother.acceleration, smoother.jerk, strict=True))
         ways = [
             max(stop_peak(v, a, A, J), stop_peak(-v, -a, A, J)) for v, a, (A, J) in zip(dq, ddq, limits, strict=True)
         ]
-        near = self._near(q, ways)
+        near = around.near(q, ways)
         if not near:
             self._floors.clear()
             return True
@@ -161,10 +159,30 @@ class CollisionGuard:
         ways = [
             max(stop_peak(v, a, A, J), stop_peak(-v, -a, A, J)) for v, a, (A, J) in zip(v0, a0, limits, strict=True)
         ]
-        self._near(smoother.q, ways)
+        around.near(smoother.q, ways)
         present = self._lowest(pairs, smoother.q, v0, a0, ways)
         floors = [self._floor(k, now) for k, now in zip(pairs, present, strict=True)]
         return all(d >= floor - _TOLERANCE for (_, d), floor in zip(tight, floors, strict=True))
+
+    def allows_arm(self, q: Floats, dq: Floats, seconds: float) -> bool:
+        """Return whether an arm that follows the set-point by a controller's torques keeps apart.
+
+        It is taken to follow a stop of the set-point that begins now, as far off as it is, and to lose the rest of its
+        speed over ``seconds``.
+
+        Args:
+            q: Measured joint positions (n,), rad.
+            dq: Measured joint speeds (n,), rad/s.
+            seconds: s.
+        """
+        smoother, measured = self._smoother, self.measured
+        speed = hypot(*smoother.dq)
+        if speed <= self._slowest:
+            stop = self._per_speed * speed + self._per_acceleration * hypot(*smoother.ddq)
+            if measured.is_clear(q, stop + seconds * dist(dq, smoother.dq)):
+                return True
+        followed = zip(q, dq, smoother.stop_end(), smoother.q, smoother.dq, strict=True)
+        return measured.allows(q, [[x + end - goal + seconds * (v - w) for x, v, end, goal, w in followed]])
 
     def _floor(self, k: int, now: float) -> float:
         """Return the smallest distance allowed for a pair that keeps ``now`` (m) in a stop from now.
@@ -184,8 +202,44 @@ class CollisionGuard:
         """Return the way (rad) in which a joint brakes gently from the speed ``v`` (rad/s), and of two ticks before."""
         return stop_distance(v, _BRAKE * A, _BRAKE_JERK * J) + 2.0 * self._smoother.dt * v
 
-    def _is_clear(self, q: Floats, way: float) -> bool:
-        """Return whether no pair can get under its margin within ``way`` (rad, all joints together) of ``q`` (n,)."""
+    def _lowest(self, pairs: Sequence[int], q: Floats, dq: Floats, ddq: Floats, ways: Floats) -> list[float]:
+        """Return the smallest distance of each pair in the stop that begins at ``q``, ``dq``, ``ddq``, m."""
+        smoother, around = self._smoother, self._around
+        places = [q]
+        count = around.count(pairs, ways)
+        if count > 0:
+            state = list(zip(q, dq, ddq, smoother.acceleration, smoother.jerk, strict=True))
+            duration = max([stop_phases(v, a, A, J)[3] for _, v, a, A, J in state])
+            for k in range(1, count + 1):  # at equal ways, for braking that is constant
+                t = duration * (1.0 - sqrt(1.0 - k / count))
+                places.append([stop_step(x, v, a, A, J, t)[0] for x, v, a, A, J in state])
+        return around.lowest(pairs, places)
+
+
+class _Surroundings:
+    """The distances of one arm from everything around it, computed only where it may be too near.
+
+    Args:
+        model: Shapes of this arm, and of the others that it must not touch.
+        others: The other arms of the model, in its order.
+        least: Distances (pairs,), m, below which a pair is near.
+    """
+
+    def __init__(self, model: CollisionModel, others: Sequence[Neighbour], least: Array) -> None:
+        self.model = model
+        self.least = least
+        self.bounds = PairBounds(model)
+        self.own, *rest = model.slices
+        self._others = list(zip(rest, others, strict=True))
+        self._q: Array = np.zeros(model.n)
+        self._ways: Array = np.zeros(model.n)
+        self._at: list[Floats] = [[inf] * (part.stop - part.start) for part in model.slices]
+        """Joint positions of this arm and of the others at which the room was computed, rad."""
+        self._room = 0.0
+        """Distance of the joints from there, all arms together, within which no pair gets near, rad."""
+
+    def is_clear(self, q: Floats, way: float) -> bool:
+        """Return whether no pair can get near within ``way`` (rad, all joints together) of ``q`` (n,)."""
         moved = dist(q, self._at[0]) + way
         if moved > self._room:
             return False
@@ -194,39 +248,103 @@ class CollisionGuard:
             moved = hypot(moved, max(dist(there, at), dist(end, at)))
         return moved <= self._room
 
-    def _near(self, q: Floats, ways: Floats) -> list[int]:
-        """Return the pairs that may get under their margin while the joints move this far (n,), rad, from ``q``."""
-        self._q[self._own], self._ways[self._own] = q, ways
+    def near(self, q: Floats, ways: Floats) -> list[int]:
+        """Return the pairs that may get near while the joints move this far (n,), rad, from ``q``."""
+        self._q[self.own], self._ways[self.own] = q, ways
         self._at = [q]
         for part, neighbour in self._others:
             there, end = neighbour()
             self._q[part], self._ways[part] = there, np.abs(np.subtract(end, there))
             self._at.append(there)
-        near = self._bounds.near(self._q, self._ways, self._model.margins)
-        self._room = self._bounds.room
+        near = self.bounds.near(self._q, self._ways, self.least)
+        self._room = self.bounds.room
         return near
 
-    def _lowest(self, pairs: Sequence[int], q: Floats, dq: Floats, ddq: Floats, ways: Floats) -> list[float]:
-        """Return the smallest distance of each pair in the stop that begins at ``q``, ``dq``, ``ddq``, m."""
-        model, smoother, own = self._model, self._smoother, self._own
-        levers = model.levers[pairs]
-        places = [q]
-        count = min(_SAMPLES, ceil(float((levers[:, own] @ np.array(ways)).max()) / _SPACING - 0.02))
-        if count > 0:
-            state = list(zip(q, dq, ddq, smoother.acceleration, smoother.jerk, strict=True))
-            duration = max([stop_phases(v, a, A, J)[3] for _, v, a, A, J in state])
-            for k in range(1, count + 1):  # at equal ways, for braking that is constant
-                t = duration * (1.0 - sqrt(1.0 - k / count))
-                places.append([stop_step(x, v, a, A, J, t)[0] for x, v, a, A, J in state])
+    def approach_of_others(self, pairs: Sequence[int]) -> Array:
+        """Return how much nearer (pairs,), m, the shapes come at most while the other arms stop."""
+        levers, own = self.model.levers[pairs], self.own
+        taken: Array = levers @ self._ways - levers[:, own] @ self._ways[own]
+        return taken
+
+    def count(self, pairs: Sequence[int], ways: Floats) -> int:
+        """Return the number of positions at which to check a motion of the joints by ``ways`` (n,), rad."""
+        farthest = float((self.model.levers[pairs, self.own] @ np.array(ways)).max())
+        return min(_SAMPLES, ceil(farthest / _SPACING - 0.02))
+
+    def distances(self, pairs: Sequence[int], q: Floats) -> list[float]:
+        """Return the distances of pairs, m, with this arm at ``q`` (n,), rad, and the others where they are now."""
+        self._q[self.own] = q
+        self.model.place(self._q)
+        return [self.model.distance(k) for k in pairs]
+
+    def lowest(self, pairs: Sequence[int], places: Sequence[Floats]) -> list[float]:
+        """Return the smallest distance of each pair, m, with this arm in any of ``places``, each (n,) rad.
+
+        The other arms are where they were in the last call of :meth:`near`, or where their stops end.
+        """
+        model = self.model
         others = [self._q.copy()]
-        if self._others and float(np.abs(levers @ self._ways - levers[:, own] @ self._ways[own]).max()) > _TOLERANCE:
+        if self._others and float(np.abs(self.approach_of_others(pairs)).max()) > _TOLERANCE:
             others.append(self._q.copy())
             for part, neighbour in self._others:
                 others[1][part] = neighbour()[1]
         lowest = [inf] * len(pairs)
         for there in others:
             for place in places:
-                there[own] = place
+                there[self.own] = place
                 model.place(there)
                 lowest = [min(d, model.distance(k)) for k, d in zip(pairs, lowest, strict=True)]
         return lowest
+
+
+class MeasuredGuard:
+    """Checks where an arm is that follows torques, and so may not be where its set-point is.
+
+    Its stop is predicted. A pair that is inside its margin when the torques begin may come no nearer.
+
+    Args:
+        model: As for :class:`CollisionGuard`.
+        others: Likewise.
+    """
+
+    def __init__(self, model: CollisionModel, others: Sequence[Neighbour]) -> None:
+        self._around = _Surroundings(model, others, model.margins)
+        self._floors: dict[int, float] = {}
+        """Smallest distance allowed for each pair that is inside its margin, m."""
+
+    def start(self, q: Floats, share: float) -> None:
+        """Start to check an arm that is at ``q`` (n,), rad, with this share of the margins."""
+        around = self._around
+        around.least = share * around.model.margins
+        self._floors.clear()
+        near = around.near(q, [0.0] * len(q))
+        for k, now in zip(near, around.lowest(near, [q]), strict=True):
+            self._floors[k] = min(float(around.least[k]), now - _NOISE)
+
+    def is_clear(self, q: Floats, way: float) -> bool:
+        """Return whether no pair can get near within ``way`` (rad, all joints together) of ``q`` (n,)."""
+        return self._around.is_clear(q, way)
+
+    def allows(self, q: Floats, ends: Sequence[Floats]) -> bool:
+        """Return whether no shapes get too near on straight ways from ``q`` (n,) to ``ends``, each (n,), rad."""
+        around = self._around
+        if around.is_clear(q, max([dist(q, end) for end in ends])):
+            return True
+        ways = [max(map(abs, turns)) for turns in zip(*[map(sub, end, q) for end in ends], strict=True)]
+        near = around.near(q, ways)
+        if not near:
+            self._floors.clear()
+            return True
+        count = around.count(near, ways)
+        places = [
+            [a + k / count * (b - a) for a, b in zip(q, end, strict=True)] for end in ends for k in range(1, count + 1)
+        ]
+        present, ahead = around.lowest(near, [q]), around.lowest(near, places)
+        allowed = True
+        for k, now, then in zip(near, present, ahead, strict=True):
+            least = float(around.least[k])
+            floor = self._floors.get(k, least)
+            if floor < least and now - _NOISE > floor:
+                self._floors[k] = floor = min(least, now - _NOISE)
+            allowed = allowed and min(now, then) >= floor
+        return allowed

@@ -33,6 +33,11 @@ LEAD = (0.05, 0.2)
 """How far a set-point may be from the measured tcp, m and rad, or from a measured joint with joint springs, rad."""
 RESUME = 0.8
 """Share of :data:`LEAD` below which a motion that was held back continues."""
+MARGIN_SHARE = 0.5
+"""Share of the collision margins that the arm itself keeps; the set-point keeps all of them. The rest is how far an arm
+that follows well is behind its set-point, or beyond it."""
+_PUSHED = 0.06
+"""Time in which an arm loses a speed that its set-point does not have, s."""
 SPEED_SHARE, TCP_SHARE = 0.8, 0.85
 """A set-point takes at most these shares of the joints' greatest speeds and of the session's tcp speed."""
 
@@ -97,6 +102,7 @@ class Compliance:
         slower = session._replace(speed=min(session.speed, SPEED_SHARE), tcp_speed=TCP_SHARE * session.tcp_speed)
         self._envelope.open(slower)
         torque.open()
+        torque.margin_share = MARGIN_SHARE
         bounds.velocity, bounds.tcp_speed = smoother.velocity, session.tcp_speed
 
     def set_gains(self, controller: Controller) -> None:
@@ -157,5 +163,10 @@ class Compliance:
 
     def strays(self) -> Limited | None:
         """Return the limit that the arm exceeds, although its set-point keeps all of them; None if it keeps all."""
-        bounds, arm = self._torque.bounds, self._torque.arm
-        return None if bounds is None or arm is None else bounds.strays(arm)
+        bounds, arm, collisions = self._torque.bounds, self._torque.arm, self._envelope.collisions
+        if bounds is None or arm is None:
+            return None
+        limit = bounds.strays(arm)
+        if limit is None and collisions is not None and not collisions.allows_arm(arm.q, arm.dq, _PUSHED):
+            limit = Limited.COLLISION
+        return limit

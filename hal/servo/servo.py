@@ -399,6 +399,8 @@ class Servo:
         if limit is None:
             return _NO_TRIP
         self._envelope.limited |= limit
+        if limit is Limited.COLLISION:
+            self._leave_torques()  # what pushes it would push it on while torques brake it
         return Trip.LIMIT
 
     def _is_position(self, q: Floats) -> bool:

@@ -305,7 +305,7 @@ class TorqueBounds:
         """Return the limit that the arm exceeds while ``tau`` (n,), Nm, drives it; None if it keeps all.
 
         It does if its measured speed is above the session's, or if a stop that begins now would end beyond a limit of
-        position or a face of the workspace.
+        position or a face of the workspace, or too near to something.
         """
         envelope, dq = self._envelope, arm.dq
         speeds = [abs(v) for v in dq]
@@ -327,6 +327,10 @@ class TorqueBounds:
             now, then = jacobian[:3].dot(dq).tolist(), jacobian[:3].dot(fastest).tolist()
             if not _stays_within(self._box, pose[:3], now, then, seconds):
                 return Limited.WORKSPACE
+        if envelope.collisions is not None:
+            ends = [[x + seconds * v for x, v in zip(arm.q, speed, strict=True)] for speed in (dq, fastest)]
+            if not envelope.collisions.measured.allows(arm.q, ends):
+                return Limited.COLLISION
         return None
 
     def strays(self, arm: ArmInMotion) -> Limited | None:
@@ -439,6 +443,8 @@ class TorqueMotion(ServoMotion):
         """The limit that the arm would have run into in the last tick without braking."""
         self._share = 0.0
         """Share of the brake that is applied (0..1)."""
+        self.margin_share = 1.0
+        """Share of the collision margins that the arm keeps while it follows torques."""
         self._given_up = False
         """Whether the device was left alone because the arm's state was unknown."""
         self._unseen = self._still = self._braking = 0.0
@@ -448,6 +454,7 @@ class TorqueMotion(ServoMotion):
 
     def open(self) -> None:
         """Open a session, at rest."""
+        self.margin_share = 1.0
         if self.bounds is not None:
             self.bounds.open_session(self.smoother.q)
 
@@ -541,6 +548,8 @@ class TorqueMotion(ServoMotion):
         self._overran = None
         self._unseen = self._still = self._braking = self._share = 0.0
         self.arm = None
+        if self.envelope.collisions is not None:
+            self.envelope.collisions.measured.start(self.q, self.margin_share)
         self._update_inertia()
         self._update_arm()
 

@@ -11,12 +11,27 @@ import pytest
 import hal
 
 SCRIPT = Path(__file__).parents[2] / "benchmarks" / "collisions.py"
+BENCHMARK = runpy.run_path(str(SCRIPT))
 POINTED = [0.0, 0.6, 0.0, -1.2, 0.0, 1.8, 0.8]
 
 
 def test_two_arms_driven_at_each_other_stop_apart() -> None:
-    found = runpy.run_path(str(SCRIPT))["arms"](1)
+    found = BENCHMARK["arms"](1)
     assert found["5 mm apart or more"] == found["came within 20 mm"] == 1
+
+
+def test_torques_towards_the_table_are_stopped_before_its_margin() -> None:
+    found = BENCHMARK["torques"](3)
+    assert found["nearest of all, mm"] >= 10.0
+    assert found["stopped because of a collision"] == 2
+
+
+def test_a_compliant_arm_that_is_pushed_beyond_the_margin_is_held() -> None:
+    free, pushed = BENCHMARK["pushes"](forces=(0.0, 20.0), names=("tcp 1000 N/m",)).values()
+    assert free == "10.0 mm, no trip"
+    distance, end = pushed.split(" mm, ")
+    assert float(distance) >= 5.0
+    assert end == "torque_limit"
 
 
 def test_a_motion_into_another_arm_is_refused_before_anything_moves() -> None:

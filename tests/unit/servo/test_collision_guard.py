@@ -12,6 +12,8 @@ import pytest
 from hal.commands import NO_INBOX, CommandRecord, Inbox, Kind, Session
 from hal.config import load
 from hal.driver import Reading
+from hal.geometry import Pose
+from hal.kinematics.arm import Kinematics
 from hal.kinematics.collision_model import CollisionModel
 from hal.servo.audit import SetpointAudit
 from hal.servo.collisions import CollisionGuard, Neighbour
@@ -146,3 +148,58 @@ def test_move_to_waits_for_an_arm_in_its_way(panda: RobotSpec) -> None:
     at[:] = away
     bench.run(8.0)
     assert bench.servo.report.arrived
+
+
+class MeasuredArm:
+    """The guard of an arm that follows torques: it is told where the arm is measured."""
+
+    def __init__(self, panda: RobotSpec, low: float, share: float = 1.0) -> None:
+        """Put the arm at ``low`` m above the margin of the table, or below it, when torques begin."""
+        self.model = CollisionModel([panda], CollisionSpec(own=False, boxes=(TABLE,)))
+        smoother = Servo(panda, 1.0 / RATE_HZ).smoother
+        smoother.anchor(list(OVER_THE_TABLE))
+        guard = CollisionGuard(self.model, smoother)
+        guard.open(panda.limits.velocity)
+        self.guard, self.measured = guard, guard.measured
+        self.solver = Kinematics(panda.kinematics)
+        self.q = list(OVER_THE_TABLE)
+        self.q = self.lower(self.distance(self.q) - 0.01 - low)
+        self.measured.start(self.q, share)
+
+    def distance(self, q: Sequence[float]) -> float:
+        self.model.place(q)
+        return float(self.model.distances().min())
+
+    def lower(self, way: float) -> list[float]:
+        """Return the joint positions that have the hand lower by ``way``, m."""
+        pose = list(self.solver.fk(self.q))
+        pose[2] -= way
+        return self.solver.solve(Pose(pose[:3], pose[3:]), np.array(self.q)).tolist()
+
+
+def test_a_measured_arm_may_not_end_inside_a_margin(panda: RobotSpec) -> None:
+    arm = MeasuredArm(panda, 0.02)
+    assert arm.measured.allows(arm.q, [arm.lower(0.018)])
+    assert not arm.measured.allows(arm.q, [arm.lower(0.022)])
+    assert not arm.measured.allows(arm.q, [arm.lower(-0.05), arm.lower(0.022)])
+    assert MeasuredArm(panda, 0.02, 0.5).measured.allows(arm.q, [arm.lower(0.024)])
+
+
+def test_a_measured_arm_inside_a_margin_may_only_leave_and_not_come_back(panda: RobotSpec) -> None:
+    arm = MeasuredArm(panda, -0.004)
+    assert arm.measured.allows(arm.q, [arm.q])
+    assert not arm.measured.allows(arm.q, [arm.lower(0.002)])
+    away = arm.lower(-0.003)
+    assert arm.measured.allows(arm.q, [away])
+    assert arm.measured.allows(away, [away])
+    assert not arm.measured.allows(away, [arm.q])
+
+
+def test_a_compliant_arm_is_checked_off_its_set_point(panda: RobotSpec) -> None:
+    arm = MeasuredArm(panda, 0.02, 0.5)
+    still = [0.0] * 7
+    assert arm.guard.allows_arm(arm.q, still, 0.06)
+    assert not arm.guard.allows_arm(arm.lower(0.026), still, 0.06)
+    speed = (np.subtract(arm.lower(0.01), arm.q) / 0.01 * 0.5).tolist()  # 0.5 m/s down
+    assert not arm.guard.allows_arm(arm.q, speed, 0.06)
+    assert arm.guard.allows_arm(arm.q, [-v for v in speed], 0.06)
