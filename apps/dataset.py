@@ -1,9 +1,11 @@
-"""Curate a dataset: list its episodes, delete, mark, re-task or extract some, merge several datasets.
+"""Curate a dataset: list its episodes, delete, mark, re-task, extract or trim some, split it, merge several.
 
 python apps/dataset.py list data/demo --failed
 python apps/dataset.py delete data/demo 3,5-7
 python apps/dataset.py mark data/demo 4 success
 python apps/dataset.py merge data/monday data/tuesday --out data/all
+python apps/dataset.py split data/all --shares train=0.9,val=0.1 --out data/parts
+python apps/dataset.py trim data/all --dry-run
 """
 
 from __future__ import annotations
@@ -23,6 +25,7 @@ if TYPE_CHECKING:
 __all__ = ["main", "parser"]
 
 MARKS: dict[str, bool | None] = {"success": True, "failure": False, "none": None}
+PARTS = {True: "success", False: "failure", None: "unmarked"}
 NAMES = {mark: name if mark is not None else "-" for name, mark in MARKS.items()}
 
 
@@ -30,9 +33,9 @@ def parser() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
     made = argparse.ArgumentParser(
         prog="dataset",
-        description="List the episodes of a dataset; delete, mark, re-task or extract some; merge several datasets.",
+        description="List the episodes of a dataset; delete, mark, re-task, extract or trim some; split and merge.",
         epilog="EPISODES are numbers such as 0,3-5. Pictures and depth are never encoded again; a result replaces the "
-        "dataset when it is complete. hal-review shows an episode, checks and repairs.",
+        "dataset when it is complete. hal-review shows an episode.",
     )
     commands = made.add_subparsers(dest="command", required=True, metavar="COMMAND")
 
@@ -73,6 +76,34 @@ def parser() -> argparse.ArgumentParser:
     merging = add("merge", "merge datasets that were recorded with the same rig")
     merging.add_argument("datasets", nargs="+", metavar="DATASET", help="folders of recordings; they are only read")
     merging.add_argument("--out", required=True, metavar="DIR", help="new folder")
+
+    splitting = add("split", "write several datasets of the episodes of one, which is only read")
+    splitting.add_argument("dataset", metavar="DATASET", help="folder of a recording")
+    splitting.add_argument("--out", required=True, metavar="DIR", help="new folder, with a folder for each part")
+    ways = splitting.add_mutually_exclusive_group(required=True)
+    ways.add_argument("--shares", metavar="NAME=SHARE,...", help="at random, for example train=0.8,val=0.2")
+    ways.add_argument("--episodes", metavar="NAME=NUMBERS;...", help='for example "train=0,3-9;val=1-2"')
+    ways.add_argument("--by-mark", action="store_true", help="into success, failure and unmarked")
+    splitting.add_argument("--seed", type=int, default=0, help="of the random order (%(default)s)")
+
+    trimming = add("trim", "remove the rows at both ends of episodes in which neither arm nor gripper moves")
+    trimming.add_argument("dataset", metavar="DATASET", help="folder of a recording")
+    trimming.add_argument("episodes", metavar="EPISODES", nargs="?", help="numbers, for example 0,3-5 (default: all)")
+    trimming.add_argument(
+        "--speed", type=float, default=0.02, metavar="RAD_S", help="slowest motion of a joint, rad/s (%(default)s)"
+    )
+    trimming.add_argument(
+        "--width", type=float, default=0.001, metavar="M", help="smallest motion of a gripper, m (%(default)s)"
+    )
+    trimming.add_argument(
+        "--keep", type=float, default=0.2, metavar="S", help="time to keep before and after the motion, s (%(default)s)"
+    )
+    trimming.add_argument("--out", metavar="DIR", help="new folder (default: replace the dataset)")
+    trimming.add_argument("--dry-run", action="store_true", help="only print what would be removed")
+    trimming.add_argument("--yes", action="store_true", help="do not ask")
+
+    add("check", "compare every file with the index").add_argument("dataset", metavar="DATASET")
+    add("repair", "finish interrupted episodes, and rebuild a lost index").add_argument("dataset", metavar="DATASET")
     return made
 
 
@@ -82,16 +113,24 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def _main(args: argparse.Namespace) -> int:
-    from hal.recording import Dataset, delete_episodes, extract, mark_episodes, merge, set_task
+    from hal.recording import Dataset, delete_episodes, extract, mark_episodes, merge, set_task, split
     from hal.recording.exporters.content import select_episodes
 
     if args.command == "merge":
         count = merge(args.datasets, args.out, on_episode=_progress())
         print(f"{args.out}: {_many(count)}")
         return 0
+    if args.command in ("check", "repair"):
+        from hal.apps import review
+
+        return review.main([args.dataset, f"--{args.command}"])
     dataset = Dataset(args.dataset)
     if args.command == "list":
         _list(dataset, args)
+        return 0
+    if args.command == "split":
+        for name, count in split(args.dataset, _parts(dataset, args), args.out).items():
+            print(f"{args.out}/{name}: {_many(count)}")
         return 0
     chosen = [episode.number for episode in select_episodes(dataset, args.episodes, successful_only=False)]
     if args.command == "extract":
@@ -102,11 +141,58 @@ def _main(args: argparse.Namespace) -> int:
     elif args.command == "task":
         set_task(args.dataset, args.task, chosen)
         print(f"{_many(len(chosen))} of {dataset.root}: {args.task}")
-    elif args.yes or _confirmed(dataset, len(chosen)):
+    elif args.command == "trim":
+        _trim(dataset, chosen, args)
+    elif args.yes or _confirmed(f"delete {len(chosen)} of {_many(len(dataset))} of {dataset.root}, for good?"):
         print(f"{dataset.root}: {_many(delete_episodes(args.dataset, chosen))} left")
     else:
         print("nothing was deleted")
     return 0
+
+
+def _parts(dataset: Dataset, args: argparse.Namespace) -> dict[str, list[int]]:
+    """Return the episodes of each part of a split."""
+    from hal.recording.curation import shares
+    from hal.recording.exporters.content import parse_episodes
+
+    if args.by_mark:
+        found: dict[str, list[int]] = {}
+        for episode in dataset.episodes:
+            found.setdefault(PARTS[episode.success], []).append(episode.number)
+        return found
+    pairs = [pair.partition("=") for pair in (args.shares or args.episodes).split("," if args.shares else ";")]
+    names = [name.strip() for name, _, _ in pairs]
+    try:
+        if len(set(names)) < len(names) or not all(names):
+            raise ValueError("every part needs a name of its own")
+        if args.shares:
+            wanted = {name: float(share) for name, (_, _, share) in zip(names, pairs, strict=True)}
+            return shares(len(dataset), wanted, args.seed)
+    except ValueError as error:
+        raise CommandError(f"parts are written as in --help: {error}", code="bad_split") from None
+    return {name: parse_episodes(numbers) for name, (_, _, numbers) in zip(names, pairs, strict=True)}
+
+
+def _trim(dataset: Dataset, chosen: list[int], args: argparse.Namespace) -> None:
+    from hal.recording import find_motion, trim
+
+    kept, before, after = {}, 0, 0
+    for number in chosen:
+        episode = dataset.episodes[number]
+        rows = find_motion(episode, speed=args.speed, width=args.width, keep=args.keep)
+        start, end = rows.first, episode.length - rows.end
+        if start or end:
+            kept[number], before, after = rows, before + start, after + end
+            times = f"{start / episode.fps:.2f} s at the start, {end / episode.fps:.2f} s at the end"
+            print(f"episode {number}: {start + end} of {episode.length} rows, {times}")
+    total = f"{before + after} rows of {_many(len(kept))}"
+    if args.dry_run or not kept:
+        print(f"{total} would be removed" if kept else "nothing to trim")
+    elif args.out or args.yes or _confirmed(f"remove {total} of {dataset.root}, for good?"):
+        trim(args.dataset, kept, args.out, on_episode=_progress())
+        print(f"{args.out or dataset.root}: {total} removed")
+    else:
+        print("nothing was removed")
 
 
 def _list(dataset: Dataset, args: argparse.Namespace) -> None:
@@ -120,6 +206,8 @@ def _list(dataset: Dataset, args: argparse.Namespace) -> None:
         end = f"{NAMES[episode.success]:8}  {dropped:7d}  {episode.task}"
         print(f"{episode.number:7d}  {episode.length / episode.fps:7.2f}  {end}")
     print(f"{len(found)} of {_many(len(dataset))} of {dataset.root}")
+    for note in dataset.notes:
+        print(f"note: {note}")
 
 
 def _matches(episode: Episode, args: argparse.Namespace) -> bool:
@@ -133,8 +221,7 @@ def _matches(episode: Episode, args: argparse.Namespace) -> bool:
     )
 
 
-def _confirmed(dataset: Dataset, count: int) -> bool:
-    question = f"delete {count} of {_many(len(dataset))} of {dataset.root}, for good?"
+def _confirmed(question: str) -> bool:
     if not sys.stdin.isatty():
         raise CommandError(f"{question} repeat the command with --yes", code="not_confirmed")
     return input(f"{question} [y/N] ").strip().lower() in ("y", "yes")

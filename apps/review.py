@@ -87,6 +87,8 @@ def _main(args: argparse.Namespace) -> int:
     else:
         (episode,) = select_episodes(dataset, [args.episode], successful_only=False)
         found = summarize(dataset, [episode])
+    for note in dataset.notes:
+        print(f"note: {note}", file=sys.stderr)
     print(summary_as_json(found) if args.json else "\n".join(_table(found)))
     if args.episode is None:
         _warn_of_index(dataset, found)
@@ -202,6 +204,8 @@ def _table(found: DatasetSummary) -> Iterator[str]:
     yield f"{'rad, gripper m':{width}}  {heads}    {heads}"
     for state, action in zip(found.state, found.action, strict=True):
         yield f"{state.name:{width}}  {_numbers(state)}    {_numbers(action)}"
+    if not found.timing:
+        return
     yield ""
     width = max(len(each.source) for each in found.timing)
     yield f"{'times, ms':{width}}  {'period':>8} {'jitter':>8} {'longest':>8} {'age':>8} {'oldest':>8}  repeated"

@@ -20,39 +20,52 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from .dataset import Dataset, Episode
+    from .curation import find_motion, split, trim
+    from .dataset import CameraDepth, Dataset, Episode, EpisodeDepth, KeptRows
     from .finish import recover, repair
     from .merging import delete_episodes, extract, mark_episodes, merge, pack, set_task
     from .recorder import Recorder, RecorderStatus
 
 __all__ = [
+    "CameraDepth",
     "Dataset",
     "Episode",
+    "EpisodeDepth",
+    "KeptRows",
     "Recorder",
     "RecorderStatus",
     "delete_episodes",
     "extract",
+    "find_motion",
     "mark_episodes",
     "merge",
     "pack",
     "recover",
     "repair",
     "set_task",
+    "split",
+    "trim",
 ]
 
 _HOME = {
+    "CameraDepth": "dataset",
     "Dataset": "dataset",
     "Episode": "dataset",
+    "EpisodeDepth": "dataset",
+    "KeptRows": "dataset",
     "Recorder": "recorder",
     "RecorderStatus": "recorder",
     "delete_episodes": "merging",
     "extract": "merging",
+    "find_motion": "curation",
     "mark_episodes": "merging",
     "merge": "merging",
     "pack": "merging",
     "recover": "finish",
     "repair": "finish",
     "set_task": "merging",
+    "split": "curation",
+    "trim": "curation",
 }
 
 

@@ -15,6 +15,7 @@ import numpy as np
 
 from ..errors import CommandError, DatasetError
 from .dataset import Dataset, Episode
+from .foreign import is_foreign
 from .index import check_next_episode, dataset_errors, read_about, read_entries, read_index, read_tasks
 from .layout import (
     BOOKKEEPING,
@@ -107,6 +108,8 @@ def check_rows(episode: Episode, start: int | None) -> None:
 
 def check_index(layout: DatasetLayout) -> Iterator[DatasetError]:
     """Yield every error in ``meta/``, in itself or against the episodes' own files."""
+    if is_foreign(layout):  # the index was read; there is nothing to compare it with
+        return
     try:
         info = read_index(layout)
     except DatasetError as error:

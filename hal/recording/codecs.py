@@ -34,6 +34,7 @@ __all__ = [
     "VideoPart",
     "as_rgb",
     "can_be_joined",
+    "copy_records",
     "choose_encoder",
     "column_stats",
     "count_frames",
@@ -41,6 +42,7 @@ __all__ = [
     "merge_stats",
     "ids_to_units",
     "join_videos",
+    "key_frames",
     "picture_stats",
     "stats_as_lists",
     "read_video",
@@ -151,14 +153,19 @@ class DepthReader:
 
         Raises IndexError if there is no such row, and ValueError if its picture is damaged.
         """
-        own = range(len(self))[k]
-        while own and not self._places[own][1]:  # the same picture as in the row before
-            own -= 1
+        own = self.stored_row(k)
         if not self._places[own][1]:
             return np.zeros(self.shape, np.float32)
         with self.path.open("rb") as file:
             depth: NDArray[np.float32] = self._decoded(file, own).astype(np.float32) * np.float32(self.unit)
             return depth
+
+    def stored_row(self, k: int) -> int:
+        """Return the row that holds the picture of row ``k``: an earlier one if it shows the same picture again."""
+        own = range(len(self))[k]
+        while own and not self._places[own][1]:
+            own -= 1
+        return own
 
     def _decoded(self, file: io.BufferedReader, k: int) -> Units:
         """Return the picture that is stored in record ``k``."""
@@ -208,6 +215,20 @@ def _write(file: io.RawIOBase, data: bytes) -> None:
     while rest:
         written = file.write(rest)
         rest = rest[written or 0 :]
+
+
+def copy_records(source: Path, target: Path, first: int, end: int) -> None:
+    """Write rows ``first`` to ``end - 1`` of a depth file into another one, as they are compressed."""
+    reader = DepthReader(source)
+    if not 0 <= first < end <= len(reader):
+        raise ValueError(f"it has {len(reader)} pictures, and not {first} to {end - 1}")
+    begin = reader.stored_row(first)
+    target.parent.mkdir(parents=True, exist_ok=True)
+    with source.open("rb") as read, target.open("wb") as write:
+        write.write(read.readline())
+        for start, stop in ((begin, begin + 1), (first + 1, end)):
+            read.seek(reader.end_of(start))
+            write.write(read.read(reader.end_of(stop) - reader.end_of(start)))
 
 
 def truncate_records(path: Path, count: int) -> None:
@@ -437,6 +458,15 @@ def _seek(container: InputContainer, first: int, fps: int) -> None:
     if first:
         stream: Any = container.streams.video[0]
         container.seek(round(first / (fps * stream.time_base)), stream=stream)
+
+
+def key_frames(path: Path, first: int, count: int, fps: int) -> NDArray[np.bool_]:
+    """Return which of ``count`` pictures of a video, from number ``first`` on, can be decoded without others."""
+    import av
+
+    with av.open(str(path)) as container:
+        flags = [packet.is_keyframe for packet in itertools.islice(_packets(container, first, fps), count)]
+    return np.array(flags + [False] * (count - len(flags)))
 
 
 def remux(source: Path, target: Path, length: int) -> None:

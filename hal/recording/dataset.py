@@ -6,17 +6,19 @@ from collections.abc import Iterator, Sequence
 from functools import cached_property
 from itertools import islice
 from pathlib import Path
-from typing import Any, TypeVar, overload
+from typing import Any, NamedTuple, TypeVar, overload
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import CommandError, DatasetError, DeviceNotFound
 from .codecs import DepthReader, count_frames, read_video
+from .foreign import is_foreign, read_foreign
 from .index import dataset_errors, read_about, read_index, repair_command
 from .layout import (
     MORE_STREAMS,
     SEGMENTATION,
+    SUCCESS,
     TIMES,
     DatasetLayout,
     EpisodePlace,
@@ -25,7 +27,7 @@ from .layout import (
     video_key,
 )
 
-__all__ = ["CameraDepth", "Dataset", "Episode", "EpisodeDepth"]
+__all__ = ["CameraDepth", "Dataset", "Episode", "EpisodeDepth", "KeptRows"]
 
 
 P = TypeVar("P", bound=NDArray[Any])
@@ -43,6 +45,14 @@ class _Columns(dict[str, NDArray[Any]]):
         raise DatasetError(f"has no column {key}", file=file, episode=episode)
 
 
+class KeptRows(NamedTuple):
+    """Rows of an episode, one after the other."""
+
+    first: int
+    end: int
+    """Row after the last one."""
+
+
 class Episode:
     """One finished episode. Files are read only when an attribute or method needs them.
 
@@ -50,16 +60,22 @@ class Episode:
     ``meta/info.json`` and ``episodes/N.json`` list; the error names the file and the episode.
     """
 
-    def __init__(self, layout: DatasetLayout, number: int, meta: dict[str, Any]) -> None:
+    def __init__(
+        self, layout: DatasetLayout, number: int, meta: dict[str, Any], about: dict[str, Any] | None = None
+    ) -> None:
         self._layout = layout
         self._meta = meta
+        self._about = about
+        """What is known about an episode without metadata of its own (:mod:`~hal.recording.foreign`)."""
+        self.rows: KeptRows | None = None
+        """The rows that are left of an episode that is being trimmed; None for one as it is on the disk."""
         self.number = number
         self.fps: int = meta["fps"]
 
     @cached_property
     def info(self) -> dict[str, Any]:
         """Content of ``episodes/N.json``: seed, cameras, gaps, versions, the rig's whole configuration."""
-        return read_about(self._layout, self.number)
+        return read_about(self._layout, self.number) if self._about is None else self._about
 
     @property
     def length(self) -> int:
@@ -75,6 +91,8 @@ class Episode:
     def success(self) -> bool | None:
         """Whether the episode was marked a success; None if it was not marked."""
         mark = self.info["success"]
+        if self._about is not None and mark is None and SUCCESS in self._meta["features"]:
+            return bool(self.columns[SUCCESS].any()) or None
         return None if mark is None else bool(mark)
 
     @property
@@ -94,8 +112,11 @@ class Episode:
         path = self._layout.root / self.data_file
         features = {key: each for key, each in self._meta["features"].items() if each["dtype"] != "video"}
         table = self.read_table()
-        if odd := sorted(set(table.column_names) ^ features.keys()):
-            raise self._wrong(path, f"does not have the columns of meta/info.json: {', '.join(odd[:5])}")
+        odd = features.keys() - set(table.column_names)
+        if self._about is None:
+            odd |= set(table.column_names) - features.keys()
+        if odd:
+            raise self._wrong(path, f"does not have the columns of meta/info.json: {', '.join(sorted(odd)[:5])}")
         for key, feature in features.items():
             column = table[key].combine_chunks()
             shape = [] if feature["shape"] == [1] else feature["shape"]
@@ -141,13 +162,15 @@ class Episode:
         """True times (rows,) on the rig's clock, s.
 
         ``grid`` is when each row was due; each source (``robot.panda``, ``camera.wrist``) has the times at which the
-        row's values were measured, NaN if that is unknown.
+        row's values were measured, NaN if that is unknown. Without recorded times ``grid`` is LeRobot's nominal time.
         """
         start = float(self.info["t_start"])
         found = _Columns(self.data_file, self.number)
         for key, value in self.columns.items():
             if key.startswith(TIMES):
                 found[key.removeprefix(TIMES)] = start + (value if value.ndim == 1 else value[:, 0])
+        if self._about is not None:
+            found.setdefault("grid", self.columns["timestamp"].astype(np.float64))
         return found
 
     @property
@@ -352,14 +375,18 @@ class Dataset:
     def __init__(self, out: str | Path) -> None:
         require_libraries()
         layout = DatasetLayout(out)
-        info = read_index(layout)
-        if info is None:
+        foreign = read_foreign(layout) if is_foreign(layout) else None
+        info = read_index(layout) if foreign is None else foreign.info
+        if info is None or info["total_episodes"] == 0:
             raise CommandError(f"there is no episode in {layout.root}{_hint(layout)}", code="no_episodes")
         self.root = layout.root
         self.info: dict[str, Any] = info
         """``meta/info.json``."""
-        self.fps: int = self.info["fps"]
-        self.episodes = tuple(Episode(layout, number, self.info) for number in range(self.info["total_episodes"]))
+        self.notes = () if foreign is None else foreign.notes
+        """What is missing in a dataset that another program edited or recorded."""
+        self.fps: int = info["fps"]
+        abouts = [None] * info["total_episodes"] if foreign is None else foreign.episodes
+        self.episodes = tuple(Episode(layout, number, info, about) for number, about in enumerate(abouts))
 
     def __len__(self) -> int:
         return len(self.episodes)

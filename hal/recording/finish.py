@@ -68,6 +68,7 @@ __all__ = [
     "recover_all",
     "repair",
     "rows_table",
+    "stats_of",
     "tasks_table",
     "write_table",
 ]
@@ -485,7 +486,7 @@ def _rebuild(layout: DatasetLayout) -> int:
         task = tasks.setdefault(int(episode.columns["task_index"][0]), episode.task)
         if task != episode.task:
             raise DatasetError(f"the task is {episode.task!r}, and {task!r} in other episodes", episode=episode.number)
-        stats = _stats(layout, episode)
+        stats = stats_of(episode)
         about = episode.info | {"episode": episode.number}
         row = entry_row(about, episode.place, start, episode.fps, stats)
         entries.setdefault(episode.place.entry, []).append(row)
@@ -524,14 +525,15 @@ def _info(layout: DatasetLayout, count: int) -> dict[str, Any]:
         ) from error
 
 
-def _stats(layout: DatasetLayout, episode: Episode) -> dict[str, Stats]:
+def stats_of(episode: Episode) -> dict[str, Stats]:
+    """Return the statistics of an episode's columns and videos, read again. Raises DatasetError for damaged files."""
     rows = episode.length
     table = episode.read_table()
     stats = {key: column_stats(_numbers(table[key], rows)) for key in table.column_names}
     episode.check_pictures()
     for path in (path for camera in episode.cameras for path in episode.files(camera).values()):
         if path.suffix == ".mp4":
-            with dataset_errors(layout.root, path, episode.number):
+            with dataset_errors(episode._layout.root, path, episode.number):
                 first = episode.first_picture(path)
                 stats[path.parent.parent.name] = picture_stats(path, rows, episode.fps, first).stats()
     return stats

@@ -36,6 +36,7 @@ __all__ = [
     "SOURCE",
     "SOURCES",
     "STATE",
+    "SUCCESS",
     "TIMES",
     "VERSION",
     "VIDEO_MB",
@@ -58,6 +59,7 @@ SETPOINT = "rig.setpoint"
 """LeRobot treats columns whose names begin with ``observation`` or ``action`` as inputs and outputs of a policy. What a
 policy must not learn from, because it contains the answer or is unknown on a robot, begins with ``rig``."""
 PAD = "rig.pad"
+SUCCESS = "next.success"
 SOURCE = "source"
 SOURCES = ("", "person", "policy", "program")
 """Who drives, by the number in :data:`SOURCE`; empty if it is unknown."""

@@ -23,9 +23,19 @@ from numpy.typing import NDArray
 
 from ..errors import CommandError, DatasetError, HalError
 from .checking import format_differences
-from .codecs import Stats, VideoPart, can_be_joined, column_stats, join_videos, merge_stats, stats_as_lists
+from .codecs import (
+    Stats,
+    VideoPart,
+    can_be_joined,
+    column_stats,
+    copy_records,
+    join_videos,
+    merge_stats,
+    stats_as_lists,
+)
 from .dataset import Dataset, Episode
-from .finish import entries_table, entry_row, last_row, new_info, tasks_table, write_table
+from .finish import entries_table, entry_row, last_row, new_info, stats_of, tasks_table, write_table
+from .foreign import is_foreign
 from .index import dataset_errors, read_entries, read_tasks
 from .layout import (
     CHUNK,
@@ -42,6 +52,7 @@ from .layout import (
 __all__ = [
     "EpisodeLabel",
     "delete_episodes",
+    "existing_episodes",
     "extract",
     "finish_replacement",
     "mark_episodes",
@@ -74,6 +85,7 @@ def merge(
     *,
     key: Callable[[Episode], Any] | None = None,
     label: Callable[[Episode], EpisodeLabel | None] | None = None,
+    view: Callable[[Episode], Episode] = lambda episode: episode,
     on_episode: Callable[[int, int], object] = lambda done, total: None,
 ) -> int:
     """Merge datasets into one. The parts are only read; the result appears when it is complete.
@@ -83,6 +95,7 @@ def merge(
         out: Folder of the result: a new one, or one of the parts, which is replaced.
         key: Sorts the episodes; of several with the same key the first is kept. None for the order of the parts.
         label: Returns the task and the mark of an episode in the result; None leaves it out. By default its own.
+        view: Returns an episode as it is written (:func:`~hal.recording.trim`).
         on_episode: Called with the number of merged episodes and of all, after each.
 
     Returns:
@@ -106,13 +119,19 @@ def merge(
         for layout in {layout.root: layout for layout in layouts}.values():
             if not layout.root.is_dir():
                 raise CommandError(f"there is no folder {layout.root}", code="no_folder")
+            if is_foreign(layout):
+                raise CommandError(
+                    f"{layout.root} was edited or recorded by another program, and has no episodes/; it can be read "
+                    "and exported, and LeRobot's own tools edit it",
+                    code="foreign_dataset",
+                )
             locks.enter_context(lock_dataset(layout))
             if layout.partials():
                 raise CommandError(
                     f"{layout.root} has an unfinished episode; finish it first, with recover()",
                     code="unfinished_episodes",
                 )
-        sources = _sources(layouts, key, label or _label)
+        sources = _sources(layouts, key, label or _label, view)
         shutil.rmtree(building, ignore_errors=True)
         _Builder(DatasetLayout(building), sources).build(on_episode)
         os.sync()  # the parts may be removed next
@@ -141,7 +160,7 @@ def extract(dataset: str | Path, episodes: Collection[int], out: str | Path) -> 
         CommandError: There is no such episode (code ``no_episodes``); otherwise as :func:`merge`.
         DatasetError: The dataset is damaged.
     """
-    chosen = _existing(dataset, episodes)
+    chosen = existing_episodes(dataset, episodes)
     return merge([dataset], out, label=lambda episode: _label(episode) if episode.number in chosen else None)
 
 
@@ -153,13 +172,13 @@ def delete_episodes(dataset: str | Path, episodes: Collection[int]) -> int:
             :func:`merge`.
         DatasetError: The dataset is damaged.
     """
-    doomed = _existing(dataset, episodes)
+    doomed = existing_episodes(dataset, episodes)
     return merge([dataset], dataset, label=lambda episode: None if episode.number in doomed else _label(episode))
 
 
 def set_task(dataset: str | Path, task: str, episodes: Collection[int] | None = None) -> None:
     """Change the task of episodes; None for all. Raises as :func:`extract`."""
-    chosen = range(len(Dataset(dataset))) if episodes is None else _existing(dataset, episodes)
+    chosen = range(len(Dataset(dataset))) if episodes is None else existing_episodes(dataset, episodes)
     merge(
         [dataset],
         dataset,
@@ -169,7 +188,7 @@ def set_task(dataset: str | Path, task: str, episodes: Collection[int] | None = 
 
 def mark_episodes(dataset: str | Path, marks: Mapping[int, bool | None]) -> None:
     """Mark episodes as a success (True), a failure (False) or neither (None). Raises as :func:`extract`."""
-    _existing(dataset, marks)
+    existing_episodes(dataset, marks)
     merge(
         [dataset],
         dataset,
@@ -210,7 +229,7 @@ def _label(episode: Episode) -> EpisodeLabel:
     return EpisodeLabel(episode.task, episode.success)
 
 
-def _existing(dataset: str | Path, episodes: Collection[int]) -> frozenset[int]:
+def existing_episodes(dataset: str | Path, episodes: Collection[int]) -> frozenset[int]:
     """Return the numbers of episodes, all of which exist."""
     count = len(Dataset(dataset))
     if unknown := sorted(set(episodes) - set(range(count))):
@@ -239,6 +258,7 @@ def _sources(
     layouts: Sequence[DatasetLayout],
     key: Callable[[Episode], Any] | None,
     label: Callable[[Episode], EpisodeLabel | None],
+    view: Callable[[Episode], Episode],
 ) -> list[_Source]:
     """Return the episodes of all parts, in the order of the result. Raises CommandError if their formats differ."""
     datasets = [Dataset(layout.root) for layout in layouts]
@@ -250,7 +270,7 @@ def _sources(
                 code="other_dataset",
             )
     sources = [
-        _Source(dataset, episode, new)
+        _Source(dataset, view(episode), new)
         for dataset in datasets
         for episode in dataset.episodes
         if (new := label(episode)) is not None
@@ -387,14 +407,18 @@ class _Builder:
             first = self.starts[number] - self.starts[begin]
             place = EpisodePlace(group, (group, first), {name: at[number] for name, at in self._places.items()})
             about = episode.info | {"episode": number} | label._asdict() | place.as_json()
-            if about == episode.info:
+            if about == episode.info and episode.rows is None:
                 _link(episode._layout.about(number), self.layout.about(number))
             else:
                 self.layout.about(number).write_text(json.dumps(about, indent=1) + "\n", encoding="utf-8")
             for path in (path for camera in episode.cameras for path in episode.files(camera).values()):
                 if path.suffix == ".depth":
                     with dataset_errors(episode._layout.root, path, episode.number):
-                        _link(path, self.layout.depth(path.parent.parent.name, number))
+                        target = self.layout.depth(path.parent.parent.name, number)
+                        if episode.rows is None:
+                            _link(path, target)
+                        else:
+                            copy_records(path, target, *episode.rows)
             rows.append(entry_row(about, place, self.starts[number], self.fps, stats))
             found.append(stats)
         write_table(self.layout.entry(group), entries_table(rows))
@@ -422,6 +446,10 @@ class _Builder:
     def _stats(self, number: int) -> dict[str, Stats]:
         """Return the statistics of an episode's columns and videos, from the index of its part."""
         episode = self.sources[number].episode
+        if episode.rows is not None:
+            return stats_of(episode) | {
+                key: column_stats(values[:, None]) for key, values in self._changed(number).items()
+            }
         stats: dict[str, Stats] = {}
         for name, value in self._entry(number).items():
             if name.startswith("stats/"):
@@ -441,7 +469,8 @@ class _Builder:
             entry = self._entry(number)
             known = self._tasks(episode._layout.tasks)
             if (
-                episode._layout.data(episode.place.data[0]) != path
+                episode.rows is not None
+                or episode._layout.data(episode.place.data[0]) != path
                 or episode.place.data[1] != end
                 or (episode.number, entry["dataset_from_index"]) != (number, self.starts[number])
                 or entry["tasks"] != [label.task]

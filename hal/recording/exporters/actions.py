@@ -95,17 +95,17 @@ def action_dict(content: EpisodeContent) -> dict[str, NDArray[np.float32]]:
     """Return every form of an episode's actions, each (rows, n), under the names of robomimic's own ``action_dict``.
 
     ``abs_pos``, ``abs_rot_axis_angle``, ``abs_rot_6d``, the same with ``rel_``, ``gripper`` (target width, m), and
-    ``joint_position`` and ``joint_velocity``. With several arms the names begin with ``robot0_``, ``robot1_``, ...
+    ``joint_position`` and ``joint_velocity``; without those whose columns another program removed. With several arms
+    the names begin with ``robot0_``, ``robot1_``, ...
     """
     found: dict[str, NDArray[np.float32]] = {}
     rotations: dict[str, RotationForm] = {"rot_axis_angle": "axis_angle", "rot_6d": "rotation_6d"}
     for k, arm in enumerate(content.arms):
         lead = f"robot{k}_" if len(content.arms) > 1 else ""
-        forms: dict[str, Array] = {
-            "joint_position": content.of(arm, ACTION),
-            "joint_velocity": _joint_velocity(content, arm)[0],
-        }
-        for name, of in (("abs", _pose), ("rel", _step)):
+        forms: dict[str, Array] = {"joint_position": content.of(arm, ACTION)}
+        if content.has(SETPOINT):
+            forms["joint_velocity"] = _joint_velocity(content, arm)[0]
+        for name, of in (("abs", _pose), ("rel", _step)) if content.has(_TCP_SETPOINT) else ():
             for rotation, form in rotations.items():
                 forms[f"{name}_pos"], forms[f"{name}_{rotation}"] = of(content, arm, form)
         if (width := content.width(arm, ACTION)) is not None:

@@ -148,6 +148,10 @@ class EpisodeContent:
     def arms(self) -> tuple[ArmColumns, ...]:
         """The arms, in the order of the columns."""
         names = [key.removeprefix(_ARM_TIME) for key in self.episode.columns if key.startswith(_ARM_TIME)]
+        if not names and self.has(STATE):  # another program removed the times
+            leads = [name.rpartition(".")[0] for name in self.episode.names(STATE)]
+            one = str(self.episode.info.get("robot_type") or "arm")
+            names = list(dict.fromkeys(leads)) if all(leads) else [one]
         return tuple(ArmColumns(name, f"{name}." if len(names) > 1 else "") for name in names)
 
     def of(self, arm: ArmColumns, key: str) -> NDArray[Any]:
@@ -225,13 +229,15 @@ class EpisodeContent:
         return None if self._size is None else Cropping(width, height, *self._size)
 
     def lenses(self) -> dict[str, dict[str, Any]]:
-        """Return size, camera matrix and distortion of each camera's pictures as they are exported."""
+        """Return size, camera matrix and distortion of each camera's pictures as they are exported, where known."""
         found: dict[str, dict[str, Any]] = {}
         for stream in self.pictures:
             if stream.camera in found:
                 continue
             known = self.episode.info["cameras"][stream.camera]
             width, height = self._recorded_size(stream.camera)
+            if known["K"] is None:  # a dataset that another program edited
+                continue
             K = np.array(known["K"], np.float64)
             scaling = self._scaling(width, height)
             found[stream.camera] = {

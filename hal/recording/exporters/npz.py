@@ -56,7 +56,8 @@ def _write_episode(job: ExportJob, content: EpisodeContent, path: Path) -> None:
     texts["observation.state.names"] = content.episode.names(STATE)
     texts["action.names"] = job.action.names(content)
     for camera, name in called.items():
-        numbers[f"{name}_stamps"] = content.episode.stamps[f"camera.{camera}"]
+        if f"camera.{camera}" in content.episode.stamps:
+            numbers[f"{name}_stamps"] = content.episode.stamps[f"camera.{camera}"]
     streams = {f"{called[stream.camera]}_{stream.what}": stream for stream in content.pictures}
     if double := sorted(set(streams) & set(numbers)):
         raise CommandError(

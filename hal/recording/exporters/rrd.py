@@ -149,7 +149,10 @@ def _log_pictures(rr: Any, recording: Any, content: EpisodeContent, stream: Pict
 
 
 def _log_lens(rr: Any, recording: Any, content: EpisodeContent, stream: PictureStream, place: str) -> None:
-    K = np.array(content.lenses()[stream.camera]["K"])
+    known = content.lenses().get(stream.camera)
+    if known is None:
+        return
+    K = np.array(known["K"])
     height, width = stream.shape[:2]
     lens = rr.Pinhole(
         image_from_camera=K, resolution=[width, height], camera_xyz=rr.ViewCoordinates.RDF, image_plane_distance=0.15

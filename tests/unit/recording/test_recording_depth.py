@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 pytest.importorskip("zstandard", reason="pip install 'robot-hal[record]'")
 
-from hal.recording.codecs import DepthFile, DepthReader, depth_unit_for, to_units, truncate_records
+from hal.recording.codecs import DepthFile, DepthReader, copy_records, depth_unit_for, to_units, truncate_records
 
 
 def pictures(count: int) -> list[NDArray[np.float32]]:
@@ -80,6 +80,19 @@ def test_a_row_is_decoded_without_the_others(tmp_path: Path) -> None:
     nothing = DepthReader(written(tmp_path / "n", [None, None]))
     assert not nothing[1].any()
     assert np.array_equal(nothing[1], list(nothing)[1])
+
+
+def test_some_rows_become_a_file_of_their_own(tmp_path: Path) -> None:
+    shown = pictures(3)
+    path = written(tmp_path / "d", [shown[0], None, None, shown[1], None, shown[2]])
+    whole = list(DepthReader(path))
+    for first in range(6):
+        for end in range(first + 1, 7):
+            copy_records(path, tmp_path / "part", first, end)
+            assert np.array_equal(list(DepthReader(tmp_path / "part")), whole[first:end]), (first, end)
+    for wrong in ((0, 7), (3, 3), (-1, 2)):
+        with pytest.raises(ValueError, match="pictures"):
+            copy_records(path, tmp_path / "wrong", *wrong)
 
 
 def test_a_file_may_end_anywhere(tmp_path: Path) -> None:
