@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from stepped_can import SteppedEmulator
+from stepped_can import SteppedEmulator, take_for_off
 
 from hal.drivers.can.damiao import DamiaoArm
 from hal.drivers.can.damiao_gripper import DamiaoGripper
@@ -39,7 +39,7 @@ def damiao_arm() -> Iterator[RobotBench]:
             restore=lambda: far.cut("off"),
             fail=fail,
         )
-        far.cut("on")  # so that the arm does not have to sink first
+        take_for_off(driver)
         driver.close()
 
 

@@ -34,7 +34,7 @@ from hal.host.hosts import LocalHost
 from hal.robot import Robot
 from hal.specs import GroupSpec, RobotSpec
 
-__all__ = ["SteppedArm", "SteppedEmulator", "stepped_arm"]
+__all__ = ["SteppedArm", "SteppedEmulator", "stepped_arm", "take_for_off"]
 
 Array = NDArray[np.float64]
 
@@ -135,6 +135,12 @@ class SteppedArm:
         return None
 
 
+def take_for_off(driver: Any) -> None:
+    """Let a driver believe that its motors are off: otherwise its close lowers the arm for up to six seconds."""
+    for motor in driver.chain.motors:
+        motor.on = False
+
+
 @contextlib.contextmanager
 def stepped_arm(rig: str = "yam") -> Iterator[SteppedArm]:
     """Yield an arm whose session is open."""
@@ -143,6 +149,6 @@ def stepped_arm(rig: str = "yam") -> Iterator[SteppedArm]:
         try:
             with arm.control:
                 yield arm
-                far.cut("on")  # so that the arm does not have to sink first
+                take_for_off(arm.driver)
         finally:
             arm.host.close()
