@@ -79,6 +79,8 @@ class Dynamics:
         self._tcp = add_tcp(self._model, spec, pin)
         if payload is not None:
             self._attach(payload)
+        self._model.gravity.linear = np.zeros(3)
+        self._weightless: Any = pin.Model(self._model)
         self._model.gravity.linear = np.array(gravity, float)
         self._data: Any = self._model.createData()
         # Place of each joint of the spec in pinocchio's vectors; None if the orders agree, as they usually do.
@@ -127,10 +129,8 @@ class Dynamics:
 
     def coriolis(self, q: Floats, dq: Floats) -> Array:
         """Return the Coriolis and centrifugal torques (n,), Nm, at ``q`` (n,) rad and ``dq`` (n,) rad/s."""
-        pin, model, data = self._pin, self._model, self._data
-        position = self._ordered(q)
-        both = pin.nonLinearEffects(model, data, position, self._ordered(dq)).copy()
-        return self._in_order(both - pin.computeGeneralizedGravity(model, data, position))
+        effects = self._pin.nonLinearEffects(self._weightless, self._data, self._ordered(q), self._ordered(dq))
+        return self._in_order(effects)
 
     def forward(self, q: Floats, dq: Floats, tau: Floats) -> Array:
         """Return the joint accelerations (n,), rad/s2, under torques: the inverse of :meth:`inverse`.

@@ -12,13 +12,11 @@ from contextlib import suppress
 from math import hypot
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..commands import Session
 from ..dynamics import Dynamics
 from ..errors import NotSupported
 from ..geometry import difference
-from ..kinematics.arm import Pose7
 from ..specs import RobotSpec
 from ..types import ControlMode, Limited
 from .controllers import Controller, ControllerLaw, Position, controller_of
@@ -68,8 +66,8 @@ class Compliance:
         """Whether the controller drives the arm."""
         self._due: tuple[Floats, Floats] = ((), ())
         """Set-point of the last tick: positions (n,), rad, and speeds (n,), rad/s, that are due now."""
-        self._seen: tuple[Pose7, NDArray[np.float64], list[float]] = ((0.0,) * 7, np.zeros((6, 0)), [])
-        """Measured pose of the tcp, its Jacobian there, and the twist to the set-point within 1 s."""
+        self._error: list[float] = []
+        """Twist (6,) from the measured pose of the tcp to the set-point's within 1 s."""
         self.held_back = False
         """Whether the set-point is as far ahead of the arm as it may be."""
 
@@ -91,7 +89,8 @@ class Compliance:
         torque, bounds = self._torque, self._torque.bounds
         self.active = self.held_back = False
         self._law = None
-        if isinstance(controller, Position) or bounds is None:
+        torque.by_controller = not isinstance(controller, Position) and bounds is not None
+        if not torque.by_controller or bounds is None:
             self._envelope.open(session)
             torque.open()
             return
@@ -127,7 +126,7 @@ class Compliance:
         if law.in_joints and max([abs(a - b) for a, b in zip(goal, q, strict=True)]) > turn:
             goal = [b + max(-turn, min(turn, a - b)) for a, b in zip(goal, q, strict=True)]
         kinematics = self._envelope.kinematics
-        pose, jacobian = kinematics.fk_and_jacobian(q)
+        pose, _ = torque.tcp()
         error = difference(pose, kinematics.fk(goal))
         share = hypot(*error[:3]) / most
         if not law.in_joints and not law.position_only:
@@ -141,7 +140,7 @@ class Compliance:
             error = difference(pose, kinematics.fk(goal))
             self._envelope.limited |= Limited.LEAD
         self._due = smoother.q, smoother.dq
-        self._seen = pose, jacobian, error
+        self._error = error
         return moved
 
     def drive(self) -> None:
@@ -153,20 +152,21 @@ class Compliance:
             return
         if self._friction is not None:  # it acts on the speed after the step, so a torque moves M + friction dt
             mass = arm.inertia.mass + np.diag(self._friction) * smoother.dt
-            arm = arm._replace(inertia=Inertia(mass, smoother.n))
+            arm = arm._replace(inertia=Inertia(mass, smoother.n, False))
         q_due, dq_due = self._due
-        pose, jacobian, error = self._seen
+        pose, jacobian = torque.tcp()
         dt = smoother.dt
         acceleration = [(new - old) / dt for new, old in zip(smoother.dq, dq_due, strict=True)]
-        tau = law.torques(arm.q, arm.dq, (q_due, dq_due, acceleration), arm.inertia, jacobian, pose, error)
+        tau = law.torques(arm.q, arm.dq, (q_due, dq_due, acceleration), arm.inertia, jacobian, pose, self._error)
         torque.drive(tau, law.gain, arm, jacobian)
 
     def strays(self) -> Limited | None:
         """Return the limit that the arm exceeds, although its set-point keeps all of them; None if it keeps all."""
-        bounds, arm, collisions = self._torque.bounds, self._torque.arm, self._envelope.collisions
+        torque, collisions = self._torque, self._envelope.collisions
+        bounds, arm = torque.bounds, torque.arm
         if bounds is None or arm is None:
             return None
-        limit = bounds.strays(arm)
+        limit = bounds.strays(arm, torque.tcp()[1])
         if limit is None and collisions is not None and not collisions.allows_arm(arm.q, arm.dq, _PUSHED):
             limit = Limited.COLLISION
         return limit

@@ -284,8 +284,9 @@ _TURN = 3.0
 """Speed that the tcp must not turn faster than when it is let go, rad/s."""
 _RELEASED = 0.7
 """Share of this speed, and of the joints', that a spring may reach."""
-_SAME_INERTIA = 0.05
-"""The root of the inertia is computed again when the joints have moved this far, rad."""
+_SAME_INERTIA = 0.02
+"""The damping is computed again when the joints have moved this far, rad."""
+_LET_GO = 1.0 / np.e
 _POSTURE_LEAD = 0.2
 """A posture that is farther away pulls no harder, rad."""
 
@@ -312,9 +313,6 @@ class ControllerLaw:
         friction: Floats | None = None,
     ) -> None:
         self._dt = dt
-        springs: Array = np.array(velocity) if isinstance(controller, JointImpedance) else np.full(3, _TURN)
-        self._reach = np.e * _RELEASED * springs
-        """Length of a spring (n,) or (3,), times its natural frequency, that is not exceeded: rad/s."""
         self._most = 1.5 * (_FASTEST / dt) ** 2
         """Greatest square of a mode's natural frequency, 1/s2: a faster one is softened."""
         self._dynamics = dynamics
@@ -327,6 +325,10 @@ class ControllerLaw:
         self.position_only = task is not None and task.position_only
         """Whether the orientation of the tcp is free."""
         self._rows = n if task is None else 3 if task.position_only else 6
+        released = np.array(velocity if task is None else [inf] * 3 + [_TURN] * (self._rows - 3))
+        self._release = np.e * _RELEASED * released
+        """Length of each spring, times its natural frequency, that is not exceeded, rad/s."""
+        self._slowest_release = min(self._release.tolist(), default=0.0)
         self._along_tcp = task is not None and task.frame == "tcp"
         self._redundant = task is not None and n > self._rows
         self._ease = 0.0 if task is None else np.diag(1.0 / _HEAVIEST[: self._rows])
@@ -334,12 +336,22 @@ class ControllerLaw:
         import eigenpy
 
         self._eigen: Any = eigenpy.SelfAdjointEigenSolver(np.eye(self._rows))
+        self._llt: Any = eigenpy.LLT(np.eye(self._rows))
+        self._unit = np.eye(n)
+        self._lengths = np.zeros((2, self._rows))
+        """Lengths of the springs of turn and of position, m and rad."""
         self._posture: Array | None = None
-        self._modes: tuple[Array, Array, Array | None] = (np.zeros(1), np.ones(1), None)
-        """Accelerations by the springs in their modes, frequencies of the modes, rad/s, and the modes."""
-        self._rooted_at: Floats = (inf,) * n
-        self._root: Array = np.zeros((n, n))
-        """Square root of the inertia (n, n) at these joint positions."""
+        self._tuned_at: Floats = ()
+        """Joint positions of what follows, rad; empty if the gains are different now."""
+        self._stiffness = self._damping = np.zeros((0, 0))
+        """Of the springs (k, k); lengths times the first are forces, and the second times speeds."""
+        self._posture_damping = np.zeros((0, 0))
+        """Of the posture (n, n), Nm s/rad."""
+        self._squares = self._modal_squares = self._frequencies = np.ones(1)
+        """Squares of the natural frequencies of each spring alone, of the modes, 1/s2, and their roots."""
+        self._fastest = 0.0
+        self._modes: Array | None = None
+        """The modes: columns, each multiplied by the root of the stiffness; None for those of the springs alone."""
         self.gain: Array = np.zeros(3)
         """Velocity (3,) of the tcp, m/s, that the springs of the last call may still add."""
         self._goal = self._numbers(controller)
@@ -376,6 +388,7 @@ class ControllerLaw:
         self._gains, self._ratio, self._posture_stiffness = numbers[:-2], float(numbers[-2]), float(numbers[-1])
         self._roots = np.sqrt(self._gains)
         self._weights = np.outer(self._roots, self._roots)
+        self._tuned_at = ()
 
     def fastest(self, inverse_mass: Array, jacobian: Array) -> float:
         """Return the fastest mode's natural frequency, rad/s, at an inverse inertia (n, n) and a Jacobian (6, n)."""
@@ -417,131 +430,121 @@ class ControllerLaw:
         if self._ramped < 1.0:
             self._ramped = min(1.0, self._ramped + self._dt / RAMP)
             self._apply(self._from + self._ramped * (self._goal - self._from))
-        q_set, dq_set, ddq_set = setpoint
-        lag: Array = np.subtract(dq_set, dq)
+        q_now, dq_now, q_set, dq_set, ddq_set = np.array((q, dq, *setpoint))
+        lag: Array = dq_set - dq_now
+        tuned = len(self._tuned_at) > 0 and dist(q, self._tuned_at) <= _SAME_INERTIA
         if self.in_joints:
-            lengths = self._shortened(np.subtract(q_set, q), inertia.inverse)
-            tau = self._springs(inertia.inverse, np.array((lag, lengths)))
+            if not tuned:
+                self._tune(q, inertia.solve(self._unit), inertia)
+            lengths = self._shortened(q_set - q_now)
+            tau = np.array((self._damping.dot(lag), lengths.dot(self._stiffness)))
         else:
-            away = np.subtract(q_set if self._posture is None else self._posture, q)
-            tau = self._task(q, away, lag, inertia, jacobian, pose, np.array(error))
-        self.gain = self._gain(float(np.abs(tau[1]).max()), jacobian, pose)
+            if self._along_tcp:
+                turn = _rotation(pose[3:])
+                jacobian, error = _turned(turn.T, jacobian), _turned(turn.T, np.array(error))
+            task = jacobian[: self._rows]
+            eased = inertia.solve(task.T)  # M^-1 J'
+            ease = task.dot(eased) + self._ease
+            if not tuned:
+                self._tune(q, ease, inertia)
+            away = (q_set if self._posture is None else self._posture) - q_now
+            tau, lengths = self._task(away, lag, task, eased, ease, error)
+        velocity = self._gain(lengths, max(map(abs, tau[1].tolist())))
+        velocity = jacobian[:3].dot(velocity) if self.in_joints else velocity[:3]
+        self.gain = turn.dot(velocity) if self._along_tcp else velocity
         tau[0] += inertia.mass.dot(ddq_set)
         if self._friction is not None:
-            tau[0] += self._friction * dq
+            tau[0] += self._friction * dq_now
         if self._dynamics is not None:
-            tau[0] += self._dynamics.coriolis(q, dq)
+            tau[0] += self._dynamics.coriolis(q_now, dq_now)
         return tau
 
-    def _gain(self, most: float, jacobian: Array, pose: Pose7) -> Array:
-        """Return the velocity (3,) of the tcp that the springs may still add, m/s, if all torques are removed from now.
+    def _task(
+        self, away: Array, lag: Array, jacobian: Array, eased: Array, ease: Array, error: Floats
+    ) -> tuple[Array, Array]:
+        """Return the torques (2, n) of the tcp's springs, with those of the posture in their null space.
+
+        Also the lengths (k,) of the springs of its position.
+        """
+        lengths = self._lengths
+        lengths[1, :3] = error[:3]
+        if self._rows == 6:
+            lengths[0, 3:] = error[3:]
+            self._shortened(lengths[0])
+        force = lengths.dot(self._stiffness)
+        force[0] += self._damping.dot(jacobian.dot(lag))
+        if not self._redundant:
+            return np.asarray(force.dot(jacobian), np.float64), lengths[1]
+        posture = self._posture_stiffness * np.minimum(np.maximum(away, -_POSTURE_LEAD), _POSTURE_LEAD)
+        posture += self._posture_damping.dot(lag)
+        self._llt.compute(ease)
+        force[0] -= self._llt.solve(posture.dot(eased))
+        tau: Array = force.dot(jacobian)
+        tau[0] += posture
+        return tau, lengths[1]
+
+    def _gain(self, lengths: Array, most: float) -> Array:
+        """Return the velocity (k,) that springs of these lengths may still add if all torques are removed from now.
 
         A mode with the natural frequency w gains no more than a critically damped one that is let go: its acceleration
         for 1 / (e w).
 
         Args:
+            lengths: (k,)
             most: Greatest torque, Nm.
-            jacobian: Jacobian (6, n) of the tcp.
-            pose: Pose of the tcp.
         """
-        accelerations, frequencies, modes = self._modes
-        seconds = 2.0 * self._dt + most * (0.5 / RATE)
-        gains = accelerations * np.minimum(seconds, 1.0 / (np.e * frequencies))
-        velocity = gains if modes is None else modes.dot(gains) / self._roots
-        if self.in_joints:
-            velocity = jacobian[:3].dot(velocity)
-        elif self._along_tcp:
-            velocity = _rotation(pose[3:]).dot(velocity[:3])
-        return np.asarray(velocity[:3], np.float64)
+        seconds = np.minimum(2.0 * self._dt + most * (0.5 / RATE), _LET_GO / self._frequencies)
+        if self._modes is None:
+            return np.asarray(lengths * self._modal_squares * seconds, np.float64)
+        return np.asarray(self._modes.dot(lengths.dot(self._modes) * self._modal_squares * seconds) / self._gains)
 
-    def _task(
-        self, q: Floats, away: Array, lag: Array, inertia: Inertia, jacobian: Array, pose: Pose7, error: Array
-    ) -> Array:
-        """Return the torques (2, n) of the tcp's springs, and those of the posture in their null space."""
-        if self._rows == 3:
-            jacobian, error = jacobian[:3], error[:3]
-        if self._along_tcp:
-            turn = _rotation(pose[3:]).T
-            jacobian, error = _turned(turn, jacobian), _turned(turn, error)
-        eased = jacobian.dot(inertia.inverse)
-        ease = eased.dot(jacobian.T) + self._ease
-        parts = np.zeros((self._rows // 3 + 1, self._rows))
-        parts[0] = jacobian.dot(lag)
-        parts[-1, :3] = error[:3]
-        if self._rows == 6:
-            parts[1, 3:] = self._shortened(error[3:], ease)
-        force = self._springs(ease, parts)
-        if not self._redundant:
-            return np.asarray(force.dot(jacobian), np.float64)
-        posture = self._posture_stiffness * np.minimum(np.maximum(away, -_POSTURE_LEAD), _POSTURE_LEAD)
-        posture += self._posture_damping(q, inertia).dot(lag)
-        force[0] -= self._held(ease, eased.dot(posture))
-        tau: Array = force.dot(jacobian)
-        tau[0] += posture
-        return tau
-
-    def _held(self, ease: Array, acceleration: Array) -> Array:
-        """Return the forces (k,) that accelerate what the springs move: in the modes that :meth:`_springs` found."""
-        _, frequencies, modes = self._modes
-        if modes is None:
-            return np.asarray(np.linalg.solve(ease, acceleration), np.float64)
-        forces = modes.dot((self._roots * acceleration).dot(modes) / (frequencies * frequencies))
-        return np.asarray(self._roots * forces, np.float64)
-
-    def _posture_damping(self, q: Floats, inertia: Inertia) -> Array:
-        """Return the damping (n, n) of the posture, Nm s/rad: 2 ratio sqrt(k) M^(1/2), with a little of M.
-
-        Along any motion z it is at most critical, as z' M^(1/2) z <= sqrt(z' M z) for |z| = 1: the elbow's own motion
-        may have a hundredth of the inertia of the joints that take part in it.
-        """
-        if dist(q, self._rooted_at) > _SAME_INERTIA:
-            self._rooted_at = q
-            squares, axes = np.linalg.eigh(inertia.mass)
-            self._root = (axes * np.sqrt(np.maximum(squares, 0.0))).dot(axes.T)
-        scale = 2.0 * self._ratio * sqrt(self._posture_stiffness)
-        return np.asarray(scale * self._root + inertia.mass, np.float64)
-
-    def _shortened(self, error: Array, ease: Array) -> Array:
-        """Return the lengths (k,) of the last k springs, cut so that none moves what it holds too fast when let go.
+    def _shortened(self, lengths: Array) -> Array:
+        """Cut the lengths (k,) of springs, in place, so that none moves what it holds too fast when let go.
 
         A critically damped spring of length x that is let go reaches the speed w x / e.
         """
-        k = len(error)
-        squares = self._gains[-k:] if self._by_rate else self._gains[-k:] * ease.diagonal()[-k:]
-        most = self._reach / np.sqrt(squares)
-        return np.asarray(np.minimum(np.maximum(error, -most), most), np.float64)
+        if sqrt(lengths.dot(lengths)) * self._fastest > self._slowest_release:
+            most = self._release / np.sqrt(self._squares)
+            np.minimum(np.maximum(lengths, -most, out=lengths), most, out=lengths)
+        return lengths
 
-    def _springs(self, ease: Array, parts: Array) -> Array:
-        """Return forces (2, k): those of the springs of the last row of ``parts``, after those of all other rows.
+    def _tune(self, q: Floats, ease: Array, inertia: Inertia) -> None:
+        """Compute stiffness, damping and modes of the springs for an inertia.
 
-        In the modes of the matrix sqrt(K) A sqrt(K), A being the inverse inertia ``ease`` (k, k), each spring of unit
-        stiffness moves a mass of 1 / w^2, so that a damper of 2 ratio / w damps it by the ratio.
+        In the modes of the matrix sqrt(K) A sqrt(K), A being the inverse inertia, each spring of unit stiffness moves a
+        mass of 1 / w^2, so that a damper of 2 ratio / w damps it by the ratio.
 
         Args:
-            ease: Inverse of the inertia that the springs move.
-            parts: Speed of the set-point relative to what was measured (k,), and then rows of its distances, which add
-                up (m, k).
+            q: Joint positions (n,), rad.
+            ease: Inverse of the inertia that the springs move (k, k).
+            inertia: Inertia of the arm.
         """
+        self._tuned_at = q
         if self._by_rate:
-            parts[0] *= np.minimum(2.0 * self._ratio * self._roots, _DAMPED / self._dt)
-            parts[1:] *= self._gains
-            self._modes = parts[-1], self._roots, None
-            forces = np.linalg.solve(ease, parts.T).T
+            heavy = np.linalg.inv(ease)
+            self._modes, self._frequencies = None, self._roots
+            self._squares = self._modal_squares = self._gains
+            self._stiffness = self._gains[:, None] * heavy
+            self._damping = heavy * np.minimum(2.0 * self._ratio * self._roots, _DAMPED / self._dt)
         else:
             self._eigen.compute(ease * self._weights)
-            modes: Array = self._eigen.eigenvectors()
             squares: Array = np.maximum(self._eigen.eigenvalues(), _SLOWEST)
-            frequencies = np.sqrt(squares)
-            parts = (parts * self._roots).dot(modes)
-            parts[0] *= np.minimum(2.0 * self._ratio / frequencies, (_DAMPED / self._dt) / squares)
+            self._modes = modes = self._roots[:, None] * self._eigen.eigenvectors()
+            self._squares, self._modal_squares = self._gains * ease.diagonal(), squares
+            self._frequencies = np.sqrt(squares)
+            damping = np.minimum(2.0 * self._ratio / self._frequencies, (_DAMPED / self._dt) / squares)
+            self._damping = (modes * damping).dot(modes.T)
+            self._stiffness = np.diag(self._gains)
             if squares[-1] > self._most:  # where the arm is lighter than at home
-                parts[1:] *= np.minimum(1.0, self._most / squares)
-            self._modes = parts[-1] * squares, frequencies, modes
-            forces = parts.dot(modes.T) * self._roots
-        if len(forces) > 2:
-            forces[0] += forces[1]
-            forces = forces[::2]
-        return np.asarray(forces, np.float64)
+                self._stiffness = (modes * np.minimum(1.0, self._most / squares)).dot(modes.T)
+        self._fastest = float(self._frequencies.max())
+        if self._redundant:
+            # The damping is 2 ratio sqrt(k) M^(1/2), with a little of M. Along any motion z it is at most critical, as
+            # z' M^(1/2) z <= sqrt(z' M z) for |z| = 1: the elbow's own motion may have a hundredth of the inertia of
+            # the joints that take part in it.
+            squares, axes = np.linalg.eigh(inertia.mass)
+            root = (axes * np.sqrt(np.maximum(squares, 0.0))).dot(axes.T)
+            self._posture_damping = 2.0 * self._ratio * sqrt(self._posture_stiffness) * root + inertia.mass
 
 
 def _tuple(gain: Gain | None) -> tuple[float, ...]:

@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 
 from ..commands import CommandRecord
 from ..driver import Reading, Setpoint
+from ..kinematics.arm import Pose7
 from ..specs import LimitsSpec
 from ..types import Limited
 from .envelope import UNLIMITED, Envelope
@@ -88,16 +89,34 @@ model's."""
 
 
 class Inertia:
-    """Joint-space inertia of an arm at one position."""
+    """Joint-space inertia of an arm at one position.
 
-    def __init__(self, mass_matrix: Any, n: int) -> None:
-        """Raise ValueError unless ``mass_matrix`` (n, n), kg m2, is that of an arm."""
+    Args:
+        mass_matrix: (n, n), kg m2.
+        n: Number of joints.
+        inverted: Make :attr:`inverse` and :attr:`alone`; otherwise :attr:`solve`, which takes less time.
+
+    Raises:
+        ValueError: It is not the inertia of an arm.
+    """
+
+    def __init__(self, mass_matrix: Any, n: int, inverted: bool = True) -> None:
         self.mass: Array = np.array(mass_matrix, float)
-        if self.mass.shape != (n, n) or not (min(self.mass.diagonal().tolist()) > 0.0 and isfinite(self.mass.sum())):
+        sound = self.mass.shape == (n, n) and isfinite(np.vdot(self.mass, self.mass))
+        if not (sound and min(self.mass.diagonal().tolist()) > 0.0):
             raise ValueError(f"not the inertia of an arm with {n} joints: {self.mass.tolist()}")
-        self.inverse: Any = np.linalg.inv(self.mass)  # its LinAlgError is a ValueError
-        self.alone: list[float] = (1.0 / self.inverse.diagonal()).tolist()
-        """Inertia of each joint (n,) while the others are free, kg m2."""
+        if inverted:
+            self.inverse: Array = np.linalg.inv(self.mass)  # its LinAlgError is a ValueError
+            self.alone: list[float] = (1.0 / self.inverse.diagonal()).tolist()
+            """Inertia of each joint (n,) while the others are free, kg m2."""
+            return
+        import eigenpy
+
+        factors = eigenpy.LLT(self.mass)
+        if factors.info() != eigenpy.ComputationInfo.Success:
+            raise ValueError(f"not positive definite, so not the inertia of an arm: {self.mass.tolist()}")
+        self.solve: Callable[[Array], Array] = factors.solve
+        """Return the accelerations, rad/s2, under torques (n,) or (n, m), Nm."""
 
     def added(self, tau: Floats, lag: float) -> list[float]:
         """Return what torques (n,) still add to the joint speeds (n,), rad/s, although they are removed from now on."""
@@ -202,7 +221,7 @@ class TorqueBounds:
             jacobian: Jacobian (6, n) of the tcp there.
         """
         envelope = self._envelope
-        slowed, more = (tau.dot(arm.inertia.inverse) * self._lag).tolist()  # the inverse is symmetric
+        slowed, more = (arm.inertia.solve(tau.T).T * self._lag).tolist()
         share = 1.0
         if hypot(*arm.dq) + hypot(*slowed) + hypot(*more) > _COUPLED * self._slowest:
             before = [v + dv for v, dv in zip(arm.dq, slowed, strict=True)]
@@ -333,17 +352,21 @@ class TorqueBounds:
                 return Limited.COLLISION
         return None
 
-    def strays(self, arm: ArmInMotion) -> Limited | None:
+    def strays(self, arm: ArmInMotion, jacobian: Array) -> Limited | None:
         """Return the limit that an arm exceeds whose set-point keeps all of them; None if it keeps all.
 
         That are its own joint speeds, half as much again as the session's tcp speed, and its ranges.
+
+        Args:
+            arm: Measured state.
+            jacobian: Jacobian (6, n) of the tcp there.
         """
         speed = hypot(*arm.dq)
         limits, fastest = self._limits.velocity, _RUNAWAY * self.tcp_speed
         if speed > self._slowest and any(abs(v) > most for v, most in zip(arm.dq, limits, strict=True)):
             return Limited.SPEED
         slow = speed * self._reach_length <= fastest
-        if not slow and hypot(*self._kinematics.jacobian(arm.q)[:3].dot(arm.dq).tolist()) > fastest:
+        if not slow and hypot(*jacobian[:3].dot(arm.dq).tolist()) > fastest:
             return Limited.TCP_SPEED
         if dist(arm.q, self._middle) > self._radius:
             for x, (low, high) in zip(arm.q, self._ranges, strict=True):
@@ -419,6 +442,8 @@ class TorqueMotion(ServoMotion):
         self.active = False
         """Whether the arm follows torques, or brakes by them."""
         self.patience = max(PATIENCE, 3.0 * smoother.dt)
+        self.by_controller = False
+        """Whether the torques of this session are those of a controller."""
         self._mass_matrix = mass_matrix
         self.bounds: TorqueBounds | None = None
         if mass_matrix is not None and limits.torque is not None:
@@ -432,6 +457,9 @@ class TorqueMotion(ServoMotion):
         """Joint positions of the inertia, rad."""
         self.arm: ArmInMotion | None = None
         """Newest measured state of the arm; None while it is unknown."""
+        self._tcp_at: Floats | None = None
+        """Joint positions of :meth:`tcp`, rad."""
+        self._tcp: tuple[Pose7, Array] = ((0.0,) * 7, np.zeros((6, 0)))
         self._nothing = [0.0] * self.size
         self.tau = self._nothing
         """Torques that drive the arm now (n,), Nm."""
@@ -477,6 +505,13 @@ class TorqueMotion(ServoMotion):
         if self.active:
             self._update_inertia()
 
+    def tcp(self) -> tuple[Pose7, Array]:
+        """Return the pose of the tcp where the arm was measured last, and its Jacobian (6, n) there."""
+        if self._tcp_at is not self.q:
+            self._tcp_at = self.q
+            self._tcp = self.envelope.kinematics.fk_and_jacobian(self.q)
+        return self._tcp
+
     def _update_inertia(self) -> None:
         """Compute the inertia where the arm was measured last; None if it is invalid."""
         if self._weighed_at is self.q:
@@ -484,7 +519,7 @@ class TorqueMotion(ServoMotion):
         assert self._mass_matrix is not None
         self._weighed_at = self.q
         try:
-            self._inertia = Inertia(self._mass_matrix(self.q), self.size)
+            self._inertia = Inertia(self._mass_matrix(self.q), self.size, not self.by_controller)
         except ValueError:
             self._inertia = None
 
