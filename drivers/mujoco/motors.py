@@ -82,6 +82,12 @@ class Motors:
         self.limit()
         for at, _ in self.torques.values():
             model.dof_damping[at] = self.damping[at]
+        # The inertia of the driven joints: where each entry of MuJoCo's sparse lower triangle is in the full matrix.
+        rows = np.repeat(np.arange(n), model.M_rownnz[:n])
+        columns = model.M_colind[: len(rows)]
+        self._dense = np.zeros((n, n))
+        self._where = np.append(rows * n + columns, columns * n + rows)
+        self._entries = np.append(np.arange(len(rows)), np.arange(len(rows)))
 
     def limit(self) -> None:
         """Use new :attr:`efforts` and :attr:`speeds`."""
@@ -137,11 +143,10 @@ class Motors:
         mujoco, model = self._mujoco, self._model
         if self._at_rest is None:
             self._at_rest = mujoco.MjData(model)
-        at_rest = self._at_rest
-        np.copyto(at_rest.qpos, self._data.qpos)
-        mujoco.mj_kinematics(model, at_rest)
-        mujoco.mj_comPos(model, at_rest)
-        mujoco.mj_rne(model, at_rest, 0, self._gravity)
+            self._places = [(getattr(self._at_rest, name), getattr(self._data, name)) for name in ("cdof", "cinert")]
+        for at_rest, now in self._places:
+            np.copyto(at_rest, now)
+        mujoco.mj_rne(model, self._at_rest, 0, self._gravity)
         for at, torques in self.torques.values():
             self._driven_force[at] = torques + self._gravity[: self.n][at]
 
@@ -157,7 +162,7 @@ class Motors:
         for name, arm in self.arms.items():
             if name in self.torques or not excess[arm].any():
                 continue
-            inertia, most = self.inertia(self._model, self._data, arm), self.efforts[arm]
+            inertia, most = self.inertia(self._data, arm), self.efforts[arm]
             wanted = self._acceleration[arm]
             rest = self.applied[arm] - excess[arm] - inertia @ wanted
             acceleration, limited, signs = wanted.copy(), np.zeros(len(arm), bool), np.zeros(len(arm))
@@ -182,12 +187,8 @@ class Motors:
             self.applied[arm] = np.clip(torques, -most, most)
             self.wanted[arm[limited]] = self._dq[arm[limited]] + self.h * acceleration[limited]
 
-    def inertia(self, model: Any, data: Any, at: NDArray[np.intp]) -> Array:
+    def inertia(self, data: Any, at: slice | NDArray[np.intp]) -> Array:
         """Return the joint-space inertia (k, k), kg m2, of the joints at these places, of the state in ``data``."""
-        rows, row, unit = np.zeros((len(at), len(at))), np.zeros(model.nv), np.zeros(model.nv)
-        for k, place in enumerate(at):
-            unit[place] = 1.0
-            self._mulm(model, data, row, unit)
-            unit[place] = 0.0
-            rows[k] = row[at]
-        return rows
+        self._dense.flat[self._where] = data.M[self._entries]
+        block: Array = self._dense[at][:, at]
+        return block

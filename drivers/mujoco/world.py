@@ -143,7 +143,7 @@ class MujocoWorld(SimulatedWorld[Body]):
             if joints <= self._fingers[name]:
                 self.data.eq_active[number] = active
 
-    def mass_matrix(self, at: Any, q: Sequence[float]) -> list[list[float]]:
+    def mass_matrix(self, at: Any, q: Sequence[float]) -> Array:
         """Return the joint-space inertia (n, n), kg m2, of the arm whose joints are at the places ``at``, if they were
         at ``q`` (n,), rad; all other joints are where they are.
         """
@@ -153,8 +153,7 @@ class MujocoWorld(SimulatedWorld[Body]):
         mujoco.mj_kinematics(model, data)
         mujoco.mj_comPos(model, data)
         mujoco.mj_makeM(model, data)
-        rows: list[list[float]] = self.motors.inertia(model, data, np.arange(model.nv)[at]).tolist()
-        return rows
+        return self.motors.inertia(data, at)
 
     def dofs(self, body: Body, names: Sequence[str]) -> Any:
         """Return the places of some of an arm's joints among the first degrees of freedom: a slice where possible."""
