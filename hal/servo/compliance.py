@@ -1,8 +1,9 @@
 """An arm that follows the servo's set-point by the torques of a controller, instead of by its own position controller.
 
 The set-point is made as ever. Its tcp goes a little slower than the session allows, so that an arm that lags can catch
-up without being faster than that. It never leads an arm that is held back by more than :data:`LEAD`, so that nothing
-springs when the arm is let go; :class:`.torque.TorqueBounds` keep the arm below the session's tcp speed besides.
+up without being faster than that, and its acceleration changes only as fast as torques can. It never leads an arm that
+is held back by more than :data:`LEAD`, so that nothing springs when the arm is let go; :class:`.torque.TorqueBounds`
+keep the arm below the session's tcp speed besides.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from ..specs import RobotSpec
 from ..types import ControlMode, Limited
 from .controllers import Controller, ControllerLaw, Position, controller_of
 from .envelope import Envelope
-from .torque import Inertia, TorqueMotion
+from .torque import RATE, Inertia, TorqueMotion
 
 __all__ = ["LEAD", "Compliance"]
 
@@ -38,6 +39,11 @@ _PUSHED = 0.06
 """Time in which an arm loses a speed that its set-point does not have, s."""
 SPEED_SHARE, TCP_SHARE = 0.8, 0.85
 """A set-point takes at most these shares of the joints' greatest speeds and of the session's tcp speed."""
+
+
+JERK_SHARE = 0.5
+"""Share of the greatest rate of a torque that a set-point's jerk may need. With more, an arm lags behind each change of
+acceleration, and catches up as slowly as its springs are."""
 
 
 class Compliance:
@@ -90,11 +96,15 @@ class Compliance:
         self.active = self.held_back = False
         self._law = None
         torque.by_controller = not isinstance(controller, Position) and bounds is not None
+        smoother = torque.smoother
+        smoother.limit_jerk()
         if not torque.by_controller or bounds is None:
             self._envelope.open(session)
             torque.open()
             return
-        smoother = torque.smoother
+        if self._dynamics is not None:
+            heavy = self._dynamics.mass_matrix(smoother.q).diagonal().tolist()
+            smoother.limit_jerk([JERK_SHARE * RATE / mass for mass in heavy])
         self._law = ControllerLaw(
             controller, smoother.n, smoother.dt, smoother.velocity, self._dynamics, self._friction
         )
@@ -136,7 +146,11 @@ class Compliance:
         self.held_back = share > RESUME if self.held_back and goal is smoother.q else goal is not smoother.q
         moved = goal is not smoother.q
         if moved:
-            smoother.anchor(goal)
+            # It continues at the arm's speed, at most at its own: its stop then ends no farther away than before.
+            dq, square = smoother.dq, sum(v * v for v in smoother.dq)
+            along = sum(v * w for v, w in zip(dq, torque.dq, strict=True))
+            rate = max(0.0, min(1.0, along / square)) if square > 0.0 else 0.0
+            smoother.anchor(goal, [rate * v for v in dq], [rate * a for a in smoother.ddq])
             error = difference(pose, kinematics.fk(goal))
             self._envelope.limited |= Limited.LEAD
         self._due = smoother.q, smoother.dq
@@ -146,7 +160,7 @@ class Compliance:
     def drive(self) -> None:
         """Advance the torques by one tick towards those of the controller."""
         torque, law, smoother = self._torque, self._law, self._torque.smoother
-        assert law is not None
+        assert law is not None and torque.bounds is not None
         arm = torque.arm
         if arm is None:  # the last ones are kept, for a bounded time
             return
@@ -155,10 +169,11 @@ class Compliance:
             arm = arm._replace(inertia=Inertia(mass, smoother.n, False))
         q_due, dq_due = self._due
         pose, jacobian = torque.tcp()
-        dt = smoother.dt
-        acceleration = [(new - old) / dt for new, old in zip(smoother.dq, dq_due, strict=True)]
+        velocity = jacobian[:3].dot(arm.dq)
+        rate = torque.bounds.feeds(velocity) / smoother.dt
+        acceleration = [rate * (new - old) for new, old in zip(smoother.dq, dq_due, strict=True)]
         tau = law.torques(arm.q, arm.dq, (q_due, dq_due, acceleration), arm.inertia, jacobian, pose, self._error)
-        torque.drive(tau, law.gain, arm, jacobian)
+        torque.drive(tau, law.gain, arm, velocity)
 
     def strays(self) -> Limited | None:
         """Return the limit that the arm exceeds, although its set-point keeps all of them; None if it keeps all."""

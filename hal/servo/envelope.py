@@ -60,11 +60,9 @@ class TcpReference:
         self._reach_length = hypot(*self._reach)
         self._root = sqrt(smoother.n)
         self._spread = self._reach_length * self._root
-        limits = list(zip(smoother.acceleration, smoother.jerk, strict=True))
-        self._overrun = max([0.5 * A / J for A, J in limits])
-        """What a joint's acceleration adds to its speed until it is taken back, at most: rad/s for each rad/s2."""
-        self._overrun_tcp = max([0.5 * r / J for r, (_, J) in zip(self._reach, limits, strict=True)])
-        """The same for the tcp: m/s for each (rad/s2)^2."""
+        self._overrun = self._overrun_tcp = inf
+        """What a joint's acceleration adds to its speed until it is taken back, at most: rad/s for each rad/s2. The
+        same for the tcp: m/s for each (rad/s2)^2."""
         self._reach_array = np.array(self._reach)
         self._accelerations = np.array(smoother.acceleration)
         self._bend = sum(map(mul, self._reach, smoother.acceleration)) / 8.0
@@ -102,6 +100,9 @@ class TcpReference:
         """Open a session whose joints stay below ``velocity`` (n,), rad/s."""
         smoother = self._smoother
         dt = smoother.dt
+        limits = list(zip(smoother.acceleration, smoother.jerk, strict=True))
+        self._overrun = max([0.5 * A / J for A, J in limits])
+        self._overrun_tcp = max([0.5 * r / J for r, (_, J) in zip(self._reach, limits, strict=True)])
         self._stops = []
         self._fastest = []
         self._slowest = min(velocity)

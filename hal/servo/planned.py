@@ -58,13 +58,6 @@ class PlannedMotion(ServoMotion):
         self.arrived = False
         self.lost = False
         """Whether the arm was moved too far off the path to continue."""
-        self._limits = LimitsSpec(
-            tuple(smoother.lower),
-            tuple(smoother.upper),
-            tuple(smoother.velocity),
-            tuple(smoother.acceleration),
-            tuple(smoother.jerk),
-        )
         self._planner = ZonePlanner()
         self._sections: list[tuple[JointPath, list[Zone]]] = []
         self._before: list[float] = []
@@ -113,9 +106,14 @@ class PlannedMotion(ServoMotion):
         self._check_limits(paths)
         self._check_workspace(paths)
         tcp_speed = _TCP_SHARE * envelope.tcp_speed if envelope.tcp_speed < UNLIMITED else inf
-        plan = [
-            (path, zones_of(path, self._limits, envelope.velocity, tcp_speed, envelope.kinematics)) for path in paths
-        ]
+        limits = LimitsSpec(
+            tuple(smoother.lower),
+            tuple(smoother.upper),
+            tuple(smoother.velocity),
+            tuple(smoother.acceleration),
+            tuple(smoother.jerk),
+        )
+        plan = [(path, zones_of(path, limits, envelope.velocity, tcp_speed, envelope.kinematics)) for path in paths]
         if not all(zone.speed > 0.0 and zone.acceleration > 0.0 and zone.jerk > 0.0 for _, z in plan for zone in z):
             raise CommandError("the path has a part that no speed is slow enough for", code="bad_path")
         self._sections = plan

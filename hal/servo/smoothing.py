@@ -178,15 +178,7 @@ class JointSmoother:
         self._upper = [x - _EDGE for x in limits.upper]
         self.velocity = [x * _INSIDE for x in limits.velocity]
         self.acceleration = [x * _INSIDE for x in limits.acceleration]
-        self.jerk = [x * _INSIDE for x in limits.jerk]
-        # No stop from within the limits is longer than the one from full speed at full acceleration.
-        room = [
-            stop_displacement(v, a, a, j) for v, a, j in zip(self.velocity, self.acceleration, self.jerk, strict=True)
-        ]
-        self.free = [
-            (low + r, high - r, v) for low, high, r, v in zip(self.lower, self.upper, room, self.velocity, strict=True)
-        ]
-        """Per joint: no faster than the third number (rad/s) and between the first two (rad), no limit can matter."""
+        self._jerk = [x * _INSIDE for x in limits.jerk]
         self.slowest = min(self.velocity)
         """A vector of joint speeds no longer than this is within every joint's limit, rad/s."""
         # Where all joints were free last, and how far around it they stay so, rad.
@@ -213,9 +205,23 @@ class JointSmoother:
         # Each joint by itself: synchronised stops are longer than the shortest one, on which the check relies.
         self._input.synchronization = Synchronization.No
         self._input.max_acceleration = self.acceleration
-        self._input.max_jerk = self.jerk
         self._speeds: Floats = ()
         """The speeds that Ruckig's position interface keeps, rad/s; its velocity interface needs none."""
+        self.limit_jerk()
+
+    def limit_jerk(self, most: Floats | None = None) -> None:
+        """Limit the joints' jerk to the arm's limits, and to ``most`` (n,), rad/s3, if given; to be called at rest."""
+        self.jerk = self._jerk if most is None else [min(x, y) for x, y in zip(self._jerk, most, strict=True)]
+        # No stop from within the limits is longer than the one from full speed at full acceleration.
+        room = [
+            stop_displacement(v, a, a, j) for v, a, j in zip(self.velocity, self.acceleration, self.jerk, strict=True)
+        ]
+        self.free = [
+            (low + r, high - r, v) for low, high, r, v in zip(self.lower, self.upper, room, self.velocity, strict=True)
+        ]
+        """Per joint: no faster than the third number (rad/s) and between the first two (rad), no limit can matter."""
+        self._free_at = [inf] * self.n
+        self._input.max_jerk = self.jerk
 
     def anchor(self, q: Floats, dq: Floats | None = None, ddq: Floats | None = None) -> None:
         """Set the set-point. Accelerations beyond the limits are cut, since no stop could be computed from them."""

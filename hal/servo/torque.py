@@ -59,6 +59,9 @@ take the torques of all others away."""
 _SPRINGS = 0.87
 """The same for what a controller's springs add to the tcp's speed: little more than its set-point's."""
 
+_FED = 0.92
+"""The same for what the acceleration of its set-point adds."""
+
 _LAG = 2.0
 """Ticks until a torque can be followed by a lower one: it acts for one, and its effect is measured after that."""
 
@@ -210,7 +213,18 @@ class TorqueBounds:
         brake = (1.0 - share) * self._decay * max(0.0, excess)
         return [share * x - brake * p for x, p in zip(slowed, arm.inertia.momentum(arm.dq), strict=True)]
 
-    def shared(self, tau: Any, gain: Any, arm: ArmInMotion, jacobian: Any) -> list[float]:
+    def feeds(self, velocity: Array) -> float:
+        """Return the share (0..1) of a set-point's acceleration that an arm at ``velocity`` (3,) of its tcp, m/s, gets.
+
+        An arm that springs made faster than its set-point must not become faster still while the set-point catches up.
+        """
+        most = self.tcp_speed
+        if most >= UNLIMITED:
+            return 1.0
+        speed = sqrt(velocity.dot(velocity))
+        return max(0.0, min(1.0, (_FED * most - speed) / ((_FED - _SPRINGS) * most)))
+
+    def shared(self, tau: Any, gain: Any, arm: ArmInMotion, velocity: Any) -> list[float]:
         """Return the torques (n,) to move towards, Nm: a controller's, with as much of the springs as keeps the speeds.
 
         Args:
@@ -218,7 +232,7 @@ class TorqueBounds:
                 are applied in full; and those of its springs.
             gain: Velocity (3,) of the tcp, m/s, that the springs may still add.
             arm: Measured state.
-            jacobian: Jacobian (6, n) of the tcp there.
+            velocity: Velocity (3,) of its tcp, m/s.
         """
         envelope = self._envelope
         slowed, more = (arm.inertia.solve(tau.T).T * self._lag).tolist()
@@ -229,7 +243,7 @@ class TorqueBounds:
             if share < 1.0:
                 envelope.limited |= Limited.SPEED
         if self.tcp_speed < UNLIMITED:
-            tcp_share = _greatest_share(jacobian[:3].dot(arm.dq), gain, _SPRINGS * self.tcp_speed)
+            tcp_share = _greatest_share(velocity, gain, _SPRINGS * self.tcp_speed)
             if tcp_share < 1.0:
                 envelope.limited |= Limited.TCP_SPEED
                 share = min(share, tcp_share)
@@ -605,7 +619,7 @@ class TorqueMotion(ServoMotion):
                 self.tau, self._share = self.bounds.brake(before, arm, 0.0)
         self._begun = True
 
-    def drive(self, tau: Any, gain: Any, arm: ArmInMotion, jacobian: Any) -> None:
+    def drive(self, tau: Any, gain: Any, arm: ArmInMotion, velocity: Any) -> None:
         """Move the torques by one tick towards those of a controller (see :meth:`TorqueBounds.shared`).
 
         The first set-point has none: it changes the mode.
@@ -613,7 +627,7 @@ class TorqueMotion(ServoMotion):
         self._braking = self._share = 0.0
         if self._begun:
             assert self.bounds is not None
-            self.tau = self.bounds.towards(self.tau, self.bounds.shared(tau, gain, arm, jacobian))
+            self.tau = self.bounds.towards(self.tau, self.bounds.shared(tau, gain, arm, velocity))
         self._begun = True
 
     def brake(self) -> bool:
