@@ -160,7 +160,8 @@ class Compliance:
     def drive(self) -> None:
         """Advance the torques by one tick towards those of the controller."""
         torque, law, smoother = self._torque, self._law, self._torque.smoother
-        assert law is not None and torque.bounds is not None
+        assert law is not None
+        assert torque.bounds is not None
         arm = torque.arm
         if arm is None:  # the last ones are kept, for a bounded time
             return
