@@ -441,7 +441,7 @@ class ControllerLaw:
         else:
             if self._along_tcp:
                 turn = _rotation(pose[3:])
-                jacobian, error = _turned(turn.T, jacobian), _turned(turn.T, np.array(error))
+                jacobian, error = _turned(turn.T, jacobian), _turned(turn.T, np.array(error)).tolist()
             task = jacobian[: self._rows]
             eased = inertia.solve(task.T)  # M^-1 J'
             ease = task.dot(eased) + self._ease
@@ -521,7 +521,7 @@ class ControllerLaw:
         """
         self._tuned_at = q
         if self._by_rate:
-            heavy = np.linalg.inv(ease)
+            heavy: Any = np.linalg.inv(ease)
             self._modes, self._frequencies = None, self._roots
             self._squares = self._modal_squares = self._gains
             self._stiffness = self._gains[:, None] * heavy

@@ -109,7 +109,7 @@ class Inertia:
         if not (sound and min(self.mass.diagonal().tolist()) > 0.0):
             raise ValueError(f"not the inertia of an arm with {n} joints: {self.mass.tolist()}")
         if inverted:
-            self.inverse: Array = np.linalg.inv(self.mass)  # its LinAlgError is a ValueError
+            self.inverse: Any = np.linalg.inv(self.mass)  # its LinAlgError is a ValueError
             self.alone: list[float] = (1.0 / self.inverse.diagonal()).tolist()
             """Inertia of each joint (n,) while the others are free, kg m2."""
             return
