@@ -1,14 +1,20 @@
-"""The skills' own code on the emulated FR3 and Franka Hand: every phase, and what goes wrong there."""
+"""The skills' own code on the emulated FR3 and Franka Hand: every phase and every failure, 20 times with HAL_SOAK=1.
+
+Only ``blocked`` is missing: nothing can be put in the way of the emulated arm.
+"""
 
 from __future__ import annotations
 
+import itertools
+import os
 from collections.abc import Callable, Iterator
 from typing import Any
 
+import numpy as np
 import pytest
 
 import hal
-from hal.skills import SkillProgress, gentle_grasp, grasp, push
+from hal.skills import SkillProgress, gentle_grasp, grasp, object_from_points, push, push_to
 
 from .franka_kit import Emulator
 from .rig_kit import arm_of, rig_of
@@ -23,7 +29,10 @@ POSE = hal.Pose([0.40, 0.03, 0.35], DOWN)
 """Near home, so that the arm is there soon."""
 WIDTH = 0.03
 OPTIONS: dict[str, Any] = {"approach": 0.03, "lift": 0.03, "speed": 0.3, "unattended": True}
+FENCE = "{name: fence, position: [-0.2, 0.42, 0.95], size: [0.2, 0.16, 0.2]}"
+"""A box in the world that the arm must not touch, far from all other ways."""
 GRASP = ["open", "approach", "descend", "close", "lift", "hold"]
+PUSH = ["close", "approach", "descend", "push", "back_off", "lift"]
 GENTLE = ["open", "approach", "descend", "touch", "centre", "close", "lift", "hold"]
 
 
@@ -36,8 +45,14 @@ def robot() -> Iterator[Emulator]:
 
 @pytest.fixture(scope="module")
 def rig(robot: Emulator) -> Iterator[hal.Rig]:
-    with rig_of(robot.host, "fr3", "robots.arm.gripper.enabled=true") as rig:
+    more = "robots.arm.gripper.enabled=true", f"collisions.boxes=[{FENCE}]"
+    with rig_of(robot.host, "fr3", *more) as rig:
         yield rig
+
+
+@pytest.fixture(autouse=True, params=range(20 if os.environ.get("HAL_SOAK") == "1" else 1))
+def _again(request: pytest.FixtureRequest) -> None:
+    """Repeat every test."""
 
 
 def at(phase: str, call: Callable[[], Any]) -> Callable[[SkillProgress], None]:
@@ -64,6 +79,8 @@ CASES: list[tuple[str, list[str], str, str, dict[str, Any]]] = [
     ("too_wide", [], "", "", {"width": 0.09}),
     ("unreachable", [], "", "", {"pose": hal.Pose([0.74, 0.45, 0.6], DOWN)}),
     ("outside_limits", [], "", "", {"pose": hal.Pose([0.40, 0.0, -0.1], DOWN)}),
+    ("collision", GRASP[:2], "", "", {"pose": hal.Pose([0.35, 0.42, 0.35], DOWN)}),
+    ("timed_out", GRASP[:2], "", "", {"timeout": 2.0, "speed": 0.005, "pose": hal.Pose([0.40, -0.1, 0.35], DOWN)}),
 ]
 
 
@@ -75,7 +92,7 @@ def test_a_grasp(
     robot.control.send(f"hand object {WIDTH if reason == 'dropped' else 'none'}")
     pose = options.pop("pose", POSE)
     tell = at(when, lambda: robot.control.send(f"hand {words}"))
-    result = grasp(arm, pose, **OPTIONS, **options, progress=tell)
+    result = grasp(arm, pose, **OPTIONS | options, progress=tell)
     assert (result.reason, [phase.name for phase in result.phases]) == (reason, phases), result.message
     if reason in ("missed", "wrong_width"):
         assert result.width == pytest.approx(0.08, abs=2e-3), "the fingers are open again"
@@ -93,16 +110,35 @@ def test_a_grasp(
 def test_a_gentle_grasp(robot: Emulator, rig: hal.Rig, reason: str, phases: list[str], words: str) -> None:
     robot.control.send("hand object none")
     tell = at("touch", lambda: robot.control.send(f"hand {words}"))
-    result = gentle_grasp(arm_of(rig), POSE, WIDTH, **OPTIONS, progress=tell)
+    result = gentle_grasp(arm_of(rig), POSE, WIDTH, touch_speed=0.05, **OPTIONS, progress=tell)
     assert (result.reason, [phase.name for phase in result.phases]) == (reason, phases), result.message
 
 
-def test_a_push(robot: Emulator, rig: hal.Rig) -> None:
-    robot.control.send("hand object none")
+@pytest.mark.parametrize(
+    ("reason", "phases", "between"), [("", PUSH, "none"), ("fingers_blocked", PUSH[:1], f"{WIDTH}")]
+)
+def test_a_push(robot: Emulator, rig: hal.Rig, reason: str, phases: list[str], between: str) -> None:
+    arm = arm_of(rig)
+    assert arm.gripper is not None
+    arm.gripper.open()
+    robot.control.send(f"hand object {between}")
     end = hal.Pose(POSE.position + [0.04, 0.0, 0.0], DOWN)
-    result = push(arm_of(rig), [POSE, end], approach=0.03, speed=0.3, unattended=True)
-    assert result, result.message
-    assert [phase.name for phase in result.phases] == ["close", "approach", "descend", "push", "back_off", "lift"]
+    result = push(arm, [POSE, end], approach=0.03, speed=0.3, unattended=True)
+    assert (result.reason, [phase.name for phase in result.phases]) == (reason, phases), result.message
+
+
+@pytest.mark.parametrize(
+    ("reason", "seen", "phases"),
+    [("not_seen", False, ["locate"]), ("off_goal", True, ["locate", "push", "locate"])],
+)
+def test_a_push_to_a_goal(robot: Emulator, rig: hal.Rig, reason: str, seen: bool, phases: list[str]) -> None:
+    """The object that is seen does not move: there is none."""
+    robot.control.send("hand object none")
+    corners = POSE.position + 0.02 * np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
+    found = object_from_points(corners) if seen else None
+    goal = POSE.position[:2] + [0.04, 0.0]
+    result = push_to(arm_of(rig), lambda: found, goal, tries=1, approach=0.03, speed=0.3, unattended=True)
+    assert (result.reason, [phase.name for phase in result.phases]) == (reason, phases), result.message
 
 
 def test_faults_and_stops_are_exceptions(robot: Emulator, rig: hal.Rig) -> None:
