@@ -118,6 +118,9 @@ class SimulatedGripper(GripperDriver, Generic[W, B]):
         self._speed = spec.speed
         self._driven: float | None = None
         """Speed of the motion that the motors make, m/s; None while they hold since a reset."""
+        self._placed = (0, 0.0, 0.0)
+        """The step after which the fingers were placed by a reset or a restored state, and the forces of
+        :meth:`_measure` since then, N: until the next step the engine may have those from before."""
 
     # --- what an engine implements -----------------------------------------------------------------------------------
 
@@ -160,7 +163,7 @@ class SimulatedGripper(GripperDriver, Generic[W, B]):
     def read(self, now: float) -> GripperReading:
         """Return the fingers after the last physics step; ``force`` is that of the weaker motor, N."""
         self._expect_open()
-        width, speed, force, load = self._width()
+        width, speed, force, load = self._measure()
         if not math.isfinite(width + speed + force + load):  # the simulation is unstable, which its arms report
             width, speed, force, load = self._stood, 0.0, 0.0, 0.0
         moving = not self._at_rest(width, speed)
@@ -177,6 +180,14 @@ class SimulatedGripper(GripperDriver, Generic[W, B]):
             grasped=not moving and pressing and width > self._aim + AT_TARGET,
             force=force,
         )
+
+    def _measure(self) -> tuple[float, float, float, float]:
+        """Return what :meth:`_width` returns, with the forces of the present state."""
+        width, speed, force, load = self._width()
+        step, *forces = self._placed
+        if step == self._world.steps:
+            force, load = forces
+        return width, speed, force, load
 
     def move(self, width: float, speed: float, force: float) -> None:
         """Start a motion to ``width``, clipped to the gripper's range; the newest command wins."""
@@ -220,7 +231,7 @@ class SimulatedGripper(GripperDriver, Generic[W, B]):
     def stop(self) -> None:
         """Stop the fingers where they are; on an object, they continue to press."""
         self._expect_open()
-        width, speed, force, _ = self._width()
+        width, speed, force, _ = self._measure()
         if force >= PRESSING * self._force and (abs(speed) <= SLOW or self._at_rest(width, speed)):
             return
         self._target = self._aim = width
@@ -236,14 +247,16 @@ class SimulatedGripper(GripperDriver, Generic[W, B]):
 
     def _save(self) -> dict[str, Any]:
         now = self._world.steps
-        steps = {"stood_for": now - self._stood_since, "unseen_for": now - self._seen}
-        return {name: getattr(self, f"_{name}") for name in _KEPT} | steps
+        _, _, pressed, load = self._measure()
+        more = {"stood_for": now - self._stood_since, "unseen_for": now - self._seen, "pressed": pressed, "load": load}
+        return {name: getattr(self, f"_{name}") for name in _KEPT} | more
 
     def _restore(self, state: dict[str, Any]) -> None:
         for name in _KEPT:
             setattr(self, f"_{name}", state[name])
         now = self._world.steps
         self._stood_since, self._seen = now - state["stood_for"], now - state["unseen_for"]
+        self._placed = (now, state["pressed"] or 0.0, state["load"] or 0.0)
         self._resume()
 
     def _was_reset(self) -> None:
@@ -251,6 +264,7 @@ class SimulatedGripper(GripperDriver, Generic[W, B]):
         self._target = self._aim = self._stood = self._width()[0]
         self._resting, self._stood_since = True, self._world.steps
         self._force = self.spec.force
+        self._placed = (self._world.steps, 0.0, 0.0)
 
     def _owner(self) -> B:
         """Return the only robot in the world that has this gripper."""

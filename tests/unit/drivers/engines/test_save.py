@@ -141,6 +141,24 @@ def test_the_steps_after_a_restore_repeat_those_after_the_save(engine, bench, to
     other.world.close()
 
 
+def test_fingers_have_the_forces_of_the_restored_state_before_the_next_step(bench: SimulatedBench) -> None:
+    """Until then an engine may have those of its last step, by which fingers at rest would count as busy."""
+    bench.run(120, False)
+    idle, there = bench.gripper.read(0.0), bench.world.save()
+    first = bench.run(30, False)
+    bench.gripper.grasp(0.0, 0.2, 20.0, 0.01, 0.01)
+    bench.run(1, False)
+    pressing, held = bench.gripper.read(0.0), bench.world.save()
+    assert abs(pressing.force - idle.force) > 1.0
+    bench.world.restore(there)
+    assert bench.gripper.read(0.0)[3:] == idle[3:]
+    assert bench.run(30, False) == first
+    bench.world.restore(held)
+    assert bench.gripper.read(0.0)[3:] == pressing[3:]
+    bench.world.reset()
+    assert bench.gripper.read(0.0).force == 0.0
+
+
 def test_a_restore_changes_what_cameras_see_and_a_state_of_other_bodies_is_refused(bench: SimulatedBench) -> None:
     world = bench.world
     state, version = world.save(), world.version
