@@ -6,6 +6,7 @@ import copy
 import random
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Callable, Sequence
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,18 @@ from errors_kit import NONSENSE, places
 
 from hal.config import load
 from hal.config.data_files import find_data
+from hal.config.files import parse_yaml
 from hal.errors import ConfigError, Problem
+
+DUMPER = getattr(yaml, "CSafeDumper", yaml.SafeDumper)
+
+
+@cache
+def built_in() -> tuple[dict[str, Any], dict[str, Any], dict[str, Any], str]:
+    """Return a rig, its arm, its camera, and the arm's URDF; read once."""
+    files = ("config", "panda_table.yaml"), ("robots", "panda.yaml"), ("sensors", "cameras", "realsense_d435.yaml")
+    rig, arm, camera = (parse_yaml(find_data(*file).read_text()) for file in files)
+    return rig, arm | {"urdf": "arm.urdf"}, camera, Path(load("panda_table").resolve().robots[0].urdf).read_text()
 
 
 class Bench:
@@ -23,11 +35,8 @@ class Bench:
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
-        self.rig = yaml.safe_load(find_data("config", "panda_table.yaml").read_text())
-        self.arm = yaml.safe_load(find_data("robots", "panda.yaml").read_text()) | {"urdf": "arm.urdf"}
-        self.camera = yaml.safe_load(find_data("sensors", "cameras", "realsense_d435.yaml").read_text())
+        self.rig, self.arm, self.camera, self.urdf = copy.deepcopy(built_in())
         self.cup = {"name": "cup", "urdf": "cup.urdf"}
-        self.urdf = Path(load("panda_table").resolve().robots[0].urdf).read_text()
         self.overrides: list[str] = []
         self.panda: dict[str, Any] = self.rig["robots"]["panda"]
         self.panda["model"] = "arm.yaml"
@@ -47,7 +56,7 @@ class Bench:
     def load(self, **options: Any) -> Sequence[Problem]:
         """Write the files and load the rig; the problems found."""
         for name in ("rig", "arm", "camera", "cup"):
-            (self.folder / f"{name}.yaml").write_text(yaml.safe_dump(getattr(self, name)))
+            (self.folder / f"{name}.yaml").write_text(yaml.dump(getattr(self, name), Dumper=DUMPER))
         (self.folder / "arm.urdf").write_text(self.urdf)
         (self.folder / "cup.urdf").write_text("<robot name='cup'><link name='cup'/></robot>")
         try:
