@@ -5,11 +5,12 @@ from __future__ import annotations
 import os
 import signal
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
+from waiting import wait_until
 
 import hal
 from hal import ConnectionLost, GripperOutcome, JointTarget, JointVelocity, MotionStopped
@@ -69,13 +70,6 @@ def host_of(rig: hal.Rig, name: str) -> RemoteHost:
     return host
 
 
-def wait_for(condition: Callable[[], bool], timeout: float = 10.0) -> None:
-    deadline = time.monotonic() + timeout
-    while not condition():
-        assert time.monotonic() < deadline, "did not happen in time"
-        time.sleep(0.005)
-
-
 def test_the_gripper_works_as_any_other(rig: hal.Rig) -> None:
     assert {host.spec.name for host in rig._hosts} == {"simulation", "panda.gripper"}
     arm, hand = rig.robots["panda"], hand_of(rig)
@@ -98,7 +92,7 @@ def test_the_gripper_works_as_any_other(rig: hal.Rig) -> None:
 def test_a_stop_of_the_rig_reaches_it(rig: hal.Rig) -> None:
     hand = hand_of(rig)
     motion = hand.start(0.0, speed=0.02)
-    wait_for(lambda: hand.state().width < 0.07)
+    wait_until(lambda: hand.state().width < 0.07)
     rig.stop()
     result = motion.wait()
     assert result.outcome is GripperOutcome.STOPPED
@@ -145,7 +139,7 @@ def test_an_arm_does_not_wait_for_a_gripper_that_is_slow_or_dead(rig: hal.Rig) -
 def test_a_motion_that_loses_its_process_says_so(rig: hal.Rig) -> None:
     hand = hand_of(rig)
     motion = hand.start(0.0, speed=0.01)
-    wait_for(lambda: hand.state().moving)
+    wait_until(lambda: hand.state().moving)
     host_of(rig, "panda.gripper").child.process.kill()
     with pytest.raises(ConnectionLost):
         motion.wait()

@@ -5,13 +5,13 @@ import os
 import signal
 import subprocess
 import sys
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
 from engines_kit import Engine
+from waiting import wait_until
 
 import hal
 from hal import BodySpec, ConnectionLost, JointVelocity, MotionStopped, Pose, RobotStatus, Trip
@@ -23,13 +23,6 @@ pytestmark = pytest.mark.slow
 def rig(engine: Engine) -> Iterator[hal.Rig]:
     with hal.open("panda_table", sim=True, engine=engine.name, clock="real_time", pad="none") as opened:
         yield opened
-
-
-def wait_for(condition: Callable[[], bool], timeout: float = 10.0) -> None:
-    deadline = time.monotonic() + timeout
-    while not condition():
-        assert time.monotonic() < deadline, "did not happen in time"
-        time.sleep(0.005)
 
 
 def pixels_of(rig: hal.Rig, color: tuple[int, int, int]) -> int:
@@ -45,11 +38,11 @@ def test_edits_of_the_world_are_seen_by_the_cameras(rig: hal.Rig) -> None:
     ball = BodySpec("ball", (0.0, 0.0, 0.75), (0, 0, 0, 1), "sphere", radius=0.1, fixed=True, rgba=green)
     rig.world.add(ball)
     assert rig.world.bodies[-1] == "ball" or "ball" in rig.world.bodies
-    wait_for(lambda: pixels_of(rig, (0, 255, 0)) > 50)
+    wait_until(lambda: pixels_of(rig, (0, 255, 0)) > 50)
     rig.world.set_color("ball", (0.0, 0.0, 1.0, 1.0))
-    wait_for(lambda: pixels_of(rig, (0, 255, 0)) == 0 and pixels_of(rig, (0, 0, 255)) > 50)
+    wait_until(lambda: pixels_of(rig, (0, 255, 0)) == 0 and pixels_of(rig, (0, 0, 255)) > 50)
     rig.world.remove("ball")
-    wait_for(lambda: pixels_of(rig, (0, 0, 255)) == 0)
+    wait_until(lambda: pixels_of(rig, (0, 0, 255)) == 0)
 
 
 @pytest.mark.parametrize("refused", [False, True])
@@ -76,7 +69,7 @@ def test_a_refused_real_time_priority_is_noted_in_one_line_with_what_allows_it(r
 def test_poses_and_reset(rig: hal.Rig) -> None:
     start = rig.world.pose("cube")
     rig.world.set_pose("cube", Pose([0.1, 0.1, 0.9]))
-    wait_for(lambda: rig.world.pose("cube").position[2] < 0.7)  # it fell onto the table
+    wait_until(lambda: rig.world.pose("cube").position[2] < 0.7)  # it fell onto the table
     rig.world.reset("cube")
     assert rig.world.pose("cube").distance(start)[0] < 0.15
     with pytest.raises(hal.DeviceNotFound, match="cube"):
@@ -105,15 +98,15 @@ def test_a_fault_in_motion_is_told_and_recovered(rig: hal.Rig) -> None:
                 break
             assert tick.elapsed < 10.0
         arm.inject(fault="collision")
-        wait_for(lambda: arm.state().status is RobotStatus.FAULT)
+        wait_until(lambda: arm.state().status is RobotStatus.FAULT)
         with pytest.raises(hal.RobotFault, match="collision"):
             control.send(velocity)
         arm.recover()
-        wait_for(lambda: control.trip is Trip.FAULT and arm.state().status is RobotStatus.TRIPPED)
+        wait_until(lambda: control.trip is Trip.FAULT and arm.state().status is RobotStatus.TRIPPED)
         with pytest.raises(MotionStopped):
             control.send(velocity)
         control.rearm()
-        wait_for(lambda: control.trip is Trip.NONE)
+        wait_until(lambda: control.trip is Trip.NONE)
 
 
 def test_a_renderer_that_is_killed_takes_only_the_cameras() -> None:
@@ -129,7 +122,7 @@ def test_a_renderer_that_is_killed_takes_only_the_cameras() -> None:
                 return True
             return False
 
-        wait_for(lost)
+        wait_until(lost)
         goal = arm.home.copy()
         goal[0] += 0.05
         arm.move_to(goal, speed=0.5)

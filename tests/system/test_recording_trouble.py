@@ -9,11 +9,12 @@ import shutil
 import signal
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 from recording_kit import check_layout, mock_rig
+from waiting import wait_until
 
 import hal
 from hal.errors import CommandError, ConnectionLost
@@ -22,8 +23,6 @@ from hal.rig import Rig
 from hal.types import Frame, RobotStatus, Trip
 
 pytestmark = [pytest.mark.slow, pytest.mark.alone]
-
-SOON = 10.0
 
 
 class Driver:
@@ -71,16 +70,9 @@ def out(tmp_path: Path) -> Path:
     return tmp_path / "out"
 
 
-def wait(condition: Callable[[], object]) -> None:
-    deadline = time.monotonic() + SOON
-    while not condition():
-        assert time.monotonic() < deadline, "it did not happen"
-        time.sleep(0.01)
-
-
 def begin(recorder: Recorder, rows: int = 15) -> None:
     recorder.start()
-    wait(lambda: recorder.status().frames >= rows)
+    wait_until(lambda: recorder.status().frames >= rows)
     assert recorder.status().trouble == ""
 
 
@@ -104,7 +96,7 @@ def test_a_disk_that_is_full(rig: Rig, out: Path) -> None:
         begin(recorder)
         largest = max(path.stat().st_size for path in out.glob("episodes/*.partial/*"))
         limit(recorder, largest + 2000)
-        wait(lambda: "cannot be written" in recorder.status().trouble)
+        wait_until(lambda: "cannot be written" in recorder.status().trouble)
         rows = recorder.status().frames
         time.sleep(0.3)
         assert recorder.status().frames - rows <= 1, "no further rows"
@@ -135,7 +127,7 @@ def test_a_disk_that_gets_full_is_noticed_before(rig: Rig, out: Path, tmp_path: 
         begin(recorder)
         with (tmp_path / "large").open("wb") as file:
             os.posix_fallocate(file.fileno(), 0, 1_000_000_000)
-        wait(lambda: "GB are free on the disk" in recorder.status().trouble)
+        wait_until(lambda: "GB are free on the disk" in recorder.status().trouble)
         recorder.save(True, wait=True)
         with pytest.raises(CommandError, match="GB are free"):
             recorder.start()
@@ -143,7 +135,7 @@ def test_a_disk_that_gets_full_is_noticed_before(rig: Rig, out: Path, tmp_path: 
     with Recorder(rig, out, warn_free=1 << 60) as recorder:
         assert "GB are free" in recorder.status().trouble, "a warning, and nothing more"
         recorder.start()
-        wait(lambda: recorder.status().frames > 5)
+        wait_until(lambda: recorder.status().frames > 5)
         recorder.save(wait=True)
 
 
@@ -151,7 +143,7 @@ def test_a_folder_that_is_deleted_is_written_anew(rig: Rig, out: Path) -> None:
     with Recorder(rig, out) as recorder:
         begin(recorder)
         shutil.rmtree(out)
-        wait(lambda: "written there again" in recorder.status().trouble)
+        wait_until(lambda: "written there again" in recorder.status().trouble)
         recorder.save(True, wait=True)
     usable(out, 15)
     assert "is gone" in Dataset(out).episodes[0].info["trouble"]
@@ -161,7 +153,7 @@ def test_a_folder_that_is_moved_can_be_recovered_where_it_is(rig: Rig, out: Path
     with Recorder(rig, out) as recorder:
         begin(recorder)
         out.rename(tmp_path / "elsewhere")
-        wait(lambda: "is gone" in recorder.status().trouble)
+        wait_until(lambda: "is gone" in recorder.status().trouble)
         with pytest.raises(hal.HalError):
             recorder.save(True, wait=True)
     assert len(recover(tmp_path / "elsewhere")) == 1
@@ -172,14 +164,14 @@ def test_a_camera_that_is_lost(rig: Rig, out: Path) -> None:
     with Recorder(rig, out) as recorder:
         begin(recorder)
         rig.cameras["wrist"].inject(disconnect=True)
-        wait(lambda: "camera wrist is lost" in recorder.status().trouble)
+        wait_until(lambda: "camera wrist is lost" in recorder.status().trouble)
         with pytest.raises(CommandError, match="save or discard"):
             recorder.start()
         recorder.save(False, wait=True)
         with pytest.raises(ConnectionLost, match="camera wrist is lost"):
             recorder.start()
         rig.cameras["wrist"].inject(disconnect=False)
-        wait(lambda: rig.cameras["wrist"].connected)
+        wait_until(lambda: rig.cameras["wrist"].connected)
         begin(recorder)
         recorder.save(wait=True)
     usable(out, 15)
@@ -196,18 +188,18 @@ def test_a_camera_that_is_lost_while_an_episode_begins(rig: Rig, out: Path, monk
     def last(**more: float) -> Frame:
         frame = latest(**more)
         camera.inject(disconnect=True)
-        wait(lambda: not camera.connected)
+        wait_until(lambda: not camera.connected)
         return frame
 
     with Recorder(rig, out) as recorder:
         with monkeypatch.context() as patched:
             patched.setattr(camera, "latest", last)
             recorder.start()
-        wait(lambda: recorder.status().trouble)
+        wait_until(lambda: recorder.status().trouble)
         assert "camera wrist is lost" in recorder.status().trouble, "and not only silent, a second later"
         recorder.discard()
         camera.inject(disconnect=False)
-        wait(lambda: camera.connected)
+        wait_until(lambda: camera.connected)
         begin(recorder)
         recorder.save(wait=True)
     usable(out, 15)
@@ -217,7 +209,7 @@ def test_a_camera_that_falls_silent(rig: Rig, out: Path) -> None:
     with Recorder(rig, out) as recorder:
         begin(recorder)
         rig.cameras["scene"].inject(freeze=True)
-        wait(lambda: "camera scene has sent no picture" in recorder.status().trouble)
+        wait_until(lambda: "camera scene has sent no picture" in recorder.status().trouble)
         recorder.save(wait=True)
     usable(out, 15)
     assert Dataset(out).episodes[0].info["repeated"]["scene"] > 10, "rows that show an old picture are counted"
@@ -227,7 +219,7 @@ def test_a_writer_that_is_killed(rig: Rig, out: Path) -> None:
     with Recorder(rig, out) as recorder:
         begin(recorder)
         os.kill(recorder._child.process.pid, signal.SIGKILL)
-        wait(lambda: "the recorder process ended" in recorder.status().trouble)
+        wait_until(lambda: "the recorder process ended" in recorder.status().trouble)
         with pytest.raises(ConnectionLost):
             recorder.save(True, wait=True)
         begin(recorder)
@@ -243,11 +235,11 @@ def test_a_writer_that_cannot_keep_up_is_said(rig: Rig, out: Path) -> None:
         pid = recorder._child.process.pid
         os.kill(pid, signal.SIGSTOP)
         try:
-            wait(lambda: recorder.status().dropped >= 3)
+            wait_until(lambda: recorder.status().dropped >= 3)
         finally:
             os.kill(pid, signal.SIGCONT)
         rows = recorder.status().frames
-        wait(lambda: recorder.status().frames >= rows + 10)
+        wait_until(lambda: recorder.status().frames >= rows + 10)
         dropped = recorder.status().dropped
         recorder.save(wait=True)
     usable(out, 30)
@@ -260,7 +252,7 @@ def test_a_rig_that_is_closed_first(out: Path) -> None:
     with mock_rig("real_time") as rig:
         recorder = Recorder(rig, out)
         begin(recorder)
-    wait(lambda: recorder.status().trouble)
+    wait_until(lambda: recorder.status().trouble)
     assert any(word in recorder.status().trouble for word in ("closed", "ended")), recorder.status().trouble
     recorder.close()
     usable(out, 15)

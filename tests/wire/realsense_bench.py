@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import pytest
+from waiting import wait_until
 
 from hal.camera import Camera
 from hal.clock import RealClock
@@ -99,14 +100,6 @@ def sent(camera: CameraSpec, stream: str, number: int, pattern: str = "test") ->
     """Return exactly what the emulated camera, or the recording, has as a frame of a stream."""
     streams = make_streams(camera)
     return EmulatedImages(streams, pattern, 0).expected(stream, streams[stream].mode, number)
-
-
-def wait_until(holds: Callable[[], bool], seconds: float = PATIENCE) -> None:
-    """Wait until a condition holds; fail if it takes too long."""
-    began = time.monotonic()
-    while not holds():
-        assert time.monotonic() - began < seconds, f"not within {seconds} s"
-        time.sleep(0.005)
 
 
 def read_until_lost(camera: Camera) -> ConnectionLost:

@@ -7,12 +7,14 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from waiting import wait_until
+
 import hal
 from hal.rig import Rig
 from hal.robot import Robot
 from hal.types import RobotState, RobotStatus
 
-__all__ = ["Drive", "arm_of", "rig_of", "settled", "wait_until"]
+__all__ = ["Drive", "arm_of", "rig_of", "settled"]
 
 
 def rig_of(host: str, robot: str = "fr3", *more: str, lock_step: bool = False, sim: bool = False) -> Rig:
@@ -27,16 +29,6 @@ def rig_of(host: str, robot: str = "fr3", *more: str, lock_step: bool = False, s
 def arm_of(rig: Rig) -> Robot:
     """Return its arm."""
     return rig.robots["arm"]
-
-
-def wait_until(condition: Callable[[], bool], what: str, timeout: float = 30.0) -> float:
-    """Poll until a condition holds, and return the time it took, s. Raises TimeoutError with ``what``."""
-    began = time.monotonic()
-    while not condition():
-        if time.monotonic() - began > timeout:
-            raise TimeoutError(f"after {timeout:g} s still not {what}")
-        time.sleep(0.002)
-    return time.monotonic() - began
 
 
 @dataclass

@@ -15,12 +15,13 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from waiting import wait_until
 
 import hal
 from hal.drivers.franka.arm import create_link
 
 from .franka_kit import Client, Emulator, free_host
-from .rig_kit import arm_of, rig_of, wait_until
+from .rig_kit import arm_of, rig_of
 
 pytest.importorskip("pylibfranka", reason="needs pylibfranka: pip install 'robot-hal[franka]'")
 pytest.importorskip("panda_py", reason="needs panda-python: pip install 'robot-hal[panda]'")

@@ -12,13 +12,14 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
+from waiting import wait_until
 
 import hal
 from hal.rig import Rig
 from hal.types import RobotStatus
 
 from .franka_kit import Emulator
-from .rig_kit import Drive, arm_of, rig_of, settled, wait_until
+from .rig_kit import Drive, arm_of, rig_of, settled
 
 pytest.importorskip("pylibfranka", reason="needs pylibfranka: pip install 'robot-hal[franka]'")
 pytestmark = pytest.mark.alone

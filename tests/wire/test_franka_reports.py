@@ -27,7 +27,7 @@ APART = 0.003
 @pytest.fixture(scope="module")
 def lagging() -> Iterator[Emulator]:
     """An arm that is measured 10 ms behind what it is commanded."""
-    with Emulator("--lockstep", "--plant", "lag") as emulator:
+    with Emulator("--lockstep", "--unpaced", "--plant", "lag") as emulator:
         yield emulator
 
 

@@ -8,6 +8,7 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import pytest
+from waiting import wait_until
 
 import hal
 from hal.config import load
@@ -17,7 +18,7 @@ from hal.drivers.franka.link import ArmLink, ArmMode, ArmSample, StreamKind
 from hal.types import RobotStatus
 
 from .franka_kit import Emulator
-from .rig_kit import Drive, arm_of, rig_of, settled, wait_until
+from .rig_kit import Drive, arm_of, rig_of, settled
 
 pytest.importorskip("pylibfranka", reason="needs pylibfranka: pip install 'robot-hal[franka]'")
 pytest.importorskip("panda_py", reason="needs panda-python: pip install 'robot-hal[panda]'")

@@ -12,11 +12,10 @@ from typing import Any
 
 import pytest
 from can_kit import EmulatorProcess
+from waiting import wait_until
 
 import hal
 from hal.errors import ConnectionLost, ControlTaken, HalError
-
-from .rig_kit import wait_until
 
 GOAL = [0.3, 1.2, -1.0, 0.2, 0.8, 0.1]
 MORE = ["gamepads={}"]
@@ -47,7 +46,7 @@ def test_a_program_drives_the_arm_and_its_gripper_and_leaves_them_holding() -> N
         with opened(emulator) as rig:
             arm = rig.robots["arm"]
             assert not any(state_of(emulator)["enabled"])  # opening switches nothing on
-            arm.move_to(GOAL, unattended=True)
+            arm.move_to(GOAL, unattended=True, speed=0.5)
             arm.gripper.move(0.02)
             assert arm.gripper.state().width == pytest.approx(0.02, abs=2e-3)
             wait_until(lambda: arm.state(max_age=1.0).q == pytest.approx(GOAL, abs=2e-3), "there")
@@ -61,7 +60,7 @@ def test_a_program_drives_the_arm_and_its_gripper_and_leaves_them_holding() -> N
         with opened(emulator) as rig:  # it is where it was, and moves on from there
             arm = rig.robots["arm"]
             assert arm.state().q == pytest.approx(GOAL, abs=2e-3)
-            arm.move_to([0.2, *GOAL[1:]], unattended=True)
+            arm.move_to([0.2, *GOAL[1:]], unattended=True, speed=0.5)
 
 
 def test_a_bus_that_is_cut_stops_the_program_and_comes_back() -> None:
@@ -86,7 +85,7 @@ def test_a_bus_that_is_cut_stops_the_program_and_comes_back() -> None:
         before = arm.state(max_age=1.0).q
         time.sleep(0.3)
         assert arm.state(max_age=1.0).q == pytest.approx(before, abs=5e-3)
-        arm.move_to(GOAL, unattended=True)
+        arm.move_to(GOAL, unattended=True, speed=0.5)
 
 
 def answers(arm: hal.Robot) -> bool:

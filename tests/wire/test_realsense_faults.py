@@ -12,6 +12,7 @@ import time
 from typing import Any
 
 import pytest
+from waiting import wait_until
 
 from hal.errors import CommandError, ConnectionLost, ControlTaken, DeviceNotFound, NotSupported, StaleStateError
 
@@ -25,7 +26,6 @@ from .realsense_bench import (
     software,
     spec,
     wait_for_code,
-    wait_until,
 )
 
 from hal.drivers.realsense.device import RealSenseDevice, find_camera, lock_camera  # isort: skip  # needs the library
@@ -319,6 +319,8 @@ def test_the_app_is_not_blocked_during_a_reconnect() -> None:
 def test_a_program_that_does_not_close_leaves_no_process() -> None:
     program = textwrap.dedent(
         """
+        import sys
+        sys.path.insert(0, "tests/kits")
         from tests.wire.realsense_bench import RealSenseCamera, software
         from hal.camera import Camera
         from hal.clock import RealClock

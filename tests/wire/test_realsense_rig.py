@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from waiting import wait_until
 
 import hal
 from hal import registry
@@ -20,7 +21,6 @@ from .realsense_bench import (
     recording,
     software,
     spec,
-    wait_until,
 )
 
 from hal.drivers.realsense.emulator import read_number  # isort: skip  # needs the library
@@ -92,7 +92,7 @@ def test_a_camera_that_starts_and_sends_nothing_is_reset_once(monkeypatch: pytes
             errors.append(caught.value)
             return "could not be reset: hardware_reset is not implemented" in str(caught.value)
 
-        wait_until(was_reset, 60.0)
+        wait_until(was_reset, timeout=60.0)
         first = next(error for error in errors if error.code == "no_frames")
         assert "reset" not in str(first), "the first failed start is not followed by a reset"
         cam.inject(freeze=False)

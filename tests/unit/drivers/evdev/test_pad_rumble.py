@@ -8,10 +8,11 @@ import os
 import struct
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 
 import pytest
 from evdev_kit import DS4, FakeInput, MakePad, poll, poll_until
+from waiting import wait_until
 
 from hal.drivers.evdev.pad import EvdevPad
 from hal.drivers.evdev.rumble import Rumble
@@ -70,13 +71,6 @@ def kernel(monkeypatch: pytest.MonkeyPatch) -> Iterator[Kernel]:
     monkeypatch.setattr(fcntl, "ioctl", made.ioctl)
     yield made
     made.close()
-
-
-def until(true: Callable[[], object], limit: float = 10.0) -> None:
-    end = time.monotonic() + limit
-    while not true():
-        assert time.monotonic() < end, "it did not happen"
-        time.sleep(0.002)
 
 
 def test_effect_has_the_layout_of_the_kernel(kernel: Kernel, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -145,7 +139,7 @@ def test_polling_thread_plays_the_rumble(system: FakeInput, make_pad: MakePad, k
     node = system.plug(DS4)
     node.can_rumble = True
     pad = make_pad()
-    until(lambda: kernel.effects)
+    wait_until(lambda: kernel.effects)
     assert kernel.effects == [(FF_RUMBLE, -1, round(RUMBLE_STRONG * 0xFFFF), round(RUMBLE_WEAK * 0xFFFF))]
     asked: list[bool] = []
 
@@ -157,7 +151,7 @@ def test_polling_thread_plays_the_rumble(system: FakeInput, make_pad: MakePad, k
         poll(pad)
         return node.written()
 
-    until(shaken)  # the effect may be ready a moment later
+    wait_until(shaken)  # the effect may be ready a moment later
     assert all(asked)
     assert Gamepad(pad).rumble()
     poll(pad)
@@ -169,7 +163,7 @@ def test_poll_does_not_wait_for_an_upload(system: FakeInput, make_pad: MakePad, 
     node = system.plug(DS4)
     node.can_rumble = True
     pad = make_pad()
-    until(lambda: kernel.effects)
+    wait_until(lambda: kernel.effects)
     kernel.answer.clear()  # the kernel does not answer the next upload for 10 s
 
     def told() -> bool:
@@ -179,14 +173,14 @@ def test_poll_does_not_wait_for_an_upload(system: FakeInput, make_pad: MakePad, 
         assert time.monotonic() - began < 2.0
         return kernel.asked == 2
 
-    until(told)
+    wait_until(told)
     for _ in range(5):
         began = time.monotonic()
         assert poll(pad).connected
         assert time.monotonic() - began < 2.0
     assert len(kernel.effects) == 1, "the upload is under way"
     kernel.answer.set()
-    until(lambda: len(kernel.effects) == 2)
+    wait_until(lambda: len(kernel.effects) == 2)
 
 
 def test_read_only_or_absent_pad_does_not_rumble(system: FakeInput, make_pad: MakePad) -> None:

@@ -5,14 +5,14 @@ from __future__ import annotations
 import os
 import shutil
 import subprocess
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
 import pytest
 from errors_kit import raises_code
 from specs import box, data, world_spec
+from waiting import wait_until
 
 from hal.drivers.pybullet.viewer import PyBulletViewer
 from hal.errors import DriverMissing, NotSupported
@@ -52,13 +52,6 @@ def lock_step() -> LocalHost:
     return LocalHost(GroupSpec("world", "lock_step", 240.0, (), spec))
 
 
-def until(condition: Callable[[], bool], limit: float = 20.0) -> None:
-    deadline = time.monotonic() + limit
-    while not condition():
-        assert time.monotonic() < deadline, "the condition did not become true"
-        time.sleep(0.01)
-
-
 @pytest.mark.parametrize("name", [None, ":9999"])
 def test_without_a_display_the_viewer_is_not_supported(monkeypatch: pytest.MonkeyPatch, name: str | None) -> None:
     monkeypatch.delenv("DISPLAY", raising=False)
@@ -96,9 +89,9 @@ def test_the_window_shows_the_world_and_its_edits_until_it_is_closed(display: Di
             revision = host.request("world.add", edit)
             host.advance_to(host.now() + 0.1)
             viewer.edited("add", edit, revision)
-            until(picture_changed)
+            wait_until(picture_changed)
         display.server.terminate()
-        until(lambda: viewer._child.process.poll() is not None)
+        wait_until(lambda: viewer._child.process.poll() is not None)
         viewer.edited("set_color", {"name": "block", "rgba": [1, 0, 0, 1]}, 4)  # not an error
     finally:
         viewer.close()
