@@ -40,6 +40,15 @@ def bench() -> Iterator[Bench]:
 
 
 @pytest.fixture
+def page(bench: Bench, page: Browser) -> Browser:
+    """The console; it drives the left arm at full speed along the base's axes, whatever a test before has left."""
+    bench.session._changes.update(speed=1.0, frame="base", robot="left")
+    wait_for(lambda: not bench.session._changes, "the program to take the settings")
+    wait_for(lambda: names_the_driven(page, "left"), "the page to name the driven arm")
+    return page
+
+
+@pytest.fixture
 def two_pads() -> Iterator[Bench]:
     """Two arms and two pads, both of which are the page."""
     need_browser()
@@ -103,7 +112,6 @@ def test_with_two_pads_the_page_drives_the_chosen_arm_alone(two_pads: Bench, bro
 
 
 def test_the_arm_that_is_chosen_is_the_arm_that_moves(bench: Bench, page: Browser) -> None:
-    wait_for(lambda: names_the_driven(page, "left"), "the page to name the driven arm")
     drive_up(bench, page, "left")
     choose(page, "right")
     wait_for(lambda: names_the_driven(page, "right"), "the page to name the other arm")
@@ -115,7 +123,6 @@ def test_the_arm_that_is_chosen_is_the_arm_that_moves(bench: Bench, page: Browse
 
 def test_a_held_dead_man_keeps_its_arm(bench: Bench, page: Browser) -> None:
     """Neither the page nor the program changes what is driven under a hand."""
-    wait_for(lambda: names_the_driven(page, "left"), "the page to name the driven arm")
     page.hold()
     wait_for(lambda: bench.deadman.held, "the dead-man")
     choose(page, "right")
