@@ -315,8 +315,11 @@ class RolloutRun:
             outcome = self.runner.run(seed, lambda seconds: self._show(number, seconds))
         finally:
             if self.recorder is not None:
-                success, taken = (None, ()) if outcome is None else (outcome.success, outcome.interventions)
-                self.recorder.save(success, wait=True, result={"interventions": taken})
+                if outcome is None:
+                    self.recorder.save(None, wait=True)
+                else:
+                    result = {"interventions": outcome.interventions, "policy": dict(outcome.statistics)}
+                    self.recorder.save(outcome.success, wait=True, result=result)
         self.outcomes.append(outcome)
         self._announce(f"episode {number}: {_describe(outcome)}")
         if self.recorder is not None and (trouble := self.recorder.status().trouble):

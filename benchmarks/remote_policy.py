@@ -6,9 +6,12 @@ python benchmarks/remote_policy.py
 from __future__ import annotations
 
 import argparse
+import contextlib
 import resource
+import tempfile
+import threading
 import time
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
@@ -18,6 +21,7 @@ from hal.learning.policy import PolicyRunner
 from hal.learning.policy_config import load_policy_config
 from hal.learning.remote import PolicyClient, PolicyServer
 from hal.learning.takeover import Takeover
+from hal.recording import Recorder
 
 STEPS, RATE = 16, 15.0
 SINE, FREQUENCY = 0.1, 0.3
@@ -103,53 +107,85 @@ def cost(seconds: float) -> None:
     )
 
 
-def takeovers(count: int) -> None:
-    with hal.open("panda_table", driver="mock", overrides=["cameras={}"]) as rig:
-        arm, pad = rig.robots["panda"], rig.driver("pad")
-        pad.press("l2")
-        begun, seen, delays = rig.clock.now(), [], []
-        period, held = 1.6, 0.5
+class Stick:
+    """A pad whose state is set by this program."""
+
+    def __init__(self) -> None:
+        self.side = 0.0
+
+    def state(self) -> hal.PadState:
+        return hal.PadState(hal.Stamp(0.0, 0.0, 0), axes={"dpad_x": self.side}, connected=True)
+
+
+def takeovers(count: int, clock: str) -> None:
+    """Move and release a stick ``count`` times, at any time within a turn; see in every tick when the arm follows."""
+    period, held = 1.0, 0.25
+    chance, stick = np.random.default_rng(1), Stick()
+    presses = np.cumsum(np.full(count, period)) + chance.uniform(0.0, 0.1, count)
+    delays: list[float] = []
+    with contextlib.ExitStack() as stack:
+        folder = stack.enter_context(tempfile.TemporaryDirectory())
+        rig = stack.enter_context(hal.open("panda_table", sim=True, clock=clock, pad="none", overrides=["cameras={}"]))
+        recorder = stack.enter_context(Recorder(rig, f"{folder}/runs", fps=30))
+        arm, begun, pressed = rig.robots["panda"], rig.clock.now(), [0.0]
 
         def policy(observation: hal.Observation) -> hal.Twist:
-            return hal.Twist([0.0, 0.0, 0.02 * np.sign(np.sin(4 * np.pi / period * observation.t))])
+            return hal.Twist([0.0, 0.0, 0.02 * np.sign(np.sin(4 * np.pi * observation.t))])
 
-        def turn(_: float) -> None:
-            elapsed = (rig.clock.now() - begun) % (2 * period)
-            side = 1.0 if elapsed < period else -1.0
-            pad.stick("dpad_x", side if elapsed % period < held else 0.0)
-            state = arm.state()
-            seen.append((elapsed % period, *state.q_set, *state.dq_set))
+        def watch() -> None:
+            now, number = rig.clock.now() - begun, len(delays)
+            if pressed[0]:  # wait for the motion of this press: the policy alone moves less than 2 mm/s sidewards
+                state = arm.state()
+                speed = (arm.kinematics.jacobian(state.q_set) @ state.dq_set)[1]
+                if abs(speed) > 5e-3:
+                    delays.append(state.stamp.t - pressed[0])
+                    pressed[0] = 0.0
+            elif number < count and now >= presses[number]:
+                stick.side = 1.0 if number % 2 else -1.0
+                pressed[0] = rig.clock.now()
+            elif stick.side and now >= presses[number - 1] + held:
+                stick.side = 0.0
 
-        takeover = Takeover(hal.Teleop(arm), rig.gamepads["pad"])
-        hold = rig.gamepads["pad"].hold("l2")
-        runner = PolicyRunner(
-            rig, policy, rate_hz=50, seconds=count * period, cameras=(), deadman=hold, takeover=takeover
-        )
-        outcome = runner.run(on_turn=turn)
-        velocity, acceleration = (np.asarray(x) for x in (arm.limits.velocity, arm.limits.acceleration))
-    rows = np.array(seen)
-    q, dq = rows[:, 1:8], rows[:, 8:15]
-    for first in np.flatnonzero(np.diff(rows[:, 0]) < 0.0) + 1:
-        moved = np.flatnonzero(np.abs(dq[first : first + 20, 0]) > 1e-3)
-        delays.append(rows[first + moved[0], 0] - rows[first, 0] if moved.size else np.inf)
-    speed = (np.abs(np.diff(q, axis=0)) / 0.02 / velocity).max()
-    change = (np.abs(np.diff(dq, axis=0)) / 0.02 / acceleration).max()
+        ended = threading.Event()
+        if rig.lock_step:
+            rig.clock.every(1.0 / 240.0, watch)
+        else:
+
+            def watch_always() -> None:
+                while not ended.wait(0.001):
+                    watch()
+
+            threading.Thread(target=watch_always, daemon=True).start()
+        takeover = Takeover(hal.Teleop(arm), cast(Any, stick))
+        seconds = (count + 1) * period
+        runner = PolicyRunner(rig, policy, rate_hz=50, seconds=seconds, cameras=(), unattended=True, takeover=takeover)
+        recorder.start()
+        outcome = runner.run()
+        ended.set()
+        rows, dropped = recorder.status().frames, recorder.status().dropped
+        recorder.save(wait=True)
+        (group,) = rig.statistics().values()
+        peak = group["robots"]["panda"]["peak"]
+    limits = ", ".join(f"{name} {peak[name]:.2f}" for name in ("velocity", "acceleration", "jerk"))
     print(
-        f"{len(outcome.interventions)} takeovers in simulated time: press to motion p99 "
-        f"{1e3 * np.percentile(delays, 99):.0f} ms; between two turns at most {speed:.2f} of the speed limits and "
-        f"{change:.2f} of the acceleration limits"
+        f"{len(outcome.interventions)} takeovers ({clock}, {outcome.ended}): press to motion p50 "
+        f"{1e3 * np.percentile(delays, 50):.0f}, p99 {1e3 * np.percentile(delays, 99):.0f}, max "
+        f"{1e3 * max(delays):.0f} ms; shares of the limits in all set-points: {limits}; {rows} rows, {dropped} lost"
     )
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("--count", type=int, default=500, help="round trips and takeovers (%(default)s)")
+    parser.add_argument(
+        "--count", type=int, default=500, help="round trips, and half the simulated takeovers (%(default)s)"
+    )
     args = parser.parse_args()
     round_trip(args.count)
     for latency in (0.05, 0.2, 0.4):
         tracking(latency, 12.0)
     cost(10.0)
-    takeovers(args.count)
+    takeovers(2 * args.count, "lock_step")
+    takeovers(50, "real_time")
 
 
 if __name__ == "__main__":

@@ -40,6 +40,8 @@ _MARGIN = 1.0
 """Steps of the policy by which it is asked earlier than its latency requires."""
 _ONSET = 1e-3
 """A target must be due so much later than now, s."""
+_MOST_CAMERAS = 8
+"""Greatest number of cameras that a server may ask for."""
 
 
 class _Pending(NamedTuple):
@@ -139,7 +141,8 @@ class RemotePolicy:
         self._ask(observation, self.rig.clock.now())
         assert self._pending is not None
         reply, self._pending = self._pending.reply, None
-        self.config.decode(check_actions(self._result(reply), self._numbers), observation, self._used)
+        actions = check_actions(self._result(reply), self._numbers)
+        self.config.decode(actions[:CHUNK_POINTS], observation, self._used)
         return None
 
     def reset(self, seed: int | None = None) -> None:
@@ -213,7 +216,13 @@ class RemotePolicy:
         self._roboarena = "action_space" in metadata
         if not self._roboarena:
             return
-        wanted = [f"observation/exterior_image_{k}_left" for k in range(int(metadata.get("n_external_cameras", 0)))]
+        count, size = metadata.get("n_external_cameras", 0), metadata.get("image_resolution")
+        if count not in range(_MOST_CAMERAS + 1) or not (size is None or _is_size(size)):
+            raise PolicyError(
+                f"{self.client.url} describes its policy wrongly: {count!r} cameras, pictures of {size!r}",
+                code="policy_protocol",
+            )
+        wanted = [f"observation/exterior_image_{k}_left" for k in range(count)]
         if metadata.get("needs_wrist_camera"):
             wanted.append("observation/wrist_image_left")
         if metadata.get("needs_stereo_camera"):
@@ -227,9 +236,8 @@ class RemotePolicy:
                 f"file has {', '.join(there)} and the action {kind}",
                 code="policy_mismatch",
             )
-        size = metadata.get("image_resolution")
         if size is not None:
-            self.config = self.config.with_size(int(size[0]), int(size[1]))
+            self.config = self.config.with_size(*size)
 
     def _described(self, metadata: dict[str, Any]) -> PolicyConfig:
         """Return the configuration that a server describes in its metadata."""
@@ -238,8 +246,11 @@ class RemotePolicy:
                 f"{self.client.url} does not describe its policy; pass a configuration (--policy-config)",
                 code="policy_mismatch",
             )
+        described, wanted = metadata["policy_config"], metadata.get("joints")
         try:
-            config = load_policy_config(metadata["policy_config"])
+            if not isinstance(described, dict) or not isinstance(wanted, list | None):
+                raise TypeError("policy_config is a map, and joints a list")
+            config = load_policy_config(described)
         except (ConfigError, TypeError) as error:
             raise PolicyError(
                 f"{self.client.url} describes its policy wrongly: {error}", code="policy_protocol"
@@ -248,8 +259,7 @@ class RemotePolicy:
         for action in config.actions:
             lead = "" if action.robot is None else f"{action.robot}."
             joints += [lead + joint for joint in robots[action.robot or self.robot.name].joints]
-        wanted = list(metadata.get("joints", joints))
-        if wanted != joints:
+        if wanted is not None and wanted != joints:
             raise PolicyError(
                 f"the policy at {self.client.url} moves {', '.join(map(str, wanted))}; this rig has "
                 f"{', '.join(joints)}",
@@ -317,10 +327,11 @@ class RemotePolicy:
         return self._follow(check_actions(reply, self._numbers), pending.observation, now)
 
     def _follow(self, actions: Array, observation: Observation, now: float) -> dict[str, JointChunk]:
-        decoded, first, steps = self.config.decode(actions, observation, self._used), self.config.due, len(actions)
-        execute = self.config.execute or max(1, steps // 2)
+        execute, first = self.config.execute or max(1, len(actions) // 2), self.config.due
         # An arm that has stood still since the observation starts at the beginning, not where it would have been.
         start = now if self._chunk is None else observation.t
+        actions = actions[: int((now - start + CHUNK_AHEAD) / self._dt) + 1]
+        decoded, steps = self.config.decode(actions, observation, self._used), len(actions)
         t: Array = start + self._dt * np.arange(first, first + steps, dtype=float)
         ahead = (t > now + _ONSET) & (t < now + CHUNK_AHEAD - self._dt)
         ahead[min(len(t), 2 * execute + int(np.argmax(ahead))) :] = False  # not for long after the server's death
@@ -381,6 +392,12 @@ class RemotePolicy:
             return None
         self._grips[name] = grip
         return grip
+
+
+def _is_size(size: Any) -> bool:
+    """Return whether this is a height and a width in pixels."""
+    sound = isinstance(size, list | tuple) and len(size) == 2
+    return sound and all(type(pixels) is int and 8 <= pixels <= 4096 for pixels in size)
 
 
 def _sampled(t: Array, targets: Decoded, at: Array) -> Decoded:

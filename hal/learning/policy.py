@@ -183,7 +183,7 @@ class PolicyRunner:
                 arm is given back.
 
         Raises:
-            CommandError: ``seconds`` is not positive, or there is no arm.
+            CommandError: ``seconds`` is not positive, there is no arm, or ``takeover`` drives another one.
         """
         if not seconds > 0.0:
             raise CommandError(f"an episode's seconds must be positive, not {seconds:g}")
@@ -192,6 +192,8 @@ class PolicyRunner:
         self.robots = {arm.name: arm for arm in ([first] if robots is None else robots)}
         if not self.robots:
             raise CommandError("a policy moves at least one arm", code="no_robot")
+        if takeover is not None and takeover.teleop.robot.name not in self.robots:
+            raise CommandError(f"the policy does not move {takeover.teleop.robot.name}, which the takeover drives")
         self._rate, self._seconds = rate_hz, seconds
         self._deadman, self._unattended = deadman, unattended
         self._cameras, self._history = cameras, history

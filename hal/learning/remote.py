@@ -238,7 +238,7 @@ class PolicyClient:
 
 
 class PolicyServer:
-    """Serves a function of a request to one client after the other; the other end of :class:`PolicyClient`.
+    """Serves a function of a request, which is called once at a time; the other end of :class:`PolicyClient`.
 
     Example:
         Serve a policy of ten targets for each request, in a process of its own::
@@ -271,6 +271,8 @@ class PolicyServer:
         self._thread = threading.Thread(target=self._loop.run_forever, name="policy-server", daemon=True)
         self._runner: Any = None
         self._ended = threading.Event()
+        self._computing = threading.Lock()
+        """A client that connects again may ask while an answer for its last connection is computed."""
 
     @property
     def url(self) -> str:
@@ -293,12 +295,15 @@ class PolicyServer:
 
     def close(self) -> None:
         """Close every connection, and stop. Idempotent."""
-        if not self._loop.is_closed() and self._thread.is_alive():
-            if self._runner is not None:
-                with contextlib.suppress(Exception):
-                    asyncio.run_coroutine_threadsafe(self._runner.cleanup(), self._loop).result(5.0)
-            self._loop.call_soon_threadsafe(self._loop.stop)
-            self._thread.join(2.0)
+        if not self._loop.is_closed():
+            if self._thread.is_alive():
+                if self._runner is not None:
+                    with contextlib.suppress(Exception):
+                        asyncio.run_coroutine_threadsafe(self._runner.cleanup(), self._loop).result(5.0)
+                self._loop.call_soon_threadsafe(self._loop.stop)
+                self._thread.join(2.0)
+            if not self._thread.is_alive():
+                self._loop.close()
         self._ended.set()
 
     def __enter__(self) -> PolicyServer:
@@ -343,11 +348,12 @@ class PolicyServer:
         request = unpack(data)
         if not isinstance(request, dict):
             raise PolicyError("a request is a map", code="policy_protocol")
-        if request.pop("endpoint", "infer") == "reset":
-            if self._reset is not None:
-                self._reset(request)
-            return "reset successful"
-        return pack(self._infer(request))
+        with self._computing:
+            if request.pop("endpoint", "infer") == "reset":
+                if self._reset is not None:
+                    self._reset(request)
+                return "reset successful"
+            return pack(self._infer(request))
 
 
 def _aiohttp() -> Any:

@@ -252,16 +252,19 @@ def test_a_policy_of_two_arms_sees_and_moves_each_by_its_own_numbers() -> None:
 def test_two_arms_stop_together(rig: Rig) -> None:
     config = {**ALOHA, "cameras": {}}
     swing = hal.JointVelocity([0.2, 0.0, 0.0, 0.0, 0.0, 0.0])
+    lost: list[float] = []
     with hal.open(config, driver="mock") as both:
 
         def act(observation: hal.Observation) -> dict[str, hal.JointVelocity]:
             if both.clock.now() > 1.0:
+                lost.append(both.clock.now())
                 both.driver("left").inject(fault="lost")
             return {"left": swing, "right": swing}
 
         outcome = PolicyRunner(both, act, robots=both.robots.values(), rate_hz=50, seconds=5.0).run()
         assert outcome.ended == "stopped"
         assert np.abs(both.robots["right"].state().dq_set).max() < 1e-9
+        assert both.clock.now() - lost[0] < 0.3, "the other arm does not wait for the first to come to rest"
         wrong = PolicyRunner(both, lambda observation: swing, robots=both.robots.values())
         with raises_code(hal.CommandError, "bad_answer"):
             wrong.rehearse()
@@ -480,10 +483,45 @@ def test_a_roboarena_server_is_reset_and_told_its_session(rig: Rig) -> None:
     assert [sorted(request) for request in seen] == [["session_id"]]
 
 
-@pytest.mark.parametrize("change", [{"action_space": "joint_velocity"}, {"needs_wrist_camera": True}])
-def test_what_a_server_needs_and_the_file_lacks_is_named(rig: Rig, change: dict[str, Any]) -> None:
-    with raises_code(hal.PolicyError, "policy_mismatch"):
+@pytest.mark.parametrize(
+    ("change", "code"),
+    [
+        ({"action_space": "joint_velocity"}, "policy_mismatch"),
+        ({"needs_wrist_camera": True}, "policy_mismatch"),
+        ({"n_external_cameras": "two"}, "policy_protocol"),
+        ({"n_external_cameras": 10**9}, "policy_protocol"),
+        ({"image_resolution": 224}, "policy_protocol"),
+        ({"image_resolution": [224, 10**6]}, "policy_protocol"),
+    ],
+)
+def test_what_a_server_needs_and_the_file_lacks_is_named(rig: Rig, change: dict[str, Any], code: str) -> None:
+    with raises_code(hal.PolicyError, code):
         run(rig, stay, metadata={**ARENA, **change}, rehearse=True)
+
+
+@pytest.mark.parametrize("described", ["droid", 3, {"rate_hz": 0}, {**CONFIG, "arms": 1}])
+def test_a_server_that_describes_its_policy_wrongly_is_an_error(rig: Rig, described: Any) -> None:
+    with PolicyServer(stay, metadata={"policy_config": described}) as server:
+        client = PolicyClient(server.url)
+        with raises_code(hal.PolicyError, "policy_protocol"):
+            RemotePolicy(rig, client)
+        client.close()
+
+
+def test_an_answer_far_into_the_future_is_decoded_only_as_far_as_it_can_be_used(rig: Rig) -> None:
+    arm = rig.robots["panda"]
+    calls: list[int] = []
+    ik = arm.ik
+
+    def counted(*args: Any) -> Any:
+        calls.append(1)
+        return ik(*args)
+
+    config = {**CONFIG, "action": {"kind": "tcp_delta", "scale": 1e-6}}
+    arm.ik = counted  # type: ignore[method-assign]
+    outcome = run(rig, lambda request: {"actions": np.ones((5000, 6))}, config=config, seconds=0.1)
+    assert outcome.ended == "time"
+    assert len(calls) < 60
 
 
 # The file.

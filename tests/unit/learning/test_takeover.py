@@ -120,3 +120,50 @@ def test_a_gripper_that_the_policy_closed_stays_closed_in_a_takeover(rig: Rig) -
     PolicyRunner(rig, close, rate_hz=50, seconds=2.5, cameras=(), deadman=hold, takeover=takeover).run(on_turn=turn)
     assert len(takeover.intervals) == 1
     assert max(widths[-40:]) < 0.002
+
+
+def test_the_other_arm_rests_in_a_takeover_and_both_pause_with_the_dead_man() -> None:
+    robots = {
+        name: {"model": "panda", "base": {"position": [0.0, y, 0.0]}} for name, y in (("left", 0.6), ("right", -0.6))
+    }
+    swing = hal.JointVelocity([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.2])
+    with hal.open({"robots": robots, "gamepads": {"pad": {"model": "auto"}}}, driver="mock") as rig:
+        pad, seen = rig.driver("pad"), []
+        pad.press("l2")
+
+        def turn(seconds: float) -> None:
+            t = rig.clock.now() - start
+            pad.stick("dpad_x", 1.0 if 0.5 < t < 0.9 else 0.0)
+            if 1.7 < t < 1.8:
+                pad.release("l2")
+            elif t > 1.9:
+                pad.press("l2")
+            seen.append((t, *(np.abs(arm.state().dq_set).max() for arm in rig.robots.values())))
+
+        runner = PolicyRunner(
+            rig,
+            lambda observation: dict.fromkeys(rig.robots, swing),
+            robots=rig.robots.values(),
+            rate_hz=50,
+            seconds=2.0,
+            deadman=rig.gamepads["pad"].hold("l2"),
+            takeover=Takeover(hal.Teleop(rig.robots["left"]), rig.gamepads["pad"]),
+        )
+        start = rig.clock.now()
+        outcome = runner.run(on_turn=turn)
+        assert (outcome.ended, outcome.pauses, len(outcome.interventions)) == ("time", 1, 1)
+        t, left, right = np.array(seen).T
+        by_hand, resumed = (t > 0.8) & (t < 0.9), (t > 1.5) & (t < 1.7)
+        assert left[by_hand].min() > 0.01
+        assert right[by_hand].max() < 1e-6
+        assert min(left[resumed].min(), right[resumed].min()) > 0.1
+        released = (t > 1.84) & (t < 1.9)
+        assert max(left[released].max(), right[released].max()) < 0.1
+        assert min(left[-1], right[-1]) > 0.1
+        with pytest.raises(hal.CommandError):
+            PolicyRunner(
+                rig,
+                lambda observation: swing,
+                robot=rig.robots["right"],
+                takeover=Takeover(hal.Teleop(rig.robots["left"]), rig.gamepads["pad"]),
+            )
