@@ -14,7 +14,7 @@ import numpy as np
 
 from hal.learning.remote import PolicyServer
 
-STEPS, RATE, SPEED = 40, 15, 0.15
+STEPS, RATE, SPEED = 60, 15, 0.15
 EXECUTE = 15
 CONFIG: dict[str, Any] = {
     "rate_hz": RATE,

@@ -517,7 +517,7 @@ def test_an_answer_far_into_the_future_is_decoded_only_as_far_as_it_can_be_used(
         calls.append(1)
         return ik(*args)
 
-    config = {**CONFIG, "action": {"kind": "tcp_delta", "scale": 1e-6}}
+    config = {**CONFIG, "action": {"kind": "tcp_delta", "scale": 1e-6, "turn": 1e-6}}
     arm.ik = counted  # type: ignore[method-assign]
     outcome = run(rig, lambda request: {"actions": np.ones((5000, 6))}, config=config, seconds=0.1)
     assert outcome.ended == "time"
