@@ -103,17 +103,22 @@ def trim(
         The number of removed rows.
 
     Raises:
-        CommandError: There is no such episode (code ``no_episodes``), or it has no such rows (``bad_rows``); otherwise
-            as :func:`~hal.recording.merge`.
+        CommandError: There is no such episode (code ``no_episodes``), it has no such rows, or the first of them has no
+            key frame (``bad_rows``); otherwise as :func:`~hal.recording.merge`.
         DatasetError: The dataset is damaged.
     """
     existing_episodes(dataset, kept)
+    episodes = Dataset(dataset).episodes
     removed = 0
     for number, rows in kept.items():
-        length = Dataset(dataset).episodes[number].length
+        length = episodes[number].length
         if not 0 <= rows.first < rows.end <= length:
             raise CommandError(
                 f"episode {number} has {length} rows, and not {rows.first} to {rows.end - 1}", code="bad_rows"
+            )
+        if (key_row := _key_row(episodes[number], rows.first)) != rows.first:
+            raise CommandError(
+                f"row {rows.first} of episode {number} has no key frame; row {key_row} has", code="bad_rows"
             )
         removed += length - (rows.end - rows.first)
 

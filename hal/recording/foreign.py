@@ -62,7 +62,8 @@ def read_foreign(layout: DatasetLayout) -> ForeignDataset:
     with dataset_errors(layout.root, layout.tasks):
         tasks = read_tasks(layout.tasks)
     cameras = _cameras(features)
-    abouts = [_about(info, entry, cameras, tasks) for entry in _places(layout, info, entries)]
+    with dataset_errors(layout.root, layout.root / "meta/episodes"):
+        abouts = [_about(info, entry, cameras, tasks) for entry in _places(layout, info, entries)]
     return ForeignDataset(info, abouts, (_notice(info, entries, cameras, left_out),))
 
 
@@ -171,7 +172,7 @@ def _about(
         "t_start": 0.0,
         "task": str(texts[0]) if texts else "",
         "success": entry.get("success"),
-        "dropped": entry.get("dropped"),
+        "dropped": None if entry.get("dropped") is None else int(entry["dropped"]),
         "cameras": {
             name: {
                 "K": _matrix(entry.get(f"camera_matrix/{name}")),

@@ -124,6 +124,7 @@ def export(
         valid=valid,
         action=form,
         report=progress,
+        notes=list(source.notes),
     )
     job.check()
     writer = import_module(f".{KINDS[kind].module}", __name__)

@@ -56,12 +56,13 @@ def _library() -> Any:
 def _write_episode(job: ExportJob, content: EpisodeContent, group: Any, h5py: Any) -> None:
     actions = job.action.values(content)
     seen = job.observations(content)
-    job.unknown(content, seen | {"actions": actions})
+    forms = {f"action_dict/{name}": values for name, values in action_dict(content).items()}
+    job.unknown(content, seen | {"actions": actions} | forms)
     last = np.zeros(content.rows)
     last[-1] = 1.0
     group["actions"] = actions
-    for name, values in action_dict(content).items():
-        group[f"action_dict/{name}"] = values
+    for name, values in forms.items():
+        group[name] = values
     group["dones"] = last
     group["rewards"] = last * bool(content.episode.success)
     group.attrs["num_samples"] = content.rows

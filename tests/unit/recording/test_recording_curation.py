@@ -131,7 +131,7 @@ def test_rows_can_be_chosen_and_metadata_follows(still: Dataset, tmp_path: Path)
     gaps = [{"from_s": t, "to_s": t + 0.05, "rows": 1, "why": "disk"} for t in (0.1, 0.8, 2.5)]
     path.write_text(json.dumps(about | {"gaps": gaps}))
     rows = still.episodes[0].length
-    for kept in (KeptRows(0, rows + 1), KeptRows(6, 6), KeptRows(-2, 9)):
+    for kept in (KeptRows(0, rows + 1), KeptRows(6, 6), KeptRows(-2, 9), KeptRows(7, 20)):  # 7 is no key frame
         with raises_code(CommandError, "bad_rows"):
             trim(folder, {0: kept})
     with raises_code(CommandError, "no_episodes"):

@@ -97,6 +97,7 @@ def test_programs_work_with_what_is_left(source: Dataset, tmp_path: Path, poor: 
     assert (reviewed.returncode, reviewed.stdout.splitlines()[-1]) == (0, "2 episodes checked, 0 problem(s)")
     for kind in ("npz", "zarr"):
         made = export(folder, kind, tmp_path / kind)
+        assert made.notes[0] == Dataset(folder).notes[0]
         assert made.rows == sum(source.episodes[k].length for k in (0, 1))
     if not poor:
         assert run_here(review_app.main, str(folder)).returncode == 0
