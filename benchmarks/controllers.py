@@ -8,7 +8,8 @@ tour    rms distance between tcp and set-point while the recorded tour is driven
 force   displacement by 10 N at the tcp along each axis, as a share of force over stiffness
 table   force on the table with the set-point 2 cm inside it at 500 N/m, and the last bounce
 held    greatest speed of a tcp that was held back by 30 N for 5 s, and is let go
-steps   steps per second of a 20 Hz policy with 500 Hz physics, in lock-step
+steps   steps per second of a 20 Hz policy with 500 Hz physics, in lock-step; with ``--robosuite``, the path of an
+        interpreter in whose environment robosuite is installed, also those of its task Lift, in turns
 
 All but the last run in lock-step and repeat exactly. ``--emulator`` measures ``rest`` and ``tour`` on an emulated
 Franka, through the vendor's own library, and needs it.
@@ -110,25 +111,33 @@ class Rest:
     worst: tuple[float, float]
     median: tuple[float, float]
     reached: int
+    missed: list[str]
+    """Why each of the other goals was not."""
 
 
 def rest(rig: hal.Rig, controller: Any, count: int, seed: int = 1) -> Rest:
     """Return the rest errors of random poses."""
-    arm, errors = arm_of(rig), []
+    arm, errors, missed = arm_of(rig), [], []
     unattended = arm.spec.attended
-    for goal in random_goals(arm, count, seed):
-        with (
-            contextlib.suppress(hal.MotionStopped),
-            arm.control(controller=controller, unattended=unattended) as control,
-        ):
-            begun = rig.clock.now()
-            while np.abs(arm.state().q_set - goal).max() > 1e-4 and rig.clock.now() < begun + LONGEST:
-                follow(rig, control, goal, 0.02)
-            if rig.clock.now() < begun + LONGEST:
-                follow(rig, control, goal, SETTLE)
-                errors.append(arm.state().tcp.distance(arm.fk(goal)))
+    for number, goal in enumerate(random_goals(arm, count, seed)):
+        limited = hal.Limited.NONE
+        try:
+            with arm.control(controller=controller, unattended=unattended) as control:
+                begun = rig.clock.now()
+                while np.abs(arm.state().q_set - goal).max() > 1e-4 and rig.clock.now() < begun + LONGEST:
+                    limited = follow(rig, control, goal, 0.02)[-1].limited
+                if rig.clock.now() < begun + LONGEST:
+                    follow(rig, control, goal, SETTLE)
+                    errors.append(arm.state().tcp.distance(arm.fk(goal)))
+                    continue
+                missed.append(f"goal {number}: {limited}, {np.abs(goal - arm.state().q_set).max():.2f} rad away")
+        except hal.MotionStopped as stop:
+            missed.append(f"goal {number}: {stop}")
+        if rig.world is not None:  # from where it was stopped, the way to the next one may be blocked as well
+            rig.world.reset()
+            rig.clock.sleep(0.2)
     worst, median = np.max(errors, axis=0), np.median(errors, axis=0)
-    return Rest((worst[0], worst[1]), (median[0], median[1]), len(errors))
+    return Rest((worst[0], worst[1]), (median[0], median[1]), len(errors), missed)
 
 
 def tour(rig: hal.Rig, controller: Any, seconds: float) -> tuple[float, float, int]:
@@ -217,7 +226,7 @@ def held(rig: hal.Rig, controller: Any, seconds: float = 5.0) -> tuple[float, fl
         return fastest, control.tcp_speed, lead
 
 
-def steps(controller: Any, engine: str | None, seconds: float = 10.0) -> float:
+def steps(controller: Any, engine: str | None, seconds: float) -> float:
     """Return the steps per second of a 20 Hz policy that moves the tcp, at 500 Hz physics."""
     with open_rig("panda", engine=engine, hz=500.0) as rig:
         arm = arm_of(rig)
@@ -233,6 +242,43 @@ def steps(controller: Any, engine: str | None, seconds: float = 10.0) -> float:
     raise AssertionError
 
 
+ROBOSUITE = """
+import sys, time, numpy as np, robosuite
+env = robosuite.make(
+    "Lift", robots="Panda", has_renderer=False, has_offscreen_renderer=False, use_camera_obs=False, control_freq=20
+)
+env.reset()
+still = np.zeros_like(env.action_spec[0])
+env.step(still)
+start, steps = time.perf_counter(), 0
+while time.perf_counter() - start < float(sys.argv[1]):
+    env.step(still)
+    steps += 1
+print(steps / (time.perf_counter() - start))
+"""
+
+
+def steps_of_robosuite(python: str, seconds: float) -> float:
+    """Return the steps per second of robosuite's task Lift (500 Hz physics, 20 Hz policy, its default controller)."""
+    command = [python, "-c", ROBOSUITE, str(seconds)]
+    done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=600)
+    return float(done.stdout.split()[-1])
+
+
+def show_steps(args: argparse.Namespace) -> None:
+    """Measure and print the steps per second, in turns, so that a busy computer slows all of them alike."""
+    rates: dict[str, list[float]] = {}
+    for _ in range(args.rounds):
+        for name, controller in (("position", None), ("task", TASK), ("joints", JOINTS)):
+            rates.setdefault(name, []).append(steps(controller, args.engine, args.turn))
+        if args.robosuite:
+            rates.setdefault("robosuite", []).append(steps_of_robosuite(args.robosuite, args.turn))
+    for name, found in rates.items():
+        print(
+            f"steps   {name:9s} {np.median(found):8.0f} steps/s at the median of {len(found)}, {max(found):.0f} at most"
+        )
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("rows", nargs="*", help="some of: rest tour force table held steps")
@@ -240,6 +286,9 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=27.0, help="length of the tour that is driven, s")
     parser.add_argument("--models", nargs="*", default=["panda", "fr3", "iiwa"])
     parser.add_argument("--engine", default=None)
+    parser.add_argument("--rounds", type=int, default=3, help="rounds of 'steps'")
+    parser.add_argument("--turn", type=float, default=5.0, help="length of each turn of 'steps', s")
+    parser.add_argument("--robosuite", default="", metavar="PYTHON", help="interpreter in whose environment it is")
     parser.add_argument("--emulator", choices=["fr3", "panda"], default=None)
     parser.add_argument("--host", default="127.0.8.3")
     args = parser.parse_args()
@@ -251,8 +300,7 @@ def main() -> None:
         return
     for row in rows:
         if row == "steps":
-            for name, controller in (("position", None), ("task", TASK), ("joints", JOINTS)):
-                print(f"steps   {name:9s} {steps(controller, args.engine):8.0f} steps/s")
+            show_steps(args)
         elif row == "tour":
             for model in args.models[:2]:
                 for hz in (240.0, 1000.0):
@@ -304,6 +352,8 @@ def show_rest(name: str, found: Rest) -> None:
         f"rest    {name:22s} {found.reached} reached; at most {1e3 * worst[0]:.3f} mm and {worst[1]:.5f} rad, "
         f"median {1e3 * median[0]:.3f} mm and {median[1]:.5f} rad"
     )
+    for text in found.missed:
+        print(f"        {text}")
 
 
 def show_tour(name: str, found: tuple[float, float, int]) -> None:

@@ -286,6 +286,18 @@ class TorqueBounds:
         step = self._step
         return [old + max(-step, min(step, new - old)) for old, new in zip(tau, goal, strict=True)]
 
+    def together(self, tau: Floats, goal: Floats) -> list[float]:
+        """Return the same, with all torques changed in proportion.
+
+        Where axes of joints are nearly in line, they turn against each other with next to no inertia: torques that are
+        late each by itself accelerate them that way, those that are late together only slow the motion down.
+        """
+        most = max([abs(new - old) for old, new in zip(tau, goal, strict=True)])
+        if most <= self._step:
+            return list(goal)
+        share = self._step / most
+        return [old + share * (new - old) for old, new in zip(tau, goal, strict=True)]
+
     # Braking.
 
     def brake(self, tau: Floats, arm: ArmInMotion, share: float) -> tuple[list[float], float]:
@@ -627,7 +639,7 @@ class TorqueMotion(ServoMotion):
         self._braking = self._share = 0.0
         if self._begun:
             assert self.bounds is not None
-            self.tau = self.bounds.towards(self.tau, self.bounds.shared(tau, gain, arm, velocity))
+            self.tau = self.bounds.together(self.tau, self.bounds.shared(tau, gain, arm, velocity))
         self._begun = True
 
     def brake(self) -> bool:

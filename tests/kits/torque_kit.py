@@ -15,6 +15,7 @@ from specs import panda
 from hal.commands import Kind, Session
 from hal.driver import Reading, Setpoint
 from hal.drivers.mock.robot import MockRobot
+from hal.servo.controllers import Controller, controller_data, resolve
 from hal.servo.servo import Servo
 from hal.specs import WorkspaceSpec
 from hal.types import RobotStatus, Trip
@@ -36,6 +37,7 @@ class Driven(HandTicked):
         tcp_speed: float = 0.25,
         deadman: bool = True,
         mass_matrix: Callable[[Sequence[float]], Any] | None = None,
+        controller: Controller | None = None,
     ) -> None:
         self.driver, self.world = driver, world
         super().__init__(driver.spec, rate_hz, 20.0, deadman)
@@ -52,7 +54,10 @@ class Driven(HandTicked):
         driver.open()
         self.reading: Reading = driver.read(self.now)
         self.servo.anchor(self.reading.q)
-        self.servo.open_session(Session(1, speed, tcp_speed, deadman), self.inbox())
+        chosen = None
+        if controller is not None:
+            chosen = controller_data(resolve(controller, self.spec, self.servo.kinematics, rate_hz))
+        self.servo.open_session(Session(1, speed, tcp_speed, deadman, controller=chosen), self.inbox())
         self.tick()
         if deadman:
             self.press()

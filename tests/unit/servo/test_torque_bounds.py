@@ -179,3 +179,10 @@ def test_a_face_of_the_workspace_is_looked_at_ahead() -> None:
 def test_what_is_no_inertia_is_refused(bad: NDArray[np.float64]) -> None:
     with pytest.raises(ValueError, match=r"inertia|[Ss]ingular"):
         Inertia(bad, N)
+
+
+def test_the_torques_of_a_controller_change_in_proportion() -> None:
+    made, _ = bounds()
+    assert made.together([0.0] * N, [0.5, -0.5, *STILL[2:]]) == [0.5, -0.5, *STILL[2:]]
+    tau = made.together([1.0, *STILL[1:]], [11.0, -5.0, *STILL[2:]])
+    assert tau == pytest.approx([1.0 + RATE * DT, -0.5 * RATE * DT, *STILL[2:]])
