@@ -19,7 +19,6 @@ TORQUE = "hal.JointTorque([5.0] + [0.0] * 6)"
 @pytest.fixture
 def watch(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[object]:
     """Start an app whose arm moves, by velocities or by torques; it is ended after the test."""
-    assert MOTION in observer.APP
     watched: list[observer.Watched] = []
 
     def start(ending: str = "", command: str = MOTION) -> observer.Watched:
@@ -67,3 +66,17 @@ def test_user_code_that_goes_wrong(watch, ending: str, trip: Trip) -> None:
         assert app.process.wait(5) == 1, "the user's own exception ends the program"
     else:
         app.wait_for(lambda: app.servo().trip is trip)  # a busy computer may show the arm at rest before its deadline
+
+
+def test_an_app_that_is_killed_while_a_motion_runs(watch, monkeypatch: pytest.MonkeyPatch) -> None:
+    session = "with rig, arm.control(rate_hz={rate_hz}) as control:"
+    assert session in observer.APP
+    motion = "motion = arm.start_move_to([2.0, *arm.home[1:]], speed=0.2)\nwith rig:"
+    send = f"control.send({MOTION})"
+    monkeypatch.setattr(observer, "APP", observer.APP.replace(session, motion).replace(send, "motion.progress"))
+    app = watch()
+    assert app.speed() > 0.1, "the arm moves before"
+    app.end("kill -9")
+    app.wait_for(app.at_rest)
+    app.wait_for(app.nobody_left)
+    assert app.servo().progress < 0.9
