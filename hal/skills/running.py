@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import product
 from types import TracebackType
 from typing import TYPE_CHECKING, Literal, NoReturn, TypedDict
 
@@ -238,35 +239,52 @@ class SkillRun:
     def choose_way(self, *groups: Sequence[Sequence[Pose]]) -> tuple[Sequence[Pose], Array]:
         """Return a way that the arm reaches all along, and the joint positions (n,) in rad at its start.
 
-        It is the nearest one, in joint positions, of the first group with any. Fails as ``unreachable`` or
-        ``outside_limits`` if there is none.
+        It is the nearest one, in joint positions, of the first group with any; one with straight lines all along comes
+        first. Fails as ``unreachable`` or ``outside_limits`` if there is none.
 
         Args:
             groups: Ways: the poses of the tcp, in the arm's base frame, in the order in which they are visited.
         """
-        now = self.arm.state().q
+        now, home = self.arm.state().q, np.asarray(self.arm.home, float)
+        first: tuple[Sequence[Pose], Array] | None = None
         problems: list[tuple[Reason, str]] = []
-        for ways in groups:
+        for near, ways in product((now, home), groups):  # from an odd posture, lines may end at a joint's limit
             found = []
             for way in ways:
                 try:
-                    start = self._solve(way)
+                    start = self._solve(way, near)
                 except Unreachable as error:
                     problems.append(("unreachable", str(error)))
                 except CommandError as error:
                     problems.append(("outside_limits", str(error)))
                 else:
                     found.append((float(np.abs(start - now).max()), way, start))
-            if found:
-                _, way, start = min(found, key=lambda each: each[0])
-                return way, start
-        reason, message = problems[0]
-        return self.fail(reason, message)
+            for _, way, start in sorted(found, key=lambda each: each[0]):
+                if self._is_straight(way, start):
+                    return way, start
+                first = first or (way, start)
+        return first or self.fail(*problems[0])
 
-    def _solve(self, way: Sequence[Pose]) -> Array:
-        """Return the joint positions (n,) in rad at the start of a way; raise if the arm does not reach all of it."""
+    def _is_straight(self, way: Sequence[Pose], q: Array) -> bool:
+        """Return whether the tcp can follow the lines of a way, which begins at joint positions (n,), rad."""
+        from ..motion.planning import PathPlanner
+
+        planner = PathPlanner(self.arm.kinematics, self.arm.limits.lower, self.arm.limits.upper)
+        try:
+            planner.along_poses(q.tolist(), [(*pose.position.tolist(), *pose.orientation.tolist()) for pose in way])
+        except (Unreachable, CommandError):
+            return False
+        return True
+
+    def _solve(self, way: Sequence[Pose], near: Array) -> Array:
+        """Return joint positions (n,) in rad at the start of a way; raise if the arm does not reach all of it.
+
+        Args:
+            way: The poses of the tcp.
+            near: Joint positions (n,) near which to search, rad.
+        """
         arm, box = self.arm, self.arm.spec.workspace
-        last, first = arm.state().q, None
+        last, first = near, None
         for pose in way:
             if box is not None and not np.all((pose.position >= box.lower) & (pose.position <= box.upper)):
                 raise CommandError(f"{_text(pose)} is outside the workspace of {arm.name}", code="outside_workspace")

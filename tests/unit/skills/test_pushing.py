@@ -47,6 +47,16 @@ def test_a_push_follows_its_path_and_leaves(rig: hal.Rig) -> None:
     assert widths == pytest.approx([0.02, 0.03]), "the fingers let go before they back off"
 
 
+def test_a_push_begins_where_the_arm_can_follow_its_line_to_the_end(rig: hal.Rig) -> None:
+    """With the half turn of the hand that is nearer, joint 7 would be at its limit after 60 % of this line."""
+    arm, leaning = rig.robots["panda"], [-0.9911718735, -0.0232643579, -0.1304902527, 0.0030628108]
+    arm.move_to(arm.home, speed=1.0)
+    result = push(
+        arm, [hal.Pose(place, leaning) for place in ([0.4175, 0.0814, 0.02], [0.5692, 0.0886, 0.02])], speed=1.0
+    )
+    assert result, result.message
+
+
 def test_what_a_push_cannot_do(rig: hal.Rig) -> None:
     arm = rig.robots["panda"]
     with raises_code(hal.CommandError, "path_too_short"):
